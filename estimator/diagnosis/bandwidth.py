@@ -1,0 +1,88 @@
+"""The bandwidth that all channels share, and the noise it lets into each equation."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import fft
+
+from estimator.diagnosis.frame import Frame, Signals
+from estimator.diagnosis.spectral import lowpass
+from estimator.model import JointModel
+from estimator.sample import FloatArray, Record
+
+__all__ = ["choose_bandwidth", "equation_noise", "torque_rms"]
+
+_CHOICES_HZ = (60.0, 40.0, 30.0, 25.0, 20.0, 16.0, 12.0, 9.0, 6.0, 4.0)
+_CONTENT = 0.98  # share of the torque's power that defines where the motion happens
+_WIDER = 4.0  # bandwidth over that frequency: effects have harmonics
+_LEAST_HZ = 12.0
+_MOST_HZ = 25.0
+_NYQUIST = 0.2  # of the sampling rate, at most
+_NOISE = 0.004  # of the torque's rms, at most
+_MODEL = 0.001  # of the torque's rms: no model is better than this
+
+
+def torque_rms(record: Record) -> float:
+    """rms of the motor torque without its mean, N·m; of the motor that has more of it."""
+    return float(np.max(np.std(record.motor_torque_nm, axis=0)))
+
+
+def choose_bandwidth(record: Record, model: JointModel) -> float:
+    """A bandwidth from the data, Hz: wide enough for the motion, narrow enough for the encoders' noise."""
+    rate = 1.0 / record.period_s
+    torque = record.motor_torque_nm - record.motor_torque_nm.mean(axis=0)
+    power = np.sum(np.abs(fft.rfft(torque, axis=0)) ** 2, axis=1)
+    share = np.cumsum(power) / max(float(power.sum()), 1e-300)
+    content = float(np.searchsorted(share, _CONTENT)) * rate / len(torque)
+    wanted = min(max(_WIDER * content, _LEAST_HZ), _MOST_HZ, _NYQUIST * rate)
+    limit = _NOISE * torque_rms(record)
+    stiffness = rough_stiffness(record, model)
+    for choice in (wanted, *(c for c in _CHOICES_HZ if c < wanted)):
+        signals = Signals(record, choice)
+        if float(np.max(equation_noise(signals, model, stiffness, linked=False))) <= limit:
+            return float(choice)
+    return min(_CHOICES_HZ[-1], wanted)
+
+
+def rough_stiffness(record: Record, model: JointModel) -> list[float]:
+    """K of each transmission from the slow part of torque and deflection, N·m/rad."""
+    found = []
+    for i, motor in enumerate(model.motors):
+        if motor.transmission.model == "none" or record.link_position_rad is None:
+            found.append(0.0)
+            continue
+        phi = record.link_position_rad - record.motor_position_rad[:, i]
+        tau = record.motor_torque_nm[:, i]
+        phi, tau = phi - phi.mean(), tau - tau.mean()
+        found.append(float(np.sqrt(np.sum(tau * tau) / max(float(np.sum(phi * phi)), 1e-300))))
+    return found
+
+
+def equation_noise(signals: Signals, model: JointModel, stiffness: list[float], linked: bool) -> FloatArray:
+    """Standard deviation that the channels' noise has in each equation's balance, N·m."""
+    f = signals.light.frequency_hz
+    s = 2j * np.pi * f
+    narrow = lowpass(f, signals.bandwidth_hz)
+
+    variances = []
+    for i, motor in enumerate(model.motors):
+        k = stiffness[i]
+        own = motor.inertia_kg_m2 * s**2 + motor.viscous_damping_nm_s_rad * s + k
+        variance = signals.noise(signals.theta[i], own * narrow) + signals.noise(signals.tau[i], narrow)
+        if k and signals.q is not None:
+            variance += signals.noise(signals.q, k * narrow)
+        variances.append(variance)
+    if linked and model.link is not None and signals.q is not None:
+        k = sum(stiffness)
+        own = model.link.inertia_kg_m2 * s**2 + model.link.viscous_damping_nm_s_rad * s + k
+        variance = signals.noise(signals.q, own * narrow)
+        for spectrum, each in zip(signals.theta, stiffness, strict=True):
+            variance += signals.noise(spectrum, each * narrow)
+        variances.append(variance)
+    return np.asarray(np.sqrt(np.array(variances)))
+
+
+def weights(frame: Frame, stiffness: list[float], torque: float) -> FloatArray:
+    """One over the expected error of each equation: the channels' noise and what no model can do."""
+    noise = equation_noise(frame.signals, frame.model, stiffness, frame.linked)
+    return np.asarray(1.0 / np.hypot(noise, _MODEL * torque))

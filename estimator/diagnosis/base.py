@@ -1,0 +1,125 @@
+"""The declared model at its best fit: transmission parameters free, everything else as declared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from estimator.diagnosis.frame import Frame
+from estimator.model import ParameterValue
+from estimator.sample import FloatArray
+from estimator.transmissions import TransmissionModel, transmission_model
+
+__all__ = ["Base", "start", "with_flexibility"]
+
+_SEARCH = 25  # points of the search over a shape parameter without prior knowledge
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Base:
+    """Transmission parameters alpha, one array per motor (empty where the transmission is rigid)."""
+
+    alpha: tuple[FloatArray, ...]
+
+    def models(self, frame: Frame) -> list[TransmissionModel | None]:
+        """The transmission models, None where rigid."""
+        return [
+            transmission_model(motor.transmission) if flexible else None
+            for motor, flexible in zip(frame.model.motors, frame.flexible, strict=True)
+        ]
+
+    def design(self, frame: Frame) -> FloatArray:
+        """Columns d tau_e / d alpha of all motors, stacked."""
+        made = []
+        for i, model in enumerate(self.models(frame)):
+            if model is None:
+                continue
+            jacobian = model.jacobian(frame.motors[i].deflection, self.alpha[i])
+            made += [frame.column(i, column, column if frame.pulls[i] else None) for column in jacobian.T]
+        empty = np.zeros((frame.rows * frame.equations, 0))
+        return np.stack(made, axis=1) if made else empty
+
+    def torque(self, frame: Frame) -> FloatArray:
+        """tau_e at alpha in all equations, stacked."""
+        total = np.zeros(frame.rows * frame.equations)
+        for i, model in enumerate(self.models(frame)):
+            if model is not None:
+                torque = model.torque(frame.motors[i].deflection, self.alpha[i])
+                total = total + frame.column(i, torque, torque if frame.pulls[i] else None)
+        return total
+
+    def moved(self, frame: Frame, step: FloatArray) -> Base:
+        """Alpha plus a step, shape parameters kept inside their bounds."""
+        alpha, begin = [], 0
+        for model, old in zip(self.models(frame), self.alpha, strict=True):
+            new = old + step[begin : begin + len(old)]
+            begin += len(old)
+            if model is not None and model.shape_bounds:
+                first = len(new) - len(model.shape_bounds)
+                for k, (low, high) in enumerate(model.shape_bounds):
+                    reach = 0.5 * abs(old[first + k])
+                    value = float(np.clip(new[first + k], old[first + k] - reach, old[first + k] + reach))
+                    new[first + k] = np.clip(value, low * 1.0001 + 1e-9, high * 0.9999)
+            alpha.append(new)
+        return replace(self, alpha=tuple(alpha))
+
+    def parameters(self, frame: Frame) -> list[dict[str, ParameterValue]]:
+        """Alpha by its names in the joint file, one mapping per motor."""
+        return [
+            {} if model is None else model.parameters(alpha)
+            for model, alpha in zip(self.models(frame), self.alpha, strict=True)
+        ]
+
+
+def start(frame: Frame) -> Base:
+    """Alpha to begin with: as declared, or by a search over the shape, motor by motor."""
+    alpha = []
+    for i, motor in enumerate(frame.model.motors):
+        model = transmission_model(motor.transmission) if frame.flexible[i] else None
+        if model is None:
+            alpha.append(np.zeros(0))
+        elif motor.transmission.parameters:
+            alpha.append(np.asarray(model.alpha(motor.transmission.parameters), dtype=np.float64).copy())
+        else:
+            alpha.append(_search(frame, i, model, motor.transmission.order or 1))
+    return Base(tuple(alpha))
+
+
+def _search(frame: Frame, i: int, model: TransmissionModel, order: int) -> FloatArray:
+    phi = frame.motors[i].deflection
+    target = frame.project(frame.motor_balance(i))
+    most = float(np.max(np.abs(phi)))
+    shapes: list[tuple[float, ...]] = [()]
+    if model.shape_bounds:
+        low, high = model.shape_bounds[0]
+        rest = model.shape_start[1:]
+        first = 1.02 * low if low > 0.5 else 0.02 / max(most, 1e-9)
+        near = np.geomspace(first, min(high, max(20.0 / max(most, 1e-9), 1.1 * first)), _SEARCH)
+        shapes = [(float(x), *rest) for x in near if model.reach((float(x), *rest)) > most * 1.001]
+    best, found = np.inf, np.zeros(0)
+    for shape in shapes:
+        columns = frame.project(np.asarray(model.basis(phi, shape, order)))
+        with_mean = np.column_stack((columns, np.ones(len(columns))))
+        solution, *_ = np.linalg.lstsq(with_mean, target, rcond=None)
+        error = float(np.sum((target - with_mean @ solution) ** 2))
+        if error < best:
+            best, found = error, np.array([*solution[:-1], *shape])
+    return found
+
+
+def with_flexibility(frame: Frame, base: Base) -> Frame:
+    """The frame with tau_e and stiffness filled into its coordinates."""
+    motors = []
+    for c, model, alpha in zip(frame.motors, base.models(frame), base.alpha, strict=True):
+        if model is None:
+            # Rigid: what the motor passes on is not known; its own torque stands for the load.
+            motors.append(c)
+            continue
+        motors.append(
+            c._replace(
+                flexibility_torque=np.asarray(model.torque(c.deflection, alpha)),
+                stiffness=np.asarray(model.stiffness(c.deflection, alpha)),
+            )
+        )
+    return replace(frame, motors=tuple(motors))

@@ -1,0 +1,238 @@
+"""The library's effects as columns of the stacked regression, and the grids of their nonlinear parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimator.diagnosis.frame import Frame
+from estimator.effects import LIBRARY, Coordinates, EffectType
+from estimator.effects.memory import trace
+from estimator.sample import FloatArray
+
+__all__ = ["Candidate", "columns", "grid", "least_periods", "members"]
+
+Values = Mapping[str, float]
+
+# Laws of friction and hysteresis with memory: Dahl, Bouc-Wen, elastic up to the limit.
+LAWS = ((1.0, 1.0), (2.0, 0.5), (50.0, 1.0))
+_LEAST_PERIODS = 1.0  # of a position ripple within the range of motion
+_MOST_WAVES = 900
+_SCALES = ("torque_constant", "torque_saturation", "torque_drift")
+_OWN_SHARE = 0.4  # of the torque's rms
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """One effect at one motor (None: at the link)."""
+
+    kind: EffectType
+    motor: int | None
+
+    @property
+    def key(self) -> tuple[str, int | None]:
+        """What identifies it."""
+        return self.kind.name, self.motor
+
+
+def members(frame: Frame, within: tuple[str, int | None] | None = None) -> list[Candidate]:
+    """The effects that this joint can have and these data could show.
+
+    Args:
+        frame: the recording.
+        within: the only place there is anything to explain: location and motor; None: anywhere.
+    """
+    return [c for c in _possible(frame) if within is None or _is_at(c, *within)]
+
+
+def _is_at(candidate: Candidate, location: str, motor: int | None) -> bool:
+    """Whether an effect acts at a place; errors of the encoders' readings act like a transmission."""
+    own = candidate.kind.location
+    if own == "measurement":
+        return location == "transmission"
+    return own == location and candidate.motor == motor
+
+
+def _possible(frame: Frame) -> list[Candidate]:
+    found = []
+    external = frame.linked
+    for kind in LIBRARY.values():
+        if kind.location == "link":
+            if external:
+                found.append(Candidate(kind, None))
+        elif kind.channel == "link_position":
+            if any(frame.flexible):
+                found.append(Candidate(kind, None))
+        else:
+            if kind.channel == "deflection" and sum(frame.flexible) > 1:
+                found.append(Candidate(kind, None))
+            found += [
+                Candidate(kind, i)
+                for i in range(len(frame.motors))
+                if (frame.flexible[i] or not _needs_deflection(kind))
+                and (kind.name not in _SCALES or _scale_shows(frame, i))
+            ]
+    return found
+
+
+def _scale_shows(frame: Frame, motor: int) -> bool:
+    """Whether a wrong torque scale would show.
+
+    Without the link's dynamics only the known inertia tells the torque's scale from that of the stiffness;
+    where it takes little torque, a smaller scale merely shrinks everything, the error included.
+    """
+    if frame.linked or not frame.flexible[motor]:
+        return True
+    c = frame.motors[motor]
+    own = frame.model.motors[motor].inertia_kg_m2 * c.acceleration
+    return float(np.std(own)) > _OWN_SHARE * float(np.std(c.torque))
+
+
+def _needs_deflection(kind: EffectType) -> bool:
+    return (
+        kind.location == "transmission"
+        or kind.channel == "deflection"
+        or kind.name == "load_dependent_friction"
+    )
+
+
+def columns(frame: Frame, candidate: Candidate, values: Values) -> FloatArray:
+    """Stacked, filtered columns (rows, k) of an effect, one per linear parameter."""
+    kind = candidate.kind
+    motor = candidate.motor or 0
+    c = frame.motors[motor]
+    terms = _terms(kind, c, values)
+    if kind.channel == "link_position":
+        return np.stack([_reading(frame, term) for term in terms], axis=1)
+    made = []
+    for term in terms:
+        if kind.channel == "deflection" and candidate.motor is None:
+            made.append(_zero(frame, term))
+        elif kind.channel == "deflection":
+            force = -c.stiffness * term
+            made.append(frame.column(motor, force, force if frame.pulls[motor] else None))
+        elif kind.location == "transmission":
+            made.append(frame.column(motor, term, term if frame.pulls[motor] else None))
+        elif kind.location == "motor":
+            made.append(frame.column(motor, -term, None))
+        else:
+            made.append(frame.column(None, None, term))
+    return np.stack(made, axis=1)
+
+
+def _terms(kind: EffectType, c: Coordinates, values: Values) -> tuple[FloatArray, ...]:
+    if kind.law is not None:
+        path = c.position if kind.location == "motor" else c.deflection
+        return (trace(path / values["displacement_rad"], values["exponent"], values["shape"]),)
+    assert kind.terms is not None
+    return kind.terms(c, values, np)
+
+
+def _zero(frame: Frame, error: FloatArray) -> FloatArray:
+    """Column of an error that all deflections have in common."""
+    parts: list[FloatArray | None] = [frame.project(-c.stiffness * error) for c in frame.motors]
+    if frame.linked:
+        force = [-c.stiffness * error for c, pulls in zip(frame.motors, frame.pulls, strict=True) if pulls]
+        parts.append(frame.project(np.sum(force, axis=0)))
+    return frame.stack(parts)
+
+
+def _reading(frame: Frame, error: FloatArray) -> FloatArray:
+    """Column of an error e that the link's reading has too much: through tau_e and the link's balance."""
+    narrow, response = frame.signals.narrow, frame.signals.response
+    parts: list[FloatArray | None] = []
+    total = np.zeros_like(error)
+    for c, flexible, pulls in zip(frame.motors, frame.flexible, frame.pulls, strict=True):
+        parts.append(frame.project(-c.stiffness * error) if flexible else None)
+        if pulls:
+            total = total + c.stiffness
+    if frame.linked:
+        link = frame.model.link
+        assert link is not None
+        slope = link.gravity_nm * np.cos(frame.motors[0].link_position + link.gravity_phase_rad)
+        spectrum = narrow.transform(error)
+        rate = narrow.apply(spectrum, response, 1)[frame.signals.keep]
+        acceleration = narrow.apply(spectrum, response, 2)[frame.signals.keep]
+        force = frame.project((total + slope) * error)
+        own = link.inertia_kg_m2 * acceleration + link.viscous_damping_nm_s_rad * rate
+        parts.append(-(force + own))
+    return frame.stack(parts)
+
+
+def grid(frame: Frame, candidate: Candidate, smoothing_rad_s: float) -> list[dict[str, float]]:
+    """Values of the nonlinear parameters to start from.
+
+    Args:
+        frame: the recording.
+        candidate: the effect.
+        smoothing_rad_s: velocity below which a sign cannot be told from noise.
+    """
+    kind = candidate.kind
+    c = frame.motors[candidate.motor or 0]
+    fixed = {p.name: float(p.default) for p in kind.parameters if not p.linear and p.default is not None}
+    if "smoothing_rad_s" in kind.nonlinear:
+        fixed["smoothing_rad_s"] = smoothing_rad_s
+    if kind.name == "stribeck_friction":
+        fast = np.maximum(_rms(c.velocity) * np.geomspace(0.04, 0.8, 7), 4.0 * smoothing_rad_s)
+        return _vary(fixed, "stribeck_velocity_rad_s", fast)
+    if kind.law is not None:
+        path = c.position if kind.location == "motor" else c.deflection
+        scales = _spread(path) * np.geomspace(0.004, 0.5, 8)
+        return [{"displacement_rad": float(d), "exponent": n, "shape": b} for n, b in LAWS for d in scales]
+    if kind.name in ("cogging", "kinematic_error"):
+        return _vary(fixed, "periods_per_rev", _waves(frame, c))
+    if kind.name == "backlash":
+        return _vary(fixed, "half_gap_rad", np.quantile(np.abs(c.deflection), np.linspace(0.05, 0.9, 9)))
+    if kind.name == "higher_order_stiffness":
+        declared = _declared_power(frame, candidate.motor or 0)
+        return _vary(fixed, "power", np.array([p for p in (3.0, 5.0, 7.0) if p > declared][:2]))
+    if kind.name == "torque_drift":
+        return _vary(fixed, "time_constant_s", c.time[-1] * np.geomspace(0.04, 1.0, 6))
+    if kind.name == "contact":
+        places = np.quantile(c.link_position, np.linspace(0.04, 0.96, 12))
+        return [{"position_rad": float(x), "side": side} for side in (1.0, -1.0) for x in places]
+    return [fixed]
+
+
+def _vary(fixed: Values, name: str, values: Iterable[float]) -> list[dict[str, float]]:
+    return [{**fixed, name: float(value)} for value in values]
+
+
+def _waves(frame: Frame, c: Coordinates) -> FloatArray:
+    """Periods per revolution whose ripple is inside the bandwidth for a good part of the motion."""
+    spread = _spread(c.position)
+    if spread <= 0.0:
+        return np.array([])
+    least = least_periods(c.position)
+    slow = float(np.quantile(np.abs(c.velocity), 0.4))
+    most = 2.0 * np.pi * frame.signals.bandwidth_hz / max(slow, 1e-12)
+    step = np.pi / spread
+    count = int(np.clip((most - least) / step, 0, _MOST_WAVES))
+    return np.asarray(least + step * np.arange(count))
+
+
+def least_periods(position: FloatArray) -> float:
+    """Fewest periods per revolution that the range of motion lets one call a ripple."""
+    return _LEAST_PERIODS * 2.0 * np.pi / max(_spread(position), 1e-300)
+
+
+def _declared_power(frame: Frame, motor: int) -> float:
+    transmission = frame.model.motors[motor].transmission
+    if transmission.model == "linear":
+        return 1.0
+    if transmission.model != "polynomial":
+        return 3.0
+    coefficients = transmission.parameters.get("coefficients_nm_rad")
+    order = transmission.order or (len(coefficients) if isinstance(coefficients, tuple) else 1)
+    return 2.0 * order - 1.0
+
+
+def _rms(x: FloatArray) -> float:
+    return float(np.sqrt(np.mean(x * x)))
+
+
+def _spread(x: FloatArray) -> float:
+    low, high = np.quantile(x, [0.01, 0.99])
+    return float(high - low)

@@ -1,0 +1,75 @@
+"""Whether the motion tells the effects apart, and which motion would."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import fft
+
+from estimator.diagnosis.frame import Frame
+from estimator.sample import FloatArray
+
+__all__ = ["advice_for", "lines", "poor"]
+
+_FEW = 1.08  # effective number of spectral lines below which everything is proportional to everything
+
+
+def lines(x: FloatArray) -> float:
+    """Effective number of spectral lines of a signal: (sum S)² / sum S², one for a sine."""
+    window = np.hanning(len(x))
+    power = np.abs(fft.rfft((x - x.mean()) * window)) ** 2
+    # A line is three bins wide behind this window, with powers 1/4, 1, 1/4 of its peak.
+    return float(power.sum() ** 2 / np.sum(power**2) / 2.0)
+
+
+def poor(frame: Frame) -> bool:
+    """Whether the motion is hardly more than one sine."""
+    return all(
+        lines(frame.project(c.velocity)) < _FEW and lines(frame.project(c.torque)) < _FEW
+        for c in frame.motors
+    )
+
+
+_HINTS = {
+    frozenset({"torque_offset", "deflection_offset"}): (
+        "torque_offset or deflection_offset: only the link's dynamics ([link.dynamics]) or a known zero of "
+        "the encoders tells them apart"
+    ),
+    frozenset({"cogging", "kinematic_error"}): (
+        "cogging or kinematic_error: declare [link.dynamics]; a kinematic error shows on both sides"
+    ),
+    frozenset({"viscous_damping", "encoder_delay"}): (
+        "viscous_damping or encoder_delay: move faster, so that the deflection changes with acceleration, or "
+        "declare [link.dynamics]"
+    ),
+    frozenset({"encoder_scale", "motor_inertia"}): (
+        "encoder_scale or motor_inertia: hold different positions under load at standstill"
+    ),
+    frozenset({"coulomb_friction", "stribeck_friction"}): (
+        "coulomb_friction or stribeck_friction: move slowly, at constant velocities near zero"
+    ),
+    frozenset({"coulomb_friction", "asymmetric_friction"}): (
+        "coulomb_friction or asymmetric_friction: move at the same speeds in both directions"
+    ),
+    frozenset({"coulomb_friction", "presliding_friction"}): (
+        "coulomb_friction or presliding_friction: reverse often, over very small distances"
+    ),
+    frozenset({"gravity", "deflection_offset"}): (
+        "gravity or deflection_offset: cover a larger arc of the link, at least a quarter turn"
+    ),
+    frozenset({"encoder_eccentricity", "encoder_scale"}): (
+        "encoder_eccentricity or encoder_scale: cover a larger arc of the link, best a full turn"
+    ),
+}
+
+
+def advice_for(name: str, alternatives: tuple[str, ...]) -> list[str]:
+    """Which motion, or which knowledge, would decide between an effect and its alternatives."""
+    said = []
+    for other in alternatives:
+        hint = _HINTS.get(frozenset({name, other}))
+        said.append(
+            hint
+            or f"{name} or {other}: repeat with another motion: faster and slower, wider, a sum of several "
+            "frequencies instead of one"
+        )
+    return said

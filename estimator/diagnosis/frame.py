@@ -1,0 +1,261 @@
+"""A recording as regression rows: coordinates of every part of the joint, and the balances of its equations.
+
+Two filters act on everything alike. The light one, G, gives smooth coordinates for nonlinear terms at a
+reduced rate; the second, F, has the bandwidth of the diagnosis and gives the rows. Both have no phase.
+The torque of row k acts from t_k to t_(k+1): its hold, a delay of half a period and sin(x)/x, is part of G.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.diagnosis.spectral import Band, Spectrum, lowpass
+from estimator.effects import Coordinates
+from estimator.model import JointModel
+from estimator.sample import FloatArray, Record
+
+__all__ = ["Corrections", "Frame", "Signals"]
+
+_LIGHT = 4.0  # bandwidth of G in units of that of F
+_GRID_RATE = 14.0  # samples of the grid per period of the bandwidth
+_LONG = 90_000  # grid points beyond which the grid gets coarser
+_ROW_RATE = 3.0  # rows per period of the bandwidth
+_EDGE_PERIODS = 1.5  # periods of the bandwidth that are not used at the ends and around gaps
+_TAIL = 0.6  # share of the Nyquist frequency above which the spectrum is taken for noise
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Corrections:
+    """Errors of the readings that are taken out before anything else is computed.
+
+    Attributes:
+        torque_delay_s: per motor, the torque acts so much later than reported.
+        offset_rad: per motor, deflection that is read when there is none.
+        encoder_delay_s: the link position is read so much later than the rest.
+        encoder_sin_rad: the link reading has sin(q) times this too much.
+        encoder_cos_rad: and cos(q) times this.
+        encoder_scale: and q times this.
+    """
+
+    torque_delay_s: tuple[float, ...]
+    offset_rad: tuple[float, ...]
+    encoder_delay_s: float = 0.0
+    encoder_sin_rad: float = 0.0
+    encoder_cos_rad: float = 0.0
+    encoder_scale: float = 0.0
+
+    @classmethod
+    def none(cls, motors: int) -> Corrections:
+        """Readings as they are."""
+        return cls(torque_delay_s=(0.0,) * motors, offset_rad=(0.0,) * motors)
+
+
+class Signals:
+    """The raw channels' spectra, made once, and the noise of each channel.
+
+    Args:
+        record: the recording; gaps are bridged by lines and not used as rows.
+        bandwidth_hz: of F.
+    """
+
+    def __init__(self, record: Record, bandwidth_hz: float) -> None:
+        sequence = record.sequence - record.sequence[0]
+        self.samples = int(sequence[-1]) + 1
+        self.period_s = record.period_s
+        self.bandwidth_hz = bandwidth_hz
+        whole = self.samples == len(sequence)
+        grid = np.arange(self.samples)
+
+        def bridged(x: FloatArray) -> FloatArray:
+            return x if whole else np.interp(grid, sequence, x)
+
+        rate = max(_GRID_RATE * bandwidth_hz, 3.0 * _LIGHT * bandwidth_hz)
+        step = max(1, int(1.0 / (record.period_s * rate)))
+        if self.samples / step > _LONG:
+            coarse = max(1, int(1.0 / (record.period_s * 2.2 * _LIGHT * bandwidth_hz)))
+            step = min(coarse, max(step, -(-self.samples // _LONG)))
+        margin = 3.0 / bandwidth_hz
+        self.light = Band(self.samples, record.period_s, step, margin)
+        link = record.link_position_rad
+        self.theta = [self.light.transform(bridged(x)) for x in record.motor_position_rad.T]
+        self.tau = [self.light.transform(bridged(x)) for x in record.motor_torque_nm.T]
+        self.q = None if link is None else self.light.transform(bridged(link))
+        external = record.external_torque_nm
+        self.external = None if external is None else self.light.transform(bridged(external))
+        rows_step = max(1, int(1.0 / (self.light.period_s * _ROW_RATE * bandwidth_hz)))
+        self.narrow = Band(self.light.kept, self.light.period_s, rows_step, margin)
+        self.response = lowpass(self.narrow.frequency_hz, bandwidth_hz)
+        self.keep = self._rows(record, sequence)
+
+    def _rows(self, record: Record, sequence: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Rows away from the ends and from gaps."""
+        edge = _EDGE_PERIODS / self.bandwidth_hz
+        time = np.arange(self.narrow.kept) * self.narrow.period_s
+        end = (self.samples - 1) * record.period_s
+        keep = (time >= edge) & (time <= end - edge)
+        gaps = np.flatnonzero(np.diff(sequence) > 1)
+        for before, after in zip(sequence[gaps], sequence[gaps + 1], strict=True):
+            keep &= (time < before * record.period_s - edge) | (time > after * record.period_s + edge)
+        return keep
+
+    def noise(self, spectrum: Spectrum, response: NDArray[Any]) -> float:
+        """Variance that a channel's white noise has after a filter; the noise is read off the upper end.
+
+        Args:
+            spectrum: of the channel.
+            response: of the filter at the frequencies of `light`.
+        """
+        power = np.abs(spectrum[0]) ** 2
+        white = float(np.median(power[int(_TAIL * len(power)) :]) / np.log(2.0))
+        return 2.0 * white * float(np.sum(np.abs(response) ** 2)) / self.light.length**2
+
+    def velocity_noise(self, motor: int) -> float:
+        """Standard deviation of a motor's velocity behind the light filter, rad/s."""
+        frequency = self.light.frequency_hz
+        response = 2.0 * np.pi * frequency * light_response(self)
+        return float(np.sqrt(self.noise(self.theta[motor], response)))
+
+
+def light_response(signals: Signals) -> FloatArray:
+    """Response of G."""
+    return lowpass(signals.light.frequency_hz, min(_LIGHT * signals.bandwidth_hz, 0.45 / signals.period_s))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """Coordinates on the grid and the equations' balances as rows.
+
+    Attributes:
+        model: the joint as declared.
+        signals: where it comes from.
+        corrections: what has been taken out of the readings.
+        motors: coordinates per motor; flexibility torque and stiffness are filled in by the base fit.
+        external: tau_k on the grid, zero where it is not measured.
+        linked: whether the link's equation is there.
+        flexible: per motor, whether it has a deflection.
+    """
+
+    model: JointModel
+    signals: Signals
+    corrections: Corrections
+    motors: tuple[Coordinates, ...]
+    external: FloatArray
+    linked: bool
+    flexible: tuple[bool, ...]
+    equations: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "equations", len(self.motors) + int(self.linked))
+
+    @classmethod
+    def make(cls, model: JointModel, signals: Signals, corrections: Corrections) -> Frame:
+        """Coordinates from the spectra, the readings corrected."""
+        band = signals.light
+        f, period = band.frequency_hz, signals.period_s
+        light = light_response(signals)
+        hold = light * np.sinc(f * period) * np.exp(-1j * np.pi * f * period)
+        zero = np.zeros(band.kept)
+        link = _link_path(signals, light, corrections) if signals.q is not None else (zero,) * 3
+        flexible = tuple(m.transmission.model != "none" and signals.q is not None for m in model.motors)
+        motors = []
+        for i, spectrum in enumerate(signals.theta):
+            theta, velocity, acceleration = (band.apply(spectrum, light, order) for order in range(3))
+            delay = corrections.torque_delay_s[i]
+            motors.append(
+                Coordinates(
+                    position=theta,
+                    velocity=velocity,
+                    acceleration=acceleration,
+                    deflection=link[0] - theta - corrections.offset_rad[i] if flexible[i] else zero,
+                    deflection_rate=link[1] - velocity if flexible[i] else zero,
+                    flexibility_torque=zero,
+                    stiffness=zero,
+                    torque=band.apply(signals.tau[i], hold, 0, delay),
+                    torque_rate=band.apply(signals.tau[i], hold, 1, delay),
+                    link_position=link[0],
+                    link_velocity=link[1],
+                    link_acceleration=link[2],
+                    time=np.arange(band.kept) * band.period_s,
+                )
+            )
+        external = zero if signals.external is None else band.apply(signals.external, light)
+        linked = model.link is not None and flexible[0]
+        return cls(model, signals, corrections, tuple(motors), external, linked, flexible)
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of one equation."""
+        return int(np.count_nonzero(self.signals.keep))
+
+    @property
+    def pulls(self) -> tuple[bool, ...]:
+        """Per motor, whether its transmission acts on the link (eqs 4, 9)."""
+        second = self.model.arrangement == "antagonistic"
+        return tuple(self.flexible[i] and (i == 0 or second) for i in range(len(self.motors)))
+
+    def project(self, x: FloatArray) -> FloatArray:
+        """F, decimation and choice of rows, for arrays on the grid, (n,) or (n, k)."""
+        return self.signals.narrow.filter(x, self.signals.response)[self.signals.keep]
+
+    def stack(self, parts: Sequence[FloatArray | None]) -> FloatArray:
+        """One column of the stacked regression from its part in each equation; None is zero."""
+        zero = np.zeros(self.rows)
+        return np.concatenate([zero if part is None else part for part in parts])
+
+    def column(
+        self, motor: int | None, on_motor: FloatArray | None, on_link: FloatArray | None
+    ) -> FloatArray:
+        """A stacked, filtered column with arrays on the grid in one motor's and the link's equation."""
+        parts: list[FloatArray | None] = [None] * self.equations
+        if motor is not None and on_motor is not None:
+            parts[motor] = self.project(on_motor)
+        if self.linked and on_link is not None:
+            parts[-1] = self.project(on_link)
+        return self.stack(parts)
+
+    def link_balance(self) -> FloatArray:
+        """tau_k - M q" - D_q q' - g(q) on the grid, which is tau_e by eq 4."""
+        link = self.model.link
+        assert link is not None
+        c = self.motors[0]
+        gravity = link.gravity_nm * np.sin(c.link_position + link.gravity_phase_rad)
+        own = link.inertia_kg_m2 * c.link_acceleration + link.viscous_damping_nm_s_rad * c.link_velocity
+        return np.asarray(self.external - own - gravity)
+
+    def motor_balance(self, i: int) -> FloatArray:
+        """B theta" + D theta' - tau on the grid, which is tau_e by eq 5."""
+        motor, c = self.model.motors[i], self.motors[i]
+        own = motor.inertia_kg_m2 * c.acceleration + motor.viscous_damping_nm_s_rad * c.velocity
+        return np.asarray(own - c.torque)
+
+    def target(self) -> FloatArray:
+        """The stacked balances as rows."""
+        parts: list[FloatArray | None] = [
+            self.project(self.motor_balance(i)) for i in range(len(self.motors))
+        ]
+        if self.linked:
+            parts.append(self.project(self.link_balance()))
+        return self.stack(parts)
+
+
+def _link_path(signals: Signals, light: FloatArray, corrections: Corrections) -> tuple[FloatArray, ...]:
+    """The link's position, velocity and acceleration, corrected for what its encoder has too much."""
+    assert signals.q is not None
+    q, rate, acceleration = (
+        signals.light.apply(signals.q, light, order, -corrections.encoder_delay_s) for order in range(3)
+    )
+    a, b, scale = corrections.encoder_sin_rad, corrections.encoder_cos_rad, corrections.encoder_scale
+    if not (a or b or scale):
+        return q, rate, acceleration
+    true = q / (1.0 + scale)
+    for _ in range(3):
+        true = (q - a * np.sin(true) - b * np.cos(true)) / (1.0 + scale)
+    slope = 1.0 + scale + a * np.cos(true) - b * np.sin(true)
+    bend = -a * np.sin(true) - b * np.cos(true)
+    velocity = rate / slope
+    return true, velocity, (acceleration - bend * velocity**2) / slope

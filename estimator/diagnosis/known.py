@@ -1,0 +1,50 @@
+"""Effects that the model already has: readings corrected, torques taken off the balances."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimator.diagnosis.candidates import Candidate, columns
+from estimator.diagnosis.frame import Corrections, Frame
+from estimator.effects import elements
+from estimator.model import Effect, JointModel
+from estimator.sample import FloatArray
+
+__all__ = ["declared_corrections", "declared_torque"]
+
+_READINGS = ("torque_delay", "deflection_offset", "encoder_delay", "encoder_scale", "encoder_eccentricity")
+
+
+def declared_corrections(model: JointModel) -> Corrections:
+    """Corrections of the readings by the model's own effects."""
+    delays, offsets = [], []
+    for motor in model.motors:
+        delays.append(_sum(motor.effects, "torque_delay", "delay_s"))
+        offsets.append(_sum(motor.effects, "deflection_offset", "offset_rad"))
+    link = model.link_effects
+    return Corrections(
+        torque_delay_s=tuple(delays),
+        offset_rad=tuple(offsets),
+        encoder_delay_s=_sum(link, "encoder_delay", "delay_s"),
+        encoder_sin_rad=_sum(link, "encoder_eccentricity", "sin_rad"),
+        encoder_cos_rad=_sum(link, "encoder_eccentricity", "cos_rad"),
+        encoder_scale=_sum(link, "encoder_scale", "relative_error"),
+    )
+
+
+def _sum(effects: tuple[Effect, ...], name: str, parameter: str) -> float:
+    return sum(v[parameter] for e in effects if e.name == name for v in elements(e)[1])
+
+
+def declared_torque(frame: Frame) -> FloatArray:
+    """What the model's own effects add to the stacked balances."""
+    total = np.zeros(frame.rows * frame.equations)
+    owners = [(i, effect) for i, motor in enumerate(frame.model.motors) for effect in motor.effects]
+    for motor, effect in [*owners, *((None, effect) for effect in frame.model.link_effects)]:
+        if effect.name in _READINGS:
+            continue
+        kind, each = elements(effect)
+        for values in each:
+            weights = np.array([values[name] for name in kind.linear])
+            total = total + columns(frame, Candidate(kind, motor), values) @ weights
+    return total

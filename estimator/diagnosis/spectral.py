@@ -1,0 +1,102 @@
+"""Zero-phase filters, exact derivatives, delays and decimation of whole recordings, by Fourier transform.
+
+A recording is continued at both ends by its own point reflection and freed of the line between the ends,
+so that value and slope are continuous all round; near the ends the results are not used.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from estimator.sample import FloatArray
+
+__all__ = ["Band", "Spectrum", "lowpass"]
+
+Spectrum = tuple[NDArray[np.complex128], float, float]
+_ORDER = 8  # of the low-pass's magnitude
+
+
+def lowpass(frequency_hz: FloatArray, bandwidth_hz: float) -> FloatArray:
+    """Magnitude 1/sqrt(1 + (f/fc)^16): -3 dB at fc, no phase."""
+    return np.asarray(1.0 / np.sqrt(1.0 + (frequency_hz / bandwidth_hz) ** (2 * _ORDER)))
+
+
+class Band:
+    """Filters arrays of one length and decimates them.
+
+    Args:
+        samples: n, length of the arrays.
+        period_s: their sampling period.
+        step: every step-th sample is kept.
+        margin_s: how far the arrays are continued at each end, at least.
+
+    Attributes:
+        frequency_hz: of the transform's bins.
+        kept: number of samples after decimation.
+        period_s: after decimation.
+        length: of the transform.
+    """
+
+    def __init__(self, samples: int, period_s: float, step: int, margin_s: float) -> None:
+        self._samples = samples
+        self._step = step
+        pad = min(int(np.ceil(margin_s / period_s / step)) * step, (samples - 1) // step * step)
+        self._pad = pad
+        self.length = fft.next_fast_len(-(-(samples + 2 * pad) // step), real=True) * step
+        self._right = self.length - samples - pad
+        self._input_period_s = period_s
+        self.frequency_hz: FloatArray = fft.rfftfreq(self.length, period_s)
+        self.kept = -(-samples // step)
+        self.period_s = period_s * step
+        self._omega = 2j * np.pi * self.frequency_hz
+
+    def transform(self, x: FloatArray) -> Spectrum:
+        """Spectrum of the continued array less its line, and that line's value at sample 0 and slope."""
+        pad, n = self._pad, self._samples
+        left = 2.0 * x[0] - x[pad:0:-1]
+        right = min(self._right, n - 1)
+        extended = np.concatenate((left, x, 2.0 * x[-1] - x[-2 : -right - 2 : -1]))
+        if len(extended) < self.length:
+            extended = np.concatenate((extended, np.full(self.length - len(extended), extended[-1])))
+        slope = (extended[-1] - extended[0]) / (self.length - 1)
+        extended -= extended[0] + slope * np.arange(self.length)
+        start = 2.0 * x[0] - x[pad] if pad else x[0]
+        return fft.rfft(extended), float(start + slope * pad), slope / self._input_period_s
+
+    def apply(
+        self,
+        spectrum: Spectrum,
+        response: NDArray[Any],
+        derivative: int = 0,
+        delay_s: float = 0.0,
+    ) -> FloatArray:
+        """Back in time, decimated: the filtered array, or its derivative, delay_s earlier or later.
+
+        Args:
+            spectrum: as `transform` gives it.
+            response: of the filter at `frequency_hz`; 1 at zero frequency.
+            derivative: order of the derivative.
+            delay_s: x(t - delay_s) is returned.
+        """
+        bins, start, slope = spectrum
+        factor = response if derivative == 0 else response * self._omega**derivative
+        if delay_s:
+            factor = factor * np.exp(-self._omega * delay_s)
+        length = self.length // self._step
+        cut = (bins * factor)[: length // 2 + 1]
+        values = fft.irfft(cut, length)[self._pad // self._step :][: self.kept] / self._step
+        if derivative == 0:
+            values += start + slope * (np.arange(self.kept) * self.period_s - delay_s)
+        elif derivative == 1:
+            values += slope
+        return values
+
+    def filter(self, x: FloatArray, response: NDArray[Any]) -> FloatArray:
+        """Filter and decimate one array (n,) or several (n, k)."""
+        if x.ndim == 1:
+            return self.apply(self.transform(x), response)
+        return np.stack([self.apply(self.transform(column), response) for column in x.T], axis=1)

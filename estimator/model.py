@@ -1,0 +1,150 @@
+"""What the estimator is told about a joint: the known terms of eqs 4-7 and how to estimate the rest.
+
+Plain frozen settings, validated when they are made. They carry no state and know no file format;
+the joint file of the service builds them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal
+
+from estimator.errors import EstimatorError
+
+__all__ = ["Arrangement", "Effect", "JointModel", "LinkDynamics", "Motor", "ParameterValue", "Transmission"]
+
+Arrangement = Literal["single", "antagonistic", "serial"]
+ParameterValue = float | tuple[float, ...]
+
+# Read by whoever validates these classes from a file: no key may be unknown, no text stands for a number.
+_STRICT: dict[str, Any] = {"extra": "forbid", "strict": True}
+
+
+def require(condition: bool, what: str) -> None:
+    """Raise EstimatorError(what) unless the condition holds."""
+    if not condition:
+        raise EstimatorError(what)
+
+
+def require_finite(minimum: float, strict: bool = False, **values: float) -> None:
+    """Require each named value to be finite and >= minimum (> minimum where strict)."""
+    for name, value in values.items():
+        bound = f"> {minimum:g}" if strict else f">= {minimum:g}"
+        inside = value > minimum if strict else value >= minimum
+        require(math.isfinite(value) and inside, f"{name}: expected a finite number {bound}, got {value!r}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Effect:
+    """One physical effect the model has been given, by its name in `estimator.effects.LIBRARY`.
+
+    Attributes:
+        name: the effect's name in the library, e.g. "coulomb_friction".
+        parameters: its parameters, by names that carry their unit, e.g. {"torque_nm": 0.25}.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = _STRICT
+
+    name: str
+    parameters: Mapping[str, ParameterValue] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Transmission:
+    """The flexibility torque's model f(phi, alpha), eq 17.
+
+    Attributes:
+        model: its name in `estimator.transmissions.MODELS`, or "none" for a rigid transmission.
+        order: p of eq 24 for polynomials; None: chosen from the data.
+        parameters: alpha where it is known or has been fitted; empty: estimated from nothing.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = _STRICT
+
+    model: str = "polynomial"
+    order: int | None = None
+    parameters: Mapping[str, ParameterValue] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        require(self.order is None or 1 <= self.order <= 9, f"order: expected 1 to 9, got {self.order}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Motor:
+    """The motor side of one transmission, eq 5 or 7, reflected to the joint.
+
+    Attributes:
+        inertia_kg_m2: B > 0.
+        viscous_damping_nm_s_rad: D_theta >= 0.
+        transmission: the model of tau_e(phi).
+        effects: what the model has been given besides, with motor, transmission or measurement location.
+    """
+
+    inertia_kg_m2: float
+    viscous_damping_nm_s_rad: float = 0.0
+    transmission: Transmission = field(default_factory=Transmission)
+    effects: tuple[Effect, ...] = ()
+
+    def __post_init__(self) -> None:
+        require_finite(0.0, strict=True, inertia_kg_m2=self.inertia_kg_m2)
+        require_finite(0.0, viscous_damping_nm_s_rad=self.viscous_damping_nm_s_rad)
+
+    @property
+    def flexible(self) -> bool:
+        """Whether its transmission deflects."""
+        return self.transmission.model != "none"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkDynamics:
+    """The link side, eq 4 or 6, with g(q) = gravity_nm * sin(q + gravity_phase_rad).
+
+    Attributes:
+        inertia_kg_m2: M > 0.
+        viscous_damping_nm_s_rad: D_q >= 0.
+        gravity_nm: amplitude of the gravity torque.
+        gravity_phase_rad: where gravity vanishes, as an angle added to q.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = _STRICT
+
+    inertia_kg_m2: float
+    viscous_damping_nm_s_rad: float = 0.0
+    gravity_nm: float = 0.0
+    gravity_phase_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        require_finite(0.0, strict=True, inertia_kg_m2=self.inertia_kg_m2)
+        require_finite(0.0, viscous_damping_nm_s_rad=self.viscous_damping_nm_s_rad)
+        require_finite(-math.inf, gravity_nm=self.gravity_nm, gravity_phase_rad=self.gravity_phase_rad)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JointModel:
+    """A joint as the estimator knows it.
+
+    Attributes:
+        arrangement: how the transmissions act on the link (eqs 9, 11 for "antagonistic").
+        motors: one motor, or two for a variable-stiffness joint.
+        link: the link dynamics where they are known; they make the external residual (eq 12) available.
+        link_effects: effects located at the link or in its encoder.
+    """
+
+    arrangement: Arrangement
+    motors: tuple[Motor, ...]
+    link: LinkDynamics | None = None
+    link_effects: tuple[Effect, ...] = ()
+
+    def __post_init__(self) -> None:
+        expected = 1 if self.arrangement == "single" else 2
+        require(
+            len(self.motors) == expected,
+            f'arrangement = "{self.arrangement}": expected {expected} motor(s), got {len(self.motors)}',
+        )
+
+    @property
+    def has_deflection(self) -> bool:
+        """Whether any transmission is flexible, so that a link position is needed."""
+        return any(motor.flexible for motor in self.motors)

@@ -1,0 +1,162 @@
+"""What goes into the estimator and what comes out: one tick as tuples, one recording as arrays.
+
+SI units, joint side, the paper's signs: phi = q - theta, and tau_e = f(phi) acts on the motor as +tau_e.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import IntFlag
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.errors import EstimatorError
+
+__all__ = ["Estimate", "FloatArray", "Record", "Sample", "Status", "TransmissionEstimate"]
+
+FloatArray = NDArray[np.float64]
+
+
+class Sample(NamedTuple):
+    """What was measured at one SYNC; NaN stands for what is not there.
+
+    Attributes:
+        sequence: number of the SYNC; a jump by more than one is a gap of whole periods.
+        motor_position_rad: theta_i, one per motor.
+        motor_velocity_rad_s: measured velocity per motor (NaN: none).
+        motor_torque_nm: tau_i, which acts from this SYNC to the next one.
+        link_position_rad: q.
+        link_velocity_rad_s: measured link velocity.
+        external_torque_nm: tau_k of eq 4.
+    """
+
+    sequence: int
+    motor_position_rad: tuple[float, ...]
+    motor_velocity_rad_s: tuple[float, ...]
+    motor_torque_nm: tuple[float, ...]
+    link_position_rad: float = math.nan
+    link_velocity_rad_s: float = math.nan
+    external_torque_nm: float = math.nan
+
+
+class Status(IntFlag):
+    """Quality of one estimate. Bits 0-7 are the estimator's, from bit 8 on the service's."""
+
+    VALID = 1 << 0  # the numbers may be used
+    OBSERVABLE = 1 << 1  # the motion at hand tells the stiffness; else it is held, with a wider interval
+    GAP = 1 << 2  # samples were missing before this one and have been bridged
+    CHANGED = 1 << 3  # innovation alarm: the joint changed, the estimate is following
+    MODEL_ALARM = 1 << 4  # residual above the model's own floor: the model is not sufficient
+    INPUT_REJECTED = 1 << 5  # this sample was not finite, jumped or froze, and was not used
+    RESTARTED = 1 << 6  # the estimator started anew at or shortly before this sample
+    DRIVE_FAULT = 1 << 8  # a drive reports a fault or is not in operation-capable state
+    BUS_FAULT = 1 << 9  # frames of this cycle were late or missing
+    STALE = 1 << 10  # the estimate is carried on without fresh measurements
+
+
+class TransmissionEstimate(NamedTuple):
+    """One transmission: flexibility torque, stiffness and its standard deviation, deflection."""
+
+    flexibility_torque_nm: float
+    stiffness_nm_rad: float
+    stiffness_std_nm_rad: float
+    deflection_rad: float
+
+
+class Estimate(NamedTuple):
+    """The joint at one SYNC: totals (eqs 9, 11) and each transmission's own."""
+
+    sequence: int
+    status: int
+    flexibility_torque_nm: float
+    stiffness_nm_rad: float
+    stiffness_std_nm_rad: float
+    transmissions: tuple[TransmissionEstimate, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Record:
+    """A recording: n samples of m motors on a grid of whole periods.
+
+    Attributes:
+        period_s: the sampling period T.
+        sequence: (n,) integers, strictly increasing; a jump by more than one is a gap.
+        motor_position_rad: (n, m).
+        motor_torque_nm: (n, m); row k acts from t_k to t_{k+1}.
+        motor_velocity_rad_s: (n, m), or None.
+        link_position_rad: (n,), or None where the transmission is "none".
+        link_velocity_rad_s: (n,), or None.
+        external_torque_nm: (n,), or None.
+        start_s: time of sequence 0.
+    """
+
+    period_s: float
+    sequence: NDArray[np.int64]
+    motor_position_rad: FloatArray
+    motor_torque_nm: FloatArray
+    motor_velocity_rad_s: FloatArray | None = None
+    link_position_rad: FloatArray | None = None
+    link_velocity_rad_s: FloatArray | None = None
+    external_torque_nm: FloatArray | None = None
+    start_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        n = len(self.sequence)
+        if self.motor_position_rad.ndim != 2 or self.motor_position_rad.shape[1] not in (1, 2):
+            raise EstimatorError(
+                f"motor_position_rad: expected (n, 1 or 2), got {self.motor_position_rad.shape}"
+            )
+        wide = self.motor_position_rad.shape
+        shapes = {
+            "motor_torque_nm": wide,
+            "motor_velocity_rad_s": wide,
+            "link_position_rad": (n,),
+            "link_velocity_rad_s": (n,),
+            "external_torque_nm": (n,),
+        }
+        for name, shape in shapes.items():
+            array = getattr(self, name)
+            if array is not None and array.shape != shape:
+                raise EstimatorError(f"{name}: expected shape {shape}, got {array.shape}")
+        if n and wide[0] != n:
+            raise EstimatorError(f"motor_position_rad: expected {n} rows, got {wide[0]}")
+        if np.any(np.diff(self.sequence) < 1):
+            raise EstimatorError("sequence: expected strictly increasing integers")
+
+    def __len__(self) -> int:
+        return len(self.sequence)
+
+    @property
+    def motors(self) -> int:
+        """Number of motors m."""
+        return int(self.motor_position_rad.shape[1])
+
+    @property
+    def time_s(self) -> FloatArray:
+        """(n,) time of each row, start_s + sequence * period_s."""
+        return np.asarray(self.start_s + self.sequence * self.period_s, dtype=np.float64)
+
+    def samples(self) -> Iterator[Sample]:
+        """The recording tick by tick, as the live loop would have seen it."""
+        n, m = self.motor_position_rad.shape
+        nan_rows = np.full((n, m), np.nan)
+        nan_column = np.full(n, np.nan)
+
+        def column(array: FloatArray | None) -> list[float]:
+            return (nan_column if array is None else array).tolist()
+
+        velocity = nan_rows if self.motor_velocity_rad_s is None else self.motor_velocity_rad_s
+        yield from map(
+            Sample,
+            self.sequence.tolist(),
+            map(tuple, self.motor_position_rad.tolist()),
+            map(tuple, velocity.tolist()),
+            map(tuple, self.motor_torque_nm.tolist()),
+            column(self.link_position_rad),
+            column(self.link_velocity_rad_s),
+            column(self.external_torque_nm),
+        )

@@ -1,0 +1,51 @@
+"""How the estimator is to work: the mode, its gains and bandwidths."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+from estimator.model import require, require_finite
+
+__all__ = ["EstimatorSettings"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EstimatorSettings:
+    """Settings of both modes; each mode reads its own.
+
+    Attributes:
+        mode: "robust", or "paper" (eqs 14, 28, 32, 33 as printed, correctly discretised).
+        method: where the stiffness comes from: "mbe" (the transmission's model), "bbe" (black box), or
+            "auto": in robust mode "mbe" wherever the transmission has a model, in paper mode "bbe".
+        bandwidth_rad_s: of the filter that every channel shares in robust mode.
+        k_tau_rad_s: K_tau_e of eq 14.
+        k_sigma_1_rad2_s2: K_sigma,1 of eq 28.
+        k_sigma_2_rad_s: K_sigma,2 of eq 28.
+        k_r_s2_rad2: K_R of eq 32.
+        k_max: K_max < 2 of eq 33.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "strict": True}
+
+    mode: Literal["robust", "paper"] = "robust"
+    method: Literal["auto", "mbe", "bbe"] = "auto"
+    bandwidth_rad_s: float = 60.0
+    k_tau_rad_s: float = 300.0
+    k_sigma_1_rad2_s2: float = 300.0
+    k_sigma_2_rad_s: float = 1.0
+    k_r_s2_rad2: float = 1900.0
+    k_max: float = 1.9
+
+    def __post_init__(self) -> None:
+        require_finite(
+            0.0,
+            strict=True,
+            bandwidth_rad_s=self.bandwidth_rad_s,
+            k_tau_rad_s=self.k_tau_rad_s,
+            k_sigma_1_rad2_s2=self.k_sigma_1_rad2_s2,
+            k_sigma_2_rad_s=self.k_sigma_2_rad_s,
+            k_r_s2_rad2=self.k_r_s2_rad2,
+            k_max=self.k_max,
+        )
+        require(self.k_max < 2.0, f"k_max: expected a number in (0, 2), got {self.k_max}")

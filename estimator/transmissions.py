@@ -1,0 +1,91 @@
+"""The transmission models by their names in the joint file, and how to add one more."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from estimator.errors import EstimatorError
+from estimator.flexibility import Exponential, Function, Linear, Polynomial, TransmissionModel, VsaII
+from estimator.model import Transmission
+
+__all__ = ["MODELS", "RIGID", "UNKNOWN", "TransmissionModel", "register", "transmission_model"]
+
+RIGID = "none"  # no deflection: the torque is what the motor's balance leaves
+UNKNOWN = "unknown"  # flexible, but no model of it: black-box estimation
+
+_STEP = 6.0e-6  # relative step of central differences, about eps**(1/3)
+
+MODELS: dict[str, TransmissionModel] = {
+    model.name: model for model in (Linear(), Polynomial(), VsaII(), Exponential())
+}
+
+
+def register(
+    name: str,
+    torque: Callable[..., Any],
+    stiffness: Callable[..., Any],
+    shape: Mapping[str, tuple[float, float, float]] | None = None,
+    *,
+    phi_max_rad: float = 0.5,
+) -> TransmissionModel:
+    """Add the model f(phi) = k_nm_rad * torque(phi, *shape) under a name for the joint file.
+
+    Args:
+        name: its name.
+        torque: g(phi, *shape), odd in phi, on arrays.
+        stiffness: dg/dphi, its analytic derivative, on arrays.
+        shape: start, low and high of each nonlinear parameter, by name, in the order of the arguments.
+        phi_max_rad: up to where oddness and derivative are checked.
+
+    Raises:
+        EstimatorError: the name is taken, the functions do not take these arguments, g is not odd, or
+            stiffness is not its derivative (against central differences).
+    """
+    shape = {} if shape is None else shape
+    if name in MODELS or name in (RIGID, UNKNOWN):
+        raise EstimatorError(f'transmission "{name}": expected a new name, this one is taken')
+    for role, function in (("torque", torque), ("stiffness", stiffness)):
+        try:
+            inspect.signature(function).bind(0.0, *shape)
+        except TypeError as error:
+            raise EstimatorError(
+                f'transmission "{name}": {role}: expected the arguments phi, {", ".join(shape)}'
+            ) from error
+    model = Function(name, torque, stiffness, shape)
+    phi = np.linspace(-phi_max_rad, phi_max_rad, 41)
+    alpha = np.array([1.0, *model.shape_start])
+    value, slope = model.torque(phi, alpha), model.stiffness(phi, alpha)
+    step = _STEP * phi_max_rad
+    difference = (model.torque(phi + step, alpha) - model.torque(phi - step, alpha)) / (2 * step)
+    if not np.allclose(value, -value[::-1], rtol=1e-9, atol=1e-12 * float(np.max(np.abs(value)))):
+        raise EstimatorError(f'transmission "{name}": torque: expected an odd function of phi (eq 2)')
+    if not np.allclose(slope, difference, rtol=1e-6, atol=1e-7 * float(np.max(np.abs(difference)))):
+        raise EstimatorError(f'transmission "{name}": stiffness: expected the derivative of torque (eq 18)')
+    MODELS[name] = model
+    return model
+
+
+def transmission_model(transmission: Transmission) -> TransmissionModel | None:
+    """The model a transmission names; None where it is rigid or unknown.
+
+    Raises:
+        EstimatorError: no model has that name, or its parameters do not fit it.
+    """
+    if transmission.model in (RIGID, UNKNOWN):
+        return None
+    model = MODELS.get(transmission.model)
+    if model is None:
+        known = ", ".join([*MODELS, RIGID, UNKNOWN])
+        raise EstimatorError(f'transmission.model: expected one of {known}, got "{transmission.model}"')
+    if transmission.parameters:
+        alpha = model.alpha(transmission.parameters)
+        if transmission.order is not None and model.linear is None and alpha.size != transmission.order:
+            raise EstimatorError(
+                f"transmission.parameters: expected {transmission.order} coefficients_nm_rad "
+                f"(order = {transmission.order}), got {alpha.size}"
+            )
+    return model

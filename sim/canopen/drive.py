@@ -1,0 +1,320 @@
+"""A CiA 402 drive as a CANopen slave: torque modes, a second encoder, units that its objects tell."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Protocol
+
+from sim.canopen.aborts import Abort, SdoAbortError
+from sim.canopen.cia402_objects import DEVICE_TYPE, RPDOS, TPDOS, DriveData, cia402_objects
+from sim.canopen.dictionary import Entry, Object
+from sim.canopen.node import Nmt, Node
+from sim.canopen.objects import Identity, communication_objects, rpdo_objects, tpdo_objects
+from sim.canopen.quirks import Quirks
+from sim.canopen.statemachine import PowerState, StateMachine
+
+__all__ = ["Cia402Drive", "Rig", "Signals", "drive_objects"]
+
+_PROFILE_TORQUE, _CYCLIC_TORQUE = 4, 10
+_MODES = (0, _PROFILE_TORQUE, _CYCLIC_TORQUE)
+_HALT = 0x0100
+_VOLTAGE, _REMOTE, _TARGET_REACHED, _LIMIT, _FOLLOWS = 0x0010, 0x0200, 0x0400, 0x0800, 0x1000
+_TOGGLE = 0x0400
+_FAULT_SIGNAL, _DISABLE_VOLTAGE, _QUICK_STOP = 1, 2, 3  # 0x6007
+_HEARTBEAT_LOST = 0x8130
+_POSITION_REVERSED, _VELOCITY_REVERSED = 0x80, 0x40
+
+# 0x60A9: units of a numerator per radian, and seconds in a denominator.
+_RADIAN, _DEGREE, _REVOLUTION, _INCREMENT = 0x10, 0x41, 0xB4, 0xB5
+_SECONDS = {0x03: 1.0, 0x47: 60.0}
+
+
+class Signals(Protocol):
+    """What the drive's sensors say, at the motor shaft."""
+
+    @property
+    def position_counts(self) -> int:
+        """Encoder counts, unbounded."""
+
+    @property
+    def velocity_rad_s(self) -> float:
+        """Of the motor shaft."""
+
+    @property
+    def current_a(self) -> float:
+        """Of the motor."""
+
+    @property
+    def torque_nm(self) -> float:
+        """At the motor shaft."""
+
+
+class Rig(Protocol):
+    """The part of a world that one drive is wired to (`sim.world.World`)."""
+
+    @property
+    def period_s(self) -> float:
+        """Control period."""
+
+    @property
+    def time_s(self) -> float:
+        """The present sampling instant."""
+
+    def drive(self, motor: int) -> Signals:
+        """What motor `motor` reports now."""
+
+    def command(self, motor: int, torque_nm: float | None) -> None:
+        """Torque at the motor shaft from the next period on; None: the rig's own."""
+
+    def link_counts(self) -> int:
+        """The link encoder."""
+
+
+IDENTITY = Identity(name="drivelink simulated CiA 402 drive", product_code=0x402)
+
+
+def drive_objects(data: DriveData, quirks: Quirks) -> list[Object]:
+    """The dictionary of a drive, as a maker's quirks leave it."""
+    objects = communication_objects(DEVICE_TYPE, quirks.identity or IDENTITY)
+    for number, pdo in enumerate(RPDOS, start=1):
+        objects += rpdo_objects(number, pdo)
+    for number, pdo in enumerate(quirks.tpdos or TPDOS, start=1):
+        objects += tpdo_objects(number, pdo)
+    objects += cia402_objects(data, quirks.second_encoder)
+    return sorted(quirks.applied(objects), key=lambda described: described.index)
+
+
+def _limited(value: float, bound: int) -> int:
+    return max(-bound, min(bound, round(value)))
+
+
+class Cia402Drive(Node):
+    """One drive of a rig.
+
+    Args:
+        node_id: 1 to 127.
+        rig: the world it is wired to.
+        motor: index of its motor there.
+        data: its nameplate.
+        quirks: how it deviates.
+    """
+
+    def __init__(
+        self, node_id: int, rig: Rig, motor: int, data: DriveData | None = None, quirks: Quirks | None = None
+    ) -> None:
+        self._rig = rig
+        self._motor = motor
+        self.data = data or DriveData()
+        quirks = quirks or Quirks()
+        self._sampled: tuple[Callable[[Signals], None], ...] = ()
+        super().__init__(node_id, drive_objects(self.data, quirks), quirks)
+        self.machine = StateMachine()
+        self._torque_unit_nm = max(1, self.data.rated_torque_mnm) * 1e-6
+        self._current_unit_a = max(1, self.data.rated_current_ma) * 1e-6
+        self._demand = 0.0  # per mille of rated torque
+        self._following = self._limiting = self._reached = False
+        self._toggle = 0
+        self._link_counts = rig.link_counts()
+        self._link_time_s = rig.time_s
+        self._bind()
+
+    # Objects
+
+    def _bind(self) -> None:
+        live = self.dictionary.optional
+        self._position, self._internal = live(0x6064), live(0x6063)
+        self._velocity, self._sensor_velocity = live(0x606C), live(0x6069)
+        self._torque, self._current = live(0x6077), live(0x6078)
+        self._milliampere = live(*(self.quirks.current_ma or (0, 0)))
+        second = self.quirks.second_encoder
+        self._link, self._link_velocity = live(0x60E4, second), live(0x60E5, second)
+        self._status, self._control = live(0x6041), live(0x6040)
+        self._mode, self._mode_shown = live(0x6060), live(0x6061)
+        self._target, self._offset, self._demanded = live(0x6071), live(0x60B2), live(0x6074)
+        self._max_torque, self._slope = live(0x6072), live(0x6087)
+        self._polarity, self._velocity_unit = live(0x607E), live(0x60A9)
+        if (0x60A9, 0) not in self.dictionary:
+            self._velocity_unit.value = self.quirks.defaults.get((0x60A9, 0), self.data.velocity_unit)
+        self._error_code = live(0x603F)
+        self._sensors: list[tuple[Callable[[Signals], None], frozenset[Entry]]] = [
+            (self._read_position, frozenset({self._position, self._internal})),
+            (self._read_velocity, frozenset({self._velocity, self._sensor_velocity})),
+            (self._read_torque, frozenset({self._torque})),
+            (self._read_current, frozenset({self._current, self._milliampere})),
+        ]
+        if self.data.link_counts_per_rev is not None:
+            self._sensors.append((self._read_link, frozenset({self._link, self._link_velocity})))
+        self._control.changed = self._obey
+        self._mode.check = self._check_mode
+        self._velocity_unit.check = self._check_velocity_unit
+        self._velocity_unit.changed = self._take_units
+        self._polarity.changed = self._take_units
+        live(0x605A).changed = self._take_units
+        for entry in (self._status, *(entry for _, entries in self._sensors for entry in entries)):
+            entry.refresh = self._measure
+        self._take_units()
+
+    def _take_units(self) -> None:
+        word, polarity = self._velocity_unit.number, self._polarity.number
+        self._velocity_scale = self._units_per_rad_s(word)
+        if polarity & _VELOCITY_REVERSED:
+            self._velocity_scale = -self._velocity_scale
+        self._position_sign = -1 if polarity & _POSITION_REVERSED else 1
+        self.machine.quick_stop_option = self.dictionary.optional(0x605A).number
+
+    def _units_per_rad_s(self, word: int) -> float:
+        turn = 2.0 * math.pi
+        per_radian = {
+            _RADIAN: 1.0,
+            _DEGREE: 360.0 / turn,
+            _REVOLUTION: 1.0 / turn,
+            _INCREMENT: self.data.counts_per_rev / turn,
+        }
+        exponent = (word >> 24) - (256 if word >> 31 else 0)
+        if exponent not in self.quirks.velocity_exponents:
+            raise KeyError(exponent)
+        return float(per_radian[word >> 16 & 0xFF] * _SECONDS[word >> 8 & 0xFF] * 10.0**-exponent)
+
+    def _check_velocity_unit(self, word: int) -> None:
+        try:
+            self._units_per_rad_s(word)
+        except KeyError:
+            raise SdoAbortError(Abort.INVALID_VALUE) from None
+
+    def _check_mode(self, mode: int) -> None:
+        if mode not in _MODES:
+            raise SdoAbortError(Abort.INVALID_VALUE)
+
+    # Control
+
+    def _obey(self) -> None:
+        if self.machine.control(self._control.number) and self._error_code.number:
+            self.emergency.clear_error(self._error_code.number)
+            self._error_code.value = 0
+
+    def fault(self, code: int, register: int = 0, vendor: bytes = b"") -> None:
+        """A fault occurs in the drive: EMCY, fault reaction, fault.
+
+        Args:
+            code: EMCY error code, e.g. 0x2310 (over-current).
+            register: bits of the error register besides bit 0.
+            vendor: up to five bytes.
+        """
+        self.machine.fault()
+        self._error_code.value = code
+        self.emergency.raise_error(code, register, vendor)
+
+    def on_control(self, periods: int) -> None:
+        """Control periods begin: the set-point that is in force becomes the rig's command."""
+        self.machine.step()
+        self._mode_shown.value = mode = self._mode.number
+        self._following = self.machine.state is PowerState.OPERATION_ENABLED and mode in (
+            _PROFILE_TORQUE,
+            _CYCLIC_TORQUE,
+        )
+        if not self._following:
+            self._demand = 0.0
+            self._demanded.value = 0
+            held = self.machine.state in (PowerState.QUICK_STOP_ACTIVE, PowerState.OPERATION_ENABLED)
+            self._rig.command(self._motor, 0.0 if held else None)
+            return
+        bound = self._max_torque.number
+        wanted = self._target.number + self._offset.number
+        target = float(max(-bound, min(bound, wanted)))
+        self._limiting = target != wanted
+        if mode == _PROFILE_TORQUE:
+            if self._control.number & _HALT:
+                target = 0.0
+            step = self._slope.number * self._rig.period_s * periods
+            self._demand = max(self._demand - step, min(self._demand + step, target))
+        else:
+            self._demand = target
+        self._reached = self._demand == target
+        self._demanded.value = round(self._demand)
+        self._rig.command(self._motor, self._demand * self._torque_unit_nm)
+
+    def on_pdos(self, mapped: frozenset[Entry]) -> None:
+        """Only what is mapped is brought up to the present with each sample."""
+        self._sampled = tuple(read for read, entries in self._sensors if mapped & entries)
+
+    def on_sample(self) -> None:
+        """Read the rig's sensors into the mapped process data."""
+        self._toggle ^= _TOGGLE
+        signals = self._rig.drive(self._motor)
+        for read in self._sampled:
+            read(signals)
+        self._status.value = self._statusword()
+
+    def _measure(self) -> None:
+        """Read the rig's sensors into all process data, for SDO."""
+        signals = self._rig.drive(self._motor)
+        for read, _ in self._sensors:
+            read(signals)
+        self._status.value = self._statusword()
+
+    def _read_position(self, signals: Signals) -> None:
+        counts = signals.position_counts
+        self._internal.value = (counts + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
+        counts *= self._position_sign
+        self._position.value = (counts + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
+
+    def _read_velocity(self, signals: Signals) -> None:
+        velocity = _limited(signals.velocity_rad_s * self._velocity_scale, 0x7FFF_FFFF)
+        self._velocity.value = self._sensor_velocity.value = velocity
+
+    def _read_torque(self, signals: Signals) -> None:
+        self._torque.value = _limited(signals.torque_nm / self._torque_unit_nm, 0x7FFF)
+
+    def _read_current(self, signals: Signals) -> None:
+        self._current.value = _limited(signals.current_a / self._current_unit_a, 0x7FFF)
+        self._milliampere.value = round(signals.current_a * 1e3)
+
+    def _read_link(self, _signals: Signals) -> None:
+        counts, time_s = self._rig.link_counts(), self._rig.time_s
+        self._link.value = (counts + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
+        elapsed_s = time_s - self._link_time_s
+        if elapsed_s > 0.0:
+            self._link_velocity.value = _limited((counts - self._link_counts) / elapsed_s, 0x7FFF_FFFF)
+            self._link_counts, self._link_time_s = counts, time_s
+
+    def _statusword(self) -> int:
+        word = self.machine.state | _VOLTAGE | _REMOTE
+        if self._following and self.machine.state is PowerState.OPERATION_ENABLED:
+            if self._limiting:
+                word |= _LIMIT
+            if self._mode.value == _CYCLIC_TORQUE:
+                word |= _FOLLOWS
+            elif self._reached:
+                word |= _TARGET_REACHED
+        if self.quirks.toggle_bit_10:
+            word = word & ~_TOGGLE | self._toggle
+        return word
+
+    # NMT
+
+    def on_reset_node(self) -> None:
+        """Switch on disabled, no command, power-on units."""
+        self.machine.reset()
+        self._demand = 0.0
+        self._following = False
+        self._take_units()
+        self._rig.command(self._motor, None)
+        self._measure()
+
+    def on_leave_operational(self) -> None:
+        """A drive that is enabled does not go on without its master."""
+        if self.state in (Nmt.STOPPED, Nmt.INITIALISING):
+            self.on_connection_lost()
+
+    def on_connection_lost(self) -> None:
+        """Do what 0x6007 says, if the drive is enabled."""
+        if self.machine.state is not PowerState.OPERATION_ENABLED:
+            return
+        option = self.dictionary.optional(0x6007).number
+        if option == _FAULT_SIGNAL:
+            self.fault(_HEARTBEAT_LOST, 0x10)
+        elif option == _DISABLE_VOLTAGE:
+            self.machine.state = PowerState.SWITCH_ON_DISABLED
+        elif option == _QUICK_STOP:
+            self.machine.state = PowerState.QUICK_STOP_ACTIVE

@@ -1,0 +1,345 @@
+"""A CANopen slave: NMT state machine, and the services that depend on its state (CiA 301)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from enum import IntEnum
+
+from sim.canopen.aborts import Abort, SdoAbortError
+from sim.canopen.dictionary import Dictionary, Entry, Object
+from sim.canopen.emergency import Emergency
+from sim.canopen.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from sim.canopen.objects import COB_INVALID
+from sim.canopen.pdo import restricted
+from sim.canopen.quirks import Quirks
+from sim.canopen.rpdo import Rpdo
+from sim.canopen.sdo import SdoServer
+from sim.canopen.storing import watch_storing
+from sim.canopen.timers import Timers
+from sim.canopen.tpdo import Tpdo
+
+__all__ = ["Nmt", "Node"]
+
+_SYNC_PRODUCER = 1 << 30
+_FRAME_29_BIT = 1 << 29
+_APPLICATION = (0x2000, 0xFFFF)
+
+_SYNC_LENGTH = 0x8240
+_HEARTBEAT_LOST = 0x8130
+_PDO_TOO_SHORT = 0x8210
+_PDO_TOO_LONG = 0x8220
+_RPDO_TIMEOUT = 0x8250
+_COMMUNICATION_ERROR = 0x10  # bit of the error register
+
+Route = Callable[[bytes], None]
+
+
+class Nmt(IntEnum):
+    """NMT states as a heartbeat reports them."""
+
+    INITIALISING = 0x00
+    STOPPED = 0x04
+    OPERATIONAL = 0x05
+    PREOPERATIONAL = 0x7F
+
+
+class Node:
+    """One device on the bus; drives and encoders derive from it and override the `on_…` hooks.
+
+    Args:
+        node_id: 1 to 127.
+        objects: its dictionary.
+        quirks: how it deviates from a strict device.
+
+    Attributes:
+        node_id: 1 to 127.
+        dictionary: live values.
+        timers: its appointments; the network moves their clock.
+        state: NMT state.
+        sync_id: identifier of the SYNC it listens to.
+        routes: what to call with the data of which identifier, besides NMT and SYNC.
+        tpdos: by number from 1.
+        rpdos: by number from 1.
+        sends_on_change: whether changed process data are an event for types 254 and 255; if not, only the
+            event timer is.
+    """
+
+    sends_on_change = True
+
+    def __init__(self, node_id: int, objects: Iterable[Object], quirks: Quirks) -> None:
+        if not 1 <= node_id <= 127:
+            raise ValueError(f"node_id: expected 1 to 127, got {node_id}")
+        self.node_id = node_id
+        self.quirks = quirks
+        self.dictionary = Dictionary(objects, node_id)
+        self.timers = Timers()
+        self.state = Nmt.INITIALISING
+        self.sync_id = 0x80
+        self.routes: dict[int, Route] = {}
+        self._put: Callable[[int, bytes], None] = lambda _can_id, _data: None
+        self._rerouted: Callable[[], None] = lambda: None
+        self._synchronous: tuple[Tpdo, ...] = ()
+        self._change_driven: tuple[Tpdo, ...] = ()
+        self._latched: tuple[Rpdo, ...] = ()
+        self._counting = False  # SYNC messages are to carry a counter
+        self._counter: int | None = None
+        self._make_services()
+        self._watch_objects()
+
+    # Wiring to the network
+
+    def attach(self, put: Callable[[int, bytes], None], rerouted: Callable[[], None]) -> None:
+        """Connect to a network: a way to send, and whom to tell of changed routes."""
+        self._put = put
+        self._rerouted = rerouted
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Put a frame on the bus."""
+        self._put(can_id, data)
+
+    def _make_services(self) -> None:
+        dictionary, timers = self.dictionary, self.timers
+        self.emergency = Emergency(dictionary, timers, self._send_emergency)
+        self.sdo = SdoServer(dictionary, timers, self._send_sdo)
+        self.heartbeat = HeartbeatProducer(dictionary, timers, self._beat)
+        self.consumer = HeartbeatConsumer(
+            dictionary, timers, self._heartbeat_lost, self._heartbeat_back, self._reroute
+        )
+        numbers = range(1, 513)
+        self.tpdos = {
+            n: Tpdo(dictionary, n, self.quirks, self._is_operational, self._pdos_changed, timers, self.send)
+            for n in numbers
+            if (0x1800 + n - 1, 1) in dictionary
+        }
+        self.rpdos = {n: self._make_rpdo(n) for n in numbers if (0x1400 + n - 1, 1) in dictionary}
+
+    def _make_rpdo(self, number: int) -> Rpdo:
+        def timed_out() -> None:
+            self.emergency.raise_error(_RPDO_TIMEOUT, _COMMUNICATION_ERROR, bytes([number]))
+
+        def wrong_length(short: bool) -> None:
+            code = _PDO_TOO_SHORT if short else _PDO_TOO_LONG
+            self.emergency.raise_error(code, _COMMUNICATION_ERROR, bytes([number]))
+
+        return Rpdo(
+            self.dictionary,
+            number,
+            self.quirks,
+            self._is_operational,
+            self._pdos_changed,
+            self.timers,
+            timed_out,
+            wrong_length,
+        )
+
+    def _watch_objects(self) -> None:
+        find = self.dictionary.find
+        find(0x1005, 0).check = self._check_sync_id
+        find(0x1005, 0).changed = self._take_sync_id
+        find(0x1014, 0).check = self._check_emergency_id
+        overflow = self.dictionary.optional(0x1019)
+        overflow.check = self._check_overflow
+        overflow.changed = self._pdos_changed
+        watch_storing(self.dictionary)
+
+    # NMT
+
+    def power_on(self) -> None:
+        """Switch on: as after *reset node*."""
+        self.reset_node()
+
+    def power_off(self) -> None:
+        """Switch off: silent from now on."""
+        self._enter(Nmt.INITIALISING)
+        self.timers.clear()
+        self.routes = {}
+
+    def nmt(self, command: int) -> None:
+        """Obey an NMT command that addresses this node."""
+        if self.state is Nmt.INITIALISING:
+            return
+        if command == 0x01:
+            self._enter(Nmt.OPERATIONAL)
+        elif command == 0x02:
+            self._enter(Nmt.STOPPED)
+        elif command == 0x80:
+            self._enter(Nmt.PREOPERATIONAL)
+        elif command == 0x81:
+            self.reset_node()
+        elif command == 0x82:
+            self.reset_communication()
+
+    def reset_node(self) -> None:
+        """Power-on values everywhere, then boot."""
+        self.dictionary.reset(*_APPLICATION)
+        self._reset(keep_pdos=False)
+        self.on_reset_node()
+
+    def reset_communication(self) -> None:
+        """Power-on values of the communication profile, then boot."""
+        self._reset(keep_pdos=self.quirks.keeps_pdos)
+
+    def _reset(self, keep_pdos: bool) -> None:
+        self._enter(Nmt.INITIALISING)
+        self.timers.clear()
+        self.dictionary.reset(0x1000, 0x13FF)
+        if not keep_pdos:
+            self.dictionary.reset(0x1400, 0x1BFF)
+        self.dictionary.reset(0x1C00, 0x1FFF)
+        self.sdo.reset()
+        self.emergency.reset()
+        for pdo in (*self.tpdos.values(), *self.rpdos.values()):
+            pdo.compile()
+        self.heartbeat.stop()
+        self.consumer.restart()
+        self._take_sync_id()
+        if self.quirks.boot_s:
+            self.timers.after(self.quirks.boot_s, self._boot)
+        else:
+            self._boot()
+
+    def _boot(self) -> None:
+        self.send(0x700 + self.node_id, b"\0")
+        self._enter(Nmt.PREOPERATIONAL)
+        self.heartbeat.restart()
+        if self.quirks.self_starting:
+            self._enter(Nmt.OPERATIONAL)
+
+    def _enter(self, state: Nmt) -> None:
+        if state is self.state:
+            return
+        left, self.state = self.state, state
+        self._pdos_changed()
+        if left is Nmt.OPERATIONAL:
+            self.on_leave_operational()
+
+    def _is_operational(self) -> bool:
+        return self.state is Nmt.OPERATIONAL
+
+    def _pdos_changed(self) -> None:
+        operational = self.state is Nmt.OPERATIONAL
+        self._counting = self.dictionary.optional(0x1019).number > 0
+        active = [pdo for pdo in self.tpdos.values() if operational and pdo.valid]
+        for tpdo in self.tpdos.values():
+            tpdo.activate(tpdo in active, self._counting)
+        for rpdo in self.rpdos.values():
+            rpdo.activate(operational and rpdo.valid)
+        self._synchronous = tuple(pdo for pdo in active if pdo.synchronous)
+        self.on_pdos(frozenset(entry for pdo in active for entry in pdo.entries if entry))
+        self._change_driven = tuple(pdo for pdo in active if not pdo.synchronous and self.sends_on_change)
+        self._latched = tuple(
+            pdo for pdo in self.rpdos.values() if operational and pdo.valid and pdo.type <= 240
+        )
+        self._reroute()
+        if self._change_driven:
+            self.timers.after(0.0, self.process)
+
+    def _reroute(self) -> None:
+        routes: dict[int, Route] = {}
+        if self.state in (Nmt.PREOPERATIONAL, Nmt.OPERATIONAL):
+            routes[0x600 + self.node_id] = self.sdo.receive
+        if self.state is Nmt.OPERATIONAL:
+            routes |= {rpdo.can_id: rpdo.receive for rpdo in self.rpdos.values() if rpdo.valid}
+        for node_id in self.consumer.watched if self.state is not Nmt.INITIALISING else ():
+            routes[0x700 + node_id] = self._heartbeat_route(node_id)
+        self.routes = routes
+        self._rerouted()
+
+    # Services
+
+    def _send_sdo(self, data: bytes) -> None:
+        self.send(0x580 + self.node_id, data)
+
+    def _send_emergency(self, can_id: int, data: bytes) -> None:
+        if self.state in (Nmt.PREOPERATIONAL, Nmt.OPERATIONAL):
+            self.send(can_id, data)
+
+    def _beat(self) -> None:
+        self.send(0x700 + self.node_id, bytes([self.state]))
+
+    def _heartbeat_route(self, node_id: int) -> Route:
+        return lambda _data: self.consumer.receive(node_id)
+
+    def _heartbeat_lost(self, node_id: int) -> None:
+        self.emergency.raise_error(_HEARTBEAT_LOST, _COMMUNICATION_ERROR, bytes([node_id]))
+        reaction = self.dictionary.optional(0x1029, 1).number
+        if reaction == 0 and self.state is Nmt.OPERATIONAL:
+            self._enter(Nmt.PREOPERATIONAL)
+        elif reaction == 2:
+            self._enter(Nmt.STOPPED)
+        self.on_connection_lost()
+
+    def _heartbeat_back(self, _node_id: int) -> None:
+        self.emergency.clear_error(_HEARTBEAT_LOST)
+
+    # SYNC
+
+    def latch(self, data: bytes) -> bool:
+        """A SYNC has come: take over what synchronous RPDOs brought.
+
+        Returns:
+            Whether this node will answer with its TPDOs (`transmit`).
+        """
+        if self.state is not Nmt.OPERATIONAL:
+            return False
+        self._counter = data[0] if data else None
+        if len(data) > 1 or bool(data) != self._counting:
+            self.emergency.raise_error(_SYNC_LENGTH, _COMMUNICATION_ERROR)
+            return False
+        if self.emergency.active:
+            self.emergency.clear_error(_SYNC_LENGTH)
+        for rpdo in self._latched:
+            rpdo.apply()
+        return True
+
+    def transmit(self) -> None:
+        """The sampling instant of a SYNC: sample, and send what is due."""
+        self.on_sample()
+        for tpdo in self._synchronous:
+            tpdo.sync(self._counter)
+        for tpdo in self._change_driven:
+            tpdo.event()
+
+    def process(self) -> None:
+        """Time has passed without a SYNC: sample, and send what is event-driven."""
+        self.on_sample()
+        for tpdo in self._change_driven:
+            tpdo.event()
+
+    def _take_sync_id(self) -> None:
+        self.sync_id = self.dictionary.find(0x1005, 0).number & 0x7FF
+        self._rerouted()
+
+    def _check_sync_id(self, value: int) -> None:
+        if value & (_SYNC_PRODUCER | _FRAME_29_BIT) or restricted(value & 0x7FF):
+            raise SdoAbortError(Abort.INVALID_VALUE)
+
+    def _check_overflow(self, value: int) -> None:
+        if self.dictionary.optional(0x1006).number:
+            raise SdoAbortError(Abort.DEVICE_STATE)
+        if value == 1 or value > 240:
+            raise SdoAbortError(Abort.INVALID_VALUE)
+
+    def _check_emergency_id(self, value: int) -> None:
+        if value & _FRAME_29_BIT or (not value & COB_INVALID and restricted(value & 0x7FF)):
+            raise SdoAbortError(Abort.INVALID_VALUE)
+
+    # What a device does besides
+
+    def on_pdos(self, mapped: frozenset[Entry]) -> None:
+        """Other TPDOs than before are active: these entries are in them."""
+
+    def on_control(self, periods: int) -> None:
+        """Control periods begin."""
+
+    def on_sample(self) -> None:
+        """Bring the process data up to the present."""
+
+    def on_reset_node(self) -> None:
+        """The application has been reset."""
+
+    def on_leave_operational(self) -> None:
+        """The NMT state operational has been left."""
+
+    def on_connection_lost(self) -> None:
+        """A watched node's heartbeat has failed to come."""

@@ -1,0 +1,75 @@
+"""Timers of simulated devices, on whatever clock the network keeps."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import math
+from collections.abc import Callable
+
+__all__ = ["Timer", "Timers"]
+
+
+class Timer:
+    """One appointment; `cancel` makes it void."""
+
+    __slots__ = ("action", "due_s")
+
+    def __init__(self, due_s: float, action: Callable[[], None] | None) -> None:
+        self.due_s = due_s
+        self.action = action
+
+    def cancel(self) -> None:
+        """Never happens."""
+        self.action = None
+
+
+class Timers:
+    """Appointments in order of time.
+
+    Attributes:
+        now_s: the present, as last told to `run`.
+        next_s: when the first appointment is due; infinity with none. Cheap to compare in every cycle.
+    """
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+        self.next_s = math.inf
+        self._heap: list[tuple[float, int, Timer]] = []
+        self._count = itertools.count()
+
+    def after(self, delay_s: float, action: Callable[[], None]) -> Timer:
+        """Call `action` once, `delay_s` from now."""
+        timer = Timer(self.now_s + delay_s, action)
+        heapq.heappush(self._heap, (timer.due_s, next(self._count), timer))
+        self.next_s = self._heap[0][0]
+        return timer
+
+    def every(self, period_s: float, action: Callable[[], None]) -> Timer:
+        """Call `action` at whole multiples of the period from now; missed ones are skipped."""
+        timer = Timer(self.now_s + period_s, None)
+
+        def fire() -> None:
+            missed = max(0, int((self.now_s - timer.due_s) / period_s))
+            timer.due_s += (1 + missed) * period_s
+            heapq.heappush(self._heap, (timer.due_s, next(self._count), timer))
+            action()
+
+        timer.action = fire
+        heapq.heappush(self._heap, (timer.due_s, next(self._count), timer))
+        self.next_s = self._heap[0][0]
+        return timer
+
+    def clear(self) -> None:
+        """No appointment is left."""
+        self._heap.clear()
+        self.next_s = math.inf
+
+    def run(self, now_s: float) -> None:
+        """Move the present to `now_s` and keep every appointment up to it."""
+        self.now_s = now_s
+        while self._heap and self._heap[0][0] <= now_s:
+            _, _, timer = heapq.heappop(self._heap)
+            if timer.action:
+                timer.action()
+        self.next_s = self._heap[0][0] if self._heap else math.inf

@@ -1,0 +1,139 @@
+"""Physics that can be switched on in the world, by name.
+
+`LISTED` are the effects of the estimator's vocabulary, with the same names and parameters and laws of their
+own; `UNLISTED` are others, for the tests of a diagnosis that has to say "unexplained".
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from sim.effects import link, measurement, motor, transmission, unlisted
+from sim.effects.assembly import Assembly, Definition, Values
+from sim.errors import SimError
+from sim.plant import JointPlant
+
+__all__ = ["LISTED", "UNLISTED", "Assembly", "Definition", "PlantEffect", "assemble", "make", "parse"]
+
+LISTED: dict[str, Definition] = {
+    definition.name: definition
+    for module in (motor, transmission, measurement, link)
+    for definition in module.DEFINITIONS
+}
+UNLISTED: dict[str, Definition] = {definition.name: definition for definition in unlisted.DEFINITIONS}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlantEffect:
+    """One effect to be switched on.
+
+    Attributes:
+        definition: what it is.
+        values: all its parameters.
+        motor: index of the motor that it acts on, where it acts on one.
+    """
+
+    definition: Definition
+    values: Values = field(default_factory=dict)
+    motor: int = 0
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self.definition.name
+
+
+def make(name: str, parameters: Mapping[str, object], motor: int | None = None) -> PlantEffect:
+    """An effect by name.
+
+    Args:
+        name: of `LISTED` or `UNLISTED`.
+        parameters: by name; what has a default may be left out. "motor" (1 or 2) says which motor.
+        motor: index of the motor, where `parameters` does not say.
+
+    Raises:
+        SimError: unknown effect, unknown, missing or impossible parameter.
+    """
+    definition = LISTED.get(name) or UNLISTED.get(name)
+    if definition is None:
+        raise SimError(f'effect: expected one of {", ".join((*LISTED, *UNLISTED))}; got "{name}"')
+    given = {key: _number(f"{name}.{key}", value) for key, value in parameters.items()}
+    which = given.pop("motor", 1.0 + (motor or 0))
+    if which not in (1.0, 2.0):
+        raise SimError(f"{name}.motor: expected 1 or 2, got {which:g}")
+    names = [parameter.name for parameter in definition.parameters]
+    for key in given:
+        if key not in names:
+            raise SimError(f"{name}.{key}: unknown parameter, expected {', '.join(names)}")
+    return PlantEffect(definition=definition, values=_complete(definition, given), motor=int(which) - 1)
+
+
+def _complete(definition: Definition, given: dict[str, float]) -> dict[str, float]:
+    values = {}
+    main = given.get(definition.parameters[0].name)
+    for parameter in definition.parameters:
+        value: object = given.get(parameter.name, parameter.default)
+        if callable(value) and main is not None:
+            value = value(main)
+        if not isinstance(value, int | float):
+            raise SimError(f"{definition.name}.{parameter.name}: expected this parameter, it is missing")
+        values[parameter.name] = float(value)
+    return values
+
+
+def _number(where: str, value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise SimError(f"{where}: expected a finite number, got {value!r}")
+    return float(value)
+
+
+def parse(text: str) -> PlantEffect:
+    """An effect from the command line: "coulomb_friction=0.3" or "cogging=0.1,periods_per_rev=12,motor=2".
+
+    The first value is the effect's main amplitude, in its unit; further ones go by name.
+
+    Raises:
+        SimError: anything else.
+    """
+    name, equals, rest = text.partition("=")
+    definition = LISTED.get(name.strip()) or UNLISTED.get(name.strip())
+    if not equals or not rest:
+        raise SimError(f'effect: expected NAME=VALUE[,PARAMETER=VALUE…], got "{text}"')
+    if definition is None:
+        return make(name.strip(), {})
+    first, *further = rest.split(",")
+    parameters = {definition.parameters[0].name: _parsed(text, first)}
+    for item in further:
+        key, _, value = item.partition("=")
+        parameters[key.strip()] = _parsed(text, value)
+    return make(definition.name, parameters)
+
+
+def _parsed(text: str, value: str) -> float:
+    try:
+        return float(value)
+    except ValueError:
+        raise SimError(f'effect "{text}": expected a number, got "{value}"') from None
+
+
+def assemble(plant: JointPlant, effects: Iterable[PlantEffect], step_s: float) -> Assembly:
+    """Put effects into a plant.
+
+    Raises:
+        SimError: an effect of a motor that the joint has not, or values that cannot be.
+    """
+    assembly = Assembly(plant, step_s)
+    for effect in effects:
+        if effect.motor >= len(plant.motors):
+            raise SimError(f"{effect.name}: the joint has no motor {effect.motor + 1}")
+        if effect.definition.location == "transmission" and plant.motors[effect.motor].spring.rigid:
+            raise SimError(f"{effect.name}: expected a flexible transmission at motor {effect.motor + 1}")
+        try:
+            effect.definition.apply(assembly, effect.motor, effect.values)
+        except SimError as error:
+            raise SimError(f"{effect.name}: {error}") from None
+        except ZeroDivisionError:
+            raise SimError(f"{effect.name}: expected scales and time constants other than 0") from None
+    return assembly

@@ -1,0 +1,130 @@
+"""A joint in parts, open for effects: what each of them may add, and what comes together in the end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+from sim.plant import Commit, Dry, Extra, JointPlant, Kinematics, Load, Terms
+from sim.springs import Law
+
+__all__ = ["Apply", "Assembly", "Definition", "LinkParts", "MotorParts", "Parameter", "Reading", "Values"]
+
+Values = Mapping[str, float]
+Reading = Callable[[float], float]
+"""True angle (rad) -> the angle that is read."""
+TorquePath = Callable[[float, float, float], float]
+"""(torque as the drive believes it, time, theta) -> torque that acts; N·m at the joint, s, rad."""
+
+
+@dataclass(slots=True, kw_only=True)
+class MotorParts:
+    """What effects add to one motor, its drive and its transmission."""
+
+    inertia_kg_m2: float = 0.0
+    viscous_damping_nm_s_rad: float = 0.0
+    reshape: list[Callable[[Law], Law]] = field(default_factory=list)
+    loads: list[Load] = field(default_factory=list)
+    dry: list[Dry] = field(default_factory=list)
+    extras: list[Extra] = field(default_factory=list)
+    kinematics: list[Kinematics] = field(default_factory=list)
+    commits: list[Commit] = field(default_factory=list)
+    torque_path: list[TorquePath] = field(default_factory=list)
+    torque_delay_s: float = 0.0
+    readings: list[Reading] = field(default_factory=list)
+
+
+@dataclass(slots=True, kw_only=True)
+class LinkParts:
+    """What effects add to the link and its encoder."""
+
+    inertia_kg_m2: float = 0.0
+    viscous_damping_nm_s_rad: float = 0.0
+    loads: list[Load] = field(default_factory=list)
+    dry: list[Dry] = field(default_factory=list)
+    readings: list[Reading] = field(default_factory=list)
+    reading_delay_s: float = 0.0
+
+
+class Assembly:
+    """A plant that effects are being added to."""
+
+    def __init__(self, plant: JointPlant, step_s: float) -> None:
+        """Begin with the plant as it is.
+
+        Args:
+            plant: the joint.
+            step_s: the integration step, which memories of time need.
+        """
+        self.plant = plant
+        self.step_s = step_s
+        self.motors = [MotorParts() for _ in plant.motors]
+        self.link = LinkParts()
+
+    def joint(self) -> JointPlant:
+        """The plant with everything that was added to its mechanics."""
+        motors = tuple(
+            replace(
+                motor,
+                inertia_kg_m2=motor.inertia_kg_m2 + parts.inertia_kg_m2,
+                viscous_damping_nm_s_rad=motor.viscous_damping_nm_s_rad + parts.viscous_damping_nm_s_rad,
+                reshape=motor.reshape + tuple(parts.reshape),
+                terms=Terms(
+                    loads=motor.terms.loads + tuple(parts.loads),
+                    dry=motor.terms.dry + tuple(parts.dry),
+                    extras=motor.terms.extras + tuple(parts.extras),
+                    kinematics=motor.terms.kinematics + tuple(parts.kinematics),
+                    commits=motor.terms.commits + tuple(parts.commits),
+                ),
+            )
+            for motor, parts in zip(self.plant.motors, self.motors, strict=True)
+        )
+        link = replace(
+            self.plant.link,
+            inertia_kg_m2=self.plant.link.inertia_kg_m2 + self.link.inertia_kg_m2,
+            viscous_damping_nm_s_rad=self.plant.link.viscous_damping_nm_s_rad
+            + self.link.viscous_damping_nm_s_rad,
+            terms=Terms(
+                loads=self.plant.link.terms.loads + tuple(self.link.loads),
+                dry=self.plant.link.terms.dry + tuple(self.link.dry),
+            ),
+        )
+        return replace(self.plant, motors=motors, link=link)
+
+
+Apply = Callable[[Assembly, int, Values], None]
+"""(assembly, motor index, parameter values): puts one effect in."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A parameter of an effect.
+
+    Attributes:
+        name: with its unit.
+        meaning: what it is.
+        default: its value where it is left out, or that value as a function of the main one; None: required.
+    """
+
+    name: str
+    meaning: str
+    default: float | Callable[[float], float] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Definition:
+    """An effect that can be switched on.
+
+    Attributes:
+        name: of the effect.
+        location: "motor", "transmission", "link" or "measurement".
+        meaning: the physics.
+        parameters: the first is the amplitude that `NAME=VALUE` sets.
+        apply: puts it into a plant.
+    """
+
+    name: str
+    location: str
+    meaning: str
+    parameters: tuple[Parameter, ...]
+    apply: Apply

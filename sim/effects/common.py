@@ -1,0 +1,57 @@
+"""What several effects need."""
+
+from __future__ import annotations
+
+import math
+
+from sim.effects.assembly import Parameter, Values
+from sim.effects.memory import Slip
+from sim.errors import SimError
+from sim.plant import Dry
+
+__all__ = ["SLIP", "SMOOTHING", "at_speed", "not_negative", "slip", "wave"]
+
+SMOOTHING = Parameter(
+    "smoothing_rad_s", "velocity below which an oil film carries the load; 0: dry, it sticks", 0.0
+)
+SLIP = (
+    Parameter("torque_nm", "torque once everything slides"),
+    Parameter("displacement_rad", "displacement over which it builds up", 0.01),
+    Parameter("exponent", "n of the law (1: Dahl, 2: Bouc-Wen, 50: a spring that slips)", 2.0),
+    Parameter("shape", "s of the law (1: Dahl, 0.5: Bouc-Wen)", 0.5),
+    Parameter("elements", "elements side by side, their scales a factor of two apart", 3.0),
+)
+
+
+def at_speed(level: Dry, smoothing: float) -> Dry:
+    """The level of dry friction, made to vanish with the velocity over `smoothing` (rad/s); 0: as it is."""
+    if smoothing <= 0.0:
+        return level
+
+    def lubricated(position: float, velocity: float, load: float, time: float) -> float:
+        return level(position, velocity, load, time) * abs(velocity) / math.hypot(velocity, smoothing)
+
+    return lubricated
+
+
+def not_negative(values: Values, name: str) -> float:
+    """That parameter.
+
+    Raises:
+        SimError: it is negative.
+    """
+    if values[name] < 0.0:
+        raise SimError(f"{name}: expected a number >= 0, got {values[name]!r}")
+    return values[name]
+
+
+def slip(values: Values) -> Slip:
+    """The element with memory that `SLIP` describes."""
+    return Slip(*(values[parameter.name] for parameter in SLIP))
+
+
+def wave(sine: float, cosine: float, periods: float) -> tuple[float, float]:
+    """sine sin(n x) + cosine cos(n x) as amplitude and phase of one sine."""
+    if periods <= 0.0:
+        raise SimError(f"periods_per_rev: expected a number > 0, got {periods!r}")
+    return math.hypot(sine, cosine), math.atan2(cosine, sine)

@@ -1,0 +1,146 @@
+"""Effects that no diagnosis has in its vocabulary: to test what it says when it meets the unknown."""
+
+from __future__ import annotations
+
+import math
+
+from sim.effects.assembly import Assembly, Definition, Parameter, Values
+from sim.effects.common import not_negative
+from sim.effects.memory import Creep
+from sim.errors import SimError
+
+__all__ = ["DEFINITIONS"]
+
+
+def _damaged_tooth(a: Assembly, m: int, p: Values) -> None:
+    level, at, per, exp = not_negative(p, "torque_nm"), p["position_rad"], 1.0 / p["width_rad"], math.exp
+    a.motors[m].dry.append(lambda theta, w, te, t: level * exp(-(((theta - at) * per) ** 2)))
+
+
+def _cold_grease(a: Assembly, m: int, p: Values) -> None:
+    level, rate, exp = not_negative(p, "torque_nm"), 1.0 / p["time_constant_s"], math.exp
+    a.motors[m].dry.append(lambda theta, w, te, t: level * exp(-rate * t))
+
+
+def _phase_imbalance(a: Assembly, m: int, p: Values) -> None:
+    share, n, sin = p["relative"], p["periods_per_rev"], math.sin
+    a.motors[m].torque_path.append(lambda tau, t, theta: tau * (1.0 + share * sin(n * theta)))
+
+
+def _mesh_stiffness(a: Assembly, m: int, p: Values) -> None:
+    share, n, sin = p["relative"], p["periods_per_rev"], math.sin
+    torque = a.plant.motors[m].law().torque
+    a.motors[m].extras.append(lambda phi, rate, theta: share * sin(n * theta) * torque(phi))
+
+
+def _creep(a: Assembly, m: int, p: Values) -> None:
+    if p["time_constant_s"] <= 0.0:
+        raise SimError(f"time_constant_s: expected a number > 0, got {p['time_constant_s']!r}")
+    element = Creep(p["stiffness_nm_rad"], p["time_constant_s"], a.step_s)
+    a.motors[m].extras.append(lambda phi, rate, theta: element.torque(phi))
+    a.motors[m].commits.append(lambda theta, phi: element.commit(phi))
+
+
+def _cable_pull(a: Assembly, m: int, p: Values) -> None:
+    height, at, per, exp = p["torque_nm"], p["position_rad"], 1.0 / p["width_rad"], math.exp
+
+    def pull(q: float, v: float) -> float:
+        u = (q - at) * per
+        return height * u * exp(0.5 - 0.5 * u * u)
+
+    a.link.loads.append(pull)
+
+
+def _air_drag(a: Assembly, m: int, p: Values) -> None:
+    c = p["damping_nm_s2_rad2"]
+    a.link.loads.append(lambda q, v: c * v * abs(v))
+
+
+def _interpolation_error(a: Assembly, m: int, p: Values) -> None:
+    height, n, sin = p["amplitude_rad"], p["periods_per_rev"], math.sin
+    a.link.readings.append(lambda q: q + height * sin(n * q))
+
+
+_WIDTH = Parameter("width_rad", "how far it reaches", 0.1)
+
+DEFINITIONS = (
+    Definition(
+        name="damaged_tooth",
+        location="motor",
+        meaning="dry friction in one place only",
+        parameters=(
+            Parameter("torque_nm", "friction torque there"),
+            Parameter("position_rad", "where, as motor position at the joint", 0.0),
+            _WIDTH,
+        ),
+        apply=_damaged_tooth,
+    ),
+    Definition(
+        name="cold_grease",
+        location="motor",
+        meaning="dry friction that fades as the joint warms up",
+        parameters=(
+            Parameter("torque_nm", "friction torque at the start"),
+            Parameter("time_constant_s", "in which it fades", 5.0),
+        ),
+        apply=_cold_grease,
+    ),
+    Definition(
+        name="phase_imbalance",
+        location="motor",
+        meaning="ripple in proportion to the torque, over the motor position",
+        parameters=(
+            Parameter("relative", "share of the torque"),
+            Parameter("periods_per_rev", "periods in one joint revolution", 20.0),
+        ),
+        apply=_phase_imbalance,
+    ),
+    Definition(
+        name="mesh_stiffness",
+        location="transmission",
+        meaning="stiffness that varies over the motor position",
+        parameters=(
+            Parameter("relative", "share of the stiffness"),
+            Parameter("periods_per_rev", "periods in one joint revolution", 10.0),
+        ),
+        apply=_mesh_stiffness,
+    ),
+    Definition(
+        name="creep",
+        location="transmission",
+        meaning="a further spring that relaxes (Maxwell)",
+        parameters=(
+            Parameter("stiffness_nm_rad", "stiffness at once"),
+            Parameter("time_constant_s", "in which it relaxes", 0.5),
+        ),
+        apply=_creep,
+    ),
+    Definition(
+        name="cable_pull",
+        location="link",
+        meaning="a cable that is pushed aside in one place",
+        parameters=(
+            Parameter("torque_nm", "largest torque, on either side of it"),
+            Parameter("position_rad", "where", 0.1),
+            _WIDTH,
+        ),
+        apply=_cable_pull,
+    ),
+    Definition(
+        name="air_drag",
+        location="link",
+        meaning="drag with the square of the link velocity",
+        parameters=(Parameter("damping_nm_s2_rad2", "torque per squared velocity"),),
+        apply=_air_drag,
+    ),
+    Definition(
+        name="interpolation_error",
+        location="measurement",
+        meaning="the link encoder errs within each of its lines",
+        parameters=(
+            Parameter("amplitude_rad", "largest error"),
+            Parameter("periods_per_rev", "lines of its disc", 64.0),
+        ),
+        apply=_interpolation_error,
+    ),
+)

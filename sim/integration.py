@@ -1,0 +1,183 @@
+"""Moving a joint by one fixed step: Runge-Kutta of order four, dry friction, memories.
+
+Smooth torques act inside the stages. Dry friction is no function of the velocity where it matters, so it
+acts as Coulomb stated it, at the end of each step: it takes from the momentum at most what stops the body,
+and the body sticks by itself (the impulse form of J. J. Moreau's time stepping). Terms with a memory
+(hysteresis, presliding) are functions of the displacement since the last step: stages ask, commits remember.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import cast
+
+from sim.dynamics import Pair, State, Triple, equations, spring_deflection, transmission_torques
+from sim.errors import SimError
+from sim.plant import Dry, JointPlant
+
+__all__ = ["Settle", "Step", "integrator", "settling", "whole_fraction"]
+
+Step = Callable[[State, float, float, float], None]
+"""(state, tau_1, tau_2, tau_k): moves the state by one step, in place."""
+Settle = Callable[[State, float], None]
+"""(state, time): what happens between two steps."""
+
+
+def integrator(plant: JointPlant, step_s: float) -> Step:
+    """Runge-Kutta of order four over one step, torques held.
+
+    For x" = a(x, x') the four classical stages read, with one acceleration each,
+        x+ = x + h v + h²/6 (a1 + a2 + a3),  v+ = v + h/6 (a1 + 2 a2 + 2 a3 + a4).
+    """
+    if len(plant.motors) == 2:
+        return _rk4_triple(cast(Triple, equations(plant)), step_s)
+    return _rk4_pair(cast(Pair, equations(plant)), step_s)
+
+
+def _rk4_pair(acc: Pair, h: float) -> Step:
+    half, quarter, whole, sixth, sixth2 = h / 2, h * h / 4, h * h / 2, h / 6, h * h / 6
+
+    def step(state: State, tau: float, _: float, tau_k: float) -> None:
+        q, v, p, w = state
+        a1, b1 = acc(q, v, p, w, tau, tau_k)
+        qm, pm = q + half * v, p + half * w
+        a2, b2 = acc(qm, v + half * a1, pm, w + half * b1, tau, tau_k)
+        a3, b3 = acc(qm + quarter * a1, v + half * a2, pm + quarter * b1, w + half * b2, tau, tau_k)
+        q += h * v
+        p += h * w
+        a4, b4 = acc(q + whole * a2, v + h * a3, p + whole * b2, w + h * b3, tau, tau_k)
+        state[0] = q + sixth2 * (a1 + a2 + a3)
+        state[1] = v + sixth * (a1 + 2.0 * (a2 + a3) + a4)
+        state[2] = p + sixth2 * (b1 + b2 + b3)
+        state[3] = w + sixth * (b1 + 2.0 * (b2 + b3) + b4)
+
+    return step
+
+
+def _rk4_triple(acc: Triple, h: float) -> Step:
+    half, quarter, whole, sixth, sixth2 = h / 2, h * h / 4, h * h / 2, h / 6, h * h / 6
+
+    def step(state: State, tau1: float, tau2: float, tau_k: float) -> None:
+        q, v, p, w, r, s = state
+        a1, b1, c1 = acc(q, v, p, w, r, s, tau1, tau2, tau_k)
+        qm, pm, rm = q + half * v, p + half * w, r + half * s
+        a2, b2, c2 = acc(
+            qm, v + half * a1, pm, w + half * b1, rm, s + half * c1, tau1, tau2, tau_k
+        )  # fmt: skip
+        a3, b3, c3 = acc(
+            qm + quarter * a1, v + half * a2, pm + quarter * b1, w + half * b2,
+            rm + quarter * c1, s + half * c2, tau1, tau2, tau_k,
+        )  # fmt: skip
+        q += h * v
+        p += h * w
+        r += h * s
+        a4, b4, c4 = acc(
+            q + whole * a2, v + h * a3, p + whole * b2, w + h * b3,
+            r + whole * c2, s + h * c3, tau1, tau2, tau_k,
+        )  # fmt: skip
+        state[0] = q + sixth2 * (a1 + a2 + a3)
+        state[1] = v + sixth * (a1 + 2.0 * (a2 + a3) + a4)
+        state[2] = p + sixth2 * (b1 + b2 + b3)
+        state[3] = w + sixth * (b1 + 2.0 * (b2 + b3) + b4)
+        state[4] = r + sixth2 * (c1 + c2 + c3)
+        state[5] = s + sixth * (c1 + 2.0 * (c2 + c3) + c4)
+
+    return step
+
+
+def whole_fraction(period_s: float, step_s: float | None, plant: JointPlant, fine: bool = False) -> int:
+    """Steps in a control period.
+
+    Args:
+        period_s: the control period.
+        step_s: the step; None: at most a tenth of a radian of the fastest oscillation that the springs
+            allow at twice their stiffness at rest, 1 ms, and 0.5 ms with dry friction or memories.
+        plant: the joint.
+        fine: whether dry friction or memories act in it.
+
+    Raises:
+        SimError: the step is no whole fraction of the period.
+    """
+    if not (math.isfinite(period_s) and period_s > 0.0):
+        raise SimError(f"period_s: expected a number > 0, got {period_s!r}")
+    if step_s is None:
+        most = 0.0005 if fine else 0.001
+        return max(1, math.ceil(period_s / min(most, 0.1 / max(_fastest(plant), 1e-9)) - 1e-9))
+    if not (math.isfinite(step_s) and step_s > 0.0):
+        raise SimError(f"plant_step_s: expected a number > 0, got {step_s!r}")
+    count = round(period_s / step_s)
+    if count < 1 or abs(count * step_s - period_s) > 1e-9 * period_s:
+        raise SimError(
+            f"plant_step_s: expected a whole fraction of the period {period_s:g} s, got {step_s:g} s"
+        )
+    return count
+
+
+def _fastest(plant: JointPlant) -> float:
+    """A bound on the joint's fastest natural frequency (rad/s) at twice the stiffness at rest."""
+    if plant.rigid:
+        return 0.0
+    springs = plant.motors if plant.arrangement == "antagonistic" else plant.motors[:1]
+    square = sum(
+        motor.law().stiffness(0.0) * (1.0 / motor.inertia_kg_m2 + 1.0 / plant.link.inertia_kg_m2)
+        for motor in springs
+    )
+    return math.sqrt(2.0 * max(square, 0.0))
+
+
+def settling(plant: JointPlant, step_s: float) -> Settle | None:
+    """Dry friction and memories between two steps; None where the joint has neither."""
+    bodies = _dry_bodies(plant, step_s)
+    commits = [
+        (2 + 2 * i, spring_deflection(motor), commit)
+        for i, motor in enumerate(plant.motors)
+        for commit in motor.terms.commits
+    ]
+    if not bodies and not commits:
+        return None
+    torques, rigid = transmission_torques(plant), plant.rigid
+
+    def settle(state: State, time_s: float) -> None:
+        if bodies:
+            loads = torques(state)
+            for index, motor, dry, per_inertia in bodies:
+                position, velocity = state[index], state[index + 1]
+                load = sum(loads) if motor is None else loads[motor]
+                level = 0.0
+                for friction in dry:
+                    level += friction(position, velocity, load, time_s)
+                after = _braked(velocity, level * per_inertia)
+                # Friction acted all along the step: half its change of velocity belongs in the position.
+                state[index] = position + 0.5 * step_s * (after - velocity)
+                state[index + 1] = after
+            if rigid:
+                state[0], state[1] = state[2], state[3]
+        for index, phi, commit in commits:
+            commit(state[index], phi(state[0], state[index]))
+
+    return settle
+
+
+def _braked(velocity: float, most: float) -> float:
+    if velocity > most:
+        return velocity - most
+    return velocity + most if velocity < -most else 0.0
+
+
+def _dry_bodies(plant: JointPlant, step_s: float) -> list[tuple[int, int | None, tuple[Dry, ...], float]]:
+    """Bodies with friction: (index of position, motor or None for the link, levels, step over inertia)."""
+    link = plant.link
+    if plant.rigid:
+        motor = plant.motors[0]
+        inertia = motor.inertia_kg_m2 + link.inertia_kg_m2
+        found: list[tuple[int, int | None, tuple[Dry, ...], float]] = [
+            (2, 0, motor.terms.dry + link.terms.dry, step_s / inertia)
+        ]
+    else:
+        found = [
+            (2 + 2 * i, i, motor.terms.dry, step_s / motor.inertia_kg_m2)
+            for i, motor in enumerate(plant.motors)
+        ]
+        found.append((0, None, link.terms.dry, step_s / link.inertia_kg_m2))
+    return [body for body in found if body[2]]

@@ -1,0 +1,146 @@
+"""A joint as its parts: bodies, springs, and the further physics that effects add to them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from sim.errors import SimError
+from sim.springs import Law, Spring
+
+__all__ = [
+    "Arrangement",
+    "Commit",
+    "Dry",
+    "Extra",
+    "JointPlant",
+    "Kinematics",
+    "LinkPlant",
+    "Load",
+    "MotorPlant",
+    "Terms",
+]
+
+Arrangement = Literal["single", "antagonistic", "serial"]
+Load = Callable[[float, float], float]
+"""Torque (N·m) that opposes the motion, of position and velocity."""
+Dry = Callable[[float, float, float, float], float]
+"""Level (N·m, >= 0) of dry friction, of position, velocity, transmission torque and time."""
+Extra = Callable[[float, float, float], float]
+"""Torque (N·m) added to tau_e on both sides, of deflection, its rate and theta."""
+Kinematics = Callable[[float], tuple[float, float]]
+"""Error e(theta) of the gear (rad) and its slope de/dtheta: the spring sees phi - e."""
+Commit = Callable[[float, float], None]
+"""Told theta and the deflection that the spring sees at the end of each step."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Terms:
+    """Further physics of one body: what effects add to it.
+
+    Attributes:
+        loads: x(position, velocity), N·m.
+        dry: levels of dry friction, N·m.
+        extras: of a motor's transmission, added to tau_e on both sides.
+        kinematics: of a motor's gear.
+        commits: memories to be told of each step.
+    """
+
+    loads: tuple[Load, ...] = ()
+    dry: tuple[Dry, ...] = ()
+    extras: tuple[Extra, ...] = ()
+    kinematics: tuple[Kinematics, ...] = ()
+    commits: tuple[Commit, ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.loads or self.dry or self.extras or self.kinematics or self.commits)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MotorPlant:
+    """A motor and its transmission, reflected to the joint.
+
+    Attributes:
+        inertia_kg_m2: B > 0.
+        viscous_damping_nm_s_rad: D_theta >= 0.
+        spring: tau_e(phi); rigid: motor and link are one body.
+        reshape: what effects make of the spring's law, applied in order.
+        terms: further physics.
+    """
+
+    inertia_kg_m2: float
+    viscous_damping_nm_s_rad: float = 0.0
+    spring: Spring
+    reshape: tuple[Callable[[Law], Law], ...] = ()
+    terms: Terms = Terms()
+
+    def __post_init__(self) -> None:
+        _check("motor", self.inertia_kg_m2, self.viscous_damping_nm_s_rad)
+
+    def law(self) -> Law:
+        """The elastic law as it acts, effects included."""
+        law = self.spring.law()
+        for reshape in self.reshape:
+            law = reshape(law)
+        return law
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkPlant:
+    """The link: g(q) = gravity_nm sin(q + gravity_phase_rad).
+
+    Attributes:
+        inertia_kg_m2: M > 0.
+        viscous_damping_nm_s_rad: D_q >= 0.
+        gravity_nm: amplitude of gravity.
+        gravity_phase_rad: angle added to q.
+        terms: further physics.
+    """
+
+    inertia_kg_m2: float
+    viscous_damping_nm_s_rad: float = 0.0
+    gravity_nm: float = 0.0
+    gravity_phase_rad: float = 0.0
+    terms: Terms = Terms()
+
+    def __post_init__(self) -> None:
+        _check("link", self.inertia_kg_m2, self.viscous_damping_nm_s_rad)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JointPlant:
+    """A joint: how its motors act on the link.
+
+    Attributes:
+        arrangement: "single", "antagonistic" (eq 9) or "serial" (motor 2 sets the lever of motor 1's spring).
+        motors: one, or two.
+        link: the link.
+        lever_per_rad: l of the serial arrangement, 1/rad; unused otherwise.
+    """
+
+    arrangement: Arrangement
+    motors: tuple[MotorPlant, ...]
+    link: LinkPlant
+    lever_per_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        expected = 1 if self.arrangement == "single" else 2
+        if len(self.motors) != expected:
+            raise SimError(f'"{self.arrangement}": expected {expected} motor(s), got {len(self.motors)}')
+        springs = self.motors if self.arrangement == "antagonistic" else self.motors[:1]
+        if expected == 2 and any(motor.spring.rigid for motor in springs):
+            raise SimError(f'"{self.arrangement}": expected a flexible transmission, got "none"')
+
+    @property
+    def rigid(self) -> bool:
+        """Whether motor and link are one body."""
+        return self.arrangement == "single" and self.motors[0].spring.rigid
+
+
+def _check(body: str, inertia: float, damping: float) -> None:
+    if not (math.isfinite(inertia) and inertia > 0.0):
+        raise SimError(f"{body}: inertia_kg_m2: expected a finite number > 0, got {inertia!r}")
+    if not (math.isfinite(damping) and damping >= 0.0):
+        raise SimError(f"{body}: viscous_damping_nm_s_rad: expected a finite number >= 0, got {damping!r}")

@@ -1,0 +1,113 @@
+"""Drives and encoders at work: from set-points to the torque that acts, from angles to what is reported."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from sim.effects.assembly import LinkParts, MotorParts, Reading
+from sim.effects.memory import Delayed, History
+from sim.sensors import DriveHardware, DriveSignals, LinkEncoder
+
+__all__ = ["Amplifier", "LinkScale"]
+
+
+class Amplifier:
+    """A drive's current loop and its sampled signals.
+
+    The current that it reports is what it believes to drive; what effects make of it acts.
+    """
+
+    def __init__(self, drive: DriveHardware, period_s: float, substeps: int, noise: Iterator[float]) -> None:
+        """Switch the drive on.
+
+        Args:
+            drive: its data.
+            period_s: control period.
+            substeps: integration steps in one period.
+            noise: of the reported current, A.
+        """
+        self.drive = drive
+        self.schedule = [0.0] * substeps
+        self._substeps, self._period_s, self._noise = substeps, period_s, noise
+        self._current_a, self._theta, self._velocity = 0.0, 0.0, 0.0
+        self._filtered: float | None = None
+        self.fit(MotorParts())
+
+    def fit(self, parts: MotorParts) -> None:
+        """What effects add to it, from the next period on."""
+        self._path, self._readings = tuple(parts.torque_path), tuple(parts.readings)
+        delay = parts.torque_delay_s
+        self._delay = Delayed(delay, self._period_s, self._substeps) if delay > 0.0 else None
+
+    def latch(self, current_a: float, time_s: float, theta: float, velocity: float) -> None:
+        """Begin a period with this set-point, and sample.
+
+        Args:
+            current_a: set-point; limited to what the drive lets through.
+            time_s: now.
+            theta: motor position at the joint, rad.
+            velocity: motor velocity at the joint, rad/s.
+        """
+        drive = self.drive
+        limit, step = drive.limit_a, drive.current_step_a
+        current_a = min(max(current_a, -limit), limit)
+        torque = current_a * drive.joint_torque_per_ampere
+        for acting in self._path:
+            torque = acting(torque, time_s, theta)
+        self.schedule = [torque] * self._substeps if self._delay is None else self._delay.schedule(torque)
+        self._current_a = step * round((current_a + next(self._noise)) / step)
+        self._theta, self._velocity = theta, velocity
+        if drive.velocity_filter_s > 0.0:
+            before = velocity if self._filtered is None else self._filtered
+            share = self._period_s / (self._period_s + drive.velocity_filter_s)
+            self._filtered = self._velocity = before + share * (velocity - before)
+
+    def signals(self) -> DriveSignals:
+        """What was sampled."""
+        drive, theta = self.drive, self._theta
+        for read in self._readings:
+            theta = read(theta)
+        shaft = self._velocity * drive.gear_ratio * drive.direction
+        resolution = drive.velocity_resolution_rad_s
+        return DriveSignals(
+            round(theta * drive.counts_per_rad),
+            resolution * round(shaft / resolution) if resolution else shaft,
+            self._current_a,
+            self._current_a * drive.torque_constant_nm_a,
+        )
+
+
+class LinkScale:
+    """The link encoder's disc and its sampled reading.
+
+    Attributes:
+        counts: the reading.
+        history: to be told of every plant step, where the reading lags.
+    """
+
+    def __init__(self, encoder: LinkEncoder, noise: Iterator[float]) -> None:
+        """Switch the encoder on.
+
+        Args:
+            encoder: its data.
+            noise: of the reading, counts.
+        """
+        self.counts = 0
+        self.history: History | None = None
+        self._encoder, self._noise = encoder, noise
+        self._readings: tuple[Reading, ...] = ()
+
+    def fit(self, parts: LinkParts, step_s: float, position: float) -> None:
+        """What effects add to it, with an integration step of step_s and the link at this position (rad)."""
+        delay = parts.reading_delay_s
+        self._readings = tuple(parts.readings)
+        self.history = History(delay, step_s, position) if delay > 0.0 else None
+
+    def sample(self, position: float) -> None:
+        """Sample at this link position (rad)."""
+        if self.history is not None:
+            position = self.history.position()
+        for read in self._readings:
+            position = read(position)
+        encoder = self._encoder
+        self.counts = round((position - encoder.zero_rad) * encoder.counts_per_rad + next(self._noise))

@@ -1,0 +1,152 @@
+"""What drives and encoders report of the joint: counts, per milles and their noise.
+
+A drive works at the motor shaft: joint position times gear ratio, joint torque divided by it. Its torque is
+its current times its torque constant, so a reported torque is never better than the reported current.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from sim.errors import SimError
+
+__all__ = ["RPM_RAD_S", "DriveHardware", "DriveSignals", "LinkEncoder", "noise"]
+
+RPM_RAD_S = 2.0 * math.pi / 60.0
+"""One revolution per minute."""
+_BLOCK = 4096
+
+
+class DriveSignals(NamedTuple):
+    """What a drive knows at one sampling instant, at the motor shaft and in its own directions.
+
+    Attributes:
+        position_counts: encoder counts since the joint's zero, unbounded (a bus object wraps it).
+        velocity_rad_s: actual velocity in steps of the drive's resolution.
+        current_a: actual current, noise and resolution included.
+        torque_nm: that current times the torque constant.
+    """
+
+    position_counts: int
+    velocity_rad_s: float
+    current_a: float
+    torque_nm: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DriveHardware:
+    """A drive, its motor's encoder and gear.
+
+    Attributes:
+        counts_per_rev: encoder counts per revolution of the motor shaft.
+        gear_ratio: motor revolutions per joint revolution.
+        torque_constant_nm_a: torque at the motor shaft per ampere.
+        rated_current_a: the thousandth of it is the unit of the reported current.
+        max_current_a: the drive's limit; None: three times the rated current.
+        current_resolution_a: step of the reported current; None: a thousandth of the rated current.
+        current_noise_a: standard deviation of the reported current (white, one draw a period).
+        velocity_resolution_rad_s: step of the reported velocity at the shaft, 1 rpm on most drives.
+        velocity_filter_s: time constant of the drive's velocity filter; 0: none.
+        direction: sign of the motor position against the joint's.
+        torque_direction: sign of current and torque against the joint's; None: like direction.
+    """
+
+    counts_per_rev: float = 4096.0
+    gear_ratio: float = 1.0
+    torque_constant_nm_a: float = 0.05
+    rated_current_a: float = 2.0
+    max_current_a: float | None = None
+    current_resolution_a: float | None = None
+    current_noise_a: float = 0.0
+    velocity_resolution_rad_s: float = RPM_RAD_S
+    velocity_filter_s: float = 0.0
+    direction: int = 1
+    torque_direction: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("counts_per_rev", "gear_ratio", "torque_constant_nm_a", "rated_current_a"):
+            _require(name, getattr(self, name), positive=True)
+        for name in ("max_current_a", "current_resolution_a"):
+            if getattr(self, name) is not None:
+                _require(name, getattr(self, name), positive=True)
+        for name in ("current_noise_a", "velocity_resolution_rad_s", "velocity_filter_s"):
+            _require(name, getattr(self, name), positive=False)
+        for name in ("direction", "torque_direction"):
+            if getattr(self, name) not in (1, -1, None):
+                raise SimError(f"{name}: expected 1 or -1, got {getattr(self, name)!r}")
+
+    @property
+    def rated_torque_nm(self) -> float:
+        """Torque at the motor shaft at rated current."""
+        return self.torque_constant_nm_a * self.rated_current_a
+
+    @property
+    def limit_a(self) -> float:
+        """Largest current the drive lets through."""
+        return 3.0 * self.rated_current_a if self.max_current_a is None else self.max_current_a
+
+    @property
+    def current_step_a(self) -> float:
+        """Step of the reported current."""
+        step = self.current_resolution_a
+        return self.rated_current_a / 1000.0 if step is None else step
+
+    @property
+    def counts_per_rad(self) -> float:
+        """Signed counts per radian of the joint."""
+        return self.direction * self.counts_per_rev * self.gear_ratio / (2.0 * math.pi)
+
+    @property
+    def joint_torque_per_ampere(self) -> float:
+        """Signed torque at the joint per ampere, as the drive believes it."""
+        sign = self.direction if self.torque_direction is None else self.torque_direction
+        return sign * self.torque_constant_nm_a * self.gear_ratio
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkEncoder:
+    """The encoder at the link.
+
+    Attributes:
+        counts_per_rev: counts per revolution of the joint.
+        direction: sign against the joint's.
+        zero_rad: joint angle at which it reads zero.
+        noise_counts: standard deviation of its reading before it is rounded.
+    """
+
+    counts_per_rev: float = 262144.0
+    direction: int = 1
+    zero_rad: float = 0.0
+    noise_counts: float = 0.0
+
+    def __post_init__(self) -> None:
+        _require("counts_per_rev", self.counts_per_rev, positive=True)
+        _require("noise_counts", self.noise_counts, positive=False)
+        if self.direction not in (1, -1):
+            raise SimError(f"direction: expected 1 or -1, got {self.direction!r}")
+
+    @property
+    def counts_per_rad(self) -> float:
+        """Signed counts per radian of the joint."""
+        return self.direction * self.counts_per_rev / (2.0 * math.pi)
+
+
+def _require(name: str, value: float, *, positive: bool) -> None:
+    bound = "> 0" if positive else ">= 0"
+    if not (math.isfinite(value) and (value > 0.0 if positive else value >= 0.0)):
+        raise SimError(f"{name}: expected a finite number {bound}, got {value!r}")
+
+
+def noise(seed: tuple[int, ...], std: float) -> Iterator[float]:
+    """White Gaussian noise without end, the same for the same seed; zeros for std 0."""
+    if std == 0.0:
+        while True:
+            yield 0.0
+    generator = np.random.default_rng(seed)
+    while True:
+        yield from (std * generator.standard_normal(_BLOCK)).tolist()

@@ -1,0 +1,287 @@
+"""One joint with its drives, encoders and rig, advanced by whole control periods.
+
+The convention of rows: at t_k everything is sampled, and the torque that a drive reports at t_k acts from
+t_k to t_{k+1}. That is what a drive does whose current loop is updated at the SYNC: the set-point that came
+before SYNC k is latched by it, is the current that the drive reports with SYNC k, and holds until SYNC k+1.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.dynamics import elasticity
+from sim.effects import PlantEffect, assemble
+from sim.errors import SimError
+from sim.excitation import Excitation
+from sim.integration import integrator, settling, whole_fraction
+from sim.plant import JointPlant
+from sim.readout import Amplifier, LinkScale
+from sim.sensors import DriveHardware, DriveSignals, LinkEncoder, noise
+
+__all__ = ["MotorTruth", "Truth", "World", "record"]
+
+
+class MotorTruth(NamedTuple):
+    """One motor and its transmission as they are, joint side.
+
+    Attributes:
+        position_rad: theta.
+        velocity_rad_s: theta'.
+        torque_nm: what acts now, which is not always what the drive reports.
+        deflection_rad: phi = q - theta.
+        flexibility_torque_nm: tau_e(phi), the elastic part of the transmission's torque.
+        stiffness_nm_rad: sigma = d tau_e / d phi.
+    """
+
+    position_rad: float
+    velocity_rad_s: float
+    torque_nm: float
+    deflection_rad: float
+    flexibility_torque_nm: float
+    stiffness_nm_rad: float
+
+
+class Truth(NamedTuple):
+    """The joint as it is at one sampling instant.
+
+    Attributes:
+        time_s: t_k.
+        link_position_rad: q.
+        link_velocity_rad_s: q'.
+        external_torque_nm: tau_k, held over the period.
+        flexibility_torque_nm: tau_e,t (eq 9).
+        stiffness_nm_rad: sigma_t (eq 11).
+        motors: one per motor.
+    """
+
+    time_s: float
+    link_position_rad: float
+    link_velocity_rad_s: float
+    external_torque_nm: float
+    flexibility_torque_nm: float
+    stiffness_nm_rad: float
+    motors: tuple[MotorTruth, ...]
+
+
+class World:
+    """A joint in motion, in lockstep with whoever advances it."""
+
+    def __init__(
+        self,
+        plant: JointPlant,
+        drives: Sequence[DriveHardware],
+        encoder: LinkEncoder | None = None,
+        *,
+        excitation: Excitation | None = None,
+        effects: Sequence[PlantEffect] = (),
+        period_s: float = 0.001,
+        plant_step_s: float | None = None,
+        seed: int = 0,
+        initial_rad: Sequence[float] = (),
+    ) -> None:
+        """Build the joint, at rest.
+
+        Args:
+            plant: its physics as declared.
+            drives: one per motor.
+            encoder: the link encoder; None: a fine one.
+            excitation: the rig's torque where nobody commands; None: no torque.
+            effects: physics that is switched on besides.
+            period_s: control period.
+            plant_step_s: integration step, a whole fraction of the period; None: chosen from the plant.
+            seed: of the sensor noise.
+            initial_rad: q, theta_1 (, theta_2) at the start; empty: zero.
+
+        Raises:
+            SimError: the step is no whole fraction, or the parts do not fit each other.
+        """
+        if len(drives) != len(plant.motors):
+            raise SimError(f"drives: expected {len(plant.motors)}, got {len(drives)}")
+        self.motors = len(drives)
+        self.drives = tuple(drives)
+        self.encoder = encoder or LinkEncoder()
+        self.excitation = excitation
+        self.period_s = period_s
+        self.substeps = whole_fraction(period_s, plant_step_s, plant, fine=bool(effects))
+        self.plant_step_s = period_s / self.substeps
+        self._declared = plant
+        self._effects = tuple(effects)
+        self._state = _start(initial_rad, self.motors, plant.rigid)
+        self._tick = 0
+        self._external = 0.0
+        self._commands: list[float | None] = [None] * self.motors
+        self._amplifiers = [
+            Amplifier(drive, period_s, self.substeps, noise((seed, 1, motor), drive.current_noise_a))
+            for motor, drive in enumerate(self.drives)
+        ]
+        self._scale = LinkScale(self.encoder, noise((seed, 2), self.encoder.noise_counts))
+        self._assemble()
+        self._latch()
+
+    @property
+    def time_s(self) -> float:
+        """t_k of the present sampling instant."""
+        return self._tick * self.period_s
+
+    def alter(self, *, plant: JointPlant | None = None, effects: Sequence[PlantEffect] | None = None) -> None:
+        """Other physics from now on: a spring that breaks, friction that comes.
+
+        Position and velocity go on as they are; memories begin anew. The plant step stays.
+
+        Args:
+            plant: another joint of the same kind; None: as it was.
+            effects: all that is switched on from now; None: as it was.
+
+        Raises:
+            SimError: a joint of another kind, or values that cannot be.
+        """
+        if plant is not None:
+            if (plant.arrangement, plant.rigid) != (self._declared.arrangement, self._declared.rigid):
+                raise SimError(f'alter: expected arrangement "{self._declared.arrangement}", as before')
+            self._declared = plant
+        if effects is not None:
+            self._effects = tuple(effects)
+        self._assemble()
+
+    def _assemble(self) -> None:
+        assembly = assemble(self._declared, self._effects, self.plant_step_s)
+        self.plant = assembly.joint()
+        self._step = integrator(self.plant, self.plant_step_s)
+        self._settle = settling(self.plant, self.plant_step_s)
+        self._elastic = elasticity(self.plant)
+        for amplifier, parts in zip(self._amplifiers, assembly.motors, strict=True):
+            amplifier.fit(parts)
+        self._scale.fit(assembly.link, self.plant_step_s, self._state[0])
+
+    def command(self, motor: int, torque_nm: float | None) -> None:
+        """Set-point of one drive, from the next period on.
+
+        Args:
+            motor: index.
+            torque_nm: at the motor shaft in the drive's own direction; None: the rig's excitation acts.
+
+        Raises:
+            SimError: no finite number.
+        """
+        if torque_nm is not None and not math.isfinite(torque_nm):
+            raise SimError(f"torque_nm: expected a finite number, got {torque_nm!r}")
+        self._commands[motor] = torque_nm
+
+    def advance(self, periods: int = 1) -> None:
+        """Move on by whole control periods."""
+        step, settle, state, history = self._step, self._settle, self._state, self._scale.history
+        first, last = self._amplifiers[0], self._amplifiers[-1]
+        for _ in range(periods):
+            tau_k, time_s = self._external, self._tick * self.period_s
+            for tau1, tau2 in zip(first.schedule, last.schedule, strict=True):
+                step(state, tau1, tau2, tau_k)
+                if settle is not None:
+                    time_s += self.plant_step_s
+                    settle(state, time_s)
+                if history is not None:
+                    history.push(state[0], state[1])
+            self._tick += 1
+            self._latch()
+
+    def _latch(self) -> None:
+        """Begin a period: set-points become currents, and everything is sampled."""
+        t, state, excitation = self._tick * self.period_s, self._state, self.excitation
+        for motor, amplifier in enumerate(self._amplifiers):
+            theta, w = state[2 + 2 * motor], state[3 + 2 * motor]
+            command = self._commands[motor]
+            if command is not None:
+                amplifier.latch(command / amplifier.drive.torque_constant_nm_a, t, theta, w)
+            elif excitation is not None:
+                torque = excitation.torque(motor, t, theta, w)
+                amplifier.latch(torque / amplifier.drive.joint_torque_per_ampere, t, theta, w)
+            else:
+                amplifier.latch(0.0, t, theta, w)
+        self._external = excitation.external(t) if excitation is not None and excitation.external else 0.0
+        self._scale.sample(state[0])
+
+    def drive(self, motor: int) -> DriveSignals:
+        """What this drive has sampled at the present instant."""
+        return self._amplifiers[motor].signals()
+
+    def link_counts(self) -> int:
+        """What the link encoder has sampled at the present instant."""
+        return self._scale.counts
+
+    def truth(self) -> Truth:
+        """The joint as it is now."""
+        state = self._state
+        elastic = self._elastic(state)
+        motors = tuple(
+            MotorTruth(
+                state[2 + 2 * i],
+                state[3 + 2 * i],
+                amplifier.schedule[0],
+                state[0] - state[2 + 2 * i],
+                *elastic[i],
+            )
+            for i, amplifier in enumerate(self._amplifiers)
+        )
+        acting = motors if self.plant.arrangement == "antagonistic" else motors[:1]
+        return Truth(
+            self.time_s,
+            state[0],
+            state[1],
+            self._external,
+            sum(motor.flexibility_torque_nm for motor in acting),
+            sum(motor.stiffness_nm_rad for motor in acting),
+            motors,
+        )
+
+
+def _start(initial_rad: Sequence[float], motors: int, rigid: bool) -> list[float]:
+    positions = list(initial_rad) or [0.0] * (1 + motors)
+    if len(positions) != 1 + motors or not all(math.isfinite(p) for p in positions):
+        raise SimError(f"initial_rad: expected {1 + motors} finite numbers, got {positions!r}")
+    if rigid and positions[0] != positions[1]:
+        raise SimError(f"initial_rad: expected q = theta at a rigid transmission, got {positions!r}")
+    return [value for position in positions for value in (position, 0.0)]
+
+
+def record(world: World, seconds: float) -> dict[str, NDArray[np.float64]]:
+    """Advance a world and keep what its sensors say, in the columns of a recording, and the truth.
+
+    Args:
+        world: where it starts is row 0.
+        seconds: length; round(seconds / period) rows.
+
+    Returns:
+        Arrays (n,): `time_s`, `motor1_position_rad`, `motor1_velocity_rad_s`, `motor1_torque_nm`,
+        `motor1_current_a`, the same for `motor2_`, `link_position_rad`, `external_torque_nm`; and what no
+        sensor tells: `truth_` followed by `link_position_rad`, `link_velocity_rad_s`,
+        `flexibility_torque_nm`, `stiffness_nm_rad` and, per motor, `motor1_` with the fields of
+        `MotorTruth`. Motor torques and positions are at the joint; row k's torque acts until row k+1.
+    """
+    rows = []
+    for k in range(round(seconds / world.period_s)):
+        if k:
+            world.advance()
+        rows.append(_row(world))
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]} if rows else {}
+
+
+def _row(world: World) -> dict[str, float]:
+    truth = world.truth()
+    row = {"time_s": truth.time_s, "external_torque_nm": truth.external_torque_nm}
+    for motor, drive in enumerate(world.drives):
+        signals, name = world.drive(motor), f"motor{motor + 1}"
+        row[f"{name}_position_rad"] = signals.position_counts / drive.counts_per_rad
+        row[f"{name}_velocity_rad_s"] = signals.velocity_rad_s * drive.direction / drive.gear_ratio
+        row[f"{name}_torque_nm"] = signals.current_a * drive.joint_torque_per_ampere
+        row[f"{name}_current_a"] = signals.current_a
+    row["link_position_rad"] = world.link_counts() / world.encoder.counts_per_rad + world.encoder.zero_rad
+    for name in ("link_position_rad", "link_velocity_rad_s", "flexibility_torque_nm", "stiffness_nm_rad"):
+        row[f"truth_{name}"] = getattr(truth, name)
+    for index, motor_truth in enumerate(truth.motors):
+        for name, value in zip(motor_truth._fields, motor_truth, strict=True):
+            row[f"truth_motor{index + 1}_{name}"] = value
+    return row

@@ -1,0 +1,33 @@
+"""Stiffness and flexibility torque of a variable-stiffness drive, on line, without a torque sensor."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from drivelink.pubsub.asyncclient import AsyncSubscription as AsyncSubscription
+    from drivelink.pubsub.asyncclient import subscribe_async as subscribe_async
+    from drivelink.pubsub.client import State as State
+    from drivelink.pubsub.client import Subscription as Subscription
+    from drivelink.pubsub.client import subscribe as subscribe
+
+__version__ = "0.1.0"
+
+_LAZY = {  # imported when asked for, so that `import drivelink` stays cheap
+    "AsyncSubscription": "drivelink.pubsub.asyncclient",
+    "State": "drivelink.pubsub.client",
+    "Subscription": "drivelink.pubsub.client",
+    "subscribe": "drivelink.pubsub.client",
+    "subscribe_async": "drivelink.pubsub.asyncclient",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        return getattr(import_module(_LAZY[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_LAZY])

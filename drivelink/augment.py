@@ -1,0 +1,130 @@
+"""A diagnosis into a joint file: the effects found, the transmission refitted, where it came from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from drivelink import __version__, jointfile
+from drivelink.floor import floor_entry
+from drivelink.jointfile import JointFile
+from estimator.diagnosis import Diagnosis
+from estimator.effects import LIBRARY
+from estimator.model import Effect, JointModel, ParameterValue
+from estimator.sample import Record
+
+__all__ = ["write"]
+
+
+def write(source: Path, target: Path, outcome: Diagnosis, record: Record, recording: str) -> JointFile:
+    """Copy a joint file with the effects that were found, and validate the copy.
+
+    Args:
+        source: the joint file the diagnosis was made with.
+        target: where the copy goes.
+        outcome: the diagnosis.
+        record: the recording it was made from.
+        recording: its name.
+
+    Raises:
+        JointFileError: the copy cannot be written.
+    """
+    joint = jointfile.load(source)
+    motors = [
+        {"effect": _all_effects(section.effect, outcome, i), **_transmission(joint, outcome, i)}
+        for i, section in enumerate(joint.motor)
+    ]
+    changes: dict[str, Any] = {"motor": motors}
+    at_link = _all_effects(joint.link.effect, outcome, None)
+    if at_link:
+        changes["link"] = {"effect": at_link}
+    changes["provenance"] = {
+        **floor_entry(record, _augmented(joint, motors, at_link)),
+        "diagnosis": {
+            "recording": recording,
+            "seconds": float((record.sequence[-1] - record.sequence[0]) * record.period_s),
+            "verdict": outcome.verdict,
+            "effects": [finding.name for finding in outcome.effects],
+            "bandwidth_hz": outcome.bandwidth_hz,
+            "error_before_relative": outcome.validation.before_relative,
+            "error_after_relative": outcome.validation.after_relative,
+            "written": datetime.now(UTC).isoformat(timespec="seconds"),
+            "version": __version__,
+        },
+    }
+    return jointfile.write_model(source, target, changes)
+
+
+def _augmented(joint: JointFile, motors: list[dict[str, Any]], at_link: list[dict[str, Any]]) -> JointModel:
+    """The model as it will be in the copy."""
+    model = joint.model()
+    changed = []
+    for motor, change in zip(model.motors, motors, strict=True):
+        transmission = motor.transmission
+        if "transmission" in change:
+            parameters = _values(change["transmission"]["parameters"])
+            transmission = replace(transmission, parameters=parameters)
+        changed.append(replace(motor, transmission=transmission, effects=_effects(change["effect"])))
+    return replace(model, motors=tuple(changed), link_effects=_effects(at_link))
+
+
+def _effects(entries: list[dict[str, Any]]) -> tuple[Effect, ...]:
+    return tuple(Effect(name=e["name"], parameters=_values(e["parameters"])) for e in entries)
+
+
+def _values(parameters: dict[str, Any]) -> dict[str, ParameterValue]:
+    return {name: tuple(v) if isinstance(v, list) else v for name, v in parameters.items()}
+
+
+def _all_effects(declared: tuple[Effect, ...], outcome: Diagnosis, motor: int | None) -> list[dict[str, Any]]:
+    """What one table of effects holds: those declared, what was taken out of the readings, those found."""
+    made = [{"name": e.name, "parameters": _plain(dict(e.parameters))} for e in declared]
+    made += _readings(outcome, motor)
+    for finding in outcome.effects:
+        kind = LIBRARY.get(finding.name)
+        if kind is None:
+            continue
+        # A zero that all deflections have in common belongs to every motor.
+        common = kind.channel == "deflection" and finding.motor is None and motor is not None
+        here = kind.on_link if motor is None else not kind.on_link and finding.motor == motor
+        if here or common:
+            made.append({"name": finding.name, "parameters": _plain(finding.parameters)})
+    return made
+
+
+def _readings(outcome: Diagnosis, motor: int | None) -> list[dict[str, Any]]:
+    """Skew and offsets between the channels: on the bus they are there as well."""
+    if outcome.verdict == "insufficient_excitation":
+        return []
+    if motor is None:
+        places = {"link_position_delay_s": ("encoder_delay", "delay_s")}
+    else:
+        places = {
+            f"motor{motor + 1}_torque_delay_s": ("torque_delay", "delay_s"),
+            f"motor{motor + 1}_deflection_offset_rad": ("deflection_offset", "offset_rad"),
+        }
+    return [
+        {"name": name, "parameters": {parameter: float(outcome.alignment[key])}}
+        for key, (name, parameter) in places.items()
+        if key in outcome.alignment
+    ]
+
+
+def _transmission(joint: JointFile, outcome: Diagnosis, motor: int) -> dict[str, Any]:
+    """The transmission's refitted parameters; nothing where it is rigid or was not named."""
+    parameters = outcome.transmissions[motor]
+    if not parameters or outcome.verdict in ("insufficient_excitation", "unexplained"):
+        return {}
+    section = joint.motor[motor].transmission
+    change: dict[str, Any] = {"model": section.model, "parameters": _plain(parameters)}
+    if section.model == "polynomial":
+        coefficients = parameters["coefficients_nm_rad"]
+        assert isinstance(coefficients, tuple)
+        change["order"] = len(coefficients)
+    return {"transmission": change}
+
+
+def _plain(parameters: dict[str, ParameterValue]) -> dict[str, float | list[float]]:
+    return {name: list(v) if isinstance(v, tuple) else float(v) for name, v in parameters.items()}

@@ -1,0 +1,98 @@
+"""Running a program to its end on a bus that nobody else reads: before the start, and in the doctor."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import time
+from collections.abc import Callable
+from typing import Protocol, TypeVar
+
+import can
+
+from drivelink.canopen.sdo import Program, Session
+from drivelink.errors import BusError
+
+__all__ = ["POLL_S", "FrameBus", "Idle", "receive", "run_program", "sender"]
+
+T = TypeVar("T")
+Idle = Callable[[], object]
+
+POLL_S = 0.005
+_QUEUE_FULL = (errno.ENOBUFS, errno.EAGAIN)
+
+logger = logging.getLogger(__name__)
+
+
+class FrameBus(Protocol):
+    """What is needed of a bus: python-can's, or `bus.Bus`."""
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Put a frame on the bus."""
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """The next frame, or None after the timeout."""
+
+
+def sender(bus: FrameBus) -> Callable[[int, bytes], None]:
+    """`send(identifier, data)` of a bus.
+
+    A frame that finds the transmit queue full is lost, like one on the wire: SDO asks again after its
+    timeout. A queue stays full where nobody acknowledges; then nobody answers, and that is what is told.
+    """
+
+    def send(cob_id: int, data: bytes) -> None:
+        try:
+            bus.send(can.Message(arbitration_id=cob_id, data=data, is_extended_id=False))
+        except can.CanError as error:
+            if error.error_code in _QUEUE_FULL or "buffer full" in str(error):
+                logger.debug("frame 0x%03X is lost: the transmit queue is full", cob_id)
+                return
+            raise BusError(f"frame 0x{cob_id:03X} cannot be sent: {error}") from error
+
+    return send
+
+
+def run_program(
+    program: Program[T],
+    bus: FrameBus,
+    *,
+    timeout_s: float = 0.5,
+    retries: int = 1,
+    idle: Idle | None = None,
+) -> T:
+    """Run a program to its end on a bus that nobody else reads.
+
+    Args:
+        program: what to do.
+        bus: where.
+        timeout_s: for each SDO answer.
+        retries: further attempts after a timeout.
+        idle: called between receptions, e.g. the simulated devices' `poll` in lockstep.
+
+    Raises:
+        DriveError: the program failed.
+        BusError: the bus did.
+    """
+    session = Session(program, sender(bus), timeout_s=timeout_s, retries=retries)
+    while not session.poll(time.monotonic()):
+        if idle is not None:
+            idle()
+        message = receive(bus, 0.0 if idle is not None else POLL_S)
+        while message is not None:
+            if not (message.is_extended_id or message.is_error_frame or message.is_remote_frame):
+                session.feed(message.arbitration_id, bytes(message.data), time.monotonic())
+            message = receive(bus, 0.0)
+    return session.result
+
+
+def receive(bus: FrameBus, timeout_s: float) -> can.Message | None:
+    """The next frame, or None after the timeout.
+
+    Raises:
+        BusError: the bus fails.
+    """
+    try:
+        return bus.recv(timeout_s)
+    except can.CanError as error:
+        raise BusError(f"the bus cannot be read: {error}") from error

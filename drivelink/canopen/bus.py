@@ -1,0 +1,193 @@
+"""Opens the bus of a joint file, on anything python-can opens, and says in one line why it cannot.
+
+SocketCAN comes first: a receive buffer sized for the bus, kernel time stamps, error frames, CAN FD frames
+accepted, state of the interface.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import errno
+import logging
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+from can.interfaces import VALID_INTERFACES
+
+from drivelink.errors import BusError
+from drivelink.jointfile import BusSection
+
+__all__ = ["interface_is_up", "open_bus", "receive_buffer_frames"]
+
+logger = logging.getLogger(__name__)
+
+_SO_RCVBUFFORCE = 33  # Linux, not in the socket module: beyond net.core.rmem_max, with CAP_NET_ADMIN
+_BYTES_PER_FRAME = 800  # that the kernel charges for a frame (measured: 212992 bytes held 278)
+_BUFFER_S = 0.5  # of a full bus; the longest stall that must lose nothing
+_SHORTEST_FRAME_BITS = 55
+_SOCKETCAND_PORT = 29536
+_SOCKETCAND_HOST = "127.0.0.1"  # where `drivelink sim` serves one, unless told otherwise
+_CONNECT_S = 3.0
+_SYS_NET = Path("/sys/class/net")
+_IFF_UP = 1
+_WITHOUT_BITRATE = frozenset({"virtual", "socketcan", "socketcand", "udp_multicast"})
+
+_REASONS = {
+    errno.ENODEV: "there is no such interface",
+    errno.ENETDOWN: "the interface is down",
+    errno.EPERM: "this user may not use it",
+    errno.EACCES: "this user may not use it",
+    errno.ENOENT: "there is no such device",
+    errno.EAFNOSUPPORT: "this kernel has no SocketCAN (AF_CAN)",
+    errno.EPROTONOSUPPORT: "this kernel has no raw CAN sockets",
+    errno.ECONNREFUSED: "nobody listens there",
+}
+
+
+def open_bus(section: BusSection) -> can.BusABC:
+    """Open the bus that a joint file names.
+
+    Raises:
+        BusError: unknown interface, wrong options, missing device, no permission, interface down.
+    """
+    where = f"{section.interface} {section.channel}"
+    _check_interface(section)
+    if section.interface == "socketcan":
+        _check_socketcan(section)
+    if section.interface == "socketcand":
+        _check_socketcand(section)
+    try:
+        with _quiet():
+            bus = can.Bus(ignore_config=True, **_arguments(section))
+    except can.CanError as error:
+        raise BusError(f"{where} cannot be opened: {_reason(error)}") from error
+    except OSError as error:
+        raise BusError(f"{where} cannot be opened: {_reason(error)}") from error
+    except (TypeError, ValueError, KeyError, ImportError) as error:
+        raise BusError(f"{where} cannot be opened, check bus.channel and bus.options: {error}") from error
+    if section.interface == "socketcan":
+        _size_receive_buffer(bus, section)
+    return bus
+
+
+def _arguments(section: BusSection) -> dict[str, Any]:
+    arguments: dict[str, Any] = {"interface": section.interface, "channel": section.channel}
+    if section.interface not in _WITHOUT_BITRATE:
+        arguments["bitrate"] = section.bitrate
+    if section.interface == "slcan" and not section.configure and section.sync == "follow":
+        arguments["listen_only"] = True  # the adapter does not even acknowledge
+    if section.interface == "virtual":
+        arguments["preserve_timestamps"] = True
+    if section.interface == "socketcan":
+        arguments["fd"] = True
+    if section.interface == "socketcand":
+        arguments |= {"host": _SOCKETCAND_HOST, "port": _SOCKETCAND_PORT}
+    return {**arguments, **section.options}
+
+
+def _check_interface(section: BusSection) -> None:
+    if section.interface in VALID_INTERFACES:
+        return
+    close = difflib.get_close_matches(section.interface, VALID_INTERFACES, n=1)
+    hint = f'"{close[0]}"?' if close else ", ".join(sorted(VALID_INTERFACES))
+    raise BusError(f'bus.interface: python-can has no "{section.interface}", expected {hint}')
+
+
+def _check_socketcan(section: BusSection) -> None:
+    """What would go wrong, said before python-can has half a socket open."""
+    name = section.channel
+    try:
+        socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except (OSError, AttributeError) as error:
+        raise BusError(
+            f"socketcan {name} cannot be opened: {_reason(error)}; sudo modprobe can_raw"
+        ) from error
+    try:
+        socket.if_nametoindex(name)
+    except OSError as error:
+        make = f"sudo ip link add {name} type vcan && " if name.startswith("vcan") else ""
+        raise BusError(
+            f"socketcan {name}: there is no such interface; {make or 'plug it in, then '}"
+            f"sudo ip link set {name} up{'' if make else f' type can bitrate {section.bitrate}'}"
+        ) from error
+    if not interface_is_up(name):
+        kind = "" if name.startswith("vcan") else f" type can bitrate {section.bitrate}"
+        raise BusError(f"socketcan {name} is down; sudo ip link set {name} up{kind}")
+
+
+def _check_socketcand(section: BusSection) -> None:
+    """Whether anybody listens: python-can would try for ten seconds, and leave a socket open."""
+    host, port = (
+        section.options.get("host", _SOCKETCAND_HOST),
+        section.options.get("port", _SOCKETCAND_PORT),
+    )
+    if not isinstance(host, str) or not isinstance(port, int):
+        raise BusError(
+            'socketcand: expected bus.options = { host = "127.0.0.1", port = 29536 }, '
+            f"got {section.options or 'none'}"
+        )
+    try:
+        socket.create_connection((host, port), timeout=_CONNECT_S).close()
+    except OSError as error:
+        raise BusError(f"socketcand {host}:{port} cannot be opened: {_reason(error)}") from error
+
+
+def interface_is_up(name: str) -> bool:
+    """Whether a network interface exists and is up; cheap enough to ask now and then in a run."""
+    try:
+        flags = (_SYS_NET / name / "flags").read_text(encoding="ascii")
+        return bool(int(flags, 16) & _IFF_UP)
+    except (OSError, ValueError):
+        return False
+
+
+def _size_receive_buffer(bus: can.BusABC, section: BusSection) -> None:
+    """Room for everything a full bus brings during the longest stall."""
+    frames = int(_BUFFER_S * section.bitrate / _SHORTEST_FRAME_BITS)
+    wanted = frames * _BYTES_PER_FRAME
+    sock: socket.socket = bus.socket  # type: ignore[attr-defined]
+    try:
+        sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, wanted // 2)  # the kernel doubles it
+    except OSError:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted // 2)
+    have = receive_buffer_frames(bus)
+    if have < frames:
+        logger.info(
+            "%s: the receive buffer holds %d frames of %d wanted; sudo sysctl net.core.rmem_max=%d",
+            section.channel,
+            have,
+            frames,
+            wanted // 2,
+        )
+
+
+def receive_buffer_frames(bus: can.BusABC) -> int:
+    """How many frames the kernel keeps for a SocketCAN bus that is not read."""
+    sock: socket.socket = bus.socket  # type: ignore[attr-defined]
+    return sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // _BYTES_PER_FRAME
+
+
+def _reason(error: BaseException) -> str:
+    cause: BaseException | None = error
+    while cause is not None:  # python-can wraps what the system said
+        number = getattr(cause, "errno", None) or getattr(cause, "error_code", None)
+        if number in _REASONS:
+            return _REASONS[number]
+        cause = cause.__cause__ or cause.__context__
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """python-can also logs what it raises."""
+    log = logging.getLogger("can")
+    before = log.level
+    log.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        log.setLevel(before)

@@ -1,0 +1,89 @@
+"""How much of the bus the cycle needs, before it is started.
+
+A standard frame with n data bytes takes at most 47 + 8 n + ⌊(33 + 8 n) / 4⌋ bits, interframe space and
+worst-case stuffing included: 55 for a SYNC, 135 for eight bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from drivelink.canopen.layout import NodeLayout, TpdoLayout
+from drivelink.errors import BusError
+
+__all__ = ["BusLoad", "bus_load", "check_capacity", "frame_bits"]
+
+CAPACITY = 1.0  # of the bit rate, worst-case stuffing
+COMFORTABLE = 0.7  # above it, event-driven frames of others begin to delay the cycle
+
+
+def frame_bits(data_bytes: int) -> int:
+    """Bits on the wire of a standard frame, worst case."""
+    return 47 + 8 * data_bytes + (33 + 8 * data_bytes) // 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BusLoad:
+    """What the cycle puts on the bus.
+
+    Attributes:
+        bits_per_s: worst case.
+        bitrate: bit/s of the bus.
+        frames_per_s: of them.
+    """
+
+    bits_per_s: float
+    bitrate: int
+    frames_per_s: float
+
+    @property
+    def fraction(self) -> float:
+        """Of the bit rate."""
+        return self.bits_per_s / self.bitrate
+
+
+def _tpdo_rate_hz(tpdo: TpdoLayout, sync_hz: float) -> float:
+    if 1 <= tpdo.transmission_type <= 240:
+        return sync_hz / tpdo.transmission_type
+    # On change: a measured value changes in every control cycle, so only the inhibit time bounds it.
+    return min(sync_hz, 1 / tpdo.inhibit_s) if tpdo.inhibit_s > 0 else sync_hz
+
+
+def bus_load(layouts: Iterable[NodeLayout], *, period_s: float, bitrate: int, sync_bytes: int = 0) -> BusLoad:
+    """Load of SYNC, TPDOs (also those nobody here needs) and heartbeats.
+
+    Args:
+        layouts: all nodes.
+        period_s: communication cycle.
+        bitrate: bit/s.
+        sync_bytes: 1 with a SYNC counter, else 0.
+    """
+    sync_hz = 1 / period_s
+    frames = [(sync_hz, frame_bits(sync_bytes))]
+    for layout in layouts:
+        frames += [
+            (_tpdo_rate_hz(tpdo, sync_hz), frame_bits(tpdo.length))
+            for tpdo in layout.tpdos + layout.other_tpdos
+        ]
+        if layout.heartbeat_ms:
+            frames.append((1000 / layout.heartbeat_ms, frame_bits(1)))
+    return BusLoad(
+        bits_per_s=sum(rate * bits for rate, bits in frames),
+        bitrate=bitrate,
+        frames_per_s=sum(rate for rate, _ in frames),
+    )
+
+
+def check_capacity(load: BusLoad, period_s: float) -> None:
+    """Refuse what the bus cannot carry.
+
+    Raises:
+        BusError: more bits per second than the bit rate.
+    """
+    if load.fraction > CAPACITY:
+        raise BusError(
+            f"bus load would be {load.fraction:.0%}: {load.frames_per_s:.0f} frames/s need up to "
+            f"{load.bits_per_s / 1000:.0f} kbit/s of {load.bitrate / 1000:.0f} kbit/s; a period of "
+            f"{period_s * load.fraction / COMFORTABLE * 1000:.2g} ms (bus.period_s) or fewer drives would fit"
+        )

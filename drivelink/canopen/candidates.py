@@ -1,0 +1,55 @@
+"""What a node offers: for each signal the objects that can give it, ready to be mapped and decoded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from drivelink.canopen.layout import MappedObject, Signal
+from drivelink.finding import Finding
+
+__all__ = ["Candidate", "Offer"]
+
+Address = tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Candidate:
+    """An object that can give a signal, with all that is needed to decode it."""
+
+    signal: Signal
+    address: Address
+    bits: int
+    signed: bool
+    scale: float
+    wraps: bool = False
+    offset: float = 0.0
+    modulus: int = 0
+
+    def mapped(self, bits: int | None = None) -> MappedObject:
+        """It as an object of a TPDO."""
+        return MappedObject(
+            signal=self.signal,
+            index=self.address[0],
+            subindex=self.address[1],
+            bits=self.bits if bits is None else bits,
+            signed=self.signed,
+            scale=self.scale,
+            wraps=self.wraps,
+            offset=self.offset,
+            modulus=self.modulus,
+        )
+
+
+@dataclass(slots=True, kw_only=True)
+class Offer:
+    """What a node can give.
+
+    Attributes:
+        candidates: for each signal the objects that can give it, best first.
+        missing: for a signal with no candidate, why.
+        findings: disagreements and remarks.
+    """
+
+    candidates: dict[Signal, tuple[Candidate, ...]] = field(default_factory=dict)
+    missing: dict[Signal, str] = field(default_factory=dict)
+    findings: list[Finding] = field(default_factory=list)

@@ -1,0 +1,231 @@
+"""From a joint file and a bus to `NodeLayout`s: before the start (blocking), and beside the loop.
+
+`configure` does it all before the start. In a run, a node that rebooted is configured again by
+`Configurator.start(node)`: the loop hands every SDO response to `feed`, lets time pass with `poll`, and
+takes the new layout when it is there. Nothing here waits, and nothing here reads the bus a second time.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+from drivelink.canopen.blocking import POLL_S, FrameBus, Idle, receive, run_program, sender
+from drivelink.canopen.busload import COMFORTABLE, BusLoad, bus_load, check_capacity
+from drivelink.canopen.layout import NodeLayout
+from drivelink.canopen.mapping import NMT_START
+from drivelink.canopen.node import configure_node
+from drivelink.canopen.roles import Role, roles
+from drivelink.canopen.sdo import Program, SdoTimeout, Session
+from drivelink.errors import BusError, DriveError
+from drivelink.finding import log_findings
+from drivelink.jointfile import BusSection, JointFile
+
+__all__ = ["Configurator", "configure", "configure_joints"]
+
+logger = logging.getLogger(__name__)
+
+_FOREIGN_SYNC_S = 0.05
+_DEVICE_TYPE = 0x1000  # what a node is asked for first
+
+
+class Configurator:
+    """Configures the nodes of one or several joints, again and again if need be.
+
+    Args:
+        send: puts a frame (identifier, data) on the bus.
+        joints: joint files on this bus; the first one's bus section counts.
+        base_dirs: their folders, for EDS files.
+    """
+
+    def __init__(
+        self,
+        send: Callable[[int, bytes], None],
+        joints: Sequence[JointFile],
+        base_dirs: Sequence[Path] | None = None,
+    ) -> None:
+        self._send = send
+        self.bus: BusSection = joints[0].bus
+        folders = base_dirs or [Path()] * len(joints)
+        self._roles: dict[int, Role] = {}
+        for joint, folder in zip(joints, folders, strict=True):
+            for role in roles(joint, folder):
+                if role.node_id in self._roles:
+                    raise BusError(f"node {role.node_id} is claimed by two joints on one bus")
+                self._roles[role.node_id] = role
+        self.layouts: dict[int, NodeLayout] = {}
+        self.drop_others = False
+        self._sessions: dict[int, Session[NodeLayout]] = {}
+
+    @property
+    def nodes(self) -> tuple[int, ...]:
+        """Node ids, in the order of the joint files."""
+        return tuple(self._roles)
+
+    def program(self, node: int, *, start: bool, stopped: bool = False) -> Program[NodeLayout]:
+        """What configures one node; one that is known to be stopped is woken first."""
+        taken = {
+            tpdo.cob_id
+            for other, layout in self.layouts.items()
+            if other != node
+            for tpdo in layout.tpdos + layout.other_tpdos
+        }
+        return configure_node(
+            self._roles[node], self.bus, taken, drop_others=self.drop_others, start=start, stopped=stopped
+        )
+
+    def start(self, node: int, *, stopped: bool = False) -> None:
+        """Begin to configure a node beside the loop, anew if that is already under way."""
+        self._sessions[node] = Session(
+            self.program(node, start=True, stopped=stopped),
+            self._send,
+            timeout_s=self.bus.sdo_timeout_s,
+            retries=self.bus.sdo_retries,
+        )
+
+    @property
+    def busy(self) -> bool:
+        """Whether any configuration is under way."""
+        return bool(self._sessions)
+
+    def feed(self, cob_id: int, data: bytes, now_s: float) -> None:
+        """Take a frame; only SDO responses (0x581 to 0x5FF) are of interest."""
+        session = self._sessions.get(cob_id - 0x580)
+        if session is not None:
+            session.feed(cob_id, data, now_s)
+
+    def poll(self, now_s: float) -> list[tuple[int, NodeLayout | DriveError]]:
+        """Let time pass; what has come to an end: the node with its new layout, or with the error."""
+        ended: list[tuple[int, NodeLayout | DriveError]] = []
+        for node, session in list(self._sessions.items()):
+            if not session.poll(now_s):
+                continue
+            del self._sessions[node]
+            try:
+                self.layouts[node] = session.result
+                ended.append((node, session.result))
+            except DriveError as error:
+                ended.append((node, error))
+        return ended
+
+    def load(self) -> BusLoad:
+        """Bus load of all that is configured."""
+        return bus_load(
+            self.layouts.values(),
+            period_s=self.bus.period_s,
+            bitrate=self.bus.bitrate,
+            sync_bytes=1 if self.bus.sync_counter_overflow else 0,
+        )
+
+
+def configure_joints(
+    bus: FrameBus,
+    joints: Sequence[JointFile],
+    base_dirs: Sequence[Path] | None = None,
+    *,
+    idle: Idle | None = None,
+) -> tuple[Configurator, tuple[tuple[NodeLayout, ...], ...]]:
+    """Configure all nodes of all joints on one bus, check the bus load, and start them.
+
+    Args:
+        bus: open, and read by nobody else meanwhile.
+        joints: joint files with `configure = true`; the first one's bus section counts.
+        base_dirs: their folders, for EDS files.
+        idle: called between receptions, e.g. the simulated devices' `poll` in lockstep.
+
+    Returns:
+        The configurator (for reboots in the run), and the layouts joint by joint.
+
+    Raises:
+        DriveError: a node is absent, refuses, or cannot give what is needed.
+        BusError: the bus fails, is too slow, or another master makes SYNC.
+    """
+    section = joints[0].bus
+    if section.sync == "produce":
+        _refuse_foreign_sync(bus, section, idle)
+    configurator = _actively(bus, joints, base_dirs, idle)
+    load = configurator.load()
+    check_capacity(load, section.period_s)
+    for layout in configurator.layouts.values():
+        log_findings(logger, layout.findings)
+    logger.info("bus load %.0f %% of %d kbit/s", 100 * load.fraction, section.bitrate // 1000)
+    send = sender(bus)
+    for node in configurator.nodes:
+        send(0, bytes([NMT_START, node]))
+    result = []
+    for joint in joints:
+        mine = {role.node_id for role in roles(joint)}
+        result.append(tuple(layout for node, layout in configurator.layouts.items() if node in mine))
+    return configurator, tuple(result)
+
+
+def _actively(
+    bus: FrameBus, joints: Sequence[JointFile], base_dirs: Sequence[Path] | None, idle: Idle | None
+) -> Configurator:
+    configurator = Configurator(sender(bus), joints, base_dirs)
+    for node in configurator.nodes:
+        _configure_one(configurator, node, bus, idle)
+    if configurator.load().fraction > COMFORTABLE:
+        configurator.drop_others = True
+        for node in configurator.nodes:
+            if configurator.layouts[node].other_tpdos:
+                _configure_one(configurator, node, bus, idle)
+    return configurator
+
+
+def configure(
+    bus: FrameBus, joint: JointFile, base_dir: Path = Path(), *, idle: Idle | None = None
+) -> tuple[NodeLayout, ...]:
+    """Configure the nodes of one joint: `configure_joints` for one."""
+    return configure_joints(bus, [joint], [base_dir], idle=idle)[1][0]
+
+
+def _configure_one(configurator: Configurator, node: int, bus: FrameBus, idle: Idle | None) -> None:
+    section = configurator.bus
+    try:
+        configurator.layouts[node] = run_program(
+            configurator.program(node, start=False),
+            bus,
+            timeout_s=section.sdo_timeout_s,
+            retries=section.sdo_retries,
+            idle=idle,
+        )
+    except SdoTimeout as error:
+        if error.index != _DEVICE_TYPE:
+            raise DriveError(
+                f"{error}, though it has answered before: bus.sdo_timeout_s = {2 * section.sdo_timeout_s:g} "
+                "gives it more time"
+            ) from error
+        raise DriveError(
+            f"{error} on {section.interface} {section.channel} at {section.bitrate // 1000} kbit/s: "
+            "is it powered, and are node id and bit rate right?"
+        ) from error
+
+
+def _refuse_foreign_sync(bus: FrameBus, section: BusSection, idle: Idle | None) -> None:
+    """Two masters must not both make SYNC.
+
+    Raises:
+        BusError: somebody else does.
+    """
+    heard = _listen(bus, max(_FOREIGN_SYNC_S, 3 * section.period_s), idle)
+    syncs = sum(1 for cob_id in heard if cob_id == 0x80)
+    if syncs > 1:
+        raise BusError(
+            f"another master already makes SYNC on {section.interface} {section.channel}: "
+            'set bus.sync = "follow", or stop it'
+        )
+
+
+def _listen(bus: FrameBus, seconds: float, idle: Idle | None) -> Iterable[int]:
+    end_s = time.monotonic() + seconds
+    heard = []
+    while (left_s := end_s - time.monotonic()) > 0:
+        if idle is not None:
+            idle()
+        message = receive(bus, min(left_s, POLL_S))
+        if message is not None and not message.is_extended_id and not message.is_error_frame:
+            heard.append(message.arbitration_id)
+    return heard

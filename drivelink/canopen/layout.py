@@ -1,0 +1,133 @@
+"""What the wire looks like once every node is configured: which frame carries which signal, at what scale.
+
+Made by the configuration (active or passive), used by the acquisition; the only thing the two share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from typing import Any
+
+from drivelink.finding import Finding
+
+__all__ = ["MappedObject", "NodeLayout", "Signal", "TpdoLayout", "layout_document", "layout_from"]
+
+
+class Signal(StrEnum):
+    """What a mapped object means to the joint."""
+
+    MOTOR_POSITION = "motor_position"
+    MOTOR_VELOCITY = "motor_velocity"
+    MOTOR_TORQUE = "motor_torque"
+    STATUSWORD = "statusword"
+    LINK_POSITION = "link_position"
+    LINK_VELOCITY = "link_velocity"
+    OTHER = "other"  # mapped by the drive, not used by us
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MappedObject:
+    """One object in a TPDO.
+
+    Attributes:
+        signal: what it means.
+        index: object index.
+        subindex: object subindex.
+        bits: its length in the frame.
+        signed: whether two's complement.
+        scale: SI units at the joint side per count, direction and gear included (1 for the statusword).
+        wraps: whether the counter rolls over at its length (absolute or incremental position).
+        offset: SI units, subtracted after scaling (0 but for the link encoder's zero).
+        modulus: counts after which it rolls over, where that is less than its length allows (the measuring
+            range of an absolute encoder, 0x6002 of CiA 406); 0: at its length.
+    """
+
+    signal: Signal
+    index: int
+    subindex: int
+    bits: int
+    signed: bool
+    scale: float = 1.0
+    wraps: bool = False
+    offset: float = 0.0
+    modulus: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TpdoLayout:
+    """One TPDO: its identifier and the objects in it, in order from bit 0.
+
+    Attributes:
+        cob_id: identifier of the frame.
+        objects: what is in it.
+        transmission_type: 1 to 240 every so many SYNCs; 254, 255 when the drive pleases.
+        number: 1 for 0x1800/0x1A00 and so on; 0 where it is not known (passive).
+        inhibit_s: shortest time between two frames with types 254 and 255; 0: none, or not known.
+    """
+
+    cob_id: int
+    objects: tuple[MappedObject, ...]
+    transmission_type: int = 1
+    number: int = 0
+    inhibit_s: float = 0.0
+
+    @property
+    def length(self) -> int:
+        """Bytes of the frame."""
+        return (sum(mapped.bits for mapped in self.objects) + 7) // 8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NodeLayout:
+    """One node of a joint.
+
+    Attributes:
+        node_id: 1 to 127.
+        motor: index of the motor this drive belongs to, or None for a node that is only an encoder.
+        tpdos: its frames that carry signals of the joint.
+        other_tpdos: enabled frames of this node that nobody here needs, but that load the bus.
+        heartbeat_ms: period of the heartbeat the node produces, as read back; 0: none, or not known.
+        identity: (vendor, product code, revision, serial number) of 0x1018; 0 where not told.
+        findings: what the configuration had to say about it.
+    """
+
+    node_id: int
+    motor: int | None
+    tpdos: tuple[TpdoLayout, ...]
+    other_tpdos: tuple[TpdoLayout, ...] = ()
+    heartbeat_ms: int = 0
+    identity: tuple[int, int, int, int] = (0, 0, 0, 0)
+    findings: tuple[Finding, ...] = ()
+
+
+def layout_document(layout: NodeLayout) -> dict[str, Any]:
+    """A layout as plain values, for the model document; without what its configuration had to say."""
+    document = asdict(layout)
+    del document["findings"]
+    return document
+
+
+def layout_from(document: Mapping[str, Any]) -> NodeLayout:
+    """A layout from its plain values.
+
+    Raises:
+        ValueError, KeyError, TypeError: they are none.
+    """
+    vendor, product, revision, serial = document["identity"]
+    return NodeLayout(
+        node_id=document["node_id"],
+        motor=document["motor"],
+        heartbeat_ms=document["heartbeat_ms"],
+        identity=(vendor, product, revision, serial),
+        tpdos=tuple(_tpdo_from(tpdo) for tpdo in document["tpdos"]),
+        other_tpdos=tuple(_tpdo_from(tpdo) for tpdo in document["other_tpdos"]),
+    )
+
+
+def _tpdo_from(document: Mapping[str, Any]) -> TpdoLayout:
+    objects = tuple(
+        MappedObject(**{**each, "signal": Signal(each["signal"])}) for each in document["objects"]
+    )
+    return TpdoLayout(**{**document, "objects": objects})

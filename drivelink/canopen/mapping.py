@@ -1,0 +1,326 @@
+"""Makes a node send what the joint needs, and reads back what it will really send.
+
+The order is the one that all drives accept: pre-operational; 0x1800:01 invalid with its bit 30 kept;
+:02 = 1; 0x1A00:00 = 0; entries; count; valid again (CiA 301, 7.5.2.36). A node that is already as it should
+be is not written to, and not taken out of operational: after a restart of the daemon nothing changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from drivelink.canopen.candidates import Candidate
+from drivelink.canopen.layout import Signal, TpdoLayout
+from drivelink.canopen.pdo import (
+    EXTENDED,
+    INVALID,
+    NO_RTR,
+    SYNC_TYPES,
+    Entry,
+    Tpdo,
+    decode,
+    describe,
+    read_optional,
+    read_tpdo,
+)
+from drivelink.canopen.plan import OPTIONAL, Assignment, assign, choose_cob_id
+from drivelink.canopen.roles import Role
+from drivelink.canopen.sdo import Nmt, Pause, Program, Read, SdoAbort, Write, abort_text
+from drivelink.errors import DriveError
+from drivelink.finding import Finding, Severity
+
+__all__ = ["NMT_PRE_OPERATIONAL", "NMT_START", "Mapper", "disable"]
+
+NMT_START = 0x01
+NMT_PRE_OPERATIONAL = 0x80
+_TIMING_NAMES = {2: "transmission type", 3: "inhibit time", 5: "event timer", 6: "SYNC start value"}
+SETTLE_S = 0.02  # for a node to change its NMT state: there is no answer to wait for
+
+_NOT_NOW = frozenset({0x08000020, 0x08000021, 0x08000022})  # local control, present state of the device
+_READ_ONLY = frozenset({0x06010000, 0x06010002})
+_TOO_MANY = 0x06040042
+_NO_SUBINDEX = 0x06090011
+_STATE_S = 1.5  # that a node may take to be pre-operational, and to take what it refuses before
+_STATE_POLL_S = 0.05
+
+
+class _MapFixed(Exception):  # noqa: N818
+    """A TPDO refuses another map, or one of so many objects: what is known of it has changed."""
+
+
+@dataclass(slots=True)
+class _ObjectRefused(Exception):  # noqa: N818
+    """A TPDO refuses one object."""
+
+    candidate: Candidate
+    code: int
+
+
+@dataclass(slots=True)
+class Mapper:
+    """Mapping of one node.
+
+    Attributes:
+        role: what the node is there for.
+        available: for each signal, the objects that the node has for it, best first.
+        tpdos: as they are in the node.
+        taken: identifiers in use elsewhere on the bus.
+        prefer_unused: see `plan.assign`.
+        findings: remarks, added to.
+        period_s: communication cycle, at which a TPDO is asked for that cannot be sent on SYNC.
+    """
+
+    role: Role
+    available: Mapping[Signal, Sequence[Candidate]]
+    tpdos: list[Tpdo]
+    taken: set[int]
+    prefer_unused: bool
+    findings: list[Finding]
+    period_s: float = 0.001
+    _pre_operational: bool = field(default=False, init=False)
+    _chosen: dict[int, int] = field(default_factory=dict, init=False)
+    _patience_s: float = field(default=_STATE_S, init=False)
+    _refusal: str = field(default="", init=False)
+
+    def program(self) -> Program[tuple[TpdoLayout, ...]]:
+        """Map, read back, decode.
+
+        Raises:
+            DriveError: the node cannot give what is needed, or does not keep what was written.
+        """
+        available = {signal: list(candidates) for signal, candidates in self.available.items()}
+        while True:
+            try:
+                assignments = assign(self.role, available, self.tpdos, prefer_unused=self.prefer_unused)
+            except DriveError as error:
+                raise DriveError(f"{error}{self._refusal}") from error
+            try:
+                for assignment in assignments:
+                    yield from self._apply(assignment)
+                break
+            except _MapFixed:
+                continue
+            except _ObjectRefused as refused:
+                self._drop(available, refused)
+        return (yield from self._read_back([assignment.tpdo.number for assignment in assignments]))
+
+    @property
+    def node(self) -> int:
+        """Node id."""
+        return self.role.node_id
+
+    def _say(self, severity: Severity, text: str, fix: str = "") -> None:
+        self.findings.append(Finding(severity=severity, subject=self.role.subject, text=text, fix=fix))
+
+    def _drop(self, available: dict[Signal, list[Candidate]], refused: _ObjectRefused) -> None:
+        signal = refused.candidate.signal
+        index, subindex = refused.candidate.address
+        available[signal].remove(refused.candidate)
+        text = f"0x{index:04X}:{subindex:02X} cannot be mapped, SDO abort {abort_text(refused.code)}"
+        if not available[signal] and signal not in OPTIONAL:
+            raise DriveError(
+                f"{self.role.subject} refuses the mapping: {text}, and it has no other object for {signal}"
+            )
+        self._say(Severity.INFO if available[signal] else Severity.WARNING, text)
+
+    def _replace(self, tpdo: Tpdo) -> None:
+        self.tpdos[[other.number for other in self.tpdos].index(tpdo.number)] = tpdo
+
+    def _apply(self, assignment: Assignment) -> Program[None]:
+        """Make one TPDO what it should be, if it is not."""
+        tpdo = assignment.tpdo
+        entries = tpdo.entries
+        if assignment.objects is not None:
+            entries = tuple((*candidate.address, candidate.bits) for candidate in assignment.objects)
+        mine = {chosen for number, chosen in self._chosen.items() if number != tpdo.number}
+        mine |= {other.cob_id for other in self.tpdos if other.enabled and other.number != tpdo.number}
+        cob_id = choose_cob_id(self.node, tpdo, self.taken | mine)
+        self._chosen[tpdo.number] = cob_id
+        if tpdo.enabled and tpdo.cob_id == cob_id and tpdo.transmission_type == 1 and tpdo.entries == entries:
+            return
+        try:
+            changed = yield from self._write(tpdo, cob_id, entries, assignment.objects)
+        except (_MapFixed, _ObjectRefused):
+            del self._chosen[tpdo.number]
+            raise
+        self._replace(changed)
+
+    def _write(
+        self, tpdo: Tpdo, cob_id: int, entries: tuple[Entry, ...], objects: tuple[Candidate, ...] | None
+    ) -> Program[Tpdo]:
+        if not self._pre_operational:
+            self._pre_operational = True
+            yield Nmt(self.node, NMT_PRE_OPERATIONAL)
+            yield Pause(SETTLE_S)
+        no_rtr = tpdo.cob & NO_RTR
+        try:
+            yield from self._cob(tpdo, tpdo.cob & ~EXTENDED | INVALID)
+        except SdoAbort as abort:
+            self._stays_on(tpdo, abort, objects)
+            yield from self._timing(tpdo)
+            return tpdo
+        yield from self._timing(tpdo)
+        if objects is not None and tpdo.entries != entries:
+            try:
+                yield from self._entries(tpdo, objects)
+            except (_MapFixed, _ObjectRefused):
+                yield from self._restore(tpdo)
+                raise
+        try:
+            yield from self._cob(tpdo, cob_id | no_rtr)
+        except SdoAbort:  # an identifier that cannot be changed: the node's own, if nobody else has it
+            if tpdo.cob_id in self.taken:
+                raise
+            yield from self._cob(tpdo, tpdo.cob & ~INVALID)
+        return replace(tpdo, cob=cob_id | no_rtr, transmission_type=1, entries=entries)
+
+    def _put(self, index: int, subindex: int, value: int, size: int) -> Program[None]:
+        """Write, with patience for a node that takes its time to be pre-operational."""
+        while True:
+            try:
+                yield Write(self.node, index, subindex, value, size)
+                return
+            except SdoAbort as abort:
+                if abort.code not in _NOT_NOW or self._patience_s <= 0:
+                    raise
+            self._patience_s -= _STATE_POLL_S
+            yield Nmt(self.node, NMT_PRE_OPERATIONAL)  # the first one may have been lost
+            yield Pause(_STATE_POLL_S)
+
+    def _cob(self, tpdo: Tpdo, value: int) -> Program[None]:
+        yield from self._put(tpdo.communication, 1, value, 4)
+
+    def _stays_on(self, tpdo: Tpdo, abort: SdoAbort, objects: tuple[Candidate, ...] | None) -> None:
+        """The TPDO cannot be switched off: then its map is what it is.
+
+        Raises:
+            _MapFixed: another map was wanted.
+            SdoAbort: it is off, and that cannot be changed.
+        """
+        if objects is not None and not tpdo.fixed:
+            self._replace(replace(tpdo, fixed=True))
+            self._refuse("is fixed", tpdo, abort)
+            raise _MapFixed from abort
+        if not tpdo.enabled:
+            raise abort
+
+    def _refuse(self, what: str, tpdo: Tpdo, abort: SdoAbort) -> None:
+        answer = f"0x{abort.index:04X}:{abort.subindex:02X} answers {abort_text(abort.code)}"
+        self._say(Severity.INFO, f"TPDO{tpdo.number} {what} ({answer})")
+        self._refusal = self._refusal or f"; writing {answer}"
+
+    def _timing(self, tpdo: Tpdo) -> Program[None]:
+        """Every SYNC, and nothing that holds frames back or adds some.
+
+        Where it is never sent on SYNC its event timer has it sent once a period.
+        """
+        start = yield from read_optional(self.node, tpdo.communication, 6)
+        on_sync = yield from self._ask(tpdo, 2, tpdo.transmission_type, 1)
+        every_ms = (
+            0 if on_sync or tpdo.transmission_type in SYNC_TYPES else max(1, round(1e3 * self.period_s))
+        )
+        yield from self._ask(tpdo, 3, tpdo.inhibit_100us, 0)
+        yield from self._ask(tpdo, 5, tpdo.event_ms, every_ms)
+        yield from self._ask(tpdo, 6, start or 0, 0)
+
+    def _ask(self, tpdo: Tpdo, subindex: int, has: int, wanted: int) -> Program[bool]:
+        """Write a communication parameter, if it is another one; whether it is as wanted."""
+        if has == wanted:
+            return True
+        try:
+            yield from self._put(tpdo.communication, subindex, wanted, 2 if subindex in (3, 5) else 1)
+        except SdoAbort as abort:
+            if subindex == 2 and abort.code in _NOT_NOW:
+                raise  # a later attempt will do; what is not sent at SYNC is worth much less
+            old = ": its values may be older than their SYNC" if subindex == 2 else ""
+            self._say(
+                Severity.WARNING if subindex == 2 else Severity.INFO,
+                f"TPDO{tpdo.number} keeps {_TIMING_NAMES[subindex]} {has} instead of {wanted}{old} "
+                f"(SDO abort {abort_text(abort.code)})",
+            )
+            return False
+        return True
+
+    def _entries(self, tpdo: Tpdo, objects: tuple[Candidate, ...]) -> Program[None]:
+        try:
+            yield from self._put(tpdo.mapping, 0, 0, 1)
+        except SdoAbort as abort:
+            self._mark_fixed(tpdo, abort)
+        for position, candidate in enumerate(objects, start=1):
+            index, subindex = candidate.address
+            value = index << 16 | subindex << 8 | candidate.bits
+            try:
+                yield from self._put(tpdo.mapping, position, value, 4)
+            except SdoAbort as abort:
+                if abort.code in _READ_ONLY:
+                    self._mark_fixed(tpdo, abort)
+                if position > 1 and (yield from self._is_full(tpdo, position, abort)):
+                    self._limit(tpdo, position - 1, abort)
+                raise _ObjectRefused(candidate, abort.code) from abort
+        try:
+            yield from self._put(tpdo.mapping, 0, len(objects), 1)
+        except SdoAbort as abort:
+            if abort.code == _TOO_MANY and len(objects) > 1:
+                self._limit(tpdo, len(objects) - 1, abort)
+            self._mark_fixed(tpdo, abort)
+
+    def _is_full(self, tpdo: Tpdo, position: int, abort: SdoAbort) -> Program[bool]:
+        """Whether it is the map that has no such entry, and not the node that has no such object."""
+        if abort.code != _NO_SUBINDEX:
+            return abort.code == _TOO_MANY
+        try:
+            yield Read(self.node, tpdo.mapping, position)
+        except SdoAbort:
+            return True
+        return False
+
+    def _limit(self, tpdo: Tpdo, most: int, abort: SdoAbort) -> None:
+        self._replace(replace(tpdo, most=most))
+        self._refuse(f"takes {most} object{'s' if most > 1 else ''}", tpdo, abort)
+        raise _MapFixed from abort
+
+    def _mark_fixed(self, tpdo: Tpdo, abort: SdoAbort) -> None:
+        self._replace(replace(tpdo, fixed=True))
+        self._refuse("has a fixed map", tpdo, abort)
+        raise _MapFixed from abort
+
+    def _restore(self, tpdo: Tpdo) -> Program[None]:
+        """After a refusal: the map and the identifier that were there."""
+        try:
+            if not self._is_fixed(tpdo):
+                yield Write(self.node, tpdo.mapping, 0, 0, 1)
+                for position, (index, subindex, bits) in enumerate(tpdo.entries, start=1):
+                    yield Write(self.node, tpdo.mapping, position, index << 16 | subindex << 8 | bits, 4)
+                yield Write(self.node, tpdo.mapping, 0, len(tpdo.entries), 1)
+            yield from self._cob(tpdo, tpdo.cob)
+        except SdoAbort as abort:
+            self._say(Severity.WARNING, f"TPDO{tpdo.number} could not be put back: {abort}")
+
+    def _is_fixed(self, tpdo: Tpdo) -> bool:
+        return any(other.fixed for other in self.tpdos if other.number == tpdo.number)
+
+    def _read_back(self, numbers: Iterable[int]) -> Program[tuple[TpdoLayout, ...]]:
+        used: list[Tpdo] = []
+        for number in numbers:
+            tpdo = yield from read_tpdo(self.node, number, exactly=True)
+            if tpdo is None or not tpdo.enabled:
+                raise DriveError(f"{self.role.subject}: TPDO{number} stays disabled after its configuration")
+            self._replace(replace(tpdo, fixed=self._is_fixed(tpdo)))
+            used.append(tpdo)
+        layouts = decode(used, self.available)
+        given = {mapped.signal for layout in layouts for mapped in layout.objects}
+        for signal in self.available:
+            if signal not in given and signal not in OPTIONAL:
+                raise DriveError(
+                    f"{self.role.subject} does not keep the mapping: {signal} is not in what reads back: "
+                    f"{describe(used)}"
+                )
+            if signal not in given:
+                self._say(Severity.WARNING, f"gives no {signal}: {describe(used)}")
+        return layouts
+
+
+def disable(node: int, tpdo: Tpdo) -> Program[None]:
+    """Switch off a TPDO that nobody here needs."""
+    yield Write(node, tpdo.communication, 1, tpdo.cob & ~EXTENDED | INVALID, 4)

@@ -1,0 +1,278 @@
+"""Everything that is asked of one node before it takes part: identity, units, mapping, SYNC, heartbeat."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from drivelink.canopen.candidates import Candidate, Offer
+from drivelink.canopen.layout import NodeLayout, Signal
+from drivelink.canopen.mapping import NMT_PRE_OPERATIONAL, NMT_START, SETTLE_S, Mapper, disable
+from drivelink.canopen.pdo import ABSENT, Tpdo, decode, read_optional, read_tpdos
+from drivelink.canopen.plan import OPTIONAL
+from drivelink.canopen.roles import Role
+from drivelink.canopen.sdo import Nmt, Pause, Program, Read, SdoAbort, SdoTimeout, Unsized, Write, abort_text
+from drivelink.canopen.units import offer, unit_objects
+from drivelink.canopen.vendors import vendor_of
+from drivelink.errors import DriveError
+from drivelink.finding import Finding, Severity
+from drivelink.jointfile import BusSection
+
+__all__ = ["NodeSurvey", "configure_node", "survey_node"]
+
+_SYNC_COB_ID = 0x80
+_SYNC_PRODUCER = 1 << 30
+_ENCODER_HEARTBEAT_MS = 100
+BOOT_S = 3.0  # that a node may take to answer after power-on; the slowest take two seconds
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NodeSurvey:
+    """What a node says of itself, nothing of it written.
+
+    Attributes:
+        role: what it is there for.
+        device_type: 0x1000; 0 where it answers, but does not tell.
+        identity: 0x1018.
+        told: unsigned values of the objects that were asked for and exist.
+        offer: what it can give.
+        refused: the last read that it aborted although the object may exist, or None.
+        available: for each signal, the objects that exist, best first, at their real length.
+        tpdos: as they are.
+    """
+
+    role: Role
+    device_type: int
+    identity: tuple[int, int, int, int]
+    told: Mapping[tuple[int, int], int]
+    offer: Offer
+    refused: SdoAbort | None
+    available: Mapping[Signal, tuple[Candidate, ...]]
+    tpdos: tuple[Tpdo, ...]
+
+
+def survey_node(role: Role, patience: int = 1, *, wake: bool = False) -> Program[NodeSurvey]:
+    """Read what a node is, what it can give, and what it sends now; writes nothing.
+
+    Args:
+        role: what it is there for.
+        patience: how often it is tried, SDO timeout and retries each time, before it counts as absent.
+        wake: send one that does not answer to pre-operational: a node that somebody stopped has no SDO
+            (CiA 301, 7.3.2.2.4).
+    """
+    node = role.node_id
+    device_type = yield from _first_contact(node, patience, wake)
+    identity = [0, 0, 0, 0]
+    for subindex in (1, 2, 3, 4):
+        identity[subindex - 1] = (yield from read_optional(node, 0x1018, subindex)) or 0
+    vendor = vendor_of(identity[0])
+    told: dict[tuple[int, int], int] = {}
+    refused = None
+    for address in unit_objects(role, vendor):
+        try:
+            told[address] = int.from_bytes((yield Read(node, *address)), "little")
+        except SdoAbort as abort:
+            refused = refused if abort.code in ABSENT else abort
+    offered = offer(role, told, vendor)
+    available: dict[Signal, tuple[Candidate, ...]] = {}
+    for signal, candidates in offered.candidates.items():
+        available[signal] = yield from _existing(node, candidates)
+    return NodeSurvey(
+        role=role,
+        device_type=device_type,
+        identity=(identity[0], identity[1], identity[2], identity[3]),
+        told=told,
+        offer=offered,
+        refused=refused,
+        available=available,
+        tpdos=(yield from read_tpdos(node)),
+    )
+
+
+def _first_contact(node: int, patience: int, wake: bool) -> Program[int]:
+    """The device type, with patience for a node that is still booting."""
+    for _ in range(patience - 1):
+        try:
+            return (yield from read_optional(node, 0x1000, 0)) or 0
+        except SdoTimeout:
+            if wake:
+                yield Nmt(node, NMT_PRE_OPERATIONAL)
+    return (yield from read_optional(node, 0x1000, 0)) or 0
+
+
+def _existing(node: int, candidates: tuple[Candidate, ...]) -> Program[tuple[Candidate, ...]]:
+    """Those that the node has, with the length it answers with; some have no value before they run."""
+    found = []
+    for candidate in candidates:
+        try:
+            data = yield Read(node, *candidate.address)
+        except SdoAbort as abort:
+            if abort.code not in ABSENT:
+                found.append(candidate)
+            continue
+        told = len(data) in (1, 2, 3, 4, 8) and not isinstance(data, Unsized)
+        bits = 8 * len(data) if told else candidate.bits
+        found.append(replace(candidate, bits=bits))
+    return tuple(found)
+
+
+def configure_node(
+    role: Role,
+    bus: BusSection,
+    taken: set[int],
+    *,
+    drop_others: bool = False,
+    start: bool = True,
+    stopped: bool = False,
+) -> Program[NodeLayout]:
+    """Make a node send what the joint needs at every SYNC.
+
+    Args:
+        role: what the node is there for.
+        bus: the bus section of the joint file.
+        taken: identifiers of other nodes' TPDOs.
+        drop_others: switch off TPDOs of this node that nobody here needs.
+        start: send NMT start at the end.
+        stopped: it has said that it is stopped, and will not answer before it is woken.
+
+    Raises:
+        DriveError: the node is absent, refuses, or cannot give what is needed.
+    """
+    if stopped:
+        yield Nmt(role.node_id, NMT_PRE_OPERATIONAL)
+        yield Pause(SETTLE_S)
+    attempt_s = bus.sdo_timeout_s * (1 + bus.sdo_retries)
+    survey = yield from survey_node(role, max(2, math.ceil(BOOT_S / attempt_s)), wake=True)
+    findings = list(survey.offer.findings)
+    available = _wanted(survey, findings)
+    mapper = Mapper(
+        role=role,
+        available=available,
+        tpdos=list(survey.tpdos),
+        taken=taken,
+        prefer_unused=bus.sync == "follow",
+        findings=findings,
+        period_s=bus.period_s,
+    )
+    layouts = yield from mapper.program()
+    used = {layout.number for layout in layouts}
+    others = tuple(tpdo for tpdo in mapper.tpdos if tpdo.enabled and tpdo.number not in used)
+    others = yield from _others(role, others, {layout.cob_id for layout in layouts}, drop_others, findings)
+    yield from _sync(role, bus, findings)
+    heartbeat_ms = yield from _heartbeat(role, findings)
+    if start:
+        yield Nmt(role.node_id, NMT_START)
+    return NodeLayout(
+        node_id=role.node_id,
+        motor=role.motor,
+        tpdos=layouts,
+        other_tpdos=decode(others, {}),
+        heartbeat_ms=heartbeat_ms,
+        identity=survey.identity,
+        findings=tuple(findings),
+    )
+
+
+def _wanted(survey: NodeSurvey, findings: list[Finding]) -> dict[Signal, tuple[Candidate, ...]]:
+    """Signals to map, each with the objects that can give it.
+
+    Raises:
+        DriveError: something needed cannot be had.
+    """
+    subject = survey.role.subject
+    for signal, reason in survey.offer.missing.items():
+        if signal not in OPTIONAL:
+            why = f"; {survey.refused}" if survey.refused is not None else ""
+            raise DriveError(f"{subject} ({survey.role.key}): {reason}{why}")
+        findings.append(Finding(severity=Severity.WARNING, subject=subject, text=f"no {signal}: {reason}"))
+    wanted = {}
+    for signal, candidates in survey.available.items():
+        if candidates:
+            wanted[signal] = candidates
+            continue
+        tried = ", ".join(f"0x{c.address[0]:04X}:{c.address[1]:02X}" for c in survey.offer.candidates[signal])
+        if signal not in OPTIONAL:
+            raise DriveError(f"{subject} ({survey.role.key}) gives no {signal}: it has no {tried}")
+        findings.append(
+            Finding(severity=Severity.WARNING, subject=subject, text=f"gives no {signal}: it has no {tried}")
+        )
+    return wanted
+
+
+def _others(
+    role: Role, others: tuple[Tpdo, ...], used: set[int], drop: bool, findings: list[Finding]
+) -> Program[tuple[Tpdo, ...]]:
+    """Switch off what shares an identifier with us, and, if asked to, what nobody here needs."""
+    left = []
+    for tpdo in others:
+        if not drop and tpdo.cob_id not in used:
+            left.append(tpdo)
+            continue
+        why = "shares its identifier with ours" if tpdo.cob_id in used else "the bus load would be too high"
+        yield Nmt(role.node_id, NMT_PRE_OPERATIONAL)
+        yield Pause(SETTLE_S)
+        try:
+            yield from disable(role.node_id, tpdo)
+        except SdoAbort as abort:
+            left.append(tpdo)
+            why += f", but it stays on: SDO abort {abort_text(abort.code)}"
+        text = f"TPDO{tpdo.number} (0x{tpdo.cob_id:03X}), which nobody here needs, is switched off: {why}"
+        findings.append(Finding(severity=Severity.INFO, subject=role.subject, text=text))
+    return tuple(left)
+
+
+def _sync(role: Role, bus: BusSection, findings: list[Finding]) -> Program[None]:
+    """SYNC identifier, one producer only, and the same counter on both sides."""
+    node = role.node_id
+    cob = yield from read_optional(node, 0x1005, 0)
+    if cob is not None and (cob & 0x7FF != _SYNC_COB_ID or cob & _SYNC_PRODUCER):
+        try:
+            yield Write(node, 0x1005, 0, _SYNC_COB_ID, 4)
+        except SdoAbort as abort:
+            what = "makes SYNC itself" if cob & _SYNC_PRODUCER else f"waits for SYNC 0x{cob & 0x7FF:03X}"
+            raise DriveError(
+                f"{role.subject} {what} (0x1005) and refuses 0x080: SDO abort {abort_text(abort.code)}; "
+                'bus.sync = "follow" may be what you want'
+            ) from abort
+    overflow = yield from read_optional(node, 0x1019, 0)
+    wanted = bus.sync_counter_overflow
+    if overflow == wanted or (overflow is None and not wanted):
+        return
+    if overflow is None:
+        findings.append(
+            Finding(
+                severity=Severity.WARNING,
+                subject=role.subject,
+                text="has no SYNC counter (0x1019) and may reject a SYNC with one",
+                fix="bus.sync_counter_overflow = 0",
+            )
+        )
+        return
+    yield from _sync_counter(node, wanted)
+
+
+def _sync_counter(node: int, overflow: int) -> Program[None]:
+    """Write 0x1019, which CiA 301 (7.5.2.22) allows only while the period 0x1006 is zero."""
+    period = yield from read_optional(node, 0x1006, 0)
+    if period:
+        yield Write(node, 0x1006, 0, 0, 4)
+    yield Write(node, 0x1019, 0, overflow, 1)
+    if period:
+        yield Write(node, 0x1006, 0, period, 4)
+
+
+def _heartbeat(role: Role, findings: list[Finding]) -> Program[int]:
+    """Ask for a heartbeat; what reads back is what will be watched."""
+    node = role.node_id
+    wanted = role.drive.heartbeat_ms if role.drive is not None else _ENCODER_HEARTBEAT_MS
+    has = yield from read_optional(node, 0x1017, 0)
+    if has is None or not wanted or has == wanted:
+        return has or 0
+    try:
+        yield Write(node, 0x1017, 0, wanted, 2)
+    except SdoAbort as abort:
+        text = f"keeps its heartbeat of {has} ms instead of {wanted} ms: SDO abort {abort_text(abort.code)}"
+        findings.append(Finding(severity=Severity.WARNING, subject=role.subject, text=text))
+        return has
+    return (yield from read_optional(node, 0x1017, 0)) or 0

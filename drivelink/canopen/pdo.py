@@ -1,0 +1,242 @@
+"""TPDOs as they are in a node: communication parameter 0x1800+n, mapping 0x1A00+n (CiA 301, 7.5.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from drivelink.canopen.candidates import Candidate
+from drivelink.canopen.layout import MappedObject, Signal, TpdoLayout
+from drivelink.canopen.sdo import Program, Read, SdoAbort
+
+__all__ = [
+    "ABSENT",
+    "Entry",
+    "Tpdo",
+    "decode",
+    "describe",
+    "entry_text",
+    "read_optional",
+    "read_tpdo",
+    "read_tpdos",
+    "tpdos_of",
+]
+
+Address = tuple[int, int]
+Entry = tuple[int, int, int]  # index, subindex, bits
+
+ABSENT = frozenset({0x06020000, 0x06090011})  # SDO aborts: no such object, no such subindex
+INVALID = 1 << 31
+NO_RTR = 1 << 30
+EXTENDED = 1 << 29
+SYNC_TYPES = range(1, 241)
+
+_MOST_TPDOS = 16  # numbers that are looked at; no drive in the field maps what is needed further up
+_ALWAYS = 4  # some makers leave gaps among the first four
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tpdo:
+    """One TPDO of a node.
+
+    Attributes:
+        number: 1 for 0x1800/0x1A00.
+        cob: 0x1800:01 as it is: bit 31 invalid, bit 30 no RTR, the identifier below.
+        transmission_type: 0x1800:02.
+        inhibit_100us: 0x1800:03.
+        event_ms: 0x1800:05.
+        entries: what is mapped, in order.
+        fixed: whether its mapping cannot be changed.
+        most: objects that can be mapped into it.
+    """
+
+    number: int
+    cob: int
+    transmission_type: int
+    inhibit_100us: int = 0
+    event_ms: int = 0
+    entries: tuple[Entry, ...] = ()
+    fixed: bool = False
+    most: int = 64
+
+    @property
+    def cob_id(self) -> int:
+        """Identifier of its frames."""
+        return self.cob & 0x7FF
+
+    @property
+    def enabled(self) -> bool:
+        """Whether it is sent at all."""
+        return not self.cob & INVALID
+
+    @property
+    def communication(self) -> int:
+        """Index of its communication parameter."""
+        return 0x17FF + self.number
+
+    @property
+    def mapping(self) -> int:
+        """Index of its mapping parameter."""
+        return 0x19FF + self.number
+
+
+def entry_text(entry: Entry) -> str:
+    """An entry as people write it."""
+    index, subindex, bits = entry
+    return f"0x{index:04X}:{subindex:02X} ({bits} bit)"
+
+
+def describe(tpdos: Iterable[Tpdo]) -> str:
+    """The maps in one line."""
+    parts = []
+    for tpdo in tpdos:
+        objects = (
+            " + ".join(f"0x{index:04X}:{subindex:02X}" for index, subindex, _ in tpdo.entries) or "empty"
+        )
+        parts.append(f"TPDO{tpdo.number} = {objects}")
+    return "; ".join(parts) or "no TPDO"
+
+
+def read_optional(node: int, index: int, subindex: int) -> Program[int | None]:
+    """An unsigned value, or None where the node does not give it."""
+    try:
+        data = yield Read(node, index, subindex)
+    except SdoAbort:
+        return None
+    return int.from_bytes(data, "little")
+
+
+def _read_exactly(node: int, index: int, subindex: int) -> Program[int | None]:
+    try:
+        data = yield Read(node, index, subindex)
+    except SdoAbort as abort:
+        if abort.code in ABSENT:
+            return None
+        raise
+    return int.from_bytes(data, "little")
+
+
+def read_tpdo(node: int, number: int, *, exactly: bool = False) -> Program[Tpdo | None]:
+    """One TPDO as it is, or None where there is none of that number.
+
+    Args:
+        node: node id.
+        number: from 1.
+        exactly: its frames will be decoded by this: what the node has and does not tell must not be guessed.
+
+    Raises:
+        SdoAbort: that is the case.
+    """
+    read = _read_exactly if exactly else read_optional
+    communication, mapping = 0x17FF + number, 0x19FF + number
+    cob = yield from read(node, communication, 1)
+    if cob is None:
+        return None
+    transmission_type = yield from read(node, communication, 2)
+    inhibit = yield from read_optional(node, communication, 3)
+    event = yield from read_optional(node, communication, 5)
+    count = (yield from read(node, mapping, 0)) or 0
+    entries: list[Entry] = []
+    for subindex in range(1, min(count, 64) + 1):
+        raw = yield from read(node, mapping, subindex)
+        if not raw:  # some count places that are empty
+            break
+        entries.append((raw >> 16, raw >> 8 & 0xFF, raw & 0xFF))
+    return Tpdo(
+        number=number,
+        cob=cob,
+        transmission_type=255 if transmission_type is None else transmission_type,
+        inhibit_100us=inhibit or 0,
+        event_ms=event or 0,
+        entries=tuple(entries) if sum(bits for _, _, bits in entries) <= 64 else (),
+    )
+
+
+def read_tpdos(node: int) -> Program[tuple[Tpdo, ...]]:
+    """All TPDOs of a node."""
+    found = []
+    for number in range(1, _MOST_TPDOS + 1):
+        tpdo = yield from read_tpdo(node, number)
+        if tpdo is not None:
+            found.append(tpdo)
+        elif number > _ALWAYS:
+            break
+    return tuple(found)
+
+
+def tpdos_of(values: Mapping[Address, int]) -> tuple[Tpdo, ...]:
+    """The TPDOs that the values of 0x1800 to 0x1BFF describe, as far as they are complete.
+
+    Args:
+        values: unsigned values by (index, subindex), from a data sheet or overheard.
+    """
+    found = []
+    for communication in sorted({index for index, _ in values if 0x1800 <= index <= 0x19FF}):
+        cob = values.get((communication, 1))
+        entries = _entries(values, communication + 0x200)
+        if cob is None or entries is None:
+            continue
+        found.append(
+            Tpdo(
+                number=communication - 0x17FF,
+                cob=cob,
+                transmission_type=values.get((communication, 2), 255),
+                inhibit_100us=values.get((communication, 3), 0),
+                event_ms=values.get((communication, 5), 0),
+                entries=entries,
+            )
+        )
+    return tuple(found)
+
+
+def _entries(values: Mapping[Address, int], mapping: int) -> tuple[Entry, ...] | None:
+    """A map, or None where its count names entries that are not known."""
+    count = values.get((mapping, 0))
+    entries: list[Entry] = []
+    for subindex in range(1, 65 if count is None else min(count, 64) + 1):
+        raw = values.get((mapping, subindex), 0)
+        if not raw:  # a data sheet without a count: the entries end with the first that is empty
+            return tuple(entries) if count is None else None
+        entries.append((raw >> 16 & 0xFFFF, raw >> 8 & 0xFF, raw & 0xFF))
+    return tuple(entries)
+
+
+def decode(tpdos: Sequence[Tpdo], candidates: Mapping[Signal, Sequence[Candidate]]) -> tuple[TpdoLayout, ...]:
+    """The layout of TPDOs' frames: what is mapped decides, not what was wished.
+
+    Where several objects for one signal are mapped, the best one counts; where one is mapped twice, its
+    place in a frame that is sent at every SYNC does, else the first. Everything else is skipped over.
+
+    Args:
+        tpdos: as read back, overheard, or declared.
+        candidates: for each signal the objects that can give it, best first.
+    """
+    mapped = {(index, subindex) for tpdo in tpdos for index, subindex, _ in tpdo.entries}
+    chosen: dict[Address, Candidate] = {}
+    for objects in candidates.values():
+        best = next((candidate for candidate in objects if candidate.address in mapped), None)
+        if best is not None:
+            chosen[best.address] = best
+    order = sorted(range(len(tpdos)), key=lambda k: (tpdos[k].transmission_type != 1, k))
+    layouts = {k: _layout(tpdos[k], chosen) for k in order}
+    return tuple(layouts[k] for k in range(len(tpdos)))
+
+
+def _layout(tpdo: Tpdo, chosen: dict[Address, Candidate]) -> TpdoLayout:
+    """One frame; what it carries is taken out of `chosen`."""
+    objects = []
+    for index, subindex, bits in tpdo.entries:
+        candidate = chosen.pop((index, subindex), None)
+        if candidate is not None:
+            objects.append(candidate.mapped(bits))
+            continue
+        objects.append(
+            MappedObject(signal=Signal.OTHER, index=index, subindex=subindex, bits=bits, signed=False)
+        )
+    return TpdoLayout(
+        cob_id=tpdo.cob_id,
+        objects=tuple(objects),
+        transmission_type=tpdo.transmission_type,
+        number=tpdo.number,
+        inhibit_s=tpdo.inhibit_100us * 1e-4,
+    )

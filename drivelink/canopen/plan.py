@@ -1,0 +1,163 @@
+"""Which signals go into which TPDO: pure reasoning, nothing is sent from here.
+
+The wish is one frame with position, torque and statusword, so that a sample is atomic; what does not fit
+goes into a second one. Where maps are fixed, those that carry what is needed are taken as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from drivelink.canopen.candidates import Candidate
+from drivelink.canopen.layout import Signal
+from drivelink.canopen.pdo import Tpdo, describe
+from drivelink.canopen.roles import Role
+from drivelink.errors import DriveError
+
+__all__ = ["OPTIONAL", "Assignment", "assign", "choose_cob_id", "pack"]
+
+FRAME_BITS = 64
+
+# Position and torque first: they must be of the same instant.
+_ORDER = (
+    Signal.MOTOR_POSITION,
+    Signal.MOTOR_TORQUE,
+    Signal.STATUSWORD,
+    Signal.LINK_POSITION,
+    Signal.MOTOR_VELOCITY,
+)
+OPTIONAL = (Signal.MOTOR_VELOCITY, Signal.STATUSWORD)
+
+Available = Mapping[Signal, Sequence[Candidate]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Assignment:
+    """One TPDO and what is to be in it.
+
+    Attributes:
+        tpdo: as it is in the node.
+        objects: what to map, in order; None: its map stays as it is.
+    """
+
+    tpdo: Tpdo
+    objects: tuple[Candidate, ...] | None
+
+
+def pack(objects: Iterable[Candidate], most: int = FRAME_BITS) -> list[tuple[Candidate, ...]]:
+    """Frames of at most eight bytes and `most` objects, first fit, in the order of importance."""
+    frames: list[list[Candidate]] = []
+    for candidate in sorted(objects, key=lambda candidate: _ORDER.index(candidate.signal)):
+        for frame in frames:
+            if len(frame) < most and sum(other.bits for other in frame) + candidate.bits <= FRAME_BITS:
+                frame.append(candidate)
+                break
+        else:
+            frames.append([candidate])
+    return [tuple(frame) for frame in frames]
+
+
+def assign(
+    role: Role, available: Available, tpdos: Sequence[Tpdo], *, prefer_unused: bool
+) -> tuple[Assignment, ...]:
+    """Signals onto TPDOs.
+
+    Args:
+        role: the node, for messages.
+        available: for each signal wanted, the objects the node has for it, best first.
+        tpdos: as they are in the node.
+        prefer_unused: take disabled TPDOs first, because another master may rely on the enabled ones.
+
+    Raises:
+        DriveError: no way to get what is needed; the message shows the maps.
+    """
+    wanted = {signal: list(candidates) for signal, candidates in available.items() if candidates}
+    result = _free(list(wanted.items()), tpdos, prefer_unused)
+    if result is not None:
+        return result
+    kept: list[Assignment] = []
+    fixed = [tpdo for tpdo in tpdos if tpdo.fixed]
+    while wanted:
+        best = max(fixed, key=lambda tpdo: len(_carried(tpdo, wanted)), default=None)
+        carried = _carried(best, wanted) if best is not None else []
+        if best is None or not carried:
+            break
+        fixed.remove(best)
+        kept.append(Assignment(tpdo=best, objects=None))
+        for signal in carried:
+            del wanted[signal]
+    rest = _free(list(wanted.items()), tpdos, prefer_unused)
+    if rest is None:
+        needed = [(signal, objects) for signal, objects in wanted.items() if signal not in OPTIONAL]
+        rest = _free(needed, tpdos, prefer_unused)
+    if rest is None:
+        raise DriveError(_cannot(role, wanted, tpdos))
+    return tuple(kept) + rest
+
+
+def _free(
+    wanted: Sequence[tuple[Signal, Sequence[Candidate]]], tpdos: Sequence[Tpdo], prefer_unused: bool
+) -> tuple[Assignment, ...] | None:
+    """Everything in TPDOs that carry it already or can be mapped, or None where there are too few."""
+    left = list(tpdos)
+    result, unplaced = [], []
+    most = min((tpdo.most for tpdo in tpdos if not tpdo.fixed), default=FRAME_BITS)
+    for frame in pack((candidates[0] for _, candidates in wanted), most):
+        entries = {(*candidate.address, candidate.bits) for candidate in frame}
+        carrying = [tpdo for tpdo in left if entries <= set(tpdo.entries)]
+        # The one that needs least: sent at every SYNC already, else the first.
+        ready = min(
+            carrying, key=lambda t: (not t.enabled or t.transmission_type != 1, t.number), default=None
+        )
+        if ready is None:
+            unplaced.append(frame)
+        else:
+            left.remove(ready)
+            result.append(Assignment(tpdo=ready, objects=None))
+    usable = [tpdo for tpdo in left if not tpdo.fixed]
+    if len(unplaced) > len(usable):
+        return None
+    if prefer_unused:
+        usable.sort(key=lambda tpdo: (tpdo.enabled, tpdo.number))
+    result += [Assignment(tpdo=tpdo, objects=frame) for tpdo, frame in zip(usable, unplaced, strict=False)]
+    return tuple(result)
+
+
+def _carried(tpdo: Tpdo, wanted: Mapping[Signal, Sequence[Candidate]]) -> list[Signal]:
+    mapped = {(index, subindex) for index, subindex, _ in tpdo.entries}
+    return [
+        signal for signal, objects in wanted.items() if any(object_.address in mapped for object_ in objects)
+    ]
+
+
+def _cannot(role: Role, wanted: Available, tpdos: Sequence[Tpdo]) -> str:
+    lacking = ", ".join(
+        f"{signal} (" + " or ".join(f"0x{c.address[0]:04X}:{c.address[1]:02X}" for c in candidates) + ")"
+        for signal, candidates in wanted.items()
+        if signal not in OPTIONAL
+    )
+    return f"{role.subject} refuses the mapping and none of its TPDOs carries {lacking}: {describe(tpdos)}"
+
+
+def choose_cob_id(node: int, tpdo: Tpdo, taken: set[int]) -> int:
+    """Identifier for a TPDO: its own where it is good, else the predefined one, else a free one.
+
+    Args:
+        node: node id.
+        tpdo: as it is in the node; a DCF may have left it with another node's identifier.
+        taken: identifiers that other TPDOs on this bus have.
+
+    Raises:
+        DriveError: no identifier is left.
+    """
+    predefined = 0x80 + 0x100 * tpdo.number + node if tpdo.number <= 4 else 0
+    own = tpdo.cob_id
+    candidates = [own] if 0x181 <= own <= 0x57F and own & 0x7F == node else []
+    candidates += [predefined] if predefined else []
+    candidates += [own] if 0x181 <= own <= 0x57F and not 0x181 <= own <= 0x4FF else []
+    candidates += [0x80 + 0x100 * number + node for number in (4, 3, 2, 1)]
+    for candidate in candidates:
+        if candidate not in taken:
+            return candidate
+    raise DriveError(f"node {node}: no identifier is free for its TPDO{tpdo.number}")

@@ -1,0 +1,113 @@
+"""Who is who on the bus: the nodes of a joint, and what each one is there for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from drivelink.errors import JointFileError
+from drivelink.jointfile import DriveSection, EncoderSection, JointFile, TpdoSection
+
+__all__ = ["Role", "object_address", "roles"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Role:
+    """One node of a joint.
+
+    Attributes:
+        node_id: 1 to 127.
+        motor: index of the motor it drives, or None.
+        drive: what the joint file says of the drive, or None.
+        encoder: the link encoder, if this node gives it.
+        key: where it stands in the joint file, for messages.
+        eds: its EDS or DCF file, if the joint file names one.
+        tpdo: its mapping, where the joint file gives it.
+    """
+
+    node_id: int
+    motor: int | None
+    drive: DriveSection | None
+    encoder: EncoderSection | None
+    key: str
+    eds: Path | None
+    tpdo: tuple[TpdoSection, ...]
+
+    @property
+    def subject(self) -> str:
+        """For findings and messages."""
+        return f"node {self.node_id}"
+
+
+def roles(joint: JointFile, base_dir: Path = Path()) -> tuple[Role, ...]:
+    """The nodes of a joint, motors first.
+
+    Args:
+        joint: the joint file.
+        base_dir: its folder; EDS paths are relative to it.
+
+    Raises:
+        JointFileError: a motor has no drive.
+    """
+    encoder = joint.link.encoder
+    encoder_node = _encoder_node(joint)
+    found: list[Role] = []
+    for number, motor in enumerate(joint.motor):
+        drive = motor.drive
+        if drive is None:
+            raise JointFileError(
+                f"{joint.name}: motor[{number + 1}].drive: expected this table, it is missing: "
+                "no bus without it"
+            )
+        mine = encoder if encoder is not None and encoder_node == drive.node_id else None
+        eds = drive.eds or (mine.eds if mine else None)
+        found.append(
+            Role(
+                node_id=drive.node_id,
+                motor=number,
+                drive=drive,
+                encoder=mine,
+                key=f"motor[{number + 1}].drive",
+                eds=base_dir / eds if eds else None,
+                tpdo=drive.tpdo + (mine.tpdo if mine else ()),
+            )
+        )
+    if encoder is not None and encoder_node is not None and all(role.encoder is None for role in found):
+        found.append(
+            Role(
+                node_id=encoder_node,
+                motor=None,
+                drive=None,
+                encoder=encoder,
+                key="link.encoder",
+                eds=base_dir / encoder.eds if encoder.eds else None,
+                tpdo=encoder.tpdo,
+            )
+        )
+    return tuple(found)
+
+
+def _encoder_node(joint: JointFile) -> int | None:
+    encoder = joint.link.encoder
+    if encoder is None:
+        return None
+    if encoder.node_id is not None:
+        return encoder.node_id
+    first = joint.motor[0].drive
+    return first.node_id if first else None
+
+
+def object_address(text: str, key: str) -> tuple[int, int]:
+    """Index and subindex of "0x60E4:01".
+
+    Raises:
+        JointFileError: the text is something else; `key` says where it stands.
+    """
+    index, _, subindex = text.partition(":")
+    try:
+        address = int(index, 16), int(subindex or "0", 16)
+    except ValueError:
+        address = (0, 0)
+    if not (0x1000 <= address[0] <= 0xFFFF and 0 <= address[1] <= 0xFF):
+        raise JointFileError(f'{key}: expected an object like "0x60E4:01", got "{text}"')
+    return address

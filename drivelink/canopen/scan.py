@@ -1,0 +1,158 @@
+"""Who is on the bus, by asking and listening; nothing is written.
+
+Every node id is asked for its device type (0x1000, mandatory in CiA 301), all at once; whoever answers, or
+is heard by heartbeat or boot-up, is there.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import can
+
+from drivelink.canopen.blocking import FrameBus, receive, run_program, sender
+from drivelink.canopen.guard import check_frame
+from drivelink.canopen.pdo import read_optional
+from drivelink.canopen.sdo import Program, Read, SdoAbort
+from drivelink.errors import DriveError
+
+__all__ = ["FoundNode", "Traffic", "identify", "listen", "scan"]
+
+_ANSWER_S = 0.3  # for the slowest node
+_GAP_S = 0.001  # between two questions: 127 of them must not fill a transmit queue
+_PROFILES = {301: "CiA 301", 401: "CiA 401 (I/O)", 402: "CiA 402 (drive)", 406: "CiA 406 (encoder)"}
+_STATES = {0x00: "boot-up", 0x04: "stopped", 0x05: "operational", 0x7F: "pre-operational"}
+_MOST_STAMPS = 200_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FoundNode:
+    """A node that is there.
+
+    Attributes:
+        node_id: 1 to 127.
+        device_type: 0x1000; 0 where it does not tell, None where it does not answer SDO.
+        identity: 0x1018.
+        name: 0x1008.
+    """
+
+    node_id: int
+    device_type: int | None
+    identity: tuple[int, int, int, int] = (0, 0, 0, 0)
+    name: str = ""
+
+    @property
+    def profile(self) -> str:
+        """The device profile in words."""
+        if self.device_type is None:
+            return "does not answer SDO"
+        number = self.device_type & 0xFFFF
+        return _PROFILES.get(number, f"CiA {number}" if number else "no standard profile")
+
+
+@dataclass(slots=True)
+class Traffic:
+    """What was heard in a while.
+
+    Attributes:
+        seconds: how long.
+        sync_s: stamps of SYNC frames.
+        counts: frames by identifier.
+        heartbeats: last NMT state by node.
+        error_frames: seen.
+        fd_frames: CAN FD frames seen.
+        last: last data by identifier.
+    """
+
+    seconds: float = 0.0
+    sync_s: list[float] = field(default_factory=list)
+    counts: dict[int, int] = field(default_factory=dict)
+    heartbeats: dict[int, str] = field(default_factory=dict)
+    error_frames: int = 0
+    fd_frames: int = 0
+    last: dict[int, bytes] = field(default_factory=dict)
+
+    def add(self, message: can.Message) -> None:
+        """Count one frame."""
+        if message.is_error_frame:
+            self.error_frames += 1
+            return
+        if message.is_extended_id or message.is_remote_frame:
+            return
+        self.fd_frames += message.is_fd
+        cob_id, data = message.arbitration_id, bytes(message.data)
+        self.counts[cob_id] = self.counts.get(cob_id, 0) + 1
+        self.last[cob_id] = data
+        if cob_id == 0x80 and len(self.sync_s) < _MOST_STAMPS:
+            self.sync_s.append(message.timestamp)
+        elif 0x701 <= cob_id <= 0x77F and len(data) == 1:
+            state = data[0] & 0x7F
+            self.heartbeats[cob_id - 0x700] = _STATES.get(state, f"0x{state:02X}")
+
+
+def listen(bus: FrameBus, seconds: float, on_frame: Callable[[can.Message], None] | None = None) -> Traffic:
+    """Listen for a while; sends nothing."""
+    traffic = Traffic(seconds=seconds)
+    end_s = time.monotonic() + seconds
+    while (left_s := end_s - time.monotonic()) > 0:
+        message = receive(bus, min(left_s, 0.05))
+        if message is not None:
+            traffic.add(message)
+            if on_frame is not None:
+                on_frame(message)
+    return traffic
+
+
+def scan(bus: FrameBus) -> tuple[list[int], Traffic]:
+    """Ask every node id for its device type.
+
+    Returns:
+        Ids of the nodes that answered or were heard, and what else was heard meanwhile.
+    """
+    send = sender(bus)
+    traffic = Traffic()
+    started_s = time.monotonic()
+    question = bytes([0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0])
+    for node in range(1, 128):
+        check_frame(0x600 + node, question)
+        send(0x600 + node, question)
+        _drain(bus, traffic, _GAP_S)
+    _drain(bus, traffic, _ANSWER_S)
+    traffic.seconds = time.monotonic() - started_s
+    answered = {cob_id - 0x580 for cob_id in traffic.counts if 0x581 <= cob_id <= 0x5FF}
+    return sorted(answered | set(traffic.heartbeats)), traffic
+
+
+def _drain(bus: FrameBus, traffic: Traffic, seconds: float) -> None:
+    end_s = time.monotonic() + seconds
+    while (left_s := end_s - time.monotonic()) > 0:
+        message = receive(bus, left_s)
+        if message is not None:
+            traffic.add(message)
+
+
+def identify(bus: FrameBus, node_id: int, *, timeout_s: float, retries: int) -> FoundNode:
+    """What a node says of itself."""
+    try:
+        return run_program(_identify(node_id), bus, timeout_s=timeout_s, retries=retries)
+    except DriveError:
+        return FoundNode(node_id=node_id, device_type=None)
+
+
+def _identify(node: int) -> Program[FoundNode]:
+    device_type = (yield from read_optional(node, 0x1000, 0)) or 0
+    identity = [0, 0, 0, 0]
+    for subindex in (1, 2, 3, 4):
+        identity[subindex - 1] = (yield from read_optional(node, 0x1018, subindex)) or 0
+    try:
+        name = yield Read(node, 0x1008, 0)
+    except SdoAbort:
+        name = b""
+    return FoundNode(
+        node_id=node,
+        device_type=device_type,
+        identity=(identity[0], identity[1], identity[2], identity[3]),
+        name=name.rstrip(b"\0 ").decode("latin-1"),
+    )

@@ -1,0 +1,308 @@
+"""SDO client as a state machine (CiA 301, section 7.2.4): it never waits, so it can run beside the loop.
+
+A *program* is a generator that yields requests (`Read`, `Write`, `Nmt`, `Pause`) and gets their answers;
+`Session` runs one program over a bus that somebody else reads: frames come in by `feed`, time by `poll`.
+The same program thus serves the blocking configuration before the start and the reconfiguration of a
+drive that rebooted in the middle of a run, with no second thread and no second reader of the bus.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+from canopen.sdo.exceptions import SdoAbortedError
+
+from drivelink.canopen.guard import check_frame
+from drivelink.errors import DriveError
+
+__all__ = [
+    "Nmt",
+    "Pause",
+    "Program",
+    "Read",
+    "SdoAbort",
+    "SdoTimeout",
+    "Send",
+    "Session",
+    "Unsized",
+    "Write",
+    "abort_text",
+]
+
+T = TypeVar("T")
+Send = Callable[[int, bytes], None]
+
+_TOGGLE_ERROR = 0x05030000
+_TIMED_OUT = 0x05040000
+_MAX_BYTES = 4096  # no object that is read here is longer: a babbling server must not fill the memory
+
+
+def abort_text(code: int) -> str:
+    """An abort code with its meaning (CiA 301, table 22)."""
+    text = SdoAbortedError.CODES.get(code)
+    return f"0x{code:08X}" + (f" ({text})" if text else "")
+
+
+def _name(index: int, subindex: int) -> str:
+    return f"0x{index:04X}:{subindex:02X}"
+
+
+class SdoAbort(DriveError):  # noqa: N818 - the protocol's own word
+    """The drive refused a transfer.
+
+    Attributes:
+        node: node id.
+        index: object.
+        subindex: of it.
+        code: abort code.
+    """
+
+    def __init__(self, node: int, index: int, subindex: int, code: int, *, writing: bool = False) -> None:
+        what = "refused writing" if writing else "refused reading"
+        super().__init__(f"node {node} {what} {_name(index, subindex)}: SDO abort {abort_text(code)}")
+        self.node, self.index, self.subindex, self.code = node, index, subindex, code
+
+
+class SdoTimeout(DriveError):  # noqa: N818 - as above
+    """The drive did not answer.
+
+    Attributes:
+        node: node id.
+        index: object it was asked for.
+    """
+
+    def __init__(self, node: int, index: int, subindex: int, timeout_s: float, attempts: int) -> None:
+        super().__init__(
+            f"node {node} does not answer: SDO {_name(index, subindex)}, no answer within {timeout_s:g} s, "
+            f"the last {attempts} time{'s' if attempts > 1 else ''} it was asked"
+        )
+        self.node, self.index = node, index
+
+
+class Unsized(bytes):
+    """The four bytes of an answer that does not say how many of them count."""
+
+
+@dataclass(frozen=True, slots=True)
+class Read:
+    """Upload of one object; the answer is its bytes."""
+
+    node: int
+    index: int
+    subindex: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Write:
+    """Expedited download of an unsigned value; the answer is empty."""
+
+    node: int
+    index: int
+    subindex: int
+    value: int
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
+class Nmt:
+    """NMT command to one node."""
+
+    node: int
+    command: int
+
+
+@dataclass(frozen=True, slots=True)
+class Pause:
+    """Nothing for so many seconds."""
+
+    seconds: float
+
+
+Request = Read | Write | Nmt | Pause
+Program = Generator[Request, bytes, T]
+
+
+class _Transfer:
+    """One upload or download: frames in, the next frame or the result out."""
+
+    def __init__(self, request: Read | Write) -> None:
+        self.request = request
+        self.result: bytes | None = None
+        self._buffer = bytearray()
+        self._toggle = 0
+        self._segmented = False
+
+    def first(self) -> bytes:
+        self._buffer.clear()
+        self._toggle, self._segmented = 0, False
+        request = self.request
+        object_ = request.index.to_bytes(2, "little") + bytes([request.subindex])
+        if isinstance(request, Read):
+            return b"\x40" + object_ + bytes(4)
+        command = 0x23 | (4 - request.size) << 2
+        return bytes([command]) + object_ + request.value.to_bytes(request.size, "little").ljust(4, b"\0")
+
+    def answer(self, data: bytes) -> bytes | None:
+        """Take a frame of the server; return the frame to send next, if any.
+
+        Raises:
+            SdoAbort: the server aborted, or answered out of step.
+        """
+        request = self.request
+        if len(data) != 8:
+            return None
+        command = data[0] >> 5
+        ours = data[1] | data[2] << 8 == request.index and data[3] == request.subindex
+        if command == 4 and (ours or not any(data[1:4])):  # some servers do not say what they abort
+            raise self._abort(int.from_bytes(data[4:8], "little"))
+        if self._segmented:
+            return self._segment(data) if command == 0 else None
+        if not ours:
+            return None  # the late answer to a transfer that was given up, or to another master
+        if isinstance(request, Write):
+            self.result = b"" if command == 3 else None
+            return None
+        if command != 2:
+            return None
+        if data[0] & 0x02:
+            unused = (data[0] >> 2) & 3
+            self.result = bytes(data[4 : 8 - unused]) if data[0] & 0x01 else Unsized(data[4:8])
+            return None
+        self._segmented = True
+        return b"\x60" + bytes(7)
+
+    def _segment(self, data: bytes) -> bytes | None:
+        if (data[0] >> 4) & 1 != self._toggle:
+            raise self._abort(_TOGGLE_ERROR)
+        self._buffer += data[1 : 8 - ((data[0] >> 1) & 7)]
+        if data[0] & 0x01 or len(self._buffer) > _MAX_BYTES:
+            self.result = bytes(self._buffer)
+            return None
+        self._toggle ^= 1
+        return bytes([0x60 | self._toggle << 4]) + bytes(7)
+
+    def _abort(self, code: int) -> SdoAbort:
+        request = self.request
+        return SdoAbort(
+            request.node, request.index, request.subindex, code, writing=isinstance(request, Write)
+        )
+
+
+class Session(Generic[T]):
+    """Runs one program; never blocks.
+
+    Args:
+        program: what to do.
+        send: puts a frame (identifier, data) on the bus.
+        timeout_s: for each answer.
+        retries: further attempts after a timeout.
+    """
+
+    def __init__(self, program: Program[T], send: Send, *, timeout_s: float = 0.5, retries: int = 1) -> None:
+        self._program = program
+        self._send = send
+        self._timeout_s = timeout_s
+        self._retries = retries
+        self._transfer: _Transfer | None = None
+        self._deadline_s = -float("inf")
+        self._attempts = 0
+        self._started = False
+        self.done = False
+        self._result: T | None = None
+        self._error: Exception | None = None
+
+    @property
+    def result(self) -> T:
+        """What the program returned.
+
+        Raises:
+            DriveError: the program failed.
+        """
+        if self._error is not None:
+            raise self._error
+        if not self.done:
+            raise RuntimeError("the session is not done")
+        return self._result  # type: ignore[return-value]
+
+    def feed(self, cob_id: int, data: bytes, now_s: float) -> None:
+        """Take a frame of the bus; what does not concern the transfer under way is ignored."""
+        transfer = self._transfer
+        if transfer is None or cob_id != 0x580 + transfer.request.node:
+            return
+        try:
+            following = transfer.answer(bytes(data))
+        except SdoAbort as abort:
+            if abort.code == _TOGGLE_ERROR:
+                self._abort_transfer(transfer, abort.code)
+            self._transfer = None
+            self._advance(now_s, abort)
+            return
+        if following is not None:
+            self._put(0x600 + transfer.request.node, following)
+            self._deadline_s = now_s + self._timeout_s
+        elif transfer.result is not None:
+            self._transfer = None
+            self._advance(now_s, transfer.result)
+
+    def poll(self, now_s: float) -> bool:
+        """Start, and let time pass; whether the program has ended."""
+        if not self._started:
+            self._started = True
+            self._advance(now_s, None)
+        if self.done or now_s < self._deadline_s:
+            return self.done
+        transfer = self._transfer
+        if transfer is None:
+            self._advance(now_s, b"")
+        elif self._attempts <= self._retries:
+            self._abort_transfer(transfer, _TIMED_OUT)
+            self._begin(transfer, now_s)
+        else:
+            self._transfer = None
+            self._abort_transfer(transfer, _TIMED_OUT)
+            request = transfer.request
+            failure = SdoTimeout(
+                request.node, request.index, request.subindex, self._timeout_s, self._attempts
+            )
+            self._advance(now_s, failure)
+        return self.done
+
+    def _advance(self, now_s: float, answer: bytes | Exception | None) -> None:
+        """Give the program its answer and do what it asks next, up to the next thing to wait for."""
+        try:
+            while True:
+                if isinstance(answer, Exception):
+                    request = self._program.throw(answer)
+                else:
+                    request = self._program.send(answer)  # type: ignore[arg-type]
+                if isinstance(request, Nmt):
+                    self._put(0, bytes([request.command, request.node]))
+                    answer = b""
+                    continue
+                if isinstance(request, Pause):
+                    self._deadline_s = now_s + request.seconds
+                    return
+                self._attempts = 0
+                self._begin(_Transfer(request), now_s)
+                return
+        except StopIteration as stop:
+            self.done, self._result = True, stop.value
+        except DriveError as error:
+            self.done, self._error = True, error
+
+    def _begin(self, transfer: _Transfer, now_s: float) -> None:
+        self._transfer = transfer
+        self._attempts += 1
+        self._deadline_s = now_s + self._timeout_s
+        self._put(0x600 + transfer.request.node, transfer.first())
+
+    def _abort_transfer(self, transfer: _Transfer, code: int) -> None:
+        request = transfer.request
+        frame = b"\x80" + request.index.to_bytes(2, "little") + bytes([request.subindex])
+        self._put(0x600 + request.node, frame + code.to_bytes(4, "little"))
+
+    def _put(self, cob_id: int, data: bytes) -> None:
+        check_frame(cob_id, data)
+        self._send(cob_id, data)

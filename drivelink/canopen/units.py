@@ -1,0 +1,367 @@
+"""Counts become SI at the joint side here, and nowhere else.
+
+What the joint file states is used; what it leaves out is taken from the drive (0x608F, 0x6091, 0x6075,
+0x6076, 0x60A8, 0x60A9 of CiA 402-2, the maker's own objects, 0x6501 of CiA 406). Where both tell and
+disagree, a finding names both numbers and the one in use.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from drivelink.canopen.candidates import Candidate, Offer
+from drivelink.canopen.cia303 import angle_unit_rad, velocity_unit_rad_s
+from drivelink.canopen.layout import Signal
+from drivelink.canopen.roles import Role, object_address
+from drivelink.canopen.vendors import Vendor
+from drivelink.finding import Finding, Severity
+from drivelink.jointfile import DriveSection, EncoderSection
+
+__all__ = ["offer", "unit_objects"]
+
+Address = tuple[int, int]
+
+_DRIVE_OBJECTS: tuple[Address, ...] = (
+    (0x608F, 1),
+    (0x608F, 2),
+    (0x6091, 1),
+    (0x6091, 2),
+    (0x6092, 1),
+    (0x6092, 2),
+    (0x60A8, 0),
+    (0x60A9, 0),
+    (0x6075, 0),
+    (0x6076, 0),
+    (0x607E, 0),
+)
+_ENCODER_OBJECTS: tuple[Address, ...] = ((0x6000, 0), (0x6001, 0), (0x6002, 0), (0x6501, 0), (0x6502, 0))
+_SCALING = 1 << 2  # of 0x6000, CiA 406: counts per revolution are those of 0x6001
+
+_SAME = 1e-3  # relative; tables in data sheets are rounded to about that
+_MICRO_FROM = 20_000  # 0x6076 of a maker who uses µN·m and mN·m: nobody there sells a motor of 20 N·m
+
+
+def unit_objects(role: Role, vendor: Vendor) -> tuple[Address, ...]:
+    """Objects whose values `offer` wants to know."""
+    wanted: tuple[Address, ...] = ()
+    if role.drive is not None:
+        wanted += _DRIVE_OBJECTS + vendor.objects()
+    if role.encoder is not None:
+        if role.encoder.source == "cia406":
+            wanted += _ENCODER_OBJECTS
+        else:
+            subindex = _encoder_address(role.encoder, role.key)[1]
+            wanted += ((0x60E6, subindex), (0x60EB, subindex))
+    return wanted
+
+
+def offer(role: Role, told: Mapping[Address, int], vendor: Vendor) -> Offer:
+    """What a node can give, and at what scale.
+
+    Args:
+        role: what the node is there for, with what the joint file states.
+        told: unsigned values of the objects the node has, as far as they are known.
+        vendor: its maker.
+    """
+    result = Offer()
+    if role.drive is not None:
+        _Drive(role, role.drive, told, vendor, result).offer()
+    if role.encoder is not None:
+        _offer_link(role, role.encoder, told, result)
+        if vendor.sensorless == _encoder_address(role.encoder, role.key) and role.encoder.object is None:
+            index, subindex = vendor.sensorless
+            result.findings.append(
+                Finding(
+                    severity=Severity.WARNING,
+                    subject=role.subject,
+                    text=f"0x{index:04X}:{subindex:02X} is {vendor.name}'s sensorless position, no encoder",
+                    fix=f'link.encoder.object = "0x{index:04X}:{subindex + 1:02X}" for the one wired to it',
+                )
+            )
+    return result
+
+
+class _Drive:
+    """The reasoning for one drive."""
+
+    def __init__(
+        self, role: Role, drive: DriveSection, told: Mapping[Address, int], vendor: Vendor, result: Offer
+    ) -> None:
+        self._role, self._drive, self._told, self._vendor, self._result = role, drive, told, vendor, result
+
+    def offer(self) -> None:
+        self._result.candidates[Signal.STATUSWORD] = (
+            Candidate(signal=Signal.STATUSWORD, address=(0x6041, 0), bits=16, signed=False, scale=1.0),
+        )
+        gear = self._gear()
+        counts = self._counts_per_rev()
+        self._position(counts, gear)
+        self._torque(gear)
+        if self._drive.velocity:
+            self._velocity(counts, gear)
+        self._polarity()
+
+    def _choose(
+        self, what: str, key: str, stated: float | None, told: float | None, source: str
+    ) -> float | None:
+        """The stated value, else the told one; a finding where they disagree."""
+        if stated is None or told is None:
+            return told if stated is None else stated
+        if not math.isclose(stated, told, rel_tol=_SAME):
+            self._say(
+                Severity.WARNING,
+                f"{what}: the drive says {told:.6g} ({source}), the joint file {stated:.6g}; "
+                f"{stated:.6g} is used",
+                f"{self._role.key}: {key} = {told:.6g}, or leave it out, or correct {source} in the drive",
+            )
+        return stated
+
+    def _say(self, severity: Severity, text: str, fix: str = "") -> None:
+        self._result.findings.append(
+            Finding(severity=severity, subject=self._role.subject, text=text, fix=fix)
+        )
+
+    def _ratio(self, numerator: Address, denominator: Address) -> float | None:
+        above, below = self._told.get(numerator, 0), self._told.get(denominator, 1)
+        return above / below if above > 0 and below > 0 else None
+
+    def _drive_gear(self) -> tuple[float | None, str]:
+        ratio, source = self._ratio((0x6091, 1), (0x6091, 2)), "0x6091"
+        if ratio is None and self._vendor.gear:
+            ratio, source = self._ratio(*self._vendor.gear), f"0x{self._vendor.gear[0][0]:04X}"
+        return ratio, source
+
+    def _gear(self) -> float:
+        """Motor revolutions per joint revolution."""
+        told, source = self._drive_gear()
+        stated = self._drive.gear_ratio
+        if "gear_ratio" not in self._drive.model_fields_set:
+            return stated if told is None else told
+        if told == 1.0 and stated != 1.0:  # the everyday case: the drive was never told of its gear
+            self._say(
+                Severity.INFO,
+                f"gear ratio: the drive says 1 ({source}), the joint file {stated:.6g}; {stated:.6g} is used",
+            )
+            return stated
+        self._choose("gear ratio", "gear_ratio", stated, told, source)
+        return stated
+
+    def _counts_per_rev(self) -> float | None:
+        """Counts of 0x6064 per motor revolution."""
+        told, source = self._told_counts()
+        return self._choose(
+            "counts per motor revolution", "counts_per_rev", self._drive.counts_per_rev, told, source
+        )
+
+    def _told_counts(self) -> tuple[float | None, str]:
+        angle = angle_unit_rad(self._told.get((0x60A8, 0), 0))
+        if angle is not None:  # user units at the output of the drive's gear
+            gear = self._drive_gear()[0] or 1.0
+            return math.tau / angle / gear, "0x60A8"
+        told = self._ratio((0x608F, 1), (0x608F, 2))
+        if told is not None and told > 1:  # 1/1 is what a drive says that was never told
+            return told, "0x608F"
+        if self._vendor.counts_per_rev:
+            counts = self._told.get(self._vendor.counts_per_rev, 0)
+            if counts > 1:
+                index, subindex = self._vendor.counts_per_rev
+                return float(counts), f"0x{index:04X}:{subindex:02X}"
+        return None, ""
+
+    def _position(self, counts: float | None, gear: float) -> None:
+        if counts is None:
+            self._result.missing[Signal.MOTOR_POSITION] = (
+                "counts per motor revolution are unknown: the drive does not tell (0x608F), "
+                f"set {self._role.key}: counts_per_rev"
+            )
+            return
+        scale = self._drive.direction * math.tau / (counts * gear)
+        feed = self._ratio((0x6092, 1), (0x6092, 2))
+        if feed is not None and feed > 1 and not math.isclose(feed, counts * gear, rel_tol=_SAME):
+            self._say(
+                Severity.INFO,
+                f"feed constant 0x6092 says {feed:.6g} units per shaft revolution, "
+                f"encoder and gear {counts * gear:.6g}; {counts * gear:.6g} is used",
+            )
+        self._result.candidates[Signal.MOTOR_POSITION] = (
+            Candidate(
+                signal=Signal.MOTOR_POSITION,
+                address=(0x6064, 0),
+                bits=32,
+                signed=True,
+                scale=scale,
+                wraps=True,
+            ),
+        )
+
+    def _rated_torque(self) -> float | None:
+        raw = self._told.get((0x6076, 0), 0)
+        told = raw * self._rated_torque_unit(raw) if raw else None
+        return self._choose(
+            "rated torque in N·m", "rated_torque_nm", self._drive.rated_torque_nm, told, "0x6076"
+        )
+
+    def _rated_torque_unit(self, raw: int) -> float:
+        """N·m per count of 0x6076: 1e-3 by CiA 402, 1e-6 with some."""
+        if not self._vendor.rated_torque_micro:
+            return 1e-3
+        evidence = self._drive.rated_torque_nm
+        constant, current = self._vendor.torque_constant, self._vendor.nominal_current
+        if constant and current and self._told.get(constant) and self._told.get(current):
+            evidence = self._told[constant] * 1e-6 * self._told[current] * 1e-3
+        if evidence is None:
+            return 1e-6 if raw >= _MICRO_FROM else 1e-3
+        return min((1e-3, 1e-6), key=lambda unit: abs(math.log(raw * unit / evidence)))
+
+    def _rated_current(self) -> float | None:
+        raw = self._told.get((0x6075, 0), 0)
+        told = raw * 1e-3 if raw else None
+        return self._choose(
+            "rated current in A", "rated_current_a", self._drive.rated_current_a, told, "0x6075"
+        )
+
+    def _torque_constant(self, rated_torque: float | None, rated_current: float | None) -> float | None:
+        told, source = None, ""
+        if self._vendor.torque_constant and self._told.get(self._vendor.torque_constant):
+            index, subindex = self._vendor.torque_constant
+            told, source = self._told[self._vendor.torque_constant] * 1e-6, f"0x{index:04X}:{subindex:02X}"
+        stated = self._drive.torque_constant_nm_a
+        chosen = self._choose("torque constant in N·m/A", "torque_constant_nm_a", stated, told, source)
+        if chosen is None and rated_torque and rated_current:
+            return rated_torque / rated_current
+        return chosen
+
+    def _torque(self, gear: float) -> None:
+        drive = self._drive
+        direction = drive.torque_direction or drive.direction
+        rated_torque, rated_current = self._rated_torque(), self._rated_current()
+        constant = self._torque_constant(rated_torque, rated_current)
+        if rated_torque is None and constant is not None and rated_current is not None:
+            rated_torque = constant * rated_current  # Nanotec: no 0x6076, the torque of the rated current
+        by_torque: list[Candidate] = []
+        by_current: list[Candidate] = []
+        if rated_torque is not None:
+            by_torque.append(_torque_candidate((0x6077, 0), 16, direction * gear * rated_torque / 1000))
+        if constant is not None:
+            per_ampere = direction * gear * constant
+            if rated_current is not None:
+                by_current.append(_torque_candidate((0x6078, 0), 16, per_ampere * rated_current / 1000))
+            if drive.current_object:
+                address = object_address(drive.current_object, f"{self._role.key}.current_object")
+                stated = _torque_candidate(address, 32, per_ampere * drive.current_unit_a)
+                by_current.insert(0, stated)
+            if self._vendor.current:
+                by_current.append(
+                    _torque_candidate(
+                        self._vendor.current.address, 32, per_ampere * self._vendor.current.unit_a
+                    )
+                )
+        sources = {
+            "torque": by_torque,
+            "current": by_current,
+            "auto": by_current + by_torque if drive.current_object else by_torque + by_current,
+        }
+        chosen = tuple(dict.fromkeys(sources[drive.torque_source]))
+        if chosen:
+            self._result.candidates[Signal.MOTOR_TORQUE] = chosen
+        else:
+            self._result.missing[Signal.MOTOR_TORQUE] = (
+                "the scale of its torque is unknown: the drive tells neither rated torque (0x6076) nor rated "
+                f"current (0x6075), set {self._role.key}: rated_torque_nm, or torque_constant_nm_a and "
+                "rated_current_a or current_object"
+            )
+
+    def _velocity(self, counts: float | None, gear: float) -> None:
+        told, source = None, "0x60A9"
+        unit = self._told.get((0x60A9, 0))
+        if unit:
+            told = velocity_unit_rad_s(unit, counts)
+        if told is None and self._vendor.velocity_counts_s is not None and counts is not None:
+            told, source = self._vendor.velocity_counts_s * math.tau / counts, self._vendor.name
+        stated = self._drive.velocity_rad_s_per_count
+        chosen = self._choose("velocity unit in rad/s", "velocity_rad_s_per_count", stated, told, source)
+        if chosen is None:
+            self._result.missing[Signal.MOTOR_VELOCITY] = (
+                "the unit of 0x606C is unknown: the drive does not tell (0x60A9), "
+                f"set {self._role.key}: velocity_rad_s_per_count"
+            )
+            return
+        scale = self._drive.direction * chosen / gear
+        self._result.candidates[Signal.MOTOR_VELOCITY] = (
+            Candidate(signal=Signal.MOTOR_VELOCITY, address=(0x606C, 0), bits=32, signed=True, scale=scale),
+        )
+
+    def _polarity(self) -> None:
+        polarity = self._told.get((0x607E, 0), 0)
+        if polarity & 0x80:
+            self._say(
+                Severity.INFO,
+                f"polarity 0x607E is 0x{polarity:02X}: the drive itself turns the position's sign; "
+                f"direction = {self._drive.direction} applies to what it reports",
+            )
+        if bool(polarity & 0x80) != bool(polarity & 0x40):
+            self._say(
+                Severity.WARNING,
+                f"polarity 0x607E is 0x{polarity:02X}: position and velocity have opposite signs",
+                "set bits 7 and 6 of 0x607E alike with the maker's tool",
+            )
+
+
+def _torque_candidate(address: Address, bits: int, scale: float) -> Candidate:
+    return Candidate(signal=Signal.MOTOR_TORQUE, address=address, bits=bits, signed=True, scale=scale)
+
+
+def _encoder_address(encoder: EncoderSection, key: str) -> Address:
+    default = "0x6004:00" if encoder.source == "cia406" else "0x60E4:01"
+    return object_address(encoder.object or default, f"{key}.object")
+
+
+def _offer_link(role: Role, encoder: EncoderSection, told: Mapping[Address, int], result: Offer) -> None:
+    """The link position."""
+    address = _encoder_address(encoder, "link.encoder")
+    if encoder.source == "cia406":
+        scaled = told.get((0x6000, 0), 0) & _SCALING and told.get((0x6001, 0), 0)
+        source = "0x6001" if scaled else "0x6501"
+        counts = float(scaled or told.get((0x6501, 0), 0)) or None
+    else:
+        above, below = told.get((0x60E6, address[1]), 0), told.get((0x60EB, address[1]), 1)
+        counts, source = (above / below if above > 1 and below else None), "0x60E6"
+    stated = encoder.counts_per_rev
+    used = counts if stated is None else stated
+    if used is None:
+        result.missing[Signal.LINK_POSITION] = (
+            f"counts per joint revolution are unknown: the node does not tell ({source}), "
+            "set link.encoder.counts_per_rev"
+        )
+        return
+    if stated is not None and counts is not None and not math.isclose(stated, counts, rel_tol=_SAME):
+        text = f"link encoder, counts per revolution: the node says {counts:.6g} ({source}), "
+        result.findings.append(
+            Finding(
+                severity=Severity.WARNING,
+                subject=role.subject,
+                text=text + f"the joint file {stated:.6g}; {stated:.6g} is used",
+                fix=f"link.encoder: counts_per_rev = {counts:.6g}, or leave it out",
+            )
+        )
+    result.candidates[Signal.LINK_POSITION] = (
+        Candidate(
+            signal=Signal.LINK_POSITION,
+            address=address,
+            bits=32,
+            signed=address[0] != 0x6004,
+            scale=encoder.direction * math.tau / used,
+            wraps=True,
+            offset=encoder.offset_rad,
+            modulus=_measuring_range(told) if encoder.source == "cia406" else 0,
+        ),
+    )
+
+
+def _measuring_range(told: Mapping[Address, int]) -> int:
+    """Counts after which an absolute encoder starts again (CiA 406); 0 where that is its full length."""
+    range_ = told.get((0x6002, 0), 0)
+    if range_ in (0, 0xFFFFFFFF):  # not told, or as near to 2^32 as 32 bits can say
+        range_ = told.get((0x6501, 0), 0) * told.get((0x6502, 0), 0)
+    return range_ if 1 < range_ < 1 << 32 else 0

@@ -1,0 +1,114 @@
+"""The command line: `drivelink VERB …`, one module of this package a verb.
+
+A verb's module has `configure(parser)`, which adds its arguments, and `run(args)`, which does the job and
+returns the exit status. Only the module of the verb that is asked for is imported. What a user can cause
+ends here as one line on stderr and the exit status of its error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import logging
+import os
+import sys
+from typing import Protocol
+
+from drivelink import __version__
+from drivelink.errors import DrivelinkError, UsageError
+from estimator.errors import EstimatorError
+
+__all__ = ["ALONE", "VERBS", "main", "make_parser"]
+
+VERBS = {
+    "demo": "simulated drive on the virtual bus, daemon, subscriber, live view: the whole chain",
+    "run": "the daemon: one or several joints on one bus",
+    "sim": "the simulated drives alone, on the bus of the joint file",
+    "monitor": "live view of any daemon",
+    "record": "record a running daemon or a bus",
+    "replay": "send a recording through the same chain",
+    "fit": "fit the transmission to a recording (model-based estimation)",
+    "diagnose": "trace what the model leaves unexplained to a physical effect, and add it",
+    "doctor": "what keeps this machine, bus or drive from doing the job, and the fix",
+    "new": "write a commented joint file, from a few questions or from what is on the bus",
+    "completion": "what a shell needs to complete verbs, options and files",
+}
+
+ALONE = (
+    'bus.interface = "virtual" lives inside this process, nobody else is on it; '
+    "with --interface socketcand, `drivelink sim` and `drivelink run` meet over TCP"
+)
+_INTERRUPTED = 130
+
+
+_EPILOG = """\
+first steps:
+  drivelink demo                   everything at once, without hardware
+  drivelink new elbow.toml         a joint file for your own joint
+  drivelink doctor elbow.toml      what is still in the way, and the fix
+  drivelink run elbow.toml         the daemon; then, elsewhere: drivelink monitor elbow
+`drivelink VERB --help` explains a verb, with examples.
+"""
+
+
+class Verb(Protocol):
+    """What a verb's module offers."""
+
+    @staticmethod
+    def configure(parser: argparse.ArgumentParser) -> None:
+        """Add the verb's arguments."""
+
+    @staticmethod
+    def run(args: argparse.Namespace) -> int:
+        """Do the job; return the exit status."""
+
+
+def make_parser(verbs: list[str]) -> argparse.ArgumentParser:
+    """The parser; only the modules of the given verbs are imported and configured."""
+    parser = argparse.ArgumentParser(
+        prog="drivelink",
+        description=sys.modules["drivelink"].__doc__,
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"drivelink {__version__}")
+    subparsers = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
+    for name, summary in VERBS.items():
+        subparser = subparsers.add_parser(
+            name, help=summary, description=summary[0].upper() + summary[1:] + "."
+        )
+        if name in verbs:
+            module: Verb = importlib.import_module(f"drivelink.cli.{name}")  # type: ignore[assignment]
+            module.configure(subparser)
+            subparser.set_defaults(run=module.run)
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command and return its exit status."""
+    argv = sys.argv[1:] if argv is None else argv
+    verb = argv[0] if argv and argv[0] in VERBS else ""
+    logging.getLogger("can").setLevel(logging.ERROR)  # some interfaces report every partial read
+    try:
+        if not argv:
+            make_parser([]).print_help(sys.stderr)
+            return UsageError.exit_status
+        args = make_parser([verb]).parse_args(argv)
+        return int(args.run(args))
+    except DrivelinkError as error:
+        return _fail(verb, error, error.exit_status)
+    except EstimatorError as error:
+        return _fail(verb, error, 1)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        return _fail(verb, f"{where}{error.strerror or error}", 1)
+    except KeyboardInterrupt:
+        return _INTERRUPTED
+
+
+def _fail(verb: str, error: object, status: int) -> int:
+    print(f"drivelink {verb}: {' '.join(str(error).split())}", file=sys.stderr)
+    return status

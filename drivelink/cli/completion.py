@@ -1,0 +1,39 @@
+"""`drivelink completion SHELL`: what a shell needs to complete verbs, options and files."""
+
+from __future__ import annotations
+
+import argparse
+
+import shtab
+
+from drivelink import cli
+
+_EPILOG = """\
+bash:  drivelink completion bash > ~/.local/share/bash-completion/completions/drivelink
+zsh:   drivelink completion zsh > ~/.zfunc/_drivelink      (with ~/.zfunc in fpath)
+tcsh:  drivelink completion tcsh | source /dev/stdin
+"""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _EPILOG
+    parser.add_argument("shell", choices=shtab.SUPPORTED_SHELLS, help="the shell")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the completion script."""
+    parser = cli.make_parser(list(cli.VERBS))
+    for action in parser._subparsers._group_actions:  # type: ignore[union-attr]
+        for subparser in action.choices.values():  # type: ignore[union-attr]
+            _complete_files(subparser)
+    print(shtab.complete(parser, shell=args.shell))
+    return 0
+
+
+def _complete_files(parser: argparse.ArgumentParser) -> None:
+    """Arguments that are paths complete as files."""
+    for action in parser._actions:
+        if getattr(action.type, "__name__", "") == "Path":
+            action.complete = shtab.FILE  # type: ignore[attr-defined]

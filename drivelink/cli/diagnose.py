@@ -1,0 +1,93 @@
+"""`drivelink diagnose RECORDING --joint JOINT`: residual, missing effect, better model, its error."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from drivelink import augment, jointfile, recording, report
+from drivelink.errors import RecordingError, UsageError
+from drivelink.progress import Meter
+from estimator.diagnosis import Diagnosis, diagnose
+from estimator.errors import EstimatorError
+
+_EPILOG = """\
+examples:
+  drivelink diagnose suspect.csv --joint elbow.toml --out diagnosis/
+  drivelink diagnose train.csv --joint axis.toml --validate other.csv --write axis-better.toml
+
+Fit a healthy run first (`drivelink fit healthy.csv --joint elbow.toml --write elbow-healthy.toml`), then
+diagnose against its result: small imperfections of the rig are then no findings.
+
+Writes report.json and report.html into --out (default: the current folder).
+"""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _EPILOG
+    parser.add_argument("recording", type=Path, metavar="RECORDING", help="measured data: CSV, MCAP, CAN log")
+    parser.add_argument("--joint", type=Path, required=True, metavar="JOINT", help="joint file")
+    parser.add_argument(
+        "--validate", type=Path, metavar="RECORDING2", help="data that takes no part in any fit"
+    )
+    parser.add_argument(
+        "--bandwidth-hz", type=float, metavar="F", help="of the filter that all channels share"
+    )
+    parser.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="where the reports go")
+    parser.add_argument(
+        "--write", type=Path, metavar="JOINT2", help="write a joint file with the effects found"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do the job; return the exit status."""
+    if args.bandwidth_hz is not None and not 0.0 < args.bandwidth_hz < math.inf:
+        raise UsageError(f"--bandwidth-hz: expected a number above 0, got {args.bandwidth_hz:g}")
+    joint = jointfile.load(args.joint)
+    base = args.joint.parent
+    record = recording.read(args.recording, joint, base_dir=base)
+    validation = None if args.validate is None else recording.read(args.validate, joint, base_dir=base)
+    with Meter("diagnose") as meter:
+        try:
+            outcome = diagnose(
+                record, joint.model(), args.bandwidth_hz, validation, lambda _: meter.advance()
+            )
+        except EstimatorError as error:
+            raise RecordingError(f"{args.recording}: {error}") from error
+    args.out.mkdir(parents=True, exist_ok=True)
+    title = report.Title(joint.name, args.recording.name, args.validate.name if args.validate else None)
+    _print(outcome)
+    for path in report.write(outcome, title, args.out):
+        print(f"wrote {path}")
+    if args.write is not None:
+        augment.write(args.joint, args.write, outcome, record, args.recording.name)
+        print(f"wrote {args.write}")
+    return 0
+
+
+def _print(outcome: Diagnosis) -> None:
+    console = Console()
+    console.print(report.sentence(outcome), highlight=False, soft_wrap=True)
+    table = Table()
+    for column in ("error of the torque balance", "before", "after"):
+        table.add_column(column, justify="left" if column.startswith("error") else "right")
+    for name, one in (("training", outcome.train), ("validation", outcome.validation)):
+        before = f"{one.before_rms_nm:.4g} N·m  {one.before_relative:.2%}"
+        table.add_row(name, before, f"{one.after_rms_nm:.4g} N·m  {one.after_relative:.2%}")
+    console.print(table)
+    for finding in outcome.effects:
+        print(f"  {report.title_of(finding)}")
+        for name, value in finding.parameters.items():
+            print(f"    {name} = {report.value_text(value, finding.std.get(name))}")
+        if finding.alternatives:
+            print(f"    could also be: {', '.join(finding.alternatives)}")
+    for name, value in outcome.alignment.items():
+        print(f"  taken out of the readings: {name} = {value:.4g}")
+    for line in (*outcome.notes, *outcome.advice):
+        print(f"  {line}")

@@ -1,0 +1,214 @@
+"""From a recording to transmission parameters: what `drivelink fit` computes, prints and writes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from dataclasses import asdict, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from drivelink import __version__, jointfile, plots, recording
+from drivelink.errors import RecordingError, UsageError
+from drivelink.floor import floor_entry
+from drivelink.jointfile import JointFile
+from estimator.batch import TransmissionFit, fit
+from estimator.diagnosis import calibrate
+from estimator.errors import EstimatorError
+from estimator.model import JointModel, ParameterValue, Transmission
+from estimator.sample import Record
+from estimator.transmissions import MODELS, RIGID
+
+__all__ = ["fit_recording"]
+
+_SIGMA_95 = 1.96
+_CURVE_POINTS = 200
+
+
+def fit_recording(args: argparse.Namespace, joint: JointFile, folder: Path | None) -> None:
+    """Fit, print, and write what was asked for.
+
+    Args:
+        args: of `drivelink fit`.
+        joint: the joint file that they name.
+        folder: where plots go; None: no plots.
+
+    Raises:
+        RecordingError: the recording cannot be read, or does not tell what is asked.
+    """
+    record = recording.read(args.recording, joint, base_dir=args.joint.parent)
+    bandwidth = None if args.bandwidth_hz is None else 2.0 * math.pi * args.bandwidth_hz
+    try:
+        fits = fit(record, joint.model(), bandwidth)
+    except EstimatorError as error:
+        raise RecordingError(f"{args.recording}: {error}") from error
+    _print(fits)
+    if args.out is not None:
+        args.out.mkdir(parents=True, exist_ok=True)
+        path = args.out / "fit.json"
+        path.write_text(json.dumps(_as_json(fits), indent=2) + "\n", encoding="utf-8")
+        print(f"wrote {path}")
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        print(f"wrote {_plot(fits, joint, folder)}")
+    if args.write is not None:
+        _write(args, fits, record)
+        print(f"wrote {args.write}")
+
+
+def _as_json(fits: list[TransmissionFit]) -> dict[str, Any]:
+    return {"transmissions": [_entry(one) for one in fits]}
+
+
+def _entry(one: TransmissionFit) -> dict[str, Any]:
+    entry: dict[str, Any] = {"model": one.model, "parameters": one.parameters, "std": one.std}
+    if one.model == RIGID:
+        return entry
+    std = one.nuisance_std
+    entry["motor"] = {
+        "inertia_kg_m2": one.inertia_kg_m2,
+        "inertia_std_kg_m2": std["inertia"],
+        "viscous_damping_nm_s_rad": one.viscous_damping_nm_s_rad,
+        "viscous_damping_std_nm_s_rad": std["damping"],
+        "coulomb_nm": one.coulomb_nm,
+        "offset_nm": one.offset_nm,
+    }
+    entry["alignment"] = {
+        "link_delay_s": one.link_delay_s,
+        "torque_skew_s": one.torque_skew_s,
+        "deflection_offset_rad": one.deflection_offset_rad,
+    }
+    entry["error_rms_nm"] = one.error_rms_nm
+    entry["error_relative"] = one.error_rms_nm / one.torque_rms_nm
+    entry["excited"] = one.excited
+    return entry
+
+
+def _print(fits: list[TransmissionFit]) -> None:
+    console = Console()
+    for number, one in enumerate(fits, start=1):
+        if one.model == RIGID:
+            console.print(f"motor {number}: rigid, nothing to fit")
+            continue
+        table = Table(title=f"motor {number}: {one.model}", title_justify="left")
+        for column in ("parameter", "value", "± (95 %)"):
+            table.add_column(column, justify="left" if column == "parameter" else "right")
+        for name, value in one.parameters.items():
+            for label, x, sigma in _rows(name, value, one.std[name]):
+                table.add_row(label, f"{x:.6g}", f"{_SIGMA_95 * sigma:.2g}")
+        std = one.nuisance_std
+        table.add_row("inertia_kg_m2", f"{one.inertia_kg_m2:.6g}", f"{_SIGMA_95 * std['inertia']:.2g}")
+        damping = f"{_SIGMA_95 * std['damping']:.2g}"
+        table.add_row("viscous_damping_nm_s_rad", f"{one.viscous_damping_nm_s_rad:.6g}", damping)
+        console.print(table)
+        share = one.error_rms_nm / one.torque_rms_nm
+        left = f"{one.error_rms_nm:.3g} N·m rms left, {100 * share:.2f} % of the flexibility torque"
+        print(f"  torque balance: {left}")
+        for line in _remarks(one):
+            print(f"  {line}")
+
+
+def _rows(name: str, value: ParameterValue, std: ParameterValue) -> list[tuple[str, float, float]]:
+    if isinstance(value, tuple) and isinstance(std, tuple):
+        return [(f"{name}[{i}]", x, s) for i, (x, s) in enumerate(zip(value, std, strict=True), start=1)]
+    assert isinstance(value, float)
+    assert isinstance(std, float)
+    return [(name, value, std)]
+
+
+def _remarks(one: TransmissionFit) -> list[str]:
+    remarks = []
+    if not one.excited:
+        remarks.append("the motion hardly tells the stiffness: record one with more deflection")
+    if abs(one.link_delay_s) > 0.0:
+        remarks.append(f"link encoder aligned: it was {1e3 * one.link_delay_s:.3f} ms late")
+    std = one.nuisance_std
+    if abs(one.torque_skew_s) > 4.0 * std["torque_skew"] and abs(one.torque_skew_s) > 2e-5:
+        remarks.append(f"torque aligned: it was {1e3 * one.torque_skew_s:.3f} ms late")
+    if abs(one.coulomb_nm) > max(4.0 * std["coulomb"], 0.01 * one.torque_rms_nm):
+        remarks.append(
+            f"friction that the model lacks, about {one.coulomb_nm:.3g} N·m: `drivelink diagnose` tells which"
+        )
+    return remarks
+
+
+def _plot(fits: list[TransmissionFit], joint: JointFile, folder: Path) -> Path:
+    flexible = [(number, one) for number, one in enumerate(fits, start=1) if one.model != RIGID]
+    if not flexible:
+        raise UsageError("--plots: expected a flexible transmission, every one is rigid")
+    figure, axes = plots.new_figure(f"{joint.name}: fitted transmissions", rows=2 * len(flexible))
+    for row, (number, one) in enumerate(flexible):
+        model = MODELS[one.model]
+        reach = float(np.max(np.abs(one.deflection_rad)))
+        phi = np.linspace(-reach, reach, _CURVE_POINTS)
+        gradient = model.stiffness_jacobian(phi, one.alpha)
+        std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", gradient, one.covariance, gradient), 0.0))
+        stiffness = plots.Curve(phi, model.stiffness(phi, one.alpha), std)
+        title = f"motor {number}: stiffness"
+        plots.xy(axes[2 * row], {"fitted": stiffness}, "deflection / rad", "stiffness / (N·m/rad)", title)
+        order = np.argsort(one.deflection_rad)
+        curves = {
+            "from the motor's balance": plots.Curve(one.deflection_rad[order], one.torque_nm[order]),
+            "fitted": plots.Curve(phi, model.torque(phi, one.alpha)),
+        }
+        plots.xy(axes[2 * row + 1], curves, "deflection / rad", "flexibility torque / N·m")
+    return plots.save(figure, folder / "fit.png")
+
+
+def _write(args: argparse.Namespace, fits: list[TransmissionFit], record: Record) -> None:
+    weak = [number for number, one in enumerate(fits, start=1) if one.model != RIGID and not one.excited]
+    if weak:
+        raise RecordingError(
+            f"{args.recording}: --write: expected a motion that tells the stiffness of motor {weak[0]}"
+        )
+    joint = jointfile.load(args.joint)
+    model = calibrate(record, _fitted(joint, fits))
+    motors: list[dict[str, Any]] = []
+    for motor in model.motors:
+        change: dict[str, Any] = {
+            "inertia_kg_m2": motor.inertia_kg_m2,
+            "viscous_damping_nm_s_rad": motor.viscous_damping_nm_s_rad,
+        }
+        if motor.transmission.model != RIGID:
+            transmission: dict[str, Any] = {"model": motor.transmission.model}
+            transmission["parameters"] = _plain(dict(motor.transmission.parameters))
+            if motor.transmission.order is not None:
+                transmission["order"] = motor.transmission.order
+            change["transmission"] = transmission
+        motors.append(change)
+    changes: dict[str, Any] = {"motor": motors}
+    if model.link is not None:
+        changes["link"] = {"dynamics": asdict(model.link)}
+    provenance = {
+        **floor_entry(record, model),
+        "fit": {
+            "recording": args.recording.name,
+            "seconds": float((record.sequence[-1] - record.sequence[0]) * record.period_s),
+            "written": datetime.now(UTC).isoformat(timespec="seconds"),
+            "version": __version__,
+        },
+    }
+    jointfile.write_model(args.joint, args.write, {**changes, "provenance": provenance})
+
+
+def _fitted(joint: JointFile, fits: list[TransmissionFit]) -> JointModel:
+    """The declared model with the transmissions as fitted: where the calibration of all of it begins."""
+    model = joint.model()
+    motors = []
+    for motor, one in zip(model.motors, fits, strict=True):
+        if one.model != RIGID:
+            order = int(one.alpha.size) if one.model == "polynomial" else motor.transmission.order
+            transmission = Transmission(model=one.model, order=order, parameters=one.parameters)
+            motor = replace(motor, transmission=transmission)
+        motors.append(motor)
+    return replace(model, motors=tuple(motors))
+
+
+def _plain(parameters: dict[str, ParameterValue]) -> dict[str, float | list[float]]:
+    return {name: list(v) if isinstance(v, tuple) else float(v) for name, v in parameters.items()}

@@ -1,0 +1,133 @@
+"""`drivelink monitor [JOINT]`: what daemons publish, live in the terminal or in a browser."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.text import Text
+
+from drivelink import jointfile
+from drivelink.errors import UsageError
+from drivelink.monitor.view import joints_table
+from drivelink.monitor.watcher import Watcher
+from drivelink.monitor.web import WebView
+from drivelink.pubsub.clientbase import ENDPOINT
+from drivelink.pubsub.session import close_session, open_client
+
+_POLL_S = 0.02
+_FRAME_S = 0.1
+_HINT_S = 3.0
+
+_EPILOG = """\
+examples:
+  drivelink monitor                    every joint on this machine
+  drivelink monitor elbow              one joint, with its curve
+  drivelink monitor --web              the same in a browser, with plots
+  drivelink monitor elbow | tee log    without a terminal: a plain line a second
+"""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _EPILOG
+    parser.add_argument("joint", nargs="?", metavar="JOINT", help="name of a joint, or its joint file")
+    parser.add_argument("--web", action="store_true", help="serve a page with live plots on this machine")
+    parser.add_argument("--port", type=int, default=8765, help="of the page (default %(default)s, 0: any)")
+    parser.add_argument("--seconds", type=float, metavar="S", help="end after so long; else with Ctrl-C")
+    parser.add_argument("--every", type=float, default=1.0, metavar="S", help="between two plain lines")
+    parser.add_argument("--endpoint", help=f"where a daemon or router listens (default {ENDPOINT})")
+    parser.add_argument("--config", type=Path, help="zenoh configuration file (JSON5) instead")
+    parser.add_argument("--prefix", help='first part of every key (default "drivelink")')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do the job; return the exit status."""
+    if args.port < 0 or args.port > 65535:
+        raise UsageError(f"--port: expected 0 to 65535, got {args.port}")
+    name, endpoint, config, prefix = _where(args)
+    session = open_client(endpoint, config)
+    try:
+        watcher = Watcher(session, prefix, name)
+        end = time.monotonic() + args.seconds if args.seconds else float("inf")
+        try:
+            if args.web:
+                _serve(watcher, args.port, end)
+            elif sys.stdout.isatty():
+                _show(watcher, end, f"{prefix}/{name or '*'} at {config or endpoint}")
+            else:
+                _print(watcher, end, args.every)
+        except KeyboardInterrupt:
+            pass
+        finally:
+            watcher.close()
+    finally:
+        close_session(session)
+    return 0
+
+
+def _where(args: argparse.Namespace) -> tuple[str | None, str, Path | None, str]:
+    """Joint, endpoint, configuration and prefix: from the joint file if one is given, and the options."""
+    name, endpoint, config, prefix = args.joint, ENDPOINT, None, "drivelink"
+    if name is not None and (name.endswith(".toml") or "/" in name):
+        path = Path(name)
+        joint = jointfile.load(path)
+        name, endpoint, prefix = joint.name, joint.zenoh.endpoint, joint.zenoh.prefix
+        config = path.absolute().parent / joint.zenoh.config if joint.zenoh.config else None
+    return name, args.endpoint or endpoint, args.config or config, args.prefix or prefix
+
+
+def _show(watcher: Watcher, end: float, where: str) -> None:
+    """The view in the terminal, until the end or Ctrl-C."""
+    console = Console()
+    begin = time.monotonic()
+    with Live(console=console, screen=True, auto_refresh=False, transient=True) as live:
+        while time.monotonic() < end:
+            frame_end = time.monotonic() + _FRAME_S
+            while (left := frame_end - time.monotonic()) > 0:
+                watcher.poll()
+                time.sleep(min(_POLL_S, left))
+            live.update(_picture(watcher, console, where, time.monotonic() - begin), refresh=True)
+
+
+def _picture(watcher: Watcher, console: Console, where: str, waited_s: float) -> RenderableType:
+    views = watcher.views
+    if not views or not any(view.history.latest for view in views.values()):
+        hint = ""
+        if waited_s > _HINT_S:
+            hint = "\n\nIs a daemon running?   drivelink run JOINT   or   drivelink demo"
+        return Text(f"waiting for {where} …{hint}", style="dim")
+    if len(views) == 1:
+        return next(iter(views.values()))
+    table = joints_table(views, console.size.width)
+    footer = Text("drivelink monitor NAME shows one joint with its curves · Ctrl-C ends", style="dim")
+    return Group(table, Text(""), footer)
+
+
+def _print(watcher: Watcher, end: float, every_s: float) -> None:
+    """A plain line for each joint, again and again."""
+    due = time.monotonic() + every_s
+    while time.monotonic() < end:
+        watcher.poll()
+        if time.monotonic() >= due:
+            due += every_s
+            lines = [view.line() for _, view in sorted(watcher.views.items())] or ["no joint yet"]
+            print("\n".join(lines), flush=True)
+        time.sleep(_POLL_S)
+
+
+def _serve(watcher: Watcher, port: int, end: float) -> None:
+    """The page, until the end or Ctrl-C."""
+    web = WebView(watcher, port)
+    print(f"live view: {web.url}   (Ctrl-C ends)", flush=True)
+    try:
+        while time.monotonic() < end:
+            web.poll()
+            time.sleep(_POLL_S)
+    finally:
+        web.close()

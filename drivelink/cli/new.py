@@ -1,0 +1,201 @@
+"""`drivelink new`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+
+from drivelink.canopen.bus import open_bus
+from drivelink.canopen.scan import identify, scan
+from drivelink.errors import UsageError
+from drivelink.jointfile import BusSection, parse
+from drivelink.newfile import Answers, answers_from_bus, joint_text
+
+__all__ = ["configure", "run"]
+
+_CASES = ("constant", "quadratic", "vsa-ii")
+_ARRANGEMENTS = ("single", "antagonistic", "serial")
+_MODELS = ("polynomial", "linear", "vsa-ii", "none")
+
+_EPILOG = """\
+examples:
+  drivelink new elbow.toml                            asks what no drive can tell
+  drivelink new elbow.toml --scan --channel can0      node ids and encoder from what answers on the bus
+  drivelink new vsa.toml --case vsa-ii                one of the paper's joints, for `sim` and `run`
+"""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _EPILOG
+    parser.add_argument("path", nargs="?", type=Path, metavar="PATH", help="default: NAME.toml; -: print it")
+    parser.add_argument("--case", choices=_CASES, help="one of the paper's joints, simulated")
+    parser.add_argument("--scan", action="store_true", help="take the nodes from what answers on the bus")
+    parser.add_argument("--name", help="of the joint")
+    parser.add_argument("--arrangement", choices=_ARRANGEMENTS, help="how the motors act on the joint")
+    parser.add_argument("--inertia", type=float, metavar="KG_M2", help="of each motor, joint side")
+    parser.add_argument("--damping", type=float, metavar="NM_S_RAD", help="of each motor, joint side")
+    parser.add_argument("--model", choices=_MODELS, help="of the transmission")
+    parser.add_argument("--node", type=int, action="append", metavar="ID", help="of a drive; twice for a VSA")
+    parser.add_argument("--gear", type=float, metavar="RATIO", help="motor revolutions per joint revolution")
+    parser.add_argument("--encoder", metavar="drive|none|ID", help="link encoder: ID of a CiA 406 node")
+    parser.add_argument("--interface", help="python-can interface (default: socketcan)")
+    parser.add_argument("--channel", help="python-can channel (default: can0)")
+    parser.add_argument("--bitrate", type=int, help="bit/s (default: 1000000)")
+    parser.add_argument("--passive", action="store_true", help="another master is in charge of the bus")
+    parser.add_argument("--force", action="store_true", help="overwrite PATH")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Ask what is not given, where somebody can answer, and write the file."""
+    text, name = _case_text(args) if args.case else _new_text(args)
+    if str(args.path) == "-":
+        print(text, end="")
+        return 0
+    path = args.path or Path(f"{name}.toml")
+    if path.exists() and not args.force:
+        raise UsageError(f"{path} exists: --force overwrites it")
+    path.write_text(text, encoding="utf-8")
+    print(f"{path} written; next: {_next(args, path)}")
+    return 0
+
+
+def _next(args: argparse.Namespace, path: Path) -> str:
+    if not args.case:
+        return f"drivelink doctor {path}"
+    here = "" if args.interface else " --interface socketcand"  # the case's own bus lives inside one process
+    return f"drivelink sim {path}{here}, and in another terminal drivelink run {path}{here}"
+
+
+def _case_text(args: argparse.Namespace) -> tuple[str, str]:
+    """A copy of the shipped joint, comments kept, with the flags that make sense for it."""
+    source = resources.files("drivelink") / "joints" / f"{args.case}.toml"
+    document: Any = tomlkit.parse(source.read_text(encoding="utf-8"))
+    if args.name:
+        document["name"] = args.name
+    for key in ("interface", "channel", "bitrate"):
+        value = getattr(args, key)
+        if value is not None:
+            document["bus"][key] = value
+    text = tomlkit.dumps(document)
+    return text, parse(text, "these answers").name
+
+
+def _new_text(args: argparse.Namespace) -> tuple[str, str]:
+    given = {
+        "name": args.name,
+        "arrangement": args.arrangement,
+        "inertia_kg_m2": args.inertia,
+        "viscous_damping_nm_s_rad": args.damping,
+        "model": args.model,
+        "nodes": args.node,
+        "gear_ratio": args.gear,
+        "encoder": _encoder(args.encoder),
+        "interface": args.interface,
+        "channel": args.channel,
+        "bitrate": args.bitrate,
+        "passive": args.passive or None,
+    }
+    answers = Answers(**{key: value for key, value in given.items() if value is not None})
+    if args.path is not None and args.name is None and args.path.stem and str(args.path) != "-":
+        answers.name = given["name"] = args.path.stem
+    if args.scan:
+        answers = _scanned(answers)
+    elif sys.stdin.isatty() and str(args.path) != "-":
+        _ask(answers, {key for key, value in given.items() if value is not None})
+    return joint_text(answers), answers.name
+
+
+def _encoder(text: str | None) -> str | None:
+    if text is None or text in ("drive", "none"):
+        return text
+    if text.isdecimal() and 1 <= int(text) <= 127:
+        return text
+    raise UsageError(f'--encoder: expected "drive", "none" or a node id from 1 to 127, got "{text}"')
+
+
+def _scanned(answers: Answers) -> Answers:
+    if answers.passive:
+        raise UsageError("--scan asks the nodes, --passive forbids it: give --node instead")
+    section = BusSection(interface=answers.interface, channel=answers.channel, bitrate=answers.bitrate)
+    bus = open_bus(section)
+    try:
+        ids, _ = scan(bus)
+        found = [
+            identify(bus, node, timeout_s=section.sdo_timeout_s, retries=section.sdo_retries) for node in ids
+        ]
+    finally:
+        bus.shutdown()
+    return answers_from_bus(answers, found)
+
+
+def _one_of(*choices: str) -> Callable[[str], str]:
+    def check(reply: str) -> str:
+        if reply not in choices:
+            raise UsageError(f"expected {', '.join(choices)}, got {reply}")
+        return reply
+
+    return check
+
+
+def _number(reply: str) -> float:
+    try:
+        return float(reply)
+    except ValueError:
+        raise UsageError(f"expected a number, got {reply}") from None
+
+
+def _node_id(reply: str) -> int:
+    if reply.isdecimal() and 1 <= int(reply) <= 127:
+        return int(reply)
+    raise UsageError(f"expected a node id from 1 to 127, got {reply}")
+
+
+_QUESTIONS: tuple[tuple[str, str, Callable[[str], Any]], ...] = (
+    ("name", "Name of the joint", str),
+    ("arrangement", ", ".join(_ARRANGEMENTS), _one_of(*_ARRANGEMENTS)),
+    (
+        "inertia_kg_m2",
+        "Motor inertia at the joint side, kg·m² (rotor inertia times gear ratio squared)",
+        _number,
+    ),
+    ("viscous_damping_nm_s_rad", "Motor damping at the joint side, N·m·s/rad", _number),
+    ("model", f"Transmission: {', '.join(_MODELS)}", _one_of(*_MODELS)),
+    ("interface", "CAN interface (python-can)", str),
+    ("channel", "Channel", str),
+)
+
+
+def _ask(answers: Answers, known: set[str]) -> None:
+    """A question for each thing that is not known; Enter keeps the default."""
+    try:
+        for key, question, check in _QUESTIONS:
+            if key not in known:
+                setattr(answers, key, _asked(question, getattr(answers, key), check))
+        if "nodes" not in known:
+            for motor in range(1, answers.motors + 1):
+                answers.nodes.append(_asked(f"Node id of the drive of motor {motor}", motor, _node_id))
+        if "encoder" not in known:
+            question = "Link encoder: drive, none, or node id of a CiA 406 encoder"
+            answers.encoder = _asked(question, answers.encoder, _encoder) or answers.encoder
+    except EOFError:
+        raise UsageError("the questions were left unanswered; options answer them, too: --help") from None
+
+
+def _asked(question: str, default: Any, check: Callable[[str], Any]) -> Any:
+    """What is answered, asked for again until it can be; the default for an empty line."""
+    while True:
+        reply = input(f"{question} [{default}]: ").strip()
+        if not reply:
+            return default
+        try:
+            return check(reply)
+        except UsageError as error:
+            print(error)

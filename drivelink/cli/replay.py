@@ -1,0 +1,133 @@
+"""`drivelink replay FILE --joint JOINT`: a recording through the same chain as live data."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from drivelink import jointfile
+from drivelink.errors import RecordingError, UsageError
+from drivelink.jointfile import JointFile
+from drivelink.progress import Meter
+from drivelink.pubsub.publisher import JointPublisher
+from drivelink.pubsub.session import close_session, open_session
+from drivelink.recording.mcapsamples import recorded_joint
+from drivelink.recording.outputs import EstimatesFile, Publication, Summary
+from drivelink.recording.playback import Playback, open_playback
+
+_INTERRUPTED = 130
+_METER_EVERY = 512
+_SUBSCRIBER_S = 1.5
+
+_EPILOG = """\
+formats: .csv, .mcap, .mf4 (with asammdf), and raw CAN: candump .log in its variants, .blf, .asc, .trc
+
+examples:
+  drivelink replay run.csv --joint elbow.toml --out estimates.csv --plots plots/
+  drivelink replay run.mcap --publish --realtime        a recording of drivelink carries its joint file
+  drivelink replay candump.log --joint elbow.toml --channel can1
+"""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _EPILOG
+    parser.add_argument("file", type=Path, metavar="FILE", help="the recording")
+    parser.add_argument("--joint", type=Path, metavar="JOINT", help="joint file it was made with")
+    parser.add_argument("--out", type=Path, metavar="CSV", help="write the estimates, a row for each cycle")
+    parser.add_argument("--plots", type=Path, metavar="DIR", help="write plots of the estimates")
+    parser.add_argument("--publish", action="store_true", help="put samples and estimates on zenoh")
+    parser.add_argument("--realtime", action="store_true", help="at the speed of the recording")
+    parser.add_argument("--speed", type=float, metavar="X", help="X times the speed of the recording")
+    parser.add_argument(
+        "--frames", action="store_true", help="of an MCAP file, decode the raw CAN frames, not the samples"
+    )
+    parser.add_argument("--channel", help="of a raw CAN log with several, the one the joint is on")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do the job; return the exit status."""
+    if args.speed is not None and not args.speed > 0:
+        raise UsageError(f"--speed: expected a number above 0, got {args.speed:g}")
+    speed = args.speed if args.speed is not None else 1.0 if args.realtime else None
+    joint, base_dir = _joint(args)
+    playback = open_playback(
+        args.file, joint, base_dir, frames=True if args.frames else None, channel=args.channel
+    )
+    summary = Summary(playback.motors, keep=args.plots is not None)
+    begin = time.perf_counter()
+    interrupted = False
+    with ExitStack() as stack:
+        takers = [summary.take]
+        if args.out is not None:
+            rows = EstimatesFile(args.out, playback.motors)
+            stack.callback(rows.close)
+            takers.append(rows.take)
+        if args.publish or speed is not None:
+            publication = _publication(args, joint, base_dir, speed, playback, stack)
+            takers.append(publication.take)
+        try:
+            with Meter(f"replay {args.file.name}", playback.total) as meter:
+                for count, played in enumerate(playback, 1):
+                    for take in takers:
+                        take(played)
+                    if not count % _METER_EVERY:
+                        meter.update(count)
+        except KeyboardInterrupt:
+            interrupted = True
+    print(f"{args.file}: {summary.text(time.perf_counter() - begin)}")
+    if args.plots is not None and summary.count:
+        for path in summary.plot(args.plots, f"{joint.name}: {args.file.name}"):
+            print(f"plot: {path}")
+    if args.out is not None:
+        print(f"estimates: {args.out}" + (" (up to the interruption)" if interrupted else ""))
+    return _INTERRUPTED if interrupted else 0
+
+
+def _publication(
+    args: argparse.Namespace,
+    joint: JointFile,
+    base_dir: Path,
+    speed: float | None,
+    playback: Playback,
+    stack: ExitStack,
+) -> Publication:
+    """Pacing and, where asked for, the keys on zenoh; both end with the stack."""
+    publisher = None
+    if args.publish:
+        session = open_session(joint.zenoh, base_dir)
+        stack.callback(close_session, session)
+        publisher = JointPublisher(session, joint, lossless=speed is None)
+        stack.callback(publisher.close)
+        _await_subscriber(session, f"{publisher.key}/estimate")
+    about = {"joint": joint.name, "recording": args.file.name, "period_s": playback.period_s}
+    publication = Publication(publisher, speed, about)
+    stack.callback(publication.close)
+    return publication
+
+
+def _await_subscriber(session: zenoh.Session, key: str) -> None:
+    """Give a subscriber that is just connecting the time to do so, that it may see the beginning."""
+    publisher: Any = session.declare_publisher(key)
+    end = time.monotonic() + _SUBSCRIBER_S
+    while not publisher.matching_status.matching and time.monotonic() < end:
+        time.sleep(0.01)
+    publisher.undeclare()
+
+
+def _joint(args: argparse.Namespace) -> tuple[JointFile, Path]:
+    """The joint file that was named, or the one that the recording carries; and its folder."""
+    if args.joint is not None:
+        return jointfile.load(args.joint), args.joint.absolute().parent
+    if not args.file.exists():
+        raise RecordingError(f"{args.file}: no such file")
+    carried = recorded_joint(args.file) if args.file.suffix.lower() == ".mcap" else None
+    if carried is None:
+        raise UsageError(f"--joint: expected the joint file that {args.file} was recorded with")
+    return jointfile.parse(carried[0], f"{args.file}: joint file in it"), carried[1]

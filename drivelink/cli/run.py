@@ -1,0 +1,134 @@
+"""`drivelink run`: the daemon of one or several joints on one bus."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING
+
+from drivelink.cli import ALONE
+from drivelink.errors import UsageError
+from drivelink.jointfile import JointFile, load
+
+if TYPE_CHECKING:
+    from drivelink.daemon.service import Daemon
+
+__all__ = ["configure", "run"]
+
+_EPILOG = """\
+examples:
+  drivelink run elbow.toml                          until Ctrl-C or SIGTERM
+  drivelink run left.toml right.toml                two joints on one bus, with one SYNC
+  drivelink run elbow.toml --interface socketcand   beside `drivelink sim elbow.toml --interface socketcand`
+  drivelink run elbow.toml --channel vcan0 --seconds 60 --no-realtime
+
+It reads: no controlword, mode or target is ever written. `drivelink doctor` says beforehand what would keep
+it from working, `drivelink monitor` shows what it publishes, a rewritten joint file changes the model.
+"""
+_LINE_S = 5.0  # between two lines of state on a terminal
+_LEVELS = ("debug", "info", "warning", "error")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `run`."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _EPILOG
+    parser.add_argument(
+        "joints", nargs="+", type=Path, metavar="JOINT", help="joint files; several share one bus"
+    )
+    parser.add_argument(
+        "--seconds", type=float, metavar="S", help="end after so long; left out: run until stopped"
+    )
+    parser.add_argument("--interface", metavar="I", help="python-can interface instead of the joint file's")
+    parser.add_argument("--channel", metavar="C", help="channel instead of the joint file's, e.g. can0")
+    parser.add_argument("--no-publish", action="store_true", help="compute, but publish nothing")
+    parser.add_argument(
+        "--no-realtime",
+        action="store_true",
+        help="do not ask for real-time scheduling and locked memory",
+    )
+    parser.add_argument("--log-level", choices=_LEVELS, default="info", help="what goes to stderr")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve the joints until told to stop."""
+    if args.seconds is not None and not args.seconds > 0:
+        raise UsageError(f"--seconds: expected a number > 0, got {args.seconds:g}")
+    _set_up_logging(args.log_level)
+    loaded = [_loaded(path, args.interface, args.channel) for path in args.joints]
+    if loaded[0].bus.interface == "virtual":
+        logging.getLogger(__name__).warning(ALONE)
+    from drivelink.daemon.service import Daemon, ServedJoint  # a wrong joint file is said before this second
+
+    joints = [ServedJoint(joint=joint, path=path) for joint, path in zip(loaded, args.joints, strict=True)]
+    with (
+        _stopped_by_signals() as stopped,
+        Daemon(joints, publish=not args.no_publish, real_time=not args.no_realtime) as daemon,
+    ):
+        stopped.append(daemon)
+        section = joints[0].joint.bus
+        names = ", ".join(served.joint.name for served in joints)
+        print(
+            f"drivelink run: {names} on {section.interface} {section.channel}, "
+            f"{1 / section.period_s:g} Hz, ready",
+            flush=True,
+        )
+        ended = threading.Event()
+        if sys.stdout.isatty():
+            threading.Thread(target=_show, args=(daemon, ended), daemon=True).start()
+        try:
+            daemon.run(args.seconds)
+        finally:
+            ended.set()
+    print(daemon.summary(), flush=True)
+    return 0
+
+
+def _loaded(path: Path, interface: str | None, channel: str | None) -> JointFile:
+    joint = load(path)
+    return joint.model_copy(update={"bus": joint.bus.moved(interface, channel)})
+
+
+def _set_up_logging(level: str) -> None:
+    logging.basicConfig(
+        level=getattr(logging, level.upper()),
+        stream=sys.stderr,
+        format="%(levelname).1s %(message)s",
+    )
+    for noisy in ("can", "canopen"):
+        logging.getLogger(noisy).setLevel(logging.ERROR)
+
+
+def _show(daemon: Daemon, ended: threading.Event) -> None:
+    while not ended.wait(_LINE_S):
+        print(daemon.summary(), flush=True)
+
+
+@contextmanager
+def _stopped_by_signals() -> Iterator[list[Daemon]]:
+    """SIGINT and SIGTERM end the daemon, or the process while there is none yet; SIGHUP reloads."""
+    running: list[Daemon] = []
+
+    def stop(_number: int, _frame: FrameType | None) -> None:
+        if not running:
+            raise KeyboardInterrupt
+        running[0].stop()
+
+    def reload(_number: int, _frame: FrameType | None) -> None:
+        for daemon in running:
+            daemon.reload()
+
+    handlers = {signal.SIGINT: stop, signal.SIGTERM: stop, signal.SIGHUP: reload}
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    try:
+        yield running
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,124 @@
+"""`drivelink sim JOINT…`: the simulated drives alone, on the bus of the joint file."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import threading
+import types
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from drivelink.cli import ALONE
+from drivelink.cycle.realtime import PRIORITY, acquire, release
+from drivelink.errors import UsageError
+from drivelink.jointfile import BusSection, JointFile, load
+from drivelink.simulate import CASE_NAMES, QUIRK_NAMES, bench_from_joints, open_sim_bus
+
+_EPILOG = """\
+examples:
+  drivelink sim elbow.toml                             on the bus of the joint file
+  drivelink sim elbow.toml --interface socketcand      serve a bus over TCP: no SocketCAN needed; the daemon
+                                                       in another terminal takes the same option
+  drivelink sim elbow.toml --channel vcan0 --effect coulomb_friction=0.3 --quirks epos4
+"""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _EPILOG
+    parser.add_argument("joints", nargs="+", type=Path, metavar="JOINT", help="joint files on one bus")
+    parser.add_argument(
+        "--effect",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="switch an effect on in the world, e.g. coulomb_friction=0.25; further parameters follow after "
+        "commas (cogging=0.1,periods_per_rev=12,motor=2); may be repeated",
+    )
+    parser.add_argument("--case", choices=CASE_NAMES, help="one of the paper's cases as the world")
+    parser.add_argument("--quirks", metavar="NAME", help=f"drives that behave like: {', '.join(QUIRK_NAMES)}")
+    parser.add_argument("--interface", help="python-can interface instead of the joint file's")
+    parser.add_argument("--channel", help="channel instead of the joint file's")
+    parser.add_argument("--seconds", type=float, metavar="S", help="end by itself after so long")
+    parser.add_argument("--seed", type=int, help="of the sensor noise")
+    parser.add_argument(
+        "--write-eds", type=Path, metavar="DIR", help="write the EDS file of every simulated node and go on"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve the devices until SIGINT, SIGTERM or the end of `--seconds`."""
+    if args.seconds is not None and not args.seconds > 0:
+        raise UsageError(f"--seconds: expected a number > 0, got {args.seconds:g}")
+    joints = [load(path) for path in args.joints]
+    section = _bus_section(joints, args)
+    bench = bench_from_joints(
+        joints, effects=args.effect, case_name=args.case, quirks=args.quirks, seed=args.seed
+    )
+    if args.write_eds:
+        bench.write_eds(args.write_eds)
+    if section.interface == "virtual":
+        print(ALONE, file=sys.stderr)
+    stop = threading.Event()
+    with _until_signal(stop), open_sim_bus(section) as bus, _ending(stop, args.seconds):
+        where = f"{section.interface} {section.channel}"
+        print(f"drivelink sim: ready on {where}: {bench.describe()}; Ctrl-C ends it", flush=True)
+        with _prompt():
+            bench.serve(bus, stop)
+    return 0
+
+
+def _bus_section(joints: list[JointFile], args: argparse.Namespace) -> BusSection:
+    first = joints[0].bus
+    for joint in joints[1:]:
+        for key in ("interface", "channel", "period_s"):
+            if getattr(joint.bus, key) != getattr(first, key):
+                raise UsageError(
+                    f"{joints[0].name}, {joint.name}: expected the same bus.{key}, "
+                    f"got {getattr(first, key)!r} and {getattr(joint.bus, key)!r}"
+                )
+    return first.moved(args.interface, args.channel)
+
+
+@contextmanager
+def _until_signal(stop: threading.Event) -> Iterator[None]:
+    """SIGINT and SIGTERM set `stop`; what they did before comes back in the end."""
+
+    def handle(_number: int, _frame: types.FrameType | None) -> None:
+        stop.set()
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _prompt() -> Iterator[None]:
+    """Answer as promptly as a drive, which has a processor of its own: before the daemon, where permitted."""
+    obtained = acquire()
+    if obtained.scheduling:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY + 1))
+    try:
+        yield
+    finally:
+        release(obtained)
+
+
+@contextmanager
+def _ending(stop: threading.Event, seconds: float | None) -> Iterator[None]:
+    """Set `stop` after so many seconds, where they are given."""
+    timer = threading.Timer(seconds or 0.0, stop.set)
+    if seconds is not None:
+        timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()

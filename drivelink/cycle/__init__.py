@@ -1,0 +1,1 @@
+"""The cycle: frames in, one sample per SYNC, estimate, out; in one thread, paced by a clock or by none."""

@@ -1,0 +1,294 @@
+"""The bus as the loop sees it: wait, take what is there, send. The seam to hardware stays `can.Bus`.
+
+python-can makes a Message of every frame, which costs more than the whole cycle. Where the bus is
+SocketCAN its socket is read directly, where it is virtual its queue; every other interface goes through
+`recv`.
+"""
+
+from __future__ import annotations
+
+import errno
+import queue
+import time
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple, Protocol
+
+import can
+
+__all__ = [
+    "MOST_FRAMES",
+    "BusLostError",
+    "BusSource",
+    "Frame",
+    "FrameSource",
+    "LostSource",
+    "PumpedSource",
+    "note_error",
+    "open_source",
+]
+
+MOST_FRAMES = 256  # taken in one go, so that a babbling node cannot hold the loop up
+
+
+_ERROR_KINDS = {  # linux/can/error.h, which python-can keeps to
+    0x001: "transmit timeout",
+    0x002: "arbitration lost",
+    0x004: "controller",
+    0x008: "protocol violation",
+    0x010: "transceiver",
+    0x020: "no acknowledgement",
+    0x040: "bus-off",
+    0x080: "bus error",
+    0x100: "restarted",
+}
+
+
+class Frame(NamedTuple):
+    """One frame: identifier, bytes, UNIX time in ns."""
+
+    cob_id: int
+    data: bytes
+    stamp_ns: int
+
+
+class BusLostError(Exception):
+    """The interface is gone or down."""
+
+
+class FrameSource(Protocol):
+    """What the loop needs of a bus.
+
+    Attributes:
+        lost_sends: frames that could not be sent because the transmit queue was full.
+        errors: error frames, by kind.
+    """
+
+    lost_sends: int
+    errors: dict[str, int]
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait for a frame; whether there is one."""
+
+    def take(self) -> list[Frame]:
+        """What has been received, in order; data frames with 11-bit identifiers only."""
+
+    def send(self, cob_id: int, data: bytes) -> None:
+        """Put a frame on the bus; a full transmit queue is counted, not raised."""
+
+    def narrow(self, cob_ids: Iterable[int]) -> None:
+        """Receive these identifiers only, where the kernel can tell them apart."""
+
+
+def open_source(bus: can.BusABC, devices: Callable[[], object] | None = None) -> FrameSource:
+    """The quickest way to read this bus; with devices that live in this thread, the way to run them too."""
+    if devices is not None:
+        return PumpedSource(bus, devices) if type(bus).__name__ == "VirtualBus" else PumpedBus(bus, devices)
+    if type(bus).__name__ == "SocketcanBus":
+        from drivelink.cycle.socketcan import SocketCanSource
+
+        return SocketCanSource(bus)
+    if type(bus).__name__ == "SocketCanDaemonBus":
+        from drivelink.cycle.socketcand import SocketcandSource
+
+        return SocketcandSource(bus)
+    if type(bus).__name__ == "VirtualBus":
+        return VirtualSource(bus)
+    return BusSource(bus)
+
+
+def note_error(errors: dict[str, int], can_id: int, data: bytes) -> None:
+    """Count an error frame by its kinds, which are bits of its identifier."""
+    kinds = [kind for bit, kind in _ERROR_KINDS.items() if can_id & bit] or ["other"]
+    if can_id & 0x004 and data[1:2] and data[1] & 0x01:
+        kinds.append("receive overflow")
+    for kind in kinds:
+        errors[kind] = errors.get(kind, 0) + 1
+
+
+class BusSource:
+    """Any python-can interface, by `recv` and `send`."""
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self._bus = bus
+        self._waiting: list[can.Message] = []
+        self.lost_sends = 0
+        self.errors: dict[str, int] = {}
+
+    def wait(self, timeout_s: float) -> bool:
+        """See FrameSource."""
+        if self._waiting:
+            return True
+        message = self._receive(timeout_s)
+        if message is None:
+            return False
+        self._waiting.append(message)
+        return True
+
+    def take(self) -> list[Frame]:
+        """See FrameSource."""
+        messages, self._waiting = self._waiting, []
+        while len(messages) < MOST_FRAMES and (message := self._receive(0.0)) is not None:
+            messages.append(message)
+        return self._frames(messages)
+
+    def send(self, cob_id: int, data: bytes) -> None:
+        """See FrameSource."""
+        try:
+            self._bus.send(
+                can.Message(timestamp=time.time(), arbitration_id=cob_id, data=data, is_extended_id=False)
+            )
+        except can.CanError as error:
+            if not _is_full(error):
+                raise BusLostError(str(error)) from error
+            self.lost_sends += 1
+        except OSError as error:
+            raise BusLostError(str(error)) from error
+
+    def narrow(self, cob_ids: Iterable[int]) -> None:
+        """Nothing to gain: python-can filters after it has received."""
+
+    def _frames(self, messages: list[can.Message]) -> list[Frame]:
+        frames = []
+        for message in messages:
+            if message.is_error_frame:
+                note_error(self.errors, message.arbitration_id, bytes(message.data))
+            elif not (message.is_extended_id or message.is_remote_frame):
+                stamp_ns = int(message.timestamp * 1e9) or time.time_ns()
+                frames.append(Frame(message.arbitration_id, bytes(message.data), stamp_ns))
+        return frames
+
+    def _receive(self, timeout_s: float) -> can.Message | None:
+        try:
+            return self._bus.recv(timeout_s)
+        except (can.CanError, OSError) as error:
+            raise BusLostError(str(error)) from error
+
+
+def _is_full(error: can.CanError) -> bool:
+    return getattr(error, "error_code", None) == errno.ENOBUFS or "buffer full" in str(error).lower()
+
+
+class VirtualSource(BusSource):
+    """python-can's virtual bus, by its queue."""
+
+    def __init__(self, bus: Any) -> None:
+        super().__init__(bus)
+        self._queue: queue.Queue[can.Message] = bus.queue
+        # The virtual bus has no other way to tell.
+        self._is_open: Callable[[], bool] = lambda: bool(bus._open)
+        self._channel: list[queue.Queue[can.Message]] = bus.channel  # of all buses on it
+        self._channel_id = bus.channel_id
+        self._pending = bus.queue.queue  # the deque inside: its popleft is atomic, and needs no lock
+
+    def wait(self, timeout_s: float) -> bool:
+        """See FrameSource."""
+        self._check()
+        if self._pending or self._waiting:
+            return True
+        if timeout_s <= 0:
+            return False
+        try:
+            self._waiting.append(self._queue.get(timeout=timeout_s))
+        except queue.Empty:
+            return False
+        return True
+
+    def take(self) -> list[Frame]:
+        """See FrameSource."""
+        if not (self._pending or self._waiting):
+            self._check()
+            return []
+        messages, self._waiting = self._waiting, []
+        while self._pending and len(messages) < MOST_FRAMES:
+            messages.append(self._pending.popleft())
+        return self._frames(messages)
+
+    def send(self, cob_id: int, data: bytes) -> None:
+        """Give every other bus of the channel a message of its own: python-can deep-copies."""
+        self._check()
+        stamp_s = time.time()
+        for receiver in self._channel:
+            if receiver is not self._queue:
+                receiver.put(
+                    can.Message(
+                        timestamp=stamp_s,
+                        arbitration_id=cob_id,
+                        data=data,
+                        channel=self._channel_id,
+                        is_extended_id=False,
+                    )
+                )
+
+    def _check(self) -> None:
+        if not self._is_open():
+            raise BusLostError("the virtual bus is closed")
+
+
+class PumpedSource(VirtualSource):
+    """The virtual bus with simulated devices that live in this thread, and answer as soon as they are asked.
+
+    Args:
+        bus: the virtual bus.
+        devices: lets them handle what has been sent, and whatever is due.
+    """
+
+    def __init__(self, bus: Any, devices: Callable[[], object]) -> None:
+        super().__init__(bus)
+        self._devices = devices
+
+    def take(self) -> list[Frame]:
+        """See FrameSource."""
+        if not self._pending:
+            self._devices()
+        return super().take()
+
+    def send(self, cob_id: int, data: bytes) -> None:
+        """See FrameSource."""
+        super().send(cob_id, data)
+        self._devices()
+
+
+class PumpedBus(BusSource):
+    """As `PumpedSource`, on a bus that delivers as promptly but by other means: vcan.
+
+    Args:
+        bus: any python-can bus.
+        devices: see `PumpedSource`.
+    """
+
+    def __init__(self, bus: can.BusABC, devices: Callable[[], object]) -> None:
+        super().__init__(bus)
+        self._devices = devices
+
+    def take(self) -> list[Frame]:
+        """See FrameSource."""
+        self._devices()
+        return super().take()
+
+    def send(self, cob_id: int, data: bytes) -> None:
+        """See FrameSource."""
+        super().send(cob_id, data)
+        self._devices()
+
+
+class LostSource:
+    """Stands in for a bus that is lost: nothing comes, nothing goes."""
+
+    def __init__(self) -> None:
+        self.lost_sends = 0
+        self.errors: dict[str, int] = {}
+
+    def wait(self, timeout_s: float) -> bool:
+        """See FrameSource."""
+        time.sleep(max(timeout_s, 0.0))
+        return False
+
+    def take(self) -> list[Frame]:
+        """See FrameSource."""
+        return []
+
+    def send(self, cob_id: int, data: bytes) -> None:
+        """Nothing."""
+
+    def narrow(self, cob_ids: Iterable[int]) -> None:
+        """Nothing."""

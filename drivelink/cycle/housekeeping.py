@@ -1,0 +1,75 @@
+"""What has to be done now and then, done in the slack of the cycle: one short task at a time.
+
+A task that is too long for one cycle is a generator: each `yield` leaves the rest to the next slack.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+
+__all__ = ["Housekeeping"]
+
+Task = Callable[[], object]
+
+_ENOUGH_NS = 250_000  # a task, or a part of one, takes less than this
+_PATIENCE_NS = 1_000_000_000  # a task that has waited so long is done even where there is no slack
+
+
+class _Periodic:
+    __slots__ = ("action", "due_ns", "period_ns")
+
+    def __init__(self, period_s: float, action: Task, due_ns: int) -> None:
+        self.period_ns = round(period_s * 1e9)
+        self.action = action
+        self.due_ns = due_ns
+
+
+class Housekeeping:
+    """Periodic tasks, of which the loop runs one at a time when there is time for it.
+
+    Attributes:
+        urgent: called in every cycle that has slack; for what must go on step by step.
+    """
+
+    def __init__(self) -> None:
+        self._tasks: list[_Periodic] = []
+        self._next_ns = 0
+        self._parts: Generator[None] | None = None
+        self.urgent: list[Callable[[int], None]] = []
+
+    def every(self, period_s: float, action: Task) -> None:
+        """Have `action` called every so often; it, or each part of it, must be done in less than 0.2 ms."""
+        self._tasks.append(_Periodic(period_s, action, self._next_ns))
+
+    def run(self, now_ns: int, slack_ns: int) -> None:
+        """Run what is due, as far as `slack_ns` of monotonic time allows."""
+        if slack_ns >= _ENOUGH_NS:
+            for step in self.urgent:
+                step(now_ns)
+            if self._parts is not None:
+                self._go_on(self._parts)
+                return
+        if now_ns < self._next_ns:
+            return
+        task = min(self._tasks, key=lambda task: task.due_ns, default=None)
+        if task is None:
+            return
+        if slack_ns >= _ENOUGH_NS or now_ns - task.due_ns > _PATIENCE_NS > task.due_ns - now_ns:
+            task.due_ns = max(task.due_ns + task.period_ns, now_ns)
+            self._finish()
+            parts = task.action()
+            if isinstance(parts, Generator):
+                self._parts = parts
+                self._go_on(parts)
+        self._next_ns = min(task.due_ns for task in self._tasks)
+
+    def _go_on(self, parts: Generator[None]) -> None:
+        try:
+            next(parts)
+        except StopIteration:
+            self._parts = None
+
+    def _finish(self) -> None:
+        """Where there was no slack for so long that another task cannot wait any more."""
+        while self._parts is not None:
+            self._go_on(self._parts)

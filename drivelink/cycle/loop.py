@@ -1,0 +1,297 @@
+"""The cycle's work: SYNC, frames, estimate, publication, for all joints of one bus.
+
+`tick` and `receive` are all there is to a cycle. `drivelink.cycle.pacing` calls them by the clock or by the
+SYNC of another master; `run_lockstep` calls them with no clock at all.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Protocol
+
+from drivelink.cycle.acquisition import SYNC_COB_ID
+from drivelink.cycle.chain import Chain
+from drivelink.cycle.framesource import BusLostError, Frame, FrameSource, LostSource
+from drivelink.cycle.housekeeping import Housekeeping
+from drivelink.cycle.syncclock import SyncClock
+from drivelink.daemon.status import Meter
+from estimator.sample import Estimate, Sample
+
+__all__ = ["CycleLoop", "Lane", "Sink"]
+
+Listener = Callable[[int, bytes], None]
+
+_CLOCK_STEP_NS = 20_000_000  # NTP slews by less between two looks; more than that is a clock that was set
+
+
+class Sink(Protocol):
+    """Where estimates and samples go."""
+
+    def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
+        """Publish an estimate."""
+
+    def put_sample(self, sample: Sample, stamp_ns: int) -> None:
+        """Publish a sample."""
+
+
+class Lane:
+    """One joint in the loop.
+
+    Attributes:
+        name: of the joint.
+        chain: from its frames to its estimates.
+        sink: where they go; None: nowhere.
+        estimates: published from fresh samples.
+        stale: cycles without a sample.
+        work: from the last frame in hand to the estimate published.
+        response: from SYNC to the last frame in hand.
+    """
+
+    __slots__ = ("chain", "estimates", "name", "response", "sink", "stale", "work")
+
+    def __init__(self, name: str, chain: Chain, sink: Sink | None) -> None:
+        self.name = name
+        self.chain = chain
+        self.sink = sink
+        self.estimates = 0
+        self.stale = 0
+        self.work = Meter()
+        self.response = Meter()
+
+
+class CycleLoop:
+    """The one thread's work for all joints of one bus.
+
+    Args:
+        source: the bus.
+        lanes: the joints.
+        period_s: communication cycle.
+        produce: make SYNC; else follow it.
+        counter_overflow: 0x1019; 0: SYNC carries no counter.
+        world_steps: SYNC is all that moves the (simulated) world on; so a SYNC left out is no gap.
+
+    Attributes:
+        produce: as given.
+        world_steps: as given.
+        period_ns: the communication cycle.
+        stopped: `stop` was called.
+        sync_ns: monotonic time of the present SYNC.
+        received_ns: monotonic time of the last reception.
+        unix_ns: UNIX time less monotonic time.
+        source: the bus; replaced when it is lost and reopened.
+        housekeeping: what is done in the slack.
+        listeners: by identifier, who else wants a frame: SDO, heartbeat, EMCY.
+        clock: what supervision goes by, ns.
+        on_lost: told when the bus is lost.
+        cycles: SYNCs since the start.
+        overruns: periods left out because this process was late.
+        foreign_syncs: SYNCs of another master while we make it, or that were not due.
+        counter_jumps: SYNCs whose counter did not follow the one before.
+        clock_step_ns: by how much the system's clock was last set.
+        clock_steps: how often that happened.
+        silent: following, and there is no SYNC.
+        lateness: of SYNC against its deadline; when following, of one SYNC against the one before.
+    """
+
+    def __init__(
+        self,
+        source: FrameSource,
+        lanes: Sequence[Lane],
+        *,
+        period_s: float,
+        produce: bool = True,
+        counter_overflow: int = 0,
+        world_steps: bool = False,
+    ) -> None:
+        self.world_steps = world_steps
+        self.source = source
+        self.lanes = tuple(lanes)
+        self.housekeeping = Housekeeping()
+        self.listeners: dict[int, Listener] = {}
+        self.clock: Callable[[], int] = time.monotonic_ns
+        self.on_lost: Callable[[str], None] = lambda _reason: None
+        self.cycles = self.overruns = self.foreign_syncs = self.counter_jumps = 0
+        self.clock_step_ns = self.clock_steps = 0
+        self.silent = False
+        self.lateness = Meter()
+        self.produce = produce
+        self.period_ns = round(period_s * 1e9)
+        self._sync_clock = SyncClock(period_s)
+        self._overflow = counter_overflow
+        self._counter = 0
+        self._chains = [lane.chain for lane in self.lanes]
+        self._lanes_of: dict[int, list[Lane]] = {}
+        self.reroute()
+        self.unix_ns = time.time_ns() - time.monotonic_ns()
+        self._stamp_ns = self._before_ns = 0
+        self.sync_ns = self.received_ns = time.monotonic_ns()
+        self.stopped = False
+
+    @property
+    def complete(self) -> bool:
+        """Whether every joint has its sample of this cycle."""
+        return all([chain.assembler.complete for chain in self._chains])  # noqa: C419 - twice as fast
+
+    def reroute(self) -> None:
+        """Learn again which joint wants which frame."""
+        self._lanes_of.clear()
+        for lane in self.lanes:
+            for cob_id in lane.chain.assembler.cob_ids:
+                self._lanes_of.setdefault(cob_id, []).append(lane)
+
+    def receive_ids(self) -> set[int]:
+        """Identifiers that anybody here wants."""
+        return {SYNC_COB_ID, *self._lanes_of, *self.listeners}
+
+    def send(self, cob_id: int, data: bytes) -> None:
+        """Put a frame on the bus that is not SYNC; the joints see it, as they would in a log."""
+        try:
+            self.source.send(cob_id, data)
+        except BusLostError as error:
+            self._lose(error)
+        for lane in self._lanes_of.get(cob_id, ()):
+            lane.chain.feed(cob_id, data)
+
+    def stop(self) -> None:
+        """Have the pacing end after the present cycle; from any thread or signal handler."""
+        self.stopped = True
+
+    def run_lockstep(self, cycles: int, start_ns: int = 0) -> None:
+        """So many cycles without waiting for anything: for devices that answer within `send`.
+
+        Supervision and housekeeping go by the stamps instead of the clock.
+
+        Args:
+            cycles: how many.
+            start_ns: stamp of the first SYNC; the others follow by periods.
+        """
+        for stamp_ns in self.stamps(cycles, start_ns):
+            self.clock = partial(int, stamp_ns)
+            self.tick(stamp_ns)
+            self.receive()
+            self.housekeeping.run(stamp_ns, self.period_ns)
+
+    def stamps(self, cycles: int, start_ns: int) -> range:
+        """The stamps of so many SYNCs on time."""
+        return range(start_ns, start_ns + cycles * self.period_ns, self.period_ns)
+
+    def tick(self, stamp_ns: int, jump: int = 1) -> None:
+        """Make SYNC. What was received before it belongs to the cycle that ends here.
+
+        Args:
+            stamp_ns: UNIX time of this SYNC.
+            jump: periods since the one before.
+        """
+        try:
+            frames = self.source.take()
+            self.source.send(SYNC_COB_ID, self._next_counter())
+        except BusLostError as error:
+            frames = []
+            self._lose(error)
+        now = self.sync_ns = time.monotonic_ns()
+        if frames:
+            self._dispatch(frames, now)
+        self._sync(b"", stamp_ns, jump, now)
+
+    def receive(self) -> None:
+        """Take what is there, and do what follows from it."""
+        try:
+            frames = self.source.take()
+        except BusLostError as error:
+            self._lose(error)
+            return
+        if frames:
+            self.received_ns = time.monotonic_ns()
+            self._dispatch(frames, self.received_ns)
+
+    def refresh_unix_time(self) -> None:
+        """Follow the system's clock with the stamps, between two cycles."""
+        before, self.unix_ns = self.unix_ns, time.time_ns() - time.monotonic_ns()
+        if abs(self.unix_ns - before) > _CLOCK_STEP_NS:
+            self.clock_step_ns = self.unix_ns - before
+            self.clock_steps += 1
+
+    def _next_counter(self) -> bytes:
+        if not self._overflow:
+            return b""
+        self._counter = self._counter % self._overflow + 1
+        return bytes((self._counter,))
+
+    def _dispatch(self, frames: list[Frame], now_ns: int) -> None:
+        lanes_of, listeners = self._lanes_of, self.listeners
+        for cob_id, data, stamp_ns in frames:
+            if cob_id == SYNC_COB_ID:
+                self._foreign_sync(data, stamp_ns, now_ns)
+                continue
+            for lane in lanes_of.get(cob_id, ()):
+                estimate = lane.chain.feed(cob_id, data)
+                if estimate is not None:
+                    self._publish(lane, estimate, now_ns)
+                    lane.response.add(now_ns - self.sync_ns)
+            if cob_id in listeners:
+                listeners[cob_id](cob_id, data)
+
+    def _foreign_sync(self, data: bytes, stamp_ns: int, now_ns: int) -> None:
+        if self.produce:
+            self.foreign_syncs += 1
+            self._sync(data, 0, 0, now_ns)
+            return
+        jump = self._sync_clock.jump(stamp_ns, now_ns)
+        if jump == 0:
+            self.foreign_syncs += 1
+        else:
+            self.lateness.add(abs(now_ns - self.sync_ns - jump * self.period_ns) if self.cycles else 0)
+            self.sync_ns = now_ns
+        if len(data) == 1:
+            expected = self._counter % self._overflow + 1 if self._overflow else data[0]
+            self.counter_jumps += data[0] != expected and self.cycles > 0
+            self._counter = data[0]
+        self._sync(data, stamp_ns, jump, now_ns)
+
+    def _sync(self, data: bytes, stamp_ns: int, jump: int, now_ns: int) -> None:
+        if jump:
+            self.cycles += 1
+            self._before_ns, self._stamp_ns = self._stamp_ns, stamp_ns
+            self.silent = False
+        for lane in self.lanes:
+            estimate = lane.chain.feed(SYNC_COB_ID, data, jump)
+            if estimate is not None:
+                self._publish(lane, estimate, now_ns)
+
+    def _publish(self, lane: Lane, estimate: Estimate, since_ns: int) -> None:
+        chain, sink = lane.chain, lane.sink
+        current = estimate.sequence == chain.assembler.sequence
+        stamp_ns = self._stamp_ns if current else self._before_ns
+        sample = chain.sample
+        if sample is None:
+            lane.stale += 1
+        else:
+            lane.estimates += 1
+        if sink is not None:
+            sink.put_estimate(estimate, stamp_ns)
+            if sample is not None:
+                sink.put_sample(sample, stamp_ns)
+        if current:
+            lane.work.add(time.monotonic_ns() - since_ns)
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait for frames and receive them; a bus that is lost ends the wait."""
+        try:
+            if self.source.wait(timeout_s):
+                self.receive()
+        except BusLostError as error:
+            self._lose(error)
+
+    def _lose(self, error: BusLostError) -> None:
+        self.source = LostSource()
+        self.on_lost(str(error))
+
+    def carry_on(self) -> None:
+        """No SYNC for a while: say that what was last published is not fresh."""
+        self.silent = True
+        for lane in self.lanes:
+            estimate = lane.chain.carry_on(lane.chain.assembler.sequence)
+            if estimate is not None:
+                self._publish(lane, estimate, time.monotonic_ns())

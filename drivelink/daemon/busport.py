@@ -1,0 +1,108 @@
+"""The bus of a daemon: the one way of sending on it, and what keeps it open."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+import can
+
+from drivelink.canopen.bus import open_bus
+from drivelink.cycle.framesource import LostSource, open_source
+from drivelink.daemon.status import EventLog
+from drivelink.errors import BusError
+from drivelink.jointfile import BusSection
+
+if TYPE_CHECKING:
+    from drivelink.cycle.loop import CycleLoop
+
+__all__ = ["BusKeeper", "BusPort"]
+
+_REOPEN_S = 0.5
+
+
+class BusPort:
+    """The bus for whoever sends python-can messages: directly before the loop runs, by the loop afterwards.
+
+    Attributes:
+        bus: as it is open now.
+        loop: the one reader, once it runs.
+    """
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self.bus = bus
+        self.loop: CycleLoop | None = None
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Put a frame on the bus."""
+        if self.loop is None:
+            self.bus.send(msg, timeout)
+        else:
+            self.loop.send(msg.arbitration_id, bytes(msg.data))
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """The next frame; only before the loop runs, which then is the one reader."""
+        return self.bus.recv(timeout)
+
+
+class BusKeeper:
+    """Opens a lost bus again, in a thread since that may take a while, and gives it to the loop.
+
+    Args:
+        port: whose bus it is.
+        section: how to open it.
+        events: where loss and return are said.
+        devices: simulated devices in the loop's thread, or None.
+    """
+
+    def __init__(
+        self, port: BusPort, section: BusSection, events: EventLog, devices: Callable[[], object] | None
+    ) -> None:
+        self._port = port
+        self._section = section
+        self._events = events
+        self._devices = devices
+        self._opening: threading.Thread | None = None
+        self._opened: can.BusABC | None = None
+
+    def lost(self, reason: str) -> None:
+        """The loop has lost the bus."""
+        self._events.begin("bus", f"{self._section.channel}: the bus is lost: {reason}", logging.ERROR)
+
+    def check(self) -> bool:
+        """In the slack: get a lost bus back; whether it has just come back."""
+        loop = self._port.loop
+        if loop is None or not isinstance(loop.source, LostSource):
+            return False
+        if self._opened is None:
+            if self._opening is None or not self._opening.is_alive():
+                self._opening = threading.Thread(target=self._reopen, name="reopen", daemon=True)
+                self._opening.start()
+            return False
+        bus, self._opened = self._opened, None
+        self._port.bus = bus
+        loop.source = open_source(bus, self._devices)
+        loop.source.narrow(loop.receive_ids())
+        self._events.end("bus", f"{self._section.channel}: the bus is back")
+        return True
+
+    def _reopen(self) -> None:
+        with suppress(can.CanError, OSError):
+            self._port.bus.shutdown()
+        with suppress(BusError):
+            self._opened = open_bus(self._section)
+        if self._opened is None:
+            time.sleep(_REOPEN_S)
+
+    def close(self) -> None:
+        """Shut the bus."""
+        if self._opening is not None:
+            self._opening.join(timeout=2 * _REOPEN_S)
+        for bus in (self._port.bus, self._opened):
+            if bus is not None:
+                with suppress(can.CanError, OSError):
+                    bus.shutdown()

@@ -1,0 +1,166 @@
+"""Joining the bus: configure the nodes or learn how they are configured, and see that it comes to life."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+
+import can
+
+from drivelink.canopen.configure import Configurator, configure_joints
+from drivelink.canopen.layout import NodeLayout
+from drivelink.canopen.passive import PassiveConfigurator
+from drivelink.canopen.roles import roles
+from drivelink.daemon.busport import BusPort
+from drivelink.errors import BusError, DriveError
+from drivelink.jointfile import JointFile
+
+__all__ = ["Joined", "join_bus"]
+
+Joined = tuple[Configurator | PassiveConfigurator, tuple[tuple[NodeLayout, ...], ...]]
+Idle = Callable[[], object]
+
+SYNC_COB_ID = 0x080
+_PATIENCE_S = 5.0  # for another master's SYNC, and for the frames that answer it
+_LISTEN_S = 0.05  # for a SYNC that should not be there; at least three periods
+_POLL_S = 0.01
+
+
+def join_bus(
+    port: BusPort,
+    joints: Sequence[JointFile],
+    folders: Sequence[Path],
+    *,
+    idle: Idle | None = None,
+    patience_s: float = _PATIENCE_S,
+) -> Joined:
+    """Get the layouts of all nodes, by configuring them or by listening.
+
+    Args:
+        port: the bus, read by nobody else meanwhile.
+        joints: joint files whose bus sections agree.
+        folders: of the joint files.
+        idle: called between receptions.
+        patience_s: for what others have to do.
+
+    Raises:
+        BusError: no SYNC where there should be one, one where there should be none, or the bus fails.
+        DriveError: a node is absent, refuses, or its mapping is not known.
+    """
+    section = joints[0].bus
+    if section.configure:
+        configurator, layouts = configure_joints(port, joints, folders, idle=idle)
+        if section.sync == "follow":
+            _await(port, _Expected(section.channel, ()), idle, patience_s)
+        return configurator, layouts
+    passive = PassiveConfigurator(joints, folders)
+    if section.sync == "produce":
+        _refuse_sync(port, section.period_s, section.channel, idle)
+    _learn(port, passive, idle, patience_s)
+    if section.sync == "follow":
+        _await(port, _Expected(section.channel, passive.layouts.values()), idle, patience_s, passive)
+    by_joint = tuple(
+        tuple(passive.layouts[role.node_id] for role in roles(joint, folder))
+        for joint, folder in zip(joints, folders, strict=True)
+    )
+    return passive, by_joint
+
+
+def _frames(port: BusPort, idle: Idle | None, seconds: float) -> Iterator[tuple[int, bytes]]:
+    """Data frames with 11-bit identifiers, for so long; and now and then (-1, b"") when nothing comes."""
+    end_s = time.monotonic() + seconds
+    while (left_s := end_s - time.monotonic()) > 0:
+        if idle is not None:
+            idle()
+        try:
+            message = port.recv(min(left_s, _POLL_S))
+        except (can.CanError, OSError) as error:
+            raise BusError(f"the bus cannot be read: {error}") from error
+        if message is None:
+            yield -1, b""
+        elif not (message.is_extended_id or message.is_error_frame or message.is_remote_frame):
+            yield message.arbitration_id, bytes(message.data)
+
+
+def _refuse_sync(port: BusPort, period_s: float, channel: str, idle: Idle | None) -> None:
+    syncs = sum(cob_id == SYNC_COB_ID for cob_id, _ in _frames(port, idle, max(_LISTEN_S, 3 * period_s)))
+    if syncs > 1:
+        raise BusError(f'another master already makes SYNC on {channel}: set bus.sync = "follow", or stop it')
+
+
+def _learn(port: BusPort, passive: PassiveConfigurator, idle: Idle | None, patience_s: float) -> None:
+    """Listen until the mapping of every node is known."""
+    if not passive.busy:
+        return
+    for cob_id, data in _frames(port, idle, patience_s):
+        _overhear(passive, cob_id, data)
+        if not passive.busy:
+            return
+    raise next(iter(passive.missing.values()))
+
+
+def _overhear(passive: PassiveConfigurator, cob_id: int, data: bytes) -> bool:
+    """Take a frame; whether the layout of a node has changed by it."""
+    now_s = time.monotonic()
+    if cob_id > 0:
+        passive.feed(cob_id, data, now_s)
+    return bool(passive.poll(now_s))
+
+
+class _Expected:
+    """What must be heard before the loop may run: SYNC, and the frames of every node that answers it."""
+
+    def __init__(self, channel: str, layouts: Iterable[NodeLayout], synced: bool = False) -> None:
+        self.channel = channel
+        self.synced = synced
+        self._frames = {
+            tpdo.cob_id: (layout.node_id, tpdo.length)
+            for layout in layouts
+            for tpdo in layout.tpdos
+            if 1 <= tpdo.transmission_type <= 240
+        }
+
+    @property
+    def met(self) -> bool:
+        return self.synced and not self._frames
+
+    def take(self, cob_id: int, data: bytes) -> None:
+        if cob_id == SYNC_COB_ID:
+            self.synced = True
+        elif cob_id in self._frames and self.synced:
+            node, length = self._frames.pop(cob_id)
+            if len(data) < length:
+                raise DriveError(
+                    f"node {node}: frame 0x{cob_id:03X} has {len(data)} bytes, expected {length}: "
+                    "its mapping is not what the joint file says"
+                )
+
+    def failure(self, patience_s: float) -> BusError | DriveError:
+        if not self.synced:
+            return BusError(
+                f'no SYNC on {self.channel} in {patience_s:g} s: with bus.sync = "follow" another master '
+                'must make it; set bus.sync = "produce" if there is none'
+            )
+        cob_id, (node, _) = next(iter(self._frames.items()))
+        return DriveError(
+            f"node {node}: no frame 0x{cob_id:03X} in {patience_s:g} s of SYNC: "
+            "is it powered, operational, and does it send this PDO on SYNC?"
+        )
+
+
+def _await(
+    port: BusPort,
+    expected: _Expected,
+    idle: Idle | None,
+    patience_s: float,
+    passive: PassiveConfigurator | None = None,
+) -> None:
+    """Listen until everything expected has been heard; a mapping that changes meanwhile is learnt."""
+    for cob_id, data in _frames(port, idle, patience_s):
+        if passive is not None and _overhear(passive, cob_id, data):
+            expected = _Expected(expected.channel, passive.layouts.values(), expected.synced)
+        expected.take(cob_id, data)
+        if expected.met:
+            return
+    raise expected.failure(patience_s)

@@ -1,0 +1,183 @@
+"""The document of the status key: one joint of a running daemon, a few times a second."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Generator
+from typing import Any
+
+from drivelink import __version__
+from drivelink.canopen.emcy import emergency_text
+from drivelink.cycle.framesource import LostSource
+from drivelink.cycle.loop import CycleLoop, Lane
+from drivelink.cycle.realtime import RealTime
+from drivelink.daemon.status import EventLog
+from drivelink.daemon.supervision import Supervisor
+from drivelink.jointfile import JointFile
+from estimator.sample import Status
+
+__all__ = ["JointStatus"]
+
+_TIMING_EVERY = 4  # documents; percentiles cost more than all the rest
+
+_BITS = (
+    ("observable", int(Status.OBSERVABLE)),
+    ("gap", int(Status.GAP)),
+    ("changed", int(Status.CHANGED)),
+    ("model_alarm", int(Status.MODEL_ALARM)),
+    ("input_rejected", int(Status.INPUT_REJECTED)),
+    ("restarted", int(Status.RESTARTED)),
+    ("drive_fault", int(Status.DRIVE_FAULT)),
+    ("bus_fault", int(Status.BUS_FAULT)),
+    ("stale", int(Status.STALE)),
+)
+
+
+class JointStatus:
+    """Makes the status documents of one joint.
+
+    Args:
+        joint: its joint file.
+        loop: the cycle it runs in.
+        lane: its place in it.
+        supervisor: knows its nodes.
+        events: what has happened.
+        bus_load: fraction of the bit rate that the configured frames take.
+    """
+
+    def __init__(
+        self,
+        joint: JointFile,
+        loop: CycleLoop,
+        lane: Lane,
+        supervisor: Supervisor,
+        events: EventLog,
+        bus_load: float,
+    ) -> None:
+        self._joint = joint
+        self._loop = loop
+        self._lane = lane
+        self._supervisor = supervisor
+        self._events = events
+        self._bus_load = bus_load
+        self._started_s = time.time()
+        self._before = (time.monotonic(), 0, time.process_time())
+        self._asked = 0
+        self._timing: dict[str, Any] = {"latency": {}, "response": {}, "jitter": {}}
+        self.real_time: RealTime | None = None
+
+    def refresh_timing(self) -> Generator[None]:
+        """Draw the percentiles anew, where it is time to; one part of the work at a time."""
+        self._asked += 1
+        if self._asked % _TIMING_EVERY == 1:
+            for name, meter in (
+                ("latency", self._lane.work),
+                ("response", self._lane.response),
+                ("jitter", self._loop.lateness),
+            ):
+                self._timing[name] = meter.recent()
+                yield
+
+    def document(self, state: str = "") -> dict[str, Any]:
+        """The state of the joint now.
+
+        Args:
+            state: "starting" or "stopped"; left out: as it is found.
+        """
+        loop, lane, events = self._loop, self._lane, self._events
+        now, unix_s = time.monotonic(), time.time()
+        before_s, before_estimates, before_cpu_s = self._before
+        cpu_s, elapsed_s = time.process_time(), max(now - before_s, 1e-9)
+        self._before = (now, lane.estimates, cpu_s)
+        return {
+            "schema": "drivelink.status/1",
+            "joint": lane.name,
+            "state": state or self._state(),
+            "time": unix_s,
+            "uptime_s": round(unix_s - self._started_s, 3),
+            "version": __version__,
+            "pid": os.getpid(),
+            "period_s": self._joint.bus.period_s,
+            "rate_hz": round((lane.estimates - before_estimates) / elapsed_s, 1),
+            "cycles": loop.cycles,
+            "estimates": lane.estimates,
+            "missed_cycles": lane.chain.missed + loop.overruns,
+            "overruns": loop.overruns,
+            "cpu_fraction": round((cpu_s - before_cpu_s) / elapsed_s, 4),
+            **self._timing,
+            "real_time": self._real_time(),
+            "bus": self._bus(),
+            "nodes": self._supervisor.node_status(lane),
+            "drive_faults": self._faults(),
+            "quality": self._quality(),
+            "transmissions": lane.chain.estimator.parameters(),
+            "residual_nm": lane.chain.estimator.residual_nm,
+            "residual_alarm": self._alarm(),
+            "conditions": sorted(events.active.values()),
+            "events": events.recent(),
+        }
+
+    def _state(self) -> str:
+        loop, lane = self._loop, self._lane
+        estimate = lane.chain.estimate
+        if isinstance(loop.source, LostSource):
+            return "bus lost"
+        if loop.silent:
+            return "no SYNC"
+        if estimate is None:
+            return "waiting for samples" if loop.cycles else "starting"
+        if estimate.status & Status.STALE:
+            return "stale"
+        return "running"
+
+    def _bus(self) -> dict[str, Any]:
+        section, source = self._joint.bus, self._loop.source
+        return {
+            "interface": section.interface,
+            "channel": section.channel,
+            "sync": section.sync,
+            "load": round(self._bus_load, 4),
+            "lost_sends": source.lost_sends,
+            "errors": dict(source.errors),
+            "foreign_syncs": self._loop.foreign_syncs,
+            "sync_counter_jumps": self._loop.counter_jumps,
+        }
+
+    def _faults(self) -> list[str]:
+        return [
+            f"node {node}: EMCY 0x{code:04X} ({emergency_text(code)})" if code else f"node {node}: fault"
+            for node, code in self._lane.chain.assembler.faults.items()
+        ]
+
+    def _quality(self) -> dict[str, bool]:
+        estimate = self._lane.chain.estimate
+        status = int(estimate.status) if estimate is not None else 0
+        return {"valid": bool(status & 1), **{name: bool(status & bit) for name, bit in _BITS}}
+
+    def _alarm(self) -> dict[str, Any]:
+        watch = self._lane.chain.watch
+        estimate = self._lane.chain.estimate
+        active = estimate is not None and bool(estimate.status & Status.MODEL_ALARM)
+        return {"active": active, **(watch.describe() if watch is not None else {})}
+
+    def _real_time(self) -> dict[str, bool]:
+        obtained = self.real_time
+        return {
+            "scheduling": obtained is not None and obtained.scheduling,
+            "memory": obtained is not None and obtained.memory,
+        }
+
+    def summary(self) -> str:
+        """The run in one line."""
+        lane, loop = self._lane, self._loop
+        work, jitter = lane.work.total(), loop.lateness.total()
+        text = f"{lane.name}: {loop.cycles} cycles, {lane.estimates} estimates, "
+        text += f"{lane.chain.missed + loop.overruns} missed"
+        if work and jitter:
+            text += (
+                f"; a cycle's work p99 {work['p99_us']:.0f} µs, SYNC late by p99 {jitter['p99_us']:.0f} µs"
+            )
+        residual = lane.chain.estimator.residual_nm
+        return text + (f"; residual {residual:.3g} N·m" if math.isfinite(residual) else "")

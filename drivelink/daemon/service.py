@@ -1,0 +1,304 @@
+"""The daemon: one bus, its joints, their keys, from the first frame to a clean end.
+
+Everything that may take time or fail for good happens before the loop runs: opening the bus, claiming the
+names on zenoh, configuring the nodes. After that there is one thread, and nothing in it raises.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from drivelink.canopen.bus import open_bus
+from drivelink.canopen.layout import NodeLayout
+from drivelink.cycle import pacing, realtime
+from drivelink.cycle.chain import Chain, build, make_chain
+from drivelink.cycle.framesource import open_source
+from drivelink.cycle.loop import CycleLoop, Lane
+from drivelink.daemon.busport import BusKeeper, BusPort
+from drivelink.daemon.joining import join_bus
+from drivelink.daemon.jointstatus import JointStatus
+from drivelink.daemon.reload import Reloader
+from drivelink.daemon.status import EventLog
+from drivelink.daemon.supervision import Supervisor
+from drivelink.daemon.systemd_notify import notify, watchdog_period_s
+from drivelink.errors import UsageError
+from drivelink.jointfile import JointFile
+from drivelink.pubsub.publisher import JointPublisher, describe_model
+from drivelink.pubsub.session import close_session, open_session
+
+__all__ = ["Daemon", "ServedJoint", "check_agreement"]
+
+logger = logging.getLogger("drivelink")
+
+_STATUS_S = 0.25
+_CHECK_S = 0.05
+_FILE_S = 0.2
+_COLLECT_S = 5.0
+_HISTORY_S = 2.0  # of samples that a new estimator starts from
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServedJoint:
+    """A joint the daemon serves.
+
+    Attributes:
+        joint: its joint file.
+        path: where that is; None: it cannot be reloaded, and names no other files.
+    """
+
+    joint: JointFile
+    path: Path | None = None
+
+    @property
+    def folder(self) -> Path:
+        """What relative paths in it are relative to."""
+        return self.path.parent if self.path else Path()
+
+
+class Daemon:
+    """Serves the joints of one bus: made ready by the constructor, then `run`, then `close`.
+
+    Args:
+        joints: their bus sections agree.
+        publish: on zenoh; False: estimates go nowhere.
+        session: an open zenoh session to publish on; None: one of its own.
+        real_time: ask the system for real-time scheduling and locked memory when it runs.
+        devices: simulated devices that live in the daemon's thread, by their `poll`. They answer at once,
+            and SYNC is what moves their world on; for demonstrations, tests and faster than real time.
+
+    Attributes:
+        loop: the cycle.
+        events: what has happened.
+
+    Raises:
+        DrivelinkError: anything that keeps it from starting, in one line.
+    """
+
+    def __init__(
+        self,
+        joints: Sequence[ServedJoint],
+        *,
+        publish: bool = True,
+        session: zenoh.Session | None = None,
+        real_time: bool = True,
+        devices: Callable[[], object] | None = None,
+    ) -> None:
+        check_agreement(joints)
+        self._joints = tuple(joints)
+        self._section = joints[0].joint.bus
+        self._real_time = real_time
+        self._devices = devices
+        self._closing = ExitStack()
+        self._end_ns: int | None = None
+        self._lockstep_ns = time.monotonic_ns()
+        self.events = EventLog(logger)
+        try:
+            self._publishers = self._open_publishers(session) if publish else [None] * len(joints)
+            self._port = BusPort(open_bus(self._section))
+            self._keeper = BusKeeper(self._port, self._section, self.events, devices)
+            self._closing.callback(self._keeper.close)
+            self._configurator, layouts = join_bus(
+                self._port, [s.joint for s in joints], [s.folder for s in joints], idle=devices
+            )
+            keep = round(_HISTORY_S / self._section.period_s)
+            self._lanes = [
+                Lane(served.joint.name, make_chain(served.joint, mine, keep=keep), publisher)
+                for served, mine, publisher in zip(joints, layouts, self._publishers, strict=True)
+            ]
+            self.loop = self._make_loop()
+            self._supervisor = Supervisor(
+                self.loop, dict(zip(self._lanes, layouts, strict=True)), self.events, self._configurator
+            )
+            load = self._configurator.load().fraction
+            self._status = [
+                JointStatus(served.joint, self.loop, lane, self._supervisor, self.events, load)
+                for served, lane in zip(joints, self._lanes, strict=True)
+            ]
+            for served, mine, publisher in zip(joints, layouts, self._publishers, strict=True):
+                _republish(publisher, mine)(served.joint)
+            self._reloaders = self._make_reloaders(layouts)
+            self._plan_housekeeping()
+            self.loop.source.narrow(self.loop.receive_ids())
+        except BaseException:
+            self._closing.close()
+            raise
+
+    def __enter__(self) -> Daemon:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def chains(self) -> tuple[Chain, ...]:
+        """Of the joints, in their order."""
+        return tuple(lane.chain for lane in self._lanes)
+
+    @property
+    def layouts(self) -> Mapping[int, NodeLayout]:
+        """How the nodes send, by node id."""
+        return self._configurator.layouts
+
+    def run(self, seconds: float | None = None) -> None:
+        """Cycle until `stop` is called, or for so long.
+
+        Args:
+            seconds: of the wall clock; None: without end.
+        """
+        obtained = realtime.acquire(privileged=self._real_time)
+        for line in obtained.lines:
+            logger.info("%s", line)
+        for status in self._status:
+            status.real_time = obtained
+        if seconds is not None:
+            self._end_ns = time.monotonic_ns() + round(seconds * 1e9)
+        try:
+            notify("READY=1", "STATUS=running")
+            pacing.run(self.loop)
+        finally:
+            notify("STOPPING=1")
+            realtime.release(obtained)
+
+    def run_lockstep(self, cycles: int) -> None:
+        """So many cycles as fast as they go, with devices that live in this thread."""
+        self.loop.run_lockstep(cycles, self._lockstep_ns)
+        self._lockstep_ns += cycles * self.loop.period_ns
+
+    def stop(self) -> None:
+        """Make `run` return within a few cycles; from any thread or signal handler."""
+        self.loop.stop()
+
+    def reload(self) -> None:
+        """Read the joint files again, changed or not; from any thread or signal handler."""
+        for reloader in self._reloaders:
+            reloader.request()
+
+    def close(self) -> None:
+        """Say that it has stopped, and leave nothing behind; a second time does nothing."""
+        if self._closing is not None:
+            self._publish_status("stopped")
+        self._closing.close()
+        self._publishers = []
+
+    def documents(self) -> list[dict[str, Any]]:
+        """What the status key of each joint would say now."""
+        for status in self._status:
+            deque(status.refresh_timing(), maxlen=0)
+        return [status.document() for status in self._status]
+
+    def summary(self) -> str:
+        """The run, one line a joint."""
+        return "\n".join(status.summary() for status in self._status)
+
+    def _open_publishers(self, session: zenoh.Session | None) -> list[JointPublisher | None]:
+        if session is None:
+            first = self._joints[0]
+            session = open_session(first.joint.zenoh, first.folder)
+            self._closing.callback(close_session, session)
+        publishers: list[JointPublisher | None] = []
+        for served in self._joints:
+            publisher = JointPublisher(session, served.joint)
+            self._closing.callback(publisher.close)
+            publishers.append(publisher)
+        return publishers
+
+    def _make_loop(self) -> CycleLoop:
+        section = self._section
+        loop = CycleLoop(
+            open_source(self._port.bus, self._devices),
+            self._lanes,
+            period_s=section.period_s,
+            produce=section.sync == "produce",
+            counter_overflow=section.sync_counter_overflow,
+            world_steps=self._devices is not None,
+        )
+        loop.on_lost = self._keeper.lost
+        self._port.loop = loop
+        return loop
+
+    def _make_reloaders(self, layouts: Sequence[tuple[NodeLayout, ...]]) -> list[Reloader]:
+        return [
+            Reloader(served.path, served.joint, lane.chain, build, _republish(publisher, mine), self.events)
+            for served, lane, publisher, mine in zip(
+                self._joints, self._lanes, self._publishers, layouts, strict=True
+            )
+            if served.path is not None
+        ]
+
+    def _plan_housekeeping(self) -> None:
+        housekeeping = self.loop.housekeeping
+        housekeeping.urgent.append(self._supervisor.step)
+        housekeeping.every(0.01, self._check_end)
+        housekeeping.every(_CHECK_S, self._supervisor.check)
+        housekeeping.every(_CHECK_S, self._check_bus)
+        housekeeping.every(_COLLECT_S, lambda: gc.collect(0))
+        housekeeping.every(1.0, self.loop.refresh_unix_time)
+        for publisher, status in zip(self._publishers, self._status, strict=True):
+            if publisher is not None:
+                housekeeping.every(_STATUS_S, partial(_put_status, publisher, status))
+        for reloader in self._reloaders:
+            housekeeping.urgent.append(reloader.step)
+            housekeeping.every(_FILE_S, reloader.check)
+        watchdog_s = watchdog_period_s()
+        if watchdog_s is not None:
+            housekeeping.every(watchdog_s, lambda: notify("WATCHDOG=1"))
+
+    def _check_bus(self) -> None:
+        if self._keeper.check():
+            self._supervisor.reconfigure_all()
+
+    def _publish_status(self, state: str) -> None:
+        for publisher, status in zip(self._publishers, self._status, strict=False):
+            if publisher is not None:
+                publisher.put_status(status.document(state))
+
+    def _check_end(self) -> None:
+        if self._end_ns is not None and time.monotonic_ns() >= self._end_ns:
+            self.loop.stop()
+
+
+def _republish(
+    publisher: JointPublisher | None, layouts: tuple[NodeLayout, ...]
+) -> Callable[[JointFile], None]:
+    def publish(joint: JointFile) -> None:
+        if publisher is not None:
+            publisher.put_model(describe_model(joint, layouts))
+
+    return publish
+
+
+def _put_status(publisher: JointPublisher, status: JointStatus) -> Generator[None]:
+    yield from status.refresh_timing()
+    document = status.document()
+    yield
+    publisher.put_status(document)
+
+
+def check_agreement(joints: Sequence[ServedJoint]) -> None:
+    """Several joints in one daemon share one bus and one zenoh session.
+
+    Raises:
+        UsageError: two of one name, or their `bus` or `zenoh` sections differ.
+    """
+    first = joints[0]
+    names = [served.joint.name for served in joints]
+    for served in joints[1:]:
+        if names.count(served.joint.name) > 1:
+            raise UsageError(f"two joints are named {served.joint.name}: expected names of their own")
+        for section in ("bus", "zenoh"):
+            if getattr(served.joint, section) != getattr(first.joint, section):
+                raise UsageError(
+                    f"[{section}] differs between {first.joint.name} and {served.joint.name}: "
+                    "joints of one daemon share it; run one daemon for each"
+                )

@@ -1,0 +1,332 @@
+"""Watches over the nodes beside the cycle: heartbeats, EMCY, reboots, and the way back after each.
+
+A node that rebooted, fell silent or left the operational state is configured again by the Configurator,
+step by step in the slack. A passive daemon only watches. Every event is said once.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+from drivelink.canopen.configure import Configurator
+from drivelink.canopen.emcy import drive_state, parse_emergency
+from drivelink.canopen.layout import NodeLayout
+from drivelink.canopen.passive import PassiveConfigurator
+from drivelink.cycle.framesource import LostSource
+from drivelink.cycle.loop import CycleLoop, Lane
+from drivelink.cycle.nodestate import NodeCounters
+from drivelink.daemon.status import EventLog
+
+__all__ = ["Supervisor"]
+
+_NS = 1_000_000_000
+_SILENT_NS = _NS // 2  # without a PDO, until the node is configured again
+_RETRY_NS = _NS  # between two attempts
+_HEARTBEATS_LOST = 3.5  # of them missing: the node is gone
+_STATES = {0x00: "boot-up", 0x04: "stopped", 0x05: "operational", 0x7F: "pre-operational"}
+_OPERATIONAL = 0x05
+_STOPPED = 0x04
+_COUNTED = (  # counter of a node; by how much it grows at least, and what is said then; and when it rests
+    ("missing", 1, "frames are missing", "frames arrive again, {} were missing so far"),
+    (
+        "wrong_length",
+        1,
+        "frames of the wrong length are not used",
+        "frames have their length, {} had not so far",
+    ),
+    (
+        "conflicting",
+        3,  # a single one may be a frame that was late
+        "different frames in one cycle are not used: has another device its node id, or its identifiers?",
+        "one frame a cycle again, {} cycles had several so far",
+    ),
+)
+
+
+_BUNCHED = (
+    "some frames are missing, others come several in one cycle and are not used: "
+    "this machine or the bus is too slow for the cycle, or another device has its node id"
+)
+_BUNCH_NS = _NS // 5  # after a missing frame, in which several in one cycle may be late ones
+_BUNCHES_NS = _NS  # for which that goes on, until it is said
+
+
+class _Watched:
+    """What is known of one node."""
+
+    __slots__ = (
+        "attempt_ns",
+        "bunched_ns",
+        "counted",
+        "heartbeat_ns",
+        "lane",
+        "layout",
+        "received",
+        "seen_ns",
+        "started",
+        "state",
+    )
+
+    def __init__(self, layout: NodeLayout, lane: Lane, now_ns: int) -> None:
+        self.layout = layout
+        self.lane = lane
+        self.started = False  # since its last frame
+        self.begin(NodeCounters(), now_ns)
+
+    def begin(self, counters: NodeCounters, now_ns: int) -> None:
+        """Take what has been until now as it is."""
+        self.state = _OPERATIONAL
+        self.seen_ns = self.heartbeat_ns = self.attempt_ns = now_ns
+        self.bunched_ns = (
+            0  # since when frames have been missing and come several in one cycle; 0: they do not
+        )
+        self.received = counters.received
+        self.counted = {name: (getattr(counters, name), -_NS) for name, *_ in _COUNTED}
+
+
+class Supervisor:
+    """Heartbeats, faults and reconfiguration of all nodes of the loop.
+
+    Args:
+        loop: its listeners are set here.
+        layouts: of each lane's nodes.
+        events: where it is said.
+        configurator: configures nodes again, or, passive, learns that somebody else has.
+    """
+
+    def __init__(
+        self,
+        loop: CycleLoop,
+        layouts: Mapping[Lane, tuple[NodeLayout, ...]],
+        events: EventLog,
+        configurator: Configurator | PassiveConfigurator,
+    ) -> None:
+        self._loop = loop
+        self._events = events
+        self._configurator = configurator
+        self._overheard = False
+        self._foreign_syncs = self._counter_jumps = self._lost_sends = self._clock_steps = 0
+        self._bus_offs = self._restarts = 0
+        self._nodes: dict[int, _Watched] = {}
+        for lane, mine in layouts.items():
+            lane.chain.assembler.supervise()
+            for layout in mine:
+                self._nodes[layout.node_id] = _Watched(layout, lane, loop.clock())
+                loop.listeners[0x700 + layout.node_id] = self._heartbeat
+                loop.listeners[0x080 + layout.node_id] = self._emergency
+                loop.listeners[0x580 + layout.node_id] = self._answer
+                if isinstance(configurator, PassiveConfigurator):
+                    loop.listeners[0x600 + layout.node_id] = self._answer
+
+    @property
+    def receive_ids(self) -> tuple[int, ...]:
+        """Identifiers of the frames it listens to."""
+        return tuple(self._loop.listeners)
+
+    def node_status(self, lane: Lane) -> dict[str, Any]:
+        """Of the nodes of one joint, for the status key."""
+        now = self._loop.clock()
+        counters = lane.chain.assembler.counters
+        faults, statuswords = lane.chain.assembler.faults, lane.chain.assembler.statuswords
+        status: dict[str, Any] = {}
+        for node, watched in self._nodes.items():
+            if watched.lane is not lane:
+                continue
+            counted = counters[node]
+            status[str(node)] = {
+                "state": _STATES.get(watched.state, f"0x{watched.state:02X}"),
+                "heartbeat_age_s": round((now - watched.heartbeat_ns) / _NS, 3)
+                if watched.layout.heartbeat_ms
+                else None,
+                "drive_state": str(drive_state(statuswords[node])) if node in statuswords else None,
+                "fault": node in faults,
+                "emergency": f"0x{faults[node]:04X}" if faults.get(node) else None,
+                **{name: getattr(counted, name) for name in counted.__slots__},
+            }
+        return status
+
+    def step(self, now_ns: int) -> None:
+        """Go on with what is being configured."""
+        if self._configurator.busy or self._overheard:
+            self._overheard = False
+            self._proceed(now_ns)
+
+    def _proceed(self, now_ns: int) -> None:
+        configurator = self._configurator
+        for node, result in configurator.poll(now_ns / _NS):
+            watched = self._nodes[node]
+            watched.attempt_ns = watched.seen_ns = now_ns
+            if not isinstance(result, NodeLayout):
+                self._events.begin(f"configure {node}", f"node {node} cannot be configured: {result}")
+                continue
+            if result.tpdos != watched.layout.tpdos:
+                watched.lane.chain.assembler.relayout(result)
+                self._loop.reroute()
+                self._events.say(f"node {node} has another mapping now: {_maps(result)}")
+            watched.layout = result
+            self._events.end(f"configure {node}")
+            if isinstance(configurator, Configurator):
+                watched.lane.chain.assembler.trust(node)
+                if not watched.started:
+                    self._events.say(f"node {node} is configured again and started")
+                watched.started = True
+
+    def check(self) -> None:
+        """What has changed since the last check; a few tens of microseconds."""
+        if isinstance(self._loop.source, LostSource):
+            return  # said already; what is not heard now says nothing of the nodes
+        now = self._loop.clock()
+        for node, watched in self._nodes.items():
+            self._check_frames(node, watched, now)
+            self._check_heartbeat(node, watched, now)
+            self._check_faults(node, watched)
+        self._check_bus()
+
+    def reconfigure_all(self) -> None:
+        """The bus was away: nobody knows what the nodes have lived through."""
+        for node, watched in self._nodes.items():
+            assembler = watched.lane.chain.assembler
+            if isinstance(self._configurator, Configurator):
+                assembler.distrust(node)
+            watched.begin(assembler.counters[node], self._loop.clock())
+            self._configurator.start(node)
+
+    def _check_frames(self, node: int, watched: _Watched, now: int) -> None:
+        assembler = watched.lane.chain.assembler
+        counters = assembler.counters[node]
+        for name, least, grows, stopped in _COUNTED:
+            count, (before, since_ns) = getattr(counters, name), watched.counted[name]
+            if count - before >= least:
+                watched.counted[name] = (count, now)
+                if name == "conflicting" and now - watched.counted["missing"][1] < _BUNCH_NS:
+                    watched.bunched_ns = watched.bunched_ns or now
+                    if now - watched.bunched_ns < _BUNCHES_NS:
+                        continue  # a second device sends more frames, not fewer
+                    grows = _BUNCHED
+                self._events.begin(f"{name} {node}", f"node {node}: {grows}")
+            elif now - since_ns > _NS:
+                watched.counted[name] = (count, now)
+                if name == "conflicting":
+                    watched.bunched_ns = 0
+                self._events.end(f"{name} {node}", f"node {node}: {stopped.format(count)}")
+        if counters.received != watched.received:
+            watched.received, watched.seen_ns = counters.received, now
+            watched.started = False
+            self._events.end(f"start {node}", f"node {node} sends its frames")
+        lost = now - watched.seen_ns > _SILENT_NS or node in assembler.untrusted
+        lost = lost or (watched.state != _OPERATIONAL and now - watched.heartbeat_ns < _NS)
+        if lost and not self._configurator.busy and now - watched.attempt_ns > _RETRY_NS:
+            watched.attempt_ns = now
+            self._configurator.start(node, stopped=watched.state == _STOPPED)
+            if watched.started:
+                self._say_unstarted(node, watched)
+
+    def _say_unstarted(self, node: int, watched: _Watched) -> None:
+        state = _STATES.get(watched.state, f"0x{watched.state:02X}")
+        code = watched.lane.chain.assembler.faults.get(node)
+        why = f" and EMCY 0x{code:04X}: its error may want a reset or its supply off and on" if code else ""
+        self._events.begin(
+            f"start {node}",
+            f"node {node} is configured and was started, but sends none of its frames; it says {state}{why}",
+        )
+
+    def _check_heartbeat(self, node: int, watched: _Watched, now: int) -> None:
+        period_ms = watched.layout.heartbeat_ms
+        age_ms = (now - watched.heartbeat_ns) / 1e6
+        if period_ms and age_ms > max(_HEARTBEATS_LOST * period_ms, 50.0):
+            self._events.begin(f"heartbeat {node}", f"node {node}: heartbeat lost")
+        else:
+            self._events.end(f"heartbeat {node}", f"node {node}: heartbeat is back")
+
+    def _check_faults(self, node: int, watched: _Watched) -> None:
+        faulted = node in watched.lane.chain.assembler.faults
+        if faulted:
+            self._events.begin(f"fault {node}", f"node {node} reports a fault")
+        else:
+            self._events.end(f"fault {node}", f"node {node} reports no fault any more")
+
+    def _check_bus(self) -> None:
+        loop = self._loop
+        if loop.foreign_syncs != self._foreign_syncs:
+            self._foreign_syncs = loop.foreign_syncs
+            self._events.begin(
+                "foreign sync",
+                "another master makes SYNC: its cycles are not used; "
+                'set bus.sync = "follow", or stop the other one',
+                logging.ERROR,
+            )
+        else:
+            self._events.end("foreign sync", "the other master makes no SYNC any more")
+        if loop.counter_jumps != self._counter_jumps:
+            self._counter_jumps = loop.counter_jumps
+            self._events.say(f"the SYNC counter jumped, {self._counter_jumps} times so far")
+        if loop.clock_steps != self._clock_steps:
+            self._clock_steps = loop.clock_steps
+            self._events.say(
+                f"the system's clock was set by {loop.clock_step_ns / _NS:+.3f} s: stamps follow it, "
+                "the cycle does not"
+            )
+        if loop.silent:
+            self._events.begin("no sync", "no SYNC on the bus: the estimates are stale", logging.ERROR)
+        else:
+            self._events.end("no sync", "SYNC is back")
+        if loop.source.lost_sends != self._lost_sends:
+            self._lost_sends = loop.source.lost_sends
+            if self._lost_sends:
+                self._events.begin(
+                    "full queue", "the transmit queue is full: SYNC is lost; is any node on the bus?"
+                )
+        else:
+            self._events.end("full queue", "the transmit queue drains again")
+
+        self._check_controller()
+
+    def _check_controller(self) -> None:
+        errors = self._loop.source.errors
+        bus_offs, restarts = errors.get("bus-off", 0), errors.get("restarted", 0)
+        if bus_offs > self._bus_offs:
+            self._events.begin(
+                "bus-off",
+                "the CAN controller is bus-off: check wiring, termination and bit rate; it stays so unless "
+                "restart-ms is set for the interface",
+                logging.ERROR,
+            )
+        if restarts > self._restarts:
+            self._events.end("bus-off", "the CAN controller is on the bus again")
+        self._bus_offs, self._restarts = bus_offs, restarts
+
+    def _heartbeat(self, cob_id: int, data: bytes) -> None:
+        if len(data) != 1:
+            return
+        node = cob_id - 0x700
+        watched = self._nodes[node]
+        watched.heartbeat_ns = self._loop.clock()
+        state = data[0] & 0x7F
+        if state == 0:  # every time: it may reboot again while it is being configured
+            self._events.say(f"node {node} has rebooted", logging.WARNING)
+            watched.attempt_ns = watched.heartbeat_ns
+            self._configurator.start(node)
+        if state in _STATES:
+            watched.state = state
+
+    def _emergency(self, cob_id: int, data: bytes) -> None:
+        emergency = parse_emergency(data)
+        if emergency is not None and not emergency.is_reset:
+            self._events.say(f"node {cob_id - 0x080}: {emergency}", logging.WARNING)
+
+    def _answer(self, cob_id: int, data: bytes) -> None:
+        now_ns = self._loop.clock()
+        self._configurator.feed(cob_id, data, now_ns / _NS)
+        if isinstance(self._configurator, Configurator):
+            self._proceed(now_ns)  # its frames must not be read by the old layout once it is started
+        else:
+            self._overheard = True
+
+
+def _maps(layout: NodeLayout) -> str:
+    return ", ".join(
+        f"0x{tpdo.cob_id:03X} = " + " ".join(f"{o.index:04X}:{o.subindex:02X}" for o in tpdo.objects)
+        for tpdo in layout.tpdos
+    )

@@ -1,0 +1,70 @@
+"""How a demo ends: truth beside estimate, and what the daemon needed for it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from rich.table import Table
+
+from drivelink.demo.comparison import Comparison
+from drivelink.demo.rig import Summary
+
+__all__ = ["as_json", "closing_table"]
+
+
+def closing_table(case: str, comparison: Comparison, summary: Summary, received: int) -> Table:
+    """The last pair of truth and estimate, the errors of the whole run, and the cycle's figures."""
+    errors = comparison.errors()
+    table = Table(title=f"{case}: truth beside estimate", title_justify="left")
+    for heading in ("", "truth", "estimate", "95 % interval", "error"):
+        table.add_column(heading, justify="left" if not heading else "right", no_wrap=True)
+    if comparison.latest is not None:
+        estimate, truth = comparison.latest
+        table.add_row(
+            "stiffness / N·m/rad",
+            f"{truth.stiffness_nm_rad:.4g}",
+            f"{estimate.stiffness_nm_rad:.4g}",
+            f"± {1.96 * estimate.stiffness_std_nm_rad:.2g}",
+            _percent(errors.stiffness),
+        )
+        table.add_row(
+            "flexibility torque / N·m",
+            f"{truth.flexibility_torque_nm:.4g}",
+            f"{estimate.flexibility_torque_nm:.4g}",
+            "",
+            _percent(errors.flexibility_torque),
+        )
+    table.caption = (
+        f"{summary.cycles} cycles, {summary.missed_cycles} missed, {received} estimates received over zenoh\n"
+        f"a cycle's work p99 {summary.work_p99_us:.0f} µs, "
+        f"SYNC late by p99 {summary.lateness_p99_us:.0f} µs\n"
+        f"the 95 % interval held the truth in {_percent(errors.covered)} of {errors.cycles} valid cycles"
+    )
+    table.caption_justify = "left"
+    return table
+
+
+def as_json(case: str, comparison: Comparison, summary: Summary, received: int) -> dict[str, Any]:
+    """The same for a program; a figure that there is none of is null."""
+    errors = comparison.errors()
+    return {
+        "case": case,
+        "cycles": summary.cycles,
+        "missed_cycles": summary.missed_cycles,
+        "received": received,
+        "valid_cycles": errors.cycles,
+        "stiffness_error_relative": _number(errors.stiffness),
+        "flexibility_torque_error_relative": _number(errors.flexibility_torque),
+        "stiffness_interval_coverage": _number(errors.covered),
+        "work_p99_us": summary.work_p99_us,
+        "lateness_p99_us": summary.lateness_p99_us,
+    }
+
+
+def _percent(value: float) -> str:
+    return f"{100 * value:.3g} %" if math.isfinite(value) else "–"
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None

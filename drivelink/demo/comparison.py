@@ -1,0 +1,94 @@
+"""Truth beside estimate, matched by sequence number, and how far they are apart."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, TypeVar
+
+from drivelink.demo.rig import TruePoint
+from drivelink.monitor.history import EstimateLike
+from estimator.sample import Status
+
+__all__ = ["Comparison", "Errors"]
+
+T = TypeVar("T")
+
+_UNMATCHED = 5_000  # sequence numbers kept while the other side is waited for
+
+
+class Errors(NamedTuple):
+    """Root-mean-square errors over the cycles whose estimate is valid, relative to the truth's rms.
+
+    Attributes:
+        cycles: that were compared.
+        stiffness: relative error of the stiffness.
+        flexibility_torque: relative error of the flexibility torque.
+        covered: fraction of the cycles whose 95 % interval of the stiffness holds the truth.
+    """
+
+    cycles: int
+    stiffness: float
+    flexibility_torque: float
+    covered: float
+
+
+class Comparison:
+    """Pairs what was received with what was true.
+
+    Attributes:
+        latest: the last pair, for a view.
+    """
+
+    def __init__(self) -> None:
+        self.latest: tuple[EstimateLike, TruePoint] | None = None
+        self._estimates: dict[int, EstimateLike] = {}
+        self._truth: dict[int, TruePoint] = {}
+        self._cycles = self._covered = 0
+        self._sums = [0.0, 0.0, 0.0, 0.0]  # squared errors and squared truths: stiffness, torque
+
+    def received(self, estimate: EstimateLike) -> None:
+        """An estimate came in over zenoh."""
+        truth = self._truth.pop(estimate.sequence, None)
+        if truth is not None:
+            self._pair(estimate, truth)
+        else:
+            _keep(self._estimates, estimate.sequence, estimate)
+
+    def known(self, truth: TruePoint) -> None:
+        """What was true at one SYNC."""
+        estimate = self._estimates.pop(truth.sequence, None)
+        if estimate is not None:
+            self._pair(estimate, truth)
+        else:
+            _keep(self._truth, truth.sequence, truth)
+
+    def errors(self) -> Errors:
+        """Over everything paired so far; NaN before there is a valid estimate."""
+        if self._cycles == 0:
+            return Errors(0, math.nan, math.nan, math.nan)
+        stiffness, true_stiffness, torque, true_torque = self._sums
+        return Errors(
+            self._cycles,
+            math.sqrt(stiffness / true_stiffness) if true_stiffness else math.nan,
+            math.sqrt(torque / true_torque) if true_torque else math.nan,
+            self._covered / self._cycles,
+        )
+
+    def _pair(self, estimate: EstimateLike, truth: TruePoint) -> None:
+        self.latest = estimate, truth
+        if not estimate.status & Status.VALID:
+            return
+        off = estimate.stiffness_nm_rad - truth.stiffness_nm_rad
+        self._cycles += 1
+        self._covered += abs(off) <= 1.96 * estimate.stiffness_std_nm_rad
+        sums = self._sums
+        sums[0] += off**2
+        sums[1] += truth.stiffness_nm_rad**2
+        sums[2] += (estimate.flexibility_torque_nm - truth.flexibility_torque_nm) ** 2
+        sums[3] += truth.flexibility_torque_nm**2
+
+
+def _keep(waiting: dict[int, T], sequence: int, item: T) -> None:
+    waiting[sequence] = item
+    if len(waiting) > _UNMATCHED:
+        del waiting[next(iter(waiting))]

@@ -1,0 +1,136 @@
+"""The demo's other process: the simulated joint and the daemon that serves it, on one virtual bus.
+
+python-can's virtual bus lives inside one process, so both are in this one, and in one thread: two would wait
+for each other's hold on the interpreter, which no real drive does. For the same reason whoever watches is in
+another process. Truth goes to the watcher by a pipe, under the
+sequence numbers of the published estimates.
+"""
+
+from __future__ import annotations
+
+import logging
+import signal
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+from drivelink import jointfile
+from drivelink.daemon.service import Daemon, ServedJoint
+from drivelink.errors import DrivelinkError
+from drivelink.monitor.history import TruthLike
+from drivelink.pubsub.publisher import JointPublisher
+from drivelink.simulate import network_from_joint, open_sim_bus, world_from_joint
+from estimator.sample import Estimate, Sample
+
+__all__ = ["Failure", "Summary", "TruePoint", "serve"]
+
+_BATCH = 50  # cycles between two messages to the watcher
+
+
+class TruePoint(NamedTuple):
+    """The joint as it really was at one SYNC."""
+
+    sequence: int
+    flexibility_torque_nm: float
+    stiffness_nm_rad: float
+
+
+class Summary(NamedTuple):
+    """How the run went, from the daemon."""
+
+    cycles: int
+    estimates: int
+    missed_cycles: int
+    work_p99_us: float
+    lateness_p99_us: float
+    text: str
+
+
+class Failure(NamedTuple):
+    """Why there was no run, in one line."""
+
+    text: str
+    exit_status: int
+
+
+class World(Protocol):
+    """What the rig needs of the simulated world."""
+
+    def truth(self) -> TruthLike:
+        """The joint as it is now."""
+
+
+class TruthTap:
+    """Publishes as the daemon's publisher does, and notes what was true at the same SYNC."""
+
+    def __init__(self, publisher: JointPublisher, world: World, connection: Connection) -> None:
+        self._publisher = publisher
+        self._world = world
+        self._connection = connection
+        self._points: list[TruePoint] = []
+
+    def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
+        """Publish, then note the truth: the world stands still until the next SYNC."""
+        self._publisher.put_estimate(estimate, stamp_ns)
+        truth = self._world.truth()
+        self._points.append(TruePoint(estimate.sequence, truth.flexibility_torque_nm, truth.stiffness_nm_rad))
+        if len(self._points) >= _BATCH:
+            self.flush()
+
+    def put_sample(self, sample: Sample, stamp_ns: int) -> None:
+        """Publish a sample."""
+        self._publisher.put_sample(sample, stamp_ns)
+
+    def flush(self) -> None:
+        """Send what has been noted."""
+        points, self._points = self._points, []
+        with suppress(OSError):  # the watcher has gone; the run goes on to its clean end
+            self._connection.send(points)
+
+
+def serve(path: Path, seconds: float | None, connection: Connection) -> None:
+    """Run simulation and daemon, and tell the watcher: batches of `TruePoint`, then a `Summary` or `Failure`.
+
+    Args:
+        path: joint file with a `[sim]` section, on the virtual bus.
+        seconds: of the run; None: until SIGTERM.
+        connection: to the watcher.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both; the watcher decides
+    logging.getLogger("drivelink").propagate = False  # the watcher's view shows the daemon's events
+    logging.getLogger("drivelink").addHandler(logging.NullHandler())
+    try:
+        summary: Summary | Failure = _run(path, seconds, connection)
+    except DrivelinkError as error:
+        summary = Failure(str(error), error.exit_status)
+    with suppress(OSError):
+        connection.send(summary)
+        connection.close()
+
+
+def _run(path: Path, seconds: float | None, connection: Connection) -> Summary:
+    joint = jointfile.load(path)
+    world = world_from_joint(joint)
+    bus = open_sim_bus(joint.bus)
+    network = network_from_joint(joint, bus, world=world)
+    try:
+        with Daemon([ServedJoint(joint=joint, path=path)], devices=network.poll) as daemon:
+            signal.signal(signal.SIGTERM, lambda *_: daemon.stop())
+            (lane,) = daemon.loop.lanes
+            assert isinstance(lane.sink, JointPublisher)
+            tap = TruthTap(lane.sink, world, connection)
+            lane.sink = tap
+            daemon.run(seconds)
+            tap.flush()
+            loop = daemon.loop
+            return Summary(
+                cycles=loop.cycles,
+                estimates=lane.estimates,
+                missed_cycles=lane.chain.missed + loop.overruns,
+                work_p99_us=lane.work.total().get("p99_us", 0.0),
+                lateness_p99_us=loop.lateness.total().get("p99_us", 0.0),
+                text=daemon.summary(),
+            )
+    finally:
+        bus.shutdown()

@@ -1,0 +1,55 @@
+"""What keeps this machine, bus or drive from doing the job, and the fix. Nothing is changed by looking."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from drivelink.doctor.datasheet import examine_sheet
+from drivelink.doctor.interface import can_interfaces, examine_interface
+from drivelink.doctor.machine import examine_machine
+from drivelink.doctor.nodes import examine_bus
+from drivelink.doctor.report import Report, Section
+from drivelink.doctor.zenohcheck import examine_zenoh
+from drivelink.finding import Severity
+from drivelink.jointfile import JointFile
+
+__all__ = ["Report", "Section", "examine", "examine_eds"]
+
+_DEFAULT_PERIOD_S = 0.001
+_LONGEST_TIMER_S = 2.0
+
+
+def examine(joint: JointFile | None, base_dir: Path, seconds: float) -> Report:
+    """The whole examination.
+
+    Args:
+        joint: the joint file; None: only the machine.
+        base_dir: its folder.
+        seconds: for each measurement (timer, SYNC, motion).
+    """
+    report = Report()
+    period_s = joint.bus.period_s if joint is not None else _DEFAULT_PERIOD_S
+    examine_machine(report.section("Machine"), period_s, min(seconds, _LONGEST_TIMER_S))
+    section = report.section("CAN interface")
+    if joint is None:
+        known = can_interfaces()
+        text = ", ".join(known) if known else "none of SocketCAN's"
+        section.say(Severity.INFO, "interfaces", text, "drivelink doctor JOINT examines bus and drives too")
+        return report
+    examine_interface(section, joint.bus)
+    zenoh = Section("Zenoh")
+    examine_zenoh(zenoh, joint, base_dir)
+    examine_bus(report, joint, base_dir, seconds, alive=zenoh.facts.get("alive", ()))
+    report.sections.append(zenoh)
+    return report
+
+
+def examine_eds(path: Path) -> Report:
+    """What a drive could give, from its EDS or DCF alone.
+
+    Raises:
+        DriveError: the file cannot be read at all.
+    """
+    report = Report(fine="this device gives what is needed")
+    examine_sheet(report.section("Data sheet"), path)
+    return report

@@ -1,0 +1,190 @@
+"""From an EDS or DCF alone: which signals that drive can give, and the mapping that would be used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from drivelink.canopen.candidates import Candidate
+from drivelink.canopen.eds import DataSheet, load_eds
+from drivelink.canopen.layout import Signal
+from drivelink.canopen.pdo import Entry, describe, entry_text
+from drivelink.canopen.plan import Assignment, assign
+from drivelink.canopen.roles import Role
+from drivelink.canopen.units import offer
+from drivelink.canopen.vendors import vendor_of
+from drivelink.doctor.report import Section
+from drivelink.errors import DriveError
+from drivelink.finding import Severity
+from drivelink.jointfile import DriveSection, EncoderSection
+
+__all__ = ["examine_sheet", "planned_entries"]
+
+# Objects that can give a signal, best first; the vendor's own current object follows.
+_OBJECTS: dict[Signal, tuple[tuple[int, int], ...]] = {
+    Signal.MOTOR_POSITION: ((0x6064, 0),),
+    Signal.MOTOR_TORQUE: ((0x6077, 0), (0x6078, 0)),
+    Signal.STATUSWORD: ((0x6041, 0),),
+    Signal.MOTOR_VELOCITY: ((0x606C, 0),),
+    Signal.LINK_POSITION: ((0x60E4, 1), (0x60E4, 0)),
+}
+_CIA406: dict[Signal, tuple[tuple[int, int], ...]] = {Signal.LINK_POSITION: ((0x6004, 0),)}
+_NEEDED = {Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE}
+_UNTOLD = {
+    Signal.MOTOR_POSITION: "the file gives no counts per motor revolution (0x608F)",
+    Signal.MOTOR_TORQUE: "the file gives no value for rated torque (0x6076) or rated current (0x6075)",
+}
+_STATE = {
+    Signal.MOTOR_POSITION: "motor.drive: counts_per_rev, where the drive itself does not tell",
+    Signal.MOTOR_TORQUE: "motor.drive: rated_torque_nm, or torque_constant_nm_a and rated_current_a or "
+    "current_object, where the drive itself does not tell",
+}
+_ASSUMED_COUNTS = 4096.0  # only so that units which need it can be told
+
+
+def examine_sheet(section: Section, path: Path) -> None:
+    """Findings about one file.
+
+    Raises:
+        DriveError: it cannot be read at all.
+    """
+    sheet = load_eds(path)
+    section.ok(path.name, _title(sheet))
+    for problem in sheet.problems:
+        section.say(Severity.INFO, path.name, problem)
+    available = _signals(section, sheet)
+    tpdos = sheet.tpdos()
+    section.say(Severity.INFO, "by default", describe(tpdo for tpdo in tpdos if tpdo.enabled))
+    role = _role(sheet)
+    mappable = {signal: objects for signal, objects in available.items() if objects}
+    mappable.pop(Signal.MOTOR_VELOCITY, None)  # not mapped unless the joint file asks for it
+    if any(not available[signal] for signal in _NEEDED & available.keys()):
+        return
+    _units(section, sheet)
+    try:
+        plan = assign(role, mappable, tpdos, prefer_unused=False) if mappable else ()
+    except DriveError as error:
+        section.say(
+            Severity.ERROR,
+            "mapping",
+            str(error).removeprefix(f"{role.subject} "),
+            "another drive, or firmware",
+        )
+        return
+    for assignment in plan:
+        number, entries = planned_entries(assignment)
+        kept = "" if assignment.objects is not None else "its map as it is, "
+        text = " + ".join(entry_text(entry) for entry in entries)
+        section.ok("configured", f"TPDO{number} = {text}, {kept}at every SYNC")
+    section.facts["mapping"] = [
+        {"tpdo": number, "objects": [f"0x{i:04X}:{s:02X}:{b}" for i, s, b in entries]}
+        for number, entries in map(planned_entries, plan)
+    ]
+
+
+def _title(sheet: DataSheet) -> str:
+    """Maker, product and numbers, as far as the file has them."""
+    maker, product = sheet.vendor_name, sheet.product_name
+    names = [product] if product.lower().startswith(maker.lower()) else [maker, product]
+    parts = [" ".join(name for name in names if name)]
+    parts += [f"vendor 0x{sheet.vendor_id:X}"] if sheet.vendor_id else []
+    parts += [f"product 0x{sheet.product_code:X}"] if sheet.product_code else []
+    return ", ".join([part for part in parts if part] + [f"{len(sheet.objects)} objects"])
+
+
+def planned_entries(assignment: Assignment) -> tuple[int, tuple[Entry, ...]]:
+    """Number and entries of a TPDO as it would be."""
+    if assignment.objects is None:
+        return assignment.tpdo.number, assignment.tpdo.entries
+    return assignment.tpdo.number, tuple((*c.address, c.bits) for c in assignment.objects)
+
+
+def _is_encoder(sheet: DataSheet) -> bool:
+    return (sheet.value(0x1000) or 0) & 0xFFFF == 406 or (
+        (0x6004, 0) in sheet.objects and (0x6064, 0) not in sheet.objects
+    )
+
+
+def _role(sheet: DataSheet) -> Role:
+    encoder = _is_encoder(sheet)
+    return Role(
+        node_id=1,
+        motor=None if encoder else 0,
+        drive=None if encoder else DriveSection(node_id=1, counts_per_rev=_ASSUMED_COUNTS),
+        encoder=EncoderSection(source="cia406", node_id=1) if encoder else None,
+        key="drive",
+        eds=sheet.path,
+        tpdo=(),
+    )
+
+
+def _signals(section: Section, sheet: DataSheet) -> dict[Signal, tuple[Candidate, ...]]:
+    """Which signals the drive can put into a TPDO, with a finding for each."""
+    vendor = vendor_of(sheet.vendor_id)
+    carried = {(i, s) for tpdo in sheet.tpdos() for i, s, _ in tpdo.entries}
+    found: dict[Signal, tuple[Candidate, ...]] = {}
+    for signal, addresses in (_CIA406 if _is_encoder(sheet) else _OBJECTS).items():
+        if signal is Signal.MOTOR_TORQUE and vendor.current is not None:
+            addresses += (vendor.current.address,)
+        there = [address for address in addresses if address in sheet.objects]
+        if (0x60E4, 1) in there:
+            there = [(0x60E4, 1)]  # subindex 0 is then only the count
+        usable = [a for a in there if sheet.objects[a].mappable or a in carried]
+        found[signal] = tuple(
+            Candidate(signal=signal, address=a, bits=sheet.objects[a].bits or 32, signed=True, scale=1.0)
+            for a in usable
+        )
+        _say_signal(section, signal, sheet, there, usable)
+    return found
+
+
+def _say_signal(
+    section: Section,
+    signal: Signal,
+    sheet: DataSheet,
+    there: list[tuple[int, int]],
+    usable: list[tuple[int, int]],
+) -> None:
+    name = signal.replace("_", " ")
+    section.facts[str(signal)] = [f"0x{index:04X}:{subindex:02X}" for index, subindex in usable]
+    if usable:
+        parts = [f"0x{i:04X}:{s:02X} {sheet.objects[i, s].name or ''}".rstrip() for i, s in usable]
+        text = " or ".join(parts) + _more(signal, sheet, usable)
+        section.ok(name, text)
+    elif there:
+        parts = [f"0x{i:04X}:{s:02X}" for i, s in there]
+        severity = Severity.ERROR if signal in _NEEDED else Severity.INFO
+        section.say(severity, name, f"{', '.join(parts)} is there, but cannot be mapped into a TPDO")
+    else:
+        section.say(Severity.ERROR if signal in _NEEDED else Severity.INFO, name, "no object that gives it")
+
+
+def _more(signal: Signal, sheet: DataSheet, usable: list[tuple[int, int]]) -> str:
+    """What else there is to say of the object of a signal."""
+    if signal is Signal.MOTOR_VELOCITY:
+        return ", mapped with velocity = true"
+    index, subindex = usable[0]
+    if signal is not Signal.LINK_POSITION or index != 0x60E4 or not subindex:
+        return ""
+    others = [s for (i, s), entry in sorted(sheet.objects.items()) if i == index and s > 1 and entry.mappable]
+    names = [f"0x{index:04X}:{s:02X} {sheet.objects[index, s].name}".rstrip() for s in others]
+    sensorless = vendor_of(sheet.vendor_id).sensorless == (index, subindex)
+    return (", the sensorless one" if sensorless else "") + (
+        f"; or, by link.encoder.object, {', '.join(names)}" if names else ""
+    )
+
+
+def _units(section: Section, sheet: DataSheet) -> None:
+    """What of the scaling the file tells, and what the joint file will have to state."""
+    if _is_encoder(sheet):
+        counts = sheet.value(0x6501)
+        text = (
+            f"0x6501 says {counts} counts per revolution" if counts else "state link.encoder.counts_per_rev"
+        )
+        section.say(Severity.INFO, "units", text)
+        return
+    drive = DriveSection(node_id=1)
+    bare = Role(node_id=1, motor=0, drive=drive, encoder=None, key="motor.drive", eds=sheet.path, tpdo=())
+    told = offer(bare, sheet.values(), vendor_of(sheet.vendor_id))
+    for signal, untold in _UNTOLD.items():
+        if signal in told.missing:
+            section.say(Severity.INFO, "units", untold, _STATE[signal])

@@ -1,0 +1,295 @@
+"""What is on the bus: who is there, what each node is, sends, and could send; SYNC and its jitter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import can
+
+from drivelink.canopen.blocking import run_program
+from drivelink.canopen.bus import open_bus
+from drivelink.canopen.busload import COMFORTABLE, bus_load
+from drivelink.canopen.eds import load_eds
+from drivelink.canopen.guard import SilentBus
+from drivelink.canopen.layout import NodeLayout, Signal, TpdoLayout
+from drivelink.canopen.node import NodeSurvey, survey_node
+from drivelink.canopen.passive import PassiveConfigurator
+from drivelink.canopen.pdo import decode, describe, entry_text
+from drivelink.canopen.plan import assign
+from drivelink.canopen.roles import Role, roles
+from drivelink.canopen.scan import FoundNode, Traffic, identify, listen, scan
+from drivelink.canopen.vendors import vendor_of
+from drivelink.doctor.datasheet import planned_entries
+from drivelink.doctor.motion import judge_motion, sample_motion
+from drivelink.doctor.report import Report, Section
+from drivelink.doctor.syncs import Daemons, judge_sync
+from drivelink.errors import BusError, DriveError, JointFileError
+from drivelink.finding import Finding, Severity
+from drivelink.jointfile import BusSection, JointFile
+
+__all__ = ["examine_bus"]
+
+
+def examine_bus(
+    report: Report, joint: JointFile, base_dir: Path, seconds: float, alive: Sequence[str] = ()
+) -> None:
+    """Everything that needs the bus to be open. Reads; in a passive joint file, listens only.
+
+    Args:
+        report: gets a section for the bus, and one for each node.
+        joint: the joint file.
+        base_dir: its folder.
+        seconds: for each measurement.
+        alive: liveliness keys of the daemons that run; one of them may make the SYNC.
+    """
+    section = report.section("Bus")
+    names = [key.split("/")[-2] for key in alive]
+    daemons = Daemons(ours=joint.name in names, others=[name for name in names if name != joint.name])
+    try:
+        bus = open_bus(joint.bus)
+    except BusError as error:
+        section.say(Severity.ERROR, joint.bus.channel, str(error))
+        return
+    try:
+        if joint.bus.configure:
+            _ask(report, section, bus, joint, base_dir, seconds, daemons)
+        else:
+            _overhear(section, SilentBus(bus), joint, base_dir, seconds, daemons)
+    except (BusError, DriveError, JointFileError) as error:
+        section.say(Severity.ERROR, joint.bus.channel, str(error))
+    finally:
+        bus.shutdown()
+
+
+def _ask(
+    report: Report,
+    section: Section,
+    bus: can.BusABC,
+    joint: JointFile,
+    base_dir: Path,
+    seconds: float,
+    daemons: Daemons,
+) -> None:
+    found, _ = scan(bus)
+    traffic = listen(bus, seconds)
+    _judge_traffic(section, traffic, joint.bus, daemons)
+    mine = {role.node_id: role for role in roles(joint, base_dir)}
+    others = [node for node in sorted(set(found) | set(traffic.heartbeats)) if node not in mine]
+    for node in others:
+        known = _identify(bus, joint.bus, node)
+        section.say(Severity.INFO, f"node {node}", f"{_describe_node(known)}, not in the joint file")
+    if not found:
+        section.say(
+            Severity.ERROR,
+            joint.bus.channel,
+            "nobody answers and nobody is heard",
+            "power the drives; check cable, termination, bit rate and node ids",
+        )
+    layouts = []
+    for role in mine.values():
+        if role.node_id in found:
+            planned = _examine_node(
+                report.section(f"Node {role.node_id}"), bus, joint, role, traffic, seconds
+            )
+            layouts += [planned] if planned else []
+        else:
+            section.say(
+                Severity.ERROR,
+                role.subject,
+                f"({role.key}) does not answer" + (f"; there are {_list(others)}" if others else ""),
+                f"power it, or correct {role.key}.node_id",
+            )
+    _judge_load(section, layouts, joint.bus)
+
+
+def _list(nodes: Sequence[int]) -> str:
+    return ", ".join(f"node {node}" for node in nodes)
+
+
+def _identify(bus: can.BusABC, section: BusSection, node: int) -> FoundNode:
+    return identify(bus, node, timeout_s=section.sdo_timeout_s, retries=section.sdo_retries)
+
+
+def _describe_node(node: FoundNode) -> str:
+    vendor, product, revision, _ = node.identity
+    maker = vendor_of(vendor).name or f"vendor 0x{vendor:X}"
+    named = f"{node.name}, " if node.name else ""
+    return f"{named}{node.profile}, {maker}, product 0x{product:X}, revision 0x{revision:X}"
+
+
+def _examine_node(
+    section: Section, bus: can.BusABC, joint: JointFile, role: Role, traffic: Traffic, seconds: float
+) -> NodeLayout | None:
+    """One node of the joint; its frames as they would be."""
+    subject = role.subject
+    node = _identify(bus, joint.bus, role.node_id)
+    state = traffic.heartbeats.get(role.node_id, "no heartbeat")
+    section.ok(subject, f"{_describe_node(node)}, {state}")
+    curious = role
+    if role.drive is not None:
+        curious = replace(role, drive=role.drive.model_copy(update={"velocity": True}))
+    try:
+        survey = run_program(
+            survey_node(curious), bus, timeout_s=joint.bus.sdo_timeout_s, retries=joint.bus.sdo_retries
+        )
+    except DriveError as error:
+        section.say(Severity.ERROR, subject, str(error))
+        return None
+    _judge_profile(section, role, node)
+    _judge_eds(section, role, node)
+    section.findings += survey.offer.findings
+    layout = _judge_mapping(section, role, survey)
+    if role.motor is not None:
+        try:
+            samples = run_program(sample_motion(survey, seconds), bus, timeout_s=joint.bus.sdo_timeout_s)
+        except DriveError as error:
+            section.say(Severity.ERROR, subject, str(error))
+            return layout
+        judge_motion(section, survey, samples)
+    return layout
+
+
+def _judge_profile(section: Section, role: Role, node: FoundNode) -> None:
+    wanted = 402 if role.motor is not None else 406
+    if node.device_type and node.device_type & 0xFFFF not in (wanted, 402):
+        section.say(
+            Severity.WARNING, role.subject, f"is {node.profile}, {role.key} wants a CiA {wanted} device"
+        )
+
+
+def _judge_eds(section: Section, role: Role, node: FoundNode) -> None:
+    if role.eds is None:
+        return
+    try:
+        sheet = load_eds(role.eds, role.node_id)
+    except DriveError as error:
+        section.say(Severity.ERROR, role.subject, str(error), f"correct {role.key}.eds")
+        return
+    said = (sheet.vendor_id, sheet.product_code)
+    is_ = node.identity[:2]
+    if any(a and b and a != b for a, b in zip(said, is_, strict=True)):
+        section.say(
+            Severity.WARNING,
+            role.subject,
+            f"{role.eds.name} is of vendor 0x{said[0]:X}, product 0x{said[1]:X}; "
+            f"the node says 0x{is_[0]:X}, 0x{is_[1]:X}",
+            f"correct {role.key}.eds, or leave it out: a drive that answers needs none",
+        )
+    else:
+        section.ok(role.subject, f"{role.eds.name} matches its identity")
+    section.findings += [
+        Finding(severity=Severity.INFO, subject=role.eds.name, text=problem) for problem in sheet.problems
+    ]
+
+
+def _judge_mapping(section: Section, role: Role, survey: NodeSurvey) -> NodeLayout | None:
+    """What it sends now, and what it would be made to send."""
+    wanted = {
+        signal: objects
+        for signal, objects in survey.available.items()
+        if signal is not Signal.MOTOR_VELOCITY or (role.drive is not None and role.drive.velocity)
+    }
+    enabled = [tpdo for tpdo in survey.tpdos if tpdo.enabled]
+    section.say(Severity.INFO, role.subject, f"sends {describe(enabled)}")
+    complete = True
+    for signal, candidates in wanted.items():
+        if not candidates:
+            tried = [f"0x{c.address[0]:04X}:{c.address[1]:02X}" for c in survey.offer.candidates[signal]]
+            severity = Severity.WARNING if signal is Signal.STATUSWORD else Severity.ERROR
+            section.say(severity, role.subject, f"gives no {signal}: it has no {', '.join(tried)}")
+            complete = complete and severity is not Severity.ERROR
+    for signal, reason in survey.offer.missing.items():
+        if signal is not Signal.MOTOR_VELOCITY:
+            section.say(Severity.ERROR, role.subject, reason)
+            complete = False
+    if not complete:
+        return None
+    try:
+        plan = assign(role, wanted, survey.tpdos, prefer_unused=False)
+    except DriveError as error:
+        section.say(Severity.ERROR, role.subject, str(error))
+        return None
+    now = {mapped.signal for layout in decode(enabled, wanted) for mapped in layout.objects}
+    if all(signal in now for signal, objects in wanted.items() if objects):
+        section.ok(role.subject, "its mapping carries everything that is needed")
+    else:
+        parts = []
+        for number, entries in map(planned_entries, plan):
+            parts.append(f"TPDO{number} = {' + '.join(map(entry_text, entries))}")
+        section.say(
+            Severity.INFO,
+            role.subject,
+            f"will be configured to send {'; '.join(parts)}",
+            "drivelink run does it",
+        )
+    tpdos = tuple(
+        TpdoLayout(cob_id=0x181, objects=tuple(c.mapped() for c in a.objects))
+        if a.objects is not None
+        else decode([a.tpdo], wanted)[0]
+        for a in plan
+    )
+    planned = {assignment.tpdo.number for assignment in plan}
+    others = decode([tpdo for tpdo in enabled if tpdo.number not in planned], {})
+    return NodeLayout(node_id=role.node_id, motor=role.motor, tpdos=tpdos, other_tpdos=others)
+
+
+def _judge_load(section: Section, layouts: Sequence[NodeLayout], bus: BusSection) -> None:
+    if not layouts:
+        return
+    load = bus_load(
+        layouts, period_s=bus.period_s, bitrate=bus.bitrate, sync_bytes=1 if bus.sync_counter_overflow else 0
+    )
+    section.facts["bus_load"] = load.fraction
+    text = f"the cycle needs {load.fraction:.0%} of {bus.bitrate // 1000} kbit/s, worst case"
+    if load.fraction <= COMFORTABLE:
+        section.ok("bus load", text)
+    else:
+        fits_ms = bus.period_s * load.fraction / COMFORTABLE * 1000
+        severity = Severity.ERROR if load.fraction > 1 else Severity.WARNING
+        section.say(severity, "bus load", text, f"bus.period_s = {fits_ms / 1000:.2g}, or fewer signals")
+
+
+def _overhear(
+    section: Section, bus: SilentBus, joint: JointFile, base_dir: Path, seconds: float, daemons: Daemons
+) -> None:
+    """A bus that may not be touched: only listen."""
+    configurator = PassiveConfigurator([joint], [base_dir])
+    traffic = listen(
+        bus, seconds, lambda message: configurator.feed(message.arbitration_id, bytes(message.data), 0.0)
+    )
+    configurator.poll(0.0)
+    _judge_traffic(section, traffic, joint.bus, daemons)
+    for error in configurator.missing.values():
+        section.say(Severity.ERROR, joint.bus.channel, str(error))
+    for node, layout in configurator.layouts.items():
+        section.findings += layout.findings
+        for tpdo in layout.tpdos:
+            count, length = traffic.counts.get(tpdo.cob_id, 0), len(traffic.last.get(tpdo.cob_id, b""))
+            if not count:
+                section.say(Severity.WARNING, f"node {node}", f"0x{tpdo.cob_id:03X} was not heard")
+            elif length < tpdo.length:
+                section.say(
+                    Severity.ERROR,
+                    f"node {node}",
+                    f"0x{tpdo.cob_id:03X} has {length} bytes, its mapping {tpdo.length}",
+                    "correct the mapping in the joint file or its EDS",
+                )
+            else:
+                section.ok(f"node {node}", f"0x{tpdo.cob_id:03X} heard {count} times")
+    _judge_load(section, list(configurator.layouts.values()), joint.bus)
+
+
+def _judge_traffic(section: Section, traffic: Traffic, bus: BusSection, daemons: Daemons) -> None:
+    frames = sum(traffic.counts.values())
+    section.facts["frames_per_s"] = frames / traffic.seconds if traffic.seconds else 0.0
+    section.facts["identifiers"] = {f"0x{cob:03X}": n for cob, n in sorted(traffic.counts.items())}
+    if traffic.error_frames:
+        section.say(
+            Severity.WARNING,
+            bus.channel,
+            f"{traffic.error_frames} error frames in {traffic.seconds:g} s",
+            "check cable, termination (2 x 120 Ω) and that all nodes have the same bit rate",
+        )
+    judge_sync(section, traffic.sync_s, bus, daemons)

@@ -1,0 +1,117 @@
+"""What the doctor found, as data and in the terminal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.padding import Padding
+from rich.table import Table
+
+from drivelink.finding import Finding, Severity
+
+__all__ = ["Report", "Section"]
+
+_MARKS = {
+    Severity.OK: ("✓", "green"),
+    Severity.INFO: ("·", "cyan"),
+    Severity.WARNING: ("!", "yellow"),
+    Severity.ERROR: ("✗", "red"),
+}
+
+
+@dataclass(slots=True)
+class Section:
+    """Findings that belong together.
+
+    Attributes:
+        title: what they are about.
+        findings: in the order in which they were made.
+        facts: figures for `--json`.
+    """
+
+    title: str
+    findings: list[Finding] = field(default_factory=list)
+    facts: dict[str, Any] = field(default_factory=dict)
+
+    def say(self, severity: Severity, subject: str, text: str, fix: str = "") -> None:
+        """Add a finding."""
+        self.findings.append(Finding(severity=severity, subject=subject, text=text, fix=fix))
+
+    def ok(self, subject: str, text: str) -> None:
+        """Add what is as it should be."""
+        self.say(Severity.OK, subject, text)
+
+
+@dataclass(slots=True)
+class Report:
+    """All sections.
+
+    Attributes:
+        sections: in their order.
+        fine: what is said where nothing is wrong.
+    """
+
+    sections: list[Section] = field(default_factory=list)
+    fine: str = "everything is as it should be"
+
+    def section(self, title: str) -> Section:
+        """Begin a section."""
+        self.sections.append(Section(title))
+        return self.sections[-1]
+
+    @property
+    def worst(self) -> Severity:
+        """The worst finding."""
+        severities = [finding.severity for section in self.sections for finding in section.findings]
+        return max(severities, default=Severity.OK)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For `--json`."""
+        return {
+            "schema": "drivelink.doctor/1",
+            "verdict": self.worst.name.lower(),
+            "findings": [
+                {"section": section.title, **finding.as_dict()}
+                for section in self.sections
+                for finding in section.findings
+            ],
+            "facts": {section.title: section.facts for section in self.sections if section.facts},
+        }
+
+    def show(self, console: Console) -> None:
+        """Print it."""
+        for section in self.sections:
+            if section.findings:
+                console.print(f"[bold]{escape(section.title)}[/bold]", highlight=False)
+                console.print(Padding(_table(section), (0, 0, 1, 1)))
+        console.print(self._closing(), highlight=False)
+
+    def _closing(self) -> str:
+        counts = dict.fromkeys(Severity, 0)
+        for section in self.sections:
+            for finding in section.findings:
+                counts[finding.severity] += 1
+        errors, warnings = counts[Severity.ERROR], counts[Severity.WARNING]
+        if errors:
+            plural = "s" if errors > 1 else ""
+            return f"[red]{errors} problem{plural} to solve[/red], {warnings} to look at"
+        if warnings:
+            return f"[yellow]{warnings} to look at[/yellow], nothing that prevents the job"
+        return f"[green]{self.fine}[/green]"
+
+
+def _table(section: Section) -> Table:
+    table = Table(box=None, show_header=False, padding=(0, 1), pad_edge=False)
+    table.add_column(width=1)
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    for finding in section.findings:
+        mark, colour = _MARKS[finding.severity]
+        text = escape(finding.text)
+        if finding.fix:
+            text += f"\n[dim]fix:[/dim] [{colour}]{escape(finding.fix)}[/{colour}]"
+        table.add_row(f"[{colour}]{mark}[/{colour}]", escape(finding.subject), text)
+    return table

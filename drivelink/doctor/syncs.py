@@ -1,0 +1,81 @@
+"""SYNC as it is on the bus: who makes it, how often, and how evenly."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from drivelink.doctor.machine import percentile
+from drivelink.doctor.report import Section
+from drivelink.finding import Severity
+from drivelink.jointfile import BusSection
+
+__all__ = ["Daemons", "judge_sync"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Daemons:
+    """The drivelink daemons that run on this machine.
+
+    Attributes:
+        ours: whether one of them serves this joint.
+        others: names of the other joints that are served.
+    """
+
+    ours: bool
+    others: Sequence[str]
+
+
+def judge_sync(
+    section: Section, stamps_s: Sequence[float], bus: BusSection, daemons: Daemons | None = None
+) -> None:
+    """SYNC as it is on the bus: rate and jitter.
+
+    Args:
+        section: findings go here.
+        stamps_s: receive stamps of the SYNC frames.
+        bus: what the joint file wants.
+        daemons: those that run now; it may be one of them that makes the SYNC.
+    """
+    if len(stamps_s) < 3:
+        if bus.sync == "follow":
+            section.say(
+                Severity.ERROR, "SYNC", "nobody makes SYNC", 'start the other master, or bus.sync = "produce"'
+            )
+        else:
+            section.ok("SYNC", "nobody makes it yet: drivelink run will")
+        return
+    gaps = [after - before for before, after in itertools.pairwise(stamps_s)]
+    period_s = percentile(gaps, 0.5)
+    deviation_us = [abs(gap - period_s) * 1e6 for gap in gaps]
+    p99, worst = percentile(deviation_us, 0.99), max(deviation_us)
+    section.facts["sync"] = {"period_s": period_s, "jitter_us": {"p99": p99, "max": worst}}
+    text = f"every {period_s * 1000:.3f} ms, jitter {p99:.0f} µs (p99), {worst:.0f} µs (max)"
+    daemons = daemons or Daemons(ours=False, others=())
+    if bus.sync == "produce" and daemons.ours:
+        section.ok("SYNC", f"{text}, made by the drivelink daemon that runs")
+    elif bus.sync == "produce" and daemons.others:
+        section.say(
+            Severity.WARNING,
+            "SYNC",
+            f"{text}: the drivelink daemon of {', '.join(daemons.others)} may make it",
+            "joints on one bus go into one command: drivelink run A.toml B.toml; "
+            'with another master: bus.sync = "follow"',
+        )
+    elif bus.sync == "produce":
+        section.say(
+            Severity.WARNING,
+            "SYNC",
+            f"{text}: another master makes it, no drivelink daemon is alive",
+            'bus.sync = "follow", or stop the other master',
+        )
+    elif abs(period_s - bus.period_s) > 0.02 * bus.period_s:
+        section.say(
+            Severity.ERROR,
+            "SYNC",
+            f"{text}, the joint file says {bus.period_s * 1000:g} ms",
+            f"bus.period_s = {round(period_s, 5):g}",
+        )
+    else:
+        section.ok("SYNC", text)

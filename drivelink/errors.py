@@ -1,0 +1,43 @@
+"""The service's exceptions. Each is one line for the user: what, where, what was expected."""
+
+
+class DrivelinkError(Exception):
+    """Root of everything a user can cause. `exit_status` is what the command line returns."""
+
+    exit_status = 1
+
+
+class UsageError(DrivelinkError):
+    """The command line asks for something that cannot be."""
+
+    exit_status = 2
+
+
+class JointFileError(DrivelinkError):
+    """A joint file is wrong: file, key, what was expected."""
+
+    exit_status = 2
+
+
+class RecordingError(DrivelinkError):
+    """A recording cannot be read, or lacks what is needed."""
+
+    exit_status = 3
+
+
+class BusError(DrivelinkError):
+    """The CAN interface is missing, down, or too slow for what is asked."""
+
+    exit_status = 4
+
+
+class DriveError(DrivelinkError):
+    """A drive is absent, refuses its configuration, or cannot give a signal."""
+
+    exit_status = 5
+
+
+class ZenohError(DrivelinkError):
+    """The zenoh session cannot be opened, or a key is taken."""
+
+    exit_status = 6

@@ -1,0 +1,56 @@
+"""What was noticed about a machine, a bus or a drive, how bad it is, and the command that fixes it."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import asdict, dataclass
+from enum import IntEnum
+
+__all__ = ["Finding", "Severity", "log_findings"]
+
+
+class Severity(IntEnum):
+    """How bad it is."""
+
+    OK = 0
+    INFO = 1
+    WARNING = 2
+    ERROR = 3
+
+
+_LEVELS = {
+    Severity.OK: logging.DEBUG,
+    Severity.INFO: logging.INFO,
+    Severity.WARNING: logging.WARNING,
+    Severity.ERROR: logging.ERROR,
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """One thing that was noticed.
+
+    Attributes:
+        severity: how bad it is.
+        subject: what it is about, e.g. "can0" or "node 1".
+        text: one line: what was found, and what it should be.
+        fix: the command or the line of the joint file that puts it right; empty where nothing is needed.
+    """
+
+    severity: Severity
+    subject: str
+    text: str
+    fix: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.subject}: {self.text}" + (f" [{self.fix}]" if self.fix else "")
+
+    def as_dict(self) -> dict[str, str]:
+        """For JSON: the severity by name."""
+        return {**asdict(self), "severity": self.severity.name.lower()}
+
+
+def log_findings(logger: logging.Logger, findings: tuple[Finding, ...] | list[Finding]) -> None:
+    """One log line for each, at the level of its severity."""
+    for finding in findings:
+        logger.log(_LEVELS[finding.severity], "%s", finding)

@@ -1,0 +1,361 @@
+"""The joint file: one TOML file that says what a joint is, how it is reached and where its estimates go.
+
+The schema below is the reference: `docs/` is generated from it. A wrong file is one line: file, key,
+what was expected.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import tomlkit
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from tomlkit.exceptions import TOMLKitError
+
+from drivelink.errors import JointFileError
+from drivelink.keyhint import unknown_key
+from estimator.model import Arrangement, Effect, JointModel, LinkDynamics, Motor, Transmission
+from estimator.settings import EstimatorSettings
+
+__all__ = [
+    "BusSection",
+    "DriveSection",
+    "EncoderSection",
+    "JointFile",
+    "LinkSection",
+    "MotorSection",
+    "Ros2Section",
+    "SimSection",
+    "TpdoSection",
+    "ZenohSection",
+    "load",
+    "parse",
+    "write_model",
+]
+
+Direction = Literal[1, -1]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+class TpdoSection(_Section):
+    """A TPDO as it is on the wire, for a bus that we may not configure."""
+
+    cob_id: int = Field(ge=0x181, le=0x57F, description="identifier of the frame, e.g. 0x181")
+    objects: tuple[str, ...] = Field(
+        min_length=1, description='mapped objects in order, "index:subindex:bits", e.g. "0x6064:00:32"'
+    )
+    transmission_type: int = Field(
+        1, ge=0, le=255, description="1 to 240: every so many SYNCs; 254, 255: when the node pleases"
+    )
+
+    @model_validator(mode="after")
+    def _objects(self) -> Self:
+        for text in self.objects:
+            if not re.fullmatch(r"0x[0-9A-Fa-f]{4}:[0-9A-Fa-f]{2}:\d{1,2}", text):
+                raise ValueError(f'expected "0xINDEX:SUB:BITS" like "0x6064:00:32", got "{text}"')
+        return self
+
+
+class DriveSection(_Section):
+    """The drive of one motor, as a CANopen node. What the drive tells by itself may be left out."""
+
+    node_id: int = Field(ge=1, le=127, description="CANopen node id")
+    counts_per_rev: float | None = Field(
+        None, gt=0, description="encoder counts per motor revolution (0x608F)"
+    )
+    gear_ratio: float = Field(1.0, gt=0, description="motor revolutions per joint revolution (0x6091)")
+    torque_constant_nm_a: float | None = Field(
+        None, gt=0, description="torque at the motor shaft per ampere; turns a current into a torque"
+    )
+    rated_current_a: float | None = Field(
+        None, gt=0, description="unit of 0x6078 is a thousandth of it (0x6075)"
+    )
+    rated_torque_nm: float | None = Field(
+        None, gt=0, description="unit of 0x6077 is a thousandth of it (0x6076)"
+    )
+    torque_source: Literal["auto", "torque", "current"] = Field(
+        "auto", description="which object the motor torque is taken from: 0x6077, or 0x6078 and the constant"
+    )
+    current_object: str | None = Field(None, description='vendor object for the current, e.g. "0x30D1:02"')
+    current_unit_a: float = Field(0.001, gt=0, description="amperes per count of current_object")
+    velocity: bool = Field(
+        False, description="also map 0x606C (the robust mode differentiates positions itself)"
+    )
+    velocity_rad_s_per_count: float | None = Field(
+        None, gt=0, description="unit of 0x606C at the motor shaft, where 0x60A9 does not tell"
+    )
+    direction: Direction = Field(1, description="sign of the motor position against the joint's")
+    torque_direction: Direction | None = Field(
+        None, description="sign of the torque; left out: like direction"
+    )
+    eds: str | None = Field(None, description="EDS or DCF file, relative to the joint file")
+    tpdo: tuple[TpdoSection, ...] = Field((), description="the mapping, where it is not read from the drive")
+    heartbeat_ms: int = Field(
+        100, ge=0, le=65535, description="heartbeat that is asked of the drive; 0: none"
+    )
+
+
+class EncoderSection(_Section):
+    """The link encoder."""
+
+    source: Literal["drive", "cia406"] = Field(
+        "drive", description="wired to a drive (0x60E4), or a node of its own"
+    )
+    node_id: int | None = Field(
+        None, ge=1, le=127, description="its node; left out with a drive: the first motor's"
+    )
+    object: str | None = Field(None, description='position object; default "0x60E4:01" or "0x6004:00"')
+    counts_per_rev: float | None = Field(
+        None, gt=0, description="counts per joint revolution (0x6501 of CiA 406)"
+    )
+    direction: Direction = Field(1, description="sign against the joint's")
+    offset_rad: float = Field(0.0, description="subtracted from the link position")
+    eds: str | None = Field(None, description="EDS or DCF file, relative to the joint file")
+    tpdo: tuple[TpdoSection, ...] = Field((), description="the mapping, where it is not read from the node")
+
+    @model_validator(mode="after")
+    def _node(self) -> Self:
+        if self.source == "cia406" and self.node_id is None:
+            raise ValueError('node_id: expected the encoder\'s node id with source = "cia406"')
+        return self
+
+
+class MotorSection(_Section):
+    """One motor and its transmission, reflected to the joint side."""
+
+    inertia_kg_m2: float = Field(gt=0, description="B of eqs 5, 7, joint side")
+    viscous_damping_nm_s_rad: float = Field(0.0, ge=0, description="D_theta of eqs 5, 7, joint side")
+    transmission: Transmission = Field(
+        default_factory=Transmission, description="model of the flexibility torque"
+    )
+    effect: tuple[Effect, ...] = Field((), description="effects the model has been given")
+    drive: DriveSection | None = Field(None, description="only run, sim, record and doctor need it")
+
+    def motor(self) -> Motor:
+        """What the estimator is told of it."""
+        return Motor(
+            inertia_kg_m2=self.inertia_kg_m2,
+            viscous_damping_nm_s_rad=self.viscous_damping_nm_s_rad,
+            transmission=self.transmission,
+            effects=self.effect,
+        )
+
+
+class LinkSection(_Section):
+    """The link side."""
+
+    encoder: EncoderSection | None = Field(None, description="the link encoder")
+    dynamics: LinkDynamics | None = Field(None, description="makes the external residual (eq 12) available")
+    effect: tuple[Effect, ...] = Field((), description="effects at the link or in its encoder")
+
+
+class BusSection(_Section):
+    """The CAN bus and the cycle on it."""
+
+    interface: str = Field(
+        "virtual", description="python-can interface: socketcan, slcan, socketcand, virtual, …"
+    )
+    channel: str = Field("drivelink", description="python-can channel, e.g. can0")
+    bitrate: int = Field(1_000_000, gt=0, description="bit/s; the bus load is computed with it")
+    options: dict[str, Any] = Field(default_factory=dict, description="passed to can.Bus as they are")
+    period_s: float = Field(0.001, gt=0, le=1.0, description="communication cycle: one SYNC, one sample")
+    sync: Literal["produce", "follow"] = Field("produce", description="make SYNC, or follow another master's")
+    sync_counter_overflow: int = Field(0, ge=0, le=240, description="0x1019: 0, or 2 to 240")
+    configure: bool = Field(True, description="configure the nodes; false: passive, never sends a frame")
+    sdo_timeout_s: float = Field(0.5, gt=0, description="for each SDO transfer")
+    sdo_retries: int = Field(1, ge=0, description="further attempts after an SDO timeout")
+
+    def moved(self, interface: str | None = None, channel: str | None = None) -> BusSection:
+        """The same cycle on another interface or channel, where one is given.
+
+        `options` belong to the interface: another one does not get them.
+        """
+        changes: dict[str, Any] = {}
+        if channel:
+            changes["channel"] = channel
+        if interface and interface != self.interface:
+            changes |= {"interface": interface, "options": {}}
+        return self.model_copy(update=changes)
+
+
+class ZenohSection(_Section):
+    """Where the estimates go."""
+
+    config: str | None = Field(None, description="zenoh configuration (JSON5), relative to the joint file")
+    prefix: str = Field(
+        "drivelink", pattern=r"^[^*$#?\s/]+(/[^*$#?\s/]+)*$", description="first part of every key"
+    )
+    endpoint: str = Field("tcp/127.0.0.1:7447", description="where subscribers connect, unless config says")
+
+
+class Ros2Section(_Section):
+    """Publishing for ROS 2 nodes with rmw_zenoh."""
+
+    enabled: bool = Field(True, description="publish JointState, stiffness and diagnostics")
+    domain: int = Field(0, ge=0, le=232, description="ROS_DOMAIN_ID")
+    namespace: str = Field("", description="namespace of the node and its topics")
+    distro: Literal["humble", "jazzy", "kilted"] = Field("jazzy", description="decides the type hashes")
+    every: int = Field(1, ge=1, description="publish every n-th cycle")
+
+
+class SimSection(_Section):
+    """The simulated world that `sim` and `demo` put on the bus; `run` never reads it."""
+
+    case: Literal["constant", "quadratic", "vsa-ii"] | None = Field(
+        None, description="one of the paper's cases"
+    )
+    parameters: dict[str, float] = Field(
+        default_factory=dict, description="true values that differ from the model's"
+    )
+    effect: tuple[Effect, ...] = Field((), description="effects of the world that the model may not know")
+    excitation: dict[str, Any] = Field(default_factory=dict, description="torque of the rig, see docs")
+    quirks: str | None = Field(None, description="behave like this maker's drives")
+    seed: int = Field(0, ge=0, description="of the sensor noise")
+
+
+class JointFile(_Section):
+    """A joint, its drives, its bus and its keys."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", description="part of the key expression")
+    arrangement: Arrangement = Field("single", description="how the transmissions act on the link")
+    motor: tuple[MotorSection, ...] = Field(min_length=1, max_length=2, description="one, or two for a VSA")
+    link: LinkSection = Field(LinkSection(), description="the link side")
+    bus: BusSection = Field(BusSection(), description="the CAN bus")
+    estimator: EstimatorSettings = Field(
+        default_factory=EstimatorSettings, description="mode, bandwidths, gains"
+    )
+    zenoh: ZenohSection = Field(ZenohSection(), description="the zenoh side")
+    ros2: Ros2Section | None = Field(None, description="publish for ROS 2")
+    sim: SimSection | None = Field(None, description="the simulated world")
+    provenance: dict[str, Any] = Field(
+        default_factory=dict,
+        description="written by fit and diagnose: when and from what the model was fitted",
+    )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        expected = 1 if self.arrangement == "single" else 2
+        if len(self.motor) != expected:
+            raise ValueError(
+                f"motor: expected {expected} [[motor]] with "
+                f'arrangement = "{self.arrangement}", got {len(self.motor)}'
+            )
+        nodes = [m.drive.node_id for m in self.motor if m.drive]
+        if (
+            self.link.encoder
+            and self.link.encoder.source == "cia406"
+            and self.link.encoder.node_id is not None
+        ):
+            nodes.append(self.link.encoder.node_id)
+        twice = {node for node in nodes if nodes.count(node) > 1}
+        if twice:
+            raise ValueError(
+                f"node_id: expected a node id of its own for each device, got {twice.pop()} twice"
+            )
+        return self
+
+    def model(self) -> JointModel:
+        """What the estimator is told of this joint."""
+        return JointModel(
+            arrangement=self.arrangement,
+            motors=tuple(section.motor() for section in self.motor),
+            link=self.link.dynamics,
+            link_effects=self.link.effect,
+        )
+
+
+def load(path: str | Path) -> JointFile:
+    """Read and validate a joint file.
+
+    Raises:
+        JointFileError: it cannot be read, is not TOML, or a key is unknown, wrong or missing.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "expected UTF-8 text"
+        raise JointFileError(f"{path}: cannot be read as a joint file: {reason}") from error
+    return parse(text, str(path))
+
+
+def parse(text: str, where: str = "joint file") -> JointFile:
+    """Validate the text of a joint file; `where` begins every message.
+
+    Raises:
+        JointFileError: not TOML, or a key is unknown, wrong or missing.
+    """
+    try:
+        document = tomlkit.parse(text).unwrap()
+    except TOMLKitError as error:
+        raise JointFileError(f"{where}: expected TOML: {error}") from error
+    try:
+        # By way of JSON: strict there means what a TOML author expects (an array is a tuple, 6 is a float).
+        return JointFile.model_validate_json(json.dumps(document, default=str))
+    except ValidationError as error:
+        raise JointFileError(f"{where}: {_one_line(error)}") from error
+
+
+def write_model(source: Path, target: Path, changes: dict[str, Any]) -> JointFile:
+    """Copy a joint file, comments kept, with some of its values replaced, and validate the copy.
+
+    Args:
+        source: joint file to start from.
+        target: where the copy goes; written only if it is valid.
+        changes: nested like the file; a mapping is merged, anything else replaces. For the tables of an
+            array (`motor`), a list of mappings is merged element by element; `effect` is replaced whole.
+
+    Raises:
+        JointFileError: the source is unreadable, the result invalid, or the target cannot be written.
+    """
+    load(source)
+    document = tomlkit.parse(source.read_text(encoding="utf-8"))
+    _merge(document, changes)
+    text = tomlkit.dumps(document)
+    joint = parse(text, str(target))
+    try:
+        target.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise JointFileError(f"{target}: cannot be written: {error.strerror}") from error
+    return joint
+
+
+def _merge(table: Any, changes: dict[str, Any]) -> None:
+    for key, value in changes.items():
+        if isinstance(value, dict) and key in table and key != "parameters":
+            _merge(table[key], value)
+        elif key == "motor":
+            for element, change in zip(table[key], value, strict=True):
+                _merge(element, change)
+        else:
+            table[key] = value
+
+
+def _one_line(error: ValidationError) -> str:
+    problems = error.errors(include_url=False)
+    # A table that is wrong inside also makes its array "too short": that says nothing.
+    problems = [problem for problem in problems if problem["type"] != "too_short"] or problems
+    first = problems[0]
+    key = _key(first["loc"])
+    message = first["msg"].removeprefix("Value error, ")
+    if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+        message = unknown_key(JointFile, first["loc"])
+    elif first["type"] == "missing":
+        message = "expected this key, it is missing"
+    elif first["type"] != "value_error":
+        message = f"{message[0].lower()}{message[1:]}, got {first['input']!r}"
+    rest = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    return f"{key}: {message}{rest}" if key else f"{message}{rest}"
+
+
+def _key(location: tuple[int | str, ...]) -> str:
+    text = ""
+    for part in location:
+        text += f"[{part + 1}]" if isinstance(part, int) else f".{part}"
+    return text.lstrip(".")

@@ -1,0 +1,137 @@
+"""Plots in text: curves of braille dots (2 by 4 in a character) and sparklines."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from rich.text import Text
+
+__all__ = ["DotPlot", "number", "sparkline"]
+
+_BARS = "▁▂▃▄▅▆▇█"
+# Bit of the dot at column c (0, 1) and row r (0 on top) of a braille character.
+_DOTS = ((0x01, 0x02, 0x04, 0x40), (0x08, 0x10, 0x20, 0x80))
+_BLANK = 0x2800
+
+
+def number(value: float, digits: int = 4) -> str:
+    """A number in few characters: so many significant digits, 4.1e6 for the very large and small."""
+    if not math.isfinite(value):
+        return "–"
+    if value != 0.0 and not 1e-3 <= abs(value) < 1e5:
+        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+        return f"{mantissa}e{int(exponent)}".replace("-", "−")
+    decimals = digits - 1 - (math.floor(math.log10(abs(value))) if value else 0)
+    return f"{value:.{max(0, min(decimals, max(digits, 4)))}f}".replace("-", "−")
+
+
+def sparkline(values: Sequence[float], width: int) -> str:
+    """The last values as bars, at most `width` of them: the mean of each share; blank where not finite."""
+    if not values or width < 1:
+        return ""
+    share = max(1, math.ceil(len(values) / width))
+    means = []
+    for start in range(0, len(values), share):
+        finite = [value for value in values[start : start + share] if math.isfinite(value)]
+        means.append(sum(finite) / len(finite) if finite else math.nan)
+    known = [mean for mean in means if math.isfinite(mean)]
+    if not known:
+        return " " * len(means)
+    low, span = min(known), max(known) - min(known)
+    scale = (len(_BARS) - 1) / span if span > 1e-9 * max(abs(low), 1e-300) else 0.0
+    return "".join(_BARS[round((m - low) * scale)] if math.isfinite(m) else " " for m in means)
+
+
+class DotPlot:
+    """Dots on a grid of characters, with the axes' ends written beside it.
+
+    Args:
+        width: characters of the whole plot, labels included.
+        height: lines of the whole plot, title and axis included.
+        x: (low, high) of the horizontal axis.
+        y: (low, high) of the vertical axis.
+    """
+
+    LABEL = 6
+
+    def __init__(self, width: int, height: int, x: tuple[float, float], y: tuple[float, float]) -> None:
+        self.columns = max(4, width - self.LABEL - 1)
+        self.rows = max(2, height - 2)
+        self._x, self._y = _opened(*x), _opened(*y)
+        self._cells = [[0] * self.columns for _ in range(self.rows)]
+        self._styles = [[""] * self.columns for _ in range(self.rows)]
+        self._note = ""
+
+    def curve(self, points: Sequence[tuple[float, float]], style: str, every: int = 1) -> None:
+        """Join the points by lines; `every` > 1 draws dotted ones. What is not finite breaks the line."""
+        last: tuple[float, float] | None = None
+        count = 0
+        for x, y in points:
+            if not (math.isfinite(x) and math.isfinite(y)):
+                last = None
+                continue
+            here = self._place(x, y)
+            begin = last if last is not None else here
+            steps = max(1, round(max(abs(here[0] - begin[0]), abs(here[1] - begin[1]))))
+            for k in range(1, steps + 1):
+                count += 1
+                if count % every == 0:
+                    part = k / steps
+                    self._dot(
+                        begin[0] + part * (here[0] - begin[0]), begin[1] + part * (here[1] - begin[1]), style
+                    )
+            last = here
+
+    def band(self, points: Sequence[tuple[float, float, float]], style: str) -> None:
+        """The edges of a band as dotted lines, from (x, low, high); what leaves the plot is not drawn."""
+        below, above = self._y
+        self.curve([(x, low if low >= below else math.nan) for x, low, _ in points], style, every=3)
+        self.curve([(x, high if high <= above else math.nan) for x, _, high in points], style, every=3)
+
+    def note(self, text: str) -> None:
+        """Say why there is nothing to see, in place of the axes."""
+        self._note = text
+
+    def render(self, title: str, x_unit: str = "") -> Text:
+        """The plot as lines of text."""
+        text = Text(no_wrap=True)
+        text.append(" " * (self.LABEL + 1) + title[: self.columns], style="bold")
+        if self._note:
+            pad = " " * (self.LABEL + 1 + max(0, (self.columns - len(self._note)) // 2))
+            above, below = self.rows // 2, self.rows - self.rows // 2
+            text.append("\n" * (above + 1) + pad + self._note[: self.columns] + "\n" * below, style="dim")
+            return text
+        for row, (cells, styles) in enumerate(zip(self._cells, self._styles, strict=True)):
+            label = {0: number(self._y[1], 3), self.rows - 1: number(self._y[0], 3)}.get(row, "")
+            text.append(f"\n{label:>{self.LABEL}}", style="dim")
+            text.append("┤" if label else "│", style="dim")
+            for dots, style in zip(cells, styles, strict=True):
+                text.append(chr(_BLANK + dots) if dots else " ", style=style)
+        low, high = number(self._x[0], 3), f"{number(self._x[1], 3)} {x_unit}".rstrip()
+        axis = low + high.rjust(self.columns - len(low))
+        text.append("\n" + " " * (self.LABEL + 1) + axis, style="dim")
+        return text
+
+    def _place(self, x: float, y: float) -> tuple[float, float]:
+        (x0, x1), (y0, y1) = self._x, self._y
+        return (
+            (x - x0) / (x1 - x0) * (2 * self.columns - 1),
+            (y1 - y) / (y1 - y0) * (4 * self.rows - 1),
+        )
+
+    def _dot(self, column: float, row: float, style: str) -> None:
+        c, r = round(column), round(row)
+        if 0 <= c < 2 * self.columns and 0 <= r < 4 * self.rows:
+            self._cells[r // 4][c // 2] |= _DOTS[c % 2][r % 4]
+            self._styles[r // 4][c // 2] = style
+
+
+def _opened(low: float, high: float) -> tuple[float, float]:
+    """A range that is none is opened around its value."""
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return 0.0, 1.0
+    if high - low <= 1e-9 * max(abs(low), abs(high)):
+        half = 0.05 * abs(low) or 1.0
+        return low - half, high + half
+    return low, high

@@ -1,0 +1,183 @@
+"""What a live view remembers: the last seconds, thinned, and stiffness over deflection as it grows.
+
+Fed with every estimate (a few microseconds each), read a few times a second.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import NamedTuple, Protocol
+
+from estimator.sample import Status, TransmissionEstimate
+
+__all__ = ["EstimateLike", "GrowingCurve", "History", "Moment", "TruthLike"]
+
+_BINS = 160
+_USABLE = int(Status.VALID | Status.OBSERVABLE)
+_NEAR = 8  # points to either side of one, among which its standard deviation is no outlier
+_OUTDATED = 2.5  # times the usual one there
+
+
+class EstimateLike(Protocol):
+    """An `Estimate`, or the message of one."""
+
+    @property
+    def sequence(self) -> int:
+        """Number of the SYNC."""
+
+    @property
+    def status(self) -> int:
+        """Bits of `Status`."""
+
+    @property
+    def flexibility_torque_nm(self) -> float:
+        """The joint's flexibility torque."""
+
+    @property
+    def stiffness_nm_rad(self) -> float:
+        """The joint's stiffness."""
+
+    @property
+    def stiffness_std_nm_rad(self) -> float:
+        """Its standard deviation."""
+
+    @property
+    def transmissions(self) -> tuple[TransmissionEstimate, ...]:
+        """Each transmission's own."""
+
+
+class TruthLike(Protocol):
+    """What is known to be true in a simulation."""
+
+    @property
+    def flexibility_torque_nm(self) -> float:
+        """The joint's flexibility torque."""
+
+    @property
+    def stiffness_nm_rad(self) -> float:
+        """The joint's stiffness."""
+
+
+class Moment(NamedTuple):
+    """One instant of the history; NaN where there is no truth."""
+
+    time_s: float
+    torque_nm: float
+    stiffness_nm_rad: float
+    std_nm_rad: float
+    true_torque_nm: float
+    true_stiffness_nm_rad: float
+    valid: bool
+
+
+class GrowingCurve:
+    """Stiffness over deflection, the latest value of each place; the range grows with what has been seen."""
+
+    def __init__(self) -> None:
+        self._low = 0.0
+        self._width = 0.0  # of one bin; 0: nothing seen yet
+        self._bins: list[tuple[float, float, float] | None] = [None] * _BINS
+
+    def add(self, deflection_rad: float, stiffness_nm_rad: float, std_nm_rad: float) -> None:
+        """Enter one estimate; what is not finite is left out."""
+        if not (math.isfinite(deflection_rad) and math.isfinite(stiffness_nm_rad)):
+            return
+        if self._width == 0.0:
+            self._width = max(abs(deflection_rad), 1e-9) / _BINS * 2.0
+            self._low = deflection_rad - self._width * _BINS / 2
+        place = int((deflection_rad - self._low) // self._width)
+        while not 0 <= place < _BINS:
+            self._double(upwards=place >= _BINS)
+            place = int((deflection_rad - self._low) // self._width)
+        self._bins[place] = (deflection_rad, stiffness_nm_rad, std_nm_rad)
+
+    def points(self) -> list[tuple[float, float, float]]:
+        """(deflection, stiffness, standard deviation), by deflection.
+
+        Left out is what its neighbours have outdated: a value from before the estimator knew the curve, at a
+        place where the joint has hardly been since, stands out by its standard deviation.
+        """
+        points = [point for point in self._bins if point is not None]
+        stds = [std for _, _, std in points]
+        kept = []
+        for k, point in enumerate(points):
+            near = sorted(stds[max(0, k - _NEAR) : k + _NEAR + 1])
+            if not point[2] > _OUTDATED * near[len(near) // 2]:
+                kept.append(point)
+        return kept
+
+    def _double(self, upwards: bool) -> None:
+        pairs = [b if b is not None else a for a, b in zip(self._bins[::2], self._bins[1::2], strict=True)]
+        empty: list[tuple[float, float, float] | None] = [None] * (_BINS // 2)
+        self._bins = pairs + empty if upwards else empty + pairs
+        if not upwards:
+            self._low -= self._width * _BINS
+        self._width *= 2.0
+
+
+class History:
+    """The last seconds of a joint and its curve.
+
+    Args:
+        seconds: how far back it reaches.
+        points: how many moments it keeps of them.
+    """
+
+    def __init__(self, seconds: float = 12.0, points: int = 600) -> None:
+        self.seconds = seconds
+        self.moments: deque[Moment] = deque(maxlen=points)
+        self.curves: tuple[GrowingCurve, ...] = ()
+        self.latest: EstimateLike | None = None
+        self._apart_s = seconds / points
+
+    def add(self, estimate: EstimateLike, time_s: float, truth: TruthLike | None = None) -> None:
+        """Enter one estimate; `time_s` is that of its SYNC, of any origin."""
+        self.latest = estimate
+        moments = self.moments
+        if moments:
+            since = time_s - moments[-1].time_s
+            if since < 0.0:  # the daemon was started anew
+                moments.clear()
+            elif since < 0.999 * self._apart_s:
+                return
+        moments.append(
+            Moment(
+                time_s,
+                estimate.flexibility_torque_nm,
+                estimate.stiffness_nm_rad,
+                estimate.stiffness_std_nm_rad,
+                truth.flexibility_torque_nm if truth else math.nan,
+                truth.stiffness_nm_rad if truth else math.nan,
+                bool(estimate.status & Status.VALID),
+            )
+        )
+        if len(self.curves) != len(estimate.transmissions):
+            self.curves = tuple(GrowingCurve() for _ in estimate.transmissions)
+        if estimate.status & _USABLE == _USABLE:
+            for curve, one in zip(self.curves, estimate.transmissions, strict=True):
+                curve.add(one.deflection_rad, one.stiffness_nm_rad, one.stiffness_std_nm_rad)
+
+    def window(self) -> list[Moment]:
+        """The moments not older than `seconds` before the last one."""
+        if not self.moments:
+            return []
+        since = self.moments[-1].time_s - self.seconds
+        return [moment for moment in self.moments if moment.time_s >= since]
+
+    def relative_errors(self) -> tuple[float, float]:
+        """Relative rms error of (stiffness, torque) against the truth over the valid part of the window.
+
+        NaN without truth.
+        """
+        window = [moment for moment in self.window() if moment.valid]
+        return (
+            _relative([(m.stiffness_nm_rad, m.true_stiffness_nm_rad) for m in window]),
+            _relative([(m.torque_nm, m.true_torque_nm) for m in window]),
+        )
+
+
+def _relative(pairs: list[tuple[float, float]]) -> float:
+    known = [(value, true) for value, true in pairs if math.isfinite(value) and math.isfinite(true)]
+    power = sum(true**2 for _, true in known)
+    return math.sqrt(sum((value - true) ** 2 for value, true in known) / power) if power else math.nan

@@ -1,0 +1,180 @@
+"""Text of a commented joint file, from a few answers or from what is on the bus."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from drivelink.canopen.scan import FoundNode
+from drivelink.canopen.vendors import vendor_of
+from drivelink.errors import DriveError
+from drivelink.jointfile import JointFile, parse
+
+__all__ = ["Answers", "answers_from_bus", "joint_text"]
+
+
+@dataclass(slots=True, kw_only=True)
+class Answers:
+    """What a new joint file is made from.
+
+    Attributes:
+        name: of the joint.
+        arrangement: single, antagonistic or serial.
+        inertia_kg_m2: of each motor, joint side.
+        viscous_damping_nm_s_rad: of each motor, joint side.
+        model: of the transmission.
+        nodes: node ids of the drives, motor by motor.
+        gear_ratio: motor revolutions per joint revolution; None: read from the drive.
+        encoder: "drive", "none", or the node id of a CiA 406 encoder.
+        interface: python-can's.
+        channel: python-can's.
+        bitrate: bit/s.
+        passive: another master configures the drives and makes SYNC.
+        remarks: about a node, written beside it.
+    """
+
+    name: str = "joint"
+    arrangement: str = "single"
+    inertia_kg_m2: float = 0.1
+    viscous_damping_nm_s_rad: float = 0.1
+    model: str = "polynomial"
+    nodes: list[int] = field(default_factory=list)
+    gear_ratio: float | None = None
+    encoder: str = "drive"
+    interface: str = "socketcan"
+    channel: str = "can0"
+    bitrate: int = 1_000_000
+    passive: bool = False
+    remarks: dict[int, str] = field(default_factory=dict)
+
+    @property
+    def motors(self) -> int:
+        """How many."""
+        return 1 if self.arrangement == "single" else 2
+
+
+def joint_text(answers: Answers) -> str:
+    """The file; it is valid, or an error tells which answer is not.
+
+    Raises:
+        JointFileError: an answer makes no valid joint file.
+    """
+    nodes = list(answers.nodes)
+    free = (node for node in range(1, 128) if node not in nodes)
+    while len(nodes) < answers.motors:
+        nodes.append(next(free))
+    parts = [_head(answers)]
+    parts += [_motor(answers, index, node) for index, node in enumerate(nodes[: answers.motors])]
+    parts += [_link(answers), _bus(answers), _ZENOH]
+    text = "\n".join(parts)
+    _validated(text)
+    return text
+
+
+def _validated(text: str) -> JointFile:
+    return parse(text, "these answers")
+
+
+def _head(answers: Answers) -> str:
+    meaning = {
+        "single": "one motor behind one transmission",
+        "antagonistic": "two motors pull against each other (eqs 9, 11)",
+        "serial": "a second motor sets the stiffness",
+    }.get(answers.arrangement, "")
+    return (
+        "# A joint of drivelink: what it is, how it is reached, where its estimates go.\n"
+        "# Check it, the bus and the drives with `drivelink doctor`, then `drivelink run`.\n"
+        f'name = "{answers.name}"  # part of the key: drivelink/{answers.name}/estimate\n'
+        f'arrangement = "{answers.arrangement}"  # {meaning}\n'
+    )
+
+
+def _motor(answers: Answers, index: int, node: int) -> str:
+    remark = f"  # {answers.remarks[node]}" if node in answers.remarks else ""
+    gear = (
+        "# gear_ratio = 1.0  # motor revolutions per joint revolution; left out: the drive's (0x6091), else 1"
+        if answers.gear_ratio is None
+        else f"gear_ratio = {answers.gear_ratio:g}  # motor revolutions per joint revolution"
+    )
+    return (
+        f"[[motor]]  # motor {index + 1}\n"
+        f"inertia_kg_m2 = {answers.inertia_kg_m2:g}  # joint side: rotor inertia times gear ratio squared\n"
+        f"viscous_damping_nm_s_rad = {answers.viscous_damping_nm_s_rad:g}  # joint side\n"
+        "[motor.transmission]\n"
+        f'model = "{answers.model}"  # form of the flexibility torque; "none" if rigid\n'
+        "# order = 2  # of a polynomial; left out: chosen from the data\n"
+        "[motor.drive]\n"
+        f"node_id = {node}{remark}\n"
+        f"{gear}\n"
+        "# counts_per_rev = 16384  # at the motor; left out: the drive's (0x608F)\n"
+        "# rated_torque_nm = 0.5  # left out: the drive's (0x6076)\n"
+        "# torque_constant_nm_a = 0.05  # where the torque has to come from the current\n"
+        "# direction = -1  # where the motor counts against the joint\n"
+        '# eds = "drive.eds"  # only needed where the drive may not be asked (configure = false)\n'
+    )
+
+
+def _link(answers: Answers) -> str:
+    if answers.encoder == "none":
+        return "[link]\n# no link encoder: only with a rigid transmission\n"
+    lines = ["[link]", "[link.encoder]"]
+    if answers.encoder == "drive":
+        lines.append('source = "drive"  # second encoder of the first drive, 0x60E4:01')
+        lines.append("counts_per_rev = 65536  # per joint revolution")
+    else:
+        node = int(answers.encoder)
+        remark = f"  # {answers.remarks[node]}" if node in answers.remarks else ""
+        lines.append('source = "cia406"  # an encoder that is a node of its own')
+        lines.append(f"node_id = {node}{remark}")
+        lines.append("# counts_per_rev = 65536  # per joint revolution; left out: the encoder's (0x6501)")
+    lines.append("# direction = -1")
+    lines.append("# [link.dynamics]  # makes external torques visible (eq 12)")
+    lines.append("# inertia_kg_m2 = 0.4")
+    return "\n".join(lines) + "\n"
+
+
+def _bus(answers: Answers) -> str:
+    passive = (
+        'configure = false  # never send a frame: another master is in charge\nsync = "follow"\n'
+        if answers.passive
+        else '# sync = "follow"  # where another master makes SYNC\n'
+        "# configure = false  # never send a frame: another master configures the drives\n"
+    )
+    return (
+        "[bus]\n"
+        f'interface = "{answers.interface}"  # any of python-can\'s\n'
+        f'channel = "{answers.channel}"\n'
+        f"bitrate = {answers.bitrate}\n"
+        "period_s = 0.001  # one SYNC, one sample, one estimate\n"
+        f"{passive}"
+    )
+
+
+_ZENOH = (
+    "[zenoh]\n"
+    '# endpoint = "tcp/127.0.0.1:7447"  # where subscribers connect\n'
+    '# config = "zenoh.json5"  # instead: a zenoh configuration of your own\n'
+)
+
+
+def answers_from_bus(answers: Answers, found: list[FoundNode]) -> Answers:
+    """Fill in what the nodes on the bus tell.
+
+    Raises:
+        DriveError: there is no drive.
+    """
+    drives = [node for node in found if node.device_type is not None and node.device_type & 0xFFFF == 402]
+    encoders = [node for node in found if node.device_type is not None and node.device_type & 0xFFFF == 406]
+    if not drives:
+        heard = ", ".join(f"node {node.node_id} ({node.profile})" for node in found) or "nobody"
+        raise DriveError(f"no CiA 402 drive answers on {answers.interface} {answers.channel}; heard: {heard}")
+    if not answers.nodes:
+        answers.nodes = [node.node_id for node in drives][:2]
+        if len(answers.nodes) == 2 and answers.arrangement == "single":
+            answers.arrangement = "antagonistic"
+    if encoders and answers.encoder == "drive":
+        answers.encoder = str(encoders[0].node_id)
+    for node in found:
+        maker = vendor_of(node.identity[0]).name or f"vendor 0x{node.identity[0]:X}"
+        name = "".join(letter for letter in node.name if letter.isprintable())
+        answers.remarks[node.node_id] = f"{name + ', ' if name else ''}{node.profile}, {maker}"
+    return answers

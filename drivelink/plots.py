@@ -1,0 +1,240 @@
+"""Plots of everything drivelink computes, in one style that a black-and-white print still tells apart.
+
+Figures are made without pyplot: no global state, no window, safe in any thread.
+
+    figure, axes = new_figure("Elbow", rows=2)
+    stiffness_against_deflection(axes[0], {"estimate": Curve(phi, sigma, std), "truth": Curve(phi, true)})
+    over_time(axes[1], {"flexibility torque": Curve(t, torque)}, "torque / N·m")
+    save(figure, Path("joint.png"))
+"""
+
+from __future__ import annotations
+
+import io
+import itertools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from estimator.sample import FloatArray
+
+__all__ = [
+    "Curve",
+    "bars",
+    "new_figure",
+    "over_time",
+    "save",
+    "stiffness_against_deflection",
+    "svg_text",
+    "xy",
+]
+
+# After Okabe and Ito (told apart by all eyes), each with a line style, a marker and a hatch of its own;
+# their lightness differs too, so that a grey print keeps them apart.
+COLORS = ("#005f9e", "#e0701a", "#000000", "#009e73", "#cc79a7", "#56b4e9")
+LINES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 2)))
+MARKERS = ("o", "s", "^", "D", "v", "x")
+FILLS = ("#ffffff", "#56b4e9", "#bbbbbb", "#e69f00", "#eeeeee", "#999999")
+HATCHES = ("", "///", "...", "xxx", "\\\\\\", "++")
+
+STYLE: dict[Any, Any] = {
+    "figure.dpi": 110,
+    "font.size": 9,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlesize": 10,
+    "axes.titlelocation": "left",
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "lines.linewidth": 1.3,
+    "svg.hashsalt": "drivelink",  # the same figure is the same file
+    "svg.fonttype": "none",
+}
+_MAX_POINTS = 4000  # a curve of more points is thinned to the extremes of each pixel column
+_BINS = 240
+_MIN_IN_BIN = 1
+_MARKERS_A_CURVE = 12
+_SIGMA_95 = 1.96
+
+
+class Curve(NamedTuple):
+    """One curve: y over x, with a standard deviation where there is one (drawn as a 95 % band)."""
+
+    x: FloatArray
+    y: FloatArray
+    std: FloatArray | None = None
+
+
+def new_figure(
+    title: str = "", rows: int = 1, columns: int = 1, width: float = 7.0, height: float = 2.6
+) -> tuple[Figure, list[Axes]]:
+    """A figure in the house style, and its axes row by row; `height` in inches is that of one row."""
+    with rc_context(STYLE):
+        figure = Figure(figsize=(width, height * rows), layout="constrained")
+        FigureCanvasAgg(figure)
+        axes = [figure.add_subplot(rows, columns, k + 1) for k in range(rows * columns)]
+        if title:
+            figure.suptitle(title, fontsize=11, x=0.01, ha="left", fontweight="bold")
+    return figure, axes
+
+
+def xy(axes: Axes, curves: Mapping[str, Curve], x_label: str, y_label: str, title: str = "") -> None:
+    """Draw curves by their names, in order: each has colour, line style and marker of its own."""
+    for k, (name, curve) in enumerate(curves.items()):
+        thin = _thinned(curve)
+        _draw(axes, thin, name, k)
+    _finish(axes, x_label, y_label, title, legend=len(curves) > 1)
+
+
+def over_time(axes: Axes, curves: Mapping[str, Curve], y_label: str, title: str = "") -> None:
+    """Draw curves over time in seconds."""
+    xy(axes, curves, "time / s", y_label, title)
+
+
+def stiffness_against_deflection(
+    axes: Axes, curves: Mapping[str, Curve], title: str = "", unit: str = "N·m/rad"
+) -> None:
+    """Draw stiffness over deflection: samples in any order become one curve, the median in each bin.
+
+    The band is the 95 % interval: 1.96 times the median standard deviation of the bin.
+    """
+    binned = {name: _binned(curve) for name, curve in curves.items()}
+    x_unit = "rad" if unit.endswith("rad") else "m"
+    xy(axes, binned, f"deflection / {x_unit}", f"stiffness / ({unit})", title)
+
+
+def bars(
+    axes: Axes, groups: Mapping[str, Mapping[str, float]], y_label: str, title: str = "", log: bool = False
+) -> None:
+    """Draw groups of bars side by side: {series: {category: value}}, each series with its own hatch."""
+    categories = list(dict.fromkeys(name for series in groups.values() for name in series))
+    width = 0.8 / max(len(groups), 1)
+    place = np.arange(len(categories), dtype=float)
+    for k, (name, series) in enumerate(groups.items()):
+        axes.bar(
+            place + (k - (len(groups) - 1) / 2) * width,
+            [series.get(category, np.nan) for category in categories],
+            width=0.92 * width,
+            label=name,
+            color=FILLS[k % len(FILLS)],
+            edgecolor="#222222",
+            hatch=HATCHES[k % len(HATCHES)],
+            linewidth=0.8,
+        )
+    axes.set_xticks(place, categories)
+    if log:
+        axes.set_yscale("log")
+    _finish(axes, "", y_label, title, legend=len(groups) > 1)
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Write the figure; the ending of the name says the format (png, svg, pdf)."""
+    with rc_context(STYLE):
+        metadata = {"Date": None} if path.suffix == ".svg" else None
+        figure.savefig(path, metadata=metadata)
+    return path
+
+
+def svg_text(figure: Figure) -> str:
+    """The figure as SVG, to be put inline into an HTML page."""
+    buffer = io.StringIO()
+    with rc_context(STYLE):
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    text = buffer.getvalue()
+    return text[text.index("<svg") :]
+
+
+def _draw(axes: Axes, curve: Curve, name: str, k: int) -> None:
+    color = COLORS[k % len(COLORS)]
+    few = max(1, len(curve.x) // _MARKERS_A_CURVE)
+    with rc_context(STYLE):
+        axes.plot(
+            curve.x,
+            curve.y,
+            label=name,
+            color=color,
+            linestyle=LINES[k % len(LINES)],
+            marker=MARKERS[k % len(MARKERS)] if k else None,
+            markevery=(few * k // 4 % few if few > 1 else 0, few),
+            markersize=4,
+            markerfacecolor="none",
+        )
+    if curve.std is not None:
+        half = _SIGMA_95 * curve.std
+        axes.fill_between(
+            curve.x,
+            curve.y - half,
+            curve.y + half,
+            facecolor=color,
+            alpha=0.22,
+            linewidth=0.0,
+            hatch=HATCHES[k % len(HATCHES)] or None,
+            label="" if k else "95 %",  # one entry stands for every curve's band
+        )
+
+
+def _finish(axes: Axes, x_label: str, y_label: str, title: str, legend: bool) -> None:
+    axes.set_xlabel(x_label)
+    axes.set_ylabel(y_label)
+    named = legend or len(axes.get_legend_handles_labels()[0]) > 1
+    if title:
+        axes.set_title(title, loc="left", pad=20.0 if named else None)
+    if named:  # on a line of its own between title and axes
+        axes.legend(
+            loc="lower left",
+            bbox_to_anchor=(0.0, 1.0),
+            ncols=6,
+            frameon=False,
+            fontsize=8,
+            borderaxespad=0.2,
+        )
+
+
+def _thinned(curve: Curve) -> Curve:
+    """At most so many points, of each stretch its lowest and highest, so that no peak is lost."""
+    n = len(curve.x)
+    if n <= _MAX_POINTS:
+        return curve
+    stretch = n // (_MAX_POINTS // 2) + 1
+    pad = (-n) % stretch
+    y = np.concatenate((curve.y, np.full(pad, np.nan))).reshape(-1, stretch)
+    base = np.arange(len(y)) * stretch
+    low = base + np.argmin(np.where(np.isfinite(y), y, np.inf), axis=1)
+    high = base + np.argmax(np.where(np.isfinite(y), y, -np.inf), axis=1)
+    keep = np.unique(np.minimum(np.concatenate((low, high)), n - 1))
+    return Curve(curve.x[keep], curve.y[keep], None if curve.std is None else curve.std[keep])
+
+
+def _binned(curve: Curve) -> Curve:
+    """Scattered samples as one curve over x: the median of each bin; gaps where there are no samples."""
+    finite = np.isfinite(curve.x) & np.isfinite(curve.y)
+    x, y = curve.x[finite], curve.y[finite]
+    if len(x) <= _BINS or float(np.ptp(x)) == 0.0:
+        order = np.argsort(x, kind="stable")
+        return Curve(x[order], y[order], None if curve.std is None else curve.std[finite][order])
+    edges = np.linspace(x.min(), x.max(), _BINS + 1)
+    place = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, _BINS - 1)
+    order = np.argsort(place, kind="stable")
+    starts = np.searchsorted(place[order], np.arange(_BINS + 1))
+
+    def medians(values: FloatArray) -> FloatArray:
+        sorted_values = values[order]
+        return np.array(
+            [
+                np.median(sorted_values[a:b]) if b - a >= _MIN_IN_BIN else np.nan
+                for a, b in itertools.pairwise(starts)
+            ]
+        )
+
+    std = None if curve.std is None else medians(curve.std[finite])
+    return Curve((edges[1:] + edges[:-1]) / 2, medians(y), std)

@@ -1,0 +1,110 @@
+"""Progress of anything that may take longer than two seconds: one bar on a terminal, plain lines elsewhere.
+
+It writes to stderr, shows nothing for work that is done at once, and costs well under a microsecond an item.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Sized
+from types import TracebackType
+from typing import Self, TypeVar
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+__all__ = ["Meter", "track"]
+
+T = TypeVar("T")
+
+_QUIET_S = 1.0  # nothing is shown before
+_LINE_S = 5.0  # between two plain lines
+_CHECK_EVERY = 256  # items between two looks at the clock
+
+
+class Meter:
+    """Progress of one job, told by its owner.
+
+    Use as a context manager; `update` it as often as you like. It ends with what has been reached, also
+    after an exception.
+
+    Args:
+        what: the job in a few words, e.g. "replay".
+        total: how much there is to do, where it is known.
+        console: where to show it; stderr if left out.
+    """
+
+    def __init__(self, what: str, total: int | None = None, console: Console | None = None) -> None:
+        self.done = 0
+        self._what = what
+        self._total = total
+        self._console = console or Console(stderr=True)
+        self._begin = time.monotonic()
+        self._next_line = self._begin + _LINE_S
+        self._bar: Progress | None = None
+        self._task = TaskID(0)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.update(self._task, completed=self.done)
+            self._bar.stop()
+
+    def advance(self, items: int = 1) -> None:
+        """So many items more are done."""
+        self.update(self.done + items)
+
+    def update(self, done: int) -> None:
+        """So many items are done in all."""
+        self.done = done
+        now = time.monotonic()
+        if now - self._begin < _QUIET_S:
+            return
+        if not self._console.is_terminal:
+            self._line(now)
+            return
+        if self._bar is None:
+            self._bar = Progress(
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeRemainingColumn(),
+                console=self._console,
+                transient=True,
+            )
+            self._task = self._bar.add_task(self._what, total=self._total)
+            self._bar.start()
+        self._bar.update(self._task, completed=done)
+
+    def _line(self, now: float) -> None:
+        if now < self._next_line:
+            return
+        self._next_line = now + _LINE_S
+        share = f"{100 * self.done / self._total:.0f} %" if self._total else f"{self.done}"
+        self._console.print(f"{self._what}: {share} after {now - self._begin:.0f} s", highlight=False)
+
+
+def track(
+    items: Iterable[T], what: str, total: int | None = None, console: Console | None = None
+) -> Iterator[T]:
+    """Yield the items and show how far it has come.
+
+    Args:
+        items: what to go through.
+        what: the job in a few words.
+        total: number of items, where the items themselves cannot tell.
+        console: where to show it; stderr if left out.
+    """
+    if total is None and isinstance(items, Sized):
+        total = len(items)
+    with Meter(what, total, console) as meter:
+        count = 0
+        for count, item in enumerate(items, 1):
+            yield item
+            if not count % _CHECK_EVERY or (total is not None and total < _CHECK_EVERY):
+                meter.update(count)
+        meter.done = count

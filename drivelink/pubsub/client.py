@@ -1,0 +1,188 @@
+"""The Python side of a joint for a controller: `drivelink.subscribe("elbow")`.
+
+    with drivelink.subscribe("elbow") as joint:
+        while True:
+            estimate = joint.wait(timeout_s=0.01)      # the next cycle, or None
+            if joint.valid:
+                use(estimate.stiffness_nm_rad, joint.age_s)
+
+What happens to the daemon is `state`, never an exception.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import zenoh
+
+from drivelink.pubsub.clientbase import ENDPOINT, Client
+from drivelink.pubsub.feed import WAKE, State
+from drivelink.pubsub.wire import EstimateMessage
+
+__all__ = ["State", "Subscription", "subscribe"]
+
+
+class Subscription(Client):
+    """Estimates of one joint; see `subscribe`."""
+
+    def wait(self, timeout_s: float | None = None) -> EstimateMessage | None:
+        """The next cycle: the newest estimate that was not read yet, waiting for one if there is none.
+
+        Args:
+            timeout_s: how long at most; None: for ever.
+
+        Returns:
+            The estimate, or None when the time is over or the subscription closed.
+        """
+        return self._wait(timeout_s, self._newest)
+
+    def cycles(self, timeout_s: float | None = None) -> Iterator[EstimateMessage | None]:
+        """Every estimate in order; None whenever `timeout_s` passed without one. Ends when closed."""
+        while not self._closed:
+            message = self._wait(timeout_s, self._oldest)
+            if message is not None or not self._closed:
+                yield message
+
+    def __iter__(self) -> Iterator[EstimateMessage]:
+        """Every estimate in order, waiting for each. Ends when closed."""
+        return (message for message in self.cycles() if message is not None)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave; a second time does nothing."""
+        self._closed = True
+        if hasattr(self, "_alarm"):
+            self._wake()
+            self._alarm.close()
+        super().close()
+
+    def _declare_estimates(self, key: str) -> zenoh.Subscriber[Any]:
+        self._alarm = _Alarm(self._wake)
+        subscriber = self._session.declare_subscriber(key, zenoh.handlers.RingChannel(self._depth))
+        self._queue = subscriber.handler  # unlike the subscriber, it may wait while that is undeclared
+        return subscriber
+
+    def _pop(self) -> zenoh.Sample | None:
+        sample: zenoh.Sample | None = self._queue.try_recv()
+        return sample
+
+    def _wake(self) -> None:
+        with suppress(zenoh.ZError):
+            self._session.put(
+                self.key + "/estimate",
+                b"",
+                attachment=WAKE,
+                allowed_destination=zenoh.Locality.SESSION_LOCAL,
+            )
+
+    def _wait(
+        self, timeout_s: float | None, pick: Callable[[], EstimateMessage | None]
+    ) -> EstimateMessage | None:
+        deadline_s = math.inf if timeout_s is None else time.monotonic() + timeout_s
+        self._drain()
+        while (message := pick()) is None:
+            if self._closed or time.monotonic() >= deadline_s:
+                return None
+            self._alarm.set(deadline_s)
+            try:
+                sample = self._queue.recv()
+                now_ns = time.monotonic_ns()
+                self._admit(sample, now_ns)
+            except zenoh.ZError:  # closed meanwhile by another thread
+                return None
+            finally:
+                self._alarm.set(math.inf)
+        return message
+
+
+class _Alarm:
+    """Ends a blocking receive at its deadline, which zenoh's channels cannot do.
+
+    The thread starts with the first deadline. Moving the deadline later, once a cycle, is one assignment: the
+    thread finds out when it would have rung.
+    """
+
+    def __init__(self, ring: Callable[[], None]) -> None:
+        self._ring = ring
+        self._deadline_s = math.inf
+        self._wakes_s = math.inf
+        self._closed = False
+        self._changed = threading.Condition()
+        self._thread: threading.Thread | None = None
+
+    def set(self, deadline_s: float) -> None:
+        """Ring at this time of the monotonic clock; infinity: not at all."""
+        self._deadline_s = deadline_s
+        if deadline_s < self._wakes_s:
+            with self._changed:
+                if self._thread is None and not self._closed:
+                    self._thread = threading.Thread(target=self._run, name="drivelink-alarm", daemon=True)
+                    self._thread.start()
+                self._changed.notify()
+
+    def close(self) -> None:
+        """End the thread."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join()
+
+    def _run(self) -> None:
+        with self._changed:
+            while not self._closed:
+                now_s = time.monotonic()
+                if self._deadline_s <= now_s:
+                    self._deadline_s = math.inf
+                    self._ring()
+                self._wakes_s = self._deadline_s
+                self._changed.wait(None if self._wakes_s == math.inf else max(0.0, self._wakes_s - now_s))
+
+
+def subscribe(
+    joint: str,
+    *,
+    endpoint: str = ENDPOINT,
+    config: str | Path | None = None,
+    prefix: str = "drivelink",
+    session: zenoh.Session | None = None,
+    depth: int = 1024,
+    stale_after_s: float | None = None,
+) -> Subscription:
+    """Subscribe to the estimates of a joint; the daemon may come later, go, and come back.
+
+    Args:
+        joint: its name, as in the joint file.
+        endpoint: where a daemon or a router listens.
+        config: a zenoh configuration file (JSON5) instead of the endpoint: TLS, access control, scouting.
+        prefix: first part of every key, as in the joint file.
+        session: an open session to use instead; it stays open.
+        depth: estimates kept unread before the oldest is dropped.
+        stale_after_s: age from which an estimate is stale; None: five periods, at least 20 ms.
+
+    Raises:
+        ZenohError: no session can be opened, or a name cannot be part of a key.
+    """
+    return Subscription(
+        joint,
+        endpoint=endpoint,
+        config=config,
+        prefix=prefix,
+        session=session,
+        depth=depth,
+        stale_after_s=stale_after_s,
+    )

@@ -1,0 +1,244 @@
+"""What the blocking and the asynchronous client share: everything that does not wait.
+
+Estimates queue up in zenoh, outside the interpreter, and are taken in when something is asked.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zenoh
+import zenoh.ext
+from numpy.typing import NDArray
+
+from drivelink.errors import ZenohError
+from drivelink.pubsub.feed import WAKE, Feed, State
+from drivelink.pubsub.session import close_session, one_line, open_client
+from drivelink.pubsub.wire import ESTIMATE, EstimateMessage
+from estimator.sample import Status
+
+__all__ = ["ENDPOINT", "Client"]
+
+ENDPOINT = "tcp/127.0.0.1:7447"
+_NAME = re.compile(r"[^*$#?\s/]+(/[^*$#?\s/]+)*")
+
+
+class Client:
+    """What both clients have: everything that does not wait."""
+
+    def __init__(
+        self,
+        joint: str,
+        *,
+        endpoint: str,
+        config: str | Path | None,
+        prefix: str,
+        session: zenoh.Session | None,
+        depth: int,
+        stale_after_s: float | None,
+    ) -> None:
+        for what, text in (("joint", joint), ("prefix", prefix)):
+            if not _NAME.fullmatch(text):
+                raise ZenohError(f'{what}: expected a name without wildcards or spaces, got "{text}"')
+        if depth < 1:
+            raise ZenohError(f"depth: expected at least 1, got {depth}")
+        self.joint = joint
+        self.key = f"{prefix}/{joint}"
+        self._depth = depth
+        self._owned = session is None
+        self._session = open_client(endpoint, config) if session is None else session
+        self._feed = Feed(self.key + "/alive", depth, stale_after_s, time.monotonic_ns())
+        self._documents: dict[str, dict[str, Any]] = {}
+        self._closed = False
+        try:
+            self._declare()
+        except zenoh.ZError as error:
+            self.close()
+            raise ZenohError(f"{self.key}: {one_line(error)}") from error
+
+    def _declare(self) -> None:
+        ring = zenoh.handlers.RingChannel
+        liveliness = self._session.liveliness()
+        self._tokens = liveliness.declare_subscriber(f"{self.key}/alive/**", ring(64), history=True)
+        self._estimates = self._declare_estimates(self.key + "/estimate")
+        history = zenoh.ext.HistoryConfig(max_samples=1, detect_late_publishers=True)
+        self._latched = {
+            name: zenoh.ext.declare_advanced_subscriber(
+                self._session, f"{self.key}/{name}", ring(4), history=history
+            )
+            for name in ("status", "model")
+        }
+
+    def _declare_estimates(self, key: str) -> zenoh.Subscriber[Any]:
+        raise NotImplementedError
+
+    def _pop(self) -> zenoh.Sample | None:
+        raise NotImplementedError
+
+    def latest(self) -> EstimateMessage | None:
+        """The newest estimate, without waiting; None until the first one came."""
+        self._drain()
+        return self._feed.latest
+
+    def take(self) -> NDArray[np.void]:
+        """Every estimate not yet read, oldest first, as one numpy record array; never waits.
+
+        Fields are those of the wire (`drivelink.pubsub.wire.ESTIMATE`): `a["stiffness_nm_rad"]` is (n,),
+        `a["transmissions"]["deflection_rad"]` is (n, transmissions).
+        """
+        self._drain()
+        unread = self._feed.unread
+        count = len(unread[-1][1].transmissions) if unread else 1
+        dtype = ESTIMATE.dtype(count)
+        joined = b"".join(payload for payload, _ in unread if len(payload) == dtype.itemsize)
+        unread.clear()
+        return np.frombuffer(joined, dtype)
+
+    @property
+    def state(self) -> State:
+        """waiting, live, stale or gone."""
+        self._drain()
+        return self._feed.state(time.monotonic_ns())
+
+    @property
+    def age_s(self) -> float:
+        """Time since the latest estimate came in here, by the local clock; infinite before the first, s."""
+        self._drain()
+        if self._feed.latest is None:
+            return math.inf
+        return self._feed.arrivals.age_ns(time.monotonic_ns()) / 1e9
+
+    @property
+    def sync_age_s(self) -> float:
+        """Time since the SYNC of the latest estimate, as far as both machines' UNIX clocks agree, s."""
+        latest = self.latest()
+        return math.inf if latest is None else (time.time_ns() - latest.stamp_ns) / 1e9
+
+    @property
+    def stale(self) -> bool:
+        """The latest estimate is too old to act on, or there is none."""
+        self._drain()
+        return self._feed.stale(time.monotonic_ns())
+
+    @property
+    def valid(self) -> bool:
+        """The latest estimate is fresh, and its numbers may be used."""
+        return self._fresh(Status.VALID)
+
+    @property
+    def observable(self) -> bool:
+        """The latest estimate is fresh, and the motion at hand tells the stiffness."""
+        return self._fresh(Status.OBSERVABLE)
+
+    @property
+    def gaps(self) -> int:
+        """Cycles that are missing in what came, by their sequence numbers."""
+        self._drain()
+        return self._feed.gaps
+
+    @property
+    def skipped(self) -> int:
+        """Cycles that came and were dropped because more than `depth` of them were left unread."""
+        self._drain()
+        return self._feed.skipped
+
+    @property
+    def received(self) -> int:
+        """Estimates that came in."""
+        self._drain()
+        return self._feed.received
+
+    @property
+    def foreign(self) -> int:
+        """Messages on the estimate's key that the daemon did not write; they are not used."""
+        self._drain()
+        return self._feed.foreign
+
+    @property
+    def status(self) -> dict[str, Any] | None:
+        """The last status of the daemon; None until it came."""
+        return self._document("status")
+
+    @property
+    def model(self) -> dict[str, Any] | None:
+        """The model in use; None until it came."""
+        return self._document("model")
+
+    def close(self) -> None:
+        """Leave; a second time does nothing."""
+        self._closed = True
+        for name in ("_estimates", "_tokens"):
+            self._undeclare(getattr(self, name, None))
+        for subscriber in getattr(self, "_latched", {}).values():
+            self._undeclare(subscriber)
+        if self._owned:
+            close_session(self._session)
+
+    @staticmethod
+    def _undeclare(entity: Any) -> None:
+        with suppress(zenoh.ZError, AttributeError):
+            entity.undeclare()
+
+    def _fresh(self, bit: Status) -> bool:
+        self._drain()
+        latest = self._feed.latest
+        return latest is not None and bool(latest.status & bit) and not self.stale
+
+    def _document(self, name: str) -> dict[str, Any] | None:
+        with suppress(zenoh.ZError):
+            while (sample := self._latched[name].try_recv()) is not None:
+                with suppress(ValueError):
+                    self._documents[name] = json.loads(sample.payload.to_bytes())
+        return self._documents.get(name)
+
+    def _drain(self) -> None:
+        """Take in everything that zenoh has queued."""
+        if self._closed:
+            return
+        with suppress(zenoh.ZError):  # closed meanwhile by another thread
+            self._learn()
+            samples: list[zenoh.Sample] = []
+            while len(samples) < self._depth and (sample := self._pop()) is not None:
+                samples.append(sample)
+            now_ns = time.monotonic_ns()
+            overrun = len(samples) == self._depth
+            for sample in samples:
+                self._admit(sample, now_ns, overrun)
+                overrun = False
+            if len(samples) < self._depth:
+                self._feed.arrivals.empty(now_ns)
+
+    def _learn(self) -> None:
+        while (token := self._tokens.try_recv()) is not None:
+            self._feed.liveliness(token)
+
+    def _admit(self, sample: zenoh.Sample, now_ns: int, overrun: bool = False) -> None:
+        payload = sample.payload.to_bytes()
+        if not payload and (attachment := sample.attachment) and attachment.to_bytes() == WAKE:
+            return
+        feed = self._feed
+        if not feed.trusts(sample, now_ns):
+            self._learn()  # its token may have come meanwhile
+            if not feed.trusts(sample, now_ns):
+                feed.foreign += 1
+                return
+        feed.admit(payload, now_ns, overrun)
+
+    def _newest(self) -> EstimateMessage | None:
+        unread = self._feed.unread
+        if not unread:
+            return None
+        message = unread[-1][1]
+        unread.clear()
+        return message
+
+    def _oldest(self) -> EstimateMessage | None:
+        unread = self._feed.unread
+        return unread.popleft()[1] if unread else None

@@ -1,0 +1,191 @@
+"""What a subscriber knows of one joint: which estimates came, when, from whom, and which are missing.
+
+No waiting here: this is the bookkeeping that the blocking and the asynchronous client share. It is fed
+with what zenoh has queued whenever the user asks for something, so that nothing runs, and the interpreter
+is not taken, while the user computes.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from enum import StrEnum
+
+import zenoh
+
+from drivelink.errors import ZenohError
+from drivelink.pubsub.wire import EstimateMessage, decode_estimate
+from estimator.sample import Status
+
+__all__ = ["WAKE", "Arrivals", "Feed", "State"]
+
+WAKE = b"drivelink.wake"  # attachment of a local message that only ends a blocking receive
+_DRIFT = 1e-4  # what two clocks may run apart: 100 ppm
+_STALE_PERIODS = 5
+_STALE_AT_LEAST_NS = 20_000_000
+_STALE_UNKNOWN_NS = 500_000_000  # until two estimates have told the period
+
+
+class State(StrEnum):
+    """How the daemon is doing, seen from here."""
+
+    WAITING = "waiting"  # nothing has been seen of it yet
+    LIVE = "live"  # fresh estimates come in
+    STALE = "stale"  # it is there, but nothing fresh came
+    GONE = "gone"  # it was there, and is not any more; it may come back
+
+
+class Arrivals:
+    """When the latest estimate came in, on the local monotonic clock, without a callback per estimate.
+
+    It came after the queue was last seen empty and before it was read: that brackets it whatever the clocks
+    do. Inside the bracket the sender's stamp tells, moved by the smallest difference of the two clocks seen
+    so far (which may grow again by their drift).
+    """
+
+    __slots__ = ("_arrival_ns", "_empty_ns", "_offset_ns", "_read_ns")
+
+    def __init__(self, now_ns: int) -> None:
+        self._empty_ns = now_ns
+        self._read_ns = now_ns
+        self._arrival_ns = now_ns
+        self._offset_ns: int | None = None
+
+    def came(self, stamp_ns: int, now_ns: int) -> None:
+        """An estimate with this stamp was read from the queue now."""
+        difference = now_ns - stamp_ns
+        if self._offset_ns is None:
+            self._offset_ns = difference
+        else:
+            drift = int((now_ns - self._read_ns) * _DRIFT)
+            self._offset_ns = min(self._offset_ns + drift, difference)
+        self._read_ns = now_ns
+        self._arrival_ns = min(max(stamp_ns + self._offset_ns, self._empty_ns), now_ns)
+
+    def empty(self, now_ns: int) -> None:
+        """The queue was seen empty now."""
+        self._empty_ns = now_ns
+
+    def age_ns(self, now_ns: int) -> int:
+        """Time since the latest estimate came in."""
+        return now_ns - self._arrival_ns
+
+
+class Feed:
+    """Estimates of one joint, admitted one by one.
+
+    Attributes:
+        latest: the newest estimate, or None.
+        unread: decoded and not yet handed to the user, oldest first.
+        received: estimates admitted.
+        gaps: cycles that the daemon made and that never came, or that it lost itself.
+        skipped: cycles that came and were dropped here because nobody read them in time.
+        foreign: messages on the key that the daemon did not write, or that are no estimates.
+    """
+
+    def __init__(self, alive_key: str, depth: int, stale_after_s: float | None, now_ns: int) -> None:
+        self.latest: EstimateMessage | None = None
+        self.unread: deque[tuple[bytes, EstimateMessage]] = deque(maxlen=depth)
+        self.received = self.gaps = self.skipped = self.foreign = 0
+        self.arrivals = Arrivals(now_ns)
+        self._alive_key = alive_key
+        self._depth = depth
+        self._stale_after_ns = None if stale_after_s is None else int(stale_after_s * 1e9)
+        self._period_ns = 0
+        self._seen = False  # whether the daemon was ever there
+        self._alive = False
+        self._owners: set[str] = set()  # sessions that say they are this joint's daemon
+        self._source: zenoh.ZenohId | None = None  # session that wrote the latest estimate
+        self._trusted = False  # whether a token vouches for that one
+        self._anew = True  # whether the next estimate is the first of its session
+
+    def liveliness(self, sample: zenoh.Sample) -> None:
+        """A liveliness token of the daemon appeared or vanished."""
+        key = str(sample.key_expr)
+        there = sample.kind == zenoh.SampleKind.PUT
+        if key == self._alive_key:
+            self._alive = there
+            self._seen = self._seen or there
+            return
+        session = key.rpartition("/")[2]
+        (self._owners.add if there else self._owners.discard)(session)
+        self._trusted = False
+
+    def trusts(self, sample: zenoh.Sample, now_ns: int) -> bool:
+        """Whether the sample comes from the session whose token says that it is the daemon.
+
+        Without such a token (a plain publisher, or access control) it is whoever writes, until it is stale.
+        """
+        info = sample.source_info
+        source = info.source_id.zid if info else None
+        if self._trusted and source == self._source:
+            return True
+        if self._owners:
+            trusted = source is not None and str(source) in self._owners
+        else:
+            trusted = self.latest is None or source == self._source or self.stale(now_ns)
+        if trusted:
+            self._anew = source != self._source
+            self._source = source
+            self._trusted = bool(self._owners)
+        return trusted
+
+    def admit(self, payload: bytes, now_ns: int, overrun: bool) -> EstimateMessage | None:
+        """Take one message of a trusted source; None: it is not an estimate.
+
+        Args:
+            payload: its bytes.
+            now_ns: local monotonic clock.
+            overrun: whether older messages were dropped here, unread, before this one.
+        """
+        try:
+            message = decode_estimate(payload)
+        except ZenohError:
+            self.foreign += 1
+            return None
+        if self._anew:
+            self._anew = False
+        else:
+            self._count(message, overrun)
+        self.arrivals.came(message.stamp_ns, now_ns)
+        self.received += 1
+        if len(self.unread) == self._depth:
+            self.skipped += 1
+        self.unread.append((payload, message))
+        self.latest = message
+        self._seen = True
+        return message
+
+    def _count(self, message: EstimateMessage, overrun: bool) -> None:
+        before = self.latest
+        if before is None:
+            return
+        step = message.sequence - before.sequence
+        if step == 1 and self._period_ns:
+            return
+        if step < 1:  # the daemon started anew
+            return
+        if overrun:
+            self.skipped += step - 1
+        else:
+            self.gaps += step - 1
+        elapsed_ns = message.stamp_ns - before.stamp_ns
+        if elapsed_ns > 0:
+            self._period_ns = elapsed_ns // step
+
+    def stale(self, now_ns: int) -> bool:
+        """Whether the latest estimate is too old to act on, or says so itself."""
+        if self.latest is None or self.latest.status & Status.STALE:
+            return True
+        limit_ns = self._stale_after_ns
+        if limit_ns is None:
+            known = max(_STALE_PERIODS * self._period_ns, _STALE_AT_LEAST_NS)
+            limit_ns = known if self._period_ns else _STALE_UNKNOWN_NS
+        return self.arrivals.age_ns(now_ns) > limit_ns
+
+    def state(self, now_ns: int) -> State:
+        """The daemon's state, seen from here."""
+        if not self.stale(now_ns):
+            return State.LIVE
+        if self._alive:
+            return State.STALE if self.latest is not None else State.WAITING
+        return State.GONE if self._seen else State.WAITING

@@ -1,0 +1,115 @@
+"""Who listens at the endpoint where everybody meets, when the one who did is gone.
+
+Zenoh can retry a listener by itself, but a session that still retries takes ten seconds to close (1.10). So
+a daemon that lost a connection looks whether anybody still answers at the endpoint; if not, it opens one
+more session there, whose only job is to listen. The other daemons and the clients keep reconnecting to the
+endpoint, and meet again there. Where a router was, nobody takes its place: it will be started again.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+import threading
+from typing import Any
+
+import zenoh
+
+__all__ = ["Rendezvous", "answers"]
+
+_ATTEMPT_S = 0.2
+_CONNECT_S = 0.5
+
+
+def answers(endpoint: str) -> bool:
+    """Whether anything accepts a TCP connection at the endpoint."""
+    address = _address(endpoint)
+    if address is None:
+        return False
+    try:
+        with socket.create_connection(address, timeout=_CONNECT_S):
+            return True
+    except OSError:
+        return False
+
+
+def _address(endpoint: str) -> tuple[str, int] | None:
+    match = re.fullmatch(r"(?:tcp|tls)/\[?([^\[\]#?]+?)\]?:(\d+)(?:[#?].*)?", endpoint)
+    return (match[1], int(match[2])) if match else None
+
+
+class Rendezvous:
+    """Follows in the place of whoever listened at the endpoint, if it is on this machine.
+
+    Args:
+        endpoint: where everybody meets.
+    """
+
+    def __init__(self, endpoint: str) -> None:
+        self._endpoint = endpoint
+        address = _address(endpoint)
+        self._here = address is not None and (address[0] == "localhost" or address[0].startswith("127."))
+        self._routed = False  # whether a router was ever there
+        self._closed = threading.Event()
+        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._session: zenoh.Session | None = None
+        self._listener: Any = None
+
+    def watch(self, session: zenoh.Session) -> None:
+        """Look after the endpoint whenever this session loses a connection."""
+        if self._here:
+            # indirect=False: in zenoh's thread, which never keeps the process from ending
+            handler = zenoh.handlers.Callback(self._changed, indirect=False)
+            self._listener = session.info.declare_transport_events_listener(handler, history=True)
+
+    def close(self) -> None:
+        """Stop listening; a second time does nothing."""
+        self._closed.set()
+        with self._lock:
+            thread, session = self._thread, self._session
+            self._session = None
+        if thread is not None:
+            thread.join()
+        if session is not None:
+            session.close()  # type: ignore[no-untyped-call]
+
+    def _changed(self, event: zenoh.TransportEvent) -> None:
+        if event.transport.whatami == zenoh.WhatAmI.ROUTER:
+            self._routed = True
+        if event.kind != zenoh.SampleKind.DELETE or self._routed:
+            return
+        with self._lock:
+            busy = self._thread is not None and self._thread.is_alive()
+            if not busy and self._session is None and not self._closed.is_set():
+                self._thread = threading.Thread(target=self._follow, name="drivelink-rendezvous", daemon=True)
+                self._thread.start()
+
+    def _follow(self) -> None:
+        while not self._closed.is_set() and not answers(self._endpoint):
+            if self._listen():
+                return
+            self._closed.wait(_ATTEMPT_S)
+
+    def _listen(self) -> bool:
+        config = zenoh.Config()
+        settings = {
+            "mode": "peer",
+            "listen/endpoints": [self._endpoint],
+            "scouting/multicast/enabled": False,
+            "adminspace/enabled": False,
+            "transport/shared_memory/enabled": False,
+        }
+        for key, value in settings.items():
+            config.insert_json5(key, json.dumps(value))
+        try:
+            session = zenoh.open(config)
+        except zenoh.ZError:  # another daemon was quicker, or the port is not free yet
+            return False
+        with self._lock:
+            if not self._closed.is_set():
+                self._session = session
+                return True
+        session.close()  # type: ignore[no-untyped-call]
+        return True

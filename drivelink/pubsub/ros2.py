@@ -1,0 +1,299 @@
+"""A joint as a ROS 2 node with rmw_zenoh sees it: found and received without a bridge.
+
+Keys, attachment and liveliness tokens are those of rmw_zenoh 0.12; payloads are XCDR1. The messages of every
+cycle have strings of fixed length only, so that each is one precompiled struct, padding included.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from contextlib import suppress
+from itertools import count
+from struct import Struct
+from typing import Any
+
+import xxhash
+import zenoh
+
+from drivelink.errors import ZenohError
+from drivelink.jointfile import JointFile, Ros2Section
+from drivelink.pubsub.session import one_line
+from estimator.sample import Estimate, Sample, Status
+
+__all__ = ["TYPE_HASHES", "Ros2Publisher", "diagnostic_array", "joint_state", "stiffness_array"]
+
+TYPE_HASHES = {
+    "sensor_msgs::msg::dds_::JointState_": (
+        "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"
+    ),
+    "std_msgs::msg::dds_::Float64MultiArray_": (
+        "RIHS01_1025ddc6b9552d191f89ef1a8d2f60f3d373e28b283d8891ddcc974e8c55397f"
+    ),
+    "diagnostic_msgs::msg::dds_::DiagnosticArray_": (
+        "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"
+    ),
+}
+_HUMBLE_HASH = "TypeHashNotSupported"
+_QOS = "::,10:,:,:,,"  # reliable, volatile, keep last 10
+_ENCAPSULATION = b"\x00\x01\x00\x00"  # XCDR1, little-endian; alignment counts after it
+_ATTACHMENT = Struct("<qqB16s")  # sequence number, UNIX ns, length of the GID, GID
+_NS = 1_000_000_000
+_VELOCITY_FILTER_S = 0.005  # of the differentiated position, where no link velocity is measured
+_entities = count()
+_OK, _WARN, _ERROR, _STALE = range(4)  # levels of diagnostic_msgs/DiagnosticStatus
+
+
+class Template:
+    """An XCDR1 message whose lengths are all fixed, as one struct; numbers that change are given to pack."""
+
+    def __init__(self) -> None:
+        self._format = "<4s"
+        self._offset = 0
+        self._values: list[bytes | int | None] = [_ENCAPSULATION]
+        self._changing: list[int] = []
+
+    def number(self, code: str, value: int | None = None) -> Template:
+        """A number of struct code `code`, aligned to its size; None: it changes."""
+        size = Struct("<" + code).size
+        padding = -self._offset % size
+        self._format += f"{padding}x{code}" if padding else code
+        self._offset += padding + size
+        if value is None:
+            self._changing.append(len(self._values))
+        self._values.append(value)
+        return self
+
+    def text(self, text: str) -> Template:
+        """A string: its length with the final zero, its bytes, the zero."""
+        data = text.encode() + b"\0"
+        self.number("I", len(data))
+        self._format += f"{len(data)}s"
+        self._offset += len(data)
+        self._values.append(data)
+        return self
+
+    def doubles(self, length: int) -> Template:
+        """A sequence of float64 that change."""
+        self.number("I", length)
+        for _ in range(length):
+            self.number("d")
+        return self
+
+    def header(self, frame_id: str) -> Template:
+        """std_msgs/Header: the stamp changes."""
+        return self.number("i").number("I").text(frame_id)
+
+    def packer(self) -> Any:
+        """A function of the changing numbers that gives the message's bytes."""
+        packing, values, changing = Struct(self._format).pack, self._values, self._changing
+
+        def message(*numbers: float) -> bytes:
+            filled = values.copy()
+            for position, number in zip(changing, numbers, strict=True):
+                filled[position] = number  # type: ignore[call-overload]
+            return packing(*filled)
+
+        return message
+
+
+def joint_state(name: str) -> Any:
+    """Packer of sensor_msgs/JointState of one joint: (s, ns, position, velocity, effort) to bytes."""
+    template = Template().header("").number("I", 1).text(name)
+    return template.doubles(1).doubles(1).doubles(1).packer()
+
+
+def stiffness_array(transmissions: int) -> Any:
+    """Packer of std_msgs/Float64MultiArray, (1 + transmissions, 2): stiffness and its standard deviation.
+
+    Row 0 is the joint, then one row a transmission; the labels of the dimensions name rows and columns.
+    """
+    rows = ["joint", *(f"transmission{i + 1}" for i in range(transmissions))]
+    columns = ["stiffness_nm_rad", "stiffness_std_nm_rad"]
+    template = Template().number("I", 2)
+    template.text(",".join(rows)).number("I", len(rows)).number("I", 2 * len(rows))
+    template.text(",".join(columns)).number("I", 2).number("I", 2)
+    return template.number("I", 0).doubles(2 * len(rows)).packer()
+
+
+def diagnostic_array(
+    stamp_ns: int, level: int, name: str, message: str, hardware: str, values: Mapping[str, str]
+) -> bytes:
+    """diagnostic_msgs/DiagnosticArray with one status."""
+    template = Template().header("").number("I", 1).number("B", level)
+    template.text(name).text(message).text(hardware).number("I", len(values))
+    for key, value in values.items():
+        template.text(key).text(value)
+    data: bytes = template.packer()(*divmod(stamp_ns, _NS))
+    return data
+
+
+class _Topic:
+    """One publisher of the node: its key, its liveliness token, its attachment."""
+
+    def __init__(self, session: zenoh.Session, node: _Node, topic: str, kind: str) -> None:
+        type_hash = _HUMBLE_HASH if node.section.distro == "humble" else TYPE_HASHES[kind]
+        key = f"{node.section.domain}/{topic.strip('/')}/{kind}/{type_hash}"
+        token = node.publisher_token(f"{_mangle(topic)}/{kind}/{type_hash}/{_QOS}")
+        self._gid = xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
+        self._sequence = 0
+        self._publisher = session.declare_publisher(
+            key, congestion_control=zenoh.CongestionControl.DROP, express=True
+        )
+        self.entities = (self._publisher, session.liveliness().declare_token(token))
+
+    def put(self, payload: bytes, stamp_ns: int) -> None:
+        self._sequence += 1
+        attachment = _ATTACHMENT.pack(self._sequence, stamp_ns, 16, self._gid)
+        self._publisher.put(payload, attachment=attachment)
+
+
+class _Node:
+    """The node's part of the liveliness tokens; nodes and their entities are numbered through the process."""
+
+    def __init__(self, session: zenoh.Session, section: Ros2Section, name: str) -> None:
+        self.section = section
+        self.namespace = "/" + section.namespace.strip("/") if section.namespace.strip("/") else ""
+        self._zid = str(session.info.zid())
+        self._name = name
+        self._id = next(_entities)
+
+    def token(self) -> str:
+        """Liveliness key of the node."""
+        return self._token(self._id, "NN")
+
+    def publisher_token(self, rest: str) -> str:
+        """Liveliness key of its next publisher."""
+        return f"{self._token(next(_entities), 'MP')}/{rest}"
+
+    def _token(self, entity: int, kind: str) -> str:
+        numbers = f"{self.section.domain}/{self._zid}/{self._id}/{entity}"
+        return f"@ros2_lv/{numbers}/{kind}/%/{_mangle(self.namespace)}/{self._name}"
+
+
+class Ros2Publisher:
+    """JointState and stiffness of every n-th cycle, diagnostics once a second.
+
+    Topics: `<namespace>/joint_states`, `<namespace>/<joint>/stiffness`, `/diagnostics`.
+
+    Args:
+        session: the daemon's session, which it does not close.
+        joint: with a `[ros2]` section.
+
+    Attributes:
+        latest: the newest estimate, which diagnostics judge.
+
+    Raises:
+        ZenohError: zenoh refuses a key.
+    """
+
+    def __init__(self, session: zenoh.Session, joint: JointFile) -> None:
+        section = joint.ros2 or Ros2Section()
+        name = "".join(letter if letter.isalnum() else "_" for letter in joint.name)
+        node = _Node(session, section, f"drivelink_{name}")
+        self._joint = joint.name
+        self._every = section.every
+        self._period_s = joint.bus.period_s
+        self._entities: list[Any] = []
+        try:
+            self._entities.append(session.liveliness().declare_token(node.token()))
+            kinds = tuple(TYPE_HASHES)
+            self._states = _Topic(session, node, f"{node.namespace}/joint_states", kinds[0])
+            self._stiffness = _Topic(session, node, f"{node.namespace}/{name}/stiffness", kinds[1])
+            self._diagnostics = _Topic(session, node, "/diagnostics", kinds[2])
+        except zenoh.ZError as error:
+            raise ZenohError(f"ros2 of joint {joint.name}: {one_line(error)}") from error
+        for topic in (self._states, self._stiffness, self._diagnostics):
+            self._entities.extend(topic.entities)
+        self._pack_state = joint_state(joint.name)
+        self._pack_stiffness = [stiffness_array(transmissions) for transmissions in range(3)]
+        self._velocity_rad_s = 0.0
+        self._before: tuple[int, float] | None = None
+        self._told_ns: int | None = None
+        self.latest: Estimate | None = None
+
+    def put_cycle(self, estimate: Estimate, sample: Sample, stamp_ns: int) -> None:
+        """Publish one cycle; cheap enough for the loop.
+
+        Args:
+            estimate: of this cycle.
+            sample: of the same cycle.
+            stamp_ns: UNIX time of its SYNC, ns.
+        """
+        position = sample.link_position_rad
+        if position != position:  # NaN: the transmission is rigid
+            position = sample.motor_position_rad[0]
+        velocity = self._velocity(sample.sequence, position, sample.link_velocity_rad_s)
+        self.latest = estimate
+        if estimate.sequence % self._every:
+            return
+        second, ns = divmod(stamp_ns, _NS)
+        effort = estimate.flexibility_torque_nm
+        self._states.put(self._pack_state(second, ns, position, velocity, effort), stamp_ns)
+        pairs = [estimate.stiffness_nm_rad, estimate.stiffness_std_nm_rad]
+        for transmission in estimate.transmissions:
+            pairs += transmission[1:3]
+        self._stiffness.put(self._pack_stiffness[len(estimate.transmissions)](*pairs), stamp_ns)
+
+    def put_status(self, status: Mapping[str, Any], stamp_ns: int) -> None:
+        """Publish diagnostics, once a second however often it is called.
+
+        Args:
+            status: as on the status key.
+            stamp_ns: UNIX time, ns.
+        """
+        if self._told_ns is not None and 0 <= stamp_ns - self._told_ns < _NS:
+            return
+        self._told_ns = stamp_ns
+        level, message = _judge(self.latest.status if self.latest else 0)
+        values = dict(_flat(status))
+        name = f"drivelink: {self._joint}"
+        payload = diagnostic_array(stamp_ns, level, name, message, self._joint, values)
+        self._diagnostics.put(payload, stamp_ns)
+
+    def close(self) -> None:
+        """Leave the ROS graph; a second time does nothing."""
+        while self._entities:
+            with suppress(zenoh.ZError):
+                self._entities.pop().undeclare()
+
+    def _velocity(self, sequence: int, position: float, measured: float) -> float:
+        """The measured velocity, or the position differentiated through a first-order filter, rad/s."""
+        before, self._before = self._before, (sequence, position)
+        if measured == measured:  # not NaN
+            self._velocity_rad_s = measured
+        elif before is not None and sequence > before[0]:
+            step_s = (sequence - before[0]) * self._period_s
+            share = -math.expm1(-step_s / _VELOCITY_FILTER_S)
+            change = (position - before[1]) / step_s - self._velocity_rad_s
+            self._velocity_rad_s += share * change if math.isfinite(change) else 0.0
+        return self._velocity_rad_s
+
+
+def _mangle(name: str) -> str:
+    """A ROS name as one chunk of a zenoh key; an empty one is %."""
+    return name.replace("/", "%") or "%"
+
+
+def _judge(status: int) -> tuple[int, str]:
+    """Level and message of diagnostics for the status bits of an estimate."""
+    flags = Status(status & sum(Status))
+    faults = flags & (Status.DRIVE_FAULT | Status.BUS_FAULT)
+    alarms = flags & (Status.MODEL_ALARM | Status.INPUT_REJECTED | Status.CHANGED)
+    words = ", ".join(str(bit.name).lower() for bit in faults | alarms)
+    if faults:
+        return _ERROR, words
+    if flags & Status.STALE:
+        return _STALE, "no fresh measurements"
+    if not flags & Status.VALID:
+        return _WARN, words or "not valid yet"
+    return (_WARN, words) if alarms else (_OK, "valid")
+
+
+def _flat(document: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    """Nested values as pairs of texts, keys joined by dots."""
+    pairs: list[tuple[str, str]] = []
+    for key, value in document.items():
+        name = f"{prefix}{key}"
+        pairs += _flat(value, name + ".") if isinstance(value, Mapping) else [(name, str(value))]
+    return pairs

@@ -1,0 +1,185 @@
+"""Opening zenoh: safe by default, whole by configuration file, and never in the way of the process's end.
+
+Without a configuration file a daemon is a peer on the loopback. The first one of a machine listens at the
+endpoint, `tcp/127.0.0.1:7447`; the others connect to it, so that a plain client there receives all of them.
+When the first one dies, `drivelink.pubsub.rendezvous` lets another one take the endpoint over. Nothing
+listens beyond the loopback, and nothing is multicast, unless the joint file says so.
+
+With a configuration file zenoh gets exactly that file and nothing of the below.
+"""
+
+from __future__ import annotations
+
+import atexit
+import json
+import re
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import zenoh
+
+from drivelink.errors import ZenohError
+from drivelink.pubsub.rendezvous import Rendezvous, answers
+
+if TYPE_CHECKING:
+    from drivelink.jointfile import ZenohSection  # a subscriber need not wait for its validator's import
+
+__all__ = ["client_config", "close_session", "daemon_config", "one_line", "open_client", "open_session"]
+
+_MEETING_S = 2.0  # for a handshake on this machine; taken only if something else than zenoh answers
+_POLL_S = 0.01
+_EXAMPLE = "tcp/127.0.0.1:7447"
+_LINKS = ("tcp", "tls", "udp", "quic", "ws", "unixsock-stream", "serial", "vsock")
+
+_COMMON: dict[str, Any] = {
+    "mode": "peer",
+    "scouting/multicast/enabled": False,
+    "scouting/delay": 250,  # ms that opening waits for somebody to connect to
+    "transport/unicast/open_timeout": 2000,  # ms; closing waits for it
+    "adminspace/enabled": False,
+    "transport/shared_memory/enabled": False,  # these messages are far too small for it
+    "transport/link/tx/queue/size/real_time": 16,  # an express message takes a place of its own
+    "transport/link/tx/queue/size/interactive_high": 16,
+    "transport/link/tx/queue/size/data": 16,
+    "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,  # a stuck subscriber costs no wait
+}
+_CONNECT: dict[str, Any] = {  # for ever, in the background
+    "connect/timeout_ms": -1,
+    "connect/exit_on_failure": False,
+    "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+}
+
+_open_sessions: list[tuple[zenoh.Session, Rendezvous | None]] = []
+
+
+def daemon_config(endpoint: str, listen: bool) -> zenoh.Config:
+    """A peer on the loopback that listens at `endpoint`, or connects to who does."""
+    if listen:
+        return _config({"listen/endpoints": [endpoint]})
+    return _config({"listen/endpoints": ["tcp/127.0.0.1:0"], "connect/endpoints": [endpoint], **_CONNECT})
+
+
+def client_config(endpoint: str) -> zenoh.Config:
+    """A peer that listens nowhere, connects to `endpoint`, and from there to every daemon of the machine."""
+    return _config({"listen/endpoints": [], "connect/endpoints": [endpoint], **_CONNECT})
+
+
+def open_session(section: ZenohSection, base_dir: Path) -> zenoh.Session:
+    """Open the daemon's session, in touch with the other daemons of the machine when it returns.
+
+    Args:
+        section: `[zenoh]` of the joint file.
+        base_dir: where a relative `config` is looked for: the joint file's directory.
+
+    Raises:
+        ZenohError: the configuration file cannot be used, or the endpoint is taken by another program.
+    """
+    if section.config is not None:
+        return _open(_read(base_dir / section.config))
+    endpoint = _require_endpoint(section.endpoint)
+    if not answers(endpoint):
+        try:
+            return _keep(zenoh.open(daemon_config(endpoint, listen=True)))
+        except zenoh.ZError:  # not an address of this machine, or another daemon was quicker
+            pass
+    return _join(endpoint)
+
+
+def open_client(endpoint: str, config: str | Path | None = None) -> zenoh.Session:
+    """Open a subscriber's session.
+
+    Args:
+        endpoint: where a daemon or a router listens; it may not be there yet.
+        config: a zenoh configuration file (JSON5) instead; then the endpoint is not used.
+
+    Raises:
+        ZenohError: the endpoint or the configuration file cannot be used.
+    """
+    if config is not None:
+        return _open(_read(Path(config)))
+    return _open(client_config(_require_endpoint(endpoint)))
+
+
+def _join(endpoint: str) -> zenoh.Session:
+    """Connect to who listens at the endpoint, and be ready to follow in its place."""
+    session = _open(daemon_config(endpoint, listen=False), Rendezvous(endpoint))
+    if not _meet(session) and answers(endpoint):
+        close_session(session)
+        raise ZenohError(
+            f"{endpoint}: another program listens there and does not speak zenoh: "
+            f"end it, or set zenoh.endpoint in the joint file"
+        )
+    return session
+
+
+def close_session(session: zenoh.Session) -> None:
+    """Close a session; a second time does nothing."""
+    for entry in [entry for entry in _open_sessions if entry[0] is session]:
+        _open_sessions.remove(entry)
+        if entry[1] is not None:
+            entry[1].close()
+    if not session.is_closed():
+        session.close()  # type: ignore[no-untyped-call]
+
+
+def one_line(error: BaseException) -> str:
+    """A zenoh error without the places in zenoh's own sources."""
+    text = " ".join(str(error).split())
+    return re.sub(r"\s+at /\S+?:\d+\.?(?=\]|\s|$)", "", text)
+
+
+def _require_endpoint(endpoint: str) -> str:
+    link, _, address = endpoint.partition("/")
+    if link not in _LINKS or not address:
+        raise ZenohError(f'endpoint: expected a zenoh endpoint like "{_EXAMPLE}", got "{endpoint}"')
+    return endpoint
+
+
+def _config(settings: dict[str, Any]) -> zenoh.Config:
+    config = zenoh.Config()
+    for key, value in (_COMMON | settings).items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _read(path: Path) -> zenoh.Config:
+    if not path.is_file():
+        raise ZenohError(f"{path}: zenoh.config: expected a zenoh configuration file (JSON5), there is none")
+    try:
+        return zenoh.Config.from_file(path)
+    except zenoh.ZError as error:
+        raise ZenohError(f"{path}: expected a zenoh configuration (JSON5): {one_line(error)}") from error
+
+
+def _open(config: zenoh.Config, rendezvous: Rendezvous | None = None) -> zenoh.Session:
+    try:
+        session = zenoh.open(config)
+    except zenoh.ZError as error:
+        raise ZenohError(f"zenoh cannot be opened: {one_line(error)}") from error
+    if rendezvous is not None:
+        rendezvous.watch(session)
+    return _keep(session, rendezvous)
+
+
+def _keep(session: zenoh.Session, rendezvous: Rendezvous | None = None) -> zenoh.Session:
+    """Note the session, so that it is closed at the end of the process whatever happens."""
+    _open_sessions[:] = [entry for entry in _open_sessions if not entry[0].is_closed()]
+    _open_sessions.append((session, rendezvous))
+    return session
+
+
+def _meet(session: zenoh.Session) -> bool:
+    """Wait until the session is connected to anybody."""
+    deadline = time.monotonic() + _MEETING_S
+    while time.monotonic() < deadline:
+        if session.info.peers_zid() or session.info.routers_zid():
+            return True
+        time.sleep(_POLL_S)
+    return False
+
+
+@atexit.register
+def _close_all() -> None:
+    while _open_sessions:
+        close_session(_open_sessions[-1][0])

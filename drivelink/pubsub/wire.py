@@ -1,0 +1,269 @@
+"""The bytes of `estimate` and `sample` on zenoh.
+
+Zenoh's serialization of a tuple of fixed-width numbers is the packed little-endian struct, and that of a
+sequence is its length as a LEB128 varint before the elements. So each message is one precompiled struct
+here, `z_deserialize` of zenoh-ext in Rust, C, C++, Kotlin and TypeScript, and a plain struct on a
+microcontroller. The tables below are the only statement of the layout: the structs, the answer of
+`<prefix>/<joint>/schema` and the table of the documentation are made from them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import chain
+from struct import Struct
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from drivelink.errors import ZenohError
+from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
+
+__all__ = [
+    "ESTIMATE",
+    "MAX_ELEMENTS",
+    "SAMPLE",
+    "STATUS_BITS",
+    "EstimateMessage",
+    "Field",
+    "Layout",
+    "SampleMessage",
+    "decode_estimate",
+    "decode_sample",
+    "encode_estimate",
+    "encode_sample",
+]
+
+MAX_ELEMENTS = 8  # transmissions or motors in one message; below 128 the varint is one byte
+_STRUCT_CODES = {"u64": "Q", "u32": "I", "f64": "d"}
+_U32 = 0xFFFF_FFFF
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One number: its name with the unit in it, its type (u64, u32, f64), its meaning."""
+
+    name: str
+    type: str
+    meaning: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """A message: fixed fields, then a sequence of equal elements.
+
+    Attributes:
+        schema: name and version, carried in the zenoh encoding.
+        head: the fixed fields, from byte 0.
+        elements: name of the sequence.
+        element: the fields of one element.
+    """
+
+    schema: str
+    head: tuple[Field, ...]
+    elements: str
+    element: tuple[Field, ...]
+
+    def struct(self, count: int) -> Struct:
+        """The whole message with `count` elements, the one-byte length between head and elements included."""
+        return Struct("<" + _codes(self.head) + "B" + _codes(self.element) * count)
+
+    def size(self, count: int) -> int:
+        """Bytes of a message with `count` elements."""
+        return self.struct(count).size
+
+    def dtype(self, count: int) -> np.dtype[np.void]:
+        """The message as a numpy record: `np.frombuffer(payload, layout.dtype(1))`."""
+        element = np.dtype([(field.name, _numpy(field)) for field in self.element])
+        head = [(field.name, _numpy(field)) for field in self.head]
+        return np.dtype([*head, ("count", "u1"), (self.elements, element, (count,))])
+
+    def describe(self) -> dict[str, Any]:
+        """The layout as plain data, for the `schema` key."""
+        return {
+            "schema": self.schema,
+            "encoding": "zenoh/serialized",
+            "byte_order": "little-endian",
+            "fields": [_describe(field) for field in self.head],
+            "sequence": {
+                "name": self.elements,
+                "length": "LEB128 varint (one byte below 128)",
+                "fields": [_describe(field) for field in self.element],
+            },
+        }
+
+
+def _codes(fields: tuple[Field, ...]) -> str:
+    return "".join(_STRUCT_CODES[field.type] for field in fields)
+
+
+def _numpy(field: Field) -> str:
+    return {"u64": "<u8", "u32": "<u4", "f64": "<f8"}[field.type]
+
+
+def _describe(field: Field) -> dict[str, str]:
+    return {"name": field.name, "type": field.type, "meaning": field.meaning}
+
+
+_SEQUENCE = Field("sequence", "u64", "number of the SYNC; a jump by more than one is a gap of whole periods")
+_STAMP = Field("stamp_ns", "u64", "UNIX time of the SYNC, ns")
+
+ESTIMATE = Layout(
+    schema="drivelink.estimate/1",
+    head=(
+        _SEQUENCE,
+        _STAMP,
+        Field("status", "u32", "status bits, see below"),
+        Field("flexibility_torque_nm", "f64", "the joint's flexibility torque, N·m"),
+        Field("stiffness_nm_rad", "f64", "the joint's stiffness, N·m/rad"),
+        Field("stiffness_std_nm_rad", "f64", "its standard deviation, N·m/rad"),
+    ),
+    elements="transmissions",
+    element=(
+        Field("flexibility_torque_nm", "f64", "of this transmission, N·m"),
+        Field("stiffness_nm_rad", "f64", "of this transmission, N·m/rad"),
+        Field("stiffness_std_nm_rad", "f64", "its standard deviation, N·m/rad"),
+        Field("deflection_rad", "f64", "φ = q − θ, rad"),
+    ),
+)
+
+SAMPLE = Layout(
+    schema="drivelink.sample/1",
+    head=(
+        _SEQUENCE,
+        _STAMP,
+        Field("link_position_rad", "f64", "q, rad; NaN where there is none, as below"),
+        Field("link_velocity_rad_s", "f64", "measured link velocity, rad/s"),
+        Field("external_torque_nm", "f64", "τ_k of eq. 4, N·m"),
+    ),
+    elements="motors",
+    element=(
+        Field("motor_position_rad", "f64", "θ, rad, joint side"),
+        Field("motor_velocity_rad_s", "f64", "measured motor velocity, rad/s, joint side"),
+        Field("motor_torque_nm", "f64", "τ, N·m, joint side; acts from this SYNC to the next"),
+    ),
+)
+
+STATUS_BITS: Mapping[str, str] = MappingProxyType(
+    {
+        "VALID": "the numbers may be used",
+        "OBSERVABLE": "the motion at hand tells the stiffness; otherwise it is held, with a wider interval",
+        "GAP": "samples were missing before this one and have been bridged",
+        "CHANGED": "innovation alarm: the joint changed, the estimate is following",
+        "MODEL_ALARM": "the residual is above the model's own floor: the model is not sufficient",
+        "INPUT_REJECTED": "this sample was not finite, jumped or froze, and was not used",
+        "RESTARTED": "the estimator started anew at or shortly before this sample",
+        "DRIVE_FAULT": "a drive reports a fault or is not operational",
+        "BUS_FAULT": "frames of this cycle were late or missing",
+        "STALE": "the estimate is carried on without fresh measurements",
+    }
+)
+
+
+class EstimateMessage(NamedTuple):
+    """One estimate as it came over the wire: an `Estimate` and the UNIX time of its SYNC."""
+
+    sequence: int
+    stamp_ns: int
+    status: int
+    flexibility_torque_nm: float
+    stiffness_nm_rad: float
+    stiffness_std_nm_rad: float
+    transmissions: tuple[TransmissionEstimate, ...]
+
+    @property
+    def valid(self) -> bool:
+        """Status bit 0: the numbers may be used."""
+        return bool(self.status & Status.VALID)
+
+    @property
+    def observable(self) -> bool:
+        """Status bit 1: the motion at hand tells the stiffness."""
+        return bool(self.status & Status.OBSERVABLE)
+
+
+class SampleMessage(NamedTuple):
+    """One sample as it came over the wire, and the UNIX time of its SYNC."""
+
+    sample: Sample
+    stamp_ns: int
+
+
+_ESTIMATES = tuple(ESTIMATE.struct(count) for count in range(MAX_ELEMENTS + 1))
+_SAMPLES = tuple(SAMPLE.struct(count) for count in range(MAX_ELEMENTS + 1))
+_ESTIMATE_COUNTS = {layout.size: count for count, layout in enumerate(_ESTIMATES)}
+_SAMPLE_COUNTS = {layout.size: count for count, layout in enumerate(_SAMPLES)}
+_ESTIMATE_HEAD = ESTIMATE.struct(0)
+_TRANSMISSION = Struct("<" + _codes(ESTIMATE.element))
+_SAMPLE_HEAD = len(SAMPLE.head)
+_make_message = EstimateMessage._make
+_make_transmission = TransmissionEstimate._make
+
+
+def encode_estimate(estimate: Estimate, stamp_ns: int) -> bytes:
+    """The bytes of `<prefix>/<joint>/estimate`.
+
+    Args:
+        estimate: at most MAX_ELEMENTS transmissions.
+        stamp_ns: UNIX time of its SYNC, ns.
+    """
+    sequence, status, torque, stiffness, std, transmissions = estimate
+    count = len(transmissions)
+    numbers = chain.from_iterable(transmissions)
+    return _ESTIMATES[count].pack(sequence, stamp_ns, status & _U32, torque, stiffness, std, count, *numbers)
+
+
+def decode_estimate(payload: bytes) -> EstimateMessage:
+    """Read the bytes of `<prefix>/<joint>/estimate`.
+
+    Raises:
+        ZenohError: these are no such bytes.
+    """
+    count = _count(payload, _ESTIMATE_COUNTS, ESTIMATE)
+    *head, told = _ESTIMATE_HEAD.unpack_from(payload)
+    _require_count(told, count, ESTIMATE)
+    elements = tuple(map(_make_transmission, _TRANSMISSION.iter_unpack(payload[_ESTIMATE_HEAD.size :])))
+    return _make_message((*head, elements))
+
+
+def encode_sample(sample: Sample, stamp_ns: int) -> bytes:
+    """The bytes of `<prefix>/<joint>/sample`.
+
+    Args:
+        sample: of at most MAX_ELEMENTS motors.
+        stamp_ns: UNIX time of its SYNC, ns.
+    """
+    sequence, position, velocity, torque, link, link_velocity, external = sample
+    count = len(position)
+    numbers = [number for motor in zip(position, velocity, torque, strict=True) for number in motor]
+    return _SAMPLES[count].pack(sequence, stamp_ns, link, link_velocity, external, count, *numbers)
+
+
+def decode_sample(payload: bytes) -> SampleMessage:
+    """Read the bytes of `<prefix>/<joint>/sample`.
+
+    Raises:
+        ZenohError: these are no such bytes.
+    """
+    count = _count(payload, _SAMPLE_COUNTS, SAMPLE)
+    values = _SAMPLES[count].unpack(payload)
+    _require_count(values[_SAMPLE_HEAD], count, SAMPLE)
+    sequence, stamp_ns, link, link_velocity, external = values[:_SAMPLE_HEAD]
+    motors = values[_SAMPLE_HEAD + 1 :]
+    sample = Sample(sequence, motors[0::3], motors[1::3], motors[2::3], link, link_velocity, external)
+    return SampleMessage(sample, stamp_ns)
+
+
+def _count(payload: bytes, counts: Mapping[int, int], layout: Layout) -> int:
+    count = counts.get(len(payload))
+    if count is None:
+        expected = ", ".join(str(size) for size in list(counts)[:3])
+        raise ZenohError(f"{layout.schema}: expected {expected}, … bytes, got {len(payload)}")
+    return count
+
+
+def _require_count(told: int, count: int, layout: Layout) -> None:
+    if told != count:
+        raise ZenohError(f"{layout.schema}: expected {count} {layout.elements} by its length, it says {told}")

@@ -1,0 +1,53 @@
+"""Recordings: every file format, in and out, as a `Record`.
+
+`read` takes any of them. What a recording lacks or has too much of is said in one line each, as a warning
+of the logger `drivelink.recording`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from drivelink.errors import RecordingError
+from drivelink.jointfile import JointFile
+from drivelink.recording.canframes import is_frame_log, read_frame_record
+from drivelink.recording.csvfile import read_csv
+from drivelink.recording.mcapsamples import read_mcap
+from drivelink.recording.mf4file import read_mf4
+from estimator.sample import Record
+
+__all__ = ["read"]
+
+
+def read(
+    path: str | Path,
+    joint: JointFile | None = None,
+    *,
+    base_dir: str | Path = "",
+    channel: str | None = None,
+    keep_nan: bool = False,
+) -> Record:
+    """Read a recording.
+
+    Args:
+        path: the file; its name's ending says the format.
+        joint: the joint it was made with: number of motors, torque constants, PDO mapping of raw CAN logs.
+        base_dir: folder of the joint file, where its EDS files are looked for.
+        channel: of a raw CAN log with several.
+        keep_nan: leave rows with NaN in, for a consumer that takes them tick by tick; else they are gaps.
+
+    Raises:
+        RecordingError: it cannot be read, or lacks what is needed.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise RecordingError(f"{path}: no such file")
+    if path.is_dir():
+        raise RecordingError(f"{path}: expected a file, got a folder")
+    if is_frame_log(path):
+        return read_frame_record(path, joint, Path(base_dir), channel)
+    if path.suffix.lower() == ".mcap":
+        return read_mcap(path, joint, keep_nan)
+    if path.suffix.lower() == ".mf4":
+        return read_mf4(path, joint, keep_nan)
+    return read_csv(path, joint, keep_nan)

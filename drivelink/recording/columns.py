@@ -1,0 +1,166 @@
+"""The recording's columns by name, whatever the file format, and the `Record` they make."""
+
+from __future__ import annotations
+
+import difflib
+import logging
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivelink.errors import RecordingError
+from drivelink.jointfile import JointFile
+from drivelink.recording.grid import find_grid, report_gaps
+from estimator.errors import EstimatorError
+from estimator.sample import FloatArray, Record, Sample
+
+__all__ = ["KNOWN", "record_from_columns", "sample_columns", "sample_row"]
+
+_LOG = logging.getLogger("drivelink.recording")
+
+_MOTOR = ("position_rad", "velocity_rad_s", "torque_nm", "current_a")
+_LINK = ("link_position_rad", "link_velocity_rad_s", "external_torque_nm")
+KNOWN = frozenset({"time_s", *(f"motor{i}_{name}" for i in (1, 2) for name in _MOTOR), *_LINK})
+
+
+def sample_columns(motors: int) -> tuple[str, ...]:
+    """Names of the columns that a sample of so many motors fills, in the order of `sample_row`."""
+    per_motor = [f"motor{i}_{name}" for i in range(1, motors + 1) for name in _MOTOR[:3]]
+    return ("time_s", *per_motor, *_LINK)
+
+
+def sample_row(sample: Sample, period_s: float) -> tuple[float, ...]:
+    """A sample as the values of `sample_columns`; its time is that of its SYNC, sequence * period."""
+    per_motor = zip(
+        sample.motor_position_rad, sample.motor_velocity_rad_s, sample.motor_torque_nm, strict=True
+    )
+    return (
+        sample.sequence * period_s,
+        *(value for motor in per_motor for value in motor),
+        sample.link_position_rad,
+        sample.link_velocity_rad_s,
+        sample.external_torque_nm,
+    )
+
+
+def record_from_columns(
+    columns: Mapping[str, FloatArray], where: str, joint: JointFile | None = None, keep_nan: bool = False
+) -> Record:
+    """Make a record of named columns: find the grid, turn currents into torques, take NaN rows as gaps.
+
+    Args:
+        columns: (rows,) each; names beyond `KNOWN` are ignored, saying so.
+        where: begins every message.
+        joint: says how many motors there are, whether a link position is needed, and the torque constants.
+        keep_nan: leave rows with NaN in, for a consumer that takes them tick by tick.
+
+    Raises:
+        RecordingError: a column is missing, or the stamps make no uniform sampling.
+    """
+    _report_unknown(columns, where)
+    motors = _motors(columns, joint)
+    _require(columns, "time_s", where)
+    nominal = joint.bus.period_s if joint else None
+    grid = find_grid(columns["time_s"], where, nominal, _repeats(columns))
+
+    def column(name: str) -> FloatArray | None:
+        values = columns.get(name)
+        if values is None or not np.any(np.isfinite(values)):
+            return None
+        return np.where(np.isfinite(values), values, np.nan)[grid.keep]
+
+    positions = [_needed(columns, f"motor{i}_position_rad", where)[grid.keep] for i in range(1, motors + 1)]
+    torques = [_torque(columns, i, joint, where)[grid.keep] for i in range(1, motors + 1)]
+    velocities = [column(f"motor{i}_velocity_rad_s") for i in range(1, motors + 1)]
+    link = column("link_position_rad")
+    if link is None and (joint.model().has_deflection if joint else False):
+        _needed(columns, "link_position_rad", where)
+    _report_constant({f"motor{i + 1}_position_rad": p for i, p in enumerate(positions)}, where)
+    needed = [*positions, *torques] + ([] if link is None else [link])
+    usable = np.all(np.isfinite(needed), axis=0)
+    if lost := int(np.count_nonzero(~usable)):
+        _LOG.warning("%s: %d row(s) with missing values are taken as gaps", where, lost)
+    if int(np.count_nonzero(usable)) < 3:
+        raise RecordingError(f"{where}: expected at least 3 complete samples, got {np.count_nonzero(usable)}")
+    rows = np.ones_like(usable) if keep_nan else usable
+
+    def stacked(arrays: list[FloatArray]) -> FloatArray:
+        return np.ascontiguousarray(np.stack(arrays, axis=1)[rows])
+
+    present = [v if v is not None else np.full(len(rows), np.nan) for v in velocities]
+    velocity = None if all(v is None for v in velocities) else stacked(present)
+    sequence = grid.sequence[rows]
+    report_gaps(sequence, grid.period_s, where)
+    optional = {name: values[rows] for name in _LINK if (values := column(name)) is not None}
+    try:
+        return Record(
+            period_s=grid.period_s,
+            sequence=sequence,
+            motor_position_rad=stacked(positions),
+            motor_torque_nm=stacked(torques),
+            motor_velocity_rad_s=velocity,
+            start_s=grid.start_s,
+            **optional,
+        )
+    except EstimatorError as error:
+        raise RecordingError(f"{where}: {error}") from error
+
+
+def _repeats(columns: Mapping[str, FloatArray]) -> NDArray[np.bool_]:
+    """(rows,) whether a row says the same as the one before, its time included."""
+    same = np.zeros(len(columns["time_s"]), dtype=np.bool_)
+    if len(same) > 1 and np.any(np.diff(columns["time_s"]) == 0.0):
+        same[1:] = np.all([v[1:] == v[:-1] for name, v in columns.items() if name in KNOWN], axis=0)
+    return same
+
+
+def _motors(columns: Mapping[str, FloatArray], joint: JointFile | None) -> int:
+    if joint is not None:
+        return len(joint.motor)
+    return 2 if "motor2_position_rad" in columns else 1
+
+
+def _torque(
+    columns: Mapping[str, FloatArray], number: int, joint: JointFile | None, where: str
+) -> FloatArray:
+    """(rows,) joint-side torque of a motor: as recorded, or current * torque constant * gear ratio."""
+    torque, current = f"motor{number}_torque_nm", f"motor{number}_current_a"
+    if torque in columns or current not in columns:
+        return _needed(columns, torque, where, f" (or {current})")
+    amperes = _needed(columns, current, where)
+    drive = joint.motor[number - 1].drive if joint else None
+    if drive is None or drive.torque_constant_nm_a is None:
+        raise RecordingError(
+            f"{where}: {current} needs motor[{number}].drive.torque_constant_nm_a (and gear_ratio) "
+            "in the joint file to become a torque"
+        )
+    return amperes * (drive.torque_constant_nm_a * drive.gear_ratio)
+
+
+def _needed(columns: Mapping[str, FloatArray], name: str, where: str, other: str = "") -> FloatArray:
+    _require(columns, name, where, other)
+    values = columns[name]
+    if not np.any(np.isfinite(values)):
+        raise RecordingError(f"{where}: column {name} holds no number")
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def _require(columns: Mapping[str, FloatArray], name: str, where: str, other: str = "") -> None:
+    if name not in columns:
+        near = difflib.get_close_matches(name, set(columns) - KNOWN, n=1, cutoff=0.75)
+        hint = f"; did you mean it by {near[0]}?" if near else ""
+        found = ", ".join(list(columns)[:12]) or "none"
+        raise RecordingError(f"{where}: expected a column {name}{other}, found {found}{hint}")
+
+
+def _report_unknown(columns: Mapping[str, FloatArray], where: str) -> None:
+    if unknown := [name for name in columns if name not in KNOWN]:
+        _LOG.warning("%s: ignored column(s) %s", where, ", ".join(unknown))
+
+
+def _report_constant(columns: Mapping[str, FloatArray], where: str) -> None:
+    for name, values in columns.items():
+        finite = values[np.isfinite(values)]
+        if len(finite) and float(np.ptp(finite)) == 0.0:
+            _LOG.warning("%s: %s never changes: nothing moved, or the signal is not connected", where, name)

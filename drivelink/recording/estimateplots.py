@@ -1,0 +1,44 @@
+"""Plots of a replay's estimates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from drivelink import plots
+from drivelink.plots import Curve
+from estimator.sample import FloatArray
+
+__all__ = ["plot_curves", "plot_over_time"]
+
+
+def plot_curves(columns: Mapping[str, FloatArray], motors: int, path: Path, title: str) -> Path:
+    """Stiffness over deflection of each transmission; columns as in estimates.csv."""
+    figure, axes = plots.new_figure(title, height=3.6)
+    seen = columns["observable"] > 0
+    curves = {
+        f"motor {i}": Curve(
+            columns[f"motor{i}_deflection_rad"][seen],
+            columns[f"motor{i}_stiffness_nm_rad"][seen],
+            columns[f"motor{i}_stiffness_std_nm_rad"][seen],
+        )
+        for i in range(1, motors + 1)
+    }
+    plots.stiffness_against_deflection(axes[0], curves, "Stiffness of the transmission, where observable")
+    return plots.save(figure, path)
+
+
+def plot_over_time(columns: Mapping[str, FloatArray], path: Path, title: str) -> Path:
+    """The joint's flexibility torque and stiffness over time."""
+    figure, axes = plots.new_figure(title, rows=2)
+    t = columns["time_s"]
+    torque = {"estimate": Curve(t, columns["flexibility_torque_nm"])}
+    plots.over_time(axes[0], torque, "torque / N·m", "Flexibility torque")
+    stiffness = Curve(t, columns["stiffness_nm_rad"], columns["stiffness_std_nm_rad"])
+    plots.over_time(axes[1], {"estimate": stiffness}, "stiffness / (N·m/rad)", "Stiffness")
+    low, high = np.nanpercentile(stiffness.y, [1, 99]) if np.any(np.isfinite(stiffness.y)) else (0.0, 1.0)
+    margin = 0.25 * (high - low) + 0.02 * abs(high)
+    axes[1].set_ylim(low - margin, high + margin)  # the band of the first moments would hide the rest
+    return plots.save(figure, path)

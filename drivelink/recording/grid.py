@@ -1,0 +1,175 @@
+"""From time stamps to the grid of whole periods: which SYNC each row of a recording belongs to.
+
+Everything behind this point counts periods. Stamps are only used here: to find the period, the gaps, and
+what is wrong with them.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
+
+from drivelink.errors import RecordingError
+from estimator.sample import FloatArray
+
+__all__ = ["Grid", "find_grid", "report_gaps"]
+
+_LOG = logging.getLogger("drivelink.recording")
+
+MINIMUM_ROWS = 3
+# A step that is no whole multiple of the period within this share of it is jitter.
+_JITTER = 0.25
+# More than this share of steps longer than a period: the sampling is not uniform.
+_MAX_GAP_SHARE = 0.35
+# Stamps may lie this many periods beside their place on the grid (arrival times of a loaded machine).
+_MAX_JITTER_PERIODS = 3.0
+_AHEAD = 65  # stamps that tell a late one from a gap
+_MAX_GAPS = 0.1  # of the rows, among stamps that jitter
+
+
+class Grid(NamedTuple):
+    """The place of each row in time.
+
+    Attributes:
+        period_s: the sampling period T.
+        sequence: (n,) whole periods since the first row, strictly increasing.
+        start_s: time of sequence 0.
+        keep: (rows,) which rows of the input have a place: those with a stamp, repeated rows left out.
+    """
+
+    period_s: float
+    sequence: NDArray[np.int64]
+    start_s: float
+    keep: NDArray[np.bool_]
+
+
+def find_grid(
+    time_s: FloatArray,
+    where: str,
+    nominal_s: float | None = None,
+    repeats: NDArray[np.bool_] | None = None,
+) -> Grid:
+    """Find the period (from the median step) and each row's number on the grid.
+
+    Args:
+        time_s: (rows,) stamps; a row without one (NaN) is left out and becomes a gap.
+        where: begins every message.
+        nominal_s: a period that is taken as it is where the stamps agree with it.
+        repeats: (rows,) whether a row is the one before once more; such rows are left out.
+
+    Raises:
+        RecordingError: too few rows, time that stands still or runs backwards, or no uniform sampling.
+    """
+    keep = np.isfinite(time_s)
+    if missing := int(np.count_nonzero(~keep)):
+        _LOG.warning("%s: %d row(s) without a time stamp are taken as gaps", where, missing)
+    if repeats is not None and (repeated := int(np.count_nonzero(repeats & keep))):
+        _LOG.warning("%s: %d row(s) repeat the row before and are left out", where, repeated)
+        keep &= ~repeats
+    time = time_s[keep]
+    if len(time) < MINIMUM_ROWS:
+        raise RecordingError(f"{where}: expected at least {MINIMUM_ROWS} samples, got {len(time)}")
+    steps = np.diff(time)
+    _require_forward(steps, np.flatnonzero(keep), time, where)
+    if np.count_nonzero(steps) < 0.5 * len(steps):
+        raise RecordingError(f"{where}: time_s stands still: expected one stamp per sample, increasing")
+    period = float(np.median(steps))
+    sequence = _number(time, period, where)
+    period = _rounded(time, sequence, nominal_s)
+    return Grid(period, sequence, float(time[0]), keep)
+
+
+def report_gaps(sequence: NDArray[np.int64], period_s: float, where: str) -> None:
+    """Say in one line how many periods are missing from a sequence, if any."""
+    steps = np.diff(sequence)
+    gaps = steps > 1
+    if np.any(gaps):
+        _LOG.warning(
+            "%s: %d gap(s), %d of %d samples missing, the longest %.6g s at %.6g s",
+            where,
+            int(np.count_nonzero(gaps)),
+            int(np.sum(steps[gaps] - 1)),
+            int(sequence[-1] - sequence[0] + 1),
+            (int(steps.max()) - 1) * period_s,
+            int(sequence[int(steps.argmax())] - sequence[0]) * period_s,
+        )
+
+
+def _require_forward(steps: FloatArray, rows: NDArray[np.int64], time: FloatArray, where: str) -> None:
+    backwards = np.flatnonzero(steps < 0.0)
+    if len(backwards):
+        k = int(backwards[0])
+        raise RecordingError(
+            f"{where}: time_s runs backwards {len(backwards)} time(s), first at sample {rows[k + 1] + 1} "
+            f"({time[k]:.9g} s to {time[k + 1]:.9g} s): expected increasing stamps (two recordings joined, "
+            "or the clock was set?)"
+        )
+
+
+def _number(time: FloatArray, period: float, where: str) -> NDArray[np.int64]:
+    """(n,) number of each stamp on a grid of the given period, that the stamps' own drift may stretch."""
+    steps = np.diff(time)
+    wide = np.count_nonzero(steps > 1.5 * period)
+    if wide > _MAX_GAP_SHARE * len(steps):
+        raise RecordingError(
+            f"{where}: expected uniform sampling, got steps from {steps.min():.3g} s to {steps.max():.3g} s "
+            f"(median {period:.3g} s)"
+        )
+    whole = np.maximum(np.rint(steps / period), 0.0)
+    if np.all(whole >= 1.0) and np.all(np.abs(steps - whole * period) <= _JITTER * period * np.sqrt(whole)):
+        return np.concatenate(([0], np.cumsum(whole))).astype(np.int64)
+    return _number_jittered(time, where)
+
+
+def _number_jittered(time: FloatArray, where: str) -> NDArray[np.int64]:
+    """Stamps that jitter like arrival times: a late one is followed by others that catch up, a gap is not.
+
+    So the number is counted, plus the periods by which everything in a window ahead stays behind.
+    """
+    index = np.arange(len(time))
+    since = time - time[0]
+    lag = max(1, min(_AHEAD, len(time) // 4))
+    period = float(np.median(time[lag:] - time[:-lag])) / lag  # jitter cancels, a rare gap does not matter
+    sequence = index
+    for _ in range(3):  # each time with a better period
+        behind = since / period - index
+        least = minimum_filter1d(behind, _AHEAD, origin=-(_AHEAD // 2), mode="nearest")
+        sequence = index + np.maximum.accumulate(np.rint(least - least[0]).astype(np.int64))
+        n = sequence - sequence.mean()
+        period = float(np.dot(n, since) / np.dot(n, n))
+    off = since - sequence * period
+    off -= np.median(off)
+    worst = float(np.abs(off).max()) / period
+    gaps = np.count_nonzero(np.diff(sequence) > 1)
+    if float(np.sqrt(np.mean(off**2))) > _MAX_JITTER_PERIODS * period or gaps > _MAX_GAPS * len(time):
+        raise RecordingError(
+            f"{where}: expected uniform sampling, got stamps up to {worst:.3g} periods of {period:.3g} s off"
+        )
+    _LOG.warning(
+        "%s: the stamps jitter by up to %.2g periods: taken as arrival times of a uniform sampling",
+        where,
+        worst,
+    )
+    return sequence
+
+
+def _rounded(time: FloatArray, sequence: NDArray[np.int64], nominal_s: float | None) -> float:
+    """The period as slope of time over number, as the round value it was meant to be.
+
+    A round value is taken where the stamps cannot tell it from the slope, by three standard deviations.
+    """
+    n = sequence - sequence.mean()
+    power = float(np.dot(n, n))
+    centred = time - time.mean()
+    slope = float(np.dot(n, centred)) / power
+    spread = float(np.sqrt(np.mean((centred - slope * n) ** 2) / power))
+    tolerance = min(3.0 * spread + 1e-6 * slope, 0.25 * slope / float(sequence[-1]))
+    nice = [] if nominal_s is None else [nominal_s]
+    nice += [float(f"{slope:.{digits}g}") for digits in (1, 2)]
+    nice += [1.0 / float(f"{1.0 / slope:.{digits}g}") for digits in (1, 2, 3)]
+    nice += [float(f"{slope:.{digits}g}") for digits in (3, 4, 5, 6, 7)]
+    return next((value for value in nice if abs(value - slope) <= tolerance), slope)

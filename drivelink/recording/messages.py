@@ -1,0 +1,146 @@
+"""What the channels of an MCAP recording say, as JSON with a JSON schema each.
+
+JSON, since Foxglove and PlotJuggler plot it without a plugin; the names are those of the CSV columns. What
+is not finite is null: JSON has no word for it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from drivelink.pubsub.wire import EstimateMessage
+from drivelink.recording.columns import sample_columns, sample_row
+from estimator.sample import Sample, Status, TransmissionEstimate
+
+__all__ = [
+    "TOPICS",
+    "estimate_columns",
+    "estimate_encoder",
+    "estimate_row",
+    "message_schema",
+    "read_sample",
+    "sample_encoder",
+]
+
+TOPICS = ("sample", "estimate", "status", "model", "joint", "can")
+
+_PER_MOTOR = ("flexibility_torque_nm", "stiffness_nm_rad", "stiffness_std_nm_rad", "deflection_rad")
+_OBSERVABLE = int(Status.OBSERVABLE)
+
+
+def estimate_columns(motors: int) -> tuple[str, ...]:
+    """Names of what an estimate of so many motors says, in the order of `estimate_row`."""
+    return (
+        "time_s",
+        "flexibility_torque_nm",
+        "stiffness_nm_rad",
+        "stiffness_std_nm_rad",
+        "observable",
+        *(f"motor{i}_{name}" for i in range(1, motors + 1) for name in _PER_MOTOR),
+    )
+
+
+def estimate_row(
+    time_s: float,
+    status: int,
+    totals: tuple[float, float, float],
+    transmissions: tuple[TransmissionEstimate, ...],
+) -> tuple[float, ...]:
+    """An estimate as the values of `estimate_columns`."""
+    observable = 1 if status & _OBSERVABLE else 0
+    return (time_s, *totals, observable, *(value for one in transmissions for value in one))
+
+
+def sample_encoder(motors: int, period_s: float) -> Callable[[Sample], bytes]:
+    """The function that makes a sample's message."""
+    fill = _template(("sequence",), sample_columns(motors))
+
+    def encode(sample: Sample) -> bytes:
+        return fill((sample.sequence, *sample_row(sample, period_s)))
+
+    return encode
+
+
+def estimate_encoder(motors: int, period_s: float) -> Callable[[EstimateMessage], bytes]:
+    """The function that makes an estimate's message."""
+    fill = _template(("sequence", "status"), estimate_columns(motors))
+
+    def encode(message: EstimateMessage) -> bytes:
+        totals = (message.flexibility_torque_nm, message.stiffness_nm_rad, message.stiffness_std_nm_rad)
+        row = estimate_row(message.sequence * period_s, message.status, totals, message.transmissions)
+        return fill((message.sequence, message.status, *row))
+
+    return encode
+
+
+def read_sample(message: Mapping[str, Any], motors: int) -> Sample:
+    """The sample that a message was made from, bit for bit; null is NaN again."""
+
+    def value(name: str) -> float:
+        found = message.get(name)
+        return math.nan if found is None else float(found)
+
+    numbers = range(1, motors + 1)
+    return Sample(
+        int(message["sequence"]),
+        tuple(value(f"motor{i}_position_rad") for i in numbers),
+        tuple(value(f"motor{i}_velocity_rad_s") for i in numbers),
+        tuple(value(f"motor{i}_torque_nm") for i in numbers),
+        value("link_position_rad"),
+        value("link_velocity_rad_s"),
+        value("external_torque_nm"),
+    )
+
+
+def message_schema(topic: str, motors: int) -> bytes:
+    """The JSON schema of a channel's messages."""
+    integer, text = {"type": "integer"}, {"type": "string"}
+    properties: dict[str, Any]
+    if topic == "sample":
+        properties = {"sequence": integer, **_numbers(sample_columns(motors))}
+    elif topic == "estimate":
+        properties = {"sequence": integer, "status": integer, **_numbers(estimate_columns(motors))}
+    elif topic == "can":
+        properties = {"id": integer, "data": text | {"description": "bytes, two hex digits each"}}
+    elif topic == "joint":
+        properties = {"text": text | {"description": "the joint file"}, "folder": text}
+    else:
+        properties = {}
+    schema = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": f"drivelink.{topic}",
+        "type": "object",
+        "properties": properties,
+        "required": list(properties),
+    }
+    return json.dumps(schema).encode()
+
+
+def _numbers(names: tuple[str, ...]) -> dict[str, Any]:
+    return {name: {"type": ["number", "null"]} for name in names}
+
+
+def _template(whole: tuple[str, ...], names: tuple[str, ...]) -> Callable[[tuple[float, ...]], bytes]:
+    """A JSON object with these names, to be filled with integers, then floats: their shortest exact text."""
+    fields = [f'"{name}":%d' for name in whole] + [f'"{name}":%r' for name in names]
+    template = "{" + ",".join(fields) + "}"
+
+    def fill(values: tuple[float, ...]) -> bytes:
+        if all(map(math.isfinite, values)):
+            return (template % values).encode()
+        return (template % tuple(value if math.isfinite(value) else _NULL for value in values)).encode()
+
+    return fill
+
+
+class _Null:
+    """Prints as null."""
+
+    def __repr__(self) -> str:
+        return "null"
+
+
+_NULL = _Null()

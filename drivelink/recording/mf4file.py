@@ -1,0 +1,117 @@
+"""Recordings as ASAM MDF 4 (.mf4), where asammdf is installed: `pip install drivelink[mf4]`.
+
+MDF cannot be written so that a kill leaves it readable. What is recorded goes to an MCAP file beside it
+first, which is whole at any moment, and becomes the .mf4 file at the end.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivelink.errors import RecordingError
+from drivelink.jointfile import JointFile
+from drivelink.recording.columns import KNOWN, record_from_columns, sample_columns, sample_row
+from drivelink.recording.mcapsamples import read_mcap
+from drivelink.recording.sinks import McapSink
+from estimator.sample import FloatArray, Record
+
+__all__ = ["Mf4Sink", "read_mf4", "write_mf4"]
+
+_LOG = logging.getLogger("drivelink.recording")
+
+
+class Mf4Sink(McapSink):
+    """Samples as MF4; until `close` they are in `FILE.mcap`, which is whole at any moment."""
+
+    wants = frozenset({"sample"})
+
+    def __init__(self, path: Path, joint: JointFile, joint_text: str = "", folder: str = "") -> None:
+        _asammdf(path)  # before anything is recorded
+        self._path, self._joint_file = path, joint
+        self._journal = path.with_name(path.name + ".mcap")
+        super().__init__(self._journal, joint, joint_text, folder)
+
+    def close(self) -> None:
+        """Make the .mf4 file of what has been recorded."""
+        super().close()
+        if not self.counts["sample"]:
+            self._journal.unlink()
+            raise RecordingError(f"{self._path}: not written: there were no samples")
+        write_mf4(self._path, read_mcap(self._journal, self._joint_file, keep_nan=True))
+        self._journal.unlink()
+
+    def abandon(self) -> None:
+        """Leave what has been recorded as MCAP."""
+        super().abandon()
+        _LOG.warning("%s: not written; the samples are in %s", self._path, self._journal)
+
+
+def write_mf4(path: Path, record: Record) -> None:
+    """Write a record as MF4, a channel for each column.
+
+    Raises:
+        RecordingError: asammdf is not installed, or the file cannot be written.
+    """
+    mdf_module = _asammdf(path)
+    table = np.array([sample_row(sample, record.period_s)[1:] for sample in record.samples()])
+    times = record.time_s
+    with mdf_module.MDF(version="4.10") as mdf:
+        signals = [
+            mdf_module.Signal(samples=column, timestamps=times, name=name, unit=_unit(name))
+            for name, column in zip(sample_columns(record.motors)[1:], table.T, strict=True)
+            if np.any(np.isfinite(column))
+        ]
+        mdf.append(signals, comment="drivelink")
+        try:
+            mdf.save(path, overwrite=True)
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def read_mf4(path: Path, joint: JointFile | None = None, keep_nan: bool = False) -> Record:
+    """Read an MF4 file whose channels are named like the CSV columns.
+
+    Raises:
+        RecordingError: asammdf is not installed, or the file lacks what is needed.
+    """
+    mdf_module = _asammdf(path)
+    try:
+        with mdf_module.MDF(path) as mdf:
+            names = [name for name in mdf.channels_db if name in KNOWN - {"time_s"}]
+            signals = [mdf.get(name) for name in names]
+    except Exception as error:  # asammdf raises whatever a broken byte leads it to
+        raise RecordingError(f"{path}: cannot be read as MF4: {error}") from error
+    if not signals:
+        raise RecordingError(f"{path}: expected channels named motor1_position_rad, …, found none")
+    times = np.asarray(signals[0].timestamps, dtype=np.float64)
+    columns: dict[str, FloatArray] = {"time_s": times}
+    for name, signal in zip(names, signals, strict=True):
+        columns[name] = _at(times, signal)
+    return record_from_columns(columns, str(path), joint, keep_nan)
+
+
+def _at(times: FloatArray, signal: Any) -> FloatArray:
+    """A channel at the times of the first one: its own samples, or the last before each."""
+    values = np.asarray(signal.samples, dtype=np.float64)
+    own = np.asarray(signal.timestamps, dtype=np.float64)
+    if len(own) == len(times) and np.array_equal(own, times):
+        return values
+    place = np.searchsorted(own, times, side="right") - 1
+    return np.where(place >= 0, values[np.maximum(place, 0)], np.nan)
+
+
+def _unit(name: str) -> str:
+    endings = {"_rad_s": "rad/s", "_rad": "rad", "_nm": "N·m"}
+    return next((unit for ending, unit in endings.items() if name.endswith(ending)), "")
+
+
+def _asammdf(path: Path) -> Any:
+    try:
+        import asammdf
+    except ImportError as error:
+        raise RecordingError(f'{path}: MF4 needs asammdf: pip install "drivelink[mf4]"') from error
+    return asammdf

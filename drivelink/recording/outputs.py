@@ -1,0 +1,150 @@
+"""What becomes of the cycles of a replay: estimates.csv, keys on zenoh, plots, a closing line."""
+
+from __future__ import annotations
+
+import time
+from array import array
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivelink.errors import RecordingError
+from drivelink.pubsub.publisher import JointPublisher
+from drivelink.recording.messages import estimate_columns, estimate_row
+from drivelink.recording.playback import Played
+from estimator.sample import FloatArray, Status
+
+__all__ = ["EstimatesFile", "Publication", "Summary"]
+
+_STATUS_EVERY_S = 0.25
+
+
+class EstimatesFile:
+    """estimates.csv, a row for each cycle as it comes; whole lines, also when it ends early."""
+
+    def __init__(self, path: Path, motors: int) -> None:
+        columns = estimate_columns(motors)
+        self._line = ",".join(["%r"] * len(columns)) + "\n"
+        try:
+            self._file = path.open("w", encoding="ascii", newline="\n", buffering=1 << 18)
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
+        self._file.write(",".join(columns) + "\n")
+
+    def take(self, played: Played) -> None:
+        """Write one row."""
+        time_s, _, estimate, _ = played
+        totals = (estimate.flexibility_torque_nm, estimate.stiffness_nm_rad, estimate.stiffness_std_nm_rad)
+        row = estimate_row(time_s, estimate.status, totals, estimate.transmissions)
+        self._file.write(self._line % row)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class Publication:
+    """Puts the cycles on zenoh as the daemon does, stamped as if they were measured now.
+
+    Args:
+        publisher: of the joint.
+        speed: recorded seconds that pass in a second; None: as fast as possible, no waiting.
+        about: what the status message says of the replay.
+    """
+
+    def __init__(self, publisher: JointPublisher | None, speed: float | None, about: dict[str, Any]) -> None:
+        self._publisher = publisher
+        self._speed = speed
+        self._about = about
+        self._begin_s = 0.0
+        self._begin_ns = self._begin_unix_ns = 0
+        self._status_due_s = 0.0
+        self._count = 0
+
+    def take(self, played: Played) -> None:
+        """Wait until it is time for a cycle, and publish it."""
+        if not self._count:
+            self._begin_s = played.time_s
+            self._begin_ns, self._begin_unix_ns = time.monotonic_ns(), time.time_ns()
+        self._count += 1
+        passed_s = played.time_s - self._begin_s
+        if self._speed is not None:
+            due_ns = self._begin_ns + round(passed_s / self._speed * 1e9)
+            wait_ns = due_ns - time.monotonic_ns()
+            if wait_ns > 0:
+                time.sleep(wait_ns * 1e-9)
+        if self._publisher is None:
+            return
+        stamp_ns = self._begin_unix_ns + round(passed_s / (self._speed or 1.0) * 1e9)
+        self._publisher.put_estimate(played.estimate, stamp_ns)
+        if played.sample is not None:
+            self._publisher.put_sample(played.sample, stamp_ns)
+        if passed_s >= self._status_due_s:
+            self._status_due_s = passed_s + _STATUS_EVERY_S * (self._speed or 1.0)
+            self._status("replay", passed_s)
+
+    def close(self) -> None:
+        """Say that it is over."""
+        if self._publisher is not None:
+            self._status("ended", self._status_due_s)
+
+    def _status(self, state: str, passed_s: float) -> None:
+        if self._publisher is not None:
+            status = {**self._about, "state": state, "time_s": passed_s, "cycles": self._count}
+            self._publisher.put_status(status)
+
+
+class Summary:
+    """Counts, and the columns that plots need."""
+
+    def __init__(self, motors: int, keep: bool) -> None:
+        self.count = self.valid = self.observable = 0
+        self._keep = keep
+        self._width = len(estimate_columns(motors))
+        self._motors = motors
+        self._values = array("d")
+        self._last: Played | None = None
+        self._first_s = 0.0
+
+    def take(self, played: Played) -> None:
+        """Count one cycle."""
+        if not self.count:
+            self._first_s = played.time_s
+        self.count += 1
+        estimate = played.estimate
+        self.valid += bool(estimate.status & Status.VALID)
+        self.observable += bool(estimate.status & Status.OBSERVABLE)
+        self._last = played
+        if self._keep:
+            totals = (
+                estimate.flexibility_torque_nm, estimate.stiffness_nm_rad, estimate.stiffness_std_nm_rad
+            )  # fmt: skip
+            self._values.extend(estimate_row(played.time_s, estimate.status, totals, estimate.transmissions))
+
+    def text(self, took_s: float) -> str:
+        """The replay in one line."""
+        if self._last is None:
+            return "no cycle in it"
+        seconds = self._last.time_s - self._first_s
+        estimate = self._last.estimate
+        half = 1.96 * estimate.stiffness_std_nm_rad
+        return (
+            f"{self.count} cycles, {seconds:.6g} s, in {took_s:.3g} s "
+            f"({seconds / max(took_s, 1e-9):.3g} × real time); "
+            f"valid {100 * self.valid / self.count:.1f} %, "
+            f"observable {100 * self.observable / self.count:.1f} %; at the end stiffness "
+            f"{estimate.stiffness_nm_rad:.6g}{f' ± {half:.2g}' if half == half else ''} N·m/rad"
+        )
+
+    def plot(self, folder: Path, title: str) -> list[Path]:
+        """Write stiffness over deflection, and torque and stiffness over time."""
+        from drivelink.recording.estimateplots import plot_curves, plot_over_time  # matplotlib, where wanted
+
+        folder.mkdir(parents=True, exist_ok=True)
+        table = np.frombuffer(self._values, dtype=np.float64).reshape(-1, self._width)
+        columns: dict[str, FloatArray] = dict(zip(estimate_columns(self._motors), table.T, strict=True))
+        return [
+            plot_curves(columns, self._motors, folder / "stiffness.png", title),
+            plot_over_time(columns, folder / "time.png", title),
+        ]

@@ -1,0 +1,142 @@
+"""A recording played through the chain that live data goes through: frames or samples in, estimates out."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from drivelink.canopen.layout import NodeLayout
+from drivelink.cycle.acquisition import Assembler
+from drivelink.cycle.chain import Chain, build, make_chain
+from drivelink.jointfile import JointFile
+from drivelink.recording import read
+from drivelink.recording.canframes import FrameLog, is_frame_log
+from drivelink.recording.mcapsamples import recorded_cycles
+from estimator.sample import Estimate, Sample
+
+__all__ = ["Playback", "Played", "open_playback"]
+
+
+class Played(NamedTuple):
+    """One cycle of a recording and what the estimator made of it.
+
+    Attributes:
+        time_s: of its SYNC, as the recording counts time.
+        stamp_ns: UNIX time of its SYNC, where the recording has it; else `time_s` in nanoseconds.
+        estimate: as the daemon would have published it.
+        sample: what it was made from; None where the last estimate was carried on.
+    """
+
+    time_s: float
+    stamp_ns: int
+    estimate: Estimate
+    sample: Sample | None
+
+
+class Playback:
+    """The cycles of a recording, in order, each estimated as it is asked for.
+
+    Attributes:
+        motors: how many the joint has.
+        period_s: of the recording; the estimator works with it.
+        total: number of cycles, where the recording tells without being read.
+        chain: what they go through.
+    """
+
+    def __init__(
+        self,
+        joint: JointFile,
+        period_s: float,
+        total: int | None,
+        layouts: tuple[NodeLayout, ...] | None,
+        cycles: Callable[[Chain], Iterator[Played]],
+    ) -> None:
+        self.motors = len(joint.motor)
+        self.period_s = period_s
+        self.total = total
+        timed = joint.model_copy(update={"bus": joint.bus.model_copy(update={"period_s": period_s})})
+        if layouts is None:
+            self.chain = Chain(Assembler((), 0), *build(timed))
+        else:
+            self.chain = make_chain(timed, layouts)
+        self._cycles = cycles
+
+    def __iter__(self) -> Iterator[Played]:
+        with _calm_collector():
+            yield from self._cycles(self.chain)
+
+
+@contextmanager
+def _calm_collector() -> Iterator[None]:
+    """Let the garbage collector look seldom: a cycle leaves nothing to it, and its looking costs a fifth."""
+    before = gc.get_threshold()
+    gc.set_threshold(100_000, *before[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*before)
+
+
+def open_playback(
+    path: Path,
+    joint: JointFile,
+    base_dir: Path,
+    *,
+    frames: bool | None = None,
+    channel: str | None = None,
+) -> Playback:
+    """Open a recording of any format for playing.
+
+    Args:
+        path: the recording.
+        joint: the joint it was made with.
+        base_dir: folder of the joint file, where its EDS files are looked for.
+        frames: of an MCAP file, play the raw frames (True) or the samples (False); None: the samples, and
+            the frames where there are none.
+        channel: of a raw CAN log with several.
+
+    Raises:
+        RecordingError: it cannot be read, or lacks what is needed.
+    """
+    if is_frame_log(path, frames):
+        log = FrameLog(path, joint, base_dir, channel)
+        return Playback(joint, log.period_s, None, log.layouts, lambda chain: _from_frames(log, chain))
+    if path.suffix.lower() == ".mcap":
+        period_s = joint.bus.period_s
+        return Playback(joint, period_s, None, None, lambda chain: _from_mcap(path, joint, chain))
+    record = read(path, joint, keep_nan=True)
+    times = record.time_s.tolist()
+    return Playback(
+        joint,
+        record.period_s,
+        len(record),
+        None,
+        lambda chain: _from_samples(record.samples(), times, chain),
+    )
+
+
+def _from_samples(samples: Iterable[Sample], times: list[float], chain: Chain) -> Iterator[Played]:
+    take = chain.take
+    for time_s, sample in zip(times, samples, strict=True):
+        yield Played(time_s, round(time_s * 1e9), take(sample), sample)
+
+
+def _from_mcap(path: Path, joint: JointFile, chain: Chain) -> Iterator[Played]:
+    """Samples with the service's flags of their estimates, and the cycles that had no sample."""
+    period_s = joint.bus.period_s
+    for sequence, stamp_ns, sample, flags in recorded_cycles(path, len(joint.motor)):
+        if sample is not None:
+            estimate: Estimate | None = chain.take(sample, flags)
+        else:
+            estimate = chain.carry_on(sequence, flags)
+        if estimate is not None:
+            yield Played(sequence * period_s, stamp_ns, estimate, sample)
+
+
+def _from_frames(log: FrameLog, chain: Chain) -> Iterator[Played]:
+    period_s = log.period_s
+    for estimate, stamp_ns in log.run(chain.assembler, chain.feed):
+        yield Played(estimate.sequence * period_s, stamp_ns, estimate, chain.sample)

@@ -1,0 +1,264 @@
+"""Listens to a daemon and to a bus, and writes what it hears; in a process of its own, never in the loop's.
+
+Nothing is ever sent: on zenoh it subscribes, on the bus it only receives. What comes faster than it is
+written waits in zenoh's and the kernel's queues; what these drop is counted, not waited for.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import can
+import zenoh
+import zenoh.ext
+
+from drivelink.canopen.layout import NodeLayout
+from drivelink.canopen.passive import PassiveConfigurator
+from drivelink.cycle.acquisition import SYNC_COB_ID, Assembler
+from drivelink.cycle.framesource import BusLostError, open_source
+from drivelink.errors import BusError, ZenohError
+from drivelink.jointfile import JointFile
+from drivelink.pubsub.wire import decode_estimate, decode_sample
+from drivelink.recording.canlog import Frame
+from drivelink.recording.sinks import Sink
+from drivelink.recording.syncnumbers import SyncNumbering
+from estimator.sample import Sample
+
+__all__ = ["BusTap", "Gate", "Recorder", "ZenohTap"]
+
+_QUEUE = 30_000  # messages of a key that may wait: half a minute at 1 kHz
+_FLUSH_S = 1.0
+_POLL_S = 0.005
+
+
+class Gate:
+    """Lets the samples of one source through, where the daemon and the bus both give them: the first's.
+
+    Args:
+        sink: where they go.
+    """
+
+    def __init__(self, sink: Sink) -> None:
+        self._sink = sink
+        self._source: object = None
+
+    def sample(self, source: object, sample: Sample, stamp_ns: int) -> None:
+        """Take a sample of a source."""
+        if self._source is None:
+            self._source = source
+        if source is self._source:
+            self._sink.sample(sample, stamp_ns)
+
+
+class ZenohTap:
+    """What a daemon publishes of a joint.
+
+    Args:
+        session: an open session; it stays open.
+        joint: the joint.
+        sink: where it goes.
+        gate: decides between its samples and others.
+
+    Attributes:
+        missed: cycles whose sample did not come.
+        newest_s: UNIX time of the newest sample, 0 before the first.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, joint: JointFile, sink: Sink, gate: Gate | None = None
+    ) -> None:
+        self._sink = sink
+        self._gate = gate or Gate(sink)
+        self.missed = 0
+        self.newest_s = 0.0
+        self._sequence = -1
+        key = f"{joint.zenoh.prefix}/{joint.name}"
+        ring = zenoh.handlers.RingChannel
+        history = zenoh.ext.HistoryConfig(max_samples=1, detect_late_publishers=True)
+        wanted: dict[str, Callable[[zenoh.Sample], None]] = {}
+        if "sample" in sink.wants:
+            wanted["sample"] = self._sample
+        if "estimate" in sink.wants:
+            wanted["estimate"] = self._estimate
+        self._streams: list[tuple[Any, Callable[[zenoh.Sample], None]]] = [
+            (session.declare_subscriber(f"{key}/{name}", ring(_QUEUE)), take) for name, take in wanted.items()
+        ]
+        for name in ("status", "model") if "document" in sink.wants else ():
+            subscriber = zenoh.ext.declare_advanced_subscriber(
+                session, f"{key}/{name}", ring(16), history=history
+            )
+            self._streams.append((subscriber, self._document))
+
+    def poll(self) -> None:
+        """Take everything that has come."""
+        for subscriber, take in self._streams:
+            while (sample := subscriber.try_recv()) is not None:
+                take(sample)
+
+    def finish(self) -> None:
+        """Nothing waits here."""
+
+    def close(self) -> None:
+        """Stop listening."""
+        for subscriber, _ in self._streams:
+            subscriber.undeclare()
+
+    def _sample(self, message: zenoh.Sample) -> None:
+        try:
+            sample, stamp_ns = decode_sample(message.payload.to_bytes())
+        except ZenohError:
+            return
+        step = sample.sequence - self._sequence
+        if self._sequence >= 0 and step > 1:
+            self.missed += step - 1
+        self._sequence = sample.sequence
+        self.newest_s = stamp_ns * 1e-9
+        self._gate.sample(self, sample, stamp_ns)
+
+    def _estimate(self, message: zenoh.Sample) -> None:
+        try:
+            self._sink.estimate(decode_estimate(message.payload.to_bytes()))
+        except ZenohError:
+            return
+
+    def _document(self, message: zenoh.Sample) -> None:
+        name = str(message.key_expr).rpartition("/")[2]
+        self._sink.document(name, message.payload.to_bytes(), time.time_ns())
+
+
+class BusTap:
+    """What is on the bus: every frame, and the samples they make where no daemon gives them.
+
+    Args:
+        bus: an open bus; it stays open.
+        joint: the joint.
+        sink: where it goes.
+        base_dir: folder of the joint file; None: no samples are made.
+        gate: decides between its samples and others.
+
+    Attributes:
+        frames: received so far.
+        assembling: whether samples are made: the mapping is known.
+    """
+
+    def __init__(
+        self,
+        bus: can.BusABC,
+        joint: JointFile,
+        sink: Sink,
+        base_dir: Path | None,
+        gate: Gate | None = None,
+    ) -> None:
+        self._gate = gate or Gate(sink)
+        self._source = open_source(bus)
+        self._sink = sink
+        self._joint = joint
+        self._listener = PassiveConfigurator([joint], [base_dir]) if base_dir is not None else None
+        self._assembler: Assembler | None = None
+        self._numbering = SyncNumbering(joint.bus.period_s)
+        self._stamp_ns = 0
+        self.frames = 0
+
+    @property
+    def assembling(self) -> bool:
+        """Whether samples are made."""
+        return self._assembler is not None
+
+    @property
+    def missing(self) -> str:
+        """Why no samples can be made."""
+        return str(next(iter(self._listener.missing.values()), "")) if self._listener else ""
+
+    def poll(self) -> None:
+        """Take everything that has come.
+
+        Raises:
+            BusError: the bus is gone.
+        """
+        try:
+            while frames := self._source.take():
+                for cob_id, data, stamp_ns in frames:
+                    self._sink.frame(stamp_ns, cob_id, data)
+                    if self._listener is not None:
+                        for frame, jump in self._numbering.push(Frame(stamp_ns, cob_id, data, "")):
+                            self._assemble(frame, jump)
+                self.frames += len(frames)
+        except BusLostError as error:
+            raise BusError(f"the bus is gone: {error}") from error
+
+    def finish(self) -> None:
+        """Take the samples that wait for later SYNCs."""
+        for frame, jump in self._numbering.rest():
+            self._assemble(frame, jump)
+
+    def _assemble(self, frame: Frame, jump: int) -> None:
+        stamp_ns, cob_id, data, _ = frame
+        listener = self._listener
+        if listener is None:
+            return
+        if 0x581 <= cob_id <= 0x67F:
+            listener.feed(cob_id, data, 0.0)
+            for _, layout in listener.poll(0.0):
+                if self._assembler is not None and isinstance(layout, NodeLayout):
+                    self._assembler.relayout(layout)
+        if self._assembler is None:
+            if listener.busy:
+                return
+            self._assembler = Assembler(
+                tuple(listener.layouts.values()), len(self._joint.motor), active=self._joint.bus.configure
+            )
+        before_ns = self._stamp_ns
+        if cob_id == SYNC_COB_ID and jump:
+            self._stamp_ns = stamp_ns
+        sample = self._assembler.feed(cob_id, data, jump)
+        if sample is not None:
+            late = sample.sequence != self._assembler.sequence
+            self._gate.sample(self, sample, before_ns if late else self._stamp_ns)
+
+
+class Recorder:
+    """Polls its taps, and puts the sink on the disk once a second.
+
+    Args:
+        sink: the recording; closed at the end.
+        taps: what it listens to.
+    """
+
+    def __init__(self, sink: Sink, taps: list[ZenohTap | BusTap]) -> None:
+        self.sink = sink
+        self.taps = taps
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.sink.close()
+        else:
+            self.sink.abandon()
+
+    def run(self, stop: Callable[[], bool], tick: Callable[[], None] = lambda: None) -> None:
+        """Record until `stop` says so; `tick` is called after each flush.
+
+        Raises:
+            RecordingError: the disk takes no more; what is on it is whole.
+        """
+        flush_at = time.monotonic() + _FLUSH_S
+        while not stop():
+            for tap in self.taps:
+                tap.poll()
+            now = time.monotonic()
+            if now >= flush_at:
+                flush_at = max(flush_at + _FLUSH_S, now)
+                self.sink.flush()
+                tick()
+            time.sleep(_POLL_S)
+        for tap in self.taps:
+            tap.poll()
+            tap.finish()

@@ -1,0 +1,131 @@
+"""A file that a kill, a full disk or a power loss leaves whole up to the last flush."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from drivelink.errors import RecordingError
+
+__all__ = ["SafeFile"]
+
+
+class SafeFile(io.BufferedIOBase):
+    """Binary file for writers: whole blocks reach the disk, or none of a block.
+
+    `write` keeps bytes in memory; `flush` hands them to the system as one block; `sync` also waits until
+    the disk has them. If there is no room, the file is cut back to the last whole block, so that what a
+    reader finds ends between two records.
+
+    Args:
+        path: the file; an existing one is replaced.
+
+    Attributes:
+        name: the path, as files tell it.
+
+    Raises:
+        RecordingError: it cannot be opened or, later, written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self._path = path
+        self.name = str(path)
+        self._pending = bytearray()
+        self._place: int | None = None  # of a write somewhere else than at the end
+        self._size = 0
+        try:
+            self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            self._fd = -1
+            raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
+
+    def writable(self) -> bool:
+        """Always."""
+        return True
+
+    def seekable(self) -> bool:
+        """Always: a header may be written again at the end."""
+        return True
+
+    def tell(self) -> int:
+        """Where the next byte goes."""
+        return self._size + len(self._pending) if self._place is None else self._place
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Go to a place; what is pending is written before."""
+        self.flush()
+        end = whence == os.SEEK_END
+        self._place = None if end else offset
+        return self.tell()
+
+    def write(self, data: bytes) -> int:  # type: ignore[override]
+        """Take bytes; at the end of the file they wait for `flush`."""
+        if self._place is not None:
+            self._put(bytes(data), self._place)
+            self._place += len(data)
+            return len(data)
+        self._pending += data
+        return len(data)
+
+    def flush(self) -> None:
+        """Hand everything pending to the system, as one block."""
+        if self._fd < 0 or not self._pending:
+            return
+        self._put(bytes(self._pending), self._size)
+        self._size += len(self._pending)
+        self._pending.clear()
+
+    def sync(self) -> None:
+        """Flush, and wait until the disk has it."""
+        self.flush()
+        try:
+            os.fdatasync(self._fd)
+        except OSError as error:
+            if error.errno not in (errno.EINVAL, errno.EROFS):  # no such thing on pipes and devices
+                raise self._failed(error) from error
+
+    def close(self) -> None:
+        """Flush and close; nothing more is said once the disk has refused."""
+        if self._fd < 0:
+            return
+        try:
+            self.sync()
+        finally:
+            os.close(self._fd)
+            self._fd = -1
+            super().close()
+
+    def abandon(self) -> None:
+        """Close without writing what is pending."""
+        self._pending.clear()
+        self.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _put(self, data: bytes, offset: int) -> None:
+        done = 0
+        try:
+            while done < len(data):
+                done += os.pwrite(self._fd, data[done:], offset + done)
+        except OSError as error:
+            self._pending.clear()
+            if offset >= self._size:
+                os.ftruncate(self._fd, self._size)
+            raise self._failed(error) from error
+
+    def _failed(self, error: OSError) -> RecordingError:
+        return RecordingError(
+            f"{self._path}: cannot be written any further: {error.strerror}; "
+            "it holds everything up to the last second"
+        )

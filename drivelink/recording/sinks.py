@@ -1,0 +1,229 @@
+"""Writers of recordings, one class a family of formats, all fed alike.
+
+A sink keeps what it is given in memory and puts it on the disk with `flush`, once a second: what is there
+is whole, whatever happens next.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import can
+from mcap.writer import CompressionType, IndexType, Writer
+
+from drivelink import __version__
+from drivelink.errors import RecordingError
+from drivelink.jointfile import JointFile
+from drivelink.pubsub.wire import EstimateMessage
+from drivelink.recording.columns import sample_columns, sample_row
+from drivelink.recording.messages import TOPICS, estimate_encoder, message_schema, sample_encoder
+from drivelink.recording.safefile import SafeFile
+from estimator.sample import Sample
+
+__all__ = ["CanSink", "CsvSink", "McapSink", "Sink", "open_sink"]
+
+
+class Sink:
+    """A recording being written; each format takes what it has a place for and leaves out the rest.
+
+    Attributes:
+        counts: how many of each kind it has taken.
+        wants: which kinds it takes: "sample", "estimate", "document", "frame".
+    """
+
+    wants: frozenset[str] = frozenset()
+
+    def __init__(self, path: Path) -> None:
+        self._file = SafeFile(path)
+        self.counts: dict[str, int] = dict.fromkeys(sorted(self.wants), 0)
+
+    def sample(self, sample: Sample, stamp_ns: int) -> None:
+        """Take what was measured at one SYNC."""
+
+    def estimate(self, message: EstimateMessage) -> None:
+        """Take one estimate."""
+
+    def document(self, name: str, payload: bytes, stamp_ns: int) -> None:
+        """Take a JSON document: status, model."""
+
+    def frame(self, stamp_ns: int, cob_id: int, data: bytes) -> None:
+        """Take one CAN frame."""
+
+    def flush(self) -> None:
+        """Put everything on the disk."""
+        self._file.sync()
+
+    def close(self) -> None:
+        """Write the end of the file and close it."""
+        self._file.close()
+
+    def abandon(self) -> None:
+        """Close it as it is on the disk."""
+        self._file.abandon()
+
+
+class CsvSink(Sink):
+    """Samples as CSV, numbers in their shortest exact text."""
+
+    wants = frozenset({"sample"})
+
+    def __init__(self, path: Path, joint: JointFile) -> None:
+        super().__init__(path)
+        self._period_s = joint.bus.period_s
+        columns = sample_columns(len(joint.motor))
+        self._line = ",".join(["%r"] * len(columns)) + "\n"
+        self._file.write((",".join(columns) + "\n").encode())
+
+    def sample(self, sample: Sample, stamp_ns: int) -> None:
+        """Take what was measured at one SYNC."""
+        self.counts["sample"] += 1
+        self._file.write((self._line % sample_row(sample, self._period_s)).encode())
+
+
+class McapSink(Sink):
+    """Everything, as MCAP with one JSON channel `/<joint>/<topic>` for each of `TOPICS`."""
+
+    wants = frozenset({"sample", "estimate", "document", "frame"})
+
+    def __init__(self, path: Path, joint: JointFile, joint_text: str = "", folder: str = "") -> None:
+        super().__init__(path)
+        motors, period_s = len(joint.motor), joint.bus.period_s
+        self._encode_sample: Callable[[Sample], bytes] = sample_encoder(motors, period_s)
+        self._encode_estimate = estimate_encoder(motors, period_s)
+        self._writer: Any = Writer(  # of its methods, some are not annotated
+            self._file,  # type: ignore[arg-type]
+            chunk_size=4 << 20,
+            compression=CompressionType.ZSTD,
+            index_types=IndexType.CHUNK | IndexType.METADATA,
+        )
+        self._writer.start(library=f"drivelink/{__version__}")
+        self._writer.add_metadata(
+            "drivelink",
+            {"joint": joint.name, "motors": str(motors), "period_s": repr(period_s), "version": __version__},
+        )
+        self._channels = {}
+        for topic in TOPICS:
+            schema = self._writer.register_schema(
+                f"drivelink.{topic}", "jsonschema", message_schema(topic, motors)
+            )
+            self._channels[topic] = self._writer.register_channel(f"/{joint.name}/{topic}", "json", schema)
+        self._joint = json.dumps({"text": joint_text, "folder": folder}).encode() if joint_text else b""
+
+    def sample(self, sample: Sample, stamp_ns: int) -> None:
+        """Take what was measured at one SYNC."""
+        self._put("sample", stamp_ns, self._encode_sample(sample))
+        self.counts["sample"] += 1
+
+    def estimate(self, message: EstimateMessage) -> None:
+        """Take one estimate."""
+        self._put("estimate", message.stamp_ns, self._encode_estimate(message))
+        self.counts["estimate"] += 1
+
+    def document(self, name: str, payload: bytes, stamp_ns: int) -> None:
+        """Take a JSON document: status, model."""
+        self._put(name, stamp_ns, payload)
+        self.counts["document"] += 1
+
+    def frame(self, stamp_ns: int, cob_id: int, data: bytes) -> None:
+        """Take one CAN frame."""
+        self._put("can", stamp_ns, f'{{"id":{cob_id},"data":"{data.hex()}"}}'.encode())
+        self.counts["frame"] += 1
+
+    def flush(self) -> None:
+        """Put everything on the disk, as a chunk of its own."""
+        self._writer.flush()
+        super().flush()
+
+    def close(self) -> None:
+        """Write the index and close."""
+        self._writer.finish()
+        super().close()
+
+    def _put(self, topic: str, stamp_ns: int, data: bytes) -> None:
+        if self._joint:
+            joint, self._joint = self._joint, b""
+            self._put("joint", stamp_ns, joint)
+        self._writer.add_message(self._channels[topic], stamp_ns, data, stamp_ns)
+
+
+class _BlfWriter(can.BLFWriter):
+    """python-can's writer, whose containers can be closed early."""
+
+    def end_container(self) -> None:
+        """Write the container begun."""
+        self._flush()
+
+
+class CanSink(Sink):
+    """Raw frames in python-can's formats: candump .log, .asc, .blf, .trc."""
+
+    wants = frozenset({"frame"})
+
+    def __init__(self, path: Path, joint: JointFile) -> None:
+        super().__init__(path)
+        suffix = path.suffix.lower()
+        self._text: io.TextIOWrapper | None = None
+        if suffix == ".blf":
+            self._writer: Any = _BlfWriter(self._file, channel=1)  # type: ignore[arg-type]
+        else:
+            kinds: dict[str, Any] = {
+                ".log": can.CanutilsLogWriter,
+                ".asc": can.ASCWriter,
+                ".trc": can.TRCWriter,
+            }
+            self._text = io.TextIOWrapper(self._file, encoding="ascii", newline="\n", write_through=True)
+            self._writer = kinds[suffix](self._text)
+        # Formats that number their channels know no names.
+        self._channel: str | int = joint.bus.channel.replace(" ", "_") if suffix == ".log" else 0
+
+    def frame(self, stamp_ns: int, cob_id: int, data: bytes) -> None:
+        """Take one CAN frame."""
+        message = can.Message(
+            timestamp=stamp_ns * 1e-9,
+            arbitration_id=cob_id,
+            data=data,
+            is_extended_id=False,
+            is_fd=len(data) > 8,
+            channel=self._channel,
+        )
+        self._writer.on_message_received(message)
+        self.counts["frame"] += 1
+
+    def flush(self) -> None:
+        """Put everything on the disk."""
+        if self._text is not None:
+            self._text.flush()
+        else:
+            self._writer.end_container()
+        super().flush()
+
+    def close(self) -> None:
+        """Write the end of the file and close it."""
+        self._writer.stop()
+        super().close()
+
+
+def open_sink(path: Path, joint: JointFile, joint_text: str = "", folder: str = "") -> Sink:
+    """The writer of the format that the file's ending names.
+
+    Raises:
+        RecordingError: no such format, or the file cannot be written.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".mcap":
+        return McapSink(path, joint, joint_text, folder)
+    if suffix == ".csv":
+        return CsvSink(path, joint)
+    if suffix == ".mf4":
+        from drivelink.recording.mf4file import Mf4Sink  # it is made of the sinks here
+
+        return Mf4Sink(path, joint, joint_text, folder)
+    if suffix in (".log", ".asc", ".blf", ".trc"):
+        return CanSink(path, joint)
+    raise RecordingError(
+        f"{path}: expected a name that ends in .mcap, .csv, .mf4, .log (candump), .blf, .asc or .trc"
+    )

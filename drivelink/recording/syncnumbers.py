@@ -1,0 +1,102 @@
+"""Numbers for the SYNCs of a recording: a late stamp is told from a lost SYNC by what comes after it.
+
+Recorded stamps are often times of arrival, and these come in bursts. A SYNC that was only late is followed
+by ones that catch up; after a lost one all others stay behind. `SyncClock`, which has to decide at once,
+cannot know.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+
+from drivelink.cycle.acquisition import SYNC_COB_ID
+from drivelink.cycle.syncclock import SyncClock
+from drivelink.recording.canlog import NO_STAMP, Frame
+
+__all__ = ["SyncNumbering", "numbered_ahead", "numbered_at_once"]
+
+_AHEAD = 64  # SYNCs that are looked at before one is numbered
+_EXTRA = -0.5  # periods before it was due: a SYNC of another master
+_FOLLOW = 0.05  # of the deviation, per SYNC: the two clocks drift
+
+
+def numbered_at_once(frames: Iterable[Frame], period_s: float) -> Iterator[tuple[Frame, int]]:
+    """Each frame with the jump of its SYNC, decided as the live loop does that follows a SYNC."""
+    clock = SyncClock(period_s)
+    for frame in frames:
+        if frame.can_id == SYNC_COB_ID and frame.stamp_ns != NO_STAMP:
+            yield frame, clock.jump(frame.stamp_ns)
+        else:
+            yield frame, 1
+
+
+def numbered_ahead(frames: Iterable[Frame], period_s: float) -> Iterator[tuple[Frame, int]]:
+    """Each frame with the jump of its SYNC: whole periods since the one before, 0 for one that is not due."""
+    numbering = SyncNumbering(period_s)
+    for frame in frames:
+        yield from numbering.push(frame)
+    yield from numbering.rest()
+
+
+class SyncNumbering:
+    """Numbers the SYNCs of a stream, each when enough others have followed it.
+
+    Args:
+        period_s: the communication cycle.
+    """
+
+    def __init__(self, period_s: float) -> None:
+        self._period_ns = period_s * 1e9
+        self._due_ns: float | None = None
+        self._waiting: deque[Frame] = deque()
+        self._stamps: deque[int] = deque()  # of the SYNCs that wait
+
+    def push(self, frame: Frame) -> list[tuple[Frame, int]]:
+        """Take a frame; returns those that are certain now, each with its jump."""
+        self._waiting.append(frame)
+        if frame.can_id != SYNC_COB_ID:
+            return []
+        self._stamps.append(frame.stamp_ns)
+        return self._released(1) if len(self._stamps) > _AHEAD else []
+
+    def rest(self) -> list[tuple[Frame, int]]:
+        """The stream has ended: everything that still waits."""
+        return self._released(len(self._stamps))
+
+    def _released(self, syncs: int) -> list[tuple[Frame, int]]:
+        """Take frames out, up to the next SYNC after so many, or all."""
+        released = []
+        waiting = self._waiting
+        while waiting:
+            if waiting[0].can_id == SYNC_COB_ID:
+                if not syncs:
+                    break
+                syncs -= 1
+                released.append((waiting.popleft(), self._jump()))
+            else:
+                released.append((waiting.popleft(), 1))
+        return released
+
+    def _jump(self) -> int:
+        """The jump of the first SYNC that waits."""
+        stamps, period_ns = self._stamps, self._period_ns
+        stamp = stamps.popleft()
+        if stamp == NO_STAMP:
+            return 1
+        due = self._due_ns
+        if due is None:
+            earliest = min([float(stamp), *(s - (k + 1) * period_ns for k, s in enumerate(stamps))])
+            self._due_ns = earliest + period_ns
+            return 1
+        late = (stamp - due) / period_ns
+        if late < _EXTRA:
+            return 0
+        lost = 0
+        if late > 0.5:
+            lost = max(
+                0, round(min([late, *((s - due) / period_ns - (k + 1) for k, s in enumerate(stamps))]))
+            )
+        left = late - lost
+        self._due_ns = due + (1 + lost + (_FOLLOW * left if abs(left) < 0.5 else 0.0)) * period_ns
+        return 1 + lost

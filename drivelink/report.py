@@ -1,0 +1,287 @@
+"""What a diagnosis says: report.json for machines, report.html for a drive engineer."""
+
+from __future__ import annotations
+
+import html
+import json
+from pathlib import Path
+from string import Template
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from drivelink import plots
+from estimator.diagnosis import Curve, Diagnosis, Errors, Finding
+from estimator.effects import LIBRARY
+from estimator.model import ParameterValue
+from estimator.sample import FloatArray
+
+__all__ = ["Title", "as_json", "sentence", "title_of", "value_text", "write"]
+
+_SCHEMA = "drivelink.diagnosis/1"
+_SIGMA_95 = 1.96
+_CURVE_POINTS = 200
+_RIVALS = 8
+_AXES = {
+    "position": "motor position / rad",
+    "velocity": "motor velocity / (rad/s)",
+    "acceleration": "motor acceleration / (rad/s²)",
+    "deflection": "deflection / rad",
+    "deflection_rate": "deflection rate / (rad/s)",
+    "torque": "motor torque / N·m",
+    "torque_rate": "torque rate / (N·m/s)",
+    "flexibility_torque": "flexibility torque / N·m",
+    "link_position": "link position / rad",
+    "link_velocity": "link velocity / (rad/s)",
+    "link_acceleration": "link acceleration / (rad/s²)",
+    "time": "time / s",
+}
+
+
+class Title(NamedTuple):
+    """What the report is about."""
+
+    joint: str
+    recording: str
+    validation: str | None
+
+
+def write(outcome: Diagnosis, title: Title, folder: Path) -> list[Path]:
+    """Write report.json and report.html."""
+    made = []
+    for name, text in (
+        ("report.json", json.dumps(as_json(outcome), indent=2) + "\n"),
+        ("report.html", page(outcome, title)),
+    ):
+        path = folder / name
+        path.write_text(text, encoding="utf-8")
+        made.append(path)
+    return made
+
+
+def as_json(outcome: Diagnosis) -> dict[str, Any]:
+    """The report as it stands in report.json."""
+    unlisted = next((c for c in outcome.curves if c.name == "unlisted"), None)
+    return {
+        "schema": _SCHEMA,
+        "verdict": outcome.verdict,
+        "bandwidth_hz": outcome.bandwidth_hz,
+        "effects": [_effect(finding, unlisted) for finding in outcome.effects],
+        "error": {"train": outcome.train._asdict(), "validation": outcome.validation._asdict()},
+        "transmissions": [dict(parameters) for parameters in outcome.transmissions],
+        "alignment": dict(outcome.alignment),
+        "candidates": [rival._asdict() for rival in outcome.rivals],
+        "advice": list(outcome.advice),
+        "notes": list(outcome.notes),
+    }
+
+
+def _effect(finding: Finding, unlisted: Curve | None) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "name": finding.name,
+        "location": finding.location,
+        "parameters": dict(finding.parameters),
+        "std": dict(finding.std),
+        "alternatives": list(finding.alternatives),
+        "share": finding.share,
+    }
+    if finding.motor is not None:
+        entry["motor"] = finding.motor + 1
+    if finding.coordinates:
+        entry["coordinates"] = list(finding.coordinates)
+        if unlisted is not None:
+            entry["curve"] = _points(unlisted)
+    return entry
+
+
+def _points(curve: Curve) -> dict[str, list[float]]:
+    """The fitted curve, a few hundred points in order of the first coordinate."""
+    order = np.argsort(curve.x)
+    pick = order[np.unique(np.linspace(0, len(order) - 1, _CURVE_POINTS).astype(int))]
+    points = {curve.coordinates[0]: curve.x[pick].tolist()}
+    if curve.second is not None:
+        points[curve.coordinates[1]] = curve.second[pick].tolist()
+    return {**points, "torque_nm": curve.fitted_nm[pick].tolist()}
+
+
+def sentence(outcome: Diagnosis) -> str:
+    """The verdict in one sentence."""
+    fall = (
+        f"the torque balance's error on data that took no part falls from "
+        f"{outcome.validation.before_relative:.2%} to {outcome.validation.after_relative:.2%}"
+    )
+    names = " and ".join(title_of(finding) for finding in outcome.effects)
+    if outcome.verdict == "effect":
+        return f"The model lacks {names}: {fall}."
+    if outcome.verdict == "unexplained":
+        where = outcome.effects[0]
+        over = " and ".join(name.replace("_", " ") for name in where.coordinates)
+        return (
+            f"Something at the {_place(where)} that is in no library, a function of {over}, is missing: "
+            f"with a free curve {fall}."
+        )
+    if outcome.verdict == "insufficient_excitation":
+        said = f" (it might be {names})" if names else ""
+        return f"The motion does not tell what could be missing{said}: record a richer one."
+    return (
+        f"The model is sufficient: what it leaves, {outcome.validation.after_relative:.2%} of the torque, "
+        "belongs to no effect."
+    )
+
+
+def title_of(finding: Finding) -> str:
+    """An effect in words, with its place."""
+    if finding.name == "unlisted":
+        return f"an unlisted effect at the {_place(finding)}"
+    return f"{finding.name.replace('_', ' ')} ({_place(finding)})"
+
+
+def _place(finding: Finding) -> str:
+    return finding.location if not finding.motor else f"{finding.location} {finding.motor + 1}"
+
+
+def value_text(value: ParameterValue, std: ParameterValue | None) -> str:
+    """A parameter with its 95 % interval."""
+    if isinstance(value, tuple):
+        return ", ".join(f"{x:.5g}" for x in value)
+    if isinstance(std, float) and std > 0.0:
+        return f"{value:.5g} ± {_SIGMA_95 * std:.2g}"
+    return f"{value:.5g}"
+
+
+def page(outcome: Diagnosis, title: Title) -> str:
+    """The report as one self-contained page."""
+    template = Template(Path(__file__).with_name("report.html").read_text(encoding="utf-8"))
+    return template.substitute(
+        title=html.escape(title.joint),
+        recording=html.escape(title.recording),
+        validation=html.escape(title.validation or "held-out blocks of the same recording"),
+        bandwidth=f"{outcome.bandwidth_hz:.3g}",
+        verdict=outcome.verdict.replace("_", " "),
+        verdict_class=outcome.verdict,
+        sentence=html.escape(sentence(outcome)),
+        errors="".join(
+            _error_row(n, e) for n, e in (("training", outcome.train), ("validation", outcome.validation))
+        ),
+        effects=_effects(outcome),
+        curves=_curves(outcome),
+        rivals=_rivals_figure(outcome),
+        series=_series_figure(outcome),
+        doubts=_doubts(outcome),
+    )
+
+
+def _error_row(name: str, errors: Errors) -> str:
+    bar = 100.0 * min(errors.after_rms_nm / max(errors.before_rms_nm, 1e-300), 1.0)
+    return (
+        f"<tr><th>{name}</th><td>{errors.before_rms_nm:.4g} N·m</td><td>{errors.before_relative:.2%}</td>"
+        f"<td>{errors.after_rms_nm:.4g} N·m</td><td>{errors.after_relative:.2%}</td>"
+        f'<td class="bar"><span style="width:{bar:.1f}%"></span></td></tr>'
+    )
+
+
+def _effects(outcome: Diagnosis) -> str:
+    rows = []
+    for finding in outcome.effects:
+        rows.append(f'<tr class="effect"><th colspan="2">{html.escape(title_of(finding))}</th></tr>')
+        if finding.name in LIBRARY:
+            rows.append(f'<tr><td colspan="2">{html.escape(LIBRARY[finding.name].description)}</td></tr>')
+        for name, value in finding.parameters.items():
+            text = html.escape(value_text(value, finding.std.get(name)))
+            rows.append(f"<tr><td><code>{html.escape(name)}</code></td><td>{text}</td></tr>")
+    for number, parameters in enumerate(outcome.transmissions, start=1):
+        if parameters:
+            rows.append(f'<tr class="effect"><th colspan="2">transmission {number}, refitted</th></tr>')
+        for name, value in parameters.items():
+            text = value_text(value, None)
+            rows.append(f"<tr><td><code>{html.escape(name)}</code></td><td>{text}</td></tr>")
+    if outcome.alignment:
+        rows.append('<tr class="effect"><th colspan="2">taken out of the readings</th></tr>')
+    for name, value in outcome.alignment.items():
+        rows.append(f"<tr><td><code>{name}</code></td><td>{value:.4g}</td></tr>")
+    return "".join(rows)
+
+
+def _curves(outcome: Diagnosis) -> str:
+    if not outcome.curves:
+        return ""
+    return "<h2>What reveals it</h2>" + "".join(_curve_figure(curve) for curve in outcome.curves)
+
+
+def _curve_figure(curve: Curve) -> str:
+    figure, (axes,) = plots.new_figure(height=3.0)
+    axes.plot(curve.x, curve.residual_nm, ".", color="#aaaaaa", markersize=2.5, rasterized=True)
+    order = np.argsort(curve.x)
+    name = curve.name.replace("_", " ")
+    if curve.second is None and _is_function(curve):
+        curves = {"left by the model": _medians(curve.x, curve.residual_nm)}
+        curves[name] = _medians(curve.x, curve.fitted_nm)
+        plots.xy(axes, curves, _AXES[curve.coordinates[0]], "torque / N·m")
+    else:
+        axes.plot(curve.x[order], curve.fitted_nm[order], ".", color=plots.COLORS[1], markersize=2.0)
+        axes.plot([], [], ".", color="#aaaaaa", label="left by the model")
+        axes.plot([], [], ".", color=plots.COLORS[1], label=name)
+        plots.xy(axes, {}, _AXES[curve.coordinates[0]], "torque / N·m")
+    return f"<figure>{plots.svg_text(figure)}<figcaption>{_caption(curve)}</figcaption></figure>"
+
+
+def _caption(curve: Curve) -> str:
+    over = " and ".join(name.replace("_", " ") for name in curve.coordinates)
+    return f"What the declared model leaves over {over}, and {html.escape(curve.name.replace('_', ' '))}."
+
+
+def _medians(x: FloatArray, y: FloatArray, bins: int = 80) -> plots.Curve:
+    low, high = np.quantile(x, [0.002, 0.998])
+    edges = np.linspace(float(low), float(high), bins + 1)
+    place = np.clip(np.searchsorted(edges, x) - 1, 0, bins - 1)
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    filled = [k for k in range(bins) if np.count_nonzero(place == k) > 2]
+    return plots.Curve(middle[filled], np.array([np.median(y[place == k]) for k in filled]))
+
+
+def _is_function(curve: Curve) -> bool:
+    """Whether the fitted torque is nearly one function of the coordinate, in spite of the filter."""
+    line = _medians(curve.x, curve.fitted_nm)
+    left = curve.fitted_nm - np.interp(curve.x, line.x, line.y)
+    return float(np.std(left)) < 0.35 * float(np.std(curve.fitted_nm)) + 1e-300
+
+
+def _rivals_figure(outcome: Diagnosis) -> str:
+    if not outcome.rivals:
+        return ""
+    shown = outcome.rivals[:_RIVALS]
+    figure, (axes,) = plots.new_figure(height=0.5 + 0.3 * len(shown))
+    names = [r.name.replace("_", " ") + (f" {r.motor + 1}" if r.motor else "") for r in shown]
+    values = [100.0 * r.error_relative for r in shown]
+    place = np.arange(len(shown))
+    axes.barh(place, values, color="#cccccc", edgecolor="#222222", linewidth=0.8)
+    axes.set_yticks(place, names)
+    axes.invert_yaxis()
+    plots.xy(axes, {}, "error left with this effect alone / % of the torque (weighted)", "")
+    return f"<figure>{plots.svg_text(figure)}</figure>"
+
+
+def _series_figure(outcome: Diagnosis) -> str:
+    series = outcome.series
+    if series is None:
+        return ""
+    figure, axes = plots.new_figure(rows=2, height=2.2)
+    plots.over_time(axes[0], {"measured": plots.Curve(series.time_s, series.torque_nm)}, "torque / N·m")
+    curves = {
+        "left before": plots.Curve(series.time_s, series.before_nm),
+        "left after": plots.Curve(series.time_s, series.after_nm),
+    }
+    plots.over_time(axes[1], curves, "torque / N·m")
+    return f"<figure>{plots.svg_text(figure)}</figure>"
+
+
+def _doubts(outcome: Diagnosis) -> str:
+    lines = [
+        f"{title_of(f)} could also be: {', '.join(a.replace('_', ' ') for a in f.alternatives)}."
+        for f in outcome.effects
+        if f.alternatives
+    ]
+    lines += [*outcome.advice, *outcome.notes]
+    if not lines:
+        return "<p>No other effect explains these data as well.</p>"
+    return "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in lines) + "</ul>"

@@ -1,0 +1,303 @@
+"""Joint file to simulated world and devices: the only module of the service that knows `sim`.
+
+The truth is one of the paper's cases (`sim.case`), or what the joint file's model says, with the values of
+`sim.parameters` in place of the model's and `sim.effect` on top. Drives and encoders are those of the
+`drive` and `encoder` sections, so that a daemon with the same joint file finds what it expects.
+"""
+
+from __future__ import annotations
+
+import errno
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from typing import Any
+
+import can
+
+from drivelink.canopen.bus import open_bus
+from drivelink.errors import BusError, JointFileError, UsageError
+from drivelink.jointfile import BusSection, JointFile, SimSection
+from estimator.model import LinkDynamics
+from sim.bench import Bench
+from sim.canopen.cia402_objects import DriveData
+from sim.canopen.cia406_objects import EncoderData
+from sim.canopen.drive import Cia402Drive
+from sim.canopen.encoder import Cia406Encoder
+from sim.canopen.node import Node
+from sim.canopen.profiles import PROFILES, profile
+from sim.canopen.quirks import Quirks
+from sim.cases import CASES, Case, case
+from sim.effects import PlantEffect, make, parse
+from sim.errors import SimError
+from sim.excitation import build
+from sim.network import Network
+from sim.plant import JointPlant, LinkPlant, MotorPlant
+from sim.sensors import DriveHardware, LinkEncoder
+from sim.socketcand import DEFAULT_PORT, SocketcandServer
+from sim.springs import Spring
+from sim.variation import suitable, typical_torque_nm, with_parameters
+from sim.world import World
+
+__all__ = [
+    "CASE_NAMES",
+    "QUIRK_NAMES",
+    "bench_from_joints",
+    "network_from_joint",
+    "nodes_from_joint",
+    "open_sim_bus",
+    "world_from_joint",
+]
+
+CASE_NAMES = tuple(CASES)
+QUIRK_NAMES = tuple(PROFILES)
+
+_LOCAL = ("127.0.0.1", "localhost", "::1")
+
+# World
+
+
+def world_from_joint(
+    joint: JointFile,
+    *,
+    effects: Sequence[str] = (),
+    case_name: str | None = None,
+    seed: int | None = None,
+) -> World:
+    """The world that a joint file describes, at rest.
+
+    Args:
+        joint: the joint file.
+        effects: "NAME=VALUE" as `sim --effect` takes them, besides those of the file.
+        case_name: one of the paper's cases instead of `sim.case`.
+        seed: of the sensor noise, instead of `sim.seed`.
+
+    Raises:
+        JointFileError: the file lacks something, or says something that cannot be.
+        UsageError: an effect that does not exist.
+    """
+    section = joint.sim or SimSection()
+    name = case_name or section.case
+    asked = _asked(effects)
+    try:
+        given = case(name) if name else None
+        if given and given.plant.arrangement != joint.arrangement:
+            raise SimError(f'case "{name}" is {given.plant.arrangement}, this joint is {joint.arrangement}')
+        plant = with_parameters(given.plant if given else _plant(joint), section.parameters)
+        excitation = build(_excitation(section, plant, given), len(plant.motors), where="sim.excitation")
+        return World(
+            plant,
+            [_hardware(joint, index, plant, given) for index in range(len(plant.motors))],
+            _scale(joint, given),
+            excitation=excitation,
+            effects=[*_declared(joint, section, given), *asked],
+            period_s=joint.bus.period_s,
+            seed=section.seed if seed is None else seed,
+        )
+    except SimError as error:
+        raise JointFileError(f"{joint.name}: sim: {error}") from error
+
+
+def _plant(joint: JointFile) -> JointPlant:
+    """The joint as its model says; without link dynamics the link weighs twice the first motor."""
+    for index, motor in enumerate(joint.motor, start=1):
+        if motor.transmission.model != "none" and not motor.transmission.parameters:
+            raise SimError(f"expected sim.case, or parameters in motor[{index}].transmission")
+    link = joint.link.dynamics or LinkDynamics(inertia_kg_m2=2.0 * joint.motor[0].inertia_kg_m2)
+    return JointPlant(
+        arrangement=joint.arrangement,
+        motors=tuple(
+            MotorPlant(
+                inertia_kg_m2=motor.inertia_kg_m2,
+                viscous_damping_nm_s_rad=motor.viscous_damping_nm_s_rad,
+                spring=Spring(model=motor.transmission.model, parameters=motor.transmission.parameters),
+            )
+            for motor in joint.motor
+        ),
+        link=LinkPlant(
+            inertia_kg_m2=link.inertia_kg_m2,
+            viscous_damping_nm_s_rad=link.viscous_damping_nm_s_rad,
+            gravity_nm=link.gravity_nm,
+            gravity_phase_rad=link.gravity_phase_rad,
+        ),
+    )
+
+
+def _declared(joint: JointFile, section: SimSection, given: Case | None) -> list[PlantEffect]:
+    """Effects of the file: those of the model too, where the model is the truth."""
+    effects = [make(effect.name, effect.parameters) for effect in section.effect]
+    if given is None:
+        effects += [
+            make(e.name, e.parameters, k) for k, motor in enumerate(joint.motor) for e in motor.effect
+        ]
+        effects += [make(effect.name, effect.parameters) for effect in joint.link.effect]
+    return effects
+
+
+def _asked(effects: Sequence[str]) -> list[PlantEffect]:
+    try:
+        return [parse(text) for text in effects]
+    except SimError as error:
+        raise UsageError(f"--effect: {error}") from error
+
+
+def _excitation(section: SimSection, plant: JointPlant, given: Case | None) -> Mapping[str, Any]:
+    """The table of the file, completed by what suits the case or the plant."""
+    table = section.excitation
+    if given is not None and table.get("kind") in (None, given.excitation["kind"]):
+        return {**given.excitation, **table}
+    suited = given.rich if given is not None else suitable(plant)
+    if table.get("kind", "rich") == "rich":
+        return {**suited, **table}
+    kept = ("centring_nm_rad", "centring_nm_s_rad") + (() if table["kind"] == "none" else ("amplitude_nm",))
+    return {**{key: suited[key] for key in kept if key in suited}, **table}
+
+
+def _hardware(joint: JointFile, index: int, plant: JointPlant, given: Case | None) -> DriveHardware:
+    """The drive of one motor: what the joint file says, completed by the case or by plausible values."""
+    drive = joint.motor[index].drive
+    assumed = given.drives[index] if given else DriveHardware()
+    if drive is None:
+        return assumed
+    told = given is None or "gear_ratio" in drive.model_fields_set
+    gear = drive.gear_ratio if told else assumed.gear_ratio
+    rated_a = drive.rated_current_a or assumed.rated_current_a
+    constant = drive.torque_constant_nm_a
+    if constant is None and drive.rated_torque_nm is not None:
+        constant = drive.rated_torque_nm / rated_a
+    if constant is None:
+        rated_nm = assumed.rated_torque_nm * assumed.gear_ratio if given else typical_torque_nm(plant)
+        constant = rated_nm / gear / rated_a
+    return DriveHardware(
+        counts_per_rev=drive.counts_per_rev or assumed.counts_per_rev,
+        gear_ratio=gear,
+        torque_constant_nm_a=constant,
+        rated_current_a=rated_a,
+        current_noise_a=0.002 * rated_a,
+        direction=drive.direction,
+        torque_direction=drive.torque_direction,
+    )
+
+
+def _scale(joint: JointFile, given: Case | None) -> LinkEncoder | None:
+    encoder = joint.link.encoder
+    assumed = given.encoder if given else LinkEncoder()
+    if encoder is None:
+        return assumed
+    return LinkEncoder(
+        counts_per_rev=encoder.counts_per_rev or assumed.counts_per_rev,
+        direction=encoder.direction,
+        zero_rad=-encoder.offset_rad,
+    )
+
+
+# Devices
+
+
+def nodes_from_joint(joint: JointFile, world: World, *, quirks: str | None = None) -> tuple[Node, ...]:
+    """The drives and the encoder of a joint.
+
+    Args:
+        joint: the joint file.
+        world: what they measure.
+        quirks: name of a profile instead of `sim.quirks`.
+
+    Raises:
+        JointFileError: a motor without a drive, or an unknown profile in the file.
+        UsageError: an unknown profile in `quirks`.
+    """
+    own = _profile(joint, quirks)
+    encoder = joint.link.encoder
+    host = None
+    if encoder is not None and encoder.source == "drive":
+        host = encoder.node_id or (joint.motor[0].drive.node_id if joint.motor[0].drive else None)
+        place = re.fullmatch(r"0x60[Ee]4:(\d+)", encoder.object or "")
+        if place:
+            own = replace(own, second_encoder=int(place[1]))
+    nodes: list[Node] = []
+    for index, motor in enumerate(joint.motor):
+        if motor.drive is None:
+            raise JointFileError(
+                f"{joint.name}: motor[{index + 1}].drive: expected this table to simulate it"
+            )
+        data = _drive_data(world, index, motor.drive.node_id == host)
+        nodes.append(Cia402Drive(motor.drive.node_id, world, index, data, own))
+    if encoder is not None and encoder.source == "cia406" and encoder.node_id is not None:
+        counts = EncoderData(counts_per_rev=round(world.encoder.counts_per_rev))
+        nodes.append(Cia406Encoder(encoder.node_id, world, counts))
+    return tuple(nodes)
+
+
+def _profile(joint: JointFile, quirks: str | None) -> Quirks:
+    try:
+        return profile(quirks or (joint.sim.quirks if joint.sim else None) or "strict")
+    except SimError as error:
+        if quirks:
+            raise UsageError(f"--{error}") from error
+        raise JointFileError(f"{joint.name}: sim.{error}") from error
+
+
+def _drive_data(world: World, motor: int, has_link_encoder: bool) -> DriveData:
+    hardware = world.drives[motor]
+    gear = Fraction(hardware.gear_ratio).limit_denominator(1000)
+    return DriveData(
+        rated_current_ma=max(1, round(hardware.rated_current_a * 1e3)),
+        rated_torque_mnm=max(1, round(hardware.rated_torque_nm * 1e3)),
+        max_current_per_mille=round(1e3 * hardware.limit_a / hardware.rated_current_a),
+        counts_per_rev=round(hardware.counts_per_rev),
+        gear=(gear.numerator, gear.denominator),
+        link_counts_per_rev=round(world.encoder.counts_per_rev) if has_link_encoder else None,
+    )
+
+
+def network_from_joint(
+    joint: JointFile, bus: can.BusABC, *, world: World | None = None, quirks: str | None = None
+) -> Network:
+    """The devices of one joint on a bus, in lockstep (`poll`) or served (`start`)."""
+    world = world or world_from_joint(joint)
+    return Network(bus, nodes_from_joint(joint, world, quirks=quirks), world)
+
+
+def open_sim_bus(section: BusSection) -> can.BusABC:
+    """Open the bus of a joint file from the devices' side.
+
+    For `interface = "socketcand"` at an address of this machine that nobody serves yet, serve it: the
+    daemon, or a second simulation, then connects to it.
+
+    Raises:
+        BusError: it cannot be opened.
+    """
+    host = str(section.options.get("host", "127.0.0.1"))
+    if section.interface == "socketcand" and host in _LOCAL:
+        port = section.options.get("port", DEFAULT_PORT)
+        if not (isinstance(port, int) and 0 <= port <= 0xFFFF):
+            raise BusError(f"bus.options.port: expected 0 to 65535, got {port!r}")
+        try:
+            return SocketcandServer(section.channel, host, port)
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise BusError(f"socketcand at {host}:{port} cannot be served: {error.strerror}") from error
+    return open_bus(section)
+
+
+def bench_from_joints(
+    joints: Sequence[JointFile],
+    *,
+    effects: Sequence[str] = (),
+    case_name: str | None = None,
+    quirks: str | None = None,
+    seed: int | None = None,
+) -> Bench:
+    """Worlds and devices of several joints; arguments as for `world_from_joint`, `nodes_from_joint`.
+
+    Raises:
+        JointFileError: a joint file cannot be simulated.
+        UsageError: two devices have the same node id, or an argument is wrong.
+    """
+    worlds = [world_from_joint(j, effects=effects, case_name=case_name, seed=seed) for j in joints]
+    nodes = [nodes_from_joint(j, w, quirks=quirks) for j, w in zip(joints, worlds, strict=True)]
+    try:
+        return Bench([joint.name for joint in joints], worlds, nodes)
+    except SimError as error:
+        raise UsageError(str(error)) from error

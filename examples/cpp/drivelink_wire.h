@@ -1,0 +1,82 @@
+/* The bytes of <prefix>/<joint>/estimate, in C99 and C++, without any library.
+ *
+ * Zenoh-serialized: packed, little-endian; the transmissions are a sequence, its length a LEB128 varint.
+ * Works on any host byte order and alignment, allocates nothing.
+ */
+#ifndef DRIVELINK_WIRE_H
+#define DRIVELINK_WIRE_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+enum {
+    DRIVELINK_VALID = 1 << 0,      /* the numbers may be used */
+    DRIVELINK_OBSERVABLE = 1 << 1, /* the motion at hand tells the stiffness */
+    DRIVELINK_MAX_TRANSMISSIONS = 8
+};
+
+typedef struct {
+    double flexibility_torque_nm;
+    double stiffness_nm_rad;
+    double stiffness_std_nm_rad;
+    double deflection_rad;
+} drivelink_transmission;
+
+typedef struct {
+    uint64_t sequence;
+    uint64_t stamp_ns; /* UNIX time of the SYNC */
+    uint32_t status;
+    double flexibility_torque_nm;
+    double stiffness_nm_rad;
+    double stiffness_std_nm_rad;
+    size_t transmissions;
+    drivelink_transmission transmission[DRIVELINK_MAX_TRANSMISSIONS];
+} drivelink_estimate;
+
+static inline uint64_t drivelink_unsigned(const uint8_t **at, size_t bytes) {
+    uint64_t value = 0;
+    for (size_t i = 0; i < bytes; i++) value |= (uint64_t)(*at)[i] << (8 * i);
+    *at += bytes;
+    return value;
+}
+
+static inline double drivelink_double(const uint8_t **at) {
+    const uint64_t bits = drivelink_unsigned(at, 8);
+    double value;
+    memcpy(&value, &bits, sizeof value);
+    return value;
+}
+
+/* Read a payload into *estimate; false, and nothing to be used, for anything that is no estimate. */
+static inline bool drivelink_decode_estimate(const uint8_t *payload, size_t length, drivelink_estimate *estimate) {
+    const size_t head = 8 + 8 + 4 + 3 * 8, element = 4 * 8;
+    if (length < head + 1) return false;
+    const uint8_t *at = payload;
+    estimate->sequence = drivelink_unsigned(&at, 8);
+    estimate->stamp_ns = drivelink_unsigned(&at, 8);
+    estimate->status = (uint32_t)drivelink_unsigned(&at, 4);
+    estimate->flexibility_torque_nm = drivelink_double(&at);
+    estimate->stiffness_nm_rad = drivelink_double(&at);
+    estimate->stiffness_std_nm_rad = drivelink_double(&at);
+    const size_t count = *at++; /* the varint is one byte below 128 */
+    if (count > DRIVELINK_MAX_TRANSMISSIONS || length != head + 1 + count * element) return false;
+    estimate->transmissions = count;
+    for (size_t i = 0; i < count; i++) {
+        estimate->transmission[i].flexibility_torque_nm = drivelink_double(&at);
+        estimate->transmission[i].stiffness_nm_rad = drivelink_double(&at);
+        estimate->transmission[i].stiffness_std_nm_rad = drivelink_double(&at);
+        estimate->transmission[i].deflection_rad = drivelink_double(&at);
+    }
+    return true;
+}
+
+#ifdef __cplusplus
+}
+#endif
+#endif

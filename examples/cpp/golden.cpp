@@ -1,0 +1,67 @@
+// Decode the golden byte vectors that every language reads: golden PATH_TO/tests/golden/estimate.txt
+
+#include <cmath>
+#include <cstdlib>
+#include <cstring>
+#include <fstream>
+#include <iostream>
+#include <iterator>
+#include <sstream>
+#include <string>
+#include <vector>
+
+#include "drivelink_wire.h"
+
+namespace {
+
+std::vector<uint8_t> bytes(const std::string &hexadecimal) {
+    std::vector<uint8_t> data;
+    for (size_t i = 0; i < hexadecimal.size(); i += 2)
+        data.push_back(static_cast<uint8_t>(std::stoul(hexadecimal.substr(i, 2), nullptr, 16)));
+    return data;
+}
+
+// Equal bit by bit, every NaN being the same.
+bool same(double a, const std::string &text) {
+    const double b = std::strtod(text.c_str(), nullptr);
+    return (std::isnan(a) && std::isnan(b)) || std::memcmp(&a, &b, sizeof a) == 0;
+}
+
+bool check(const std::vector<uint8_t> &payload, const std::vector<std::string> &numbers) {
+    drivelink_estimate estimate;
+    if (!drivelink_decode_estimate(payload.data(), payload.size(), &estimate)) return false;
+    bool good = estimate.sequence == std::stoull(numbers[0]) && estimate.stamp_ns == std::stoull(numbers[1]) &&
+                estimate.status == std::stoull(numbers[2]) && same(estimate.flexibility_torque_nm, numbers[3]) &&
+                same(estimate.stiffness_nm_rad, numbers[4]) && same(estimate.stiffness_std_nm_rad, numbers[5]) &&
+                estimate.transmissions == std::stoull(numbers[6]);
+    for (size_t i = 0; good && i < estimate.transmissions; i++) {
+        const std::string *group = &numbers[7 + 4 * i];
+        const drivelink_transmission &each = estimate.transmission[i];
+        good = same(each.flexibility_torque_nm, group[0]) && same(each.stiffness_nm_rad, group[1]) &&
+               same(each.stiffness_std_nm_rad, group[2]) && same(each.deflection_rad, group[3]);
+    }
+    // neither a byte less nor a byte more
+    auto other = payload;
+    other.push_back(0);
+    good = good && !drivelink_decode_estimate(other.data(), other.size(), &estimate);
+    return good && !drivelink_decode_estimate(payload.data(), payload.size() - 1, &estimate);
+}
+
+}  // namespace
+
+int main(int argc, char **argv) {
+    std::ifstream file(argc > 1 ? argv[1] : "../../tests/golden/estimate.txt");
+    int vectors = 0, wrong = 0;
+    for (std::string line; std::getline(file, line); vectors++) {
+        std::istringstream words(line);
+        std::string name, payload;
+        words >> name >> payload;
+        const std::vector<std::string> numbers{std::istream_iterator<std::string>(words), {}};
+        if (!check(bytes(payload), numbers)) {
+            std::cerr << name << ": decoded wrongly\n";
+            wrong++;
+        }
+    }
+    std::cout << vectors << " vectors, " << wrong << " wrong\n";
+    return vectors == 0 || wrong != 0;
+}

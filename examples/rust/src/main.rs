@@ -1,0 +1,52 @@
+//! Print a joint's estimates, gaps counted: `cargo run -- elbow [tcp/127.0.0.1:7447 [COUNT]]`.
+
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use drivelink_wire::Estimate;
+use zenoh::handlers::RingChannel;
+use zenoh::{Config, Wait};
+
+fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
+    let mut arguments = std::env::args().skip(1);
+    let joint = arguments.next().unwrap_or("elbow".into());
+    let endpoint = arguments.next().unwrap_or("tcp/127.0.0.1:7447".into());
+    let count: usize = arguments.next().map_or(Ok(usize::MAX), |n| n.parse())?;
+
+    let mut config = Config::default();
+    config.insert_json5("mode", "\"client\"")?;
+    config.insert_json5("connect/endpoints", &format!("[\"{endpoint}\"]"))?;
+    config.insert_json5("scouting/multicast/enabled", "false")?;
+    let session = zenoh::open(config).wait()?;
+    let subscriber = session
+        .declare_subscriber(format!("drivelink/{joint}/estimate"))
+        .with(RingChannel::new(1024))
+        .wait()?;
+
+    let mut last: Option<u64> = None;
+    let mut gaps = 0;
+    for _ in 0..count {
+        let sample = subscriber.recv()?;
+        let estimate = match Estimate::decode(sample.payload()) {
+            Ok(estimate) => estimate,
+            Err(error) => {
+                eprintln!("not an estimate: {error}");
+                continue;
+            }
+        };
+        gaps += last.map_or(0, |last| estimate.sequence.saturating_sub(last + 1));
+        last = Some(estimate.sequence);
+        let now_ns = SystemTime::now().duration_since(UNIX_EPOCH)?.as_nanos() as i128;
+        println!(
+            "{} {:.3} N·m, {:.1} ± {:.1} N·m/rad, valid {}, observable {}, {} µs after its SYNC, {} gaps",
+            estimate.sequence,
+            estimate.flexibility_torque_nm,
+            estimate.stiffness_nm_rad,
+            estimate.stiffness_std_nm_rad,
+            estimate.valid(),
+            estimate.observable(),
+            (now_ns - i128::from(estimate.stamp_ns)) / 1000,
+            gaps
+        );
+    }
+    Ok(())
+}

@@ -1,0 +1,31 @@
+"""Several joints in one asyncio program: one task a joint, and the daemon's own status beside it.
+
+python examples/subscribe_async.py [JOINT,JOINT… [ENDPOINT [SECONDS]]]
+"""
+
+import asyncio
+import sys
+
+import drivelink
+
+
+async def follow(joint: str, endpoint: str) -> None:
+    async with drivelink.subscribe_async(joint, endpoint=endpoint) as subscription:
+        async for estimate in subscription.cycles(timeout_s=0.5):
+            if estimate is None:
+                print(f"{joint}: nothing for half a second, the daemon is {subscription.state}")
+            elif estimate.sequence % 500 == 0:
+                state = (subscription.status or {}).get("state")
+                print(f"{joint}: cycle {estimate.sequence}, {estimate.stiffness_nm_rad:.1f} N·m/rad, {state}")
+
+
+async def main(joints: str = "elbow", endpoint: str = "tcp/127.0.0.1:7447", seconds: str = "10") -> None:
+    tasks = [asyncio.create_task(follow(joint, endpoint)) for joint in joints.split(",")]
+    _, running = await asyncio.wait(tasks, timeout=float(seconds))
+    for task in running:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+
+
+if __name__ == "__main__":
+    asyncio.run(main(*sys.argv[1:]))

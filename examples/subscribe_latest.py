@@ -1,0 +1,31 @@
+"""A control loop at its own rate, 100 Hz, that takes the latest stiffness and never waits for it.
+
+python examples/subscribe_latest.py [JOINT [ENDPOINT [SECONDS]]]
+"""
+
+import sys
+import time
+
+import drivelink
+
+PERIOD_S = 0.01
+FALLBACK_NM_RAD = 500.0  # what the controller assumes where it must not trust the estimate
+
+
+def main(joint: str = "elbow", endpoint: str = "tcp/127.0.0.1:7447", seconds: str = "10") -> None:
+    with drivelink.subscribe(joint, endpoint=endpoint) as elbow:
+        start = deadline = time.monotonic()
+        while deadline < start + float(seconds):
+            estimate = elbow.latest()
+            trusted = estimate is not None and elbow.valid and elbow.observable
+            stiffness = estimate.stiffness_nm_rad if trusted else FALLBACK_NM_RAD
+            gain = 0.1 * stiffness  # ... and here the controller uses it
+            if round((deadline - start) / PERIOD_S) % 50 == 0:
+                age_ms = elbow.age_s * 1e3
+                print(f"{elbow.state:8} gain {gain:7.1f} N·m/rad  age {age_ms:6.2f} ms  gaps {elbow.gaps}")
+            deadline += PERIOD_S
+            time.sleep(max(0.0, deadline - time.monotonic()))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

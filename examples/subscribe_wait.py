@@ -1,0 +1,37 @@
+"""A controller in step with the joint: one pass per SYNC, and a safe state when none comes in time.
+
+python examples/subscribe_wait.py [JOINT [ENDPOINT [SECONDS]]]
+"""
+
+import sys
+import time
+
+import drivelink
+
+TIMEOUT_S = 0.01  # ten cycles at 1 kHz
+
+
+def main(joint: str = "elbow", endpoint: str = "tcp/127.0.0.1:7447", seconds: str = "10") -> None:
+    end = time.monotonic() + float(seconds)
+    passes, safe = 0, True
+    with drivelink.subscribe(joint, endpoint=endpoint) as elbow:
+        while time.monotonic() < end:
+            estimate = elbow.wait(TIMEOUT_S)
+            if estimate is None or not estimate.valid:
+                if not safe:
+                    print(f"safe state: the daemon is {elbow.state}")
+                safe = True
+                continue
+            if safe:
+                print(f"in control from cycle {estimate.sequence} on")
+            safe = False
+            passes += 1
+            reaction_nm = -estimate.flexibility_torque_nm  # ... and here the controller uses it
+            if passes % 500 == 0:
+                stiffness = f"{estimate.stiffness_nm_rad:.1f} ± {estimate.stiffness_std_nm_rad:.1f} N·m/rad"
+                print(f"cycle {estimate.sequence}: {reaction_nm:+.3f} N·m, {stiffness}")
+        print(f"{passes} passes, {elbow.gaps} cycles missing, {elbow.foreign} messages of a foreign writer")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

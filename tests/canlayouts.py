@@ -1,0 +1,79 @@
+"""Layouts and frames for the tests of the loop: a VSA of two drives and a CiA 406 encoder."""
+
+import struct
+
+from drivelink.canopen.layout import MappedObject, NodeLayout, Signal, TpdoLayout
+
+COUNT_RAD = 1e-4
+TORQUE_NM = 1e-3
+LINK_RAD = 2e-4
+
+
+def drive(node_id: int, motor: int | None, transmission_type: int = 1) -> NodeLayout:
+    """A drive whose one TPDO carries 0x6064 (32), 0x6077 (16), 0x6041 (16): eight bytes."""
+    return NodeLayout(
+        node_id=node_id,
+        motor=motor,
+        tpdos=(
+            TpdoLayout(
+                cob_id=0x180 + node_id,
+                transmission_type=transmission_type,
+                objects=(
+                    MappedObject(
+                        signal=Signal.MOTOR_POSITION,
+                        index=0x6064,
+                        subindex=0,
+                        bits=32,
+                        signed=True,
+                        scale=COUNT_RAD,
+                        wraps=True,
+                    ),
+                    MappedObject(
+                        signal=Signal.MOTOR_TORQUE,
+                        index=0x6077,
+                        subindex=0,
+                        bits=16,
+                        signed=True,
+                        scale=TORQUE_NM,
+                    ),
+                    MappedObject(signal=Signal.STATUSWORD, index=0x6041, subindex=0, bits=16, signed=False),
+                ),
+            ),
+        ),
+    )
+
+
+def encoder(node_id: int, bits: int = 32, modulus: int = 0, offset: float = 0.0) -> NodeLayout:
+    """A CiA 406 encoder node: 0x6004."""
+    position = MappedObject(
+        signal=Signal.LINK_POSITION,
+        index=0x6004,
+        subindex=0,
+        bits=bits,
+        signed=False,
+        scale=LINK_RAD,
+        wraps=True,
+        modulus=modulus,
+        offset=offset,
+    )
+    return NodeLayout(
+        node_id=node_id, motor=None, tpdos=(TpdoLayout(cob_id=0x180 + node_id, objects=(position,)),)
+    )
+
+
+VSA = (drive(1, 0), drive(2, 1), encoder(3))
+
+
+def pdo(position: int, torque: int = 0, statusword: int = 0x0237) -> bytes:
+    """The eight bytes of `drive`."""
+    return struct.pack("<ihH", position, torque, statusword)
+
+
+def link(position: int) -> bytes:
+    """The four bytes of `encoder`."""
+    return struct.pack("<I", position)
+
+
+def vsa_cycle(count: int) -> list[tuple[int, bytes]]:
+    """The frames that answer one SYNC; every value tells the cycle."""
+    return [(0x181, pdo(count, count)), (0x182, pdo(-count, -count)), (0x183, link(count))]

@@ -1,0 +1,455 @@
+"""Where the fault script is played: a daemon, its devices, a third party on the bus, and the truth.
+
+Besides what the script expects, every VALID sample is held against `Truth`: all its values are those of one
+and the same SYNC, and that is the latest.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import threading
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+import can
+from daemonkit import Collector
+from faultscript import Fault
+
+from drivelink.canopen.layout import MappedObject, Signal
+from drivelink.daemon.service import Daemon
+from drivelink.jointfile import JointFile
+from drivelink.simulate import network_from_joint, nodes_from_joint, world_from_joint
+from estimator.sample import Sample, Status
+from sim.canopen.node import Node
+from sim.faults import Faults
+
+__all__ = ["Stage", "Truth"]
+
+_PATIENCE_S = 30.0  # of the stage's own time; every way back takes less
+
+
+class Truth:
+    """What the devices of a world measured at every SYNC, in counts, and a check of samples against it."""
+
+    def __init__(self, stage: Stage) -> None:
+        self._world = stage.world
+        self._objects = [_position(stage.daemon, motor) for motor in range(stage.world.motors)]
+        self._objects.append(_link(stage.daemon))
+        self._history: list[tuple[int, ...]] = []
+        self._forgotten = 0
+        self._inner = stage.world.advance
+        self._synced = False
+        stage.world.advance = self._advance  # type: ignore[method-assign]
+
+    @property
+    def syncs(self) -> int:
+        """SYNCs that the devices have seen."""
+        return self._forgotten + len(self._history)
+
+    def sync(self) -> None:
+        """The devices see a SYNC: it moves the world on, and then they sample."""
+        self._synced = True
+
+    def _advance(self, periods: int = 1) -> None:
+        self._inner(periods)
+        if not self._synced:
+            return
+        self._synced = False
+        world = self._world
+        counts = [world.drive(motor).position_counts for motor in range(world.motors)]
+        self._history.append((*counts, world.link_counts()))
+
+    def forget(self) -> None:
+        """Keep only what a sample under way may still be of."""
+        keep = 100
+        self._forgotten += max(0, len(self._history) - keep)
+        del self._history[:-keep]
+
+    def measured(self, sample: Sample, sync: int, late: bool) -> bool:
+        """Whether all positions of a sample are those of one SYNC.
+
+        Args:
+            sample: as published.
+            sync: number of the SYNC, from 0.
+            late: single values may be those of the SYNC before.
+        """
+        place = sync - self._forgotten
+        if not 0 < place < len(self._history):
+            return False
+        now, before = self._history[place], self._history[place - 1]
+        values = (*sample.motor_position_rad, sample.link_position_rad)
+        for mapped, value, right, old in zip(self._objects, values, now, before, strict=True):
+            count = round((value + mapped.offset) / mapped.scale)
+            if count != right and not (late and count == old):
+                return False
+        return True
+
+
+class Sink(Collector):
+    """Keeps everything, and with each sample the SYNC that its values must be of.
+
+    Attributes:
+        due: for every sample, number of the last SYNC that its values may be of.
+    """
+
+    def __init__(self, stage: Stage) -> None:
+        super().__init__()
+        self._stage = stage
+        self.due: list[int] = []
+
+    def forget(self) -> None:
+        """Start anew."""
+        self.estimates, self.samples, self.due = [], [], []
+
+    def put_sample(self, sample: Sample, stamp_ns: int) -> None:
+        super().put_sample(sample, stamp_ns)
+        current = sample.sequence == self._stage.lane.chain.assembler.sequence
+        self.due.append(self._stage.truth.syncs - (1 if current else 2))
+
+
+def _objects(daemon: Daemon) -> Iterator[tuple[int | None, MappedObject]]:
+    for layout in daemon.layouts.values():
+        for tpdo in layout.tpdos:
+            for mapped in tpdo.objects:
+                yield layout.motor, mapped
+
+
+def _position(daemon: Daemon, motor: int) -> MappedObject:
+    return next(o for m, o in _objects(daemon) if m == motor and o.signal is Signal.MOTOR_POSITION)
+
+
+def _link(daemon: Daemon) -> MappedObject:
+    return next(o for _, o in _objects(daemon) if o.signal is Signal.LINK_POSITION)
+
+
+class _Said(logging.Handler):
+    """Everything that the daemon logs."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.INFO)
+        self.lines: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append(record.getMessage())
+
+
+class Stage:
+    """A daemon, its devices, and what can be done to them; the actions of the script are its methods."""
+
+    daemon: Daemon
+    exact = False  # whether every cycle is a matter of the script alone
+    patience_s = _PATIENCE_S
+    late_syncs = 2  # that the devices may have seen before a sample is out
+
+    def __init__(self, joint: JointFile, bus: can.BusABC) -> None:
+        self.joint = joint
+        self.world = world_from_joint(joint)
+        self.bus = bus
+        self.network = network_from_joint(joint, self.bus, world=self.world)
+        self.faults = Faults(self.network)
+        self.said = _Said()
+        self.checked = 0  # VALID samples that were held against the truth
+        self._impostor: Node | None = None
+        self._injector: can.BusABC | None = None
+        self._due: dict[int, list[Callable[[], None]]] = {}
+        self._held: dict[str, str] = {}
+        self._planning = threading.Lock()
+
+    def _begin(self) -> None:
+        logger = logging.getLogger("drivelink")
+        self._level = logger.level
+        logger.setLevel(logging.INFO)
+        logger.addHandler(self.said)
+        (self.lane,) = self.daemon.loop.lanes
+        self.truth = Truth(self)
+        self.lane.sink = self.collector = Sink(self)
+        inner = self.network.sync_filter
+        assert inner is not None
+
+        def sync(data: bytes) -> bool:
+            seen = inner(data)
+            if seen:
+                self.truth.sync()
+            return seen
+
+        self.network.sync_filter = sync
+
+    def close(self) -> None:
+        logger = logging.getLogger("drivelink")
+        logger.removeHandler(self.said)
+        logger.setLevel(self._level)
+        self.daemon.close()
+        if self._injector is not None:
+            self._injector.shutdown()
+        self.bus.shutdown()
+
+    # Time, as each stage has it
+
+    def run(self, seconds: float) -> None:
+        """Let time pass."""
+        raise NotImplementedError
+
+    def schedule(self, seconds: float, action: Callable[[], None]) -> None:
+        """Have an action taken at the SYNC that is so many seconds away."""
+        cycle = self.daemon.loop.cycles + round(seconds / self.joint.bus.period_s)
+        with self._planning:
+            self._due.setdefault(cycle, []).append(action)
+
+    def act(self) -> None:
+        """Take the actions that are due."""
+        if not self._due:
+            return
+        with self._planning:
+            cycles = sorted(cycle for cycle in self._due if cycle <= self.daemon.loop.cycles)
+            actions = [action for cycle in cycles for action in self._due.pop(cycle)]
+        for action in actions:
+            action()
+
+    # Play
+
+    @property
+    def valid(self) -> bool:
+        estimate = self.lane.chain.estimate
+        return (
+            estimate is not None
+            and bool(estimate.status & Status.VALID)
+            and self.lane.chain.sample is not None
+        )
+
+    @property
+    def well(self) -> bool:
+        """Whether everything is as if nothing had ever been."""
+        return (
+            self.valid
+            and not self.lane.chain.estimate.status & (Status.BUS_FAULT | Status.STALE | Status.DRIVE_FAULT)
+            and not self.daemon.events.active
+            and self.document()["state"] == "running"
+        )
+
+    def document(self) -> dict[str, Any]:
+        return self.daemon.documents()[0]
+
+    def settle(self, also: Callable[[], bool] = lambda: True) -> None:
+        """Until everything is well, and something else is true."""
+        for _ in range(int(self.patience_s / 0.25)):
+            self.run(0.25)
+            if self.well and also():
+                return
+        document = self.document()
+        kept = {key: document[key] for key in ("state", "conditions", "quality", "nodes")}
+        raise AssertionError(f"not well again: {kept}")
+
+    def forget(self) -> None:
+        """What was published, said and measured until now is of no more interest."""
+        self.daemon.events._said.clear()  # what was said for the fault before must not count as said
+        self.collector.forget()
+        self.truth.forget()
+        self.said.lines.clear()
+        try:
+            while self._injector is not None and self._injector.recv(0.0) is not None:
+                pass  # it hears everything, and nobody else reads it
+        except can.CanError:  # its interface was away
+            self._injector = None
+
+    def start(self, fault: Fault) -> None:
+        """Plan what the script has for a fault."""
+        for seconds, action, arguments in fault.steps:
+            self.schedule(seconds, partial(getattr(self, action), *arguments))
+
+    def play(self, fault: Fault) -> None:
+        """Replay one fault and hold the daemon to what the script expects."""
+        self.forget()
+        before = self._counters()
+        self._held = self.daemon.events.active
+        self.start(fault)
+        states = self._watch(fault.seconds)
+        self.settle(lambda: self.exact or all(self._said(pattern) for pattern in fault.says))
+        self._check_flags(fault)
+        assert not self.wrong_samples(), f"{fault.name}: {self.wrong_samples()}"
+        self._check_words(fault)
+        if fault.state:
+            assert fault.state in states, f"{fault.name}: the status only said {states}"
+        after = self._counters()
+        for (node, name), count in fault.counts.items():
+            self.compare(
+                f"{fault.name}: {name} of node {node}", after[node][name] - before[node][name], count
+            )
+
+    def compare(self, what: str, found: int, expected: int) -> None:
+        assert found >= 1, what
+
+    def _watch(self, seconds: float) -> set[str]:
+        states = set()
+        for _ in range(round(seconds / 0.1)):
+            self.run(0.1)
+            states.add(self.document()["state"])
+        return states
+
+    def _counters(self) -> dict[int, dict[str, int]]:
+        counters = self.lane.chain.assembler.counters
+        return {n: {name: getattr(c, name) for name in c.__slots__} for n, c in counters.items()}
+
+    def _check_flags(self, fault: Fault) -> None:
+        estimates = [estimate for estimate, _ in self.collector.estimates]
+        seen = 0
+        for estimate in estimates:
+            seen |= estimate.status
+            assert not (estimate.status & Status.STALE and estimate.status & Status.VALID), fault.name
+        assert fault.flags & ~seen == 0, (
+            f"{fault.name}: flags {Status(seen)!r}, expected {Status(fault.flags)!r}"
+        )
+        stale = sum(bool(e.status & Status.STALE) for e in estimates)
+        assert bool(stale) == fault.gaps or not self.exact, f"{fault.name}: {stale} stale estimates"
+        sequences = [e.sequence for e in estimates if not e.status & Status.STALE]
+        assert all(a < b for a, b in pairwise(sequences)), fault.name
+        if fault.valid_throughout and self.exact:
+            assert all(e.status & Status.VALID for e in estimates), fault.name
+
+    def wrong_samples(self) -> str:
+        """The first VALID sample with a value of another SYNC than its own, or nothing.
+
+        Where frames were late, and it says so, values of the SYNC before are right.
+        """
+        collector = self.collector
+        flags = {estimate.sequence: Status(estimate.status) for estimate, _ in list(collector.estimates)}
+        for (sample, _), due in zip(list(collector.samples), list(collector.due), strict=False):
+            status = flags.get(sample.sequence, Status(0))
+            late = Status.BUS_FAULT in status
+            if Status.VALID not in status or (late and not self.exact):
+                continue  # how late frames are in real time is not a matter of the script
+            self.checked += 1
+            possible = range(due - self.late_syncs, due + 1)
+            if not any(self.truth.measured(sample, sync, late) for sync in possible):
+                return f"sample {sample.sequence} is not of its SYNC: {status!r}"
+        return ""
+
+    def _said(self, pattern: str) -> list[str]:
+        """Lines that were said; in real time also what held before, and therefore is not said again."""
+        held = [] if self.exact else list(self._held.values())
+        return [line for line in self.said.lines + held if re.search(pattern, line)]
+
+    def _check_words(self, fault: Fault) -> None:
+        for pattern in fault.says:
+            lines = self._said(pattern)
+            # In real time a slow machine may bring the same thing about again, but not time after time.
+            assert len(lines) == 1 or (not self.exact and 1 <= len(lines) <= 3), (
+                f"{fault.name}: {pattern!r} was said {len(lines)} times: {self.said.lines}"
+            )
+        once = len(self.said.lines) == len(set(self.said.lines))
+        assert once or not self.exact, f"{fault.name}: {self.said.lines}"  # in real time it may come again
+        told = [event["text"] for event in self.document()["events"]]
+        for line in self.said.lines[-8:]:
+            assert line in told, f"{fault.name}: {line!r} is in the log and not in the status"
+
+    # Actions
+
+    def node(self, node_id: int) -> Node:
+        return next(node for node in self.network.nodes if node.node_id == node_id)
+
+    def _tpdo(self, node_id: int) -> int:
+        return self.daemon.layouts[node_id].tpdos[0].number
+
+    def mute(self, node: int, cycles: int) -> None:
+        self.faults.mute(self.node(node), self._tpdo(node), cycles)
+
+    def delay(self, node: int, cycles: int) -> None:
+        self.faults.delay(self.node(node), self._tpdo(node), cycles)
+
+    def resize(self, node: int, length: int, cycles: int) -> None:
+        self.faults.resize(self.node(node), self._tpdo(node), length, cycles)
+
+    def repeat(self, node: int, cycles: int) -> None:
+        self.faults.repeat(self.node(node), self._tpdo(node), cycles)
+
+    def reverse(self) -> None:
+        self.faults.reverse()
+
+    def drop_sync(self, count: int) -> None:
+        self.faults.drop_sync(count)
+
+    def emergency(self, node: int, code: int) -> None:
+        self.faults.emergency(self.node(node), code, 0x02)
+
+    def mend(self, node: int) -> None:
+        self.inject(0x200 + node, b"\x80\x00")  # whoever has control resets the fault; we never do
+        self.inject(0x200 + node, b"\x00\x00")
+
+    def kill(self, node: int) -> None:
+        self.faults.kill(self.node(node))
+
+    def revive(self, node: int) -> None:
+        self.faults.revive(self.node(node))
+
+    def reboot(self, node: int) -> None:
+        self.faults.reboot(self.node(node))
+
+    def ignore_sdo(self, node: int, requests: int) -> None:
+        self.faults.ignore_sdo(self.node(node), requests)
+
+    def refuse_sdo(self, node: int, code: int, requests: int) -> None:
+        self.faults.refuse_sdo(self.node(node), code, requests)
+
+    def impostor(self, node_id: int) -> None:
+        """A second device with the node id of a drive, in a world of its own."""
+        other = world_from_joint(self.joint, seed=99)
+        other.advance(500)
+        self._impostor = next(n for n in nodes_from_joint(self.joint, other) if n.node_id == node_id)
+        self.faults.impostor(self._impostor)
+
+    def banish(self) -> None:
+        assert self._impostor is not None
+        self.faults.kill(self._impostor)
+        self.network.nodes.remove(self._impostor)
+
+    def foreign_sync(self, count: int) -> None:
+        for k in range(count):
+            self.schedule(0.005 * k, lambda: self.inject(0x080, b""))
+
+    def babble(self, cob_id: int, data: bytes, per_cycle: int) -> None:
+        self.faults.babble(cob_id, data, per_cycle)
+
+    def babble_as(self, node_id: int, per_cycle: int) -> None:
+        """Frames with the identifier of a drive, after its own."""
+        node, cob_id = self.node(node_id), self.daemon.layouts[node_id].tpdos[0].cob_id
+        inner = node.transmit
+
+        def transmit() -> None:
+            inner()
+            for _ in range(per_cycle):
+                self.network.send(cob_id, bytes(8))
+
+        node.transmit = transmit  # type: ignore[method-assign]
+
+    def quiet(self) -> None:
+        self.faults.babble(0, b"", 0)
+        for node in self.network.nodes:
+            vars(node).pop("transmit", None)
+
+    def unplug(self) -> None:
+        self.faults.unplug()
+
+    def plug(self) -> None:
+        self.faults.plug()
+
+    def send(self, cob_id: int, data: bytes) -> None:
+        self.inject(cob_id, data)
+
+    def inject(self, cob_id: int, data: bytes) -> None:
+        """A frame from a third party on the same bus."""
+        self.injector.send(can.Message(arbitration_id=cob_id, data=data, is_extended_id=False))
+
+    @property
+    def injector(self) -> can.BusABC:
+        """The third party."""
+        if self._injector is None:
+            section = self.joint.bus
+            self._injector = can.Bus(interface=section.interface, channel=section.channel)
+        return self._injector
+
+    def error_frame(self, kind: int) -> None:
+        self.injector.send(
+            can.Message(arbitration_id=kind, data=bytes(8), is_error_frame=True, is_extended_id=False)
+        )

@@ -1,0 +1,240 @@
+"""The daemon's own cycle on the bus that lies (`fuzzbus`), and the judge of what it publishes."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Iterable
+from functools import partial
+from typing import Any
+
+import can
+from daemonkit import vsa_text
+from fuzzbus import MIXES, FuzzBus
+
+from drivelink.canopen.configure import configure_joints
+from drivelink.canopen.layout import NodeLayout, Signal
+from drivelink.canopen.passive import PassiveConfigurator
+from drivelink.cycle.acquisition import Assembler
+from drivelink.cycle.chain import Chain, build
+from drivelink.cycle.loop import CycleLoop, Lane
+from drivelink.daemon.status import EventLog
+from drivelink.daemon.supervision import Supervisor
+from drivelink.jointfile import JointFile, parse
+from estimator.sample import Estimate, Sample, Status
+
+__all__ = ["FuzzRun", "WrongValidError"]
+
+PERIOD_S = 0.001
+FOLLOW = """configure = false
+sync = "follow"
+"""
+
+
+class WrongValidError(AssertionError):
+    """An estimate is VALID, and its sample is not that of its SYNC."""
+
+
+class Witness:
+    """An estimator that believes everything: whatever it is given is VALID."""
+
+    residual_nm = 0.0
+
+    def step(self, sample: Sample) -> Estimate:
+        return Estimate(sample.sequence, int(Status.VALID), 0.0, 0.0, 0.0, ())
+
+    def reset(self) -> None:
+        pass
+
+    def parameters(self) -> list[dict[str, Any]]:
+        return []
+
+
+class ForeignMaster:
+    """The same bus for a daemon that may only listen."""
+
+    def __init__(self, bus: FuzzBus) -> None:
+        self.lost_sends = 0
+        self.errors: dict[str, int] = {}
+        self.take, self.wait, self.narrow = bus.take, bus.wait, bus.narrow
+
+    def send(self, cob_id: int, data: bytes) -> None:
+        raise AssertionError(f"a passive daemon has sent 0x{cob_id:03X} [{data.hex(' ')}]")
+
+
+class _Port:
+    """The configuration's way to the bus, before the loop runs and while it does."""
+
+    def __init__(self, bus: FuzzBus) -> None:
+        self._bus = bus
+        self.recv = bus.recv
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        self._bus.send_message(msg)
+
+
+class _Judge:
+    """The sink: holds every VALID sample against what the nodes measured at its SYNC."""
+
+    def __init__(self, run: FuzzRun) -> None:
+        self._run = run
+        self.valid = self.samples = self.unknowable = 0
+
+    def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
+        if estimate.status & Status.VALID and estimate.status & Status.STALE:
+            raise WrongValidError(f"VALID and STALE: {estimate}")
+
+    def put_sample(self, sample: Sample, stamp_ns: int) -> None:
+        self.samples += 1
+        estimate = self._run.chain.estimate
+        assert estimate is not None
+        if not estimate.status & Status.VALID:
+            return
+        self.valid += 1
+        if not math.isfinite(estimate.stiffness_nm_rad + estimate.flexibility_torque_nm):
+            raise WrongValidError(f"{self._run.where}: VALID and not finite: {estimate}")
+        if not self._run.hostile:
+            self._judge(sample, Status(estimate.status))
+
+    def _judge(self, sample: Sample, status: Status) -> None:
+        run = self._run
+        before, due = run.due[-2:] if sample.sequence == run.chain.assembler.sequence else run.due[-3:-1]
+        # BUS_FAULT says that frames were late: then they are of the cycle before, whose SYNC it may be.
+        allowed = range(before, due + 1) if Status.BUS_FAULT in status else range(due, due + 1)
+        told = run.ticks_of(sample)
+        wrong = [name for name, tick in told.items() if tick not in allowed]
+        if not wrong:
+            return
+        if all(run.forged(name) for name in wrong):
+            self.unknowable += 1
+            return
+        raise WrongValidError(f"{run.where}: sample of SYNC {due} tells {told}, {status!r}")
+
+
+class FuzzRun:
+    """A configured joint on a bus that lies.
+
+    Args:
+        seed: of everything that is drawn.
+        hostile: see the module.
+        passive: somebody else makes SYNC and has configured the nodes; hostile, and nothing may be sent.
+        real: step the real estimator, not one that believes everything.
+        overflow: of the SYNC counter.
+    """
+
+    def __init__(
+        self,
+        seed: int,
+        *,
+        hostile: bool = False,
+        passive: bool = False,
+        real: bool = False,
+        overflow: int = 0,
+    ) -> None:
+        self.hostile = hostile or passive
+        self.seed = seed
+        self.joint: JointFile = parse(vsa_text(bus=FOLLOW if passive else ""))
+        self.bus = FuzzBus(random.Random(seed), hostile=self.hostile)
+        port: Any = _Port(self.bus)
+        self.configurator, (layouts,) = configure_joints(port, [parse(vsa_text())])
+        self._scales = _scales(layouts)
+        estimator = build(self.joint)[0] if real else Witness()
+        self.chain = Chain(Assembler(layouts, 2, active=not passive), estimator)
+        self.judge = _Judge(self)
+        lane = Lane("fuzzed", self.chain, self.judge)
+        source: Any = ForeignMaster(self.bus) if passive else self.bus
+        self.loop = CycleLoop(
+            source,
+            [lane],
+            period_s=PERIOD_S,
+            produce=not passive,
+            world_steps=True,
+            counter_overflow=overflow,
+        )
+        self.bus.loop = self.loop
+        self.events = EventLog(_Silent(), clock=lambda: self.loop.clock() * 1e-9)  # type: ignore[arg-type]
+        watching = PassiveConfigurator([self.joint]) if passive else self.configurator
+        self.supervisor = Supervisor(self.loop, {lane: layouts}, self.events, watching)
+        self.loop.housekeeping.urgent.append(self.supervisor.step)
+        self.loop.housekeeping.every(0.05, self.supervisor.check)
+        self.due = [0, 0, 0]  # SYNCs of the last three cycles, as the nodes count
+        self._passive = passive
+        self._stamp_ns = 0
+
+    @property
+    def where(self) -> str:
+        """For the one who has to reproduce it."""
+        return f"seed {self.seed}, cycle {self.loop.cycles}"
+
+    def told(self) -> str:
+        """The run in one line."""
+        kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(self.bus.kinds.items()))
+        return (
+            f"seed {self.seed}: {self.bus.frames} frames in {self.loop.cycles} cycles ({kinds}); "
+            f"{self.judge.valid} VALID, of these {self.judge.unknowable} with a forged frame nobody could tell"
+        )
+
+    def ticks_of(self, sample: Sample) -> dict[str, float]:
+        """The SYNC that each value of a sample tells."""
+        first, second = self._scales["motor1"], self._scales["motor2"]
+        return {
+            "motor1": (round(sample.motor_position_rad[0] / first) - 1000) / 3,
+            "motor2": (round(sample.motor_position_rad[1] / second) - 2000) / 3,
+            "link": (round(sample.link_position_rad / self._scales["link"]) - 7) / 5,
+        }
+
+    def run(self, frames: int) -> None:
+        """Run until so many frames have reached the daemon, restless and calm by turns.
+
+        Raises:
+            WrongValidError: see there.
+        """
+        bus, draw = self.bus, random.Random(self.seed + 1)
+        end = bus.frames + frames
+        while bus.frames < end:
+            bus.rate, bus.mix = draw.choice((0.001, 0.01, 0.1, 0.5)), draw.choice(MIXES)
+            for _ in range(draw.randrange(1, 300)):
+                self.cycle()
+            bus.rate = 0.0
+            for _ in range(draw.randrange(200)):
+                self.cycle()
+
+    def cycle(self) -> None:
+        """One cycle of the daemon's own loop."""
+        self._stamp_ns += self.loop.period_ns
+        self.due = [*self.due[1:], self.bus.tick + 1]
+        if not self._passive:
+            self.loop.run_lockstep(1, self._stamp_ns)
+            return
+        self.loop.clock = partial(int, self._stamp_ns)
+        self.bus.lead(self._stamp_ns)
+        self.loop.receive()
+        self.loop.housekeeping.run(self._stamp_ns, self.loop.period_ns)
+
+    def forged(self, name: str) -> bool:
+        """Whether a frame that looks like that of this value was forged in this cycle or the one before."""
+        node = {"motor1": 1, "motor2": 2, "link": 3}[name]
+        frames = {(t.cob_id, t.length) for t in self.configurator.layouts[node].tpdos}
+        return any(frames & forged for forged in self.bus.forged)
+
+
+def _scales(layouts: Iterable[NodeLayout]) -> dict[str, float]:
+    scales = {}
+    for layout in layouts:
+        for frame in layout.tpdos:
+            for mapped in frame.objects:
+                if mapped.signal is Signal.MOTOR_POSITION:
+                    scales[f"motor{(layout.motor or 0) + 1}"] = mapped.scale
+                elif mapped.signal is Signal.LINK_POSITION:
+                    scales["link"] = mapped.scale
+    return scales
+
+
+class _Silent:
+    """A log that nobody reads."""
+
+    def __init__(self) -> None:
+        self.lines = 0
+
+    def log(self, *_: object) -> None:
+        self.lines += 1

@@ -1,0 +1,209 @@
+"""The daemon on a real SocketCAN: kernel stamps, filters, CAN FD, interface away and back, three processes."""
+
+import os
+import re
+import signal
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import can
+import pytest
+from daemonkit import running, vsa, vsa_text
+from zenohkit import free_endpoint, until
+
+from drivelink.canopen.bus import interface_is_up, open_bus
+from drivelink.cycle.framesource import BusLostError, open_source
+from drivelink.cycle.socketcan import SocketCanSource
+from drivelink.daemon.service import Daemon, ServedJoint
+from drivelink.jointfile import BusSection
+from drivelink.pubsub.client import subscribe
+from drivelink.simulate import network_from_joint, open_sim_bus
+from estimator.sample import Status
+
+CHANNEL = "vcan0"
+pytestmark = [
+    pytest.mark.socketcan,
+    pytest.mark.skipif(not interface_is_up(CHANNEL), reason="no SocketCAN interface vcan0 here"),
+]
+SOCKETCAN = 'interface = "socketcan"\nperiod_s = {}'
+REPOSITORY = Path(__file__).parents[2]
+
+
+def ip(*arguments: str) -> None:
+    subprocess.run(["ip", "link", *arguments], check=True)
+
+
+def section(channel: str = CHANNEL) -> BusSection:
+    return BusSection(interface="socketcan", channel=channel)
+
+
+@contextmanager
+def source(channel: str = CHANNEL) -> Iterator[SocketCanSource]:
+    bus = open_bus(section(channel))
+    try:
+        opened = open_source(bus)
+        assert isinstance(opened, SocketCanSource)
+        yield opened
+    finally:
+        bus.shutdown()
+
+
+@contextmanager
+def peer(channel: str = CHANNEL) -> Iterator[can.BusABC]:
+    with can.Bus(interface="socketcan", channel=channel, fd=True) as bus:
+        yield bus
+
+
+def test_frames_come_in_order_with_the_kernels_stamps() -> None:
+    with source() as mine, peer() as other:
+        before = time.time_ns()
+        for k in range(100):
+            other.send(can.Message(arbitration_id=0x181, data=struct.pack("<q", k), is_extended_id=False))
+        assert mine.wait(1.0)
+        frames = mine.take()
+        assert [struct.unpack("<q", frame.data)[0] for frame in frames] == list(range(100))
+        stamps = [frame.stamp_ns for frame in frames]
+        assert stamps == sorted(stamps)
+        assert before - 10**9 < stamps[0] < time.time_ns() + 10**9
+        assert not mine.wait(0.0)
+        assert mine.take() == []
+
+
+def test_what_is_sent_arrives_and_is_not_heard_by_oneself() -> None:
+    with source() as mine, peer() as other:
+        mine.send(0x080, b"")
+        mine.send(0x601, bytes(8))
+        first, second = other.recv(1.0), other.recv(1.0)
+        assert (first.arbitration_id, bytes(first.data)) == (0x080, b"")
+        assert (second.arbitration_id, bytes(second.data)) == (0x601, bytes(8))
+        assert mine.take() == []
+
+
+def test_only_what_is_wanted_passes_the_kernels_filter() -> None:
+    with source() as mine, peer() as other:
+        mine.narrow({0x080, 0x181})
+        for cob_id, extended in ((0x080, False), (0x123, False), (0x181, True), (0x181, False)):
+            other.send(can.Message(arbitration_id=cob_id, is_extended_id=extended))
+        until(lambda: mine.wait(0.1))
+        time.sleep(0.05)
+        assert [frame.cob_id for frame in mine.take()] == [0x080, 0x181]
+
+
+def test_can_fd_frames_are_read_whole() -> None:
+    with source() as mine, peer() as other:
+        data = bytes(range(12))
+        other.send(can.Message(arbitration_id=0x181, data=data, is_extended_id=False, is_fd=True))
+        assert mine.wait(1.0)
+        assert [frame.data for frame in mine.take()] == [data]
+
+
+def test_extended_remote_and_error_frames_are_no_canopen() -> None:
+    with source() as mine, peer() as other:
+        other.send(can.Message(arbitration_id=0x1_8181, is_extended_id=True))
+        other.send(can.Message(arbitration_id=0x181, is_remote_frame=True, is_extended_id=False))
+        other.send(can.Message(arbitration_id=0x182, data=b"x", is_extended_id=False))
+        assert mine.wait(1.0)
+        time.sleep(0.05)
+        assert [frame.cob_id for frame in mine.take()] == [0x182]
+
+
+def test_an_interface_that_goes_down_is_a_lost_bus() -> None:
+    with source("vcan1") as mine:
+        ip("set", "vcan1", "down")
+        try:
+            with pytest.raises(BusLostError):
+                for _ in range(50):
+                    mine.send(0x080, b"")
+                    mine.take()
+        finally:
+            ip("set", "vcan1", "up")
+
+
+@pytest.mark.parametrize("removed", [False, True])
+def test_the_daemon_survives_an_interface_that_goes_and_comes_back(removed: bool) -> None:
+    joint = vsa(channel="vcan1", bus=SOCKETCAN.format(0.01))
+    bus = open_sim_bus(joint.bus)
+    network = network_from_joint(joint, bus)
+    network.start()
+    daemon = Daemon([ServedJoint(joint=joint)], publish=False, real_time=False)
+    chain = daemon.chains[0]
+    try:
+        with running(daemon):
+            until(lambda: chain.estimate and chain.estimate.status & Status.VALID)
+            ip("set", "vcan1", "down")
+            if removed:
+                ip("del", "vcan1")
+            until(lambda: chain.estimate.status & Status.STALE)
+            assert not chain.estimate.status & Status.VALID
+            until(lambda: any("the bus is lost" in text for text in daemon.events.active.values()))
+            network.stop()
+            bus.shutdown()
+            if removed:
+                ip("add", "vcan1", "mtu", "72", "type", "vcan")
+            ip("set", "vcan1", "up")
+            bus = open_sim_bus(joint.bus)
+            network = network_from_joint(joint, bus)
+            network.start()
+            until(lambda: chain.estimate.status & Status.VALID)
+            assert "bus" not in daemon.events.active
+    finally:
+        network.stop()
+        bus.shutdown()
+
+
+def test_drives_daemon_and_subscriber_are_three_processes(tmp_path: Path) -> None:
+    path = tmp_path / "elbow.toml"
+    endpoint = free_endpoint()
+    text = vsa_text(channel=CHANNEL, endpoint=endpoint, bus=SOCKETCAN.format(0.004))
+    path.write_text(text, encoding="utf-8")
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-m", "drivelink", verb, str(path)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=REPOSITORY,
+            env=os.environ | {"PYTHONUNBUFFERED": "1"},
+        )
+        for verb in ("sim",)
+    ]
+    try:
+        assert "ready" in started[0].stdout.readline()
+        started.append(
+            subprocess.Popen(
+                [sys.executable, "-m", "drivelink", "run", str(path)],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                cwd=REPOSITORY,
+            )
+        )
+        daemon = started[1]
+        assert "ready" in daemon.stdout.readline(), daemon.stderr.read()
+        with subscribe("elbow", endpoint=endpoint) as client:
+            until(lambda: (e := client.wait(timeout_s=1.0)) and e.status & Status.VALID, 60.0)
+        daemon.send_signal(signal.SIGTERM)
+        out, err = daemon.communicate(timeout=30.0)
+        assert daemon.returncode == 0, err
+        cycles, estimates = map(int, re.search(r"(\d+) cycles, (\d+) estimates", out).groups())
+        assert 0 < estimates <= cycles
+    finally:
+        for process in started:
+            process.kill()
+            process.communicate()
+
+
+def test_the_receive_buffer_holds_a_long_stall() -> None:
+    with source() as mine, peer() as other:
+        for k in range(2000):
+            other.send(can.Message(arbitration_id=0x181, data=struct.pack("<q", k), is_extended_id=False))
+        got = 0
+        while mine.wait(0.1):
+            got += len(mine.take())
+        assert got == 2000
+        assert mine.lost_sends == 0

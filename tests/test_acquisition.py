@@ -1,0 +1,415 @@
+"""Frames in, one sample per SYNC out: gaps, late and doubled frames, rolled-over counters, reboots."""
+
+import math
+import random
+import struct
+
+import pytest
+from canlayouts import COUNT_RAD, LINK_RAD, TORQUE_NM, VSA, drive, encoder, link, pdo, vsa_cycle
+
+from drivelink.canopen.layout import MappedObject, NodeLayout, Signal, TpdoLayout
+from drivelink.cycle.acquisition import Assembler
+from drivelink.cycle.frames import make_decoder
+from drivelink.cycle.syncclock import SyncClock
+from drivelink.errors import DriveError
+from estimator.sample import Sample, Status
+
+SYNC = 0x080
+MS = 1_000_000
+
+
+def run(assembler: Assembler, frames: list[tuple[int, bytes]]) -> list[Sample]:
+    return [sample for frame in frames if (sample := assembler.feed(*frame)) is not None]
+
+
+def test_the_last_frame_of_a_cycle_gives_its_sample_in_si_units() -> None:
+    assembler = Assembler(VSA, 2)
+    samples = run(assembler, [(SYNC, b""), *vsa_cycle(100)])
+    assert samples == [
+        Sample(
+            0,
+            (100 * COUNT_RAD, -100 * COUNT_RAD),
+            samples[0].motor_velocity_rad_s,
+            (100 * TORQUE_NM, -100 * TORQUE_NM),
+            100 * LINK_RAD,
+            samples[0].link_velocity_rad_s,
+            samples[0].external_torque_nm,
+        )
+    ]
+    assert all(math.isnan(v) for v in samples[0].motor_velocity_rad_s)
+    assert assembler.complete
+    assert assembler.flags == 0
+
+
+def test_frames_before_the_first_sync_belong_to_no_sample() -> None:
+    assembler = Assembler(VSA, 2)
+    assert run(assembler, vsa_cycle(1)) == []
+    assert [s.sequence for s in run(assembler, [(SYNC, b""), *vsa_cycle(2)])] == [0]
+
+
+def test_order_of_the_nodes_within_a_cycle_does_not_matter() -> None:
+    rng = random.Random(1)
+    assembler = Assembler(VSA, 2)
+    for k in range(50):
+        frames = vsa_cycle(k)
+        rng.shuffle(frames)
+        (sample,) = run(assembler, [(SYNC, b""), *frames])
+        assert (sample.sequence, sample.link_position_rad) == (k, k * LINK_RAD)
+
+
+def test_a_missing_frame_is_a_gap_known_by_node_and_never_filled() -> None:
+    assembler = Assembler(VSA, 2)
+    run(assembler, [(SYNC, b""), *vsa_cycle(0)])
+    assert run(assembler, [(SYNC, b""), *vsa_cycle(1)[:2]]) == []
+    assert assembler.missing_nodes() == (3,)
+    assembler.feed(SYNC, b"")
+    assert assembler.missed == 1
+    assert assembler.flags & Status.BUS_FAULT
+    assert [assembler.counters[n].missing for n in (1, 2, 3)] == [0, 0, 1]
+    run(assembler, vsa_cycle(2))
+    sample = assembler.feed(SYNC, b"")  # doubtful until its end: the one frame could have been the late one
+    assert sample is not None
+    assert (sample.sequence, sample.link_position_rad) == (2, 2 * LINK_RAD)
+    assert assembler.flags & Status.BUS_FAULT
+    assert assembler.missed == -1
+
+
+def test_a_late_frame_is_counted_late_and_not_taken_for_the_next_cycles() -> None:
+    assembler = Assembler(VSA, 2)
+    late = vsa_cycle(0)[2]
+    run(assembler, [(SYNC, b""), *vsa_cycle(0)[:2], (SYNC, b""), late])
+    samples = run(assembler, vsa_cycle(1))
+    assert [(s.sequence, s.link_position_rad) for s in samples] == [(1, LINK_RAD)]
+    assert assembler.counters[3].late == 1
+    assert assembler.flags & Status.BUS_FAULT
+    assert [s.sequence for s in run(assembler, [(SYNC, b""), *vsa_cycle(2)])] == [2]
+    assert assembler.flags == 0
+
+
+def test_frames_of_several_cycles_that_come_late_together_are_no_conflict() -> None:
+    assembler = Assembler(VSA, 2)
+    for k in range(3):
+        run(assembler, [(SYNC, b""), *vsa_cycle(k)[:2]])
+    late = [(0x183, link(100 * k)) for k in range(4)]
+    (sample,) = run(assembler, [(SYNC, b""), *vsa_cycle(3)[:2], *late])
+    (prompt,) = run(Assembler(VSA, 2), [(SYNC, b""), *vsa_cycle(3)[:2], late[3]])
+    assert (sample.sequence, sample.link_position_rad) == (3, prompt.link_position_rad)
+    assert assembler.flags & Status.BUS_FAULT
+    assert (assembler.counters[3].late, assembler.counters[3].conflicting) == (3, 0)
+    assert [s.sequence for s in run(assembler, [(SYNC, b""), *vsa_cycle(4)])] == [4]
+    assert assembler.flags == 0
+
+
+def test_while_late_frames_are_still_to_come_none_is_believed_without_a_flag() -> None:
+    assembler = Assembler(VSA, 2)
+    run(assembler, [(SYNC, b""), *vsa_cycle(0)[:2], (SYNC, b""), *vsa_cycle(1)[:2]])
+    # Two are owed; one of them comes late and alone, so what follows may be one cycle late as well.
+    run(assembler, [(SYNC, b""), *vsa_cycle(2)[:2], vsa_cycle(0)[2], vsa_cycle(1)[2]])
+    assert assembler.counters[3].late == 1
+    run(assembler, [(SYNC, b"")])
+    assert assembler.flags & Status.BUS_FAULT
+    (sample,) = run(assembler, [*vsa_cycle(3)[:2], vsa_cycle(2)[2], vsa_cycle(3)[2]])
+    assert sample.sequence == 3
+    assert assembler.counters[3].late == 2
+    assert assembler.flags & Status.BUS_FAULT
+    assert [s.sequence for s in run(assembler, [(SYNC, b""), *vsa_cycle(4)])] == [4]
+    assert assembler.flags == 0
+
+
+def test_a_node_that_was_configured_again_owes_nothing() -> None:
+    assembler = Assembler(VSA, 2)
+    for k in range(5):
+        run(assembler, [(SYNC, b""), *vsa_cycle(k)[:2]])
+    assembler.trust(3)
+    given = [run(assembler, [(SYNC, b""), *vsa_cycle(k), (0x183, link(70_000))]) for k in range(6, 20)]
+    assert assembler.counters[3].late == 1  # the sample of that cycle is flagged, and the last one
+    assert not any(given[2:])
+
+
+def test_samples_after_a_lost_frame_stay_flagged_until_it_cannot_be_a_late_one() -> None:
+    assembler = Assembler(VSA, 2)
+    run(assembler, [(SYNC, b""), *vsa_cycle(0)[:2]])
+    flagged = 0
+    for k in range(1, 300):
+        run(assembler, [(SYNC, b""), *vsa_cycle(k)])
+        flagged += bool(assembler.flags & Status.BUS_FAULT)
+    assert 90 <= flagged <= 110  # _DOUBT_CYCLES = 100
+    assert assembler.complete
+
+
+def test_frames_of_a_wrong_length_are_counted_and_not_used() -> None:
+    assembler = Assembler(VSA, 2)
+    frames = vsa_cycle(5)
+    frames[0] = (0x181, frames[0][1][:6])
+    assert run(assembler, [(SYNC, b""), *frames, (0x181, frames[1][1] + b"\0")]) == []
+    assert assembler.counters[1].wrong_length == 2
+    assert run(assembler, [(SYNC, b"")]) == []
+    assert assembler.missed == 0
+
+
+def test_the_same_frame_twice_is_counted_once_used_once() -> None:
+    assembler = Assembler(VSA, 2)
+    frames = [frame for frame in vsa_cycle(3) for _ in range(2)]
+    assert len(run(assembler, [(SYNC, b""), *frames])) == 1
+    assert [assembler.counters[n].duplicate for n in (1, 2, 3)] == [1, 1, 1]
+    assert len(run(assembler, [(SYNC, b""), *vsa_cycle(4)])) == 1
+
+
+def test_two_nodes_with_one_id_discredit_each_other() -> None:
+    assembler = Assembler(VSA, 2)
+    run(assembler, [(SYNC, b""), *vsa_cycle(0), (0x183, link(70_000))])
+    given = [run(assembler, [(SYNC, b""), *vsa_cycle(k), (0x183, link(70_000))]) for k in range(1, 40)]
+    assert not any(given)
+    after = [bool(run(assembler, [(SYNC, b""), *vsa_cycle(k)])) for k in range(60)]
+    assert after[-1]  # believed again once it has been quiet for a while
+    assert assembler.counters[3].duplicate == 40
+
+
+def test_a_sync_that_was_not_due_spoils_what_has_not_been_given_yet() -> None:
+    assembler = Assembler(VSA, 2)
+    run(assembler, [(SYNC, b""), vsa_cycle(0)[0]])
+    assembler.feed(SYNC, b"", 0)
+    assert run(assembler, vsa_cycle(0)) == []
+    assembler.feed(SYNC, b"")
+    assert (assembler.missed, assembler.extra_syncs) == (0, 1)
+
+
+def test_a_jump_of_sync_is_a_jump_of_the_sequence() -> None:
+    assembler = Assembler(VSA, 2)
+    run(assembler, [(SYNC, b""), *vsa_cycle(0)])
+    assembler.feed(SYNC, b"", 4)
+    assert [s.sequence for s in run(assembler, vsa_cycle(4))] == [4]
+
+
+@pytest.mark.parametrize("bits", [16, 32])
+def test_a_counter_that_rolls_over_goes_on(bits: int) -> None:
+    span = 1 << bits
+    assembler = Assembler((drive(1, 0), encoder(3, bits=bits)), 1)
+    code = "<H" if bits == 16 else "<I"
+    truth = [100 * k - 300 for k in range(10)] + [600 - 100 * k for k in range(20)]
+    found = []
+    for count in truth:
+        frames = [(SYNC, b""), (0x181, pdo(0)), (0x183, struct.pack(code, count % span))]
+        found += [s.link_position_rad for s in run(assembler, frames)]
+    # The first reading is the one nearest zero, from there on nothing rolls over.
+    assert found == pytest.approx([count * LINK_RAD for count in truth], abs=1e-9)
+
+
+def test_an_encoder_rolls_over_at_its_measuring_range_and_has_its_zero() -> None:
+    assembler = Assembler((drive(1, 0), encoder(3, modulus=5000, offset=0.25)), 1)
+    found = []
+    truth = range(-300, 400, 100)  # it begins a little below the encoder's zero, and so near the joint's
+    for count in truth:
+        frames = [(SYNC, b""), (0x181, pdo(0)), (0x183, link(count % 5000))]
+        found += [s.link_position_rad for s in run(assembler, frames)]
+    assert found == pytest.approx([c * LINK_RAD - 0.25 for c in range(-300, 400, 100)], abs=1e-9)
+
+
+def test_a_forged_reading_does_not_leave_the_counter_a_turn_off() -> None:
+    rng = random.Random(2)
+    assembler = Assembler((drive(1, 0),), 1)
+    for k in range(2000):
+        assembler.feed(SYNC, b"")
+        if k % 3 == 0:
+            assembler.feed(0x701, b"\x00")  # as if it had rebooted: the forged reading is the first
+            assembler.feed(0x000, b"\x01\x01")
+        assembler.feed(0x181, pdo(rng.randint(-(2**31), 2**31 - 1)))
+        assembler.feed(SYNC, b"")
+        assembler.feed(0x181, pdo(1000 + k))
+        sample = assembler.feed(SYNC, b"")
+        assert sample is None or sample.motor_position_rad[0] == (1000 + k) * COUNT_RAD
+
+
+def test_a_counter_is_followed_across_a_gap() -> None:
+    top = 2**31 - 10
+    assembler = Assembler((drive(1, 0),), 1)
+    run(assembler, [(SYNC, b""), (0x181, pdo(top))])
+    for _ in range(5):
+        assembler.feed(SYNC, b"")
+    assembler.feed(0x181, pdo(-(2**31) + 40))
+    sample = assembler.feed(SYNC, b"")
+    assert sample is not None
+    assert sample.motor_position_rad[0] == pytest.approx((top + 50) * COUNT_RAD, abs=1e-9)
+
+
+def test_a_rebooted_node_is_not_believed_before_it_is_started_again() -> None:
+    assembler = Assembler(VSA, 2)
+    run(assembler, [(SYNC, b""), *vsa_cycle(0)])
+    assembler.feed(0x702, b"\x00")
+    assert assembler.untrusted == (2,)
+    assert run(assembler, [(SYNC, b""), *vsa_cycle(1), (SYNC, b"")]) == []
+    assert (assembler.counters[2].reboots, assembler.counters[2].ignored) == (1, 1)
+    assembler.feed(0x702, b"\x05")  # operational by itself, with its default PDOs: not ours
+    assert assembler.untrusted == (2,)
+    assembler.feed(0x000, b"\x01\x02")
+    run(assembler, [(SYNC, b""), (0x181, pdo(3)), (0x182, pdo(777)), (0x183, link(3))])
+    sample = assembler.feed(SYNC, b"")
+    assert sample is not None
+    assert assembler.restarted  # positions may have started anew
+    assert sample.motor_position_rad[1] == pytest.approx(777 * COUNT_RAD)
+    run(assembler, vsa_cycle(4))
+    assembler.feed(SYNC, b"")
+    assert not assembler.restarted
+
+
+def test_a_passive_listener_believes_a_node_that_starts_by_itself() -> None:
+    assembler = Assembler(VSA, 2, active=False)
+    assembler.feed(0x000, b"\x82\x00")  # a gateway begins with reset communication to all
+    assert assembler.untrusted == (1, 2, 3)
+    for node in (1, 2, 3):
+        assembler.feed(0x700 + node, b"\x00")
+        assembler.feed(0x700 + node, b"\x05")
+    assert assembler.untrusted == ()
+    assert len(run(assembler, [(SYNC, b""), *vsa_cycle(1)])) == 1
+
+
+def test_a_drive_fault_is_flagged_by_statusword_and_by_emcy() -> None:
+    assembler = Assembler(VSA, 2)
+    run(assembler, [(SYNC, b""), (0x181, pdo(0, statusword=0x0218)), *vsa_cycle(0)[1:]])
+    assert assembler.flags == Status.DRIVE_FAULT
+    assert assembler.faults == {1: 0}
+    run(assembler, [(SYNC, b""), *vsa_cycle(1)])
+    assert assembler.flags == 0
+    assembler.feed(0x082, bytes.fromhex("1023 01 0000000000".replace(" ", "")))
+    run(assembler, [(SYNC, b""), *vsa_cycle(2)])
+    assert assembler.flags == Status.DRIVE_FAULT
+    assert assembler.faults == {2: 0x2310}
+    assembler.feed(0x082, bytes(8))
+    run(assembler, [(SYNC, b""), *vsa_cycle(3)])
+    assert assembler.flags == 0
+    assert assembler.counters[2].emergencies == 1
+
+
+def test_a_toggling_statusword_bit_is_no_fault() -> None:
+    assembler = Assembler((drive(1, 0),), 1)
+    for k in range(4):
+        run(assembler, [(SYNC, b""), (0x181, pdo(k, statusword=0x0237 ^ (k % 2) << 10))])
+        assert assembler.flags == 0
+
+
+def test_every_second_sync_gives_every_second_sample() -> None:
+    assembler = Assembler((drive(1, 0, transmission_type=2), drive(2, 1)), 2)
+    given = []
+    for k in range(20):
+        frames = [(SYNC, b""), (0x182, pdo(k))] + ([(0x181, pdo(k))] if k % 2 == 0 else [])
+        given += [s.sequence for s in run(assembler, frames)]
+        assert assembler.missed == -1
+    assert given == list(range(0, 20, 2))
+
+
+def test_an_event_driven_value_is_held_while_its_node_is_alive_and_no_longer() -> None:
+    assembler = Assembler((drive(1, 0, transmission_type=255), drive(2, 1)), 2, hold_periods=10)
+    assembler.feed(SYNC, b"")
+    assembler.feed(0x181, pdo(42))
+    given = []
+    for k in range(40):
+        if k < 20 and k % 5 == 0:
+            assembler.feed(0x701, b"\x05")
+        given += [s.sequence for s in run(assembler, [(SYNC, b""), (0x182, pdo(k))])]
+    assert given[0] == 1
+    assert given[-1] in range(24, 28)  # last heartbeat before cycle 16, then ten periods
+
+
+def test_all_event_driven_nodes_give_the_sample_at_the_end_of_the_cycle() -> None:
+    assembler = Assembler((drive(1, 0, transmission_type=255),), 1)
+    run(assembler, [(SYNC, b""), (0x181, pdo(1)), (0x181, pdo(2))])
+    sample = assembler.feed(SYNC, b"")
+    assert sample is not None
+    assert (sample.sequence, sample.motor_position_rad[0]) == (0, 2 * COUNT_RAD)
+    assert assembler.counters[1].duplicate == 0
+
+
+def test_can_fd_frames_may_be_padded() -> None:
+    objects = (
+        *drive(1, 0).tpdos[0].objects,
+        MappedObject(signal=Signal.LINK_POSITION, index=0x60E4, subindex=1, bits=16, signed=True, scale=1.0),
+    )
+    layout = NodeLayout(node_id=1, motor=0, tpdos=(TpdoLayout(cob_id=0x181, objects=objects),))
+    assembler = Assembler((layout,), 1)
+    data = pdo(1) + struct.pack("<h", -5) + b"\0\0"
+    (sample,) = run(assembler, [(SYNC, b""), (0x181, data)])
+    assert sample.link_position_rad == -5.0
+
+
+def test_objects_of_any_length_are_decoded_bit_by_bit() -> None:
+    rng = random.Random(3)
+    for _ in range(200):
+        objects, word, shift, truth = [], 0, 0, []
+        while True:
+            bits, signed = rng.randint(1, 32), rng.random() < 0.5
+            if shift + bits > 64:
+                break
+            low = -(1 << bits - 1) if signed else 0
+            value = rng.randint(low, low + (1 << bits) - 1)
+            objects.append(
+                MappedObject(signal=Signal.OTHER, index=0x2000, subindex=0, bits=bits, signed=signed)
+            )
+            word |= (value & (1 << bits) - 1) << shift
+            shift += bits
+            truth.append(value)
+        assert make_decoder(tuple(objects))(word.to_bytes(8, "little")) == tuple(truth)
+
+
+def test_a_layout_that_cannot_make_a_sample_is_refused_in_a_line() -> None:
+    with pytest.raises(DriveError, match="motor 2: no TPDO carries its position"):
+        Assembler((drive(1, 0),), 2)
+    with pytest.raises(DriveError, match="COB-ID 0x181 is used by two"):
+        Assembler((drive(1, 0), drive(1, 1)), 2)
+
+
+def test_no_frame_whatever_raises_or_makes_a_sample_of_a_cycle_that_lacks_one() -> None:
+    rng = random.Random(7)
+    assembler = Assembler(VSA, 2)
+    ids = [SYNC, 0, *assembler.cob_ids, 0x7FF, 0x18FF1234]
+    without_link = 0
+    for _ in range(200_000):
+        cob_id = rng.choice(ids)
+        if cob_id == 0x183:
+            without_link += 1
+            continue
+        assert assembler.feed(cob_id, rng.randbytes(rng.randint(0, 9)), rng.randint(0, 3)) is None
+    assert without_link > 1000
+
+
+def test_the_same_frames_give_the_same_samples_bit_for_bit() -> None:
+    rng = random.Random(11)
+    frames = []
+    for _ in range(2000):
+        frames += [(SYNC, b"")] + [
+            f for f in vsa_cycle(rng.randint(-9999, 9999) & 0xFFF) if rng.random() < 0.99
+        ]
+    first, second = (repr(run(Assembler(VSA, 2), frames)) for _ in range(2))
+    assert first == second
+
+
+class TestSyncClock:
+    def test_jitter_is_no_gap_and_a_gap_is_whole_periods(self) -> None:
+        rng = random.Random(5)
+        clock, truth, due = SyncClock(0.001), [], 0
+        found = []
+        for k in range(5000):
+            jump = 1 if k == 0 or rng.random() < 0.98 else rng.randint(2, 9)
+            due += jump if k else 0
+            found.append(clock.jump(round(due * MS + rng.uniform(-0.3, 0.3) * MS)))
+            truth.append(jump)
+        assert found == truth
+
+    def test_a_drifting_master_stays_in_step(self) -> None:
+        clock = SyncClock(0.001)
+        assert {clock.jump(round(k * MS * 1.0005)) for k in range(100_000)} == {1}
+
+    def test_a_sync_that_was_not_due_is_no_period(self) -> None:
+        clock = SyncClock(0.001)
+        assert [clock.jump(t * MS // 10) for t in (0, 10, 13, 20, 30)] == [1, 1, 0, 1, 1]
+
+    @pytest.mark.parametrize("step_s", [3600, -3600, 0.2, -0.2])
+    def test_a_clock_that_is_set_is_no_gap(self, step_s: float) -> None:
+        clock = SyncClock(0.001)
+        step = round(step_s * 1e9)
+        stamps = [(k * MS + (step if k >= 50 else 0), k * MS + 7) for k in range(100)]
+        assert {clock.jump(*stamp) for stamp in stamps} == {1}
+
+    def test_frames_read_late_in_one_go_keep_their_stamps(self) -> None:
+        clock = SyncClock(0.001)
+        read = [k if k < 10 else max(k, 40) for k in range(60)]
+        assert {clock.jump(k * MS, at * MS) for k, at in enumerate(read)} == {1}

@@ -1,0 +1,67 @@
+"""The arrows of docs/architecture.md, held."""
+
+import ast
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+STANDARD = set(sys.stdlib_module_names) | {"__future__"}
+ALLOWED = {
+    "estimator": STANDARD | {"numpy", "scipy", "estimator"},
+    "sim": STANDARD | {"numpy", "scipy", "can", "canopen", "sim"},
+}
+CLOCKS_AND_IO = {
+    "time",
+    "datetime",
+    "socket",
+    "os",
+    "io",
+    "pathlib",
+    "threading",
+    "subprocess",
+    "asyncio",
+    "random",
+}
+
+
+def imports(path: Path) -> set[str]:
+    """Top-level names of the packages that a module imports, wherever in the file."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            found.add((node.module or "").split(".")[0])
+    return found
+
+
+def modules(package: str) -> list[Path]:
+    files = sorted((ROOT / package).rglob("*.py"))
+    assert files, f"no module found in {package}"
+    return files
+
+
+@pytest.mark.parametrize("package", ["estimator", "sim"])
+def test_the_package_imports_nothing_beyond_what_it_may(package: str) -> None:
+    for path in modules(package):
+        assert imports(path) <= ALLOWED[package], f"{path.relative_to(ROOT)}"
+
+
+def test_the_estimator_reads_no_clock_and_touches_no_file_or_socket() -> None:
+    for path in modules("estimator"):
+        assert not imports(path) & CLOCKS_AND_IO, f"{path.relative_to(ROOT)}"
+        calls = {
+            node.func.id
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+        }
+        assert not calls & {"open", "print", "input"}, f"{path.relative_to(ROOT)}"
+
+
+def test_the_service_reaches_the_simulated_world_in_one_place_only() -> None:
+    for path in modules("drivelink"):
+        if path.name != "simulate.py":
+            assert "sim" not in imports(path), f"{path.relative_to(ROOT)}"

@@ -1,0 +1,208 @@
+"""Data sheets as they are found. The makers' own files are used where they are at hand, never shipped."""
+
+import contextlib
+import os
+import random
+from pathlib import Path
+
+import pytest
+from canopenkit import Slave, Wire, joint_text, sheet_objects
+
+from drivelink.canopen import Signal, configure
+from drivelink.canopen.eds import load_eds
+from drivelink.errors import DriveError
+from drivelink.jointfile import parse
+
+REPOSITORY = Path(__file__).parents[1]
+FOLDERS = [os.environ.get("DRIVELINK_EDS"), REPOSITORY / "../shared/data/eds", REPOSITORY / "data/eds"]
+REAL = next((sorted(Path(f).iterdir()) for f in FOLDERS if f and Path(f).is_dir()), [])
+OURS = sorted((REPOSITORY / "sim/eds").glob("*.eds"))
+needs_real = pytest.mark.skipif(not REAL, reason="the makers' EDS files are not here (DRIVELINK_EDS)")
+
+MINIMAL = """
+[DeviceInfo]
+VendorName=Somebody
+VendorNumber=0x1F
+ProductNumber=7
+[1018sub1]
+ParameterName=Vendor
+DataType=7
+AccessType=ro
+[1800sub1]
+ParameterName=COB-ID
+DataType=0x0007
+AccessType=rw
+DefaultValue=$NODEID+0x40000180
+[1800sub2]
+DataType=5
+AccessType=rw
+DefaultValue=0x01
+[1A00sub0]
+DataType=5
+AccessType=rw
+DefaultValue=1
+[1A00sub1]
+DataType=7
+AccessType=rw
+DefaultValue=0x60640020
+[6064]
+ParameterName=Position
+DataType=4
+AccessType=ro
+DefaultValue=-5
+PDOMapping=1
+"""
+
+
+def sheet(tmp_path, text, node=None, name="x.eds"):
+    path = tmp_path / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return load_eds(path, node)
+
+
+def test_a_sheet_tells_objects_identity_and_tpdos(tmp_path):
+    found = sheet(tmp_path, MINIMAL, 5)
+    assert (found.vendor_name, found.vendor_id, found.product_code) == ("Somebody", 0x1F, 7)
+    (frame,) = found.tpdos()
+    assert (frame.number, frame.cob, frame.transmission_type) == (1, 0x40000185, 1)
+    assert frame.entries == ((0x6064, 0, 32),)
+    assert not frame.fixed
+    assert found.value(0x6064) == 0xFFFFFFFB  # as an unsigned number of its length
+    assert found.problems == []
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (("Somebody", "Gr\xfc\xdfe"), "cp1252"),
+        (("ProductNumber=7", "ProductNumber="), "no value for productnumber"),
+        (("ProductNumber=7", "ProductNumber=7\nProductNumber=8"), "ProductNumber in [DeviceInfo] twice"),
+        (("[6064]", "[1018sub1]\n[6064]"), "[1018sub1] twice"),
+        (("DefaultValue=-5", "DefaultValue=minus five"), "6064:00 has a value that is no number"),
+        (("DataType=4", "DataType=0x99"), "6064:00 has an unknown data type"),
+        (("[DeviceInfo]", "[Device]"), "no [DeviceInfo]"),
+        (("[6064]", "this is nothing\n[6064]"), "neither key nor section"),
+    ],
+)
+def test_what_is_wrong_is_one_line_and_the_rest_is_read(tmp_path, change, problem):
+    text = MINIMAL.replace(*change)
+    found = sheet(tmp_path, text.encode("cp1252"), 5)
+    assert any(problem.lower() in line.lower() for line in found.problems), found.problems
+    assert all("\n" not in line for line in found.problems)
+    assert found.tpdos()[0].entries == ((0x6064, 0, 32),)
+
+
+def test_line_ends_case_comments_and_a_byte_order_mark_do_not_matter(tmp_path):
+    text = MINIMAL.replace("[1A00sub1]", "[1a00SUB1]").replace("0x60640020", "0x60640020 ; position")
+    text = text.replace("DefaultValue", "defaultvalue").replace("\n", "\r\n")
+    found = sheet(tmp_path, b"\xef\xbb\xbf" + text.encode(), 5)
+    assert found.tpdos()[0].entries == ((0x6064, 0, 32),)
+    assert found.problems == []
+
+
+@pytest.mark.parametrize("made_for", ["stated", "seen"])
+def test_a_dcf_made_for_another_node_is_changed_for_ours(tmp_path, made_for):
+    text = MINIMAL.replace("DefaultValue=$NODEID+0x40000180", "ParameterValue=0x181")
+    if made_for == "stated":
+        text += "[DeviceComissioning]\nNodeID=1\n"
+    found = sheet(tmp_path, text, 5, "x.dcf")
+    assert found.tpdos()[0].cob_id == 0x185
+    assert "of node 1: changed for node 5" in found.problems[0]
+    assert sheet(tmp_path, text).tpdos()[0].cob_id == 0x181
+
+
+def test_an_array_written_once_is_all_its_entries(tmp_path):
+    text = MINIMAL.replace("[1A00sub0]", "[1A09]").replace("[1A00sub1]", "[1A09x]")
+    text += "[1A00]\nParameterName=Map\nObjectType=9\nDataType=7\nAccessType=rw\nCompactSubObj=2\n"
+    text = text.replace("ObjectType=9\nDataType=7", "ObjectType=9") + "DefaultValue=0\n[1A00Value]\n"
+    text += "NrOfEntries=2\n1=0x60640020\n2=0x60410010\n"
+    found = sheet(tmp_path, text, 5)
+    assert found.tpdos()[0].entries == ((0x6064, 0, 32), (0x6041, 0, 16))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "is no EDS"),
+        (b"name = 'elbow'\n", "is no EDS"),
+        (b'<?xml version="1.0"?><ISO15745ProfileContainer/>', "is XML"),
+        (bytes(range(256)) * 20, "is no EDS"),
+    ],
+)
+def test_what_is_no_eds_is_one_line(tmp_path, content, message):
+    with pytest.raises(DriveError, match=message) as error:
+        sheet(tmp_path, content)
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_that_is_not_there_is_one_line(tmp_path):
+    with pytest.raises(DriveError, match=r"nowhere\.eds: cannot be read"):
+        load_eds(tmp_path / "nowhere.eds")
+
+
+def test_damaged_files_never_raise_anything_else(tmp_path):
+    random.seed(7)
+    sources = [path.read_bytes() for path in OURS[:2]] + [MINIMAL.encode()]
+    for _ in range(60):
+        data = bytearray(random.choice(sources))
+        for _ in range(random.randrange(1, 200)):
+            data[random.randrange(len(data))] = random.randrange(256)
+        del data[random.randrange(len(data)) :]
+        with contextlib.suppress(DriveError):
+            sheet(tmp_path, bytes(data), 5).tpdos()
+
+
+@needs_real
+@pytest.mark.parametrize("path", REAL, ids=lambda path: path.name)
+def test_every_makers_file_loads(path):
+    found = load_eds(path, 5)
+    assert len(found.objects) > 100
+    assert found.vendor_id
+    assert found.objects[0x6064, 0].bits == 32
+    assert found.objects[0x6064, 0].signed
+    assert all(len(line) < 200 and "\n" not in line for line in found.problems)
+    for frame in found.tpdos():
+        assert frame.cob_id & 0x7F in (0, 5)
+        assert sum(bits for _, _, bits in frame.entries) <= 64
+
+
+@needs_real
+def test_the_known_faults_of_makers_files_are_named():
+    problems = {path.name: " ".join(load_eds(path, 5).problems) for path in REAL}
+    assert "cp1252" in problems["faulhaber_605.3150.71.eds"]
+    assert "twice" in problems["infranor_Easy-ak.eds"]
+    assert "of node 1" in problems["maxon_EPOS4_50_15.dcf"]
+    assert "of node 32" in problems["e35.eds"]
+    assert "unknown data type" in problems["kollmorgen_RGM.eds"]
+
+
+STATED = "counts_per_rev = 4096\nrated_torque_nm = 1.0\nvelocity_rad_s_per_count = 0.001"
+
+
+@needs_real
+@pytest.mark.parametrize("path", REAL, ids=lambda path: path.name)
+def test_a_strict_slave_with_a_makers_dictionary_is_configured(path):
+    """Its writes, its access rights, its mappable objects, its fixed maps: as the file has them."""
+    slave = Slave(5, sheet_objects(load_eds(path, 5), 5), keep_bit_30=True)
+    wire = Wire([slave])
+    joint = parse(joint_text(drive=STATED))
+    if "faulhaber" in path.name:  # a drive whose fixed maps have no position: it says so
+        with pytest.raises(DriveError, match=r"motor_torque|motor_position"):
+            configure(wire, joint)
+        return
+    (layout,) = configure(wire, joint)
+    given = {mapped.signal for frame in layout.tpdos for mapped in frame.objects}
+    assert {Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE, Signal.STATUSWORD} <= given
+    assert all(frame.transmission_type == 1 for frame in layout.tpdos)
+    assert slave.state == 5
+    for frame in layout.tpdos:  # what we will decode is what the slave really has
+        mapping = 0x19FF + frame.number
+        has = [slave.objects[mapping, n].value for n in range(1, slave.objects[mapping, 0].value + 1)]
+        assert has == [o.index << 16 | o.subindex << 8 | o.bits for o in frame.objects]
+
+
+@pytest.mark.parametrize("path", OURS, ids=lambda path: path.name)
+def test_the_shipped_sheets_load_without_a_word(path):
+    found = load_eds(path, 5)
+    assert found.problems == []
+    assert found.tpdos()

@@ -1,0 +1,59 @@
+import pytest
+
+from drivelink.canopen.emcy import DriveState, drive_state, emergency_text, parse_emergency
+
+
+@pytest.mark.parametrize(
+    ("code", "text"),
+    [
+        (0x0000, "error reset or no error"),
+        (0x2310, "continuous overcurrent"),
+        (0x2315, "continuous overcurrent"),  # the group it belongs to
+        (0x3210, "DC link overvoltage"),
+        (0x4310, "excess temperature of the drive"),
+        (0x7305, "incremental sensor 1"),
+        (0x8130, "life guard or heartbeat error"),
+        (0x8240, "unexpected SYNC data length"),
+        (0x8611, "following error"),
+        (0x5999, "device hardware"),
+        (0xFF12, "device specific"),
+        (0xA000, "unknown"),
+    ],
+)
+def test_error_codes_have_words(code, text):
+    assert emergency_text(code) == text
+
+
+def test_an_emcy_is_decoded_with_its_register_and_the_makers_bytes():
+    message = parse_emergency(bytes.fromhex("10 23 03 01 02 00 00 00"))
+    assert message is not None
+    assert (message.code, message.register, message.vendor) == (0x2310, 0x03, b"\x01\x02\0\0\0")
+    assert not message.is_reset
+    assert str(message) == (
+        "EMCY 0x2310 (continuous overcurrent), error register 0x03 (generic, current), vendor 01 02 00 00 00"
+    )
+    assert parse_emergency(bytes(8)).is_reset
+
+
+def test_a_short_emcy_says_what_it_can_and_an_empty_one_nothing():
+    assert parse_emergency(b"\x10\x23").code == 0x2310
+    assert parse_emergency(b"\x10") is None
+    assert parse_emergency(b"") is None
+
+
+@pytest.mark.parametrize(
+    ("statusword", "state"),
+    [
+        (0x0000, DriveState.NOT_READY),
+        (0x0250, DriveState.SWITCH_ON_DISABLED),
+        (0x0231, DriveState.READY),
+        (0x0233, DriveState.SWITCHED_ON),
+        (0x0637, DriveState.ENABLED),
+        (0x0237, DriveState.ENABLED),  # bit 10 toggles on some drives: no other state
+        (0x0217, DriveState.QUICK_STOP),
+        (0x021F, DriveState.FAULT_REACTION),
+        (0x0218, DriveState.FAULT),
+    ],
+)
+def test_statuswords_have_states(statusword, state):
+    assert drive_state(statusword) is state

@@ -1,0 +1,396 @@
+import errno
+from collections import Counter
+
+import can
+import pytest
+from canopenkit import (
+    INVALID,
+    NO_RTR,
+    NOT_MAPPABLE,
+    READ_ONLY,
+    Item,
+    Slave,
+    Wire,
+    drive_objects,
+    joint_text,
+    tpdo,
+    u32,
+)
+
+from drivelink.canopen import Signal, configure, configure_joints
+from drivelink.canopen.guard import check_frame
+from drivelink.errors import BusError, DriveError
+from drivelink.jointfile import parse
+
+POSITION, TORQUE, STATUS = 0x60640020, 0x60770010, 0x60410010
+CURRENT, VELOCITY, LINK = 0x60780010, 0x606C0020, 0x60E40120
+
+
+def configured(slave, text="", **sections):
+    wire = Wire([slave])
+    layouts = configure(wire, parse(text or joint_text(**sections)))
+    for cob_id, data in wire.sent:
+        check_frame(cob_id, data)
+    return wire, layouts
+
+
+def drive(node=5, **changes):
+    objects = drive_objects(node)
+    return Slave(node, objects, **changes)
+
+
+def signals(layout):
+    return [[mapped.signal for mapped in tpdo.objects] for tpdo in layout.tpdos]
+
+
+def test_the_order_that_all_drives_accept_frame_by_frame():
+    wire, _ = configured(drive())
+    start = wire.log.index("> 000 80 05")
+    assert [line for line in wire.log[start:] if line.startswith(">") and line[6:8] != "40"] == [
+        "> 000 80 05",  # NMT: enter pre-operational
+        "> 605 23 00 18 01 85 01 00 C0",  # 0x1800:01: invalid (bit 31), bit 30 kept
+        "> 605 2F 00 18 02 01 00 00 00",  # 0x1800:02 = 1: at every SYNC
+        "> 605 2F 00 1A 00 00 00 00 00",  # 0x1A00:00 = 0: mapping off
+        "> 605 23 00 1A 01 20 00 64 60",  # position actual value, 32 bit
+        "> 605 23 00 1A 02 10 00 77 60",  # torque actual value, 16 bit
+        "> 605 23 00 1A 03 10 00 41 60",  # statusword, 16 bit
+        "> 605 2F 00 1A 00 03 00 00 00",  # three objects
+        "> 605 23 00 18 01 85 01 00 40",  # valid again
+        "> 605 2B 17 10 00 64 00 00 00",  # heartbeat every 100 ms
+        "> 000 01 05",  # NMT: start
+    ]
+
+
+def test_one_frame_carries_position_torque_and_statusword():
+    _, (layout,) = configured(drive())
+    assert layout.node_id == 5
+    assert layout.motor == 0
+    assert layout.heartbeat_ms == 100
+    assert layout.identity == (0x1234, 0x77, 0x10002, 99)
+    (frame,) = layout.tpdos
+    assert (frame.cob_id, frame.length, frame.transmission_type, frame.number) == (0x185, 8, 1, 1)
+    assert signals(layout) == [[Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE, Signal.STATUSWORD]]
+
+
+def test_link_encoder_and_velocity_share_a_second_frame():
+    _, (layout,) = configured(drive(), drive="velocity = true", link="[link.encoder]\ncounts_per_rev = 65536")
+    assert signals(layout)[1] == [Signal.LINK_POSITION, Signal.MOTOR_VELOCITY]
+    assert [frame.cob_id for frame in layout.tpdos] == [0x185, 0x285]
+
+
+def test_a_32_bit_current_moves_the_statusword_to_the_next_frame():
+    slave = drive()
+    slave.objects[0x30D1, 2] = u32(0, mappable=True)
+    _, (layout,) = configured(
+        slave,
+        drive='torque_source = "current"\ncurrent_object = "0x30D1:02"\ntorque_constant_nm_a = 0.1',
+    )
+    assert sorted(signals(layout), key=len) == [  # TPDO1 has the statusword already, and is taken as it is
+        [Signal.STATUSWORD],
+        [Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE],
+    ]
+
+
+def test_a_second_start_writes_nothing_and_leaves_operational_alone():
+    slave = drive()
+    configured(slave)
+    before = list(slave.writes)
+    wire, _ = configured(slave)
+    assert slave.writes == before
+    assert [frame for frame in wire.sent if frame[0] == 0] == [(0, b"\x01\x05")]
+
+
+def test_bit_30_is_kept_for_drives_that_insist():
+    configured(drive(keep_bit_30=True))
+    slave = drive(keep_bit_30=True)
+    slave.objects[0x1800, 1].value = 0x185  # this one answers remote frames: bit 30 is clear
+    configured(slave)
+    assert slave.objects[0x1800, 1].value == 0x185
+
+
+def test_a_torque_that_cannot_be_mapped_gives_way_to_the_current():
+    slave = drive()
+    slave.objects[0x6077, 0].mappable = False
+    _, (layout,) = configured(slave, drive="torque_constant_nm_a = 0.1")
+    torque = layout.tpdos[0].objects[1]
+    assert (torque.signal, torque.index) == (Signal.MOTOR_TORQUE, 0x6078)
+    # 4 A rated: a count is 4 mA, times 0.1 N·m/A, times gear 50
+    assert torque.scale == pytest.approx(0.004 * 0.1 * 50)
+    assert any("0x6077:00 cannot be mapped" in finding.text for finding in layout.findings)
+
+
+def test_a_refused_mapping_is_one_line_with_code_node_and_object():
+    slave = drive(refuse={(0x1A00, 1): NOT_MAPPABLE})
+    for item in slave.objects.values():
+        item.mappable = False
+    with pytest.raises(DriveError) as error:
+        configured(slave)
+    assert "node 5" in str(error.value)
+    assert "0x6064:00" in str(error.value)
+    assert "0x06040041" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_refused_mapping_is_put_back_as_it_was():
+    slave = drive()
+    slave.objects[0x6064, 0].mappable = False
+    with pytest.raises(DriveError):
+        configured(slave)
+    assert slave.objects[0x1800, 1].value == NO_RTR | 0x185
+    assert slave.objects[0x1A00, 0].value == 1
+    assert slave.objects[0x1A00, 1].value == STATUS
+
+
+def fixed(slave, *maps):
+    """Maps of TPDO1, 2, … that cannot be changed."""
+    for number in range(1, 5):
+        entries = maps[number - 1] if number <= len(maps) else ()
+        slave.objects.update(tpdo(number, NO_RTR | INVALID | 0x80 + 0x100 * number + 5, 255, *entries))
+        for subindex in range(9):
+            slave.objects[0x19FF + number, subindex].writable = False
+    return slave
+
+
+def test_a_fixed_map_that_carries_what_is_needed_is_taken():
+    wire, (layout,) = configured(fixed(drive(), (STATUS,), (STATUS, POSITION, TORQUE)))
+    assert signals(layout) == [[Signal.STATUSWORD, Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE]]
+    assert layout.tpdos[0].cob_id == 0x285
+    assert not [write for write in wire.written() if 0x1A00 <= write[1] <= 0x1BFF]
+
+
+def test_several_fixed_maps_are_put_together():
+    _, (layout,) = configured(fixed(drive(), (STATUS,), (STATUS, POSITION), (STATUS, VELOCITY), (TORQUE,)))
+    given = {signal for frame in signals(layout) for signal in frame}
+    assert {Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE, Signal.STATUSWORD} <= given
+    seen = Counter(signal for frame in signals(layout) for signal in frame)
+    assert seen[Signal.STATUSWORD] == 1  # the second one is skipped over
+
+
+def test_fixed_maps_that_lack_something_are_shown():
+    with pytest.raises(DriveError, match=r"motor_torque.*TPDO1 = 0x6041:00; TPDO2 = 0x6064:00"):
+        configured(fixed(drive(), (STATUS,), (POSITION,)))
+
+
+def test_what_reads_back_decides_and_a_drive_that_forgets_is_found_out():
+    with pytest.raises(DriveError, match=r"does not keep the mapping: motor_position.*TPDO3 = empty"):
+        configured(drive(forgets=True))
+
+
+def test_an_identifier_left_over_from_another_node_is_corrected():
+    slave = drive()
+    slave.objects[0x1800, 1].value = NO_RTR | INVALID | 0x181
+    _, (layout,) = configured(slave)
+    assert layout.tpdos[0].cob_id == 0x185
+
+
+def test_two_tpdos_with_one_identifier_are_told_apart():
+    slave = fixed(drive(), (STATUS,), (), (STATUS, POSITION), (), ())
+    slave.objects.update(tpdo(5, NO_RTR | INVALID | 0x385, 1, STATUS, TORQUE))
+    for subindex in range(9):
+        slave.objects[0x1A04, subindex].writable = False
+    _, (layout,) = configured(slave)
+    assert sorted(frame.number for frame in layout.tpdos) == [3, 5]
+    assert len({frame.cob_id for frame in layout.tpdos}) == 2
+
+
+def test_a_missing_tpdo_among_the_first_ones_is_skipped():
+    slave = drive()
+    for key in [key for key in slave.objects if key[0] in (0x1801, 0x1A01)]:
+        del slave.objects[key]
+    _, (layout,) = configured(slave, link="[link.encoder]\ncounts_per_rev = 4096")
+    assert [frame.number for frame in layout.tpdos] == [1, 3]
+
+
+def test_beside_another_master_the_unused_tpdos_are_taken():
+    _, (layout,) = configured(drive(), bus='sync = "follow"')
+    assert layout.tpdos[0].number == 2
+    assert [frame.number for frame in layout.other_tpdos] == [1]
+
+
+def test_inhibit_time_and_event_timer_are_cleared():
+    slave = drive()
+    slave.objects[0x1800, 3].value = 10
+    slave.objects[0x1800, 5].value = 50
+    configured(slave)
+    assert slave.objects[0x1800, 3].value == 0
+    assert slave.objects[0x1800, 5].value == 0
+
+
+def test_a_transmission_type_that_is_refused_is_reported_and_kept():
+    _, (layout,) = configured(drive(refuse={(0x1800, 2): READ_ONLY}))
+    assert layout.tpdos[0].transmission_type == 255
+    assert any("keeps transmission type 255" in finding.text for finding in layout.findings)
+
+
+def test_the_sync_counter_is_written_with_the_period_off():
+    slave = drive()
+    slave.objects[0x1006, 0].value = 1000
+    configured(slave, bus="sync_counter_overflow = 240")
+    assert slave.objects[0x1019, 0].value == 240
+    assert slave.objects[0x1006, 0].value == 1000
+    assert [write for write in slave.writes if write[0] in (0x1006, 0x1019)] == [
+        (0x1006, 0, 0),
+        (0x1019, 0, 240),
+        (0x1006, 0, 1000),
+    ]
+
+
+def test_a_drive_that_makes_sync_itself_is_stopped_or_named():
+    slave = drive()
+    slave.objects[0x1005, 0].value = 0x40000080
+    configured(slave)
+    assert slave.objects[0x1005, 0].value == 0x80
+    constant = drive()
+    constant.objects[0x1005, 0] = u32(0x40000080)
+    with pytest.raises(DriveError, match="makes SYNC itself"):
+        configured(constant)
+
+
+def test_a_constant_sync_identifier_that_is_right_is_left_alone():
+    slave = drive()
+    slave.objects[0x1005, 0] = u32(0x80)  # EPOS4
+    configured(slave)
+
+
+def test_a_heartbeat_that_cannot_be_set_is_what_it_is():
+    slave = drive(refuse={(0x1017, 0): READ_ONLY})
+    slave.objects[0x1017, 0].value = 500
+    _, (layout,) = configured(slave)
+    assert layout.heartbeat_ms == 500
+    assert any("keeps its heartbeat of 500 ms" in finding.text for finding in layout.findings)
+
+
+def test_nobody_at_home_is_one_line(monkeypatch):
+    monkeypatch.setattr("drivelink.canopen.node.BOOT_S", 0.1)
+    with pytest.raises(DriveError) as error:
+        configured(drive(silent=True))
+    assert "node 5 does not answer" in str(error.value)
+    assert "is it powered" in str(error.value)
+
+
+def test_a_foreign_sync_is_refused_before_anything_is_sent():
+    wire = Wire([drive()])
+    for _ in range(5):
+        wire.put(0x80, b"")
+    with pytest.raises(BusError, match=r'another master already makes SYNC.*bus\.sync = "follow"'):
+        configure(wire, parse(joint_text()))
+    assert wire.sent == []
+
+
+def test_what_the_bus_cannot_carry_is_refused_with_numbers():
+    nodes = [drive_objects(node) for node in range(1, 9)]
+    wire = Wire(Slave(node, objects) for node, objects in enumerate(nodes, start=1))
+    joints = [
+        parse(joint_text().replace("node_id = 5", f"node_id = {node}").replace("elbow", f"joint{node}"))
+        for node in range(1, 9)
+    ]
+    with pytest.raises(BusError, match=r"bus load would be 11\d%.*kbit/s of 1000 kbit/s"):
+        configure_joints(wire, joints)
+
+
+def test_unneeded_frames_are_switched_off_where_the_load_demands_it():
+    slaves = []
+    for node in (5, 6, 7, 8):
+        objects = drive_objects(node)
+        objects[0x1801, 1].value = NO_RTR | 0x280 + node
+        slaves.append(Slave(node, objects))
+    wire = Wire(slaves)
+    joints = [
+        parse(joint_text().replace("node_id = 5", f"node_id = {node}").replace("elbow", f"joint{node}"))
+        for node in (5, 6, 7, 8)
+    ]
+    configurator, layouts = configure_joints(wire, joints)
+    assert all(not layout.other_tpdos for mine in layouts for layout in mine)
+    assert all(slave.objects[0x1801, 1].value & INVALID for slave in slaves)
+    # SYNC 55 + 4 frames of 135 bits at 1 kHz, four heartbeats of 65 bits at 10 Hz
+    assert configurator.load().bits_per_s == pytest.approx(1000 * (55 + 4 * 135) + 4 * 10 * 65)
+
+
+def test_one_node_cannot_serve_two_joints():
+    joint = parse(joint_text())
+    with pytest.raises(BusError, match="node 5 is claimed by two joints"):
+        configure_joints(Wire([drive()]), [joint, joint])
+
+
+def test_a_link_encoder_of_its_own_is_a_third_node():
+    encoder = {
+        (0x1000, 0): u32(0x00010196),
+        (0x1017, 0): Item(0, 2, True),
+        (0x6004, 0): u32(77, mappable=True),
+        (0x6501, 0): u32(8192),
+        (0x6502, 0): u32(4096),
+    } | tpdo(1, NO_RTR | 0x189, 254, 0x60040020)
+    wire = Wire([drive(), Slave(9, encoder)])
+    text = joint_text(link='[link.encoder]\nsource = "cia406"\nnode_id = 9\ndirection = -1\noffset_rad = 0.5')
+    layouts = configure(wire, parse(text))
+    assert [(layout.node_id, layout.motor) for layout in layouts] == [(5, 0), (9, None)]
+    (mapped,) = layouts[1].tpdos[0].objects
+    assert (mapped.signal, mapped.signed, mapped.wraps) == (Signal.LINK_POSITION, False, True)
+    assert mapped.modulus == 8192 * 4096
+    assert mapped.offset == 0.5
+    assert mapped.scale == pytest.approx(-2 * 3.141592653589793 / 8192)
+
+
+def test_a_node_that_rebooted_is_configured_again_beside_the_loop():
+    slave = drive()
+    wire = Wire([slave])
+    configurator, ((before,),) = configure_joints(wire, [parse(joint_text())])
+    slave.objects = drive_objects(5)  # as after power-on
+    slave.state = 0x7F
+    configurator.start(5)
+    ended, now = [], 0.0
+    for _ in range(2000):  # the loop's slack: one step at a time, nothing blocks
+        now += 0.001
+        ended += configurator.poll(now)
+        message = wire.recv()
+        if message is not None:
+            configurator.feed(message.arbitration_id, bytes(message.data), now)
+        if ended:
+            break
+    assert [(node, result.tpdos) for node, result in ended] == [(5, before.tpdos)]
+    assert slave.state == 5
+    assert not configurator.busy
+
+
+def test_a_node_that_stays_away_ends_in_an_error_and_can_be_tried_again():
+    slave = drive()
+    wire = Wire([slave])
+    configurator, _ = configure_joints(wire, [parse(joint_text())])
+    slave.silent = True
+    configurator.start(5)
+    ended, now = [], 0.0
+    while not ended:
+        now += 0.01
+        ended += configurator.poll(now)
+    ((node, error),) = ended
+    assert node == 5
+    assert isinstance(error, DriveError)
+    slave.silent = False
+    configurator.start(5)
+    assert configurator.busy
+
+
+class FullQueue(Wire):
+    """Every third frame finds the transmit queue full."""
+
+    def send(self, msg, timeout=None):
+        self.count = getattr(self, "count", 0) + 1
+        if self.count % 3 == 0:
+            raise can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS)
+        super().send(msg, timeout)
+
+
+def test_a_full_transmit_queue_costs_time_only():
+    wire = FullQueue([drive()])
+    joint = parse(joint_text(bus="sdo_retries = 3"))
+    (layout,) = configure(wire, joint)
+    assert layout.tpdos[0].cob_id == 0x185
+
+
+def test_an_interface_that_is_down_is_one_line():
+    class Down(Wire):
+        def send(self, msg, timeout=None):
+            raise can.CanOperationError("Failed to transmit: Network is down", errno.ENETDOWN)
+
+    with pytest.raises(BusError, match=r"cannot be sent: .*Network is down"):
+        configure(Down(), parse(joint_text()))

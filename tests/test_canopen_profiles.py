@@ -1,0 +1,116 @@
+"""The configuration against the simulated drives, each with its maker's habits, in lockstep."""
+
+import math
+
+import can
+import pytest
+from canopenkit import joint_text
+
+from drivelink.canopen import Signal, configure, configure_joints
+from drivelink.canopen.guard import check_frame
+from drivelink.errors import DriveError
+from drivelink.jointfile import parse
+from drivelink.simulate import network_from_joint
+from sim.canopen.profiles import PROFILES
+
+TEXT = joint_text(
+    drive="counts_per_rev = 8192\ngear_ratio = 20.0\ntorque_constant_nm_a = 0.05\nrated_current_a = 4.0",
+    link='[link.encoder]\nsource = "cia406"\nnode_id = 9\n[link.dynamics]\ninertia_kg_m2 = 0.2',
+    bus="",
+).replace("sdo_timeout_s = 0.02", "sdo_timeout_s = 0.2")
+TEXT = TEXT.replace(
+    "[motor.drive]",
+    '[motor.transmission]\nmodel = "linear"\nparameters = { k_nm_rad = 100.0 }\n[motor.drive]',
+)
+
+
+class Watched:
+    """A virtual bus that writes down what the master sends, and refuses what it must never send."""
+
+    def __init__(self, bus):
+        self.inner = bus
+        self.recv = bus.recv
+        self.sent = []
+
+    def send(self, msg, timeout=None):
+        check_frame(msg.arbitration_id, bytes(msg.data))
+        self.sent.append((msg.arbitration_id, bytes(msg.data)))
+        self.inner.send(msg, timeout)
+
+
+@pytest.fixture
+def rig(request):
+    joint = parse(TEXT)
+    with (
+        can.Bus(interface="virtual", channel=request.node.name) as ours,
+        can.Bus(interface="virtual", channel=request.node.name) as theirs,
+    ):
+
+        def build(quirks):
+            return Watched(ours), joint, network_from_joint(joint, theirs, quirks=quirks)
+
+        yield build
+
+
+@pytest.mark.parametrize("quirks", [name for name in PROFILES if name != "slow-boot"])
+def test_every_makers_drive_is_configured_and_its_frames_decode(rig, quirks):
+    bus, joint, network = rig(quirks)
+    drive, encoder = configure(bus, joint, idle=network.poll)
+    given = {mapped.signal for frame in drive.tpdos for mapped in frame.objects}
+    assert {Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE, Signal.STATUSWORD} <= given
+    assert encoder.tpdos[0].objects[0].signal is Signal.LINK_POSITION
+    while bus.recv(0.0) is not None:
+        pass
+    bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+    network.poll()
+    lengths = {}
+    while (message := bus.recv(0.0)) is not None:
+        lengths[message.arbitration_id] = len(message.data)
+    for frame in drive.tpdos + encoder.tpdos:
+        assert lengths[frame.cob_id] == frame.length
+    position = next(o for f in drive.tpdos for o in f.objects if o.signal is Signal.MOTOR_POSITION)
+    assert position.scale == pytest.approx(math.tau / (8192 * 20))
+
+
+def test_a_slow_drive_is_waited_for(rig):
+    bus, joint, network = rig("slow-boot")
+    assert len(configure(bus, joint, idle=network.poll)) == 2
+
+
+@pytest.mark.parametrize("quirks", ["strict", "keeps-pdos", "self-starting", "synapticon"])
+def test_after_a_reboot_the_same_layout_comes_back(rig, quirks):
+    bus, joint, network = rig(quirks)
+    configurator, ((drive, _),) = configure_joints(bus, [joint], idle=network.poll)
+    bus.inner.send(can.Message(arbitration_id=0, data=b"\x81\x05", is_extended_id=False))
+    network.poll()
+    booted, ended, now = False, [], 0.0
+    for _ in range(5000):
+        now += 0.001
+        ended += configurator.poll(now)
+        network.poll()
+        while (message := bus.recv(0.0)) is not None:
+            if message.arbitration_id == 0x705 and message.data[0] == 0 and not booted:
+                booted = True
+                configurator.start(5)
+            configurator.feed(message.arbitration_id, bytes(message.data), now)
+        if ended:
+            break
+    ((node, layout),) = ended
+    assert node == 5
+    assert layout.tpdos == drive.tpdos
+
+
+def test_a_drive_without_a_second_encoder_says_so(rig):
+    bus, _, network = rig("copley")
+    joint = parse(TEXT.replace('source = "cia406"\nnode_id = 9', "counts_per_rev = 4096"))
+    with pytest.raises(
+        DriveError, match=r"node 5 \(motor\[1\]\.drive\) gives no link_position: it has no 0x60E4:01"
+    ):
+        configure(bus, joint, idle=network.poll)
+
+
+def test_a_drive_that_does_not_tell_its_resolution_says_what_to_state(rig):
+    bus, _, network = rig("epos4")
+    joint = parse(TEXT.replace("counts_per_rev = 8192\n", ""))
+    with pytest.raises(DriveError, match="counts_per_rev"):
+        configure(bus, joint, idle=network.poll)

@@ -1,0 +1,182 @@
+import can
+import pytest
+from canopenkit import Item, Slave, Wire, drive_objects
+
+from drivelink.canopen.blocking import run_program
+from drivelink.canopen.guard import ForbiddenFrameError, SilentBus, check_frame
+from drivelink.canopen.pdo import read_optional
+from drivelink.canopen.sdo import Nmt, Pause, Read, SdoAbort, SdoTimeout, Session, Write, abort_text
+from drivelink.errors import BusError, DriveError
+
+
+def read(node, index, subindex=0):
+    return (yield Read(node, index, subindex))
+
+
+def write(node, index, subindex, value, size):
+    return (yield Write(node, index, subindex, value, size))
+
+
+def session(program, sent, **options):
+    return Session(program, lambda cob_id, data: sent.append((cob_id, data.hex(" "))), **options)
+
+
+def test_expedited_upload_as_on_the_wire():
+    wire = Wire([Slave(5, drive_objects(5))])
+    assert run_program(read(5, 0x6076), wire) == (800).to_bytes(4, "little")
+    assert wire.log == [
+        "> 605 40 76 60 00 00 00 00 00",  # initiate upload 0x6076:00
+        "< 585 43 76 60 00 20 03 00 00",  # expedited, 4 bytes: 800 mN·m
+    ]
+
+
+@pytest.mark.parametrize(("size", "command"), [(1, "2f"), (2, "2b"), (4, "23")])
+def test_expedited_download_tells_its_length(size, command):
+    sent = []
+    running = session(write(5, 0x1017, 0, 100, size), sent)
+    assert not running.poll(0.0)
+    assert sent[0] == (0x605, f"{command} 17 10 00 64 00 00 00")
+    running.feed(0x585, bytes.fromhex("60 17 10 00 00 00 00 00"), 0.0)
+    assert running.done
+    assert running.result == b""
+
+
+@pytest.mark.parametrize("length", [5, 7, 8, 14, 15, 22])
+def test_segmented_upload_is_put_together(length):
+    text = bytes(range(65, 65 + length))
+    wire = Wire([Slave(5, {(0x1008, 0): Item(text, length)})])
+    assert run_program(read(5, 0x1008), wire) == text
+
+
+def test_wrong_toggle_bit_aborts_the_transfer():
+    sent = []
+    running = session(read(5, 0x1008), sent)
+    running.poll(0.0)
+    running.feed(0x585, bytes.fromhex("41 08 10 00 0a 00 00 00"), 0.0)
+    running.feed(0x585, bytes.fromhex("10 41 42 43 44 45 46 47"), 0.0)  # toggle 1 where 0 is due
+    assert sent[-1] == (0x605, "80 08 10 00 00 00 03 05")
+    with pytest.raises(SdoAbort, match="0x05030000"):
+        _ = running.result
+
+
+def test_an_abort_names_node_object_code_and_text():
+    wire = Wire([Slave(5, drive_objects(5))])
+    with pytest.raises(DriveError) as error:
+        run_program(read(5, 0x2FFF, 1), wire)
+    assert str(error.value) == (
+        "node 5 refused reading 0x2FFF:01: SDO abort 0x06020000 (Object does not exist)"
+    )
+    assert abort_text(0x12345678) == "0x12345678"
+
+
+def test_silence_is_retried_and_then_named():
+    sent = []
+    running = session(read(5, 0x1000), sent, timeout_s=0.5, retries=1)
+    assert not running.poll(0.0)
+    assert not running.poll(0.4)
+    assert len(sent) == 1
+    assert not running.poll(0.6)  # aborted with 0x05040000, and asked again
+    assert [data for _, data in sent[1:]] == ["80 00 10 00 00 00 04 05", "40 00 10 00 00 00 00 00"]
+    assert running.poll(1.2)
+    with pytest.raises(SdoTimeout, match=r"node 5 does not answer: SDO 0x1000:00.* 0.5 s.*2 times"):
+        _ = running.result
+
+
+def test_late_answers_and_other_nodes_are_not_taken_for_ours():
+    running = session(read(5, 0x6064), [])
+    running.poll(0.0)
+    running.feed(0x585, bytes.fromhex("43 76 60 00 20 03 00 00"), 0.0)  # answer to an earlier question
+    running.feed(0x586, bytes.fromhex("43 64 60 00 01 00 00 00"), 0.0)  # another node
+    running.feed(0x585, b"\x43", 0.0)  # cut short
+    running.feed(0x585, bytes.fromhex("60 64 60 00 00 00 00 00"), 0.0)  # confirms a download
+    assert not running.done
+    running.feed(0x585, bytes.fromhex("43 64 60 00 07 00 00 00"), 0.0)
+    assert running.result == b"\x07\0\0\0"
+
+
+def test_a_program_can_pause_and_command_nodes_without_anybody_waiting():
+    def program():
+        yield Nmt(5, 0x80)
+        yield Pause(0.02)
+        return (yield Read(5, 0x1000))
+
+    sent = []
+    running = session(program(), sent)
+    running.poll(1.0)
+    assert sent == [(0, "80 05")]
+    running.poll(1.01)
+    assert len(sent) == 1
+    running.poll(1.03)
+    assert sent[1][0] == 0x605
+
+
+def test_an_endless_segmented_upload_ends():
+    running = session(read(5, 0x1008), [])
+    running.poll(0.0)
+    running.feed(0x585, bytes.fromhex("41 08 10 00 00 00 00 00"), 0.0)
+    for k in range(2000):
+        running.feed(0x585, bytes([0x10 * (k % 2)]) + bytes(7), 0.0)
+    assert running.done
+
+
+def test_an_object_that_may_be_missing_is_none():
+    wire = Wire([Slave(5, drive_objects(5))])
+    assert run_program(read_optional(5, 0x1005, 0), wire) == 0x80
+    assert run_program(read_optional(5, 0x2FFF, 0), wire) is None
+
+
+FORBIDDEN = {
+    "controlword": (0x605, bytes.fromhex("2b 40 60 00 0f 00 00 00")),
+    "mode": (0x605, bytes.fromhex("2f 60 60 00 0a 00 00 00")),
+    "target torque": (0x605, bytes.fromhex("2b 71 60 00 0a 00 00 00")),
+    "target position": (0x605, bytes.fromhex("23 7a 60 00 0a 00 00 00")),
+    "vendor object": (0x605, bytes.fromhex("23 00 20 01 0a 00 00 00")),
+    "store parameters": (0x605, bytes.fromhex("23 10 10 01 73 61 76 65")),
+    "RPDO mapping": (0x605, bytes.fromhex("23 00 16 01 10 00 40 60")),
+    "segmented download": (0x605, bytes.fromhex("21 17 10 00 08 00 00 00")),
+    "RPDO": (0x205, bytes.fromhex("0f 00")),
+    "NMT reset": (0, bytes.fromhex("81 05")),
+    "NMT stop": (0, bytes.fromhex("02 05")),
+    "TIME": (0x100, bytes(6)),
+    "heartbeat": (0x705, b"\x05"),
+}
+
+
+@pytest.mark.parametrize("name", FORBIDDEN)
+def test_nothing_that_could_move_a_drive_leaves(name):
+    with pytest.raises(ForbiddenFrameError):
+        check_frame(*FORBIDDEN[name])
+
+
+def test_no_program_can_write_an_object_of_the_profile():
+    sent = []
+    for index in (0x6040, 0x6060, 0x6071, 0x607A, 0x60FF, 0x2000, 0x1010, 0x1600, 0x1400):
+        with pytest.raises(ForbiddenFrameError):
+            session(write(5, index, 0, 0, 2), sent).poll(0.0)
+    assert sent == []
+
+
+def test_what_configures_may_leave():
+    for cob_id, data in (
+        (0x080, b""),
+        (0x080, b"\x01"),
+        (0, b"\x01\x05"),
+        (0, b"\x80\x05"),
+        (0x605, bytes.fromhex("40 40 60 00 00 00 00 00")),  # reading the controlword moves nothing
+        (0x605, bytes.fromhex("23 00 1a 01 20 00 64 60")),
+        (0x605, bytes.fromhex("80 00 10 00 00 00 04 05")),
+    ):
+        check_frame(cob_id, data)
+
+
+def test_a_silent_bus_sends_nothing():
+    with (
+        can.Bus(interface="virtual", channel="silent") as bus,
+        can.Bus(interface="virtual", channel="silent") as other,
+    ):
+        silent = SilentBus(bus)
+        with pytest.raises(BusError, match="passive"):
+            silent.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+        assert other.recv(0.02) is None
+        other.send(can.Message(arbitration_id=0x181, is_extended_id=False))
+        assert silent.recv(0.5).arbitration_id == 0x181

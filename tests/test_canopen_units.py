@@ -1,0 +1,202 @@
+import math
+
+import pytest
+from canopenkit import joint_text
+
+from drivelink.canopen.cia303 import velocity_unit_rad_s
+from drivelink.canopen.layout import Signal
+from drivelink.canopen.roles import object_address, roles
+from drivelink.canopen.units import offer
+from drivelink.canopen.vendors import GENERIC, VENDORS
+from drivelink.errors import JointFileError
+from drivelink.finding import Severity
+from drivelink.jointfile import parse
+
+MAXON, ELMO, COPLEY = VENDORS[0xFB], VENDORS[0x9A], VENDORS[0xAB]
+PLAIN = {(0x608F, 1): 16384, (0x608F, 2): 1, (0x6091, 1): 50, (0x6091, 2): 1, (0x6076, 0): 800}
+
+
+def offered(told, vendor=GENERIC, **sections):
+    return offer(roles(parse(joint_text(**sections)))[0], told, vendor)
+
+
+def scale(result, signal):
+    return result.candidates[signal][0].scale
+
+
+def test_everything_is_read_from_a_drive_that_tells():
+    result = offered(PLAIN)
+    assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.tau / (16384 * 50))
+    # a count of 0x6077 is a thousandth of 0.8 N·m at the motor, times the gear at the joint
+    assert scale(result, Signal.MOTOR_TORQUE) == pytest.approx(0.0008 * 50)
+    assert result.findings == []
+
+
+def test_what_the_joint_file_states_is_used_and_a_disagreement_names_both_numbers():
+    result = offered(PLAIN, drive="counts_per_rev = 4096\ngear_ratio = 100.0\nrated_torque_nm = 0.5", link="")
+    assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.tau / (4096 * 100))
+    texts = [finding.text for finding in result.findings if finding.severity is Severity.WARNING]
+    assert len(texts) == 3
+    assert any("says 16384 (0x608F), the joint file 4096; 4096 is used" in text for text in texts)
+    assert any("says 50 (0x6091), the joint file 100; 100 is used" in text for text in texts)
+    assert any("says 0.8 (0x6076), the joint file 0.5; 0.5 is used" in text for text in texts)
+    assert all(finding.fix for finding in result.findings)
+
+
+def test_a_drive_that_was_never_told_of_its_gear_is_no_warning():
+    result = offered({**PLAIN, (0x6091, 1): 1}, drive="gear_ratio = 100.0")
+    assert [finding.severity for finding in result.findings] == [Severity.INFO]
+    assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.tau / (16384 * 100))
+
+
+def test_direction_turns_position_and_torque_and_can_be_split():
+    result = offered(PLAIN, drive="direction = -1")
+    assert scale(result, Signal.MOTOR_POSITION) < 0
+    assert scale(result, Signal.MOTOR_TORQUE) < 0
+    result = offered(PLAIN, drive="direction = -1\ntorque_direction = 1")
+    assert scale(result, Signal.MOTOR_POSITION) < 0
+    assert scale(result, Signal.MOTOR_TORQUE) > 0
+
+
+def test_values_a_drive_was_never_given_count_as_not_told():
+    # Elmo's DCF: resolution 1/1, rated values 0
+    told = {(0x608F, 1): 1, (0x608F, 2): 1, (0x6076, 0): 0, (0x6075, 0): 0}
+    result = offered(told)
+    assert "counts_per_rev" in result.missing[Signal.MOTOR_POSITION]
+    assert "rated_torque_nm" in result.missing[Signal.MOTOR_TORQUE]
+
+
+def test_epos4_tells_by_objects_of_its_own_and_in_micro_newton_metres():
+    # values of a real EPOS4's DCF: 4.76 A, 107.746 mN·m/A, 0x6076 = 512871 µN·m, gear 26, 3200 counts
+    told = {
+        (0x3000, 5): 3200,
+        (0x3001, 1): 4760,
+        (0x3001, 5): 107746,
+        (0x3003, 1): 26,
+        (0x3003, 2): 1,
+        (0x6076, 0): 512871,
+    }
+    result = offered(told, MAXON)
+    assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.tau / (3200 * 26))
+    assert scale(result, Signal.MOTOR_TORQUE) == pytest.approx(0.512871 / 1000 * 26)
+    current = result.candidates[Signal.MOTOR_TORQUE][1]
+    assert current.address == (0x30D1, 2)
+    assert current.scale == pytest.approx(0.001 * 0.107746 * 26)
+
+
+@pytest.mark.parametrize(
+    ("raw", "drive", "expected"),
+    [
+        (512871, "", 0.512871),  # nothing else told: no such motor has 512 N·m
+        (513, "", 0.513),
+        (512, "rated_torque_nm = 0.51", 0.51),  # the joint file says which of the two it is
+        (510, "rated_torque_nm = 0.00051", 0.00051),
+    ],
+)
+def test_the_unit_of_maxons_rated_torque_is_told_from_evidence(raw, drive, expected):
+    result = offered({**PLAIN, (0x6076, 0): raw}, MAXON, drive=f"{drive}\ngear_ratio = 50.0")
+    assert scale(result, Signal.MOTOR_TORQUE) == pytest.approx(expected / 1000 * 50, rel=2e-3)
+
+
+def test_current_with_the_constant_gives_the_torque_where_0x6076_is_missing():
+    told = {key: value for key, value in PLAIN.items() if key != (0x6076, 0)} | {(0x6075, 0): 4000}
+    result = offered(told, drive="torque_constant_nm_a = 0.1\ntorque_source = 'current'")
+    assert result.candidates[Signal.MOTOR_TORQUE][0].address == (0x6078, 0)
+    assert scale(result, Signal.MOTOR_TORQUE) == pytest.approx(0.004 * 0.1 * 50)
+    # Nanotec: 0x6077 without 0x6076; its unit is the torque of the rated current
+    result = offered(told, drive="torque_constant_nm_a = 0.1")
+    assert result.candidates[Signal.MOTOR_TORQUE][0].address == (0x6077, 0)
+    assert scale(result, Signal.MOTOR_TORQUE) == pytest.approx(4 * 0.1 / 1000 * 50)
+
+
+def test_a_stated_current_object_comes_first_in_its_own_unit():
+    result = offered(
+        PLAIN,
+        drive='current_object = "0x2100:01"\ncurrent_unit_a = 0.1\ntorque_constant_nm_a = 0.2',
+    )
+    first = result.candidates[Signal.MOTOR_TORQUE][0]
+    assert first.address == (0x2100, 1)
+    assert first.scale == pytest.approx(0.1 * 0.2 * 50)
+
+
+@pytest.mark.parametrize(
+    ("unit", "expected"),
+    [
+        (0x00B44700, math.tau / 60),  # rpm
+        (0xFDB44700, math.tau / 60e3),  # milli rpm
+        (0xFAB44700, math.tau / 60e6),  # EPOS4's finest
+        (0x00B50300, math.tau / 16384),  # increments per second
+        (0xFFB50300, math.tau / 163840),  # Copley's tenths
+        (0x00100300, 1.0),  # rad/s
+        (0x00410300, math.pi / 180),  # degrees per second
+        (0x00B40300, math.tau),  # revolutions per second
+        (0x00014700, None),  # metres per minute
+        (0x00000000, None),
+    ],
+)
+def test_velocity_units(unit, expected):
+    told = velocity_unit_rad_s(unit, 16384.0)
+    assert told == (None if expected is None else pytest.approx(expected, rel=1e-12))
+
+
+def test_velocity_is_scaled_to_the_joint_or_left_out_saying_why():
+    result = offered({**PLAIN, (0x60A9, 0): 0x00B44700}, drive="velocity = true")
+    assert scale(result, Signal.MOTOR_VELOCITY) == pytest.approx(math.tau / 60 / 50)
+    result = offered(PLAIN, drive="velocity = true")
+    assert "velocity_rad_s_per_count" in result.missing[Signal.MOTOR_VELOCITY]
+    assert scale(offered(PLAIN, ELMO, drive="velocity = true"), Signal.MOTOR_VELOCITY) == pytest.approx(
+        math.tau / 16384 / 50
+    )
+    assert scale(offered(PLAIN, COPLEY, drive="velocity = true"), Signal.MOTOR_VELOCITY) == pytest.approx(
+        math.tau / 163840 / 50
+    )
+
+
+def test_positions_in_user_units_are_understood():
+    # Nanotec's default 0x60A8: tenths of a degree, behind the gear the drive knows
+    told = {(0x60A8, 0): 0xFF410000, (0x608F, 1): 2000, (0x608F, 2): 1, (0x6091, 1): 1, (0x6091, 2): 1}
+    result = offered(told, drive="gear_ratio = 20.0")
+    assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.radians(0.1) / 20)
+    told |= {(0x6091, 1): 20}
+    assert scale(offered(told), Signal.MOTOR_POSITION) == pytest.approx(math.radians(0.1))
+
+
+def test_polarity_of_position_against_velocity_is_a_warning():
+    assert offered({**PLAIN, (0x607E, 0): 0xC0}).findings[0].severity is Severity.INFO
+    severities = [finding.severity for finding in offered({**PLAIN, (0x607E, 0): 0x80}).findings]
+    assert Severity.WARNING in severities
+
+
+def test_the_second_encoder_takes_its_resolution_from_the_drive_if_it_tells():
+    link = "[link.encoder]"
+    result = offered({**PLAIN, (0x60E6, 1): 65536, (0x60EB, 1): 1}, link=link)
+    assert scale(result, Signal.LINK_POSITION) == pytest.approx(math.tau / 65536)
+    assert "counts_per_rev" in offered(PLAIN, link=link).missing[Signal.LINK_POSITION]
+    result = offered({**PLAIN, (0x60E6, 1): 65536}, link=link + "\ncounts_per_rev = 1000")
+    assert scale(result, Signal.LINK_POSITION) == pytest.approx(math.tau / 1000)
+    assert "65536" in result.findings[-1].text
+    assert "1000" in result.findings[-1].text
+
+
+@pytest.mark.parametrize("text", ["60E4:01:32", "0x60E4:zz", "x", "0x0:1", ""])
+def test_a_wrong_object_is_one_line(text):
+    with pytest.raises(JointFileError, match=r"link\.encoder\.object"):
+        object_address(text, "link.encoder.object")
+
+
+@pytest.mark.parametrize(
+    ("told", "counts", "modulus"),
+    [
+        ({(0x6501, 0): 8192}, 8192, 0),  # revolutions unknown: the full length
+        ({(0x6501, 0): 8192, (0x6502, 0): 1}, 8192, 8192),  # single turn
+        ({(0x6501, 0): 8192, (0x6502, 0): 4096, (0x6002, 0): 1 << 25}, 8192, 1 << 25),
+        ({(0x6501, 0): 1 << 18, (0x6502, 0): 1 << 14, (0x6002, 0): 0xFFFFFFFF}, 1 << 18, 0),  # all 32 bits
+        ({(0x6501, 0): 8192, (0x6000, 0): 4, (0x6001, 0): 3600, (0x6002, 0): 36000}, 3600, 36000),  # scaled
+        ({(0x6501, 0): 8192, (0x6000, 0): 0, (0x6001, 0): 3600, (0x6502, 0): 1}, 8192, 8192),  # scaling off
+    ],
+)
+def test_absolute_encoders_tell_resolution_and_where_they_start_again(told, counts, modulus):
+    text = joint_text(link='[link.encoder]\nsource = "cia406"\nnode_id = 9')
+    (candidate,) = offer(roles(parse(text))[1], told, GENERIC).candidates[Signal.LINK_POSITION]
+    assert candidate.scale == pytest.approx(math.tau / counts)
+    assert candidate.modulus == modulus

@@ -1,0 +1,147 @@
+import can
+import pytest
+
+from drivelink import jointfile
+from drivelink.canopen.scan import FoundNode
+from drivelink.cli import main
+from drivelink.errors import DriveError
+from drivelink.newfile import Answers, answers_from_bus, joint_text
+from drivelink.simulate import network_from_joint
+
+
+def made(tmp_path, *arguments, name="elbow.toml"):
+    path = tmp_path / name
+    assert main(["new", str(path), *arguments]) == 0
+    return jointfile.load(path)
+
+
+def test_without_a_question_the_file_is_valid_and_commented(tmp_path, capsys):
+    joint = made(tmp_path)
+    assert joint.name == "elbow"
+    assert joint.motor[0].drive.node_id == 1
+    assert "next: drivelink doctor" in capsys.readouterr().out
+    assert (tmp_path / "elbow.toml").read_text().count("#") > 15
+
+
+def test_flags_are_what_the_file_says(tmp_path):
+    flags = (
+        "--arrangement antagonistic --inertia 0.02 --damping 0.3 --node 3 --node 4 --gear 50 --encoder 9"
+        " --interface socketcan --channel can1 --bitrate 500000 --passive --model linear --name wrist"
+    )
+    joint = made(tmp_path, *flags.split())
+    assert joint.name == "wrist"
+    assert [motor.drive.node_id for motor in joint.motor] == [3, 4]
+    assert joint.motor[1].inertia_kg_m2 == 0.02
+    assert joint.motor[1].drive.gear_ratio == 50
+    assert joint.motor[0].transmission.model == "linear"
+    assert (joint.link.encoder.source, joint.link.encoder.node_id) == ("cia406", 9)
+    assert (joint.bus.channel, joint.bus.bitrate) == ("can1", 500_000)
+    assert not joint.bus.configure
+    assert joint.bus.sync == "follow"
+
+
+def test_every_line_that_is_commented_out_is_valid_too(tmp_path):
+    """Whoever removes a `#` gets a joint file, not an error."""
+    text = joint_text(Answers(nodes=[3]))
+    for line in text.splitlines():
+        if line.startswith("# ") and " = " in line and "config" not in line and "eds" not in line:
+            jointfile.parse(text.replace(line, line[2:], 1) if "inertia" not in line else text)
+
+
+@pytest.mark.parametrize("case", ["constant", "quadratic", "vsa-ii"])
+def test_a_case_is_a_copy_of_the_shipped_joint(tmp_path, case):
+    joint = made(tmp_path, "--case", case, "--name", "mine", "--interface", "socketcan", "--channel", "vcan0")
+    assert joint.name == "mine"
+    assert joint.sim.case == case
+    assert (joint.bus.interface, joint.bus.channel) == ("socketcan", "vcan0")
+
+
+def test_an_existing_file_is_kept_unless_forced(tmp_path, capsys):
+    made(tmp_path)
+    assert main(["new", str(tmp_path / "elbow.toml")]) == 2
+    assert "--force" in capsys.readouterr().err
+    made(tmp_path, "--force", "--inertia", "7")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--inertia", "-1"], "inertia_kg_m2"),
+        (["--name", "a b"], "name"),
+        (["--node", "200"], "node_id"),
+        (["--encoder", "left"], "--encoder"),
+        (["--encoder", "128"], "--encoder"),
+        (["--scan", "--passive"], "--passive forbids"),
+    ],
+)
+def test_a_wrong_answer_is_one_line_and_no_file(tmp_path, arguments, expected, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert expected in error
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_questions_are_asked_where_somebody_can_answer(tmp_path, monkeypatch):
+    replies = iter(
+        ["duble", "antagonistic", "heavy", "0.5", "", "", "socketcan", "can3", "200", "7", "8", "drive"]
+    )
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    monkeypatch.setattr("builtins.input", lambda question: next(replies))
+    joint = made(tmp_path)
+    assert joint.arrangement == "antagonistic"
+    assert joint.motor[0].inertia_kg_m2 == 0.5
+    assert joint.bus.channel == "can3"
+    assert [motor.drive.node_id for motor in joint.motor] == [7, 8]
+
+
+def test_questions_left_unanswered_are_one_line(tmp_path, monkeypatch, capsys):
+    def closed(_question):
+        raise EOFError
+
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    monkeypatch.setattr("builtins.input", closed)
+    assert main(["new", str(tmp_path / "elbow.toml")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_the_next_step_is_one_that_works(tmp_path, capsys):
+    made(tmp_path, "--case", "vsa-ii")
+    assert "sim" in (said := capsys.readouterr().out) and "--interface socketcand" in said
+
+
+def test_the_bus_is_asked_who_is_there(tmp_path, request):
+    channel = request.node.name
+    described = jointfile.load(_vsa(tmp_path, channel))
+    with can.Bus(interface="virtual", channel=channel) as bus:
+        network = network_from_joint(described, bus)
+        network.start()
+        try:
+            joint = made(tmp_path, "--scan", "--interface", "virtual", "--channel", channel)
+        finally:
+            network.stop()
+    assert joint.arrangement == "antagonistic"
+    assert [motor.drive.node_id for motor in joint.motor] == [1, 2]
+    assert joint.link.encoder.node_id == 10
+    assert "CiA 402 (drive)" in (tmp_path / "elbow.toml").read_text()
+
+
+def _vsa(tmp_path, channel):
+    path = tmp_path / "sim.toml"
+    assert main(["new", str(path), "--case", "vsa-ii", "--channel", channel]) == 0
+    return path
+
+
+def test_a_bus_without_a_drive_is_one_line():
+    found = [FoundNode(node_id=4, device_type=0x00010191)]
+    with pytest.raises(
+        DriveError, match=r"no CiA 402 drive answers on socketcan can0; heard: node 4 \(CiA 401"
+    ):
+        answers_from_bus(Answers(), found)
+
+
+def test_names_of_devices_cannot_break_the_file():
+    found = [FoundNode(node_id=4, device_type=0x00020192, name='x"\n[evil]\x07\x00')]
+    joint = jointfile.parse(joint_text(answers_from_bus(Answers(), found)))
+    assert joint.motor[0].drive.node_id == 4

@@ -1,0 +1,147 @@
+"""`drivelink run` as a process: ready, published, ended; and every bad start in one line."""
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from daemonkit import vsa_text
+from zenohkit import free_endpoint, until
+
+from drivelink.pubsub.client import subscribe
+from estimator.sample import Status
+
+REPOSITORY = Path(__file__).parent.parent
+
+
+@contextmanager
+def process(*arguments: str, **environment: str) -> Iterator[subprocess.Popen[str]]:
+    running = subprocess.Popen(
+        [sys.executable, "-m", "drivelink", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=REPOSITORY,
+        env=os.environ | environment,
+    )
+    try:
+        yield running
+    finally:
+        running.kill()
+        running.communicate()
+
+
+def finished(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "drivelink", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        cwd=REPOSITORY,
+        check=False,
+    )
+
+
+def one_line(result: subprocess.CompletedProcess[str], status: int, pattern: str) -> None:
+    """It failed as a user should see it: this exit status, and one line of plain words."""
+    assert result.returncode == status, result.stderr
+    lines = [line for line in result.stderr.splitlines() if not re.match(r"[DIW] ", line)]
+    assert len(lines) == 1, result.stderr
+    assert re.search(pattern, lines[0])
+    assert "Traceback" not in result.stderr
+
+
+def free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return int(listener.getsockname()[1])
+
+
+@pytest.fixture
+def joint(tmp_path: Path) -> Path:
+    """A joint on a bus that processes share without SocketCAN: socketcand over the loopback."""
+    path = tmp_path / "elbow.toml"
+    bus = f'interface = "socketcand"\noptions = {{ host = "127.0.0.1", port = {free_port()} }}\nperiod_s = 0.005'
+    path.write_text(vsa_text(channel="can0", endpoint=free_endpoint(), bus=bus), encoding="utf-8")
+    return path
+
+
+def endpoint_of(path: Path) -> str:
+    return re.search(r'endpoint = "([^"]+)"', path.read_text(encoding="utf-8"))[1]
+
+
+def test_simulated_drives_daemon_and_subscriber_are_three_processes(joint: Path, tmp_path: Path) -> None:
+    told = str(tmp_path / "notify")
+    with (
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager,
+        process("sim", str(joint)) as drives,
+    ):
+        manager.bind(told)
+        manager.settimeout(30.0)
+        assert "ready" in drives.stdout.readline()
+        with process("run", str(joint), "--no-realtime", NOTIFY_SOCKET=told) as daemon:
+            line = daemon.stdout.readline()
+            assert line.startswith("drivelink run: elbow on socketcand can0, 200 Hz, ready"), (
+                daemon.stderr.read()
+            )
+            assert manager.recv(100).startswith(b"READY=1")
+            with subscribe("elbow", endpoint=endpoint_of(joint)) as client:
+                until(lambda: (e := client.wait(timeout_s=1.0)) and e.status & Status.VALID)
+                daemon.send_signal(signal.SIGHUP)  # reloads, and does not end it
+                last = client.wait(timeout_s=5.0)
+                assert until(lambda: client.wait(timeout_s=1.0)).sequence > last.sequence
+                daemon.send_signal(signal.SIGTERM)
+                out, err = daemon.communicate(timeout=20.0)
+            assert daemon.returncode == 0, err
+            assert re.match(r"elbow: \d+ cycles, \d+ estimates, \d+ missed", out.splitlines()[-1])
+            assert "Traceback" not in err
+        with process("run", str(joint), "--no-realtime") as again:  # the drives were left as they were
+            assert "ready" in again.stdout.readline()
+            again.kill()
+        with process("run", str(joint), "--no-realtime", "--seconds", "0.5") as after_kill:
+            out, err = after_kill.communicate(timeout=60.0)
+            assert after_kill.returncode == 0, err
+            assert "ready" in out
+
+
+def test_a_bus_without_drives_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "elbow.toml"
+    path.write_text(vsa_text(endpoint=free_endpoint()), encoding="utf-8")
+    one_line(finished("run", str(path)), 5, "node 1 does not answer")
+
+
+def test_a_missing_interface_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "elbow.toml"
+    path.write_text(vsa_text(endpoint=free_endpoint()), encoding="utf-8")
+    one_line(
+        finished("run", str(path), "--interface", "socketcan", "--channel", "nocan3"), 4, "socketcan nocan3"
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "pattern"),
+    [
+        (("run", "missing.toml"), 2, "missing.toml: cannot be read"),
+        (("run", "README.md", "--seconds", "-1"), 2, "--seconds"),
+    ],
+)
+def test_a_wrong_command_line_is_one_line(arguments: tuple[str, ...], status: int, pattern: str) -> None:
+    one_line(finished(*arguments), status, pattern)
+
+
+def test_a_wrong_key_in_the_joint_file_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "elbow.toml"
+    path.write_text(vsa_text().replace("node_id = 1", "node_idd = 1"), encoding="utf-8")
+    one_line(finished("run", str(path)), 2, r"motor\[1\]\.drive\.node_id")
+
+
+def test_an_endpoint_that_is_no_endpoint_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "elbow.toml"
+    path.write_text(vsa_text(endpoint="nonsense"), encoding="utf-8")
+    one_line(finished("run", str(path)), 6, "zenoh")

@@ -1,0 +1,153 @@
+"""`drivelink sim` as a process."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import can
+import pytest
+
+from drivelink.cli import main
+
+PATIENCE_S = 20.0  # only ever waited for when something is broken
+
+JOINT = """
+name = "wrist"
+arrangement = "antagonistic"
+[[motor]]
+inertia_kg_m2 = 0.0005
+[motor.drive]
+node_id = 1
+[[motor]]
+inertia_kg_m2 = 0.0005
+[motor.drive]
+node_id = 2
+[link.encoder]
+[bus]
+interface = "socketcand"
+channel = "vcan0"
+options = {{ host = "127.0.0.1", port = {port} }}
+[sim]
+case = "vsa-ii"
+"""
+
+
+@pytest.fixture
+def port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return int(free.getsockname()[1])
+
+
+@pytest.fixture
+def file(tmp_path: Path, port: int) -> Path:
+    path = tmp_path / "wrist.toml"
+    path.write_text(JOINT.format(port=port), encoding="utf-8")
+    return path
+
+
+@contextmanager
+def simulation(*arguments: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """The process, and the line that it prints when it is ready."""
+    command = [sys.executable, "-m", "drivelink", "sim", *map(str, arguments)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            yield process, process.stdout.readline().strip()
+        finally:
+            process.kill()
+
+
+def test_two_processes_share_the_bus_over_tcp_and_sigterm_ends_cleanly(file: Path, port: int) -> None:
+    with simulation(file) as (process, ready):
+        assert ready == ("drivelink sim: ready on socketcand vcan0: wrist (drive 1, drive 2); Ctrl-C ends it")
+        with can.Bus(interface="socketcand", channel="vcan0", host="127.0.0.1", port=port) as bus:
+            bus.send(can.Message(arbitration_id=0, data=[1, 0], is_extended_id=False))
+            seen: set[int] = set()
+            for _ in range(1000):
+                if {0x281, 0x282} <= seen:
+                    break
+                bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+                message = bus.recv(0.05)
+                seen |= {message.arbitration_id} if message else set()
+            assert {0x281, 0x282} <= seen
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(PATIENCE_S) == 0
+        assert process.stderr is not None
+        assert process.stderr.read() == ""
+
+
+def test_sigint_ends_it_too(file: Path) -> None:
+    with simulation(file) as (process, _):
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE_S) == 0
+
+
+def test_it_ends_by_itself_and_leaves_the_data_sheets(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    arguments = [str(file), "--interface", "virtual", "--seconds", "0.1", "--write-eds", str(tmp_path)]
+    assert main(["sim", *arguments]) == 0
+    assert "ready on virtual vcan0" in capsys.readouterr().out
+    assert (tmp_path / "wrist-node1.eds").is_file()
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "message"),
+    [
+        (("--quirks", "acme"), 2, "--quirks: expected one of strict, epos4"),
+        (("--effect", "magic=1"), 2, "--effect: effect: expected one of"),
+        (("--effect", "cogging"), 2, "--effect: effect: expected NAME=VALUE"),
+        (("--seconds", "-1"), 2, "--seconds: expected a number > 0"),
+        (("--interface", "socketcan", "--channel", "can77"), 4, "socketcan can77"),
+        (("--interface", "carrierpigeon"), 4, "carrierpigeon"),
+    ],
+)
+def test_what_is_asked_wrongly_is_one_line(
+    file: Path, arguments: tuple[str, ...], status: int, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["sim", str(file), *arguments]) == status
+    said = capsys.readouterr().err
+    assert message in said
+    assert len(said.strip().splitlines()) == 1
+
+
+def test_a_missing_file_and_joints_of_different_buses(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["sim", str(tmp_path / "none.toml")]) == 2
+    other = tmp_path / "other.toml"
+    other.write_text(JOINT.format(port=1).replace("vcan0", "vcan1"), encoding="utf-8")
+    assert main(["sim", str(file), str(other)]) == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 2
+    assert "expected the same bus.channel" in said[1]
+
+
+def test_a_second_simulation_joins_the_first_as_a_client(file: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.toml"
+    text = file.read_text(encoding="utf-8").replace('"wrist"', '"elbow"')
+    other.write_text(text.replace("node_id = 1", "node_id = 11").replace("node_id = 2", "node_id = 12"))
+    with simulation(file) as (_, first), simulation(other) as (process, second):
+        assert "wrist (drive 1, drive 2)" in first
+        assert "elbow (drive 11, drive 12)" in second
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(PATIENCE_S) == 0
+
+
+def test_an_address_that_cannot_be_served_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "wrist.toml"
+    path.write_text(JOINT.format(port=70000), encoding="utf-8")
+    assert main(["sim", str(path)]) == 4
+    said = capsys.readouterr().err
+    assert "port" in said
+    assert len(said.strip().splitlines()) == 1

@@ -1,0 +1,327 @@
+"""The client: values, waiting, gaps, age, sources, and the daemon's comings and goings as states."""
+
+import asyncio
+import math
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+from zenohkit import free_endpoint, make_estimate, make_joint, ready, script, until
+
+import drivelink
+from drivelink.errors import ZenohError
+from drivelink.pubsub import wire
+from drivelink.pubsub.feed import Arrivals
+from drivelink.pubsub.publisher import JointPublisher
+from drivelink.pubsub.session import close_session, open_client, open_session
+from estimator.sample import Status
+
+STALE_S = 0.3  # generous, so that a busy machine does not make things stale in between
+
+
+@pytest.fixture
+def endpoint():
+    return free_endpoint()
+
+
+@pytest.fixture
+def publisher(endpoint):
+    joint = make_joint("elbow", endpoint)
+    session = open_session(joint.zenoh, Path())
+    yield JointPublisher(session, joint)
+    close_session(session)
+
+
+@pytest.fixture
+def joint(publisher, endpoint):
+    with drivelink.subscribe("elbow", endpoint=endpoint, stale_after_s=STALE_S, depth=64) as joint:
+        connected(joint)
+        yield joint
+
+
+def connected(joint):
+    """Until the daemon is seen, and so its publishers know of the subscription."""
+    until(lambda: joint.model is not None)
+    until(lambda: joint._session.info.peers_zid())
+    time.sleep(0.05)
+
+
+def publish(publisher, *sequences, status=Status.VALID | Status.OBSERVABLE):
+    for sequence in sequences:
+        publisher.put_estimate(make_estimate(sequence, status), time.time_ns())
+        time.sleep(0.001)  # a burst faster than any bus would be dropped
+
+
+def test_the_latest_value_comes_without_waiting(publisher, joint):
+    assert joint.latest() is None
+    assert not joint.valid
+    assert joint.stale
+    assert joint.age_s == math.inf
+    publish(publisher, 1, 2)
+    until(lambda: joint.received == 2)
+    assert joint.latest() == wire.decode_estimate(
+        wire.encode_estimate(make_estimate(2), joint.latest().stamp_ns)
+    )
+    assert joint.valid
+    assert joint.observable
+    assert not joint.stale
+    assert joint.state == "live"
+
+
+def test_waiting_gives_the_next_cycle_once(publisher, joint):
+    publish(publisher, 5)
+    assert joint.wait(5.0).sequence == 5
+    assert joint.wait(0.01) is None  # the same cycle does not come twice
+    timer = threading.Timer(0.05, publish, (publisher, 6))
+    timer.start()
+    assert joint.wait(5.0).sequence == 6
+    timer.join()
+
+
+def test_waiting_gives_the_newest_of_what_piled_up(publisher, joint):
+    publish(publisher, 1, 2, 3)
+    until(lambda: joint.received == 3)
+    assert joint.wait(1.0).sequence == 3
+
+
+def test_a_timeout_of_nothing_does_not_wait(joint):
+    assert joint.wait(0.0) is None
+
+
+def test_iteration_gives_every_cycle_in_order(publisher, joint):
+    publish(publisher, *range(1, 21))
+    seen = []
+    for estimate in joint:
+        seen.append(estimate.sequence)
+        if estimate.sequence == 20:
+            break
+    assert seen == list(range(1, 21))
+
+
+def test_iteration_can_tell_that_nothing_came(publisher, joint):
+    publish(publisher, 1)
+    cycles = joint.cycles(timeout_s=0.05)
+    assert next(cycles).sequence == 1
+    assert next(cycles) is None
+
+
+def test_iteration_ends_when_the_subscription_is_closed_meanwhile(publisher, joint):
+    timer = threading.Timer(0.1, joint.close)
+    timer.start()
+    assert list(joint) == []
+    timer.join()
+    assert joint.wait() is None
+    assert joint.latest() is None
+
+
+def test_missing_sequence_numbers_are_counted_as_gaps(publisher, joint):
+    publish(publisher, 1, 2, 5, 6, 10)
+    until(lambda: joint.received == 5)
+    assert joint.gaps == 2 + 3
+    assert joint.skipped == 0
+
+
+def test_what_the_reader_left_unread_is_counted_apart_from_gaps(publisher, joint):
+    publish(publisher, 1)
+    until(lambda: joint.received == 1)
+    publish(publisher, *range(2, 201))
+    assert until(lambda: joint.latest() and joint.latest().sequence == 200)
+    assert joint.gaps == 0
+    assert joint.skipped > 0
+    assert len(joint.take()) <= 64
+
+
+def test_a_value_that_may_not_be_used_is_not_valid(publisher, joint):
+    publish(publisher, 1, status=Status.OBSERVABLE)
+    until(lambda: joint.received)
+    assert not joint.valid
+    assert joint.observable
+    publish(publisher, 2, status=Status.VALID | Status.STALE)
+    until(lambda: joint.received == 2)
+    assert joint.stale  # by its own word
+    assert not joint.valid
+
+
+def test_everything_unread_comes_as_numpy_records(publisher, joint):
+    publish(publisher, 1, 2, 3)
+    until(lambda: joint.received == 3)
+    records = joint.take()
+    assert records["sequence"].tolist() == [1, 2, 3]
+    assert np.mean(records["stiffness_nm_rad"]) == 700.0
+    assert records["transmissions"]["deflection_rad"][:, 0].tolist() == [0.001, 0.002, 0.003]
+    assert len(joint.take()) == 0
+
+
+def test_the_age_grows_until_it_is_stale(publisher, joint):
+    publish(publisher, 1)
+    until(lambda: joint.received)
+    first = joint.age_s
+    assert first < joint.age_s
+    until(lambda: joint.stale)
+    assert joint.age_s > STALE_S
+    assert joint.state == "stale"  # the daemon is there, but says nothing new
+
+
+def test_the_age_does_not_believe_the_senders_clock(publisher, joint):
+    """Stamps an hour ahead, or all the same: the age is still that on the local clock."""
+    for stamp_ns in (time.time_ns() + 3_600_000_000_000, 5, 5, 5):
+        before = time.monotonic()
+        joint.latest()  # the queue is seen empty now
+        publisher.put_estimate(make_estimate(stamp_ns % 7), stamp_ns)
+        assert joint.wait(5.0) is not None
+        assert 0.0 <= joint.age_s <= time.monotonic() - before
+
+
+def test_arrival_is_the_stamp_moved_by_the_smallest_difference_seen():
+    """Estimates made each 1 ms, 0.2 ms under way, read each 10 ms: the age is exact to the clocks' drift."""
+    offset_ns, way_ns = 123_456_789, 200_000
+    arrivals = Arrivals(0)
+    for read in range(1, 2000):
+        now_ns = read * 10_000_000
+        made_ns = now_ns - read % 11 * 100_000 - way_ns  # how long before the read the last one was made
+        arrivals.came(made_ns + offset_ns, now_ns)
+        arrivals.empty(now_ns)
+    assert arrivals.age_ns(now_ns) == pytest.approx(read % 11 * 100_000, abs=way_ns)
+
+
+@pytest.mark.parametrize("stamp_ns", [0, 10**19])
+def test_arrival_lies_between_the_queue_seen_empty_and_the_read(stamp_ns):
+    arrivals = Arrivals(0)
+    arrivals.came(1_000_000_000, 10)
+    arrivals.empty(1_000)
+    arrivals.came(stamp_ns, 2_000)
+    assert 0 <= arrivals.age_ns(2_000) <= 1_000
+
+
+def test_a_foreign_writer_is_noticed_and_not_believed(publisher, joint, endpoint):
+    publish(publisher, 1)
+    until(lambda: joint.received == 1)
+    config = zenoh.Config()
+    for key, value in (("mode", '"client"'), ("connect/endpoints", f'["{endpoint}"]')):
+        config.insert_json5(key, value)
+    with zenoh.open(config) as other:
+        intruder = other.declare_publisher("drivelink/elbow/estimate")
+        until(lambda: intruder.put(wire.encode_estimate(make_estimate(999), 0)) or joint.foreign)
+        intruder.put(b"not an estimate")
+        publish(publisher, 2)
+        until(lambda: joint.received == 2)
+        assert joint.latest().sequence == 2
+        assert joint.gaps == 0
+
+
+def test_bytes_that_are_no_estimate_do_no_harm(endpoint):
+    """Also where no daemon vouches for its source."""
+    config = zenoh.Config()
+    config.insert_json5("listen/endpoints", f'["{endpoint}"]')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    with zenoh.open(config) as session, drivelink.subscribe("elbow", endpoint=endpoint) as joint:
+        until(lambda: session.put("drivelink/elbow/estimate", b"junk") or joint.foreign)
+        until(
+            lambda: (
+                session.put("drivelink/elbow/estimate", wire.encode_estimate(make_estimate(3), 0))
+                or joint.received
+            )
+        )
+        assert joint.latest().sequence == 3
+        assert joint.valid
+
+
+def test_the_daemons_death_and_return_are_states(endpoint):
+    with drivelink.subscribe("elbow", endpoint=endpoint, stale_after_s=STALE_S) as joint:
+        assert joint.state == "waiting"
+        assert joint.wait(0.01) is None
+        for _ in range(2):
+            with script("elbow", endpoint) as daemon:
+                ready(daemon)
+                until(lambda: joint.valid)
+                assert joint.state == "live"
+                received = joint.received
+                until(lambda: joint.status)
+                daemon.kill()
+                until(lambda: joint.state == "gone")
+                assert not joint.valid
+                assert joint.latest() is not None  # the last word stays readable
+            assert joint.received >= received
+        assert joint.gaps == 0
+        assert joint.foreign == 0
+
+
+def test_a_daemon_that_hangs_is_stale_and_not_gone(publisher, joint):
+    publish(publisher, 1)
+    until(lambda: joint.state == "live")
+    until(lambda: joint.state == "stale")
+    publisher.close()
+    until(lambda: joint.state == "gone")
+
+
+def test_no_thread_and_no_session_is_left_behind(endpoint, publisher):
+    before = set(threading.enumerate())
+    with drivelink.subscribe("elbow", endpoint=endpoint) as joint:
+        joint.wait(0.01)
+        session = joint._session
+    assert set(threading.enumerate()) == before
+    assert session.is_closed()
+    joint.close()  # a second time does nothing
+
+
+def test_a_session_that_was_lent_stays_open(endpoint, publisher):
+    session = open_client(endpoint)
+    try:
+        with (
+            drivelink.subscribe("elbow", session=session) as one,
+            drivelink.subscribe("elbow", session=session) as two,
+        ):
+            connected(one)
+            publish(publisher, 1)
+            assert one.wait(5.0).sequence == two.wait(5.0).sequence == 1
+            assert one.wait(0.05) is two.wait(0.05) is None
+            assert one.foreign == two.foreign == 0  # their own wake-ups are nobody's estimates
+        assert not session.is_closed()
+    finally:
+        close_session(session)
+
+
+@pytest.mark.parametrize("name", ["", "*", "a b", "elbow?x", "el/**"])
+def test_a_name_that_cannot_be_a_joint_is_one_line(name):
+    with pytest.raises(ZenohError, match="joint: expected a name"):
+        drivelink.subscribe(name)
+
+
+def test_asyncio_waits_iterates_and_times_out(publisher, endpoint):
+    async def controller():
+        async with drivelink.subscribe_async("elbow", endpoint=endpoint, stale_after_s=STALE_S) as joint:
+            assert await joint.wait(0.01) is None
+            while joint.model is None:
+                await asyncio.sleep(0.01)
+            await asyncio.sleep(0.05)
+            asyncio.get_running_loop().call_later(0.05, publish, publisher, 1)
+            assert (await joint.wait(5.0)).sequence == 1
+            publish(publisher, 2, 3, 5)
+            seen = []
+            async for estimate in joint:
+                seen.append(estimate.sequence)
+                if estimate.sequence == 5:
+                    break
+            assert seen == [2, 3, 5]
+            assert joint.gaps == 1
+            assert joint.valid
+            async for nothing in joint.cycles(timeout_s=0.02):
+                assert nothing is None
+                break
+            asyncio.get_running_loop().call_later(0.05, joint.close)
+            assert [estimate async for estimate in joint] == []
+
+    before = set(threading.enumerate())
+    asyncio.run(controller())
+    assert set(threading.enumerate()) == before
+
+
+def test_importing_drivelink_does_not_import_zenoh():
+    import subprocess
+    import sys
+
+    code = "import drivelink, sys; sys.exit('zenoh' in sys.modules or 'subscribe' not in dir(drivelink))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

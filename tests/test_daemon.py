@@ -1,0 +1,381 @@
+"""The daemon's life: what it publishes, how it starts and ends, another model in the running loop."""
+
+import threading
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import pytest
+from daemonkit import Listener, Rig, rig, running, served, vsa, vsa_text
+from zenohkit import free_endpoint, until
+
+from drivelink.canopen.guard import check_frame
+from drivelink.cycle.acquisition import SYNC_COB_ID
+from drivelink.cycle.chain import make_chain
+from drivelink.cycle.lockstep import run_lockstep
+from drivelink.daemon import reload
+from drivelink.daemon.joining import join_bus
+from drivelink.daemon.service import Daemon, ServedJoint
+from drivelink.errors import BusError, DriveError, UsageError, ZenohError
+from drivelink.jointfile import JointFile, load, parse
+from drivelink.pubsub.client import subscribe
+from drivelink.simulate import network_from_joint, open_sim_bus
+from estimator.sample import Estimate, Status
+
+
+def daemon(joint: JointFile, **options: bool) -> Daemon:
+    return Daemon([ServedJoint(joint=joint)], real_time=False, **options)
+
+
+# Devices, daemon and test share one interpreter here: at 1 kHz a loaded machine loses so many cycles that the
+# estimator may never find its model valid, which is right, and not what these tests are about.
+SLOWLY = "period_s = 0.005"
+
+
+def fresh(estimate: Estimate | None) -> bool:
+    """Whether it was made from a measurement of its own cycle."""
+    return estimate is not None and not estimate.status & Status.STALE
+
+
+@pytest.fixture
+def no_thread_left() -> Iterator[None]:
+    """Whatever the test starts is gone when it ends."""
+    before = set(threading.enumerate())
+    yield
+    assert {thread.name for thread in set(threading.enumerate()) - before} == set()
+
+
+@pytest.mark.usefixtures("no_thread_left")
+def test_frames_become_estimates_that_a_subscriber_receives() -> None:
+    joint = vsa(endpoint=free_endpoint(), bus=SLOWLY)
+    with served(joint), running(daemon(joint)) as loop:
+        with subscribe("elbow", endpoint=joint.zenoh.endpoint) as client:
+            first = client.wait(timeout_s=20.0)
+            later = until(lambda: (e := client.wait(timeout_s=1.0)) and fresh(e) and e)
+            assert later.sequence > first.sequence
+            assert later.stamp_ns > first.stamp_ns
+            assert abs(later.stamp_ns / 1e9 - time.time()) < 60.0
+            assert len(later.transmissions) == 2
+        assert loop.is_alive()
+
+
+def test_the_status_says_what_the_contract_promises() -> None:
+    with rig() as made:
+        made.run(300)
+        status = made.status
+        assert status["state"] == "running"
+        assert {"p50_us", "p99_us", "max_us"} <= set(status["latency"])
+        assert {"rate_hz", "missed_cycles", "drive_faults", "residual_alarm", "jitter", "events"} <= set(
+            status
+        )
+        assert status["residual_alarm"]["active"] is False
+        assert status["nodes"]["1"]["drive_state"] == "switch on disabled"  # and we leave it so
+        assert 0.1 < status["bus"]["load"] < 0.9
+
+
+@pytest.mark.usefixtures("no_thread_left")
+def test_after_stop_the_loop_ends_within_a_few_cycles_and_nothing_stays() -> None:
+    joint = vsa()
+    with served(joint):
+        made = daemon(joint, publish=False)
+        loop = threading.Thread(target=made.run)
+        loop.start()
+        until(lambda: made.loop.cycles > 50)
+        made.stop()
+        loop.join(10.0)
+        assert not loop.is_alive()
+        made.close()
+        made.close()
+
+
+def test_a_given_time_is_kept() -> None:
+    joint = vsa()
+    with served(joint):
+        made = daemon(joint, publish=False)
+        made.run(0.3)
+        assert 0 < made.loop.cycles <= 300 + 20  # the end is looked for every 10 ms
+        made.close()
+
+
+def test_a_second_daemon_of_the_same_name_is_refused_and_leaves_the_drives_alone() -> None:
+    joint = vsa(endpoint=free_endpoint())
+    with served(joint), running(daemon(joint)):
+        listener = Listener(joint)
+        with pytest.raises(ZenohError, match="another daemon already serves a joint named elbow"):
+            daemon(vsa(endpoint=joint.zenoh.endpoint))
+        assert not [f for f in listener.frames() if 0x600 <= f[0] < 0x680 or f[0] == 0]
+        listener.close()
+
+
+@pytest.mark.usefixtures("no_thread_left")
+def test_a_bus_without_drives_is_one_line() -> None:
+    with pytest.raises(DriveError, match="node 1 does not answer: SDO 0x1000:00"):
+        daemon(vsa(), publish=False)
+
+
+def test_a_master_that_already_makes_sync_is_one_line() -> None:
+    joint = vsa()
+    one_line = pytest.raises(BusError, match="another master already makes SYNC")
+    with served(joint), running(daemon(joint, publish=False)), one_line:
+        daemon(joint, publish=False)
+
+
+@pytest.mark.parametrize(
+    "change", [{"interface": "socketcan", "channel": "nocan7"}, {"interface": "no-such-interface"}]
+)
+def test_a_missing_interface_is_one_line(change: dict[str, str]) -> None:
+    joint = vsa()
+    joint = joint.model_copy(update={"bus": joint.bus.model_copy(update=change)})
+    with pytest.raises(BusError) as caught:
+        daemon(joint, publish=False)
+    assert "\n" not in str(caught.value)
+
+
+def test_joints_of_one_daemon_share_the_bus() -> None:
+    one, other = vsa(name="one", channel="a"), vsa(name="other", channel="b")
+    with pytest.raises(UsageError, match=r"\[bus\] differs between one and other"):
+        Daemon([ServedJoint(joint=one), ServedJoint(joint=other)])
+    with pytest.raises(UsageError, match="two joints are named one"):
+        Daemon([ServedJoint(joint=one), ServedJoint(joint=one)])
+
+
+def test_everything_it_sends_is_allowed_by_the_guard() -> None:
+    joint = vsa()
+    listener = Listener(joint)
+    with rig(joint) as made:
+        made.run(200)
+        made.faults.reboot(made.node(1))
+        made.run(1000)
+        own = {0x000, SYNC_COB_ID}
+        sent = [f for f in listener.frames() if f[0] in own or 0x600 <= f[0] < 0x680]
+        assert len(sent) > 1200
+        for cob_id, data in sent:
+            check_frame(cob_id, data)
+    listener.close()
+
+
+PASSIVE = """
+sync = "follow"
+configure = false
+"""
+
+
+def passive(active: JointFile) -> JointFile:
+    """A second daemon's joint file for the bus of another master; the mapping is overheard."""
+    return vsa(name="guest", channel=active.bus.channel, bus=PASSIVE)
+
+
+def test_a_passive_daemon_follows_a_foreign_master_and_never_sends_a_frame() -> None:
+    joint = vsa()
+    bus = open_sim_bus(joint.bus)
+    network = network_from_joint(joint, bus)
+    network.start()
+    made: list[Daemon] = []
+    guest = threading.Thread(target=lambda: made.append(daemon(passive(joint), publish=False)))
+    guest.start()  # it must be there before the master configures, to overhear the mapping
+    time.sleep(0.3)
+    with running(daemon(joint, publish=False)):
+        guest.join(20.0)
+        follower = made[0]
+        follower._port.bus.send = lambda *_: pytest.fail("a passive daemon has sent a frame")
+        with running(follower):
+            until(lambda: follower.loop.lanes[0].estimates > 300)
+            assert follower.documents()[0]["bus"]["sync"] == "follow"
+    network.stop()
+    bus.shutdown()
+
+
+def test_a_passive_daemon_without_sync_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    joint = vsa(bus='sync = "follow"')
+    monkeypatch.setattr("drivelink.daemon.service.join_bus", partial(join_bus, patience_s=0.2))
+    with served(joint), pytest.raises(BusError, match=r"no SYNC on \S+ in 0.2 s"):
+        daemon(joint, publish=False)
+
+
+def test_when_sync_stops_the_estimates_are_stale_and_come_back_with_it() -> None:
+    joint = vsa()
+    follow = vsa(name="guest", channel=joint.bus.channel, bus='sync = "follow"')
+    with served(joint) as network:
+        listener = Listener(joint)
+        stop = threading.Event()
+        going = threading.Event()
+        going.set()
+
+        def master() -> None:
+            while not stop.wait(0.002):
+                if going.is_set():
+                    listener.send(SYNC_COB_ID)
+
+        maker = threading.Thread(target=master)
+        maker.start()
+        follower = daemon(follow, publish=False)
+        chain = follower.chains[0]
+        with running(follower):
+            until(lambda: chain.estimate and not chain.estimate.status & Status.STALE)
+            going.clear()
+            until(lambda: follower.documents()[0]["state"] == "no SYNC")
+            assert chain.estimate.status & Status.STALE
+            assert not chain.estimate.status & Status.VALID
+            going.set()
+            until(lambda: not chain.estimate.status & Status.STALE)
+        stop.set()
+        maker.join()
+        listener.close()
+        assert network.syncs > 0
+
+
+def test_a_lost_bus_is_opened_again_by_itself() -> None:
+    joint = vsa(bus=SLOWLY)
+    with served(joint):
+        made = daemon(joint, publish=False)
+        chain = made.chains[0]
+        with running(made):
+            until(lambda: fresh(chain.estimate))
+            made._port.bus.shutdown()  # as if the interface were gone
+            until(lambda: chain.estimate.status & Status.STALE)
+            assert made.documents()[0]["state"] in ("bus lost", "stale")
+            until(lambda: not chain.estimate.status & Status.STALE)
+            texts = [event["text"] for event in made.events.recent()]
+            assert sum("the bus is lost" in text for text in texts) == 1
+            assert sum("the bus is back" in text for text in texts) == 1
+
+
+def reloadable(tmp_path: Path) -> Rig:
+    path = tmp_path / "elbow.toml"
+    path.write_text(vsa_text(), encoding="utf-8")
+    return Rig(load(path), path)
+
+
+def test_a_rewritten_joint_file_changes_the_model_without_losing_a_cycle(tmp_path: Path) -> None:
+    made = reloadable(tmp_path)
+    path = tmp_path / "elbow.toml"
+    made.run(3000)  # until the model in use has shown itself valid
+    old = made.lane.chain.estimator
+    text = path.read_text(encoding="utf-8").replace("k_nm_rad = 0.5", "k_nm_rad = 0.51")
+    path.write_text(text, encoding="utf-8")
+    estimates = []
+    limit = time.monotonic() + 60.0
+    while made.lane.chain.estimator is old and time.monotonic() < limit:
+        estimates += made.run(1)
+        time.sleep(0.001)  # the slack of a cycle, in which the new estimator catches up
+    assert made.lane.chain.estimator is not old
+    estimates += made.run(50)
+    sequences = [estimate.sequence for estimate in estimates]
+    assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
+    assert not any(estimate.status & Status.STALE for estimate in estimates)
+    assert all(estimate.status & Status.VALID for estimate in estimates)
+    assert "elbow.toml: the model in it is now in use" in made.events
+    made.close()
+
+
+def test_the_new_model_comes_into_use_even_where_its_thread_gets_no_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reload, "_PATIENCE", 50)
+    monkeypatch.setattr(reload, "_PAUSE_S", 60.0)  # five steps, and never another one
+    made = reloadable(tmp_path)
+    path = tmp_path / "elbow.toml"
+    made.run(1000)
+    old = made.lane.chain.estimator
+    path.write_text(path.read_text(encoding="utf-8").replace("= 0.5,", "= 0.51,"), encoding="utf-8")
+    (reloader,) = made.daemon._reloaders
+    reloader.check()
+    until(lambda: reloader._ready is not None)
+    behind = len(made.lane.chain.history)
+    estimates = made.run(2 * 50 + behind)  # while it waits 50 more samples come; then two steps for each
+    assert made.lane.chain.estimator is not old
+    assert not any(estimate.status & Status.STALE for estimate in estimates)
+    assert "elbow.toml: the model in it is now in use" in made.events
+    made.close()
+
+
+def test_a_joint_file_with_an_error_leaves_the_model_as_it_is(tmp_path: Path) -> None:
+    made = reloadable(tmp_path)
+    made.run(100)
+    old = made.lane.chain.estimator
+    (tmp_path / "elbow.toml").write_text("name = 3", encoding="utf-8")
+    made.daemon.reload()
+
+    def said() -> bool:
+        made.run(20)
+        return any("the model stays as it is" in text for text in made.events)
+
+    until(said)
+    assert made.lane.chain.estimator is old
+    made.close()
+
+
+def test_the_raw_frames_of_a_run_give_its_estimates_back_bit_for_bit() -> None:
+    joint = vsa()
+    with rig(joint) as made:
+        listener = Listener(joint)
+        layouts = tuple(made.daemon.layouts.values())
+        for at in (300, 500, 501, 502, 900):
+            made.faults.at(at, lambda: made.faults.mute(made.node(2), made.tpdo(2)[0]))
+        made.faults.at(1200, lambda: made.faults.reboot(made.node(1)))
+        made.run(3000)
+        chain = make_chain(joint, layouts)
+        again = [e for frame in listener.frames() if (e := chain.feed(*frame)) is not None]
+        assert len(again) == len(made.collector.estimates)
+        assert repr(again) == repr([estimate for estimate, _ in made.collector.estimates])
+        listener.close()
+
+
+def test_lockstep_is_the_same_cycle_without_the_daemon_around_it() -> None:
+    joint = vsa()
+    bus = open_sim_bus(joint.bus)
+    network = network_from_joint(joint, bus)
+    truth = []
+    lane = run_lockstep(joint, network, None, 400, each=lambda: truth.append(network.syncs))
+    assert (lane.estimates, lane.chain.missed) == (400, 0)
+    assert truth == list(range(1, 401))
+    bus.shutdown()
+
+
+SINGLE = """
+name = "wrist"
+[[motor]]
+inertia_kg_m2 = 0.05
+viscous_damping_nm_s_rad = 0.001
+[motor.transmission]
+model = "linear"
+[motor.drive]
+node_id = 11
+gear_ratio = 20.0
+torque_constant_nm_a = 0.005
+[link.encoder]
+source = "drive"
+[bus]
+channel = "{channel}"
+period_s = 0.002
+[sim]
+case = "constant"
+"""
+
+
+def test_two_joints_share_a_bus_and_its_sync() -> None:
+    elbow = vsa(bus="period_s = 0.002")
+    wrist = parse(SINGLE.format(channel=elbow.bus.channel))
+    wrist = wrist.model_copy(update={"bus": elbow.bus, "zenoh": elbow.zenoh})
+    bus = open_sim_bus(elbow.bus)
+    networks = [network_from_joint(joint, bus) for joint in (elbow,)]
+    other = open_sim_bus(elbow.bus)
+    networks.append(network_from_joint(wrist, other))
+
+    def devices() -> None:
+        for network in networks:
+            network.poll()
+
+    served_joints = [ServedJoint(joint=elbow), ServedJoint(joint=wrist)]
+    with Daemon(served_joints, publish=False, real_time=False, devices=devices) as made:
+        made.run_lockstep(600)
+        first, second = made.documents()
+        assert (first["joint"], second["joint"]) == ("elbow", "wrist")
+        assert first["estimates"] == second["estimates"] == 600
+        assert set(second["nodes"]) == {"11"}
+        assert {chain.estimate.sequence for chain in made.chains} == {599}
+        assert [len(chain.estimate.transmissions) for chain in made.chains] == [2, 1]
+        assert first["bus"]["load"] == second["bus"]["load"] > 0.3
+    bus.shutdown()
+    other.shutdown()

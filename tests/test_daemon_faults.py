@@ -1,0 +1,248 @@
+"""What a bus does to a daemon: after each fault the right flags, one event, and the way back by itself."""
+
+from itertools import pairwise
+
+import pytest
+from daemonkit import Listener, Rig, rig, vsa
+
+from estimator.sample import Estimate, Status
+
+ENOUGH = 3000  # cycles; every way back takes less
+
+
+def valid(estimates: list[Estimate]) -> list[bool]:
+    return [bool(estimate.status & Status.VALID) for estimate in estimates]
+
+
+def settle(made: Rig) -> None:
+    """Past the estimator's start."""
+    assert valid(made.run(2000))[-1]
+    assert made.status["state"] == "running"
+
+
+def test_every_cycle_has_an_estimate_in_order_and_nothing_is_missed() -> None:
+    with rig() as made:
+        estimates = made.run(500)
+        assert [estimate.sequence for estimate in estimates] == list(range(500))
+        stamps = [stamp for _, stamp in made.collector.estimates]
+        assert {b - a for a, b in pairwise(stamps)} == {1_000_000}
+        status = made.status
+        assert (status["estimates"], status["missed_cycles"]) == (500, 0)
+        assert set(status["nodes"]) == {"1", "2", "3"}
+        assert made.events == []
+
+
+def test_a_lost_pdo_is_one_stale_estimate_and_one_event() -> None:
+    with rig() as made:
+        settle(made)
+        made.faults.mute(made.node(2), made.tpdo(2)[0])
+        estimates = made.run(300)
+        assert [e.sequence for e in estimates] == list(range(2000, 2300))  # still one for every cycle
+        stale = [e for e in estimates if e.status & Status.STALE]
+        assert [e.sequence for e in stale] == [2000]
+        assert not stale[0].status & Status.VALID
+        assert stale[0].status & Status.BUS_FAULT
+        assert estimates[1].status & Status.GAP
+        assert not estimates[-1].status & Status.BUS_FAULT
+        assert made.status["nodes"]["2"]["missing"] == 1
+        assert made.events.count("node 2: frames are missing") == 1
+
+
+@pytest.mark.parametrize("cycles", [1, 3])
+def test_late_pdos_are_counted_late_and_never_used_unflagged(cycles: int) -> None:
+    with rig() as made:
+        settle(made)
+        made.faults.delay(made.node(3), made.tpdo(3)[0], cycles)
+        estimates = made.run(20)
+        assert made.status["nodes"]["3"]["late"] == 1
+        flagged = [e.sequence - 2000 for e in estimates if e.status & Status.BUS_FAULT]
+        assert flagged == list(range(cycles + 1))
+
+
+def test_wrong_length_and_repeated_frames_are_counted_by_node() -> None:
+    with rig() as made:
+        settle(made)
+        made.faults.resize(made.node(1), made.tpdo(1)[0], 6, cycles=3)
+        made.faults.repeat(made.node(2), made.tpdo(2)[0], cycles=4)
+        estimates = made.run(50)
+        nodes = made.status["nodes"]
+        assert nodes["1"]["wrong_length"] == 3
+        assert nodes["2"]["duplicate"] == 4
+        assert sum(bool(e.status & Status.STALE) for e in estimates) == 3
+
+
+def test_a_dead_drive_makes_stale_estimates_and_comes_back_without_a_restart() -> None:
+    with rig() as made:
+        settle(made)
+        made.faults.kill(made.node(2))
+        estimates = made.run(1500)
+        assert not any(valid(estimates))
+        assert all(e.status & Status.STALE for e in estimates)
+        assert made.status["state"] == "stale"
+        assert made.events.count("node 2: heartbeat lost") == 1
+        made.faults.revive(made.node(2))
+        estimates = made.run(ENOUGH)
+        assert valid(estimates)[-1]
+        assert not estimates[-1].status & Status.STALE
+        assert made.status["state"] == "running"
+        assert made.status["conditions"] == []
+        assert "node 2 has rebooted" in made.events
+        assert "node 2 is configured again and started" in made.events
+        assert len(made.events) == len(set(made.events))  # each said once
+
+
+def test_a_drive_that_reboots_is_not_believed_until_it_is_configured_again() -> None:
+    with rig() as made:
+        settle(made)
+        made.faults.reboot(made.node(1))
+        estimates = made.run(ENOUGH)
+        assert not any(valid(estimates[:3]))
+        assert any(e.status & Status.RESTARTED for e in estimates)
+        assert valid(estimates)[-1]
+        assert made.status["nodes"]["1"]["reboots"] == 1
+        assert [e.sequence for e in estimates] == list(range(2000, 2000 + ENOUGH))
+
+
+def test_a_reset_of_all_nodes_by_somebody_else_is_survived() -> None:
+    with rig() as made:
+        settle(made)
+        for node in list(made.network.nodes):
+            made.faults.reboot(node)
+        assert valid(made.run(ENOUGH))[-1]
+
+
+def test_an_emcy_is_a_drive_fault_in_words_and_said_once() -> None:
+    with rig() as made:
+        settle(made)
+        made.faults.emergency(made.node(1), 0x2310, 0x02)
+        estimates = made.run(200)
+        assert all(e.status & Status.DRIVE_FAULT for e in estimates)
+        assert made.status["drive_faults"] == ["node 1: EMCY 0x2310 (continuous overcurrent)"]
+        assert made.status["nodes"]["1"]["drive_state"] == "fault"
+        said = [text for text in made.events if "0x2310" in text]
+        assert len(said) == 1
+
+
+def test_a_drive_that_refuses_or_ignores_the_configuration_is_tried_again() -> None:
+    with rig() as made:
+        settle(made)
+        made.faults.reboot(made.node(2))
+        made.faults.ignore_sdo(made.node(2), 1_000_000)
+        assert not any(valid(made.run(ENOUGH)))
+        made.faults.ignore_sdo(made.node(2), 0)
+        assert valid(made.run(2 * ENOUGH))[-1]
+        assert any("node 2 cannot be configured" in text for text in made.events)
+
+
+def test_another_master_that_makes_sync_is_noticed_once_and_its_cycles_are_not_used() -> None:
+    with rig() as made:
+        settle(made)
+        for sync in range(10):
+            made.faults.at(made.network.syncs + 5 + 3 * sync, lambda: made.network.send(0x80, b""))
+        estimates = made.run(200)
+        assert made.status["bus"]["foreign_syncs"] == 10
+        assert sum("another master makes SYNC" in text for text in made.events) == 1
+        assert valid(estimates)[-1]
+
+
+def test_a_babbling_node_holds_nothing_up() -> None:
+    with rig() as made:
+        settle(made)
+        made.faults.babble(0x555, bytes(8), per_cycle=50)
+        estimates = made.run(100)
+        assert all(valid(estimates))
+
+
+def test_a_node_that_babbles_with_the_identifier_of_a_drive_discredits_it() -> None:
+    with rig() as made:
+        settle(made)
+        made.faults.babble(made.tpdo(2)[1], bytes(8), per_cycle=1)
+        estimates = made.run(100)
+        assert [e.sequence for e in estimates] == list(range(2000, 2099))  # the last is not over
+        assert not any(valid(estimates)[1:])
+
+
+def test_a_device_that_drops_sync_is_a_gap() -> None:
+    with rig() as made:
+        settle(made)
+        made.faults.drop_sync(5)
+        estimates = made.run(300)
+        assert sum(bool(e.status & Status.STALE) for e in estimates) == 5
+        assert valid(estimates)[-1]
+
+
+def test_a_counter_on_sync_is_made_where_it_is_asked_for() -> None:
+    with rig(vsa(bus="sync_counter_overflow = 10")) as made:
+        seen: list[bytes] = []
+        inner = made.network.sync_filter
+        made.network.sync_filter = lambda data: (seen.append(data), inner(data))[1]
+        assert len(made.run(25)) == 25
+        assert [data[0] for data in seen] == [k % 10 + 1 for k in range(25)]
+
+
+def test_a_drive_that_takes_the_start_and_does_not_run_is_said_once() -> None:
+    with rig() as made:
+        settle(made)
+        node = made.node(2)
+        take = node.nmt
+        node.nmt = lambda command: None if command == 0x01 else take(command)
+        made.faults.reboot(node)
+        assert not any(valid(made.run(4000))[2:])
+        said = [text for text in made.events if "was started, but sends none of its frames" in text]
+        assert said == [
+            "node 2 is configured and was started, but sends none of its frames; it says pre-operational"
+        ]
+        node.nmt = take
+        made.run(ENOUGH)
+        assert made.status["state"] == "running"
+        assert made.status["conditions"] == []
+
+
+def test_a_second_reboot_in_the_middle_of_the_configuration_begins_it_anew() -> None:
+    with rig() as made:
+        settle(made)
+        made.faults.reboot(made.node(2))
+        for _ in range(3):
+            made.run(8)
+            assert made.daemon.chains[0].assembler.untrusted == (2,)
+            made.faults.reboot(made.node(2))
+        assert valid(made.run(ENOUGH))[-1]
+        assert made.status["nodes"]["2"]["reboots"] == 4
+
+
+def bunches(made: Rig, listener: Listener, count: int) -> list[str]:
+    """One frame of node 2 is missing, and two more than one come afterwards; what is said of that."""
+    number, cob_id = made.tpdo(2)
+    for k in range(count):
+        made.faults.mute(made.node(2), number)
+        made.run(2)
+        listener.send(cob_id, bytes([k % 100] * 8))
+        listener.send(cob_id, bytes([k % 100 + 101] * 8))
+        made.run(8)
+    assert made.status["nodes"]["2"]["conflicting"] >= count / 2
+    return [event for event in made.events if "used" in event]
+
+
+def test_frames_that_come_in_bunches_are_no_second_device() -> None:
+    with rig() as made:
+        settle(made)
+        listener = Listener(made.joint)
+        assert bunches(made, listener, 10) == []
+        made.run(1500)
+        assert not [event for event in made.events if "used" in event]
+        (said,) = bunches(made, listener, 150)  # 1.5 s of it
+        assert said.startswith("node 2: some frames are missing, others come several in one cycle")
+        made.run(1500)
+        assert not made.status["conditions"]
+        listener.close()
+
+
+def test_nodes_that_somebody_stopped_are_woken_before_they_are_asked() -> None:
+    with rig() as made:
+        settle(made)
+        listener = Listener(made.joint)
+        listener.send(0x000, b"\x02\x00")
+        back = next(k for k, e in enumerate(made.run(3000)[100:]) if not e.status & Status.STALE)
+        listener.close()
+    # Silence of half a second, and no SDO timeout (0.2 s each time) for any of the three.
+    assert back < 800

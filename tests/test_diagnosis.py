@@ -1,0 +1,195 @@
+"""Injected effects are named, located and measured; clean recordings raise no alarm; faults are one line."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import diagnosiskit as kit
+import numpy as np
+import pytest
+
+from estimator.diagnosis import calibrate, diagnose
+from estimator.errors import EstimatorError
+from estimator.model import Effect
+from estimator.sample import Record
+
+# What is put into each joint, and what must come out: name, location, main parameter, its tolerance.
+# Tolerances: 3 % for what enters linearly, more where the law differs from the library's (friction's shape).
+CASES: dict[str, tuple[dict[str, float], str, str, str, float, float]] = {
+    "coulomb": ({"coulomb_nm": 0.4}, "coulomb_friction", "motor", "torque_nm", 0.4, 0.02),
+    "cogging": ({"cogging_nm": 0.5}, "cogging", "motor", "periods_per_rev", 17.0, 0.05),
+    "offset": ({"offset_nm": -0.3}, "torque_offset", "motor", "torque_nm", -0.3, 0.01),
+    "constant": ({"constant": 0.06}, "torque_constant", "motor", "relative_error", 0.06, 0.003),
+    "inertia": ({"inertia_kg_m2": 0.02}, "motor_inertia", "motor", "inertia_kg_m2", 0.02, 0.001),
+    "hysteresis": (
+        {"hysteresis_nm": 0.6, "hysteresis_rad": 0.01}, "hysteresis", "transmission", "torque_nm", 0.6, 0.03,
+    ),
+    "zero": ({"zero_rad": 0.006}, "deflection_offset", "measurement", "offset_rad", 0.006, 2e-4),
+    "late": ({"late_s": 0.004}, "encoder_delay", "measurement", "delay_s", 0.004, 1e-4),
+    "gravity": ({"gravity_nm": 0.8}, "gravity", "link", "sin_nm", 0.8, 0.03),
+    "link": ({"link_nm": 0.3}, "link_coulomb_friction", "link", "torque_nm", 0.3, 0.02),
+}  # fmt: skip
+OTHERS: dict[str, dict[str, float]] = {
+    "clean": {}, "clean2": {}, "skew": {"late_s": 0.0007}, "bump": {"bump_nm": 1.0},
+    "two": {"coulomb_nm": 0.4, "gravity_nm": 0.8},
+    "push": {"push_nm": 2.0}, "fading": {"fading_nm": 0.8}, "ripple": {"ripple": 0.2},
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def records() -> dict[str, Record]:
+    effects = {name: case[0] for name, case in CASES.items()} | OTHERS
+    return dict(zip(effects, kit.World(list(effects.values())).run(), strict=True))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_an_injected_effect_is_named_located_and_measured(case: str, records: dict[str, Record]) -> None:
+    _, name, location, parameter, value, tolerance = CASES[case]
+    found = diagnose(records[case], kit.model())
+    assert found.verdict == "effect"
+    first = found.effects[0]
+    assert (first.name, first.location) == (name, location)
+    assert first.parameters[parameter] == pytest.approx(value, abs=tolerance)
+    assert found.validation.after_rms_nm <= found.validation.before_rms_nm
+
+
+@pytest.mark.parametrize("case", ["clean", "clean2", "skew"])
+def test_clean_and_everyday_recordings_are_sufficient(case: str, records: dict[str, Record]) -> None:
+    found = diagnose(records[case], kit.model())
+    assert found.verdict == "sufficient"
+    assert found.effects == ()
+    # What is left is the encoders' and the torque's noise: well below a percent.
+    assert found.validation.after_relative < 0.01
+
+
+def test_skew_within_a_sample_is_aligned_and_reported(records: dict[str, Record]) -> None:
+    found = diagnose(records["skew"], kit.model())
+    assert found.alignment["link_position_delay_s"] == pytest.approx(0.0007, abs=5e-5)
+
+
+def test_two_effects_are_both_named(records: dict[str, Record]) -> None:
+    names = {effect.name for effect in diagnose(records["two"], kit.model()).effects}
+    assert {"coulomb_friction", "gravity"} <= names
+
+
+def test_what_is_in_no_library_is_located_and_described_by_a_curve(records: dict[str, Record]) -> None:
+    found = diagnose(records["bump"], kit.model())
+    assert found.verdict == "unexplained"
+    assert (found.effects[0].name, found.effects[0].location) == ("unlisted", "motor")
+    assert found.effects[0].coordinates == ("position",)
+    assert found.validation.after_rms_nm < 0.5 * found.validation.before_rms_nm
+    curve = found.curves[0]
+    assert curve.fitted_nm.max() == pytest.approx(1.0, abs=0.3)  # the filter rounds a narrow bump
+
+
+@pytest.mark.parametrize(
+    ("case", "location", "coordinates"),
+    [
+        ("push", "link", ("time",)),
+        ("fading", "motor", ("velocity", "time")),
+        ("ripple", "motor", ("position", "torque")),
+    ],
+)
+def test_what_no_function_of_one_coordinate_explains_is_never_sufficient(
+    case: str, location: str, coordinates: tuple[str, ...], records: dict[str, Record]
+) -> None:
+    found = diagnose(records[case], kit.model())
+    assert found.verdict == "unexplained"
+    assert (found.effects[0].location, found.effects[0].coordinates) == (location, coordinates)
+    assert found.validation.after_rms_nm < 0.5 * found.validation.before_rms_nm
+
+
+def test_without_link_dynamics_friction_is_still_found(records: dict[str, Record]) -> None:
+    found = diagnose(records["coulomb"], kit.model(linked=False))
+    # Offset and asymmetry are one thing without the link's side: a half quantum of the encoders is enough.
+    assert {found.effects[0].name, *found.effects[0].alternatives} >= {"coulomb_friction"}
+    assert {effect.location for effect in found.effects} == {"motor"}
+
+
+def test_an_offset_of_the_motor_side_alone_names_its_twin(records: dict[str, Record]) -> None:
+    found = diagnose(records["offset"], kit.model(linked=False))
+    assert {found.effects[0].name, *found.effects[0].alternatives} >= {"torque_offset", "deflection_offset"}
+
+
+def test_a_model_that_knows_the_effect_is_sufficient(records: dict[str, Record]) -> None:
+    known = kit.model()
+    first = diagnose(records["late"], known).effects[0]
+    known = replace(known, link_effects=(Effect(name=first.name, parameters=first.parameters),))
+    assert diagnose(records["late"], known).verdict == "sufficient"
+
+
+def test_declared_numbers_off_by_a_percent_alarm_until_calibrated_on_a_healthy_run(
+    records: dict[str, Record],
+) -> None:
+    off = kit.model(error=0.01)
+    assert diagnose(records["clean"], off).verdict != "sufficient"
+    calibrated = calibrate(records["clean"], off)
+    assert diagnose(records["clean2"], calibrated).verdict == "sufficient"
+    assert [e.name for e in diagnose(records["coulomb"], calibrated).effects] == ["coulomb_friction"]
+    # The torque is the anchor and exact but for its noise, so the number itself comes back.
+    assert calibrated.motors[0].inertia_kg_m2 == pytest.approx(kit.INERTIA, rel=5e-3)
+
+
+def test_a_slow_sine_does_not_tell() -> None:
+    (record,) = kit.World([{"constant": 0.05}], slow=True).run()
+    found = diagnose(record, kit.model(linked=False))
+    assert found.verdict == "insufficient_excitation"
+
+
+def test_a_validation_recording_takes_no_part(records: dict[str, Record]) -> None:
+    (other,) = kit.World([{"coulomb_nm": 0.4}], seed=9).run()
+    found = diagnose(records["coulomb"], kit.model(), validation=other)
+    assert found.validation.after_relative < 0.1 * found.validation.before_relative
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda r: replace(r, motor_torque_nm=-r.motor_torque_nm), "motor torque has the wrong sign"),
+        (lambda r: replace(r, motor_torque_nm=1e3 * r.motor_torque_nm), "looks like N·mm"),
+        (
+            lambda r: replace(
+                r,
+                motor_position_rad=np.degrees(r.motor_position_rad),
+                link_position_rad=np.degrees(r.link_position_rad),
+            ),
+            "positions look like degrees",
+        ),
+        (lambda r: replace(r, link_position_rad=-r.link_position_rad), "link position has the wrong sign"),
+        (lambda r: replace(r, motor_position_rad=30.0 * r.motor_position_rad), "wrong gear ratio"),
+        (lambda r: replace(r, motor_torque_nm=0.0 * r.motor_torque_nm), "motor1_torque_nm is constant"),
+        (lambda r: replace(r, motor_torque_nm=np.nan * r.motor_torque_nm), "not finite"),
+        (lambda r: replace(r, link_position_rad=None), "no link_position_rad"),
+    ],
+)
+def test_a_fault_of_installation_is_one_line(change, message: str, records: dict[str, Record]) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(EstimatorError, match=message):
+        diagnose(change(records["clean"]), kit.model())
+
+
+def test_a_short_recording_is_refused(records: dict[str, Record]) -> None:
+    clean = records["clean"]
+    short = Record(
+        period_s=clean.period_s,
+        sequence=clean.sequence[:500],
+        motor_position_rad=clean.motor_position_rad[:500],
+        motor_torque_nm=clean.motor_torque_nm[:500],
+        link_position_rad=clean.link_position_rad[:500] if clean.link_position_rad is not None else None,
+    )
+    with pytest.raises(EstimatorError, match="too short"):
+        diagnose(short, kit.model())
+
+
+def test_gaps_are_left_out(records: dict[str, Record]) -> None:
+    whole = records["coulomb"]
+    keep = np.ones(len(whole), dtype=bool)
+    keep[3000:3040] = keep[9000:9300] = False
+    assert whole.link_position_rad is not None
+    holed = Record(
+        period_s=whole.period_s,
+        sequence=whole.sequence[keep],
+        motor_position_rad=whole.motor_position_rad[keep],
+        motor_torque_nm=whole.motor_torque_nm[keep],
+        link_position_rad=whole.link_position_rad[keep],
+    )
+    assert [e.name for e in diagnose(holed, kit.model()).effects] == ["coulomb_friction"]

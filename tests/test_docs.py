@@ -1,0 +1,92 @@
+"""The documentation says what the code does: generated pages are current, links and examples lead somewhere."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import re
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from drivelink import cli, jointfile
+
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+PAGES = sorted(DOCS.glob("*.md"))
+
+
+def generator(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def subparsers() -> dict[str, argparse.ArgumentParser]:
+    (action,) = (a for a in cli.make_parser(list(cli.VERBS))._actions if a.dest == "verb")
+    return dict(action.choices)  # type: ignore[arg-type]
+
+
+def test_the_joint_file_reference_is_current() -> None:
+    page = (DOCS / "joint-file.md").read_text(encoding="utf-8")
+    assert page == generator("generate_reference").joint_file_page(), "run python docs/generate_reference.py"
+
+
+def test_every_verb_and_option_is_in_the_command_reference() -> None:
+    """Not word for word: how help is wrapped differs between versions of Python."""
+    page = (DOCS / "commands.md").read_text(encoding="utf-8")
+    for verb, parser in subparsers().items():
+        section = page.partition(f"## `drivelink {verb}`")[2].partition("\n## ")[0]
+        assert section, verb
+        for action in parser._actions:
+            for option in action.option_strings or [str(action.metavar or action.dest)]:
+                assert option in section, f"{verb} {option}: run python docs/generate_reference.py"
+
+
+def test_every_verb_explains_each_of_its_arguments() -> None:
+    silent = [
+        f"{verb} {action.dest}"
+        for verb, p in subparsers().items()
+        for action in p._actions
+        if not action.help
+    ]
+    assert not silent
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_that_a_page_names_exist(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    named = re.findall(r"`((?:examples|benchmarks|docs|tests|sim|estimator|drivelink)/[\w./*-]+)`", text)
+    missing = [name for name in named if "*" not in name and not (ROOT / name).exists()]
+    assert not missing
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_that_a_page_shows_can_be_parsed(page: Path) -> None:
+    parser = cli.make_parser(list(cli.VERBS))
+    for line in re.findall(
+        r"^ {0,4}\$? ?drivelink ([a-z].*)$", page.read_text(encoding="utf-8"), re.MULTILINE
+    ):
+        command = re.split(r"\s{2,}|\s[#|&]|`", line)[0].split()
+        if command[0] not in cli.VERBS or page.name == "commands.md" or set(line) & set("…["):
+            continue
+        assert parser.parse_args(command).verb == command[0]
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.toml")), ids=lambda path: path.name)
+def test_example_joint_files_are_valid(path: Path) -> None:
+    assert jointfile.load(path).model().motors
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "drivelink" / "joints").glob("*.toml")), ids=lambda p: p.name)
+def test_the_cases_among_the_examples_are_those_of_the_package(path: Path) -> None:
+    assert (ROOT / "examples" / path.name).read_text(encoding="utf-8") == path.read_text(encoding="utf-8")
+
+
+def test_every_example_is_listed() -> None:
+    listed = (ROOT / "examples" / "README.md").read_text(encoding="utf-8")
+    for path in (ROOT / "examples").iterdir():
+        assert path.name == "README.md" or path.name in listed, path.name

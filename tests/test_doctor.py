@@ -1,0 +1,473 @@
+import itertools
+import json
+import math
+import socket
+from pathlib import Path
+
+import can
+import pytest
+from canopenkit import Slave, Wire, drive_objects, joint_text
+from rich.console import Console
+
+from drivelink.canopen.blocking import run_program
+from drivelink.canopen.guard import check_frame
+from drivelink.canopen.layout import Signal
+from drivelink.canopen.node import survey_node
+from drivelink.canopen.roles import roles
+from drivelink.canopen.scan import listen, scan
+from drivelink.cli import main
+from drivelink.doctor import Report, Section, examine, examine_eds
+from drivelink.doctor.interface import examine_interface, judge_link
+from drivelink.doctor.machine import examine_machine, percentile
+from drivelink.doctor.motion import MotionSample, judge_motion, sample_motion, slope
+from drivelink.doctor.syncs import Daemons, judge_sync
+from drivelink.finding import Finding, Severity
+from drivelink.jointfile import BusSection, parse
+from drivelink.simulate import network_from_joint
+
+REPOSITORY = Path(__file__).parents[1]
+OURS = sorted((REPOSITORY / "sim/eds").glob("*.eds"))
+
+
+def free_port():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+def joint_on(channel, extra="", encoder=""):
+    return f"""
+name = "elbow"
+[[motor]]
+inertia_kg_m2 = 0.1
+[motor.transmission]
+model = "linear"
+parameters = {{ k_nm_rad = 100.0 }}
+[motor.drive]
+node_id = 5
+counts_per_rev = 8192
+gear_ratio = 20.0
+torque_constant_nm_a = 0.05
+{extra}
+[link.encoder]
+source = "cia406"
+node_id = 9
+{encoder}
+[link.dynamics]
+inertia_kg_m2 = 0.2
+[bus]
+channel = "{channel}"
+sdo_timeout_s = 0.3
+[zenoh]
+endpoint = "tcp/127.0.0.1:{free_port()}"
+"""
+
+
+@pytest.fixture
+def rig(request):
+    """A simulated drive and encoder, served by a thread on a virtual bus."""
+    channel = request.node.name
+    with can.Bus(interface="virtual", channel=channel) as bus:
+        network = network_from_joint(parse(joint_on(channel)), bus)
+        network.start()
+        yield channel
+        network.stop()
+
+
+def texts(report, severity=None):
+    return [
+        f"{finding.subject}: {finding.text}"
+        for section in report.sections
+        for finding in section.findings
+        if severity is None or finding.severity is severity
+    ]
+
+
+def test_a_healthy_bus_is_found_healthy_and_nothing_is_written(rig):
+    sent = []
+    with can.Bus(interface="virtual", channel=rig) as spy:
+        report = examine(parse(joint_on(rig)), Path(), 0.5)
+        while (message := spy.recv(0.0)) is not None:
+            sent.append((message.arbitration_id, bytes(message.data)))
+    said = "\n".join(texts(report))
+    assert report.worst < Severity.ERROR, said
+    assert "CiA 402 (drive)" in said
+    assert "CiA 406 (encoder)" in said
+    assert "the cycle needs" in said
+    questions = [(cob_id, data) for cob_id, data in sent if cob_id == 0 or 0x601 <= cob_id <= 0x67F]
+    assert len(questions) > 127
+    for cob_id, data in questions:  # uploads and their segments only
+        check_frame(cob_id, data)
+        assert cob_id != 0
+        assert data[0] >> 5 in (2, 3, 4)
+
+
+def test_units_that_disagree_are_named_with_both_numbers(rig):
+    text = joint_on(rig).replace("counts_per_rev = 8192", "counts_per_rev = 4096")
+    report = examine(parse(text), Path(), 0.3)
+    (said,) = [line for line in texts(report, Severity.WARNING) if "counts per motor revolution" in line]
+    assert "8192" in said
+    assert "4096" in said
+
+
+def test_a_node_that_is_not_there_is_an_error_that_names_who_is(rig):
+    report = examine(parse(joint_on(rig).replace("node_id = 5", "node_id = 6")), Path(), 0.2)
+    (said,) = [line for line in texts(report, Severity.ERROR) if "node 6" in line]
+    assert "there are node 5" in said
+
+
+def test_an_empty_bus_is_an_error():
+    report = examine(parse(joint_on("empty bus")), Path(), 0.1)
+    assert any("nobody answers" in line for line in texts(report, Severity.ERROR))
+
+
+def test_a_wrong_bus_is_one_finding():
+    text = joint_on("x").replace("[bus]", '[bus]\ninterface = "socketcan"').replace('"x"', '"vcan77"')
+    report = examine(parse(text), Path(), 0.1)
+    assert any("vcan77" in line for line in texts(report, Severity.ERROR))
+
+
+def test_passive_sends_nothing_at_all(rig):
+    text = joint_on(rig).replace("[bus]", '[bus]\nconfigure = false\nsync = "follow"')
+    with can.Bus(interface="virtual", channel=rig) as spy:
+        report = examine(parse(text), Path(), 0.3)
+        heard = []
+        while (message := spy.recv(0.0)) is not None:
+            heard.append(message.arbitration_id)
+    assert not [cob_id for cob_id in heard if cob_id in (0, 0x80) or 0x601 <= cob_id <= 0x67F]
+    said = texts(report, Severity.ERROR)
+    assert any("nobody makes SYNC" in line for line in said)
+    assert any("mapping is not known" in line for line in said)
+
+
+def test_an_eds_that_does_not_match_the_node_is_a_warning(rig, tmp_path):
+    source = next(path for path in OURS if "elmo" in path.name)
+    (tmp_path / "elmo.eds").write_bytes(source.read_bytes())
+    text = joint_on(rig, extra='eds = "elmo.eds"')
+    report = examine(parse(text), tmp_path, 0.2)
+    assert any("elmo.eds is of vendor" in line for line in texts(report, Severity.WARNING))
+
+
+@pytest.mark.parametrize("path", OURS, ids=lambda path: path.name)
+def test_from_a_sheet_alone_the_mapping_is_told(path):
+    report = examine_eds(path)
+    facts = report.sections[0].facts
+    if "encoder" in path.name:
+        assert facts["mapping"][0]["objects"] == ["0x6004:00:32"]
+        return
+    mapped = [entry for frame in facts["mapping"] for entry in frame["objects"]]
+    assert "0x6064:00:32" in mapped
+    assert "0x6041:00:16" in mapped
+    assert facts["motor_position"] == ["0x6064:00"]
+    assert report.worst < Severity.ERROR
+
+
+def test_a_sheet_without_what_is_needed_says_what_is_missing(tmp_path):
+    (tmp_path / "poor.eds").write_text(
+        "[DeviceInfo]\nVendorName=Poor\n[6041]\nParameterName=Status\nDataType=6\nAccessType=ro\nPDOMapping=1\n"
+        "[6064]\nParameterName=Position\nDataType=4\nAccessType=ro\nPDOMapping=0\n"
+    )
+    report = examine_eds(tmp_path / "poor.eds")
+    said = texts(report, Severity.ERROR)
+    assert any("motor position: 0x6064:00 is there, but cannot be mapped" in line for line in said)
+    assert any("motor torque: no object" in line for line in said)
+    assert "mapping" not in report.sections[0].facts  # of what is left there is nothing to plan
+    assert main(["doctor", "--eds", str(tmp_path / "poor.eds")]) == 1
+
+
+SHEET = """
+[DeviceInfo]
+VendorName=Nano
+ProductName=NANO 7
+VendorNumber=0x26C
+[1A00]
+ParameterName=Map
+DataType=7
+{objects}"""
+
+
+def sheet_of(*addresses, tmp_path):
+    objects = "".join(
+        f"[{address}]\nParameterName=Object {address}\nDataType=4\nAccessType=ro\nPDOMapping=1\n"
+        for address in addresses
+    )
+    for number in range(2):
+        objects += (
+            f"[{0x1800 + number:X}sub1]\nDataType=7\nAccessType=rw\nDefaultValue=0x80000{number + 1}81\n"
+        )
+        objects += f"[{0x1800 + number:X}sub2]\nDataType=5\nAccessType=rw\nDefaultValue=255\n"
+        objects += f"[{0x1A00 + number:X}sub0]\nDataType=5\nAccessType=rw\nDefaultValue=0\n"
+        objects += f"[{0x1A00 + number:X}sub1]\nDataType=7\nAccessType=rw\n"
+    path = tmp_path / "nano.eds"
+    path.write_text(SHEET.format(objects=objects))
+    return examine_eds(path)
+
+
+def test_a_sheet_tells_of_every_link_encoder_and_which_is_none(tmp_path):
+    report = sheet_of("6064", "6077", "606C", "60E4sub1", "60E4sub2", tmp_path=tmp_path)
+    said = texts(report)
+    (line,) = [line for line in said if line.startswith("link position")]
+    assert "sensorless" in line
+    assert "by link.encoder.object, 0x60E4:02" in line
+    assert any(line.startswith("nano.eds: NANO 7, vendor 0x26C, ") for line in said)  # the maker only once
+
+
+def test_a_sheet_s_mapping_is_the_one_that_run_would_use(tmp_path):
+    report = sheet_of("6064", "6077", "6041", "606C", tmp_path=tmp_path)
+    mapped = [entry for frame in report.sections[0].facts["mapping"] for entry in frame["objects"]]
+    assert not any(entry.startswith("0x606C") for entry in mapped)
+    out = Console(record=True, width=120)
+    report.show(out)
+    assert "this device gives what is needed" in out.export_text()
+
+
+def test_the_command_prints_one_json_object(capsys):
+    assert main(["doctor", "--eds", str(OURS[0]), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["schema"] == "drivelink.doctor/1"
+    assert told["verdict"] in ("ok", "info", "warning")
+    assert {"section", "severity", "subject", "text", "fix"} == set(told["findings"][0])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status"),
+    [
+        (["--eds", "nowhere.eds"], 5),
+        (["nowhere.toml"], 2),
+        (["--seconds", "0"], 2),
+        (["x.toml", "--eds", "y.eds"], 2),
+    ],
+)
+def test_bad_arguments_are_one_line(arguments, status, capsys):
+    assert main(["doctor", *arguments]) == status
+    error = capsys.readouterr().err
+    assert error.startswith("drivelink doctor: ")
+    assert error.count("\n") == 1
+
+
+def test_without_a_joint_the_machine_is_examined(capsys):
+    assert main(["doctor", "--seconds", "0.05"]) in (0, 1)
+    shown = capsys.readouterr().out
+    assert "kernel" in shown
+    assert "timer" in shown
+
+
+def test_every_warning_of_the_machine_has_a_fix():
+    section = Section("Machine")
+    examine_machine(section, 0.001, 0.05)
+    assert {"kernel", "real time", "memory", "timer"} <= {finding.subject for finding in section.findings}
+    assert all(finding.fix for finding in section.findings if finding.severity is Severity.WARNING)
+
+
+def test_text_of_devices_is_shown_as_it_is():
+    report = Report()
+    report.section("A").say(Severity.WARNING, "node 1", "called [bold]x[/nonsense]", "echo '[red]'")
+    console = Console(width=100, record=True, file=None)
+    with console.capture() as capture:
+        report.show(console)
+    assert "[bold]x[/nonsense]" in capture.get()
+    assert "echo '[red]'" in capture.get()
+
+
+LINK = {
+    "ifname": "can0",
+    "link_type": "can",
+    "flags": ["NOARP", "UP", "LOWER_UP"],
+    "txqlen": 10,
+    "mtu": 16,
+    "linkinfo": {
+        "info_kind": "can",
+        "info_data": {
+            "state": "ERROR-PASSIVE",
+            "berr_counter": {"tx": 128, "rx": 3},
+            "restart_ms": 0,
+            "bittiming": {"bitrate": 500000},
+        },
+        "info_xstats": {"bus_off": 2},
+    },
+    "stats64": {"rx": {"dropped": 7}},
+}
+
+
+def test_a_sick_interface_is_seen_in_every_way():
+    section = Section("CAN")
+    judge_link(section, LINK, BusSection(interface="socketcan", channel="can0"))
+    said = "\n".join(str(finding) for finding in section.findings)
+    for expected in (
+        "runs at 500 kbit/s, the joint file says 1000",
+        "error-passive, error counters: tx 128, rx 3",
+        "transmit queue of 10",
+        "txqueuelen 1000",
+        "does not recover from bus-off",
+        "restart-ms 100",
+        "bus-off 2 times",
+        "7 received frames were dropped",
+    ):
+        assert expected in said
+
+
+def test_a_healthy_interface_has_no_warning():
+    link = json.loads(json.dumps(LINK))
+    link["txqlen"], link["stats64"]["rx"]["dropped"] = 1000, 0
+    data = link["linkinfo"]["info_data"]
+    data.update(state="ERROR-ACTIVE", restart_ms=100, bittiming={"bitrate": 1_000_000})
+    del link["linkinfo"]["info_xstats"]
+    section = Section("CAN")
+    judge_link(section, link, BusSection(interface="socketcan", channel="can0"))
+    assert {finding.severity for finding in section.findings} == {Severity.OK}
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [({"flags": ["NOARP"]}, "is down"), ({"link_type": "ether"}, "is no CAN interface")],
+)
+def test_an_interface_that_cannot_work_is_an_error_with_a_fix(change, expected):
+    section = Section("CAN")
+    judge_link(section, {**LINK, **change}, BusSection(interface="socketcan", channel="can0"))
+    (finding,) = [f for f in section.findings if f.severity is Severity.ERROR]
+    assert expected in finding.text
+    assert finding.fix
+
+
+def test_a_virtual_bus_is_explained():
+    section = Section("CAN")
+    examine_interface(section, BusSection())
+    assert "one process" in section.findings[0].text
+
+
+def sync(period_s, jitter_s=0.0, count=500):
+    return [k * period_s + (jitter_s if k % 2 else 0.0) for k in range(count)]
+
+
+@pytest.mark.parametrize(
+    ("stamps", "bus", "severity", "expected"),
+    [
+        (sync(0.001), {"sync": "follow"}, Severity.OK, "every 1.000 ms"),
+        (sync(0.002), {"sync": "follow"}, Severity.ERROR, "the joint file says 1 ms"),
+        ([], {"sync": "follow"}, Severity.ERROR, "nobody makes SYNC"),
+        ([], {}, Severity.OK, "drivelink run will"),
+        (sync(0.001), {}, Severity.WARNING, "another master makes it"),
+    ],
+)
+def test_sync_is_judged_by_rate_and_role(stamps, bus, severity, expected):
+    section = Section("Bus")
+    judge_sync(section, stamps, BusSection(**bus))
+    (finding,) = section.findings
+    assert finding.severity is severity
+    assert expected in finding.text
+
+
+def test_a_sync_of_our_own_daemon_is_no_reason_to_follow():
+    section = Section("Bus")
+    judge_sync(section, sync(0.001), BusSection(), Daemons(ours=True, others=()))
+    (finding,) = section.findings
+    assert finding.severity is Severity.OK
+    assert "made by the drivelink daemon" in finding.text
+    assert not finding.fix
+
+
+def test_a_sync_of_another_joint_s_daemon_is_named():
+    section = Section("Bus")
+    judge_sync(section, sync(0.001), BusSection(), Daemons(ours=False, others=("wrist",)))
+    (finding,) = section.findings
+    assert finding.severity is Severity.WARNING
+    assert "wrist" in finding.text
+    assert "one command" in finding.fix
+
+
+def test_jitter_is_the_deviation_from_the_period():
+    section = Section("Bus")
+    judge_sync(section, sync(0.001, 50e-6), BusSection(sync="follow"))
+    # gaps alternate between 1.05 and 0.95 ms; their median is one of the two, the largest deviation 0.1 ms
+    assert section.facts["sync"]["jitter_us"]["max"] == pytest.approx(100.0, rel=1e-6)
+
+
+def survey(**sections):
+    slave = Slave(5, drive_objects(5))
+    text = joint_text(drive="velocity = true", **sections)
+    return run_program(survey_node(roles(parse(text))[0]), Wire([slave])), slave
+
+
+def test_a_value_that_is_not_there_before_the_drive_runs_is_left_out():
+    found, slave = survey()
+    answer = slave._sdo
+    slave._sdo = lambda data: (
+        b"\x80" + data[1:4] + b"\x22\0\0\x08" if data[1:3] == b"\x6c\x60" else answer(data)
+    )
+    samples = run_program(sample_motion(found, 0.05), Wire([slave]))
+    assert samples
+    assert all(Signal.MOTOR_VELOCITY not in sample.values for sample in samples)
+    assert all(Signal.MOTOR_POSITION in sample.values for sample in samples)
+
+
+def moving(ratio=1.0, link=None, amplitude=0.5):
+    samples = []
+    for k in range(400):
+        t = 0.005 * k
+        values = {
+            Signal.MOTOR_POSITION: amplitude * math.sin(3 * t),
+            Signal.MOTOR_VELOCITY: amplitude * 3 * math.cos(3 * t) / ratio if ratio else 0.0,
+        }
+        if link is not None:
+            values[Signal.LINK_POSITION] = link * amplitude * math.sin(3 * t)
+        samples.append(MotionSample(t, values))
+    return samples
+
+
+@pytest.mark.parametrize(
+    ("samples", "severity", "expected"),
+    [
+        (moving(), Severity.OK, "velocity agrees"),
+        (moving(-1.0), Severity.WARNING, "opposite signs"),
+        (moving(4.0), Severity.WARNING, "4 times as fast"),
+        (moving(amplitude=1e-7), Severity.INFO, "stands still"),
+        (moving(link=1.02), Severity.OK, "the link follows"),
+        (moving(link=-1.0), Severity.WARNING, "moves -1 times as far"),
+        (moving(link=20.0), Severity.WARNING, "moves 20 times as far"),
+    ],
+)
+def test_signs_and_units_are_checked_against_each_other(samples, severity, expected):
+    section = Section("Node 5")
+    judge_motion(section, survey()[0], samples)
+    finding = next(finding for finding in section.findings if expected in finding.text)
+    assert finding.severity is severity
+
+
+def test_positions_are_sampled_over_the_roll_over():
+    told, slave = survey(link="[link.encoder]\ncounts_per_rev = 65536")
+    slave.objects[0x6064, 0].value = 0x7FFFFFFF
+    ticks = iter(range(10_000))
+
+    def clock():
+        k = next(ticks)
+        slave.objects[0x6064, 0].value = (0x7FFFFFF0 + k) & 0xFFFFFFFF
+        return 0.01 * k
+
+    samples = run_program(sample_motion(told, 1.0, clock), Wire([slave]))
+    positions = [sample.values[Signal.MOTOR_POSITION] for sample in samples]
+    assert all(0 < after - before < 1e-4 for before, after in itertools.pairwise(positions))
+
+
+def test_scanning_asks_every_id_and_hears_who_is_there():
+    wire = Wire([Slave(3, drive_objects(3)), Slave(77, drive_objects(77))])
+    wire.put(0x705, b"\x05")  # alive, but without SDO
+    found, traffic = scan(wire)
+    assert found == [3, 5, 77]
+    assert len(wire.sent) == 127
+    assert traffic.heartbeats == {5: "operational"}
+
+
+def test_listening_counts_what_is_not_canopen_too():
+    wire = Wire()
+    wire.queue.append(can.Message(is_error_frame=True))
+    wire.queue.append(can.Message(arbitration_id=0x12345, is_extended_id=True))
+    wire.queue.append(can.Message(arbitration_id=0x181, is_extended_id=False, is_fd=True, data=bytes(12)))
+    traffic = listen(wire, 0.02)
+    assert (traffic.error_frames, traffic.fd_frames, traffic.counts) == (1, 1, {0x181: 1})
+
+
+def test_helpers():
+    assert slope([1.0, 2.0], [2.0, 4.0]) == pytest.approx(2.0)
+    assert slope([0.0], [1.0]) == 0.0
+    assert percentile([3.0, 1.0, 2.0], 0.5) == 2.0
+    finding = Finding(severity=Severity.WARNING, subject="a", text="b", fix="c")
+    assert str(finding) == "a: b [c]"

@@ -1,0 +1,38 @@
+"""The fault script on the virtual bus, in lockstep: every fault in turn, one daemon, never a restart."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from daemonkit import vsa
+from faultscript import SCRIPT, Fault
+from faultstages import LockstepStage
+
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
+from soak import Soak
+
+
+@pytest.fixture(scope="module")
+def stage() -> Iterator[LockstepStage]:
+    with pytest.MonkeyPatch.context() as patch:
+        made = LockstepStage(vsa(), patch.setattr)
+        made.settle()
+        yield made
+        made.close()
+
+
+@pytest.mark.parametrize("fault", [f for f in SCRIPT if f.where != "real"], ids=lambda fault: fault.name)
+def test_each_fault_is_flagged_said_once_and_survived_without_a_restart(
+    stage: LockstepStage, fault: Fault
+) -> None:
+    stage.settle()
+    stage.play(fault)
+
+
+@pytest.mark.slow
+def test_a_short_soak_in_real_time_ends_well_and_with_as_many_threads() -> None:
+    result = Soak(20.0, seed=7).run()
+    assert result["faults"] >= 3
+    assert len(result["threads"]) == 1
+    assert result["samples_checked"] > 100

@@ -1,0 +1,96 @@
+"""Another master's SYNC: its counter jumps, it is left out, comes twice, and clocks are set; nothing shifts."""
+
+import itertools
+import time
+
+import pytest
+from fuzzrun import FuzzRun
+
+from estimator.sample import Status
+
+PERIOD_NS = 1_000_000
+START_NS = 1_800_000_000 * 1_000_000_000
+
+
+class Follower:
+    """A passive daemon, and the master that it follows."""
+
+    def __init__(self) -> None:
+        self.run = FuzzRun(1, passive=True, overflow=10)
+        self.stamp_ns = START_NS
+        self.counter = 0
+        self.found: list[tuple[int, int, set[float]]] = []
+        self.run.judge.put_sample = self._keep  # type: ignore[method-assign]
+
+    def _keep(self, sample, _stamp_ns: int) -> None:
+        status = self.run.chain.estimate.status
+        self.found.append((sample.sequence, status, set(self.run.ticks_of(sample).values())))
+
+    def syncs(self, count: int) -> None:
+        for _ in range(count):
+            self.stamp_ns += PERIOD_NS
+            self.counter = self.counter % 10 + 1
+            self.run.bus.sync(self.stamp_ns, bytes([self.counter]))
+            self.run.loop.receive()
+        self.run.supervisor.check()
+
+    @property
+    def events(self) -> list[str]:
+        return [event["text"] for event in self.run.events.recent()]
+
+    def steps(self) -> set[tuple[int, float]]:
+        """From one sample to the next: by how much the sequence grows, and the SYNC that the values tell."""
+        assert all(len(ticks) == 1 for _, _, ticks in self.found)  # never two SYNCs in one sample
+        told = [(sequence, next(iter(ticks))) for sequence, _, ticks in self.found]
+        return {(b[0] - a[0], b[1] - a[1]) for a, b in itertools.pairwise(told)}
+
+
+def test_every_sync_is_a_sample_of_its_own() -> None:
+    follower = Follower()
+    follower.syncs(500)
+    assert len(follower.found) == 500
+    assert follower.steps() == {(1, 1.0)}
+    assert follower.events == []
+
+
+def test_a_counter_that_jumps_is_counted_and_said_and_shifts_nothing() -> None:
+    follower = Follower()
+    follower.syncs(100)
+    follower.counter += 3
+    follower.syncs(100)
+    assert follower.steps() == {(1, 1.0)}
+    assert follower.run.loop.counter_jumps == 1
+    assert follower.events == ["the SYNC counter jumped, 1 times so far"]
+
+
+def test_syncs_that_are_left_out_are_a_gap_of_whole_periods() -> None:
+    follower = Follower()
+    follower.syncs(100)
+    follower.stamp_ns += 5 * PERIOD_NS
+    follower.counter += 5
+    follower.syncs(100)
+    assert follower.steps() == {(1, 1.0), (6, 1.0)}  # these slaves count SYNCs, not time
+
+
+def test_clocks_that_are_set_forward_and_back_are_no_gap(monkeypatch: pytest.MonkeyPatch) -> None:
+    follower = Follower()
+    # The clock that nobody sets goes on with the SYNCs.
+    monkeypatch.setattr(time, "monotonic_ns", lambda: follower.run.bus.tick * PERIOD_NS)
+    for step_s in (3600, -3600, -86_400, 10):
+        follower.syncs(100)
+        follower.stamp_ns += step_s * 1_000_000_000
+    follower.syncs(100)
+    assert len(follower.found) == 500
+    assert follower.steps() == {(1, 1.0)}
+
+
+def test_a_second_masters_sync_spoils_its_cycle_only() -> None:
+    follower = Follower()
+    follower.syncs(100)
+    follower.run.bus.sync(follower.stamp_ns + PERIOD_NS // 4)
+    follower.run.loop.receive()
+    follower.syncs(100)
+    assert all(len(ticks) == 1 for _, _, ticks in follower.found)
+    assert [sequence for sequence, _, _ in follower.found][-90:] == list(range(110, 200))
+    assert follower.run.loop.foreign_syncs == 1
+    assert not follower.found[-1][1] & Status.BUS_FAULT

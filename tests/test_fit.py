@@ -1,0 +1,196 @@
+"""Batch fits of whole recordings: known truth found again, with intervals that mean something."""
+
+import json
+
+import joints
+import numpy as np
+import pytest
+
+from drivelink.cli import main
+from estimator import EstimatorError, Record, fit
+from estimator.transmissions import MODELS
+
+T = 1e-3
+
+
+@pytest.fixture(scope="module")
+def elbow():
+    """Twelve soft joints, 10 s."""
+    rng = np.random.default_rng(11)
+    N, n = 12, 10_000
+    K = rng.uniform(80, 220, (N, 1))
+    alpha = np.stack([K, K * rng.uniform(2, 15, (N, 1))], axis=-1)
+    torque, stiffness = joints.polynomial(alpha)
+    B, D = rng.uniform(0.08, 0.2, (N, 1)), rng.uniform(0.4, 1.2, (N, 1))
+    plants = joints.Plants(torque, stiffness, B, D, np.full(N, 0.45), np.full(N, 0.2), np.full(N, 5.0))
+    truth = joints.simulate(plants, joints.sweep(rng, n, N, 1, T, np.full((1, N, 1), 8.0), 3.0), T)
+    return plants, alpha[:, 0], truth
+
+
+def _record(truth, j, **how):
+    noise = np.random.default_rng(j).normal(0, 0.04, truth.tau[:, j].shape)
+    how = {"motor_counts": 16384, "link_bits": 17, "velocity_rad_s": None, "torque_noise": noise, **how}
+    return joints.record(truth, j, T, **how)
+
+
+def _error(found, alpha, truth, j):
+    phi = truth.q[2000::7, j] - truth.theta[2000::7, j, 0]
+    model = MODELS["polynomial"]
+    return np.sqrt(np.mean((model.stiffness(phi, found.alpha) / model.stiffness(phi, alpha[j]) - 1) ** 2))
+
+
+def test_stiffness_is_found_to_a_thousandth_also_with_wrong_declared_parameters(elbow):
+    plants, alpha, truth = elbow
+    for j in range(12):
+        wrong = joints.joint_model(1.04 * plants.B[j, 0], 0.85 * plants.D[j, 0])
+        (found,) = fit(_record(truth, j), wrong)
+        assert _error(found, alpha, truth, j) < 1e-3
+        assert found.inertia_kg_m2 == pytest.approx(plants.B[j, 0], rel=2e-3)
+        assert found.viscous_damping_nm_s_rad == pytest.approx(plants.D[j, 0], rel=1e-2)
+
+
+def test_a_late_link_encoder_is_found_and_does_no_harm(elbow):
+    plants, alpha, truth = elbow
+    for j in range(3):
+        model = joints.joint_model(plants.B[j, 0], plants.D[j, 0])
+        (found,) = fit(_record(truth, j, link_delay=2), model)
+        assert found.link_delay_s == pytest.approx(2e-3, abs=5e-5)
+        assert _error(found, alpha, truth, j) < 2e-3
+
+
+def test_the_order_is_found_where_it_is_not_declared(elbow):
+    plants, _, truth = elbow
+    orders = [
+        fit(_record(truth, j), joints.joint_model(plants.B[j, 0], plants.D[j, 0], order=None))[0].alpha.size
+        for j in range(6)
+    ]
+    assert sorted(orders)[3] == 2
+
+
+def test_intervals_cover_about_as_often_as_they_say(elbow):
+    plants, alpha, truth = elbow
+    z = []
+    for j in range(12):
+        (found,) = fit(_record(truth, j), joints.joint_model(plants.B[j, 0], plants.D[j, 0]))
+        z += ((found.alpha - alpha[j]) / np.sqrt(np.diag(found.covariance))).tolist()
+    # 24 numbers of unit variance: their rms is 1 within 0.15 (one sigma); naive intervals give 3 to 5.
+    assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.6
+
+
+def test_gaps_and_missing_values_are_bridged_or_left_out(elbow):
+    plants, alpha, truth = elbow
+    whole = _record(truth, 0)
+    keep = np.random.default_rng(0).random(len(whole)) > 0.01
+    keep[4000:4300] = False
+    holed = Record(
+        period_s=T,
+        sequence=whole.sequence[keep],
+        motor_position_rad=whole.motor_position_rad[keep],
+        motor_torque_nm=whole.motor_torque_nm[keep],
+        link_position_rad=whole.link_position_rad[keep],
+    )
+    holed.link_position_rad[50] = np.nan
+    (found,) = fit(holed, joints.joint_model(plants.B[0, 0], plants.D[0, 0]))
+    assert _error(found, alpha, truth, 0) < 2e-3
+
+
+def test_what_cannot_be_fitted_is_told(elbow):
+    plants, _, truth = elbow
+    model = joints.joint_model(plants.B[0, 0], plants.D[0, 0])
+    record = _record(truth, 0)
+    still = Record(
+        period_s=T,
+        sequence=np.arange(3000),
+        motor_position_rad=np.zeros((3000, 1)),
+        motor_torque_nm=np.zeros((3000, 1)),
+        link_position_rad=np.zeros(3000),
+    )
+    with pytest.raises(EstimatorError, match="stands still"):
+        fit(still, model)
+    with pytest.raises(EstimatorError, match="at least"):
+        fit(
+            Record(
+                period_s=T,
+                sequence=np.arange(100),
+                motor_position_rad=record.motor_position_rad[:100],
+                motor_torque_nm=record.motor_torque_nm[:100],
+                link_position_rad=record.link_position_rad[:100],
+            ),
+            model,
+        )
+    with pytest.raises(EstimatorError, match="2 motor"):
+        fit(record, joints.joint_model(1.0, 1.0, m=2))
+
+
+def test_command_writes_json_plots_and_a_joint_file_that_loads(elbow, tmp_path, capsys):
+    plants, alpha, truth = elbow
+    record = _record(truth, 2)
+    columns = [
+        record.time_s,
+        record.motor_position_rad[:, 0],
+        record.motor_torque_nm[:, 0],
+        record.link_position_rad,
+    ]
+    header = "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad"
+    np.savetxt(tmp_path / "run.csv", np.column_stack(columns), delimiter=",", header=header, comments="")
+    joint = tmp_path / "joint.toml"
+    joint.write_text(
+        f'name = "elbow"\n[[motor]]\ninertia_kg_m2 = {plants.B[2, 0]}  # from the drawing\n'
+        f'viscous_damping_nm_s_rad = {plants.D[2, 0]}\n[motor.transmission]\nmodel = "polynomial"\norder = 2\n'
+    )
+    args = [
+        "fit",
+        str(tmp_path / "run.csv"),
+        "--joint",
+        str(joint),
+        "--out",
+        str(tmp_path / "out"),
+        "--plots",
+    ]
+    assert main([*args, "--write", str(tmp_path / "fitted.toml")]) == 0
+    (entry,) = json.loads((tmp_path / "out" / "fit.json").read_text())["transmissions"]
+    assert entry["model"] == "polynomial"
+    assert entry["parameters"]["coefficients_nm_rad"] == pytest.approx(alpha[2].tolist(), rel=2e-2)
+    assert entry["parameters"]["coefficients_nm_rad"][0] == pytest.approx(alpha[2][0], rel=1e-3)
+    assert set(entry["std"]) == {"coefficients_nm_rad"}
+    assert (tmp_path / "out" / "fit.png").stat().st_size > 1000
+    from drivelink import jointfile
+
+    written = jointfile.load(tmp_path / "fitted.toml")
+    assert written.motor[0].transmission.parameters["coefficients_nm_rad"][0] == pytest.approx(
+        alpha[2][0], rel=1e-3
+    )
+    assert "from the drawing" in (tmp_path / "fitted.toml").read_text()
+    assert written.provenance["fit"]["recording"] == "run.csv"
+    capsys.readouterr()
+
+
+@pytest.fixture(scope="module")
+def wrist():
+    """Six stiff joints, 6 s, in slow motion: viscous friction and a late encoder look alike."""
+    rng = np.random.default_rng(12)
+    N, n = 6, 6000
+    K = rng.uniform(6000, 12000, (N, 1))
+    alpha = np.stack([K, K * rng.uniform(0, 1.5e4, (N, 1))], axis=-1)
+    torque, stiffness = joints.polynomial(alpha)
+    B, D = rng.uniform(0.4, 1.2, (N, 1)), rng.uniform(2, 8, (N, 1))
+    plants = joints.Plants(torque, stiffness, B, D, np.full(N, 1.5), np.full(N, 2.0), np.full(N, 20.0))
+    truth = joints.simulate(plants, joints.sweep(rng, n, N, 1, T, np.full((1, N, 1), 30.0), 1.5), T)
+    return plants, truth
+
+
+@pytest.mark.parametrize("late", [0, 1])
+def test_no_delay_is_made_of_noise_and_one_that_is_there_has_an_honest_interval(wrist, late):
+    plants, truth = wrist
+    z = []
+    for j in range(6):
+        noise = np.random.default_rng(j).normal(0, 0.4, truth.tau[:, j].shape)
+        record = joints.record(
+            truth, j, T, motor_counts=4e5, link_bits=17, torque_noise=noise, link_delay=late
+        )
+        (found,) = fit(record, joints.joint_model(plants.B[j, 0], plants.D[j, 0]))
+        std = found.nuisance_std["link_delay"]
+        assert abs(found.link_delay_s - late * T) <= 4 * std
+        assert found.link_delay_s == 0.0 or late
+        z.append((found.inertia_kg_m2 - plants.B[j, 0]) / found.nuisance_std["inertia"])
+    assert np.sqrt(np.mean(np.square(z))) < 2.0

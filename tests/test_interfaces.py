@@ -1,0 +1,185 @@
+"""The daemon on the interfaces that need no kernel: a serial adapter (slcan), socketcand over TCP; lost and back."""
+
+import os
+import pty
+import socket
+import threading
+import tty
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import can
+import pytest
+from daemonkit import running, vsa
+from zenohkit import until
+
+from drivelink.canopen.bus import open_bus
+from drivelink.cycle.chain import Chain
+from drivelink.cycle.framesource import BusLostError, open_source
+from drivelink.daemon.service import Daemon, ServedJoint
+from drivelink.jointfile import BusSection, JointFile
+from drivelink.simulate import network_from_joint, open_sim_bus
+from estimator.sample import Status
+from sim.network import Network
+
+PERIOD_S = 0.01
+
+
+class SerialAdapter:
+    """An slcan adapter on a pseudo terminal; its CAN side is a python-can virtual channel.
+
+    Args:
+        link: what the serial device is called; it may be pulled out and put in again.
+        channel: of the virtual bus.
+    """
+
+    def __init__(self, link: Path, channel: str) -> None:
+        self._link = link
+        self._bus = can.Bus(interface="virtual", channel=channel)
+        self.commands: list[str] = []
+        self.put_in()
+
+    def put_in(self) -> None:
+        self._master, self._follower = pty.openpty()
+        tty.setraw(self._master)
+        self._link.unlink(missing_ok=True)
+        self._link.symlink_to(os.ttyname(self._follower))
+        self._stop = threading.Event()
+        self._threads = [threading.Thread(target=work) for work in (self._to_can, self._from_can)]
+        for thread in self._threads:
+            thread.start()
+
+    def pull_out(self) -> None:
+        self._stop.set()
+        self._link.unlink()
+        self._threads[1].join()
+        os.close(self._follower)
+        os.close(self._master)
+        self._threads[0].join()
+
+    def close(self) -> None:
+        self.pull_out()
+        self._bus.shutdown()
+
+    def _to_can(self) -> None:
+        buffer = b""
+        os.set_blocking(self._master, False)
+        while not self._stop.wait(0.0005):
+            with suppress(BlockingIOError, OSError):
+                buffer += os.read(self._master, 4096)
+            *lines, buffer = buffer.split(b"\r")
+            for line in lines:
+                self._line(line.decode("ascii"))
+
+    def _line(self, line: str) -> None:
+        if line[:1] != "t":
+            self.commands.append(line)
+            return
+        data = bytes.fromhex(line[5:])
+        assert len(data) == int(line[4])
+        self._bus.send(can.Message(arbitration_id=int(line[1:4], 16), data=data, is_extended_id=False))
+
+    def _from_can(self) -> None:
+        while not self._stop.is_set():
+            message = self._bus.recv(0.01)
+            if message is not None:
+                text = f"t{message.arbitration_id:03X}{message.dlc}{bytes(message.data).hex().upper()}\r"
+                with suppress(BlockingIOError):
+                    os.write(self._master, text.encode("ascii"))
+
+
+def joint_on(interface: str, channel: str, options: str, more: str = "") -> JointFile:
+    bus = f'interface = "{interface}"\noptions = {{ {options} }}\nperiod_s = {PERIOD_S}\n{more}'
+    return vsa(channel=channel, bus=bus)
+
+
+@contextmanager
+def devices(joint: JointFile) -> Iterator[Network]:
+    bus = open_sim_bus(joint.bus)
+    network = network_from_joint(joint, bus)
+    network.start()
+    try:
+        yield network
+    finally:
+        network.stop()
+        bus.shutdown()
+
+
+def is_valid(chain: Chain) -> bool:
+    return chain.estimate is not None and bool(chain.estimate.status & Status.VALID)
+
+
+def lost(daemon: Daemon) -> bool:
+    return "bus" in daemon.events.active
+
+
+def test_a_joint_behind_a_serial_adapter_that_is_pulled_out_and_put_in(tmp_path: Path) -> None:
+    behind = vsa(bus=f"period_s = {PERIOD_S}")
+    joint = joint_on("slcan", str(tmp_path / "ttyCAN"), "sleep_after_open = 0.0")
+    adapter = SerialAdapter(tmp_path / "ttyCAN", behind.bus.channel)
+    try:
+        with devices(behind):
+            daemon = Daemon([ServedJoint(joint=joint)], publish=False, real_time=False)
+            chain = daemon.chains[0]
+            with running(daemon):
+                until(lambda: is_valid(chain))
+                adapter.pull_out()
+                until(lambda: lost(daemon))
+                until(lambda: not is_valid(chain))
+                adapter.put_in()
+                until(lambda: is_valid(chain))
+                assert not lost(daemon)
+            assert {"S8", "O"} <= set(adapter.commands)
+    finally:
+        adapter.close()
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+def test_a_socketcand_server_that_goes_and_comes_back() -> None:
+    joint = joint_on("socketcand", "can0", f'host = "127.0.0.1", port = {free_port()}')
+    with devices(joint):
+        daemon = Daemon([ServedJoint(joint=joint)], publish=False, real_time=False)
+        chain = daemon.chains[0]
+        thread = running(daemon)
+        thread.__enter__()
+        until(lambda: is_valid(chain))
+    try:
+        until(lambda: lost(daemon))
+        until(lambda: not is_valid(chain))
+        with devices(joint):
+            until(lambda: is_valid(chain))
+            assert not lost(daemon)
+    finally:
+        thread.__exit__(None, None, None)
+
+
+def test_a_listener_too_notices_that_a_socketcand_server_is_gone() -> None:
+    joint = joint_on("socketcand", "can0", f'host = "127.0.0.1", port = {free_port()}')
+    with devices(joint):
+        bus = open_bus(joint.bus)
+        source = open_source(bus)
+        source.wait(0.01)
+    try:
+        with pytest.raises(BusLostError, match="closed"):
+            for _ in range(100):  # python-can itself would say for ever that there is nothing
+                source.wait(0.01)
+                source.take()
+    finally:
+        bus.shutdown()
+
+
+def test_error_frames_of_any_interface_are_counted_by_kind() -> None:
+    section = BusSection(channel="error-frames")
+    with can.Bus(interface="virtual", channel="error-frames") as other, open_bus(section) as bus:
+        source = open_source(bus)
+        for kind in (0x040, 0x100, 0x004):
+            other.send(
+                can.Message(arbitration_id=kind, data=b"\0\1", is_error_frame=True, is_extended_id=False)
+            )
+        assert source.take() == []
+        assert source.errors == {"bus-off": 1, "restarted": 1, "controller": 1, "receive overflow": 1}

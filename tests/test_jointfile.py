@@ -1,0 +1,145 @@
+"""The joint file: what is right is read, what is wrong is one line."""
+
+from pathlib import Path
+
+import pytest
+
+from drivelink import jointfile
+from drivelink.errors import JointFileError
+
+ELBOW = """\
+name = "elbow"                       # part of the key expression
+arrangement = "single"
+
+[[motor]]                            # one, or two for a VSA
+inertia_kg_m2 = 0.125                # joint side
+viscous_damping_nm_s_rad = 0.8
+[motor.transmission]
+model = "polynomial"
+order = 2
+[[motor.effect]]
+name = "coulomb_friction"
+parameters = { torque_nm = 0.25 }
+[motor.drive]
+node_id = 1
+counts_per_rev = 16384
+
+[link]
+[link.encoder]
+[link.dynamics]
+inertia_kg_m2 = 0.4
+viscous_damping_nm_s_rad = 0.1
+gravity_nm = 6
+
+[bus]
+period_s = 0.001
+[estimator]
+mode = "robust"
+[zenoh]
+prefix = "drivelink"
+"""
+
+
+def test_the_contract_s_example_is_read_as_written() -> None:
+    joint = jointfile.parse(ELBOW)
+    model = joint.model()
+    assert model.motors[0].inertia_kg_m2 == 0.125
+    assert model.motors[0].transmission.order == 2
+    assert dict(model.motors[0].effects[0].parameters) == {"torque_nm": 0.25}
+    assert model.link is not None
+    assert model.link.gravity_nm == 6.0
+    assert joint.motor[0].drive is not None
+    assert joint.motor[0].drive.counts_per_rev == 16384
+    assert joint.bus.sync == "produce"
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "message"),
+    [
+        (
+            "inertia_kg_m2 = 0.125",
+            "inertia_kg_m2 = -1",
+            "motor[1].inertia_kg_m2: input should be greater than 0, got -1",
+        ),
+        ("inertia_kg_m2 = 0.125", "", "motor[1].inertia_kg_m2: expected this key, it is missing"),
+        (
+            "inertia_kg_m2 = 0.125",
+            "inertia_kg_m2 = nan",
+            "motor[1].inertia_kg_m2: input should be a finite number, got nan",
+        ),
+        ("order = 2", "order = 22", "motor[1].transmission: order: expected 1 to 9, got 22"),
+        ("order = 2", "ordr = 2", "motor[1].transmission.ordr: unknown key, did you mean order?"),
+        ("node_id = 1", 'node_id = "x"', "motor[1].drive.node_id: input should be a valid integer, got 'x'"),
+        (
+            "node_id = 1",
+            "node_id = 128",
+            "motor[1].drive.node_id: input should be less than or equal to 127, got 128",
+        ),
+        ('name = "elbow"', "", "name: expected this key, it is missing"),
+        ('name = "elbow"', 'name = "el/bow"', "name: string should match pattern"),
+        ('"robust"', '"rob"', "estimator.mode: input should be 'robust' or 'paper', got 'rob'"),
+        ("gravity_nm", "grav", "link.dynamics.grav: unknown key, expected one of inertia_kg_m2"),
+        ('"single"', '"serial"', 'motor: expected 2 [[motor]] with arrangement = "serial", got 1'),
+        ("[bus]", "[bus", "expected TOML"),
+        (
+            "inertia_kg_m2 = 0.4",
+            "inertia_kg_m2 = -0.4",
+            "link.dynamics: inertia_kg_m2: expected a finite number > 0",
+        ),
+    ],
+)
+def test_what_is_wrong_is_one_line_with_file_key_and_expectation(
+    right: str, wrong: str, message: str
+) -> None:
+    text = ELBOW.replace(right, wrong, 1)
+    assert text != ELBOW
+    with pytest.raises(JointFileError) as caught:
+        jointfile.parse(text, "elbow.toml")
+    assert str(caught.value).startswith(f"elbow.toml: {message}")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(JointFileError, match=r"none\.toml: cannot be read as a joint file: No such file"):
+        jointfile.load(tmp_path / "none.toml")
+
+
+def test_a_binary_file_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "joint.toml"
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(JointFileError, match="expected UTF-8 text"):
+        jointfile.load(path)
+
+
+def test_a_rewritten_model_keeps_everything_else_and_its_comments(tmp_path: Path) -> None:
+    source, target = tmp_path / "elbow.toml", tmp_path / "elbow2.toml"
+    source.write_text(ELBOW, encoding="utf-8")
+    changes = {
+        "motor": [
+            {
+                "transmission": {"parameters": {"coefficients_nm_rad": [100.0, 500.0]}},
+                "effect": [{"name": "cogging", "parameters": {"amplitude_nm": 0.1}}],
+            }
+        ],
+        "provenance": {"recording": "run.csv"},
+    }
+    joint = jointfile.write_model(source, target, changes)
+    assert joint == jointfile.load(target)
+    assert joint.motor[0].transmission.parameters == {"coefficients_nm_rad": (100.0, 500.0)}
+    assert [effect.name for effect in joint.motor[0].effect] == ["cogging"]
+    assert joint.motor[0].drive == jointfile.load(source).motor[0].drive
+    assert "# part of the key expression" in target.read_text(encoding="utf-8")
+
+
+def test_an_invalid_rewrite_writes_nothing(tmp_path: Path) -> None:
+    source, target = tmp_path / "elbow.toml", tmp_path / "elbow2.toml"
+    source.write_text(ELBOW, encoding="utf-8")
+    with pytest.raises(JointFileError):
+        jointfile.write_model(source, target, {"bus": {"period_s": -1.0}})
+    assert not target.exists()
+
+
+def test_two_devices_with_one_node_id_are_refused() -> None:
+    text = ELBOW.replace("[link.encoder]", '[link.encoder]\nsource = "cia406"\nnode_id = 1')
+    with pytest.raises(JointFileError, match="got 1 twice"):
+        jointfile.parse(text)

@@ -1,0 +1,289 @@
+"""The live views: what fits where, what is told apart, and the page in a real browser."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import threading
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import chromium
+import pytest
+import zenohkit
+from rich.console import Console
+
+from drivelink import cli
+from drivelink.monitor.braille import DotPlot, number, sparkline
+from drivelink.monitor.history import GrowingCurve, History
+from drivelink.monitor.statuslines import status_lines, status_text
+from drivelink.monitor.view import JointView, joints_table
+from drivelink.monitor.watcher import Watcher
+from drivelink.monitor.web import WebView, snapshot
+from drivelink.pubsub.session import close_session, open_client
+from estimator.sample import Estimate, Status, TransmissionEstimate
+
+STATUS = {
+    "state": "running", "rate_hz": 999.8, "cycles": 5000, "missed_cycles": 2, "cpu_fraction": 0.123,
+    "latency": {"p50_us": 60.0, "p99_us": 95.0, "max_us": 300.0},
+    "response": {"p50_us": 300.0, "p99_us": 420.0, "max_us": 700.0},
+    "jitter": {"p50_us": 60.0, "p99_us": 110.0, "max_us": 900.0},
+    "nodes": {"1": {"state": "operational", "fault": False}, "2": {"state": "stopped", "fault": True}},
+    "bus": {"load": 0.38}, "residual_nm": 0.00312, "conditions": ["node 2 reports a fault"],
+    "events": [{"time": 1.7e9, "text": "node 2 reports a fault", "count": 1}],
+}  # fmt: skip
+
+
+class Truth(NamedTuple):
+    flexibility_torque_nm: float
+    stiffness_nm_rad: float
+
+
+def estimate(k: int, motors: int = 2, status: int = 3) -> Estimate:
+    t = k * 1e-3
+    ones = []
+    for i in range(motors):
+        phi = 0.1 * math.sin((1.3 + 0.4 * i) * t)
+        ones.append(
+            TransmissionEstimate(100 * phi + 1000 * phi**3, 100 + 3000 * phi * phi, 2 + 20 * abs(phi), phi)
+        )
+    return Estimate(k, status, sum(o[0] for o in ones), sum(o[1] for o in ones), 4.0, tuple(ones))
+
+
+def filled(motors: int = 2, truth: bool = False, n: int = 4000) -> JointView:
+    view = JointView("elbow", subtitle="vsa-ii on the virtual bus")
+    for k in range(n):
+        e = estimate(k, motors)
+        view.update(e, k * 1e-3, Truth(e[2] * 1.01, e[3] * 1.002) if truth else None)
+    view.status = STATUS
+    return view
+
+
+def lines(view: object, width: int = 80, height: int = 24) -> list[str]:
+    console = Console(width=width, height=height, record=True, file=io.StringIO())
+    console.print(view)
+    return console.export_text().rstrip("\n").split("\n")
+
+
+@pytest.mark.parametrize("motors", [1, 2])
+@pytest.mark.parametrize("truth", [True, False])
+@pytest.mark.parametrize(("width", "height"), [(80, 24), (132, 50), (60, 20), (40, 12)])
+def test_the_view_fits_the_terminal(motors: int, truth: bool, width: int, height: int) -> None:
+    shown = lines(filled(motors, truth), width, height)
+    assert len(shown) <= height
+    assert all(len(line) <= width for line in shown)
+
+
+def test_the_view_says_what_matters_at_80_by_24() -> None:
+    text = "\n".join(lines(filled(truth=True)))
+    for part in ("elbow", "running", "stiffness", "±", "N·m/rad", "truth", "error 0.20 %", "torque", "deflection",
+                 "1000 Hz", "95", "missed 2", "1 operational", "2 stopped FAULT", "node 2 reports a fault",
+                 "valid", "observable", "bus 38 %"):  # fmt: skip
+        assert part in text, part
+    assert sum(ord(c) > 0x2800 and ord(c) < 0x2900 for c in text) > 100  # the curves
+
+
+def test_a_view_without_anything_yet_says_so() -> None:
+    view = JointView("elbow")
+    assert "waiting for the first estimate" in "\n".join(lines(view))
+    assert view.line() == "elbow: no estimate yet"
+
+
+def test_the_plain_line_has_no_control_characters() -> None:
+    line = filled().line()
+    assert line.startswith("elbow: stiffness ") and "observable" in line and "\x1b" not in line
+
+
+def test_what_is_not_finite_breaks_nothing() -> None:
+    view = JointView("elbow")
+    nan = math.nan
+    one = TransmissionEstimate(nan, nan, nan, nan)
+    for k in range(100):
+        view.update(Estimate(k, 0, nan, nan, nan, (one,)), k * 1e-3)
+    assert "not valid" in "\n".join(lines(view)) and "nan" not in view.line()
+    assert json.dumps(snapshot(view, True, {}), allow_nan=False)
+
+
+def test_several_joints_are_one_line_each() -> None:
+    other = filled(1)
+    other.gone = True
+    shown = lines(joints_table({"elbow": filled(), "wrist": other}, 80))
+    assert len(shown) == 3 and "daemon gone" in shown[2] and all(len(line) <= 80 for line in shown)
+
+
+def test_the_curve_grows_and_keeps_the_latest_value_of_each_place() -> None:
+    curve = GrowingCurve()
+    for scale in (1.0, 2.0):
+        for k in range(-500, 501):
+            phi = 1e-3 * k * scale
+            curve.add(phi, scale * 100 + phi, 1.0)
+    curve.add(math.nan, 1.0, 1.0)
+    points = curve.points()
+    assert points[0][0] == pytest.approx(-1.0, rel=0.05) and points[-1][0] == pytest.approx(1.0, rel=0.05)
+    assert points == sorted(points) and 40 < len(points) <= 160
+    assert all(stiffness > 198 for _, stiffness, _ in points)
+
+
+def test_unobservable_estimates_leave_the_curve_as_it_is() -> None:
+    history = History()
+    history.add(estimate(1, 1), 0.0)
+    history.add(estimate(400, 1, status=int(Status.VALID)), 0.4)
+    assert len(history.curves[0].points()) == 1 and len(history.moments) == 2
+
+
+def test_a_daemon_that_starts_anew_clears_the_history() -> None:
+    history = History()
+    for t in (10.0, 10.5, 2.0):
+        history.add(estimate(1), t)
+    assert [m.time_s for m in history.window()] == [2.0]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0.000"),
+        (123.456, "123.5"),
+        (-0.0123456, "−0.0123"),
+        (4.1e6, "4.100e6"),
+        (-2e-5, "−2.000e−5"),
+        (99999.4, "99999"),
+        (math.nan, "–"),
+    ],
+)
+def test_numbers_are_short(value: float, text: str) -> None:
+    assert number(value) == text
+
+
+def test_sparkline_and_plot_take_anything() -> None:
+    assert sparkline([], 10) == "" and sparkline([math.nan] * 3, 10) == "   "
+    assert sparkline([1.0, 2.0, 3.0], 10) == "▁▅█" and len(sparkline(list(range(1000)), 17)) <= 17
+    plot = DotPlot(40, 10, (math.nan, math.nan), (1.0, 1.0))
+    plot.curve([(0.0, 1.0), (math.inf, 0.0), (0.5, 1.0)], "")
+    plot.band([(0.5, -math.inf, math.nan)], "")
+    assert len(plot.render("t").plain.split("\n")) == 10
+
+
+def test_a_status_of_another_version_is_shown_as_far_as_it_goes() -> None:
+    assert status_text({}) == "" and status_lines({}, 80) == []
+    odd = {"state": 3, "latency": None, "nodes": {"1": "up"}, "rate_hz": "fast", "conditions": None}
+    assert all(len(line.plain) <= 80 for line in status_lines(odd, 80))
+
+
+# Between processes
+
+
+@pytest.fixture
+def daemon() -> Iterator[str]:
+    endpoint = zenohkit.free_endpoint()
+    with zenohkit.script("elbow", endpoint) as process:
+        zenohkit.ready(process)
+        yield endpoint
+
+
+def test_the_watcher_finds_joints_and_notes_when_they_are_gone() -> None:
+    endpoint = zenohkit.free_endpoint()
+    session = open_client(endpoint)
+    watcher = Watcher(session)
+
+    def polled() -> JointView | None:
+        watcher.poll()
+        return watcher.views.get("elbow")
+
+    with zenohkit.script("elbow", endpoint) as process:
+        zenohkit.ready(process)
+        zenohkit.until(lambda: (view := polled()) and view.history.latest and view.status and not view.gone)
+    zenohkit.until(lambda: (view := polled()) and view.gone)
+    watcher.close()
+    close_session(session)
+
+
+def test_without_a_terminal_monitor_prints_plain_lines(
+    daemon: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["monitor", "elbow", "--endpoint", daemon, "--seconds", "2", "--every", "0.5"]) == 0
+    out = capsys.readouterr().out
+    assert "elbow: stiffness 700.0 ± 5.9 N·m/rad" in out and "\x1b" not in out
+
+
+def get(url: str, host: str | None = None) -> tuple[int, bytes]:
+    request = urllib.request.Request(url, headers={"Host": host} if host else {})
+    try:
+        with urllib.request.urlopen(request, timeout=10) as response:
+            return response.status, response.read(20_000)
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, b""
+
+
+@pytest.fixture
+def web(daemon: str) -> Iterator[WebView]:
+    session = open_client(daemon)
+    watcher = Watcher(session)
+    view = WebView(watcher)
+    yield view
+    view.close()
+    watcher.close()
+    close_session(session)
+
+
+def test_the_page_loads_nothing_from_elsewhere_and_answers_this_machine_only(web: WebView) -> None:
+    status, page = get(web.url)
+    text = page.decode()
+    assert status == 200 and "http://" not in text and "https://" not in text and "src=" not in text
+    assert get(web.url + "etc/passwd")[0] == 404
+    assert get(web.url, host="evil.example")[0] == 403
+    assert get(web.url + "events", host="evil.example:80")[0] == 403
+
+
+def test_events_bring_new_moments_once(web: WebView) -> None:
+    since: dict[str, float] = {}
+
+    def event() -> dict:
+        web.poll()
+        return json.loads(web.event(since))["joints"].get("elbow", {})
+
+    zenohkit.until(lambda: event().get("moments"))
+    times: list[float] = []
+    while len(times) < 30:
+        times += [moment[0] for moment in event()["moments"]]
+    assert times == sorted(set(times))
+
+
+@pytest.mark.skipif(chromium.EXECUTABLE is None, reason="needs Chromium")
+def test_the_page_draws_live_plots_in_a_browser(web: WebView, tmp_path: Path) -> None:
+    over = threading.Event()
+
+    def poll() -> None:
+        while not over.wait(0.02):
+            web.poll()
+
+    poller = threading.Thread(target=poll)
+    poller.start()
+    try:
+        with chromium.Chromium(tmp_path / "profile") as browser:
+            browser.open(web.url)
+            browser.wait_for("document.getElementById('stiffness').textContent === '700.0'")
+            assert browser.wait_for("document.getElementById('state').textContent") == "running"
+            drawn = (
+                "(() => { const c = document.getElementById('torqueplot');"
+                "const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;"
+                "let n = 0; for (let i = 0; i < d.length; i += 4)"
+                "if (d[i + 3] > 200 && d[i + 2] - d[i] > 80) n++; return n; })()"
+            )
+            assert browser.wait_for(f"{drawn} > 100 ? {drawn} : 0")  # blue: the curve
+            browser.screenshot(tmp_path / "page.png")
+            assert (tmp_path / "page.png").stat().st_size > 20_000
+    finally:
+        over.set()
+        poller.join()
+
+
+def test_a_port_that_is_taken_is_one_line(web: WebView, capsys: pytest.CaptureFixture[str]) -> None:
+    port = web.url.rsplit(":", 1)[1].strip("/")
+    assert cli.main(["monitor", "--web", "--port", port, "--endpoint", zenohkit.free_endpoint()]) == 2
+    err = capsys.readouterr().err
+    assert "cannot be served" in err and err.count("\n") == 1

@@ -1,0 +1,97 @@
+"""Plots: one style, told apart without colour, the same file for the same data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivelink.plots import (
+    COLORS,
+    Curve,
+    bars,
+    new_figure,
+    over_time,
+    save,
+    stiffness_against_deflection,
+    svg_text,
+)
+
+
+def wave(n: int = 20_000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    t = np.arange(n) * 1e-3
+    phi = 0.1 * np.sin(t)
+    return t, phi, 100.0 + 3000.0 * phi**2
+
+
+def test_curves_differ_in_line_style_and_marker_not_only_in_colour() -> None:
+    _, (axes,) = new_figure()
+    t, phi, _ = wave(100)
+    over_time(axes, {name: Curve(t, k + phi) for k, name in enumerate("abcdef")}, "y")
+    looks = [(line.get_linestyle(), line.get_marker()) for line in axes.lines]
+    assert len(set(looks)) == len(looks) == 6
+
+
+def test_neighbouring_colours_differ_in_lightness() -> None:
+    def lightness(color: str) -> float:
+        r, g, b = (int(color[i : i + 2], 16) for i in (1, 3, 5))
+        return 0.2126 * r + 0.7152 * g + 0.0722 * b
+
+    values = [lightness(color) for color in COLORS[:3]]
+    assert min(abs(a - b) for i, a in enumerate(values) for b in values[:i]) > 20
+
+
+def test_bars_carry_hatches_so_that_a_grey_print_tells_them_apart() -> None:
+    _, (axes,) = new_figure()
+    bars(axes, {"paper": {"A": 1.0, "B": 2.0}, "robust": {"A": 0.5}, "floor": {"B": 0.1}}, "error / %")
+    assert len({patch.get_hatch() for patch in axes.patches}) == 3
+
+
+def test_stiffness_over_scattered_deflections_becomes_one_curve() -> None:
+    t, phi, sigma = wave()
+    rng = np.random.default_rng(1)
+    _, (axes,) = new_figure()
+    noisy = sigma + rng.normal(0, 5, len(t))
+    stiffness_against_deflection(axes, {"estimate": Curve(phi, noisy, np.full(len(t), 5.0))})
+    x, y = (np.asarray(values, float) for values in axes.lines[0].get_data())
+    assert len(x) < 500 and np.all(np.diff(x) > 0)
+    inside = np.abs(x) < 0.095  # the outermost bins average over the steepest part
+    # The median of some 80 samples a bin: 5 N·m/rad * 1.25 / sqrt(80) = 0.7, four of them are a wide bound.
+    assert np.nanmax(np.abs(y - 100.0 - 3000.0 * x**2)[inside]) < 2.8
+
+
+def test_thinning_loses_no_peak() -> None:
+    t = np.arange(300_000) * 1e-3
+    y = np.zeros_like(t)
+    y[123_456] = 7.0
+    _, (axes,) = new_figure()
+    over_time(axes, {"a": Curve(t, y)}, "y")
+    assert len(axes.lines[0].get_xdata()) < 5000 and max(axes.lines[0].get_ydata()) == 7.0
+
+
+def test_what_is_not_finite_or_constant_or_empty_can_be_drawn(tmp_path: Path) -> None:
+    figure, axes = new_figure("title", rows=3)
+    nan = np.full(5000, np.nan)
+    over_time(axes[0], {"a": Curve(nan, nan, nan)}, "y")
+    stiffness_against_deflection(axes[1], {"a": Curve(np.zeros(5000), np.ones(5000), nan)})
+    stiffness_against_deflection(axes[2], {"a": Curve(np.zeros(0), np.zeros(0))})
+    assert save(figure, tmp_path / "x.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("suffix", [".svg", ".png"])
+def test_the_same_data_are_the_same_file(suffix: str, tmp_path: Path) -> None:
+    contents = []
+    for name in ("a", "b"):
+        figure, (axes,) = new_figure("t")
+        t, phi, _ = wave(200)
+        over_time(axes, {"φ": Curve(t, phi)}, "φ / rad")
+        contents.append(save(figure, tmp_path / f"{name}{suffix}").read_bytes())
+    assert contents[0] == contents[1]
+
+
+def test_svg_for_a_page_is_one_element() -> None:
+    figure, (axes,) = new_figure()
+    over_time(axes, {"a": Curve(np.arange(3.0), np.arange(3.0))}, "y")
+    text = svg_text(figure)
+    assert text.startswith("<svg") and text.rstrip().endswith("</svg>")

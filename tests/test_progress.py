@@ -1,0 +1,84 @@
+"""Progress: nothing for quick work, a bar on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+
+import pytest
+from rich.console import Console
+
+from drivelink import progress
+from drivelink.progress import Meter, track
+
+
+class Clock:
+    """Seconds that pass as told."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    made = Clock()
+    monkeypatch.setattr(progress, "time", made)
+    return made
+
+
+def console(terminal: bool) -> Console:
+    return Console(file=io.StringIO(), force_terminal=terminal, width=80)
+
+
+def text(shown: Console) -> str:
+    assert isinstance(shown.file, io.StringIO)
+    return shown.file.getvalue()
+
+
+def test_quick_work_shows_nothing(clock: Clock) -> None:
+    for terminal in (True, False):
+        shown = console(terminal)
+        assert list(track(range(1000), "count", console=shown)) == list(range(1000))
+        assert text(shown) == ""
+
+
+def test_long_work_without_a_terminal_is_a_line_now_and_then(clock: Clock) -> None:
+    shown = console(terminal=False)
+    with Meter("fit", 100, shown) as meter:
+        for k in range(100):
+            clock.now_s += 0.3
+            meter.update(k)
+    lines = text(shown).splitlines()
+    assert lines[0] == "fit: 16 % after 5 s" and 5 <= len(lines) <= 6
+
+
+def test_long_work_on_a_terminal_is_a_bar_that_goes_away(clock: Clock) -> None:
+    shown = console(terminal=True)
+    with Meter("fit", 100, shown) as meter:
+        clock.now_s += 3.0
+        meter.advance(40)
+    assert "fit" in text(shown) and "40/100" in text(shown)
+    assert text(shown).rstrip().endswith("\x1b[2K")  # the line is erased
+
+
+def test_work_that_breaks_off_leaves_the_terminal_as_it_was(clock: Clock) -> None:
+    shown = console(terminal=True)
+
+    def items() -> Iterator[int]:
+        yield from range(300)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        for _ in track(items(), "fit", 1000, shown):
+            clock.now_s += 0.01
+    assert "\x1b[?25h" in text(shown)  # the cursor is back
+
+
+def test_the_total_is_taken_from_the_items_where_they_tell(clock: Clock) -> None:
+    shown = console(terminal=False)
+    for _ in track([0] * 20, "fit", console=shown):
+        clock.now_s += 1.0
+    assert "% after" in text(shown)

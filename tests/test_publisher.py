@@ -1,0 +1,206 @@
+"""The keys of one joint: latched documents, queries, bytes and quality of service, and nobody else's say in it."""
+
+import json
+import math
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+import zenoh.ext
+from zenohkit import free_endpoint, make_estimate, make_joint, make_sample, ready, script, until
+
+from drivelink.pubsub import wire
+from drivelink.pubsub.publisher import JointPublisher, describe_model, schema, to_json
+from drivelink.pubsub.session import close_session, open_client, open_session
+from estimator.sample import Status
+
+
+@pytest.fixture
+def endpoint():
+    return free_endpoint()
+
+
+@pytest.fixture
+def joint(endpoint):
+    return make_joint("elbow", endpoint)
+
+
+@pytest.fixture
+def publisher(joint):
+    session = open_session(joint.zenoh, Path())
+    yield JointPublisher(session, joint)
+    close_session(session)
+
+
+@pytest.fixture
+def client(publisher, endpoint):
+    session = open_client(endpoint)
+    until(lambda: session.info.peers_zid())
+    yield session
+    close_session(session)
+
+
+def ask(session, key):
+    """The only answer to a query."""
+    (reply,) = list(session.get(key, timeout=5.0))
+    assert reply.ok is not None
+    assert str(reply.ok.encoding) == "application/json"
+    return json.loads(reply.ok.payload.to_bytes())
+
+
+def number(sample):
+    return wire.decode_estimate(sample.payload.to_bytes()).sequence
+
+
+def received(subscriber):
+    return until(subscriber.try_recv)
+
+
+def test_estimate_and_sample_arrive_as_the_contract_says(publisher, client):
+    ring = zenoh.handlers.RingChannel
+    estimates = client.declare_subscriber("drivelink/elbow/estimate", ring(4))
+    samples = client.declare_subscriber("drivelink/elbow/sample", ring(4))
+
+    def both():
+        publisher.put_estimate(make_estimate(7), 123)
+        publisher.put_sample(make_sample(7), 123)
+        return estimates.try_recv()
+
+    message = until(both)
+    assert message.payload.to_bytes() == wire.encode_estimate(make_estimate(7), 123)
+    assert str(message.encoding) == "zenoh/serialized;drivelink.estimate/1"
+    assert message.express
+    assert message.priority == zenoh.Priority.REAL_TIME
+    assert message.congestion_control == zenoh.CongestionControl.DROP
+    assert message.source_info.source_id.zid == client.info.peers_zid()[0]
+    assert received(samples).payload.to_bytes() == wire.encode_sample(make_sample(7), 123)
+
+
+def test_a_new_subscriber_gets_the_last_status_and_model_at_once(publisher, client):
+    publisher.put_status({"state": "starting"})
+    publisher.put_status({"state": "running"})
+    history = zenoh.ext.HistoryConfig(max_samples=1, detect_late_publishers=True)
+    for name, expected in (("status", "running"), ("model", "elbow")):
+        subscriber = zenoh.ext.declare_advanced_subscriber(
+            client, f"drivelink/elbow/{name}", zenoh.handlers.RingChannel(4), history=history
+        )
+        until(lambda s=subscriber, e=expected: e.encode() in received(s).payload.to_bytes())
+
+
+def test_model_status_and_schema_answer_queries_with_json(publisher, client, joint):
+    publisher.put_status({"state": "running"})
+    assert ask(client, "drivelink/elbow/model") == json.loads(to_json(describe_model(joint)))
+    assert ask(client, "drivelink/elbow/status") == {"state": "running"}
+    assert ask(client, "drivelink/elbow/schema") == schema()
+    publisher.put_model({"changed": True})
+    assert ask(client, "drivelink/elbow/model") == {"changed": True}
+
+
+def test_the_model_says_its_effects_and_where_it_comes_from(endpoint):
+    joint = make_joint("elbow", endpoint, '[provenance]\nfitted = "2026-01-01"\n')
+    model = describe_model(joint)
+    assert model["motors"][0]["transmission"] == {
+        "model": "linear",
+        "order": None,
+        "parameters": {"k_nm_rad": 700.0},
+    }
+    assert model["motors"][0]["effects"] == []
+    assert model["provenance"] == {"fitted": "2026-01-01"}
+    json.loads(to_json(model))
+
+
+def test_the_schema_tells_how_to_read_the_bytes():
+    told = schema()
+    assert [field["name"] for field in told["estimate"]["fields"]] == list(wire.EstimateMessage._fields[:6])
+    assert {bit["name"]: bit["bit"] for bit in told["status_bits"]}["observable"] == 1
+    assert [1 << bit["bit"] for bit in told["status_bits"]] == [int(bit) for bit in Status]
+
+
+def test_numbers_that_are_not_finite_become_null():
+    document = {
+        "a": math.nan,
+        "b": [1.0, -math.inf],
+        "c": {"d": np.float64(2.5), "e": np.array([1.0, np.nan])},
+    }
+    assert json.loads(to_json(document)) == {"a": None, "b": [1.0, None], "c": {"d": 2.5, "e": [1.0, None]}}
+
+
+def test_the_liveliness_token_comes_and_goes_with_the_publisher(publisher, client):
+    def alive():
+        return [str(reply.ok.key_expr) for reply in client.liveliness().get("drivelink/*/alive", timeout=1.0)]
+
+    assert until(alive) == ["drivelink/elbow/alive"]
+    publisher.close()
+    publisher.close()
+    until(lambda: not alive())
+
+
+def test_nothing_that_others_write_changes_what_the_daemon_says(publisher, client):
+    """No key is read: whoever writes into them changes neither the answers nor the daemon's own stream."""
+    publisher.put_status({"state": "running"})
+    before = {name: ask(client, f"drivelink/elbow/{name}") for name in ("status", "model", "schema")}
+    for name in ("estimate", "sample", "status", "model", "schema", "alive", "config", "command"):
+        client.put(f"drivelink/elbow/{name}", b'{"state": "stop"}')
+        client.delete(f"drivelink/elbow/{name}")
+    client.put("@/**/config/mode", b"client")
+    assert {name: ask(client, f"drivelink/elbow/{name}") for name in before} == before
+    told = [str(reply.ok.key_expr) for reply in client.get("@/**", timeout=0.5) if reply.ok]
+    assert not [key for key in told if key.split("/")[1] != str(client.zid())]  # no admin space either
+
+
+def test_a_subscriber_that_stopped_does_not_stop_the_publisher(publisher, endpoint):
+    """Far more than every buffer on the way holds; a put that waited for the subscriber would never end."""
+    with script(endpoint, name="zenoh_reader.py") as process:
+        ready(process)
+        process.send_signal(signal.SIGSTOP)
+        estimate = make_estimate(1, motors=8)
+        for _ in range(60_000):  # 300 bytes each: 18 MB
+            publisher.put_estimate(estimate, 0)
+        process.send_signal(signal.SIGCONT)
+
+
+def test_a_subscriber_that_dies_does_not_disturb_the_others(publisher, client, endpoint):
+    subscriber = client.declare_subscriber("drivelink/elbow/estimate", zenoh.handlers.RingChannel(4096))
+    with script(endpoint, name="zenoh_reader.py") as process:
+        ready(process)
+        until(lambda: publisher.put_estimate(make_estimate(0), 0) or subscriber.try_recv())
+        while subscriber.try_recv() is not None:
+            pass
+        for sequence in range(1, 301):
+            publisher.put_estimate(make_estimate(sequence), 0)
+            time.sleep(0.001)
+            if sequence == 150:
+                process.kill()
+    numbers = []
+
+    def drained():
+        publisher.put_estimate(make_estimate(301), 0)
+        while (sample := subscriber.try_recv()) is not None:
+            numbers.append(number(sample))
+        return numbers and numbers[-1] == 301
+
+    until(drained)
+    numbers = sorted(set(numbers))
+    assert len([n for n in numbers if n > 150]) > 100  # a busy machine may drop some
+
+
+def test_what_is_faster_than_real_time_can_be_published_without_loss(endpoint):
+    joint = make_joint("elbow", endpoint)
+    session = open_session(joint.zenoh, Path())
+    client = open_client(endpoint)
+    try:
+        publisher = JointPublisher(session, joint, lossless=True)
+        subscriber = client.declare_subscriber("drivelink/elbow/estimate", zenoh.handlers.RingChannel(8192))
+        until(lambda: publisher.put_estimate(make_estimate(0), 0) or subscriber.try_recv())
+        for sequence in range(1, 2001):
+            publisher.put_estimate(make_estimate(sequence), 0)
+        numbers = []
+        while not numbers or numbers[-1] != 2000:
+            numbers.append(number(subscriber.recv()))
+        assert [n for n in numbers if n] == list(range(1, 2001))
+    finally:
+        close_session(client)
+        close_session(session)

@@ -1,0 +1,190 @@
+"""What is asked of the operating system is given back; deadlines are whole periods; systemd is told."""
+
+import gc
+import os
+import socket
+import sys
+import threading
+from collections.abc import Generator
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from canlayouts import VSA, vsa_cycle
+
+from drivelink.cycle import pacing, realtime
+from drivelink.cycle.acquisition import Assembler
+from drivelink.cycle.chain import Chain
+from drivelink.cycle.framesource import Frame
+from drivelink.cycle.housekeeping import Housekeeping
+from drivelink.cycle.loop import CycleLoop, Lane
+from drivelink.daemon.systemd_notify import notify, watchdog_period_s
+from estimator.sample import Estimate, Sample
+
+MS = 1_000_000
+
+
+def test_what_was_taken_is_given_back() -> None:
+    before = sys.getswitchinterval()
+    obtained = realtime.acquire()
+    assert not gc.isenabled()
+    assert sys.getswitchinterval() < before
+    realtime.release(obtained)
+    assert gc.isenabled()
+    assert sys.getswitchinterval() == pytest.approx(before)
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
+
+
+def test_what_is_refused_is_a_plain_line_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    obtained = realtime.acquire()
+    realtime.release(obtained)
+    assert not obtained.scheduling
+    (line,) = [line for line in obtained.lines if "SCHED_FIFO" in line]
+    assert "LimitRTPRIO" in line
+    assert "\n" not in line
+
+
+def test_an_alarm_never_rings_early() -> None:
+    import time
+
+    alarm = realtime.Alarm()
+    for _ in range(50):
+        deadline = time.monotonic_ns() + 300_000
+        alarm.sleep_until(deadline)
+        assert time.monotonic_ns() >= deadline
+    alarm.sleep_until(0)  # has passed: back at once
+
+
+class Echo:
+    """A bus whose devices answer SYNC at once, and that can make the loop late."""
+
+    def __init__(self) -> None:
+        self.lost_sends = 0
+        self.errors: dict[str, int] = {}
+        self.pending: list[Frame] = []
+        self.syncs = 0
+        self.delay: dict[int, float] = {}
+
+    def wait(self, timeout_s: float) -> bool:
+        return bool(self.pending)
+
+    def take(self) -> list[Frame]:
+        frames, self.pending = self.pending, []
+        return frames
+
+    def send(self, cob_id: int, data: bytes) -> None:
+        self.syncs += 1
+        self.pending = [Frame(*frame, 0) for frame in vsa_cycle(self.syncs)]
+        threading.Event().wait(self.delay.pop(self.syncs, 0.0))
+
+    def narrow(self, cob_ids: object) -> None:
+        pass
+
+
+class Last:
+    """An estimator that only repeats the sequence."""
+
+    residual_nm = 0.0
+
+    def step(self, sample: Sample) -> Estimate:
+        return Estimate(sample.sequence, 1, 0.0, 0.0, 0.0, ())
+
+    def reset(self) -> None:
+        pass
+
+    def parameters(self) -> list[dict[str, object]]:
+        return []
+
+
+class Stamps:
+    def __init__(self, stop_after: int) -> None:
+        self.stop_after = stop_after
+        self.seen: list[tuple[int, int]] = []
+        self.loop: CycleLoop | None = None
+
+    def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
+        self.seen.append((estimate.sequence, stamp_ns))
+        if len(self.seen) >= self.stop_after and self.loop is not None:
+            self.loop.stop()
+
+    def put_sample(self, sample: Sample, stamp_ns: int) -> None:
+        pass
+
+
+def test_deadlines_move_by_whole_periods_and_late_cycles_are_left_out_as_gaps() -> None:
+    source, sink = Echo(), Stamps(100)
+    source.delay = {20: 0.005, 50: 0.0101}
+    lane = Lane("x", Chain(Assembler(VSA, 2), Last()), sink)
+    loop = sink.loop = CycleLoop(source, [lane], period_s=0.001)
+    pacing.run(loop)
+    assert loop.overruns >= 4 + 9
+    for (before, stamp_before), (after, stamp) in pairwise(sink.seen):
+        assert stamp - stamp_before == (after - before) * MS
+    assert sink.seen[-1][0] + 1 == len(sink.seen) + loop.overruns
+
+
+def test_housekeeping_is_done_in_the_slack_one_task_at_a_time() -> None:
+    done: list[str] = []
+    housekeeping = Housekeeping()
+    housekeeping.every(0.01, lambda: done.append("a"))
+    housekeeping.every(0.02, lambda: done.append("b"))
+    housekeeping.urgent.append(lambda _now: done.append("u"))
+    housekeeping.run(0, 0)  # no slack, and nobody has waited long
+    assert done == []
+    for now in range(0, 40 * MS, MS):
+        housekeeping.run(now, MS)
+    assert (done.count("a"), done.count("b"), done.count("u")) == (4, 2, 40)
+
+
+def test_a_long_task_is_done_in_parts_and_finished_before_the_next_begins() -> None:
+    done: list[str] = []
+
+    def long() -> Generator[None]:
+        for part in "123":
+            done.append(part)
+            yield
+
+    housekeeping = Housekeeping()
+    housekeeping.every(10.0, long)
+    housekeeping.every(10.0, lambda: done.append("other"))
+    housekeeping.run(0, MS)
+    housekeeping.run(MS, 0)
+    assert done == ["1"]
+    housekeeping.run(2 * MS, MS)
+    assert done == ["1", "2"]
+    housekeeping.run(1500 * MS, 0)  # the other has waited for so long that it does not ask for slack any more
+    assert done == ["1", "2", "3", "other"]
+
+
+def test_a_task_that_never_finds_slack_is_done_all_the_same_after_a_while() -> None:
+    done: list[int] = []
+    housekeeping = Housekeeping()
+    housekeeping.every(0.5, lambda: done.append(1))
+    for now in range(0, 4000 * MS, MS):
+        housekeeping.run(now, 0)
+    assert 1 <= len(done) <= 4
+
+
+def test_systemd_is_told_and_its_absence_is_no_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    assert not notify("READY=1")
+    address = str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(address)
+        monkeypatch.setenv("NOTIFY_SOCKET", address)
+        assert notify("READY=1", "STATUS=running")
+        assert manager.recv(100) == b"READY=1\nSTATUS=running"
+
+
+def test_the_watchdog_is_fed_twice_as_often_as_it_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("WATCHDOG_USEC", raising=False)
+    monkeypatch.delenv("WATCHDOG_PID", raising=False)
+    assert watchdog_period_s() is None
+    monkeypatch.setenv("WATCHDOG_USEC", "2000000")
+    assert watchdog_period_s() == 1.0
+    monkeypatch.setenv("WATCHDOG_PID", "1")  # somebody else's
+    assert watchdog_period_s() is None

@@ -1,0 +1,233 @@
+"""Raw CAN logs: the variants found in the wild, as annotated lines, and files that a crash cut off."""
+
+from __future__ import annotations
+
+import logging
+import random
+from pathlib import Path
+
+import can
+import pytest
+
+from drivelink.errors import RecordingError
+from drivelink.jointfile import parse
+from drivelink.recording.canlog import NO_STAMP, Frame, read_frames
+from drivelink.recording.sinks import open_sink
+from drivelink.recording.syncnumbers import numbered_ahead, numbered_at_once
+
+JOINT = parse('name = "j"\n[[motor]]\ninertia_kg_m2 = 0.1\n[bus]\nchannel = "can0"\n')
+FRAME = Frame(1_436_509_052_249_713_000, 0x181, bytes.fromhex("2A366C2BBA"), "can0")
+SYNC = Frame(1_436_509_052_250_713_000, 0x080, b"", "can0")
+
+# What each tool writes for FRAME and SYNC.
+VARIANTS = {
+    "candump -L": "(1436509052.249713) can0 181#2A366C2BBA\n(1436509052.250713) can0 080#\n",
+    "candump -L, newer": "(1436509052.249713) can0 181#2A366C2BBA R\n(1436509052.250713) can0 080# T\n",
+    "no brackets": "1436509052.249713 can0 181#2A366C2BBA\n1436509052.250713 can0 080#\n",
+    "lower case": "(1436509052.249713) can0 181#2a366c2bba\n(1436509052.250713) can0 080#\n",
+    "dotted bytes": "(1436509052.249713) can0 181#2A.36.6C.2B.BA\n(1436509052.250713) can0 080#\n",
+    "candump -t a": " (1436509052.249713)  can0  181   [5]  2A 36 6C 2B BA\n (1436509052.250713)  can0  080   [0]\n",
+    "candump -t a, spaced without brackets": "1436509052.249713  can0  181  [5]  2A 36 6C 2B BA\n"
+    "1436509052.250713  can0  080  [0] \n",
+    "candump -t a -a": " (1436509052.249713)  can0  181   [5]  2A 36 6C 2B BA            '*6l+.'\n"
+    " (1436509052.250713)  can0  080   [0]                            ''\n",
+    "candump -t a -x": " (1436509052.249713)  can0  RX - -  181   [5]  2A 36 6C 2B BA\n"
+    " (1436509052.250713)  can0  TX - -  080   [0] \n",
+    "candump -t A": " (2015-07-10 06:17:32.249713)  can0  181   [5]  2A 36 6C 2B BA\n"
+    " (2015-07-10 06:17:32.250713)  can0  080   [0]\n",
+    "CAN FD": "(1436509052.249713) can0 181##12A366C2BBA\n(1436509052.250713) can0 080##0\n",
+    "what is not CANopen is left out": "# a comment\n(1436509052.1) can0 00000181#01\n(1436509052.1) can0 181#R\n"
+    "(1436509052.249713) can0 181#2A366C2BBA\n(1436509052.25) can0 20000080#0000000000000000\n"
+    "(1436509052.250713) can0 080#\n",
+    "CRLF": "(1436509052.249713) can0 181#2A366C2BBA\r\n(1436509052.250713) can0 080#\r\n",
+}
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_each_variant_of_candump_gives_the_same_frames(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.log"
+    path.write_text(VARIANTS[name], newline="")
+    assert list(read_frames(path)) == [FRAME, SYNC]
+
+
+def test_a_log_without_stamps_has_frames_without_stamps(tmp_path: Path) -> None:
+    path = tmp_path / "x.log"
+    path.write_text("  can0  181   [5]  2A 36 6C 2B BA\n  can0  080   [0]\n")
+    assert [f.stamp_ns for f in read_frames(path)] == [NO_STAMP, NO_STAMP]
+
+
+def test_stamps_that_are_differences_are_added_up(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "x.log"
+    path.write_text("".join(f" (000.000{200 + 600 * (k % 2)})  can0  080   [0]\n" for k in range(20)))
+    with caplog.at_level(logging.WARNING, "drivelink.recording"):
+        stamps = [f.stamp_ns for f in read_frames(path)]
+    assert stamps[::2] == [200_000 + 1_000_000 * k for k in range(10)]
+    assert "added up" in caplog.text
+
+
+TRC_1_1 = """\
+;$FILEVERSION=1.1
+;$STARTTIME=42195.2621788
+;
+     1)         0.2  Rx         0181  5  2A 36 6C 2B BA
+     2)         1.2  Rx         0080  0
+     3)         1.9  Rx     00000181  1  00
+"""
+TRC_2_1 = """\
+;$FILEVERSION=2.1
+;$STARTTIME=42195.2621788
+;$COLUMNS=N,O,T,B,I,d,R,L,D
+;
+      1         0.200 DT 1      0181 Rx -  5    2A 36 6C 2B BA
+      2         1.200 DT 1      0080 Rx -  0
+"""
+
+
+@pytest.mark.parametrize("text", [TRC_1_1, TRC_2_1])
+def test_peaks_traces_are_read(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.trc"
+    path.write_text(text)
+    frames = list(read_frames(path))
+    assert [(f.can_id, f.data) for f in frames] == [(FRAME.can_id, FRAME.data), (0x080, b"")]
+    # A float of UNIX time holds a quarter of a microsecond.
+    assert frames[1].stamp_ns - frames[0].stamp_ns == pytest.approx(1_000_000, abs=500)
+
+
+def many_frames(n: int = 3000) -> list[Frame]:
+    rng = random.Random(1)
+    ids = (0x080, 0x181, 0x182, 0x18A)
+    return [
+        Frame(
+            1_700_000_000_000_000_000 + 250_000 * k,
+            ids[k % 4],
+            rng.randbytes(8) if k % 4 else b"",
+            "can0",
+        )
+        for k in range(n)
+    ]
+
+
+@pytest.mark.parametrize("suffix", [".log", ".blf", ".asc", ".trc"])
+@pytest.mark.parametrize("ended", [True, False])
+def test_what_is_recorded_is_read_back_also_without_its_end(suffix: str, ended: bool, tmp_path: Path) -> None:
+    path = tmp_path / f"x{suffix}"
+    sink = open_sink(path, JOINT)
+    frames = many_frames()
+    for k, frame in enumerate(frames):
+        sink.frame(frame.stamp_ns, frame.can_id, frame.data)
+        if k % 1000 == 999:
+            sink.flush()
+    if ended:
+        sink.close()
+    else:
+        sink.abandon()
+    back = list(read_frames(path))
+    assert [(f.can_id, f.data) for f in back] == [(f.can_id, f.data) for f in frames]
+    first = back[0].stamp_ns - frames[0].stamp_ns  # ASC counts from its start, in microseconds
+    assert all(abs(b.stamp_ns - f.stamp_ns - first) < 2000 for b, f in zip(back, frames, strict=True))
+
+
+@pytest.mark.parametrize("suffix", [".log", ".blf", ".asc", ".trc"])
+def test_a_log_cut_off_anywhere_gives_what_is_whole(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"x{suffix}"
+    sink = open_sink(path, JOINT)
+    frames = many_frames(1200)
+    for k, frame in enumerate(frames):
+        sink.frame(frame.stamp_ns, frame.can_id, frame.data)
+        if k % 200 == 199:
+            sink.flush()
+    sink.close()
+    whole = path.read_bytes()
+    rng = random.Random(2)
+    for _ in range(12):
+        path.write_bytes(whole[: rng.randrange(len(whole) // 2, len(whole))])
+        back = list(read_frames(path))
+        assert len(back) > 300
+        # The last line of a text may be cut inside its bytes.
+        assert [(f.can_id, f.data) for f in back[:-1]] == [
+            (f.can_id, f.data) for f in frames[: len(back) - 1]
+        ]
+
+
+def test_of_several_channels_the_configured_one_is_taken(tmp_path: Path) -> None:
+    path = tmp_path / "x.log"
+    lines = [f"({k}.{c}00000) can{c} 18{c}#0{c}\n" for k in range(20) for c in (0, 1)]
+    path.write_text("".join(lines))
+    assert {f.can_id for f in read_frames(path, configured="can1")} == {0x181}
+    assert {f.can_id for f in read_frames(path, channel="can0", configured="can1")} == {0x180}
+    with pytest.raises(RecordingError, match=r"channels can0, can1: say which one with --channel"):
+        list(read_frames(path, configured="vcan7"))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "line"),
+    [
+        ("x.log", b"hello\nworld\n", "expected lines as candump writes them"),
+        ("x.log", b"", "expected lines as candump writes them"),
+        ("x.blf", b"no such thing", "cannot be read as .blf log"),
+        ("x.asc", b"", "no CAN frame"),
+    ],
+)
+def test_a_file_that_is_no_log_is_one_clear_line(
+    name: str, content: bytes, line: str, tmp_path: Path
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(RecordingError) as caught:
+        list(read_frames(path))
+    assert line in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_python_cans_own_writer_and_this_reader_agree(tmp_path: Path) -> None:
+    path = tmp_path / "x.log"
+    with can.CanutilsLogWriter(path) as writer:
+        for frame in many_frames(100):
+            writer.on_message_received(
+                can.Message(
+                    timestamp=frame.stamp_ns * 1e-9,
+                    arbitration_id=frame.can_id,
+                    data=frame.data,
+                    is_extended_id=False,
+                    channel="can0",
+                )
+            )
+    with can.CanutilsLogReader(path) as reader:
+        theirs = [(m.arbitration_id, bytes(m.data)) for m in reader]
+    assert [(f.can_id, f.data) for f in read_frames(path)] == theirs
+
+
+def syncs(stamps_ms: list[float]) -> list[Frame]:
+    return [Frame(round(1e6 * t), 0x080, b"", "can0") for t in stamps_ms]
+
+
+def jumps(stamps_ms: list[float]) -> list[int]:
+    return [jump for _, jump in numbered_ahead(syncs(stamps_ms), 1e-3)]
+
+
+def test_syncs_whose_stamps_come_in_a_burst_are_numbered_one_by_one() -> None:
+    stamps = [float(k) for k in range(200)]
+    stamps[100:106] = [106.0] * 6  # the interface handed six over at once
+    assert jumps(stamps) == [1] * 200
+    # The live loop, which cannot look ahead, takes the same for a gap and SYNCs that are not due.
+    assert [j for _, j in numbered_at_once(syncs(stamps), 1e-3)] != [1] * 200
+
+
+def test_a_burst_at_the_very_start_is_no_gap() -> None:
+    assert jumps([5.0] * 5 + [float(k) for k in range(5, 200)]) == [1] * 200
+
+
+def test_lost_syncs_are_a_gap() -> None:
+    stamps = [float(k) for k in range(300) if k not in (100, 101, 200)]
+    expected = [1] * 297
+    expected[100], expected[198] = 3, 2
+    assert jumps(stamps) == expected
+
+
+def test_syncs_that_are_not_due_are_told() -> None:
+    stamps = [float(k) for k in range(200)]
+    stamps[150:150] = [149.2]  # a second master
+    assert jumps(stamps) == [1] * 150 + [0] + [1] * 50
+
+
+def test_a_clock_that_drifts_makes_no_gap() -> None:
+    assert jumps([k * 1.0002 for k in range(20_000)]) == [1] * 20_000

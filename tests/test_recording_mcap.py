@@ -1,0 +1,250 @@
+"""MCAP recordings: bit for bit, by an independent reader, and after everything that may go wrong."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import random
+import signal
+import struct
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import NonSeekingReader, make_reader
+
+from drivelink.errors import RecordingError
+from drivelink.jointfile import parse
+from drivelink.pubsub.wire import EstimateMessage
+from drivelink.recording import read
+from drivelink.recording.mcapfile import read_messages
+from drivelink.recording.mcapsamples import recorded_cycles, recorded_joint
+from drivelink.recording.sinks import open_sink
+from estimator.sample import Sample, Status, TransmissionEstimate
+
+TEXT = 'name = "elbow"\n[[motor]]\ninertia_kg_m2 = 0.1\n'
+JOINT = parse(TEXT)
+BEGIN_NS = 1_700_000_000_000_000_000
+
+
+def sample(k: int) -> Sample:
+    rng = random.Random(k)
+    velocity = math.nan if k % 3 else rng.gauss(0, 1)
+    return Sample(k, (rng.gauss(0, 1),), (velocity,), (rng.gauss(0, 1e6),), rng.gauss(0, 1e-9))
+
+
+def estimate(k: int, status: int = 3) -> EstimateMessage:
+    one = TransmissionEstimate(k / 3, 700.0 + k, math.inf if k < 5 else 3.0, k * 1e-3)
+    return EstimateMessage(k, BEGIN_NS + k * 1_000_000, status, k / 3, 700.0 + k, 3.0, (one,))
+
+
+def record(path: Path, n: int = 500, close: bool = True) -> None:
+    sink = open_sink(path, JOINT, TEXT, "somewhere")
+    for k in range(n):
+        stamp_ns = BEGIN_NS + k * 1_000_000
+        sink.sample(sample(k), stamp_ns)
+        sink.estimate(estimate(k))
+        sink.frame(stamp_ns, 0x181, struct.pack("<iH", k, 7))
+        if k % 100 == 99:
+            sink.document("status", b'{"state": "running"}', stamp_ns)
+            sink.flush()
+    if close:
+        sink.close()
+    else:
+        sink.abandon()
+
+
+def bits(one: Sample) -> bytes:
+    values = (*one.motor_position_rad, *one.motor_velocity_rad_s, *one.motor_torque_nm, *one[4:])
+    return struct.pack(f"<q{len(values)}d", one.sequence, *values)
+
+
+def test_samples_come_back_bit_for_bit(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    record(path)
+    back = [cycle.sample for cycle in recorded_cycles(path, 1)]
+    assert [bits(one) for one in back if one] == [bits(sample(k)) for k in range(500)]
+    assert recorded_joint(path) == (TEXT, Path("somewhere"))
+
+
+def test_a_record_of_it_is_that_of_its_samples(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    record(path)
+    back = read(path, JOINT)
+    assert back.period_s == JOINT.bus.period_s and len(back) == 500
+    assert np.array_equal(back.motor_torque_nm[:, 0], [sample(k).motor_torque_nm[0] for k in range(500)])
+
+
+def check(value: Any, schema: dict[str, Any], where: str) -> None:
+    """What our schemas use of JSON schema: type, properties, required."""
+    types = {"object": dict, "integer": int, "string": str, "number": (int, float), "null": type(None)}
+    wanted = schema["type"] if isinstance(schema["type"], list) else [schema["type"]]
+    assert any(isinstance(value, types[name]) for name in wanted), where  # type: ignore[arg-type]
+    if isinstance(value, dict):
+        assert set(schema.get("required", ())) <= set(value), where
+        for name, inner in schema.get("properties", {}).items():
+            check(value[name], inner, f"{where}.{name}")
+
+
+def strict(text: str) -> Any:
+    """JSON as other languages read it: no NaN, no Infinity."""
+
+    def refuse(name: str) -> Any:
+        raise AssertionError(f"{name} is no JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_an_independent_reader_finds_channels_schemas_and_messages_that_obey_them(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    record(path)
+    counts: dict[str, int] = {}
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None and schema.encoding == "jsonschema"
+            assert channel.message_encoding == "json"
+            check(strict(message.data.decode()), json.loads(schema.data), channel.topic)
+            counts[channel.topic] = counts.get(channel.topic, 0) + 1
+    assert counts == {
+        "/elbow/sample": 500, "/elbow/estimate": 500, "/elbow/can": 500, "/elbow/status": 5, "/elbow/joint": 1
+    }  # fmt: skip
+    assert summary is not None and summary.statistics is not None
+    assert summary.statistics.message_start_time == BEGIN_NS
+
+
+def test_without_its_end_everything_flushed_is_there_for_both_readers(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    record(path, close=False)
+    assert sum(m.topic == "/elbow/sample" for m in read_messages(path)) == 500
+    found = 0
+    with path.open("rb") as file, pytest.raises(Exception):  # noqa: B017  (the end is missing, and it says so)
+        for _ in NonSeekingReader(file).iter_messages(log_time_order=False):
+            found += 1
+    assert found == 1506
+
+
+def test_cut_off_anywhere_it_gives_what_is_whole(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    record(path)
+    whole = path.read_bytes()
+    rng = random.Random(3)
+    before = 0
+    for size in sorted(rng.randrange(3000, len(whole)) for _ in range(25)):
+        path.write_bytes(whole[:size])
+        found = [m for m in read_messages(path) if m.topic == "/elbow/sample"]
+        assert before <= len(found) <= 500 and len(found) % 100 == 0
+        before = len(found)
+    assert before >= 400
+
+
+def test_a_broken_chunk_ends_the_reading_and_is_no_traceback(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    record(path)
+    data = bytearray(path.read_bytes())
+    for at in range(len(data) // 2, len(data) // 2 + 40):
+        data[at] ^= 0x5A
+    path.write_bytes(data)
+    assert sum(m.topic == "/elbow/sample" for m in read_messages(path)) < 500
+
+
+def test_a_cycle_that_was_carried_on_is_a_cycle_without_sample(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    sink = open_sink(path, JOINT)
+    stale = int(Status.STALE | Status.BUS_FAULT)
+    for k in range(300):
+        if k != 120:
+            sink.sample(sample(k), BEGIN_NS + k)
+        sink.estimate(estimate(k, stale if k == 120 else 3 | int(Status.DRIVE_FAULT) * (k == 200)))
+    sink.close()
+    cycles = list(recorded_cycles(path, 1))
+    assert [c.sequence for c in cycles] == list(range(300))
+    assert [c.sequence for c in cycles if c.sample is None] == [120]
+    assert cycles[120].flags == Status.BUS_FAULT and cycles[200].flags == Status.DRIVE_FAULT
+
+
+def test_what_is_no_mcap_file_is_one_clear_line(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    path.write_bytes(b"something else entirely")
+    with pytest.raises(RecordingError, match="expected an MCAP file"):
+        read(path, JOINT)
+    record(path, n=0)
+    with pytest.raises(RecordingError, match="no samples in it"):
+        read(path, JOINT)
+
+
+WRITER = """
+import sys, time
+sys.path.insert(0, {tests!r})
+from pathlib import Path
+from test_recording_mcap import JOINT, TEXT, BEGIN_NS, sample, estimate
+from drivelink.errors import RecordingError
+from drivelink.recording.sinks import open_sink
+sink = open_sink(Path(sys.argv[1]), JOINT, TEXT)
+k = 0
+try:
+    while True:
+        for _ in range(100):
+            sink.sample(sample(k), BEGIN_NS + k * 1_000_000)
+            sink.frame(BEGIN_NS + k * 1_000_000, 0x181, bytes(8))
+            k += 1
+        sink.flush()
+        print(k, flush=True)
+except RecordingError as error:
+    sink.abandon()
+    print(k - 100, error, flush=True)
+    sys.exit(3)
+"""
+
+
+def writer(path: Path, before: str = "") -> subprocess.Popen[str]:
+    tests = str(Path(__file__).parent)
+    return subprocess.Popen(
+        [sys.executable, "-c", before + WRITER.format(tests=tests), str(path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(Path(tests).parent)},
+    )
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".csv", ".blf"])
+def test_a_killed_recording_is_there_up_to_the_last_flush(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"r{suffix}"
+    process = writer(path)
+    assert process.stdout is not None
+    flushed = [int(process.stdout.readline()) for _ in range(8)][-1]
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert count(path) >= flushed
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".csv", ".blf"])
+def test_a_full_disk_is_one_line_and_a_file_that_is_whole(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"r{suffix}"
+    # No more than 40 kB in a file: the write fails as on a full disk (EFBIG instead of ENOSPC).
+    limit = "import resource, signal\nsignal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+    limit += "resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, 40_000))\n"
+    process = writer(path, limit)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 3, err
+    whole, _, line = out.splitlines()[-1].partition(" ")
+    assert "cannot be written any further" in line
+    assert not err
+    assert count(path) == int(whole) > 0
+
+
+def count(path: Path) -> int:
+    """Samples, or frames, in a recording."""
+    from drivelink.recording.canlog import read_frames
+
+    if path.suffix == ".mcap":
+        return sum(m.topic == "/elbow/sample" for m in read_messages(path))
+    if path.suffix == ".csv":
+        return len(read(path, parse(TEXT + '[motor.transmission]\nmodel = "none"\n')))
+    return sum(1 for _ in read_frames(path))

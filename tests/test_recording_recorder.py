@@ -1,0 +1,167 @@
+"""`drivelink record`: what a daemon and a bus say, into a file, with nothing sent to either."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import daemonkit
+import pytest
+import zenohkit
+
+from drivelink import cli, jointfile
+from drivelink.canopen.bus import open_bus
+from drivelink.cycle.framesource import Frame, FrameSource
+from drivelink.recording import read
+from drivelink.recording.canlog import read_frames
+from drivelink.recording.mcapfile import read_messages
+from drivelink.recording.mcapsamples import recorded_joint
+from drivelink.recording.recorder import BusTap, Recorder
+from drivelink.recording.sinks import open_sink
+
+
+def joint_file(folder: Path, endpoint: str) -> Path:
+    path = folder / "elbow.toml"
+    path.write_text(
+        'name = "elbow"\n[[motor]]\ninertia_kg_m2 = 0.125\n[motor.transmission]\nmodel = "linear"\n'
+        f'[bus]\nperiod_s = 0.005\n[zenoh]\nendpoint = "{endpoint}"\n'
+    )
+    return path
+
+
+@contextmanager
+def start(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "drivelink", "record", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def samples_in(path: Path) -> int:
+    """How many samples are on the disk so far."""
+    if not path.exists() or not path.stat().st_size:
+        return 0
+    return sum(message.topic.endswith("/sample") for message in read_messages(path))
+
+
+def test_a_daemon_is_recorded_until_sigterm_and_replays(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    endpoint = zenohkit.free_endpoint()
+    path, out = joint_file(tmp_path, endpoint), tmp_path / "r.mcap"
+    with zenohkit.script("elbow", endpoint) as daemon, start(str(path), "--out", str(out)) as process:
+        zenohkit.ready(daemon)
+        zenohkit.until(lambda: samples_in(out) > 150)  # on the disk while it still records
+        process.send_signal(signal.SIGTERM)
+        text, errors = process.communicate(timeout=20)
+    assert process.returncode == 0 and not errors, errors
+    assert "samples" in text and "estimates" in text
+    record = read(out, jointfile.load(path))
+    assert len(record) > 150 and (record.sequence[1:] - record.sequence[:-1] == 1).all()
+    assert set(record.motor_position_rad[:, 0]) == {0.5}
+    status = [json.loads(m.data) for m in read_messages(out) if m.topic == "/elbow/status"]
+    assert status and status[0]["state"] == "running"
+    carried = recorded_joint(out)
+    assert carried is not None and carried[0] == path.read_text()
+    # One file replays everything: the joint file is in it.
+    assert cli.main(["replay", str(out), "--out", str(tmp_path / "e.csv")]) == 0
+    assert (tmp_path / "e.csv").read_text().count("\n") == len(record) + 1
+    capsys.readouterr()
+
+
+def test_a_daemon_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> None:
+    endpoint = zenohkit.free_endpoint()
+    path, out = joint_file(tmp_path, endpoint), tmp_path / "r.csv"
+    with start(str(path), "--out", str(out)) as process:
+        assert process.stderr is not None
+        assert "no daemon serves elbow yet: waiting" in process.stderr.readline()
+        with zenohkit.script("elbow", endpoint) as daemon:
+            zenohkit.ready(daemon)
+            zenohkit.until(lambda: out.read_text().count("\n") > 20)
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=20)
+        assert process.returncode == 0
+    assert len(read(out, jointfile.load(path).model_copy(update={"link": jointfile.LinkSection()}))) > 15
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["--out", "{folder}/r.xyz"], "expected a name that ends in .mcap"),
+        (["--out", "{folder}/none/r.csv"], "cannot be written"),
+        (["--out", "{folder}/elbow.toml"], "exists already; --force replaces it"),
+        (["--out", "{folder}/r.log"], 'bus.interface = "virtual" lives inside one process'),
+        (["--out", "{folder}/r.csv", "--seconds", "0"], "--seconds: expected a number above 0"),
+    ],
+)
+def test_what_cannot_be_recorded_is_one_line(
+    arguments: list[str], line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = joint_file(tmp_path, zenohkit.free_endpoint())
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        status = cli.main(["record", str(path), *(a.format(folder=tmp_path) for a in arguments)])
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    err = capsys.readouterr().err
+    assert status in (2, 3) and line in err and err.count("\n") == 1
+
+
+class InRealTime:
+    """A bus in lockstep, with the stamps that one in real time would have given."""
+
+    def __init__(self, source: FrameSource) -> None:
+        self._source = source
+        self._syncs = 0
+
+    def take(self) -> list[Frame]:
+        frames = []
+        for cob_id, data, _ in self._source.take():
+            self._syncs += cob_id == 0x080
+            frames.append(Frame(cob_id, data, 1_700_000_000_000_000_000 + self._syncs * 1_000_000))
+        return frames
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".csv", ".log"])
+def test_a_bus_is_recorded_by_listening_only(suffix: str, tmp_path: Path) -> None:
+    joint = daemonkit.vsa()
+    path = tmp_path / f"r{suffix}"
+    sent_before_us: list[int] = []
+    bus = open_bus(joint.bus)
+    bus.send = lambda *_: sent_before_us.append(1)  # type: ignore[method-assign,assignment]
+    sink = open_sink(path, joint)
+    tap = BusTap(bus, joint, sink, tmp_path)
+    tap._source = InRealTime(tap._source)
+    with daemonkit.rig(joint) as rig, Recorder(sink, [tap]) as recorder:
+        live = []
+        for _ in range(150):
+            live += rig.run(1)
+            tap.poll()
+        recorder.run(lambda: True)
+        samples = [sample for sample, _ in rig.collector.samples]
+    bus.shutdown()
+    assert not sent_before_us and len(live) == 150
+    if suffix == ".log":
+        assert sum(frame.can_id == 0x080 for frame in read_frames(path)) == 150
+        return
+    # Samples of the bus alone, by the mapping that was overheard: those of the daemon.
+    record = read(path, joint)
+    assert [tuple(row) for row in record.motor_position_rad.tolist()] == [
+        s.motor_position_rad for s in samples
+    ][: len(record)]
+    assert len(record) >= 148  # the first cycle's SYNC may come before the mapping is at rest

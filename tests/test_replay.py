@@ -1,0 +1,298 @@
+"""Replay: the same chain, bit for bit, from every format; and what the command leaves behind."""
+
+from __future__ import annotations
+
+import csv
+import logging
+import signal
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import can
+import daemonkit
+import numpy as np
+import pytest
+import zenohkit
+
+from drivelink import cli, jointfile
+from drivelink.errors import DrivelinkError
+from drivelink.jointfile import JointFile, parse
+from drivelink.pubsub.publisher import describe_model, to_json
+from drivelink.pubsub.wire import EstimateMessage
+from drivelink.recording import read
+from drivelink.recording.playback import open_playback
+from drivelink.recording.sinks import Sink, open_sink
+from estimator.sample import Estimate
+
+BEGIN_NS = 1_700_000_000_000_000_000
+FORMATS = (".log", ".blf", ".asc", ".trc", ".mcap", ".csv")
+CYCLES = 400
+
+
+def bits(estimate: Estimate) -> bytes:
+    values = [*estimate[2:5], *(value for one in estimate.transmissions for value in one)]
+    return struct.pack(f"<qI{len(values)}d", estimate.sequence, int(estimate.status), *values)
+
+
+class Recorded:
+    """A daemon in lockstep with its devices, all its frames and estimates recorded in every format."""
+
+    def __init__(self, folder: Path, text: str, disturb: Callable[[daemonkit.Rig], None] | None) -> None:
+        self.folder = folder
+        self.joint = parse(text)
+        self.tap = can.Bus(interface="virtual", channel=self.joint.bus.channel)
+        self.sinks: list[Sink] = [
+            open_sink(folder / f"r{suffix}", self.joint, text, str(folder)) for suffix in FORMATS
+        ]
+        self.stamp_ns = BEGIN_NS - 1_000_000_000
+        with daemonkit.rig(self.joint) as rig:
+            self.drain()
+            if disturb:
+                disturb(rig)
+            for _ in range(CYCLES):
+                rig.run(1)
+                self.drain()
+            self.live = [estimate for estimate, _ in rig.collector.estimates]
+            for estimate, _ in rig.collector.estimates:
+                stamp_ns = BEGIN_NS + estimate.sequence * 1_000_000
+                for sink in self.sinks:
+                    sink.estimate(EstimateMessage(estimate[0], stamp_ns, int(estimate[1]), *estimate[2:]))
+            for sample, _ in rig.collector.samples:
+                for sink in self.sinks:
+                    sink.sample(sample, BEGIN_NS + sample.sequence * 1_000_000)
+        for sink in self.sinks:
+            sink.close()
+        self.tap.shutdown()
+
+    def drain(self) -> None:
+        """Write what was on the bus, with the stamps that a bus in real time would have given."""
+        while (message := self.tap.recv(0)) is not None:
+            if message.arbitration_id == 0x080:
+                self.stamp_ns = max(self.stamp_ns, BEGIN_NS - 1_000_000) + 1_000_000
+            for sink in self.sinks:
+                late_ns = 0 if message.arbitration_id == 0x080 else 150_000
+                sink.frame(self.stamp_ns + late_ns, message.arbitration_id, bytes(message.data))
+
+    def replayed(self, suffix: str, frames: bool | None = None) -> list[Estimate]:
+        path = self.folder / f"r{suffix}"
+        playback = open_playback(path, self.joint, self.folder, frames=frames)
+        return [played.estimate for played in playback]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    return Recorded(tmp_path_factory.mktemp("rec"), daemonkit.vsa_text(), None)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "frames"), [(suffix, None) for suffix in FORMATS] + [(".mcap", True)], ids=str
+)
+def test_every_format_gives_the_published_estimates_bit_for_bit(
+    recorded: Recorded, suffix: str, frames: bool | None
+) -> None:
+    # The mapping of the raw logs is the one the daemon configured by SDO, heard in the log itself.
+    assert len(recorded.live) == CYCLES
+    assert [bits(e) for e in recorded.replayed(suffix, frames)] == [bits(e) for e in recorded.live]
+
+
+def disturb(rig: daemonkit.Rig) -> None:
+    at, syncs = rig.faults.at, rig.network.syncs
+    node = rig.node
+    at(syncs + 60, lambda: rig.faults.mute(node(2), rig.tpdo(2)[0]))
+    at(syncs + 120, lambda: rig.faults.delay(node(3), rig.tpdo(3)[0], 2))
+    at(syncs + 180, lambda: rig.faults.repeat(node(1), rig.tpdo(1)[0], cycles=3))
+    at(syncs + 240, lambda: rig.faults.emergency(node(1), 0x2310, 0x02))
+    at(syncs + 300, lambda: rig.faults.resize(node(2), rig.tpdo(2)[0], 6, cycles=2))
+
+
+@pytest.mark.parametrize("suffix", [".log", ".blf"])
+def test_a_disturbed_bus_is_judged_as_it_was_live(suffix: str, tmp_path: Path) -> None:
+    recorded = Recorded(tmp_path, daemonkit.vsa_text(), disturb)
+    statuses = {int(e.status) for e in recorded.live}
+    assert len(statuses) > 3  # faults were seen at all
+    assert [bits(e) for e in recorded.replayed(suffix)] == [bits(e) for e in recorded.live]
+
+
+def test_raw_frames_and_samples_make_the_same_record(recorded: Recorded) -> None:
+    first = read(recorded.folder / "r.csv", recorded.joint)
+    for suffix in (".log", ".mcap"):
+        other = read(recorded.folder / f"r{suffix}", recorded.joint)
+        assert np.array_equal(first.motor_position_rad, other.motor_position_rad)
+        assert np.array_equal(first.motor_torque_nm, other.motor_torque_nm)
+        assert first.period_s == other.period_s
+
+
+def test_a_log_without_its_configuration_says_what_the_joint_file_must_tell(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    lines = (recorded.folder / "r.log").read_text().splitlines(keepends=True)
+    path = tmp_path / "late.log"
+    path.write_text("".join(lines[len(lines) // 2 :]))
+    with pytest.raises(DrivelinkError) as caught:
+        open_playback(path, recorded.joint, tmp_path)
+    assert "late.log" in str(caught.value) and "motor[1].drive" in str(caught.value)
+
+
+def test_frames_recorded_from_a_running_daemon_are_decoded_by_its_model_document(tmp_path: Path) -> None:
+    """Nobody configures the drives in this recording: the daemon did so before it began."""
+    text = daemonkit.vsa_text()
+    joint = parse(text)
+    path = tmp_path / "late.mcap"
+    sink = open_sink(path, joint, text, str(tmp_path))
+    with can.Bus(interface="virtual", channel=joint.bus.channel) as tap, daemonkit.rig(joint) as rig:
+        rig.run(20)
+        while tap.recv(0) is not None:
+            pass
+        skipped, cycle = len(rig.collector.samples), 0
+        model = describe_model(joint, list(rig.daemon.layouts.values()))
+        sink.document("model", to_json(model), BEGIN_NS)
+        rig.run(100)
+        while (message := tap.recv(0)) is not None:
+            cycle += message.arbitration_id == 0x080
+            sink.frame(BEGIN_NS + cycle * 1_000_000, message.arbitration_id, bytes(message.data))
+        live = [sample for sample, _ in rig.collector.samples[skipped:]]
+    sink.close()
+    played = [one.sample for one in open_playback(path, joint, tmp_path, frames=True)]
+    assert len(live) == 100
+    assert [repr(one[1:]) for one in played if one is not None] == [repr(one[1:]) for one in live]
+
+
+def test_a_log_with_another_period_is_taken_as_it_comes(
+    recorded: Recorded, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    bus = recorded.joint.bus.model_copy(update={"period_s": 0.002})
+    joint = recorded.joint.model_copy(update={"bus": bus})
+    with caplog.at_level(logging.WARNING, "drivelink.recording"):
+        playback = open_playback(recorded.folder / "r.log", joint, tmp_path)
+    assert playback.period_s == 0.001 and "SYNC comes every 0.001 s" in caplog.text
+
+
+# The command
+
+SINE = """\
+name = "sine"
+[[motor]]
+inertia_kg_m2 = 0.125
+viscous_damping_nm_s_rad = 0.8
+[motor.transmission]
+model = "linear"
+parameters = { k_nm_rad = 150.0 }
+"""
+
+
+def write_csv(path: Path, n: int, nan_row: int | None = None) -> Path:
+    t = np.arange(n) * 0.002
+    theta, q = 0.2 * np.sin(3 * t), 0.25 * np.sin(3 * t - 0.1)
+    tau = 0.125 * -1.8 * np.sin(3 * t) + 0.8 * 0.6 * np.cos(3 * t) - 150.0 * (q - theta)
+    table = np.column_stack((t, theta, tau, q))
+    if nan_row is not None:
+        table[nan_row, 1] = np.nan
+    header = "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad"
+    np.savetxt(path, table, fmt="%.17g", delimiter=",", header=header, comments="")
+    return path
+
+
+@pytest.fixture
+def joint_path(tmp_path: Path) -> Path:
+    path = tmp_path / "sine.toml"
+    path.write_text(SINE)
+    return path
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_estimates_csv_has_the_columns_of_the_contract_and_a_row_for_each_sample(
+    tmp_path: Path, joint_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = write_csv(tmp_path / "r.csv", 1500, nan_row=700)
+    out, plots = tmp_path / "e.csv", tmp_path / "plots"
+    arguments = ["--joint", str(joint_path), "--out", str(out), "--plots", str(plots)]
+    assert cli.main(["replay", str(recording), *arguments]) == 0
+    table = rows(out)
+    assert list(table[0])[:5] == [
+        "time_s", "flexibility_torque_nm", "stiffness_nm_rad", "stiffness_std_nm_rad", "observable"
+    ]  # fmt: skip
+    assert list(table[0])[5:8] == [
+        "motor1_flexibility_torque_nm", "motor1_stiffness_nm_rad", "motor1_stiffness_std_nm_rad"
+    ]  # fmt: skip
+    assert [float(row["time_s"]) for row in table] == pytest.approx(np.arange(1500) * 0.002, abs=1e-12)
+    assert {row["observable"] for row in table} <= {"0", "1"}
+    # The truth is 150 N·m/rad and noise-free: 1 % after three seconds is a wide bound.
+    assert float(table[-1]["stiffness_nm_rad"]) == pytest.approx(150.0, rel=0.01)
+    assert all((plots / name).stat().st_size > 5000 for name in ("stiffness.png", "time.png"))
+    assert "1500 cycles" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "line"),
+    [
+        (["none.csv", "--joint", "{joint}"], 3, "no such file"),
+        (["{recording}"], 2, "--joint: expected the joint file"),
+        (["{recording}", "--joint", "none.toml"], 2, "cannot be read as a joint file"),
+        (["{recording}", "--joint", "{joint}", "--speed", "-1"], 2, "--speed: expected a number above 0"),
+        (["{recording}", "--joint", "{joint}", "--out", "/no/such/folder/e.csv"], 3, "cannot be written"),
+    ],
+)
+def test_wrong_use_is_one_line_and_a_status(
+    arguments: list[str],
+    status: int,
+    line: str,
+    tmp_path: Path,
+    joint_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    recording = write_csv(tmp_path / "r.csv", 100)
+    filled = [a.format(joint=joint_path, recording=recording) for a in arguments]
+    assert cli.main(["replay", *filled]) == status
+    err = capsys.readouterr().err
+    assert line in err and err.count("\n") == 1
+
+
+def test_ctrl_c_leaves_the_estimates_so_far(tmp_path: Path, joint_path: Path) -> None:
+    recording = write_csv(tmp_path / "r.csv", 20_000)
+    out = tmp_path / "e.csv"
+    command = [sys.executable, "-m", "drivelink", "replay", str(recording), "--joint", str(joint_path)]
+    process = subprocess.Popen(
+        [*command, "--out", str(out), "--realtime"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    zenohkit.until(out.exists)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGINT)
+    text, errors = process.communicate(timeout=90)
+    assert process.returncode == 130 and not errors, errors
+    assert "up to the interruption" in text
+    table = rows(out)
+    assert 0 < len(table) < 20_000 and all(row["motor1_deflection_rad"] for row in table)
+
+
+def test_publish_sends_every_estimate_to_a_subscriber(tmp_path: Path) -> None:
+    endpoint = zenohkit.free_endpoint()
+    joint_path = tmp_path / "sine.toml"
+    joint_path.write_text(SINE + f'[zenoh]\nendpoint = "{endpoint}"\n')
+    recording = write_csv(tmp_path / "r.csv", 2000)
+    joint: JointFile = jointfile.load(joint_path)
+    from drivelink import subscribe
+
+    with subscribe("sine", endpoint=endpoint, depth=4096) as subscription:
+        status = cli.main(["replay", str(recording), "--joint", str(joint_path), "--publish"])
+        assert status == 0
+        got = []
+        for estimate in subscription.cycles(timeout_s=2.0):
+            if estimate is None:
+                break
+            got.append(estimate)
+            if estimate.sequence == 1999:
+                break
+        assert subscription.status["state"] == "ended"
+    local = [p.estimate for p in open_playback(recording, joint, tmp_path)]
+    by_sequence = {e.sequence: bits(e) for e in local}
+    # The replay begins when the subscriber is there: nothing is missing.
+    received = [bits(Estimate(e.sequence, e.status, *e[3:])) for e in got]
+    assert received == [by_sequence[k] for k in range(2000)]

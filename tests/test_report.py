@@ -1,0 +1,130 @@
+"""`drivelink diagnose`: report.json as promised, a page of its own, a joint file that knows the effect."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import diagnosiskit as kit
+import numpy as np
+import pytest
+
+from drivelink import jointfile
+from drivelink.cli import main
+from drivelink.floor import make_watch
+from estimator.sample import Record
+
+JOINT = f"""\
+name = "elbow"
+arrangement = "single"
+[[motor]]
+inertia_kg_m2 = {kit.INERTIA}
+viscous_damping_nm_s_rad = {kit.DAMPING}
+[motor.transmission]
+model = "linear"
+[link.dynamics]
+inertia_kg_m2 = {kit.LINK_INERTIA}
+viscous_damping_nm_s_rad = {kit.LINK_DAMPING}
+gravity_nm = {kit.GRAVITY}
+"""
+ERROR = {"before_rms_nm", "after_rms_nm", "before_relative", "after_relative"}
+
+
+def _csv(record: Record, path: Path) -> Path:
+    names = "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad"
+    assert record.link_position_rad is not None
+    motor, torque = record.motor_position_rad[:, 0], record.motor_torque_nm[:, 0]
+    table = np.column_stack((record.time_s, motor, torque, record.link_position_rad))
+    np.savetxt(path, table, delimiter=",", header=names, comments="", fmt="%.9g")
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("diagnose")
+    effects = [{}, {"coulomb_nm": 0.4}, {"late_s": 0.004}, {"bump_nm": 1.0}]
+    for name, record in zip(("clean", "coulomb", "late", "bump"), kit.World(effects).run(), strict=True):
+        _csv(record, folder / f"{name}.csv")
+    (folder / "joint.toml").write_text(JOINT, encoding="utf-8")
+    return folder
+
+
+def _diagnose(folder: Path, name: str, joint: str = "joint.toml", *more: str) -> dict:  # type: ignore[type-arg]
+    out = folder / f"{name}-{joint}"
+    arguments = ["diagnose", str(folder / f"{name}.csv"), "--joint", str(folder / joint), "--out", str(out)]
+    assert main([*arguments, *more]) == 0
+    return json.loads((out / "report.json").read_text(encoding="utf-8"))  # type: ignore[no-any-return]
+
+
+def test_report_json_is_as_promised(folder: Path) -> None:
+    report = _diagnose(folder, "coulomb")
+    assert report["schema"] == "drivelink.diagnosis/1"
+    assert report["verdict"] == "effect"
+    assert report["bandwidth_hz"] > 0
+    effect = report["effects"][0]
+    assert {"name", "location", "parameters", "std", "alternatives"} <= set(effect)
+    assert (effect["name"], effect["location"]) == ("coulomb_friction", "motor")
+    assert set(report["error"]) == {"train", "validation"}
+    assert set(report["error"]["train"]) == set(report["error"]["validation"]) == ERROR
+
+
+def test_the_written_joint_file_knows_the_effect_and_its_floor(folder: Path) -> None:
+    for name, place in (("coulomb", "motor"), ("late", "link")):
+        better = f"{name}-better.toml"
+        _diagnose(folder, name, "joint.toml", "--write", str(folder / better))
+        joint = jointfile.load(folder / better)
+        effects = joint.motor[0].effect if place == "motor" else joint.link.effect
+        assert [e.name for e in effects] == [{"coulomb": "coulomb_friction", "late": "encoder_delay"}[name]]
+        assert make_watch(joint) is not None
+        assert _diagnose(folder, name, better)["verdict"] == "sufficient"
+
+
+def test_an_unlisted_effect_comes_with_its_curve(folder: Path) -> None:
+    effect = _diagnose(folder, "bump")["effects"][0]
+    assert (effect["name"], effect["location"], effect["coordinates"]) == ("unlisted", "motor", ["position"])
+    assert len(effect["curve"]["position"]) == len(effect["curve"]["torque_nm"]) > 100
+
+
+def test_the_page_is_self_contained_and_says_the_verdict(folder: Path) -> None:
+    _diagnose(folder, "coulomb")
+    page = (folder / "coulomb-joint.toml" / "report.html").read_text(encoding="utf-8")
+    assert "The model lacks coulomb friction (motor)" in page
+    assert page.count("<svg") >= 3
+    for foreign in ('src="http', 'href="http', "@import", "<script"):
+        assert foreign not in page
+
+
+def test_a_page_without_a_curve_has_no_empty_section(folder: Path) -> None:
+    for name, there in (("clean", False), ("coulomb", True)):
+        _diagnose(folder, name)
+        page = (folder / f"{name}-joint.toml" / "report.html").read_text(encoding="utf-8")
+        assert ("What reveals it" in page) is there
+
+
+def test_a_fitted_joint_file_is_calibrated_and_watched(folder: Path) -> None:
+    fitted = folder / "healthy.toml"
+    arguments = [
+        "fit",
+        str(folder / "clean.csv"),
+        "--joint",
+        str(folder / "joint.toml"),
+        "--write",
+        str(fitted),
+    ]
+    assert main(arguments) == 0
+    joint = jointfile.load(fitted)
+    assert joint.link.dynamics is not None
+    # The declared numbers are exact; noise moves them by less than a percent.
+    assert joint.link.dynamics.inertia_kg_m2 == pytest.approx(kit.LINK_INERTIA, rel=0.01)
+    assert make_watch(joint) is not None
+    assert _diagnose(folder, "clean", "healthy.toml")["verdict"] == "sufficient"
+
+
+def test_what_cannot_be_diagnosed_is_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (folder / "clean.csv").read_text(encoding="utf-8").splitlines()
+    (folder / "short.csv").write_text("\n".join(text[:900]) + "\n", encoding="utf-8")
+    arguments = ["diagnose", str(folder / "short.csv"), "--joint", str(folder / "joint.toml")]
+    assert main([*arguments, "--out", str(folder / "no")]) == 3
+    error = capsys.readouterr().err
+    assert "too short" in error
+    assert error.count("\n") == 1

@@ -1,0 +1,272 @@
+"""What a ROS 2 node with rmw_zenoh would find and receive; rosbags is the independent reading of it."""
+
+import struct
+import time
+from pathlib import Path
+
+import pytest
+import xxhash
+import zenoh
+from rosbags.typesys import Stores, get_typestore
+from zenoh.ext import Int64, z_serialize
+from zenohkit import free_endpoint, make_joint, until
+
+from drivelink.pubsub.publisher import JointPublisher
+from drivelink.pubsub.ros2 import TYPE_HASHES, Ros2Publisher, joint_state, stiffness_array
+from drivelink.pubsub.session import close_session, open_client, open_session
+from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+STAMP_NS = 1_700_000_000_123_456_789
+STATE = "sensor_msgs::msg::dds_::JointState_"
+ARRAY = "std_msgs::msg::dds_::Float64MultiArray_"
+DIAGNOSTICS = "diagnostic_msgs::msg::dds_::DiagnosticArray_"
+
+
+def estimate(sequence=1, status=Status.VALID):
+    transmissions = (TransmissionEstimate(9.0, 30.0, 1.0, 0.3), TransmissionEstimate(-10.0, 31.0, 1.5, -0.3))
+    return Estimate(sequence, int(status), -1.0, 61.0, 1.75, transmissions)
+
+
+def sample(sequence=1, position=0.25, velocity=0.5):
+    return Sample(sequence, (0.1, 0.2), (0.0, 0.0), (1.0, 2.0), position, velocity)
+
+
+@pytest.fixture
+def ros2():
+    """A function that opens a joint with this [ros2] table; and a client of its endpoint."""
+    endpoint = free_endpoint()
+    sessions = []
+    publishers = []  # what is dropped leaves the graph
+
+    def start(table="", name="elbow"):
+        joint = make_joint(name, endpoint, f"[ros2]\n{table}")
+        if not sessions:
+            sessions.append(open_session(joint.zenoh, Path()))
+            sessions.append(open_client(endpoint))
+            until(lambda: sessions[1].info.peers_zid())
+        publishers.append(Ros2Publisher(sessions[0], joint))
+        return publishers[-1], sessions[1]
+
+    yield start
+    for session in reversed(sessions):
+        close_session(session)
+
+
+def tokens(client, domain=0):
+    return sorted(
+        str(reply.ok.key_expr)
+        for reply in client.liveliness().get(f"@ros2_lv/{domain}/**", timeout=2.0)
+        if reply.ok
+    )
+
+
+def receive(client, key, put):
+    subscriber = client.declare_subscriber(key, zenoh.handlers.RingChannel(64))
+    return until(lambda: put() or subscriber.try_recv())
+
+
+@pytest.mark.parametrize("kind", TYPE_HASHES)
+def test_type_hashes_are_those_that_rosbags_computes(kind):
+    name = kind.replace("::msg::dds_::", "/msg/").rstrip("_")
+    assert TYPE_HASHES[kind] == STORE.hash_rihs01(name)
+
+
+@pytest.mark.parametrize("name", ["e", "el", "elb", "elbo", "elbow", "elbow6", "elbow_7", "elbow_78"])
+def test_joint_states_are_the_bytes_that_rosbags_writes_whatever_the_alignment(name):
+    payload = joint_state(name)(7, 8, 0.25, 0.5, -1.0)
+    message = STORE.deserialize_cdr(payload, "sensor_msgs/msg/JointState")
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (7, 8)
+    assert message.name == [name]
+    assert message.position.tolist() == [0.25]
+    assert message.velocity.tolist() == [0.5]
+    assert message.effort.tolist() == [-1.0]
+    assert bytes(STORE.serialize_cdr(message, message.__msgtype__)) == payload
+
+
+@pytest.mark.parametrize("transmissions", [0, 1, 2])
+def test_stiffness_is_a_labelled_matrix(transmissions):
+    numbers = [float(n) for n in range(2 + 2 * transmissions)]
+    payload = stiffness_array(transmissions)(*numbers)
+    message = STORE.deserialize_cdr(payload, "std_msgs/msg/Float64MultiArray")
+    rows, columns = message.layout.dim
+    assert rows.label.split(",") == ["joint", "transmission1", "transmission2"][: 1 + transmissions]
+    assert columns.label.split(",") == ["stiffness_nm_rad", "stiffness_std_nm_rad"]
+    assert (rows.size, rows.stride) == (1 + transmissions, len(numbers))
+    assert (columns.size, columns.stride, message.layout.data_offset) == (2, 2, 0)
+    assert message.data.tolist() == numbers
+    assert bytes(STORE.serialize_cdr(message, message.__msgtype__)) == payload
+
+
+def test_a_cycle_arrives_where_a_ros_node_listens(ros2):
+    publisher, client = ros2()
+    put = lambda: publisher.put_cycle(estimate(), sample(), STAMP_NS)  # noqa: E731
+    state = receive(client, f"0/joint_states/{STATE}/{TYPE_HASHES[STATE]}", put)
+    message = STORE.deserialize_cdr(state.payload.to_bytes(), "sensor_msgs/msg/JointState")
+    assert message.name == ["elbow"]
+    assert (message.position[0], message.velocity[0], message.effort[0]) == (0.25, 0.5, -1.0)
+    assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == STAMP_NS
+    array = receive(client, f"0/elbow/stiffness/{ARRAY}/{TYPE_HASHES[ARRAY]}", put)
+    message = STORE.deserialize_cdr(array.payload.to_bytes(), "std_msgs/msg/Float64MultiArray")
+    assert message.data.reshape(3, 2).tolist() == [[61.0, 1.75], [30.0, 1.0], [31.0, 1.5]]
+
+
+def test_the_graph_shows_one_node_with_three_publishers(ros2):
+    _, client = ros2('namespace = "robot/arm"\ndomain = 7')
+    until(lambda: len(tokens(client, 7)) == 4)
+    node, *publishers = sorted(tokens(client, 7), key=lambda key: "/MP/" in key)
+    root, domain, zid, node_id, entity_id, kind, *names = node.split("/")
+    assert (root, domain, kind, node_id) == ("@ros2_lv", "7", "NN", entity_id)
+    assert names == ["%", "%robot%arm", "drivelink_elbow"]
+    assert len(publishers) == 3
+    assert {key.split("/")[9] for key in publishers} == {
+        "%robot%arm%joint_states",
+        "%robot%arm%elbow%stiffness",
+        "%diagnostics",
+    }
+    for key in publishers:
+        parts = key.split("/")
+        assert parts[:4] == ["@ros2_lv", "7", zid, node_id]
+        assert parts[5:9] == ["MP", "%", "%robot%arm", "drivelink_elbow"]
+        assert parts[11] == TYPE_HASHES[parts[10]]
+        assert parts[12] == "::,10:,:,:,,"
+
+
+def test_two_joints_of_one_session_are_two_nodes(ros2):
+    _, client = ros2()
+    ros2(name="knee")
+    until(lambda: len(tokens(client)) == 8)
+    identities = [tuple(key.split("/")[2:5]) for key in tokens(client)]
+    assert len(set(identities)) == 8
+
+
+def test_the_attachment_carries_sequence_time_and_the_publishers_identity(ros2):
+    publisher, client = ros2()
+    put = lambda: publisher.put_cycle(estimate(), sample(), STAMP_NS)  # noqa: E731
+    message = receive(client, f"0/joint_states/{STATE}/*", put)
+    attachment = message.attachment.to_bytes()
+    sequence, stamp_ns, length, gid = struct.unpack("<qqB16s", attachment)
+    assert attachment == z_serialize((Int64(sequence), Int64(STAMP_NS), gid)).to_bytes()
+    assert (stamp_ns, length) == (STAMP_NS, 16)
+    assert sequence >= 1
+    (token,) = [key for key in tokens(client) if "%joint_states" in key]
+    digest = xxhash.xxh3_128(token.encode()).digest()  # big-endian: high 64 bits, then low
+    assert gid == digest[:7:-1] + digest[7::-1]
+
+
+def test_diagnostics_come_once_a_second_with_a_level_that_fits_the_status(ros2):
+    publisher, client = ros2()
+    subscriber = client.declare_subscriber(f"0/diagnostics/{DIAGNOSTICS}/**", zenoh.handlers.RingChannel(64))
+    start_ns = 0
+
+    def begin():
+        nonlocal start_ns
+        start_ns += 10**9
+        publisher.put_status({"state": "running"}, start_ns)
+        return subscriber.try_recv()
+
+    until(begin)
+    time.sleep(0.3)  # for those of the beginning that are still under way
+    while subscriber.try_recv() is not None:
+        pass
+    expected = [(Status.VALID, 0, "valid"), (Status(0), 1, "not valid yet")]
+    expected += [
+        (Status.VALID | Status.DRIVE_FAULT, 2, "drive_fault"),
+        (Status.VALID | Status.STALE, 3, "no fresh"),
+    ]
+    expected += [(Status.VALID | Status.MODEL_ALARM, 1, "model_alarm")]
+    for number, (status, level, words) in enumerate(expected, 1):
+        publisher.put_cycle(estimate(status=status), sample(), STAMP_NS)
+        for tenth in range(10):
+            now_ns = start_ns + number * 10**9 + tenth * 10**8
+            publisher.put_status({"state": "running", "latency": {"p99_us": 80.5}}, now_ns)
+        message = STORE.deserialize_cdr(
+            until(subscriber.try_recv).payload.to_bytes(), "diagnostic_msgs/msg/DiagnosticArray"
+        )
+        (told,) = message.status
+        assert told.level == level
+        assert told.message.startswith(words)
+        assert (told.name, told.hardware_id) == ("drivelink: elbow", "elbow")
+        assert {pair.key: pair.value for pair in told.values} == {
+            "state": "running",
+            "latency.p99_us": "80.5",
+        }
+        assert bytes(STORE.serialize_cdr(message, message.__msgtype__))
+    assert subscriber.try_recv() is None
+
+
+def test_humble_knows_no_type_hashes(ros2):
+    publisher, client = ros2('distro = "humble"')
+    put = lambda: publisher.put_cycle(estimate(), sample(), STAMP_NS)  # noqa: E731
+    assert receive(client, f"0/joint_states/{STATE}/TypeHashNotSupported", put)
+
+
+def test_every_nth_cycle_only_where_that_is_asked(ros2):
+    publisher, client = ros2("every = 10")
+    subscriber = client.declare_subscriber(f"0/joint_states/{STATE}/**", zenoh.handlers.RingChannel(64))
+    until(lambda: publisher.put_cycle(estimate(10), sample(10), 10) or subscriber.try_recv())
+    while subscriber.try_recv() is not None:
+        pass
+    for sequence in range(11, 41):
+        publisher.put_cycle(estimate(sequence), sample(sequence), sequence)
+        time.sleep(0.001)
+    stamps = []
+    until(
+        lambda: (
+            stamps.append(struct.unpack("<q", until(subscriber.try_recv).attachment.to_bytes()[8:16])[0])
+            or stamps[-1] == 40
+        )
+    )
+    # Those of the tenth that were still under way when the subscriber was found come first.
+    assert [stamp for stamp in stamps if stamp > 10] == [20, 30, 40]
+
+
+def test_a_velocity_that_is_not_measured_is_the_filtered_change_of_position(ros2):
+    """A steady 2 rad/s comes out to the filter's settling, e^-20 after 100 ms."""
+    publisher, client = ros2()
+    for sequence in range(1, 101):
+        publisher.put_cycle(estimate(sequence), sample(sequence, 0.002 * sequence, float("nan")), STAMP_NS)
+    put = lambda: publisher.put_cycle(estimate(101), sample(101, 0.202, float("nan")), STAMP_NS)  # noqa: E731
+    state = receive(client, f"0/joint_states/{STATE}/*", put)
+    message = STORE.deserialize_cdr(state.payload.to_bytes(), "sensor_msgs/msg/JointState")
+    assert message.velocity[0] == pytest.approx(2.0, rel=1e-6)
+
+
+def test_leaving_takes_the_node_off_the_graph(ros2):
+    publisher, client = ros2()
+    assert until(lambda: tokens(client))
+    publisher.close()
+    publisher.close()
+    until(lambda: not tokens(client))
+
+
+def test_the_joints_publisher_serves_ros_where_the_joint_file_asks_for_it():
+    joint = make_joint("elbow", free_endpoint(), "[ros2]\n")
+    session = open_session(joint.zenoh, Path())
+    try:
+        publisher = JointPublisher(session, joint)
+        subscriber = session.declare_subscriber("0/**", zenoh.handlers.RingChannel(64))
+        publisher.put_estimate(estimate(), STAMP_NS)
+        publisher.put_sample(sample(), STAMP_NS)
+        publisher.put_status({"state": "running"})
+        topics = {str(until(subscriber.try_recv).key_expr).rpartition("/")[0] for _ in range(3)}
+        assert topics == {
+            f"0/joint_states/{STATE}",
+            f"0/elbow/stiffness/{ARRAY}",
+            f"0/diagnostics/{DIAGNOSTICS}",
+        }
+        publisher.close()
+    finally:
+        close_session(session)
+
+
+def test_a_joint_without_the_table_or_with_it_switched_off_is_no_ros_node():
+    for table in ("", "[ros2]\nenabled = false\n"):
+        joint = make_joint("elbow", free_endpoint(), table)
+        session = open_session(joint.zenoh, Path())
+        try:
+            publisher = JointPublisher(session, joint)
+            assert not tokens(session)
+            publisher.close()
+        finally:
+            close_session(session)

@@ -1,0 +1,245 @@
+"""Zenoh sessions between real processes: sharing one endpoint, losing one, safe defaults, clean ends."""
+
+import json
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import zenoh
+from zenohkit import LIMIT_S, free_endpoint, make_joint, ready, script, until
+
+from drivelink.errors import ZenohError
+from drivelink.jointfile import ZenohSection
+from drivelink.pubsub.publisher import JointPublisher
+from drivelink.pubsub.session import client_config, close_session, daemon_config, open_client, open_session
+
+
+@pytest.fixture
+def endpoint():
+    return free_endpoint()
+
+
+@pytest.fixture
+def plain_client(endpoint):
+    """A client as somebody else would write it: no drivelink in it."""
+    sessions = []
+
+    def connect():
+        config = zenoh.Config()
+        for key, value in {
+            "mode": "client",
+            "connect/endpoints": [endpoint],
+            "scouting/multicast/enabled": False,
+        }.items():
+            config.insert_json5(key, json.dumps(value))
+        sessions.append(zenoh.open(config))
+        return sessions[-1]
+
+    yield connect
+    for session in sessions:
+        session.close()
+
+
+def heard(subscriber):
+    """Drain a subscriber; the joints that spoke since."""
+    names = set()
+    while (sample := subscriber.try_recv()) is not None:
+        names.add(str(sample.key_expr).split("/")[1])
+    return names
+
+
+def hear(subscriber, expected):
+    """Wait until exactly these joints have been heard."""
+    joints = set()
+    until(lambda: joints.update(heard(subscriber)) or joints == expected)
+
+
+def test_a_plain_client_of_the_one_endpoint_receives_every_daemon_of_the_machine(endpoint, plain_client):
+    with script("a", endpoint) as a, script("b", endpoint) as b, script("c", endpoint) as c:
+        for process in (a, b, c):
+            ready(process)
+        subscriber = plain_client().declare_subscriber("drivelink/*/estimate", zenoh.handlers.RingChannel(64))
+        hear(subscriber, {"a", "b", "c"})
+
+
+def test_when_the_first_daemon_is_killed_the_others_are_received_again(endpoint, plain_client):
+    with script("a", endpoint) as a:
+        ready(a)
+        with script("b", endpoint) as b, script("c", endpoint) as c:
+            ready(b), ready(c)
+            subscriber = plain_client().declare_subscriber(
+                "drivelink/*/estimate", zenoh.handlers.RingChannel(64)
+            )
+            hear(subscriber, {"a", "b", "c"})
+            a.kill()
+            a.wait()
+            time.sleep(0.3)  # for what it sent before
+            heard(subscriber)
+            hear(subscriber, {"b", "c"})
+            with script("a", endpoint) as again:  # and the dead one may come back
+                ready(again)
+                hear(subscriber, {"a", "b", "c"})
+
+
+def test_daemons_that_start_before_any_of_them_listens_still_meet(endpoint, plain_client):
+    with script("a", endpoint) as a, script("b", endpoint) as b:  # at once: both ask for the endpoint
+        ready(a), ready(b)
+        subscriber = plain_client().declare_subscriber("drivelink/*/estimate", zenoh.handlers.RingChannel(64))
+        hear(subscriber, {"a", "b"})
+
+
+def test_nothing_listens_beyond_the_loopback_and_nothing_is_multicast(endpoint):
+    config = daemon_config(endpoint, listen=True)
+    assert json.loads(config.get_json("scouting/multicast/enabled")) is False
+    assert json.loads(config.get_json("adminspace/enabled")) is False
+    with script("a", endpoint) as process:
+        ready(process)
+        inodes = {link.readlink().name for link in Path(f"/proc/{process.pid}/fd").iterdir() if link.exists()}
+        local = [
+            fields[1].split(":")[0]
+            for table in ("tcp", "tcp6", "udp", "udp6")
+            for fields in map(
+                str.split, Path(f"/proc/{process.pid}/net/{table}").read_text().splitlines()[1:]
+            )
+            if f"socket:[{fields[9]}]" in inodes
+        ]
+    assert local
+    assert set(local) == {"0100007F"}  # 127.0.0.1 only, UDP included
+
+
+def test_a_second_daemon_with_the_same_joint_name_ends_with_one_line(endpoint):
+    with script("elbow", endpoint) as first:
+        ready(first)
+        with script("elbow", endpoint) as second:
+            out, error = second.communicate(timeout=LIMIT_S)
+    assert second.returncode == 1
+    assert out == ""
+    assert error.strip().count("\n") == 0
+    assert "another daemon already serves a joint named elbow" in error
+
+
+def test_the_name_is_free_again_once_its_daemon_was_killed(endpoint):
+    for _ in range(2):
+        with script("elbow", endpoint) as process:
+            ready(process)
+
+
+def test_of_two_daemons_that_start_at_once_with_one_name_one_stays(endpoint):
+    with script("elbow", endpoint) as one, script("elbow", endpoint) as other:
+        until(lambda: one.poll() is not None or other.poll() is not None)
+        stays = other if one.poll() is not None else one
+        ready(stays)
+        assert stays.poll() is None
+
+
+def test_an_uncaught_exception_ends_the_process(endpoint):
+    with script("elbow", endpoint, "", "raise") as process:
+        _, error = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 1
+    assert error.endswith("RuntimeError: uncaught\n")
+
+
+def test_a_client_that_forgets_to_close_ends_too(endpoint):
+    code = (
+        "import drivelink, time\n"
+        f"joint = drivelink.subscribe('elbow', endpoint='{endpoint}')\n"
+        "joint.wait(0.05); joint.status\n"
+        "raise RuntimeError('uncaught')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=LIMIT_S, check=False
+    )
+    assert done.returncode == 1
+    assert done.stderr.endswith("RuntimeError: uncaught\n")
+
+
+def test_another_program_on_the_endpoint_is_one_line(endpoint):
+    port = int(endpoint.rpartition(":")[2])
+    with socket.create_server(("127.0.0.1", port)), pytest.raises(ZenohError) as error:
+        open_session(ZenohSection(endpoint=endpoint), Path())
+    assert f"{endpoint}: another program listens there" in str(error.value)
+
+
+@pytest.mark.parametrize("endpoint", ["nonsense", "tcp", "carrier-pigeon/roof"])
+def test_an_endpoint_that_is_none_is_one_line(endpoint):
+    with pytest.raises(ZenohError) as error:
+        close_session(open_session(ZenohSection(endpoint=endpoint), Path()))
+    assert "\n" not in str(error.value)
+    assert endpoint in str(error.value)
+
+
+def test_the_users_configuration_is_passed_through_whole(tmp_path, endpoint):
+    (tmp_path / "mine.json5").write_text(
+        f'{{ mode: "router", listen: {{ endpoints: ["{endpoint}"] }}, /* a comment */\n'
+        '  scouting: { multicast: { enabled: false } }, id: "abcdef0123456789" }'
+    )
+    session = open_session(ZenohSection(config="mine.json5"), tmp_path)
+    try:
+        assert str(session.zid()) == "abcdef0123456789"
+        client = open_client(endpoint)
+        try:
+            assert until(lambda: [str(zid) for zid in client.info.routers_zid()]) == ["abcdef0123456789"]
+        finally:
+            close_session(client)
+    finally:
+        close_session(session)
+
+
+@pytest.mark.parametrize("text", [None, "{ mode: ", '{ mode: "spectator" }', "{ no_such_key: 1 }"])
+def test_a_configuration_that_cannot_be_used_is_one_line_with_its_file(tmp_path, text):
+    if text is not None:
+        (tmp_path / "mine.json5").write_text(text)
+    with pytest.raises(ZenohError) as error:
+        open_session(ZenohSection(config="mine.json5"), tmp_path)
+    assert str(tmp_path / "mine.json5") in str(error.value)
+    assert "\n" not in str(error.value)
+    assert ".rs:" not in str(error.value)
+
+
+def test_a_subscriber_that_is_stuck_never_makes_the_publisher_wait(endpoint):
+    settings = json.loads(
+        daemon_config(endpoint, listen=True).get_json("transport/link/tx/queue/congestion_control/drop")
+    )
+    assert settings["wait_before_drop"] == 0
+
+
+def test_closing_twice_and_closing_after_the_end_is_fine(endpoint):
+    session = zenoh.open(client_config(endpoint))
+    close_session(session)
+    close_session(session)
+
+
+def test_two_joints_of_one_process_share_a_session(endpoint):
+    elbow, knee = make_joint("elbow", endpoint), make_joint("knee", endpoint)
+    session = open_session(elbow.zenoh, Path())
+    try:
+        publishers = [JointPublisher(session, joint) for joint in (elbow, knee)]
+        with pytest.raises(ZenohError, match="joint named knee"):
+            JointPublisher(session, knee)
+        for publisher in publishers:
+            publisher.close()
+    finally:
+        close_session(session)
+
+
+def test_where_a_router_was_no_daemon_takes_its_place(endpoint, tmp_path):
+    (tmp_path / "router.json5").write_text(
+        f'{{ mode: "router", listen: {{ endpoints: ["{endpoint}"] }}, scouting: {{ multicast: {{ enabled: false }} }} }}'
+    )
+    router = ZenohSection(config="router.json5")
+    first = open_session(router, tmp_path)
+    daemon = open_session(ZenohSection(endpoint=endpoint), Path())
+    try:
+        until(lambda: daemon.info.routers_zid())
+        close_session(first)
+        until(lambda: not daemon.info.routers_zid())
+        again = open_session(router, tmp_path)  # fails if the endpoint is taken
+        try:
+            until(lambda: daemon.info.routers_zid())
+        finally:
+            close_session(again)
+    finally:
+        close_session(daemon)

@@ -1,0 +1,138 @@
+"""TLS, mutual TLS and access control, with the configuration files that are shipped as examples."""
+
+import os
+import shutil
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+import zenoh
+from zenohkit import free_endpoint, make_estimate, make_joint, until
+
+import drivelink
+from drivelink.errors import ZenohError
+from drivelink.pubsub import wire
+from drivelink.pubsub.publisher import JointPublisher
+from drivelink.pubsub.session import close_session, open_session
+
+EXAMPLES = Path(__file__).parent.parent / "examples" / "zenoh"
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory):
+    if shutil.which("openssl") is None:
+        pytest.skip("no openssl command on this machine")
+    directory = tmp_path_factory.mktemp("certificates")
+    subprocess.run(
+        ["sh", str(EXAMPLES / "certificates.sh"), str(directory)],
+        check=True,
+        capture_output=True,
+        env=os.environ | {"LC_ALL": "C"},
+    )
+    return directory
+
+
+@pytest.fixture
+def configure(certificates, tmp_path):
+    """A function that gives a shipped configuration with this test's port and certificates, and changes."""
+    port = free_endpoint().rpartition(":")[2]
+
+    def configuration(name, *changes):
+        text = (EXAMPLES / name).read_text(encoding="utf-8")
+        changes = (("0.0.0.0:7447", f"127.0.0.1:{port}"), ("localhost:7447", f"localhost:{port}"), *changes)
+        for old, new in (*changes, ("certificates/", f"{certificates}/")):
+            text = text.replace(old, new)
+        path = tmp_path / name
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return configuration
+
+
+@pytest.fixture
+def serve():
+    """A function that starts a daemon's publisher with a configuration."""
+    sessions = []
+
+    def start(config):
+        joint = make_joint("elbow", "tcp/127.0.0.1:1", f'config = "{config}"')
+        sessions.append(open_session(joint.zenoh, Path()))
+        return sessions[-1], JointPublisher(sessions[-1], joint)
+
+    yield start
+    for session in sessions:
+        close_session(session)
+
+
+def put_until(publisher, condition):
+    sequence = 0
+
+    def step():
+        nonlocal sequence
+        sequence += 1
+        publisher.put_estimate(make_estimate(sequence), time.time_ns())
+        return condition()
+
+    return until(step)
+
+
+@pytest.mark.parametrize("kind", ["tls", "mtls"])
+def test_a_controller_with_the_right_certificates_receives_everything(configure, serve, kind):
+    _, publisher = serve(configure(f"daemon-{kind}.json5"))
+    publisher.put_status({"state": "running"})
+    with drivelink.subscribe("elbow", config=configure(f"controller-{kind}.json5")) as joint:
+        put_until(publisher, lambda: joint.valid)
+        assert until(lambda: joint.status) == {"state": "running"}
+        assert until(lambda: joint.model)["joint"] == "elbow"
+        publisher.close()
+        until(lambda: joint.state == "gone")  # liveliness comes through, too
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes"),
+    [
+        pytest.param("tls", [("tls/", "tcp/")], id="without TLS"),
+        pytest.param("tls", [("ca.pem", "daemon.pem")], id="with another authority"),
+        pytest.param(
+            "mtls",
+            [("enable_mtls: true,", ""), ("connect_", "// connect_")],
+            id="without its own certificate",
+        ),
+    ],
+)
+def test_nobody_else_gets_in(configure, serve, kind, changes):
+    serve(configure(f"daemon-{kind}.json5"))
+    config = configure(f"controller-{kind}.json5", *changes, ("timeout_ms: 5000", "timeout_ms: 500"))
+    with pytest.raises(ZenohError) as error, drivelink.subscribe("elbow", config=config) as joint:
+        assert not joint.received  # a link that is refused only after its handshake
+        raise ZenohError("refused")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("controlled", [True, False])
+def test_a_controller_can_subscribe_but_not_publish_into_the_daemons_keys(configure, serve, controlled):
+    """With access control nothing gets in; without, it does: so the test would see it."""
+    change = () if controlled else (("enabled: true,\n    default", "enabled: false,\n    default"),)
+    session, publisher = serve(configure("daemon-mtls.json5", *change))
+    heard = session.declare_subscriber(
+        "drivelink/**", zenoh.handlers.RingChannel(64), allowed_origin=zenoh.Locality.REMOTE
+    )
+    with (
+        drivelink.subscribe("elbow", config=configure("controller-mtls.json5")) as joint,
+        zenoh.open(zenoh.Config.from_file(configure("controller-mtls.json5"))) as intruder,
+    ):
+        put_until(publisher, lambda: joint.valid)
+        forged = wire.encode_estimate(make_estimate(999_999), 0)
+        for _ in range(20):
+            for name in ("estimate", "status", "model"):
+                intruder.put(f"drivelink/elbow/{name}", forged)
+            time.sleep(0.005)
+        if not controlled:
+            until(heard.try_recv)
+            until(lambda: joint.foreign)
+            return
+        put_until(publisher, lambda: joint.received > 50)  # whatever was under way has come by now
+        assert heard.try_recv() is None
+        assert joint.foreign == 0
+        assert joint.latest().sequence != 999_999

@@ -1,0 +1,271 @@
+"""An independent master (python-canopen) with our EDS files against the simulated devices."""
+
+from __future__ import annotations
+
+import itertools
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import can
+import canopen
+import pytest
+from canopen.objectdictionary import ODArray, ODRecord, ODVariable
+from canopen.sdo.exceptions import SdoAbortedError
+from simkit import StubRig
+
+from sim.canopen.cia402_objects import DriveData
+from sim.canopen.cia406_objects import EncoderData
+from sim.canopen.drive import Cia402Drive
+from sim.canopen.edsfile import eds_directory, eds_files
+from sim.canopen.encoder import Cia406Encoder
+from sim.canopen.node import Node
+from sim.canopen.profiles import PROFILES, profile
+from sim.network import Network
+
+_channels = itertools.count()
+PATIENCE_S = 5.0  # only ever waited for when something is broken
+
+
+def has_vcan0() -> bool:
+    try:
+        return bool(socket.if_nametoindex("vcan0"))
+    except OSError:
+        return False
+
+
+BUSES = [
+    "virtual",
+    pytest.param(
+        "socketcan",
+        marks=[pytest.mark.socketcan, pytest.mark.skipif(not has_vcan0(), reason="no SocketCAN vcan0 here")],
+    ),
+]
+
+
+@contextmanager
+def mastered(*nodes: Node, rig: StubRig, interface: str = "virtual") -> Iterator[canopen.Network]:
+    """A served network and a master on the same bus."""
+    channel = f"master-{next(_channels)}" if interface == "virtual" else "vcan0"
+    with can.Bus(interface=interface, channel=channel) as device_end:
+        network = Network(device_end, nodes, rig)
+        master = canopen.Network()
+        master.NOTIFIER_CYCLE = 0.02  # how long its thread takes to end
+        master.connect(interface=interface, channel=channel)
+        network.start()
+        try:
+            yield master
+        finally:
+            network.stop()
+            master.disconnect()
+
+
+def drive(rig: StubRig, quirks: str = "strict", node_id: int = 1) -> Cia402Drive:
+    return Cia402Drive(node_id, rig, 0, quirks=profile(quirks))
+
+
+def remote(master: canopen.Network, node_id: int, eds: str) -> canopen.RemoteNode:
+    node = master.add_node(node_id, str(eds_directory() / eds))
+    node.sdo.RESPONSE_TIMEOUT = PATIENCE_S
+    return node
+
+
+def variables(od: canopen.ObjectDictionary) -> Iterator[ODVariable]:
+    for described in (described for described in od.values() if described.index >= 0x1000):
+        if isinstance(described, ODVariable):
+            yield described
+        elif isinstance(described, ODRecord | ODArray):
+            yield from described.subindices.values()
+
+
+EDS = {
+    "cia402-drive.eds": "strict",
+    "cia406-encoder.eds": None,
+    **{f"{name}.eds": name for name in PROFILES if f"{name}.eds" in eds_files()},
+}
+
+
+@pytest.mark.parametrize("eds", EDS)
+def test_every_object_of_the_eds_is_served_with_its_type_and_default(eds: str) -> None:
+    rig = StubRig()
+    quirks = EDS[eds]
+    node: Node = drive(rig, quirks) if quirks else Cia406Encoder(1, rig, EncoderData())
+    with mastered(node, rig=rig) as master:
+        peer = remote(master, 1, eds)
+        served = set()
+        for variable in variables(peer.object_dictionary):
+            served.add((variable.index, variable.subindex))
+            if variable.index == 0x1003 and variable.subindex:
+                with pytest.raises(SdoAbortedError) as aborted:
+                    peer.sdo.upload(variable.index, variable.subindex)
+                assert aborted.value.code == 0x08000024
+                continue
+            data = peer.sdo.upload(variable.index, variable.subindex)
+            if variable.data_type in canopen.objectdictionary.datatypes.INTEGER_TYPES:
+                assert len(data) * 8 == len(variable), variable.name
+            if not variable.pdo_mappable and variable.default is not None:
+                assert variable.decode_raw(data) == variable.default, variable.name
+        assert served == {(entry.index, entry.item.subindex) for entry in node.dictionary}
+
+
+def test_the_shipped_eds_files_are_those_of_the_served_objects() -> None:
+    shipped = {path.name: path.read_text(encoding="ascii") for path in eds_directory().glob("*.eds")}
+    # If this fails: python -m sim.canopen.edsfile
+    assert shipped == eds_files()
+
+
+@pytest.mark.parametrize("eds", EDS)
+def test_an_eds_file_lists_what_it_describes(eds: str) -> None:
+    text = eds_files()[eds]
+    sections = [line.strip("[]") for line in text.splitlines() if line.startswith("[")]
+    assert len(sections) == len(set(sections))
+    listed = [line.split("=0x")[1] for line in text.splitlines() if line[0:1].isdigit() and "=0x" in line]
+    assert sorted(listed) == sorted(s for s in sections if len(s) == 4)
+    counts = [int(line.split("=")[1]) for line in text.splitlines() if line.startswith("SupportedObjects")]
+    assert sum(counts) == len(listed)
+    assert counts[0] == 3  # 0x1000, 0x1001, 0x1018 are mandatory
+    for section in (s for s in sections if len(s) == 4):
+        subs = [s for s in sections if s.startswith(f"{section}sub")]
+        block = text.split(f"[{section}]\n")[1].split("\n\n")[0]
+        assert ("SubNumber" in block) == bool(subs)
+        assert not subs or f"SubNumber={len(subs)}" in block
+    assert "CompactSubObj" not in text
+
+
+@pytest.mark.parametrize("interface", BUSES)
+def test_a_master_maps_saves_reads_back_and_receives(interface: str) -> None:
+    rig = StubRig()
+    with mastered(drive(rig), rig=rig, interface=interface) as master:
+        peer = remote(master, 1, "cia402-drive.eds")
+        peer.nmt.state = "PRE-OPERATIONAL"
+        peer.tpdo.read()
+        peer.rpdo.read()
+        peer.tpdo[1].clear()
+        for name in (0x6064, 0x6077, 0x6041):
+            peer.tpdo[1].add_variable(name)
+        peer.tpdo[1].trans_type = 1
+        peer.tpdo[1].enabled = True
+        peer.tpdo.save()
+        peer.tpdo.read()
+        assert [variable.index for variable in peer.tpdo[1].map] == [0x6064, 0x6077, 0x6041]
+        got = threading.Event()
+        values: list[int] = []
+
+        def received(pdo: canopen.pdo.PdoMap) -> None:
+            values[:] = [variable.raw for variable in pdo]
+            got.set()
+
+        peer.tpdo[1].add_callback(received)
+        peer.nmt.state = "OPERATIONAL"
+        master.sync.transmit()
+        assert got.wait(PATIENCE_S)
+        assert values[0] % 100 == 0  # the rig's position is a multiple of 100
+        assert values[1:] == [500, 0x0250]
+
+
+def test_a_master_enables_the_drive_and_commands_torque() -> None:
+    rig = StubRig()
+    with mastered(drive(rig), rig=rig) as master:
+        peer = remote(master, 1, "cia402-drive.eds")
+        peer.sdo[0x6060].raw = 10
+        for word, state in ((0x06, 0x21), (0x07, 0x23), (0x0F, 0x27)):
+            peer.sdo[0x6040].raw = word
+            assert peer.sdo[0x6041].raw & 0x6F == state
+        peer.sdo[0x6071].raw = 250
+        master.sync.transmit()
+        assert peer.sdo[0x6061].raw == 10
+        for _ in range(100):
+            if rig.commands[-1] == pytest.approx(0.025):  # 250 per mille of 100 mN·m
+                break
+            master.sync.transmit()
+            assert peer.sdo[0x6041].raw & 0x6F == 0x27
+        assert rig.commands[-1] == pytest.approx(0.025)
+
+
+@pytest.mark.parametrize("interface", BUSES)
+def test_nmt_to_all_nodes_boots_every_one(interface: str) -> None:
+    rig = StubRig()
+    nodes = [drive(rig, node_id=1), drive(rig, node_id=2), Cia406Encoder(9, rig)]
+    with mastered(*nodes, rig=rig, interface=interface) as master:
+        peers = [remote(master, 1, "cia402-drive.eds"), remote(master, 2, "cia402-drive.eds")]
+        peers.append(remote(master, 9, "cia406-encoder.eds"))
+        for peer in peers:
+            peer.sdo[0x1017].raw = 20
+            peer.nmt.wait_for_heartbeat(PATIENCE_S)
+        master.nmt.state = "OPERATIONAL"
+        for peer in peers:
+            while peer.nmt.wait_for_heartbeat(PATIENCE_S) != "OPERATIONAL":
+                pass
+        seen: set[int] = set()
+        booted = threading.Event()
+
+        def boot(can_id: int, data: bytearray, _stamp: float) -> None:
+            if data == b"\0":
+                seen.add(can_id)
+            if len(seen) == 3:
+                booted.set()
+
+        for peer in peers:
+            master.subscribe(0x700 + peer.id, boot)
+        master.nmt.send_command(0x82)
+        assert booted.wait(PATIENCE_S)
+        assert {peer.sdo[0x1017].raw for peer in peers} == {0}
+
+
+@pytest.mark.parametrize("interface", BUSES)
+def test_strings_go_by_segments_and_by_blocks(interface: str) -> None:
+    rig = StubRig()
+    with mastered(drive(rig), rig=rig, interface=interface) as master:
+        peer = remote(master, 1, "cia402-drive.eds")
+        assert peer.sdo[0x1008].raw == "drivelink simulated CiA 402 drive"
+        with peer.sdo[0x1008].open("rb", block_transfer=True) as blocks:
+            assert blocks.read() == b"drivelink simulated CiA 402 drive"
+        with peer.sdo[0x1017].open("wb", size=2, block_transfer=True) as blocks:
+            blocks.write(b"\x64\x00")
+        assert peer.sdo[0x1017].raw == 100
+
+
+def test_an_emergency_reaches_the_master_and_its_history() -> None:
+    rig = StubRig()
+    device = drive(rig)
+    with mastered(device, rig=rig) as master:
+        peer = remote(master, 1, "cia402-drive.eds")
+        peer.sdo[0x1000].raw  # noqa: B018 - the drive is up
+        told = threading.Event()
+        peer.emcy.add_callback(lambda _emergency: told.set())
+        device.fault(0x2310, 0x02, b"\x01\x02")
+        assert told.wait(PATIENCE_S)
+        emergency = peer.emcy.log[-1]
+        assert (emergency.code, emergency.register, emergency.data[:2]) == (0x2310, 0x03, b"\x01\x02")
+        assert peer.sdo[0x1003][1].raw == 0x0201_2310
+        assert peer.sdo[0x603F].raw == 0x2310
+        master.sync.transmit()
+        while peer.sdo[0x6041].raw & 0x4F != 0x08:  # fault reaction ends with a control cycle
+            master.sync.transmit()
+        peer.sdo[0x6040].raw = 0x80
+        assert (peer.emcy.log[-1].code, peer.emcy.log[-1].register) == (0, 0)  # before the SDO response
+        assert peer.sdo[0x6041].raw & 0x4F == 0x40
+
+
+def test_units_are_readable_and_the_velocity_follows_its_unit() -> None:
+    rig = StubRig()
+    data = DriveData(rated_current_ma=2000, rated_torque_mnm=100, counts_per_rev=4096, gear=(20, 1))
+    with mastered(Cia402Drive(1, rig, 0, data), rig=rig) as master:
+        peer = remote(master, 1, "cia402-drive.eds")
+        assert peer.sdo[0x6077].raw == 500  # 0.05 N·m of 0.1 N·m
+        assert peer.sdo[0x6078].raw == 250  # 0.5 A of 2 A
+        assert [peer.sdo[0x608F][k].raw for k in (1, 2)] == [4096, 1]
+        assert [peer.sdo[0x6091][k].raw for k in (1, 2)] == [20, 1]
+        for unit, expected in (
+            (0x00B44700, 30),  # rpm
+            (0xFDB44700, 30000),  # 1e-3 rpm
+            (0xFFB50300, 20480),  # 0.1 counts/s
+            (0x00100300, 3),  # rad/s
+        ):
+            peer.sdo[0x60A9].raw = unit
+            assert peer.sdo[0x606C].raw == expected
+        peer.sdo[0x607E].raw = 0x40  # velocity polarity
+        assert peer.sdo[0x606C].raw == -3
+        with pytest.raises(SdoAbortedError, match="0x06090030"):
+            peer.sdo[0x60A9].raw = 0x00FF0300

@@ -1,0 +1,240 @@
+"""The network of devices: lockstep, served by a thread, over TCP."""
+
+from __future__ import annotations
+
+import itertools
+import socket
+import threading
+import time
+
+import can
+import pytest
+from simkit import StubRig
+
+from sim.canopen.drive import Cia402Drive
+from sim.network import Network
+from sim.socketcand import SocketcandServer
+
+PATIENCE_S = 5.0  # only ever waited for when something is broken
+
+
+def sync(stamp_s: float = 0.0) -> can.Message:
+    return can.Message(arbitration_id=0x80, is_extended_id=False, timestamp=stamp_s)
+
+
+def start(node_id: int = 0) -> can.Message:
+    return can.Message(arbitration_id=0, data=[1, node_id], is_extended_id=False)
+
+
+def test_in_lockstep_a_sync_is_one_period_however_long_the_caller_takes() -> None:
+    rig = StubRig()
+    now = 0.0
+    with (
+        can.Bus(interface="virtual", channel="net-1") as device_end,
+        can.Bus(interface="virtual", channel="net-1") as master_end,
+    ):
+        network = Network(device_end, [Cia402Drive(1, rig, 0)], rig, clock=lambda: now)
+        network.poll()
+        for pause_s in (0.0, 0.001, 0.3, 10.0):
+            now += pause_s
+            master_end.send(sync())
+            network.poll()
+        assert rig.tick == 4
+        for _ in range(3):
+            master_end.send(sync())
+        assert network.poll() == 3
+        assert rig.tick == 7
+
+
+def test_foreign_frames_of_every_kind_disturb_nobody() -> None:
+    rig = StubRig()
+    with (
+        can.Bus(interface="virtual", channel="net-2") as device_end,
+        can.Bus(interface="virtual", channel="net-2") as master_end,
+    ):
+        network = Network(device_end, [Cia402Drive(1, rig, 0)], rig)
+        network.poll()
+        for message in (
+            can.Message(arbitration_id=0x12345678, data=b"\1", is_extended_id=True),
+            can.Message(arbitration_id=0x181, is_remote_frame=True, is_extended_id=False),
+            can.Message(arbitration_id=0x80, is_error_frame=True),
+            can.Message(arbitration_id=0x601, data=bytes(3), is_extended_id=False),
+            can.Message(arbitration_id=0x601, data=bytes(64), is_fd=True, is_extended_id=False),
+            can.Message(arbitration_id=0x7E5, data=bytes(8), is_extended_id=False),
+            can.Message(arbitration_id=0, is_extended_id=False),
+        ):
+            master_end.send(message)
+        network.poll()
+        (boot,) = iter(lambda: master_end.recv(0), None)
+        assert boot.arbitration_id == 0x701
+        assert rig.tick == 0
+
+
+class ScriptedBus(can.BusABC):
+    """Hands out given frames, then fails, then ends its reader."""
+
+    def __init__(self, frames: list[can.Message | Exception], stop: threading.Event) -> None:
+        super().__init__(channel="script")
+        self.frames = frames
+        self.stop = stop
+        self.sent: list[can.Message] = []
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if not self.frames:
+            self.stop.set()
+            return None, False
+        frame = self.frames.pop(0)
+        if isinstance(frame, Exception):
+            raise frame
+        return frame, False
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        self.sent.append(msg)
+
+
+def served_ticks(stamps_s: list[float]) -> list[int]:
+    """Rig ticks after each SYNC that arrives at these times (relative to now)."""
+    rig = StubRig()
+    stop = threading.Event()
+    ticks: list[int] = []
+    origin_s = time.time()
+    frames: list[can.Message | Exception] = [sync(origin_s + stamp_s) for stamp_s in stamps_s]
+    bus = ScriptedBus(frames, stop)
+    network = Network(bus, [Cia402Drive(1, rig, 0)], rig)
+    network.sync_filter = lambda _data: ticks.append(rig.tick) is None
+    network.serve(stop)
+    return [*ticks[1:], rig.tick]
+
+
+def test_served_the_world_keeps_pace_with_a_jittering_sync() -> None:
+    # 0.3 ms of jitter at 1 ms: whole periods all the same, none lost and none invented.
+    stamps = [0.001 * k + 0.0003 * (-1) ** k for k in range(1, 400)]
+    ticks = served_ticks(stamps)
+    steps = [b - a for a, b in itertools.pairwise(ticks[5:])]
+    assert set(steps) == {1}
+
+
+def test_served_a_lost_sync_is_two_periods() -> None:
+    stamps = [0.001 * k for k in range(1, 200) if k != 100]
+    ticks = served_ticks(stamps)
+    assert ticks[99] - ticks[98] == 2
+
+
+def test_served_a_jump_of_the_clock_is_one_period() -> None:
+    stamps = [0.001 * k + (3600.0 if k >= 100 else 0.0) for k in range(1, 200)]
+    ticks = served_ticks(stamps)
+    steps = [b - a for a, b in itertools.pairwise(ticks[5:])]
+    assert set(steps) == {1}
+
+
+def test_a_bus_that_fails_is_tried_again() -> None:
+    rig = StubRig()
+    stop = threading.Event()
+    bus = ScriptedBus([can.CanOperationError("cable out"), start(), sync(time.time())], stop)
+    network = Network(bus, [Cia402Drive(1, rig, 0)], rig)
+    network.serve(stop)
+    assert network.syncs == 1
+    assert [message.arbitration_id for message in bus.sent][:1] == [0x701]
+
+
+def test_without_a_sync_the_world_follows_the_wall_clock() -> None:
+    rig = StubRig()
+    with can.Bus(interface="virtual", channel="net-3") as device_end:
+        network = Network(device_end, [Cia402Drive(1, rig, 0)], rig)
+        network.start()
+        deadline = time.monotonic() + PATIENCE_S
+        while rig.tick < 20 and time.monotonic() < deadline:
+            time.sleep(0.01)
+        network.stop()
+        assert rig.tick >= 20
+        assert not [t for t in threading.enumerate() if t.name == "sim-network"]
+
+
+def clients(server: SocketcandServer, count: int) -> list[can.BusABC]:
+    """Connected clients; the server is served meanwhile."""
+    made: list[can.BusABC] = []
+
+    def connect() -> None:
+        made.extend(
+            can.Bus(interface="socketcand", channel="vcan0", host="127.0.0.1", port=server.port)
+            for _ in range(count)
+        )
+
+    thread = threading.Thread(target=connect)
+    thread.start()
+    while thread.is_alive():
+        assert server.recv(0.01) is None
+    thread.join()
+    return made
+
+
+def exchange(server: SocketcandServer, client: can.BusABC) -> can.Message | None:
+    """What the client receives, with the server served meanwhile."""
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        server.recv(0.005)
+        message = client.recv(0.005)
+        if message is not None:
+            return message
+    return None
+
+
+def test_frames_pass_between_the_server_and_all_its_clients() -> None:
+    with SocketcandServer("vcan0", port=0) as server:
+        first, second = clients(server, 2)
+        first.send(can.Message(arbitration_id=0x123, data=[1, 2, 0xFF], is_extended_id=False))
+        message = exchange(server, second)
+        assert message is not None
+        assert (message.arbitration_id, bytes(message.data)) == (0x123, b"\x01\x02\xff")
+        server.send(sync())
+        for client in (first, second):
+            message = exchange(server, client)
+            assert message is not None
+            assert (message.arbitration_id, message.dlc) == (0x80, 0)
+        second.send(can.Message(arbitration_id=0x1ABCDEF0, data=b"", is_extended_id=True))
+        message = server.recv(PATIENCE_S)
+        assert message is not None
+        assert (message.arbitration_id, message.is_extended_id) == (0x1ABCDEF0, True)
+        first.shutdown()
+        second.shutdown()
+
+
+@pytest.mark.parametrize(
+    ("said", "answered"),
+    [
+        (b"< open can7 >", b"< error could not open bus >"),
+        (b"< rawmode >", b"< error unknown command >"),
+        (b"< open vcan0 >< send 123 9 1 2 3 >", b"< ok >< error could not parse frame >"),
+        (b"< open vcan0 >< send 123 1 fff >", b"< ok >< error could not parse frame >"),
+        (b"< open vcan0 >< send >", b"< ok >< error could not parse frame >"),
+        (b"\xff\xfe >", b"< error unknown command >"),
+        (b"< echo >", b"< echo >"),
+    ],
+)
+def test_what_a_client_says_wrong_is_answered_and_ends_nothing(said: bytes, answered: bytes) -> None:
+    with SocketcandServer("vcan0", port=0) as server:
+        with socket.create_connection(("127.0.0.1", server.port)) as client:
+            client.settimeout(PATIENCE_S)
+            server.recv(0.02)
+            assert client.recv(6) == b"< hi >"
+            client.sendall(said)
+            server.recv(0.05)
+            assert client.recv(100) == answered
+        assert server.recv(0.02) is None  # the client's end is no end of the server
+
+
+def test_drives_behind_socketcand_answer_a_master_in_another_thread() -> None:
+    rig = StubRig()
+    with SocketcandServer("vcan0", port=0) as server:
+        network = Network(server, [Cia402Drive(1, rig, 0)], rig)
+        network.start()
+        with can.Bus(interface="socketcand", channel="vcan0", host="127.0.0.1", port=server.port) as master:
+            master.send(start())
+            master.send(sync())
+            deadline = time.monotonic() + PATIENCE_S
+            seen = set()
+            while 0x281 not in seen and time.monotonic() < deadline:
+                message = master.recv(0.05)
+                seen |= {message.arbitration_id} if message else set()
+            assert 0x281 in seen
+        network.stop()

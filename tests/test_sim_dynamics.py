@@ -1,0 +1,163 @@
+"""The joint of eqs 4-7: laws, equations, integration."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from simjoints import EXPONENTIAL, HARDENING, LINEAR, RIGID, VSA_II, energy, sea
+
+from sim.errors import SimError
+from sim.integration import integrator, whole_fraction
+from sim.plant import JointPlant, LinkPlant, MotorPlant
+from sim.springs import Spring
+
+SPRINGS = [LINEAR, HARDENING, VSA_II, EXPONENTIAL]
+
+
+def run(
+    plant: JointPlant, state: list[float], seconds: float, step_s: float, tau: float = 0.0
+) -> list[float]:
+    step = integrator(plant, step_s)
+    for _ in range(round(seconds / step_s)):
+        step(state, tau, 0.0, 0.0)
+    return state
+
+
+@pytest.mark.parametrize("spring", SPRINGS, ids=lambda spring: spring.model)
+def test_torque_and_stiffness_are_the_derivatives_of_the_potential(spring: Spring) -> None:
+    law, h = spring.law(), 1e-5
+    for phi in np.linspace(-0.9, 0.9, 37):
+        slope = (law.potential(phi + h) - law.potential(phi - h)) / (2 * h)
+        rise = (law.torque(phi + h) - law.torque(phi - h)) / (2 * h)
+        # Central differences: error h²/6 of the third derivative, which the exponential has largest;
+        # its stiffness has a kink at zero, worth h b / 2.
+        assert slope == pytest.approx(law.torque(phi), rel=1e-6, abs=1e-6)
+        assert rise == pytest.approx(law.stiffness(phi), rel=1e-4)
+        assert law.torque(-phi) == pytest.approx(-law.torque(phi), abs=1e-15)
+
+
+def test_vsa_ii_has_the_exact_taylor_coefficients() -> None:
+    phi = np.linspace(0.002, 0.25, 400)
+    torque = np.array([VSA_II.law().torque(x) for x in phi])
+    powers = np.stack([phi ** (2 * h - 1) for h in range(1, 8)], axis=1)
+    found = np.linalg.lstsq(powers / 0.25 ** np.arange(1, 15, 2), torque, rcond=None)[0]
+    found = 1000.0 * found / 0.25 ** np.arange(1, 15, 2)
+    # The series of eqs 19, 20 at C = 1.75, k = 500 N·mm/rad; the fit's own truncation limits the last ones.
+    assert found[:4] == pytest.approx([140.625, 112.793, 73.139, 45.830], rel=2e-3)
+
+
+def test_vsa_ii_goes_on_straight_where_the_linkage_is_stretched() -> None:
+    law, stop = VSA_II.law(), 0.995 * 2.0 * math.asin(1.0 / 1.75)
+    assert law.torque(stop + 1e-9) == pytest.approx(law.torque(stop - 1e-9), rel=1e-6)
+    assert law.potential(stop + 1e-9) == pytest.approx(law.potential(stop - 1e-9), rel=1e-6)
+    assert law.torque(3.0) - law.torque(2.0) == pytest.approx(law.stiffness(2.5), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "plant",
+    [
+        sea(LINEAR, damping=0.0),
+        sea(HARDENING, damping=0.0),
+        sea(EXPONENTIAL, damping=0.0),
+        sea(LINEAR, motors=2, damping=0.0),
+        sea(HARDENING, motors=2, damping=0.0, lever=0.7),
+    ],
+    ids=["linear", "polynomial", "exponential", "antagonistic", "serial"],
+)
+def test_energy_is_kept_without_damping(plant: JointPlant) -> None:
+    state = [0.3, 0.0, 0.25, 0.0, 0.2, 0.0][: 2 + 2 * len(plant.motors)]
+    before = energy(plant, state)
+    run(plant, state, 5.0, 0.0005)
+    # Runge-Kutta's own dissipation: (omega h)^5/72 a step at omega = 60 rad/s over 10^4 steps is 3e-6.
+    # The exponential's kink at phi = 0 costs an order.
+    assert energy(plant, state) == pytest.approx(before, rel=1e-5)
+    assert state[1] != 0.0
+
+
+def test_two_masses_move_as_in_closed_form() -> None:
+    """phi" = -K (1/M + 1/B) phi - tau/B from rest: phi = -tau/(B omega²) (1 - cos omega t)."""
+    plant = sea(LINEAR, damping=0.0, gravity=0.0)
+    k, b, m, tau, t = 150.0, 0.125, 0.4, 2.0, 1.234
+    state = run(plant, [0.0] * 4, t, 0.0005, tau)
+    omega = math.sqrt(k * (1 / b + 1 / m))
+    phi = -tau / (b * omega**2) * (1.0 - math.cos(omega * t))
+    centre = 0.5 * tau / (b + m) * t * t
+    # Phase error of the method: t omega (omega h)^4/120 = 4e-7 rad.
+    assert state[0] - state[2] == pytest.approx(phi, abs=2e-8)
+    assert (m * state[0] + b * state[2]) / (m + b) == pytest.approx(centre, rel=1e-12)
+
+
+def test_damped_motor_comes_to_the_closed_form_speed() -> None:
+    plant = JointPlant(
+        arrangement="single",
+        motors=(MotorPlant(inertia_kg_m2=0.2, viscous_damping_nm_s_rad=0.5, spring=RIGID),),
+        link=LinkPlant(inertia_kg_m2=0.3),
+    )
+    state = run(plant, [0.0] * 4, 1.0, 0.001, 2.0)
+    assert state[3] == pytest.approx(4.0 * -math.expm1(-1.0), rel=1e-12)
+    assert state[:2] == state[2:]
+
+
+@pytest.mark.parametrize("motors", [1, 2])
+def test_integration_converges_with_order_four(motors: int) -> None:
+    plant = sea(HARDENING, motors=motors)
+    start = [0.4, 0.0, 0.3, 0.0, 0.35, 0.0][: 2 + 2 * motors]
+
+    def end(steps: int) -> np.ndarray:
+        return np.array(run(plant, list(start), 0.5, 0.5 / steps, 3.0))
+
+    exact = end(4000)
+    errors = [np.linalg.norm(end(steps) - exact) for steps in (100, 200, 400)]
+    for coarse, fine in pairwise(errors):
+        assert 13.0 < coarse / fine < 20.0  # 2^4, with the next order's remainder
+
+
+def test_both_motors_of_a_vsa_pull_at_the_link() -> None:
+    plant = sea(LINEAR, motors=2, damping=0.0, gravity=0.0)
+    step = integrator(plant, 1e-4)
+    state = [0.0, 0.0, 0.01, 0.0, -0.02, 0.0]
+    step(state, 0.0, 0.0, 0.0)
+    # tau_e,1 = -1.5 and tau_e,2 = 3 N·m: the link gets -(1.5), the motors -1.5 and +3 (eqs 6, 7, 9).
+    assert state[1] / 1e-4 == pytest.approx(-1.5 / 0.4, rel=1e-3)
+    assert state[3] / 1e-4 == pytest.approx(-1.5 / 0.125, rel=1e-3)
+    assert state[5] / 1e-4 == pytest.approx(3.0 / 0.125, rel=1e-3)
+
+
+@pytest.mark.parametrize("step_s", [0.0003, 0.002, 0.0, -0.001, math.nan])
+def test_a_step_that_is_no_whole_fraction_of_the_period_is_refused(step_s: float) -> None:
+    with pytest.raises(SimError, match="plant_step_s: expected") as caught:
+        whole_fraction(0.001, step_s, sea())
+    assert "\n" not in str(caught.value)
+
+
+def test_the_step_is_chosen_from_the_stiffness() -> None:
+    assert whole_fraction(0.001, None, sea()) == 1
+    assert whole_fraction(0.001, None, sea(), fine=True) == 2
+    assert whole_fraction(0.004, None, sea(Spring(model="linear", parameters={"k_nm_rad": 8e3}))) > 10
+
+
+@pytest.mark.parametrize(
+    ("model", "parameters", "message"),
+    [
+        ("cubic", {}, "expected one of"),
+        ("linear", {}, "expected k_nm_rad, got nothing"),
+        ("linear", {"k_nm_rad": -1.0}, "k_nm_rad: expected a finite number > 0"),
+        ("vsa-ii", {"k_nm_rad": 0.5, "c": 0.9}, "c: expected a number > 1"),
+        ("polynomial", {"coefficients_nm_rad": 3.0}, "expected a list"),
+    ],
+)
+def test_impossible_springs_are_one_clear_line(model: str, parameters: dict, message: str) -> None:
+    with pytest.raises(SimError, match=message):
+        Spring(model=model, parameters=parameters)
+
+
+def test_impossible_joints_are_one_clear_line() -> None:
+    with pytest.raises(SimError, match=r"inertia_kg_m2: expected a finite number > 0"):
+        LinkPlant(inertia_kg_m2=0.0)
+    with pytest.raises(SimError, match=r"expected 2 motor\(s\), got 1"):
+        JointPlant(arrangement="antagonistic", motors=sea().motors, link=sea().link)
+    with pytest.raises(SimError, match="expected a flexible transmission"):
+        sea(RIGID, motors=2)

@@ -1,0 +1,436 @@
+"""Each effect does to the joint what its physics says: the torque it takes is found again from the motion."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from simjoints import HARDENING, LINEAR, PERFECT, PERFECT_ENCODER, RIGID, measured, sea
+
+from sim.effects import LISTED, UNLISTED, make, parse
+from sim.effects.memory import Delayed, History, Slip
+from sim.errors import SimError
+from sim.plant import JointPlant
+from sim.world import World
+
+PERIOD_S = 0.001
+Columns = dict[str, np.ndarray]
+
+# NAME=VALUE of a noticeable size in the joint of `simjoints.sea` (torques of about 10 N·m, phi of 0.05 rad).
+NOTICEABLE = {
+    "coulomb_friction": 1.0, "stribeck_friction": 1.0, "asymmetric_friction": 1.0, "presliding_friction": 1.0,
+    "load_dependent_friction": 0.1, "viscous_damping": 1.0, "quadratic_damping": 1.0, "cogging": 0.5,
+    "torque_offset": 1.0, "torque_constant": 0.1, "torque_saturation": 0.003, "torque_drift": 0.2,
+    "motor_inertia": 0.05, "torque_delay": 0.002, "hysteresis": 1.0, "backlash": 0.01,
+    "asymmetric_stiffness": 1000.0, "higher_order_stiffness": 1e6, "transmission_damping": 1.0,
+    "kinematic_error": 0.005, "deflection_offset": 0.01, "encoder_eccentricity": 0.005,
+    "encoder_delay": 0.002, "encoder_scale": 0.02, "gravity": 2.0, "link_coulomb_friction": 1.0,
+    "link_viscous_damping": 1.0, "link_inertia": 0.1, "contact": 50.0,
+    "damaged_tooth": 1.0, "cold_grease": 1.0, "phase_imbalance": 0.1, "mesh_stiffness": 0.2, "creep": 50.0,
+    "cable_pull": 1.0, "air_drag": 1.0, "interpolation_error": 0.001,
+}  # fmt: skip
+
+
+def switched_on(name: str, plant: JointPlant | None = None, **further: float) -> Columns:
+    text = ",".join([f"{name}={NOTICEABLE[name]}", *(f"{key}={value}" for key, value in further.items())])
+    return measured(plant or sea(HARDENING), parse(text), step_s=0.00025)
+
+
+def motor_remainder(r: Columns, plant: JointPlant) -> np.ndarray:
+    """Mean over each period of what is missing in eq 5: x = tau + tau_e - B theta" - D theta'."""
+    motor = plant.motors[0]
+    w, theta = r["truth_motor1_velocity_rad_s"], r["truth_motor1_position_rad"]
+    momentum = motor.inertia_kg_m2 * np.diff(w) + motor.viscous_damping_nm_s_rad * np.diff(theta)
+    return r["motor1_torque_nm"][:-1] + over_periods(declared_torque(r, plant)) - momentum / PERIOD_S
+
+
+def link_remainder(r: Columns, plant: JointPlant) -> np.ndarray:
+    """Mean over each period of what is missing in eq 4."""
+    link, q = plant.link, r["truth_link_position_rad"]
+    momentum = link.inertia_kg_m2 * np.diff(r["truth_link_velocity_rad_s"])
+    momentum = momentum + link.viscous_damping_nm_s_rad * np.diff(q)
+    static = declared_torque(r, plant) + link.gravity_nm * np.sin(q)
+    return -over_periods(static) - momentum / PERIOD_S
+
+
+def declared_torque(r: Columns, plant: JointPlant) -> np.ndarray:
+    law = plant.motors[0].law()
+    return np.array([law.torque(phi) for phi in r["truth_motor1_deflection_rad"]])
+
+
+def over_periods(x: np.ndarray) -> np.ndarray:
+    """Mean of a smooth signal over each period, by Simpson's rule on a cubic: error of order T^4."""
+    inner = x[1:-1]
+    mean = 0.5 * (x[1:] + x[:-1])
+    bend = np.zeros_like(mean)
+    second = x[2:] - 2.0 * inner + x[:-2]
+    bend[1:-1] = 0.5 * (second[1:] + second[:-1])
+    return mean - bend / 12.0
+
+
+def slope(x: np.ndarray, regressor: np.ndarray) -> float:
+    """Least squares of x on one regressor, ends left out."""
+    inside = slice(5, -5)
+    return float(regressor[inside] @ x[inside] / (regressor[inside] @ regressor[inside]))
+
+
+MOTOR_LAWS = {
+    "viscous_damping": lambda r: r["truth_motor1_velocity_rad_s"],
+    "quadratic_damping": lambda r: r["truth_motor1_velocity_rad_s"] * abs(r["truth_motor1_velocity_rad_s"]),
+    "cogging": lambda r: np.sin(24.0 * r["truth_motor1_position_rad"]),
+    "torque_offset": lambda r: np.ones_like(r["time_s"]),
+    "coulomb_friction": lambda r: np.sign(r["truth_motor1_velocity_rad_s"]),
+    "asymmetric_friction": lambda r: np.where(r["truth_motor1_velocity_rad_s"] > 0, 1.0, -0.4),
+    "load_dependent_friction": lambda r: (
+        np.sign(r["truth_motor1_velocity_rad_s"]) * abs(r["truth_motor1_flexibility_torque_nm"])
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MOTOR_LAWS)
+def test_a_motor_effect_takes_its_torque_from_the_motor_alone(name: str) -> None:
+    plant = sea(HARDENING)
+    r = switched_on(name, plant)
+    found = slope(motor_remainder(r, plant), over_periods(MOTOR_LAWS[name](r)))
+    # The signs of dry friction change within periods that this mean does not resolve: half a percent.
+    assert found == pytest.approx(NOTICEABLE[name], rel=0.01)
+    assert np.std(link_remainder(r, plant)[5:-5]) < 2e-3
+
+
+TORQUE_LAWS = {
+    "torque_constant": lambda tau, t: -tau,
+    "torque_saturation": lambda tau, t: (tau - tau / np.sqrt(1.0 + 2.0 * 0.003 * tau**2)) / 0.003,
+    "torque_drift": lambda tau, t: -tau * -np.expm1(-t / 20.0),
+}
+
+
+@pytest.mark.parametrize("name", TORQUE_LAWS)
+def test_a_drive_that_errs_reports_another_torque_than_acts(name: str) -> None:
+    plant = sea(HARDENING)
+    r = switched_on(name, plant)
+    regressor = TORQUE_LAWS[name](r["motor1_torque_nm"], r["time_s"])[:-1]
+    assert slope(motor_remainder(r, plant), regressor) == pytest.approx(NOTICEABLE[name], rel=1e-3)
+    acting = r["truth_motor1_torque_nm"] - r["motor1_torque_nm"]
+    assert slope(-acting[:-1], regressor) == pytest.approx(NOTICEABLE[name], rel=1e-9)
+
+
+def test_inertia_beyond_the_declared_is_found_in_the_acceleration() -> None:
+    plant = sea(HARDENING)
+    for name, remainder, column in (
+        ("motor_inertia", motor_remainder, "truth_motor1_velocity_rad_s"),
+        ("link_inertia", link_remainder, "truth_link_velocity_rad_s"),
+    ):
+        r = switched_on(name, plant)
+        acceleration = np.diff(r[column]) / PERIOD_S
+        assert slope(remainder(r, plant), acceleration) == pytest.approx(NOTICEABLE[name], rel=2e-3)
+
+
+def test_a_delayed_torque_acts_later_by_exactly_that_time() -> None:
+    r = switched_on("torque_delay")
+    tau = r["motor1_torque_nm"]
+    assert r["truth_motor1_torque_nm"][2:] == pytest.approx(tau[:-2], abs=1e-9)
+    # 1.25 periods on a quarter-period grid: one step of the set-point before the last, then the last one.
+    delayed = Delayed(0.00125, 0.001, 4)
+    delayed.schedule(8.0)
+    delayed.schedule(4.0)
+    assert delayed.schedule(0.0) == [8.0, 4.0, 4.0, 4.0]
+    # 0.1 periods in steps of a half: 20 % of the first step is still the old one.
+    delayed = Delayed(0.0001, 0.001, 2)
+    delayed.schedule(10.0)
+    assert delayed.schedule(0.0) == pytest.approx([2.0, 0.0])
+
+
+TRANSMISSION_LAWS = {
+    "asymmetric_stiffness": lambda r: r["truth_motor1_deflection_rad"] ** 2,
+    "higher_order_stiffness": lambda r: r["truth_motor1_deflection_rad"] ** 5,
+    "transmission_damping": lambda r: r["truth_link_velocity_rad_s"] - r["truth_motor1_velocity_rad_s"],
+}
+
+
+@pytest.mark.parametrize("name", TRANSMISSION_LAWS)
+def test_a_transmission_effect_acts_on_both_sides(name: str) -> None:
+    plant = sea(HARDENING)
+    r = switched_on(name, plant)
+    regressor = over_periods(TRANSMISSION_LAWS[name](r))
+    assert slope(-motor_remainder(r, plant), regressor) == pytest.approx(NOTICEABLE[name], rel=0.01)
+    assert slope(link_remainder(r, plant), regressor) == pytest.approx(NOTICEABLE[name], rel=0.01)
+
+
+def test_backlash_leaves_a_range_without_torque() -> None:
+    r = switched_on("backlash", sea(LINEAR))
+    phi, te = r["truth_motor1_deflection_rad"], r["truth_motor1_flexibility_torque_nm"]
+    inside = np.abs(phi) < 0.01
+    assert inside.any() and (~inside).any()
+    assert te[inside] == pytest.approx(0.0)
+    assert te[~inside] == pytest.approx(150.0 * (phi - np.clip(phi, -0.01, 0.01))[~inside])
+    assert r["truth_stiffness_nm_rad"] == pytest.approx(np.where(inside, 0.0, 150.0))
+
+
+def test_backlash_of_a_stated_stiffness_is_the_same_on_a_linear_spring() -> None:
+    whole = measured(sea(LINEAR), parse("backlash=0.01"), seconds=0.5)
+    stated = measured(sea(LINEAR), parse("backlash=0.01,stiffness_nm_rad=150"), seconds=0.5)
+    assert stated["truth_link_position_rad"] == pytest.approx(whole["truth_link_position_rad"], abs=1e-12)
+
+
+def test_the_gears_error_bends_the_spring_and_does_no_work() -> None:
+    plant = sea(HARDENING, damping=0.0, gravity=0.0)
+    drives = (PERFECT,)
+    error = parse("kinematic_error=0.01,periods_per_rev=16")
+    world = World(plant, drives, PERFECT_ENCODER, effects=[error], initial_rad=(0.3, 0.25))
+    law = plant.motors[0].law()
+
+    def total() -> float:
+        t = world.truth()
+        (m,) = t.motors
+        seen = m.deflection_rad + 0.01 * math.sin(16.0 * m.position_rad)
+        assert m.flexibility_torque_nm == pytest.approx(law.torque(seen))
+        kinetic = 0.5 * 0.4 * t.link_velocity_rad_s**2 + 0.5 * 0.125 * m.velocity_rad_s**2
+        return kinetic + law.potential(seen)
+
+    before = total()
+    world.advance(3000)
+    assert total() == pytest.approx(before, rel=1e-6)  # Runge-Kutta's own loss
+
+
+LINK_LAWS = {
+    "gravity": lambda r: np.sin(r["truth_link_position_rad"]),
+    "link_coulomb_friction": lambda r: np.sign(r["truth_link_velocity_rad_s"]),
+    "link_viscous_damping": lambda r: r["truth_link_velocity_rad_s"],
+    "air_drag": lambda r: r["truth_link_velocity_rad_s"] * np.abs(r["truth_link_velocity_rad_s"]),
+}
+
+
+@pytest.mark.parametrize("name", LINK_LAWS)
+def test_a_link_effect_takes_its_torque_from_the_link_alone(name: str) -> None:
+    plant = sea(HARDENING)
+    r = switched_on(name, plant)
+    found = slope(link_remainder(r, plant), over_periods(LINK_LAWS[name](r)))
+    assert found == pytest.approx(NOTICEABLE[name], rel=0.01)
+    assert np.std(motor_remainder(r, plant)[5:-5]) < 2e-3
+
+
+def test_contact_pushes_back_on_one_side_only() -> None:
+    plant = sea(HARDENING)
+    r = switched_on("contact", plant, position_rad=0.05)
+    depth = np.maximum(0.0, r["truth_link_position_rad"] - 0.05)
+    assert 0.0 < np.mean(depth > 0.0) < 1.0
+    assert slope(link_remainder(r, plant), over_periods(depth)) == pytest.approx(50.0, rel=0.01)
+
+
+READINGS = {
+    "deflection_offset": lambda r: r["truth_link_position_rad"] + 0.01,
+    "encoder_eccentricity": lambda r: (
+        r["truth_link_position_rad"] + 0.005 * np.sin(r["truth_link_position_rad"])
+    ),
+    "encoder_scale": lambda r: 1.02 * r["truth_link_position_rad"],
+    "interpolation_error": lambda r: (
+        r["truth_link_position_rad"] + 0.001 * np.sin(64.0 * r["truth_link_position_rad"])
+    ),
+}
+
+
+@pytest.mark.parametrize("name", READINGS)
+def test_a_reading_errs_and_the_joint_does_not(name: str) -> None:
+    r, clean = switched_on(name), measured(sea(HARDENING), seconds=4.0, step_s=0.00025)
+    assert r["truth_link_position_rad"] == pytest.approx(clean["truth_link_position_rad"])
+    assert r["link_position_rad"] == pytest.approx(READINGS[name](r), abs=1e-9)
+
+
+@pytest.mark.parametrize("delay_s", [0.002, 0.0023, 0.0001])
+def test_a_late_encoder_reads_where_the_link_was(delay_s: float) -> None:
+    r = measured(sea(HARDENING), make("encoder_delay", {"delay_s": delay_s}))
+    t, q = r["time_s"], r["truth_link_position_rad"]
+    was = np.interp(t - delay_s, t, q)
+    # Linear interpolation between periods is good to q" T²/8 = 1e-5 rad here.
+    assert r["link_position_rad"][5:] == pytest.approx(was[5:], abs=1e-5)
+    assert np.abs(r["link_position_rad"] - q).max() > 100 * 1e-5 * delay_s / 0.002
+
+
+def test_history_is_exact_on_a_parabola() -> None:
+    history = History(0.0024, 0.001, 0.0)
+    for k in range(1, 10):
+        t = 0.001 * k
+        history.push(5.0 * t * t, 10.0 * t)
+    assert history.position() == pytest.approx(5.0 * (0.009 - 0.0024) ** 2, rel=1e-12)
+
+
+def test_deflection_offset_of_a_two_motor_joint_is_at_that_motor() -> None:
+    r = measured(sea(motors=2), parse("deflection_offset=0.01,motor=2"), seconds=0.2)
+    assert r["motor1_position_rad"] == pytest.approx(r["truth_motor1_position_rad"], abs=1e-9)
+    assert r["motor2_position_rad"] == pytest.approx(r["truth_motor2_position_rad"] - 0.01, abs=1e-9)
+
+
+def world_at_rest(effect: str, plant: JointPlant | None = None) -> World:
+    return World(plant or sea(RIGID, gravity=0.0), (PERFECT,), PERFECT_ENCODER, effects=[parse(effect)])
+
+
+def test_dry_friction_holds_against_less_than_its_level_without_creeping() -> None:
+    world = world_at_rest("coulomb_friction=0.5")
+    world.command(0, 0.49 / PERFECT.gear_ratio)
+    world.advance(2000)
+    # Viscous damping within a step, which the stop does not see: h³ D tau / 12 J² a step.
+    assert abs(world.truth().motors[0].position_rad) < 1e-7
+    assert world.truth().motors[0].velocity_rad_s == 0.0
+
+
+def test_dry_friction_brakes_at_a_constant_rate_and_stops() -> None:
+    world = world_at_rest("coulomb_friction=0.5", sea(RIGID, gravity=0.0, damping=0.0))
+    world.command(0, 2.0 / PERFECT.gear_ratio)
+    world.advance(1001)
+    world.command(0, 0.0)
+    inertia, go = 0.525, (2.0 - 0.5) / 0.525
+    at_end = world.truth().motors[0]
+    assert at_end.velocity_rad_s == pytest.approx(go, rel=1e-9)
+    assert at_end.position_rad == pytest.approx(0.5 * go, rel=1e-6)
+    world.advance(5000)
+    stopped = world.truth().motors[0]
+    way = 0.5 * go * go / (0.5 / inertia)
+    # The drive latches a set-point with the next period: one more period of thrust.
+    assert stopped.velocity_rad_s == 0.0
+    assert stopped.position_rad - at_end.position_rad == pytest.approx(way, rel=5e-3)
+
+
+def test_stribeck_friction_breaks_away_above_its_sliding_level() -> None:
+    held, gone = world_at_rest("stribeck_friction=0.5"), world_at_rest("stribeck_friction=0.5")
+    held.command(0, 0.88 / PERFECT.gear_ratio)  # level 0.5 + 0.4 N·m at rest
+    gone.command(0, 0.92 / PERFECT.gear_ratio)
+    held.advance(500)
+    gone.advance(500)
+    assert held.truth().motors[0].velocity_rad_s == 0.0
+    assert gone.truth().motors[0].velocity_rad_s > 0.01
+
+
+def test_lubricated_friction_creeps_where_dry_friction_sticks() -> None:
+    world = world_at_rest("coulomb_friction=0.5,smoothing_rad_s=0.05")
+    world.command(0, 0.25 / PERFECT.gear_ratio)
+    world.advance(5000)
+    # w / hypot(w, v0) = 1/2, less what the viscous damping of 0.9 N·m·s/rad carries.
+    w = world.truth().motors[0].velocity_rad_s
+    # Sampled after the step's braking, so below the mean by half of h tau / J = 2.4e-4 rad/s: half a percent.
+    assert 0.5 * w / math.hypot(w, 0.05) + 0.9 * w == pytest.approx(0.25, rel=1e-2)
+
+
+@pytest.mark.parametrize("exponent", [1.0, 2.0, 60.0])
+@pytest.mark.parametrize("elements", [1.0, 4.0])
+def test_slip_builds_up_saturates_and_dissipates(exponent: float, elements: float) -> None:
+    slip = Slip(2.0, 0.01, exponent, 1.0, elements)
+    x = 0.1 * np.sin(np.linspace(0.0, 4.0 * np.pi, 4001))
+    torque = []
+    for position in x:
+        slip.commit(float(position))
+        torque.append(slip.torque(float(position)))
+    assert np.max(np.abs(torque)) == pytest.approx(2.0, rel=0.07)
+    assert np.trapezoid(torque[2001:], x[2001:]) > 0.5 * 4 * 2.0 * 0.1  # near the rectangle 4 F X
+    assert slip.torque(1.0) == pytest.approx(2.0)
+
+
+def test_dahl_follows_its_closed_form() -> None:
+    slip = Slip(1.0, 0.01, 1.0, 1.0, 1.0)
+    for k in range(101):
+        slip.commit(0.0003 * k)
+    assert slip.torque(0.03) == pytest.approx(-math.expm1(-3.0), rel=1e-3)
+    for k in range(1, 101):
+        slip.commit(0.03 - 0.0003 * k)
+    turned = -math.expm1(-3.0)
+    assert slip.torque(0.0) == pytest.approx(-1.0 + (1.0 + turned) * math.exp(-3.0), rel=1e-3)
+
+
+def test_hysteresis_opens_a_loop_on_both_sides() -> None:
+    plant = sea(HARDENING)
+    r = switched_on("hysteresis", plant)
+    on_motor, on_link = -motor_remainder(r, plant)[5:-5], link_remainder(r, plant)[5:-5]
+    assert on_motor == pytest.approx(on_link, abs=1e-3)
+    assert 0.5 < np.max(np.abs(on_motor)) <= 1.01
+    ways = np.diff(r["truth_motor1_deflection_rad"])[5:-5]
+    assert np.sum(on_motor * ways) > 0.0  # it takes energy out
+
+
+def test_creep_relaxes() -> None:
+    r = measured(sea(LINEAR), parse("creep=50,time_constant_s=0.05"), step_s=0.00025)
+    plant = sea(LINEAR)
+    x = -motor_remainder(r, plant)
+    phi, torque, decay = r["truth_motor1_deflection_rad"], 0.0, math.exp(-PERIOD_S / 0.05)
+    expected = [0.0]
+    for dphi in np.diff(phi):
+        torque = torque * decay + 50.0 * dphi * 0.05 / PERIOD_S * (1.0 - decay)
+        expected.append(torque)
+    # Of 2 N·m; the deflection is taken as straight within a step here and within a period there.
+    assert x[5:-5] == pytest.approx(over_periods(np.array(expected))[5:-5], abs=1e-2)
+
+
+@pytest.mark.parametrize("name", [*LISTED, *UNLISTED])
+@pytest.mark.parametrize("motors", [1, 2])
+def test_every_effect_changes_what_is_recorded(name: str, motors: int) -> None:
+    # Gravity's pull and contact need a link away from rest; all else shows within a second.
+    further = ",position_rad=0.0" if name == "contact" else ""
+    effect = parse(f"{name}={NOTICEABLE[name]}{further}")
+    plant = sea(HARDENING, motors=motors)
+    r, clean = measured(plant, effect, seconds=1.0), measured(plant, seconds=1.0)
+    columns = [column for column in clean if column.endswith("position_rad") and "truth" not in column]
+    assert all(np.isfinite(r[column]).all() for column in r)
+    assert max(np.abs(r[column] - clean[column]).max() for column in columns) > 1e-4
+
+
+def test_the_names_are_those_of_the_contract() -> None:
+    assert set(LISTED) == {
+        "coulomb_friction", "stribeck_friction", "asymmetric_friction", "presliding_friction",
+        "load_dependent_friction", "viscous_damping", "quadratic_damping", "cogging", "torque_offset",
+        "torque_constant", "torque_saturation", "torque_drift", "motor_inertia", "torque_delay",
+        "hysteresis", "backlash", "asymmetric_stiffness", "higher_order_stiffness", "transmission_damping",
+        "kinematic_error", "deflection_offset", "encoder_eccentricity", "encoder_delay", "encoder_scale",
+        "gravity", "link_coulomb_friction", "link_viscous_damping", "link_inertia", "contact",
+    }  # fmt: skip
+    assert len(UNLISTED) >= 4
+    assert not set(UNLISTED) & set(LISTED)
+    assert set(NOTICEABLE) == set(LISTED) | set(UNLISTED)
+
+
+def test_an_effect_is_written_name_value_and_further_parameters() -> None:
+    effect = parse("cogging=0.1,periods_per_rev=12,motor=2")
+    assert (effect.name, effect.motor) == ("cogging", 1)
+    assert effect.values == {"sin_nm": 0.1, "cos_nm": 0.0, "periods_per_rev": 12.0}
+    assert parse("stribeck_friction=0.5").values["stribeck_nm"] == pytest.approx(0.4)
+    assert make("coulomb_friction", {"torque_nm": 1}, motor=1).motor == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("coulomb_friction", "expected NAME=VALUE"),
+        ("coulomb_friction=", "expected NAME=VALUE"),
+        ("colomb=1", "expected one of coulomb_friction"),
+        ("coulomb_friction=much", 'expected a number, got "much"'),
+        ("coulomb_friction=nan", "expected a finite number"),
+        ("coulomb_friction=1,torque=3", "unknown parameter, expected torque_nm"),
+        ("coulomb_friction=1,motor=3", "expected 1 or 2, got 3"),
+    ],
+)
+def test_a_wrong_effect_is_one_clear_line(text: str, message: str) -> None:
+    with pytest.raises(SimError, match=message) as caught:
+        parse(text)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "coulomb_friction=-1",
+        "stribeck_friction=1,stribeck_velocity_rad_s=0",
+        "torque_delay=-0.001",
+        "cogging=1,periods_per_rev=0",
+        "presliding_friction=1,displacement_rad=0",
+        "higher_order_stiffness=1,power=2.5",
+        "creep=1,time_constant_s=0",
+        "coulomb_friction=1,motor=2",
+    ],
+)
+def test_values_that_cannot_be_are_refused_when_the_world_is_built(text: str) -> None:
+    effect = parse(text)
+    with pytest.raises(SimError, match=f"^{effect.name}: "):
+        World(sea(), (PERFECT,), PERFECT_ENCODER, effects=[effect])
+
+
+def test_a_rigid_transmission_has_no_effects_of_its_own() -> None:
+    with pytest.raises(SimError, match="hysteresis: expected a flexible transmission at motor 1"):
+        World(sea(RIGID), (PERFECT,), PERFECT_ENCODER, effects=[parse("hysteresis=1")])

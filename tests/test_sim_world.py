@@ -1,0 +1,186 @@
+"""The world in lockstep: periods, set-points, rows, determinism."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from simjoints import EXCITATION, HARDENING, LINEAR, PERFECT, PERFECT_ENCODER, RIGID, measured, sea
+
+from sim.cases import case
+from sim.effects import parse
+from sim.errors import SimError
+from sim.excitation import build
+from sim.sensors import DriveHardware
+from sim.variation import with_parameters
+from sim.world import World, record
+
+NOISY = DriveHardware(gear_ratio=50.0, current_noise_a=0.01)
+
+
+def world(seed: int = 0, **kwargs: object) -> World:
+    return World(sea(), (NOISY,), excitation=build(EXCITATION, 1), seed=seed, **kwargs)
+
+
+def test_row_k_holds_what_is_sampled_at_t_k_and_the_torque_that_acts_from_there() -> None:
+    """B w_{k+1} - B w_k = (tau_k + tau_e - D w) T: the torque of row k, neither the one before nor the next."""
+    plant = sea(HARDENING)
+    r = measured(plant)
+    law, w = plant.motors[0].law(), r["truth_motor1_velocity_rad_s"]
+    te = np.array([law.torque(phi) for phi in r["truth_motor1_deflection_rad"]])
+    rest = 0.125 * np.diff(w) / 0.001 + 0.8 * (w[1:] + w[:-1]) / 2 - (te[1:] + te[:-1]) / 2
+    tau = r["motor1_torque_nm"]
+    assert np.std(rest - tau[:-1]) < 0.01 * np.std(rest - tau[1:])
+    assert r["time_s"] == pytest.approx(0.001 * np.arange(len(tau)))
+
+
+def test_a_set_point_acts_from_the_next_period_on() -> None:
+    w = World(sea(), (PERFECT,), PERFECT_ENCODER)
+    w.command(0, 0.1)
+    assert w.drive(0).torque_nm == 0.0
+    w.advance()
+    assert w.truth().motors[0].velocity_rad_s == 0.0
+    assert w.drive(0).torque_nm == pytest.approx(0.1)
+    w.advance()
+    assert w.truth().motors[0].velocity_rad_s == pytest.approx(5.0 / 0.125 * 0.001, rel=0.02)
+    w.command(0, None)
+    w.advance()
+    assert w.drive(0).torque_nm == 0.0
+
+
+def test_a_command_takes_over_from_the_rig_and_gives_it_back() -> None:
+    w = world()
+    w.advance(100)
+    rig = w.truth().motors[0].torque_nm
+    w.command(0, 0.0)
+    w.advance()
+    assert rig != 0.0
+    assert w.truth().motors[0].torque_nm == 0.0
+    w.command(0, None)
+    w.advance()
+    assert w.truth().motors[0].torque_nm != 0.0
+
+
+def test_many_periods_at_once_are_the_same_as_one_by_one() -> None:
+    once, singly = world(), world()
+    once.advance(500)
+    for _ in range(500):
+        singly.advance()
+        singly.drive(0)  # reading changes nothing
+        singly.truth()
+    assert once.truth() == singly.truth()
+    assert once.drive(0) == singly.drive(0)
+    assert once.link_counts() == singly.link_counts()
+
+
+@pytest.mark.parametrize("effect", ["coulomb_friction=0.5", "hysteresis=1", "encoder_delay=0.0023"])
+def test_a_world_is_told_by_its_seed(effect: str) -> None:
+    first, again, other = (record(world(seed, effects=[parse(effect)]), 0.5) for seed in (3, 3, 4))
+    for name, column in first.items():
+        assert np.array_equal(column, again[name], equal_nan=True)
+    assert not np.array_equal(first["motor1_current_a"], other["motor1_current_a"])
+    assert np.array_equal(first["truth_motor1_torque_nm"], other["truth_motor1_torque_nm"])
+
+
+def test_truth_adds_up_over_two_motors() -> None:
+    w = case("vsa-ii").world()
+    w.advance(3000)
+    truth = w.truth()
+    one, two = truth.motors
+    assert truth.flexibility_torque_nm == one.flexibility_torque_nm + two.flexibility_torque_nm
+    assert truth.stiffness_nm_rad == one.stiffness_nm_rad + two.stiffness_nm_rad
+    assert one.deflection_rad == truth.link_position_rad - one.position_rad
+
+
+def test_the_second_motor_of_a_serial_joint_sets_the_stiffness() -> None:
+    plant = sea(LINEAR, motors=2, gravity=0.0, lever=0.5)
+    w = World(plant, (PERFECT, PERFECT), PERFECT_ENCODER, initial_rad=(0.1, 0.05, 0.4))
+    truth = w.truth()
+    assert truth.stiffness_nm_rad == pytest.approx(150.0 * 1.2**2)
+    assert truth.flexibility_torque_nm == pytest.approx(150.0 * 1.2**2 * 0.05)
+    # tau_e,2 = -dU/dtheta_2 = -2 l rho K phi²/2
+    assert truth.motors[1].flexibility_torque_nm == pytest.approx(-2 * 0.5 * 1.2 * 75.0 * 0.05**2)
+
+
+def test_the_lever_of_a_serial_joint_is_a_parameter() -> None:
+    assert with_parameters(sea(motors=2, lever=0.5), {"lever_per_rad": 0.8}).lever_per_rad == 0.8
+    with pytest.raises(SimError, match="lever_per_rad: unknown"):
+        with_parameters(sea(motors=2), {"lever_per_rad": 0.8})
+
+
+def test_a_rigid_joint_has_no_stiffness_to_tell() -> None:
+    w = World(sea(RIGID), (PERFECT,), PERFECT_ENCODER)
+    w.command(0, 0.1)
+    w.advance(100)
+    truth = w.truth()
+    assert math.isinf(truth.stiffness_nm_rad) and math.isnan(truth.flexibility_torque_nm)
+    assert truth.link_position_rad == truth.motors[0].position_rad > 0.0
+
+
+def test_a_recording_has_the_contracts_columns_and_the_truth() -> None:
+    r = record(case("vsa-ii").world(), 0.25)
+    assert {len(column) for column in r.values()} == {250}
+    for name in ("time_s", "link_position_rad", "external_torque_nm", "truth_stiffness_nm_rad"):
+        assert name in r
+    for motor in ("motor1", "motor2"):
+        for name in ("position_rad", "velocity_rad_s", "torque_nm", "current_a"):
+            assert f"{motor}_{name}" in r
+        assert f"truth_{motor}_flexibility_torque_nm" in r
+    assert record(case("vsa-ii").world(), 0.0) == {}
+
+
+def test_a_finer_plant_step_changes_little() -> None:
+    coarse, fine = (record(case("vsa-ii").world(plant_step_s=step), 2.0) for step in (0.001, 0.00025))
+    name = "truth_motor1_deflection_rad"
+    # (omega h)^4 at omega = 20 rad/s
+    assert coarse[name] == pytest.approx(fine[name], abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"plant_step_s": 0.0007}, "plant_step_s: expected a whole fraction of the period 0.001 s"),
+        ({"period_s": 0.0}, "period_s: expected a number > 0"),
+        ({"initial_rad": (0.1,)}, "initial_rad: expected 2 finite numbers"),
+    ],
+)
+def test_a_world_that_cannot_be_is_refused_in_one_line(kwargs: dict, message: str) -> None:
+    with pytest.raises(SimError, match=message) as caught:
+        world(**kwargs)
+    assert "\n" not in str(caught.value)
+
+
+def test_physics_can_change_on_the_way() -> None:
+    w, unchanged = world(), world()
+    for each in (w, unchanged):
+        each.advance(1000)
+    before = w.truth()
+    w.alter(effects=[parse("hysteresis=1"), parse("coulomb_friction=0.5"), parse("encoder_delay=0.002")])
+    assert w.truth() == before
+    w.advance(1)
+    unchanged.advance(1)
+    # Nothing jumps: friction changes the velocity by at most F T / B = 4e-3 rad/s in one period.
+    step = w.truth().motors[0].velocity_rad_s - unchanged.truth().motors[0].velocity_rad_s
+    assert 0.0 < abs(step) < 4.1e-3
+    w.alter(effects=[], plant=with_parameters(sea(), {"motor1_k_nm_rad": 120.0}))
+    assert w.truth().stiffness_nm_rad == 120.0
+    w.advance(1000)
+    assert w.time_s == pytest.approx(2.001)
+
+
+def test_a_joint_does_not_change_its_kind() -> None:
+    with pytest.raises(SimError, match='alter: expected arrangement "single", as before'):
+        world().alter(plant=sea(RIGID))
+
+
+def test_a_set_point_that_is_no_number_is_refused() -> None:
+    with pytest.raises(SimError, match="torque_nm: expected a finite number, got nan"):
+        world().command(0, math.nan)
+
+
+def test_parts_must_fit_each_other() -> None:
+    with pytest.raises(SimError, match="drives: expected 2, got 1"):
+        World(sea(motors=2), (PERFECT,))
+    with pytest.raises(SimError, match="expected q = theta at a rigid transmission"):
+        World(sea(RIGID), (PERFECT,), initial_rad=(0.1, 0.2))

@@ -1,0 +1,215 @@
+"""Joint file to simulated world and devices."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import can
+import pytest
+
+from drivelink.errors import JointFileError, UsageError
+from drivelink.jointfile import JointFile, parse
+from drivelink.simulate import bench_from_joints, network_from_joint, nodes_from_joint, world_from_joint
+from sim.canopen.drive import Cia402Drive
+from sim.canopen.encoder import Cia406Encoder
+
+SINGLE = """
+name = "elbow"
+[[motor]]
+inertia_kg_m2 = 0.125
+viscous_damping_nm_s_rad = 0.8
+[motor.transmission]
+model = "polynomial"
+parameters = { coefficients_nm_rad = [150.0, 400.0] }
+[motor.drive]
+node_id = 3
+counts_per_rev = 4096
+gear_ratio = 100.0
+direction = -1
+[link.encoder]
+source = "cia406"
+node_id = 9
+counts_per_rev = 65536
+offset_rad = 0.25
+[link.dynamics]
+inertia_kg_m2 = 0.4
+"""
+
+VSA = """
+name = "wrist"
+arrangement = "antagonistic"
+[[motor]]
+inertia_kg_m2 = 0.0005
+[motor.drive]
+node_id = 1
+[[motor]]
+inertia_kg_m2 = 0.0005
+[motor.drive]
+node_id = 2
+[link.encoder]
+node_id = 2
+[sim]
+case = "vsa-ii"
+"""
+
+
+def joint(text: str = SINGLE, extra: str = "") -> JointFile:
+    return parse(text + extra)
+
+
+def test_without_a_case_the_model_is_the_truth() -> None:
+    world = world_from_joint(joint())
+    world.advance(500)
+    truth = world.truth()
+    phi = truth.motors[0].deflection_rad
+    assert phi != 0.0
+    assert truth.flexibility_torque_nm == pytest.approx(150.0 * phi + 400.0 * phi**3)
+    assert truth.stiffness_nm_rad == pytest.approx(150.0 + 1200.0 * phi**2)
+
+
+def test_the_rig_moves_any_joint_enough_and_not_too_far() -> None:
+    for stiffness in (0.1, 10.0, 150.0, 8000.0):
+        text = SINGLE.replace("[150.0, 400.0]", f"[{stiffness}]")
+        scale = stiffness / 150.0
+        text = text.replace("0.125", str(0.125 * scale)).replace("0.4\n", f"{0.4 * scale}\n")
+        text = text.replace("0.8", str(0.8 * scale))
+        world = world_from_joint(joint(text))
+        deflections, positions = [], []
+        for _ in range(1000):
+            world.advance(10)
+            truth = world.truth()
+            deflections.append(abs(truth.motors[0].deflection_rad))
+            positions.append(abs(truth.link_position_rad))
+        # Enough: a hundred counts of a 16-bit encoder. Not too far: within half a turn.
+        assert max(deflections) > 100 * 2 * math.pi / 65536, stiffness
+        assert max(positions) < math.pi, stiffness
+
+
+def test_true_values_may_differ_from_the_models() -> None:
+    extra = """
+[sim]
+parameters = { motor1_inertia_kg_m2 = 0.2, motor1_coefficient2_nm_rad = 500.0, link_gravity_nm = 6.0 }
+"""
+    plant = world_from_joint(joint(extra=extra)).plant
+    assert plant.motors[0].inertia_kg_m2 == 0.2
+    assert plant.motors[0].spring.parameters["coefficients_nm_rad"] == (150.0, 500.0)
+    assert plant.link.gravity_nm == 6.0
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        ("[sim]\nparameters = { motor1_mass = 1.0 }", "elbow: sim: parameters.motor1_mass: unknown"),
+        ("[sim]\nparameters = { motor2_inertia_kg_m2 = 1.0 }", "parameters.motor2_inertia_kg_m2: unknown"),
+        ("[sim]\nparameters = { link_mass = 1.0 }", "parameters.link_mass: unknown, the link has inertia"),
+        ("[sim]\nparameters = { motor1_inertia_kg_m2 = -1.0 }", "expected a finite number > 0"),
+        ("[sim]\nexcitation = { kind = 'noise' }", "sim.excitation.kind: expected one of"),
+        ("[sim]\n[[sim.effect]]\nname = 'magic'", "effect: expected one of"),
+        ("[sim]\ncase = 'vsa-ii'", 'elbow: sim: case "vsa-ii" is antagonistic, this joint is single'),
+    ],
+)
+def test_what_cannot_be_simulated_is_one_line(extra: str, message: str) -> None:
+    with pytest.raises(JointFileError) as caught:
+        world_from_joint(joint(extra=extra))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_model_without_parameters_asks_for_a_case() -> None:
+    text = SINGLE.replace("parameters = { coefficients_nm_rad = [150.0, 400.0] }", "")
+    with pytest.raises(JointFileError, match=r"expected sim.case, or parameters in motor\[1\]"):
+        world_from_joint(joint(text))
+
+
+def test_effects_come_from_the_file_the_model_and_the_command_line() -> None:
+    extra = "[sim]\n[[sim.effect]]\nname = 'torque_offset'\nparameters = { torque_nm = 0.1 }"
+    plain = world_from_joint(joint())
+    offset = world_from_joint(joint(extra=extra))
+    asked = world_from_joint(joint(), effects=["torque_offset=0.1"])
+    for world in (plain, offset, asked):
+        world.advance(50)
+    assert offset.truth() == asked.truth() != plain.truth()
+    with pytest.raises(UsageError, match="--effect"):
+        world_from_joint(joint(), effects=["magic=1"])
+
+
+def test_the_devices_tell_what_the_joint_file_says() -> None:
+    drive, encoder = nodes_from_joint(joint(), world_from_joint(joint()))
+    assert isinstance(drive, Cia402Drive)
+    assert isinstance(encoder, Cia406Encoder)
+    assert (drive.node_id, encoder.node_id) == (3, 9)
+    assert drive.dictionary.find(0x608F, 1).value == 4096
+    assert [drive.dictionary.find(0x6091, k).value for k in (1, 2)] == [100, 1]
+    assert encoder.dictionary.find(0x6501, 0).value == 65536
+
+
+def test_positions_on_the_bus_are_the_joints_through_gear_direction_and_offset() -> None:
+    file = joint()
+    world = world_from_joint(file)
+    drive, encoder = nodes_from_joint(file, world)
+    world.advance(300)
+    truth = world.truth()
+    counts = int.from_bytes(drive.dictionary.find(0x6064, 0).upload(), "little", signed=True)
+    # Half a count of each encoder, at the joint.
+    assert -counts * 2 * math.pi / 409600 == pytest.approx(truth.motors[0].position_rad, abs=8e-6)
+    link = int.from_bytes(encoder.dictionary.find(0x6004, 0).upload(), "little", signed=True)
+    assert link * 2 * math.pi / 65536 - 0.25 == pytest.approx(truth.link_position_rad, abs=5e-5)
+
+
+def test_the_link_encoder_is_wired_to_the_drive_that_the_file_names() -> None:
+    first, second = nodes_from_joint(joint(VSA), world_from_joint(joint(VSA)))
+    assert first.dictionary.find(0x60E6, 1).value == 0
+    assert second.dictionary.find(0x60E6, 1).value == 262144
+
+
+def test_a_case_brings_its_drives_and_the_file_overrides_them() -> None:
+    world = world_from_joint(joint(VSA))
+    assert world.drives[0].gear_ratio == 20.0
+    text = VSA.replace("node_id = 1\n", "node_id = 1\ngear_ratio = 50.0\n")
+    assert world_from_joint(joint(text)).drives[0].gear_ratio == 50.0
+
+
+def test_quirks_come_from_the_file_or_the_command_line() -> None:
+    file = joint(VSA + 'quirks = "epos4"\n')
+    world = world_from_joint(file)
+    assert nodes_from_joint(file, world)[0].quirks.name == "epos4"
+    assert nodes_from_joint(file, world, quirks="elmo")[0].quirks.name == "elmo"
+    with pytest.raises(UsageError, match="--quirks"):
+        nodes_from_joint(file, world, quirks="acme")
+    with pytest.raises(JointFileError, match=r"sim\.quirks"):
+        nodes_from_joint(joint(VSA + 'quirks = "acme"\n'), world)
+
+
+def test_two_joints_share_a_bus_and_their_data_sheets_are_written(tmp_path: Path) -> None:
+    bench = bench_from_joints([joint(), joint(VSA)])
+    assert bench.describe() == "elbow (drive 3, encoder 9); wrist (drive 1, drive 2)"
+    bench.write_eds(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "elbow-node3.eds",
+        "elbow-node9.eds",
+        "wrist-node1.eds",
+        "wrist-node2.eds",
+    }
+    with pytest.raises(UsageError, match="got 1 twice"):
+        bench_from_joints([joint(VSA), joint(VSA)])
+
+
+def test_lockstep_is_the_same_every_time() -> None:
+    def frames() -> list[bytes]:
+        heard = []
+        with (
+            can.Bus(interface="virtual", channel="same") as device_end,
+            can.Bus(interface="virtual", channel="same") as master_end,
+        ):
+            network = network_from_joint(joint(VSA), device_end)
+            network.poll()
+            master_end.send(can.Message(arbitration_id=0, data=[1, 0], is_extended_id=False))
+            for _ in range(200):
+                master_end.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+                network.poll()
+            while (message := master_end.recv(0)) is not None:
+                heard.append(bytes(message.data))
+        return heard
+
+    assert frames() == frames()

@@ -1,0 +1,78 @@
+"""Percentiles are those of the durations; an event is said once, however often it happens."""
+
+import logging
+import random
+
+import numpy as np
+import pytest
+
+from drivelink.daemon.status import EventLog, Meter
+
+
+def test_percentiles_are_those_of_the_durations() -> None:
+    rng = random.Random(1)
+    durations_us = [rng.lognormvariate(4.0, 0.6) for _ in range(20_000)]
+    meter = Meter()
+    for us in durations_us:
+        meter.add(int(us * 1000))
+    for name, q in (("p50_us", 50), ("p90_us", 90), ("p99_us", 99), ("p999_us", 99.9)):
+        assert meter.total()[name] == pytest.approx(np.percentile(durations_us, q), abs=2.0)  # bins of 1 us
+    assert meter.total()["max_us"] == pytest.approx(max(durations_us), abs=1.0)
+    assert meter.count == len(durations_us)
+
+
+def test_recent_is_since_the_last_look() -> None:
+    meter = Meter()
+    for _ in range(100):
+        meter.add(10_000)
+    assert meter.recent()["p50_us"] == 11.0
+    for _ in range(100):
+        meter.add(500_000)
+    assert meter.recent()["p50_us"] == 501.0
+    assert meter.recent() == {}
+    assert meter.total()["max_us"] == 500.0
+
+
+def test_durations_beyond_the_range_and_below_zero_are_counted() -> None:
+    meter = Meter()
+    meter.add(-5)
+    meter.add(10**12)
+    assert meter.count == 2
+    assert meter.total()["max_us"] == 10**9
+
+
+def log(clock: list[float]) -> EventLog:
+    return EventLog(logging.getLogger("drivelink.test"), clock=lambda: clock[0])
+
+
+def test_a_condition_is_said_when_it_begins_and_when_it_ends(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    events = log([0.0])
+    for _ in range(1000):
+        events.begin("hot", "it is hot")
+    assert events.active == {"hot": "it is hot"}
+    for _ in range(1000):
+        events.end("hot", "it is cool again")
+    assert events.active == {}
+    assert [record.getMessage() for record in caplog.records] == ["it is hot", "it is cool again"]
+
+
+def test_what_comes_and_goes_is_counted_not_repeated(caplog: pytest.LogCaptureFixture) -> None:
+    clock = [0.0]
+    events = log(clock)
+    for _ in range(500):
+        events.begin("flaky", "the cable is loose")
+        events.end("flaky")
+    assert len(caplog.records) == 1
+    (event,) = events.recent()
+    assert (event["text"], event["count"]) == ("the cable is loose", 500)
+    clock[0] = 60.0
+    events.begin("flaky", "the cable is loose")
+    assert caplog.records[-1].getMessage() == "the cable is loose (499 more times before)"
+
+
+def test_the_last_events_are_kept_and_no_more() -> None:
+    events = log([0.0])
+    for k in range(1000):
+        events.say(f"event {k}")
+    assert [event["text"] for event in events.recent()] == [f"event {k}" for k in range(984, 1000)]

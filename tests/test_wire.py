@@ -1,0 +1,132 @@
+"""The bytes on zenoh: against zenoh's own serializer (golden vectors), and back."""
+
+import math
+import runpy
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+from zenoh.ext import Float64, UInt32, UInt64, z_deserialize, z_serialize
+
+from drivelink.errors import ZenohError
+from drivelink.pubsub import wire
+from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
+
+GOLDEN = Path(__file__).parent / "golden"
+NUMBER = st.floats(allow_nan=False)
+U64 = st.integers(0, 2**64 - 1)
+
+
+def vectors(file):
+    lines = (GOLDEN / file).read_text(encoding="ascii").splitlines()
+    return [
+        pytest.param(bytes.fromhex(payload), list(map(number, numbers)), id=name)
+        for name, payload, *numbers in map(str.split, lines)
+    ]
+
+
+def number(text):
+    return int(text) if text.isdigit() else float(text)
+
+
+def groups(numbers, size):
+    return tuple(tuple(numbers[i : i + size]) for i in range(0, len(numbers), size))
+
+
+def same(a, b):
+    """Equal, NaN and the sign of zero included."""
+    return struct.pack(f"<{len(a)}d", *a) == struct.pack(f"<{len(b)}d", *b)
+
+
+@pytest.mark.parametrize(("payload", "numbers"), vectors("estimate.txt"))
+def test_an_estimate_is_the_bytes_that_zenoh_serializes(payload, numbers):
+    sequence, stamp_ns, status, *totals = numbers[:6]
+    transmissions = tuple(TransmissionEstimate(*group) for group in groups(numbers[7:], 4))
+    estimate = Estimate(sequence, status, *totals, transmissions)
+    assert wire.encode_estimate(estimate, stamp_ns) == payload
+
+    message = wire.decode_estimate(payload)
+    assert message[:3] == (sequence, stamp_ns, status)
+    assert same(message[3:6], totals)
+    assert same([n for t in message.transmissions for n in t], numbers[7:])
+    assert message.valid == bool(status & 1)
+    assert message.observable == bool(status & 2)
+
+
+@pytest.mark.parametrize(("payload", "numbers"), vectors("sample.txt"))
+def test_a_sample_is_the_bytes_that_zenoh_serializes(payload, numbers):
+    sequence, stamp_ns, link, velocity, external = numbers[:5]
+    motors = tuple(zip(*groups(numbers[6:], 3), strict=True))
+    assert wire.encode_sample(Sample(sequence, *motors, link, velocity, external), stamp_ns) == payload
+
+    sample, stamp = wire.decode_sample(payload)
+    assert (sample.sequence, stamp) == (sequence, stamp_ns)
+    assert same(sample[4:], [link, velocity, external])
+    assert same([n for column in sample[1:4] for n in column], [n for column in motors for n in column])
+
+
+@given(
+    U64,
+    U64,
+    st.integers(0, 2**32 - 1),
+    st.tuples(NUMBER, NUMBER, NUMBER),
+    st.lists(st.tuples(NUMBER, NUMBER, NUMBER, NUMBER), max_size=4),
+)
+def test_any_estimate_can_be_read_by_zenohs_deserializer(sequence, stamp_ns, status, totals, transmissions):
+    estimate = Estimate(sequence, status, *totals, tuple(TransmissionEstimate(*t) for t in transmissions))
+    payload = wire.encode_estimate(estimate, stamp_ns)
+    number = Float64
+    kind = tuple[UInt64, UInt64, UInt32, number, number, number, list[tuple[number, number, number, number]]]
+    assert z_deserialize(kind, zenoh.ZBytes(payload)) == (sequence, stamp_ns, status, *totals, transmissions)
+    assert wire.decode_estimate(payload)[:6] == (sequence, stamp_ns, status, *totals)
+
+
+def test_numpy_reads_the_same_bytes_as_records():
+    estimate = Estimate(7, 3, 1.0, 2.0, 3.0, (TransmissionEstimate(4.0, 5.0, 6.0, 7.0),) * 2)
+    records = np.frombuffer(wire.encode_estimate(estimate, 9) * 3, wire.ESTIMATE.dtype(2))
+    assert records["stiffness_nm_rad"].tolist() == [2.0] * 3
+    assert records["transmissions"]["deflection_rad"].shape == (3, 2)
+    assert set(records["count"]) == {2}
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"\x00" * 44,
+        bytes(wire.ESTIMATE.size(1) - 1),
+        bytes(wire.ESTIMATE.size(1)),  # long enough for one element, but says none
+        bytes(wire.ESTIMATE.size(wire.MAX_ELEMENTS) + 32),
+    ],
+)
+def test_bytes_that_are_no_estimate_are_refused_in_one_line(payload):
+    with pytest.raises(ZenohError) as error:
+        wire.decode_estimate(payload)
+    assert "drivelink.estimate/1: expected" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_bytes_that_are_no_sample_are_refused():
+    with pytest.raises(ZenohError, match=r"drivelink\.sample/1"):
+        wire.decode_sample(z_serialize(b"something else").to_bytes())
+
+
+def test_a_status_that_carries_higher_bits_fits_its_field():
+    estimate = Estimate(1, -1, math.nan, 0.0, 0.0, ())
+    assert wire.decode_estimate(wire.encode_estimate(estimate, 0)).status == 2**32 - 1
+
+
+def test_every_status_bit_is_described():
+    assert list(wire.STATUS_BITS) == [bit.name for bit in Status]
+
+
+def test_the_documented_layout_is_the_codes():
+    docs = Path(__file__).parent.parent / "docs"
+    generator = runpy.run_path(str(docs / "generate_wire.py"))
+    page = (docs / "wire.md").read_text(encoding="utf-8")
+    assert generator["generate"](page) == page, "run python docs/generate_wire.py"
+    assert "| 0x002 | observable |" in page

@@ -1,0 +1,71 @@
+"""What the zenoh tests share: free ports, joints, and daemons in processes of their own that can be killed."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+from drivelink.jointfile import JointFile, parse
+from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
+
+HERE = Path(__file__).parent
+LIMIT_S = 20.0  # patience with a loaded machine; nothing is asserted about time itself
+
+
+def free_endpoint() -> str:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{listener.getsockname()[1]}"
+
+
+def make_joint(name: str, endpoint: str, more: str = "") -> JointFile:
+    return parse(
+        f'name = "{name}"\n[[motor]]\ninertia_kg_m2 = 0.125\n[motor.transmission]\nmodel = "linear"\n'
+        f'parameters = {{ k_nm_rad = 700.0 }}\n[zenoh]\nendpoint = "{endpoint}"\n{more}'
+    )
+
+
+def make_estimate(sequence: int, status: int = Status.VALID | Status.OBSERVABLE, motors: int = 1) -> Estimate:
+    each = (TransmissionEstimate(sequence * 0.5, 700.0, 3.0, sequence * 0.001),) * motors
+    return Estimate(sequence, int(status), sequence * 0.5, 700.0, 3.0, each)
+
+
+def make_sample(sequence: int) -> Sample:
+    return Sample(sequence, (0.5,), (0.0,), (1.5,), 0.25)
+
+
+def until(condition, limit_s: float = LIMIT_S):
+    """Wait until the condition holds and return what it gave; fail after a generous limit."""
+    deadline = time.monotonic() + limit_s
+    while not (result := condition()):
+        assert time.monotonic() < deadline, "did not come about"
+        time.sleep(0.01)
+    return result
+
+
+@contextmanager
+def script(*args: str, name: str = "zenoh_daemon.py"):
+    """A Python process of the test; killed at the end, stopped or not."""
+    environment = os.environ | {"PYTHONPATH": str(HERE.parent)}
+    process = subprocess.Popen(
+        [sys.executable, str(HERE / name), *args],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+
+
+def ready(process: subprocess.Popen) -> None:
+    """Wait for the process's word that it is at work."""
+    line = process.stdout.readline()
+    assert line == "ready\n", (line, process.stderr.read() if process.poll() is not None else "")

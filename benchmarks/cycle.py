@@ -1,0 +1,194 @@
+"""The work of one cycle: a two-motor VSA on the virtual bus, beside the textbook way and the floor.
+
+    python benchmarks/cycle.py [--seconds S] [--rounds N] [--json FILE]
+
+All variants make SYNC at 1 kHz for the same simulated devices, which answer in the thread that sends and
+whose CPU time is not counted, and publish in the same zenoh session to a subscriber in another process.
+Rounds alternate between them, so that all see the same machine. CPU is that of the whole process without
+the devices, over the SYNCs that were made: SYNC, reception, estimation, publication, zenoh's own threads,
+and the threads that each variant brings with it. Work is wall-clock time from the last PDO in hand to the
+put returned.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import zenoh
+from rig import PERIOD_S, Devices, free_endpoint, joint, subscriber
+from rivals import Floor, Textbook
+
+from drivelink.canopen.busload import bus_load
+from drivelink.canopen.layout import NodeLayout
+from drivelink.cycle import realtime
+from drivelink.cycle.lockstep import run_lockstep
+from drivelink.daemon.service import Daemon, ServedJoint
+from drivelink.jointfile import JointFile
+from drivelink.pubsub.publisher import JointPublisher
+from drivelink.pubsub.session import close_session, open_session
+from drivelink.simulate import network_from_joint, open_sim_bus
+
+
+class Row:
+    """One variant over all rounds."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.cpu_s = self.wall_s = 0.0
+        self.syncs = self.complete = 0
+        self.work: list[dict[str, float]] = []
+
+    def measure(self, devices: Devices, run: Callable[[], None]) -> None:
+        """CPU of the process without that of the devices, over the SYNCs that were made."""
+        syncs, cpu_s = devices.syncs, time.process_time() - devices.cpu_s
+        start = time.monotonic()
+        run()
+        self.wall_s += time.monotonic() - start
+        self.cpu_s += time.process_time() - devices.cpu_s - cpu_s
+        self.syncs += devices.syncs - syncs
+
+    def result(self) -> dict[str, Any]:
+        """Totals; of the percentiles the median over the rounds."""
+
+        def middle(name: str) -> float:
+            return statistics.median(work[name] for work in self.work)
+
+        return {
+            "variant": self.name,
+            "syncs": self.syncs,
+            "complete": self.complete,
+            "cpu_us_per_cycle": 1e6 * self.cpu_s / self.syncs,
+            "cpu_of_a_core": self.cpu_s / self.wall_s,
+            "work_p50_us": middle("p50_us"),
+            "work_p99_us": middle("p99_us"),
+            "work_p999_us": middle("p999_us"),
+        }
+
+
+def daemon_round(
+    row: Row, which: JointFile, devices: Devices, session: zenoh.Session, seconds: float
+) -> Mapping[int, NodeLayout]:
+    """The daemon as `drivelink run` runs it, supervision, status key and housekeeping included."""
+    with Daemon([ServedJoint(joint=which)], session=session, devices=devices.poll) as daemon:
+        row.measure(devices, lambda: daemon.run(seconds))
+        (lane,) = daemon.loop.lanes
+        row.complete += lane.estimates
+        row.work.append(lane.work.total())
+        return dict(daemon.layouts)
+
+
+def rival_round(row: Row, rival: Textbook | Floor, devices: Devices, seconds: float) -> None:
+    """A rival, with the same help of the operating system."""
+    obtained = realtime.acquire()
+    row.measure(devices, lambda: rival.run(seconds, devices))
+    realtime.release(obtained)
+    row.complete += rival.cycles
+    row.work.append(rival.work.total())
+    rival.close()
+
+
+def compare(seconds: float, rounds: int) -> list[dict[str, Any]]:
+    """All variants, round by round."""
+    endpoint = free_endpoint()
+    robust, paper = joint("robust", endpoint), joint("paper", endpoint)
+    session = open_session(robust.zenoh, Path())
+    reader = subscriber(endpoint)
+    rows = [Row("drivelink, robust"), Row("drivelink, paper"), Row(Textbook.name), Row(Floor.name)]
+    devices = Devices(robust)
+    try:
+        for _ in range(rounds):
+            layouts = daemon_round(rows[0], robust, devices, session, seconds)
+            daemon_round(rows[1], paper, devices, session, seconds)
+            rival_round(rows[2], Textbook(paper, devices.nodes, layouts, session), devices, seconds)
+            rival_round(rows[3], Floor(paper, layouts, session), devices, seconds)
+    finally:
+        devices.close()
+        close_session(session)
+        reader.communicate(b"")
+    load = bus_load(layouts.values(), period_s=PERIOD_S, bitrate=1_000_000, sync_bytes=0)
+    results = [row.result() for row in rows]
+    for result in results:
+        result["bus_load_1_mbit"] = load.fraction
+        for name, baseline in (("textbook", results[2]), ("floor", results[3])):
+            result[f"cpu_against_{name}"] = result["cpu_us_per_cycle"] / baseline["cpu_us_per_cycle"]
+    return results
+
+
+def lockstep(mode: str, seconds: float) -> dict[str, Any]:
+    """World, devices, frames, cycle and puts in one thread, as fast as it goes."""
+    which = joint(mode, free_endpoint())
+    session = open_session(which.zenoh, Path())
+    bus = open_sim_bus(which.bus)
+    network = network_from_joint(which, bus)
+    publisher = JointPublisher(session, which)
+    start, cpu_s = time.perf_counter(), time.process_time()
+    lane = run_lockstep(which, network, publisher, round(seconds / PERIOD_S))
+    elapsed, cpu_s = time.perf_counter() - start, time.process_time() - cpu_s
+    publisher.close()
+    bus.shutdown()
+    close_session(session)
+    return {
+        "mode": mode,
+        "simulated_s": seconds,
+        "took_s": elapsed,
+        "cpu_s": cpu_s,
+        "faster_than_real_time": seconds / elapsed,
+        **{f"work_{key}": value for key, value in lane.work.total().items()},
+    }
+
+
+def report(results: list[dict[str, Any]], flat_out: list[dict[str, Any]]) -> str:
+    """The tables in Markdown."""
+    lines = [
+        "| at 1 kHz | CPU a cycle / µs | of a core | of textbook | of floor | work p50 / p99 / p99.9 µs "
+        "| cycles complete |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {r['variant']} | {r['cpu_us_per_cycle']:.0f} | {100 * r['cpu_of_a_core']:.1f} % "
+        f"| {r['cpu_against_textbook']:.2f}× | {r['cpu_against_floor']:.2f}× "
+        f"| {r['work_p50_us']:.0f} / {r['work_p99_us']:.0f} / {r['work_p999_us']:.0f} "
+        f"| {r['complete']} of {r['syncs']} |"
+        for r in results
+    ]
+    lines += [
+        "",
+        "| lockstep | 10 s of VSA-II took | CPU | faster than real time | work p50 / p99 µs |",
+        "|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {r['mode']} | {10 * r['took_s'] / r['simulated_s']:.2f} s "
+        f"| {10 * r['cpu_s'] / r['simulated_s']:.2f} s | {r['faster_than_real_time']:.1f}× "
+        f"| {r['work_p50_us']:.0f} / {r['work_p99_us']:.0f} |"
+        for r in flat_out
+    ]
+    load = results[0]["bus_load_1_mbit"]
+    lines += [
+        "",
+        f"Frames of this joint take {100 * load:.0f} % of 1 Mbit/s: the bus ends at {1e3 / load:.0f} Hz.",
+    ]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=5.0, help="of each round")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--json", type=Path, help="also write the numbers there")
+    args = parser.parse_args()
+    results = compare(args.seconds, args.rounds)
+    flat_out = [lockstep(mode, 10.0) for mode in ("robust", "paper")]
+    print(report(results, flat_out))
+    if args.json:
+        args.json.write_text(json.dumps({"cycle": results, "lockstep": flat_out}, indent=1), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

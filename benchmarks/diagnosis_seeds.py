@@ -1,0 +1,182 @@
+"""How often `diagnose` names what the simulated joint carries, on random joints from published seeds.
+
+    python benchmarks/diagnosis_seeds.py [--seeds N] [--seconds S] [--effects NAME ...] [--json FILE]
+
+Every joint, motion and effect is drawn from its seed: soft joints of 80 to 220 N·m/rad with encoders and
+torque noise as drives have them, effects of 3 to 30 % of the torque. The world is `sim`, which shares no code
+with the estimator; the accuracy that counts was measured with other simulators still (docs/diagnosis.md).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivelink.jointfile import JointFile, parse
+from drivelink.progress import track
+from drivelink.simulate import world_from_joint
+from estimator.diagnosis import diagnose
+from estimator.effects import LIBRARY
+from estimator.sample import Record
+from sim.world import record
+
+JOINT = """
+name = "bench"
+arrangement = "single"
+[[motor]]
+inertia_kg_m2 = {inertia}
+viscous_damping_nm_s_rad = {damping}
+transmission = {{ model = "linear", parameters = {{ k_nm_rad = {stiffness} }} }}
+drive = {{ node_id = 1, counts_per_rev = 16384, gear_ratio = 50 }}
+[link]
+encoder = {{ source = "cia406", node_id = 2, counts_per_rev = 131072 }}
+[link.dynamics]
+inertia_kg_m2 = {link}
+viscous_damping_nm_s_rad = 0.1
+gravity_nm = {gravity}
+[sim]
+seed = {seed}
+effect = [{effect}]
+[sim.excitation]
+kind = "rich"
+seed = {seed}
+amplitude_nm = {torque}
+centring_nm_rad = {centring}
+centring_nm_s_rad = {brake}
+"""
+
+
+def sizes(
+    torque: float, stiffness: float, share: float, rng: np.random.Generator
+) -> dict[str, dict[str, float]]:
+    """Parameters of each effect so that it takes about that share of the torque."""
+    x, angle = share * torque, share * torque / stiffness
+    waves = {"periods_per_rev": float(rng.integers(12, 30))}
+    return {
+        "coulomb_friction": {"torque_nm": x},
+        "stribeck_friction": {"torque_nm": x, "stribeck_nm": 0.8 * x, "stribeck_velocity_rad_s": 0.25},
+        "asymmetric_friction": {"positive_nm": 1.5 * x, "negative_nm": 0.6 * x},
+        "presliding_friction": {"torque_nm": x, "displacement_rad": 0.04},
+        "load_dependent_friction": {"coefficient": 1.5 * share},
+        "viscous_damping": {"damping_nm_s_rad": x},
+        "quadratic_damping": {"damping_nm_s2_rad2": x},
+        "cogging": {"sin_nm": x, "cos_nm": 0.5 * x, **waves},
+        "torque_offset": {"torque_nm": x},
+        "torque_constant": {"relative_error": share},
+        "torque_saturation": {"coefficient_per_nm2": 0.3 * share / torque**2},
+        "torque_drift": {"relative_change": 1.5 * share, "time_constant_s": 6.0},
+        "motor_inertia": {"inertia_kg_m2": 0.4 * share},
+        "torque_delay": {"delay_s": 0.0025 + 0.01 * share},
+        "hysteresis": {"torque_nm": x, "displacement_rad": 0.01},
+        "backlash": {"stiffness_nm_rad": stiffness, "half_gap_rad": angle},
+        "asymmetric_stiffness": {"coefficient_nm_rad2": share * stiffness**2 / torque},
+        "higher_order_stiffness": {"coefficient": share * stiffness**3 / torque**2, "power": 3.0},
+        "transmission_damping": {"damping_nm_s_rad": 2.0 * x},
+        "kinematic_error": {"sin_rad": angle, "cos_rad": 0.5 * angle, **waves},
+        "deflection_offset": {"offset_rad": angle},
+        "encoder_eccentricity": {"sin_rad": angle, "cos_rad": 0.7 * angle},
+        "encoder_delay": {"delay_s": 0.0025 + 0.01 * share},
+        "encoder_scale": {"relative_error": 0.3 * share},
+        "gravity": {"sin_nm": 2.0 * x, "cos_nm": 0.5 * x},
+        "link_coulomb_friction": {"torque_nm": x},
+        "link_viscous_damping": {"damping_nm_s_rad": x},
+        "link_inertia": {"inertia_kg_m2": 0.4 * share},
+        "contact": {"stiffness_nm_rad": 10.0 * x, "position_rad": 0.1},
+    }
+
+
+def joint_of(name: str, seed: int) -> tuple[JointFile, JointFile]:
+    """The joint as it is declared, and as it is."""
+    rng = np.random.default_rng([seed, sorted(LIBRARY).index(name) if name in LIBRARY else 99])
+    stiffness, share = rng.uniform(80.0, 220.0), np.exp(rng.uniform(np.log(0.03), np.log(0.3)))
+    torque = 0.12 * stiffness
+    link = rng.uniform(0.2, 0.6)
+    values = {
+        "inertia": rng.uniform(0.08, 0.25),
+        "damping": rng.uniform(0.3, 1.2),
+        "stiffness": stiffness,
+        "link": link,
+        "gravity": rng.uniform(2.0, 7.0),
+        "seed": seed,
+        "torque": torque,
+        "centring": 3.0 * torque,
+        "brake": 0.5 * float(np.sqrt(3.0 * torque * link)),
+    }
+    effect = ""
+    if name in LIBRARY:
+        parameters = sizes(0.5 * torque, stiffness, float(share), rng)[name]
+        inside = ", ".join(f"{key} = {value!r}" for key, value in parameters.items())
+        effect = f'{{ name = "{name}", parameters = {{ {inside} }} }}'
+    text = {key: float(v) if key != "seed" else v for key, v in values.items()}
+    return parse(JOINT.format(effect="", **text)), parse(JOINT.format(effect=effect, **text))
+
+
+def measured(joint: JointFile, seconds: float) -> Record:
+    """A recording of the joint's world."""
+    columns = record(world_from_joint(joint), seconds)
+    return Record(
+        period_s=joint.bus.period_s,
+        sequence=np.arange(len(columns["time_s"])),
+        motor_position_rad=columns["motor1_position_rad"][:, None],
+        motor_torque_nm=columns["motor1_torque_nm"][:, None],
+        link_position_rad=columns["link_position_rad"],
+    )
+
+
+def judged(name: str, seed: int, seconds: float) -> dict[str, Any]:
+    """One recording made and diagnosed."""
+    declared, real = joint_of(name, seed)
+    outcome = diagnose(measured(real, seconds), declared.model())
+    names = [effect.name for effect in outcome.effects]
+    first = outcome.effects[0] if outcome.effects else None
+    clean = name not in LIBRARY
+    return {
+        "effect": name,
+        "seed": seed,
+        "verdict": outcome.verdict,
+        "found": names,
+        "named_first": outcome.verdict == "sufficient" if clean else names[:1] == [name],
+        "located": clean or (first is not None and first.location == LIBRARY[name].location),
+        "among_alternatives": first is not None and name in first.alternatives,
+        "surplus": max(0, len(names) - (0 if clean else 1)),
+        "after_over_before": outcome.validation.after_rms_nm / outcome.validation.before_rms_nm,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--seeds", type=int, default=2, help="recordings of each effect")
+    parser.add_argument("--seconds", type=float, default=20.0, help="length of a recording")
+    parser.add_argument("--effects", nargs="*", default=["clean", *LIBRARY], metavar="NAME")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write every outcome there")
+    args = parser.parse_args()
+    jobs = [(name, seed) for name in args.effects for seed in range(args.seeds)]
+    outcomes = [judged(name, seed, args.seconds) for name, seed in track(jobs, "diagnose")]
+    print("| effect | named first | located | else found |\n|---|---|---|---|")
+    for name in args.effects:
+        mine = [o for o in outcomes if o["effect"] == name]
+        wrong = Counter(
+            str(f) for o in mine if not o["named_first"] for f in o["found"][:1] or [o["verdict"]]
+        )
+        named, located = (sum(o[key] for o in mine) for key in ("named_first", "located"))
+        print(f"| {name} | {named}/{len(mine)} | {located}/{len(mine)} | {', '.join(wrong) or '-'} |")
+    real = [o for o in outcomes if o["effect"] in LIBRARY]
+    if real:
+        ratios = [o["after_over_before"] for o in real]
+        print(
+            f"\nnamed first {sum(o['named_first'] for o in real)}/{len(real)}, "
+            f"located {sum(o['located'] for o in real)}/{len(real)}, "
+            f"surplus terms {sum(o['surplus'] for o in real)}, "
+            f"held-out error after/before: median {np.median(ratios):.3f}"
+        )
+    if args.json:
+        args.json.write_text(json.dumps(outcomes, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

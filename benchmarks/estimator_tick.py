@@ -1,0 +1,128 @@
+"""Speed of the estimators: one tick, batch fits, memory over many ticks.
+
+    python benchmarks/estimator_tick.py [--ticks N] [--json]
+
+Two-motor VSA joints at 1 kHz on encoder counts. A tick is timed alone, with nothing compiled at run time;
+the percentiles are over all ticks after the first three seconds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import time
+import tracemalloc
+
+import numpy as np
+
+from estimator import EstimatorSettings, JointModel, Motor, Record, Transmission, fit, make_estimator
+
+T = 1e-3
+_CASES = {
+    "robust, polynomial": ("polynomial", EstimatorSettings()),
+    "robust, vsa-ii": ("vsa-ii", EstimatorSettings()),
+    "robust, black box": ("unknown", EstimatorSettings()),
+    "paper": ("polynomial", EstimatorSettings(mode="paper")),
+}
+
+
+def joint(name: str, motors: int) -> JointModel:
+    motor = Motor(
+        inertia_kg_m2=0.02,
+        viscous_damping_nm_s_rad=0.02,
+        transmission=Transmission(model=name, order=2 if name == "polynomial" else None),
+    )
+    return JointModel(arrangement="antagonistic" if motors == 2 else "single", motors=(motor,) * motors)
+
+
+def record(n: int, motors: int) -> Record:
+    """A motion that obeys eq 5 by construction: theta and phi are given, the torque follows."""
+    t = np.arange(n) * T
+    theta, torque = np.empty((n, motors)), np.empty((n, motors))
+    q = 0.3 * np.sin(1.1 * t)
+    for i in range(motors):
+        w1, w2 = 4.0 + i, 9.0 - i
+        phi = 0.3 * np.sin(w1 * t) + 0.15 * np.sin(w2 * t)
+        beta = np.arcsin(1.75 * np.sin(phi / 2)) - phi / 2
+        spring = 0.5 * beta * (1.75 * np.cos(phi / 2) / np.sqrt(1 - (1.75 * np.sin(phi / 2)) ** 2) - 1)
+        theta[:, i] = q - phi
+        omega = np.gradient(theta[:, i], T)
+        torque[:, i] = 0.02 * np.gradient(omega, T) + 0.02 * omega - spring
+    step = 2 * np.pi / 65536
+    return Record(
+        period_s=T,
+        sequence=np.arange(n),
+        motor_position_rad=np.floor(theta / step) * step,
+        motor_torque_nm=torque,
+        link_position_rad=np.floor(q / step) * step,
+    )
+
+
+def ticks(name: str, settings: EstimatorSettings, n: int) -> dict[str, float]:
+    """Percentiles of one tick in microseconds."""
+    estimator = make_estimator(joint(name, 2), settings, T)
+    samples = list(record(n, 2).samples())
+    clock = time.perf_counter_ns
+    spent = np.empty(n)
+    gc.collect()
+    gc.disable()
+    for k, sample in enumerate(samples):
+        begin = clock()
+        estimator.step(sample)
+        spent[k] = clock() - begin
+    gc.enable()
+    late = spent[3000:] / 1e3
+    return {f"p{p:g}": float(np.percentile(late, p)) for p in (50, 90, 99, 99.9)}
+
+
+def batch(name: str) -> float:
+    """Seconds to fit 1e5 samples of one transmission; the best of three."""
+    data = record(100_000, 1)
+    spent = []
+    for _ in range(3):
+        begin = time.perf_counter()
+        fit(data, joint(name, 1))
+        spent.append(time.perf_counter() - begin)
+    return min(spent)
+
+
+def memory(n: int) -> float:
+    """Growth in bytes over n ticks of the robust mode, after a warm-up."""
+    estimator = make_estimator(joint("polynomial", 2), EstimatorSettings(), T)
+    samples = list(record(30_000, 2).samples())
+    for sample in samples:
+        estimator.step(sample)
+    tracemalloc.start()
+    start = tracemalloc.get_traced_memory()[0]
+    for k in range(n):
+        sample = samples[k % len(samples)]
+        estimator.step(sample._replace(sequence=len(samples) + k))
+    growth = tracemalloc.get_traced_memory()[0] - start
+    tracemalloc.stop()
+    return float(growth)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--ticks", type=int, default=20_000, metavar="N")
+    parser.add_argument("--json", action="store_true", help="print one JSON object only")
+    args = parser.parse_args()
+    result = {
+        "tick_us": {case: ticks(name, settings, args.ticks) for case, (name, settings) in _CASES.items()},
+        "batch_1e5_s": {name: batch(name) for name in ("polynomial", "vsa-ii")},
+        "growth_bytes_per_1e5_ticks": memory(100_000),
+    }
+    if args.json:
+        print(json.dumps(result))
+        return
+    print(f"{'one tick, two motors':<24}{'p50':>8}{'p90':>8}{'p99':>8}{'p99.9':>8}  µs")
+    for case, numbers in result["tick_us"].items():
+        print(f"{case:<24}" + "".join(f"{value:8.1f}" for value in numbers.values()))
+    for name, seconds in result["batch_1e5_s"].items():
+        print(f"batch, 1e5 samples, {name:<14}{seconds:6.3f} s")
+    print(f"memory growth over 1e5 ticks: {result['growth_bytes_per_1e5_ticks']:.0f} bytes")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,148 @@
+"""What the benchmarks of the service share: the joint, its simulated devices, a subscriber."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import time
+
+import can
+from can.interfaces.virtual import VirtualBus
+
+from drivelink.jointfile import JointFile, parse
+from drivelink.simulate import network_from_joint, open_sim_bus
+from sim.canopen.node import Node
+
+__all__ = ["PERIOD_S", "AnsweringBus", "Devices", "free_endpoint", "joint", "joint_text", "subscriber"]
+
+PERIOD_S = 0.001
+JOINT = """
+name = "{name}"
+arrangement = "{arrangement}"
+{motors}
+[link.encoder]
+source = "cia406"
+node_id = {link_node}
+[bus]
+channel = "bench"
+bitrate = 8_000_000  # a virtual bus carries more joints than a real one
+[estimator]
+mode = "{mode}"
+[zenoh]
+endpoint = "{endpoint}"
+[sim]
+case = "{case}"
+"""
+MOTOR = """[[motor]]
+inertia_kg_m2 = 0.0005
+viscous_damping_nm_s_rad = 0.005
+[motor.transmission]
+model = "polynomial"
+order = 2
+[motor.drive]
+node_id = {}
+gear_ratio = 20.0
+torque_constant_nm_a = 0.02
+"""
+SUBSCRIBER = """
+import sys, time
+from drivelink.pubsub.session import open_client
+import zenoh
+session = open_client(sys.argv[1])
+ring = zenoh.handlers.RingChannel
+kept = [session.declare_subscriber(key, ring(10)) for key in ("bench/**", "drivelink/**")]
+print("ready", flush=True)
+sys.stdin.read()
+session.close()
+"""
+
+
+def joint_text(mode: str, endpoint: str, *, index: int = 0, motors: int = 2) -> str:
+    """The joint file of the paper's VSA-II, or of its quadratic joint with one motor.
+
+    Args:
+        mode: of the estimator.
+        endpoint: zenoh's.
+        index: of several on one bus.
+        motors: 1 or 2.
+    """
+    first = 3 * index + 1
+    return JOINT.format(
+        name="bench" if index == 0 else f"bench{index}",
+        arrangement="antagonistic" if motors == 2 else "single",
+        motors="".join(MOTOR.format(first + i) for i in range(motors)),
+        link_node=first + 2,
+        mode=mode,
+        endpoint=endpoint,
+        case="vsa-ii" if motors == 2 else "quadratic",
+    )
+
+
+def joint(mode: str, endpoint: str, *, index: int = 0, motors: int = 2) -> JointFile:
+    """The same, read."""
+    return parse(joint_text(mode, endpoint, index=index, motors=motors))
+
+
+def free_endpoint() -> str:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{listener.getsockname()[1]}"
+
+
+def subscriber(endpoint: str) -> subprocess.Popen[bytes]:
+    """A process that receives everything; ends with its stdin."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", SUBSCRIBER, endpoint], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    process.stdout.readline()
+    return process
+
+
+class Devices:
+    """Simulated devices that answer in the thread of whoever sends, with their CPU time on an account apart.
+
+    A thread of their own would fight for Python's lock with what is measured, which no real drive does.
+    """
+
+    def __init__(self, *joints: JointFile) -> None:
+        self._buses = [open_sim_bus(which.bus) for which in joints]
+        self.networks = [
+            network_from_joint(which, bus) for which, bus in zip(joints, self._buses, strict=True)
+        ]
+        self.cpu_s = 0.0
+
+    @property
+    def nodes(self) -> list[Node]:
+        """All devices."""
+        return [node for network in self.networks for node in network.nodes]
+
+    @property
+    def syncs(self) -> int:
+        """SYNCs seen."""
+        return self.networks[0].syncs
+
+    def poll(self) -> None:
+        """Let them answer."""
+        start = time.thread_time()
+        for network in self.networks:
+            network.poll()
+        self.cpu_s += time.thread_time() - start
+
+    def close(self) -> None:
+        """Take them off the bus."""
+        for bus in self._buses:
+            bus.shutdown()
+
+
+class AnsweringBus(VirtualBus):
+    """The virtual bus, with devices that answer before `send` returns."""
+
+    def __init__(self, channel: str | None, devices: Devices) -> None:
+        super().__init__(channel)
+        self._devices = devices
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """See can.BusABC."""
+        super().send(msg, timeout)
+        self._devices.poll()

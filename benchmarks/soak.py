@@ -1,0 +1,163 @@
+"""Ten minutes at 1 kHz with faults drawn at random: everything comes back, and nothing grows.
+
+    python benchmarks/soak.py [--seconds 600] [--seed 1] [--json FILE]
+
+The daemon's own loop in real time on the virtual bus, with the simulated devices in its thread, so that no
+other thread of this process makes them late. Faults of the fault script (`tests/faultscript.py`) are played
+one after the other, with a calm stretch between them, at the end of which the daemon must be well again.
+Memory is the resident set after a collection, threads are counted; both must be flat once the first minute,
+in which buffers fill, is over.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import gc
+import json
+import logging
+import random
+import sys
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from daemonkit import vsa
+from faultscript import SCRIPT, Fault
+from faultstages import RealStage
+
+FILLING_S = 60.0
+FLAT_KB_PER_MIN = 500.0  # the allocator's own unrest; a leak of one sample a cycle would be thirty thousand
+FLAT_OBJECTS = 2000  # what is made once, at the first fault of a kind; a leak of one a cycle would be 400 000
+_ON_ANY_BUS = {
+    *("mute", "delay", "resize", "repeat", "reverse", "drop_sync", "emergency", "mend", "kill", "revive"),
+    *("reboot", "send", "ignore_sdo", "refuse_sdo", "impostor", "banish", "foreign_sync", "babble", "quiet"),
+    *("babble_as", "unplug", "plug", "error_frame"),
+}
+
+
+_libc = ctypes.CDLL(None)
+
+
+def rss_kb() -> int:
+    """Resident memory of this process, without what the allocator merely keeps."""
+    gc.collect()
+    _libc.malloc_trim(0)
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    return int(status.partition("VmRSS:")[2].split()[0])
+
+
+def measured(stage: RealStage) -> tuple[int, int, int]:
+    """Memory, threads and objects, without the samples that are kept for the check while this is measured."""
+    sink, stage.lane.sink = stage.lane.sink, None
+    stage.forget()
+    try:
+        gc.collect()
+        objects = len(gc.get_objects())  # at once: every cycle of the daemon makes some
+        return rss_kb(), threading.active_count(), objects
+    finally:
+        stage.lane.sink = sink
+
+
+def faults() -> list[Fault]:
+    """Those that the virtual bus can have while somebody else serves the devices."""
+    return [f for f in SCRIPT if f.where == "both" and {action for _, action, _ in f.steps} <= _ON_ANY_BUS]
+
+
+class Soak:
+    """One run.
+
+    Args:
+        seconds: how long.
+        seed: of the order of the faults.
+    """
+
+    def __init__(self, seconds: float, seed: int) -> None:
+        self._draw = random.Random(seed)
+        self._seconds = seconds
+        self.played: Counter[str] = Counter()
+        self.rows: list[tuple[float, int, int, int]] = []
+        self.slowest_s = 0.0
+        self.said = 0
+
+    def run(self) -> dict[str, Any]:
+        """Play faults until the time is over; what was counted."""
+        stage = RealStage(vsa(), together=True)
+        start = time.monotonic()
+        try:
+            stage.settle()
+            while time.monotonic() - start < self._seconds:
+                self._one(stage)
+                self.rows.append((time.monotonic() - start, *measured(stage)))
+            return self._summary(stage, time.monotonic() - start)
+        finally:
+            stage.close()
+
+    def _one(self, stage: RealStage) -> None:
+        fault = self._draw.choice(faults())
+        stage.start(fault)
+        stage.run(fault.seconds)
+        ended = time.monotonic()
+        stage.settle()
+        self.slowest_s = max(self.slowest_s, time.monotonic() - ended)
+        self.said += len(stage.said.lines)
+        wrong = stage.wrong_samples()
+        if wrong:
+            raise AssertionError(f"{fault.name}: {wrong}")
+        self.played[fault.name] += 1
+        stage.run(self._draw.uniform(0.0, 1.0))
+        stage.forget()
+
+    def _summary(self, stage: RealStage, seconds: float) -> dict[str, Any]:
+        document = stage.document()
+        late = [row for row in self.rows if row[0] > min(FILLING_S, seconds / 3)]
+        times, memory, threads, objects = (
+            np.array(column, dtype=float) for column in zip(*late, strict=True)
+        )
+        growth = float(np.polyfit(times / 60.0, memory, 1)[0]) if len(late) > 2 else 0.0
+        return {
+            "seconds": round(seconds, 1),
+            "cycles": document["cycles"],
+            "estimates": document["estimates"],
+            "missed_cycles": document["missed_cycles"],
+            "overruns": document["overruns"],
+            "faults": sum(self.played.values()),
+            "kinds": dict(self.played),
+            "samples_checked": stage.checked,
+            "slowest_recovery_s": round(self.slowest_s, 2),
+            "rss_kb": [int(memory[0]), int(memory[-1])],
+            "rss_growth_kb_per_min": round(growth, 1),
+            "objects": [int(np.median(part)) for part in (np.array_split(objects, 3)[k] for k in (0, -1))],
+            "threads": sorted({int(count) for count in threads}),
+            "log_lines": self.said,
+        }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seconds", type=float, default=600.0)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    logging.getLogger("drivelink").setLevel(logging.CRITICAL)
+    sys.setswitchinterval(0.0005)  # the bookkeeping here must not hold the daemon's thread up for long
+    result = Soak(options.seconds, options.seed).run()
+    if options.json:
+        options.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    print(json.dumps(result, indent=1))
+    first, last = result["objects"]
+    flat = result["rss_growth_kb_per_min"] < FLAT_KB_PER_MIN and last < first + FLAT_OBJECTS
+    flat = flat and len(result["threads"]) == 1
+    sys.exit(0 if flat else "memory or threads are not flat")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,240 @@
+"""What each stage of a cycle costs as joints are added, and how many joints one core carries.
+
+    python benchmarks/stages.py [--cycles N] [--json FILE]
+
+Recorded frames of the simulated devices are laid into the queues of virtual buses; then the daemon's own
+parts take them, at 1 kHz in one thread with real-time scheduling where the system allows, and publish to a
+subscriber in another process. CPU of the thread, by stage; CPU of the whole process a cycle, with zenoh's
+threads and the sleeping, without the laying of frames. The floor receives, unpacks and puts the same bytes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import can
+import zenoh
+from rig import PERIOD_S, free_endpoint, joint, subscriber
+from rivals import Floor
+
+from drivelink.canopen.layout import NodeLayout
+from drivelink.cycle import realtime
+from drivelink.cycle.chain import make_chain
+from drivelink.cycle.framesource import open_source
+from drivelink.daemon.service import Daemon, ServedJoint
+from drivelink.jointfile import JointFile
+from drivelink.pubsub.publisher import JointPublisher
+from drivelink.pubsub.session import close_session, open_session
+from drivelink.pubsub.wire import encode_estimate, encode_sample
+from drivelink.simulate import network_from_joint, open_sim_bus
+
+STAGES = ("receive", "decode", "estimate", "encode", "put")
+CASES = ((1, 1), (1, 2), (2, 2), (4, 2), (8, 2))  # joints, motors of each
+SETTLE = 500  # cycles at the start that are not counted
+
+Cycles = list[list[can.Message]]
+
+
+def frames_of(which: JointFile, cycles: int) -> tuple[Cycles, dict[int, NodeLayout]]:
+    """The PDOs of so many cycles, and how they are laid out."""
+    bus = open_sim_bus(which.bus)
+    network = network_from_joint(which, bus)
+    recorder = can.Bus(interface="virtual", channel=which.bus.channel, preserve_timestamps=True)
+    recorded: Cycles = []
+    with Daemon([ServedJoint(joint=which)], publish=False, real_time=False, devices=network.poll) as daemon:
+        layouts = dict(daemon.layouts)
+        while recorder.recv(0):
+            pass
+        for _ in range(cycles):
+            daemon.run_lockstep(1)
+            frames = iter(partial(recorder.recv, 0), None)
+            recorded.append([frame for frame in frames if frame.arbitration_id > 0x180])
+    recorder.shutdown()
+    bus.shutdown()
+    return recorded, layouts
+
+
+class Clocked:
+    """One joint's part of the daemon, stage by stage."""
+
+    def __init__(
+        self, index: int, motors: int, layouts: dict[int, NodeLayout], session: zenoh.Session
+    ) -> None:
+        which = joint("robust", free_endpoint(), motors=motors)
+        self.bus = can.Bus(interface="virtual", channel=f"stage-{index}")
+        self._source = open_source(self.bus)
+        self._chain = make_chain(which, tuple(layouts.values()))
+        named = joint("robust", free_endpoint(), index=index, motors=motors)
+        self.publisher = JointPublisher(session, named)
+
+    def work(self, spent: list[int]) -> None:
+        """One cycle; adds the CPU time of each stage, ns."""
+        clock, chain = time.thread_time_ns, self._chain
+        begin = clock()
+        frames = self._source.take()
+        received = clock()
+        chain.assembler.sync(1)
+        samples = [chain.assembler.feed(cob_id, data) for cob_id, data, _ in frames]
+        sample = samples[-1]
+        assert sample is not None
+        decoded = clock()
+        estimate = chain.estimator.step(sample)
+        estimated = clock()
+        encode_estimate(estimate, 0)
+        encode_sample(sample, 0)
+        encoded = clock()
+        self.publisher.put_estimate(estimate, 0)
+        self.publisher.put_sample(sample, 0)
+        put = clock() - encoded - (encoded - estimated)  # which encodes once more
+        for stage, ns in enumerate(
+            (received - begin, decoded - received, estimated - decoded, encoded - estimated, put)
+        ):
+            spent[stage] += ns
+
+
+class Bare:
+    """The floor's part for one joint, with the same interface."""
+
+    def __init__(
+        self, index: int, motors: int, layouts: dict[int, NodeLayout], session: zenoh.Session
+    ) -> None:
+        self.bus = can.Bus(interface="virtual", channel=f"floor-{index}")
+        self._source = open_source(self.bus)
+        self.publisher = Floor(joint("paper", free_endpoint(), motors=motors), layouts, session)
+
+    def work(self, spent: list[int]) -> None:
+        """One cycle."""
+        begin = time.thread_time_ns()
+        self.publisher.take(self._source)
+        received = time.thread_time_ns()
+        self.publisher.put()
+        spent[0] += received - begin
+        spent[4] += time.thread_time_ns() - received
+
+
+def paced(parts: list[Clocked] | list[Bare], recorded: Cycles) -> dict[str, Any]:
+    """All joints at 1 kHz: CPU by stage and in all, and cycles that took longer than a period."""
+    alarm, clock = realtime.Alarm(), time.monotonic_ns
+    period = round(PERIOD_S * 1e9)
+    stages: list[list[int]] = []
+    late, laying_s, cpu_s = 0, 0.0, 0.0
+    obtained = realtime.acquire()
+    deadline = clock() + period
+    for k, messages in enumerate(recorded):
+        if k == SETTLE:
+            cpu_s, laying_s, late = time.process_time(), 0.0, 0
+        start = time.thread_time()
+        for part in parts:
+            for message in messages:
+                part.bus.queue.put(message)
+        laying_s += time.thread_time() - start
+        alarm.sleep_until(deadline)
+        spent = [0] * len(STAGES)
+        for part in parts:
+            part.work(spent)
+        stages.append(spent)
+        late += clock() > deadline + period
+        deadline = max(deadline + period, clock())
+    cpu_s = time.process_time() - cpu_s - laying_s
+    realtime.release(obtained)
+    cycles = len(recorded) - SETTLE
+    columns = zip(*stages[SETTLE:], strict=True)
+    totals = sorted(map(sum, stages[SETTLE:]))
+    return {
+        **{name: statistics.median(column) / 1e3 for name, column in zip(STAGES, columns, strict=True)},
+        "work_p50_us": statistics.median(totals) / 1e3,
+        "work_p99_us": totals[int(0.99 * cycles)] / 1e3,
+        "process_us_per_cycle": 1e6 * cpu_s / cycles,
+        "over_a_period": late,
+        "cycles": cycles,
+    }
+
+
+def flat_out(parts: list[Clocked], recorded: Cycles) -> float:
+    """Cycles a second with nothing waited for."""
+    cpu_s = 0.0
+    for messages in recorded:
+        for part in parts:
+            for message in messages:
+                part.bus.queue.put(message)
+        start = time.thread_time()
+        for part in parts:
+            part.work([0] * len(STAGES))
+        cpu_s += time.thread_time() - start
+    return len(recorded) / cpu_s
+
+
+def measure(cycles: int) -> list[dict[str, Any]]:
+    """One row a number of joints."""
+    rows = []
+    recordings = {
+        motors: frames_of(joint("robust", free_endpoint(), motors=motors), cycles) for motors in (1, 2)
+    }
+    for joints, motors in CASES:
+        endpoint = free_endpoint()
+        session = open_session(joint("robust", endpoint).zenoh, Path())
+        reader = subscriber(endpoint)
+        recorded, layouts = recordings[motors]
+        parts = [Clocked(index, motors, layouts, session) for index in range(joints)]
+        row = {"joints": joints, "motors": joints * motors, **paced(parts, recorded)}
+        row["flat_out_hz"] = flat_out(parts, recorded)
+        for part in parts:
+            part.publisher.close()
+            part.bus.shutdown()
+        bare = [Bare(index, motors, layouts, session) for index in range(joints)]
+        row["floor"] = paced(bare, recorded)
+        for floor in bare:
+            floor.publisher.close()
+            floor.bus.shutdown()
+        close_session(session)
+        reader.communicate(b"")
+        rows.append(row)
+    return rows
+
+
+def carried(rows: list[dict[str, Any]]) -> float:
+    """VSA joints that one core carries at 1 kHz, from what the last ones added cost."""
+    one, many = (next(r for r in rows if (r["joints"], r["motors"]) == at) for at in ((1, 2), (4, 8)))
+    each = (many["process_us_per_cycle"] - one["process_us_per_cycle"]) / (many["joints"] - one["joints"])
+    return 1 + (1e6 * PERIOD_S - one["process_us_per_cycle"]) / each
+
+
+def report(rows: list[dict[str, Any]]) -> str:
+    """The table in Markdown."""
+    lines = [
+        f"| joints | motors | {' | '.join(STAGES)} | work p50 / p99 | process a cycle | of floor "
+        "| over 1 ms | flat out |",
+        "|" + "---|" * 12,
+    ]
+    for row in rows:
+        ratio = row["process_us_per_cycle"] / row["floor"]["process_us_per_cycle"]
+        lines.append(
+            f"| {row['joints']} | {row['motors']} | "
+            + " | ".join(f"{row[name]:.0f}" for name in STAGES)
+            + f" | {row['work_p50_us']:.0f} / {row['work_p99_us']:.0f} | {row['process_us_per_cycle']:.0f} "
+            f"| {ratio:.1f}× | {row['over_a_period']} of {row['cycles']} | {row['flat_out_hz']:.0f} Hz |"
+        )
+    lines += ["", f"CPU in µs. At 1 kHz one core carries {carried(rows):.1f} VSA joints (process, computed)."]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--cycles", type=int, default=5000)
+    parser.add_argument("--json", type=Path, help="also write the numbers there")
+    args = parser.parse_args()
+    rows = measure(args.cycles)
+    print(report(rows))
+    if args.json:
+        args.json.write_text(json.dumps({"rows": rows, "joints_per_core": carried(rows)}, indent=1))
+
+
+if __name__ == "__main__":
+    main()

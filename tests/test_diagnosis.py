@@ -130,6 +130,30 @@ def test_declared_numbers_off_by_a_percent_alarm_until_calibrated_on_a_healthy_r
     assert calibrated.motors[0].inertia_kg_m2 == pytest.approx(kit.INERTIA, rel=5e-3)
 
 
+def test_what_a_healthy_rig_reads_skewed_and_shifted_is_calibrated_too(records: dict[str, Record]) -> None:
+    """An encoder 0.3 ms late, with another zero, and a torque 0.25 ms late: no findings of a suspect run."""
+    rig = {"late_s": 0.0003, "zero_rad": 0.004}
+    (healthy,) = kit.World([rig], seed=3).run()
+    clean, rubbing = kit.World([rig, {**rig, "coulomb_nm": 0.4}], seed=4).run()
+    healthy, clean, rubbing = (with_late_torque(r, 0.00025) for r in (healthy, clean, rubbing))
+    calibrated = calibrate(healthy, kit.model(error=0.01))
+    (motor,) = calibrated.motors
+    readings = {e.name: e.parameters for e in (*motor.effects, *calibrated.link_effects)}
+    assert readings["encoder_delay"]["delay_s"] == pytest.approx(0.0003, abs=3e-5)
+    assert readings["deflection_offset"]["offset_rad"] == pytest.approx(0.004, abs=2e-4)
+    # The kit's torque is held for a period and acts as read: reported late by 0.25 ms is -0.25 ms of delay.
+    assert readings["torque_delay"]["delay_s"] == pytest.approx(-0.00025, abs=5e-5)
+    assert diagnose(clean, calibrated).verdict == "sufficient"
+    assert [e.name for e in diagnose(rubbing, calibrated).effects] == ["coulomb_friction"]
+
+
+def with_late_torque(record: Record, late_s: float) -> Record:
+    """The same with its torque reported later, between the samples by lines."""
+    index = np.arange(len(record), dtype=np.float64)
+    torque = np.interp(index - late_s / record.period_s, index, record.motor_torque_nm[:, 0])
+    return replace(record, motor_torque_nm=torque[:, None])
+
+
 def test_a_slow_sine_does_not_tell() -> None:
     (record,) = kit.World([{"constant": 0.05}], slow=True).run()
     found = diagnose(record, kit.model(linked=False))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,7 +22,7 @@ from drivelink.jointfile import JointFile
 from estimator.batch import TransmissionFit, fit
 from estimator.diagnosis import calibrate
 from estimator.errors import EstimatorError
-from estimator.model import JointModel, ParameterValue, Transmission
+from estimator.model import Effect, JointModel, ParameterValue, Transmission
 from estimator.sample import Record
 from estimator.transmissions import MODELS, RIGID
 
@@ -177,14 +178,21 @@ def _write(args: argparse.Namespace, fits: list[TransmissionFit], record: Record
         }
         if motor.transmission.model != RIGID:
             transmission: dict[str, Any] = {"model": motor.transmission.model}
-            transmission["parameters"] = _plain(dict(motor.transmission.parameters))
+            transmission["parameters"] = _plain(motor.transmission.parameters)
             if motor.transmission.order is not None:
                 transmission["order"] = motor.transmission.order
             change["transmission"] = transmission
+        if motor.effects:
+            change["effect"] = [_effect(effect) for effect in motor.effects]
         motors.append(change)
     changes: dict[str, Any] = {"motor": motors}
+    link: dict[str, Any] = {}
     if model.link is not None:
-        changes["link"] = {"dynamics": asdict(model.link)}
+        link["dynamics"] = asdict(model.link)
+    if model.link_effects:
+        link["effect"] = [_effect(effect) for effect in model.link_effects]
+    if link:
+        changes["link"] = link
     provenance = {
         **floor_entry(record, model),
         "fit": {
@@ -210,5 +218,9 @@ def _fitted(joint: JointFile, fits: list[TransmissionFit]) -> JointModel:
     return replace(model, motors=tuple(motors))
 
 
-def _plain(parameters: dict[str, ParameterValue]) -> dict[str, float | list[float]]:
+def _effect(effect: Effect) -> dict[str, Any]:
+    return {"name": effect.name, "parameters": _plain(effect.parameters)}
+
+
+def _plain(parameters: Mapping[str, ParameterValue]) -> dict[str, float | list[float]]:
     return {name: list(v) if isinstance(v, tuple) else float(v) for name, v in parameters.items()}

@@ -1,7 +1,8 @@
 """The declared model brought into line with a healthy run, so that a suspect run is judged against that.
 
 All declared numbers are fitted together: both balances share the transmission, the motor torque's scale is
-the anchor. What the recording does not tell stays near what was declared.
+the anchor. So are the small errors that every rig's readings have: channels that are not taken at the same
+instant, encoders with different zeros. What the recording does not tell stays near what was declared.
 """
 
 from __future__ import annotations
@@ -13,13 +14,13 @@ import numpy as np
 from estimator.diagnosis.bandwidth import choose_bandwidth, rough_stiffness, torque_rms, weights
 from estimator.diagnosis.candidates import Candidate
 from estimator.diagnosis.checks import check
-from estimator.diagnosis.frame import Frame, Signals
+from estimator.diagnosis.frame import Corrections, Frame, Signals
 from estimator.diagnosis.known import declared_corrections
 from estimator.diagnosis.regression import Blocks, Rows
 from estimator.diagnosis.search import corrected
-from estimator.diagnosis.select import Term, Tracer
+from estimator.diagnosis.select import Selection, Term, Tracer
 from estimator.effects import LIBRARY
-from estimator.model import JointModel
+from estimator.model import Effect, JointModel
 from estimator.sample import FloatArray, Record
 
 __all__ = ["calibrate"]
@@ -29,6 +30,8 @@ _ROUNDS = 3
 _TRUST = 0.05  # standard deviation of a declared number, as a share of it
 _MOTOR = ("motor_inertia", "viscous_damping")
 _LINK = ("link_inertia", "link_viscous_damping", "gravity")
+_SURE = 4.0  # standard deviations from zero at which an error of the readings is kept
+_SKEW_S = 2e-5  # and how much of it at least
 
 
 def calibrate(record: Record, model: JointModel, bandwidth_hz: float | None = None) -> JointModel:
@@ -40,7 +43,8 @@ def calibrate(record: Record, model: JointModel, bandwidth_hz: float | None = No
         bandwidth_hz: of the filter that all channels share; None: chosen from the data.
 
     Returns:
-        The model with inertias, dampings, gravity and transmission parameters refitted.
+        The model with inertias, dampings, gravity and transmission parameters refitted, and with the skews
+        and the zeros between its readings as effects, where there are any.
 
     Raises:
         EstimatorError: the recording does not allow it.
@@ -59,16 +63,18 @@ def calibrate(record: Record, model: JointModel, bandwidth_hz: float | None = No
         selection = tracer.evaluate(terms)
         selection = replace(selection, fit=selection.fit._replace(coefficients=solution))
         corrections, _ = corrected(frame, selection)
-    return model
+    return _with_readings(model, corrections, _deviations(selection))
 
 
 def _free(frame: Frame) -> list[Candidate]:
-    """What is fitted beside the transmissions: declared numbers, and the readings' offset and skew."""
+    """What is fitted beside the transmissions: declared numbers, and the readings' offsets and skews."""
     free = [Candidate(LIBRARY[name], i) for i in range(len(frame.motors)) for name in _MOTOR]
+    flexible = [i for i, here in enumerate(frame.flexible) if here]
+    free += [Candidate(LIBRARY["deflection_offset"], i) for i in flexible]
     if frame.linked:
         free += [Candidate(LIBRARY[name], None) for name in _LINK]
-    elif any(frame.flexible):
-        free += [Candidate(LIBRARY["deflection_offset"], i) for i, here in enumerate(frame.flexible) if here]
+        free += [Candidate(LIBRARY["torque_delay"], i) for i in flexible]
+        free.append(Candidate(LIBRARY["encoder_delay"], None))
     return free
 
 
@@ -146,3 +152,43 @@ def _applied(model: JointModel, tracer: Tracer, terms: tuple[Term, ...], solutio
             gravity_phase_rad=float(np.arctan2(sign * b, sign * a)),
         )
     return replace(model, motors=tuple(motors), link=link)
+
+
+def _deviations(selection: Selection) -> dict[tuple[str, int | None], float]:
+    """Standard deviation of each term's first parameter."""
+    std = np.sqrt(np.maximum(np.diag(selection.fit.covariance), 0.0))
+    place = selection.design.shape[1] - sum(term.width for term in selection.terms)
+    found = {}
+    for term in selection.terms:
+        found[term.candidate.key] = float(std[place])
+        place += term.width
+    return found
+
+
+def _with_readings(
+    model: JointModel, corrections: Corrections, std: dict[tuple[str, int | None], float]
+) -> JointModel:
+    """The model with the errors of its readings as effects; what is not sure stays as declared."""
+
+    def sure(name: str, motor: int | None, now: float, declared: float, least: float) -> bool:
+        return abs(now - declared) > max(_SURE * std.get((name, motor), np.inf), least)
+
+    before = declared_corrections(model)
+    motors = []
+    for i, motor in enumerate(model.motors):
+        effects = motor.effects
+        delay, offset = corrections.torque_delay_s[i], corrections.offset_rad[i]
+        if sure("torque_delay", i, delay, before.torque_delay_s[i], _SKEW_S):
+            effects = _with_effect(effects, "torque_delay", delay_s=delay)
+        if sure("deflection_offset", i, offset, before.offset_rad[i], 0.0):
+            effects = _with_effect(effects, "deflection_offset", offset_rad=offset)
+        motors.append(replace(motor, effects=effects))
+    at_link, delay = model.link_effects, corrections.encoder_delay_s
+    if sure("encoder_delay", None, delay, before.encoder_delay_s, _SKEW_S):
+        at_link = _with_effect(at_link, "encoder_delay", delay_s=delay)
+    return replace(model, motors=tuple(motors), link_effects=at_link)
+
+
+def _with_effect(effects: tuple[Effect, ...], name: str, **parameters: float) -> tuple[Effect, ...]:
+    """The effects with one of them as given now, whether or not it was there."""
+    return (*(e for e in effects if e.name != name), Effect(name=name, parameters=parameters))

@@ -78,7 +78,7 @@ SECTIONS = (
     Section(
         name="joints",
         title="Many joints through one router",
-        full=("--joints", "1,6,12"),
+        full=("--joints", "1,6,12,24"),
         quick=("--joints", "1,6", "--seconds", "3"),
         json_file=False,
         markdown=False,

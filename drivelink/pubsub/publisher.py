@@ -2,9 +2,10 @@
 
 The 1 kHz keys are plain publishers: dropped rather than waited for, the estimate with real-time priority,
 the sample next to it in a queue of its own. `status` and `model` are latched: an advanced subscriber with
-history gets the last one at once, and so does a query, which also answers `schema`. Everything is express:
-without that the stream stalled for half a second in two of six runs (zenoh 1.10, cause not traced). Nothing
-here listens to anything but those queries: no key changes what the daemon does.
+history gets the last one at once, and so does a query, which also answers `schema`. What is sent every
+cycle is not express: each express message would take one of the 16 places of a link's queue for itself, and be
+lost when they are full (docs/scaling.md). Nothing here listens to anything but those queries: no key changes
+what the daemon does.
 """
 
 from __future__ import annotations
@@ -150,7 +151,6 @@ class JointPublisher:
             encoding=zenoh.Encoding.ZENOH_SERIALIZED.with_schema(schema_name),
             congestion_control=self._congestion_control,
             priority=priority,
-            express=True,
         )
         self._entities.append(publisher)
         return publisher

@@ -39,7 +39,7 @@ _COMMON: dict[str, Any] = {
     "transport/unicast/open_timeout": 2000,  # ms; closing waits for it
     "adminspace/enabled": False,
     "transport/shared_memory/enabled": False,  # these messages are far too small for it
-    "transport/link/tx/queue/size/real_time": 16,  # an express message takes a place of its own
+    "transport/link/tx/queue/size/real_time": 16,
     "transport/link/tx/queue/size/interactive_high": 16,
     "transport/link/tx/queue/size/data": 16,
     "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,  # a stuck subscriber costs no wait

@@ -156,7 +156,7 @@ def run(section: Section, quick: bool) -> dict[str, Any]:
 
 def execute(command: list[str], folder: str) -> subprocess.CompletedProcess[str]:
     """Run a program, in a folder it may write to."""
-    environment = {**os.environ, "COLUMNS": "150", "OMP_NUM_THREADS": "1"}
+    environment = {**os.environ, "COLUMNS": "150", "OPENBLAS_NUM_THREADS": "1"}
     try:
         return subprocess.run(
             command,

@@ -89,6 +89,8 @@ def main(argv: list[str] | None = None) -> int:
     argv = sys.argv[1:] if argv is None else argv
     verb = argv[0] if argv and argv[0] in VERBS else ""
     logging.getLogger("can").setLevel(logging.ERROR)  # some interfaces report every partial read
+    # Before numpy is imported: on matrices as small as ours threads only wait for each other.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         if not argv:
             make_parser([]).print_help(sys.stderr)

@@ -3,9 +3,9 @@
 The 1 kHz keys are plain publishers: dropped rather than waited for, the estimate with real-time priority,
 the sample next to it in a queue of its own. `status` and `model` are latched: an advanced subscriber with
 history gets the last one at once, and so does a query, which also answers `schema`. What is sent every
-cycle is not express: each express message would take one of the 16 places of a link's queue for itself, and be
-lost when they are full (docs/scaling.md). Nothing here listens to anything but those queries: no key changes
-what the daemon does.
+cycle is not express: each express message would take one of the 16 places of a link's queue for itself, and
+be lost when they are full (docs/scaling.md). Nothing here listens to anything but those queries: no key
+changes what the daemon does.
 """
 
 from __future__ import annotations

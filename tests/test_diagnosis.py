@@ -62,6 +62,15 @@ def test_clean_and_everyday_recordings_are_sufficient(case: str, records: dict[s
     assert found.validation.after_relative < 0.01
 
 
+def test_an_inertia_that_is_hardly_to_be_believed_is_doubted(records: dict[str, Record]) -> None:
+    declared = kit.model()
+    light = replace(declared.motors[0], inertia_kg_m2=kit.INERTIA / 2)
+    found = diagnose(records["clean"], replace(declared, motors=(light,)))
+    assert found.effects[0].name == "motor_inertia"
+    assert any("hardly to be believed" in note for note in found.notes)
+    assert diagnose(records["inertia"], declared).notes == ()
+
+
 def test_skew_within_a_sample_is_aligned_and_reported(records: dict[str, Record]) -> None:
     found = diagnose(records["skew"], kit.model())
     assert found.alignment["link_position_delay_s"] == pytest.approx(0.0007, abs=5e-5)

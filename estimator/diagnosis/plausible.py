@@ -1,13 +1,14 @@
-"""What an effect cannot be: friction that drives, negative inertia, a torque scale that explains nothing."""
+"""What an effect cannot be, or hardly: friction that drives, negative inertia, twice the declared inertia."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from estimator.diagnosis.frame import Frame
+from estimator.model import JointModel
 from estimator.sample import FloatArray
 
-__all__ = ["plausible"]
+__all__ = ["doubt", "plausible"]
 
 _POSITIVE = {
     "coulomb_friction",
@@ -26,6 +27,9 @@ _LATEST_S = 0.0125  # no drive and no encoder is later than this
 _DRIFT = 0.8  # and by drift in the long run
 _READ = 0.3  # largest relative error of an encoder
 _INERTIA = 0.8  # largest share of an inertia that may be missing
+_UNLIKELY = (
+    0.4  # share of an inertia from which a correction is doubted: declared numbers are better than that
+)
 _OPPOSITE = -0.2  # of the larger friction in one direction: the smaller one in the other
 
 
@@ -65,3 +69,27 @@ def plausible(frame: Frame, name: str, motor: int | None, weights: FloatArray) -
         low, high = sorted((first, float(weights[1])))
         return high > 0.0 and low > _OPPOSITE * high
     return True
+
+
+def doubt(model: JointModel, name: str, motor: int | None, first: float) -> str | None:
+    """Why a finding is hardly to be believed, although it can be; None where nothing speaks against it.
+
+    Args:
+        model: the joint as declared.
+        name: of the effect.
+        motor: where it is; None: at the link.
+        first: its first parameter.
+    """
+    if name == "motor_inertia":
+        declared = model.motors[motor or 0].inertia_kg_m2
+    elif name == "link_inertia" and model.link is not None:
+        declared = model.link.inertia_kg_m2
+    else:
+        return None
+    if abs(first) <= _UNLIKELY * declared:
+        return None
+    return (
+        f"an inertia of {first:.3g} kg·m² beyond the declared {declared:.3g} kg·m² is hardly to be believed: "
+        "if the declared number is known, this motion does not tell it from a stiffness, a torque scale or "
+        "what is not in the library"
+    )

@@ -17,6 +17,7 @@ from estimator.diagnosis.known import declared_corrections
 from estimator.diagnosis.locate import places_left, the_place
 from estimator.diagnosis.openorder import raised
 from estimator.diagnosis.outcome import curve_of, curve_of_free, errors, findings, rivals
+from estimator.diagnosis.plausible import doubt
 from estimator.diagnosis.regression import Blocks, Rows
 from estimator.diagnosis.result import Curve, Diagnosis, Errors, Finding, Series, Verdict
 from estimator.diagnosis.search import Found, additions, search
@@ -152,8 +153,20 @@ class _Judge:
             notes.append("the motion is hardly more than one sine: many effects look alike in it")
             if not effects or any(f.alternatives for f in effects):
                 verdict = "insufficient_excitation"
+        notes += self._doubts(effects)
         advice = [line for f in effects for line in advice_for(f.name, f.alternatives)]
         return self._report(verdict, effects, everyday, aligned, curve, advice, notes)
+
+    def _doubts(self, effects: list[Finding]) -> list[str]:
+        """What speaks against findings."""
+        model = self.start.tracer.frame.model
+        first = [next(iter(f.parameters.values()), 0.0) for f in effects]
+        doubts = [
+            doubt(model, f.name, f.motor, x)
+            for f, x in zip(effects, first, strict=True)
+            if isinstance(x, float)
+        ]
+        return [line for line in doubts if line is not None]
 
     def _is_everyday(self, finding: Finding, named: list[Finding]) -> bool:
         """Skew of up to a sample; a zero between encoders that nothing ties, unless it is all there is."""

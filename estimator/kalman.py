@@ -16,12 +16,17 @@ from estimator.sample import FloatArray
 
 __all__ = ["ColouredKalman"]
 
-_LAGS = 16  # updates over which the noise is correlated
+import os
+
+_LAGS = int(os.environ.get("LAGS", "16"))  # updates over which the noise is correlated
 _MEMORY = 500  # updates over which the noise's autocorrelation is averaged
 _QUICK = 3.0  # the noise is an average over this share, one in so many, of the updates so far
 _HALVED = 6.0  # updates in which the noise assumed at the start may at most be halved
 _OUTLIER = 5.0  # standard deviations that an innovation may count as
 _LEAST_FREEDOM = 4.0  # independent errors that are left over parameters
+# Errors that are in no covariance: noise in h, its linearisation, what aligns the channels. Measured as the
+# error over its standard deviation without this, on 86 simulated joints that took no part in anything else.
+_UNSEEN = 1.3
 
 
 class ColouredKalman:
@@ -90,11 +95,11 @@ class ColouredKalman:
 
     @property
     def caution(self) -> float:
-        """How much larger a variance is that few independent errors tell: that of a t distribution."""
+        """How much larger than Sigma a variance is: few errors are seen (t distribution), some not at all."""
         shape = self._r * (self._taper / max(self.noise, 1e-300))
         seen = min(self._count, 2.0 / max(self._growth - 1.0, 1e-9))
         freedom = max(seen / (1.0 + 2.0 * float(shape @ shape)) - self._n, _LEAST_FREEDOM)
-        return freedom / (freedom - 2.0)
+        return _UNSEEN**2 * freedom / (freedom - 2.0)
 
     def update(self, h: FloatArray, innovation: float, floor: float) -> None:
         """One equation: h (n,), its innovation, and the least noise variance to reckon with.
@@ -199,27 +204,18 @@ class ColouredKalman:
         self._r *= ratio * ratio
         self._past *= ratio
 
-    def constrain(self, index: int, value: float = 0.0) -> None:
-        """Fix one parameter, the others moving as their correlation with it tells."""
+    def draw(self, index: int) -> None:
+        """Draw one parameter half way to zero, as an observation of zero does that is as sure as it is."""
         self.account()
         self._Ph = None
-        gain = self.P[:, index] / self.P[index, index]
-        self.x -= gain * (self.x[index] - value)
+        variance = float(self.Sigma[index, index])
+        gain = self.P[:, index] / (2.0 * self.P[index, index])
+        self.x -= gain * self.x[index]
         self.P -= np.outer(gain, self.P[index])
         self.Sigma -= np.outer(gain, self.Sigma[index])
         self.Sigma -= np.outer(self.Sigma[:, index], gain)
+        self.Sigma += variance * np.outer(gain, gain)
         self._gains -= np.outer(self._gains[:, index], gain)
-        for matrix in (self.P, self.Sigma):
-            matrix[index, :] = matrix[:, index] = 0.0
-        self._gains[:, index] = 0.0
-        self.x[index] = value
-        self.ceiling[index] = 0.0
-
-    def release(self, index: int, std: float) -> None:
-        """Let a fixed parameter go again."""
-        self._Ph = None
-        self.ceiling[index] = std * std
-        self.P[index, index] = self.Sigma[index, index] = std * std
 
 
 def _positive(matrix: FloatArray) -> FloatArray:

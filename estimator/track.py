@@ -29,7 +29,7 @@ _FLUSH_DELAYS = 1.6  # filter delays until what was before a change has left the
 _FOLLOW_S = 0.6  # after an alarm, in which the change is still being followed
 _STEP = 0.3  # how much a stiffness may change at an alarm, relative
 _SETTLED_S = 1.0  # of updates, before there is an alarm or an invalid curve
-_ORDER_S = 5.0  # of updates between decisions about the polynomial's order
+_ORDER_S = 5.0  # of updates between looks at the polynomial's highest powers
 _REGULAR_S = 0.5  # of updates between two looks at the covariance
 _DUE_S = 0.1  # of updates between two looks at a nonlinear model's linearisation
 _ORDER_SIGMA = 3.0
@@ -276,7 +276,7 @@ class Track:
             self.regression.relax()
         elif self._choose_order and self._updates >= self._order_at:
             self._order_at = self._updates + self._order
-            self._decide_order()
+            self._draw_higher_orders()
 
     @property
     def astray(self) -> bool:
@@ -342,15 +342,17 @@ class Track:
             self._follow = _FOLLOW_S
         self.changed = self._follow > 0.0
 
-    def _decide_order(self) -> None:
+    def _draw_higher_orders(self) -> None:
+        """Draw the highest powers towards zero, down to the first one that the data want.
+
+        Not to zero: what is not significant may still be there, and matters most at large deflections.
+        """
         kalman = self.regression.filter
         assert kalman is not None
         for h in range(self.regression.size - 1, 0, -1):
-            if kalman.ceiling[h] == 0.0:
-                continue
-            if abs(kalman.x[h]) < _ORDER_SIGMA * math.sqrt(max(kalman.Sigma[h, h], 1e-300)):
-                kalman.constrain(h)
-            break
+            if abs(kalman.x[h]) > _ORDER_SIGMA * math.sqrt(max(kalman.Sigma[h, h], 1e-300)):
+                break
+            kalman.draw(h)
 
     def _publishable(self) -> None:
         regression = self.regression

@@ -60,33 +60,37 @@ class Channels:
             )
         self.balance = balance[rows]
         self.resolution_rad = math.hypot(_noise(theta), _noise(q))
-        # Behind a linear filter a shift in time is exact to third order by the filter's own derivatives.
-        self._late_theta: tuple[float, FloatArray] | None = None
+        self._phi_of: tuple[float, FloatArray] = (math.nan, np.zeros(0))  # the last delay's
 
     def _phi(self, delay: float) -> FloatArray:
         """Raw deflection with the link encoder's delay taken out, as of the motor's time."""
-        if delay == 0.0:
-            return self._q - self._theta
-        return np.asarray(_shifted(self._q, delay / self.period_s) - self._theta)
+        if self._phi_of[0] != delay:
+            q = self._q if delay == 0.0 else _shifted(self._q, delay / self.period_s)
+            self._phi_of = delay, q - self._theta
+        return self._phi_of[1]
 
     def deflection(self, delay: float) -> FloatArray:
         """F[phi], (rows,)."""
         return np.asarray(self._filter.apply(self._phi(delay))[0][self._rows])
 
-    def basis(
-        self, model: TransmissionModel, delay: float, shape: tuple[float, ...], order: int
-    ) -> FloatArray:
-        """F of the model's basis, (rows, order)."""
-        columns = model.basis(self._phi(delay), shape, order)
+    def powers(self, delay: float, order: int) -> FloatArray:
+        """F of the odd powers of phi, (rows, order)."""
+        columns = Polynomial().basis(self._phi(delay), order=order)
         return np.stack([self._filter.apply(column)[0][self._rows] for column in columns.T], axis=1)
 
-    def slope(
-        self, model: TransmissionModel, delay: float, shape: tuple[float, ...], coefficients: FloatArray
-    ) -> FloatArray:
-        """F[sigma(phi)] for given linear coefficients, (rows,)."""
-        phi = self._phi(delay)
-        alpha = coefficients if isinstance(model, Polynomial) else (coefficients[0], *shape)
-        return np.asarray(self._filter.apply(model.stiffness(phi, alpha))[0][self._rows])
+    def basis_and_slope(
+        self, model: TransmissionModel, delay: float, shape: tuple[float, ...]
+    ) -> tuple[FloatArray, FloatArray]:
+        """(F[g], F[dg/dphi]) of a model f = k g, (rows, 1) and (rows,)."""
+        torque, stiffness = model.both(self._phi(delay), (1.0, *shape))
+        first, slope = (self._filter.apply(x)[0][self._rows] for x in (torque, stiffness))
+        return first[:, None], slope
+
+    def slope(self, delay: float, coefficients: FloatArray) -> FloatArray:
+        """F[sigma(phi)] of a polynomial, (rows,)."""
+        return np.asarray(
+            self._filter.apply(Polynomial().stiffness(self._phi(delay), coefficients))[0][self._rows]
+        )
 
     def lateness(self, model: TransmissionModel, delay: float, alpha: FloatArray) -> FloatArray:
         """dF[f(phi)]/d(delay), (rows,)."""

@@ -25,6 +25,8 @@ from estimator.transmissions import RIGID, UNKNOWN, transmission_model
 
 __all__ = ["TransmissionFit", "fit"]
 
+_SHAPE = 1e-7  # relative tolerance of a shape parameter: far below what noise leaves of it
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TransmissionFit:
@@ -104,9 +106,10 @@ def _fit_motor(record: Record, index: int, motor: Motor, bandwidth: float) -> Tr
     shape: tuple[float, ...] = ()
     if transmission.shape_names:
         reach = float(np.max(np.abs(channels.deflection(delay))))
-        shape = search_shape(transmission, reach, lambda s: solver.cost(delay, s, 1))
-        delay = solver.refine_delay(delay, shape)
-        shape = search_shape(transmission, reach, lambda s: solver.cost(delay, s, 1))
+        shape = search_shape(transmission, reach, lambda s: solver.cost(delay, s, 1), _SHAPE)
+        if delay != 0.0:
+            delay = solver.refine_delay(delay, shape)
+            shape = search_shape(transmission, reach, lambda s: solver.cost(delay, s, 1), _SHAPE)
     order = solver.choose_order(delay)
     return _finish(
         solver, motor, delay, shape, order, UNKNOWN if motor.transmission.model == UNKNOWN else None

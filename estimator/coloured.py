@@ -30,15 +30,16 @@ def coloured_covariance(
     rows = len(residual)
     lags = min(_LAGS, rows // 4)
     taper = np.minimum(1.0, 2.0 - 2.0 * np.arange(lags + 1) / lags)
-    measured = _lagged(residual[:, None], residual[:, None], lags) / rows
-    projector = A @ _root(inverse)
+    measured = _autocovariance(residual[:, None], lags)
+    grams = [A[m:].T @ A[: rows - m] for m in range(lags + 1)]
+    root = _root(inverse)
+    left = _what_a_fit_leaves(np.array([root.T @ gram @ root for gram in grams]), A @ root, lags)
     r = measured * taper
     for _ in range(_ROUNDS):
-        r = r + taper * (measured - _left(r, projector, lags))
-    middle = np.diag(held) + r[0] * (A.T @ A)
+        r = r + taper * (measured - left @ r)
+    middle = np.diag(held) + r[0] * grams[0]
     for m in range(1, lags + 1):
-        R = A[m:].T @ A[: rows - m]
-        middle += r[m] * (R + R.T)
+        middle += r[m] * (grams[m] + grams[m].T)
     shape = r / max(r[0], 1e-300)
     independent = rows / (2.0 * float(shape @ shape) - 1.0)
     freedom = max(independent - A.shape[1], _LEAST_FREEDOM)
@@ -48,24 +49,31 @@ def coloured_covariance(
     return np.asarray(covariance)
 
 
-def _left(r: FloatArray, Q: FloatArray, lags: int) -> FloatArray:
-    """Autocovariance that a residual (1 - Q Q') e shows where e has autocovariance r, (lags + 1,)."""
+def _what_a_fit_leaves(grams: FloatArray, Q: FloatArray, lags: int) -> FloatArray:
+    """M (lags + 1, lags + 1): errors of autocovariance r leave a residual (1 - Q Q') e of autocovariance M r.
+
+    With V the Toeplitz matrix of r and G_m = sum_t Q_(t+m) Q_t' that is, but for the rows at the two ends,
+    (V - 2 V Q Q' + Q (Q' V Q) Q') summed along its m-th diagonal.
+
+    Args:
+        grams: (lags + 1, n, n), G_m. Q: (rows, n).
+    """
     rows = len(Q)
-    size = 1 << (2 * rows - 1).bit_length()
-    kernel = np.zeros(size)
-    kernel[: lags + 1] = r
-    kernel[-lags:] = r[:0:-1]
-    VQ = np.fft.irfft(np.fft.rfft(kernel)[:, None] * np.fft.rfft(Q, size, axis=0), size, axis=0)[:rows]
-    fitted = Q @ (Q.T @ VQ).T - 2.0 * VQ
-    return np.asarray(r * (1.0 - np.arange(lags + 1) / rows) + _lagged(Q, fitted, lags) / rows)
+    own = rows * _autocovariance(Q, 2 * lags)  # tr G_m
+    k = np.arange(lags + 1)
+    both = own[np.abs(k[:, None] - k)] + own[k[:, None] + k]  # V Q against Q, m by k: r_k acts at -k and k
+    both[:, 0] = own[: lags + 1]
+    seen = grams + np.swapaxes(grams, 1, 2)  # Q' V Q is the sum of these times r
+    seen[0] = grams[0]
+    middle = 0.5 * np.einsum("mij,kij->mk", grams + np.swapaxes(grams, 1, 2), seen)
+    return np.asarray(np.diag(1.0 - k / rows) + (middle - 2.0 * both) / rows)
 
 
-def _lagged(x: FloatArray, y: FloatArray, lags: int) -> FloatArray:
-    """Sum over columns and rows of x_t y_(t+m), the mean of m and -m, for m = 0 … lags."""
-    size = 1 << (2 * len(x) - 1).bit_length()
-    cross = np.sum(np.conj(np.fft.rfft(x, size, axis=0)) * np.fft.rfft(y, size, axis=0), axis=1)
-    c = np.fft.irfft(cross, size)
-    return np.asarray(0.5 * (c[: lags + 1] + np.concatenate([c[:1], c[: -lags - 1 : -1]])))
+def _autocovariance(x: FloatArray, lags: int) -> FloatArray:
+    """Sum over columns and mean over rows of x_t x_(t+m), for m = 0 … lags."""
+    size = 1 << (len(x) + lags - 1).bit_length()
+    power = np.sum(np.abs(np.fft.rfft(x, size, axis=0)) ** 2, axis=1)
+    return np.asarray(np.fft.irfft(power, size)[: lags + 1] / len(x))
 
 
 def _root(matrix: FloatArray) -> FloatArray:

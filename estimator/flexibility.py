@@ -53,6 +53,10 @@ class TransmissionModel(ABC):
     def stiffness(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
         """Sigma = df/dphi in N·m/rad (eq 18)."""
 
+    def both(self, phi: ArrayLike, alpha: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """(torque, stiffness), in one go where that is faster."""
+        return self.torque(phi, alpha), self.stiffness(phi, alpha)
+
     @abstractmethod
     def jacobian(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
         """df/dalpha, (..., n) (eq 25)."""
@@ -222,11 +226,16 @@ class VsaII(_Shaped):
 
     def stiffness(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
         """Its derivative (eq 18)."""
+        return self.both(phi, alpha)[1]
+
+    def both(self, phi: ArrayLike, alpha: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """See TransmissionModel."""
         k, c = _split(alpha)
         sine, cosine, root, beta = self._parts(np.asarray(phi, dtype=np.float64), c)
         slope = 0.5 * (c * cosine / root - 1.0)  # beta'
-        bend = 0.25 * sine * (c * c - 1.0) / root**3  # beta''
-        return np.asarray(2.0 * k * (slope * slope + beta * bend))
+        bend = (0.25 * (c * c - 1.0)) * sine / (root * root * root)  # beta''
+        twice = 2.0 * k
+        return np.asarray(twice * beta * slope), np.asarray(twice * (slope * slope + beta * bend))
 
     def jacobian(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
         """Its Jacobian (eq 25)."""

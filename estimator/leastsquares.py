@@ -15,7 +15,7 @@ from estimator.sample import FloatArray
 
 __all__ = ["ArrayFit", "fit_alpha", "fit_polynomial", "fit_projected", "solve"]
 
-_GRID = 40  # starts of the one-dimensional search over a shape parameter
+_GRID = 24  # starts of the one-dimensional search over a shape parameter
 _FOLDS = 10
 _HIGHEST_ORDER = 9
 _NEGLIGIBLE = 1e-4  # an error of this share of the torque needs no further order
@@ -220,9 +220,19 @@ def fit_projected(
 
 
 def search_shape(
-    model: TransmissionModel, reach_rad: float, cost: Callable[[tuple[float, ...]], float]
+    model: TransmissionModel,
+    reach_rad: float,
+    cost: Callable[[tuple[float, ...]], float],
+    tolerance: float = 1e-10,
 ) -> tuple[float, ...]:
-    """The shape parameters with the least cost(shape), within bounds and where the model reaches |phi|."""
+    """The shape parameters with the least cost(shape), within bounds and where the model reaches |phi|.
+
+    Args:
+        model: of the transmission.
+        reach_rad: largest |phi| in the data.
+        cost: of a shape, everything linear at its best.
+        tolerance: relative, of a single shape parameter.
+    """
     if not model.shape_names:
         return ()
     if len(model.shape_names) > 1:
@@ -249,7 +259,7 @@ def search_shape(
     if bounds[0] == bounds[1]:
         return (bounds[0],)
     found = minimize_scalar(
-        lambda c: cost((float(c),)), bounds=bounds, method="bounded", options={"xatol": 1e-10 * bounds[1]}
+        lambda c: cost((float(c),)), bounds=bounds, method="bounded", options={"xatol": tolerance * bounds[1]}
     )
     return (float(found.x),)
 

@@ -79,12 +79,16 @@ class Solver:
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """(A, y, units, prior std), everything in units of the torque."""
         c, unit = self.channels, self.torque_unit
-        basis = c.basis(self.model, delay, shape, order)
         columns, units, prior = self._nuisances()
+        if isinstance(self.model, Polynomial):
+            basis, slope = c.powers(delay, order), None
+        else:
+            basis, slope = c.basis_and_slope(self.model, delay, shape)
         scale = np.max(np.abs(basis), axis=0) + 1e-300
         # The offset of the deflection acts through sigma: a first guess of alpha makes its column.
         guess, *_ = np.linalg.lstsq(np.column_stack([basis / scale, columns[:, 3]]), c.balance, rcond=None)
-        columns[:, 4] = c.slope(self.model, delay, shape, guess[:order] / scale)
+        alpha = guess[:order] / scale
+        columns[:, 4] = c.slope(delay, alpha) if slope is None else alpha[0] * slope
         A = np.column_stack([basis, columns]) * np.concatenate([unit / scale, units]) / unit
         prior = np.concatenate([np.full(order, 1e4), prior])
         return A, c.balance / unit, np.concatenate([unit / scale, units]), prior
@@ -174,8 +178,6 @@ class Solver:
 
     def refine_delay(self, delay: float, shape: tuple[float, ...]) -> float:
         """The delay again, with the transmission's own model."""
-        if delay == 0.0:
-            return 0.0
         T = self.channels.period_s
         found = minimize_scalar(
             lambda d: self.cost(float(d), shape, 1),

@@ -16,9 +16,7 @@ from estimator.sample import FloatArray
 
 __all__ = ["ColouredKalman"]
 
-import os
-
-_LAGS = int(os.environ.get("LAGS", "16"))  # updates over which the noise is correlated
+_LAGS = 16  # updates over which the noise is correlated
 _MEMORY = 500  # updates over which the noise's autocorrelation is averaged
 _QUICK = 3.0  # the noise is an average over this share, one in so many, of the updates so far
 _HALVED = 6.0  # updates in which the noise assumed at the start may at most be halved

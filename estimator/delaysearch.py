@@ -21,7 +21,7 @@ _WINDOW_S = 2.0
 _LOOKS_S = (2.0, 6.0, 20.0)  # after a start: when it is searched
 _LATEST = 3.0  # periods to either side
 _ROW_HZ = 100.0
-_PIECE = 16  # rows at a tick
+_PIECE = 12  # rows at a tick
 _GAIN = 0.8  # the error has to fall to this share, else no delay is assumed
 _LATER_GAIN = 0.5  # … to this one once there has been a search
 _INERTIA, _DAMPING = 0.05, 0.3  # prior std, relative
@@ -93,7 +93,6 @@ class DelaySearch:
             return None
 
     def _search(self, past: FloatArray) -> Iterator[float | None]:
-        n = len(past)
         q, theta = past[:, 0], past[:, 1]
         _, velocity, acceleration = yield from self._rows(theta, self._smooth, 3)
         (torque,) = yield from self._rows(past[:, 2], self._held, 1)
@@ -104,19 +103,20 @@ class DelaySearch:
         fixed = np.stack([acceleration, velocity, np.ones(len(balance))], axis=1)
         rate = float(np.max(np.abs(velocity))) + 1e-12
         prior = np.array([_INERTIA * self._B, _DAMPING * self._D + _DAMPING_SHARE * size / rate, size])
-        index = np.arange(n)
         costs: dict[float, float] = {}
 
         def look(delay: float) -> Generator[None, None, None]:
-            phi = np.interp(index + delay, index, q) - theta
-            yield
+            phi = _shifted(q, delay) - theta
             yield
             (first,) = yield from self._rows(phi, self._smooth, 1)
             scaled = phi / (np.max(np.abs(phi)) + 1e-15)
             cube = scaled * scaled * scaled
             yield
             (third,) = yield from self._rows(cube, self._smooth, 1)
-            costs[delay] = _cost(np.column_stack([first, third, fixed]), balance, prior)
+            A = np.column_stack([first, third, fixed])
+            yield
+            costs[delay] = _cost(A, balance, prior)
+            yield
 
         for delay in np.arange(-_LATEST, _LATEST + 0.1, 0.5).tolist():
             for _ in look(delay):
@@ -144,6 +144,16 @@ class DelaySearch:
             yield
         out[0] += signal[0]
         return out
+
+
+def _shifted(signal: FloatArray, periods: float) -> FloatArray:
+    """The signal so many periods later, along straight lines; its ends stay where they are."""
+    whole = int(np.floor(periods))
+    share = periods - whole
+    n = len(signal)
+    padded = np.concatenate([np.full(4, signal[0]), signal, np.full(4, signal[-1])])
+    start = 4 + whole
+    return np.asarray((1.0 - share) * padded[start : start + n] + share * padded[start + 1 : start + 1 + n])
 
 
 def _cost(A: FloatArray, y: FloatArray, prior: FloatArray) -> float:

@@ -162,15 +162,22 @@ class ColouredKalman:
         return math.isfinite(float(np.sum(self.x)) + float(np.sum(self.P)) + float(np.sum(self.Sigma)))
 
     def keep_regular(self) -> None:
-        """Symmetry, and no direction more uncertain than before any data (against wind-up)."""
+        """Symmetry, and no direction with a negative variance."""
         self.account()
-        if float(np.min(np.linalg.eigvalsh(self.P))) < 0.0:
-            self.repair()
         self.P, self._Ph = 0.5 * (self.P + self.P.T), None
+        try:
+            np.linalg.cholesky(self.P)
+        except np.linalg.LinAlgError:
+            self.repair()
+
+    def keep_bounded(self) -> None:
+        """No parameter more uncertain than before any data (against wind-up), none much surer than P says."""
+        self.account()
         diagonal = np.diag(self.P)
         if np.any(diagonal > self.ceiling):
             shrink = np.sqrt(np.minimum(1.0, self.ceiling / np.maximum(diagonal, 1e-300)))
             self.P *= np.outer(shrink, shrink)
+            self._Ph = None
         variance = np.diag(self.Sigma)
         low = 1e-4 * np.diag(self.P)
         if np.any(variance < low):

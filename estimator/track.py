@@ -268,11 +268,15 @@ class Track:
         kalman.account()
         self._impossible = self._impossible + 1 if self._is_impossible() else 0
         self._accounts += 1
-        if self._accounts % self._often == 0:
+        turn = self._accounts % self._often
+        if turn == 0:
             if not kalman.finite:
                 self._impossible = self._astray + 1
                 return
             kalman.keep_regular()
+        elif turn == 1:
+            kalman.keep_bounded()
+        elif turn == 2:
             self.regression.relax()
         elif self._choose_order and self._updates >= self._order_at:
             self._order_at = self._updates + self._order

@@ -209,12 +209,12 @@ class ColouredKalman:
         self._r *= ratio * ratio
         self._past *= ratio
 
-    def draw(self, index: int) -> None:
-        """Draw one parameter half way to zero, as an observation of zero does that is as sure as it is."""
+    def draw(self, index: int, share: float) -> None:
+        """Draw one parameter towards zero, as an observation of zero with `share` of its variance does."""
         self.account()
         self._Ph = None
-        variance = float(self.Sigma[index, index])
-        gain = self.P[:, index] / (2.0 * self.P[index, index])
+        variance = share * float(self.Sigma[index, index])
+        gain = self.P[:, index] / ((1.0 + share) * self.P[index, index])
         self.x -= gain * self.x[index]
         self.P -= np.outer(gain, self.P[index])
         self.Sigma -= np.outer(gain, self.Sigma[index])

@@ -349,14 +349,16 @@ class Track:
     def _draw_higher_orders(self) -> None:
         """Draw the highest powers towards zero, down to the first one that the data want.
 
-        Not to zero: what is not significant may still be there, and matters most at large deflections.
+        As far as a prior does that is as wide as the power is large or uncertain: what is not significant may
+        still be there, and matters most at large deflections. In the filter's memory it is drawn a few times.
         """
         kalman = self.regression.filter
         assert kalman is not None
         for h in range(self.regression.size - 1, 0, -1):
-            if abs(kalman.x[h]) > _ORDER_SIGMA * math.sqrt(max(kalman.Sigma[h, h], 1e-300)):
+            square = kalman.x[h] ** 2 / max(kalman.Sigma[h, h], 1e-300)
+            if square > _ORDER_SIGMA**2:
                 break
-            kalman.draw(h)
+            kalman.draw(h, max(float(square), 1.0) * _MEMORY_S / _ORDER_S)
 
     def _publishable(self) -> None:
         regression = self.regression

@@ -5,8 +5,9 @@
 The daemon's own loop in real time on the virtual bus, with the simulated devices in its thread, so that no
 other thread of this process makes them late. Faults of the fault script (`tests/faultscript.py`) are played
 one after the other, with a calm stretch between them, at the end of which the daemon must be well again.
-Memory is the resident set after a collection, threads are counted; both must be flat once the first minute,
-in which buffers fill, is over.
+Memory is the resident set after a collection, with the C library's allocator alone, so that what is freed is
+seen to be (Python's own keeps it); threads are counted. Both must be flat once the first minute, in which
+buffers fill, is over: medians of the first and the last third are compared.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import ctypes
 import gc
 import json
 import logging
+import os
 import random
 import sys
 import threading
@@ -32,8 +34,12 @@ from daemonkit import vsa
 from faultscript import SCRIPT, Fault
 from faultstages import RealStage
 
+from estimator.sample import FloatArray
+
 FILLING_S = 60.0
-FLAT_KB_PER_MIN = 500.0  # the allocator's own unrest; a leak of one sample a cycle would be thirty thousand
+FLAT_KB = (
+    8000.0  # from the first third to the last: the allocator's own unrest; one sample a cycle would be 36 000
+)
 FLAT_OBJECTS = 2000  # what is made once, at the first fault of a kind; a leak of one a cycle would be 400 000
 _ON_ANY_BUS = {
     *("mute", "delay", "resize", "repeat", "reverse", "drop_sync", "emergency", "mend", "kill", "revive"),
@@ -83,7 +89,7 @@ class Soak:
         self._seconds = seconds
         self.played: Counter[str] = Counter()
         self.rows: list[tuple[float, int, int, int]] = []
-        self.slowest_s = 0.0
+        self.slowest = (0.0, "")
         self.said = 0
 
     def run(self) -> dict[str, Any]:
@@ -105,7 +111,7 @@ class Soak:
         stage.run(fault.seconds)
         ended = time.monotonic()
         stage.settle()
-        self.slowest_s = max(self.slowest_s, time.monotonic() - ended)
+        self.slowest = max(self.slowest, (time.monotonic() - ended, fault.name))
         self.said += len(stage.said.lines)
         wrong = stage.wrong_samples()
         if wrong:
@@ -117,10 +123,7 @@ class Soak:
     def _summary(self, stage: RealStage, seconds: float) -> dict[str, Any]:
         document = stage.document()
         late = [row for row in self.rows if row[0] > min(FILLING_S, seconds / 3)]
-        times, memory, threads, objects = (
-            np.array(column, dtype=float) for column in zip(*late, strict=True)
-        )
-        growth = float(np.polyfit(times / 60.0, memory, 1)[0]) if len(late) > 2 else 0.0
+        _, memory, threads, objects = (np.array(column, dtype=float) for column in zip(*late, strict=True))
         return {
             "seconds": round(seconds, 1),
             "cycles": document["cycles"],
@@ -130,13 +133,19 @@ class Soak:
             "faults": sum(self.played.values()),
             "kinds": dict(self.played),
             "samples_checked": stage.checked,
-            "slowest_recovery_s": round(self.slowest_s, 2),
-            "rss_kb": [int(memory[0]), int(memory[-1])],
-            "rss_growth_kb_per_min": round(growth, 1),
-            "objects": [int(np.median(part)) for part in (np.array_split(objects, 3)[k] for k in (0, -1))],
+            "slowest_recovery_s": round(self.slowest[0], 2),
+            "slowest_recovery_of": self.slowest[1],
+            "rss_kb": _thirds(memory),
+            "objects": _thirds(objects),
             "threads": sorted({int(count) for count in threads}),
             "log_lines": self.said,
         }
+
+
+def _thirds(values: FloatArray) -> list[int]:
+    """Medians of the first and the last third."""
+    parts = np.array_split(values, 3)
+    return [int(np.median(parts[k])) for k in (0, -1)]
 
 
 def main() -> None:
@@ -153,11 +162,13 @@ def main() -> None:
     if options.json:
         options.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     print(json.dumps(result, indent=1))
-    first, last = result["objects"]
-    flat = result["rss_growth_kb_per_min"] < FLAT_KB_PER_MIN and last < first + FLAT_OBJECTS
+    memory, objects = result["rss_kb"], result["objects"]
+    flat = memory[1] < memory[0] + FLAT_KB and objects[1] < objects[0] + FLAT_OBJECTS
     flat = flat and len(result["threads"]) == 1
     sys.exit(0 if flat else "memory or threads are not flat")
 
 
 if __name__ == "__main__":
+    if os.environ.get("PYTHONMALLOC") != "malloc":
+        os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, "PYTHONMALLOC": "malloc"})
     main()

@@ -22,9 +22,6 @@ _QUICK = 3.0  # the noise is an average over this share, one in so many, of the 
 _HALVED = 6.0  # updates in which the noise assumed at the start may at most be halved
 _OUTLIER = 5.0  # standard deviations that an innovation may count as
 _LEAST_FREEDOM = 4.0  # independent errors that are left over parameters
-# Errors that are in no covariance: noise in h, its linearisation, what aligns the channels. Measured as the
-# error over its standard deviation without this, on 86 simulated joints that took no part in anything else.
-_UNSEEN = 1.3
 
 
 class ColouredKalman:
@@ -93,11 +90,11 @@ class ColouredKalman:
 
     @property
     def caution(self) -> float:
-        """How much larger than Sigma a variance is: few errors are seen (t distribution), some not at all."""
+        """How much larger a variance is that few independent errors tell: that of a t distribution."""
         shape = self._r * (self._taper / max(self.noise, 1e-300))
         seen = min(self._count, 2.0 / max(self._growth - 1.0, 1e-9))
         freedom = max(seen / (1.0 + 2.0 * float(shape @ shape)) - self._n, _LEAST_FREEDOM)
-        return _UNSEEN**2 * freedom / (freedom - 2.0)
+        return freedom / (freedom - 2.0)
 
     def update(self, h: FloatArray, innovation: float, floor: float) -> None:
         """One equation: h (n,), its innovation, and the least noise variance to reckon with.

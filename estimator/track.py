@@ -12,7 +12,7 @@ from estimator.bank import FilterBank
 from estimator.declared import Elastic
 from estimator.flexibility import Polynomial, TransmissionModel
 from estimator.model import Motor, ParameterValue
-from estimator.regression import Regression, Signals
+from estimator.regression import UNSEEN, Regression, Signals
 from estimator.sample import FloatArray, TransmissionEstimate
 from estimator.settings import EstimatorSettings
 from estimator.transmissions import UNKNOWN, transmission_model
@@ -480,6 +480,6 @@ class Track:
         """{"model", "parameters", "std"}, names as in the joint file."""
         if self._black_box or not self._alpha:
             return {"model": UNKNOWN if self._black_box else self._basis.name, "parameters": {}, "std": {}}
-        std = np.sqrt(np.maximum(np.diag(self.regression.covariance), 0.0))
+        std = UNSEEN * np.sqrt(np.maximum(np.diag(self.regression.covariance), 0.0))
         values: dict[str, ParameterValue] = self._basis.parameters(self._alpha)
         return {"model": self._basis.name, "parameters": values, "std": self._basis.parameters(std)}

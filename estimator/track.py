@@ -33,6 +33,7 @@ _ORDER_S = 5.0  # of updates between looks at the polynomial's highest powers
 _REGULAR_S = 0.5  # of updates between two looks at the covariance
 _DUE_S = 0.1  # of updates between two looks at a nonlinear model's linearisation
 _ORDER_SIGMA = 3.0
+_MOVED = 0.65  # standard deviations that a nonlinear model's shape moves before it is linearised anew
 _DELAY_S = 0.5  # of updates between two alignments of late channels
 _DELAY_PERIODS = 0.05  # no smaller delay is worth one
 _VALID = 0.25  # relative standard deviation of the stiffness up to which it is of use
@@ -425,7 +426,7 @@ class Track:
             std = np.sqrt(np.maximum(np.diag(regression.covariance), 0.0))
             assert regression.alpha0 is not None
             moved = np.abs(alpha[1:] - regression.alpha0[1:])
-            if not np.any(moved > np.maximum(0.5 * std[1:], 1e-5 * np.abs(alpha[1:]))):
+            if not np.any(moved > np.maximum(_MOVED * std[1:], 1e-5 * np.abs(alpha[1:]))):
                 return
             regression.relinearise(alpha)
         assert regression.alpha0 is not None

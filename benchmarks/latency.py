@@ -36,6 +36,7 @@ QUALITY = {
     "encoding": zenoh.Encoding.ZENOH_SERIALIZED,
     "congestion_control": zenoh.CongestionControl.DROP,
     "priority": zenoh.Priority.REAL_TIME,
+    "express": True,
 }
 JOINT = f"""
 name = "latency"

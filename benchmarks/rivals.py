@@ -28,6 +28,7 @@ from sim.canopen.node import Node
 _ENCODING = {
     "congestion_control": zenoh.CongestionControl.DROP,
     "priority": zenoh.Priority.REAL_TIME,
+    "express": True,
 }
 
 

@@ -72,7 +72,7 @@ def test_estimate_and_sample_arrive_as_the_contract_says(publisher, client):
     message = until(both)
     assert message.payload.to_bytes() == wire.encode_estimate(make_estimate(7), 123)
     assert str(message.encoding) == "zenoh/serialized;drivelink.estimate/1"
-    assert not message.express
+    assert message.express
     assert message.priority == zenoh.Priority.REAL_TIME
     assert message.congestion_control == zenoh.CongestionControl.DROP
     assert message.source_info.source_id.zid == client.info.peers_zid()[0]

@@ -2,9 +2,9 @@
 
 The 1 kHz keys are plain publishers: dropped rather than waited for, the estimate with real-time priority,
 the sample next to it in a queue of its own. `status` and `model` are latched: an advanced subscriber with
-history gets the last one at once, and so does a query, which also answers `schema`. What is sent every
-cycle is not express: each express message would take one of the 16 places of a link's queue for itself, and
-be lost when they are full (docs/scaling.md). Nothing here listens to anything but those queries: no key
+history gets the last one at once, and so does a query, which also answers `schema`. What is sent
+every cycle is express: without that the stream stalls for half a second now and then (docs/scaling.md).
+Nothing here listens to anything but those queries: no key
 changes what the daemon does.
 """
 
@@ -151,6 +151,7 @@ class JointPublisher:
             encoding=zenoh.Encoding.ZENOH_SERIALIZED.with_schema(schema_name),
             congestion_control=self._congestion_control,
             priority=priority,
+            express=True,
         )
         self._entities.append(publisher)
         return publisher

@@ -26,6 +26,9 @@ class Estimator(Protocol):
         `sample.sequence` counts periods: a jump by more than one is a gap of whole periods.
         """
 
+    def distrust(self) -> None:
+        """The next sample may not be of its moment: use it, but learn nothing from it."""
+
     def reset(self) -> None:
         """Forget everything that was learned."""
 

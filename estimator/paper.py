@@ -120,6 +120,9 @@ class PaperEstimator:
         """The paper has no model to fall short of: always nan."""
         return math.nan
 
+    def distrust(self) -> None:
+        """Nothing to do: the paper's residuals are made from every sample."""
+
     def reset(self) -> None:
         """Forget everything."""
         self._guard.reset()

@@ -63,6 +63,11 @@ class RobustEstimator:
         self._last: list[float] = []
         self._estimate: Estimate | None = None
 
+    def distrust(self) -> None:
+        """The next sample may not be of its moment: learn nothing until the filters have forgotten it."""
+        self._learner.unsettle(self._learner.settle)
+        self._learner.postpone_search()
+
     @property
     def residual_nm(self) -> float:
         """Largest misfit among the motors' balances at the last update, N·m; nan until there is a model."""
@@ -95,8 +100,7 @@ class RobustEstimator:
         if self._moved:
             inputs = [value - zero for value, zero in zip(inputs, self._zeros, strict=True)]
         if frozen:
-            self._learner.unsettle(self._learner.settle)
-            self._learner.postpone_search()
+            self.distrust()
         inputs = self._alignment.align(inputs, restart)
         if restart:
             self._restart(inputs)

@@ -56,6 +56,8 @@ class Status(IntFlag):
     DRIVE_FAULT = 1 << 8  # a drive reports a fault or is not in operation-capable state
     BUS_FAULT = 1 << 9  # frames of this cycle were late or missing
     STALE = 1 << 10  # the estimate is carried on without fresh measurements
+    UNTIMED = 1 << 11  # SYNCs of another master: the values may be of another moment; nothing is learned
+    NODE_RESTARTED = 1 << 12  # positions may have started anew: with this sample the estimator begins anew
 
 
 class TransmissionEstimate(NamedTuple):

@@ -245,11 +245,11 @@ def test_a_rebooted_node_is_not_believed_before_it_is_started_again() -> None:
     run(assembler, [(SYNC, b""), (0x181, pdo(3)), (0x182, pdo(777)), (0x183, link(3))])
     sample = assembler.feed(SYNC, b"")
     assert sample is not None
-    assert assembler.restarted  # positions may have started anew
+    assert assembler.flags & Status.NODE_RESTARTED  # positions may have started anew
     assert sample.motor_position_rad[1] == pytest.approx(777 * COUNT_RAD)
     run(assembler, vsa_cycle(4))
     assembler.feed(SYNC, b"")
-    assert not assembler.restarted
+    assert not assembler.flags & Status.NODE_RESTARTED
 
 
 def test_a_passive_listener_believes_a_node_that_starts_by_itself() -> None:

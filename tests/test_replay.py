@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import gc
 import logging
+import multiprocessing
 import signal
 import struct
 import subprocess
@@ -19,14 +21,14 @@ import pytest
 import zenohkit
 
 from drivelink import cli, jointfile
-from drivelink.errors import DrivelinkError
+from drivelink.errors import DrivelinkError, RecordingError
 from drivelink.jointfile import JointFile, parse
 from drivelink.pubsub.publisher import describe_model, to_json
 from drivelink.pubsub.wire import EstimateMessage
 from drivelink.recording import read
 from drivelink.recording.playback import open_playback
 from drivelink.recording.sinks import Sink, open_sink
-from estimator.sample import Estimate
+from estimator.sample import Estimate, Status
 
 BEGIN_NS = 1_700_000_000_000_000_000
 FORMATS = (".log", ".blf", ".asc", ".trc", ".mcap", ".csv")
@@ -57,13 +59,13 @@ class Recorded:
                 rig.run(1)
                 self.drain()
             self.live = [estimate for estimate, _ in rig.collector.estimates]
-            for estimate, _ in rig.collector.estimates:
+            samples = {sample.sequence: sample for sample, _ in rig.collector.samples}
+            for estimate in self.live:
                 stamp_ns = BEGIN_NS + estimate.sequence * 1_000_000
                 for sink in self.sinks:
                     sink.estimate(EstimateMessage(estimate[0], stamp_ns, int(estimate[1]), *estimate[2:]))
-            for sample, _ in rig.collector.samples:
-                for sink in self.sinks:
-                    sink.sample(sample, BEGIN_NS + sample.sequence * 1_000_000)
+                    if estimate.sequence in samples:
+                        sink.sample(samples[estimate.sequence], stamp_ns)
         for sink in self.sinks:
             sink.close()
         self.tap.shutdown()
@@ -109,12 +111,54 @@ def disturb(rig: daemonkit.Rig) -> None:
     at(syncs + 300, lambda: rig.faults.resize(node(2), rig.tpdo(2)[0], 6, cycles=2))
 
 
-@pytest.mark.parametrize("suffix", [".log", ".blf"])
+@pytest.mark.parametrize("suffix", [".log", ".blf", ".mcap"])
 def test_a_disturbed_bus_is_judged_as_it_was_live(suffix: str, tmp_path: Path) -> None:
     recorded = Recorded(tmp_path, daemonkit.vsa_text(), disturb)
     statuses = {int(e.status) for e in recorded.live}
     assert len(statuses) > 3  # faults were seen at all
     assert [bits(e) for e in recorded.replayed(suffix)] == [bits(e) for e in recorded.live]
+
+
+def upset(rig: daemonkit.Rig) -> None:
+    at, syncs, tap = rig.faults.at, rig.network.syncs, daemonkit.Listener(rig.joint)
+    at(syncs + 60, lambda: rig.faults.reboot(rig.node(2)))
+    at(syncs + 320, lambda: tap.send(0x080))
+
+
+def test_what_begins_anew_or_is_not_learned_from_does_so_in_the_replay_of_samples(tmp_path: Path) -> None:
+    recorded = Recorded(tmp_path, daemonkit.vsa_text(), upset)
+    statuses = [e.status for e in recorded.live]
+    assert any(status & Status.NODE_RESTARTED for status in statuses)
+    assert any(status & Status.UNTIMED for status in statuses)
+    assert [bits(e) for e in recorded.replayed(".mcap")] == [bits(e) for e in recorded.live]
+
+
+@pytest.mark.parametrize("suffix", [".log", ".mcap"])
+def test_a_process_that_reads_ahead_reads_the_same(recorded: Recorded, suffix: str) -> None:
+    path = recorded.folder / f"r{suffix}"
+    playback = open_playback(path, recorded.joint, recorded.folder, frames=True, ahead=True)
+    assert [bits(one.estimate) for one in playback] == [bits(e) for e in recorded.live]
+    assert not multiprocessing.active_children()
+
+
+def test_what_a_process_that_reads_ahead_has_to_say_is_said_here(
+    recorded: Recorded, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    lines = (recorded.folder / "r.log").read_text().splitlines(keepends=True)
+    strange = tmp_path / "strange.log"
+    strange.write_text("".join([*lines, "no frame\n"]))
+    with caplog.at_level(logging.WARNING, "drivelink.recording"):
+        played = list(open_playback(strange, recorded.joint, tmp_path, ahead=True))
+    assert len(played) == CYCLES and "1 line(s) are no CAN frame" in caplog.text
+    late = tmp_path / "late.log"
+    late.write_text("".join(lines[len(lines) // 2 :]))
+    with pytest.raises(RecordingError, match=r"late\.log"):
+        open_playback(late, recorded.joint, tmp_path, ahead=True)
+    cut = open_playback(recorded.folder / "r.log", recorded.joint, tmp_path, ahead=True)
+    next(iter(cut))  # whoever stops early leaves nothing behind
+    del cut
+    gc.collect()
+    assert not multiprocessing.active_children()
 
 
 def test_raw_frames_and_samples_make_the_same_record(recorded: Recorded) -> None:

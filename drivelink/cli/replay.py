@@ -22,6 +22,7 @@ from drivelink.recording.playback import Playback, open_playback
 
 _INTERRUPTED = 130
 _METER_EVERY = 512
+_LARGE = 2_000_000  # bytes: a recording that is worth a process that reads it
 _SUBSCRIBER_S = 1.5
 
 _EPILOG = """\
@@ -58,7 +59,12 @@ def run(args: argparse.Namespace) -> int:
     speed = args.speed if args.speed is not None else 1.0 if args.realtime else None
     joint, base_dir = _joint(args)
     playback = open_playback(
-        args.file, joint, base_dir, frames=True if args.frames else None, channel=args.channel
+        args.file,
+        joint,
+        base_dir,
+        frames=True if args.frames else None,
+        channel=args.channel,
+        ahead=args.file.exists() and args.file.stat().st_size > _LARGE,
     )
     summary = Summary(playback.motors, keep=args.plots is not None)
     begin = time.perf_counter()

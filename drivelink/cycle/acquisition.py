@@ -25,6 +25,8 @@ __all__ = ["SYNC_COB_ID", "Assembler"]
 SYNC_COB_ID = 0x080
 _DRIVE_FAULT = int(Status.DRIVE_FAULT)
 _BUS_FAULT = int(Status.BUS_FAULT)
+_UNTIMED = int(Status.UNTIMED)
+_NODE_RESTARTED = int(Status.NODE_RESTARTED)
 _CONFLICT_CYCLES = 20  # for which two different frames in one cycle discredit their sender
 _MOST_OWED = 10  # frames that may come late in one go, after a stall of somebody
 _DOUBT_CYCLES = 100  # after a missing frame or a SYNC too many: what comes may be one period late
@@ -47,7 +49,6 @@ class Assembler:
         sequence: number of the current SYNC, from 0; -1 before the first.
         missed: number of the cycle the last SYNC closed without a sample, or -1 if it had one.
         flags: service bits of `Status` that hold for the sample just given, or the cycle just missed.
-        restarted: whether the sample just given is the first after positions may have started anew.
         extra_syncs: SYNCs that were not due: another master makes them, or a frame is repeated.
 
     Raises:
@@ -78,7 +79,7 @@ class Assembler:
         self._faulted = 0
         self.sequence = self.missed = -1
         self.flags = 0
-        self.restarted = False
+        self._untimed = 0  # cycles for which SYNCs of another master discredit the samples
         self.extra_syncs = 0
 
     @property
@@ -147,10 +148,13 @@ class Assembler:
         if jump <= 0:
             self.extra_syncs += 1
             self._spoiled = True  # what comes now answers that SYNC, or ours: nobody can tell
+            self._untimed = _DOUBT_CYCLES
             for slot in self._timed:
                 slot.suspect = _DOUBT_CYCLES  # nor of those that come after ours
             return None
         sample = self._close(jump)
+        if self._untimed:
+            self._untimed -= 1
         self.sequence += jump
         self._open = True
         self._spoiled = self._cycle_fault = False
@@ -275,8 +279,15 @@ class Assembler:
     def _sample(self) -> Sample:
         values, m = self._values, self._motors
         self._open = False
-        self.flags = self._faulted | _BUS_FAULT if self._cycle_fault else self._faulted
-        self.restarted, self._restart = self._restart, False
+        flags = self._faulted
+        if self._cycle_fault:
+            flags |= _BUS_FAULT
+        if self._untimed:
+            flags |= _UNTIMED
+        if self._restart:
+            flags |= _NODE_RESTARTED
+            self._restart = False
+        self.flags = flags
         return Sample(
             self.sequence,
             tuple(values[:m]),

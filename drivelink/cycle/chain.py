@@ -18,11 +18,13 @@ from drivelink.jointfile import JointFile
 from estimator import Estimator, make_estimator
 from estimator.sample import Estimate, Sample, Status
 
-__all__ = ["Built", "Chain", "Watch", "build", "make_chain"]
+__all__ = ["Built", "Chain", "Watch", "build", "make_assembler", "make_chain"]
 
-_VALID = int(Status.VALID)
+_OF_A_SAMPLE = int(Status.VALID | Status.NODE_RESTARTED)  # never of an estimate that is carried on
 _STALE = int(Status.STALE)
 _RESTARTED = int(Status.RESTARTED)
+_NODE_RESTARTED = int(Status.NODE_RESTARTED)
+_UNTIMED = int(Status.UNTIMED)
 _MODEL_ALARM = int(Status.MODEL_ALARM)
 _HOLD_S, _HOLD_PERIODS = 0.25, 10  # of silence, and at least so many, see `Assembler`
 
@@ -45,8 +47,8 @@ def build(joint: JointFile) -> Built:
     return make_estimator(joint.model(), joint.estimator, joint.bus.period_s), make_watch(joint)
 
 
-def make_chain(joint: JointFile, layouts: Sequence[NodeLayout], *, keep: int = 0) -> Chain:
-    """The chain of a joint file whose nodes send by these layouts; arguments as for `Chain`.
+def make_assembler(joint: JointFile, layouts: Sequence[NodeLayout]) -> Assembler:
+    """The assembler of a joint file whose nodes send by these layouts.
 
     Raises:
         DriveError: the layouts lack something that the joint's model needs.
@@ -58,7 +60,16 @@ def make_chain(joint: JointFile, layouts: Sequence[NodeLayout], *, keep: int = 0
             f"{joint.name}: no frame carries the link position: expected [link.encoder], "
             'or transmission.model = "none"'
         )
-    return Chain(assembler, *build(joint), keep=keep)
+    return assembler
+
+
+def make_chain(joint: JointFile, layouts: Sequence[NodeLayout], *, keep: int = 0) -> Chain:
+    """The chain of a joint file whose nodes send by these layouts; arguments as for `Chain`.
+
+    Raises:
+        DriveError: the layouts lack something that the joint's model needs.
+    """
+    return Chain(make_assembler(joint, layouts), *build(joint), keep=keep)
 
 
 class Chain:
@@ -97,25 +108,26 @@ class Chain:
         assembler = self.assembler
         sample = assembler.feed(cob_id, data, jump)
         if sample is not None:
-            return self.take(sample, assembler.flags, assembler.restarted)
+            return self.take(sample, assembler.flags)
         if assembler.missed >= 0:
             missed, assembler.missed = assembler.missed, -1
             self.missed += 1
             return self.carry_on(missed, assembler.flags)
         return None
 
-    def take(self, sample: Sample, flags: int = 0, restarted: bool = False) -> Estimate:
+    def take(self, sample: Sample, flags: int = 0) -> Estimate:
         """Take one sample, as the assembler gives it or as it was recorded.
 
         Args:
             sample: of the cycle.
             flags: service bits of `Status` that hold for it.
-            restarted: positions may have started anew before it.
         """
         estimator = self.estimator
-        if restarted:
+        if flags & _NODE_RESTARTED:
             estimator.reset()
             flags |= _RESTARTED
+        if flags & _UNTIMED:
+            estimator.distrust()
         estimate = estimator.step(sample)
         if self.watch is not None and self.watch.step(sample, estimate, estimator.residual_nm):
             flags |= _MODEL_ALARM
@@ -130,7 +142,7 @@ class Chain:
         """The last estimate under a new number: stale, not valid; None where there never was one."""
         if self.estimate is None:
             return None
-        status = int(self.estimate.status) & ~_VALID | _STALE | flags
+        status = int(self.estimate.status) & ~_OF_A_SAMPLE | _STALE | flags
         self.sample = None
         self.estimate = self.estimate._replace(sequence=sequence, status=status)
         return self.estimate

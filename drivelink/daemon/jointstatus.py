@@ -32,6 +32,7 @@ _BITS = (
     ("drive_fault", int(Status.DRIVE_FAULT)),
     ("bus_fault", int(Status.BUS_FAULT)),
     ("stale", int(Status.STALE)),
+    ("untimed", int(Status.UNTIMED)),
 )
 
 

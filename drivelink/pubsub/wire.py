@@ -158,6 +158,8 @@ STATUS_BITS: Mapping[str, str] = MappingProxyType(
         "DRIVE_FAULT": "a drive reports a fault or is not operational",
         "BUS_FAULT": "frames of this cycle were late or missing",
         "STALE": "the estimate is carried on without fresh measurements",
+        "UNTIMED": "another master made SYNC: values may be of another moment; nothing is learned from them",
+        "NODE_RESTARTED": "positions may have started anew: with this sample the estimator begins anew",
     }
 )
 

@@ -8,20 +8,21 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import chain, islice, pairwise
 from pathlib import Path
 from statistics import median
-from typing import TypeVar
 
 import numpy as np
 
 from drivelink.canopen.layout import NodeLayout, layout_from
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.acquisition import SYNC_COB_ID, Assembler
+from drivelink.cycle.chain import make_assembler
 from drivelink.errors import DriveError, RecordingError
 from drivelink.jointfile import JointFile
 from drivelink.recording.canlog import CAN_SUFFIXES, NO_STAMP, Frame, read_frames
+from drivelink.recording.cycles import Cycle
 from drivelink.recording.grid import report_gaps
 from drivelink.recording.mcapfile import read_messages
 from drivelink.recording.syncnumbers import numbered_ahead, numbered_at_once
@@ -30,8 +31,6 @@ from estimator.sample import FloatArray, Record
 __all__ = ["FrameLog", "is_frame_log", "read_frame_record"]
 
 _LOG = logging.getLogger("drivelink.recording")
-
-T = TypeVar("T")
 
 _QUIET_SYNCS = 500  # without a change of the configuration: it is over
 _PERIOD_TOLERANCE = 0.03
@@ -70,10 +69,9 @@ class FrameLog:
 
     Attributes:
         period_s: the communication cycle, as the SYNCs in it tell.
-        layouts: of the joint's nodes, at the start.
 
     Raises:
-        RecordingError: no SYNC or no frames in it, or the mapping of a node is not known.
+        RecordingError: no SYNC or no frames in it, or the mapping of a node is not known or lacks something.
     """
 
     def __init__(self, path: Path, joint: JointFile, base_dir: Path, channel: str | None = None) -> None:
@@ -89,28 +87,30 @@ class FrameLog:
             self._head, self._frames = [], _mcap_frames(path)
         self._check_complete()
         self.period_s = self._period(syncs, joint.bus.period_s)
-        self.layouts = tuple(self._listener.layouts.values())
+        timed = joint.model_copy(update={"bus": joint.bus.model_copy(update={"period_s": self.period_s})})
+        try:
+            self._assembler = make_assembler(timed, tuple(self._listener.layouts.values()))
+        except DriveError as error:
+            raise RecordingError(f"{path}: {error}") from error
 
-    def run(
-        self, assembler: Assembler, feed: Callable[[int, bytes, int], T | None]
-    ) -> Iterator[tuple[T, int]]:
-        """Feed the frames, once; yield what they lead to with the UNIX time of its SYNC, ns.
-
-        Args:
-            assembler: made from `layouts`; told when the configuration changes on the way.
-            feed: its `feed`, or that of the chain it is in.
-        """
+    def cycles(self) -> Iterator[Cycle]:
+        """The cycles that the frames make; once."""
+        assembler = self._assembler
         numbered = numbered_at_once if self._follow else numbered_ahead
         stamp_now = stamp_before = 0
         for (stamp_ns, can_id, data, _), jump in numbered(chain(self._head, self._frames), self.period_s):
             was = assembler.sequence
-            result = feed(can_id, data, jump)
+            sample = assembler.feed(can_id, data, jump)
             if can_id == SYNC_COB_ID and jump:
                 stamp_before, stamp_now = stamp_now, stamp_ns
             elif 0x581 <= can_id <= 0x67F:
                 self._relayout(can_id, data, assembler)
-            if result is not None:
-                yield result, stamp_before if assembler.sequence != was else stamp_now
+            if sample is not None:
+                stamp_ns = stamp_before if assembler.sequence != was else stamp_now
+                yield Cycle(sample.sequence, stamp_ns, sample, assembler.flags)
+            elif assembler.missed >= 0:
+                missed, assembler.missed = assembler.missed, -1
+                yield Cycle(missed, stamp_before, None, assembler.flags)
 
     def _learn_configuration(self) -> tuple[list[int], bool]:
         """Listen to the SDO transfers until the mapping is known and at rest.
@@ -186,11 +186,7 @@ def read_frame_record(path: Path, joint: JointFile | None, base_dir: Path, chann
     if joint is None:
         raise RecordingError(f"{path}: a raw CAN recording needs the joint file that says what is in it")
     log = FrameLog(path, joint, base_dir, channel)
-    try:
-        assembler = Assembler(log.layouts, len(joint.motor), active=joint.bus.configure)
-    except DriveError as error:
-        raise RecordingError(f"{path}: {error}") from error
-    samples = [sample for sample, _ in log.run(assembler, assembler.feed)]
+    samples = [cycle.sample for cycle in log.cycles() if cycle.sample is not None]
     if len(samples) < 3:
         raise RecordingError(f"{path}: expected at least 3 complete samples, got {len(samples)}")
     sequence = np.array([sample.sequence for sample in samples], dtype=np.int64)

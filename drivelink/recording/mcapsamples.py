@@ -5,31 +5,23 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from drivelink.errors import RecordingError
 from drivelink.jointfile import JointFile
 from drivelink.recording.columns import KNOWN, record_from_columns
+from drivelink.recording.cycles import Cycle
 from drivelink.recording.mcapfile import read_messages
 from drivelink.recording.messages import read_sample
-from estimator.sample import Record, Sample, Status
+from estimator.sample import Record, Status
 
-__all__ = ["Cycle", "read_mcap", "recorded_cycles", "recorded_joint"]
+__all__ = ["read_mcap", "recorded_cycles", "recorded_joint"]
 
 _STALE = int(Status.STALE)
-_SERVICE = int(Status.DRIVE_FAULT | Status.BUS_FAULT)
+_SERVICE = int(Status.DRIVE_FAULT | Status.BUS_FAULT | Status.UNTIMED | Status.NODE_RESTARTED)
 _APART = 64  # cycles that a sample and its estimate may be apart in the file
-
-
-class Cycle(NamedTuple):
-    """One recorded cycle: its sample, or None where there was none, and the service's flags."""
-
-    sequence: int
-    stamp_ns: int
-    sample: Sample | None
-    flags: int
 
 
 def recorded_joint(path: Path) -> tuple[str, Path] | None:

@@ -8,12 +8,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle.acquisition import Assembler
-from drivelink.cycle.chain import Chain, build, make_chain
+from drivelink.cycle.chain import Chain, build
 from drivelink.jointfile import JointFile
 from drivelink.recording import read
+from drivelink.recording.ahead import FrameLogAhead
 from drivelink.recording.canframes import FrameLog, is_frame_log
+from drivelink.recording.cycles import Cycle, estimated
 from drivelink.recording.mcapsamples import recorded_cycles
 from estimator.sample import Estimate, Sample
 
@@ -51,17 +52,13 @@ class Playback:
         joint: JointFile,
         period_s: float,
         total: int | None,
-        layouts: tuple[NodeLayout, ...] | None,
         cycles: Callable[[Chain], Iterator[Played]],
     ) -> None:
         self.motors = len(joint.motor)
         self.period_s = period_s
         self.total = total
         timed = joint.model_copy(update={"bus": joint.bus.model_copy(update={"period_s": period_s})})
-        if layouts is None:
-            self.chain = Chain(Assembler((), 0), *build(timed))
-        else:
-            self.chain = make_chain(timed, layouts)
+        self.chain = Chain(Assembler((), 0), *build(timed))  # what it is given are samples already
         self._cycles = cycles
 
     def __iter__(self) -> Iterator[Played]:
@@ -87,6 +84,7 @@ def open_playback(
     *,
     frames: bool | None = None,
     channel: str | None = None,
+    ahead: bool = False,
 ) -> Playback:
     """Open a recording of any format for playing.
 
@@ -97,23 +95,25 @@ def open_playback(
         frames: of an MCAP file, play the raw frames (True) or the samples (False); None: the samples, and
             the frames where there are none.
         channel: of a raw CAN log with several.
+        ahead: have raw frames read by a process of its own: worth its start where there are many.
 
     Raises:
         RecordingError: it cannot be read, or lacks what is needed.
     """
     if is_frame_log(path, frames):
-        log = FrameLog(path, joint, base_dir, channel)
-        return Playback(joint, log.period_s, None, log.layouts, lambda chain: _from_frames(log, chain))
+        log = (FrameLogAhead if ahead else FrameLog)(path, joint, base_dir, channel)
+        period_s = log.period_s
+        return Playback(joint, period_s, None, lambda chain: _from_cycles(log.cycles(), chain, period_s))
     if path.suffix.lower() == ".mcap":
         period_s = joint.bus.period_s
-        return Playback(joint, period_s, None, None, lambda chain: _from_mcap(path, joint, chain))
+        recorded = recorded_cycles(path, len(joint.motor))
+        return Playback(joint, period_s, None, lambda chain: _from_cycles(recorded, chain, period_s))
     record = read(path, joint, keep_nan=True)
     times = record.time_s.tolist()
     return Playback(
         joint,
         record.period_s,
         len(record),
-        None,
         lambda chain: _from_samples(record.samples(), times, chain),
     )
 
@@ -124,19 +124,6 @@ def _from_samples(samples: Iterable[Sample], times: list[float], chain: Chain) -
         yield Played(time_s, round(time_s * 1e9), take(sample), sample)
 
 
-def _from_mcap(path: Path, joint: JointFile, chain: Chain) -> Iterator[Played]:
-    """Samples with the service's flags of their estimates, and the cycles that had no sample."""
-    period_s = joint.bus.period_s
-    for sequence, stamp_ns, sample, flags in recorded_cycles(path, len(joint.motor)):
-        if sample is not None:
-            estimate: Estimate | None = chain.take(sample, flags)
-        else:
-            estimate = chain.carry_on(sequence, flags)
-        if estimate is not None:
-            yield Played(sequence * period_s, stamp_ns, estimate, sample)
-
-
-def _from_frames(log: FrameLog, chain: Chain) -> Iterator[Played]:
-    period_s = log.period_s
-    for estimate, stamp_ns in log.run(chain.assembler, chain.feed):
-        yield Played(estimate.sequence * period_s, stamp_ns, estimate, chain.sample)
+def _from_cycles(cycles: Iterable[Cycle], chain: Chain, period_s: float) -> Iterator[Played]:
+    for (sequence, stamp_ns, sample, _), estimate in estimated(cycles, chain):
+        yield Played(sequence * period_s, stamp_ns, estimate, sample)

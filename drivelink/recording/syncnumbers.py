@@ -49,34 +49,28 @@ class SyncNumbering:
     def __init__(self, period_s: float) -> None:
         self._period_ns = period_s * 1e9
         self._due_ns: float | None = None
-        self._waiting: deque[Frame] = deque()
-        self._stamps: deque[int] = deque()  # of the SYNCs that wait
+        self._cycles: deque[list[Frame]] = deque()  # each SYNC that waits, and what follows it
+        self._stamps: deque[int] = deque()  # of these SYNCs
 
     def push(self, frame: Frame) -> list[tuple[Frame, int]]:
         """Take a frame; returns those that are certain now, each with its jump."""
-        self._waiting.append(frame)
-        if frame.can_id != SYNC_COB_ID:
+        if frame.can_id == SYNC_COB_ID:
+            self._cycles.append([frame])
+            self._stamps.append(frame.stamp_ns)
+            return self._released() if len(self._cycles) > _AHEAD else []
+        if self._cycles:
+            self._cycles[-1].append(frame)
             return []
-        self._stamps.append(frame.stamp_ns)
-        return self._released(1) if len(self._stamps) > _AHEAD else []
+        return [(frame, 1)]
 
     def rest(self) -> list[tuple[Frame, int]]:
         """The stream has ended: everything that still waits."""
-        return self._released(len(self._stamps))
+        return [numbered for _ in range(len(self._cycles)) for numbered in self._released()]
 
-    def _released(self, syncs: int) -> list[tuple[Frame, int]]:
-        """Take frames out, up to the next SYNC after so many, or all."""
-        released = []
-        waiting = self._waiting
-        while waiting:
-            if waiting[0].can_id == SYNC_COB_ID:
-                if not syncs:
-                    break
-                syncs -= 1
-                released.append((waiting.popleft(), self._jump()))
-            else:
-                released.append((waiting.popleft(), 1))
-        return released
+    def _released(self) -> list[tuple[Frame, int]]:
+        """The first cycle that waits."""
+        sync, *others = self._cycles.popleft()
+        return [(sync, self._jump()), *[(frame, 1) for frame in others]]
 
     def _jump(self) -> int:
         """The jump of the first SYNC that waits."""

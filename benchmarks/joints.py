@@ -50,7 +50,7 @@ def publish(names, cycles):
         for name in names
     ]
     session = open_session(joints[0].zenoh, Path())
-    publishers = [JointPublisher(session, joint) for joint in joints]
+    publishers = [JointPublisher(session, joint, express=joint is joints[-1]) for joint in joints]
     print("ready", flush=True)
     sys.stdin.readline()
     obtained = realtime.acquire()

@@ -204,3 +204,27 @@ def test_what_is_faster_than_real_time_can_be_published_without_loss(endpoint):
     finally:
         close_session(client)
         close_session(session)
+
+
+def test_of_several_joints_the_last_one_s_message_takes_along_what_the_others_have_put(endpoint):
+    first, last = (make_joint(name, endpoint) for name in ("elbow", "knee"))
+    session = open_session(first.zenoh, Path())
+    client = open_client(endpoint)
+    try:
+        publishers = [JointPublisher(session, first, express=False), JointPublisher(session, last)]
+        ring = client.declare_subscriber("drivelink/*/estimate", zenoh.handlers.RingChannel(1024))
+
+        seen = {}
+
+        def cycle():
+            for publisher in publishers:
+                publisher.put_estimate(make_estimate(0), 0)
+            while (sample := ring.try_recv()) is not None:
+                seen[str(sample.key_expr)] = sample.express
+            return len(seen) == 2
+
+        until(cycle)
+        assert seen == {"drivelink/elbow/estimate": False, "drivelink/knee/estimate": True}
+    finally:
+        close_session(client)
+        close_session(session)

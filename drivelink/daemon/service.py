@@ -208,7 +208,7 @@ class Daemon:
             self._closing.callback(close_session, session)
         publishers: list[JointPublisher | None] = []
         for served in self._joints:
-            publisher = JointPublisher(session, served.joint)
+            publisher = JointPublisher(session, served.joint, express=served is self._joints[-1])
             self._closing.callback(publisher.close)
             publishers.append(publisher)
         return publishers

@@ -2,10 +2,10 @@
 
 The 1 kHz keys are plain publishers: dropped rather than waited for, the estimate with real-time priority,
 the sample next to it in a queue of its own. `status` and `model` are latched: an advanced subscriber with
-history gets the last one at once, and so does a query, which also answers `schema`. What is sent
-every cycle is express: without that the stream stalls for half a second now and then (docs/scaling.md).
-Nothing here listens to anything but those queries: no key
-changes what the daemon does.
+history gets the last one at once, and so does a query, which also answers `schema`. Of the joints of one
+daemon the last one's messages are express: each sends what waits in its queue, so that a cycle of many
+joints leaves in one batch. Nothing here listens to anything but those queries: no key changes what the
+daemon does.
 """
 
 from __future__ import annotations
@@ -47,16 +47,20 @@ class JointPublisher:
         joint: gives the name, the prefix and the model as declared.
         lossless: wait for slow subscribers rather than drop: for what is faster than real time, never for a
             bus.
+        express: send at once, with what waits: for the last joint that the session publishes in a cycle.
 
     Raises:
         ZenohError: another daemon serves a joint of this name.
     """
 
-    def __init__(self, session: zenoh.Session, joint: JointFile, lossless: bool = False) -> None:
+    def __init__(
+        self, session: zenoh.Session, joint: JointFile, *, lossless: bool = False, express: bool = True
+    ) -> None:
         self.key = f"{joint.zenoh.prefix}/{joint.name}"
         self._session = session
         control = zenoh.CongestionControl
         self._congestion_control = control.BLOCK if lossless else control.DROP
+        self._express = express
         self._documents: dict[str, bytes] = {}
         self._entities: list[Any] = []
         self._ros2: Ros2Publisher | None = None
@@ -151,7 +155,7 @@ class JointPublisher:
             encoding=zenoh.Encoding.ZENOH_SERIALIZED.with_schema(schema_name),
             congestion_control=self._congestion_control,
             priority=priority,
-            express=True,
+            express=self._express,
         )
         self._entities.append(publisher)
         return publisher

@@ -47,7 +47,7 @@ _COMMON: dict[str, Any] = {
 _CONNECT: dict[str, Any] = {  # for ever, in the background
     "connect/timeout_ms": -1,
     "connect/exit_on_failure": False,
-    "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+    "connect/retry": {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 2},
 }
 
 _open_sessions: list[tuple[zenoh.Session, Rendezvous | None]] = []

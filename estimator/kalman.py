@@ -162,8 +162,9 @@ class ColouredKalman:
         """Symmetry, and no direction with a negative variance."""
         self.account()
         self.P, self._Ph = 0.5 * (self.P + self.P.T), None
+        exact = np.diag(np.where(np.diag(self.P) == 0.0, 1.0, 0.0))  # what is known exactly is no direction
         try:
-            np.linalg.cholesky(self.P)
+            np.linalg.cholesky(self.P + exact)
         except np.linalg.LinAlgError:
             self.repair()
 

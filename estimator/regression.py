@@ -27,6 +27,7 @@ NUISANCES = ("inertia", "damping", "coulomb", "offset", "delay", "shift")
 _SHIFT = -1  # its place
 _DIFFUSE = 30.0  # prior std of the linear coefficient: in units of torque per deflection
 _SHARE = 2.0  # prior std of a higher power: its share of the torque at the largest deflection
+_CUT_OFF_SHARE = 0.003  # … of the first power that a declared order leaves out
 _KNOWN = 0.3  # relative prior std of parameters that the model gives
 _INERTIA = 0.05  # prior std, relative to the declared inertia
 _DAMPING = 0.2  # prior std, relative to the declared damping …
@@ -76,6 +77,7 @@ class Regression:
         period_s: T.
         forgetting: see ColouredKalman.
         black_box: estimate the derivative of the balance.
+        cut_off: the last parameter is the first power that a polynomial leaves out: near zero.
     """
 
     def __init__(
@@ -88,6 +90,7 @@ class Regression:
         period_s: float,
         forgetting: float,
         black_box: bool,
+        cut_off: bool = False,
     ) -> None:
         self._model, self._B, self._D, self._T = model, inertia, damping, period_s
         self.size = size
@@ -95,6 +98,7 @@ class Regression:
         self._first = 1 if black_box else 0
         self._black_box = black_box
         self._polynomial = isinstance(model, Polynomial)
+        self._cut_off = cut_off
         self.alpha0 = alpha  # where a nonlinear model is linearised
         self.filter: ColouredKalman | None = None
         self.torque_unit = self.deflection_unit = self.rate_unit = 0.0
@@ -169,6 +173,16 @@ class Regression:
         n = self.size
         grown = np.maximum(0.0, self._nuisance_std() ** 2 - (old_std * ratio[n:]) ** 2)
         self.filter.inflate(np.diag(np.concatenate([np.zeros(n), grown])))
+        self._restrain_cut_off()
+
+    def _restrain_cut_off(self) -> None:
+        """Its prior, which was a share of the torque at the deflection reached then, is one of now."""
+        assert self.filter is not None
+        power, most = self.size - 1, _CUT_OFF_SHARE**2
+        variance = float(self.filter.P[power, power])
+        if self._cut_off and variance > most:
+            self.filter.ceiling[power] = most
+            self.filter.draw(power, most / variance)
 
     def _set_units(self) -> None:
         tiny = 1e-12
@@ -205,13 +219,16 @@ class Regression:
         mean = np.zeros(n + len(NUISANCES))
         std = np.empty_like(mean)
         if self._known is not None:
-            mean[:n] = self._known / self._units[:n]
+            known = self._known.size
+            mean[:known] = self._known / self._units[:known]
             std[:n] = _KNOWN * np.abs(mean[:n])
             if self._polynomial:
                 std[:n] += 0.02
         else:
             std[:n] = _SHARE
             std[0] = _DIFFUSE
+        if self._cut_off:
+            std[n - 1] = _CUT_OFF_SHARE
         std[n:] = self._nuisance_std()
         self.filter = ColouredKalman(mean, std, _NOISE_SHARE, self._forgetting)
 

@@ -93,7 +93,8 @@ class Track:
         assert model is not None
         if model.linear is None:
             known = len(model.alpha(motor.transmission.parameters)) if motor.transmission.parameters else 0
-            return motor.transmission.order or known or _START_ORDER
+            declared = motor.transmission.order or known
+            return declared + 1 if declared else _START_ORDER
         return 1 if not model.shape_names else max(_START_ORDER, 1 + len(model.shape_names))
 
     def reset(self) -> None:
@@ -118,6 +119,8 @@ class Track:
             self._T,
             1.0 + self._dt / memory,
             self._black_box,
+            cut_off=isinstance(self._target, Polynomial)
+            and bool(transmission.order or transmission.parameters),
         )
         self._alpha: list[float] = []
         self._known = known

@@ -43,6 +43,9 @@ class Witness:
     def step(self, sample: Sample) -> Estimate:
         return Estimate(sample.sequence, int(Status.VALID), 0.0, 0.0, 0.0, ())
 
+    def distrust(self) -> None:
+        pass
+
     def reset(self) -> None:
         pass
 

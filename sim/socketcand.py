@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import selectors
 import socket
+import threading
 import time
 from collections import deque
 from typing import Any
@@ -58,6 +59,7 @@ class SocketcandServer(can.BusABC):
         self, channel: str = "", host: str = "127.0.0.1", port: int = DEFAULT_PORT, **kwargs: Any
     ) -> None:
         self._is_shutdown = True  # nothing to close yet, python-can, if the next line fails
+        self._writing = threading.RLock()  # one thread may send while another one receives
         self._listener = socket.create_server((host, port))
         self._is_shutdown = False
         self._selector = selectors.DefaultSelector()
@@ -127,10 +129,11 @@ class SocketcandServer(can.BusABC):
         self._write(client, b"< hi >")
 
     def _drop(self, client: _Client) -> None:
-        if client in self._clients:
-            self._clients.remove(client)
-            self._selector.unregister(client.socket)
-            client.socket.close()
+        with self._writing:
+            if client in self._clients:
+                self._clients.remove(client)
+                self._selector.unregister(client.socket)
+                client.socket.close()
 
     def _read(self, client: _Client) -> None:
         try:
@@ -185,10 +188,17 @@ class SocketcandServer(can.BusABC):
                 self._write(client, text)
 
     def _write(self, client: _Client, text: bytes) -> None:
-        client.unsent += text
-        self._flush(client)
+        with self._writing:
+            client.unsent += text
+            self._flush(client)
 
     def _flush(self, client: _Client) -> None:
+        with self._writing:
+            self._send_unsent(client)
+
+    def _send_unsent(self, client: _Client) -> None:
+        if client not in self._clients:  # the other thread has just dropped it
+            return
         try:
             sent = client.socket.send(client.unsent)
             del client.unsent[:sent]

@@ -199,6 +199,55 @@ def test_frames_pass_between_the_server_and_all_its_clients() -> None:
         second.shutdown()
 
 
+def test_one_thread_sends_while_another_one_serves(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = 1000
+    sending = socket.socket.send
+
+    def send_slowly(self: socket.socket, data: bytes) -> int:
+        with memoryview(data):  # held as long as the system call holds it, which others may use
+            time.sleep(1e-4)
+            return sending(self, data)
+
+    monkeypatch.setattr(socket.socket, "send", send_slowly)
+    with SocketcandServer("vcan0", port=0) as server:
+        first, second = clients(server, 2)
+        server.send(sync())
+        assert exchange(server, second) is not None  # nothing is held back after the greeting any more
+        ended, failures = threading.Event(), []
+
+        def serve() -> None:
+            try:
+                while not ended.is_set():
+                    server.recv(0.01)
+            except (BufferError, ValueError, OSError) as error:
+                failures.append(error)
+
+        def send(bus: can.BusABC, cob_id: int) -> None:
+            for _ in range(frames):
+                bus.send(can.Message(arbitration_id=cob_id, data=bytes(8), is_extended_id=False))
+
+        threads = [
+            threading.Thread(target=serve),
+            threading.Thread(target=send, args=(first, 0x201)),
+            threading.Thread(target=send, args=(server, 0x181)),
+        ]
+        for thread in threads:
+            thread.start()
+        got: dict[int, int] = {}
+        deadline = time.monotonic() + 60.0
+        while sum(got.values()) < 2 * frames and time.monotonic() < deadline and not failures:
+            message = second.recv(0.05)
+            if message is not None:
+                got[message.arbitration_id] = got.get(message.arbitration_id, 0) + 1
+        ended.set()
+        for thread in threads:
+            thread.join(PATIENCE_S)
+        first.shutdown()
+        second.shutdown()
+    assert not failures
+    assert got == {0x201: frames, 0x181: frames}
+
+
 @pytest.mark.parametrize(
     ("said", "answered"),
     [

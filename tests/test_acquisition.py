@@ -252,6 +252,16 @@ def test_a_rebooted_node_is_not_believed_before_it_is_started_again() -> None:
     assert not assembler.flags & Status.NODE_RESTARTED
 
 
+@pytest.mark.parametrize("tpdos", [(TpdoLayout(cob_id=0x183, transmission_type=1, objects=()),), ()])
+def test_a_mapping_that_cannot_be_changes_nothing(tpdos: tuple[TpdoLayout, ...]) -> None:
+    assembler = Assembler(VSA, 2)
+    with pytest.raises(DriveError):  # another node's identifier; nothing that carries the motor's position
+        assembler.relayout(NodeLayout(node_id=2, motor=1, tpdos=tpdos))
+    (sample,) = run(assembler, [(SYNC, b""), *vsa_cycle(7)])
+    assert sample.motor_position_rad == (7 * COUNT_RAD, -7 * COUNT_RAD)
+    assert sample.link_position_rad == 7 * LINK_RAD
+
+
 def test_a_passive_listener_believes_a_node_that_starts_by_itself() -> None:
     assembler = Assembler(VSA, 2, active=False)
     assembler.feed(0x000, b"\x82\x00")  # a gateway begins with reset communication to all

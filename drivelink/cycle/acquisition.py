@@ -314,12 +314,19 @@ class Assembler:
         """A node has been configured differently: from now on its frames are read by this layout.
 
         Raises:
-            DriveError: as in the constructor.
+            DriveError: as in the constructor; then everything is as it was.
         """
-        for slot in self._nodes[layout.node_id].slots:
+        slots, node = dict(self._slots), self._nodes[layout.node_id]
+        before = list(node.slots)
+        for slot in before:
             del self._slots[slot.cob_id]
-        self._add(layout)
-        self._arrange()
+        try:
+            self._add(layout)
+            self._arrange()
+        except DriveError:
+            self._slots, node.slots[:] = slots, before
+            self._arrange()
+            raise
 
     def _command(self, cob_id: int, data: bytes) -> None:
         if len(data) != 2:

@@ -18,6 +18,7 @@ from drivelink.cycle.framesource import LostSource
 from drivelink.cycle.loop import CycleLoop, Lane
 from drivelink.cycle.nodestate import NodeCounters
 from drivelink.daemon.status import EventLog
+from drivelink.errors import DriveError
 
 __all__ = ["Supervisor"]
 
@@ -162,7 +163,11 @@ class Supervisor:
                 self._events.begin(f"configure {node}", f"node {node} cannot be configured: {result}")
                 continue
             if result.tpdos != watched.layout.tpdos:
-                watched.lane.chain.assembler.relayout(result)
+                try:
+                    watched.lane.chain.assembler.relayout(result)
+                except DriveError as error:  # what it has answered cannot be
+                    self._events.begin(f"configure {node}", f"node {node} cannot be configured: {error}")
+                    continue
                 self._loop.reroute()
                 self._events.say(f"node {node} has another mapping now: {_maps(result)}")
             watched.layout = result

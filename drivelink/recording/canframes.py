@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Iterator
+from contextlib import suppress
 from itertools import chain, islice, pairwise
 from pathlib import Path
 from statistics import median
@@ -174,7 +175,8 @@ class FrameLog:
         self._listener.feed(can_id, data, 0.0)
         for _, layout in self._listener.poll(0.0):
             if isinstance(layout, NodeLayout):
-                assembler.relayout(layout)
+                with suppress(DriveError):  # what cannot be the daemon has not taken either
+                    assembler.relayout(layout)
 
 
 def read_frame_record(path: Path, joint: JointFile | None, base_dir: Path, channel: str | None) -> Record:

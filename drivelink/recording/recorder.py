@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -20,7 +21,7 @@ from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.acquisition import SYNC_COB_ID, Assembler
 from drivelink.cycle.framesource import BusLostError, open_source
-from drivelink.errors import BusError, ZenohError
+from drivelink.errors import BusError, DriveError, ZenohError
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.wire import decode_estimate, decode_sample
 from drivelink.recording.canlog import Frame
@@ -204,7 +205,8 @@ class BusTap:
             listener.feed(cob_id, data, 0.0)
             for _, layout in listener.poll(0.0):
                 if self._assembler is not None and isinstance(layout, NodeLayout):
-                    self._assembler.relayout(layout)
+                    with suppress(DriveError):  # what cannot be the daemon has not taken either
+                        self._assembler.relayout(layout)
         if self._assembler is None:
             if listener.busy:
                 return

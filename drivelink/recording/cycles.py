@@ -34,8 +34,8 @@ class Cycle(NamedTuple):
 def estimated(cycles: Iterable[Cycle], chain: Chain) -> Iterator[tuple[Cycle, Estimate]]:
     """The cycles with what the chain makes of them, as the live loop would have published it.
 
-    Reading and estimating take turns of many cycles: a processor that does one thing for a while is a
-    quarter quicker than one that changes between them every cycle.
+    Reading and estimating take turns of many cycles: a processor that does one thing for a while is quicker
+    than one that changes between them every cycle.
     """
     for batch in batches(cycles):
         for cycle in batch:

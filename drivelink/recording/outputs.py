@@ -18,10 +18,8 @@ from estimator.sample import FloatArray, Status
 __all__ = ["EstimatesFile", "Publication", "Summary"]
 
 _STATUS_EVERY_S = 0.25
-_VALID, _OBSERVABLE = (
-    int(Status.VALID),
-    int(Status.OBSERVABLE),
-)  # plain integers: an IntFlag costs a microsecond
+# Plain integers: an IntFlag costs a microsecond.
+_VALID, _OBSERVABLE = int(Status.VALID), int(Status.OBSERVABLE)
 
 
 class EstimatesFile:

@@ -183,3 +183,8 @@ def test_error_frames_of_any_interface_are_counted_by_kind() -> None:
             )
         assert source.take() == []
         assert source.errors == {"bus-off": 1, "restarted": 1, "controller": 1, "receive overflow": 1}
+
+
+def test_a_lost_bus_is_one_line_whatever_python_can_puts_into_its_message() -> None:
+    said = "Failed to receive: [Errno 104] Connection reset by peer  Traceback (most recent call last):\n  File ...\n"
+    assert str(BusLostError(said)) == "Failed to receive: [Errno 104] Connection reset by peer"

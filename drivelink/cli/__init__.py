@@ -88,7 +88,8 @@ def main(argv: list[str] | None = None) -> int:
     """Run one command and return its exit status."""
     argv = sys.argv[1:] if argv is None else argv
     verb = argv[0] if argv and argv[0] in VERBS else ""
-    logging.getLogger("can").setLevel(logging.ERROR)  # some interfaces report every partial read
+    # Some interfaces report every partial read, or log what they raise with a traceback: we say it in a line.
+    logging.getLogger("can").setLevel(logging.CRITICAL)
     # Before numpy is imported: on matrices as small as ours threads only wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:

@@ -102,8 +102,7 @@ def _set_up_logging(level: str) -> None:
         stream=sys.stderr,
         format="%(levelname).1s %(message)s",
     )
-    for noisy in ("can", "canopen"):
-        logging.getLogger(noisy).setLevel(logging.ERROR)
+    logging.getLogger("canopen").setLevel(logging.ERROR)
 
 
 def _show(daemon: Daemon, ended: threading.Event) -> None:

@@ -52,7 +52,14 @@ class Frame(NamedTuple):
 
 
 class BusLostError(Exception):
-    """The interface is gone or down."""
+    """The bus is gone: interface down, removed, connection closed. The reason is one line.
+
+    Args:
+        reason: as python-can or the system says it; some of python-can's messages carry a whole traceback.
+    """
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(" ".join(reason.partition("Traceback (most recent call last)")[0].split()))
 
 
 class FrameSource(Protocol):

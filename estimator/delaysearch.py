@@ -21,7 +21,7 @@ _WINDOW_S = 2.0
 _LOOKS_S = (2.0, 6.0, 20.0)  # after a start: when it is searched
 _LATEST = 3.0  # periods to either side
 _ROW_HZ = 100.0
-_PIECE = 12  # rows at a tick
+_PIECE = 10  # rows at a tick
 _GAIN = 0.8  # the error has to fall to this share, else no delay is assumed
 _LATER_GAIN = 0.5  # … to this one once there has been a search
 _INERTIA, _DAMPING = 0.05, 0.3  # prior std, relative
@@ -68,7 +68,7 @@ class DelaySearch:
 
     def see(self, block: FloatArray) -> None:
         """Link position, motor position and torque at consecutive ticks, (n, 3)."""
-        if not self._looks and self._job is None:
+        if not self._looks:
             return
         at = self._seen % self._length
         room = self._length - at
@@ -100,20 +100,23 @@ class DelaySearch:
         size = float(np.std(balance))
         if not size > 0.0 or not np.std(q - theta) > 0.0:
             return
-        fixed = np.stack([acceleration, velocity, np.ones(len(balance))], axis=1)
+        A = np.stack([balance, balance, acceleration, velocity, np.ones(len(balance))], axis=1)
         rate = float(np.max(np.abs(velocity))) + 1e-12
         prior = np.array([_INERTIA * self._B, _DAMPING * self._D + _DAMPING_SHARE * size / rate, size])
         costs: dict[float, float] = {}
 
         def look(delay: float) -> Generator[None, None, None]:
-            phi = _shifted(q, delay) - theta
+            late = _shifted(q, delay)
+            yield
+            phi = late - theta
             yield
             (first,) = yield from self._rows(phi, self._smooth, 1)
-            scaled = phi / (np.max(np.abs(phi)) + 1e-15)
+            scaled = phi / (np.abs(phi).max() + 1e-15)
+            yield
             cube = scaled * scaled * scaled
             yield
             (third,) = yield from self._rows(cube, self._smooth, 1)
-            A = np.column_stack([first, third, fixed])
+            A[:, 0], A[:, 1] = first, third
             yield
             costs[delay] = _cost(A, balance, prior)
             yield
@@ -151,19 +154,20 @@ def _shifted(signal: FloatArray, periods: float) -> FloatArray:
     whole = int(np.floor(periods))
     share = periods - whole
     n = len(signal)
-    padded = np.concatenate([np.full(4, signal[0]), signal, np.full(4, signal[-1])])
-    start = 4 + whole
-    return np.asarray((1.0 - share) * padded[start : start + n] + share * padded[start + 1 : start + 1 + n])
+    padded = np.empty(n + 8)
+    padded[:4], padded[4:-4], padded[-4:] = signal[0], signal, signal[-1]
+    later = padded[4 + whole : 4 + whole + n + 1]
+    return np.asarray(later[:-1] + share * (later[1:] - later[:-1]))
 
 
 def _cost(A: FloatArray, y: FloatArray, prior: FloatArray) -> float:
     """Sum of squared errors with the motor's own parameters held near what is declared."""
-    scale = np.sqrt(np.sum(A * A, axis=0)) + 1e-300
-    A = A / scale
     gram = A.T @ A
+    scale = np.sqrt(gram.diagonal()) + 1e-300
+    gram /= scale[:, None] * scale
     noise = 1e-3 * float(y @ y) / len(y)
-    gram[np.arange(2, 5), np.arange(2, 5)] += 10.0 * noise / (prior * scale[2:]) ** 2
-    gram[np.diag_indices(5)] += 1e-12
-    x = np.linalg.solve(gram, A.T @ y)
-    error = y - A @ x
+    held = np.full(5, 1e-12)
+    held[2:] += 10.0 * noise / (prior * scale[2:]) ** 2
+    gram.ravel()[::6] += held
+    error = y - A @ (np.linalg.solve(gram, (y @ A) / scale) / scale)
     return float(error @ error)

@@ -57,6 +57,10 @@ class TransmissionModel(ABC):
         """(torque, stiffness), in one go where that is faster."""
         return self.torque(phi, alpha), self.stiffness(phi, alpha)
 
+    def tangent(self, phi: ArrayLike, alpha: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """(Jacobian, stiffness), in one go where that is faster."""
+        return self.jacobian(phi, alpha), self.stiffness(phi, alpha)
+
     @abstractmethod
     def jacobian(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
         """df/dalpha, (..., n) (eq 25)."""
@@ -214,9 +218,10 @@ class VsaII(_Shaped):
     @staticmethod
     def _parts(phi: FloatArray, c: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """(C sin(phi/2) kept inside its domain, cos(phi/2), sqrt(1 - (C sin)²), beta)."""
-        sine = np.clip(c * np.sin(0.5 * phi), -_EDGE, _EDGE)
+        half = 0.5 * phi
+        sine = np.minimum(np.maximum(c * np.sin(half), -_EDGE), _EDGE)
         root = np.sqrt(1.0 - sine * sine)
-        return sine, np.cos(0.5 * phi), root, np.arcsin(sine) - 0.5 * phi
+        return sine, np.cos(half), root, np.arcsin(sine) - half
 
     def torque(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
         """Flexibility torque (eq 17)."""
@@ -232,20 +237,41 @@ class VsaII(_Shaped):
         """See TransmissionModel."""
         k, c = _split(alpha)
         sine, cosine, root, beta = self._parts(np.asarray(phi, dtype=np.float64), c)
-        slope = 0.5 * (c * cosine / root - 1.0)  # beta'
-        bend = (0.25 * (c * c - 1.0)) * sine / (root * root * root)  # beta''
-        twice = 2.0 * k
-        return np.asarray(twice * beta * slope), np.asarray(twice * (slope * slope + beta * bend))
+        slope = 0.5 * (c * cosine / root - 1.0)
+        return np.asarray(2.0 * k * beta * slope), self._stiffness(k, c, sine, root, beta, slope)
+
+    @staticmethod
+    def _stiffness(
+        k: float, c: float, sine: FloatArray, root: FloatArray, beta: FloatArray, slope: FloatArray
+    ) -> FloatArray:
+        """2 k (beta'² + beta beta''); slope is beta'."""
+        bend = (0.25 * (c * c - 1.0)) * sine / (root * root * root)
+        return np.asarray((2.0 * k) * (slope * slope + beta * bend))
 
     def jacobian(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
         """Its Jacobian (eq 25)."""
         k, c = _split(alpha)
-        phi = np.asarray(phi, dtype=np.float64)
-        _, cosine, root, beta = self._parts(phi, c)
+        sine, cosine, root, beta = self._parts(np.asarray(phi, dtype=np.float64), c)
+        return self._jacobian(k, c, sine, cosine, root, beta)[0]
+
+    def tangent(self, phi: ArrayLike, alpha: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """See TransmissionModel."""
+        k, c = _split(alpha)
+        sine, cosine, root, beta = self._parts(np.asarray(phi, dtype=np.float64), c)
+        jacobian, slope = self._jacobian(k, c, sine, cosine, root, beta)
+        return jacobian, self._stiffness(k, c, sine, root, beta, slope)
+
+    @staticmethod
+    def _jacobian(
+        k: float, c: float, sine: FloatArray, cosine: FloatArray, root: FloatArray, beta: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """(Jacobian, beta')."""
         slope = 0.5 * (c * cosine / root - 1.0)
-        beta_c = np.sin(0.5 * phi) / root
-        slope_c = 0.5 * cosine / root**3
-        return np.stack([2.0 * beta * slope, 2.0 * k * (beta_c * slope + beta * slope_c)], axis=-1)
+        slope_c = 0.5 * cosine / (root * root * root)
+        out = np.empty((*sine.shape, 2))
+        out[..., 0] = 2.0 * beta * slope
+        out[..., 1] = (2.0 * k) * (sine / (c * root) * slope + beta * slope_c)
+        return out, slope
 
     def at(self, phi: float, alpha: Sequence[float]) -> tuple[float, float]:
         """Both from one evaluation of the arcsine."""
@@ -339,7 +365,7 @@ def _exponent(b: float, phi: FloatArray) -> FloatArray:
 
 
 def _split(alpha: ArrayLike) -> tuple[float, float]:
-    k, shape = np.asarray(alpha, dtype=np.float64)
+    k, shape = alpha if isinstance(alpha, tuple) else np.asarray(alpha, dtype=np.float64)
     return float(k), float(shape)
 
 

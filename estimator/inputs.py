@@ -119,8 +119,11 @@ class InputGuard:
         if periods > self._longest:
             return self._after_gap(sample.sequence, places, periods)
         self._samples += 1
-        if not self._samples % _REVIEW:
-            self._review()
+        turn = self._samples % _REVIEW
+        if turn == 0:
+            self._review_positions()
+        elif turn == 1:
+            self._review_torques()
         was_frozen = self._frozen
         frozen = self._stands_still((*places, *torques))
         if self._jumped(places, periods):
@@ -154,7 +157,8 @@ class InputGuard:
         self._frozen = False
         self._seen = self._rejected = 0
         self._astray = [False] * len(places)
-        self._review()
+        self._review_torques()
+        self._review_positions()
         return Accepted(1, True, status, False, jumps)
 
     def _is_wild(self, torques: tuple[float, ...]) -> bool:
@@ -176,13 +180,16 @@ class InputGuard:
         self._wild = 0
         return False
 
-    def _review(self) -> None:
+    def _review_torques(self) -> None:
         """What has been seen fades, and with it what is too much."""
         self._torque *= self._fade
         self._largest = [self._fade_torque * size for size in self._largest]
         self._surprising = [
             max(tame, _WILD * size) for tame, size in zip(self._tame, self._largest, strict=True)
         ]
+
+    def _review_positions(self) -> None:
+        """So do the bends of positions."""
         self._peaks = [self._fade * peak for peak in self._peaks]
         floor = max(_FLOOR_RAD, self._gain * self._torque)
         self._limits = [

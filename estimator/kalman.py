@@ -32,6 +32,9 @@ class ColouredKalman:
         std: its standard deviations, (n,): no more uncertainty than this is ever assumed.
         noise: standard deviation of e assumed at the start.
         forgetting: growth of P from one update to the next, at least 1.
+
+    Attributes:
+        caution: how much larger a variance is than Sigma has it, as few independent errors have told it.
     """
 
     def __init__(self, mean: FloatArray, std: FloatArray, noise: float, forgetting: float) -> None:
@@ -54,6 +57,7 @@ class ColouredKalman:
         self._count = 0
         self._pending: tuple[FloatArray, FloatArray, float] | None = None
         self._prepared: tuple[FloatArray, FloatArray] | None = None
+        self.caution = self._caution()
 
     def innovation(self, h: FloatArray, y: float) -> float:
         """What y is beyond h x."""
@@ -88,8 +92,7 @@ class ColouredKalman:
         most = _OUTLIER * math.sqrt(self.noise)
         return min(max(e, -most), most)
 
-    @property
-    def caution(self) -> float:
+    def _caution(self) -> float:
         """How much larger a variance is that few independent errors tell: that of a t distribution."""
         shape = self._r * (self._taper / max(self.noise, 1e-300))
         seen = min(self._count, 2.0 / max(self._growth - 1.0, 1e-9))
@@ -131,6 +134,7 @@ class ColouredKalman:
         change[:n] = cross
         np.negative(seen[n:], out=change[n:])
         self._prepared = gain, cross
+        self.caution = self._caution()
 
     def account(self) -> None:
         """Carry Sigma over the last equation.
@@ -156,29 +160,32 @@ class ColouredKalman:
     @property
     def finite(self) -> bool:
         """Whether parameters and covariances still are numbers."""
-        return math.isfinite(float(np.sum(self.x)) + float(np.sum(self.P)) + float(np.sum(self.Sigma)))
+        return math.isfinite(float(self.x.sum() + self.P.sum() + self.Sigma.sum()))
 
     def keep_regular(self) -> None:
-        """Symmetry, and no direction with a negative variance."""
-        self.account()
-        self.P, self._Ph = 0.5 * (self.P + self.P.T), None
-        exact = np.diag(np.where(np.diag(self.P) == 0.0, 1.0, 0.0))  # what is known exactly is no direction
+        """P symmetric, as rounding leaves it only nearly, and no direction with a negative variance."""
+        self.P = P = 0.5 * (self.P + self.P.T)
+        self._Ph = None
+        diagonal = P.diagonal()
+        if not diagonal.all():  # what is known exactly is no direction
+            P = P + np.diag(np.where(diagonal == 0.0, 1.0, 0.0))
         try:
-            np.linalg.cholesky(self.P + exact)
+            np.linalg.cholesky(P)
         except np.linalg.LinAlgError:
             self.repair()
 
     def keep_bounded(self) -> None:
         """No parameter more uncertain than before any data (against wind-up), none much surer than P says."""
         self.account()
-        diagonal = np.diag(self.P)
-        if np.any(diagonal > self.ceiling):
-            shrink = np.sqrt(np.minimum(1.0, self.ceiling / np.maximum(diagonal, 1e-300)))
-            self.P *= np.outer(shrink, shrink)
+        diagonal = self.P.diagonal()
+        wound_up = diagonal > self.ceiling
+        if wound_up.any():
+            shrink = np.sqrt(np.divide(self.ceiling, diagonal, out=np.ones(self._n), where=wound_up))
+            self.P *= shrink[:, None] * shrink
             self._Ph = None
-        variance = np.diag(self.Sigma)
-        low = 1e-4 * np.diag(self.P)
-        if np.any(variance < low):
+        variance = self.Sigma.diagonal()
+        low = 1e-4 * self.P.diagonal()
+        if (variance < low).any():
             np.fill_diagonal(self.Sigma, np.maximum(variance, low))
 
     def inflate(self, extra: FloatArray) -> None:

@@ -113,7 +113,8 @@ class Learner:
     def _share_out(self) -> list[list[Callable[[], None]]]:
         """The parts of the work on one block, over the ticks of the next one."""
         motors = range(len(self.tracks))
-        parts: list[Callable[[], None]] = [self._collect, self._measure_noise]  # of about equal weight
+        # Of about equal weight: the heaviest one makes the slowest tick.
+        parts: list[Callable[[], None]] = [self._collect, self._measure_noise]
         parts += [partial(self._widen, i) for i in motors]
         parts += [self._pass_light]
         if self._effects.active:
@@ -210,11 +211,11 @@ class Learner:
             past[: -len(phi)] = past[len(phi) :]
             past[-len(phi) :] = phi
             self._known += len(phi)
+        if self._flexible and self._usable:
+            self._search.see(samples[:, self._lead])
 
     def _measure_noise(self) -> None:
         self._noise.see(self._samples[:, : self._torques])
-        if self._flexible and self._usable:
-            self._search.see(self._samples[:, self._lead])
 
     def _widen(self, i: int) -> None:
         """The channels that a track's basis wants."""

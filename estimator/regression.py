@@ -252,6 +252,16 @@ class Regression:
         new.repair()
         self.filter = new
 
+    def shape_moved(self, share: float) -> bool:
+        """Whether a shape parameter is more than `share` standard deviations from where f is linearised."""
+        assert self.filter is not None and self.alpha0 is not None
+        values, Sigma = self.values(), self.filter.Sigma
+        for i in range(1, self.size):
+            std = float(self._units[i]) * math.sqrt(self.filter.caution * max(float(Sigma[i, i]), 0.0))
+            if abs(values[i] - float(self.alpha0[i])) > max(share * std, 1e-5 * abs(values[i])):
+                return True
+        return False
+
     def relinearise(self, alpha: FloatArray) -> None:
         """Linearise the nonlinear model at alpha from now on.
 
@@ -341,7 +351,7 @@ class Regression:
         n = self.size
         x, ceiling = self.filter.x[n:], self.filter.ceiling[n:]
         strained = x * x > _RELAX**2 * ceiling
-        if np.any(strained & (ceiling > 0)):
+        if (strained & (ceiling > 0)).any():
             extra = np.zeros(self.filter.x.size)
             extra[n:] = np.where(strained, 4.0 * ceiling, 0.0)
             self.filter.inflate(np.diag(extra))

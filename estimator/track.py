@@ -30,7 +30,7 @@ _FOLLOW_S = 0.6  # after an alarm, in which the change is still being followed
 _STEP = 0.3  # how much a stiffness may change at an alarm, relative
 _SETTLED_S = 1.0  # of updates, before there is an alarm or an invalid curve
 _ORDER_S = 5.0  # of updates between looks at the polynomial's highest powers
-_REGULAR_S = 0.5  # of updates between two looks at the covariance
+_OFTEN_S = 0.5  # of updates between two looks at what rounding has done, and at the priors
 _DUE_S = 0.1  # of updates between two looks at a nonlinear model's linearisation
 _ORDER_SIGMA = 3.0
 _MOVED = 0.65  # standard deviations that a nonlinear model's shape moves before it is linearised anew
@@ -72,7 +72,7 @@ class Track:
         self._motor, self._T, self._dt = motor, period_s, dt_s
         self._settled, self._order, self._delay, self._astray, self._few, self._often, self._soon = (
             max(1, round(duration / dt_s))
-            for duration in (_SETTLED_S, _ORDER_S, _DELAY_S, _ASTRAY_S, _FIRST_S, _REGULAR_S, _DUE_S)
+            for duration in (_SETTLED_S, _ORDER_S, _DELAY_S, _ASTRAY_S, _FIRST_S, _OFTEN_S, _DUE_S)
         )
         self._black_box = settings.method == "bbe" or target is None
         self._target = None if self._black_box else target
@@ -188,8 +188,7 @@ class Track:
             out[:, -1] = square
         else:
             alpha = (1.0, *self.shape)
-            out[:, : len(alpha)] = self._basis.jacobian(phi, alpha)
-            out[:, -1] = self._basis.stiffness(phi, alpha)
+            out[:, : len(alpha)], out[:, -1] = self._basis.tangent(phi, alpha)
         return out
 
     # -- one update --------------------------------------------------------------------------------
@@ -260,27 +259,26 @@ class Track:
         self._updates += 1
 
     def prepare(self) -> None:
-        """Fourth part: what the last equation does to the covariance."""
+        """Fourth part: what the last equation does to the covariance that is published."""
         if self.regression.filter is not None:
             self.regression.filter.prepare()
 
     def account(self) -> None:
-        """Fifth part: the covariance, and what is decided now and then."""
+        """Fifth part: that covariance, and what is decided now and then."""
         kalman = self.regression.filter
         if kalman is None:
             return
         kalman.account()
+        if not kalman.finite:
+            self._impossible = self._astray + 1
+            return
+        kalman.keep_bounded()
         self._impossible = self._impossible + 1 if self._is_impossible() else 0
         self._accounts += 1
         turn = self._accounts % self._often
         if turn == 0:
-            if not kalman.finite:
-                self._impossible = self._astray + 1
-                return
             kalman.keep_regular()
         elif turn == 1:
-            kalman.keep_bounded()
-        elif turn == 2:
             self.regression.relax()
         elif self._choose_order and self._updates >= self._order_at:
             self._order_at = self._updates + self._order
@@ -425,18 +423,13 @@ class Track:
             self._basis = target
             regression.adopt(*adopted, target)
         else:
-            alpha = regression.alpha
-            std = np.sqrt(np.maximum(np.diag(regression.covariance), 0.0))
-            assert regression.alpha0 is not None
-            moved = np.abs(alpha[1:] - regression.alpha0[1:])
-            if not np.any(moved > np.maximum(_MOVED * std[1:], 1e-5 * np.abs(alpha[1:]))):
+            if not regression.shape_moved(_MOVED):
                 return
-            regression.relinearise(alpha)
+            regression.relinearise(regression.alpha)
         assert regression.alpha0 is not None
         self.shape = tuple(regression.alpha0[1:].tolist())
-        columns = target.jacobian(phi_past, (1.0, *self.shape))
+        columns, slope = target.tangent(phi_past, (1.0, *self.shape))
         bank.replace(first, columns, responses)
-        slope = target.stiffness(phi_past, (1.0, *self.shape))
         bank.replace(first + self._slots, slope[:, None], responses)
         self._publishable()
 

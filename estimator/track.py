@@ -134,7 +134,8 @@ class Track:
         self._missing = self._strange = 0
         self._contradicted = False  # whether the data want another motor than the declared one
         self._reach = 0.0
-        self._window: deque[float] = deque(maxlen=_ALARM_UPDATES)
+        # Of the last innovations: their squares, and what variance was foreseen for them besides the noise.
+        self._window: deque[tuple[float, float]] = deque(maxlen=_ALARM_UPDATES)
         self._recent = 0.0
         self._flush = 0.0
         self._follow = 0.0
@@ -338,12 +339,13 @@ class Track:
                 self.regression.open_up(_STEP)
                 self._window.clear()
             return
-        self._window.append(innovation * innovation)
+        self._window.append((innovation * innovation, spread))
         if self._updates < self._settled or len(self._window) < _ALARM_UPDATES:
             self.changed = False
             return
-        mean = sum(self._window) / _ALARM_UPDATES
-        if mean > _ALARM_SIGMA**2 * (noise + spread) + _ALARM_SHARE**2:
+        mean = sum(square for square, _ in self._window) / _ALARM_UPDATES
+        foreseen = noise + sum(variance for _, variance in self._window) / _ALARM_UPDATES
+        if mean > _ALARM_SIGMA**2 * foreseen + _ALARM_SHARE**2:
             self._flush = _FLUSH_DELAYS * late_s if self._follow <= 0.0 else 0.5 * late_s
             self._follow = _FOLLOW_S
         self.changed = self._follow > 0.0

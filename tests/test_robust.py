@@ -126,6 +126,27 @@ def test_a_stiffness_step_is_announced_and_followed_within_half_a_second(changin
         assert np.median(error) < 0.02
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_first_reversal_of_a_motion_is_no_change(seed):
+    """Coulomb friction is not told before it, so one large innovation is foreseen there; three are not."""
+    rng = np.random.default_rng(seed)
+    N, n, reversal = 4, 4000, 3000
+    K = rng.uniform(80, 220, (N, 1))
+    torque, stiffness = joints.polynomial(np.stack([K, 5 * K], axis=-1))
+    B, D = rng.uniform(0.08, 0.2, (N, 1)), rng.uniform(0.8, 1.2, (N, 1))
+    plants = joints.Plants(torque, stiffness, B, D, np.full(N, 0.45), np.full(N, 0.3), np.zeros(N))
+    tau = joints.sweep(rng, n, N, 1, T, np.full((1, N, 1), 3.0), 3.0)
+    tau += np.where(np.arange(n) < reversal, 10.0, -10.0)[:, None, None]
+    truth = joints.simulate(plants, tau, T)
+    assert np.all(truth.omega[600:reversal] > 0) and np.all(truth.omega[-1] < 0)
+    for j in range(N):
+        noise = np.random.default_rng(j).normal(0, 0.02, tau[:, j].shape)
+        how = {"motor_counts": 8192, "link_bits": 16, "velocity_rad_s": None, "torque_noise": noise}
+        estimator = make_estimator(joints.joint_model(B[j, 0], D[j, 0]), EstimatorSettings(), T)
+        samples = joints.record(truth, j, T, **how).samples()
+        assert not any(estimator.step(sample).status & Status.CHANGED for sample in samples)
+
+
 def test_standstill_moves_nothing_and_is_not_called_observable(changing):
     for j in range(3):
         out, estimator = changing.run(j)

@@ -12,13 +12,14 @@ __all__ = ["polynomial_to_model"]
 
 _POINTS = 24
 _ENOUGH = 0.1  # relative std of the cubic coefficient from which on the shape is told
-_CAUTION = 4.0  # by which the covariance is widened: the polynomial is not the model
 
 
 def polynomial_to_model(
     model: TransmissionModel, coefficients: FloatArray, covariance: FloatArray, reach_rad: float
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Alpha and its covariance for a model k g(phi, shape) with one shape parameter, or None if too early.
+    """Alpha of a model k g(phi, shape) with one shape parameter, and its slopes by the coefficients, (2, p).
+
+    None if it is too early.
 
     The shape is searched on a line, k follows linearly (variable projection), over |phi| <= reach_rad.
 
@@ -53,4 +54,4 @@ def polynomial_to_model(
     if alpha[0] <= 0.0:
         return None
     to_alpha = np.linalg.pinv(model.jacobian(phi, alpha)) @ Polynomial().jacobian(phi, coefficients)
-    return alpha, _CAUTION * to_alpha @ covariance @ to_alpha.T
+    return alpha, to_alpha

@@ -196,6 +196,24 @@ class ColouredKalman:
         self.Sigma += extra
         self.ceiling = np.maximum(self.ceiling, np.diag(self.P))
 
+    def transformed(self, mean: FloatArray, std: FloatArray, change: FloatArray) -> ColouredKalman:
+        """What goes on with other parameters, under the same noise.
+
+        Args:
+            mean: the new parameters, (m,).
+            std: see the class, (m,).
+            change: their slopes by the old ones, (m, n).
+        """
+        self.account()
+        new = ColouredKalman(mean, std, math.sqrt(self._assumed), self._growth)
+        new.noise, new._count, new.caution = self.noise, self._count, self.caution
+        new._r[:], new._past[:] = self._r, self._past
+        new.P = change @ self.P @ change.T
+        new.ceiling = np.maximum(new.ceiling, new.P.diagonal())
+        new.Sigma[:] = change @ self.Sigma @ change.T
+        new._gains[:] = self._gains @ change.T
+        return new
+
     def rescale(self, ratio: FloatArray) -> None:
         """Parameters in new units: x becomes ratio * x, exactly."""
         self.account()

@@ -38,7 +38,11 @@ _DELAY_PERIODS = 1.0
 _SHIFT_SHARE = 0.003  # of the largest deflection, besides what the encoders' resolution leaves open
 _REOPENED_SHARE = 0.1  # std of a deflection's offset after an encoder has moved its zero
 _RELAX = 2.5  # a nuisance this many prior std off: the prior was too narrow
-_FORESEEN = 0.4  # standard deviations that a nonlinear model's shape may go between two linearisations
+_POINTS = 16  # deflections that a nonlinear model is linearised anew over
+_LOOKED_AT = (0.4, 0.9)  # of the largest deflection: where a curve is held against its tangent
+_RIDGE = 1e-12  # relative, in the normal equations of that
+_STEPS = 3  # … and Gauss-Newton steps for that
+_HANDED_OVER = 4.0  # by which the covariance of a model's parameters is widened that a polynomial has told
 _LEAST_VARIANCE = 0.02
 _NOISE_SHARE = 0.01  # noise assumed at the start, as a share of the torque
 
@@ -99,7 +103,8 @@ class Regression:
         self._black_box = black_box
         self._polynomial = isinstance(model, Polynomial)
         self._cut_off = cut_off
-        self.alpha0 = alpha  # where a nonlinear model is linearised
+        self.alpha0 = alpha  # where a nonlinear model is linearised …
+        self._tangent: tuple[list[float], FloatArray, FloatArray] = ([], np.zeros(0), np.zeros((0, size)))
         self.filter: ColouredKalman | None = None
         self.torque_unit = self.deflection_unit = self.rate_unit = 0.0
         self._peaks = (0.0, 0.0, 0.0)
@@ -174,6 +179,7 @@ class Regression:
         grown = np.maximum(0.0, self._nuisance_std() ** 2 - (old_std * ratio[n:]) ** 2)
         self.filter.inflate(np.diag(np.concatenate([np.zeros(n), grown])))
         self._restrain_cut_off()
+        self._look_there()
 
     def _restrain_cut_off(self) -> None:
         """Its prior, which was a share of the torque at the deflection reached then, is one of now."""
@@ -231,63 +237,98 @@ class Regression:
             std[n - 1] = _CUT_OFF_SHARE
         std[n:] = self._nuisance_std()
         self.filter = ColouredKalman(mean, std, _NOISE_SHARE, self._forgetting)
+        self._look_there()
 
-    def adopt(self, alpha: FloatArray, covariance: FloatArray, model: TransmissionModel) -> None:
-        """Go on with another model, its parameters and their covariance known from the last one."""
+    def adopt(self, alpha: FloatArray, slopes: FloatArray, model: TransmissionModel) -> None:
+        """Go on with another model: its parameters, and their slopes by those of the last one."""
         assert self.filter is not None
-        old = self.filter
-        n_old, n = self.size, alpha.size
+        n_old, n, old_units = self.size, alpha.size, self._units
         self._model, self.size, self._polynomial = model, n, isinstance(model, Polynomial)
-        self.alpha0 = alpha
+        self.alpha0 = alpha  # the units follow it
         self._known = None
         self._use(self._make_units(), self.torque_unit)
-        mean = np.concatenate([alpha / self._units[:n], old.x[n_old:]])
-        std = np.sqrt(np.concatenate([np.full(n, 1.0), old.ceiling[n_old:]]))
-        new = ColouredKalman(mean, std, math.sqrt(old.noise), self._forgetting)
-        scaled = covariance / np.outer(self._units[:n], self._units[:n])
-        old.account()
-        for target, source in ((new.P, old.P), (new.Sigma, old.Sigma)):
-            target[:n, :n] = scaled
-            target[n:, n:] = source[n_old:, n_old:]
-        new.repair()
-        self.filter = new
+        ceiling = np.concatenate([np.full(n, 1.0), self.filter.ceiling[n_old:]])
+        self._transform(alpha, slopes * old_units[:n_old] / self._units[:n, None], ceiling)
+        self._look_there()
+        open_part = np.zeros_like(self.filter.P)
+        open_part[:n, :n] = (_HANDED_OVER - 1.0) * self.filter.Sigma[:n, :n]
+        self.filter.inflate(open_part)
 
-    def shape_moved(self, share: float) -> bool:
-        """Whether a shape parameter is more than `share` standard deviations from where f is linearised."""
-        assert self.filter is not None and self.alpha0 is not None
-        values, Sigma = self.values(), self.filter.Sigma
-        for i in range(1, self.size):
-            std = float(self._units[i]) * math.sqrt(self.filter.caution * max(float(Sigma[i, i]), 0.0))
-            if abs(values[i] - float(self.alpha0[i])) > max(share * std, 1e-5 * abs(values[i])):
-                return True
-        return False
+    def _transform(self, alpha: FloatArray, slopes: FloatArray, ceiling: FloatArray) -> None:
+        """The filter's first parameters become alpha, of these (scaled) slopes by the old ones."""
+        assert self.filter is not None
+        n, n_old = slopes.shape
+        nuisances = self.filter.x[n_old:]
+        change = np.zeros((n + len(NUISANCES), n_old + len(NUISANCES)))
+        change[:n, :n_old] = slopes
+        change[n:, n_old:] = np.eye(len(NUISANCES))
+        mean = np.concatenate([alpha / self._units[:n], nuisances])
+        self.filter = self.filter.transformed(mean, np.sqrt(ceiling), change)
 
-    def relinearise(self, alpha: FloatArray) -> None:
-        """Linearise the nonlinear model at alpha from now on.
-
-        What was learned before was learned with other derivatives. Where alpha has gone farther since than
-        its standard deviation foresaw, it is less certain along that way.
-        """
+    def off_tangent(self, share: float) -> bool:
+        """Whether the model's curve has left its tangent by more than `share` of the curve's uncertainty."""
         assert self.filter is not None and self.alpha0 is not None
         n = self.size
-        moved = np.zeros(self._units.size)
-        moved[:n] = (alpha - self.alpha0) / self._units[:n]
-        foreseen = float(np.max(moved[1:n] ** 2 / np.maximum(np.diag(self.filter.Sigma)[1:n], 1e-300)))
-        if foreseen > _FORESEEN**2:
-            self.filter.inflate(np.outer(moved, moved))
+        alpha = self.values()[:n]
+        phis, torques, slopes = self._tangent
+        on_tangent = (torques + slopes @ (alpha - self.alpha0)).tolist()
+        rows = slopes * self._units[:n]
+        variances = self.filter.caution * ((rows @ self.filter.Sigma[:n, :n]) * rows).sum(axis=1)
+        return any(
+            (self._model.at(phi, alpha)[0] - torque) ** 2 > share * share * variance
+            for phi, torque, variance in zip(phis, on_tangent, variances.tolist(), strict=True)
+        )
+
+    def _look_there(self) -> None:
+        """Deflections, torques and slopes of the tangent at alpha0, for `off_tangent`."""
+        if self._polynomial or self.alpha0 is None:
+            return
+        phis = [part * self.deflection_unit for part in _LOOKED_AT]
+        self._tangent = phis, self._model.torque(phis, self.alpha0), self._model.jacobian(phis, self.alpha0)
+
+    def relinearise(self) -> None:
+        """Linearise the nonlinear model anew, where the parameters are now.
+
+        What has been learned is the curve, as far as the tangent at the old parameters goes. It is held: the
+        new parameters are those of the curve nearest to it, and their covariance is that of the curve.
+        Holding the parameters' covariance instead would make sure of what no data have told: the tangent
+        turns, so along the direction in which parameters compensate each other, old and new seem to cross.
+        """
+        assert self.filter is not None and self.alpha0 is not None
+        n, old, model = self.size, self.alpha0, self._model
+        units = self._units[:n]
+        phi = np.linspace(0.0, self.deflection_unit, _POINTS + 1)[1:]
+        tangent = model.jacobian(phi, old) * units
+        alpha = self.alpha
+        curve = model.torque(phi, old) + tangent @ ((alpha - old) / units)
+        for _ in range(_STEPS):
+            slopes = model.jacobian(phi, alpha) * units
+            normal = slopes.T @ slopes
+            normal += _RIDGE * np.trace(normal) * np.eye(n)  # what the curve does not tell stays as it is
+            step = np.linalg.solve(normal, slopes.T @ (curve - model.torque(phi, alpha)))
+            alpha = self._bounded(alpha + units * step)
+        change = np.eye(n) + np.linalg.solve(normal, slopes.T @ (tangent - slopes))
+        self._transform(alpha, change, self.filter.ceiling)
         self.alpha0 = alpha
+        self._look_there()
+
+    def _bounded(self, alpha: FloatArray) -> FloatArray:
+        """Alpha with shape parameters that can be."""
+        for i, (low, high) in enumerate(self._model.shape_bounds, start=1):
+            alpha[i] = min(max(alpha[i], low * (1 + 1e-6)), high)
+        return alpha
 
     def equation(self, signals: Signals) -> Equation:
         """The scaled equation of this update."""
         k, n = self._first, self.size
-        alpha = self.values()
+        self.values()
         row = list(signals.basis[k][:n])
         y = self.balance(signals)
         if not self._polynomial:
             # f ~ k g + k0 (c - c0) dg/dc: y is referred to the point of linearisation.
             assert self.alpha0 is not None
             for i in range(1, n):
-                row[i] *= alpha[0]
+                row[i] *= float(self.alpha0[0])
                 y += row[i] * float(self.alpha0[i])
         late = 0.0
         if not self._black_box:

@@ -33,7 +33,7 @@ _ORDER_S = 5.0  # of updates between looks at the polynomial's highest powers
 _OFTEN_S = 0.5  # of updates between two looks at what rounding has done, and at the priors
 _DUE_S = 0.1  # of updates between two looks at a nonlinear model's linearisation
 _ORDER_SIGMA = 3.0
-_MOVED = 0.65  # standard deviations that a nonlinear model's shape moves before it is linearised anew
+_OFF_TANGENT = 0.3  # standard deviations that a nonlinear model's curve leaves its tangent by, at most
 _DELAY_S = 0.5  # of updates between two alignments of late channels
 _DELAY_PERIODS = 0.05  # no smaller delay is worth one
 _VALID = 0.25  # relative standard deviation of the stiffness up to which it is of use
@@ -425,9 +425,9 @@ class Track:
             self._basis = target
             regression.adopt(*adopted, target)
         else:
-            if not regression.shape_moved(_MOVED):
+            if not regression.off_tangent(_OFF_TANGENT):
                 return
-            regression.relinearise(regression.alpha)
+            regression.relinearise()
         assert regression.alpha0 is not None
         self.shape = tuple(regression.alpha0[1:].tolist())
         columns, slope = target.tangent(phi_past, (1.0, *self.shape))

@@ -278,6 +278,36 @@ def test_vsa_ii_is_found_from_nothing_on_both_sides():
     assert out[late, 3] == pytest.approx(truth.sigma[late, 0].sum(1), rel=0.02)
 
 
+def test_what_a_nonlinear_model_is_declared_with_does_not_matter_after_some_seconds():
+    """Right, or k 20 % too small and c too large: the same curve is found, and its interval holds."""
+    rng = np.random.default_rng(5)
+    N, n = 4, 12_000
+    k, c = rng.uniform(300, 700, (N, 1)), rng.uniform(1.5, 1.9, (N, 1))
+    torque, stiffness = joints.vsa_ii(k, c)
+    B, D = rng.uniform(0.08, 0.2, (N, 1)), rng.uniform(0.4, 1.2, (N, 1))
+    plants = joints.Plants(torque, stiffness, B, D, np.full(N, 0.45), np.full(N, 0.3), np.full(N, 3.0))
+    truth = joints.simulate(plants, joints.sweep(rng, n, N, 1, T, np.full((1, N, 1), 8.0), 3.0), T)
+    late = slice(8000, None)
+    inside = []
+    for j in range(N):
+        noise = rng.normal(0, 0.04, (n, 1))
+        record = joints.record(
+            truth, j, T, motor_counts=8192, link_bits=17, velocity_rad_s=None, torque_noise=noise
+        )
+        found = []
+        for k_off, c_off in ((1.0, 1.0), (0.8, 1.2)):
+            declared = {"k_nm_rad": k_off * k[j, 0], "c": 1.0 + c_off * (c[j, 0] - 1.0)}
+            model = joints.joint_model(B[j, 0], D[j, 0], model="vsa-ii", order=None, parameters=declared)
+            estimator = make_estimator(model, EstimatorSettings(), T)
+            out = np.array([estimator.step(sample)[:5] for sample in record.samples()])[late]
+            found.append(out[:, 3])
+            inside.append(np.mean(np.abs(out[:, 3] - truth.sigma[late, j, 0]) < 1.96 * out[:, 4]))
+            error = out[:, 3] / truth.sigma[late, j, 0] - 1
+            assert np.sqrt(np.mean(error**2)) < 2e-3
+        assert found[1] == pytest.approx(found[0], rel=1e-3)
+    assert np.mean(inside) > 0.85  # eight draws of what is slow to change
+
+
 def test_serial_takes_the_first_transmission_and_asks_for_a_rigid_second():
     flexible = Motor(
         inertia_kg_m2=0.1, transmission=Transmission(model="linear", parameters={"k_nm_rad": 50.0})

@@ -21,6 +21,7 @@ from estimator.sample import FloatArray
 __all__ = ["Exponential", "Function", "Linear", "Polynomial", "TransmissionModel", "VsaII"]
 
 _STEP = 6.0e-6  # relative step of central differences, about eps**(1/3)
+_STEEPEST = 50.0  # largest exponent of an exponential spring
 _EDGE = 1.0 - 1e-9  # how near to its end the arcsine of the VSA-II is taken
 
 
@@ -92,6 +93,16 @@ class TransmissionModel(ABC):
     def reach(self, shape: Sequence[float] = ()) -> float:
         """Largest |phi| for which the model is defined, rad."""
         return math.inf
+
+    def shapes(self, reach_rad: float, points: int) -> FloatArray:
+        """Values of a single shape parameter that a search begins with, at most so many; each reaches |phi|.
+
+        Geometrically from the lower bound: from a thousandth of what the usual start is above it.
+        """
+        (low, high), (start,) = self.shape_bounds[0], self.shape_start
+        least = 1e-3 * (start - low if start > low else high - low)
+        values = low + np.geomspace(least, high - low, points)
+        return values[[self.reach((value,)) > reach_rad for value in values.tolist()]]
 
     @abstractmethod
     def parameters(self, alpha: ArrayLike) -> dict[str, ParameterValue]:
@@ -306,6 +317,10 @@ class Exponential(_Shaped):
         """Its derivative (eq 18)."""
         k, b = _split(alpha)
         return np.asarray(k * np.exp(_exponent(b, np.asarray(phi, dtype=np.float64))))
+
+    def reach(self, shape: Sequence[float] = ()) -> float:
+        """Beyond this the torque is no spring's, and soon no number."""
+        return _STEEPEST / shape[0] if shape and shape[0] > 0.0 else math.inf
 
     def jacobian(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
         """Its Jacobian (eq 25)."""

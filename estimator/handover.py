@@ -11,6 +11,7 @@ from estimator.sample import FloatArray
 __all__ = ["polynomial_to_model"]
 
 _POINTS = 24
+_GRID = 60
 _ENOUGH = 0.1  # relative std of the cubic coefficient from which on the shape is told
 
 
@@ -42,9 +43,7 @@ def polynomial_to_model(
         k = float(g @ curve / (g @ g)) if np.any(g) else 0.0
         return float(np.sum((k * g - curve) ** 2)), k
 
-    low, high = model.shape_bounds[0]
-    grid = low + np.geomspace(1e-4, 1.0, 60) * (high - low)
-    grid = grid[[model.reach((c,)) > 1.02 * reach_rad for c in grid]]
+    grid = model.shapes(1.02 * reach_rad, _GRID)
     if grid.size < 3:
         return None
     best = int(np.argmin([project(c)[0] for c in grid]))

@@ -15,7 +15,7 @@ from estimator.sample import FloatArray
 
 __all__ = ["ArrayFit", "fit_alpha", "fit_polynomial", "fit_projected", "solve"]
 
-_GRID = 24  # starts of the one-dimensional search over a shape parameter
+_GRID = 30  # starts of the one-dimensional search over a shape parameter
 _FOLDS = 10
 _HIGHEST_ORDER = 9
 _NEGLIGIBLE = 1e-4  # an error of this share of the torque needs no further order
@@ -245,9 +245,7 @@ def search_shape(
             options={"xatol": 1e-8, "fatol": 0.0, "maxfev": 400},
         )
         return tuple(result.x.tolist())
-    low_1, high_1 = model.shape_bounds[0]
-    grid = low_1 + np.geomspace(1e-4, 1.0, _GRID) * (high_1 - low_1)
-    grid = grid[[model.reach((c,)) > 1.001 * reach_rad for c in grid]]
+    grid = model.shapes(1.001 * reach_rad, _GRID)
     if grid.size == 0:
         raise EstimatorError(
             f"{model.name}: no {model.shape_names[0]} reaches deflections of {reach_rad:g} rad"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drivelink.cli import main
-from estimator import EstimatorError, Record, fit
+from estimator import EstimatorError, EstimatorSettings, Record, Status, fit, make_estimator
 from estimator.transmissions import MODELS
 
 T = 1e-3
@@ -75,6 +75,28 @@ def test_intervals_cover_about_as_often_as_they_say(elbow):
         z += ((found.alpha - alpha[j]) / np.sqrt(np.diag(found.covariance))).tolist()
     # 24 numbers of unit variance: their rms is 1 within 0.15 (one sigma); naive intervals give 3 to 5.
     assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.6
+
+
+@pytest.mark.parametrize("b", [2.0, 8.0, 40.0])
+def test_an_exponential_spring_is_found_from_nothing_in_batch_and_on_line(b):
+    rng = np.random.default_rng(1)
+    n = 6000
+    plants = joints.Plants(
+        lambda phi: np.sign(phi) * 150.0 / b * np.expm1(b * np.abs(phi)),
+        lambda phi: 150.0 * np.exp(b * np.abs(phi)),
+        *(np.array([[value]]) for value in (0.1, 0.5)),
+        *(np.array([value]) for value in (0.45, 0.3, 5.0)),
+    )
+    truth = joints.simulate(plants, joints.sweep(rng, n, 1, 1, T, np.full((1, 1, 1), 6.0), 3.0), T)
+    record = _record(truth, 0)
+    model = joints.joint_model(0.1, 0.5, model="exponential", order=None)
+    (found,) = fit(record, model)
+    assert found.parameters["k_nm_rad"] == pytest.approx(150.0, rel=3e-3)
+    assert found.parameters["b_per_rad"] == pytest.approx(b, rel=2e-2)
+    estimator = make_estimator(model, EstimatorSettings(), T)
+    out = np.array([estimator.step(sample)[:5] for sample in record.samples()])[4000:]
+    assert not np.any(out[:, 1].astype(int) & Status.CHANGED)
+    assert np.sqrt(np.mean((out[:, 3] / truth.sigma[4000:, 0, 0] - 1) ** 2)) < 0.01
 
 
 def test_gaps_and_missing_values_are_bridged_or_left_out(elbow):

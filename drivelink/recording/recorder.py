@@ -20,6 +20,7 @@ import zenoh.ext
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.acquisition import SYNC_COB_ID, Assembler
+from drivelink.cycle.chain import make_assembler
 from drivelink.cycle.framesource import BusLostError, open_source
 from drivelink.errors import BusError, DriveError, ZenohError
 from drivelink.jointfile import JointFile
@@ -160,6 +161,7 @@ class BusTap:
         self._joint = joint
         self._listener = PassiveConfigurator([joint], [base_dir]) if base_dir is not None else None
         self._assembler: Assembler | None = None
+        self._lacking = ""  # what the mapping lacks, where it is known
         self._numbering = SyncNumbering(joint.bus.period_s)
         self._stamp_ns = 0
         self.frames = 0
@@ -172,7 +174,7 @@ class BusTap:
     @property
     def missing(self) -> str:
         """Why no samples can be made."""
-        return str(next(iter(self._listener.missing.values()), "")) if self._listener else ""
+        return str(next(iter(self._listener.missing.values()), "")) if self._listener else self._lacking
 
     def poll(self) -> None:
         """Take everything that has come.
@@ -210,9 +212,11 @@ class BusTap:
         if self._assembler is None:
             if listener.busy:
                 return
-            self._assembler = Assembler(
-                tuple(listener.layouts.values()), len(self._joint.motor), active=self._joint.bus.configure
-            )
+            try:
+                self._assembler = make_assembler(self._joint, tuple(listener.layouts.values()))
+            except DriveError as error:  # the frames are recorded all the same
+                self._lacking, self._listener = str(error), None
+                return
         before_ns = self._stamp_ns
         if cob_id == SYNC_COB_ID and jump:
             self._stamp_ns = stamp_ns

@@ -42,8 +42,8 @@ def register(
         phi_max_rad: up to where oddness and derivative are checked.
 
     Raises:
-        EstimatorError: the name is taken, the functions do not take these arguments, g is not odd, or
-            stiffness is not its derivative (against central differences).
+        EstimatorError: the name is taken, the functions do not take these arguments, a start is out of
+            bounds, g is not odd, or stiffness is not its derivative (against central differences).
     """
     shape = {} if shape is None else shape
     if name in MODELS or name in (RIGID, UNKNOWN):
@@ -55,6 +55,12 @@ def register(
             raise EstimatorError(
                 f'transmission "{name}": {role}: expected the arguments phi, {", ".join(shape)}'
             ) from error
+    for parameter, (start, low, high) in shape.items():
+        if not low <= start <= high:
+            raise EstimatorError(
+                f'transmission "{name}": {parameter}: expected (start, low, high) with low <= start <= high, '
+                f"got ({start:g}, {low:g}, {high:g})"
+            )
     model = Function(name, torque, stiffness, shape)
     phi = np.linspace(-phi_max_rad, phi_max_rad, 41)
     alpha = np.array([1.0, *model.shape_start])

@@ -1,11 +1,20 @@
 """Transmission models: oddness, derivatives, names, registering one more."""
 
+import joints
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from estimator import MODELS, EstimatorError, Transmission, register
+from estimator import (
+    MODELS,
+    EstimatorError,
+    EstimatorSettings,
+    Status,
+    Transmission,
+    make_estimator,
+    register,
+)
 from estimator.transmissions import transmission_model
 
 ALPHAS = {
@@ -84,6 +93,48 @@ def test_what_is_no_transmission_is_refused(torque, stiffness, what):
     with pytest.raises(EstimatorError, match=what):
         register("refused", torque, stiffness)
     assert "refused" not in MODELS
+
+
+def test_a_start_beyond_its_bounds_is_one_clear_line():
+    with pytest.raises(EstimatorError, match=r"b_per_rad: expected \(start, low, high\).*got \(0, 1, 9\)"):
+        register(
+            "refused", lambda phi, b: b * phi, lambda phi, b: b + 0 * phi, {"b_per_rad": (0.0, 1.0, 9.0)}
+        )
+    assert "refused" not in MODELS
+
+
+@pytest.fixture
+def quintic():
+    """A model with two nonlinear parameters."""
+    register(
+        "quintic-for-test",
+        lambda phi, a, c: phi + a * phi**3 + c * phi**5,
+        lambda phi, a, c: 1 + 3 * a * phi**2 + 5 * c * phi**4,
+        {"a": (10.0, 0.0, 1e3), "c": (1.0, 0.0, 1e5)},
+    )
+    yield "quintic-for-test"
+    del MODELS["quintic-for-test"]
+
+
+@pytest.mark.parametrize("declared", [{}, {"k_nm_rad": 130.0, "a": 25.0, "c": 80.0}])
+def test_a_registered_model_with_two_shape_parameters_is_estimated_on_line(quintic, declared):
+    rng = np.random.default_rng(1)
+    n, T = 7000, 1e-3
+    torque, stiffness = joints.polynomial(150.0 * np.array([[[1.0, 20.0, 100.0]]]))
+    one = np.ones(1)
+    plants = joints.Plants(
+        torque, stiffness, 0.1 * one[:, None], 0.5 * one[:, None], 0.45 * one, 0.3 * one, 5.0 * one
+    )
+    truth = joints.simulate(plants, joints.sweep(rng, n, 1, 1, T, np.full((1, 1, 1), 8.0), 3.0), T)
+    noise = rng.normal(0, 0.03, (n, 1))
+    how = {"motor_counts": 16384, "link_bits": 17, "velocity_rad_s": None, "torque_noise": noise}
+    model = joints.joint_model(0.1, 0.5, model=quintic, order=None, parameters=declared)
+    estimator = make_estimator(model, EstimatorSettings(), T)
+    out = np.array([estimator.step(sample)[:5] for sample in joints.record(truth, 0, T, **how).samples()])[
+        4000:
+    ]
+    assert np.all(out[:, 1].astype(int) & Status.VALID)
+    assert np.sqrt(np.mean((out[:, 3] / truth.sigma[4000:, 0, 0] - 1) ** 2)) < 2e-3
 
 
 @pytest.mark.parametrize(

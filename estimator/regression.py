@@ -179,7 +179,7 @@ class Regression:
         grown = np.maximum(0.0, self._nuisance_std() ** 2 - (old_std * ratio[n:]) ** 2)
         self.filter.inflate(np.diag(np.concatenate([np.zeros(n), grown])))
         self._restrain_cut_off()
-        self._look_there()
+        self._remember_tangent()
 
     def _restrain_cut_off(self) -> None:
         """Its prior, which was a share of the torque at the deflection reached then, is one of now."""
@@ -237,7 +237,7 @@ class Regression:
             std[n - 1] = _CUT_OFF_SHARE
         std[n:] = self._nuisance_std()
         self.filter = ColouredKalman(mean, std, _NOISE_SHARE, self._forgetting)
-        self._look_there()
+        self._remember_tangent()
 
     def adopt(self, alpha: FloatArray, slopes: FloatArray, model: TransmissionModel) -> None:
         """Go on with another model: its parameters, and their slopes by those of the last one."""
@@ -249,7 +249,7 @@ class Regression:
         self._use(self._make_units(), self.torque_unit)
         ceiling = np.concatenate([np.full(n, 1.0), self.filter.ceiling[n_old:]])
         self._transform(alpha, slopes * old_units[:n_old] / self._units[:n, None], ceiling)
-        self._look_there()
+        self._remember_tangent()
         open_part = np.zeros_like(self.filter.P)
         open_part[:n, :n] = (_HANDED_OVER - 1.0) * self.filter.Sigma[:n, :n]
         self.filter.inflate(open_part)
@@ -279,7 +279,7 @@ class Regression:
             for phi, torque, variance in zip(phis, on_tangent, variances.tolist(), strict=True)
         )
 
-    def _look_there(self) -> None:
+    def _remember_tangent(self) -> None:
         """Deflections, torques and slopes of the tangent at alpha0, for `off_tangent`."""
         if self._polynomial or self.alpha0 is None:
             return
@@ -310,7 +310,7 @@ class Regression:
         change = np.eye(n) + np.linalg.solve(normal, slopes.T @ (tangent - slopes))
         self._transform(alpha, change, self.filter.ceiling)
         self.alpha0 = alpha
-        self._look_there()
+        self._remember_tangent()
 
     def _bounded(self, alpha: FloatArray) -> FloatArray:
         """Alpha with shape parameters that can be."""
@@ -321,7 +321,7 @@ class Regression:
     def equation(self, signals: Signals) -> Equation:
         """The scaled equation of this update."""
         k, n = self._first, self.size
-        self.values()
+        self.values()  # the present ones, for what depends on the stiffness
         row = list(signals.basis[k][:n])
         y = self.balance(signals)
         if not self._polynomial:

@@ -73,6 +73,11 @@ class DeflectionFilter:
         return self._x[2] + ahead_s * (self._x[3] + 0.5 * ahead_s * self._x[4])
 
     @property
+    def link_rate(self) -> float:
+        """Velocity of the link at the last sample, rad/s."""
+        return self._x[1] + self._x[3]
+
+    @property
     def variance(self) -> float:
         """Variance of phi: the filter's, or that of as many counts as pass while it averages.
 

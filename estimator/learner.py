@@ -329,7 +329,8 @@ class Learner:
         if i < 0:
             return
         track = self.tracks[i]
-        track.publish(self.deflections[i].at(0.0))
+        deflection = self.deflections[i]
+        track.publish(deflection.at(0.0), deflection.link_rate)
         if not isinstance(track, Track) or not self._usable:
             return
         if track.shaped and track.due and self._known >= len(self._past):

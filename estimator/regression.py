@@ -108,7 +108,7 @@ class Regression:
         self.filter: ColouredKalman | None = None
         self.torque_unit = self.deflection_unit = self.rate_unit = 0.0
         self._peaks = (0.0, 0.0, 0.0)
-        self._no_nuisance = [0.0] * (len(NUISANCES) - 1)
+        self._motor_side = [0.0] * NUISANCES.index("delay")  # what no deflection depends on
         self.resolution_rad = 0.0
         self._alpha_list: list[float] = []
         self._use(np.ones(size + len(NUISANCES)), 1.0)
@@ -378,10 +378,10 @@ class Regression:
         honest = self.filter.caution * self.filter.Sigma[: self.size, : self.size]
         return np.asarray(honest * np.outer(units, units))
 
-    def variance(self, by_alpha: list[float], by_shift: float) -> float:
-        """Variance to publish of a function of alpha and the deflection's offset e, from its derivatives."""
+    def variance(self, by_alpha: list[float], by_delay: float, by_shift: float) -> float:
+        """Variance to publish of a function of alpha and of the link's delay and offset, by its slopes."""
         assert self.filter is not None
-        row = self._units * [*by_alpha, *self._no_nuisance, by_shift]
+        row = self._units * [*by_alpha, *self._motor_side, by_delay, by_shift]
         # However the noise is coloured, it leaves more than a share of what white noise would.
         honest = UNSEEN**2 * self.filter.caution * float(row @ self.filter.Sigma @ row)
         return max(honest, _LEAST_VARIANCE * float(row @ self.filter.P @ row))

@@ -65,10 +65,10 @@ class RigidTrack:
     def account(self) -> None:
         """Nothing is estimated."""
 
-    def publish(self, phi: float) -> None:
+    def publish(self, phi: float, link_rate: float) -> None:
         """Nothing is estimated."""
 
-    def estimate(self, phi: float) -> tuple[TransmissionEstimate, bool]:
+    def estimate(self, phi: float, aligned: float, link_rate: float) -> tuple[TransmissionEstimate, bool]:
         """Torque alone; valid as soon as there is one."""
         torque = self._torque
         self._torque = torque + self._T * self._rate  # until the next update

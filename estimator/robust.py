@@ -83,7 +83,7 @@ class RobustEstimator:
             return self._step(sample)
         except (ArithmeticError, ValueError):  # numbers beyond what the guard foresees: begin anew
             self.reset()
-            parts = tuple(track.estimate(math.nan)[0] for track in self._tracks)
+            parts = tuple(track.estimate(math.nan, math.nan, 0.0)[0] for track in self._tracks)
             return joint_estimate(self._arrangement, sample.sequence, _REJECTED | _RESTARTED, parts)
 
     def _step(self, sample: Sample) -> Estimate:
@@ -176,7 +176,7 @@ class RobustEstimator:
         ahead = abs(self._alignment.periods) * self._T  # what waits for the latest channel
         parts = []
         for i, (track, deflection) in enumerate(self._pairs):
-            part, of_use = track.estimate(deflection.at(ahead))
+            part, of_use = track.estimate(deflection.at(ahead), deflection.at(0.0), deflection.link_rate)
             parts.append(part)
             if not of_use:
                 valid = False
@@ -205,14 +205,17 @@ class RobustEstimator:
         self._rejected += 1
         last = self._estimate
         if last is None:
-            parts = tuple(track.estimate(math.nan)[0] for track in self._tracks)
+            parts = tuple(track.estimate(math.nan, math.nan, 0.0)[0] for track in self._tracks)
             return joint_estimate(self._arrangement, sequence, status, parts)
         status |= last.status & (_CHANGED | _RESTARTED)
         since = self._rejected * self._T
         if since > _TRUST_S:
             return last._replace(sequence=sequence, status=status)
         ahead = since + abs(self._alignment.periods) * self._T
-        told = [track.estimate(deflection.at(ahead)) for track, deflection in self._pairs]
+        told = [
+            track.estimate(deflection.at(ahead), deflection.at(0.0), deflection.link_rate)
+            for track, deflection in self._pairs
+        ]
         if all(of_use for _, of_use in told):
             status |= last.status & _VALID
         return joint_estimate(self._arrangement, sequence, status, tuple(part for part, _ in told))

@@ -145,7 +145,7 @@ class Track:
         self.excited = False
         self.misfit_nm = math.nan
         self._trusted = False  # whether the curve has been good enough to read torques off it
-        self._shift = self._offset_nm = 0.0
+        self._shift = self._late_s = self._offset_nm = 0.0  # what the link encoder is off and late by
         self.deflection_variance = 0.0
         self.acting_nm = 0.0  # flexibility torque (less offset) that moved the motor over the last period
         self.stiffness = 0.0
@@ -315,12 +315,12 @@ class Track:
         k, *shape = self.regression.alpha.tolist()
         return bool(k <= 0.0) or self._basis.reach(shape) < 0.5 * self.regression.deflection_unit
 
-    def publish(self, phi: float) -> None:
+    def publish(self, phi: float, link_rate: float) -> None:
         """Last part of an update: what the ticks until the next one say, and how sure it is."""
         if self.regression.filter is None:
             return
         self._publishable()
-        self._std = self._stiffness_std(phi + self._shift)
+        self._std = self._stiffness_std(phi + self._shift + self._late_s * link_rate, link_rate)
         self._reach = _BEYOND * self.regression.deflection_peak
         if not isinstance(self._basis, Polynomial):
             self._reach = min(self._reach, _EDGE * self._basis.reach(self.regression.alpha[1:].tolist()))
@@ -368,7 +368,7 @@ class Track:
         regression = self.regression
         values, n = regression.values(), regression.size
         self._alpha = values[:n]
-        inertia, damping, coulomb, self._offset_nm, _, self._shift = values[n:]
+        inertia, damping, coulomb, self._offset_nm, self._late_s, self._shift = values[n:]
         damping += self._motor.viscous_damping_nm_s_rad
         self._contradicted = (
             abs(inertia) > _INERTIA_OFF * self._motor.inertia_kg_m2
@@ -403,6 +403,7 @@ class Track:
     def shift_delay(self, periods: float) -> None:
         """The channels have been aligned by so much more."""
         self.regression.shift_delay(periods)
+        self._late_s -= periods * self._T
 
     def hand_over(self, phi_past: FloatArray, bank: FilterBank, first: int, responses: FloatArray) -> None:
         """Go over from the polynomial to the nonlinear model, or linearise that anew, when it is due.
@@ -437,8 +438,14 @@ class Track:
 
     # -- what it says ------------------------------------------------------------------------------
 
-    def estimate(self, phi: float) -> tuple[TransmissionEstimate, bool]:
-        """The estimate at a deflection, and whether it is of use."""
+    def estimate(self, phi: float, aligned: float, link_rate: float) -> tuple[TransmissionEstimate, bool]:
+        """The estimate at a deflection, and whether it is of use.
+
+        Args:
+            phi: of this moment, as the encoders have it.
+            aligned: of the last moment that all channels have told of.
+            link_rate: of the link, rad/s.
+        """
         alpha, lead = self._alpha, self._lead_torque
         self._lead_torque = lead + self._T * self._lead_rate  # until the next update
         if not alpha:
@@ -449,9 +456,12 @@ class Track:
                 extra, slope = self._elastic.at(phi)
                 torque, stiffness = torque + extra, stiffness + slope
             return TransmissionEstimate(torque, stiffness, math.nan, phi), False
-        phi += self._shift
+        off = self._shift + self._late_s * link_rate
+        ahead = phi != aligned
+        phi += off
         torque, stiffness = self._basis.at(phi, alpha)
-        self.acting_nm = torque - self._offset_nm
+        acted = self._basis.at(aligned + off, alpha)[0] if ahead else torque
+        self.acting_nm = acted - self._offset_nm
         more = 0.0
         if self._elastic.active:
             more, slope = self._elastic.at(phi)
@@ -469,10 +479,11 @@ class Track:
             self.acting_nm, torque = lead, lead + more
         return TransmissionEstimate(torque, stiffness, std, phi), valid
 
-    def _stiffness_std(self, phi: float) -> float:
+    def _stiffness_std(self, phi: float, link_rate: float) -> float:
         """From the covariance of alpha and of the deflection that sigma is read off at."""
         by_alpha, slope = self._basis.stiffness_slopes(phi, self._alpha)
-        variance = self.regression.variance(by_alpha, slope) + slope * slope * self.deflection_variance
+        variance = self.regression.variance(by_alpha, slope * link_rate, slope)
+        variance += slope * slope * self.deflection_variance
         return math.sqrt(max(variance, 0.0))
 
     def parameters(self) -> dict[str, Any]:

@@ -105,14 +105,16 @@ def test_torque_noise_is_a_tenth_of_the_paper_modes(rig):
         assert errors[0] < 0.1 * errors[1]
 
 
-def test_deflection_is_that_of_this_moment(rig):
+@pytest.mark.parametrize("late", [0, 1, 3])
+def test_deflection_is_that_of_this_moment_however_late_the_link_encoder(rig, late):
     for j in range(2):
         estimator = make_estimator(joints.joint_model(rig.B[j, 0], rig.D[j, 0]), EstimatorSettings(), T)
-        told = np.array([estimator.step(s).transmissions[0].deflection_rad for s in rig.record(j).samples()])
+        samples = rig.record(j, link_delay=late).samples()
+        told = np.array([estimator.step(sample).transmissions[0].deflection_rad for sample in samples])
         phi = rig.truth.q[:, j] - rig.truth.theta[:, j, 0]
-        late = slice(4000, None)
-        rate = np.gradient(phi, T)[late]
-        error = told[late] - phi[late]
+        settled = slice(4000, None)
+        rate = np.gradient(phi, T)[settled]
+        error = told[settled] - phi[settled]
         assert abs(rate @ (error - error.mean()) / (rate @ rate)) < 0.1 * T
 
 

@@ -1,0 +1,146 @@
+"""Stiffness on line over random joints of another integrator: errors, intervals, false alarms.
+
+    python benchmarks/ensembles.py [--joints 8] [--seconds 20] [--seed 1] [--json]
+
+Fresh joints on random multisines, read as drives read them: 4096 to 16384 counts (stiff joints behind a gear
+of 100), 16 to 18 bits at the link, no velocity, torque noise of 0.1 to 0.5 % of rated. From five seconds on,
+where the estimate is valid and observable. The integrator is that of the tests (`tests/joints.py`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from drivelink.progress import track
+from estimator import EstimatorSettings, Status, make_estimator
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+
+import joints
+
+T = 1e-3
+USABLE = int(Status.VALID | Status.OBSERVABLE)
+OFF = (0.8, 1.2)  # k, and the shape above its lower bound, of a declaration that is 20 % off
+# name: (spring, model, order, declared off by, stiff, periods that the link is late, Coulomb friction in N·m)
+CASES = {
+    "linear": ("linear", "linear", None, None, False, 0, 0.0),
+    "cubic": ("cubic", "polynomial", 2, None, False, 0, 0.0),
+    "cubic, order left out": ("cubic", "polynomial", None, None, False, 0, 0.0),
+    "cubic, link 1 period late": ("cubic", "polynomial", 2, None, False, 1, 0.0),
+    "cubic, link 3 periods late": ("cubic", "polynomial", 2, None, False, 3, 0.0),
+    "cubic, undeclared friction": ("cubic", "polynomial", 2, None, False, 0, 0.3),
+    "cubic, stiff": ("cubic", "polynomial", 2, None, True, 0, 0.0),
+    "vsa-ii from nothing": ("vsa-ii", "vsa-ii", None, None, False, 0, 0.0),
+    "vsa-ii declared right": ("vsa-ii", "vsa-ii", None, (1.0, 1.0), False, 0, 0.0),
+    "vsa-ii declared 20 % off": ("vsa-ii", "vsa-ii", None, OFF, False, 0, 0.0),
+    "exponential from nothing": ("exponential", "exponential", None, None, False, 0, 0.0),
+    "exponential declared 20 % off": ("exponential", "exponential", None, OFF, False, 0, 0.0),
+}
+
+
+def springs(kind, K, rng):
+    """(torque, stiffness, per joint what declares it and its lower bound)."""
+    if kind == "vsa-ii":
+        k, c = rng.uniform(300, 700, K.shape), rng.uniform(1.5, 1.9, K.shape)
+        return *joints.vsa_ii(k, c), [
+            (("k_nm_rad", a), ("c", b), 1.0) for a, b in zip(k[:, 0], c[:, 0], strict=True)
+        ]
+    if kind == "exponential":
+        b = rng.uniform(3, 12, K.shape)
+        return (
+            lambda phi: np.sign(phi) * K / b * np.expm1(b * np.abs(phi)),
+            lambda phi: K * np.exp(b * np.abs(phi)),
+            [(("k_nm_rad", x), ("b_per_rad", y), 0.0) for x, y in zip(K[:, 0], b[:, 0], strict=True)],
+        )
+    where = 4e-3 if K.max() > 1000 else 0.06  # rad: there the cubic part is a few to thirty percent
+    cubic = rng.uniform(0.03, 0.3, K.shape) / where**2 if kind == "cubic" else np.zeros(K.shape)
+    return *joints.polynomial(np.stack([K, K * cubic], axis=-1)), [None] * len(K)
+
+
+def measure(case, n_joints, seconds, seed):
+    """One row."""
+    kind, model, order, off, stiff, late, friction = CASES[case]
+    rng, n = np.random.default_rng(seed), round(seconds / T)
+
+    def draw(soft, hard):
+        return rng.uniform(*(hard if stiff else soft), (n_joints, 1))
+
+    K, B, D = draw((80, 220), (5500, 12000)), draw((0.08, 0.2), (0.3, 1.2)), draw((0.4, 1.2), (2, 10))
+    torque, stiffness, declared = springs(kind, K, rng)
+    M, Dq, gravity = draw((0.3, 0.6), (0.5, 1.5)), draw((0.1, 1), (0.1, 1)), draw((0, 6), (0, 15))
+    plants = joints.Plants(torque, stiffness, B, D, M[:, 0], Dq[:, 0], gravity[:, 0], coulomb=friction)
+    size = draw((5, 10), (15, 40))[None]
+    truth = joints.simulate(plants, joints.sweep(rng, n, n_joints, 1, T, size, 4.0 if stiff else 3.0), T)
+    rows = []
+    for j in range(n_joints):
+        rated = 1.2 * np.abs(truth.tau[:, j]).max()
+        record = joints.record(
+            truth,
+            j,
+            T,
+            motor_counts=rng.choice([4096, 8192, 16384]) * (100 if stiff else 1),
+            link_bits=rng.choice([17, 18] if stiff else [16, 17, 18]),
+            velocity_rad_s=None,
+            torque_noise=rng.normal(0, rng.uniform(0.001, 0.005) * rated, (n, 1)),
+            link_delay=late,
+        )
+        parameters = {}
+        if off is not None:
+            (k_name, k), (shape_name, shape), low = declared[j]
+            parameters = {k_name: off[0] * k, shape_name: low + off[1] * (shape - low)}
+        told = joints.joint_model(B[j, 0], D[j, 0], model=model, order=order, parameters=parameters)
+        estimator = make_estimator(told, EstimatorSettings(), T)
+        out = np.array([estimator.step(sample)[:5] for sample in record.samples()])
+        status, sigma = out[:, 1].astype(int), truth.sigma[:, j, 0]
+        usable = (status & USABLE == USABLE) & (np.arange(n) * T >= 5.0)
+        error = out[usable, 3] - sigma[usable]
+        changed = (status & int(Status.CHANGED)) > 0
+        rows.append(
+            (
+                np.mean(usable[round(5 / T) :]),
+                np.sqrt(np.mean((error / sigma[usable]) ** 2)),
+                np.mean(np.abs(error) < 1.96 * out[usable, 4]),
+                np.sum(changed[1:] & ~changed[:-1]),
+            )
+        )
+    valid, rmse, coverage, alarms = np.array(rows).T
+    return {
+        "case": case,
+        "usable": float(np.mean(valid)),
+        "rmse_relative_median": float(np.nanmedian(rmse)),
+        "rmse_relative_worst": float(np.nanmax(rmse)),
+        "coverage": float(np.nanmean(coverage)),
+        "false_alarms": int(np.sum(alarms)),
+    }
+
+
+def main():
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--joints", type=int, default=8)
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args()
+    rows = [measure(case, args.joints, args.seconds, args.seed) for case in track(list(CASES), "cases")]
+    if args.json:
+        print(json.dumps(rows))
+        return
+    print("| springs | usable | RMSE %: median | worst | 95 % intervals cover | false alarms |")
+    print("|---|---|---|---|---|---|")
+    for row in rows:
+        print(
+            f"| {row['case']} | {100 * row['usable']:.0f} % | {100 * row['rmse_relative_median']:.2f} "
+            f"| {100 * row['rmse_relative_worst']:.2f} | {100 * row['coverage']:.0f} % "
+            f"| {row['false_alarms']} |"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -17,6 +17,7 @@ import zenohkit
 
 from drivelink import cli, jointfile
 from drivelink.canopen.bus import open_bus
+from drivelink.cli.record import _Teller
 from drivelink.cycle.framesource import Frame, FrameSource
 from drivelink.recording import read
 from drivelink.recording.canlog import read_frames
@@ -165,3 +166,23 @@ def test_a_bus_is_recorded_by_listening_only(suffix: str, tmp_path: Path) -> Non
         s.motor_position_rad for s in samples
     ][: len(record)]
     assert len(record) >= 148  # the first cycle's SYNC may come before the mapping is at rest
+
+
+def test_a_mapping_without_the_link_makes_no_samples_and_says_so(tmp_path: Path) -> None:
+    joint = daemonkit.vsa()
+    nobody_told_of_the_link = joint.model_copy(
+        update={"link": joint.link.model_copy(update={"encoder": None})}
+    )
+    bus = open_bus(joint.bus)
+    sink = open_sink(tmp_path / "r.mcap", joint)
+    tap = BusTap(bus, nobody_told_of_the_link, sink, tmp_path)
+    tap._source = InRealTime(tap._source)
+    with daemonkit.rig(joint) as rig, Recorder(sink, [tap]) as recorder:
+        for _ in range(150):
+            rig.run(1)
+            tap.poll()
+        told = _Teller(tmp_path / "r.mcap", recorder).text()
+        recorder.run(lambda: True)
+    bus.shutdown()
+    assert "no samples: " in told and "no frame carries the link position" in told
+    assert not tap.assembling and sink.counts["frame"] >= 150 * 4 and not sink.counts.get("sample")

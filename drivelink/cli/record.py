@@ -152,6 +152,10 @@ class _Teller:
         counts = [f"{n} {kind}s" for kind, n in self._recorder.sink.counts.items() if n] or ["nothing yet"]
         missed = sum(tap.missed for tap in self._recorder.taps if isinstance(tap, ZenohTap))
         lost = f", {missed} cycles without sample" if missed else ""
+        why = next(
+            (tap.missing for tap in self._recorder.taps if isinstance(tap, BusTap) and tap.missing), ""
+        )
+        lost += f", no samples: {why}" if why else ""
         return f"{', '.join(counts)} in {time.monotonic() - self._begin:.0f} s{lost}"
 
     def tick(self) -> None:

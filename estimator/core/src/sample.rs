@@ -1,0 +1,83 @@
+//! What goes into an estimator and what comes out of it, one tick at a time.
+
+/// Motors of a joint, at most.
+pub const MOTORS: usize = 2;
+
+/// What was measured at one SYNC; NaN stands for what is not there.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Sample {
+    /// Number of the SYNC; a jump by more than one is a gap of whole periods.
+    pub sequence: u64,
+    /// θ_i, rad.
+    pub motor_position: [f64; MOTORS],
+    /// θ'_i as the drive measures it, rad/s.
+    pub motor_velocity: [f64; MOTORS],
+    /// τ_i, N·m, which acts from this SYNC to the next one.
+    pub motor_torque: [f64; MOTORS],
+    /// q, rad.
+    pub link_position: f64,
+    /// q' as it is measured, rad/s.
+    pub link_velocity: f64,
+    /// τ_k of eq 4, N·m.
+    pub external_torque: f64,
+}
+
+/// Bits of [`Estimate::status`]; 0 to 7 are the estimator's, from 8 on the service's.
+pub mod status {
+    /// The numbers may be used.
+    pub const VALID: u32 = 1 << 0;
+    /// The motion at hand tells the stiffness; else it is held, with a wider interval.
+    pub const OBSERVABLE: u32 = 1 << 1;
+    /// Samples were missing before this one and have been bridged.
+    pub const GAP: u32 = 1 << 2;
+    /// Innovation alarm: the joint changed, the estimate is following.
+    pub const CHANGED: u32 = 1 << 3;
+    /// Residual above the model's own floor: the model is not sufficient.
+    pub const MODEL_ALARM: u32 = 1 << 4;
+    /// This sample was not finite, jumped or froze, and was not used.
+    pub const INPUT_REJECTED: u32 = 1 << 5;
+    /// The estimator started anew at or shortly before this sample.
+    pub const RESTARTED: u32 = 1 << 6;
+}
+
+/// One transmission: torque, stiffness and its standard deviation, deflection.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TransmissionEstimate {
+    /// τ_e, N·m.
+    pub flexibility_torque: f64,
+    /// σ, N·m/rad.
+    pub stiffness: f64,
+    /// Its standard deviation, N·m/rad.
+    pub stiffness_std: f64,
+    /// φ, rad.
+    pub deflection: f64,
+}
+
+impl TransmissionEstimate {
+    /// Nothing is known yet.
+    pub const NOTHING: TransmissionEstimate = TransmissionEstimate {
+        flexibility_torque: f64::NAN,
+        stiffness: f64::NAN,
+        stiffness_std: f64::NAN,
+        deflection: f64::NAN,
+    };
+}
+
+/// The joint at one SYNC: totals (eqs 9, 11) and each transmission's own.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Estimate {
+    /// That of the sample.
+    pub sequence: u64,
+    /// See [`status`].
+    pub status: u32,
+    /// τ_e,t, N·m.
+    pub flexibility_torque: f64,
+    /// σ_t, N·m/rad.
+    pub stiffness: f64,
+    /// Its standard deviation, N·m/rad.
+    pub stiffness_std: f64,
+    /// The first `motors` of them.
+    pub transmissions: [TransmissionEstimate; MOTORS],
+    /// How many motors the joint has.
+    pub motors: usize,
+}

@@ -21,9 +21,9 @@ from typing import Any
 from rig import PERIOD_S, free_endpoint, joint
 
 from drivelink.cycle import pacing, realtime
+from drivelink.cycle.meter import Meter
 from drivelink.cycle.realtime import Alarm
 from drivelink.daemon.service import Daemon, ServedJoint
-from drivelink.daemon.status import Meter
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.session import close_session, open_session
 from drivelink.simulate import network_from_joint, open_sim_bus

@@ -16,9 +16,10 @@ from rig import AnsweringBus, Devices
 
 from drivelink.canopen.layout import NodeLayout, Signal
 from drivelink.cycle.acquisition import SYNC_COB_ID
-from drivelink.cycle.framesource import FrameSource, open_source
+from drivelink.cycle.framesource import FrameSource
+from drivelink.cycle.meter import Meter
 from drivelink.cycle.realtime import Alarm
-from drivelink.daemon.status import Meter
+from drivelink.cycle.sources import open_source
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.wire import encode_estimate
 from estimator.sample import Estimate, TransmissionEstimate

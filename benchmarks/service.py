@@ -22,8 +22,8 @@ import zenoh
 from rig import PERIOD_S, Devices, free_endpoint, joint, joint_text
 
 from drivelink.cycle import realtime
+from drivelink.cycle.meter import Meter
 from drivelink.daemon.service import Daemon, ServedJoint
-from drivelink.daemon.status import Meter
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.session import close_session, open_session
 

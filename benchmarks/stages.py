@@ -26,7 +26,7 @@ from rivals import Floor
 from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle import realtime
 from drivelink.cycle.chain import make_chain
-from drivelink.cycle.framesource import open_source
+from drivelink.cycle.sources import open_source
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.publisher import JointPublisher

@@ -65,3 +65,47 @@ def test_the_service_reaches_the_simulated_world_in_one_place_only() -> None:
     for path in modules("drivelink"):
         if path.name != "simulate.py":
             assert "sim" not in imports(path), f"{path.relative_to(ROOT)}"
+
+
+def _modules_imported(path: Path) -> set[str]:
+    """Full names of the modules that a module imports at run time, wherever in the file."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    typing_only = {
+        id(inner)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+        for inner in ast.walk(node)
+    }
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if id(node) in typing_only:
+            continue
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+    return found
+
+
+ROOMS = ("drivelink/canopen", "drivelink/cycle", "drivelink/daemon", "drivelink/doctor")
+
+
+def test_no_circle_of_imports_on_the_way_from_the_bus_to_the_daemon() -> None:
+    names = {}
+    for room in ROOMS:
+        for path in modules(room):
+            name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+            if not name.endswith("__init__"):
+                names[name] = path
+    imported = {name: _modules_imported(path) & names.keys() - {name} for name, path in names.items()}
+    left = dict(imported)
+    while free := [name for name, needs in left.items() if not needs & left.keys()]:
+        for name in free:
+            del left[name]
+    assert not left, f"modules in a circle, or above one: {sorted(left)}"
+    below = {"canopen": ("cycle", "daemon", "doctor"), "cycle": ("daemon", "doctor"), "daemon": ("doctor",)}
+    for package, above in below.items():
+        for name, needs in imported.items():
+            if name.startswith(f"drivelink.{package}."):
+                wrong = {need for need in needs if need.split(".")[1] in above}
+                assert not wrong, f"{name} imports {wrong}"

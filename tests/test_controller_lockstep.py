@@ -9,7 +9,8 @@ import pytest
 from vsacontrol.lockstep import Rig
 from vsacontrol.springs import spring, springs_of
 
-from drivelink.cycle.framesource import PumpedBus, open_source
+from drivelink.cycle.framesource import PumpedBus
+from drivelink.cycle.sources import open_source
 from drivelink.jointfile import JointFile
 
 _channels = itertools.count()

@@ -13,9 +13,9 @@ from zenohkit import free_endpoint, until
 from drivelink.canopen.guard import check_frame
 from drivelink.cycle.acquisition import SYNC_COB_ID
 from drivelink.cycle.chain import make_chain
+from drivelink.cycle.joining import join_bus
 from drivelink.cycle.lockstep import run_lockstep
 from drivelink.daemon import reload
-from drivelink.daemon.joining import join_bus
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.errors import BusError, DriveError, UsageError, ZenohError
 from drivelink.jointfile import JointFile, load, parse

@@ -16,7 +16,8 @@ from zenohkit import until
 
 from drivelink.canopen.bus import open_bus
 from drivelink.cycle.chain import Chain
-from drivelink.cycle.framesource import BusLostError, open_source
+from drivelink.cycle.framesource import BusLostError
+from drivelink.cycle.sources import open_source
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.jointfile import BusSection, JointFile
 from drivelink.simulate import network_from_joint, open_sim_bus

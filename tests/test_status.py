@@ -6,7 +6,8 @@ import random
 import numpy as np
 import pytest
 
-from drivelink.daemon.status import EventLog, Meter
+from drivelink.cycle.meter import Meter
+from drivelink.daemon.status import EventLog
 
 
 def test_percentiles_are_those_of_the_durations() -> None:

@@ -22,9 +22,10 @@ __all__ = [
     "Frame",
     "FrameSource",
     "LostSource",
+    "PumpedBus",
     "PumpedSource",
+    "VirtualSource",
     "note_error",
-    "open_source",
 ]
 
 MOST_FRAMES = 256  # taken in one go, so that a babbling node cannot hold the loop up
@@ -84,23 +85,6 @@ class FrameSource(Protocol):
 
     def narrow(self, cob_ids: Iterable[int]) -> None:
         """Receive these identifiers only, where the kernel can tell them apart."""
-
-
-def open_source(bus: can.BusABC, devices: Callable[[], object] | None = None) -> FrameSource:
-    """The quickest way to read this bus; with devices that live in this thread, the way to run them too."""
-    if devices is not None:
-        return PumpedSource(bus, devices) if type(bus).__name__ == "VirtualBus" else PumpedBus(bus, devices)
-    if type(bus).__name__ == "SocketcanBus":
-        from drivelink.cycle.socketcan import SocketCanSource
-
-        return SocketCanSource(bus)
-    if type(bus).__name__ == "SocketCanDaemonBus":
-        from drivelink.cycle.socketcand import SocketcandSource
-
-        return SocketcandSource(bus)
-    if type(bus).__name__ == "VirtualBus":
-        return VirtualSource(bus)
-    return BusSource(bus)
 
 
 def note_error(errors: dict[str, int], can_id: int, data: bytes) -> None:

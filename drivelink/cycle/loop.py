@@ -15,8 +15,8 @@ from drivelink.cycle.acquisition import SYNC_COB_ID
 from drivelink.cycle.chain import Chain
 from drivelink.cycle.framesource import BusLostError, Frame, FrameSource, LostSource
 from drivelink.cycle.housekeeping import Housekeeping
+from drivelink.cycle.meter import Meter
 from drivelink.cycle.syncclock import SyncClock
-from drivelink.daemon.status import Meter
 from estimator.sample import Estimate, Sample
 
 __all__ = ["CycleLoop", "Lane", "Sink"]

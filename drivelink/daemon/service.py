@@ -22,11 +22,12 @@ import zenoh
 from drivelink.canopen.bus import open_bus
 from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle import pacing, realtime
+from drivelink.cycle.busport import BusPort
 from drivelink.cycle.chain import Chain, build, make_chain
-from drivelink.cycle.framesource import open_source
+from drivelink.cycle.joining import join_bus
 from drivelink.cycle.loop import CycleLoop, Lane
-from drivelink.daemon.busport import BusKeeper, BusPort
-from drivelink.daemon.joining import join_bus
+from drivelink.cycle.sources import open_source
+from drivelink.daemon.buskeeper import BusKeeper
 from drivelink.daemon.jointstatus import JointStatus
 from drivelink.daemon.reload import Reloader
 from drivelink.daemon.status import EventLog

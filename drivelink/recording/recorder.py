@@ -21,7 +21,8 @@ from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.acquisition import SYNC_COB_ID, Assembler
 from drivelink.cycle.chain import make_assembler
-from drivelink.cycle.framesource import BusLostError, open_source
+from drivelink.cycle.framesource import BusLostError
+from drivelink.cycle.sources import open_source
 from drivelink.errors import BusError, DriveError, ZenohError
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.wire import decode_estimate, decode_sample

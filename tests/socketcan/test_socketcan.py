@@ -17,8 +17,9 @@ from daemonkit import running, vsa, vsa_text
 from zenohkit import free_endpoint, until
 
 from drivelink.canopen.bus import interface_is_up, open_bus
-from drivelink.cycle.framesource import BusLostError, open_source
+from drivelink.cycle.framesource import BusLostError
 from drivelink.cycle.socketcan import SocketCanSource
+from drivelink.cycle.sources import open_source
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.jointfile import BusSection
 from drivelink.pubsub.client import subscribe

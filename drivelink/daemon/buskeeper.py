@@ -1,4 +1,4 @@
-"""The bus of a daemon: the one way of sending on it, and what keeps it open."""
+"""Keeps the bus of a daemon open: a lost one is opened again, and given to the loop."""
 
 from __future__ import annotations
 
@@ -7,46 +7,20 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING
 
 import can
 
 from drivelink.canopen.bus import open_bus
-from drivelink.cycle.framesource import LostSource, open_source
+from drivelink.cycle.busport import BusPort
+from drivelink.cycle.framesource import LostSource
+from drivelink.cycle.sources import open_source
 from drivelink.daemon.status import EventLog
 from drivelink.errors import BusError
 from drivelink.jointfile import BusSection
 
-if TYPE_CHECKING:
-    from drivelink.cycle.loop import CycleLoop
-
-__all__ = ["BusKeeper", "BusPort"]
+__all__ = ["BusKeeper"]
 
 _REOPEN_S = 0.5
-
-
-class BusPort:
-    """The bus for whoever sends python-can messages: directly before the loop runs, by the loop afterwards.
-
-    Attributes:
-        bus: as it is open now.
-        loop: the one reader, once it runs.
-    """
-
-    def __init__(self, bus: can.BusABC) -> None:
-        self.bus = bus
-        self.loop: CycleLoop | None = None
-
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Put a frame on the bus."""
-        if self.loop is None:
-            self.bus.send(msg, timeout)
-        else:
-            self.loop.send(msg.arbitration_id, bytes(msg.data))
-
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        """The next frame; only before the loop runs, which then is the one reader."""
-        return self.bus.recv(timeout)
 
 
 class BusKeeper:

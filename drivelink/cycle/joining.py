@@ -12,7 +12,8 @@ from drivelink.canopen.configure import Configurator, configure_joints
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.canopen.roles import roles
-from drivelink.daemon.busport import BusPort
+from drivelink.cycle.acquisition import SYNC_COB_ID
+from drivelink.cycle.busport import BusPort
 from drivelink.errors import BusError, DriveError
 from drivelink.jointfile import JointFile
 
@@ -21,7 +22,6 @@ __all__ = ["Joined", "join_bus"]
 Joined = tuple[Configurator | PassiveConfigurator, tuple[tuple[NodeLayout, ...], ...]]
 Idle = Callable[[], object]
 
-SYNC_COB_ID = 0x080
 _PATIENCE_S = 5.0  # for another master's SYNC, and for the frames that answer it
 _LISTEN_S = 0.05  # for a SYNC that should not be there; at least three periods
 _POLL_S = 0.01

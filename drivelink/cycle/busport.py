@@ -1,0 +1,36 @@
+"""The one way of sending on the bus of a daemon: directly before the loop runs, through the loop later."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import can
+
+if TYPE_CHECKING:
+    from drivelink.cycle.loop import CycleLoop
+
+__all__ = ["BusPort"]
+
+
+class BusPort:
+    """The bus for whoever sends python-can messages: directly before the loop runs, by the loop afterwards.
+
+    Attributes:
+        bus: as it is open now.
+        loop: the one reader, once it runs.
+    """
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self.bus = bus
+        self.loop: CycleLoop | None = None
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Put a frame on the bus."""
+        if self.loop is None:
+            self.bus.send(msg, timeout)
+        else:
+            self.loop.send(msg.arbitration_id, bytes(msg.data))
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """The next frame; only before the loop runs, which then is the one reader."""
+        return self.bus.recv(timeout)

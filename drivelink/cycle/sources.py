@@ -1,0 +1,26 @@
+"""Which way of reading a bus is the quickest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import can
+
+from drivelink.cycle.framesource import BusSource, FrameSource, PumpedBus, PumpedSource, VirtualSource
+from drivelink.cycle.socketcan import SocketCanSource
+from drivelink.cycle.socketcand import SocketcandSource
+
+__all__ = ["open_source"]
+
+
+def open_source(bus: can.BusABC, devices: Callable[[], object] | None = None) -> FrameSource:
+    """The quickest way to read this bus; with devices that live in this thread, the way to run them too."""
+    if devices is not None:
+        return PumpedSource(bus, devices) if type(bus).__name__ == "VirtualBus" else PumpedBus(bus, devices)
+    if type(bus).__name__ == "SocketcanBus":
+        return SocketCanSource(bus)
+    if type(bus).__name__ == "SocketCanDaemonBus":
+        return SocketcandSource(bus)
+    if type(bus).__name__ == "VirtualBus":
+        return VirtualSource(bus)
+    return BusSource(bus)

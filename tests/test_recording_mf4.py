@@ -41,6 +41,6 @@ def test_samples_come_back_bit_for_bit_and_the_journal_is_gone(tmp_path: Path) -
 
 @pytest.mark.skipif(HAVE, reason="asammdf is installed")
 def test_without_asammdf_it_is_one_line_before_anything_is_recorded(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r'MF4 needs asammdf: pip install "drivelink\[mf4\]"'):
+    with pytest.raises(RecordingError, match=r'MF4 needs asammdf: pip install "drivelink-vsa\[mf4\]"'):
         open_sink(tmp_path / "r.mf4", JOINT)
     assert not list(tmp_path.iterdir())

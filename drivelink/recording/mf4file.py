@@ -1,4 +1,4 @@
-"""Recordings as ASAM MDF 4 (.mf4), where asammdf is installed: `pip install drivelink[mf4]`.
+"""Recordings as ASAM MDF 4 (.mf4), where asammdf is installed: `pip install drivelink-vsa[mf4]`.
 
 MDF cannot be written so that a kill leaves it readable. What is recorded goes to an MCAP file beside it
 first, which is whole at any moment, and becomes the .mf4 file at the end.
@@ -113,5 +113,5 @@ def _asammdf(path: Path) -> Any:
     try:
         import asammdf
     except ImportError as error:
-        raise RecordingError(f'{path}: MF4 needs asammdf: pip install "drivelink[mf4]"') from error
+        raise RecordingError(f'{path}: MF4 needs asammdf: pip install "drivelink-vsa[mf4]"') from error
     return asammdf

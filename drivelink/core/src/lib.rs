@@ -1,0 +1,8 @@
+//! One joint's pipeline: CAN frames to a sample per SYNC, its estimate, and the exact bytes for zenoh.
+//!
+//! No socket and no clock: live, lockstep and replay feed the same pipeline.
+
+#![cfg_attr(not(feature = "python"), forbid(unsafe_code))]
+
+#[cfg(feature = "python")]
+pub mod python;

@@ -1,0 +1,79 @@
+"""What is believed about a joint before any data: one table for the on-line estimator, `fit` and `diagnose`.
+
+Every number is a standard deviation relative to a scale that the joint file or the recording gives, so the
+table has no unit of its own and holds for a finger as for a crane.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+__all__ = ["PRIORS", "Prior", "Scale"]
+
+Scale = Literal[
+    "declared",  # the declared value itself
+    "torque",  # rms of the motor torque without its mean, N·m
+    "torque over speed",  # that torque over the largest motor speed, N·m·s/rad
+    "period",  # the sampling period, s
+    "deflection",  # half the range of the deflection, rad
+]
+
+
+class Prior(NamedTuple):
+    """A Gaussian prior about what is declared (zero where nothing is declared).
+
+    Attributes:
+        std: standard deviation, as a share of the scale.
+        scale: what it is a share of.
+        meaning: the quantity.
+        reason: why this wide.
+    """
+
+    std: float
+    scale: Scale
+    meaning: str
+    reason: str
+
+
+PRIORS: dict[str, Prior] = {
+    "motor_inertia": Prior(
+        0.05, "declared", "motor inertia B", "rotor and gear inertias of data sheets agree with tests to 5 %"
+    ),
+    "torque_constant": Prior(
+        0.03, "declared", "scale of the motor torque", "torque constants are specified to a few per cent"
+    ),
+    "viscous_damping": Prior(
+        0.2, "declared", "viscous damping D beside its floor", "damping changes so much between cold and warm"
+    ),
+    "viscous_damping_floor": Prior(
+        0.05, "torque over speed", "viscous damping that nobody declared", "what seals and grease take"
+    ),
+    "coulomb_friction": Prior(
+        0.1, "torque", "dry friction that nobody declared", "usual loss of bearings and a gear"
+    ),
+    "torque_offset": Prior(
+        0.3, "torque", "constant torque", "current offsets, and a load that does not move"
+    ),
+    "deflection_offset": Prior(
+        1.0, "deflection", "zero between the encoders", "two encoders are seldom set to one zero"
+    ),
+    "encoder_delay": Prior(
+        1.0, "period", "delay of the link position", "it is sampled within a cycle and sent in the next one"
+    ),
+    "torque_delay": Prior(
+        0.5, "period", "delay of the motor torque beyond its hold", "a drive samples within its own cycle"
+    ),
+    "link_inertia": Prior(
+        0.1, "declared", "link inertia M", "payload and cables are seldom declared to better"
+    ),
+    "link_viscous_damping": Prior(
+        0.2, "declared", "link damping D_q", "damping changes so much between cold and warm"
+    ),
+    "gravity": Prior(0.1, "declared", "amplitude of gravity", "as the link's inertia"),
+    "effect": Prior(
+        0.3, "torque", "torque of a missing effect", "larger ones are the joint's main physics, and declared"
+    ),
+    "transmission": Prior(
+        10.0, "torque", "flexibility torque at the deflections seen", "wide: the data tell it"
+    ),
+}

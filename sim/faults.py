@@ -91,6 +91,10 @@ class Faults:
         """Its SDO server aborts so many requests."""
         node.sdo.refusal, node.sdo.refused = code, requests
 
+    def endless_sdo(self, node: Node, segment_bytes: int) -> None:
+        """Its SDO server answers every upload without end, so many bytes (0 to 7) at a time; -1: no more."""
+        node.sdo.endless = segment_bytes
+
     def impostor(self, node: Node) -> None:
         """One more device; with a node id that is taken, if you like."""
         self._network.add(node)

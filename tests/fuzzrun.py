@@ -158,6 +158,7 @@ class FuzzRun:
         self.events = EventLog(_Silent(), clock=lambda: self.loop.clock() * 1e-9)  # type: ignore[arg-type]
         watching = PassiveConfigurator([self.joint]) if passive else self.configurator
         self.supervisor = Supervisor(self.loop, {lane: layouts}, self.events, watching)
+        self.loop.on_fault = _reraise  # whatever the daemon would survive is a failure here
         self.loop.housekeeping.urgent.append(self.supervisor.step)
         self.loop.housekeeping.every(0.05, self.supervisor.check)
         self.due = [0, 0, 0]  # SYNCs of the last three cycles, as the nodes count
@@ -231,6 +232,10 @@ def _scales(layouts: Iterable[NodeLayout]) -> dict[str, float]:
                 elif mapped.signal is Signal.LINK_POSITION:
                     scales["link"] = mapped.scale
     return scales
+
+
+def _reraise(_where: str, error: Exception) -> None:
+    raise error
 
 
 class _Silent:

@@ -5,7 +5,17 @@ from canopenkit import Item, Slave, Wire, drive_objects
 from drivelink.canopen.blocking import run_program
 from drivelink.canopen.guard import ForbiddenFrameError, SilentBus, check_frame
 from drivelink.canopen.pdo import read_optional
-from drivelink.canopen.sdo import Nmt, Pause, Read, SdoAbort, SdoTimeout, Session, Write, abort_text
+from drivelink.canopen.sdo import (
+    Nmt,
+    Pause,
+    Read,
+    SdoAbort,
+    SdoTimeout,
+    Session,
+    Write,
+    abort_text,
+    read_number,
+)
 from drivelink.errors import BusError, DriveError
 
 
@@ -117,6 +127,62 @@ def test_an_endless_segmented_upload_ends():
     for k in range(2000):
         running.feed(0x585, bytes([0x10 * (k % 2)]) + bytes(7), 0.0)
     assert running.done
+
+
+def segment(*, toggle=0, length=7, last=False):
+    return bytes([toggle << 4 | (7 - length) << 1 | last]) + b"\xff" * 7
+
+
+@pytest.mark.parametrize(
+    ("declared", "segments", "why", "abort"),
+    [
+        (4, [segment(length=5)], "more than 4 bytes", "12 00 07 06"),
+        (
+            10,
+            [segment(), segment(toggle=1, length=2, last=True)],
+            "9 bytes after declaring 10",
+            "13 00 07 06",
+        ),
+        (9, [segment(length=0)], "a segment without data that is not the last", "10 00 07 06"),
+        (None, [segment(toggle=k % 2) for k in range(37)], "more than 256 bytes", "12 00 07 06"),
+        (100_000, [], "100000 bytes, expected 256 at most", "12 00 07 06"),
+    ],
+    ids=["longer than declared", "shorter", "empty", "undeclared and endless", "declared too long"],
+)
+def test_an_upload_of_another_length_than_it_should_have_is_aborted(declared, segments, why, abort):
+    sent = []
+    running = session(read(5, 0x1008), sent)
+    running.poll(0.0)
+    size = b"\x40" + bytes(7) if declared is None else b"\x41" + bytes(3) + declared.to_bytes(4, "little")
+    running.feed(0x585, size[:1] + bytes.fromhex("08 10 00") + size[4:], 0.0)
+    for data in segments:
+        assert not running.done
+        running.feed(0x585, data, 0.0)
+    assert sent[-1] == (0x605, f"80 08 10 00 {abort}")
+    with pytest.raises(
+        DriveError, match=rf"^node 5 answers 0x1008:00 against the protocol: {why}; SDO abort"
+    ):
+        _ = running.result
+
+
+def test_an_upload_that_goes_on_for_ever_ends_in_bounded_time():
+    running = session(read(5, 0x1008), [], timeout_s=0.5, retries=1)
+    now_s, k = 0.0, 0
+    while not running.poll(now_s):
+        if k % 2 == 0 and now_s in (0.0, 2.0):
+            running.feed(0x585, bytes.fromhex("40 08 10 00 00 00 00 00"), now_s)
+        running.feed(0x585, segment(toggle=k % 2, length=1), now_s)  # always just before its timeout
+        now_s, k = now_s + 0.4, k + 1
+        assert now_s < 10.0
+    with pytest.raises(DriveError, match=r"^node 5 does not "):
+        _ = running.result
+
+
+def test_a_number_of_more_bytes_than_any_has_is_not_taken():
+    wire = Wire([Slave(5, {(0x6076, 0): Item(b"\xff" * 400, 400)})])
+    assert run_program(read_optional(5, 0x6076, 0), wire) is None
+    with pytest.raises(DriveError, match="400 bytes, expected 8 at most"):
+        run_program(read_number(5, 0x6076, 0), wire)
 
 
 def test_an_object_that_may_be_missing_is_none():

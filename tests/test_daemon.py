@@ -3,11 +3,12 @@
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
 import pytest
-from daemonkit import Listener, Rig, rig, running, served, vsa, vsa_text
+from daemonkit import Collector, Listener, Rig, rig, running, served, vsa, vsa_text
 from zenohkit import free_endpoint, until
 
 from drivelink.canopen.guard import check_frame
@@ -354,7 +355,9 @@ case = "constant"
 """
 
 
-def test_two_joints_share_a_bus_and_its_sync() -> None:
+@contextmanager
+def two_joints() -> Iterator[Daemon]:
+    """Elbow (two motors) and wrist (one) in one daemon."""
     elbow = vsa(bus="period_s = 0.002")
     wrist = parse(SINGLE.format(channel=elbow.bus.channel))
     wrist = wrist.model_copy(update={"bus": elbow.bus, "zenoh": elbow.zenoh})
@@ -369,6 +372,13 @@ def test_two_joints_share_a_bus_and_its_sync() -> None:
 
     served_joints = [ServedJoint(joint=elbow), ServedJoint(joint=wrist)]
     with Daemon(served_joints, publish=False, real_time=False, devices=devices) as made:
+        yield made
+    bus.shutdown()
+    other.shutdown()
+
+
+def test_two_joints_share_a_bus_and_its_sync() -> None:
+    with two_joints() as made:
         made.run_lockstep(600)
         first, second = made.documents()
         assert (first["joint"], second["joint"]) == ("elbow", "wrist")
@@ -377,5 +387,59 @@ def test_two_joints_share_a_bus_and_its_sync() -> None:
         assert {chain.estimate.sequence for chain in made.chains} == {599}
         assert [len(chain.estimate.transmissions) for chain in made.chains] == [2, 1]
         assert first["bus"]["load"] == second["bus"]["load"] > 0.3
-    bus.shutdown()
-    other.shutdown()
+
+
+class Broken:
+    """An estimator with a mistake in it."""
+
+    residual_nm = 0.0
+
+    def step(self, _sample: object) -> None:
+        raise ZeroDivisionError("float division by zero")
+
+    def parameters(self) -> list[object]:
+        return []
+
+
+def test_an_exception_in_one_joint_takes_that_one_to_a_fault_and_the_others_go_on() -> None:
+    with two_joints() as made:
+        made.run_lockstep(100)
+        elbow, wrist = made.loop.lanes
+        sound, wrist.chain.estimator = wrist.chain.estimator, Broken()
+        collector = wrist.sink = Collector()
+        made.run_lockstep(200)
+        first, second = made.documents()
+        assert (first["state"], first["estimates"]) == ("running", 300)
+        assert (second["state"], second["estimates"]) == ("fault", 100)
+        assert any("wrist: no estimates any more after ZeroDivisionError" in c for c in second["conditions"])
+        assert len(collector.estimates) == 199  # one for each cycle after that of the exception
+        assert [e.sequence for e, _ in collector.estimates] == list(range(100, 299))
+        assert all(e.status & Status.STALE and not e.status & Status.VALID for e, _ in collector.estimates)
+        wrist.chain.estimator = sound  # as a joint file written again does it
+        made.run_lockstep(100)
+        assert made.documents()[1]["state"] == "running"
+        assert elbow.estimates == 400
+
+
+def test_an_exception_in_publishing_or_beside_the_cycle_is_said_and_the_loop_goes_on() -> None:
+    class Full:
+        def put_estimate(self, _estimate: object, _stamp_ns: int) -> None:
+            raise RuntimeError("no session")
+
+    def task() -> None:
+        raise ValueError("a task's own")
+
+    with two_joints() as made:
+        elbow, _wrist = made.loop.lanes
+        elbow.sink = Full()
+        made.loop.housekeeping.every(0.01, task)
+        made.loop.listeners[0x181] = lambda *_: {}["nothing"]
+        made.run_lockstep(100)
+        assert [document["estimates"] for document in made.documents()] == [100, 100]
+        said = " ".join(event["text"] for event in made.events.recent())
+        for text in (
+            "elbow: RuntimeError: no session",
+            "housekeeping: ValueError: a task's own",
+            "frame 0x181: KeyError",
+        ):
+            assert text in said

@@ -246,3 +246,38 @@ def test_nodes_that_somebody_stopped_are_woken_before_they_are_asked() -> None:
         listener.close()
     # Silence of half a second, and no SDO timeout (0.2 s each time) for any of the three.
     assert back < 800
+
+
+@pytest.mark.parametrize("segment_bytes", [7, 1, 0])
+def test_a_drive_that_answers_sdo_without_end_harms_itself_only(segment_bytes: int) -> None:
+    with rig() as made:
+        settle(made)
+        made.faults.endless_sdo(made.node(2), segment_bytes)
+        made.faults.reboot(made.node(2))
+        made.run(6000)
+        cannot = [text for text in made.events if text.startswith("node 2 cannot be configured: ")]
+        assert cannot
+        assert len(made.run(100)) == 100  # the loop goes on, and says that these are stale
+        assert made.status["nodes"]["1"]["missing"] == 0
+        made.faults.endless_sdo(made.node(2), -1)
+        assert any(valid(made.run(ENOUGH + 3000)))
+
+
+def test_whatever_goes_wrong_in_the_configuration_of_a_node_is_that_nodes_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with rig() as made:
+        settle(made)
+
+        def broken(*_: object, **__: object) -> None:
+            raise OverflowError("int too large to convert to float")
+
+        monkeypatch.setattr("drivelink.canopen.node.offer", broken)
+        made.faults.reboot(made.node(1))
+        estimates = made.run(1500)
+        assert len(estimates) >= 1499  # a cycle that lacks a frame is told with the next SYNC
+        assert "node 1 cannot be configured: node 1: OverflowError in its configuration: int too large" in (
+            " ".join(made.events)
+        )
+        monkeypatch.undo()
+        assert any(valid(made.run(ENOUGH)))

@@ -58,6 +58,7 @@ class Configurator:
         self.layouts: dict[int, NodeLayout] = {}
         self.drop_others = False
         self._sessions: dict[int, Session[NodeLayout]] = {}
+        self._broken: dict[int, DriveError] = {}  # nodes whose configuration ended with a mistake of ours
 
     @property
     def nodes(self) -> tuple[int, ...]:
@@ -88,27 +89,41 @@ class Configurator:
     @property
     def busy(self) -> bool:
         """Whether any configuration is under way."""
-        return bool(self._sessions)
+        return bool(self._sessions or self._broken)
 
     def feed(self, cob_id: int, data: bytes, now_s: float) -> None:
         """Take a frame; only SDO responses (0x581 to 0x5FF) are of interest."""
-        session = self._sessions.get(cob_id - 0x580)
-        if session is not None:
+        node = cob_id - 0x580
+        session = self._sessions.get(node)
+        if session is None:
+            return
+        try:
             session.feed(cob_id, data, now_s)
+        except Exception as error:  # noqa: BLE001 - whatever a node provokes ends its own part
+            self._break_off(node, error)
 
     def poll(self, now_s: float) -> list[tuple[int, NodeLayout | DriveError]]:
         """Let time pass; what has come to an end: the node with its new layout, or with the error."""
         ended: list[tuple[int, NodeLayout | DriveError]] = []
         for node, session in list(self._sessions.items()):
-            if not session.poll(now_s):
-                continue
-            del self._sessions[node]
             try:
+                if not session.poll(now_s):
+                    continue
+                del self._sessions[node]
                 self.layouts[node] = session.result
                 ended.append((node, session.result))
             except DriveError as error:
                 ended.append((node, error))
+            except Exception as error:  # noqa: BLE001 - as in `feed`
+                self._break_off(node, error)
+        ended += self._broken.items()
+        self._broken.clear()
         return ended
+
+    def _break_off(self, node: int, error: Exception) -> None:
+        self._sessions.pop(node, None)
+        logger.debug("the configuration of node %d has failed", node, exc_info=error)
+        self._broken[node] = DriveError(f"node {node}: {type(error).__name__} in its configuration: {error}")
 
     def load(self) -> BusLoad:
         """Bus load of all that is configured."""

@@ -12,7 +12,18 @@ from drivelink.canopen.mapping import NMT_PRE_OPERATIONAL, NMT_START, SETTLE_S, 
 from drivelink.canopen.pdo import ABSENT, Tpdo, decode, read_optional, read_tpdos
 from drivelink.canopen.plan import OPTIONAL
 from drivelink.canopen.roles import Role
-from drivelink.canopen.sdo import Nmt, Pause, Program, Read, SdoAbort, SdoTimeout, Unsized, Write, abort_text
+from drivelink.canopen.sdo import (
+    Nmt,
+    Pause,
+    Program,
+    Read,
+    SdoAbort,
+    SdoTimeout,
+    Unsized,
+    Write,
+    abort_text,
+    read_number,
+)
 from drivelink.canopen.units import offer, unit_objects
 from drivelink.canopen.vendors import vendor_of
 from drivelink.errors import DriveError
@@ -24,6 +35,7 @@ __all__ = ["NodeSurvey", "configure_node", "survey_node"]
 _SYNC_COB_ID = 0x80
 _SYNC_PRODUCER = 1 << 30
 _ENCODER_HEARTBEAT_MS = 100
+_VALUE_BYTES = 8  # of the longest object that can be mapped
 BOOT_S = 3.0  # that a node may take to answer after power-on; the slowest take two seconds
 
 
@@ -71,7 +83,7 @@ def survey_node(role: Role, patience: int = 1, *, wake: bool = False) -> Program
     refused = None
     for address in unit_objects(role, vendor):
         try:
-            told[address] = int.from_bytes((yield Read(node, *address)), "little")
+            told[address] = yield from read_number(node, *address)
         except SdoAbort as abort:
             refused = refused if abort.code in ABSENT else abort
     offered = offer(role, told, vendor)
@@ -106,7 +118,7 @@ def _existing(node: int, candidates: tuple[Candidate, ...]) -> Program[tuple[Can
     found = []
     for candidate in candidates:
         try:
-            data = yield Read(node, *candidate.address)
+            data = yield Read(node, *candidate.address, most=_VALUE_BYTES)
         except SdoAbort as abort:
             if abort.code not in ABSENT:
                 found.append(candidate)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from drivelink.canopen.candidates import Candidate
 from drivelink.canopen.layout import MappedObject, Signal, TpdoLayout
-from drivelink.canopen.sdo import Program, Read, SdoAbort
+from drivelink.canopen.sdo import Program, SdoAbort, read_number
 
 __all__ = [
     "ABSENT",
@@ -100,20 +100,18 @@ def describe(tpdos: Iterable[Tpdo]) -> str:
 def read_optional(node: int, index: int, subindex: int) -> Program[int | None]:
     """An unsigned value, or None where the node does not give it."""
     try:
-        data = yield Read(node, index, subindex)
+        return (yield from read_number(node, index, subindex))
     except SdoAbort:
         return None
-    return int.from_bytes(data, "little")
 
 
 def _read_exactly(node: int, index: int, subindex: int) -> Program[int | None]:
     try:
-        data = yield Read(node, index, subindex)
+        return (yield from read_number(node, index, subindex))
     except SdoAbort as abort:
         if abort.code in ABSENT:
             return None
         raise
-    return int.from_bytes(data, "little")
 
 
 def read_tpdo(node: int, number: int, *, exactly: bool = False) -> Program[Tpdo | None]:

@@ -23,12 +23,14 @@ __all__ = [
     "Program",
     "Read",
     "SdoAbort",
+    "SdoBreach",
     "SdoTimeout",
     "Send",
     "Session",
     "Unsized",
     "Write",
     "abort_text",
+    "read_number",
 ]
 
 T = TypeVar("T")
@@ -36,7 +38,10 @@ Send = Callable[[int, bytes], None]
 
 _TOGGLE_ERROR = 0x05030000
 _TIMED_OUT = 0x05040000
-_MAX_BYTES = 4096  # no object that is read here is longer: a babbling server must not fill the memory
+_WRONG_LENGTH, _TOO_LONG, _TOO_SHORT = 0x06070010, 0x06070012, 0x06070013
+_NUMBER_BYTES = 8  # of the longest integer (CiA 301, table 44)
+_TEXT_BYTES = 256  # the longest object that is read here is a device name
+_TRANSFER_TIMEOUTS = 4  # of a whole transfer in answer timeouts: many short answers must not last for ever
 
 
 def abort_text(code: int) -> str:
@@ -65,6 +70,15 @@ class SdoAbort(DriveError):  # noqa: N818 - the protocol's own word
         self.node, self.index, self.subindex, self.code = node, index, subindex, code
 
 
+class SdoBreach(SdoAbort):
+    """The drive answered against the protocol; the transfer was aborted from here."""
+
+    def __init__(self, node: int, index: int, subindex: int, code: int, what: str) -> None:
+        super().__init__(node, index, subindex, code)
+        text = f"node {node} answers {_name(index, subindex)} against the protocol: {what}"
+        self.args = (f"{text}; SDO abort {abort_text(code)}",)
+
+
 class SdoTimeout(DriveError):  # noqa: N818 - as above
     """The drive did not answer.
 
@@ -73,9 +87,12 @@ class SdoTimeout(DriveError):  # noqa: N818 - as above
         index: object it was asked for.
     """
 
-    def __init__(self, node: int, index: int, subindex: int, timeout_s: float, attempts: int) -> None:
+    def __init__(
+        self, node: int, index: int, subindex: int, timeout_s: float, attempts: int, *, begun: bool = False
+    ) -> None:
+        does, what = ("end its answer", "no end") if begun else ("answer", "no answer")
         super().__init__(
-            f"node {node} does not answer: SDO {_name(index, subindex)}, no answer within {timeout_s:g} s, "
+            f"node {node} does not {does}: SDO {_name(index, subindex)}, {what} within {timeout_s:g} s, "
             f"the last {attempts} time{'s' if attempts > 1 else ''} it was asked"
         )
         self.node, self.index = node, index
@@ -87,11 +104,12 @@ class Unsized(bytes):
 
 @dataclass(frozen=True, slots=True)
 class Read:
-    """Upload of one object; the answer is its bytes."""
+    """Upload of one object; the answer is its bytes, `most` at most."""
 
     node: int
     index: int
     subindex: int = 0
+    most: int = _TEXT_BYTES
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,8 +142,23 @@ Request = Read | Write | Nmt | Pause
 Program = Generator[Request, bytes, T]
 
 
+def read_number(node: int, index: int, subindex: int) -> Program[int]:
+    """An object as an unsigned number.
+
+    Raises:
+        SdoAbort: the node refuses, or answers with more bytes than any number has.
+    """
+    return int.from_bytes((yield Read(node, index, subindex, _NUMBER_BYTES)), "little")
+
+
 class _Transfer:
-    """One upload or download: frames in, the next frame or the result out."""
+    """One upload or download: frames in, the next frame or the result out.
+
+    Attributes:
+        request: what it is for.
+        result: what came of it; None until it has ended.
+        answered: the server has begun to answer.
+    """
 
     def __init__(self, request: Read | Write) -> None:
         self.request = request
@@ -133,10 +166,13 @@ class _Transfer:
         self._buffer = bytearray()
         self._toggle = 0
         self._segmented = False
+        self._declared: int | None = None
+        self.answered = False
 
     def first(self) -> bytes:
         self._buffer.clear()
-        self._toggle, self._segmented = 0, False
+        self._toggle, self._segmented, self._declared = 0, False, None
+        self.answered = False
         request = self.request
         object_ = request.index.to_bytes(2, "little") + bytes([request.subindex])
         if isinstance(request, Read):
@@ -148,7 +184,8 @@ class _Transfer:
         """Take a frame of the server; return the frame to send next, if any.
 
         Raises:
-            SdoAbort: the server aborted, or answered out of step.
+            SdoAbort: the server aborted.
+            SdoBreach: it answered out of step, or with another number of bytes than it declared.
         """
         request = self.request
         if len(data) != 8:
@@ -170,16 +207,30 @@ class _Transfer:
             unused = (data[0] >> 2) & 3
             self.result = bytes(data[4 : 8 - unused]) if data[0] & 0x01 else Unsized(data[4:8])
             return None
-        self._segmented = True
+        if data[0] & 0x01:
+            self._declared = int.from_bytes(data[4:8], "little")
+        if self._declared is not None and self._declared > request.most:
+            raise self._breach(_TOO_LONG, f"{self._declared} bytes, expected {request.most} at most")
+        self._segmented = self.answered = True
         return b"\x60" + bytes(7)
 
     def _segment(self, data: bytes) -> bytes | None:
+        request = self.request
+        assert isinstance(request, Read)
         if (data[0] >> 4) & 1 != self._toggle:
-            raise self._abort(_TOGGLE_ERROR)
-        self._buffer += data[1 : 8 - ((data[0] >> 1) & 7)]
-        if data[0] & 0x01 or len(self._buffer) > _MAX_BYTES:
+            raise self._breach(_TOGGLE_ERROR, "a segment out of turn")
+        part, last = data[1 : 8 - ((data[0] >> 1) & 7)], bool(data[0] & 0x01)
+        self._buffer += part
+        most = request.most if self._declared is None else self._declared
+        if len(self._buffer) > most:
+            raise self._breach(_TOO_LONG, f"more than {most} bytes")
+        if last and self._declared is not None and len(self._buffer) < self._declared:
+            raise self._breach(_TOO_SHORT, f"{len(self._buffer)} bytes after declaring {self._declared}")
+        if last:
             self.result = bytes(self._buffer)
             return None
+        if not part:
+            raise self._breach(_WRONG_LENGTH, "a segment without data that is not the last")
         self._toggle ^= 1
         return bytes([0x60 | self._toggle << 4]) + bytes(7)
 
@@ -189,6 +240,10 @@ class _Transfer:
             request.node, request.index, request.subindex, code, writing=isinstance(request, Write)
         )
 
+    def _breach(self, code: int, what: str) -> SdoBreach:
+        request = self.request
+        return SdoBreach(request.node, request.index, request.subindex, code, what)
+
 
 class Session(Generic[T]):
     """Runs one program; never blocks.
@@ -196,7 +251,7 @@ class Session(Generic[T]):
     Args:
         program: what to do.
         send: puts a frame (identifier, data) on the bus.
-        timeout_s: for each answer.
+        timeout_s: for each answer; a whole transfer has four times as long.
         retries: further attempts after a timeout.
     """
 
@@ -206,7 +261,7 @@ class Session(Generic[T]):
         self._timeout_s = timeout_s
         self._retries = retries
         self._transfer: _Transfer | None = None
-        self._deadline_s = -float("inf")
+        self._deadline_s = self._end_s = -float("inf")
         self._attempts = 0
         self._started = False
         self.done = False
@@ -234,14 +289,14 @@ class Session(Generic[T]):
         try:
             following = transfer.answer(bytes(data))
         except SdoAbort as abort:
-            if abort.code == _TOGGLE_ERROR:
+            if isinstance(abort, SdoBreach):
                 self._abort_transfer(transfer, abort.code)
             self._transfer = None
             self._advance(now_s, abort)
             return
         if following is not None:
             self._put(0x600 + transfer.request.node, following)
-            self._deadline_s = now_s + self._timeout_s
+            self._deadline_s = min(now_s + self._timeout_s, self._end_s)
         elif transfer.result is not None:
             self._transfer = None
             self._advance(now_s, transfer.result)
@@ -264,7 +319,12 @@ class Session(Generic[T]):
             self._abort_transfer(transfer, _TIMED_OUT)
             request = transfer.request
             failure = SdoTimeout(
-                request.node, request.index, request.subindex, self._timeout_s, self._attempts
+                request.node,
+                request.index,
+                request.subindex,
+                self._timeout_s * (_TRANSFER_TIMEOUTS if transfer.answered else 1),
+                self._attempts,
+                begun=transfer.answered,
             )
             self._advance(now_s, failure)
         return self.done
@@ -296,6 +356,7 @@ class Session(Generic[T]):
         self._transfer = transfer
         self._attempts += 1
         self._deadline_s = now_s + self._timeout_s
+        self._end_s = now_s + _TRANSFER_TIMEOUTS * self._timeout_s
         self._put(0x600 + transfer.request.node, transfer.first())
 
     def _abort_transfer(self, transfer: _Transfer, code: int) -> None:

@@ -151,8 +151,8 @@ class BusSource:
     def _receive(self, timeout_s: float) -> can.Message | None:
         try:
             return self._bus.recv(timeout_s)
-        except (can.CanError, OSError) as error:
-            raise BusLostError(str(error)) from error
+        except Exception as error:  # python-can's interfaces raise what their parsers meet
+            raise BusLostError(str(error) or type(error).__name__) from error
 
 
 def _is_full(error: can.CanError) -> bool:

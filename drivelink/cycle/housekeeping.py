@@ -15,6 +15,10 @@ _ENOUGH_NS = 250_000  # a task, or a part of one, takes less than this
 _PATIENCE_NS = 1_000_000_000  # a task that has waited so long is done even where there is no slack
 
 
+def _raise(error: Exception) -> None:
+    raise error
+
+
 class _Periodic:
     __slots__ = ("action", "due_ns", "period_ns")
 
@@ -27,8 +31,11 @@ class _Periodic:
 class Housekeeping:
     """Periodic tasks, of which the loop runs one at a time when there is time for it.
 
+    An exception ends the task that raised it, for this time; nothing else.
+
     Attributes:
         urgent: called in every cycle that has slack; for what must go on step by step.
+        on_fault: told of an exception.
     """
 
     def __init__(self) -> None:
@@ -36,6 +43,7 @@ class Housekeeping:
         self._next_ns = 0
         self._parts: Generator[None] | None = None
         self.urgent: list[Callable[[int], None]] = []
+        self.on_fault: Callable[[Exception], None] = _raise
 
     def every(self, period_s: float, action: Task) -> None:
         """Have `action` called every so often; it, or each part of it, must be done in less than 0.2 ms."""
@@ -45,7 +53,10 @@ class Housekeeping:
         """Run what is due, as far as `slack_ns` of monotonic time allows."""
         if slack_ns >= _ENOUGH_NS:
             for step in self.urgent:
-                step(now_ns)
+                try:
+                    step(now_ns)
+                except Exception as error:  # noqa: BLE001 - the cycle goes on
+                    self.on_fault(error)
             if self._parts is not None:
                 self._go_on(self._parts)
                 return
@@ -57,7 +68,11 @@ class Housekeeping:
         if slack_ns >= _ENOUGH_NS or now_ns - task.due_ns > _PATIENCE_NS > task.due_ns - now_ns:
             task.due_ns = max(task.due_ns + task.period_ns, now_ns)
             self._finish()
-            parts = task.action()
+            try:
+                parts = task.action()
+            except Exception as error:  # noqa: BLE001 - as above
+                self.on_fault(error)
+                parts = None
             if isinstance(parts, Generator):
                 self._parts = parts
                 self._go_on(parts)
@@ -68,6 +83,9 @@ class Housekeeping:
             next(parts)
         except StopIteration:
             self._parts = None
+        except Exception as error:  # noqa: BLE001 - as above
+            self._parts = None
+            self.on_fault(error)
 
     def _finish(self) -> None:
         """Where there was no slack for so long that another task cannot wait any more."""

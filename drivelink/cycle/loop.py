@@ -6,6 +6,7 @@ SYNC of another master; `run_lockstep` calls them with no clock at all.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -20,6 +21,8 @@ from drivelink.cycle.syncclock import SyncClock
 from estimator.sample import Estimate, Sample
 
 __all__ = ["CycleLoop", "Lane", "Sink"]
+
+logger = logging.getLogger(__name__)
 
 Listener = Callable[[int, bytes], None]
 
@@ -43,22 +46,29 @@ class Lane:
         name: of the joint.
         chain: from its frames to its estimates.
         sink: where they go; None: nowhere.
+        fault: what has ended its estimates; empty: nothing. A new estimator in the chain mends it.
         estimates: published from fresh samples.
         stale: cycles without a sample.
         work: from the last frame in hand to the estimate published.
         response: from SYNC to the last frame in hand.
     """
 
-    __slots__ = ("chain", "estimates", "name", "response", "sink", "stale", "work")
+    __slots__ = ("broken", "chain", "estimates", "fault", "name", "response", "sink", "stale", "work")
 
     def __init__(self, name: str, chain: Chain, sink: Sink | None) -> None:
         self.name = name
         self.chain = chain
         self.sink = sink
+        self.fault = ""
+        self.broken: object = None  # the estimator that it ended with
         self.estimates = 0
         self.stale = 0
         self.work = Meter()
         self.response = Meter()
+
+
+def _log_fault(where: str, error: Exception) -> None:
+    logger.error("%s: %s: %s", where, type(error).__name__, error, exc_info=error)
 
 
 class CycleLoop:
@@ -85,6 +95,8 @@ class CycleLoop:
         listeners: by identifier, who else wants a frame: SDO, heartbeat, EMCY.
         clock: what supervision goes by, ns.
         on_lost: told when the bus is lost.
+        on_fault: told of an exception in what concerns one joint or one node, and whose; that one is left
+            out, the loop goes on.
         cycles: SYNCs since the start.
         overruns: periods left out because this process was late.
         foreign_syncs: SYNCs of another master while we make it, or that were not due.
@@ -112,6 +124,8 @@ class CycleLoop:
         self.listeners: dict[int, Listener] = {}
         self.clock: Callable[[], int] = time.monotonic_ns
         self.on_lost: Callable[[str], None] = lambda _reason: None
+        self.on_fault: Callable[[str, Exception], None] = _log_fault
+        self.housekeeping.on_fault = lambda error: self.on_fault("housekeeping", error)
         self.cycles = self.overruns = self.foreign_syncs = self.counter_jumps = 0
         self.clock_step_ns = self.clock_steps = 0
         self.silent = False
@@ -121,7 +135,6 @@ class CycleLoop:
         self._sync_clock = SyncClock(period_s)
         self._overflow = counter_overflow
         self._counter = 0
-        self._chains = [lane.chain for lane in self.lanes]
         self._lanes_of: dict[int, list[Lane]] = {}
         self.reroute()
         self.unix_ns = time.time_ns() - time.monotonic_ns()
@@ -137,7 +150,9 @@ class CycleLoop:
     def reroute(self) -> None:
         """Learn again which joint wants which frame."""
         self._lanes_of.clear()
-        for lane in self.lanes:
+        sound = [lane for lane in self.lanes if not lane.fault]
+        self._chains = [lane.chain for lane in sound]
+        for lane in sound:
             for cob_id in lane.chain.assembler.cob_ids:
                 self._lanes_of.setdefault(cob_id, []).append(lane)
 
@@ -151,8 +166,8 @@ class CycleLoop:
             self.source.send(cob_id, data)
         except BusLostError as error:
             self._lose(error)
-        for lane in self._lanes_of.get(cob_id, ()):
-            lane.chain.feed(cob_id, data)
+        for lane in list(self._lanes_of.get(cob_id, ())):
+            self._feed(lane, cob_id, data)
 
     def stop(self) -> None:
         """Have the pacing end after the present cycle; from any thread or signal handler."""
@@ -226,12 +241,15 @@ class CycleLoop:
                 self._foreign_sync(data, stamp_ns, now_ns)
                 continue
             for lane in lanes_of.get(cob_id, ()):
-                estimate = lane.chain.feed(cob_id, data)
+                estimate = self._feed(lane, cob_id, data)
                 if estimate is not None:
                     self._publish(lane, estimate, now_ns)
                     lane.response.add(now_ns - self.sync_ns)
             if cob_id in listeners:
-                listeners[cob_id](cob_id, data)
+                try:
+                    listeners[cob_id](cob_id, data)
+                except Exception as error:  # noqa: BLE001 - one frame of one node
+                    self.on_fault(f"frame 0x{cob_id:03X}", error)
 
     def _foreign_sync(self, data: bytes, stamp_ns: int, now_ns: int) -> None:
         if self.produce:
@@ -256,23 +274,50 @@ class CycleLoop:
             self._before_ns, self._stamp_ns = self._stamp_ns, stamp_ns
             self.silent = False
         for lane in self.lanes:
-            estimate = lane.chain.feed(SYNC_COB_ID, data, jump)
+            if lane.fault:
+                estimate = self._carry_on_faulted(lane, jump)
+            else:
+                estimate = self._feed(lane, SYNC_COB_ID, data, jump)
             if estimate is not None:
                 self._publish(lane, estimate, now_ns)
+
+    def _feed(self, lane: Lane, cob_id: int, data: bytes, jump: int = 1) -> Estimate | None:
+        """A frame for one joint; an exception ends its estimates, and nobody else's."""
+        try:
+            return lane.chain.feed(cob_id, data, jump)
+        except Exception as error:  # noqa: BLE001 - see above
+            lane.fault = f"{type(error).__name__}: {error}"
+            lane.broken = lane.chain.estimator
+            self.reroute()
+            self.on_fault(lane.name, error)
+            return None
+
+    def _carry_on_faulted(self, lane: Lane, jump: int) -> Estimate | None:
+        """What a joint in fault has to say at a SYNC: that its last estimate is not fresh."""
+        chain = lane.chain
+        if chain.estimator is not lane.broken:  # the joint file was mended
+            lane.fault, lane.broken = "", None
+            self.reroute()
+        if chain.estimate is None or not jump:
+            return None
+        return chain.carry_on(chain.estimate.sequence + jump)
 
     def _publish(self, lane: Lane, estimate: Estimate, since_ns: int) -> None:
         chain, sink = lane.chain, lane.sink
         current = estimate.sequence == chain.assembler.sequence
-        stamp_ns = self._stamp_ns if current else self._before_ns
+        stamp_ns = self._stamp_ns if current or lane.fault else self._before_ns
         sample = chain.sample
         if sample is None:
             lane.stale += 1
         else:
             lane.estimates += 1
         if sink is not None:
-            sink.put_estimate(estimate, stamp_ns)
-            if sample is not None:
-                sink.put_sample(sample, stamp_ns)
+            try:
+                sink.put_estimate(estimate, stamp_ns)
+                if sample is not None:
+                    sink.put_sample(sample, stamp_ns)
+            except Exception as error:  # noqa: BLE001 - the other joints' go out all the same
+                self.on_fault(lane.name, error)
         if current:
             lane.work.add(time.monotonic_ns() - since_ns)
 

@@ -125,6 +125,8 @@ class JointStatus:
         estimate = lane.chain.estimate
         if isinstance(loop.source, LostSource):
             return "bus lost"
+        if lane.fault:
+            return "fault"
         if loop.silent:
             return "no SYNC"
         if estimate is None:

@@ -22,6 +22,8 @@ from drivelink.errors import DriveError
 
 __all__ = ["Supervisor"]
 
+logger = logging.getLogger(__name__)
+
 _NS = 1_000_000_000
 _SILENT_NS = _NS // 2  # without a PDO, until the node is configured again
 _RETRY_NS = _NS  # between two attempts
@@ -110,6 +112,7 @@ class Supervisor:
         self._overheard = False
         self._foreign_syncs = self._counter_jumps = self._lost_sends = self._clock_steps = 0
         self._bus_offs = self._restarts = 0
+        loop.on_fault = self._say_fault
         self._nodes: dict[int, _Watched] = {}
         for lane, mine in layouts.items():
             lane.chain.assembler.supervise()
@@ -187,7 +190,24 @@ class Supervisor:
             self._check_frames(node, watched, now)
             self._check_heartbeat(node, watched, now)
             self._check_faults(node, watched)
+        for lane in self._loop.lanes:
+            self._check_lane(lane)
         self._check_bus()
+
+    def _check_lane(self, lane: Lane) -> None:
+        if lane.fault:
+            self._events.begin(
+                f"joint {lane.name}",
+                f"{lane.name}: no estimates any more after {lane.fault}; its joint file, written again, or a "
+                "restart begins anew",
+                logging.ERROR,
+            )
+        else:
+            self._events.end(f"joint {lane.name}", f"{lane.name}: estimates begin anew")
+
+    def _say_fault(self, where: str, error: Exception) -> None:
+        logger.debug("%s", where, exc_info=error)
+        self._events.say(f"{where}: {type(error).__name__}: {error}", logging.ERROR)
 
     def reconfigure_all(self) -> None:
         """The bus was away: nobody knows what the nodes have lived through."""

@@ -40,11 +40,14 @@ class SdoServer:
         ignored: requests that it will not answer, for tests.
         refused: requests that it will abort, with `refusal`, for tests.
         refusal: the abort code.
+        endless: bytes in each segment of an upload that never ends, whatever is asked for, for tests;
+            -1: it is a sound server.
     """
 
     def __init__(self, dictionary: Dictionary, timers: Timers, send: Callable[[bytes], None]) -> None:
         self.ignored = self.refused = 0
         self.refusal = int(Abort.DATA_TRANSFER)
+        self.endless = -1
         self._dictionary = dictionary
         self._timers = timers
         self._send = send
@@ -74,6 +77,9 @@ class SdoServer:
             self._multiplexer = struct.unpack_from("<HB", data, 1)
             self._abort(self.refusal)
             return
+        if self.endless >= 0 and data[0] >> 5 in (_UPLOAD, _UPLOAD_SEGMENT):
+            self._send(self._endless(data))
+            return
         try:
             response = self._answer(data)
         except SdoAbortError as abort:
@@ -83,6 +89,12 @@ class SdoServer:
         if response is not None:
             self._send(response)
         self._watch()
+
+    def _endless(self, data: bytes) -> bytes:
+        """Four bytes are declared, and segment follows segment."""
+        if data[0] >> 5 == _UPLOAD:
+            return bytes([0x41]) + data[1:4] + struct.pack("<I", 4)
+        return bytes([data[0] & 0x10 | (7 - self.endless) << 1]) + b"\xff" * 7
 
     def _answer(self, data: bytes) -> bytes | None:
         if data[0] == _ABORT << 5:

@@ -53,6 +53,9 @@ class TpdoSection(_Section):
     transmission_type: int = Field(
         1, ge=0, le=255, description="1 to 240: every so many SYNCs; 254, 255: when the node pleases"
     )
+    default: bool = Field(
+        False, description="the node has this map by itself after every start; false: a master gives it"
+    )
 
     @model_validator(mode="after")
     def _objects(self) -> Self:

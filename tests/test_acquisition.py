@@ -262,14 +262,17 @@ def test_a_mapping_that_cannot_be_changes_nothing(tpdos: tuple[TpdoLayout, ...])
     assert sample.link_position_rad == 7 * LINK_RAD
 
 
-def test_a_passive_listener_believes_a_node_that_starts_by_itself() -> None:
+def test_a_passive_listener_takes_no_start_for_a_mapping() -> None:
     assembler = Assembler(VSA, 2, active=False)
     assembler.feed(0x000, b"\x82\x00")  # a gateway begins with reset communication to all
     assert assembler.untrusted == (1, 2, 3)
     for node in (1, 2, 3):
         assembler.feed(0x700 + node, b"\x00")
         assembler.feed(0x700 + node, b"\x05")
-    assert assembler.untrusted == ()
+        assembler.feed(0x000, bytes((1, node)))
+    assert assembler.untrusted == (1, 2, 3)
+    for node in (1, 2, 3):
+        assembler.trust(node)
     assert len(run(assembler, [(SYNC, b""), *vsa_cycle(1)])) == 1
 
 

@@ -217,3 +217,62 @@ def test_a_disabled_frame_of_a_data_sheet_is_not_expected():
     configurator._nodes[5].listener.changes += 1
     assert configurator.poll(0.0) == []
     assert configurator.busy
+
+
+def after(configurator, *frames):
+    for cob_id, data in frames:
+        configurator.feed(cob_id, data, 0.0)
+        configurator.poll(0.0)
+    return configurator
+
+
+BOOT = (0x705, b"\x00")
+
+
+def test_a_stated_map_holds_until_the_node_restarts_and_one_of_its_own_for_ever():
+    joint = parse(joint_text(drive=STATED + MAP, bus=PASSIVE))
+    configurator = PassiveConfigurator([joint])
+    assert configurator.believed == {5}
+    after(configurator, BOOT)
+    assert configurator.believed == set()
+    assert "default = true in [[motor.drive.tpdo]]" in configurator.doubts[5]
+    own = parse(joint_text(drive=STATED + MAP + "default = true\n", bus=PASSIVE))
+    assert after(PassiveConfigurator([own]), BOOT, (0, b"\x82\x00"), BOOT).believed == {5}
+
+
+def test_what_is_overheard_counts_more_than_what_the_joint_file_states():
+    joint = parse(joint_text(drive=STATED + MAP + "default = true\n", bus=PASSIVE))
+    configurator = PassiveConfigurator([joint])
+    after(configurator, (0x605, bytes.fromhex("23 02 18 01 a5 02 00 80")))  # TPDO3 has that identifier: off
+    assert configurator.believed == set()  # it is being changed, or it is not: nobody knows before the answer
+    after(configurator, (0x585, bytes.fromhex("60 02 18 01 00 00 00 00")))
+    assert configurator.believed == set()
+    for place, entry in enumerate((0x60770010, 0x60410010, 0x60640020), start=1):
+        request = bytes.fromhex("23 02 1a") + bytes([place]) + entry.to_bytes(4, "little")
+        after(configurator, (0x605, request), (0x585, b"\x60" + request[1:4] + bytes(4)))
+    on = bytes.fromhex("23 02 18 01 a5 02 00 00")
+    after(configurator, (0x605, on), (0x585, b"\x60" + on[1:4] + bytes(4)))
+    assert configurator.believed == {5}
+    assert signals(configurator.layouts[5])[0][0] is Signal.MOTOR_TORQUE
+
+
+def test_a_data_sheets_map_is_offered_and_not_believed(tmp_path):
+    (tmp_path / "drive.eds").write_text(EDS)
+    text = joint_text(drive='eds = "drive.eds"\ngear_ratio = 50.0', bus=PASSIVE)
+    configurator = PassiveConfigurator([parse(text)], [tmp_path])
+    assert configurator.believed == set()
+    line = (
+        'tpdo = [{ cob_id = 0x185, objects = ["0x6064:00:32", "0x6077:00:16"], transmission_type = 1, '
+        "default = true }]"
+    ).replace("transmission_type = 1, ", "")
+    assert f"in [motor.drive] {line}" in configurator.doubts[5]
+    pasted = parse(text.replace("gear_ratio", f"{line}\ngear_ratio"))
+    assert PassiveConfigurator([pasted], [tmp_path]).believed == {5}
+
+
+def test_frames_that_are_heard_of_a_node_whose_map_is_unknown_are_named():
+    configurator = PassiveConfigurator([parse(joint_text(drive=STATED, bus=PASSIVE))])
+    after(configurator, (0x185, bytes(8)), (0x285, bytes(6)))
+    configurator._nodes[5].listener.changes += 1
+    configurator.poll(0.0)
+    assert "it sends 0x185 (8 bytes), 0x285 (6 bytes)" in str(configurator.missing[5])

@@ -288,7 +288,7 @@ class Mapper:
     def _restore(self, tpdo: Tpdo) -> Program[None]:
         """After a refusal: the map and the identifier that were there."""
         try:
-            if not self._is_fixed(tpdo):
+            if tpdo.known and not self._is_fixed(tpdo):
                 yield Write(self.node, tpdo.mapping, 0, 0, 1)
                 for position, (index, subindex, bits) in enumerate(tpdo.entries, start=1):
                     yield Write(self.node, tpdo.mapping, position, index << 16 | subindex << 8 | bits, 4)

@@ -23,18 +23,33 @@ class SdoListener:
 
     Attributes:
         values: confirmed unsigned values by (index, subindex).
-        changes: how often a value became known or another one.
+        written: of these, the ones that were written, not read.
+        changes: how often a value became known or another one, or was forgotten.
     """
 
     def __init__(self, interesting: Callable[[int, int], bool]) -> None:
         self._interesting = interesting
         self.values: dict[Address, int] = {}
+        self.written: set[Address] = set()
         self.changes = 0
         self._address: Address | None = None
         self._writing = False
         self._segments: bytearray | None = None
         self._expedited: bytes | None = None
         self._last = False
+
+    @property
+    def pending(self) -> Address | None:
+        """The object that is being written: asked for, not yet confirmed."""
+        return self._address if self._writing else None
+
+    def forget(self, lost: Callable[[Address], bool]) -> None:
+        """The node has restarted: what was written is gone, and whatever else `lost` names."""
+        self._forget()
+        for address in [a for a in self.values if a in self.written or lost(a)]:
+            del self.values[address]
+        self.written.clear()
+        self.changes += 1
 
     def request(self, data: bytes) -> None:
         """A frame of the master, 0x600 + node."""
@@ -99,6 +114,8 @@ class SdoListener:
     def _keep(self, data: bytes) -> None:
         address = self._address
         self._forget()
+        if address is not None and self._writing:
+            self.written.add(address) if self._interesting(*address) else None
         if address is None or not self._interesting(*address):
             return
         value = int.from_bytes(data, "little")

@@ -1,7 +1,7 @@
 """Layouts of nodes that somebody else configures: from the joint file, a data sheet, or by listening.
 
-Nothing is ever sent from here; there is nothing here to send with. Where several sources tell, the joint
-file comes before what is overheard, and that before the EDS or DCF.
+Nothing is ever sent from here; there is nothing here to send with. What is overheard comes before what the
+joint file states, and only these two are believed; see `_PassiveNode`.
 """
 
 from __future__ import annotations
@@ -32,11 +32,18 @@ Address = tuple[int, int]
 _COMMUNICATION = frozenset(
     {(0x1005, 0), (0x1006, 0), (0x1017, 0), (0x1018, 1), (0x1018, 2), (0x1018, 3), (0x1018, 4), (0x1019, 0)}
 )
+_NMT_RESETS = (0x81, 0x82)  # of the node, of its communication
+_VOLATILE = frozenset({(0x1005, 0), (0x1006, 0), (0x1017, 0), (0x1019, 0)})  # as after power-on again
 _MOST_ENTRIES = 8  # of a map whose objects are whole bytes
 
 
 class _PassiveNode:
-    """What is known of one node."""
+    """What is known of one node, and how far that is believed.
+
+    A map is believed when it was written or read back since the node's last start, or when the joint file
+    states it: for good with `default = true`, else until the node restarts. What a data sheet says of a map
+    is what the node was born with; who has changed it since nobody can tell, so it is only offered.
+    """
 
     def __init__(self, role: Role) -> None:
         self.role = role
@@ -46,18 +53,81 @@ class _PassiveNode:
         } | _COMMUNICATION
         self.listener = SdoListener(self._interesting)
         self.seen_changes = -1
+        self.adopted: NodeLayout | None = None
+        self.restarted = False
+        self.heard: dict[int, int] = {}  # lengths of frames with its predefined identifiers
 
     def _interesting(self, index: int, subindex: int) -> bool:
-        if 0x1800 <= index <= 0x1BFF:
+        if _is_mapping((index, subindex)):
             return subindex <= _MOST_ENTRIES
         return (index, subindex) in self._units
 
-    def layout(self) -> NodeLayout:
-        """The layout, from all that is known.
+    def restart(self) -> None:
+        """It boots: maps and whatever was written are as the node has them by itself."""
+        self.restarted, self.adopted = True, None
+        self.listener.forget(lambda address: _is_mapping(address) or address in _VOLATILE)
+
+    def lose_sight(self) -> None:
+        """The bus was away: nobody knows what the node has lived through."""
+        self.adopted = None
+        self.listener.forget(_is_mapping)
+
+    @property
+    def being_mapped(self) -> bool:
+        """Whether the master is writing to its maps just now."""
+        pending = self.listener.pending
+        return pending is not None and _is_mapping(pending)
+
+    def layout(self) -> tuple[NodeLayout, str]:
+        """The layout from all that is known, and why it is not believed; empty: it is.
 
         Raises:
             DriveError: mapping or scale of something needed is not known.
         """
+        try:
+            return self._layout(self._believed_tpdos()), ""
+        except DriveError as error:
+            if self.adopted is not None and not any(map(_is_mapping, self.listener.written)):
+                return self.adopted, ""
+            sheet = self._sheet_tpdos()
+            if not sheet:
+                raise
+            try:
+                layout = self._layout(sheet)
+            except DriveError:
+                raise error from None
+            return layout, self.doubt()
+
+    def doubt(self) -> str:
+        """One line on a mapping that is not believed, and what would settle it."""
+        role = self.role
+        if self.restarted:
+            why = "it has restarted, and its mapping was neither written nor read since"
+        elif self._sheet is not None:
+            why = f"its mapping is that of {self._sheet.path.name}, which a master may have changed"
+        else:
+            why = "its mapping was neither written nor read since the bus is back"
+        return (
+            f"{role.subject} ({role.key}): {why}: its frames are not used until its master writes or reads "
+            f"back the mapping; if the node has it by itself, say so in the joint file: {self.offered()}"
+        )
+
+    def offered(self) -> str:
+        """What would state the mapping in the joint file: TOML to be pasted, where a data sheet tells it."""
+        if self.role.tpdo:
+            return f"default = true in {self._keys()}"
+        tpdos = self._sheet_tpdos()
+        if not tpdos:
+            return f"{self._keys()} with default = true"
+        return f"in [{self._table()}] tpdo = [{', '.join(map(_toml, tpdos))}]"
+
+    def _table(self) -> str:
+        return f"{self.role.key.partition('[')[0]}{'.drive' if self.role.drive else ''}"
+
+    def _keys(self) -> str:
+        return f"[[{self._table()}.tpdo]]"
+
+    def _layout(self, tpdos: tuple[Tpdo, ...]) -> NodeLayout:
         role = self.role
         values = {**(self._sheet.values() if self._sheet else {}), **self.listener.values}
         if self._sheet is not None and self._sheet.vendor_id:
@@ -69,7 +139,6 @@ class _PassiveNode:
                 Finding(severity=Severity.INFO, subject=str(self._sheet.path.name), text=problem)
                 for problem in self._sheet.problems
             ]
-        tpdos = self._tpdos(values)
         for signal, reason in told.missing.items() if tpdos else ():
             if signal not in OPTIONAL:
                 raise DriveError(f"{role.subject} ({role.key}): {reason}")
@@ -90,14 +159,37 @@ class _PassiveNode:
             findings=tuple(findings),
         )
 
-    def _tpdos(self, values: dict[Address, int]) -> tuple[Tpdo, ...]:
-        if self.role.tpdo:
-            return tuple(_declared(section) for section in self.role.tpdo)
-        found: dict[int, Tpdo] = {}
-        for tpdo in tpdos_of(values):
-            if tpdo.enabled and 0x181 <= tpdo.cob_id <= 0x57F:
-                found.setdefault(tpdo.cob_id, tpdo)
-        return tuple(found.values())
+    def _believed_tpdos(self) -> tuple[Tpdo, ...]:
+        """What the joint file states, as far as the node still has it, and what was overheard."""
+        seen = {address: value for address, value in self.listener.values.items() if _is_mapping(address)}
+        touched = {(index & 0x1FF) + 1 for index, _ in seen}
+        stated, values = [], dict(seen)
+        for section in self.role.tpdo:
+            if self.restarted and not section.default:
+                continue
+            tpdo, number = _declared(section), self._number(section, seen)
+            if number not in touched:
+                stated.append(tpdo)
+                continue
+            for address, value in _objects_of(tpdo, number).items():
+                values.setdefault(address, value)
+        return _sent(stated + list(tpdos_of(values)))
+
+    def _sheet_tpdos(self) -> tuple[Tpdo, ...]:
+        if self._sheet is None:
+            return ()
+        seen = {address: value for address, value in self.listener.values.items() if _is_mapping(address)}
+        return _sent(tpdos_of({**self._sheet.values(), **seen}))
+
+    def _number(self, section: TpdoSection, seen: dict[Address, int]) -> int:
+        """The number of a TPDO that the joint file states by its identifier; 0: not known."""
+        for (index, subindex), value in seen.items():
+            if index < 0x1A00 and subindex == 1 and value & 0x7FF == section.cob_id:
+                return index - 0x17FF
+        number, node = divmod(section.cob_id - 0x80, 0x100)
+        known = seen.get((0x17FF + number, 1))
+        predefined = 1 <= number <= 4 and node == self.role.node_id
+        return number if predefined and known is None else 0
 
     def _lacking(self, lacking: list[Signal], tpdos: tuple[Tpdo, ...]) -> str:
         role = self.role
@@ -106,11 +198,47 @@ class _PassiveNode:
                 f"{role.subject} ({role.key}) sends no {' and no '.join(lacking)}: {describe(tpdos)}; "
                 f"have its master map it, or correct {role.key}.tpdo"
             )
+        if self.restarted:
+            return self.doubt()
+        heard = ", ".join(f"0x{cob_id:03X} ({length} bytes)" for cob_id, length in sorted(self.heard.items()))
         return (
-            f"{role.subject} ({role.key}): its mapping is not known: give [[{role.key.partition('[')[0]}"
-            f"{'.drive' if role.drive else ''}.tpdo]] or eds in the joint file, "
-            "or start drivelink before the master configures the drives"
-        )
+            f"{role.subject} ({role.key}): its mapping is not known: give {self._keys()} or eds in the joint "
+            "file, or start drivelink before the master configures the drives"
+        ) + (f"; it sends {heard}" if heard else "")
+
+
+def _is_mapping(address: Address) -> bool:
+    return 0x1800 <= address[0] <= 0x1BFF
+
+
+def _objects_of(tpdo: Tpdo, number: int) -> dict[Address, int]:
+    """A TPDO as the objects that describe it."""
+    communication, mapping = 0x17FF + number, 0x19FF + number
+    entries = {
+        (mapping, place): index << 16 | subindex << 8 | bits
+        for place, (index, subindex, bits) in enumerate(tpdo.entries, start=1)
+    }
+    return {
+        (communication, 1): tpdo.cob,
+        (communication, 2): tpdo.transmission_type,
+        (mapping, 0): len(tpdo.entries),
+        **entries,
+    }
+
+
+def _sent(tpdos: Iterable[Tpdo]) -> tuple[Tpdo, ...]:
+    """Those that are enabled and known, one for each identifier."""
+    found: dict[int, Tpdo] = {}
+    for tpdo in tpdos:
+        if tpdo.enabled and tpdo.known and 0x181 <= tpdo.cob_id <= 0x57F:
+            found.setdefault(tpdo.cob_id, tpdo)
+    return tuple(found.values())
+
+
+def _toml(tpdo: Tpdo) -> str:
+    objects = ", ".join(f'"0x{index:04X}:{subindex:02X}:{bits}"' for index, subindex, bits in tpdo.entries)
+    timing = "" if tpdo.transmission_type == 1 else f", transmission_type = {tpdo.transmission_type}"
+    return f"{{ cob_id = 0x{tpdo.cob_id:03X}, objects = [{objects}]{timing}, default = true }}"
 
 
 def _declared(section: TpdoSection) -> Tpdo:
@@ -136,6 +264,8 @@ class PassiveConfigurator:
     Attributes:
         layouts: of the nodes that are known so far.
         missing: for the others, what is missing.
+        doubts: of the nodes in `layouts`, those whose layout is not believed now: why, and what would
+            settle it.
     """
 
     def __init__(self, joints: Sequence[JointFile], base_dirs: Sequence[Path] | None = None) -> None:
@@ -149,6 +279,7 @@ class PassiveConfigurator:
                 self._nodes[role.node_id] = _PassiveNode(role)
         self.layouts: dict[int, NodeLayout] = {}
         self.missing: dict[int, DriveError] = {}
+        self.doubts: dict[int, str] = {}
         self.poll(0.0)
 
     @property
@@ -161,25 +292,53 @@ class PassiveConfigurator:
         """Whether the mapping of any node is still unknown."""
         return bool(self.missing)
 
+    @property
+    def believed(self) -> frozenset[int]:
+        """Nodes whose frames mean what their layout says: it is known, not doubted, and not being changed."""
+        return frozenset(
+            node
+            for node in self.layouts
+            if node not in self.doubts and not (node in self._nodes and self._nodes[node].being_mapped)
+        )
+
     def adopt(self, layouts: Iterable[NodeLayout]) -> None:
         """Take layouts that are known from elsewhere; what is overheard later counts more."""
         for layout in layouts:
-            if layout.node_id in self._nodes:
-                self.layouts[layout.node_id] = layout
+            node = self._nodes.get(layout.node_id)
+            if node is not None:
+                node.adopted = self.layouts[layout.node_id] = layout
                 self.missing.pop(layout.node_id, None)
+                self.doubts.pop(layout.node_id, None)
 
     def start(self, node: int, *, stopped: bool = False) -> None:
         """Nothing: whoever configures this node will do it again."""
 
+    def lose_sight(self) -> None:
+        """The bus was away: what was overheard may hold no more."""
+        for node in self._nodes.values():
+            node.lose_sight()
+
     def feed(self, cob_id: int, data: bytes, now_s: float) -> None:
-        """Take a frame; SDO requests (0x601 to 0x67F) and responses (0x581 to 0x5FF) are of interest."""
-        node = self._nodes.get(cob_id & 0x7F)
-        if node is None:
+        """Take a frame: SDO, boot-up and NMT resets are of interest, and which PDOs there are at all."""
+        if cob_id == 0:
+            if len(data) == 2 and data[0] in _NMT_RESETS:
+                for node_id, node in self._nodes.items():
+                    if data[1] in (0, node_id):
+                        node.restart()
             return
-        if cob_id >> 7 == 0x600 >> 7:
-            node.listener.request(data)
-        elif cob_id >> 7 == 0x580 >> 7:
-            node.listener.response(data)
+        one = self._nodes.get(cob_id & 0x7F)
+        if one is None:
+            return
+        function = cob_id >> 7
+        if function == 0x600 >> 7:
+            one.listener.request(data)
+        elif function == 0x580 >> 7:
+            one.listener.response(data)
+        elif function == 0x700 >> 7:
+            if len(data) == 1 and data[0] & 0x7F == 0:
+                one.restart()
+        elif 0x180 >> 7 <= function <= 0x480 >> 7 and function & 1:
+            one.heard[cob_id] = len(data)
 
     def poll(self, now_s: float) -> list[tuple[int, NodeLayout | DriveError]]:
         """Nodes whose layout became known or another one since the last call."""
@@ -189,13 +348,18 @@ class PassiveConfigurator:
                 continue
             node.seen_changes = node.listener.changes
             try:
-                layout = node.layout()
+                layout, doubt = node.layout()
             except DriveError as error:
-                # While a master rewrites the map there is none for a moment; the old one goes on until then.
+                # While a master rewrites the map there is none; what is known of the old one is kept.
                 if node_id not in self.layouts:
                     self.missing[node_id] = error
+                else:
+                    self.doubts[node_id] = str(error)
                 continue
             self.missing.pop(node_id, None)
+            self.doubts.pop(node_id, None)
+            if doubt:
+                self.doubts[node_id] = doubt
             if self.layouts.get(node_id) != layout:
                 self.layouts[node_id] = layout
                 log_findings(logger, layout.findings)

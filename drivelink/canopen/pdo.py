@@ -48,6 +48,7 @@ class Tpdo:
         entries: what is mapped, in order.
         fixed: whether its mapping cannot be changed.
         most: objects that can be mapped into it.
+        known: whether the entries are; a map that the node or the sheet does not tell is not an empty one.
     """
 
     number: int
@@ -58,6 +59,7 @@ class Tpdo:
     entries: tuple[Entry, ...] = ()
     fixed: bool = False
     most: int = 64
+    known: bool = True
 
     @property
     def cob_id(self) -> int:
@@ -90,8 +92,8 @@ def describe(tpdos: Iterable[Tpdo]) -> str:
     """The maps in one line."""
     parts = []
     for tpdo in tpdos:
-        objects = (
-            " + ".join(f"0x{index:04X}:{subindex:02X}" for index, subindex, _ in tpdo.entries) or "empty"
+        objects = " + ".join(f"0x{index:04X}:{subindex:02X}" for index, subindex, _ in tpdo.entries) or (
+            "empty" if tpdo.known else "unknown"
         )
         parts.append(f"TPDO{tpdo.number} = {objects}")
     return "; ".join(parts) or "no TPDO"
@@ -133,10 +135,12 @@ def read_tpdo(node: int, number: int, *, exactly: bool = False) -> Program[Tpdo 
     transmission_type = yield from read(node, communication, 2)
     inhibit = yield from read_optional(node, communication, 3)
     event = yield from read_optional(node, communication, 5)
-    count = (yield from read(node, mapping, 0)) or 0
+    count = yield from read(node, mapping, 0)
+    known = count is not None
     entries: list[Entry] = []
-    for subindex in range(1, min(count, 64) + 1):
+    for subindex in range(1, min(count or 0, 64) + 1):
         raw = yield from read(node, mapping, subindex)
+        known = known and raw is not None
         if not raw:  # some count places that are empty
             break
         entries.append((raw >> 16, raw >> 8 & 0xFF, raw & 0xFF))
@@ -146,7 +150,8 @@ def read_tpdo(node: int, number: int, *, exactly: bool = False) -> Program[Tpdo 
         transmission_type=255 if transmission_type is None else transmission_type,
         inhibit_100us=inhibit or 0,
         event_ms=event or 0,
-        entries=tuple(entries) if sum(bits for _, _, bits in entries) <= 64 else (),
+        entries=tuple(entries) if (known := known and sum(bits for _, _, bits in entries) <= 64) else (),
+        known=known,
     )
 
 
@@ -163,7 +168,7 @@ def read_tpdos(node: int) -> Program[tuple[Tpdo, ...]]:
 
 
 def tpdos_of(values: Mapping[Address, int]) -> tuple[Tpdo, ...]:
-    """The TPDOs that the values of 0x1800 to 0x1BFF describe, as far as they are complete.
+    """The TPDOs that the values of 0x1800 to 0x1BFF describe; one whose map is not complete is not `known`.
 
     Args:
         values: unsigned values by (index, subindex), from a data sheet or overheard.
@@ -171,9 +176,9 @@ def tpdos_of(values: Mapping[Address, int]) -> tuple[Tpdo, ...]:
     found = []
     for communication in sorted({index for index, _ in values if 0x1800 <= index <= 0x19FF}):
         cob = values.get((communication, 1))
-        entries = _entries(values, communication + 0x200)
-        if cob is None or entries is None:
+        if cob is None:
             continue
+        entries = _entries(values, communication + 0x200)
         found.append(
             Tpdo(
                 number=communication - 0x17FF,
@@ -181,7 +186,8 @@ def tpdos_of(values: Mapping[Address, int]) -> tuple[Tpdo, ...]:
                 transmission_type=values.get((communication, 2), 255),
                 inhibit_100us=values.get((communication, 3), 0),
                 event_ms=values.get((communication, 5), 0),
-                entries=entries,
+                entries=entries or (),
+                known=entries is not None,
             )
         )
     return tuple(found)
@@ -194,7 +200,7 @@ def _entries(values: Mapping[Address, int], mapping: int) -> tuple[Entry, ...] |
     for subindex in range(1, 65 if count is None else min(count, 64) + 1):
         raw = values.get((mapping, subindex), 0)
         if not raw:  # a data sheet without a count: the entries end with the first that is empty
-            return tuple(entries) if count is None else None
+            return tuple(entries) if count is None and entries else None
         entries.append((raw >> 16 & 0xFFFF, raw >> 8 & 0xFF, raw & 0xFF))
     return tuple(entries)
 

@@ -39,7 +39,7 @@ class Assembler:
         layouts: the joint's nodes, as configured or as declared.
         motors: how many motors the joint has.
         active: whether we configure the nodes. Then a node that rebooted is believed again when it is
-            started again; else also when its heartbeat says operational.
+            started again; else `trust` alone makes it so.
         sync_cob_id: identifier of SYNC.
         hold_periods: how long the last value of a TPDO that is not sent on SYNC may be used while nothing
             at all is heard of its node; and how long one that is sent on SYNC may fail before a node that we
@@ -300,7 +300,7 @@ class Assembler:
     def supervise(self) -> None:
         """From now on `trust` alone makes a node believed again: somebody else may start it too."""
         for node in self._nodes.values():
-            node.supervised = self._active
+            node.supervised = True
 
     def distrust(self, node_id: int) -> None:
         """Do not use what a node sends until it is started again."""
@@ -327,6 +327,7 @@ class Assembler:
             self._slots, node.slots[:] = slots, before
             self._arrange()
             raise
+        self._restart = True  # what is decoded anew may jump
 
     def _command(self, cob_id: int, data: bytes) -> None:
         if len(data) != 2:

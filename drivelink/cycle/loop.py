@@ -93,6 +93,7 @@ class CycleLoop:
         source: the bus; replaced when it is lost and reopened.
         housekeeping: what is done in the slack.
         listeners: by identifier, who else wants a frame: SDO, heartbeat, EMCY.
+        after_sync: called at each SYNC, after the joints have taken it.
         clock: what supervision goes by, ns.
         on_lost: told when the bus is lost.
         on_fault: told of an exception in what concerns one joint or one node, and whose; that one is left
@@ -122,6 +123,7 @@ class CycleLoop:
         self.lanes = tuple(lanes)
         self.housekeeping = Housekeeping()
         self.listeners: dict[int, Listener] = {}
+        self.after_sync: list[Callable[[], None]] = []
         self.clock: Callable[[], int] = time.monotonic_ns
         self.on_lost: Callable[[str], None] = lambda _reason: None
         self.on_fault: Callable[[str, Exception], None] = _log_fault
@@ -280,6 +282,8 @@ class CycleLoop:
                 estimate = self._feed(lane, SYNC_COB_ID, data, jump)
             if estimate is not None:
                 self._publish(lane, estimate, now_ns)
+        for follow in self.after_sync:
+            follow()
 
     def _feed(self, lane: Lane, cob_id: int, data: bytes, jump: int = 1) -> Estimate | None:
         """A frame for one joint; an exception ends its estimates, and nobody else's."""

@@ -13,7 +13,6 @@ __all__ = ["NodeCounters", "NodeState"]
 
 _START = 0x01
 _RESETS = (0x81, 0x82)  # node, communication
-_OPERATIONAL = 0x05
 _FAULT_BIT = 0x0008  # of the statusword
 
 
@@ -52,9 +51,9 @@ class NodeState:
 
     Args:
         active: whether we configure the nodes. We start each by its own number when it is configured; a
-            start of all nodes is somebody else's, and says nothing of their mapping. A passive listener
-            believes that too, and a heartbeat that says operational, since a node may start by itself.
-            In a log, a start by its own number is taken for ours.
+            start of all nodes is somebody else's, and says nothing of their mapping. In a log, a start by its
+            own number is taken for ours. Where somebody else configures them no start tells anything: see
+            `MapFollower`.
 
     Attributes:
         supervised: somebody knows for sure when it is configured, and calls `trust`: no frame tells.
@@ -92,10 +91,11 @@ class NodeState:
 
     def command(self, _cob_id: int, data: bytes) -> None:
         """An NMT command that is addressed to this node, or to all."""
-        if data[0] == _START and not self.supervised and (data[1] or not self._active):
+        if data[0] == _START and self._active and not self.supervised and data[1]:
             self.trust()
         elif data[0] in _RESETS:
             self.trusted = False
+            self.restarted = True  # it will; its boot-up message may get lost
 
     def trust(self) -> None:
         """From now on its frames mean what its layout says."""
@@ -116,8 +116,6 @@ class NodeState:
             for slot in self.slots:
                 slot.forget()
             return
-        if state == _OPERATIONAL and not self._active:
-            self.trusted = True
         for slot in self.slots:
             if not slot.every:
                 slot.silent = 0

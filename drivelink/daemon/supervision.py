@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from drivelink.canopen.configure import Configurator
 from drivelink.canopen.emcy import drive_state, parse_emergency
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
+from drivelink.cycle.following import MapFollower
 from drivelink.cycle.framesource import LostSource
 from drivelink.cycle.loop import CycleLoop, Lane
 from drivelink.cycle.nodestate import NodeCounters
@@ -109,7 +111,7 @@ class Supervisor:
         self._loop = loop
         self._events = events
         self._configurator = configurator
-        self._overheard = False
+        self._follower: MapFollower | None = None
         self._foreign_syncs = self._counter_jumps = self._lost_sends = self._clock_steps = 0
         self._bus_offs = self._restarts = 0
         loop.on_fault = self._say_fault
@@ -121,8 +123,22 @@ class Supervisor:
                 loop.listeners[0x700 + layout.node_id] = self._heartbeat
                 loop.listeners[0x080 + layout.node_id] = self._emergency
                 loop.listeners[0x580 + layout.node_id] = self._answer
-                if isinstance(configurator, PassiveConfigurator):
-                    loop.listeners[0x600 + layout.node_id] = self._answer
+        if isinstance(configurator, PassiveConfigurator):
+            self._follow(configurator)
+
+    def _follow(self, configurator: PassiveConfigurator) -> None:
+        """Somebody else maps the nodes: have every frame that tells of it heard in its turn."""
+        loop, nodes = self._loop, self._nodes
+        self._follower = MapFollower(
+            configurator,
+            {node: watched.lane.chain.assembler for node, watched in nodes.items()},
+            {node: watched.layout for node, watched in nodes.items()},
+            self._listen_anew,
+        )
+        loop.listeners[0] = self._follower.feed
+        for node in nodes:
+            loop.listeners[0x580 + node] = loop.listeners[0x600 + node] = self._follower.feed
+        loop.after_sync.append(self._follower.sync)
 
     @property
     def receive_ids(self) -> tuple[int, ...]:
@@ -153,8 +169,7 @@ class Supervisor:
 
     def step(self, now_ns: int) -> None:
         """Go on with what is being configured."""
-        if self._configurator.busy or self._overheard:
-            self._overheard = False
+        if self._configurator.busy and self._follower is None:
             self._proceed(now_ns)
 
     def _proceed(self, now_ns: int) -> None:
@@ -175,11 +190,10 @@ class Supervisor:
                 self._events.say(f"node {node} has another mapping now: {_maps(result)}")
             watched.layout = result
             self._events.end(f"configure {node}")
-            if isinstance(configurator, Configurator):
-                watched.lane.chain.assembler.trust(node)
-                if not watched.started:
-                    self._events.say(f"node {node} is configured again and started")
-                watched.started = True
+            watched.lane.chain.assembler.trust(node)
+            if not watched.started:
+                self._events.say(f"node {node} is configured again and started")
+            watched.started = True
 
     def check(self) -> None:
         """What has changed since the last check; a few tens of microseconds."""
@@ -192,7 +206,26 @@ class Supervisor:
             self._check_faults(node, watched)
         for lane in self._loop.lanes:
             self._check_lane(lane)
+        if self._follower is not None:
+            self._check_maps(self._follower)
         self._check_bus()
+
+    def _listen_anew(self) -> None:
+        self._loop.reroute()
+        self._loop.source.narrow(self._loop.receive_ids())
+
+    def _check_maps(self, follower: MapFollower) -> None:
+        for node, layout in follower.changed.items():
+            watched = self._nodes[node]
+            if layout.tpdos != watched.layout.tpdos:
+                self._events.say(f"node {node} has another mapping now: {_maps(layout)}")
+            watched.layout = layout
+        follower.changed.clear()
+        for node in self._nodes:
+            if node in follower.doubts:
+                self._events.begin(f"mapping {node}", follower.doubts[node])
+            else:
+                self._events.end(f"mapping {node}", f"node {node}: its mapping is known, its frames are used")
 
     def _check_lane(self, lane: Lane) -> None:
         if lane.fault:
@@ -217,6 +250,8 @@ class Supervisor:
                 assembler.distrust(node)
             watched.begin(assembler.counters[node], self._loop.clock())
             self._configurator.start(node)
+        if self._follower is not None:
+            self._follower.lose_sight()
 
     def _check_frames(self, node: int, watched: _Watched, now: int) -> None:
         assembler = watched.lane.chain.assembler
@@ -333,6 +368,10 @@ class Supervisor:
             self._events.say(f"node {node} has rebooted", logging.WARNING)
             watched.attempt_ns = watched.heartbeat_ns
             self._configurator.start(node)
+            if self._follower is not None:  # its heartbeat, too, is as the node has it by itself
+                watched.layout = replace(watched.layout, heartbeat_ms=0)
+        if self._follower is not None:
+            self._follower.feed(cob_id, data)
         if state in _STATES:
             watched.state = state
 
@@ -344,10 +383,7 @@ class Supervisor:
     def _answer(self, cob_id: int, data: bytes) -> None:
         now_ns = self._loop.clock()
         self._configurator.feed(cob_id, data, now_ns / _NS)
-        if isinstance(self._configurator, Configurator):
-            self._proceed(now_ns)  # its frames must not be read by the old layout once it is started
-        else:
-            self._overheard = True
+        self._proceed(now_ns)  # its frames must not be read by the old layout once it is started
 
 
 def _maps(layout: NodeLayout) -> str:

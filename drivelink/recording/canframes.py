@@ -20,6 +20,7 @@ from drivelink.canopen.layout import NodeLayout, layout_from
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.acquisition import SYNC_COB_ID, Assembler
 from drivelink.cycle.chain import make_assembler
+from drivelink.cycle.following import MapFollower
 from drivelink.errors import DriveError, RecordingError
 from drivelink.jointfile import JointFile
 from drivelink.recording.canlog import CAN_SUFFIXES, NO_STAMP, Frame, read_frames
@@ -33,6 +34,8 @@ __all__ = ["FrameLog", "is_frame_log", "read_frame_record"]
 
 _LOG = logging.getLogger("drivelink.recording")
 
+_SDO = range(0x581, 0x680)
+_OF_MAPS = frozenset({0, *_SDO, *range(0x701, 0x780)})  # NMT, SDO, boot-up
 _QUIET_SYNCS = 500  # without a change of the configuration: it is over
 _PERIOD_TOLERANCE = 0.03
 _PEEK = 20_000  # messages that tell whether an MCAP file has samples
@@ -80,10 +83,12 @@ class FrameLog:
         mcap = path.suffix.lower() == ".mcap"
         self._frames = _mcap_frames(path) if mcap else read_frames(path, channel, joint.bus.channel)
         self._follow = joint.bus.sync == "follow"
+        self._passive = not joint.bus.configure
         self._listener = PassiveConfigurator([joint], [base_dir])
         self._head: list[Frame] = []  # after the configuration, read already
         syncs, overheard = self._learn_configuration()
         if mcap and not overheard and (known := _mcap_layouts(path, joint.name)):
+            self._listener = PassiveConfigurator([joint], [base_dir])
             self._listener.adopt(known)  # the recording began when the daemon was running already
             self._head, self._frames = [], _mcap_frames(path)
         self._check_complete()
@@ -97,6 +102,7 @@ class FrameLog:
     def cycles(self) -> Iterator[Cycle]:
         """The cycles that the frames make; once."""
         assembler = self._assembler
+        follower = self._follower() if self._passive else None
         numbered = numbered_at_once if self._follow else numbered_ahead
         stamp_now = stamp_before = 0
         for (stamp_ns, can_id, data, _), jump in numbered(chain(self._head, self._frames), self.period_s):
@@ -104,7 +110,9 @@ class FrameLog:
             sample = assembler.feed(can_id, data, jump)
             if can_id == SYNC_COB_ID and jump:
                 stamp_before, stamp_now = stamp_now, stamp_ns
-            elif 0x581 <= can_id <= 0x67F:
+            if follower is not None and (can_id in _OF_MAPS or can_id == SYNC_COB_ID):
+                follower.feed(can_id, data)
+            elif can_id in _SDO:
                 self._relayout(can_id, data, assembler)
             if sample is not None:
                 stamp_ns = stamp_before if assembler.sequence != was else stamp_now
@@ -113,8 +121,16 @@ class FrameLog:
                 missed, assembler.missed = assembler.missed, -1
                 yield Cycle(missed, stamp_before, None, assembler.flags)
 
+    def _follower(self) -> MapFollower:
+        """Somebody else maps the nodes: the maps are followed as the daemon follows them."""
+        layouts = self._listener.layouts
+        return MapFollower(self._listener, dict.fromkeys(layouts, self._assembler), layouts)
+
     def _learn_configuration(self) -> tuple[list[int], bool]:
         """Listen to the SDO transfers until the mapping is known and at rest.
+
+        Where somebody else maps the nodes it is enough that it is known: it may change at any time, and what
+        follows is heard in its turn.
 
         Returns:
             Stamps of the SYNCs till then, and whether a node's mapping was overheard.
@@ -131,7 +147,7 @@ class FrameLog:
                 quiet += 1
                 if quiet > _QUIET_SYNCS and not listener.busy:
                     break
-            elif 0x581 <= can_id <= 0x67F:
+            elif can_id in (_OF_MAPS if self._passive else _SDO) and (listener.busy or not self._passive):
                 listener.feed(can_id, data, 0.0)
                 if listener.poll(0.0):
                     head.clear()

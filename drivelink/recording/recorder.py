@@ -21,6 +21,7 @@ from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.acquisition import SYNC_COB_ID, Assembler
 from drivelink.cycle.chain import make_assembler
+from drivelink.cycle.following import MapFollower
 from drivelink.cycle.framesource import BusLostError
 from drivelink.cycle.sources import open_source
 from drivelink.errors import BusError, DriveError, ZenohError
@@ -162,6 +163,7 @@ class BusTap:
         self._joint = joint
         self._listener = PassiveConfigurator([joint], [base_dir]) if base_dir is not None else None
         self._assembler: Assembler | None = None
+        self._follower: MapFollower | None = None
         self._lacking = ""  # what the mapping lacks, where it is known
         self._numbering = SyncNumbering(joint.bus.period_s)
         self._stamp_ns = 0
@@ -204,7 +206,9 @@ class BusTap:
         listener = self._listener
         if listener is None:
             return
-        if 0x581 <= cob_id <= 0x67F:
+        passive = not self._joint.bus.configure
+        sdo = 0x581 <= cob_id <= 0x67F
+        if self._follower is None and (sdo or (passive and (cob_id == 0 or cob_id >= 0x700))):
             listener.feed(cob_id, data, 0.0)
             for _, layout in listener.poll(0.0):
                 if self._assembler is not None and isinstance(layout, NodeLayout):
@@ -215,6 +219,9 @@ class BusTap:
                 return
             try:
                 self._assembler = make_assembler(self._joint, tuple(listener.layouts.values()))
+                if passive:
+                    nodes = dict.fromkeys(listener.layouts, self._assembler)
+                    self._follower = MapFollower(listener, nodes, listener.layouts)
             except DriveError as error:  # the frames are recorded all the same
                 self._lacking, self._listener = str(error), None
                 return
@@ -222,6 +229,8 @@ class BusTap:
         if cob_id == SYNC_COB_ID and jump:
             self._stamp_ns = stamp_ns
         sample = self._assembler.feed(cob_id, data, jump)
+        if self._follower is not None:
+            self._follower.feed(cob_id, data)
         if sample is not None:
             late = sample.sequence != self._assembler.sequence
             self._gate.sample(self, sample, before_ns if late else self._stamp_ns)

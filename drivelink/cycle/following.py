@@ -1,0 +1,107 @@
+"""Maps that somebody else writes: what the samples of a passive daemon are decoded by, and from when on.
+
+The frames go past here after the assemblers have seen them, live or from a log. From the frame on that makes
+a map doubtful, the frames of that node are not used; a map that is known again holds from the next SYNC on,
+for that is the first one which the node answers with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from drivelink.canopen.layout import NodeLayout
+from drivelink.canopen.passive import PassiveConfigurator
+from drivelink.cycle.acquisition import SYNC_COB_ID, Assembler
+from drivelink.errors import DriveError
+
+__all__ = ["MapFollower"]
+
+
+class MapFollower:
+    """Keeps the assemblers of passive joints to maps that are believed.
+
+    Args:
+        configurator: learns the maps by listening. Nodes that it knows nothing of are taken to send by the
+            layouts given here.
+        assemblers: of each node's joint.
+        layouts: by which they decode now.
+        relaid: called when frames of another identifier have come into use.
+
+    Attributes:
+        changed: by node, the layouts that have come into use since somebody last cleared this.
+        refused: by node, why a map that was overheard cannot be used.
+    """
+
+    def __init__(
+        self,
+        configurator: PassiveConfigurator,
+        assemblers: Mapping[int, Assembler],
+        layouts: Mapping[int, NodeLayout],
+        relaid: Callable[[], object] = lambda: None,
+    ) -> None:
+        self._configurator = configurator
+        self._assemblers = assemblers
+        self._in_use = dict(layouts)
+        self._trusted = dict.fromkeys(layouts, True)
+        self._due: set[int] = set()
+        self._relaid = relaid
+        self.changed: dict[int, NodeLayout] = {}
+        self.refused: dict[int, str] = {}
+        configurator.adopt(layout for node, layout in layouts.items() if node not in configurator.layouts)
+        for assembler in assemblers.values():
+            assembler.supervise()
+        self._judge()
+        self.sync()
+
+    @property
+    def doubts(self) -> dict[int, str]:
+        """Nodes whose frames are not used, and why."""
+        return {**self._configurator.doubts, **self.refused}
+
+    def feed(self, cob_id: int, data: bytes) -> None:
+        """Take a frame, in the order of the bus."""
+        if cob_id == SYNC_COB_ID:
+            self.sync()
+            return
+        self._configurator.feed(cob_id, data, 0.0)
+        self._configurator.poll(0.0)
+        self._judge()
+
+    def sync(self) -> None:
+        """A SYNC, after the assemblers have taken it: what is known by now holds from here on."""
+        for node in self._due:
+            layout, assembler = self._configurator.layouts[node], self._assemblers[node]
+            before, self._in_use[node] = self._in_use[node], layout
+            if layout.tpdos != before.tpdos:
+                try:
+                    assembler.relayout(layout)
+                except DriveError as error:
+                    self._in_use[node], self.refused[node] = before, str(error)
+                    continue
+                self._relaid()
+            if layout != before:
+                self.changed[node] = layout
+            if not self._trusted[node]:
+                self._trusted[node] = True
+                assembler.trust(node)
+        self._due.clear()
+
+    def lose_sight(self) -> None:
+        """The bus was away: what was overheard may hold no more."""
+        self._configurator.lose_sight()
+        self._configurator.poll(0.0)
+        self._judge()
+
+    def _judge(self) -> None:
+        believed = self._configurator.believed
+        for node, assembler in self._assemblers.items():
+            if node not in believed:
+                self._due.discard(node)
+                self._trusted[node] = False
+                assembler.distrust(node)
+            elif not self._trusted[node] or self._configurator.layouts[node] != self._in_use[node]:
+                if self._configurator.layouts[node].tpdos != self._in_use[node].tpdos:
+                    self._trusted[node] = False
+                    assembler.distrust(node)
+                self.refused.pop(node, None)
+                self._due.add(node)

@@ -1,0 +1,230 @@
+"""A passive daemon beside a master that maps, stops, resets and starts the nodes: no sample by a wrong map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from canopenkit import INVALID
+from fuzzrun import FuzzRun
+
+from drivelink.recording.canframes import FrameLog
+from estimator.sample import Status
+
+START, STOP, PRE, RESET_NODE, RESET_COMMUNICATION = 0x01, 0x02, 0x80, 0x81, 0x82
+PERIOD_NS = 1_000_000
+POSITION, TORQUE, STATUSWORD = 0x60640020, 0x60770010, 0x60410010
+
+
+class Master:
+    """Somebody else's master on the bus of a passive daemon: 1 kHz SYNC, SDO and NMT in between."""
+
+    def __init__(self) -> None:
+        self.run = FuzzRun(1, passive=True)
+        self.log: list[tuple[int, int, bytes]] = []
+        self.stamp_ns = 1_800_000_000 * 1_000_000_000
+        self.valid: list[tuple[int, dict[str, float]]] = []  # SYNC of the nodes, and that of each value
+        self.run.judge.put_sample = self._keep  # type: ignore[method-assign]
+
+    def _keep(self, sample, _stamp_ns: int) -> None:
+        estimate = self.run.chain.estimate
+        assert estimate is not None and estimate.status & Status.VALID
+        later = self.run.chain.assembler.sequence - sample.sequence  # given at the end of its cycle
+        self.valid.append((self.run.bus.tick - later, self.run.ticks_of(sample)))
+
+    def syncs(self, count: int) -> None:
+        for _ in range(count):
+            self.stamp_ns += PERIOD_NS
+            self.run.bus.sync(self.stamp_ns)
+            self._deliver()
+        self.run.supervisor.check()
+
+    def send(self, cob_id: int, data: bytes) -> None:
+        bus = self.run.bus
+        bus._queue.append((cob_id, data))
+        bus._queue.extend(bus._handled(cob_id, data))
+        self._deliver()
+
+    def _deliver(self) -> None:
+        self.log += [(self.stamp_ns + k, *frame) for k, frame in enumerate(self.run.bus._queue)]
+        self.run.loop.receive()
+
+    def nmt(self, command: int, node: int) -> None:
+        self.send(0, bytes((command, node)))
+
+    def write(self, node: int, index: int, subindex: int, value: int, size: int) -> None:
+        head = bytes([0x23 | (4 - size) << 2]) + index.to_bytes(2, "little") + bytes([subindex])
+        self.send(0x600 + node, head + value.to_bytes(size, "little").ljust(4, b"\0"))
+
+    def read(self, node: int, index: int, subindex: int = 0) -> None:
+        self.send(0x600 + node, b"\x40" + index.to_bytes(2, "little") + bytes([subindex]) + bytes(4))
+
+    def map(self, node: int, number: int, *entries: int, syncs: int = 0) -> None:
+        """As every master does it, with so many SYNCs after each step."""
+        communication, mapping = 0x17FF + number, 0x19FF + number
+        cob_id = 0x80 + 0x100 * number + node
+        steps = [(communication, 1, INVALID | cob_id, 4), (communication, 2, 1, 1), (mapping, 0, 0, 1)]
+        steps += [(mapping, place, entry, 4) for place, entry in enumerate(entries, start=1)]
+        steps += [(mapping, 0, len(entries), 1), (communication, 1, cob_id, 4)]
+        for step in steps:
+            self.write(node, *step)
+            self.syncs(syncs)
+
+    @property
+    def wrong(self) -> list[tuple[int, dict[str, float]]]:
+        return [(tick, told) for tick, told in self.valid if set(told.values()) != {float(tick)}]
+
+    @property
+    def conditions(self) -> str:
+        return " | ".join(self.run.events.active.values())
+
+    def disable_others(self) -> None:
+        """The TPDOs that the configuration before the start has chosen for node 2."""
+        for tpdo in self.run.configurator.layouts[2].tpdos:
+            self.write(2, 0x17FF + tpdo.number, 1, INVALID | tpdo.cob_id, 4)
+
+
+def read_scales(master: Master) -> None:
+    """What a master reads of the drives, and a passive listener learns the scales from."""
+    for node in (1, 2):
+        for index, subindex in ((0x608F, 1), (0x608F, 2), (0x6075, 0), (0x6076, 0), (0x60A9, 0)):
+            master.read(node, index, subindex)
+    for index in (0x6001, 0x6002, 0x6501, 0x6502):
+        master.read(3, index)
+
+
+@pytest.mark.parametrize("syncs", [0, 1, 3])
+@pytest.mark.parametrize("stopped_by", [PRE, STOP], ids=["pre-operational", "stopped"])
+def test_a_map_that_changes_holds_from_its_sync_on(syncs: int, stopped_by: int) -> None:
+    master = Master()
+    read_scales(master)
+    master.syncs(50)
+    assert [tick for tick, _ in master.valid] == list(range(1, 51))
+    master.nmt(stopped_by, 2)
+    master.syncs(syncs)
+    master.nmt(PRE, 2)
+    master.disable_others()
+    master.map(2, 1, TORQUE, STATUSWORD, POSITION, syncs=syncs)  # of the same length, in another order
+    before = len(master.valid)
+    assert before == 50
+    master.nmt(START, 2)
+    first = master.run.bus.tick + 1
+    master.syncs(50)
+    # After missing frames a sample is given at the end of its cycle: the last one has not come yet.
+    assert [tick for tick, _ in master.valid[50:]][:49] == list(range(first, first + 49))
+    assert master.wrong == []
+    assert "node 2 has another mapping now" in " ".join(e["text"] for e in master.run.events.recent())
+
+
+@pytest.mark.parametrize("reset", [RESET_NODE, RESET_COMMUNICATION])
+@pytest.mark.parametrize("everybody", [False, True], ids=["one", "all"])
+def test_after_a_reset_without_a_new_map_nothing_is_valid_and_one_line_says_what_would_settle_it(
+    reset: int, everybody: bool
+) -> None:
+    master = Master()
+    master.syncs(50)
+    master.nmt(reset, 0 if everybody else 1)  # its default map has identifier and length of ours, and starts
+    master.nmt(START, 0)
+    master.syncs(1500)
+    assert len(master.valid) == 50
+    assert master.wrong == []
+    assert (
+        "node 1 (motor[1].drive): it has restarted, and its mapping was neither written nor read since"
+        in (master.conditions)
+    )
+    assert "[[motor.drive.tpdo]] with default = true" in master.conditions
+
+
+def test_a_boot_up_message_that_nobody_expected_is_enough() -> None:
+    master = Master()
+    master.syncs(50)
+    master.run.bus.nodes[0].reset()
+    master.send(0x701, b"\x00")
+    master.syncs(100)
+    assert len(master.valid) == 50
+
+
+def test_after_a_reset_a_map_that_is_read_back_is_believed() -> None:
+    master = Master()
+    read_scales(master)
+    master.syncs(50)
+    layout = master.run.configurator.layouts[2]
+    master.nmt(RESET_NODE, 2)
+    (tpdo,) = layout.tpdos
+    entries = [o.index << 16 | o.subindex << 8 | o.bits for o in tpdo.objects]
+    number = (tpdo.cob_id - 0x82) // 0x100
+    objects = master.run.bus.nodes[1].slave.objects  # it comes back with the map it has stored
+    for place, entry in enumerate(entries, start=1):
+        objects[0x19FF + number, place].value = entry
+    objects[0x19FF + number, 0].value, objects[0x17FF + number, 2].value = len(entries), 1
+    objects[0x17FF + number, 1].value = tpdo.cob_id
+    master.nmt(START, 2)
+    master.syncs(50)
+    assert len(master.valid) == 50
+    for subindex in (1, 2):
+        master.read(2, 0x17FF + number, subindex)
+    for place in range(1, len(entries) + 1):
+        master.read(2, 0x19FF + number, place)
+    master.read(2, 0x19FF + number, 0)
+    first = master.run.bus.tick + 1
+    master.syncs(50)
+    # After missing frames a sample is given at the end of its cycle: the last one has not come yet.
+    assert [tick for tick, _ in master.valid[50:]][:49] == list(range(first, first + 49))
+    assert master.wrong == []
+    assert "mapping" not in master.conditions
+
+
+def test_a_map_rewritten_while_the_node_sends_is_never_half_believed() -> None:
+    master = Master()
+    master.syncs(20)
+    slave = master.run.bus.nodes[1].slave
+    (tpdo,) = master.run.configurator.layouts[2].tpdos
+    mapping = 0x19FF + (tpdo.cob_id - 0x82) // 0x100
+    for place, entry in ((1, TORQUE), (2, STATUSWORD), (3, POSITION)):
+        slave.objects[mapping, place].value = entry  # a lenient node takes it at once
+        head = b"\x23" + mapping.to_bytes(2, "little") + bytes([place])
+        bus = master.run.bus
+        bus._queue.append((0x602, head + entry.to_bytes(4, "little")))
+        master.syncs(1)
+        bus._queue.append((0x582, b"\x60" + head[1:] + bytes(4)))
+        master.syncs(1)
+    master.syncs(20)
+    assert master.wrong == []
+
+
+def test_a_log_gives_the_samples_of_the_live_run(tmp_path: Path) -> None:
+    master = Master()
+    read_scales(master)
+    for node, entries in ((1, (POSITION, TORQUE, STATUSWORD)), (3, (0x60040020,))):
+        master.nmt(PRE, node)
+        master.map(node, 1, *entries)
+        master.nmt(START, node)
+    master.nmt(PRE, 2)
+    master.disable_others()
+    master.map(2, 1, POSITION, TORQUE, STATUSWORD)
+    master.nmt(START, 2)
+    begun = len(master.valid)
+    master.syncs(100)
+    master.nmt(PRE, 2)
+    master.map(2, 1, TORQUE, STATUSWORD, POSITION, syncs=1)
+    master.nmt(START, 2)
+    master.syncs(50)
+    master.nmt(RESET_NODE, 1)
+    master.nmt(START, 1)
+    master.syncs(50)
+    master.nmt(PRE, 1)
+    master.map(1, 1, POSITION, STATUSWORD, TORQUE)
+    master.nmt(START, 1)
+    master.syncs(600)
+    assert master.wrong == []
+    path = tmp_path / "passive.log"
+    path.write_text(
+        "".join(
+            f"({stamp_ns // 10**9}.{stamp_ns % 10**9 // 1000:06d}) vcan0 {cob_id:03X}#{data.hex().upper()}\n"
+            for stamp_ns, cob_id, data in master.log
+        )
+    )
+    log = FrameLog(path, master.run.joint, tmp_path)
+    replayed = [master.run.ticks_of(cycle.sample) for cycle in log.cycles() if cycle.sample is not None]
+    assert replayed == [told for _, told in master.valid[begun:]]
+    assert len(replayed) > 700

@@ -119,7 +119,8 @@ class Track:
             self._T,
             1.0 + self._dt / memory,
             self._black_box,
-            cut_off=isinstance(self._target, Polynomial)
+            cut_off=self._target is not None
+            and self._target.linear is None  # as many powers as one likes, so one more can be left out
             and bool(transmission.order or transmission.parameters),
         )
         self._alpha: list[float] = []

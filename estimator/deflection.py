@@ -4,6 +4,12 @@ A steady-state Kalman filter with the states [theta, theta', phi, phi', phi'']: 
 equation (eq 5, with the stiffness that has been estimated), the deflection by a random third derivative,
 and theta and q = theta + phi are measured. Where encoders are coarse it so leans on the torque balance,
 where they are fine on the encoders. Its covariance is iterated at the update rate, not at every tick.
+
+That covariance is a model's: of white noise and of a white third derivative, at a bandwidth with limits. Fine
+encoders break it, as their steps are neither. So the innovations of phi are held against it: where their mean
+square e² is more than the S = P + R it foresees, the covariance is e²/S times as large (the normalised
+innovation squared of Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation",
+2001, section 5.4), and so is the square of what counts as lost.
 """
 
 from __future__ import annotations
@@ -14,7 +20,7 @@ from estimator.covariance import Covariance
 
 __all__ = ["DeflectionFilter"]
 
-_JERK_S = 1.0  # over which the mean square of phi''' is taken
+_JERK_S = 1.0  # over which the mean squares of phi''' and of the innovations are taken
 _JERK_HOLD_S = 30.0  # how long a lively phase is remembered
 _LIVELY = 8.0  # the regression's filter hides this much of the square of phi'''
 _CORRELATION_S = 0.05  # of the third derivative and of unmodelled torques
@@ -35,7 +41,7 @@ class DeflectionFilter:
         dt_s: time between two updates.
 
     Attributes:
-        unsettled: periods until the last start is forgotten.
+        unsettled: periods until the last start is forgotten; zero or less: it is.
     """
 
     def __init__(
@@ -43,6 +49,7 @@ class DeflectionFilter:
     ) -> None:
         self._B, self._D, self._w, self._T = inertia, damping, bandwidth_rad_s, period_s
         self._average = min(1.0, dt_s / _JERK_S)
+        self._average_tick = min(1.0, period_s / _JERK_S)
         self._fade = math.exp(-dt_s / _JERK_HOLD_S)
         # Before anything is known: both positions through g-h-k filters.
         p = math.exp(-_PLAIN * bandwidth_rad_s * period_s)
@@ -58,7 +65,9 @@ class DeflectionFilter:
         self._P: Covariance | None = None
         self._modelled = False  # whether the motor's equation is of use
         self._gain_theta, self._gain_phi = self._plain_theta, self._plain_phi
-        self._band = math.inf
+        self._band_square = math.inf
+        self._surprise_square = 0.0  # mean square of the innovations of phi …
+        self._inconsistent = 1.0  # … over what the covariance foresees of it, where it is more
         self._pull = 0.0  # what half a period of phi' adds to the motor's mean acceleration
         self._motor_square = self._link_square = self._counted = 0.0
         self.restart(0.0, 0.0)
@@ -84,7 +93,7 @@ class DeflectionFilter:
         A quantised position errs alike until the next count, so in a memory 1/w there are 1 + rate/(w count)
         independent errors that average out.
         """
-        return 0.0 if self._P is None else max(self._P.phi_phi, self._counted)
+        return 0.0 if self._P is None else max(self._inconsistent * self._P.phi_phi, self._counted)
 
     def update(self, theta: float, phi: float, torque: float) -> None:
         """One period later: measured theta and phi, and the torque that acted, tau + tau_e - x, N·m."""
@@ -100,10 +109,18 @@ class DeflectionFilter:
         if plain:
             self.unsettled -= 1
             g, h = self._plain_theta, self._plain_phi
-        elif not -self._band < f < self._band:
-            self.restart(theta, phi)
-            return
+        elif self.unsettled > -self._settling:  # what the plain filters lag by is no surprise
+            self.unsettled -= 1
+            g, h = self._gain_theta, self._gain_phi
         else:
+            square = f * f
+            if not square < self._band_square:
+                # Just lost, however far, for as long as a new start takes: one jump tells little of the
+                # filter, one after the other does.
+                self._surprise(self._band_square, self._settling)
+                self.restart(theta, phi)
+                return
+            self._surprise(square, 1)
             g, h = self._gain_theta, self._gain_phi
         self._x = (
             x0 + g[0] * e + h[0] * f,
@@ -112,6 +129,10 @@ class DeflectionFilter:
             x3 + g[3] * e + h[3] * f,
             x4 + g[4] * e + h[4] * f,
         )
+
+    def _surprise(self, square: float, periods: int) -> None:
+        """Average the square of an innovation that stands for so many periods."""
+        self._surprise_square += min(1.0, periods * self._average_tick) * (square - self._surprise_square)
 
     def adopt(self, inertia: float, damping: float) -> None:
         """B and D as they have turned out to be."""
@@ -156,7 +177,9 @@ class DeflectionFilter:
             return
         self._gain_theta, self._gain_phi = gains
         self._P = P.measure(*gains)
-        self._band = _LOST * math.sqrt(P.phi_phi + noise)
+        foreseen = P.phi_phi + noise
+        self._inconsistent = max(1.0, self._surprise_square / foreseen)
+        self._band_square = _LOST**2 * self._inconsistent * foreseen
 
     def _count_steps(self, motor_noise: float, link_noise: float, memory_rad_s: float) -> None:
         """The variance of phi that quantisation leaves, were all noise quantisation."""

@@ -1,0 +1,148 @@
+"""What the tests of the on-line estimator share: the project's simulated joints as samples, and their truth.
+
+Everything goes through the public interface, `make_estimator(...).step`, so it holds for whatever is behind.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from estimator import (
+    Estimator,
+    EstimatorSettings,
+    JointModel,
+    Motor,
+    Sample,
+    Status,
+    Transmission,
+    make_estimator,
+)
+from sim.cases import case
+from sim.effects import PlantEffect
+from sim.world import record
+
+VALID, OBSERVABLE = int(Status.VALID), int(Status.OBSERVABLE)
+PERIOD_S = 0.001
+WRONG_RELATIVE, WRONG_STD = 0.10, 5.0  # off by more than both: wrong (issue 18)
+
+
+class Motion(NamedTuple):
+    """A joint in motion: what its sensors said, and its true stiffness and torque at each sample."""
+
+    samples: list[Sample]
+    stiffness_nm_rad: np.ndarray
+    torque_nm: np.ndarray
+
+
+class Told(NamedTuple):
+    """What an estimator said of a motion, one entry a sample that it was given."""
+
+    status: np.ndarray
+    torque_nm: np.ndarray
+    stiffness_nm_rad: np.ndarray
+    std_nm_rad: np.ndarray
+
+    @property
+    def valid(self) -> np.ndarray:
+        return self.status & VALID > 0
+
+
+def motion(
+    name: str,
+    seconds: float,
+    *,
+    seed: int = 0,
+    excitation: Mapping[str, Any] | None = None,
+    bits: int | None = None,
+    noise: bool = True,
+    effects: Sequence[PlantEffect] = (),
+) -> Motion:
+    """One of the paper's cases in rich motion.
+
+    Args:
+        name: of the case.
+        seconds: how long.
+        seed: of the noise.
+        excitation: another motion than the case's rich one.
+        bits: of the encoders at motor and link alike, per revolution of the joint; None: the case's own.
+        noise: whether current and encoders have any besides their steps (one count where `bits` is given).
+        effects: physics that the case does not have.
+    """
+    given = case(name)
+    drives, encoder = given.drives, given.encoder
+    if bits is not None:
+        drives = tuple(replace(drive, counts_per_rev=2.0**bits / drive.gear_ratio) for drive in drives)
+        encoder = replace(encoder, counts_per_rev=2.0**bits, noise_counts=1.0 if noise else 0.0)
+    if not noise:
+        drives = tuple(replace(d, current_noise_a=0.0, current_resolution_a=1e-9) for d in drives)
+    rich = given.rich if excitation is None else excitation
+    world = replace(given, drives=drives, encoder=encoder).world(excitation=rich, effects=effects, seed=seed)
+    rows = record(world, seconds)
+    motors = range(1, len(drives) + 1)
+
+    def stacked(quantity: str) -> list[tuple[float, ...]]:
+        return list(zip(*(rows[f"motor{i}_{quantity}"].tolist() for i in motors), strict=True))
+
+    samples = [
+        Sample(k, theta, omega, tau, q)
+        for k, (theta, omega, tau, q) in enumerate(
+            zip(
+                stacked("position_rad"),
+                stacked("velocity_rad_s"),
+                stacked("torque_nm"),
+                rows["link_position_rad"].tolist(),
+                strict=True,
+            )
+        )
+    ]
+    return Motion(samples, rows["truth_stiffness_nm_rad"], rows["truth_flexibility_torque_nm"])
+
+
+def declared(name: str, **transmission: Any) -> JointModel:
+    """The model of a case as a joint file would declare it; `transmission` as for `Transmission`."""
+    plant = case(name).plant
+    spring = plant.motors[0].spring
+    given: dict[str, Any] = {"model": spring.model, "parameters": spring.parameters}
+    motors = tuple(
+        Motor(
+            inertia_kg_m2=motor.inertia_kg_m2,
+            viscous_damping_nm_s_rad=motor.viscous_damping_nm_s_rad,
+            transmission=Transmission(**{**given, **transmission}),
+        )
+        for motor in plant.motors
+    )
+    return JointModel(arrangement=plant.arrangement, motors=motors)
+
+
+def play(model: JointModel, samples: Iterable[Sample], **settings: Any) -> tuple[Told, Estimator]:
+    """An estimator's word on these samples, and the estimator."""
+    estimator = make_estimator(model, EstimatorSettings(**settings), PERIOD_S)
+    rows = []
+    for sample in samples:
+        e = estimator.step(sample)
+        rows.append((e.status, e.flexibility_torque_nm, e.stiffness_nm_rad, e.stiffness_std_nm_rad))
+    status, torque, stiffness, std = np.array(rows).T
+    return Told(status.astype(int), torque, stiffness, std), estimator
+
+
+def wrong(told: Told, truth: np.ndarray) -> np.ndarray:
+    """Which samples are valid and wrong: off by more than 10 % and by more than five standard deviations."""
+    off = np.abs(told.stiffness_nm_rad - truth)
+    beyond = ~(off <= np.maximum(WRONG_RELATIVE * np.abs(truth), WRONG_STD * told.std_nm_rad))
+    return np.asarray(told.valid & beyond)
+
+
+def without(samples: Sequence[Sample], share: float, seed: int) -> tuple[list[Sample], np.ndarray]:
+    """The samples with whole cycles lost at random, and the places of those that are left."""
+    kept = np.flatnonzero(np.random.default_rng(seed).random(len(samples)) >= share)
+    return [samples[k] for k in kept], kept
+
+
+def nothing_lost(sample: Sample) -> bool:
+    """Whether a sample holds what its joint needs."""
+    return all(map(math.isfinite, (*sample.motor_position_rad, *sample.motor_torque_nm)))

@@ -1,0 +1,46 @@
+"""Encoders from 12 to 26 bits, quiet or noisy, slow or fast: valid where the stiffness is told, never wrong.
+
+Fine, quiet encoders used to cost `valid`: 2^22 counts a revolution left one sample in 35, although the
+stiffness was right. The deflection filter starts anew where its innovation is twelve standard deviations, and
+takes the deviation from its own covariance: that of white noise and of a white third derivative, at a bandwidth
+with an upper limit. The finer the encoder, the smaller that covariance, while what the filter cannot follow
+stays what it is; in the end every innovation is "lost", and the 33 samples until the new start has settled are
+not valid. Now the innovations' own mean square is held against the covariance, and the larger of the two counts.
+"""
+
+import numpy as np
+import onlinekit as kit
+import pytest
+
+from sim.cases import case
+
+SECONDS = 12.0
+SETTLED = 5000
+FINE = (17, 18, 19, 20, 22, 24, 26)
+COARSE = (12, 14, 16)
+
+
+def told_of(name, bits, noise, excitation=None):
+    motion = kit.motion(name, SECONDS, bits=bits, noise=noise, excitation=excitation)
+    told, _ = kit.play(kit.declared(name), motion.samples)
+    return told, kit.wrong(told, motion.stiffness_nm_rad)
+
+
+@pytest.mark.parametrize("noise", [False, True], ids=["quiet", "noisy"])
+@pytest.mark.parametrize("bits", FINE)
+@pytest.mark.parametrize("name", ["constant", "vsa-ii"])
+@pytest.mark.parametrize("pace", ["fast", "slow"])
+def test_fine_encoders_cost_no_valid(name, pace, bits, noise):
+    excitation = case(name).excitation if pace == "slow" else None  # slow: one sine of 0.05 Hz a motor
+    told, wrong = told_of(name, bits, noise, excitation)
+    assert not np.any(wrong)
+    assert np.mean(told.valid[SETTLED:]) > 0.99
+
+
+@pytest.mark.parametrize("noise", [False, True], ids=["quiet", "noisy"])
+@pytest.mark.parametrize("bits", COARSE)
+@pytest.mark.parametrize("name", ["constant", "vsa-ii"])
+def test_coarse_encoders_are_never_wrong_and_valid(name, bits, noise):
+    """A large inertia behind 12 bits tells no stiffness; then nothing is valid rather than something wrong."""
+    _, wrong = told_of(name, bits, noise)
+    assert not np.any(wrong)

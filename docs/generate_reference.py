@@ -53,6 +53,10 @@ One TOML file says what a joint is, how it is reached, and where its estimates g
 An unknown key, a wrong type, a missing or impossible value is one line: file, key, what was expected.
 `drivelink new` writes a commented file to start from.
 
+A file that `fit --write` or `diagnose --write` wrote ends with a check line. Where it is missing, the file
+was cut off, and is refused, by a daemon that reloads too; where it does not fit, somebody edited the file,
+which is allowed and said. A joint file has at most 256 KiB.
+
 | you want to | you need |
 |---|---|
 | `fit`, `diagnose`, `replay` a CSV | `name`, `[[motor]]`, and what you know of `[link.dynamics]` |

@@ -9,7 +9,7 @@ from typing import Any
 
 from drivelink import __version__, jointfile
 from drivelink.floor import floor_entry
-from drivelink.jointfile import JointFile
+from drivelink.jointfile import JointFile, JointText
 from estimator.diagnosis import Diagnosis
 from estimator.effects import LIBRARY
 from estimator.model import Effect, JointModel, ParameterValue
@@ -18,7 +18,15 @@ from estimator.sample import Record
 __all__ = ["write"]
 
 
-def write(source: Path, target: Path, outcome: Diagnosis, record: Record, recording: str) -> JointFile:
+def write(
+    source: JointText,
+    target: Path,
+    outcome: Diagnosis,
+    record: Record,
+    recording: str,
+    *,
+    force: bool = False,
+) -> JointFile:
     """Copy a joint file with the effects that were found, and validate the copy.
 
     Args:
@@ -27,11 +35,12 @@ def write(source: Path, target: Path, outcome: Diagnosis, record: Record, record
         outcome: the diagnosis.
         record: the recording it was made from.
         recording: its name.
+        force: whether the copy may take the place of another file.
 
     Raises:
         JointFileError: the copy cannot be written.
     """
-    joint = jointfile.load(source)
+    joint = source.joint
     motors = [
         {"effect": _all_effects(section.effect, outcome, i), **_transmission(joint, outcome, i)}
         for i, section in enumerate(joint.motor)
@@ -54,7 +63,7 @@ def write(source: Path, target: Path, outcome: Diagnosis, record: Record, record
             "version": __version__,
         },
     }
-    return jointfile.write_model(source, target, changes)
+    return jointfile.write_model(source, target, changes, force=force)
 
 
 def _augmented(joint: JointFile, motors: list[dict[str, Any]], at_link: list[dict[str, Any]]) -> JointModel:

@@ -6,17 +6,21 @@ what was expected.
 
 from __future__ import annotations
 
+import hashlib
 import json
+import logging
 import re
+import tomllib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Self
 
 import tomlkit
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
-from tomlkit.exceptions import TOMLKitError
 
 from drivelink.errors import JointFileError
 from drivelink.keyhint import unknown_key
+from drivelink.outfile import write_whole
 from estimator.model import Arrangement, Effect, JointModel, LinkDynamics, Motor, Transmission
 from estimator.settings import EstimatorSettings
 
@@ -25,6 +29,7 @@ __all__ = [
     "DriveSection",
     "EncoderSection",
     "JointFile",
+    "JointText",
     "LinkSection",
     "MotorSection",
     "Ros2Section",
@@ -32,9 +37,19 @@ __all__ = [
     "TpdoSection",
     "ZenohSection",
     "load",
+    "load_text",
     "parse",
     "write_model",
 ]
+
+_LOG = logging.getLogger(__name__)
+
+MAX_BYTES = 256 << 10  # of a joint file; the longest that fit and diagnose write have some 10 KiB
+_SHOWN = 80  # characters of a wrong value in a message
+_DEEP = re.compile(r"(?:[\w\"' \t-]+\.){32}")  # parts of one key
+_NESTED = "expected a joint file, got tables nested without end"
+_MARK = "# drivelink wrote this file, and ends it with a check line: a part of it is refused."
+_CHECK = re.compile(r"^# drivelink check: sha256 ([0-9a-f]{16})$\n?", re.MULTILINE)
 
 Direction = Literal[1, -1]
 
@@ -273,60 +288,133 @@ class JointFile(_Section):
         )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JointText:
+    """A joint file and the text it was read from: what a copy of it starts from.
+
+    Attributes:
+        joint: what the text says.
+        text: the whole of it, comments included.
+        folder: where its EDS and zenoh files are looked for.
+        name: begins every message about it.
+        path: the file; None: it came with a recording.
+    """
+
+    joint: JointFile
+    text: str
+    folder: Path
+    name: str
+    path: Path | None = None
+
+
 def load(path: str | Path) -> JointFile:
     """Read and validate a joint file.
 
     Raises:
         JointFileError: it cannot be read, is not TOML, or a key is unknown, wrong or missing.
     """
+    return load_text(path).joint
+
+
+def load_text(path: str | Path) -> JointText:
+    """Read and validate a joint file, and keep its text.
+
+    Raises:
+        JointFileError: as `load`.
+    """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+        text = data.decode().replace("\r\n", "\n")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "expected UTF-8 text"
         raise JointFileError(f"{path}: cannot be read as a joint file: {reason}") from error
-    return parse(text, str(path))
+    joint = parse(text, str(path))
+    return JointText(joint=joint, text=text, folder=path.absolute().parent, name=str(path), path=path)
 
 
 def parse(text: str, where: str = "joint file") -> JointFile:
     """Validate the text of a joint file; `where` begins every message.
 
     Raises:
-        JointFileError: not TOML, or a key is unknown, wrong or missing.
+        JointFileError: too large, cut off, not TOML, or a key is unknown, wrong or missing.
     """
+    if len(text) > MAX_BYTES:
+        raise JointFileError(f"{where}: expected a joint file, of at most {MAX_BYTES >> 10} KiB, got more")
+    _require_whole(text, where)
+    if _DEEP.search(text):  # tomllib's time grows with the square of it
+        raise JointFileError(f"{where}: {_NESTED}")
     try:
-        document = tomlkit.parse(text).unwrap()
-    except TOMLKitError as error:
-        raise JointFileError(f"{where}: expected TOML: {error}") from error
-    try:
+        document = tomllib.loads(text)
         # By way of JSON: strict there means what a TOML author expects (an array is a tuple, 6 is a float).
         return JointFile.model_validate_json(json.dumps(document, default=str))
     except ValidationError as error:
         raise JointFileError(f"{where}: {_one_line(error)}") from error
+    except RecursionError as error:
+        raise JointFileError(f"{where}: {_NESTED}") from error
+    except ValueError as error:
+        raise JointFileError(f"{where}: expected TOML: {error}") from error
 
 
-def write_model(source: Path, target: Path, changes: dict[str, Any]) -> JointFile:
+def write_model(
+    source: JointText, target: Path, changes: dict[str, Any], *, force: bool = False
+) -> JointFile:
     """Copy a joint file, comments kept, with some of its values replaced, and validate the copy.
+
+    The copy ends with a check line, by which every reader knows that it is whole.
 
     Args:
         source: joint file to start from.
-        target: where the copy goes; written only if it is valid.
+        target: where the copy goes; written in one step, and only if it is valid.
         changes: nested like the file; a mapping is merged, anything else replaces. For the tables of an
             array (`motor`), a list of mappings is merged element by element; `effect` is replaced whole.
+        force: whether the copy may take the place of another file.
 
     Raises:
-        JointFileError: the source is unreadable, the result invalid, or the target cannot be written.
+        JointFileError: the result is invalid, or the target cannot be written.
     """
-    load(source)
-    document = tomlkit.parse(source.read_text(encoding="utf-8"))
+    document = tomlkit.parse(_unchecked(source.text))
     _merge(document, changes)
-    text = tomlkit.dumps(document)
+    text = _checked(tomlkit.dumps(document))
     joint = parse(text, str(target))
     try:
-        target.write_text(text, encoding="utf-8")
+        write_whole(target, text, force=force)
     except OSError as error:
         raise JointFileError(f"{target}: cannot be written: {error.strerror}") from error
     return joint
+
+
+def _checked(text: str) -> str:
+    """A joint file's text with its first line and its check line."""
+    text = f"{_MARK}\n{text.rstrip()}\n"
+    return f"{text}# drivelink check: sha256 {_digest(text)}\n"
+
+
+def _unchecked(text: str) -> str:
+    """The text without these two lines."""
+    return _CHECK.sub("", text).replace(f"{_MARK}\n", "", 1)
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _require_whole(text: str, where: str) -> None:
+    """Refuse what is only a part of a file that drivelink wrote; a file edited since then may be meant so.
+
+    Raises:
+        JointFileError: its check line is missing.
+    """
+    checks = list(_CHECK.finditer(text))
+    if not checks:
+        if _MARK in text:
+            raise JointFileError(
+                f"{where}: cut off: its check line, the last one, is missing (write it anew; if you "
+                "removed that line yourself, remove the first one as well)"
+            )
+    elif _digest(text[: checks[-1].start()]) != checks[-1][1]:
+        _LOG.warning("%s: edited since drivelink wrote it: read as it is now", where)
 
 
 def _merge(table: Any, changes: dict[str, Any]) -> None:
@@ -352,9 +440,14 @@ def _one_line(error: ValidationError) -> str:
     elif first["type"] == "missing":
         message = "expected this key, it is missing"
     elif first["type"] != "value_error":
-        message = f"{message[0].lower()}{message[1:]}, got {first['input']!r}"
+        message = f"{message[0].lower()}{message[1:]}, got {_shown(first['input'])}"
     rest = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     return f"{key}: {message}{rest}" if key else f"{message}{rest}"
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
 
 
 def _key(location: tuple[int | str, ...]) -> str:

@@ -22,6 +22,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from drivelink.outfile import write_whole
 from estimator.sample import FloatArray
 
 __all__ = [
@@ -139,9 +140,11 @@ def bars(
 
 def save(figure: Figure, path: Path) -> Path:
     """Write the figure; the ending of the name says the format (png, svg, pdf)."""
+    buffer = io.BytesIO()
     with rc_context(STYLE):
         metadata = {"Date": None} if path.suffix == ".svg" else None
-        figure.savefig(path, metadata=metadata)
+        figure.savefig(buffer, format=path.suffix[1:], metadata=metadata)
+    write_whole(path, buffer.getvalue(), force=True)
     return path
 
 

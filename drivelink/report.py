@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drivelink import plots
+from drivelink.outfile import write_whole
 from estimator.diagnosis import Curve, Diagnosis, Errors, Finding
 from estimator.effects import LIBRARY
 from estimator.model import ParameterValue
@@ -54,7 +55,7 @@ def write(outcome: Diagnosis, title: Title, folder: Path) -> list[Path]:
         ("report.html", page(outcome, title)),
     ):
         path = folder / name
-        path.write_text(text, encoding="utf-8")
+        write_whole(path, text, force=True)
         made.append(path)
     return made
 

@@ -13,7 +13,7 @@ from drivelink import jointfile
 from drivelink.canopen.bus import open_bus
 from drivelink.cli import main as drivelink
 from drivelink.cycle.lockstep import run_lockstep
-from drivelink.recording.sinks import open_sink
+from drivelink.recording.formats import open_sink
 from drivelink.simulate import network_from_joint, world_from_joint
 from estimator.sample import Estimate, Sample
 

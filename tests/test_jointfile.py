@@ -1,10 +1,13 @@
 """The joint file: what is right is read, what is wrong is one line."""
 
+import logging
 from pathlib import Path
 
 import pytest
 
 from drivelink import jointfile
+from drivelink.daemon.reload import Reloader
+from drivelink.daemon.status import EventLog
 from drivelink.errors import JointFileError
 
 ELBOW = """\
@@ -123,7 +126,7 @@ def test_a_rewritten_model_keeps_everything_else_and_its_comments(tmp_path: Path
         ],
         "provenance": {"recording": "run.csv"},
     }
-    joint = jointfile.write_model(source, target, changes)
+    joint = jointfile.write_model(jointfile.load_text(source), target, changes)
     assert joint == jointfile.load(target)
     assert joint.motor[0].transmission.parameters == {"coefficients_nm_rad": (100.0, 500.0)}
     assert [effect.name for effect in joint.motor[0].effect] == ["cogging"]
@@ -131,11 +134,82 @@ def test_a_rewritten_model_keeps_everything_else_and_its_comments(tmp_path: Path
     assert "# part of the key expression" in target.read_text(encoding="utf-8")
 
 
+@pytest.fixture
+def written(tmp_path: Path) -> Path:
+    """A joint file as `fit --write` leaves it."""
+    source, target = tmp_path / "elbow.toml", tmp_path / "fitted.toml"
+    source.write_text(ELBOW, encoding="utf-8")
+    parameters = {"coefficients_nm_rad": [100.0, 500.0]}
+    changes = {"motor": [{"transmission": {"parameters": parameters}}], "provenance": {"recording": "r.csv"}}
+    jointfile.write_model(jointfile.load_text(source), target, changes)
+    return target
+
+
+def test_no_part_of_a_written_file_is_taken_for_a_model(written: Path) -> None:
+    whole = written.read_bytes()
+    assert whole.splitlines()[-1].startswith(b"# drivelink check: sha256 ")
+    for end in range(len(whole) - 1):  # without its last line end it is still whole
+        written.write_bytes(whole[:end])
+        with pytest.raises(JointFileError) as caught:
+            jointfile.load(written)
+        assert "\n" not in str(caught.value) and str(caught.value).startswith(str(written))
+        if end > 100:
+            assert "cut off: its check line, the last one, is missing" in str(caught.value)
+
+
+def test_a_written_file_may_be_edited_and_that_is_said(
+    written: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    jointfile.load(written)
+    written.write_bytes(written.read_bytes().replace(b"\n", b"\r\n"))  # by a checkout on another system
+    jointfile.load(written)
+    assert not caplog.messages
+    written.write_text(written.read_text().replace("500.0", "600.0"))
+    assert jointfile.load(written).motor[0].transmission.parameters["coefficients_nm_rad"] == (100.0, 600.0)
+    assert caplog.messages == [f"{written}: edited since drivelink wrote it: read as it is now"]
+
+
+def test_a_copy_of_a_written_file_has_one_check_line(written: Path) -> None:
+    source = jointfile.load_text(written)
+    for _ in range(2):
+        jointfile.write_model(source, written, {"provenance": {"recording": "s.csv"}}, force=True)
+        source = jointfile.load_text(written)
+    assert source.text.count("# drivelink ") == 2 and source.joint.provenance == {"recording": "s.csv"}
+
+
+def test_the_daemon_does_not_take_a_part_of_a_joint_file_over(written: Path) -> None:
+    events = EventLog(logging.getLogger("drivelink.test"))
+    reloader = Reloader(written, jointfile.load(written), None, None, None, events)  # type: ignore[arg-type]
+    written.write_bytes(written.read_bytes()[:-40])
+    reloader._prepare()
+    (said,) = [event["text"] for event in events.recent()]
+    assert said.startswith("the model stays as it is") and "cut off" in said
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("\n".join(f"key{k} = 1" for k in range(1_000_000)), "at most 256 KiB, got more"),
+        ("a = " + "[" * 200_000, "nested without end"),
+        (".".join("a" * 100_000) + " = 1", "nested without end"),
+        ("name = [" + "'x'," * 20_000 + "]", "name: input should be a valid string"),
+        ("x = " + "9" * 10_000, "expected TOML"),
+        ("\n".join(f"k{k} = 1" for k in range(20_000)), "(and 20001 more)"),
+    ],
+)
+def test_a_joint_file_that_grows_without_end_is_one_line(tmp_path: Path, text: str, line: str) -> None:
+    path = tmp_path / "joint.toml"
+    path.write_text(text)
+    with pytest.raises(JointFileError) as caught:
+        jointfile.load(path)
+    assert line in str(caught.value) and "\n" not in str(caught.value) and len(str(caught.value)) < 600
+
+
 def test_an_invalid_rewrite_writes_nothing(tmp_path: Path) -> None:
     source, target = tmp_path / "elbow.toml", tmp_path / "elbow2.toml"
     source.write_text(ELBOW, encoding="utf-8")
     with pytest.raises(JointFileError):
-        jointfile.write_model(source, target, {"bus": {"period_s": -1.0}})
+        jointfile.write_model(jointfile.load_text(source), target, {"bus": {"period_s": -1.0}})
     assert not target.exists()
 
 

@@ -12,7 +12,7 @@ import pytest
 from drivelink.errors import RecordingError
 from drivelink.jointfile import parse
 from drivelink.recording.canlog import NO_STAMP, Frame, read_frames
-from drivelink.recording.sinks import open_sink
+from drivelink.recording.formats import open_sink
 from drivelink.recording.syncnumbers import numbered_ahead, numbered_at_once
 
 JOINT = parse('name = "j"\n[[motor]]\ninertia_kg_m2 = 0.1\n[bus]\nchannel = "can0"\n')

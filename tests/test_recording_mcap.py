@@ -21,9 +21,10 @@ from drivelink.errors import RecordingError
 from drivelink.jointfile import parse
 from drivelink.pubsub.wire import EstimateMessage
 from drivelink.recording import read
+from drivelink.recording.formats import open_sink
+from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import read_messages
-from drivelink.recording.mcapsamples import recorded_cycles, recorded_joint
-from drivelink.recording.sinks import open_sink
+from drivelink.recording.mcapsamples import recorded_cycles
 from estimator.sample import Sample, Status, TransmissionEstimate
 
 TEXT = 'name = "elbow"\n[[motor]]\ninertia_kg_m2 = 0.1\n'
@@ -68,7 +69,8 @@ def test_samples_come_back_bit_for_bit(tmp_path: Path) -> None:
     record(path)
     back = [cycle.sample for cycle in recorded_cycles(path, 1)]
     assert [bits(one) for one in back if one] == [bits(sample(k)) for k in range(500)]
-    assert recorded_joint(path) == (TEXT, Path("somewhere"))
+    carried = joint_of(path, None)
+    assert (carried.text, carried.folder) == (TEXT, Path("somewhere"))
 
 
 def test_a_record_of_it_is_that_of_its_samples(tmp_path: Path) -> None:
@@ -173,6 +175,7 @@ def test_what_is_no_mcap_file_is_one_clear_line(tmp_path: Path) -> None:
     path.write_bytes(b"something else entirely")
     with pytest.raises(RecordingError, match="expected an MCAP file"):
         read(path, JOINT)
+    path.unlink()
     record(path, n=0)
     with pytest.raises(RecordingError, match="no samples in it"):
         read(path, JOINT)
@@ -184,7 +187,7 @@ sys.path.insert(0, {tests!r})
 from pathlib import Path
 from test_recording_mcap import JOINT, TEXT, BEGIN_NS, sample, estimate
 from drivelink.errors import RecordingError
-from drivelink.recording.sinks import open_sink
+from drivelink.recording.formats import open_sink
 sink = open_sink(Path(sys.argv[1]), JOINT, TEXT)
 k = 0
 try:

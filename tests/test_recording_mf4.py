@@ -11,7 +11,7 @@ import pytest
 from drivelink.errors import RecordingError
 from drivelink.jointfile import parse
 from drivelink.recording import read
-from drivelink.recording.sinks import open_sink
+from drivelink.recording.formats import open_sink
 from estimator.sample import Sample
 
 JOINT = parse('name = "elbow"\n[[motor]]\ninertia_kg_m2 = 0.1\n')

@@ -21,10 +21,10 @@ from drivelink.cli.record import _Teller
 from drivelink.cycle.framesource import Frame, FrameSource
 from drivelink.recording import read
 from drivelink.recording.canlog import read_frames
+from drivelink.recording.formats import open_sink
+from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import read_messages
-from drivelink.recording.mcapsamples import recorded_joint
 from drivelink.recording.recorder import BusTap, Recorder
-from drivelink.recording.sinks import open_sink
 
 
 def joint_file(folder: Path, endpoint: str) -> Path:
@@ -76,8 +76,7 @@ def test_a_daemon_is_recorded_until_sigterm_and_replays(
     assert set(record.motor_position_rad[:, 0]) == {0.5}
     status = [json.loads(m.data) for m in read_messages(out) if m.topic == "/elbow/status"]
     assert status and status[0]["state"] == "running"
-    carried = recorded_joint(out)
-    assert carried is not None and carried[0] == path.read_text()
+    assert joint_of(out, None).text == path.read_text()
     # One file replays everything: the joint file is in it.
     assert cli.main(["replay", str(out), "--out", str(tmp_path / "e.csv")]) == 0
     assert (tmp_path / "e.csv").read_text().count("\n") == len(record) + 1
@@ -104,7 +103,7 @@ def test_a_daemon_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> None:
     [
         (["--out", "{folder}/r.xyz"], "expected a name that ends in .mcap"),
         (["--out", "{folder}/none/r.csv"], "cannot be written"),
-        (["--out", "{folder}/elbow.toml"], "exists already; --force replaces it"),
+        (["--out", "{folder}/elbow.toml"], "is read here and must not be replaced"),
         (["--out", "{folder}/r.log"], 'bus.interface = "virtual" lives inside one process'),
         (["--out", "{folder}/r.csv", "--seconds", "0"], "--seconds: expected a number above 0"),
     ],

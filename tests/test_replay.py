@@ -26,8 +26,9 @@ from drivelink.jointfile import JointFile, parse
 from drivelink.pubsub.publisher import describe_model, to_json
 from drivelink.pubsub.wire import EstimateMessage
 from drivelink.recording import read
+from drivelink.recording.formats import open_sink
 from drivelink.recording.playback import open_playback
-from drivelink.recording.sinks import Sink, open_sink
+from drivelink.recording.sinks import Sink
 from estimator.sample import Estimate, Status
 
 BEGIN_NS = 1_700_000_000_000_000_000
@@ -306,7 +307,7 @@ def test_ctrl_c_leaves_the_estimates_so_far(tmp_path: Path, joint_path: Path) ->
     process = subprocess.Popen(
         [*command, "--out", str(out), "--realtime"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
-    zenohkit.until(out.exists)
+    zenohkit.until(lambda: list(tmp_path.glob(f".{out.name}.*")))
     time.sleep(0.5)
     process.send_signal(signal.SIGINT)
     text, errors = process.communicate(timeout=90)

@@ -18,7 +18,7 @@ from drivelink import __version__
 from drivelink.errors import DrivelinkError, UsageError
 from estimator.errors import EstimatorError
 
-__all__ = ["ALONE", "VERBS", "main", "make_parser"]
+__all__ = ["ALONE", "VERBS", "add_map", "main", "make_parser"]
 
 VERBS = {
     "demo": "simulated drive on the virtual bus, daemon, subscriber, live view: the whole chain",
@@ -110,6 +110,18 @@ def main(argv: list[str] | None = None) -> int:
         return _fail(verb, f"{where}{error.strerror or error}", 1)
     except KeyboardInterrupt:
         return _INTERRUPTED
+
+
+def add_map(parser: argparse.ArgumentParser) -> None:
+    """Add `--map`, for the verbs that read recordings."""
+    parser.add_argument(
+        "--map",
+        action="append",
+        default=[],
+        metavar="SOURCE=COLUMN[:UNIT]",
+        help="take a column of a CSV or MF4 file for one of ours, e.g. q_link=link_position_rad:deg; "
+        "a factor may stand for UNIT, e.g. tau=motor1_torque_nm:-0.05; may be repeated",
+    )
 
 
 def _fail(verb: str, error: object, status: int) -> int:

@@ -9,9 +9,13 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from drivelink import augment, jointfile, recording, report
+from drivelink import augment, recording, report
+from drivelink.cli import add_map
 from drivelink.errors import RecordingError, UsageError
+from drivelink.outfile import check_target
 from drivelink.progress import Meter
+from drivelink.recording.columnmap import parse_column_map
+from drivelink.recording.mapping import joint_of
 from estimator.diagnosis import Diagnosis, diagnose
 from estimator.errors import EstimatorError
 
@@ -32,7 +36,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _EPILOG
     parser.add_argument("recording", type=Path, metavar="RECORDING", help="measured data: CSV, MCAP, CAN log")
-    parser.add_argument("--joint", type=Path, required=True, metavar="JOINT", help="joint file")
+    parser.add_argument(
+        "--joint", type=Path, metavar="JOINT", help="joint file; left out: the one that the recording carries"
+    )
     parser.add_argument(
         "--validate", type=Path, metavar="RECORDING2", help="data that takes no part in any fit"
     )
@@ -43,16 +49,25 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--write", type=Path, metavar="JOINT2", help="write a joint file with the effects found"
     )
+    parser.add_argument("--force", action="store_true", help="replace the file of --write if it exists")
+    add_map(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Do the job; return the exit status."""
     if args.bandwidth_hz is not None and not 0.0 < args.bandwidth_hz < math.inf:
         raise UsageError(f"--bandwidth-hz: expected a number above 0, got {args.bandwidth_hz:g}")
-    joint = jointfile.load(args.joint)
-    base = args.joint.parent
-    record = recording.read(args.recording, joint, base_dir=base)
-    validation = None if args.validate is None else recording.read(args.validate, joint, base_dir=base)
+    source = joint_of(args.recording, args.joint)
+    joint, base, names = source.joint, source.folder, parse_column_map(args.map)
+    inputs = [path for path in (args.recording, args.validate, args.joint) if path is not None]
+    if args.write is not None:  # the joint file itself may be brought up to date
+        check_target(args.write, inputs[: 1 if args.validate is None else 2], force=args.force)
+    for name in ("report.json", "report.html"):
+        check_target(args.out / name, inputs, force=True)
+    record = recording.read(args.recording, joint, base_dir=base, names=names)
+    validation = None
+    if args.validate is not None:
+        validation = recording.read(args.validate, joint, base_dir=base, names=names)
     with Meter("diagnose") as meter:
         try:
             outcome = diagnose(
@@ -66,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
     for path in report.write(outcome, title, args.out):
         print(f"wrote {path}")
     if args.write is not None:
-        augment.write(args.joint, args.write, outcome, record, args.recording.name)
+        augment.write(source, args.write, outcome, record, args.recording.name, force=args.force)
         print(f"wrote {args.write}")
     return 0
 

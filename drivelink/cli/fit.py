@@ -7,11 +7,15 @@ import math
 from pathlib import Path
 
 from drivelink import jointfile
+from drivelink.cli import add_map
 from drivelink.errors import RecordingError, UsageError
+from drivelink.outfile import check_target
+from drivelink.recording.mapping import joint_of
 
 _EPILOG = """\
-example:
+examples:
   drivelink fit healthy.csv --joint elbow.toml --out fit/ --plots --write elbow-fitted.toml
+  drivelink fit healthy.mcap --json                   a recording of drivelink carries its joint file
 
 --write puts the transmission's parameters, and the motor's inertia and damping as far as the recording
 tells them, into a copy of the joint file; `run`, `replay` and `diagnose` start from there.
@@ -23,15 +27,20 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _EPILOG
     parser.add_argument("recording", type=Path, metavar="RECORDING", help="measured data: CSV, MCAP, CAN log")
-    parser.add_argument("--joint", type=Path, required=True, metavar="JOINT", help="joint file")
+    parser.add_argument(
+        "--joint", type=Path, metavar="JOINT", help="joint file; left out: the one that the recording carries"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="write fit.json there")
     parser.add_argument("--write", type=Path, metavar="JOINT2", help="write a copy of the joint file")
+    parser.add_argument("--force", action="store_true", help="replace the file of --write if it exists")
     parser.add_argument(
         "--plots", nargs="?", type=Path, const=Path(), metavar="DIR", help="write plots there, or into --out"
     )
     parser.add_argument(
         "--bandwidth-hz", type=float, metavar="F", help="of the filter that all channels share"
     )
+    add_map(parser)
+    parser.add_argument("--json", action="store_true", help="print what fit.json says, and nothing else")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -39,12 +48,16 @@ def run(args: argparse.Namespace) -> int:
     if args.bandwidth_hz is not None and not 0.0 < args.bandwidth_hz < math.inf:
         raise UsageError(f"--bandwidth-hz: expected a number above 0, got {args.bandwidth_hz:g}")
     folder = _plots_folder(args)
-    joint = jointfile.load(args.joint)
+    if args.joint is not None:
+        jointfile.load(args.joint)  # it is named first when both are wrong
     if not args.recording.exists():
         raise RecordingError(f"{args.recording}: no such file")
+    if args.write is not None:  # the joint file itself may be brought up to date
+        check_target(args.write, [args.recording], force=args.force)
+    source = joint_of(args.recording, args.joint)
     from drivelink.cli.fitting import fit_recording  # a second; what can be wrong before is said before
 
-    fit_recording(args, joint, folder)
+    fit_recording(args, source, folder)
     return 0
 
 

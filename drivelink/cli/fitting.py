@@ -18,7 +18,9 @@ from rich.table import Table
 from drivelink import __version__, jointfile, plots, recording
 from drivelink.errors import RecordingError, UsageError
 from drivelink.floor import floor_entry
-from drivelink.jointfile import JointFile
+from drivelink.jointfile import JointFile, JointText
+from drivelink.outfile import check_target, write_whole
+from drivelink.recording.columnmap import parse_column_map
 from estimator.batch import TransmissionFit, fit
 from estimator.diagnosis import calibrate
 from estimator.errors import EstimatorError
@@ -32,35 +34,51 @@ _SIGMA_95 = 1.96
 _CURVE_POINTS = 200
 
 
-def fit_recording(args: argparse.Namespace, joint: JointFile, folder: Path | None) -> None:
+def fit_recording(args: argparse.Namespace, source: JointText, folder: Path | None) -> None:
     """Fit, print, and write what was asked for.
 
     Args:
         args: of `drivelink fit`.
-        joint: the joint file that they name.
+        source: the joint file that they name, or that the recording carries.
         folder: where plots go; None: no plots.
 
     Raises:
         RecordingError: the recording cannot be read, or does not tell what is asked.
     """
-    record = recording.read(args.recording, joint, base_dir=args.joint.parent)
+    joint = source.joint
+    names = parse_column_map(args.map)
+    record = recording.read(args.recording, joint, base_dir=source.folder, names=names)
     bandwidth = None if args.bandwidth_hz is None else 2.0 * math.pi * args.bandwidth_hz
     try:
         fits = fit(record, joint.model(), bandwidth)
     except EstimatorError as error:
         raise RecordingError(f"{args.recording}: {error}") from error
-    _print(fits)
+    document, made = _as_json(fits), []
     if args.out is not None:
-        args.out.mkdir(parents=True, exist_ok=True)
-        path = args.out / "fit.json"
-        path.write_text(json.dumps(_as_json(fits), indent=2) + "\n", encoding="utf-8")
-        print(f"wrote {path}")
+        made.append(args.out / "fit.json")
+        _folder(args.out)
+        check_target(made[0], _inputs(args), force=True)
+        write_whole(made[0], json.dumps(document, indent=2) + "\n", force=True)
     if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        print(f"wrote {_plot(fits, joint, folder)}")
+        _folder(folder)
+        made.append(_plot(fits, joint, folder))
     if args.write is not None:
-        _write(args, fits, record)
-        print(f"wrote {args.write}")
+        _write(args, source, fits, record)
+        made.append(args.write)
+    if args.json:
+        print(json.dumps(document))
+        return
+    _print(fits)
+    for path in made:
+        print(f"wrote {path}")
+
+
+def _folder(path: Path) -> None:
+    path.mkdir(parents=True, exist_ok=True)
+
+
+def _inputs(args: argparse.Namespace) -> list[Path]:
+    return [args.recording, *([args.joint] if args.joint else [])]
 
 
 def _as_json(fits: list[TransmissionFit]) -> dict[str, Any]:
@@ -162,14 +180,13 @@ def _plot(fits: list[TransmissionFit], joint: JointFile, folder: Path) -> Path:
     return plots.save(figure, folder / "fit.png")
 
 
-def _write(args: argparse.Namespace, fits: list[TransmissionFit], record: Record) -> None:
+def _write(args: argparse.Namespace, source: JointText, fits: list[TransmissionFit], record: Record) -> None:
     weak = [number for number, one in enumerate(fits, start=1) if one.model != RIGID and not one.excited]
     if weak:
         raise RecordingError(
             f"{args.recording}: --write: expected a motion that tells the stiffness of motor {weak[0]}"
         )
-    joint = jointfile.load(args.joint)
-    model = calibrate(record, _fitted(joint, fits))
+    model = calibrate(record, _fitted(source.joint, fits))
     motors: list[dict[str, Any]] = []
     for motor in model.motors:
         change: dict[str, Any] = {
@@ -202,7 +219,8 @@ def _write(args: argparse.Namespace, fits: list[TransmissionFit], record: Record
             "version": __version__,
         },
     }
-    jointfile.write_model(args.joint, args.write, {**changes, "provenance": provenance})
+    changes["provenance"] = provenance
+    jointfile.write_model(source, args.write, changes, force=args.force)
 
 
 def _fitted(joint: JointFile, fits: list[TransmissionFit]) -> JointModel:

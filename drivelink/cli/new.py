@@ -16,6 +16,7 @@ from drivelink.canopen.scan import identify, scan
 from drivelink.errors import UsageError
 from drivelink.jointfile import BusSection, parse
 from drivelink.newfile import Answers, answers_from_bus, joint_text
+from drivelink.outfile import check_target, write_whole
 
 __all__ = ["configure", "run"]
 
@@ -50,7 +51,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--channel", help="python-can channel (default: can0)")
     parser.add_argument("--bitrate", type=int, help="bit/s (default: 1000000)")
     parser.add_argument("--passive", action="store_true", help="another master is in charge of the bus")
-    parser.add_argument("--force", action="store_true", help="overwrite PATH")
+    parser.add_argument("--force", action="store_true", help="replace PATH if it exists")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -60,9 +61,8 @@ def run(args: argparse.Namespace) -> int:
         print(text, end="")
         return 0
     path = args.path or Path(f"{name}.toml")
-    if path.exists() and not args.force:
-        raise UsageError(f"{path} exists: --force overwrites it")
-    path.write_text(text, encoding="utf-8")
+    check_target(path, force=args.force)
+    write_whole(path, text, force=args.force)
     print(f"{path} written; next: {_next(args, path)}")
     return 0
 

@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 import argparse
+import json
 import signal
 import sys
 import threading
 import time
-from contextlib import ExitStack
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
+from typing import Any
 
 import zenoh
 
 from drivelink import jointfile
 from drivelink.canopen.bus import open_bus
-from drivelink.errors import BusError, UsageError
-from drivelink.jointfile import JointFile
+from drivelink.canopen.layout import NodeLayout
+from drivelink.canopen.passive import PassiveConfigurator
+from drivelink.errors import BusError, DrivelinkError, UsageError, ZenohError
+from drivelink.jointfile import JointFile, JointText
+from drivelink.outfile import check_target
 from drivelink.pubsub.session import close_session, open_client
+from drivelink.recording.formats import open_sink
+from drivelink.recording.mapping import layouts_from, mapping_document
 from drivelink.recording.recorder import BusTap, Gate, Recorder, ZenohTap
-from drivelink.recording.sinks import Sink, open_sink
+from drivelink.recording.sinks import Sink
 
 _ALIVE_S = 1.0  # in which a daemon answers
 _SAY_EVERY_S = 10.0
@@ -30,6 +38,8 @@ The ending of FILE says the format:
   .csv                      samples
   .mf4                      samples (needs asammdf)
   .log .blf .asc .trc       raw CAN, as candump, Vector's and PEAK's tools write it
+
+A raw CAN log gets FILE.mapping.json beside it: how the daemon has the frames mapped, and the joint file.
 
 Recording runs in this process and never holds up the daemon. A kill, a full disk or a power loss leaves a
 file that can be read up to the last second.
@@ -54,46 +64,50 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="listen to the daemon, to the bus, or to what is there (default)",
     )
     parser.add_argument("--force", action="store_true", help="replace a file that exists")
+    parser.add_argument("--json", action="store_true", help="print what was recorded as one JSON object")
 
 
 def run(args: argparse.Namespace) -> int:
     """Do the job; return the exit status."""
-    joint = jointfile.load(args.joint)
-    if args.out.exists() and not args.force and args.out.is_file():
-        raise UsageError(f"{args.out}: exists already; --force replaces it")
+    source = jointfile.load_text(args.joint)
+    joint = source.joint
+    check_target(args.out, [args.joint], force=args.force)
     if args.seconds is not None and not args.seconds > 0:
         raise UsageError(f"--seconds: expected a number above 0, got {args.seconds:g}")
     stopped = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopped.set())
     with ExitStack() as stack:
-        folder = args.joint.absolute().parent
-        sink = open_sink(args.out, joint, args.joint.read_text(encoding="utf-8"), str(folder))
+        sink = open_sink(args.out, joint, source.text, str(source.folder), force=args.force)
         recorder = stack.enter_context(Recorder(sink, []))
-        _add_taps(recorder, args.source, joint, folder, stack)
+        _add_taps(recorder, args.source, source, stack)
         end = time.monotonic() + args.seconds if args.seconds else float("inf")
         say = _Teller(args.out, recorder)
         recorder.run(lambda: stopped.is_set() or time.monotonic() >= end, say.tick)
-    print(f"{args.out}: {say.text()}")
+    print(json.dumps(say.document()) if args.json else f"{args.out}: {say.text()}")
     return 0
 
 
-def _add_taps(recorder: Recorder, source: str, joint: JointFile, folder: Path, stack: ExitStack) -> None:
+def _add_taps(recorder: Recorder, source: str, text: JointText, stack: ExitStack) -> None:
     """Listen to what there is: the daemon for samples and estimates, the bus for frames.
 
     Raises:
         BusError: the bus is needed and cannot be opened.
         UsageError: raw frames of a bus that lives inside another process.
     """
-    sink = recorder.sink
-    alive = False
+    sink, joint, folder = recorder.sink, text.joint, text.folder
     gate = Gate(sink)
-    if source != "bus" and sink.wants - {"frame"}:
-        session = open_client(
-            joint.zenoh.endpoint, folder / joint.zenoh.config if joint.zenoh.config else None
-        )
+    needed = source == "daemon" or (source == "auto" and sink.wants != {"frame"})
+    session = _session(joint, folder, needed)
+    if session is not None:
         stack.callback(close_session, session)
-        alive = source == "daemon" or _alive(session, joint)
+    alive = session is not None and _alive(session, joint)
+    known = _daemon_layouts(session, joint) if session is not None and alive else ()
+    layouts = known or _declared_layouts(joint, folder)
+    document = mapping_document(joint.name, layouts, text.text, str(folder), daemon=bool(known))
+    sink.mapping(document, time.time_ns())
+    alive = source == "daemon" or (alive and source == "auto")
+    if session is not None and source != "bus" and sink.wants - {"frame"}:
         tap = ZenohTap(session, joint, sink, gate)
         stack.callback(tap.close)
         recorder.taps.append(tap)
@@ -138,6 +152,40 @@ def _alive(session: zenoh.Session, joint: JointFile) -> bool:
     return False
 
 
+def _session(joint: JointFile, folder: Path, needed: bool) -> zenoh.Session | None:
+    """A subscriber's session; None where it cannot be opened and is not needed.
+
+    Raises:
+        ZenohError: it is needed.
+    """
+    try:
+        return open_client(joint.zenoh.endpoint, folder / joint.zenoh.config if joint.zenoh.config else None)
+    except ZenohError as error:
+        if needed:
+            raise
+        _say(f"without the mapping that a daemon knows: {error}")
+        return None
+
+
+def _daemon_layouts(session: zenoh.Session, joint: JointFile) -> Sequence[NodeLayout]:
+    """How the running daemon has the nodes of the joint mapped; () if it does not say."""
+    key = f"{joint.zenoh.prefix}/{joint.name}/model"
+    for reply in session.get(key, timeout=_ALIVE_S):
+        with suppress(ValueError):
+            if reply.ok and (layouts := layouts_from(reply.ok.payload.to_bytes(), joint.name)):
+                return layouts
+    return ()
+
+
+def _declared_layouts(joint: JointFile, folder: Path) -> Sequence[NodeLayout]:
+    """How the joint file, or a data sheet, says they are mapped; () if they do not."""
+    with suppress(DrivelinkError):  # no drives, no EDS: then nobody knows it
+        listener = PassiveConfigurator([joint], [folder])
+        if not listener.busy:
+            return tuple(listener.layouts.values())
+    return ()
+
+
 class _Teller:
     """Says how the recording goes."""
 
@@ -147,16 +195,30 @@ class _Teller:
         self._begin = time.monotonic()
         self._next = self._begin + _SAY_EVERY_S
 
+    def document(self) -> dict[str, Any]:
+        """What has been recorded, for machines."""
+        return {
+            "file": str(self._path),
+            "seconds": round(time.monotonic() - self._begin, 3),
+            "recorded": dict(self._recorder.sink.counts),
+            "cycles_without_sample": self._missed(),
+            "no_samples_because": self._why() or None,
+        }
+
     def text(self) -> str:
         """What has been recorded."""
         counts = [f"{n} {kind}s" for kind, n in self._recorder.sink.counts.items() if n] or ["nothing yet"]
-        missed = sum(tap.missed for tap in self._recorder.taps if isinstance(tap, ZenohTap))
+        missed = self._missed()
         lost = f", {missed} cycles without sample" if missed else ""
-        why = next(
-            (tap.missing for tap in self._recorder.taps if isinstance(tap, BusTap) and tap.missing), ""
-        )
-        lost += f", no samples: {why}" if why else ""
+        lost += f", no samples: {why}" if (why := self._why()) else ""
         return f"{', '.join(counts)} in {time.monotonic() - self._begin:.0f} s{lost}"
+
+    def _missed(self) -> int:
+        return sum(tap.missed for tap in self._recorder.taps if isinstance(tap, ZenohTap))
+
+    def _why(self) -> str:
+        taps = self._recorder.taps
+        return next((tap.missing for tap in taps if isinstance(tap, BusTap) and tap.missing), "")
 
     def tick(self) -> None:
         """After each second: one line that is written over on a terminal, one now and then elsewhere."""

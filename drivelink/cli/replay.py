@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -10,13 +11,15 @@ from typing import Any
 
 import zenoh
 
-from drivelink import jointfile
-from drivelink.errors import RecordingError, UsageError
+from drivelink.cli import add_map
+from drivelink.errors import UsageError
 from drivelink.jointfile import JointFile
+from drivelink.outfile import check_target
 from drivelink.progress import Meter
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_session
-from drivelink.recording.mcapsamples import recorded_joint
+from drivelink.recording.columnmap import parse_column_map
+from drivelink.recording.mapping import joint_of
 from drivelink.recording.outputs import EstimatesFile, Publication, Summary
 from drivelink.recording.playback import Playback, open_playback
 
@@ -32,6 +35,7 @@ examples:
   drivelink replay run.csv --joint elbow.toml --out estimates.csv --plots plots/
   drivelink replay run.mcap --publish --realtime        a recording of drivelink carries its joint file
   drivelink replay candump.log --joint elbow.toml --channel can1
+  drivelink replay rig.csv --joint elbow.toml --map t=time_s:ms --map q_link=link_position_rad:deg
 """
 
 
@@ -42,6 +46,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, metavar="FILE", help="the recording")
     parser.add_argument("--joint", type=Path, metavar="JOINT", help="joint file it was made with")
     parser.add_argument("--out", type=Path, metavar="CSV", help="write the estimates, a row for each cycle")
+    parser.add_argument("--force", action="store_true", help="replace the CSV of --out if it exists")
     parser.add_argument("--plots", type=Path, metavar="DIR", help="write plots of the estimates")
     parser.add_argument("--publish", action="store_true", help="put samples and estimates on zenoh")
     parser.add_argument("--realtime", action="store_true", help="at the speed of the recording")
@@ -50,6 +55,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--frames", action="store_true", help="of an MCAP file, decode the raw CAN frames, not the samples"
     )
     parser.add_argument("--channel", help="of a raw CAN log with several, the one the joint is on")
+    add_map(parser)
+    parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -57,7 +64,11 @@ def run(args: argparse.Namespace) -> int:
     if args.speed is not None and not args.speed > 0:
         raise UsageError(f"--speed: expected a number above 0, got {args.speed:g}")
     speed = args.speed if args.speed is not None else 1.0 if args.realtime else None
-    joint, base_dir = _joint(args)
+    source = joint_of(args.file, args.joint)
+    joint, base_dir = source.joint, source.folder
+    names = parse_column_map(args.map)
+    if args.out is not None:
+        check_target(args.out, [args.file, *([args.joint] if args.joint else [])], force=args.force)
     playback = open_playback(
         args.file,
         joint,
@@ -65,6 +76,7 @@ def run(args: argparse.Namespace) -> int:
         frames=True if args.frames else None,
         channel=args.channel,
         ahead=args.file.exists() and args.file.stat().st_size > _LARGE,
+        names=names,
     )
     summary = Summary(playback.motors, keep=args.plots is not None)
     begin = time.perf_counter()
@@ -72,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
     with ExitStack() as stack:
         takers = [summary.take]
         if args.out is not None:
-            rows = EstimatesFile(args.out, playback.motors)
+            rows = EstimatesFile(args.out, playback.motors, force=args.force)
             stack.callback(rows.close)
             takers.append(rows.take)
         if args.publish or speed is not None:
@@ -87,10 +99,16 @@ def run(args: argparse.Namespace) -> int:
                         meter.update(count)
         except KeyboardInterrupt:
             interrupted = True
-    print(f"{args.file}: {summary.text(time.perf_counter() - begin)}")
-    if args.plots is not None and summary.count:
-        for path in summary.plot(args.plots, f"{joint.name}: {args.file.name}"):
-            print(f"plot: {path}")
+    took_s = time.perf_counter() - begin
+    made = summary.plot(args.plots, f"{joint.name}: {args.file.name}") if args.plots and summary.count else []
+    if args.json:
+        files = {"estimates": str(args.out) if args.out else None, "plots": [str(path) for path in made]}
+        document = {"recording": str(args.file), "joint": joint.name, **summary.document(), **files}
+        print(json.dumps({**document, "took_s": round(took_s, 3), "interrupted": interrupted}))
+        return _INTERRUPTED if interrupted else 0
+    print(f"{args.file}: {summary.text(took_s)}")
+    for path in made:
+        print(f"plot: {path}")
     if args.out is not None:
         print(f"estimates: {args.out}" + (" (up to the interruption)" if interrupted else ""))
     return _INTERRUPTED if interrupted else 0
@@ -125,15 +143,3 @@ def _await_subscriber(session: zenoh.Session, key: str) -> None:
     while not publisher.matching_status.matching and time.monotonic() < end:
         time.sleep(0.01)
     publisher.undeclare()
-
-
-def _joint(args: argparse.Namespace) -> tuple[JointFile, Path]:
-    """The joint file that was named, or the one that the recording carries; and its folder."""
-    if args.joint is not None:
-        return jointfile.load(args.joint), args.joint.absolute().parent
-    if not args.file.exists():
-        raise RecordingError(f"{args.file}: no such file")
-    carried = recorded_joint(args.file) if args.file.suffix.lower() == ".mcap" else None
-    if carried is None:
-        raise UsageError(f"--joint: expected the joint file that {args.file} was recorded with")
-    return jointfile.parse(carried[0], f"{args.file}: joint file in it"), carried[1]

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drivelink.errors import RecordingError
+from drivelink.errors import RecordingError, UsageError
 from drivelink.jointfile import JointFile
 from drivelink.recording.canframes import is_frame_log, read_frame_record
+from drivelink.recording.canlog import CAN_SUFFIXES
+from drivelink.recording.columnmap import ColumnMap
 from drivelink.recording.csvfile import read_csv
 from drivelink.recording.mcapsamples import read_mcap
 from drivelink.recording.mf4file import read_mf4
@@ -26,6 +28,7 @@ def read(
     base_dir: str | Path = "",
     channel: str | None = None,
     keep_nan: bool = False,
+    names: ColumnMap | None = None,
 ) -> Record:
     """Read a recording.
 
@@ -35,19 +38,24 @@ def read(
         base_dir: folder of the joint file, where its EDS files are looked for.
         channel: of a raw CAN log with several.
         keep_nan: leave rows with NaN in, for a consumer that takes them tick by tick; else they are gaps.
+        names: columns of a CSV or MF4 file that have other names or units there.
 
     Raises:
         RecordingError: it cannot be read, or lacks what is needed.
+        UsageError: `names` for a format that has names of its own.
     """
     path = Path(path)
     if not path.exists():
         raise RecordingError(f"{path}: no such file")
     if path.is_dir():
         raise RecordingError(f"{path}: expected a file, got a folder")
+    suffix = path.suffix.lower()
+    if names and (suffix == ".mcap" or suffix in CAN_SUFFIXES):
+        raise UsageError(f"--map: {path}: only CSV and MF4 files have columns to be named")
     if is_frame_log(path):
         return read_frame_record(path, joint, Path(base_dir), channel)
-    if path.suffix.lower() == ".mcap":
+    if suffix == ".mcap":
         return read_mcap(path, joint, keep_nan)
-    if path.suffix.lower() == ".mf4":
-        return read_mf4(path, joint, keep_nan)
-    return read_csv(path, joint, keep_nan)
+    if suffix == ".mf4":
+        return read_mf4(path, joint, keep_nan, names)
+    return read_csv(path, joint, keep_nan, names)

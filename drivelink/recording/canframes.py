@@ -16,7 +16,7 @@ from statistics import median
 
 import numpy as np
 
-from drivelink.canopen.layout import NodeLayout, layout_from
+from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.acquisition import SYNC_COB_ID, Assembler
 from drivelink.cycle.chain import make_assembler
@@ -26,6 +26,7 @@ from drivelink.jointfile import JointFile
 from drivelink.recording.canlog import CAN_SUFFIXES, NO_STAMP, Frame, read_frames
 from drivelink.recording.cycles import Cycle
 from drivelink.recording.grid import report_gaps
+from drivelink.recording.mapping import recorded_layouts
 from drivelink.recording.mcapfile import read_messages
 from drivelink.recording.syncnumbers import numbered_ahead, numbered_at_once
 from estimator.sample import FloatArray, Record
@@ -80,17 +81,22 @@ class FrameLog:
 
     def __init__(self, path: Path, joint: JointFile, base_dir: Path, channel: str | None = None) -> None:
         self._path = path
-        mcap = path.suffix.lower() == ".mcap"
-        self._frames = _mcap_frames(path) if mcap else read_frames(path, channel, joint.bus.channel)
+
+        def frames() -> Iterator[Frame]:
+            mcap = path.suffix.lower() == ".mcap"
+            return _mcap_frames(path) if mcap else read_frames(path, channel, joint.bus.channel)
+
+        self._frames = frames()
         self._follow = joint.bus.sync == "follow"
         self._passive = not joint.bus.configure
         self._listener = PassiveConfigurator([joint], [base_dir])
         self._head: list[Frame] = []  # after the configuration, read already
         syncs, overheard = self._learn_configuration()
-        if mcap and not overheard and (known := _mcap_layouts(path, joint.name)):
+        declared = not self._listener.busy
+        if not overheard and (known := recorded_layouts(path, joint.name, daemon=declared)):
             self._listener = PassiveConfigurator([joint], [base_dir])
-            self._listener.adopt(known)  # the recording began when the daemon was running already
-            self._head, self._frames = [], _mcap_frames(path)
+            self._listener.adopt(known)  # the recording began when the nodes were configured already
+            self._head, self._frames = [], frames()
         self._check_complete()
         self.period_s = self._period(syncs, joint.bus.period_s)
         timed = joint.model_copy(update={"bus": joint.bus.model_copy(update={"period_s": self.period_s})})
@@ -226,19 +232,14 @@ def read_frame_record(path: Path, joint: JointFile | None, base_dir: Path, chann
     )
 
 
-def _mcap_layouts(path: Path, joint: str) -> list[NodeLayout]:
-    """The nodes' layouts as the daemon had them, by the first model document that tells them."""
-    for message in read_messages(path, frozenset({"model"})):
-        try:
-            document = json.loads(message.data)
-            if document.get("joint") == joint and document.get("nodes"):
-                return [layout_from(node) for node in document["nodes"]]
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise RecordingError(f"{path}: {message.topic} is no model of drivelink: {error}") from error
-    return []
-
-
 def _mcap_frames(path: Path) -> Iterator[Frame]:
     for message in read_messages(path, frozenset({"can"})):
-        fields = json.loads(message.data)
-        yield Frame(message.log_time_ns, fields["id"], bytes.fromhex(fields["data"]), "")
+        try:
+            fields = json.loads(message.data)
+            can_id, data = int(fields["id"]), bytes.fromhex(fields["data"])
+            if not 0 <= can_id <= 0x7FF or len(data) > 64:
+                raise ValueError("expected an 11-bit identifier and at most 64 bytes")
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            reason = f"{message.topic[:80]} is no frame of drivelink: {error}"
+            raise RecordingError(f"{path}: {reason}") from error
+        yield Frame(message.log_time_ns, can_id, data, "")

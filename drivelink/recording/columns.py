@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ __all__ = ["KNOWN", "record_from_columns", "sample_columns", "sample_row"]
 
 _LOG = logging.getLogger("drivelink.recording")
 
+_SHOWN = 12  # names in a message
 _MOTOR = ("position_rad", "velocity_rad_s", "torque_nm", "current_a")
 _LINK = ("link_position_rad", "link_velocity_rad_s", "external_torque_nm")
 KNOWN = frozenset({"time_s", *(f"motor{i}_{name}" for i in (1, 2) for name in _MOTOR), *_LINK})
@@ -45,7 +46,11 @@ def sample_row(sample: Sample, period_s: float) -> tuple[float, ...]:
 
 
 def record_from_columns(
-    columns: Mapping[str, FloatArray], where: str, joint: JointFile | None = None, keep_nan: bool = False
+    columns: Mapping[str, FloatArray],
+    where: str,
+    joint: JointFile | None = None,
+    keep_nan: bool = False,
+    ignored: Sequence[str] = (),
 ) -> Record:
     """Make a record of named columns: find the grid, turn currents into torques, take NaN rows as gaps.
 
@@ -54,11 +59,14 @@ def record_from_columns(
         where: begins every message.
         joint: says how many motors there are, whether a link position is needed, and the torque constants.
         keep_nan: leave rows with NaN in, for a consumer that takes them tick by tick.
+        ignored: names of columns that were there and are not in `columns`.
 
     Raises:
         RecordingError: a column is missing, or the stamps make no uniform sampling.
     """
-    _report_unknown(columns, where)
+    columns = {**columns, **dict.fromkeys(ignored, np.empty(0))}
+    if unknown := [name for name in columns if name not in KNOWN]:
+        _LOG.warning("%s: ignored column(s) %s", where, _some(unknown))
     motors = _motors(columns, joint)
     _require(columns, "time_s", where)
     nominal = joint.bus.period_s if joint else None
@@ -150,13 +158,14 @@ def _require(columns: Mapping[str, FloatArray], name: str, where: str, other: st
     if name not in columns:
         near = difflib.get_close_matches(name, set(columns) - KNOWN, n=1, cutoff=0.75)
         hint = f"; did you mean it by {near[0]}?" if near else ""
-        found = ", ".join(list(columns)[:12]) or "none"
+        found = _some(list(columns)) or "none"
         raise RecordingError(f"{where}: expected a column {name}{other}, found {found}{hint}")
 
 
-def _report_unknown(columns: Mapping[str, FloatArray], where: str) -> None:
-    if unknown := [name for name in columns if name not in KNOWN]:
-        _LOG.warning("%s: ignored column(s) %s", where, ", ".join(unknown))
+def _some(names: Sequence[str]) -> str:
+    """Some names, for a message."""
+    more = f", … ({len(names)} in all)" if len(names) > _SHOWN else ""
+    return ", ".join(name[:40] for name in names[:_SHOWN]) + more
 
 
 def _report_constant(columns: Mapping[str, FloatArray], where: str) -> None:

@@ -1,17 +1,26 @@
-"""Recordings as CSV: fast where the file is clean, forgiving where spreadsheets and crashes left marks."""
+"""Recordings as CSV: fast where the file is clean, forgiving where spreadsheets and crashes left marks.
+
+A file is read in blocks of lines, and of its columns only those that are known: what is held in memory is
+their numbers.
+"""
 
 from __future__ import annotations
 
+import csv
 import io
 import logging
 import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import IO, NamedTuple
 
 import numpy as np
 
 from drivelink.errors import RecordingError
 from drivelink.jointfile import JointFile
+from drivelink.recording.columnmap import ColumnMap, renamed
 from drivelink.recording.columns import KNOWN, record_from_columns
+from drivelink.recording.limits import MAX_COLUMNS, MAX_LINE_BYTES, require_samples
 from estimator.sample import FloatArray, Record
 
 __all__ = ["read_csv", "read_csv_columns"]
@@ -19,107 +28,187 @@ __all__ = ["read_csv", "read_csv_columns"]
 _LOG = logging.getLogger("drivelink.recording")
 
 _EMPTY = re.compile(rb"(?:(?<=,)|(?<=\n)|^)[ \t]*(?:null|none|n/a|na|-)?[ \t\r]*(?=,|\n|$)", re.IGNORECASE)
+_BLOCK = 1 << 22  # bytes read at once
 
 
-def read_csv(path: Path, joint: JointFile | None = None, keep_nan: bool = False) -> Record:
+def read_csv(
+    path: Path, joint: JointFile | None = None, keep_nan: bool = False, names: ColumnMap | None = None
+) -> Record:
     """Read a CSV recording (columns as in docs/recordings.md).
 
     Raises:
         RecordingError: it cannot be read, or lacks what is needed.
     """
-    return record_from_columns(read_csv_columns(path), str(path), joint, keep_nan)
+    columns, ignored = read_csv_columns(path, names)
+    return record_from_columns(columns, str(path), joint, keep_nan, ignored)
 
 
-def read_csv_columns(path: Path) -> dict[str, FloatArray]:
-    """(rows,) values of each column by its name; an empty cell is NaN.
+def read_csv_columns(
+    path: Path, names: ColumnMap | None = None
+) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
+    """(rows,) values of each known column by its name, and the names of the others; an empty cell is NaN.
 
     Comma, semicolon or tab between the columns, decimal commas with the latter two, a byte-order mark,
-    `#` comments before the header, and a last line that a crash cut off are understood.
+    `#` comments before the header, and a last line that a crash cut off are understood. A last line that
+    does not end is left out: nothing tells whether its last number is whole.
+
+    Args:
+        path: the file.
+        names: columns that have other names or units in the file.
 
     Raises:
-        RecordingError: no header, a cell that is no number, or a line with another number of columns.
+        RecordingError: no header, a cell that is no number, a line with another number of columns, or more
+            lines or columns than there may be.
     """
     try:
-        text = path.read_bytes()
+        with path.open("rb") as file:
+            return _read(file, path, names or {})
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-    header, body, line = _split_header(text, path)
-    names, body = _columns(header, body, path)
-    body, cut = _without_cut_line(body, len(names))
-    if cut:
-        _LOG.warning("%s: the last line is cut off and left out", path)
-    table = _numbers(body, names, path, line)
-    return {name: np.ascontiguousarray(table[:, k]) for k, name in enumerate(names)}
 
 
-def _split_header(text: bytes, path: Path) -> tuple[str, bytes, int]:
-    """Header line, what follows it, and the line number of the latter's first line."""
-    if text.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise RecordingError(f"{path}: expected UTF-8 text, got UTF-16 (save it as plain CSV)")
-    text = text.removeprefix(b"\xef\xbb\xbf")
+def _read(file: IO[bytes], path: Path, names: ColumnMap) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
+    header, first_line = _header(file, path)
+    layout = _layout(header, path, names)
+    tables: list[FloatArray] = []
+    rows = 0
+    for block, line in _blocks(file, path, first_line):
+        if block.strip():
+            table = _numbers(layout.with_commas(block), layout, path, line)
+            rows += len(table)
+            require_samples(rows, str(path))
+            tables.append(table)
+    if not rows:
+        raise RecordingError(f"{path}: expected samples below the header, got none")
+    columns: dict[str, FloatArray] = {}
+    for k, name in enumerate(layout.used):
+        columns[name] = np.concatenate([table[:, k] for table in tables])
+    ignored = tuple(name for name in layout.names if name not in columns)
+    return renamed(columns, names, str(path)), ignored
+
+
+class _Layout(NamedTuple):
+    """The columns of a file.
+
+    Attributes:
+        names: of all of them.
+        used: of those that are read.
+        places: where these are.
+        separator: between columns.
+    """
+
+    names: tuple[str, ...]
+    used: tuple[str, ...]
+    places: tuple[int, ...]
+    separator: bytes
+
+    def with_commas(self, block: bytes) -> bytes:
+        """Lines with commas between their columns and points in their numbers."""
+        if self.separator != b",":
+            block = block.replace(b",", b".").replace(self.separator, b",")
+        return block.replace(b"\r\n", b"\n")
+
+
+def _header(file: IO[bytes], path: Path) -> tuple[str, int]:
+    """Header line, and the number of the line after it."""
     number = 0
-    while text:
-        line, _, text = text.partition(b"\n")
+    while line := file.readline(MAX_LINE_BYTES + 1):
+        if not number:
+            if line.startswith((b"\xff\xfe", b"\xfe\xff")):
+                raise RecordingError(f"{path}: expected UTF-8 text, got UTF-16 (save it as plain CSV)")
+            line = line.removeprefix(b"\xef\xbb\xbf")
         number += 1
+        if len(line) > MAX_LINE_BYTES:
+            raise RecordingError(f"{path}: line {number}: expected at most {MAX_LINE_BYTES >> 10} KiB")
         if line.strip() and not line.lstrip().startswith(b"#"):
             if b"\0" in line:
                 break
-            return line.decode("utf-8", errors="replace").strip(), text, number + 1
+            return line.decode("utf-8", errors="replace").strip(), number + 1
     raise RecordingError(f"{path}: expected a CSV file with a line of column names, got no text")
 
 
-def _columns(header: str, body: bytes, path: Path) -> tuple[list[str], bytes]:
-    """Column names, and the body with commas between its columns."""
+def _layout(header: str, path: Path, wanted: ColumnMap) -> _Layout:
     separator = max(",;\t", key=header.count)
-    names = [name.strip().strip("\"'").strip() for name in header.split(separator)]
-    if not KNOWN.intersection(names):
+    if (count := header.count(separator) + 1) > MAX_COLUMNS:
+        raise RecordingError(f"{path}: expected at most {MAX_COLUMNS} columns, got {count}")
+    names = tuple(name.strip().strip("\"'").strip() for name in header.split(separator))
+    sources = {source.column for source in wanted.values()}
+    used = tuple(name for name in names if name in KNOWN or name in sources)
+    if not used:
         raise RecordingError(
             f"{path}: expected a header with time_s, motor1_position_rad, motor1_torque_nm, …, "
-            f"got {header[:60]!r}"
+            f"got {header[:60]!r} (--map SOURCE=COLUMN[:UNIT] names columns of others)"
         )
     twice = {name for name in names if name and names.count(name) > 1}
     if twice:
         raise RecordingError(f"{path}: column {min(twice)} appears twice")
-    if separator != ",":
-        body = body.replace(b",", b".").replace(separator.encode(), b",")
-    return names, body.replace(b"\r\n", b"\n")
+    return _Layout(names, used, tuple(map(names.index, used)), separator.encode())
 
 
-def _without_cut_line(body: bytes, width: int) -> tuple[bytes, bool]:
-    body = body.rstrip(b" \t\r\n\0")
-    begin = body.rfind(b"\n") + 1
-    if begin and body.count(b",", begin) < width - 1:
-        return body[:begin], True
-    return body, False
+def _blocks(file: IO[bytes], path: Path, line: int) -> Iterator[tuple[bytes, int]]:
+    """Whole lines, many at once, with the number of the first; what follows the last line end is left out."""
+    rest, padding = b"", False
+    while data := file.read(_BLOCK):
+        if not data.strip(b"\0"):
+            padding = True  # what a power loss leaves at the end of a file
+            continue
+        end = data.rfind(b"\n") + 1
+        if padding or (not end and len(rest) + len(data) > MAX_LINE_BYTES):
+            raise RecordingError(f"{path}: line {line}: expected at most {MAX_LINE_BYTES >> 10} KiB")
+        if end:
+            yield rest + data[:end], line
+            line += data.count(b"\n")
+            rest = data[end:]
+        else:
+            rest += data
+    if rest.strip(b" \t\r\0"):
+        _LOG.warning("%s: the last line has no end and is left out: it may be cut off", path)
 
 
-def _numbers(body: bytes, names: list[str], path: Path, first_line: int) -> FloatArray:
-    if not body.strip():
-        raise RecordingError(f"{path}: expected samples below the header, got none")
-    for attempt in ("as it is", "with empty cells filled"):
-        text = body if attempt == "as it is" else _EMPTY.sub(b"nan", body)
+def _numbers(block: bytes, layout: _Layout, path: Path, first_line: int) -> FloatArray:
+    """(rows, used columns) numbers of some lines."""
+    even = _even(block, len(layout.names))
+    for attempt in ("as it is", "with empty cells filled") if even else ():
+        text = block if attempt == "as it is" else _EMPTY.sub(b"nan", block.rstrip())
         try:
-            table = np.loadtxt(
-                io.BytesIO(text), dtype=np.float64, delimiter=",", ndmin=2, comments="#", quotechar='"'
+            return np.loadtxt(
+                io.BytesIO(text),
+                dtype=np.float64,
+                delimiter=",",
+                ndmin=2,
+                comments="#",
+                quotechar='"',
+                usecols=layout.places,
             )
         except ValueError:
             continue
-        if table.shape[1] == len(names):
-            return table
-    raise RecordingError(_wrong_line(body, names, path, first_line))
+    raise RecordingError(_wrong_line(block, layout, path, first_line))
 
 
-def _wrong_line(body: bytes, names: list[str], path: Path, first_line: int) -> str:
+def _even(block: bytes, width: int) -> bool:
+    """Whether every line has so many columns: a reader of some columns only does not look."""
+    if b"#" in block or b'"' in block or b"\n\n" in block or block.startswith(b"\n"):
+        lines = (line.partition("#")[0] for line in io.StringIO(block.decode("utf-8", errors="replace")))
+        return all(len(cells) == width for cells in csv.reader(lines) if "".join(cells).strip())
+    data = np.frombuffer(block, dtype=np.uint8)
+    commas = np.flatnonzero(data == ord(","))
+    ends = np.flatnonzero(data == ord("\n"))
+    each = np.diff(np.searchsorted(commas, ends), prepend=0)
+    return bool(np.all(each == width - 1))
+
+
+def _wrong_line(block: bytes, layout: _Layout, path: Path, first_line: int) -> str:
     """Say which line and cell is wrong: the slow look, after the fast reading failed."""
-    for number, line in enumerate(body.split(b"\n"), first_line):
-        if not line.strip() or line.lstrip().startswith(b"#"):
+    for number, line in enumerate(block.split(b"\n"), first_line):
+        text = line.decode("utf-8", errors="replace").partition("#")[0]
+        if not text.strip():
             continue
-        cells = line.decode("utf-8", errors="replace").split(",")
-        if len(cells) != len(names):
-            return f"{path}: line {number}: expected {len(names)} columns, got {len(cells)}"
-        for name, cell in zip(names, cells, strict=True):
+        cells = next(csv.reader([text]))
+        if len(cells) != len(layout.names):
+            return f"{path}: line {number}: expected {len(layout.names)} columns, got {len(cells)}"
+        for name, place in zip(layout.used, layout.places, strict=True):
             try:
-                float(cell.strip().strip('"') or "nan")
+                float(cells[place].strip() or "nan")
             except ValueError:
-                return f"{path}: line {number}: {name}: expected a number, got {cell.strip()[:40]!r}"
+                return f"{path}: line {number}: {name}: expected a number, got {cells[place].strip()[:40]!r}"
     return f"{path}: cannot be read as CSV"

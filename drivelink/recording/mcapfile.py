@@ -7,6 +7,7 @@ file without its end (a kill, a power loss) is an ordinary file to it. Record la
 from __future__ import annotations
 
 import logging
+import os
 import struct
 import zlib
 from collections.abc import Iterator
@@ -17,6 +18,7 @@ import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 
 from drivelink.errors import RecordingError
+from drivelink.recording.limits import MAX_BLOCK_BYTES
 
 __all__ = ["McapMessage", "is_mcap", "read_messages"]
 
@@ -26,7 +28,10 @@ _MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")  # opcode, length of the record
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _CHUNK = struct.Struct("<QQQII")  # first, last, size, CRC, length of the compression's name
+_CHANNEL_HEAD = struct.Struct("<HHI")  # channel, schema, length of the topic
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE_OP, _CHUNK_OP, _DATA_END = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F
+_WANTED = frozenset({_CHANNEL, _MESSAGE_OP, _CHUNK_OP})
+_ZSTD_WINDOW = 128 << 20  # bytes that its decoder may ask for; zstd's own tools stop there, too
 
 
 class McapMessage(NamedTuple):
@@ -44,55 +49,82 @@ def is_mcap(path: Path) -> bool:
 
 
 def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[McapMessage]:
-    """The messages of a file in its order.
+    """The messages of a file in its order, up to where it is whole.
 
     Args:
         path: the file.
         topics: last parts of the topics of interest (`sample` for `/elbow/sample`); None: all.
 
     Raises:
-        RecordingError: it cannot be read, or is no MCAP file.
+        RecordingError: it cannot be read, is no MCAP file, or has a record larger than `MAX_BLOCK_BYTES`.
     """
     channels: dict[int, str | None] = {}
     try:
         with path.open("rb") as file:
             if file.read(len(_MAGIC)) != _MAGIC:
                 raise RecordingError(f"{path}: expected an MCAP file, its first bytes are others")
+            left = os.fstat(file.fileno()).st_size - len(_MAGIC)
             while len(head := file.read(_HEAD.size)) == _HEAD.size:
                 opcode, length = _HEAD.unpack(head)
+                left -= _HEAD.size + length
                 if opcode in (_DATA_END, _FOOTER):
                     return
-                body = file.read(length)
-                if len(body) < length:
+                if left < 0:  # cut off, or a length that is damaged
                     break
-                if opcode == _CHUNK_OP:
-                    chunk = _decompressed(body, path)
-                    if chunk is None:
-                        break
-                    yield from _messages(chunk, channels, topics)
-                else:
-                    yield from _messages(head + body, channels, topics)
+                if opcode not in _WANTED:  # indexes, attachments, metadata: not read here
+                    file.seek(length, os.SEEK_CUR)
+                    continue
+                _require_size(length, path)
+                body = file.read(length)
+                records = _decompressed(body, path) if opcode == _CHUNK_OP else head + body
+                yield from _messages(records, channels, topics)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-    _LOG.warning("%s: the end is missing: read up to where it is whole", path)
+    except _BrokenError:
+        pass
+    _LOG.warning("%s: cut off or damaged: read up to where it is whole", path)
 
 
-def _decompressed(body: bytes, path: Path) -> bytes | None:
-    """The records of a chunk, or None where it is broken."""
-    _, _, size, crc, name_length = _CHUNK.unpack_from(body)
-    name_end = _CHUNK.size + name_length
-    compression = body[_CHUNK.size : name_end].decode(errors="replace")
-    data = body[name_end + 8 :]
+class _BrokenError(Exception):
+    """What follows cannot be read."""
+
+
+def _require_size(size: int, path: Path) -> None:
+    if size > MAX_BLOCK_BYTES:
+        raise RecordingError(
+            f"{path}: expected records of at most {MAX_BLOCK_BYTES >> 20} MiB unpacked, got {size >> 20} MiB"
+        )
+
+
+def _decompressed(body: bytes, path: Path) -> bytes:
+    """The records of a chunk.
+
+    Raises:
+        RecordingError: they are larger than the file says or than they may be, or packed in an unknown way.
+    """
     try:
+        _, _, size, crc, name_length = _CHUNK.unpack_from(body)
+        name_end = _CHUNK.size + name_length
+        (packed,) = struct.unpack_from("<Q", body, name_end)
+    except struct.error as error:
+        raise _BrokenError from error
+    _require_size(size, path)
+    compression = body[_CHUNK.size : name_end].decode(errors="replace")
+    data = body[name_end + 8 : name_end + 8 + packed]
+    try:
+        # At most a byte more than it says: what does not end there is damaged, or made to fill memory.
         if compression == "zstd":
-            data = zstandard.decompress(data, max_output_size=size)
+            decompressor = zstandard.ZstdDecompressor(max_window_size=_ZSTD_WINDOW)
+            data = decompressor.stream_reader(data).read(size + 1)
         elif compression == "lz4":
-            data = lz4.frame.decompress(data)
+            data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
         elif compression:
-            raise RecordingError(f"{path}: compression {compression!r} is not known here")
-    except (zstandard.ZstdError, RuntimeError):
-        return None
-    return data if not crc or zlib.crc32(data) == crc else None
+            raise RecordingError(f"{path}: compression {compression[:20]!r} is not known here")
+    except (zstandard.ZstdError, RuntimeError, MemoryError) as error:
+        raise _BrokenError from error
+    if len(data) != size or (crc and zlib.crc32(data) != crc):
+        raise _BrokenError
+    return data
 
 
 def _messages(
@@ -101,17 +133,26 @@ def _messages(
     """The messages among some records; `channels` learns those that are declared on the way."""
     at, end = 0, len(data)
     unpack_head, unpack_message, head_size = _HEAD.unpack_from, _MESSAGE.unpack_from, _HEAD.size
-    while at + head_size <= end:
+    while at < end:
+        if at + head_size > end:
+            raise _BrokenError
         opcode, length = unpack_head(data, at)
         at += head_size
+        if not opcode or at + length > end:
+            raise _BrokenError
         if opcode == _MESSAGE_OP:
+            if length < _MESSAGE.size:
+                raise _BrokenError
             channel, _, log_time, _ = unpack_message(data, at)
             topic = channels.get(channel)
             if topic is not None:
                 yield McapMessage(topic, log_time, data[at + _MESSAGE.size : at + length])
         elif opcode == _CHANNEL:
-            number, _, name_length = struct.unpack_from("<HHI", data, at)
-            name = data[at + 8 : at + 8 + name_length].decode(errors="replace")
+            if length < _CHANNEL_HEAD.size:
+                raise _BrokenError
+            number, _, name_length = _CHANNEL_HEAD.unpack_from(data, at)
+            begin = at + _CHANNEL_HEAD.size
+            name = data[begin : min(begin + name_length, at + length)].decode(errors="replace")
             wanted = topics is None or name.rsplit("/", 1)[-1] in topics
             channels[number] = name if wanted else None
         at += length

@@ -1,8 +1,10 @@
-"""The samples of an MCAP recording, one by one or as a record, and the joint file it carries."""
+"""The samples of an MCAP recording, one by one or as a record."""
 
 from __future__ import annotations
 
 import json
+import math
+from array import array
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,23 +15,17 @@ from drivelink.errors import RecordingError
 from drivelink.jointfile import JointFile
 from drivelink.recording.columns import KNOWN, record_from_columns
 from drivelink.recording.cycles import Cycle
+from drivelink.recording.limits import require_samples
 from drivelink.recording.mcapfile import read_messages
 from drivelink.recording.messages import read_sample
 from estimator.sample import Record, Status
 
-__all__ = ["read_mcap", "recorded_cycles", "recorded_joint"]
+__all__ = ["read_mcap", "recorded_cycles"]
 
 _STALE = int(Status.STALE)
 _SERVICE = int(Status.DRIVE_FAULT | Status.BUS_FAULT | Status.UNTIMED | Status.NODE_RESTARTED)
+_MESSAGE_BYTES = 64 << 10  # of a sample or an estimate: ours have some 500
 _APART = 64  # cycles that a sample and its estimate may be apart in the file
-
-
-def recorded_joint(path: Path) -> tuple[str, Path] | None:
-    """Text and folder of the joint file that a recording carries, if it does."""
-    for message in read_messages(path, frozenset({"joint"})):
-        document = json.loads(message.data)
-        return str(document["text"]), Path(document.get("folder") or ".")
-    return None
 
 
 def recorded_cycles(path: Path, motors: int) -> Iterator[Cycle]:
@@ -44,7 +40,7 @@ def recorded_cycles(path: Path, motors: int) -> Iterator[Cycle]:
     newest, found = -1, False
     for message in read_messages(path, frozenset({"sample", "estimate"})):
         try:
-            fields: dict[str, Any] = json.loads(message.data)
+            fields = _fields(message.data)
             if message.topic.endswith("/sample"):
                 sample = read_sample(fields, motors)
                 found = True
@@ -54,8 +50,8 @@ def recorded_cycles(path: Path, motors: int) -> Iterator[Cycle]:
                 sequence, flags = int(fields["sequence"]), int(fields["status"]) & (_SERVICE | _STALE)
                 before = waiting.get(sequence)
                 cycle = Cycle(sequence, message.log_time_ns, before.sample if before else None, flags)
-        except (ValueError, KeyError, TypeError) as error:
-            raise RecordingError(f"{path}: {message.topic} is no message of drivelink: {error}") from error
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise _strange(path, message.topic, error) from error
         if cycle.sequence < newest - _APART:  # the daemon was started anew: numbers begin again
             yield from _released(waiting, newest + 1)
             newest = -1
@@ -82,14 +78,41 @@ def read_mcap(path: Path, joint: JointFile | None, keep_nan: bool) -> Record:
     """Read the samples of an MCAP recording.
 
     Raises:
-        RecordingError: it cannot be read, or has no samples in it.
+        RecordingError: it cannot be read, or has no samples in it, or more than are read as a whole.
     """
-    rows: list[dict[str, Any]] = [
-        json.loads(message.data) for message in read_messages(path, frozenset({"sample"}))
-    ]
-    if not rows:
+    columns: dict[str, array[float]] = {}
+    count = 0
+    for message in read_messages(path, frozenset({"sample"})):
+        try:
+            row = _fields(message.data)
+            if not count:
+                columns = {name: array("d") for name in row if name in KNOWN}
+            for name, values in columns.items():
+                value = row.get(name)
+                values.append(math.nan if value is None else value)
+        except (ValueError, TypeError, RecursionError) as error:
+            raise _strange(path, message.topic, error) from error
+        count += 1
+        require_samples(count, str(path))
+    if not count:
         raise RecordingError(f"{path}: no samples in it (with raw frames in it: replay --frames)")
-    columns = {
-        name: np.array([row.get(name) for row in rows], dtype=np.float64) for name in rows[0] if name in KNOWN
-    }
-    return record_from_columns(columns, str(path), joint, keep_nan)
+    table = {name: np.frombuffer(values, dtype=np.float64) for name, values in columns.items()}
+    return record_from_columns(table, str(path), joint, keep_nan)
+
+
+def _fields(data: bytes) -> dict[str, Any]:
+    """What a message says.
+
+    Raises:
+        ValueError: it is too long, or no JSON object.
+    """
+    if len(data) > _MESSAGE_BYTES:
+        raise ValueError(f"expected at most {_MESSAGE_BYTES >> 10} KiB, got {len(data) >> 10} KiB")
+    fields = json.loads(data)
+    if not isinstance(fields, dict):
+        raise ValueError(f"expected a JSON object, got {data[:40]!s}")
+    return fields
+
+
+def _strange(path: Path, topic: str, error: Exception) -> RecordingError:
+    return RecordingError(f"{path}: {topic[:80]} is no message of drivelink: {error}")

@@ -25,7 +25,7 @@ __all__ = [
     "sample_encoder",
 ]
 
-TOPICS = ("sample", "estimate", "status", "model", "joint", "can")
+TOPICS = ("sample", "estimate", "status", "model", "joint", "mapping", "can")
 
 _PER_MOTOR = ("flexibility_torque_nm", "stiffness_nm_rad", "stiffness_std_nm_rad", "deflection_rad")
 _OBSERVABLE = int(Status.OBSERVABLE)
@@ -105,6 +105,8 @@ def message_schema(topic: str, motors: int) -> bytes:
         properties = {"sequence": integer, "status": integer, **_numbers(estimate_columns(motors))}
     elif topic == "can":
         properties = {"id": integer, "data": text | {"description": "bytes, two hex digits each"}}
+    elif topic == "mapping":
+        properties = {"joint": text, "nodes": {"type": "array", "items": {"type": "object"}}}
     elif topic == "joint":
         properties = {"text": text | {"description": "the joint file"}, "folder": text}
     else:

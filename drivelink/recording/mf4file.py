@@ -7,14 +7,19 @@ first, which is whole at any moment, and becomes the .mf4 file at the end.
 from __future__ import annotations
 
 import logging
+import os
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from drivelink.errors import RecordingError
 from drivelink.jointfile import JointFile
+from drivelink.outfile import check_target, put_in_place, sync
+from drivelink.recording.columnmap import ColumnMap, renamed
 from drivelink.recording.columns import KNOWN, record_from_columns, sample_columns, sample_row
+from drivelink.recording.limits import require_samples
 from drivelink.recording.mcapsamples import read_mcap
 from drivelink.recording.sinks import McapSink
 from estimator.sample import FloatArray, Record
@@ -29,10 +34,13 @@ class Mf4Sink(McapSink):
 
     wants = frozenset({"sample"})
 
-    def __init__(self, path: Path, joint: JointFile, joint_text: str = "", folder: str = "") -> None:
+    def __init__(
+        self, path: Path, joint: JointFile, joint_text: str = "", folder: str = "", *, force: bool = False
+    ) -> None:
         _asammdf(path)  # before anything is recorded
-        self._path, self._joint_file = path, joint
+        self._path, self._joint_file, self._force = path, joint, force
         self._journal = path.with_name(path.name + ".mcap")
+        check_target(self._journal)  # samples of a recording that was killed: never replaced
         super().__init__(self._journal, joint, joint_text, folder)
 
     def close(self) -> None:
@@ -41,7 +49,8 @@ class Mf4Sink(McapSink):
         if not self.counts["sample"]:
             self._journal.unlink()
             raise RecordingError(f"{self._path}: not written: there were no samples")
-        write_mf4(self._path, read_mcap(self._journal, self._joint_file, keep_nan=True))
+        record = read_mcap(self._journal, self._joint_file, keep_nan=True)
+        write_mf4(self._path, record, force=self._force)
         self._journal.unlink()
 
     def abandon(self) -> None:
@@ -50,8 +59,13 @@ class Mf4Sink(McapSink):
         _LOG.warning("%s: not written; the samples are in %s", self._path, self._journal)
 
 
-def write_mf4(path: Path, record: Record) -> None:
+def write_mf4(path: Path, record: Record, *, force: bool = False) -> None:
     """Write a record as MF4, a channel for each column.
+
+    Args:
+        path: the file.
+        record: what goes into it.
+        force: whether it may take the place of another file.
 
     Raises:
         RecordingError: asammdf is not installed, or the file cannot be written.
@@ -67,12 +81,18 @@ def write_mf4(path: Path, record: Record) -> None:
         ]
         mdf.append(signals, comment="drivelink")
         try:
-            mdf.save(path, overwrite=True)
+            with TemporaryDirectory(dir=path.parent, prefix=".mf4-") as folder:
+                made = Path(mdf.save(Path(folder, "r.mf4")))
+                with made.open("rb") as file:
+                    sync(file.fileno())
+                put_in_place(made, Path(os.path.realpath(path)), force=force)
         except OSError as error:
             raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def read_mf4(path: Path, joint: JointFile | None = None, keep_nan: bool = False) -> Record:
+def read_mf4(
+    path: Path, joint: JointFile | None = None, keep_nan: bool = False, names: ColumnMap | None = None
+) -> Record:
     """Read an MF4 file whose channels are named like the CSV columns.
 
     Raises:
@@ -81,17 +101,22 @@ def read_mf4(path: Path, joint: JointFile | None = None, keep_nan: bool = False)
     mdf_module = _asammdf(path)
     try:
         with mdf_module.MDF(path) as mdf:
-            names = [name for name in mdf.channels_db if name in KNOWN - {"time_s"}]
-            signals = [mdf.get(name) for name in names]
+            wanted = {source.column for source in (names or {}).values()} | KNOWN - {"time_s"}
+            for group in mdf.groups:
+                require_samples(group.channel_group.cycles_nr, str(path))
+            found = [name for name in mdf.channels_db if name in wanted]
+            signals = [mdf.get(name) for name in found]
+    except RecordingError:
+        raise
     except Exception as error:  # asammdf raises whatever a broken byte leads it to
         raise RecordingError(f"{path}: cannot be read as MF4: {error}") from error
     if not signals:
         raise RecordingError(f"{path}: expected channels named motor1_position_rad, …, found none")
     times = np.asarray(signals[0].timestamps, dtype=np.float64)
     columns: dict[str, FloatArray] = {"time_s": times}
-    for name, signal in zip(names, signals, strict=True):
+    for name, signal in zip(found, signals, strict=True):
         columns[name] = _at(times, signal)
-    return record_from_columns(columns, str(path), joint, keep_nan)
+    return record_from_columns(renamed(columns, names or {}, str(path)), str(path), joint, keep_nan)
 
 
 def _at(times: FloatArray, signal: Any) -> FloatArray:

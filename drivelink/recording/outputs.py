@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 import time
 from array import array
 from pathlib import Path
@@ -10,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from drivelink.errors import RecordingError
+from drivelink.outfile import NewFile
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.recording.messages import estimate_columns, estimate_row
 from drivelink.recording.playback import Played
@@ -18,32 +21,66 @@ from estimator.sample import FloatArray, Status
 __all__ = ["EstimatesFile", "Publication", "Summary"]
 
 _STATUS_EVERY_S = 0.25
+_ROWS = 2048  # that are written at once
 # Plain integers: an IntFlag costs a microsecond.
 _VALID, _OBSERVABLE = int(Status.VALID), int(Status.OBSERVABLE)
 
 
 class EstimatesFile:
-    """estimates.csv, a row for each cycle as it comes; whole lines, also when it ends early."""
+    """estimates.csv, a row for each cycle as it comes; it is in its place when it is closed.
 
-    def __init__(self, path: Path, motors: int) -> None:
+    Args:
+        path: the file.
+        motors: of the joint.
+        force: whether it may take the place of another file.
+
+    Raises:
+        RecordingError: it cannot be opened or, later, written; what was there is there still.
+    """
+
+    def __init__(self, path: Path, motors: int, *, force: bool = False) -> None:
         columns = estimate_columns(motors)
+        self._path = path
         self._line = ",".join(["%r"] * len(columns)) + "\n"
+        self._rows = [",".join(columns) + "\n"]
         try:
-            self._file = path.open("w", encoding="ascii", newline="\n", buffering=1 << 18)
+            self._file = NewFile(path, force=force)
         except OSError as error:
-            raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
-        self._file.write(",".join(columns) + "\n")
+            raise self._failed(error) from error
 
     def take(self, played: Played) -> None:
         """Write one row."""
         time_s, _, estimate, _ = played
         totals = (estimate.flexibility_torque_nm, estimate.stiffness_nm_rad, estimate.stiffness_std_nm_rad)
         row = estimate_row(time_s, estimate.status, totals, estimate.transmissions)
-        self._file.write(self._line % row)
+        self._rows.append(self._line % row)
+        if len(self._rows) >= _ROWS:
+            self._write()
 
     def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        """Put the file in its place; nothing where it could not be written."""
+        if self._file.fd < 0:
+            return
+        try:
+            self._write()
+            self._file.place()
+        except OSError as error:
+            raise self._failed(error) from error
+        finally:
+            self._file.close()
+
+    def _write(self) -> None:
+        rest = memoryview("".join(self._rows).encode("ascii"))
+        self._rows.clear()
+        try:
+            while rest:
+                rest = rest[os.write(self._file.fd, rest) :]
+        except OSError as error:
+            self._file.close()
+            raise self._failed(error) from error
+
+    def _failed(self, error: OSError) -> RecordingError:
+        return RecordingError(f"{self._path}: cannot be written: {error.strerror}")
 
 
 class Publication:
@@ -138,6 +175,17 @@ class Summary:
             f"observable {100 * self.observable / self.count:.1f} %; at the end stiffness "
             f"{estimate.stiffness_nm_rad:.6g}{f' ± {half:.2g}' if half == half else ''} N·m/rad"
         )
+
+    def document(self) -> dict[str, Any]:
+        """The replay for machines; what is not finite is None."""
+        estimate = self._last.estimate if self._last is not None else None
+        end = {
+            name: value if estimate is not None and math.isfinite(value := getattr(estimate, name)) else None
+            for name in ("stiffness_nm_rad", "stiffness_std_nm_rad", "flexibility_torque_nm")
+        }
+        seconds = self._last.time_s - self._first_s if self._last is not None else 0.0
+        counts = {"cycles": self.count, "valid": self.valid, "observable": self.observable}
+        return {"seconds": seconds, **counts, "end": end}
 
     def plot(self, folder: Path, title: str) -> list[Path]:
         """Write stiffness over deflection, and torque and stiffness over time."""

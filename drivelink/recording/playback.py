@@ -14,6 +14,7 @@ from drivelink.jointfile import JointFile
 from drivelink.recording import read
 from drivelink.recording.ahead import FrameLogAhead
 from drivelink.recording.canframes import FrameLog, is_frame_log
+from drivelink.recording.columnmap import ColumnMap
 from drivelink.recording.cycles import Cycle, estimated
 from drivelink.recording.mcapsamples import recorded_cycles
 from estimator.sample import Estimate, Sample
@@ -85,6 +86,7 @@ def open_playback(
     frames: bool | None = None,
     channel: str | None = None,
     ahead: bool = False,
+    names: ColumnMap | None = None,
 ) -> Playback:
     """Open a recording of any format for playing.
 
@@ -97,6 +99,8 @@ def open_playback(
         channel: of a raw CAN log with several.
         ahead: have raw frames read by a process of its own: worth its start where there are many.
 
+        names: columns of a CSV or MF4 file that have other names or units there.
+
     Raises:
         RecordingError: it cannot be read, or lacks what is needed.
     """
@@ -108,7 +112,7 @@ def open_playback(
         period_s = joint.bus.period_s
         recorded = recorded_cycles(path, len(joint.motor))
         return Playback(joint, period_s, None, lambda chain: _from_cycles(recorded, chain, period_s))
-    record = read(path, joint, keep_nan=True)
+    record = read(path, joint, keep_nan=True, names=names)
     times = record.time_s.tolist()
     return Playback(
         joint,

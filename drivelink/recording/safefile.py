@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import io
 import os
 from pathlib import Path
@@ -10,6 +9,7 @@ from types import TracebackType
 from typing import Self
 
 from drivelink.errors import RecordingError
+from drivelink.outfile import NewFile
 
 __all__ = ["SafeFile"]
 
@@ -18,11 +18,12 @@ class SafeFile(io.BufferedIOBase):
     """Binary file for writers: whole blocks reach the disk, or none of a block.
 
     `write` keeps bytes in memory; `flush` hands them to the system as one block; `sync` also waits until
-    the disk has them. If there is no room, the file is cut back to the last whole block, so that what a
-    reader finds ends between two records.
+    the disk has them. The first `sync` gives the file its name: from then on a reader finds it there. If
+    there is no room, the file is cut back to the last whole block, so that it ends between two records.
 
     Args:
-        path: the file; an existing one is replaced.
+        path: the file.
+        force: whether it may take the place of another one, which is there until the first `sync`.
 
     Attributes:
         name: the path, as files tell it.
@@ -31,7 +32,7 @@ class SafeFile(io.BufferedIOBase):
         RecordingError: it cannot be opened or, later, written.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, force: bool = False) -> None:
         super().__init__()
         self._path = path
         self.name = str(path)
@@ -39,9 +40,8 @@ class SafeFile(io.BufferedIOBase):
         self._place: int | None = None  # of a write somewhere else than at the end
         self._size = 0
         try:
-            self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+            self._file = NewFile(path, force=force)
         except OSError as error:
-            self._fd = -1
             raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
 
     def writable(self) -> bool:
@@ -74,36 +74,35 @@ class SafeFile(io.BufferedIOBase):
 
     def flush(self) -> None:
         """Hand everything pending to the system, as one block."""
-        if self._fd < 0 or not self._pending:
+        if self._file.fd < 0 or not self._pending:
             return
         self._put(bytes(self._pending), self._size)
         self._size += len(self._pending)
         self._pending.clear()
 
     def sync(self) -> None:
-        """Flush, and wait until the disk has it."""
+        """Flush, and wait until the disk has it, and its name."""
         self.flush()
         try:
-            os.fdatasync(self._fd)
+            self._file.place()
         except OSError as error:
-            if error.errno not in (errno.EINVAL, errno.EROFS):  # no such thing on pipes and devices
-                raise self._failed(error) from error
+            raise self._failed(error) from error
 
     def close(self) -> None:
         """Flush and close; nothing more is said once the disk has refused."""
-        if self._fd < 0:
+        if self._file.fd < 0:
             return
         try:
             self.sync()
         finally:
-            os.close(self._fd)
-            self._fd = -1
+            self._file.close()
             super().close()
 
     def abandon(self) -> None:
-        """Close without writing what is pending."""
+        """Close without writing what is pending; a file that was never synced is not there at all."""
         self._pending.clear()
-        self.close()
+        self._file.close()
+        super().close()
 
     def __enter__(self) -> Self:
         return self
@@ -114,18 +113,16 @@ class SafeFile(io.BufferedIOBase):
         self.close()
 
     def _put(self, data: bytes, offset: int) -> None:
-        done = 0
+        fd, done = self._file.fd, 0
         try:
             while done < len(data):
-                done += os.pwrite(self._fd, data[done:], offset + done)
+                done += os.pwrite(fd, data[done:], offset + done)
         except OSError as error:
             self._pending.clear()
             if offset >= self._size:
-                os.ftruncate(self._fd, self._size)
+                os.ftruncate(fd, self._size)
             raise self._failed(error) from error
 
     def _failed(self, error: OSError) -> RecordingError:
-        return RecordingError(
-            f"{self._path}: cannot be written any further: {error.strerror}; "
-            "it holds everything up to the last second"
-        )
+        kept = "it holds everything up to the last second" if self._file.placed else "nothing was written"
+        return RecordingError(f"{self._path}: cannot be written any further: {error.strerror}; {kept}")

@@ -18,13 +18,15 @@ from mcap.writer import CompressionType, IndexType, Writer
 from drivelink import __version__
 from drivelink.errors import RecordingError
 from drivelink.jointfile import JointFile
+from drivelink.outfile import check_target, write_whole
 from drivelink.pubsub.wire import EstimateMessage
 from drivelink.recording.columns import sample_columns, sample_row
+from drivelink.recording.mapping import side_file
 from drivelink.recording.messages import TOPICS, estimate_encoder, message_schema, sample_encoder
 from drivelink.recording.safefile import SafeFile
 from estimator.sample import Sample
 
-__all__ = ["CanSink", "CsvSink", "McapSink", "Sink", "open_sink"]
+__all__ = ["CanSink", "CsvSink", "McapSink", "Sink"]
 
 
 class Sink:
@@ -37,8 +39,8 @@ class Sink:
 
     wants: frozenset[str] = frozenset()
 
-    def __init__(self, path: Path) -> None:
-        self._file = SafeFile(path)
+    def __init__(self, path: Path, *, force: bool = False) -> None:
+        self._file = SafeFile(path, force=force)
         self.counts: dict[str, int] = dict.fromkeys(sorted(self.wants), 0)
 
     def sample(self, sample: Sample, stamp_ns: int) -> None:
@@ -52,6 +54,9 @@ class Sink:
 
     def frame(self, stamp_ns: int, cob_id: int, data: bytes) -> None:
         """Take one CAN frame."""
+
+    def mapping(self, document: dict[str, Any], stamp_ns: int) -> None:
+        """Take what makes samples of the frames, see `drivelink.recording.mapping`."""
 
     def flush(self) -> None:
         """Put everything on the disk."""
@@ -71,8 +76,8 @@ class CsvSink(Sink):
 
     wants = frozenset({"sample"})
 
-    def __init__(self, path: Path, joint: JointFile) -> None:
-        super().__init__(path)
+    def __init__(self, path: Path, joint: JointFile, *, force: bool = False) -> None:
+        super().__init__(path, force=force)
         self._period_s = joint.bus.period_s
         columns = sample_columns(len(joint.motor))
         self._line = ",".join(["%r"] * len(columns)) + "\n"
@@ -89,8 +94,10 @@ class McapSink(Sink):
 
     wants = frozenset({"sample", "estimate", "document", "frame"})
 
-    def __init__(self, path: Path, joint: JointFile, joint_text: str = "", folder: str = "") -> None:
-        super().__init__(path)
+    def __init__(
+        self, path: Path, joint: JointFile, joint_text: str = "", folder: str = "", *, force: bool = False
+    ) -> None:
+        super().__init__(path, force=force)
         motors, period_s = len(joint.motor), joint.bus.period_s
         self._encode_sample: Callable[[Sample], bytes] = sample_encoder(motors, period_s)
         self._encode_estimate = estimate_encoder(motors, period_s)
@@ -133,6 +140,11 @@ class McapSink(Sink):
         self._put("can", stamp_ns, f'{{"id":{cob_id},"data":"{data.hex()}"}}'.encode())
         self.counts["frame"] += 1
 
+    def mapping(self, document: dict[str, Any], stamp_ns: int) -> None:
+        """Take what makes samples of the frames."""
+        fields = {key: value for key, value in document.items() if key not in ("text", "folder")}
+        self._put("mapping", stamp_ns, json.dumps(fields).encode())  # the joint file has a channel of its own
+
     def flush(self) -> None:
         """Put everything on the disk, as a chunk of its own."""
         self._writer.flush()
@@ -159,12 +171,15 @@ class _BlfWriter(can.BLFWriter):
 
 
 class CanSink(Sink):
-    """Raw frames in python-can's formats: candump .log, .asc, .blf, .trc."""
+    """Raw frames in python-can's formats: candump .log, .asc, .blf, .trc; the mapping beside them."""
 
     wants = frozenset({"frame"})
 
-    def __init__(self, path: Path, joint: JointFile) -> None:
-        super().__init__(path)
+    def __init__(self, path: Path, joint: JointFile, *, force: bool = False) -> None:
+        side = side_file(path)
+        check_target(side, force=force)
+        super().__init__(path, force=force)
+        self._side, self._force, self._beside = side, force, ""
         suffix = path.suffix.lower()
         self._text: io.TextIOWrapper | None = None
         if suffix == ".blf":
@@ -193,6 +208,10 @@ class CanSink(Sink):
         self._writer.on_message_received(message)
         self.counts["frame"] += 1
 
+    def mapping(self, document: dict[str, Any], stamp_ns: int) -> None:
+        """Take what the file beside the log says."""
+        self._beside = json.dumps(document, indent=1) + "\n"
+
     def flush(self) -> None:
         """Put everything on the disk."""
         if self._text is not None:
@@ -200,30 +219,18 @@ class CanSink(Sink):
         else:
             self._writer.end_container()
         super().flush()
+        self._write_beside()
 
     def close(self) -> None:
         """Write the end of the file and close it."""
         self._writer.stop()
         super().close()
+        self._write_beside()
 
-
-def open_sink(path: Path, joint: JointFile, joint_text: str = "", folder: str = "") -> Sink:
-    """The writer of the format that the file's ending names.
-
-    Raises:
-        RecordingError: no such format, or the file cannot be written.
-    """
-    suffix = path.suffix.lower()
-    if suffix == ".mcap":
-        return McapSink(path, joint, joint_text, folder)
-    if suffix == ".csv":
-        return CsvSink(path, joint)
-    if suffix == ".mf4":
-        from drivelink.recording.mf4file import Mf4Sink  # it is made of the sinks here
-
-        return Mf4Sink(path, joint, joint_text, folder)
-    if suffix in (".log", ".asc", ".blf", ".trc"):
-        return CanSink(path, joint)
-    raise RecordingError(
-        f"{path}: expected a name that ends in .mcap, .csv, .mf4, .log (candump), .blf, .asc or .trc"
-    )
+    def _write_beside(self) -> None:
+        text, self._beside = self._beside, ""
+        if text:
+            try:
+                write_whole(self._side, text, force=self._force)
+            except OSError as error:
+                raise RecordingError(f"{self._side}: cannot be written: {error.strerror}") from error

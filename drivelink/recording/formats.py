@@ -1,0 +1,41 @@
+"""The format that a recording's name asks for, and its writer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from drivelink.errors import RecordingError
+from drivelink.jointfile import JointFile
+from drivelink.recording.mf4file import Mf4Sink
+from drivelink.recording.sinks import CanSink, CsvSink, McapSink, Sink
+
+__all__ = ["open_sink"]
+
+
+def open_sink(
+    path: Path, joint: JointFile, joint_text: str = "", folder: str = "", *, force: bool = False
+) -> Sink:
+    """The writer of the format that the file's ending names.
+
+    Args:
+        path: the recording.
+        joint: the joint.
+        joint_text: its joint file, for the formats that carry it.
+        folder: of that file, where its EDS files are looked for.
+        force: whether the recording may take the place of another file.
+
+    Raises:
+        RecordingError: no such format, or the file cannot be written.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".mcap":
+        return McapSink(path, joint, joint_text, folder, force=force)
+    if suffix == ".csv":
+        return CsvSink(path, joint, force=force)
+    if suffix == ".mf4":
+        return Mf4Sink(path, joint, joint_text, folder, force=force)
+    if suffix in (".log", ".asc", ".blf", ".trc"):
+        return CanSink(path, joint, force=force)
+    raise RecordingError(
+        f"{path}: expected a name that ends in .mcap, .csv, .mf4, .log (candump), .blf, .asc or .trc"
+    )

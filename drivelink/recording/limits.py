@@ -1,0 +1,35 @@
+"""What a recording may ask of this machine's memory, checked before it is taken.
+
+A file says itself how long its parts are, and may say anything. None of these bounds is near what a real
+recording has; docs/recordings.md states them.
+"""
+
+from __future__ import annotations
+
+from drivelink.errors import RecordingError
+
+__all__ = [
+    "MAX_BLOCK_BYTES",
+    "MAX_COLUMNS",
+    "MAX_LINE_BYTES",
+    "MAX_SAMPLES",
+    "require_samples",
+]
+
+MAX_SAMPLES = 10_000_000  # periods from first to last where a recording is read as a whole: 2.7 h at 1 kHz
+MAX_COLUMNS = 4096  # of a CSV file; those that nobody knows are never held in memory
+MAX_LINE_BYTES = 1 << 20  # of a line of text
+MAX_BLOCK_BYTES = 64 << 20  # an MCAP chunk or a BLF container, unpacked; tools write up to 8 MiB
+
+
+def require_samples(count: int, where: str, longest_gap: str = "") -> None:
+    """Refuse more samples, or periods with their gaps, than are read as a whole.
+
+    Raises:
+        RecordingError: there are more.
+    """
+    if count > MAX_SAMPLES:
+        raise RecordingError(
+            f"{where}: expected at most {MAX_SAMPLES} periods from the first sample to the last, "
+            f"got {count}{longest_gap}: split it"
+        )

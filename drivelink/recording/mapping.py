@@ -1,0 +1,135 @@
+"""What a recording of raw frames knows beside them: how its nodes were mapped, and the joint file.
+
+An MCAP file carries both. The other formats have no place for them that every tool would pass over, so they
+get a file beside them: `r.log` has `r.log.mapping.json`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from drivelink import jointfile
+from drivelink.canopen.layout import NodeLayout, layout_document, layout_from
+from drivelink.errors import RecordingError, UsageError
+from drivelink.jointfile import JointText
+from drivelink.recording.canlog import CAN_SUFFIXES
+from drivelink.recording.mcapfile import read_messages
+
+__all__ = ["joint_of", "layouts_from", "mapping_document", "recorded_layouts", "side_file"]
+
+_SCHEMA = "drivelink.mapping/1"
+MAX_BYTES = 1 << 20  # of such a document
+
+
+def side_file(path: Path) -> Path:
+    """The file beside a raw CAN log that says how its nodes were mapped."""
+    return path.with_name(path.name + ".mapping.json")
+
+
+def mapping_document(
+    joint: str, layouts: Iterable[NodeLayout], text: str = "", folder: str = "", *, daemon: bool = False
+) -> dict[str, Any]:
+    """What is kept of a recording of frames.
+
+    Args:
+        joint: its name.
+        layouts: of its nodes, as far as they are known.
+        text: the joint file.
+        folder: where its EDS files are looked for.
+        daemon: whether a daemon that has the nodes mapped so said it, not a file.
+    """
+    nodes = [layout_document(layout) for layout in layouts]
+    about = {"schema": _SCHEMA, "joint": joint, "source": "daemon" if daemon else "file", "nodes": nodes}
+    return about | {"text": text, "folder": folder}
+
+
+def layouts_from(data: bytes, joint: str, *, daemon: bool = False) -> list[NodeLayout]:
+    """The layouts of a joint's nodes in a mapping or model document; none where it is another joint's.
+
+    Args:
+        data: the document.
+        joint: name of the joint.
+        daemon: only what a daemon said.
+
+    Raises:
+        ValueError: it is no such document.
+    """
+    if len(data) > MAX_BYTES:
+        raise ValueError(f"expected at most {MAX_BYTES >> 10} KiB, got {len(data) >> 10} KiB")
+    try:
+        document = json.loads(data)
+        if document.get("joint") != joint or (daemon and document.get("source") == "file"):
+            return []
+        return [layout_from(node) for node in document.get("nodes") or ()]
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{type(error).__name__}: {error}") from error
+
+
+def recorded_layouts(path: Path, joint: str, *, daemon: bool) -> Sequence[NodeLayout]:
+    """The layouts that a recording knows of a joint's nodes, the first ones that it has; none: ().
+
+    Args:
+        path: the recording.
+        joint: name of the joint.
+        daemon: only what a daemon said: it is so on the bus, whatever the joint file or an EDS declares.
+
+    Raises:
+        RecordingError: what should tell them is damaged.
+    """
+    try:
+        if path.suffix.lower() != ".mcap":
+            side = _read_side(path)
+            return layouts_from(side, joint, daemon=daemon) if side else ()
+        for message in read_messages(path, frozenset({"mapping", "model"})):
+            if layouts := layouts_from(message.data, joint, daemon=daemon):
+                return layouts
+    except ValueError as error:
+        raise RecordingError(f"{path}: what it knows of the mapping cannot be read: {error}") from error
+    return ()
+
+
+def joint_of(path: Path, named: Path | None) -> JointText:
+    """The joint file that is named, else the one that the recording carries.
+
+    Raises:
+        JointFileError: it is wrong.
+        RecordingError: the recording does not exist, or what it carries is damaged.
+        UsageError: none is named and none is carried.
+    """
+    if named is not None:
+        return jointfile.load_text(named)
+    if not path.exists():
+        raise RecordingError(f"{path}: no such file")
+    carried = _carried(path)
+    if carried is None:
+        raise UsageError(f"--joint: expected the joint file that {path} was recorded with")
+    try:
+        document = json.loads(carried)
+        text, folder = str(document["text"]), str(document.get("folder") or ".")
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise RecordingError(f"{path}: the joint file in it cannot be read: {error}") from error
+    name = f"{path}: joint file in it"
+    return JointText(joint=jointfile.parse(text, name), text=text, folder=Path(folder), name=name)
+
+
+def _carried(path: Path) -> bytes | None:
+    """The document with the joint file's text, if there is one."""
+    suffix = path.suffix.lower()
+    if suffix == ".mcap":
+        message = next(read_messages(path, frozenset({"joint"})), None)
+        return message.data if message is not None else None
+    return _read_side(path) if suffix in CAN_SUFFIXES else None
+
+
+def _read_side(path: Path) -> bytes | None:
+    side = side_file(path)
+    try:
+        with side.open("rb") as file:
+            return file.read(MAX_BYTES + 1)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise RecordingError(f"{side}: cannot be read: {error.strerror}") from error

@@ -1,0 +1,324 @@
+"""What is written: whole or not at all, never in the place of what was read, nothing replaced unasked."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import signal
+import stat
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import joints
+import numpy as np
+import pytest
+
+from drivelink import cli, outfile
+from drivelink.errors import RecordingError, UsageError
+from drivelink.jointfile import parse
+from drivelink.outfile import NewFile, check_target, write_whole
+from drivelink.recording.formats import open_sink
+from drivelink.recording.safefile import SafeFile
+from estimator.sample import Sample
+
+JOINT = 'name = "elbow"\n[[motor]]\ninertia_kg_m2 = 0.5\n[motor.transmission]\nmodel = "linear"\n'
+HEADER = "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Iterator[Path]:
+    """A folder in which nothing unfinished may be left."""
+    yield tmp_path
+    assert not list(tmp_path.rglob(".*.tmp"))
+
+
+def test_a_file_is_written_in_one_step_and_keeps_its_mode_and_its_links(folder: Path) -> None:
+    path, link = folder / "a.txt", folder / "link.txt"
+    write_whole(path, "first")
+    path.chmod(0o640)
+    link.symlink_to(path)
+    before = path.stat().st_ino
+    write_whole(link, b"second", force=True)
+    assert path.read_text() == "second" and link.is_symlink()
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+    assert path.stat().st_ino != before  # another file took its place: nobody saw it grow
+
+
+def test_without_force_an_existing_file_stays_even_one_that_came_meanwhile(folder: Path) -> None:
+    path = folder / "a.txt"
+    file = NewFile(path)
+    os.write(file.fd, b"mine")
+    path.write_text("somebody else's")
+    with pytest.raises(FileExistsError):
+        file.place()
+    file.close()
+    assert path.read_text() == "somebody else's"
+    with pytest.raises(FileExistsError):
+        write_whole(path, "mine")
+
+
+def test_a_file_system_without_hard_links_is_written_too(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: object) -> None:
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refused)
+    write_whole(folder / "a.txt", "whole")
+    assert (folder / "a.txt").read_text() == "whole"
+    with pytest.raises(FileExistsError):
+        write_whole(folder / "a.txt", "another")
+
+
+def test_the_disk_has_the_file_before_its_name_and_the_folder_after(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+
+    def synced(fd: int) -> None:
+        done.append("folder" if stat.S_ISDIR(os.fstat(fd).st_mode) else "file")
+
+    def replaced(self: Path, target: Path) -> Path:
+        done.append("name")
+        return self.rename(target)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(Path, "replace", replaced)
+    write_whole(folder / "a.txt", "whole", force=True)
+    assert done == ["file", "name", "folder"]
+
+
+@pytest.mark.parametrize("linked", [lambda a, b: b.symlink_to(a), lambda a, b: os.link(a, b)])
+def test_an_input_is_known_by_its_links(folder: Path, linked: Callable[[Path, Path], None]) -> None:
+    recording, other = folder / "r.csv", folder / "other.csv"
+    recording.write_text("data")
+    linked(recording, other)
+    for force in (False, True):
+        with pytest.raises(UsageError, match="is read here and must not be replaced"):
+            check_target(other, [recording], force=force)
+
+
+def test_a_write_protected_file_is_not_replaced(folder: Path) -> None:
+    path = folder / "a.txt"
+    path.write_text("kept")
+    path.chmod(0o444)
+    if os.access(path, os.W_OK):
+        pytest.skip("this user may write everything")
+    with pytest.raises(PermissionError):
+        write_whole(path, "new", force=True)
+
+
+def test_a_full_disk_leaves_what_was_there(folder: Path) -> None:
+    """The limit of a file's size stands for a full disk: writing fails half-way."""
+    path = folder / "a.txt"
+    path.write_text("kept")
+    script = (
+        "import resource, signal, sys\nfrom pathlib import Path\n"
+        "from drivelink.outfile import write_whole\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
+        "try:\n    write_whole(Path(sys.argv[1]), b'x' * 5000, force=True)\n"
+        "except OSError as error:\n    print(error.filename, error.strerror)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script, str(path)], capture_output=True, text=True)
+    assert done.stdout == f"{path} {os.strerror(errno.EFBIG)}\n", done.stderr
+    assert path.read_text() == "kept"
+
+
+def test_a_kill_at_any_moment_leaves_the_old_file_or_the_new_one(tmp_path: Path) -> None:
+    """Thirty kills of a process that replaces a file again and again."""
+    path = tmp_path / "a.txt"
+    texts = {letter * 200_000 for letter in "ab"}
+    path.write_text("a" * 200_000)
+    script = textwrap.dedent(
+        """
+        import sys
+        from pathlib import Path
+        from drivelink.outfile import write_whole
+        print("ready", flush=True)
+        while True:
+            for letter in "ab":
+                write_whole(Path(sys.argv[1]), letter * 200_000, force=True)
+        """
+    )
+    rng = np.random.default_rng(1)
+    for _ in range(30):
+        process = subprocess.Popen([sys.executable, "-c", script, str(path)], stdout=subprocess.PIPE)
+        assert process.stdout is not None and process.stdout.readline()
+        time.sleep(rng.uniform(0.0, 0.02))
+        process.kill()
+        process.communicate()
+        assert path.read_text() in texts
+
+
+# Recordings grow in their place
+
+
+def test_a_recording_takes_the_place_of_another_one_with_its_first_block(folder: Path) -> None:
+    path = folder / "r.csv"
+    path.write_text("an older recording")
+    joint = parse(JOINT)
+    with pytest.raises(RecordingError, match="File exists"):
+        open_sink(path, joint)
+    sink = open_sink(path, joint, force=True)
+    sink.sample(Sample(0, (0.0,), (0.0,), (0.0,), 0.0), 0)
+    assert path.read_text() == "an older recording"
+    sink.flush()
+    assert path.read_text().startswith("time_s,") and path.read_text().count("\n") == 2
+    sink.sample(Sample(1, (0.0,), (0.0,), (0.0,), 0.0), 0)
+    sink.flush()
+    assert path.read_text().count("\n") == 3
+    sink.close()
+
+
+def test_a_recording_that_never_began_leaves_nothing(folder: Path) -> None:
+    kept = folder / "kept.csv"
+    kept.write_text("an older recording")
+    for path, force in ((folder / "r.csv", False), (kept, True)):
+        sink = open_sink(path, parse(JOINT), force=force)
+        sink.abandon()
+    assert sorted(folder.iterdir()) == [kept] and kept.read_text() == "an older recording"
+
+
+def test_a_full_disk_cuts_a_recording_at_a_whole_block(folder: Path) -> None:
+    file = SafeFile(folder / "r.bin")
+    file.write(b"a" * 1000)
+    file.sync()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1500, hard))
+        file.write(b"b" * 1000)
+        with pytest.raises(RecordingError, match="it holds everything up to the last second"):
+            file.sync()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, before)
+    file.close()
+    assert (folder / "r.bin").read_bytes() == b"a" * 1000
+
+
+# The commands
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """Eight seconds of a linear joint, as CSV."""
+    rng = np.random.default_rng(5)
+    torque, stiffness = joints.polynomial(np.full((1, 1, 1), 100.0))
+    plants = joints.Plants(
+        torque,
+        stiffness,
+        *(np.full((1, 1), x) for x in (0.5, 0.8)),
+        *(np.full(1, x) for x in (0.4, 0.2, 5.0)),
+    )
+    truth = joints.simulate(plants, joints.sweep(rng, 8000, 1, 1, 0.001, np.full((1, 1, 1), 8.0), 3.0), 0.001)
+    record = joints.record(truth, 0, 0.001)
+    table = np.column_stack(
+        (
+            record.time_s,
+            record.motor_position_rad[:, 0],
+            record.motor_torque_nm[:, 0],
+            record.link_position_rad,
+        )
+    )
+    path = tmp_path_factory.mktemp("data") / "r.csv"
+    np.savetxt(path, table, delimiter=",", header=HEADER, comments="")
+    return path.read_bytes()
+
+
+@pytest.fixture
+def files(folder: Path, data: bytes) -> tuple[Path, Path]:
+    recording, joint = folder / "r.csv", folder / "elbow.toml"
+    recording.write_bytes(data)
+    joint.write_text(JOINT + "# my own remark\n")
+    return recording, joint
+
+
+@pytest.mark.parametrize("force", [[], ["--force"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["replay", "{r}", "--joint", "{j}", "--out", "{r}"],
+        ["replay", "{r}", "--joint", "{j}", "--out", "{link}"],
+        ["replay", "{r}", "--joint", "{j}", "--out", "{hard}"],
+        ["replay", "{r}", "--joint", "{j}", "--out", "{j}"],
+        ["fit", "{r}", "--joint", "{j}", "--write", "{r}"],
+        ["fit", "{r}", "--joint", "{j}", "--write", "{link}"],
+        ["diagnose", "{r}", "--joint", "{j}", "--write", "{r}", "--out", "{d}"],
+        ["diagnose", "{r}", "--joint", "{j}", "--validate", "{v}", "--write", "{v}", "--out", "{d}"],
+        ["record", "{j}", "--out", "{j}"],
+    ],
+)
+def test_no_command_replaces_what_it_reads(
+    arguments: list[str],
+    force: list[str],
+    files: tuple[Path, Path],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    recording, joint = files
+    names = {name: recording.with_name(name) for name in ("link", "hard", "v", "d")}
+    names["link"].symlink_to(recording)
+    os.link(recording, names["hard"])
+    names["v"].write_bytes(recording.read_bytes())
+    before = {path: path.read_bytes() for path in (recording, joint, names["v"])}
+    filled = [a.format(r=recording, j=joint, **names) for a in arguments]
+    assert cli.main([*filled, *force]) == 2
+    err = capsys.readouterr().err
+    assert "is read here and must not be replaced" in err and err.count("\n") == 1
+    assert {path: path.read_bytes() for path in before} == before
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["replay", "{r}", "--joint", "{j}", "--out", "{out}"],
+        ["fit", "{r}", "--joint", "{j}", "--write", "{out}"],
+        ["new", "{out}", "--case", "constant"],
+    ],
+)
+def test_a_named_file_is_replaced_with_force_only(
+    arguments: list[str], files: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording, joint = files
+    out = recording.with_name("out.x")
+    out.write_text("kept")
+    filled = [a.format(r=recording, j=joint, out=out) for a in arguments]
+    assert cli.main(filled) == 2
+    assert capsys.readouterr().err == f"drivelink {filled[0]}: {out}: exists already; --force replaces it\n"
+    assert out.read_text() == "kept"
+    assert cli.main([*filled, "--force"]) == 0
+    assert out.read_text() != "kept"
+
+
+def test_fit_brings_its_own_joint_file_up_to_date_in_one_step(
+    files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording, joint = files
+    arguments = ["fit", str(recording), "--joint", str(joint), "--write", str(joint)]
+    assert cli.main(arguments) == 2 and "--force replaces it" in capsys.readouterr().err
+    before = joint.read_text()
+
+    def killed(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(outfile, "put_in_place", killed)
+        assert cli.main([*arguments, "--force"]) == 130
+    assert joint.read_text() == before
+    assert cli.main([*arguments, "--force"]) == 0
+    assert "# my own remark" in joint.read_text()
+    assert cli.main([*arguments, "--force"]) == 0  # and again, from what it wrote
+
+
+def test_a_results_folder_holds_what_the_last_run_found(files: tuple[Path, Path]) -> None:
+    recording, joint = files
+    out = recording.parent / "fit"
+    for _ in range(2):
+        assert cli.main(["fit", str(recording), "--joint", str(joint), "--out", str(out), "--plots"]) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["fit.json", "fit.png"]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
+from array import array
 from collections.abc import Iterator
 from contextlib import suppress
 from itertools import chain, islice, pairwise
@@ -24,8 +25,10 @@ from drivelink.cycle.following import MapFollower
 from drivelink.errors import DriveError, RecordingError
 from drivelink.jointfile import JointFile
 from drivelink.recording.canlog import CAN_SUFFIXES, NO_STAMP, Frame, read_frames
+from drivelink.recording.columns import sample_columns, sample_row
 from drivelink.recording.cycles import Cycle
 from drivelink.recording.grid import report_gaps
+from drivelink.recording.limits import require_samples
 from drivelink.recording.mapping import recorded_layouts
 from drivelink.recording.mcapfile import read_messages
 from drivelink.recording.syncnumbers import numbered_ahead, numbered_at_once
@@ -210,25 +213,35 @@ def read_frame_record(path: Path, joint: JointFile | None, base_dir: Path, chann
     if joint is None:
         raise RecordingError(f"{path}: a raw CAN recording needs the joint file that says what is in it")
     log = FrameLog(path, joint, base_dir, channel)
-    samples = [cycle.sample for cycle in log.cycles() if cycle.sample is not None]
-    if len(samples) < 3:
-        raise RecordingError(f"{path}: expected at least 3 complete samples, got {len(samples)}")
-    sequence = np.array([sample.sequence for sample in samples], dtype=np.int64)
-    report_gaps(sequence, log.period_s, str(path))
+    motors = len(joint.motor)
+    sequence, values = array("q"), array("d")
+    for cycle in log.cycles():
+        if (sample := cycle.sample) is not None:
+            sequence.append(sample.sequence)
+            values.extend(sample_row(sample, log.period_s))
+            require_samples(sample.sequence - sequence[0] + 1, str(path))
+    if len(sequence) < 3:
+        raise RecordingError(f"{path}: expected at least 3 complete samples, got {len(sequence)}")
+    number = np.frombuffer(sequence, dtype=np.int64)
+    report_gaps(number, log.period_s, str(path))
+    names = sample_columns(motors)
+    table = np.frombuffer(values, dtype=np.float64).reshape(-1, len(names))
+    columns = {name: np.ascontiguousarray(table[:, k]) for k, name in enumerate(names)}
 
-    def optional(values: list[float]) -> FloatArray | None:
-        column = np.array(values, dtype=np.float64)
+    def motor(name: str) -> FloatArray:
+        return np.stack([columns[f"motor{i}_{name}"] for i in range(1, motors + 1)], axis=1)
+
+    def known(column: FloatArray) -> FloatArray | None:
         return column if np.any(np.isfinite(column)) else None
 
-    velocity = np.array([sample.motor_velocity_rad_s for sample in samples], dtype=np.float64)
     return Record(
         period_s=log.period_s,
-        sequence=sequence,
-        motor_position_rad=np.array([sample.motor_position_rad for sample in samples], dtype=np.float64),
-        motor_torque_nm=np.array([sample.motor_torque_nm for sample in samples], dtype=np.float64),
-        motor_velocity_rad_s=velocity if np.any(np.isfinite(velocity)) else None,
-        link_position_rad=optional([sample.link_position_rad for sample in samples]),
-        link_velocity_rad_s=optional([sample.link_velocity_rad_s for sample in samples]),
+        sequence=number,
+        motor_position_rad=motor("position_rad"),
+        motor_torque_nm=motor("torque_nm"),
+        motor_velocity_rad_s=known(motor("velocity_rad_s")),
+        link_position_rad=known(columns["link_position_rad"]),
+        link_velocity_rad_s=known(columns["link_velocity_rad_s"]),
     )
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from daemonkit import Collector, Listener, Rig, rig, running, served, vsa, vsa_text
@@ -304,6 +305,33 @@ def test_a_joint_file_with_an_error_leaves_the_model_as_it_is(tmp_path: Path) ->
 
     until(said)
     assert made.lane.chain.estimator is old
+    made.close()
+
+
+def test_a_flood_of_reloads_begins_one_in_a_while_and_forgets_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 1000.0
+    begun: list[float] = []
+    clock = SimpleNamespace(monotonic=lambda: now_s, sleep=time.sleep)
+    made = reloadable(tmp_path)
+    monkeypatch.setattr(reload, "time", clock)
+    (reloader,) = made.daemon._reloaders
+    monkeypatch.setattr(
+        reloader, "_prepare", lambda: begun.append(now_s) or setattr(reloader, "_thread", None)
+    )
+    for k in range(300):  # 30 a second, for ten seconds
+        now_s = 1000.0 + k / 30
+        reloader.request()
+        reloader.check()
+        while reloader._thread is not None:
+            pass
+    assert 9 <= len(begun) <= 11
+    now_s += 10.0
+    reloader.check()  # the last request is still there
+    while reloader._thread is not None:
+        pass
+    assert begun[-1] == now_s
     made.close()
 
 

@@ -14,8 +14,8 @@ import os
 import sys
 from typing import Protocol
 
-from drivelink import __version__
 from drivelink.errors import DrivelinkError, UsageError
+from drivelink.version import __version__
 from estimator.errors import EstimatorError
 
 __all__ = ["ALONE", "VERBS", "add_map", "main", "make_parser"]

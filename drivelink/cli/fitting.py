@@ -15,12 +15,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from drivelink import __version__, jointfile, plots, recording
+from drivelink import jointfile, plots, recording
 from drivelink.errors import RecordingError, UsageError
 from drivelink.floor import floor_entry
 from drivelink.jointfile import JointFile, JointText
 from drivelink.outfile import check_target, write_whole
 from drivelink.recording.columnmap import parse_column_map
+from drivelink.version import __version__
 from estimator.batch import TransmissionFit, fit
 from estimator.diagnosis import calibrate
 from estimator.errors import EstimatorError

@@ -8,7 +8,6 @@ import time
 from collections.abc import Generator
 from typing import Any
 
-from drivelink import __version__
 from drivelink.canopen.emcy import emergency_text
 from drivelink.cycle.framesource import LostSource
 from drivelink.cycle.loop import CycleLoop, Lane
@@ -16,6 +15,7 @@ from drivelink.cycle.realtime import RealTime
 from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor
 from drivelink.jointfile import JointFile
+from drivelink.version import __version__
 from estimator.sample import Status
 
 __all__ = ["JointStatus"]

@@ -9,6 +9,7 @@ steps in each slack than there are new samples: the exchange comes, however slow
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections import deque
@@ -24,6 +25,7 @@ from estimator.sample import Sample
 
 __all__ = ["Reloader"]
 
+_EVERY_S = 1.0  # between the beginnings of two reloads: a file or a signal that flaps costs little
 _STEPS = 5  # of the new estimator in one go; then the cycle gets its turn
 _PAUSE_S = 0.0005
 _BEHIND = 4  # samples that the cycle itself may catch up with at the exchange
@@ -61,6 +63,7 @@ class Reloader:
         self._events = events
         self._seen = self._signature()
         self._requested = False
+        self._next_s = -math.inf
         self._thread: threading.Thread | None = None
         self._turn = threading.Lock()  # the new estimator is stepped by one thread at a time
         self._ready: tuple[JointFile, Built, int] | None = None
@@ -72,12 +75,13 @@ class Reloader:
 
     def check(self) -> None:
         """In the slack: begin to reload when the file has changed."""
-        if self._thread is not None:
+        if self._thread is not None or time.monotonic() < self._next_s:
             return
         signature = self._signature()
         if (signature == self._seen or signature is None) and not self._requested:
             return
         self._seen, self._requested, self._slacks = signature, False, 0
+        self._next_s = time.monotonic() + _EVERY_S
         self._thread = threading.Thread(target=self._prepare, name="reload", daemon=True)
         self._thread.start()
 

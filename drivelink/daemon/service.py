@@ -35,7 +35,7 @@ from drivelink.daemon.supervision import Supervisor
 from drivelink.daemon.systemd_notify import notify, watchdog_period_s
 from drivelink.errors import UsageError
 from drivelink.jointfile import JointFile
-from drivelink.pubsub.publisher import JointPublisher, describe_model
+from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_session
 
 __all__ = ["Daemon", "ServedJoint", "check_agreement"]
@@ -44,6 +44,7 @@ logger = logging.getLogger("drivelink")
 
 _STATUS_S = 0.25
 _CHECK_S = 0.05
+_ANSWER_S = 0.05
 _FILE_S = 0.2
 _COLLECT_S = 5.0
 _HISTORY_S = 2.0  # of samples that a new estimator starts from
@@ -248,6 +249,7 @@ class Daemon:
         for publisher, status in zip(self._publishers, self._status, strict=True):
             if publisher is not None:
                 housekeeping.every(_STATUS_S, partial(_put_status, publisher, status))
+                housekeeping.every(_ANSWER_S, publisher.answer)
         for reloader in self._reloaders:
             housekeeping.urgent.append(reloader.step)
             housekeeping.every(_FILE_S, reloader.check)
@@ -274,7 +276,7 @@ def _republish(
 ) -> Callable[[JointFile], None]:
     def publish(joint: JointFile) -> None:
         if publisher is not None:
-            publisher.put_model(describe_model(joint, layouts))
+            publisher.put_joint(joint, layouts)
 
     return publish
 

@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle.frames import Slot, signal_targets
 from drivelink.cycle.nodestate import NodeCounters, NodeState
+from drivelink.cycle.syncclock import LATE
 from drivelink.errors import DriveError
 from estimator.sample import Sample, Status
 
@@ -75,7 +76,7 @@ class Assembler:
         for layout in layouts:
             self._add(layout)
         self._arrange()
-        self._open = self._spoiled = self._cycle_fault = self._restart = False
+        self._open = self._spoiled = self._cycle_fault = self._restart = self._unnumbered = False
         self._faulted = 0
         self.sequence = self.missed = -1
         self.flags = 0
@@ -127,7 +128,8 @@ class Assembler:
         Args:
             cob_id: identifier of the frame.
             data: its bytes.
-            jump: for a SYNC, whole periods since the one before; 0: one that was not due.
+            jump: for a SYNC, whole periods since the one before; 0: one that was not due; `LATE`: one whose
+                period is over.
 
         Returns:
             The sample that this frame completes, if it does.
@@ -145,7 +147,9 @@ class Assembler:
 
     def sync(self, jump: int = 1) -> Sample | None:
         """A SYNC: close the cycle and open the next one; returns the sample if it was only now certain."""
-        if jump <= 0:
+        if jump == LATE:
+            return self._open_unnumbered()
+        if jump == 0:
             self.extra_syncs += 1
             self._spoiled = True  # what comes now answers that SYNC, or ours: nobody can tell
             self._untimed = _DOUBT_CYCLES
@@ -163,13 +167,25 @@ class Assembler:
         self._awaited = len(self._timed)
         return sample
 
+    def _open_unnumbered(self) -> Sample | None:
+        """Our own master's SYNC, too late for a number: what answers it is of no sample, and spoils none."""
+        sample = self._close(0)
+        for slot in self._slots.values():
+            slot.arrived = False
+        self._awaited = len(self._timed)
+        self._unnumbered = True
+        return sample
+
     def _close(self, jump: int) -> Sample | None:
         was_open, self._open = self._open, False
+        unnumbered, self._unnumbered = self._unnumbered, False
         self.missed = -1
         for slot in self._needed:
             if not slot.arrived:
                 self._note_silence(slot, jump)
         if not was_open:
+            if unnumbered:
+                self._note_missing()
             return None
         if self._usable():
             for slot in self._timed:

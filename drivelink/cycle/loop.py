@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Protocol
@@ -17,7 +18,7 @@ from drivelink.cycle.chain import Chain
 from drivelink.cycle.framesource import BusLostError, Frame, FrameSource, LostSource
 from drivelink.cycle.housekeeping import Housekeeping
 from drivelink.cycle.meter import Meter
-from drivelink.cycle.syncclock import SyncClock
+from drivelink.cycle.syncclock import LATE, MEASURED_SYNCS, SyncClock
 from estimator.sample import Estimate, Sample
 
 __all__ = ["CycleLoop", "Lane", "Sink"]
@@ -101,6 +102,8 @@ class CycleLoop:
         cycles: SYNCs since the start.
         overruns: periods left out because this process was late.
         foreign_syncs: SYNCs of another master while we make it, or that were not due.
+        late_syncs: SYNCs of the master we follow that came when their period was over.
+        sync_stamps: of the last SYNCs, when following.
         counter_jumps: SYNCs whose counter did not follow the one before.
         clock_step_ns: by how much the system's clock was last set.
         clock_steps: how often that happened.
@@ -128,7 +131,8 @@ class CycleLoop:
         self.on_lost: Callable[[str], None] = lambda _reason: None
         self.on_fault: Callable[[str, Exception], None] = _log_fault
         self.housekeeping.on_fault = lambda error: self.on_fault("housekeeping", error)
-        self.cycles = self.overruns = self.foreign_syncs = self.counter_jumps = 0
+        self.cycles = self.overruns = self.foreign_syncs = self.late_syncs = self.counter_jumps = 0
+        self.sync_stamps: deque[int] = deque(maxlen=MEASURED_SYNCS)
         self.clock_step_ns = self.clock_steps = 0
         self.silent = False
         self.lateness = Meter()
@@ -258,9 +262,12 @@ class CycleLoop:
             self.foreign_syncs += 1
             self._sync(data, 0, 0, now_ns)
             return
+        self.sync_stamps.append(stamp_ns)
         jump = self._sync_clock.jump(stamp_ns, now_ns)
         if jump == 0:
             self.foreign_syncs += 1
+        elif jump == LATE:
+            self.late_syncs += 1
         else:
             self.lateness.add(abs(now_ns - self.sync_ns - jump * self.period_ns) if self.cycles else 0)
             self.sync_ns = now_ns
@@ -271,7 +278,7 @@ class CycleLoop:
         self._sync(data, stamp_ns, jump, now_ns)
 
     def _sync(self, data: bytes, stamp_ns: int, jump: int, now_ns: int) -> None:
-        if jump:
+        if jump > 0:
             self.cycles += 1
             self._before_ns, self._stamp_ns = self._stamp_ns, stamp_ns
             self.silent = False
@@ -302,7 +309,7 @@ class CycleLoop:
         if chain.estimator is not lane.broken:  # the joint file was mended
             lane.fault, lane.broken = "", None
             self.reroute()
-        if chain.estimate is None or not jump:
+        if chain.estimate is None or jump <= 0:
             return None
         return chain.carry_on(chain.estimate.sequence + jump)
 

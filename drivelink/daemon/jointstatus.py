@@ -145,6 +145,8 @@ class JointStatus:
             "lost_sends": source.lost_sends,
             "errors": dict(source.errors),
             "foreign_syncs": self._loop.foreign_syncs,
+            "late_syncs": self._loop.late_syncs,
+            "sync_period_s": self._supervisor.sync_period_s,
             "sync_counter_jumps": self._loop.counter_jumps,
         }
 

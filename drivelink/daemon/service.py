@@ -113,9 +113,10 @@ class Daemon:
             self._configurator, layouts = join_bus(
                 self._port, [s.joint for s in joints], [s.folder for s in joints], idle=devices
             )
+            self._section = self._configurator.bus  # with the period that another master's SYNC really has
             keep = round(_HISTORY_S / self._section.period_s)
             self._lanes = [
-                Lane(served.joint.name, make_chain(served.joint, mine, keep=keep), publisher)
+                Lane(served.joint.name, make_chain(self._timed(served.joint), mine, keep=keep), publisher)
                 for served, mine, publisher in zip(joints, layouts, self._publishers, strict=True)
             ]
             self.loop = self._make_loop()
@@ -124,11 +125,11 @@ class Daemon:
             )
             load = self._configurator.load().fraction
             self._status = [
-                JointStatus(served.joint, self.loop, lane, self._supervisor, self.events, load)
+                JointStatus(self._timed(served.joint), self.loop, lane, self._supervisor, self.events, load)
                 for served, lane in zip(joints, self._lanes, strict=True)
             ]
             for served, mine, publisher in zip(joints, layouts, self._publishers, strict=True):
-                _republish(publisher, mine)(served.joint)
+                self._republish(publisher, mine)(served.joint)
             self._reloaders = self._make_reloaders(layouts)
             self._plan_housekeeping()
             self.loop.source.narrow(self.loop.receive_ids())
@@ -231,7 +232,14 @@ class Daemon:
 
     def _make_reloaders(self, layouts: Sequence[tuple[NodeLayout, ...]]) -> list[Reloader]:
         return [
-            Reloader(served.path, served.joint, lane.chain, build, _republish(publisher, mine), self.events)
+            Reloader(
+                served.path,
+                served.joint,
+                lane.chain,
+                lambda joint: build(self._timed(joint)),
+                self._republish(publisher, mine),
+                self.events,
+            )
             for served, lane, publisher, mine in zip(
                 self._joints, self._lanes, self._publishers, layouts, strict=True
             )
@@ -257,6 +265,19 @@ class Daemon:
         if watchdog_s is not None:
             housekeeping.every(watchdog_s, lambda: notify("WATCHDOG=1"))
 
+    def _timed(self, joint: JointFile) -> JointFile:
+        """A joint file with the period that SYNC has."""
+        return joint.model_copy(update={"bus": self._section})
+
+    def _republish(
+        self, publisher: JointPublisher | None, layouts: tuple[NodeLayout, ...]
+    ) -> Callable[[JointFile], None]:
+        def publish(joint: JointFile) -> None:
+            if publisher is not None:
+                publisher.put_joint(self._timed(joint), layouts)
+
+        return publish
+
     def _check_bus(self) -> None:
         if self._keeper.check():
             self._supervisor.reconfigure_all()
@@ -269,16 +290,6 @@ class Daemon:
     def _check_end(self) -> None:
         if self._end_ns is not None and time.monotonic_ns() >= self._end_ns:
             self.loop.stop()
-
-
-def _republish(
-    publisher: JointPublisher | None, layouts: tuple[NodeLayout, ...]
-) -> Callable[[JointFile], None]:
-    def publish(joint: JointFile) -> None:
-        if publisher is not None:
-            publisher.put_joint(joint, layouts)
-
-    return publish
 
 
 def _put_status(publisher: JointPublisher, status: JointStatus) -> Generator[None]:

@@ -11,9 +11,8 @@ import logging
 from array import array
 from collections.abc import Iterator
 from contextlib import suppress
-from itertools import chain, islice, pairwise
+from itertools import chain, islice
 from pathlib import Path
-from statistics import median
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.acquisition import SYNC_COB_ID, Assembler
 from drivelink.cycle.chain import make_assembler
 from drivelink.cycle.following import MapFollower
+from drivelink.cycle.syncclock import measure_period
 from drivelink.errors import DriveError, RecordingError
 from drivelink.jointfile import JointFile
 from drivelink.recording.canlog import CAN_SUFFIXES, NO_STAMP, Frame, read_frames
@@ -41,7 +41,6 @@ _LOG = logging.getLogger("drivelink.recording")
 _SDO = range(0x581, 0x680)
 _OF_MAPS = frozenset({0, *_SDO, *range(0x701, 0x780)})  # NMT, SDO, boot-up
 _QUIET_SYNCS = 500  # without a change of the configuration: it is over
-_PERIOD_TOLERANCE = 0.03
 _PEEK = 20_000  # messages that tell whether an MCAP file has samples
 
 
@@ -117,7 +116,7 @@ class FrameLog:
         for (stamp_ns, can_id, data, _), jump in numbered(chain(self._head, self._frames), self.period_s):
             was = assembler.sequence
             sample = assembler.feed(can_id, data, jump)
-            if can_id == SYNC_COB_ID and jump:
+            if can_id == SYNC_COB_ID and jump > 0:
                 stamp_before, stamp_now = stamp_now, stamp_ns
             if follower is not None and (can_id in _OF_MAPS or can_id == SYNC_COB_ID):
                 follower.feed(can_id, data)
@@ -177,23 +176,16 @@ class FrameLog:
             )
         if syncs[0] == NO_STAMP:
             return configured_s
-        steps_s = sorted((b - a) * 1e-9 for a, b in pairwise(syncs))
-        measured_s = median(steps_s)
-        # A master that is often late leaves SYNCs out: then the shorter steps tell.
-        short_s = steps_s[len(steps_s) // 10]
-        if measured_s <= 0 or any(
-            abs(s / configured_s - 1) <= _PERIOD_TOLERANCE for s in (measured_s, short_s)
-        ):
+        measured = measure_period([stamp for stamp in syncs if stamp != NO_STAMP], configured_s)
+        if measured is None or measured.same:
             return configured_s
-        rounded = float(f"{measured_s:.2g}")
-        period_s = rounded if abs(rounded / measured_s - 1) <= _PERIOD_TOLERANCE else measured_s
         _LOG.warning(
             "%s: SYNC comes every %.4g s, not every %.4g s as bus.period_s says: taken as it comes",
             self._path,
-            period_s,
+            measured.period_s,
             configured_s,
         )
-        return period_s
+        return measured.period_s
 
     def _relayout(self, can_id: int, data: bytes, assembler: Assembler) -> None:
         """A node is given another mapping in the middle of the recording."""

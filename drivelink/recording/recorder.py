@@ -195,7 +195,7 @@ class BusTap:
         self._assembler: Assembler | None = None
         self._follower: MapFollower | None = None
         self._lacking = ""  # what the mapping lacks, where it is known
-        self._numbering = SyncNumbering(joint.bus.period_s)
+        self._numbering = SyncNumbering(joint.bus.period_s, measure=True)
         self._stamp_ns = 0
         self.frames = 0
 
@@ -256,7 +256,7 @@ class BusTap:
                 self._lacking, self._listener = str(error), None
                 return
         before_ns = self._stamp_ns
-        if cob_id == SYNC_COB_ID and jump:
+        if cob_id == SYNC_COB_ID and jump > 0:
             self._stamp_ns = stamp_ns
         sample = self._assembler.feed(cob_id, data, jump)
         if self._follower is not None:

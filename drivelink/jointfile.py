@@ -23,6 +23,7 @@ from drivelink.keyhint import unknown_key
 from drivelink.outfile import write_whole
 from estimator.model import Arrangement, Effect, JointModel, LinkDynamics, Motor, Transmission
 from estimator.settings import EstimatorSettings
+from estimator.transmissions import MODELS, transmission_model
 
 __all__ = [
     "BusSection",
@@ -154,6 +155,12 @@ class MotorSection(_Section):
     )
     effect: tuple[Effect, ...] = Field((), description="effects the model has been given")
     drive: DriveSection | None = Field(None, description="only run, sim, record and doctor need it")
+
+    @model_validator(mode="after")
+    def _parameters_can_be(self) -> MotorSection:
+        if self.transmission.model in MODELS:  # of one's own models the estimator tells when it is made
+            transmission_model(self.transmission)
+        return self
 
     def motor(self) -> Motor:
         """What the estimator is told of it."""

@@ -153,9 +153,9 @@ class RobustEstimator:
     def _bridge(self, inputs: list[float], periods: int) -> None:
         """The periods that are missing, along a straight line.
 
-        A motion at the filter's bandwidth w loses (w n T)²/12 of its amplitude by that, for n T of the filter's
-        memory 1/w: half a percent at w n T = 0.4. Up to there the gap is forgotten; beyond, what has
-        been made up is not learned from.
+        A motion at the filter's bandwidth w loses (w n T)²/12 of its amplitude by that, for n T of a memory
+        1/w: half a percent at w n T = 0.4. Up to there the gap is forgotten; beyond, what has been made up is
+        not learned from.
         """
         last = self._last
         for k in range(1, periods):

@@ -24,6 +24,12 @@ _DEFLATE_RATIO = 1032  # of zlib at its best
 _CONTAINER_HEAD = 16  # bytes of a BLF container before what is packed
 _STAMP = re.compile(r"^[ \t]*(\d{1,12}\.\d{1,12})(?=[ \t])")
 _RELATIVE = re.compile(r"^\s*base\s+\w+\s+timestamps\s+relative", re.IGNORECASE)
+# time CANFD channel Rx identifier [name] BRS ESI DLC length duration bits flags …, of a frame without data
+_EMPTY_FD = re.compile(
+    r"^\s*(\S+)\s+CANFD\s+(\d+)\s+(\w+)\s+(\w+)(?:\s+\w*[^\W01]\w*)?\s+[01]\s+[01]\s+0\s+0"
+    r"\s+\d+\s+\d+\s+([0-9A-Fa-f]+)(?:\s|$)"
+)
+_REMOTE = 0x10  # among these flags
 _TRC_VERSIONS = ("1.0", "1.1", "1.2", "1.3", "2.0", "2.1")
 
 
@@ -113,7 +119,9 @@ class AscText(_Text):
             self._relative = True
         elif self._relative and (stamp := _STAMP.match(line)):
             self._total += float(stamp[1])
-            return f"{self._total:.9f}{line[stamp.end() :]}"
+            line = f"{self._total:.9f}{line[stamp.end() :]}"
+        if (empty := _EMPTY_FD.match(line)) and not int(empty[5], 16) & _REMOTE:
+            return f"{empty[1]} {empty[2]} {empty[4]} {empty[3]} d 0\n"  # else it is taken for a remote frame
         return line
 
 

@@ -24,12 +24,12 @@ from drivelink.cycle.following import MapFollower
 from drivelink.cycle.syncclock import measure_period
 from drivelink.errors import DriveError, RecordingError
 from drivelink.jointfile import JointFile
-from drivelink.recording.canlog import CAN_SUFFIXES, NO_STAMP, Frame, read_frames
+from drivelink.recording.canlog import CAN_SUFFIXES, NO_STAMP, Frame, in_order, read_frames
 from drivelink.recording.columns import sample_columns, sample_row
 from drivelink.recording.cycles import Cycle
 from drivelink.recording.grid import report_gaps
 from drivelink.recording.limits import require_samples
-from drivelink.recording.mapping import recorded_layouts
+from drivelink.recording.mapping import recorded_layouts, side_file
 from drivelink.recording.mcapfile import read_messages
 from drivelink.recording.syncnumbers import numbered_ahead, numbered_at_once
 from estimator.sample import FloatArray, Record
@@ -86,7 +86,9 @@ class FrameLog:
 
         def frames() -> Iterator[Frame]:
             mcap = path.suffix.lower() == ".mcap"
-            return _mcap_frames(path) if mcap else read_frames(path, channel, joint.bus.channel)
+            return (
+                in_order(_mcap_frames(path), path) if mcap else read_frames(path, channel, joint.bus.channel)
+            )
 
         self._frames = frames()
         self._follow = joint.bus.sync == "follow"
@@ -108,14 +110,21 @@ class FrameLog:
             raise RecordingError(f"{path}: {error}") from error
 
     def cycles(self) -> Iterator[Cycle]:
-        """The cycles that the frames make; once."""
+        """The cycles that the frames make; once.
+
+        Raises:
+            RecordingError: the recording is broken, or they make no sample.
+        """
         assembler = self._assembler
         follower = self._follower() if self._passive else None
         numbered = numbered_at_once if self._follow else numbered_ahead
         stamp_now = stamp_before = 0
+        heard: set[int] = set()
+        samples = False
         for (stamp_ns, can_id, data, _), jump in numbered(chain(self._head, self._frames), self.period_s):
             was = assembler.sequence
             sample = assembler.feed(can_id, data, jump)
+            heard.add(can_id)
             if can_id == SYNC_COB_ID and jump > 0:
                 stamp_before, stamp_now = stamp_now, stamp_ns
             if follower is not None and (can_id in _OF_MAPS or can_id == SYNC_COB_ID):
@@ -124,10 +133,25 @@ class FrameLog:
                 self._relayout(can_id, data, assembler)
             if sample is not None:
                 stamp_ns = stamp_before if assembler.sequence != was else stamp_now
+                samples = True
                 yield Cycle(sample.sequence, stamp_ns, sample, assembler.flags)
             elif assembler.missed >= 0:
                 missed, assembler.missed = assembler.missed, -1
                 yield Cycle(missed, stamp_before, None, assembler.flags)
+        if not samples:
+            raise RecordingError(f"{self._path}: no complete sample in it{self._absent(heard)}")
+
+    def _absent(self, heard: set[int]) -> str:
+        """Which frames of the mapping never came."""
+        absent = [
+            f"0x{tpdo.cob_id:03X} of node {layout.node_id}"
+            for layout in self._listener.layouts.values()
+            for tpdo in layout.tpdos
+            if tpdo.cob_id not in heard
+        ]
+        if not absent:
+            return ""
+        return f": expected frames {', '.join(absent)}, got none (another node id, channel or mapping?)"
 
     def _follower(self) -> MapFollower:
         """Somebody else maps the nodes: the maps are followed as the daemon follows them."""
@@ -166,13 +190,17 @@ class FrameLog:
         """Raise where the mapping of a node is not known."""
         if self._listener.busy:
             reason = next(iter(self._listener.missing.values()))
-            raise RecordingError(f"{self._path}: {reason} (nor is it configured by SDO in the recording)")
+            raise RecordingError(
+                f"{self._path}: {reason} (nor is it configured by SDO in the recording, nor is "
+                f"there a {side_file(self._path).name} beside it)"
+            )
 
     def _period(self, syncs: list[int], configured_s: float) -> float:
         """The period that the recorded SYNCs have: the configured one, where they agree."""
         if len(syncs) < 3:
             raise RecordingError(
-                f"{self._path}: expected SYNC frames (0x080) to tell the time of a sample, got {len(syncs)}"
+                f"{self._path}: expected SYNC frames (0x080), which tell the time of a sample, got "
+                f"{len(syncs)}: record the whole bus, no filter set, while its master sends SYNC"
             )
         if syncs[0] == NO_STAMP:
             return configured_s

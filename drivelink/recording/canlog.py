@@ -21,7 +21,7 @@ from drivelink.errors import RecordingError
 from drivelink.recording.boundedlog import AscText, BlfBytes, TrcText
 from drivelink.recording.limits import MAX_LINE_BYTES
 
-__all__ = ["CAN_SUFFIXES", "NO_STAMP", "Frame", "read_frames"]
+__all__ = ["CAN_SUFFIXES", "NO_STAMP", "Frame", "in_order", "read_frames"]
 
 _LOG = logging.getLogger("drivelink.recording")
 
@@ -35,6 +35,8 @@ _LONGEST = 64  # bytes of a frame: those of CAN XL are no CANopen
 _LINE = 16 << 10  # bytes; candump's longest, of CAN XL, has 6 KiB
 _BLOCK = 1 << 18  # bytes read at once
 _HOPELESS = 20  # strange lines at the beginning: it is no log
+_DISORDER_NS = 1_000_000_000  # by which stamps of frames in one file may be out of order
+_GAP_NS = 1_000_000_000
 _LOOK_AHEAD = 2000  # frames that decide what the stamps mean, and which channels there are
 
 
@@ -86,10 +88,32 @@ def read_frames(path: Path, channel: str | None = None, configured: str = "") ->
     frames = _text_frames(path) if path.suffix.lower() in (".log", ".candump") else _library_frames(path)
     head = list(islice(frames, _LOOK_AHEAD))
     chosen = channel or _channel(head, configured, path)
-    whole = chain(head, frames)
-    if chosen is None:
-        return whole
-    return (frame for frame in whole if _same_channel(frame.channel, chosen))
+    whole: Iterator[Frame] = chain(head, frames)
+    if chosen is not None:
+        whole = (frame for frame in whole if _same_channel(frame.channel, chosen))
+    return in_order(whole, path)
+
+
+def in_order(frames: Iterable[Frame], path: Path) -> Iterator[Frame]:
+    """Frames whose stamps go on where they jump back: a clock that was set, or two logs in one file.
+
+    How long it took nobody knows: it is a gap, of a second, and said.
+    """
+    offset = last = 0
+    for frame in frames:
+        stamp_ns = frame.stamp_ns + offset
+        if last - stamp_ns > _DISORDER_NS and frame.stamp_ns != NO_STAMP:
+            _LOG.warning(
+                "%s: the stamps jump back by %.4g s at %.6f s: taken as a gap of %g s",
+                path,
+                (last - stamp_ns) * 1e-9,
+                frame.stamp_ns * 1e-9,
+                _GAP_NS * 1e-9,
+            )
+            offset += last + _GAP_NS - stamp_ns
+            stamp_ns = last + _GAP_NS
+        last = max(last, stamp_ns)
+        yield frame._replace(stamp_ns=stamp_ns) if offset and frame.stamp_ns != NO_STAMP else frame
 
 
 def _channel(head: list[Frame], configured: str, path: Path) -> str | None:

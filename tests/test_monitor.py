@@ -356,7 +356,7 @@ def test_the_residual_is_a_gauge_against_its_baseline_before_and_after() -> None
     shown = shape(ALARM, IMPROVED)
     assert [(b.name, round(b.ratio, 6)) for b in shown.balances] == [("motor", 3.0), ("link", 0.5)]
     text = "\n".join(line.plain for line in status_lines(ALARM, 130, IMPROVED))
-    assert "motor ████████████ 3.0" in text and "link ███░░░░░░░░░ 0.50" in text  # half a bar is the baseline
+    assert "motor ██████████ 3.0" in text and "link ██▌░░░░░░░ 0.50" in text  # half a bar is the baseline
     assert "effects: 8.1 → 1.2 %" in text
     view = filled()
     view.status, view.model = ALARM, IMPROVED
@@ -370,7 +370,8 @@ def test_every_view_says_what_to_do_on_a_model_alarm() -> None:
     view = filled()
     view.status = ALARM
     told = snapshot(view, True, {})["status"]
-    for text in (view.line(), "\n".join(lines(view, 200)), told["advice"]):
+    assert "do not control on it; drivelink diagnose tells why" in "\n".join(lines(view, 80))
+    for text in (view.line(), "\n".join(lines(view, 240)), told["advice"]):
         assert "likely at the transmission" in text and "drivelink diagnose" in text
     view.status = STATUS
     assert "diagnose" not in view.line() and not snapshot(view, True, {})["status"]["alarm"]

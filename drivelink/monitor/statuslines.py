@@ -23,9 +23,10 @@ MODEL_ALARM_ADVICE = (
     "the model is not sufficient: do not control on its numbers; record a minute of motion "
     "(drivelink record), then drivelink diagnose names the effect and writes a better joint file"
 )
+_SHORT_ADVICE = "model alarm: do not control on it; drivelink diagnose tells why"
 _MOST = 16  # entries of a list that a view shows
 _WORDS = 200  # characters of one entry
-_GAUGE = 12  # characters
+_GAUGE = 10  # characters
 _FULL = 2.0  # times its baseline where a gauge is full
 
 
@@ -229,13 +230,15 @@ def _residual(shown: Shown) -> str:
 
 
 def status_lines(status: Mapping[str, Any], width: int, model: Mapping[str, Any] | None = None) -> list[Text]:
-    """At most four lines of so many characters: cycle and timing, nodes, residual, what is wrong."""
+    """At most five lines of so many characters: cycle, nodes, residual, what to do, what is wrong."""
     if not status:
         return []
     shown = shape(status, model)
     lines = [_line("cycle", _cycle(shown), width), _nodes(shown, width), _gauges(shown, width)]
-    wrong = "; ".join((*((shown.advice,) if shown.alarm else ()), *shown.wrong))
-    lines.append(_line("look here", wrong, width, "bold red"))
+    if shown.alarm:
+        advice = shown.advice if len(shown.advice) + 11 <= width else _SHORT_ADVICE
+        lines.append(_line("look here", advice, width, "bold red"))
+    lines.append(_line("look here", "; ".join(shown.wrong), width, "bold red"))
     return [line for line in lines if line is not None]
 
 
@@ -275,7 +278,8 @@ def _gauges(shown: Shown, width: int) -> Text | None:
         if len(shown.balances) > 1:
             line.append(f"{balance.name} ", style="dim")
         line.append(gauge(balance.ratio, _FULL, _GAUGE), style=style)
-        line.append(f" {number(balance.ratio, 2)} × baseline  ")
+        line.append(f" {number(balance.ratio, 2)} ×  ")
+    line.append("of the baseline  ", style="dim")
     if shown.improved is not None:
         line.append(
             "effects: {:.1f} → {:.1f} %".format(*(100 * part for part in shown.improved)), style="dim"

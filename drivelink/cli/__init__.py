@@ -30,6 +30,7 @@ VERBS = {
     "fit": "fit the transmission to a recording (model-based estimation)",
     "diagnose": "trace what the model leaves unexplained to a physical effect, and add it",
     "doctor": "what keeps this machine, bus or drive from doing the job, and the fix",
+    "service": "run the daemon of a joint as a systemd service, from boot on",
     "new": "write a commented joint file, from a few questions or from what is on the bus",
     "completion": "what a shell needs to complete verbs, options and files",
 }

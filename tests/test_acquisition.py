@@ -7,9 +7,8 @@ import struct
 import pytest
 from canlayouts import COUNT_RAD, LINK_RAD, TORQUE_NM, VSA, drive, encoder, link, pdo, vsa_cycle
 
+from drivelink._core import Assembler
 from drivelink.canopen.layout import MappedObject, NodeLayout, Signal, TpdoLayout
-from drivelink.cycle.acquisition import Assembler
-from drivelink.cycle.frames import make_decoder
 from drivelink.cycle.syncclock import LATE, SyncClock, measure_period
 from drivelink.errors import DriveError
 from estimator.sample import Sample, Status
@@ -346,21 +345,25 @@ def test_can_fd_frames_may_be_padded() -> None:
 
 def test_objects_of_any_length_are_decoded_bit_by_bit() -> None:
     rng = random.Random(3)
+    signals = [Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE, Signal.MOTOR_VELOCITY, Signal.LINK_POSITION]
     for _ in range(200):
-        objects, word, shift, truth = [], 0, 0, []
-        while True:
-            bits, signed = rng.randint(1, 32), rng.random() < 0.5
-            if shift + bits > 64:
-                break
+        objects, word, shift, truth = [], 0, 0, {}
+        for signal in rng.sample([*signals, Signal.OTHER, Signal.OTHER], 6):
+            bits, signed = rng.randint(1, 10), rng.random() < 0.5
             low = -(1 << bits - 1) if signed else 0
-            value = rng.randint(low, low + (1 << bits) - 1)
-            objects.append(
-                MappedObject(signal=Signal.OTHER, index=0x2000, subindex=0, bits=bits, signed=signed)
-            )
-            word |= (value & (1 << bits) - 1) << shift
+            truth[signal] = rng.randint(low, low + (1 << bits) - 1)
+            objects.append(MappedObject(signal=signal, index=0x2000, subindex=0, bits=bits, signed=signed))
+            word |= (truth[signal] & (1 << bits) - 1) << shift
             shift += bits
-            truth.append(value)
-        assert make_decoder(tuple(objects))(word.to_bytes(8, "little")) == tuple(truth)
+        tpdo = TpdoLayout(cob_id=0x181, objects=tuple(objects))
+        assembler = Assembler((NodeLayout(node_id=1, motor=0, tpdos=(tpdo,)),), 1)
+        (sample,) = run(assembler, [(SYNC, b""), (0x181, word.to_bytes(tpdo.length, "little"))])
+        assert [
+            sample.motor_position_rad[0],
+            sample.motor_torque_nm[0],
+            sample.motor_velocity_rad_s[0],
+            sample.link_position_rad,
+        ] == [truth[signal] for signal in signals]
 
 
 def test_a_layout_that_cannot_make_a_sample_is_refused_in_a_line() -> None:

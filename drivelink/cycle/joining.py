@@ -9,11 +9,11 @@ from pathlib import Path
 
 import can
 
+from drivelink._core import SYNC_COB_ID
 from drivelink.canopen.configure import Configurator, configure_joints
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.canopen.roles import roles
-from drivelink.cycle.acquisition import SYNC_COB_ID
 from drivelink.cycle.busport import BusPort
 from drivelink.cycle.syncclock import MEASURED_SYNCS, measure_period
 from drivelink.errors import BusError, DriveError

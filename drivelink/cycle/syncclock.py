@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drivelink._core import LATE
+
 FloatArray = NDArray[np.float64]
 
 __all__ = ["LATE", "MEASURED_SYNCS", "MeasuredPeriod", "SyncClock", "measure_period"]
-
-LATE = -1  # the jump of a SYNC that was counted as lost before it came
 
 MEASURED_SYNCS = 64  # tell the period to 0.2 % where they jitter by half of it, to 0.01 % where by a fortieth
 _FEWEST = 8

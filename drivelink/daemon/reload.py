@@ -12,11 +12,11 @@ import logging
 import math
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from drivelink.cycle.chain import Built, Chain
+from drivelink._core import Chain
+from drivelink.cycle.chain import Built
 from drivelink.daemon.status import EventLog
 from drivelink.errors import DrivelinkError
 from drivelink.jointfile import JointFile, load
@@ -57,7 +57,7 @@ class Reloader:
     ) -> None:
         self._path = path
         self._joint = joint
-        self._chain = chain
+        self._chain, self._history = chain, chain.history
         self._build = build
         self._publish = publish
         self._events = events
@@ -91,14 +91,13 @@ class Reloader:
             return
         try:
             joint, (estimator, watch), sequence = self._ready
-            unseen = _after(self._chain.history, sequence)
-            if len(unseen) > _BEHIND:
+            if self._history.behind(sequence) > _BEHIND:
                 self._slacks += 1
                 if self._slacks > _PATIENCE:
-                    self._lead(joint, (estimator, watch), unseen[:_AID])
+                    self._lead(joint, (estimator, watch), self._history.after(sequence, _AID))
                 return
             self._ready = self._thread = None
-            self._chain.exchange(estimator, watch, unseen)
+            self._chain.exchange(estimator, watch, self._history.after(sequence))
         finally:
             self._turn.release()
         self._joint = joint
@@ -131,7 +130,7 @@ class Reloader:
             with self._turn:
                 if self._thread is not mine or self._slacks > _PATIENCE:
                     return
-                sequence = self._lead(joint, built, _after(list(self._chain.history), sequence)[:_STEPS])
+                sequence = self._lead(joint, built, self._history.after(sequence, _STEPS))
             time.sleep(_PAUSE_S)
 
     def _lead(self, joint: JointFile, built: Built, samples: Sequence[Sample]) -> int:
@@ -157,14 +156,3 @@ class Reloader:
             )
         if joint.arrangement != self._joint.arrangement:
             raise DrivelinkError(f"arrangement: expected {self._joint.arrangement}, as it was at the start")
-
-
-def _after(history: Sequence[Sample] | deque[Sample], sequence: int) -> list[Sample]:
-    """The samples that came after one of that number."""
-    found: list[Sample] = []
-    for sample in reversed(history):
-        if sample.sequence <= sequence:
-            break
-        found.append(sample)
-    found.reverse()
-    return found

@@ -19,11 +19,12 @@ from typing import Any
 
 import zenoh
 
+from drivelink._core import Chain
 from drivelink.canopen.bus import open_bus
 from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle import pacing, realtime
 from drivelink.cycle.busport import BusPort
-from drivelink.cycle.chain import Chain, build, make_chain
+from drivelink.cycle.chain import build, make_chain
 from drivelink.cycle.joining import join_bus
 from drivelink.cycle.loop import CycleLoop, Lane
 from drivelink.cycle.sources import open_source

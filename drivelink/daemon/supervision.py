@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from drivelink._core import NodeCounters
 from drivelink.canopen.configure import Configurator
 from drivelink.canopen.emcy import drive_state, parse_emergency
 from drivelink.canopen.layout import NodeLayout
@@ -18,7 +19,6 @@ from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.following import MapFollower
 from drivelink.cycle.framesource import LostSource
 from drivelink.cycle.loop import CycleLoop, Lane
-from drivelink.cycle.nodestate import NodeCounters
 from drivelink.cycle.syncclock import MEASURED_SYNCS, measure_period
 from drivelink.daemon.status import EventLog
 from drivelink.errors import DriveError
@@ -171,7 +171,7 @@ class Supervisor:
                 "drive_state": str(drive_state(statuswords[node])) if node in statuswords else None,
                 "fault": node in faults,
                 "emergency": f"0x{faults[node]:04X}" if faults.get(node) else None,
-                **{name: getattr(counted, name) for name in counted.__slots__},
+                **counted.as_dict(),
             }
         return status
 

@@ -22,11 +22,12 @@ from typing import TYPE_CHECKING, Any
 import zenoh
 import zenoh.ext
 
+from drivelink._core import Tick, encode_estimate, encode_sample
 from drivelink.canopen.layout import NodeLayout, layout_document
 from drivelink.errors import ZenohError
 from drivelink.jointfile import JointFile, MotorSection
 from drivelink.pubsub.session import one_line
-from drivelink.pubsub.wire import ESTIMATE, SAMPLE, STATUS_BITS, encode_estimate, encode_sample
+from drivelink.pubsub.wire import ESTIMATE, SAMPLE, STATUS_BITS
 from drivelink.version import __version__
 from estimator.model import Effect
 from estimator.sample import Estimate, Sample, Status
@@ -88,6 +89,20 @@ class JointPublisher:
         # who writes; the message carries its own sequence number
         self._estimate_source = zenoh.SourceInfo(self._estimate.id, 0)
         self._sample_source = zenoh.SourceInfo(self._sample.id, 0)
+
+    def put(self, tick: Tick) -> None:
+        """Publish one cycle, its estimate before its sample; never waits for a subscriber."""
+        if self._partial:
+            tick = tick.flagged(_PARTIAL)
+        self._estimate.put(tick.estimate_payload, source_info=self._estimate_source)
+        payload = tick.sample_payload
+        if payload is not None:
+            self._sample.put(payload, source_info=self._sample_source)
+        if self._ros2 is not None:
+            self._ros2.latest = tick.estimate
+            sample = tick.sample
+            if sample is not None:
+                self._ros2.put_cycle(self._ros2.latest, sample, tick.stamp_ns)
 
     def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
         """Publish the estimate of one cycle; never waits for a subscriber.

@@ -12,15 +12,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import chain
 from struct import Struct
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from drivelink._core import encode_estimate, encode_sample
 from drivelink.errors import ZenohError
-from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
+from estimator.sample import Sample, Status, TransmissionEstimate
 
 __all__ = [
     "ESTIMATE",
@@ -39,7 +39,6 @@ __all__ = [
 
 MAX_ELEMENTS = 8  # transmissions or motors in one message; below 128 the varint is one byte
 _STRUCT_CODES = {"u64": "Q", "u32": "I", "f64": "d"}
-_U32 = 0xFFFF_FFFF
 _VALID, _PARTIAL = int(Status.VALID), int(Status.PARTIAL)
 
 
@@ -207,19 +206,6 @@ _make_message = EstimateMessage._make
 _make_transmission = TransmissionEstimate._make
 
 
-def encode_estimate(estimate: Estimate, stamp_ns: int) -> bytes:
-    """The bytes of `<prefix>/<joint>/estimate`.
-
-    Args:
-        estimate: at most MAX_ELEMENTS transmissions.
-        stamp_ns: UNIX time of its SYNC, ns.
-    """
-    sequence, status, torque, stiffness, std, transmissions = estimate
-    count = len(transmissions)
-    numbers = chain.from_iterable(transmissions)
-    return _ESTIMATES[count].pack(sequence, stamp_ns, status & _U32, torque, stiffness, std, count, *numbers)
-
-
 def decode_estimate(payload: bytes) -> EstimateMessage:
     """Read the bytes of `<prefix>/<joint>/estimate`.
 
@@ -257,19 +243,6 @@ def _usable(message: EstimateMessage) -> bool:
 def _magnitude(number: float, partial: bool) -> bool:
     """Whether it is finite and not negative, or NaN where that is said."""
     return 0.0 <= number < math.inf or (partial and number != number)
-
-
-def encode_sample(sample: Sample, stamp_ns: int) -> bytes:
-    """The bytes of `<prefix>/<joint>/sample`.
-
-    Args:
-        sample: of at most MAX_ELEMENTS motors.
-        stamp_ns: UNIX time of its SYNC, ns.
-    """
-    sequence, position, velocity, torque, link, link_velocity, external = sample
-    count = len(position)
-    numbers = [number for motor in zip(position, velocity, torque, strict=True) for number in motor]
-    return _SAMPLES[count].pack(sequence, stamp_ns, link, link_velocity, external, count, *numbers)
 
 
 def decode_sample(payload: bytes) -> SampleMessage:

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
+from drivelink._core import SYNC_COB_ID, Assembler
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cycle.acquisition import SYNC_COB_ID, Assembler
 from drivelink.cycle.chain import make_assembler
 from drivelink.cycle.following import MapFollower
 from drivelink.cycle.syncclock import measure_period
@@ -135,8 +135,7 @@ class FrameLog:
                 stamp_ns = stamp_before if assembler.sequence != was else stamp_now
                 samples = True
                 yield Cycle(sample.sequence, stamp_ns, sample, assembler.flags)
-            elif assembler.missed >= 0:
-                missed, assembler.missed = assembler.missed, -1
+            elif can_id == SYNC_COB_ID and jump and (missed := assembler.missed) >= 0:
                 yield Cycle(missed, stamp_before, None, assembler.flags)
         if not samples:
             raise RecordingError(f"{self._path}: no complete sample in it{self._absent(heard)}")

@@ -19,9 +19,9 @@ import can
 import zenoh
 import zenoh.ext
 
+from drivelink._core import SYNC_COB_ID, Assembler
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cycle.acquisition import SYNC_COB_ID, Assembler
 from drivelink.cycle.chain import make_assembler
 from drivelink.cycle.following import MapFollower
 from drivelink.cycle.framesource import BusLostError

@@ -11,7 +11,7 @@ import logging
 from collections import deque
 from collections.abc import Iterable, Iterator
 
-from drivelink.cycle.acquisition import SYNC_COB_ID
+from drivelink._core import SYNC_COB_ID
 from drivelink.cycle.syncclock import SyncClock, measure_period
 from drivelink.recording.canlog import NO_STAMP, Frame
 

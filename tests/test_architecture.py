@@ -61,6 +61,16 @@ def test_the_estimator_reads_no_clock_and_touches_no_file_or_socket() -> None:
         assert not calls & {"open", "print", "input"}, f"{path.relative_to(ROOT)}"
 
 
+def test_only_the_fleet_imports_what_its_extra_brings() -> None:
+    extra = {"dask", "distributed", "fsspec", "pyarrow"}
+    for path in modules("drivelink"):
+        if path.parent.name != "fleet":
+            assert not imports(path) & extra, f"{path.relative_to(ROOT)}"
+            if path.name != "fleet.py":  # the verb
+                text = path.read_text(encoding="utf-8")
+                assert "drivelink.fleet" not in text, f"{path.relative_to(ROOT)}"
+
+
 def test_the_service_reaches_the_simulated_world_in_one_place_only() -> None:
     for path in modules("drivelink"):
         if path.name != "simulate.py":

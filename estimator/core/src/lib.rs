@@ -5,10 +5,5 @@
 
 #![cfg_attr(not(feature = "python"), forbid(unsafe_code))]
 
-pub mod error;
-pub mod estimator;
-pub mod model;
 #[cfg(feature = "python")]
 pub mod python;
-pub mod sample;
-pub mod settings;

@@ -1,0 +1,366 @@
+"""The fleet: what it finds, what it costs, and what survives.
+
+    python benchmarks/fleet.py changes [--joints 40] [--nights 25] [--seconds 10]
+    python benchmarks/fleet.py throughput [--recordings 40]      one worker, two workers
+    python benchmarks/fleet.py cpu [--recordings 5]              beside fit and diagnose
+    python benchmarks/fleet.py table [--rows 10000]              appended and reported
+    python benchmarks/fleet.py statistics [--fleets 200]         the tests alone, on many fleets
+    python benchmarks/fleet.py memory                            of fit and diagnose, by size
+
+`changes` starts a Dask scheduler and two workers on loopback, hands the simulated fleet of `fleet_world.py`
+to `drivelink fleet --scheduler`, ends one worker process by SIGKILL when half is done, and compares table and
+report with the truth. Each prints one JSON object last. Sizes are arguments.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+import os
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import fleet_world
+import numpy as np
+import psutil
+from distributed import Client
+
+from drivelink import __version__, cli
+from drivelink.fleet.changes import q_values, series_test
+from drivelink.fleet.joints import Joints
+from drivelink.fleet.storage import Store, find
+from drivelink.fleet.table import Table, read_rows
+from drivelink.fleet.task import Task, process
+
+BIN = Path(sys.executable).parent
+
+
+def prepared(args: argparse.Namespace) -> Path:
+    """The fleet's folder; made if it is not there."""
+    folder: Path = args.folder or Path(tempfile.mkdtemp(prefix="drivelink-fleet-"))
+    if not (folder / "truth.json").exists():
+        fleet_world.make(folder, args.joints, args.nights, args.seconds, args.seed)
+    return folder
+
+
+@contextlib.contextmanager
+def cluster(folder: Path, workers: int) -> Iterator[str]:
+    """A scheduler and workers, each a process of its own, on loopback; yields its address."""
+    file = folder / f"scheduler-{os.getpid()}.json"
+    file.unlink(missing_ok=True)
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    begin = [BIN / "dask", "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
+    processes = [subprocess.Popen([*begin, "--scheduler-file", file], **quiet)]
+    try:
+        while not file.exists():
+            time.sleep(0.1)
+        work = ["--nworkers", "1", "--nthreads", "1", "--memory-limit", "2GiB", "--no-dashboard"]
+        for _ in range(workers):
+            command = [BIN / "dask", "worker", "--scheduler-file", file, "--host", "127.0.0.1", *work]
+            processes.append(subprocess.Popen(command, cwd=folder, **quiet))
+        with Client(scheduler_file=str(file)) as client:
+            client.wait_for_workers(workers, timeout=60)
+        yield json.loads(file.read_text())["address"]
+    finally:
+        for process_ in reversed(processes):
+            process_.send_signal(signal.SIGINT)
+        for process_ in processes:
+            try:
+                process_.wait(timeout=15)
+            except subprocess.TimeoutExpired:
+                process_.kill()
+
+
+def worker_pids(address: str) -> list[int]:
+    with Client(address) as client:
+        return list(client.run(os.getpid).values())
+
+
+class Memory(threading.Thread):
+    """Resident memory of the client and of each worker, every two seconds."""
+
+    def __init__(self, client_pid: int, address: str) -> None:
+        super().__init__(daemon=True)
+        self.client: list[float] = []
+        self.workers: list[float] = []
+        self._pid, self._address, self._over = client_pid, address, threading.Event()
+
+    def run(self) -> None:
+        with Client(self._address) as client:
+            while not self._over.wait(2.0):
+                with contextlib.suppress(Exception):
+                    self.workers.append(max(client.run(_rss).values()))
+                    self.client.append(psutil.Process(self._pid).memory_info().rss / 2**20)
+
+    def stop(self) -> dict[str, float]:
+        self._over.set()
+        self.join(timeout=20)
+        result = {}
+        for name, values in (("client", self.client), ("worker", self.workers)):
+            third = max(1, len(values) // 3)
+            result[f"{name}_middle_third_mib"] = round(statistics.median(values[third : 2 * third] or [0]), 1)
+            result[f"{name}_last_third_mib"] = round(statistics.median(values[-third:] or [0]), 1)
+            result[f"{name}_peak_mib"] = round(max(values, default=0.0), 1)
+        return result
+
+
+def _rss() -> float:
+    return psutil.Process().memory_info().rss / 2**20
+
+
+def run_changes(args: argparse.Namespace) -> dict[str, Any]:
+    folder = prepared(args)
+    out = folder / f"out-{os.getpid()}"
+    total = len(list((folder / "recordings").iterdir()))
+    begin = time.monotonic()
+    with cluster(folder, 2) as address:
+        command = [BIN / "drivelink", "fleet", folder / "recordings", "--joints", folder / "joints"]
+        run = subprocess.Popen([*command, "--out", out, "--scheduler", address])
+        memory = Memory(run.pid, address)
+        memory.start()
+        killed = 0
+        while run.poll() is None:
+            time.sleep(1.0)
+            if not killed and len(list(out.glob("diagnoses/*/*/report.json"))) >= total // 2:
+                killed = worker_pids(address)[0]
+                os.kill(killed, signal.SIGKILL)
+        used = memory.stop()
+        seconds = time.monotonic() - begin
+        again = subprocess.run(
+            [*command, "--out", out, "--scheduler", address], capture_output=True, text=True
+        )
+    rows = read_rows(Store(str(out)))
+    keys = [(row["recording"], row["transmission"]) for row in rows]
+    return {
+        "recordings": total,
+        "exit": run.returncode,
+        "killed": bool(killed),
+        "rows": len(rows),
+        "lost": total - len({row["recording"] for row in rows}),
+        "twice": len(keys) - len(set(keys)),
+        "broken": sum(row["status"] != "done" for row in rows),
+        "second_run": again.stdout.splitlines()[0] if again.stdout else again.stderr,
+        "seconds": round(seconds, 1),
+        "cpu_s_a_recording": round(statistics.mean(row["cpu_s"] for row in rows), 3),
+        **used,
+        **judged(folder, json.loads((out / "fleet.json").read_text())),
+        "out": str(out),
+    }
+
+
+def judged(folder: Path, report: dict[str, Any]) -> dict[str, Any]:
+    """What the report says against what is true."""
+    joints = {one["joint"]: one for one in report["joints"]}
+    truth = json.loads((folder / "truth.json").read_text())
+    found: dict[str, list[int]] = {"drift": [], "step": [], "effect": []}
+    places, when, called, false = [], [], 0, 0
+    for true in truth:
+        said = joints[true["name"]]
+        moved = [c for t in said["transmissions"] for c in t["changes"]]
+        appeared = [e for e in said["effects"] if e["significant"]]
+        called += bool(moved or appeared)
+        false += bool(moved or appeared) and true["kind"] == "healthy"
+        if true["kind"] in ("drift", "step"):
+            found[true["kind"]].append(bool(moved))
+        if true["kind"] == "step" and moved:
+            at = [(datetime.fromisoformat(c["since"]).date() - fleet_world.FIRST_NIGHT).days for c in moved]
+            when.append(min(abs(day - true["since_night"]) for day in at))
+        if true["kind"] == "effect":
+            hit = [e for e in appeared if set(e["names"]) & fleet_world.NAMES[true["effect"]]]
+            found["effect"].append(bool(hit))
+        places.append((true["kind"], said["state"]))
+    result = {f"found_{kind}": f"{sum(hits)} of {len(hits)}" for kind, hits in found.items()}
+    result["called_changing"], result["false"] = called, false
+    result["false_share"] = round(false / max(called, 1), 4)
+    result["step_nights_off_max"] = max(when, default=0)
+    return result
+
+
+def run_throughput(args: argparse.Namespace) -> dict[str, Any]:
+    folder = prepared(args)
+    files = sorted((folder / "recordings").iterdir())[: args.recordings]
+    rate: dict[int, list[float]] = {1: [], 2: []}
+    for round_ in range(args.rounds):
+        for workers in (1, 2):
+            with cluster(folder, workers) as address:
+                out = folder / f"throughput-{os.getpid()}-{round_}-{workers}"
+                command = ["fleet", *map(str, files), "--joints", str(folder / "joints"), "--out", str(out)]
+                with contextlib.redirect_stdout(io.StringIO()):
+                    cli.main(
+                        [*command[:1], str(files[0]), *command[-4:-1], f"{out}-warm", "--scheduler", address]
+                    )
+                    begin = time.monotonic()
+                    assert cli.main([*command, "--scheduler", address]) == 0
+                rate[workers].append(len(files) / (time.monotonic() - begin))
+    one, two = (statistics.median(rate[k]) for k in (1, 2))
+    return {
+        "recordings": len(files),
+        "one_a_s": one,
+        "two_a_s": two,
+        "ratio": two / one,
+        "load": os.getloadavg()[0],
+    }
+
+
+def run_cpu(args: argparse.Namespace) -> dict[str, Any]:
+    """CPU of one recording as a task, over that of the two verbs, in turns in one process."""
+    folder = prepared(args)
+    joints = Joints.load(folder / "joints")
+    sources, _ = find([str(folder / "recordings")])
+    alone, fleet = [], []
+    with tempfile.TemporaryDirectory() as out, contextlib.redirect_stdout(io.StringIO()):
+        for k, source in enumerate(sources[: args.recordings + 1]):
+            file = joints.named(source.url).where
+            begin = time.process_time()
+            for verb in ("fit", "diagnose"):
+                assert cli.main([verb, source.url, "--joint", file, "--out", out]) == 0
+            middle = time.process_time()
+            assert process(Task(source=source, version=__version__), joints).kind == "done"
+            if k:  # the first one warms up
+                alone.append(middle - begin)
+                fleet.append(time.process_time() - middle)
+    ratio = sum(fleet) / sum(alone)
+    return {"recordings": len(alone), "verbs_s": sum(alone), "fleet_s": sum(fleet), "ratio": ratio}
+
+
+def run_table(args: argparse.Namespace) -> dict[str, Any]:
+    """Rows appended one recording at a time, then the report: 250 nights of 40 joints."""
+    rng, joints = np.random.default_rng(args.seed), 40
+    with tempfile.TemporaryDirectory() as folder:
+        store = Store(folder)
+        begin = time.monotonic()
+        with Table(store) as table:
+            for k in range(args.rows):
+                table.append([_row(k // joints, k % joints, rng)])
+        appended = time.monotonic() - begin
+        begin = time.monotonic()
+        with contextlib.redirect_stdout(io.StringIO()):
+            assert cli.main(["fleet", "report", folder]) == 0
+        reported = time.monotonic() - begin
+        size = sum(path.stat().st_size for path in Path(folder, "table").iterdir())
+        page = Path(folder, "fleet.html").stat().st_size
+        parts = len(list(Path(folder, "table").glob("*.parquet")))
+    return {
+        "rows": args.rows, "append_s": appended, "report_s": reported, "table_bytes_a_row": size / args.rows,
+        "parts": parts, "page_mb": page / 1e6,
+    }  # fmt: skip
+
+
+def _row(night: int, joint: int, rng: np.random.Generator) -> dict[str, Any]:
+    stiffness = 150.0 * (1.0 + 0.002 * rng.standard_normal())
+    name, std = f"axis{joint:03d}", 0.1
+    return {
+        "id": f"{night}-{joint}", "joint": name, "transmission": 1, "part": 1, "parts": 1,
+        "time": datetime(2026, 1, 5, tzinfo=UTC) + timedelta(days=night), "recording": f"{name}-{night}.csv",
+        "digest": f"{night:08d}{joint:08d}", "size_bytes": 1000, "stamp": "", "status": "done", "error": None,
+        "verdict": "sufficient", "sentence": "The model is sufficient.", "effects": [], "details": "{}",
+        "error_before_relative": 0.01, "error_after_relative": 0.01, "model": "linear",
+        "parameters": json.dumps({"k_nm_rad": stiffness}), "covariance": [std**2], "excited": True,
+        "deflection_middle_rad": 0.02, "stiffness_middle_nm_rad": stiffness,
+        "stiffness_std_middle_nm_rad": std, "cpu_s": 0.0, "version": __version__,
+        "report": f"diagnoses/{name}/{night}/report.html", "accepted_model": "0",
+    }  # fmt: skip
+
+
+def run_statistics(args: argparse.Namespace) -> dict[str, Any]:
+    """False discovery rate and power over many fleets, for several kinds of scatter from night to night."""
+    rng, result = np.random.default_rng(args.seed), {}
+    time_s = np.arange(args.nights) * 86400.0
+    for name, draw in NOISES.items():
+        for scatter in (0.003, 0.006):
+            rates, power = [], []
+            for _ in range(args.fleets):
+                kinds = rng.permutation(args.joints) < 0.4 * args.joints
+                p = []
+                for drifting in kinds:
+                    noise = scatter * draw(rng, args.nights)
+                    level = 1.0 - fleet_world.DRIFT * drifting * time_s / time_s[-1]
+                    stated = np.full(args.nights, 0.5 * scatter)
+                    p.append(series_test(time_s, level + noise, stated).p_value)
+                called = q_values(np.array(p)) <= args.fdr
+                rates.append((called & ~kinds).sum() / max(called.sum(), 1))
+                power.append((called & kinds).sum() / kinds.sum())
+            key = f"{name}, scatter {scatter:.1%}"
+            result[key] = {"false_discovery_rate": float(np.mean(rates)), "found": float(np.mean(power))}
+    return result
+
+
+def _correlated(rng: np.random.Generator, n: int) -> np.ndarray:
+    noise = rng.standard_normal(n)
+    for k in range(1, n):
+        noise[k] = 0.3 * noise[k - 1] + np.sqrt(1 - 0.3**2) * noise[k]
+    return noise
+
+
+def _spiked(rng: np.random.Generator, n: int) -> np.ndarray:
+    return np.asarray(rng.standard_normal(n) + 8.0 * (rng.random(n) < 0.04))
+
+
+NOISES = {
+    "normal": lambda rng, n: rng.standard_normal(n),
+    "Student t, 3 degrees of freedom": lambda rng, n: rng.standard_t(3, n) / np.sqrt(3.0),
+    "lag-1 correlation 0.3": _correlated,
+    "4 % of the nights 8 sigma off": _spiked,
+}
+
+
+def run_memory(args: argparse.Namespace) -> dict[str, Any]:
+    """Peak memory of fit and diagnose over the size of the file, each size in a process of its own."""
+    result = {}
+    for seconds in (50.0, 200.0):
+        with tempfile.TemporaryDirectory() as folder:
+            fleet_world.make(Path(folder), 1, 1, seconds, args.seed)
+            (path,) = (Path(folder) / "recordings").iterdir()
+            joint = Path(folder) / "joints" / "axis000.toml"
+            code = (
+                "import sys, resource; from drivelink import cli; import drivelink.report, estimator.batch;"
+                "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024; before = peak();"
+                "[cli.main([v, sys.argv[1], '--joint', sys.argv[2], '--out', sys.argv[3]]) for v in "
+                "('fit', 'diagnose')]; print(before, peak())"
+            )
+            done = subprocess.run(
+                [sys.executable, "-c", code, path, joint, folder], capture_output=True, text=True, check=True
+            )
+            before, peak = map(int, done.stdout.split()[-2:])
+            result[f"{path.stat().st_size / 1e6:.1f} MB"] = round((peak - before) / path.stat().st_size, 1)
+    return result
+
+
+RUNS = {
+    "changes": run_changes, "throughput": run_throughput, "cpu": run_cpu, "table": run_table,
+    "statistics": run_statistics, "memory": run_memory,
+}  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("what", choices=RUNS)
+    parser.add_argument(
+        "--folder", type=Path, metavar="DIR", help="of the simulated fleet; made if it is missing"
+    )
+    parser.add_argument("--joints", type=int, default=40)
+    parser.add_argument("--nights", type=int, default=25)
+    parser.add_argument("--seconds", type=float, default=10.0, help="of each recording")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--recordings", type=int, default=40)
+    parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--rows", type=int, default=10_000)
+    parser.add_argument("--fleets", type=int, default=200)
+    parser.add_argument("--fdr", type=float, default=0.05)
+    args = parser.parse_args()
+    print(json.dumps(RUNS[args.what](args), indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,193 @@
+"""`drivelink fleet RECORDINGS --joints DIR`: many recordings of many joints, here or on a Dask cluster."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import sys
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drivelink.errors import UsageError
+from drivelink.progress import Meter
+
+if TYPE_CHECKING:
+    from drivelink.fleet.runner import Counts
+
+_NEEDS = ("distributed", "fsspec", "pyarrow")
+_REPORT = "report"
+_WARNINGS = 20  # lines about single recordings that are shown; all are in the table
+_SPANS = {"d": 1, "w": 7}
+
+_EPILOG = """\
+examples:
+  drivelink fleet night/ --joints joints/ --out fleet/
+  drivelink fleet 's3://plant/2026-11-*/*.mcap' --joints joints/ --scheduler tcp://10.0.0.5:8786
+  drivelink fleet report fleet/                    the page again, from the table alone
+
+RECORDINGS are files, globs, folders or URLs of fsspec (file:, sftp:, s3:, http:). A recording is of the joint
+whose file it carries (MCAP), else of the one of --joints whose name stands in its name or folder. The date
+is its own, where it has one, else that in its name, else that of the file.
+
+Writes a table with a row for each recording and transmission (DIR/table/*.parquet), each diagnosis,
+fleet.html and fleet.json. What is in the table is not done again: start it every night with the same line.
+"""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _EPILOG
+    parser.usage = (
+        "drivelink fleet [-h] --joints DIR [options] RECORDINGS [RECORDINGS ...]\n"
+        "       drivelink fleet report [--fdr Q] DIR"
+    )
+    parser.add_argument(
+        "recordings",
+        nargs="+",
+        metavar="RECORDINGS",
+        help="measured data; or `report` and the folder of results",
+    )
+    parser.add_argument("--joints", type=Path, metavar="DIR", help="folder of joint files, a joint each")
+    parser.add_argument(
+        "--out", default="fleet", metavar="DIR", help="where results go, a URL too (default: fleet)"
+    )
+    parser.add_argument(
+        "--since", metavar="DATE", help="leave earlier ones out: 2026-11-22, or 30d, 4w for days, weeks"
+    )
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="a running Dask scheduler, e.g. tcp://10.0.0.5:8786"
+    )
+    parser.add_argument(
+        "--workers", type=int, metavar="N", help="processes on this machine (default: one a core)"
+    )
+    parser.add_argument(
+        "--memory",
+        metavar="SIZE",
+        help="limit of each worker, e.g. 2GiB; a larger recording is cut into parts",
+    )
+    parser.add_argument(
+        "--validate",
+        choices=["previous"],
+        help="validate on the joint's recording before, not on held-out blocks",
+    )
+    parser.add_argument("--again", action="store_true", help="also do what is in the table already")
+    parser.add_argument(
+        "--fdr",
+        type=float,
+        default=0.05,
+        metavar="Q",
+        help="false discovery rate of the changes (default: 0.05)",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do the job; return the exit status."""
+    missing = [name for name in _NEEDS if importlib.util.find_spec(name) is None]
+    if missing:
+        raise UsageError(
+            f"fleet needs {', '.join(missing)}: install the extra, pip install 'drivelink-vsa[fleet]'"
+        )
+    if not 0.0 < args.fdr < 1.0:
+        raise UsageError(f"--fdr: expected a number between 0 and 1, got {args.fdr:g}")
+    if args.recordings[0] == _REPORT and args.joints is None:
+        if len(args.recordings) != 2:
+            raise UsageError("fleet report: expected one folder of results")
+        _report(args.recordings[1], args.fdr)
+        return 0
+    return _run(args)
+
+
+def _run(args: argparse.Namespace) -> int:
+    if args.joints is None:
+        raise UsageError("--joints: expected the folder of the joint files")
+    if args.workers is not None and args.workers < 1:
+        raise UsageError(f"--workers: expected 1 or more, got {args.workers}")
+    if args.workers is not None and args.scheduler is not None:
+        raise UsageError("--workers: expected without --scheduler, whose workers are started elsewhere")
+    since = None if args.since is None else _since(args.since)
+    if not args.joints.exists():
+        raise UsageError(f"--joints: expected a folder of joint files, there is no {args.joints}")
+    from drivelink.fleet import runner, storage
+    from drivelink.fleet.joints import Joints
+
+    settings = runner.Settings(
+        scheduler=args.scheduler,
+        workers=args.workers,
+        memory=args.memory,
+        since=since,
+        validate=args.validate,
+        again=args.again,
+    )
+    _ = settings.limit_bytes  # what can be wrong before is said before
+    joints = Joints.load(args.joints)
+    sources, empty = storage.find(args.recordings)
+    for pattern in empty:
+        print(f"{pattern}: no recording there", file=sys.stderr)
+    if not sources:
+        raise UsageError("RECORDINGS: expected at least one recording, found none")
+    said = 0
+
+    def say(line: str) -> None:
+        nonlocal said
+        said += 1
+        if said <= _WARNINGS:
+            print(line, file=sys.stderr)
+
+    with Meter("fleet", len(sources)) as meter:
+
+        def progress(counts: Counts) -> None:
+            meter.update(counts.done + counts.known + counts.early + counts.broken)
+
+        try:
+            counts = runner.run(sources, joints, storage.Store(args.out), settings, progress, say)
+        except KeyboardInterrupt:
+            print(
+                f"interrupted; what was finished is in {args.out}: the same line goes on from there",
+                file=sys.stderr,
+            )
+            raise
+    if said > _WARNINGS:
+        print(f"and {said - _WARNINGS} lines more", file=sys.stderr)
+    print(_summary(counts))
+    _report(args.out, args.fdr)
+    return 0
+
+
+def _summary(counts: Counts) -> str:
+    parts = [f"{counts.done} done"]
+    for number, what in (
+        (counts.known, "there already"),
+        (counts.early, "too early"),
+        (counts.broken, "broken"),
+    ):
+        if number:
+            parts.append(f"{number} {what}")
+    return f"{counts.found} recording{'s' * (counts.found != 1)}: {', '.join(parts)}"
+
+
+def _report(folder: str, rate: float) -> None:
+    from drivelink.fleet import page, summary, table
+    from drivelink.fleet.storage import Store
+
+    store = Store(folder)
+    document = summary.summarise(table.read_rows(store, summary.COLUMNS), rate)
+    store.write("fleet.json", (json.dumps(document, indent=1) + "\n").encode())
+    store.write("fleet.html", page.page(document).encode())
+    for joint in document["joints"]:
+        if joint["state"] == "changing":
+            print(f"  {joint['joint']}: {joint['sentence']}")
+    for name in ("fleet.json", "fleet.html"):
+        print(f"wrote {folder.rstrip('/')}/{name}")
+
+
+def _since(text: str) -> datetime:
+    if text[:-1].isdigit() and text[-1:] in _SPANS:
+        return datetime.now(UTC) - timedelta(days=int(text[:-1]) * _SPANS[text[-1]])
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise UsageError(f"--since: expected a date such as 2026-11-22, or 30d, got {text!r}") from error
+    return moment if moment.tzinfo else moment.replace(tzinfo=UTC)

@@ -1,0 +1,285 @@
+"""Which series of a fleet change, and since when, at a declared false discovery rate.
+
+Level and drift. A series of estimates is compared with one that stays constant. The alternatives are a step
+before any recording, a ramp that begins at any recording, and two steps before any two recordings (a repair
+undoes a damage). Each is an F test in the regression weighted by the inverse variances (Chow 1960). The
+largest over all of a kind is the sup-F statistic (Andrews 1993; Bai and Perron 1998 for two steps);
+Bonferroni's inequality bounds its significance, one half of it for one change and one half for two. The bound
+holds for every n and needs no simulation. Variances are those that the estimates state, plus a variance
+between recordings estimated from successive differences (von Neumann 1941), which no step or ramp spoils. The
+scale is estimated from the residuals, so that only the ratios of the stated variances matter. Positive
+correlation between successive residuals reduces the number of independent ones (Bayley and Hammersley 1946).
+A change must stay significant whichever recording is left out: one odd recording is none.
+
+Appearance. Whether an effect is found more often after some recording than before: Fisher's exact test, the
+smallest p over all recordings, with the same bound.
+
+Fleet. Benjamini and Hochberg (1995) over all series of all joints. Further changes of a series that is
+selected are looked for one after the other at the level of the selection (Benjamini and Bogomolov 2014).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import f as f_distribution
+from scipy.stats import hypergeom
+
+from estimator.sample import FloatArray
+
+__all__ = ["LEAST", "Appearance", "Change", "SeriesTest", "appearance", "changes", "q_values", "series_test"]
+
+LEAST = 6  # recordings: fewer leave no degrees of freedom once one is left out and a shape is fitted
+_SEGMENT = 2  # recordings on either side of a step: one alone is an odd one
+_RAMP = 3  # recordings on a ramp: two are a step
+_CHI2_95 = 3.841  # of one degree of freedom: the interval of the place by the likelihood ratio
+_MOST = 4  # changes looked for in one series
+_MAD = 1.4826  # standard deviation of a normal variable over its median absolute deviation
+
+
+class Change(NamedTuple):
+    """One change of a series.
+
+    Attributes:
+        kind: "step" or "drift".
+        first: index of the first recording after it, or of the one where the drift begins.
+        earliest: 95 % interval of `first`.
+        latest: 95 % interval of `first`.
+        amount: of the step, or of the drift up to the last recording; unit of the series.
+        amount_std: its standard deviation.
+        shape: (n,) amount as it comes about.
+    """
+
+    kind: str
+    first: int
+    earliest: int
+    latest: int
+    amount: float
+    amount_std: float
+    shape: FloatArray
+
+
+class SeriesTest(NamedTuple):
+    """A series against its being constant: p value, and the series without any change."""
+
+    p_value: float
+    scatter: float
+
+
+class Appearance(NamedTuple):
+    """An effect that is found more often from recording `first` on."""
+
+    p_value: float
+    first: int
+    rate_before: float
+    rate_after: float
+
+
+class _Shapes(NamedTuple):
+    kinds: list[str]
+    first: NDArray[np.int64]
+    values: FloatArray  # (shapes, n)
+
+
+def series_test(time_s: FloatArray, value: FloatArray, std: FloatArray) -> SeriesTest:
+    """Test one series for any change.
+
+    Args:
+        time_s: (n,) increasing.
+        value: (n,) estimates.
+        std: (n,) their standard deviations, as stated.
+
+    Returns:
+        p value, bounded as the module says; 1 for fewer than `LEAST` recordings. And the scatter: standard
+        deviation of a typical recording about the constant or changing level.
+    """
+    if len(value) < LEAST:
+        return SeriesTest(1.0, float(np.std(value)) if len(value) > 1 else math.nan)
+    weight = _weights(value, std)
+    shapes = _shapes(time_s)
+    design = np.ones((1, len(value)))
+    p_value, best = _strongest(shapes, value, weight, design)
+    residual = _projected(np.vstack([design, shapes.values[best]]), value, weight)
+    scatter = math.sqrt(float(weight @ residual**2) / float(weight.sum()) * len(value) / (len(value) - 2))
+    return SeriesTest(p_value, scatter)
+
+
+def changes(time_s: FloatArray, value: FloatArray, std: FloatArray, level: float) -> list[Change]:
+    """The changes of a series, one after the other as long as the next is significant.
+
+    Args:
+        time_s: (n,) increasing.
+        value: (n,) estimates.
+        std: (n,) their standard deviations.
+        level: of significance for each.
+
+    Returns:
+        In order of time; empty where the first is not significant.
+    """
+    n = len(value)
+    if n < LEAST:
+        return []
+    weight, shapes = _weights(value, std), _shapes(time_s)
+    design = np.ones((1, n))
+    chosen: list[int] = []
+    while len(chosen) < _MOST and n - len(design) >= LEAST - 1:
+        p_value, best = _strongest(shapes, value, weight, design, level)
+        if p_value > level:
+            break
+        chosen += best
+        design = np.vstack([design, shapes.values[best]])
+    found = [_change(shapes, place, k, design, value, weight) for k, place in enumerate(chosen, start=1)]
+    return sorted(found, key=lambda change: change.first)
+
+
+def _weights(value: FloatArray, std: FloatArray) -> FloatArray:
+    """Inverse variances: as stated, plus what successive recordings differ by beyond that."""
+    stated = np.square(std)
+    typical = (_MAD * float(np.median(np.abs(np.diff(value))))) ** 2 / 2.0
+    between = max(typical - float(np.median(stated)), 0.0)
+    variance = stated + between
+    positive = variance[variance > 0.0]
+    floor = float(np.median(positive)) if positive.size else 1.0
+    return np.asarray(1.0 / np.maximum(variance, 1e-6 * floor))
+
+
+def _shapes(time_s: FloatArray) -> _Shapes:
+    """Steps before each recording, and ramps from each on, rising to 1."""
+    n = len(time_s)
+    even = float(np.min(np.diff(time_s))) <= 0.0
+    t = np.arange(n, dtype=np.float64) if even else time_s - time_s[0]
+    steps = [(k, (np.arange(n) >= k).astype(float)) for k in range(_SEGMENT, n - _SEGMENT + 1)]
+    ramps = [(k, np.maximum(t - t[k], 0.0) / (t[-1] - t[k])) for k in range(n - _RAMP + 1)]
+    kinds = ["step"] * len(steps) + ["drift"] * len(ramps)
+    return _Shapes(kinds, np.array([k for k, _ in steps + ramps]), np.array([s for _, s in steps + ramps]))
+
+
+def _projected(design: FloatArray, rows: FloatArray, weight: FloatArray) -> FloatArray:
+    """Rows less their weighted regression on the design; (…, n)."""
+    root = np.sqrt(weight)
+    basis, _ = np.linalg.qr((design * root).T)
+    scaled = rows * root
+    return np.asarray((scaled - (scaled @ basis) @ basis.T) / root)
+
+
+def _strongest(
+    shapes: _Shapes, value: FloatArray, weight: FloatArray, design: FloatArray, enough: float = 0.0
+) -> tuple[float, list[int]]:
+    """The shape, or pair of steps, that is most significant beside a design, and its bounded p value.
+
+    A pair is not looked for where one shape is significant at the level `enough`.
+    """
+    x, y = _projected(design, shapes.values, weight), _projected(design, value, weight)
+    gram, c = (x * weight) @ x.T, (x * weight) @ y
+    size = np.diag(gram)
+    able = size > 1e-9 * (np.square(shapes.values) @ weight)  # a shape that is in the design already is not
+    one = np.where(able, c**2 / np.where(able, size, 1.0), 0.0)
+    best = [int(np.argmax(one))]
+    p_one = _p_value(design, shapes.values[best], value, weight) * len(shapes.kinds)
+    if 2.0 * p_one <= enough:
+        return 2.0 * p_one, best
+    steps = shapes.kinds.count("step")
+    first = shapes.first[:steps]
+    apart = (first[None, :] - first[:, None] >= _SEGMENT) & able[:steps, None] & able[None, :steps]
+    gram, c, size = gram[:steps, :steps], c[:steps], size[:steps]
+    determinant = np.outer(size, size) - gram**2
+    apart &= determinant > 1e-9 * np.outer(size, size)
+    if not apart.any() or len(value) - len(design) - 3 < 1:
+        return min(1.0, 2.0 * p_one), best
+    cross = np.outer(c**2, size) - 2.0 * np.outer(c, c) * gram + np.outer(size, c**2)
+    two = np.where(apart, cross / np.where(apart, determinant, 1.0), -1.0)
+    pair = [int(k) for k in np.unravel_index(int(np.argmax(two)), two.shape)]
+    p_two = _p_value(design, shapes.values[pair], value, weight) * int(apart.sum())
+    return (min(1.0, 2.0 * p_one), best) if p_one <= p_two else (min(1.0, 2.0 * p_two), pair)
+
+
+def _p_value(design: FloatArray, added: FloatArray, value: FloatArray, weight: FloatArray) -> float:
+    """Of the F test of some shapes beside a design, the largest over every recording left out and none."""
+    (n,), extra = value.shape, len(added)
+    whole = np.vstack([design, added])
+    freedom = n - len(whole)
+    before, after = _squares(design, value, weight), _squares(whole, value, weight)
+    share = _independent(_projected(whole, value, weight))
+    gain = np.maximum(before - after, 0.0) / np.maximum(after, 1e-12 * before[0] + 1e-300)
+    degrees = np.append(freedom, np.full(n, freedom - 1))
+    tails = f_distribution.sf(share * gain * degrees / extra, extra, degrees)
+    return float(np.max(tails)) if before[0] > 1e-18 * float(weight @ value**2) else 1.0
+
+
+def _squares(design: FloatArray, value: FloatArray, weight: FloatArray) -> FloatArray:
+    """(1 + n,) weighted squares that a regression leaves: with all recordings, and without each of them."""
+    basis, _ = np.linalg.qr((design * np.sqrt(weight)).T)
+    leverage = np.minimum(np.square(basis).sum(axis=1), 1.0 - 1e-9)
+    terms = weight * np.square(_projected(design, value, weight))
+    total = float(terms.sum())
+    return np.append(total, np.maximum(total - terms / (1.0 - leverage), 0.0))
+
+
+def _independent(residual: FloatArray) -> float:
+    """Share of independent ones among residuals with lag-1 correlation r > 0: (1 - r) / (1 + r)."""
+    power = float(residual @ residual)
+    if power <= 0.0:
+        return 1.0
+    r = max(float(residual[1:] @ residual[:-1]) / power, 0.0)
+    return (1.0 - r) / (1.0 + r)
+
+
+def _change(
+    shapes: _Shapes, place: int, row: int, design: FloatArray, value: FloatArray, weight: FloatArray
+) -> Change:
+    """A chosen shape with its size beside the others, and the places that fit as well."""
+    n, used = len(value), len(design)
+    normal = (design * weight) @ design.T
+    solution = np.linalg.solve(normal, (design * weight) @ value)
+    residual = value - solution @ design
+    scale = float(weight @ residual**2) / (n - used) / _independent(residual)
+    std = math.sqrt(scale * float(np.linalg.inv(normal)[row, row]))
+    others = np.delete(design, row, axis=0)
+    x, y = _projected(others, shapes.values, weight), _projected(others, value, weight)
+    wxx = np.square(x) @ weight
+    explained = ((x * y) @ weight) ** 2 / np.where(wxx > 1e-12, wxx, np.inf)
+    cost = float(np.square(y) @ weight) - explained
+    kind = np.array([k == shapes.kinds[place] for k in shapes.kinds])
+    near = shapes.first[kind & (cost <= cost[place] + _CHI2_95 * scale)]
+    amount = float(solution[row])
+    return Change(
+        shapes.kinds[place],
+        int(shapes.first[place]),
+        int(near.min()),
+        int(near.max()),
+        amount,
+        std,
+        amount * shapes.values[place],
+    )
+
+
+def appearance(found: NDArray[np.bool_]) -> Appearance:
+    """Test whether something is found more often from some recording on.
+
+    Args:
+        found: (n,) whether it was, in order of time.
+    """
+    n, total = len(found), int(found.sum())
+    if n < 2 or total == 0 or total == n:
+        return Appearance(1.0, 0, total / max(n, 1), total / max(n, 1))
+    k = np.arange(1, n)
+    after = total - np.cumsum(found)[:-1]
+    p = np.asarray(hypergeom.sf(after - 1, n, total, n - k))
+    best = int(np.argmin(p))
+    first = int(k[best])
+    return Appearance(
+        min(1.0, float(p[best]) * (n - 1)), first, float(found[:first].mean()), float(found[first:].mean())
+    )
+
+
+def q_values(p: FloatArray) -> FloatArray:
+    """Smallest false discovery rate at which each test would be a discovery (Benjamini and Hochberg 1995)."""
+    n = len(p)
+    order = np.argsort(p)
+    ranked = np.asarray(p)[order] * n / np.arange(1, n + 1)
+    q = np.empty(n)
+    q[order] = np.minimum(np.minimum.accumulate(ranked[::-1])[::-1], 1.0)
+    return q

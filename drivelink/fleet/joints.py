@@ -1,0 +1,173 @@
+"""Which joint a recording is of, and the joint's last accepted model."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+from drivelink import jointfile
+from drivelink.errors import DrivelinkError, RecordingError, UsageError
+from drivelink.fleet.errors import FleetError
+from drivelink.jointfile import JointFile
+from drivelink.recording.mapping import joint_of
+
+__all__ = ["Joint", "Joints"]
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """A joint file as it travels to the workers.
+
+    Attributes:
+        name: of the joint.
+        text: of the joint file.
+        where: the file, for messages.
+        eds: the EDS and DCF files it refers to: (name, content) each.
+    """
+
+    name: str
+    text: str
+    where: str
+    eds: tuple[tuple[str, bytes], ...] = ()
+
+    @property
+    def file(self) -> JointFile:
+        """The joint file, validated."""
+        return _parsed(self.text, self.where)
+
+    @property
+    def digest(self) -> str:
+        """Names this version of the model."""
+        return hashlib.sha256(self.text.encode()).hexdigest()[:16]
+
+    @contextmanager
+    def base_dir(self) -> Iterator[Path]:
+        """A folder in which the files that the joint file refers to are found."""
+        if not self.eds:
+            yield Path(self.where).parent
+            return
+        with tempfile.TemporaryDirectory(prefix="drivelink-eds-") as folder:
+            for name, content in self.eds:
+                path = Path(folder) / name
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(content)
+            yield Path(folder)
+
+
+@lru_cache(maxsize=256)
+def _parsed(text: str, where: str) -> JointFile:
+    return jointfile.parse(text, where)
+
+
+@dataclass(frozen=True, slots=True)
+class Joints:
+    """The joints of a fleet, by name."""
+
+    by_name: dict[str, Joint]
+
+    @classmethod
+    def load(cls, folder: Path) -> Joints:
+        """Read a folder of joint files, subfolders included.
+
+        Of several files for one joint the last accepted one counts: the one that `fit --write` or
+        `diagnose --write` wrote last, as its `[provenance]` says.
+
+        Raises:
+            FleetError: no such folder, no joint file in it, or two of one joint between which nothing tells.
+            JointFileError: a joint file is wrong.
+        """
+        paths = [folder] if folder.is_file() else sorted(folder.rglob("*.toml"))
+        if not paths:
+            raise FleetError(f"{folder}: expected joint files (*.toml) in this folder, found none")
+        best: dict[str, tuple[str, Joint]] = {}
+        for path in paths:
+            joint = jointfile.load(path)
+            written = _written(joint.provenance)
+            one = Joint(joint.name, path.read_text(encoding="utf-8"), str(path), _eds(joint, path.parent))
+            if joint.name in best and best[joint.name][0] == written:
+                raise FleetError(
+                    f"{path}: joint {joint.name} is in {best[joint.name][1].where} too; expected one file, "
+                    "or [provenance] of fit --write or diagnose --write that says which is newer"
+                )
+            if joint.name not in best or written > best[joint.name][0]:
+                best[joint.name] = (written, one)
+        return cls({name: one for name, (_, one) in best.items()})
+
+    def of(self, path: Path, url: str) -> Joint:
+        """The joint that a recording is of.
+
+        Args:
+            path: the recording, as a local file.
+            url: its address, by which it is named.
+
+        Raises:
+            RecordingError: it carries no joint, and its name has none or several of ours.
+        """
+        carried = carried_joint(path)
+        if carried is not None:
+            return self.by_name.get(carried.name, carried)
+        return self.named(url)
+
+    def named(self, url: str) -> Joint:
+        """The joint whose name stands in an address: in the file's name, else in that of a folder above.
+
+        Raises:
+            RecordingError: none does, or several do.
+        """
+        for part in reversed(re.split(r"[/\\]", unquote(url))):
+            matches = [name for name in self.by_name if _stands_in(name, part)]
+            longest = [a for a in matches if not any(a != b and _stands_in(a, b) for b in matches)]
+            if len(longest) > 1:
+                raise RecordingError(f"{url}: its name fits several joints: {', '.join(sorted(longest))}")
+            if longest:
+                return self.by_name[longest[0]]
+        known = ", ".join(sorted(self.by_name)[:8]) + (", …" if len(self.by_name) > 8 else "")
+        raise RecordingError(f"{url}: expected the name of a joint in the file's name or folder ({known})")
+
+
+def carried_joint(path: Path) -> Joint | None:
+    """The joint file that a recording carries, if it does.
+
+    Raises:
+        RecordingError: it carries one that cannot be read.
+        JointFileError: the one that it carries is wrong.
+    """
+    try:
+        carried = joint_of(path, None)
+    except UsageError:
+        return None
+    return Joint(carried.joint.name, carried.text, str(carried.folder / "joint.toml"))
+
+
+def _stands_in(name: str, text: str) -> bool:
+    """Whether a name stands in a text as words of its own."""
+    return re.search(rf"(?<![A-Za-z0-9]){re.escape(name)}(?![A-Za-z0-9])", text) is not None
+
+
+def _written(provenance: dict[str, Any]) -> str:
+    """When fit or diagnose wrote the file; "" if neither did."""
+    stamps = [entry.get("written") for entry in provenance.values() if isinstance(entry, dict)]
+    return max((str(stamp) for stamp in stamps if stamp), default="")
+
+
+def _eds(joint: JointFile, base: Path) -> tuple[tuple[str, bytes], ...]:
+    names = {motor.drive.eds for motor in joint.motor if motor.drive and motor.drive.eds}
+    if joint.link.encoder and joint.link.encoder.eds:
+        names.add(joint.link.encoder.eds)
+    found = []
+    for name in sorted(names):
+        if Path(name).is_absolute() or ".." in Path(name).parts:
+            continue  # only a path below the joint file can be laid out again elsewhere
+        try:
+            found.append((name, (base / name).read_bytes()))
+        except OSError as error:
+            raise DrivelinkError(f"{base / name}: cannot be read: {error.strerror}") from error
+    return tuple(found)

@@ -1,0 +1,115 @@
+"""A recording as records that fit into a worker's memory: whole, or in parts one after the other."""
+
+from __future__ import annotations
+
+import csv
+import logging
+import math
+import tempfile
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+from typing import NamedTuple
+
+from drivelink import recording
+from drivelink.errors import RecordingError
+from drivelink.jointfile import JointFile
+from drivelink.recording.canframes import FrameLog, is_frame_log
+from drivelink.recording.columns import sample_columns, sample_row
+from drivelink.recording.cycles import Cycle
+from drivelink.recording.mcapsamples import recorded_cycles
+from estimator.sample import Record
+
+__all__ = ["Piece", "pieces"]
+
+# Peak memory of reading, fit, diagnosis and report over the size of the file, measured on one-motor
+# recordings with an effect (benchmarks/fleet.py memory) and rounded up; compressed formats hold more a byte.
+_EXPANSION = {".csv": 12.0, ".log": 12.0, ".candump": 12.0, ".asc": 12.0, ".trc": 12.0, ".blf": 40.0}
+_EXPANSION_OTHER = 40.0
+_BASE_BYTES = 250 << 20  # a worker before its first recording: interpreter, libraries, Dask
+_USED = 0.7  # share of the limit that is planned with: Dask pauses a worker at 0.8 and ends it at 0.95
+
+
+class Piece(NamedTuple):
+    """One part of a recording, numbered from 1."""
+
+    record: Record
+    part: int
+    parts: int
+
+
+def pieces(path: Path, joint: JointFile, base_dir: Path, limit_bytes: float) -> Iterator[Piece]:
+    """Read a recording, cut into equal parts in time where it does not fit.
+
+    Args:
+        path: the recording.
+        joint: the joint that it is of.
+        base_dir: folder in which the joint's EDS files are found.
+        limit_bytes: memory of the worker; not above 0: no limit.
+
+    Raises:
+        RecordingError: it cannot be read, or is too large and of a format that cannot be cut.
+    """
+    parts = _parts(path, limit_bytes)
+    if parts == 1:
+        yield Piece(recording.read(path, joint, base_dir=base_dir), 1, 1)
+        return
+    logging.getLogger("drivelink.fleet").warning(
+        "%s: larger than the memory of a worker: cut into %d parts", path.name, parts
+    )
+    with tempfile.TemporaryDirectory(prefix="drivelink-parts-") as folder:
+        table = path if path.suffix.lower() == ".csv" else _as_csv(path, joint, base_dir, Path(folder))
+        for number, piece in enumerate(_cut(table, parts, Path(folder) / path.with_suffix(".csv").name), 1):
+            yield Piece(recording.read(piece, joint, base_dir=base_dir), number, parts)
+
+
+def _parts(path: Path, limit_bytes: float) -> int:
+    if limit_bytes <= 0:
+        return 1
+    budget = _USED * limit_bytes - _BASE_BYTES
+    needed = path.stat().st_size * _EXPANSION.get(path.suffix.lower(), _EXPANSION_OTHER)
+    if budget <= 0:
+        least = math.ceil(_BASE_BYTES / _USED / (1 << 20))
+        raise RecordingError(f"expected more than {least} MiB of memory for each worker")
+    return max(1, math.ceil(needed / budget))
+
+
+def _as_csv(path: Path, joint: JointFile, base_dir: Path, folder: Path) -> Path:
+    """The samples of a recording as one CSV, read and written cycle by cycle."""
+    motors = len(joint.motor)
+    cycles: Iterator[Cycle]
+    if is_frame_log(path):
+        log = FrameLog(path, joint, base_dir)
+        cycles, period_s = log.cycles(), log.period_s
+    elif path.suffix.lower() == ".mcap":
+        cycles, period_s = recorded_cycles(path, motors), joint.bus.period_s
+    else:
+        raise RecordingError(f"{path}: larger than the memory of a worker, and {path.suffix} cannot be cut")
+    target = folder / "samples.csv"
+    with target.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(sample_columns(motors))
+        writer.writerows(sample_row(c.sample, period_s) for c in cycles if c.sample is not None)
+    return target
+
+
+def _cut(table: Path, parts: int, target: Path) -> Iterator[Path]:
+    """Parts of a CSV of about the same size, each with the header; the same file is used for all."""
+    share = math.ceil(table.stat().st_size / parts)
+    with table.open("rb") as file:
+        head = []
+        for line in file:
+            head.append(line)
+            if line.strip() and not line.lstrip().startswith(b"#"):
+                break
+        lines: Iterator[bytes] = iter(file)
+        while (first := next(lines, None)) is not None:
+            with target.open("wb") as out:
+                size = 0
+                out.writelines(head)
+                for line in chain([first], lines):
+                    out.write(line)
+                    size += len(line)
+                    if size >= share:
+                        break
+            yield target

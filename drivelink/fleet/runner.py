@@ -1,0 +1,327 @@
+"""A fleet run: recordings handed to Dask, a few ahead of the workers, and their results into the table."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from itertools import islice, pairwise
+from types import FrameType
+from typing import Any, Literal
+
+import dask
+from dask.utils import parse_bytes
+from distributed import Client, LocalCluster, as_completed
+from distributed.scheduler import KilledWorker
+
+from drivelink import __version__
+from drivelink.fleet.errors import FleetError
+from drivelink.fleet.joints import Joints, carried_joint
+from drivelink.fleet.storage import Source, Store, fetched
+from drivelink.fleet.table import Table
+from drivelink.fleet.task import Outcome, Task, broken_row, named_time, process, recorded_time
+
+__all__ = ["Counts", "Settings", "run"]
+
+_AHEAD = 4  # recordings a worker thread is given before it has asked for them
+_CONNECT_S = 10.0
+_EPOCH = datetime.fromtimestamp(0, UTC)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """How a run is to be done.
+
+    Attributes:
+        scheduler: address of a running Dask scheduler; None: a local cluster.
+        workers: processes of the local cluster; None: one a core.
+        memory: limit of each worker, e.g. "2GiB"; None: the local machine's memory in equal shares, or what
+            the scheduler's workers have declared.
+        since: earlier recordings are left out.
+        validate: "previous" validates on the joint's recording before; None: on held-out blocks.
+        again: also do what is in the table already.
+    """
+
+    scheduler: str | None = None
+    workers: int | None = None
+    memory: str | None = None
+    since: datetime | None = None
+    validate: Literal["previous"] | None = None
+    again: bool = False
+
+    @property
+    def limit_bytes(self) -> float:
+        """`memory` as a number; 0 where it is left to Dask.
+
+        Raises:
+            FleetError: it is no size.
+        """
+        if self.memory is None:
+            return 0.0
+        try:
+            return float(parse_bytes(self.memory))
+        except ValueError as error:
+            raise FleetError(f'--memory: expected a size such as 2GiB, got "{self.memory}"') from error
+
+
+@dataclass(slots=True)
+class Counts:
+    """What became of the recordings."""
+
+    found: int = 0
+    done: int = 0
+    known: int = 0
+    early: int = 0
+    broken: int = 0
+    errors: list[str] = field(default_factory=list)
+
+
+def run(
+    sources: list[Source],
+    joints: Joints,
+    store: Store,
+    settings: Settings,
+    progress: Callable[[Counts], None] = lambda _: None,
+    say: Callable[[str], None] = lambda _: None,
+) -> Counts:
+    """Do what is not in the table yet.
+
+    What is finished is in the table whenever the run ends, whyever it ends.
+
+    Args:
+        sources: the recordings.
+        joints: the fleet's joints.
+        store: the folder of results.
+        settings: how.
+        progress: told after each recording.
+        say: told what the user should know, a line each.
+
+    Raises:
+        FleetError: the scheduler is not reached or lost, or results cannot be written.
+        KeyboardInterrupt: Ctrl-C or SIGTERM.
+    """
+    counts = Counts(found=len(sources))
+    with Table(store) as table:
+        wanted = [source for source in sources if _wanted(source, joints, table, settings, counts)]
+        if not wanted:
+            return counts
+        with _interruptible(), _client(settings, len(wanted)) as client:
+            shared = client.submit(Joints, joints.by_name, pure=False)
+            before = _previous(sources, joints, shared, client) if settings.validate == "previous" else {}
+            tasks = (_task(source, before.get(source.url), table, settings) for source in wanted)
+            for task, outcome in _results(client, tasks, shared):
+                _take(task, outcome, table, store, counts, say)
+                progress(counts)
+    return counts
+
+
+def _wanted(source: Source, joints: Joints, table: Table, settings: Settings, counts: Counts) -> bool:
+    """Whether a recording is to be looked at, as far as its listing tells."""
+    latest = named_time(source) or source.modified
+    if settings.since and latest and latest < settings.since:
+        counts.early += 1
+        return False
+    known = table.at(source)
+    if known is None or settings.again or known.version != __version__:
+        return True
+    if known.failed:  # worth another try once there is a joint, or another model of it
+        now = joints.by_name.get(known.joint) if known.joint else None
+        if known.joint is None or (now is not None and now.digest != known.accepted_model):
+            return True
+    counts.known += 1
+    return False
+
+
+def _task(source: Source, previous: Source | None, table: Table, settings: Settings) -> Task:
+    return Task(
+        source=source,
+        version=__version__,
+        done=frozenset() if settings.again else table.contents(source.size, __version__),
+        previous=previous,
+        since=settings.since,
+        limit_bytes=settings.limit_bytes if settings.scheduler else 0.0,
+    )
+
+
+def _results(client: Client, tasks: Iterable[Task], shared: Any) -> Iterator[tuple[Task, Outcome]]:
+    """Outcomes in the order in which they are finished; never more than a few tasks a worker are out."""
+    tasks = iter(tasks)
+    out: dict[str, Task] = {}
+    finished = as_completed(loop=client.loop)
+
+    def submit(count: int) -> None:
+        for task in islice(tasks, count):
+            future = client.submit(process, task, shared, pure=False)
+            out[future.key] = task
+            finished.add(future)
+
+    submit(_window(client))
+    for future in finished:
+        task = out.pop(future.key)
+        yield task, _outcome(future, task)
+        future.release()
+        submit(max(1, _window(client) - len(out)))
+
+
+def _window(client: Client) -> int:
+    workers = client.scheduler_info(n_workers=-1)["workers"].values()
+    return max(2, _AHEAD * sum(int(worker["nthreads"]) for worker in workers))
+
+
+def _outcome(future: Any, task: Task) -> Outcome:
+    if future.status == "finished":
+        outcome: Outcome = future.result()
+        return outcome
+    if future.status in ("cancelled", "lost"):
+        raise FleetError("the scheduler is gone; what was finished is in the table")
+    error = future.exception()
+    if isinstance(error, KilledWorker):
+        line = f"ended {error.allowed_failures + 1} workers one after the other: out of memory, or a crash"
+    else:
+        line = " ".join(f"{type(error).__name__}: {error}".split())
+    return Outcome("error", [broken_row(task, line)], [], [])
+
+
+def _take(
+    task: Task, outcome: Outcome, table: Table, store: Store, counts: Counts, say: Callable[[str], None]
+) -> None:
+    for note in outcome.notes:
+        say(note)
+    if outcome.kind == "early":
+        counts.early += 1
+        return
+    if outcome.kind == "known" or _already(outcome, table):
+        counts.known += 1
+        return
+    for name, text in outcome.reports:  # before the row that points to them
+        store.write(name, text.encode())
+    table.append(outcome.rows)
+    if outcome.kind == "error":
+        counts.broken += 1
+        counts.errors.append(f"{task.source.url}: {outcome.rows[0]['error']}")
+        say(counts.errors[-1])
+    else:
+        counts.done += 1
+
+
+def _already(outcome: Outcome, table: Table) -> bool:
+    """Whether the same content came in this very run: two copies of one recording."""
+    return table.has_now(outcome.rows[0]["digest"], outcome.rows[0]["joint"])
+
+
+@contextmanager
+def _client(settings: Settings, tasks: int) -> Iterator[Client]:
+    """A client of the scheduler that was asked for, or of a local cluster that ends with it."""
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    dask.config.set(
+        {
+            "distributed.comm.timeouts.connect": f"{_CONNECT_S:g}s",
+            "distributed.worker.profile.enabled": False,  # a hundred looks a second at every worker's stack
+        }
+    )
+    if settings.scheduler is None:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+        with (
+            LocalCluster(
+                n_workers=min(settings.workers or cores, tasks),
+                threads_per_worker=1,
+                processes=True,
+                memory_limit=settings.limit_bytes or "auto",
+                dashboard_address="127.0.0.1:0",  # its port of HTTP: any, and on loopback
+                silence_logs=logging.CRITICAL,
+                preload=["drivelink.fleet.undisturbed"],
+            ) as cluster,
+            Client(cluster, set_as_default=False) as client,
+        ):
+            yield client
+        return
+    try:
+        client = Client(settings.scheduler, timeout=f"{_CONNECT_S:g}s", set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        line = " ".join(str(error).split())
+        raise FleetError(f"--scheduler {settings.scheduler}: cannot be reached: {line}") from error
+    with client:
+        _check_workers(client, settings.scheduler)
+        yield client
+
+
+def _check_workers(client: Client, address: str) -> None:
+    """Raise unless every worker that is there has this version; those that come later are checked by task."""
+    try:
+        versions = client.run(_worker_version)
+    except Exception as error:
+        line = " ".join(str(error).split())
+        raise FleetError(
+            f"--scheduler {address}: its workers need drivelink {__version__}: {line}"
+        ) from error
+    for worker, version in versions.items():
+        if version != __version__:
+            raise FleetError(
+                f"--scheduler {address}: worker {worker} has drivelink {version}, not {__version__}"
+            )
+
+
+def _worker_version() -> str:
+    from drivelink import __version__ as version
+
+    return version
+
+
+def _previous(sources: list[Source], joints: Joints, shared: Any, client: Client) -> dict[str, Source]:
+    """Each recording's predecessor of the same joint, by address.
+
+    MCAP files carry joint and time: workers look them up. Others are known by name and date.
+    """
+    known = {s.url: _listed(s, joints) for s in sources if not s.name.lower().endswith(".mcap")}
+    asked = [s for s in sources if s.url not in known]
+    known |= dict(client.gather(client.map(_identified, asked, joints=shared, pure=False)))
+    order: dict[str, list[tuple[datetime, str, Source]]] = {}
+    for source in sources:
+        joint, when = known[source.url]
+        if joint is not None:
+            order.setdefault(joint, []).append((when or _EPOCH, source.url, source))
+    before: dict[str, Source] = {}
+    for entries in order.values():
+        entries.sort(key=lambda entry: entry[:2])
+        before.update((later[1], earlier[2]) for earlier, later in pairwise(entries))
+    return before
+
+
+def _listed(source: Source, joints: Joints) -> tuple[str | None, datetime | None]:
+    try:
+        name = joints.named(source.url).name
+    except Exception:  # noqa: BLE001 - the task itself says what is wrong
+        name = None
+    return name, named_time(source) or source.modified
+
+
+def _identified(source: Source, joints: Joints) -> tuple[str, tuple[str | None, datetime | None]]:
+    try:
+        with fetched(source) as (path, _):
+            joint = carried_joint(path)
+            name = joint.name if joint else joints.named(source.url).name
+            return source.url, (name, recorded_time(path, source))
+    except Exception:  # noqa: BLE001 - the task itself says what is wrong
+        return source.url, (None, None)
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """SIGTERM ends a run as Ctrl-C does."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    try:
+        before = signal.signal(signal.SIGTERM, stop)
+    except ValueError:  # not in the main thread
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

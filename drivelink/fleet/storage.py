@@ -1,0 +1,258 @@
+"""Where recordings come from and results go to: anything fsspec opens (`file:`, `sftp:`, `s3:`, `http:`).
+
+Credentials and endpoints are fsspec's own (its configuration files, `FSSPEC_…` and `AWS_…` variables).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import urlsplit
+from uuid import uuid4
+
+import fsspec
+from fsspec.core import url_to_fs
+
+from drivelink.fleet.errors import FleetError
+from drivelink.recording.canlog import CAN_SUFFIXES
+from drivelink.recording.mapping import side_file
+
+__all__ = ["SUFFIXES", "Source", "Store", "fetched", "find"]
+
+SUFFIXES = frozenset({".csv", ".mcap", ".mf4", *CAN_SUFFIXES})  # what a folder is searched for
+
+_CHUNK = 1 << 20
+_MODIFIED = ("mtime", "LastModified", "last_modified", "Last-Modified", "time", "created")
+
+
+class Source(NamedTuple):
+    """A recording as its storage lists it.
+
+    Attributes:
+        url: where it is; a plain absolute path for local files.
+        size: bytes; -1 where the storage does not say.
+        stamp: changes when the content does: the entity tag, else the time of modification; "" if unknown.
+        modified: time of modification, where it is known.
+    """
+
+    url: str
+    size: int
+    stamp: str
+    modified: datetime | None
+
+    @property
+    def name(self) -> str:
+        """The file name."""
+        return urlsplit(self.url).path.rsplit("/", 1)[-1] if "://" in self.url else Path(self.url).name
+
+
+def find(patterns: Iterable[str]) -> tuple[list[Source], list[str]]:
+    """Expand paths, globs, folders and URLs to recordings, each once, in order of name.
+
+    Args:
+        patterns: as the user gave them; a folder stands for every recording below it.
+
+    Returns:
+        The recordings, and the patterns that match nothing.
+
+    Raises:
+        FleetError: a storage cannot be reached or is not known.
+    """
+    found: dict[str, Source] = {}
+    empty = []
+    for pattern in patterns:
+        sources = _listed(pattern)
+        if not sources:
+            empty.append(pattern)
+        found.update((source.url, source) for source in sources)
+    return sorted(found.values(), key=lambda source: source.url), empty
+
+
+def _listed(pattern: str) -> list[Source]:
+    fs, path = _opened(pattern)
+    try:
+        if any(sign in path for sign in "*?["):
+            entries = fs.glob(path, detail=True)
+        elif fs.isdir(path) and not _is_recording(path):
+            entries = fs.find(path, detail=True)
+        elif fs.exists(path):
+            entries = {path: fs.info(path)}
+        else:
+            entries = {}
+    except Exception as error:
+        raise FleetError(f"{pattern}: cannot be listed: {_line(error)}") from error
+    single = path in entries and len(entries) == 1
+    return [
+        _source(_url(pattern, str(name)), info)
+        for name, info in entries.items()
+        if info.get("type", "file") == "file" and (single or _is_recording(str(name)))
+    ]
+
+
+def _is_recording(path: str) -> bool:
+    return Path(path).suffix.lower() in SUFFIXES
+
+
+def _source(url: str, info: dict[str, Any]) -> Source:
+    modified = next((_time(info[key]) for key in _MODIFIED if info.get(key)), None)
+    tag = info.get("ETag") or info.get("etag")
+    stamp = str(tag) if tag else (modified.isoformat() if modified else "")
+    size = info.get("size")
+    return Source(url, -1 if size is None else int(size), stamp, modified)
+
+
+def _time(value: Any) -> datetime | None:
+    if isinstance(value, datetime):
+        return value if value.tzinfo else value.replace(tzinfo=UTC)
+    if isinstance(value, int | float):
+        return datetime.fromtimestamp(value, UTC)
+    try:
+        return parsedate_to_datetime(str(value))
+    except ValueError:
+        return None
+
+
+def _opened(url: str) -> tuple[Any, str]:
+    try:
+        fs, path = url_to_fs(url)
+    except ImportError as error:
+        raise FleetError(f"{url}: {_line(error)}") from error
+    except Exception as error:
+        raise FleetError(f"{url}: cannot be reached: {_line(error)}") from error
+    return fs, str(path)
+
+
+def _url(pattern: str, path: str) -> str:
+    """The address of what was listed: some file systems return paths without their host."""
+    if "://" in path:
+        return path
+    if "://" not in pattern or pattern.startswith(("file://", "local://")):
+        return path
+    split = urlsplit(pattern)
+    host = split.netloc if path.startswith("/") else ""
+    return f"{split.scheme}://{host}{path}"
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+@contextmanager
+def fetched(source: Source) -> Iterator[tuple[Path, str]]:
+    """A recording as a local file, with the SHA-256 of its content; a remote one is copied, in pieces.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    if "://" not in source.url:
+        path = Path(source.url)
+        with path.open("rb") as file:
+            yield path, hashlib.file_digest(file, "sha256").hexdigest()
+        return
+    with tempfile.TemporaryDirectory(prefix="drivelink-fleet-") as folder:
+        path = Path(folder) / source.name
+        digest = _copy(source.url, path)
+        if path.suffix.lower() in CAN_SUFFIXES:
+            with suppress(FileNotFoundError):  # most have none
+                _copy(source.url + side_file(path).name.removeprefix(path.name), side_file(path))
+        yield path, digest
+
+
+def _copy(url: str, path: Path) -> str:
+    """Copy a remote file in pieces; its SHA-256."""
+    digest = hashlib.sha256()
+    with fsspec.open(url, "rb") as remote, path.open("wb") as copy:
+        while piece := remote.read(_CHUNK):
+            digest.update(piece)
+            copy.write(piece)
+    return digest.hexdigest()
+
+
+class Store:
+    """The folder of the results: whole files in, whole files out.
+
+    A file is there with all of its content or not at all: locally and over SFTP it gets its name when it is
+    complete; an object store shows an object once it is complete anyway.
+
+    Args:
+        url: the folder; made if it is missing.
+
+    Attributes:
+        url: as given.
+        folder: the local folder, None where it is elsewhere.
+
+    Raises:
+        FleetError: it cannot be reached or made.
+    """
+
+    def __init__(self, url: str) -> None:
+        self.url = url
+        self._fs, self._root = _opened(url)
+        local = "file" in ([self._fs.protocol] if isinstance(self._fs.protocol, str) else self._fs.protocol)
+        self.folder: Path | None = Path(self._root) if local else None
+        self._made: set[str] = set()
+
+    def write(self, name: str, data: bytes) -> None:
+        """Put a file there, in place of one that has the name.
+
+        Raises:
+            FleetError: it cannot be written.
+        """
+        target, temporary = f"{self._root}/{name}", f"{self._root}/{name}.{uuid4().hex}.tmp"
+        try:
+            self._make(target.rpartition("/")[0])
+            if self.folder is not None:
+                with Path(temporary).open("wb") as file:
+                    file.write(data)
+                    file.flush()
+                    os.fsync(file.fileno())
+                Path(temporary).replace(target)
+            elif hasattr(self._fs, "ftp"):
+                self._fs.pipe_file(temporary, data)
+                self._fs.ftp.posix_rename(temporary, target)
+            else:
+                self._fs.pipe_file(target, data)
+        except Exception as error:
+            raise FleetError(f"{self.url}/{name}: cannot be written: {_line(error)}") from error
+
+    def _make(self, folder: str) -> None:
+        if folder not in self._made:
+            self._fs.makedirs(folder, exist_ok=True)
+            self._made.add(folder)
+
+    def read(self, name: str) -> bytes:
+        """The content of a file.
+
+        Raises:
+            FleetError: it cannot be read.
+        """
+        try:
+            return bytes(self._fs.cat_file(f"{self._root}/{name}"))
+        except Exception as error:
+            raise FleetError(f"{self.url}/{name}: cannot be read: {_line(error)}") from error
+
+    def names(self, folder: str, suffix: str) -> list[str]:
+        """Names, relative to the store, of the files in a folder that end so; hidden ones are left out."""
+        self._fs.invalidate_cache()
+        try:
+            paths = self._fs.ls(f"{self._root}/{folder}", detail=False)
+        except FileNotFoundError:
+            return []
+        except Exception as error:
+            raise FleetError(f"{self.url}: cannot be listed: {_line(error)}") from error
+        names = (str(path).rstrip("/").rpartition("/")[2] for path in paths)
+        return sorted(f"{folder}/{n}" for n in names if n.endswith(suffix) and not n.startswith("."))
+
+    def remove(self, name: str) -> None:
+        """Delete a file; one that is gone already is fine."""
+        try:
+            self._fs.rm_file(f"{self._root}/{name}")
+        except FileNotFoundError:
+            return

@@ -1,0 +1,290 @@
+"""One recording, from its storage to the rows of the table: what runs on a worker."""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import unquote
+
+from drivelink import __version__, recording
+from drivelink.errors import DrivelinkError, RecordingError
+from drivelink.fleet.analysis import Analysis, TransmissionRow, analyse
+from drivelink.fleet.joints import Joint, Joints
+from drivelink.fleet.pieces import Piece, pieces
+from drivelink.fleet.storage import Source, fetched
+from drivelink.recording.canlog import CAN_SUFFIXES, read_frames
+from drivelink.recording.mcapfile import read_messages
+from drivelink.report import Title
+from estimator.errors import EstimatorError
+from estimator.sample import Record
+
+__all__ = ["HELD_OUT", "Outcome", "Task", "broken_row", "named_time", "process", "recorded_time"]
+
+HELD_OUT = "held-out blocks"
+
+_UNIX = 1.0e9  # stamps from here on are UNIX time: they began in 2001
+_DATE = re.compile(
+    r"(?<!\d)(20\d\d)[-_.]?(0[1-9]|1[0-2])[-_.]?(0[1-9]|[12]\d|3[01])"
+    r"(?:[T_ -]?([01]\d|2[0-3])[-:._]?([0-5]\d)(?:[-:._]?([0-5]\d))?)?(?!\d)"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Task:
+    """What a worker is asked.
+
+    Attributes:
+        source: the recording.
+        version: of drivelink that is to do it.
+        done: contents, with their joints, that need not be done again: those of the same size.
+        previous: the joint's recording before, to validate with.
+        since: earlier recordings are left out.
+        limit_bytes: memory of a worker; 0: what Dask has declared.
+    """
+
+    source: Source
+    version: str
+    done: frozenset[tuple[str, str | None]] = frozenset()
+    previous: Source | None = None
+    since: datetime | None = None
+    limit_bytes: float = 0.0
+
+
+class Outcome(NamedTuple):
+    """What came of it.
+
+    Attributes:
+        kind: "done", "error", "known" (the same content is in the table already) or "early" (before `since`).
+        rows: for the table.
+        reports: (name below the result folder, content).
+        notes: a line each, for the user.
+    """
+
+    kind: str
+    rows: list[dict[str, Any]]
+    reports: list[tuple[str, str]]
+    notes: list[str]
+
+
+def process(task: Task, joints: Joints) -> Outcome:
+    """Fetch, identify, read, fit, diagnose. Whatever is wrong with the recording becomes a row.
+
+    Args:
+        task: what to do.
+        joints: the fleet's joints.
+    """
+    begin = time.process_time()
+    row: dict[str, Any] = broken_row(task, "")
+    with _notes() as notes:
+        try:
+            if task.version != __version__:
+                raise DrivelinkError(
+                    f"expected drivelink {task.version} on worker {socket.gethostname()}, got {__version__}"
+                )
+            with fetched(task.source) as (path, digest):
+                row["digest"] = digest
+                joint = joints.of(path, task.source.url)
+                row |= {"joint": joint.name, "accepted_model": joint.digest}
+                if (digest, joint.name) in task.done:
+                    return Outcome("known", [], [], [])
+                row["time"] = recorded_time(path, task.source, joint.file.bus.channel)
+                if task.since and row["time"] and row["time"] < task.since:
+                    return Outcome("early", [], [], [])
+                rows, reports = _results(task, joint, path, row)
+        except (DrivelinkError, EstimatorError, OSError) as error:
+            return _broken(row, str(error).replace(task.source.url + ": ", ""), notes, begin)
+        except MemoryError:
+            return _broken(row, "does not fit into the memory of a worker", notes, begin)
+        except Exception as error:  # noqa: BLE001 - one recording never ends the run
+            return _broken(row, f"unexpected {type(error).__name__}: {error}", notes, begin)
+    for one in rows:
+        one["cpu_s"] = (time.process_time() - begin) / len(rows)
+    return Outcome("done", rows, reports, notes)
+
+
+def broken_row(task: Task, error: str) -> dict[str, Any]:
+    """The row of a recording of which no more is known than where it is."""
+    time_ = named_time(task.source) or task.source.modified
+    place = f"{task.source.url}|{task.source.size}|{task.source.stamp}"
+    return {
+        "id": f"broken-{place}",
+        "joint": None,
+        "time": time_,
+        "recording": task.source.url,
+        "digest": f"unread-{place}",
+        "size_bytes": task.source.size,
+        "stamp": task.source.stamp,
+        "status": "error",
+        "error": error,
+        "accepted_model": None,
+        "worker": socket.gethostname(),
+        "version": task.version,
+    }
+
+
+def _broken(row: dict[str, Any], error: str, notes: list[str], begin: float) -> Outcome:
+    line = " ".join(error.split())
+    if not row["digest"].startswith("unread-"):
+        row["id"] = f"{row['digest'][:24]}-{row['joint'] or ''}"
+    return Outcome("error", [row | {"error": line, "cpu_s": time.process_time() - begin}], [], notes)
+
+
+def _results(
+    task: Task, joint: Joint, path: Path, row: dict[str, Any]
+) -> tuple[list[dict[str, Any]], list[tuple[str, str]]]:
+    """The rows of a recording, and its reports."""
+    rows, reports = [], []
+    file, limit = joint.file, task.limit_bytes or _declared_limit()
+    with joint.base_dir() as base, _validation(task, joint, base) as validation:
+        where = HELD_OUT if validation is None or task.previous is None else task.previous.url
+        begin: float | None = None
+        for piece in pieces(path, file, base, limit):
+            at = piece.record.start_s + float(piece.record.sequence[0]) * piece.record.period_s
+            begin = at if begin is None else begin
+            title = Title(
+                joint.name, _part_name(task.source.name, piece), None if validation is None else where
+            )
+            analysis = analyse(piece.record, file, validation, title)
+            suffix = f"-{piece.part}" if piece.parts > 1 else ""
+            folder = f"diagnoses/{joint.name}/{row['digest'][:24]}{suffix}"
+            common = row | _of_joint(analysis, piece, where) | {"report": f"{folder}/report.html"}
+            common["time"] = row["time"] and row["time"] + timedelta(seconds=at - begin)
+            for one in analysis.transmissions:
+                name = f"{row['digest'][:24]}-{joint.name}-{one.transmission}{suffix}"
+                rows.append(common | _of_transmission(one) | {"id": name})
+            reports.append((f"{folder}/report.json", analysis.report_json))
+            reports.append((f"{folder}/report.html", analysis.report_html))
+    return rows, reports
+
+
+def _part_name(name: str, piece: Piece) -> str:
+    return name if piece.parts == 1 else f"{name}, part {piece.part} of {piece.parts}"
+
+
+def _of_joint(analysis: Analysis, piece: Piece, validated_on: str) -> dict[str, Any]:
+    record = piece.record
+    return {
+        "status": "done",
+        "error": None,
+        "part": piece.part,
+        "parts": piece.parts,
+        "verdict": analysis.verdict,
+        "sentence": analysis.sentence,
+        "effects": analysis.effects,
+        "details": analysis.details,
+        "error_before_rms_nm": analysis.before_rms_nm,
+        "error_after_rms_nm": analysis.after_rms_nm,
+        "error_before_relative": analysis.before_relative,
+        "error_after_relative": analysis.after_relative,
+        "validated_on": validated_on,
+        "duration_s": float((record.sequence[-1] - record.sequence[0]) * record.period_s),
+        "samples": len(record),
+        "period_s": record.period_s,
+    }
+
+
+def _of_transmission(one: TransmissionRow) -> dict[str, Any]:
+    row = {name: value for name, value in one._asdict().items() if name != "named"}
+    for name, (deflection, stiffness, std) in one.named.items():
+        row[f"deflection_{name}_rad"] = deflection
+        row[f"stiffness_{name}_nm_rad"] = stiffness
+        row[f"stiffness_std_{name}_nm_rad"] = std
+    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
+
+
+@contextmanager
+def _validation(task: Task, joint: Joint, base: Path) -> Iterator[Record | None]:
+    """The joint's recording before; where it cannot be read, none, which is said."""
+    if task.previous is None:
+        yield None
+        return
+    record = None
+    try:
+        with fetched(task.previous) as (path, _):
+            record = recording.read(path, joint.file, base_dir=base)
+    except (RecordingError, OSError) as error:
+        logging.getLogger("drivelink.fleet").warning("validated on held-out blocks: %s", error)
+    yield record
+
+
+def named_time(source: Source) -> datetime | None:
+    """The date, with the time of day where there is one (UTC), in the name of a file or of a folder above."""
+    for part in reversed(re.split(r"[/\\]", unquote(source.url))):
+        for match in _DATE.finditer(part):
+            year, month, day, hour, minute, second = (int(text or 0) for text in match.groups())
+            try:
+                return datetime(year, month, day, hour, minute, second, tzinfo=UTC)
+            except ValueError:
+                continue
+    return None
+
+
+def recorded_time(path: Path, source: Source, channel: str = "") -> datetime | None:
+    """When a recording was made: its own UNIX stamps, else the date in its name, else its modification."""
+    stamp_s = 0.0
+    suffix = path.suffix.lower()
+    if suffix == ".mcap":
+        message = next(iter(read_messages(path, frozenset({"sample", "can"}))), None)
+        stamp_s = message.log_time_ns * 1e-9 if message else 0.0
+    elif suffix in CAN_SUFFIXES:
+        frame = next(iter(read_frames(path, configured=channel)), None)
+        stamp_s = frame.stamp_ns * 1e-9 if frame else 0.0
+    elif suffix == ".csv":
+        stamp_s = _first_time(path)
+    if _UNIX < stamp_s < 1e11:
+        return datetime.fromtimestamp(stamp_s, UTC)
+    return named_time(source) or source.modified
+
+
+def _first_time(path: Path) -> float:
+    """`time_s` of the first row of a CSV; 0 where it is not found."""
+    with path.open("r", encoding="utf-8-sig", errors="replace") as file:
+        lines = (line.strip() for line in file)
+        rows = (line for line in lines if line and not line.startswith("#"))
+        header, first = next(rows, ""), next(rows, "")
+    separator = max(",;\t", key=header.count)
+    names = [name.strip().strip("\"'") for name in header.split(separator)]
+    try:
+        return float(first.split(separator)[names.index("time_s")].strip().strip("\"'").replace(",", "."))
+    except (ValueError, IndexError):
+        return 0.0
+
+
+def _declared_limit() -> float:
+    """Memory that Dask has declared for the worker that this runs on; 0: none, or no worker."""
+    from distributed import get_worker
+
+    try:
+        manager = getattr(get_worker(), "memory_manager", None)
+    except ValueError:
+        return 0.0
+    return float(getattr(manager, "memory_limit", None) or 0.0)
+
+
+@contextmanager
+def _notes() -> Iterator[list[str]]:
+    """What the readers warn of, as lines."""
+    lines: list[str] = []
+
+    class Collect(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            lines.append(record.getMessage())
+
+    handler, logger = Collect(logging.WARNING), logging.getLogger("drivelink")
+    before = logger.propagate
+    logger.addHandler(handler)
+    logger.propagate = False
+    try:
+        yield lines
+    finally:
+        logger.removeHandler(handler)
+        logger.propagate = before

@@ -1,0 +1,54 @@
+"""A few small recordings of small joints, for the tests of the fleet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import diagnosiskit as kit
+import numpy as np
+
+from estimator.sample import Record
+
+JOINT = f"""\
+name = "{{name}}"
+arrangement = "single"
+[[motor]]
+inertia_kg_m2 = {kit.INERTIA}
+viscous_damping_nm_s_rad = {kit.DAMPING}
+[motor.transmission]
+model = "linear"
+[link.dynamics]
+inertia_kg_m2 = {kit.LINK_INERTIA}
+viscous_damping_nm_s_rad = {kit.LINK_DAMPING}
+gravity_nm = {kit.GRAVITY}
+"""
+SECONDS = 4.0
+NAMES = ("elbow", "wrist")
+
+
+def write_csv(record: Record, path: Path) -> Path:
+    names = "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad"
+    assert record.link_position_rad is not None
+    motor, torque = record.motor_position_rad[:, 0], record.motor_torque_nm[:, 0]
+    table = np.column_stack((record.time_s, motor, torque, record.link_position_rad))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savetxt(path, table, delimiter=",", header=names, comments="", fmt="%.9g")
+    return path
+
+
+def make_fleet(folder: Path, nights: int = 2) -> Path:
+    """FOLDER/joints and FOLDER/recordings of two joints; the second night of the wrist has friction."""
+    seconds = kit.SECONDS
+    kit.SECONDS = SECONDS
+    try:
+        for night in range(nights):
+            effects = [{}, {"coulomb_nm": 0.4} if night % 2 else {}]
+            for name, record in zip(NAMES, kit.World(effects, seed=10 + night).run(), strict=True):
+                write_csv(record, folder / "recordings" / f"{name}-2026-01-{night + 5:02d}.csv")
+    finally:
+        kit.SECONDS = seconds
+    for name in NAMES:
+        path = folder / "joints" / f"{name}.toml"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(JOINT.format(name=name), encoding="utf-8")
+    return folder

@@ -1,0 +1,479 @@
+"""`drivelink fleet`: every recording once, whatever breaks; what the table holds is what fit and diagnose say."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import diagnosiskit as kit
+import fleetkit
+import numpy as np
+import pytest
+
+REASON = "the extra [fleet] is not installed"
+pytest.importorskip("distributed", reason=REASON)
+pq = pytest.importorskip("pyarrow.parquet", reason=REASON)
+
+from drivelink import __version__, recording  # noqa: E402
+from drivelink.cli import main  # noqa: E402
+from drivelink.errors import RecordingError  # noqa: E402
+from drivelink.fleet import pieces, runner, storage, table, task  # noqa: E402
+from drivelink.fleet.errors import FleetError  # noqa: E402
+from drivelink.fleet.joints import Joints  # noqa: E402
+from drivelink.fleet.storage import Source, Store  # noqa: E402
+from drivelink.fleet.summary import COLUMNS, summarise  # noqa: E402
+from drivelink.fleet.table import Table, read_rows  # noqa: E402
+
+# Dask's own: a process that was ended on purpose leaves sockets behind.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
+)
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return fleetkit.make_fleet(tmp_path_factory.mktemp("fleet"))
+
+
+@pytest.fixture
+def joints(fleet: Path) -> Joints:
+    return Joints.load(fleet / "joints")
+
+
+def source(path: Path) -> Source:
+    ((found,), _) = storage.find([str(path)])
+    return found
+
+
+def done(path: Path, joints: Joints, **more: Any) -> task.Outcome:
+    return task.process(task.Task(source=source(path), version=__version__, **more), joints)
+
+
+# One recording
+
+
+def test_a_row_says_what_fit_and_diagnose_say(fleet: Path, joints: Joints, tmp_path: Path) -> None:
+    path, joint = fleet / "recordings" / "wrist-2026-01-06.csv", str(fleet / "joints" / "wrist.toml")
+    outcome = done(path, joints)
+    (row,) = outcome.rows
+    assert main(["fit", str(path), "--joint", joint, "--out", str(tmp_path)]) == 0
+    assert main(["diagnose", str(path), "--joint", joint, "--out", str(tmp_path)]) == 0
+    (fitted,) = json.loads((tmp_path / "fit.json").read_text())["transmissions"]
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert json.loads(row["parameters"]) == fitted["parameters"]
+    assert row["stiffness_middle_nm_rad"] == pytest.approx(fitted["parameters"]["k_nm_rad"])
+    assert row["stiffness_std_middle_nm_rad"] == pytest.approx(fitted["std"]["k_nm_rad"])
+    assert (row["joint"], row["time"]) == ("wrist", datetime(2026, 1, 6, tzinfo=UTC))
+    assert (row["status"], row["verdict"], row["effects"]) == ("done", "effect", ["coulomb_friction@motor"])
+    assert row["error_after_relative"] == report["error"]["validation"]["after_relative"]
+    assert json.loads(dict(outcome.reports)[row["report"].replace(".html", ".json")]) == report
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("elbow-a.csv", "time_s,motor1_position_rad\n0,zero\n", "expected"),
+        ("elbow-b.mcap", "no MCAP", "expected an MCAP file"),
+        ("knee.csv", "time_s\n", "expected the name of a joint in the file's name or folder (elbow, wrist)"),
+        ("elbow-wrist.csv", "time_s\n", "its name fits several joints: elbow, wrist"),
+        ("elbow-c.log", "(1.0) can0 123#00\n", "expected SYNC frames"),
+    ],
+)
+def test_a_broken_recording_is_a_row_with_one_line(
+    joints: Joints, tmp_path: Path, name: str, text: str, said: str
+) -> None:
+    path = tmp_path / name
+    path.write_text(text)
+    outcome = done(path, joints)
+    (row,) = outcome.rows
+    assert outcome.kind == row["status"] == "error"
+    assert "\n" not in row["error"]
+    if name != "elbow-c.log":
+        assert said in row["error"]
+
+
+def test_units_and_signs_are_checked_before_anything_else(
+    fleet: Path, joints: Joints, tmp_path: Path
+) -> None:
+    record = recording.read(fleet / "recordings" / "elbow-2026-01-05.csv")
+    degrees = np.rad2deg(record.link_position_rad)  # type: ignore[arg-type]
+    wrong = fleetkit.write_csv(
+        type(record)(
+            period_s=record.period_s,
+            sequence=record.sequence,
+            motor_position_rad=record.motor_position_rad,
+            motor_torque_nm=record.motor_torque_nm,
+            link_position_rad=degrees,
+        ),
+        tmp_path / "elbow.csv",
+    )
+    (row,) = done(wrong, joints).rows
+    assert row["status"] == "error"
+    assert "degree" in row["error"]
+
+
+def test_a_recording_larger_than_the_memory_is_cut_into_parts(
+    joints: Joints, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kit, "SECONDS", 12.0)
+    (record,) = kit.World([{}]).run()
+    path = fleetkit.write_csv(record, tmp_path / "elbow.csv")
+    monkeypatch.setattr(pieces, "_BASE_BYTES", 0)
+    outcome = done(path, joints, limit_bytes=10.0 * path.stat().st_size)
+    assert [(row["part"], row["parts"]) for row in outcome.rows] == [(1, 2), (2, 2)]
+    assert sum(row["samples"] for row in outcome.rows) == len(record)
+    assert outcome.rows[1]["time"] - outcome.rows[0]["time"] > timedelta(seconds=1)
+    assert len({row["id"] for row in outcome.rows}) == 2
+    assert any("cut into 2 parts" in note for note in outcome.notes)
+
+
+def test_the_recording_before_validates(fleet: Path, joints: Joints) -> None:
+    before = source(fleet / "recordings" / "wrist-2026-01-05.csv")
+    (row,) = done(fleet / "recordings" / "wrist-2026-01-06.csv", joints, previous=before).rows
+    assert row["validated_on"] == before.url
+    gone = before._replace(url=before.url + ".gone")
+    outcome = done(fleet / "recordings" / "wrist-2026-01-06.csv", joints, previous=gone)
+    assert outcome.rows[0]["validated_on"] == task.HELD_OUT
+    assert "validated on held-out blocks" in outcome.notes[0]
+
+
+def test_another_version_is_refused(fleet: Path, joints: Joints) -> None:
+    asked = task.Task(source=source(fleet / "recordings" / "elbow-2026-01-05.csv"), version="0.0.0")
+    assert "expected drivelink 0.0.0 on worker" in task.process(asked, joints).rows[0]["error"]
+
+
+# Joints and times
+
+
+def test_the_joint_is_the_name_that_stands_in_the_nearest_part_of_the_path(tmp_path: Path) -> None:
+    for name in ("arm", "arm-left", "elbow"):
+        (tmp_path / f"{name}.toml").write_text(fleetkit.JOINT.format(name=name))
+    joints = Joints.load(tmp_path)
+    assert joints.named("/data/elbow/arm-2026.csv").name == "arm"
+    assert joints.named("s3://plant/arm-left/0001.mcap").name == "arm-left"
+    assert joints.named("/data/2026-11-22_elbow.csv").name == "elbow"
+    with pytest.raises(RecordingError, match="expected the name of a joint"):
+        joints.named("/data/alarm/elbows.csv")
+
+
+def test_of_several_files_for_a_joint_the_last_accepted_one_counts(tmp_path: Path) -> None:
+    text = fleetkit.JOINT.format(name="elbow")
+    (tmp_path / "elbow.toml").write_text(text)
+    for day in ("2026-01-07", "2026-01-06"):
+        (tmp_path / f"{day}.toml").write_text(f'{text}[provenance.fit]\nwritten = "{day}T00:00:00+00:00"\n')
+    assert Joints.load(tmp_path).by_name["elbow"].where.endswith("2026-01-07.toml")
+    (tmp_path / "again.toml").write_text((tmp_path / "2026-01-07.toml").read_text())
+    with pytest.raises(FleetError, match="joint elbow is in"):
+        Joints.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "moment"),
+    [
+        ("elbow-2026-11-22.csv", datetime(2026, 11, 22, tzinfo=UTC)),
+        ("elbow_20261122T2315.csv", datetime(2026, 11, 22, 23, 15, tzinfo=UTC)),
+        ("2026-11-22/elbow.csv", datetime(2026, 11, 22, tzinfo=UTC)),
+        ("elbow-2026-11-22T23-15-07.mcap", datetime(2026, 11, 22, 23, 15, 7, tzinfo=UTC)),
+        ("elbow-2026-02-31.csv", None),
+        ("elbow-120261122.csv", None),
+    ],
+)
+def test_the_date_in_a_name(name: str, moment: datetime | None) -> None:
+    assert task.named_time(Source(f"/data/{name}", 1, "", None)) == moment
+
+
+def test_unix_stamps_in_a_recording_are_its_time(tmp_path: Path) -> None:
+    path = tmp_path / "elbow-2020-01-01.csv"
+    path.write_text("# a comment\ntime_s;motor1_position_rad\n1780000000,5;1\n")
+    assert task.recorded_time(path, source(path)) == datetime.fromtimestamp(1780000000.5, UTC)
+
+
+# The table
+
+
+def row(digest: str = "a", joint: str | None = "elbow", **more: Any) -> dict[str, Any]:
+    return {
+        "id": f"{digest}-{joint}", "joint": joint, "digest": digest, "recording": f"{digest}.csv", "size_bytes": 1,
+        "stamp": "s", "status": "done", "version": "1", "accepted_model": "m", "transmission": 1,
+        "time": datetime(2026, 1, 1, tzinfo=UTC),
+    } | more  # fmt: skip
+
+
+def ids(folder: Path) -> list[str]:
+    """As DuckDB or pandas would see them."""
+    parts = sorted(folder.glob("table/*.parquet"))
+    return sorted(name for part in parts for name in pq.read_table(part)["id"].to_pylist())
+
+
+def test_rows_are_appended_over_runs_and_stand_in_one_part(tmp_path: Path) -> None:
+    for digest in "abc":
+        with Table(Store(str(tmp_path))) as one:
+            one.append([row(digest)])
+    assert ids(tmp_path) == ["a-elbow", "b-elbow", "c-elbow"]
+    assert len(list(tmp_path.glob("table/*.parquet"))) == 1
+    assert not list(tmp_path.glob("table/*.tmp"))
+
+
+def test_full_parts_follow_each_other_and_a_newer_row_takes_the_place_of_an_old_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(table, "_PART_ROWS", 2)
+    for digest in "abcde":
+        with Table(Store(str(tmp_path))) as one:
+            one.append([row(digest)])
+    assert len(list(tmp_path.glob("table/*.parquet"))) == 3
+    with Table(Store(str(tmp_path))) as one:
+        one.append([row("a", version="2")])
+    assert ids(tmp_path) == [f"{digest}-elbow" for digest in "abcde"]
+    assert {r["id"]: r["version"] for r in read_rows(Store(str(tmp_path)))}["a-elbow"] == "2"
+
+
+def test_what_a_kill_between_two_writes_leaves_double_is_read_once_and_mended(tmp_path: Path) -> None:
+    store = Store(str(tmp_path))
+    with Table(store) as one:
+        one.append([row("a")])
+    (part,) = tmp_path.glob("table/*.parquet")
+    shutil.copy(part, part.with_name("part-0.parquet"))
+    assert len(read_rows(store)) == 1
+    with Table(store) as one:
+        one.append([row("b")])
+    assert ids(tmp_path) == ["a-elbow", "b-elbow"]
+
+
+def test_two_runs_at_once_lose_nothing(tmp_path: Path) -> None:
+    store = Store(str(tmp_path))
+    with Table(store) as one:
+        one.append([row("a")])
+    with Table(store) as first, Table(store) as second:
+        first.append([row("b")])
+        second.append([row("c")])
+    assert ids(tmp_path) == ["a-elbow", "b-elbow", "c-elbow"]
+
+
+def test_an_error_gives_way_to_the_result_of_the_same_recording(tmp_path: Path) -> None:
+    store = Store(str(tmp_path))
+    with Table(store) as one:
+        one.append([row("unread-1", None, recording="a.csv", status="error", error="no such host")])
+    with Table(store) as one:
+        assert one.at(Source("a.csv", 1, "s", None)).failed  # type: ignore[union-attr]
+        one.append([row("a")])
+    assert ids(tmp_path) == ["a-elbow"]
+
+
+def test_a_part_that_is_no_parquet_file_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "table").mkdir()
+    (tmp_path / "table" / "part-1.parquet").write_text("garbage")
+    with pytest.raises(FleetError, match=r"part-1.parquet: expected a Parquet file"):
+        read_rows(Store(str(tmp_path)))
+
+
+# The whole
+
+
+def run_fleet(fleet: Path, out: Path, *more: str, recordings: Path | None = None) -> int:
+    joints = str(fleet / "joints")
+    return main(
+        ["fleet", str(recordings or fleet / "recordings"), "--joints", joints, "--out", str(out), *more]
+    )
+
+
+def test_from_recordings_to_a_page(fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recordings = shutil.copytree(fleet / "recordings", tmp_path / "recordings")
+    shutil.copy(recordings / "elbow-2026-01-05.csv", recordings / "elbow-2026-01-05-copy.csv")
+    (recordings / "elbow-2026-01-07.csv").write_text("nothing")
+    out = tmp_path / "out"
+    assert run_fleet(fleet, out, "--workers", "2", "--validate", "previous", recordings=recordings) == 0
+    said = capsys.readouterr()
+    assert "6 recordings: 4 done, 1 there already, 1 broken" in said.out
+    assert "elbow-2026-01-07.csv" in said.err
+    rows = read_rows(Store(str(out)))
+    assert sorted((r["joint"], r["status"]) for r in rows) == [("elbow", "done")] * 2 + [
+        ("elbow", "error"), ("wrist", "done"), ("wrist", "done"),
+    ]  # fmt: skip
+    document = json.loads((out / "fleet.json").read_text())
+    assert document["schema"] == "drivelink.fleet/1"
+    assert {one["joint"]: one["recordings"] for one in document["joints"]} == {"elbow": 3, "wrist": 2}
+    page = (out / "fleet.html").read_text()
+    assert "http" not in page.replace("http://www.w3.org", "")  # self-contained
+    for r in rows:
+        assert r["status"] == "error" or (out / r["report"]).exists()
+        assert r["report"] is None or r["report"] in page
+    # once more: nothing is done, nothing is lost
+    before = ids(out)
+    assert run_fleet(fleet, out, recordings=recordings) == 0
+    assert "0 done, 6 there already" in capsys.readouterr().out
+    assert ids(out) == before
+
+
+def test_a_killed_worker_loses_nothing_and_doubles_nothing(fleet: Path, tmp_path: Path) -> None:
+    from distributed import Client, LocalCluster
+
+    sources, _ = storage.find([str(fleet / "recordings")])
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0") as cluster:
+        address, killed = cluster.scheduler_address, []
+
+        def kill_one(counts: runner.Counts) -> None:
+            if not killed:
+                with Client(address, set_as_default=False) as client:
+                    killed.append(client.run(os.getpid).popitem()[1])
+                os.kill(killed[0], signal.SIGKILL)
+
+        settings = runner.Settings(scheduler=address)
+        counts = runner.run(sources, Joints.load(fleet / "joints"), Store(str(tmp_path)), settings, kill_one)
+    assert killed
+    assert (counts.done, counts.broken) == (len(sources), 0)
+    assert sorted(r["recording"] for r in read_rows(Store(str(tmp_path)))) == [one.url for one in sources]
+
+
+@pytest.mark.slow
+def test_ctrl_c_leaves_what_is_finished(fleet: Path, tmp_path: Path) -> None:
+    recordings = tmp_path / "recordings"
+    recordings.mkdir()
+    lines = (fleet / "recordings" / "elbow-2026-01-05.csv").read_text().splitlines(keepends=True)
+    for k in range(40):  # each is a content of its own
+        (recordings / f"elbow-{k:02d}.csv").write_text("".join(lines[: len(lines) - k]))
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "drivelink", "fleet", str(recordings), "--joints", str(fleet / "joints")]
+    command += ["--out", str(out), "--workers", "1"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    end = time.monotonic() + 90
+    while len(list(out.glob("diagnoses/*/*/report.html"))) < 3 and time.monotonic() < end:
+        time.sleep(0.1)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers get it too
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in error
+    assert 3 <= len(read_rows(Store(str(out)))) < 40
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["fleet", "{recordings}"], "--joints: expected the folder of the joint files"),
+        (["fleet", "{recordings}", "--joints", "nowhere"], "there is no nowhere"),
+        (["fleet", "nothing/*.csv", "--joints", "{joints}"], "expected at least one recording"),
+        (["fleet", "{recordings}", "--joints", "{recordings}"], "expected joint files (*.toml)"),
+        (
+            ["fleet", "{recordings}", "--joints", "{joints}", "--workers", "0"],
+            "--workers: expected 1 or more",
+        ),
+        (["fleet", "{recordings}", "--joints", "{joints}", "--memory", "much"], "--memory: expected a size"),
+        (["fleet", "{recordings}", "--joints", "{joints}", "--since", "soon"], "--since: expected a date"),
+        (["fleet", "{recordings}", "--joints", "{joints}", "--fdr", "5"], "--fdr: expected a number between"),
+        (["fleet", "nosuch://x/*.csv", "--joints", "{joints}"], "nosuch://x/*.csv: cannot be reached"),
+        (["fleet", "report"], "fleet report: expected one folder"),
+        (["fleet", "report", "nowhere"], "expected a table of `drivelink fleet`"),
+    ],
+)
+def test_what_a_user_gets_wrong_is_one_line(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    arguments: list[str], said: str,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    places = {"recordings": fleet / "recordings", "joints": fleet / "joints"}
+    assert main([text.format(**places) for text in arguments]) != 0
+    error = capsys.readouterr().err.splitlines()
+    assert said in error[-1]
+    assert len(error) <= 2
+
+
+def test_a_scheduler_that_is_not_there_is_one_line(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(runner, "_CONNECT_S", 0.5)
+    assert run_fleet(fleet, tmp_path, "--scheduler", "tcp://127.0.0.1:1") != 0
+    assert "--scheduler tcp://127.0.0.1:1: cannot be reached" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_earlier_recordings_are_left_out(
+    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_fleet(fleet, tmp_path, "--since", "2026-01-06", "--workers", "1") == 0
+    assert "4 recordings: 2 done, 2 too early" in capsys.readouterr().out
+
+
+# The summary
+
+
+def night(joint: str, k: int, stiffness: float, effects: list[str]) -> dict[str, Any]:
+    values = dict.fromkeys([*COLUMNS, "recording", "time"])
+    return values | {
+        "joint": joint, "transmission": 1, "status": "done", "effects": effects, "model": "linear",
+        "verdict": "effect" if effects else "sufficient", "sentence": "said", "excited": True,
+        "parameters": json.dumps({"k_nm_rad": stiffness}), "covariance": [0.01], "deflection_middle_rad": 0.02,
+        "stiffness_middle_nm_rad": stiffness, "stiffness_std_middle_nm_rad": 0.1, "report": f"{joint}{k}.html",
+        "error_before_relative": 0.1, "error_after_relative": 0.02, "recording": f"{joint}-{k}.csv",
+        "time": datetime(2026, 1, 5, tzinfo=UTC) + timedelta(days=k),
+    }  # fmt: skip
+
+
+def test_joints_come_by_urgency_with_what_changed_since_when() -> None:
+    rng = np.random.default_rng(8)
+    rows = []
+    for k in range(20):
+        noise = 0.3 * rng.standard_normal(4)
+        rows.append(night("steady", k, 150.0 + noise[0], []))
+        rows.append(night("drifts", k, 150.0 - 0.5 * k + noise[1], []))
+        rows.append(night("steps", k, 150.0 + 4.0 * (k >= 12) + noise[2], []))
+        rows.append(night("rubs", k, 150.0 + noise[3], ["coulomb_friction@motor"] if k >= 9 else []))
+    document = summarise(rows, 0.05)
+    assert json.loads(json.dumps(document)) == document
+    joints = {one["joint"]: one for one in document["joints"]}
+    assert [one["state"] for one in document["joints"]] == ["changing"] * 3 + ["steady"]
+    (drift,) = joints["drifts"]["transmissions"][0]["changes"]
+    assert drift["kind"] == "drift"
+    assert drift["amount_relative"] == pytest.approx(-9.5 / 150.0, abs=4 * drift["amount_std_relative"])
+    (step,) = joints["steps"]["transmissions"][0]["changes"]
+    assert (step["kind"], step["since"][:10]) == ("step", "2026-01-17")
+    (effect,) = joints["rubs"]["effects"]
+    assert (effect["significant"], effect["since"][:10]) == (True, "2026-01-14")
+    assert joints["rubs"]["sentence"] == "New at the motor since 2026-01-14: coulomb friction."
+
+
+def test_an_unusable_stiffness_is_no_point_of_the_trend() -> None:
+    rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) for k in range(10)]
+    rows[4] |= {"stiffness_middle_nm_rad": -20.0, "parameters": '{"k_nm_rad": -20.0}'}
+    rows[5]["excited"] = False
+    (joint,) = summarise(rows, 0.05)["joints"]
+    assert len(joint["transmissions"][0]["series"]) == 8
+
+
+# The rest of the service
+
+
+def test_neither_daemon_nor_command_line_imports_what_the_fleet_needs() -> None:
+    code = (
+        "import sys, drivelink, drivelink.cli, drivelink.cli.run, drivelink.daemon.service, drivelink.cli.fleet;"
+        "found = {'dask', 'distributed', 'fsspec', 'pyarrow', 'pandas', 'botocore', 'paramiko'} & set(sys.modules);"
+        "sys.exit(', '.join(found) or None)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_examples_of_the_documentation_read_the_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("duckdb")
+    pytest.importorskip("pandas")
+    text = (Path(__file__).parent.parent / "docs" / "fleet.md").read_text(encoding="utf-8")
+    examples = [block.split("```")[0] for block in text.split("```python\n")[1:]]
+    assert len(examples) == 2
+    with Table(Store(str(tmp_path / "fleet"))) as one:
+        for k in range(3):
+            one.append([row(str(k), excited=True, stiffness_middle_nm_rad=100.0 + k)])
+        one.append([row("bad", None, status="error", error="broken", recording="bad.csv")])
+    monkeypatch.chdir(tmp_path)
+    for example in examples:
+        exec(compile(example, "docs/fleet.md", "exec"), {})
+    said = capsys.readouterr().out
+    assert "elbow" in said
+    assert "bad.csv" in said

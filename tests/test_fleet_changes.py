@@ -1,0 +1,107 @@
+"""Change points of a fleet: what is there is found, at the declared rate of false ones; what is odd is not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pyarrow", reason="the extra [fleet] is not installed")
+
+from drivelink.fleet.changes import LEAST, appearance, changes, q_values, series_test
+from estimator.sample import FloatArray
+
+NIGHTS, SCATTER = 25, 0.004
+TIME_S = np.arange(NIGHTS) * 86400.0
+STATED = np.full(NIGHTS, 0.5 * SCATTER)
+
+
+def series(rng: np.random.Generator, change: FloatArray | float = 0.0) -> FloatArray:
+    return np.asarray(1.0 + change + SCATTER * rng.standard_normal(NIGHTS))
+
+
+def test_a_fleet_without_changes_has_no_discovery_beyond_the_declared_rate() -> None:
+    rng = np.random.default_rng(1)
+    p = np.array([series_test(TIME_S, series(rng), STATED).p_value for _ in range(1000)])
+    # Bonferroni's bound: at most 5 % below 0.05. Binomial, 1000 draws: 7.3 % is 3.3 sigma above.
+    assert np.mean(p < 0.05) < 0.073
+    assert not np.any(q_values(p) <= 0.05)
+
+
+def test_a_drift_of_three_per_cent_is_found_in_nearly_all() -> None:
+    rng = np.random.default_rng(2)
+    drift = -0.03 * TIME_S / TIME_S[-1]
+    hits = [series_test(TIME_S, series(rng, drift), STATED).p_value < 1e-3 for _ in range(200)]
+    assert np.mean(hits) >= 0.95
+
+
+def test_a_step_is_dated_and_its_size_lies_in_its_interval() -> None:
+    rng = np.random.default_rng(3)
+    inside = []
+    for _ in range(100):
+        (found,) = changes(TIME_S, series(rng, 0.03 * (np.arange(NIGHTS) >= 15)), STATED, 1e-3)
+        assert found.kind == "step"
+        assert found.earliest <= found.first <= found.latest
+        assert abs(found.first - 15) <= 1
+        inside.append(abs(found.amount - 0.03) < 1.96 * found.amount_std)
+    assert np.mean(inside) > 0.87  # 95 %, three sigma of 100 draws below
+
+
+def test_a_drift_that_begins_later_is_dated() -> None:
+    rng = np.random.default_rng(4)
+    (found,) = changes(TIME_S, series(rng, 0.06 * np.maximum(np.arange(NIGHTS) - 10, 0) / 14), STATED, 1e-3)
+    assert found.kind == "drift"
+    assert found.earliest <= 10 <= found.latest
+
+
+def test_two_steps_are_two_changes() -> None:
+    rng = np.random.default_rng(5)
+    night = np.arange(NIGHTS)
+    found = changes(TIME_S, series(rng, 0.05 * (night >= 8) - 0.1 * (night >= 17)), STATED, 1e-3)
+    assert [(one.kind, one.first) for one in found] == [("step", 8), ("step", 17)]
+
+
+@pytest.mark.parametrize("night", [0, 12, NIGHTS - 1])
+def test_one_odd_recording_is_no_change(night: int) -> None:
+    value = series(np.random.default_rng(6))
+    value[night] += 20.0 * SCATTER
+    assert series_test(TIME_S, value, STATED).p_value > 0.05
+
+
+def test_nights_that_resemble_each_other_are_not_taken_for_a_trend() -> None:
+    rng, p = np.random.default_rng(7), []
+    for _ in range(500):
+        noise = rng.standard_normal(NIGHTS)
+        for k in range(1, NIGHTS):
+            noise[k] = 0.3 * noise[k - 1] + np.sqrt(1.0 - 0.3**2) * noise[k]
+        p.append(series_test(TIME_S, 1.0 + SCATTER * noise, STATED).p_value)
+    assert np.mean(np.array(p) < 0.05) < 0.08  # binomial, 500 draws: three sigma above 5 %
+
+
+def test_too_few_recordings_tell_nothing() -> None:
+    few = LEAST - 1
+    assert series_test(TIME_S[:few], np.linspace(1.0, 2.0, few), STATED[:few]).p_value == 1.0
+    assert changes(TIME_S[:few], np.linspace(1.0, 2.0, few), STATED[:few], 0.05) == []
+
+
+def test_a_series_without_any_scatter_is_steady_and_one_that_steps_is_not() -> None:
+    assert series_test(TIME_S, np.ones(NIGHTS), np.zeros(NIGHTS)).p_value == 1.0
+    assert series_test(TIME_S, 1.0 + (TIME_S[9] <= TIME_S), np.zeros(NIGHTS)).p_value < 1e-6
+
+
+def test_recordings_of_one_moment_are_taken_in_order() -> None:
+    assert series_test(np.zeros(NIGHTS), np.linspace(1.0, 1.2, NIGHTS), STATED).p_value < 1e-6
+
+
+def test_an_effect_that_appears_is_dated_and_one_that_comes_and_goes_is_not_significant() -> None:
+    appeared = appearance(np.arange(NIGHTS) >= 14)
+    assert appeared.first == 14
+    assert appeared.p_value < 1e-4
+    assert appearance(np.arange(NIGHTS) % 5 == 0).p_value > 0.2
+    assert appearance(np.ones(NIGHTS, dtype=bool)).p_value == 1.0
+    assert appearance(np.arange(NIGHTS) < 10).p_value == 1.0  # it went away
+
+
+def test_q_values_are_those_of_benjamini_and_hochberg() -> None:
+    """By hand: p · n / rank from the largest down, never rising."""
+    p = np.array([0.01, 0.04, 0.03, 0.005])
+    assert q_values(p) == pytest.approx([0.02, 0.04, 0.04, 0.02])

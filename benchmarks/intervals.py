@@ -14,6 +14,7 @@ from importlib import resources
 import numpy as np
 
 from drivelink import jointfile
+from drivelink.cycle.loop import ObjectSink
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.simulate import network_from_joint, open_sim_bus, world_from_joint
 from estimator.sample import Estimate, Sample, Status
@@ -21,7 +22,7 @@ from estimator.sample import Estimate, Sample, Status
 WINDOW_S = 10
 
 
-class Beside:
+class Beside(ObjectSink):
     """A sink that keeps each estimate with what was true at its SYNC."""
 
     def __init__(self, world):

@@ -14,8 +14,8 @@ import numpy as np
 import zenoh
 from rig import AnsweringBus, Devices
 
+from drivelink._core import SYNC_COB_ID
 from drivelink.canopen.layout import NodeLayout, Signal
-from drivelink.cycle.acquisition import SYNC_COB_ID
 from drivelink.cycle.framesource import FrameSource
 from drivelink.cycle.meter import Meter
 from drivelink.cycle.realtime import Alarm

@@ -23,6 +23,7 @@ import zenoh
 from rig import PERIOD_S, free_endpoint, joint, subscriber
 from rivals import Floor
 
+from drivelink._core import SYNC_COB_ID
 from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle import realtime
 from drivelink.cycle.chain import make_chain
@@ -79,7 +80,7 @@ class Clocked:
         begin = clock()
         frames = self._source.take()
         received = clock()
-        chain.assembler.sync(1)
+        chain.assembler.feed(SYNC_COB_ID, b"")
         samples = [chain.assembler.feed(cob_id, data) for cob_id, data, _ in frames]
         sample = samples[-1]
         assert sample is not None

@@ -5,14 +5,14 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from drivelink.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from drivelink.pubsub.asyncclient import AsyncSubscription as AsyncSubscription
     from drivelink.pubsub.asyncclient import subscribe_async as subscribe_async
     from drivelink.pubsub.client import State as State
     from drivelink.pubsub.client import Subscription as Subscription
     from drivelink.pubsub.client import subscribe as subscribe
-
-__version__ = "0.1.0"
 
 _LAZY = {  # imported when asked for, so that `import drivelink` stays cheap
     "AsyncSubscription": "drivelink.pubsub.asyncclient",

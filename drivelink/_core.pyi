@@ -1,1 +1,275 @@
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from drivelink.canopen.layout import NodeLayout
+from drivelink.cycle.chain import Watch
+from estimator.online import Estimator
+from estimator.sample import Estimate, Sample
+
+LATE: int
+SYNC_COB_ID: int
 __version__: str
+
+def encode_estimate(estimate: Estimate, stamp_ns: int) -> bytes:
+    """The bytes of `<prefix>/<joint>/estimate`; see `drivelink.pubsub.wire.ESTIMATE`.
+
+    Args:
+        estimate: of at most 8 transmissions.
+        stamp_ns: UNIX time of its SYNC.
+    """
+
+def encode_sample(sample: Sample, stamp_ns: int) -> bytes:
+    """The bytes of `<prefix>/<joint>/sample`; see `drivelink.pubsub.wire.SAMPLE`.
+
+    Args:
+        sample: of at most 2 motors.
+        stamp_ns: UNIX time of its SYNC.
+    """
+
+class NodeCounters:
+    """What became of one node's frames since the start.
+
+    Attributes:
+        received: PDOs of this node that were used.
+        missing: frames that had not come when the next SYNC came.
+        late: of these, frames that came in the cycle after.
+        duplicate: frames beyond the one a cycle needs.
+        conflicting: of the cycles with such frames, those in which they differed; not used.
+        wrong_length: frames that do not carry what is mapped; not used.
+        ignored: frames sent after a reboot, before the node was configured and started again.
+        reboots: boot-up messages.
+        emergencies: EMCY messages that report an error.
+    """
+
+    received: int
+    missing: int
+    late: int
+    duplicate: int
+    conflicting: int
+    wrong_length: int
+    ignored: int
+    reboots: int
+    emergencies: int
+
+    def as_dict(self) -> dict[str, int]:
+        """All of them, by name."""
+
+class Assembler:
+    """Makes the samples of one joint from the frames of its nodes (CiA 301, 7.2.2 and 7.2.5).
+
+    Frames after SYNC k and before SYNC k+1 belong to sample k, which is given out with the last frame it
+    needs. A frame that does not come leaves a gap: counted by node, never filled with an older value. What
+    comes after a missing frame may be the missing one, late: for a while such cycles are judged only at their
+    end, and are flagged. No clock is read: the same frames in the same order give the same samples, live or
+    from a log.
+
+    Args:
+        layouts: the joint's nodes, as configured or as declared.
+        motors: how many motors the joint has.
+        active: whether we configure the nodes. Then a node that rebooted is believed again when it is
+            started again; else `trust` alone makes it so.
+        hold_periods: how long the last value of a TPDO that is not sent on SYNC may be used while nothing
+            at all is heard of its node; and how long one that is sent on SYNC may fail before a node that we
+            configure is not believed any more, since it may have lost its mapping meanwhile.
+
+    Attributes:
+        sequence: number of the current SYNC, from 0; -1 before the first.
+        missed: number of the cycle the last SYNC closed without a sample, or -1 if it had one.
+        flags: service bits of `Status` that hold for the sample just given, or the cycle just missed.
+        extra_syncs: SYNCs that were not due: another master makes them, or a frame is repeated.
+        cob_ids: identifiers that concern this joint, SYNC aside.
+        counters: by node id, as they are now.
+        faults: nodes that report a fault, with the EMCY error code (0: by statusword only).
+        statuswords: of the drives, as last heard, by node id.
+        untrusted: nodes that rebooted or were silent for long, and have not been started again.
+        has_link: whether any frame carries the link position.
+        complete: whether this cycle has given its sample: nothing more is expected before the next SYNC.
+
+    Raises:
+        DriveError: two frames with one identifier, or a motor without position or torque.
+    """
+
+    def __init__(
+        self,
+        layouts: Sequence[NodeLayout],
+        motors: int,
+        *,
+        active: bool = True,
+        hold_periods: int = 250,
+    ) -> None: ...
+    @property
+    def sequence(self) -> int: ...
+    @property
+    def missed(self) -> int: ...
+    @property
+    def flags(self) -> int: ...
+    @property
+    def extra_syncs(self) -> int: ...
+    @property
+    def cob_ids(self) -> tuple[int, ...]: ...
+    @property
+    def counters(self) -> dict[int, NodeCounters]: ...
+    @property
+    def faults(self) -> dict[int, int]: ...
+    @property
+    def statuswords(self) -> dict[int, int]: ...
+    @property
+    def untrusted(self) -> tuple[int, ...]: ...
+    @property
+    def has_link(self) -> bool: ...
+    @property
+    def complete(self) -> bool: ...
+    def missing_nodes(self) -> tuple[int, ...]:
+        """Nodes that the current cycle still waits for."""
+
+    def feed(self, cob_id: int, data: bytes, jump: int = 1) -> Sample | None:
+        """Take one frame in the order of the bus, SYNC included; the sample that it completes, if it does.
+
+        Args:
+            cob_id: identifier of the frame.
+            data: its bytes.
+            jump: for a SYNC, whole periods since the one before; 0: one that was not due; `LATE`: one whose
+                period is over.
+        """
+
+    def supervise(self) -> None:
+        """From now on `trust` alone makes a node believed again: somebody else may start it too."""
+
+    def distrust(self, node_id: int) -> None:
+        """Do not use what a node sends until it is started again."""
+
+    def trust(self, node_id: int) -> None:
+        """A node has been configured and started."""
+
+    def relayout(self, layout: NodeLayout) -> None:
+        """A node has been configured differently: from now on its frames are read by this layout.
+
+        Raises:
+            DriveError: as in the constructor; then everything is as it was.
+        """
+
+class Tick:
+    """What is published of one cycle.
+
+    Attributes:
+        sequence: number of its SYNC.
+        status: bits of `Status`.
+        stamp_ns: UNIX time of its SYNC.
+        current: whether it is the cycle of the last SYNC.
+        fresh: whether it has a sample; else the last estimate is carried on.
+        estimate: as an object.
+        sample: likewise; None where it is not fresh.
+        estimate_payload: the bytes of `<prefix>/<joint>/estimate`.
+        sample_payload: the bytes of `<prefix>/<joint>/sample`; None where it is not fresh.
+    """
+
+    @property
+    def sequence(self) -> int: ...
+    @property
+    def status(self) -> int: ...
+    @property
+    def stamp_ns(self) -> int: ...
+    @property
+    def current(self) -> bool: ...
+    @property
+    def fresh(self) -> bool: ...
+    @property
+    def estimate(self) -> Estimate: ...
+    @property
+    def sample(self) -> Sample | None: ...
+    @property
+    def estimate_payload(self) -> bytes: ...
+    @property
+    def sample_payload(self) -> bytes | None: ...
+    def flagged(self, status: int) -> Tick:
+        """The same with these status bits set too."""
+
+    def stamped(self, stamp_ns: int) -> Tick:
+        """The same at another time."""
+
+class History:
+    """The last samples of a joint, for a new estimator to start from; any thread may read them."""
+
+    def __len__(self) -> int: ...
+    def after(self, sequence: int, most: int | None = None) -> list[Sample]:
+        """The samples that came after one of that number, the oldest `most` of them."""
+
+    def behind(self, sequence: int) -> int:
+        """How many came after one of that number."""
+
+class Chain:
+    """One joint from frames to the bytes for zenoh: assembler, estimator, watch. No clock, no bus, no key.
+
+    What the service knows of the estimate's quality is added to its status: drive faults, missing frames, and
+    estimates carried on without fresh measurements. It is fed by one thread; others may look at it.
+
+    Args:
+        assembler: makes the samples.
+        estimator: steps once a sample.
+        watch: raises the model alarm, if there is one.
+        keep: how many of the last samples are kept, for a new estimator to start from.
+
+    Attributes:
+        assembler: as given.
+        estimator: the one in use.
+        watch: likewise.
+        history: the last samples.
+        estimate: the last one, None before the first.
+        sample: what the last estimate was made from; None where it was carried on.
+        missed: cycles that gave no sample.
+    """
+
+    def __init__(
+        self, assembler: Assembler, estimator: Estimator, watch: Watch | None = None, *, keep: int = 0
+    ) -> None: ...
+    @property
+    def assembler(self) -> Assembler: ...
+    @property
+    def estimator(self) -> Estimator: ...
+    @property
+    def watch(self) -> Watch | None: ...
+    @property
+    def history(self) -> History: ...
+    @property
+    def estimate(self) -> Estimate | None: ...
+    @property
+    def sample(self) -> Sample | None: ...
+    @property
+    def missed(self) -> int: ...
+    def feed(self, cob_id: int, data: bytes, jump: int = 1, stamp_ns: int = 0) -> Tick | None:
+        """Take one frame (see `Assembler.feed`); what is published of the cycle that it ends, if it does.
+
+        A cycle that is closed without a sample gives the last estimate again, under its own sequence
+        number, stale and not valid.
+
+        Args:
+            cob_id: identifier of the frame.
+            data: its bytes.
+            jump: for a SYNC, whole periods since the one before; 0: one that was not due; `LATE`: one whose
+                period is over.
+            stamp_ns: for a SYNC that was due, its UNIX time.
+
+        Raises:
+            Exception: whatever an estimator in Python raises.
+        """
+
+    def take(self, sample: Sample, flags: int = 0, stamp_ns: int = 0) -> Tick:
+        """Take one sample as it was recorded.
+
+        Args:
+            sample: of the cycle.
+            flags: service bits of `Status` that hold for it.
+            stamp_ns: UNIX time of its SYNC.
+        """
+
+    def carry_on(self, sequence: int, flags: int = 0, stamp_ns: int | None = None) -> Tick | None:
+        """The last estimate under a new number: stale, not valid; None where there never was one.
+
+        Args:
+            sequence: of the cycle.
+            flags: service bits of `Status` that hold for it.
+            stamp_ns: UNIX time of its SYNC; None: as the SYNCs fed tell.
+        """
+
+    def exchange(self, estimator: Any, watch: Watch | None, unseen: Iterable[Sample] = ()) -> None:
+        """Put another estimator in place between two cycles, after it has seen the last samples too."""

@@ -7,9 +7,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from drivelink import __version__, jointfile
+from drivelink import jointfile
 from drivelink.floor import floor_entry
 from drivelink.jointfile import JointFile, JointText
+from drivelink.version import __version__
 from estimator.diagnosis import Diagnosis
 from estimator.effects import LIBRARY
 from estimator.model import Effect, JointModel, ParameterValue

@@ -23,6 +23,7 @@ from drivelink.keyhint import unknown_key
 from drivelink.outfile import write_whole
 from estimator.model import Arrangement, Effect, JointModel, LinkDynamics, Motor, Transmission
 from estimator.settings import EstimatorSettings
+from estimator.transmissions import MODELS, transmission_model
 
 __all__ = [
     "BusSection",
@@ -155,6 +156,12 @@ class MotorSection(_Section):
     effect: tuple[Effect, ...] = Field((), description="effects the model has been given")
     drive: DriveSection | None = Field(None, description="only run, sim, record and doctor need it")
 
+    @model_validator(mode="after")
+    def _parameters_can_be(self) -> MotorSection:
+        if self.transmission.model in MODELS:  # of one's own models the estimator tells when it is made
+            transmission_model(self.transmission)
+        return self
+
     def motor(self) -> Motor:
         """What the estimator is told of it."""
         return Motor(
@@ -182,7 +189,12 @@ class BusSection(_Section):
     channel: str = Field("drivelink", description="python-can channel, e.g. can0")
     bitrate: int = Field(1_000_000, gt=0, description="bit/s; the bus load is computed with it")
     options: dict[str, Any] = Field(default_factory=dict, description="passed to can.Bus as they are")
-    period_s: float = Field(0.001, gt=0, le=1.0, description="communication cycle: one SYNC, one sample")
+    period_s: float = Field(
+        0.001,
+        gt=0,
+        le=1.0,
+        description="communication cycle: one SYNC, one sample; when following and left out: measured",
+    )
     sync: Literal["produce", "follow"] = Field("produce", description="make SYNC, or follow another master's")
     sync_counter_overflow: int = Field(0, ge=0, le=240, description="0x1019: 0, or 2 to 240")
     configure: bool = Field(True, description="configure the nodes; false: passive, never sends a frame")

@@ -21,10 +21,12 @@ from estimator.leastsquares import search_shape
 from estimator.model import JointModel, Motor, ParameterValue
 from estimator.sample import FloatArray, Record
 from estimator.solver import NUISANCES, Solver
-from estimator.transmissions import RIGID, UNKNOWN, transmission_model
+from estimator.transmissions import MODELS, RIGID, UNKNOWN, transmission_model
 
 __all__ = ["TransmissionFit", "fit"]
 
+_SIGMA_95 = 1.96
+_LOOKED_AT = 33  # deflections from zero to the largest one
 _SHAPE = 1e-7  # relative tolerance of a shape parameter: far below what noise leaves of it
 
 
@@ -71,6 +73,16 @@ class TransmissionFit:
     torque_skew_s: float
     nuisance_std: dict[str, float]
     excited: bool
+
+    @property
+    def stiffens(self) -> bool:
+        """Whether the stiffness is positive, its 95 % interval too, at every deflection of the recording."""
+        law = MODELS[self.model]
+        reach = float(np.max(np.abs(self.deflection_rad)))
+        phi = np.linspace(0.0, reach, _LOOKED_AT)
+        slopes = law.stiffness_jacobian(phi, self.alpha)
+        std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", slopes, self.covariance, slopes), 0.0))
+        return bool(np.all(law.stiffness(phi, self.alpha) > _SIGMA_95 * std))
 
 
 def fit(record: Record, model: JointModel, bandwidth_rad_s: float | None = None) -> list[TransmissionFit]:

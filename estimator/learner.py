@@ -52,7 +52,7 @@ class Learner:
         tracks: one a motor.
         deflections: their deflections of this moment.
         effect_nm: x_motor - x_transmission per motor, the latest that is known.
-        delay_s: of the filters.
+        delay_s: of the filters. bandwidth_rad_s: of the slower one.
         settle: periods after which a wrong start has left them.
         unsettled: how many are still to go.
     """
@@ -83,7 +83,7 @@ class Learner:
         self._positions = positions
         self._bank = FilterBank(positions, m, 2 * m, settings.bandwidth_rad_s, period_s, block)
         self.delay_s = delay = self._bank.delay_s
-        bandwidth = self._bank.main.bandwidth_rad_s
+        self.bandwidth_rad_s = bandwidth = self._bank.main.bandwidth_rad_s
         self.settle = math.ceil(_SETTLE_DELAYS * delay / period_s)
         past = math.ceil(_PAST_DELAYS * delay / period_s / block) * block
         self._shaped = any(isinstance(track, Track) and track.shaped for track in self.tracks)

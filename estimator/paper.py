@@ -29,7 +29,9 @@ __all__ = ["PaperEstimator"]
 _VALID, _OBSERVABLE = int(Status.VALID), int(Status.OBSERVABLE)
 _NOTHING = TransmissionEstimate(math.nan, math.nan, math.nan, math.nan)
 _EXCITED_RAD2_S2 = 1e-6  # mean square of phi' above which K_R phi'² teaches anything
-_ENERGY_S = 0.5  # over which that mean is taken
+_ENERGY_S = 0.5  # over which that mean is taken …
+_SCATTER_S = 0.5  # … and those of the stiffness and of its scatter
+_SIGMA_95 = 1.96
 
 
 class _Transmission:
@@ -52,6 +54,7 @@ class _Transmission:
     def reset(self) -> None:
         self.stiffness = 0.0
         self._energy = 0.0
+        self._mean = self._scatter = 0.0
         self._squares.reset()
         self.restart()
 
@@ -87,8 +90,24 @@ class _Transmission:
         else:
             self._squares.update(self._model.basis(phi, order=self._squares.size), torque)
             self.stiffness = float(self._model.stiffness(phi, self._squares.alpha))
+        gain, off = min(1.0, span / _SCATTER_S), self.stiffness - self._mean
+        self._mean += gain * off
+        self._scatter += gain * (off * off - self._scatter)
         self.held = TransmissionEstimate(torque, self.stiffness, math.nan, phi)
         return self.held
+
+    @property
+    def usable(self) -> bool:
+        """Whether the torque is a number and the stiffness is told to be positive.
+
+        The paper's stiffness has no standard deviation. Its scatter over half a second is the least that
+        it is uncertain by: where mean and scatter leave zero inside 95 %, nothing is told, not even the sign.
+        """
+        if not math.isfinite(self.held[0]):
+            return False
+        if self.rigid:
+            return True
+        return self.stiffness > 0.0 and self._mean > _SIGMA_95 * math.sqrt(self._scatter)
 
     @property
     def observable(self) -> bool:
@@ -149,7 +168,7 @@ class PaperEstimator:
                 part.update(theta, omega, tau, sample.link_position_rad, sample.link_velocity_rad_s, periods)
         held = tuple(part.held for part in self._parts)
         flexible = [part for part in self._parts if not part.rigid]
-        if all(math.isfinite(part.held[0]) for part in self._parts):
+        if all(part.usable for part in self._parts):
             status |= _VALID
         if periods and flexible and all(part.observable for part in flexible):
             status |= _OBSERVABLE

@@ -58,6 +58,9 @@ class Status(IntFlag):
     STALE = 1 << 10  # the estimate is carried on without fresh measurements
     UNTIMED = 1 << 11  # SYNCs of another master: the values may be of another moment; nothing is learned
     NODE_RESTARTED = 1 << 12  # positions may have started anew: with this sample the estimator begins anew
+    PARTIAL = (
+        1 << 13
+    )  # what is NaN is not given: stiffness of a rigid joint, standard deviation of mode paper
 
 
 class TransmissionEstimate(NamedTuple):

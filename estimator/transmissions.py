@@ -89,6 +89,12 @@ def transmission_model(transmission: Transmission) -> TransmissionModel | None:
         raise EstimatorError(f'transmission.model: expected one of {known}, got "{transmission.model}"')
     if transmission.parameters:
         alpha = model.alpha(transmission.parameters)
+        stiffness = model.at(0.0, alpha.tolist())[1]
+        if not stiffness >= 0.0 or not np.any(alpha):
+            raise EstimatorError(
+                f"transmission.parameters: expected a stiffness above 0 N·m/rad, "
+                f"got {stiffness:g} at no deflection"
+            )
         if transmission.order is not None and model.linear is None and alpha.size != transmission.order:
             raise EstimatorError(
                 f"transmission.parameters: expected {transmission.order} coefficients_nm_rad "

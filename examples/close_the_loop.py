@@ -13,6 +13,7 @@ from drivelink import jointfile
 from drivelink.canopen.bus import open_bus
 from drivelink.cli import main as drivelink
 from drivelink.cycle.lockstep import run_lockstep
+from drivelink.cycle.loop import ObjectSink
 from drivelink.recording.formats import open_sink
 from drivelink.simulate import network_from_joint, world_from_joint
 from estimator.sample import Estimate, Sample
@@ -21,7 +22,7 @@ JOINT = Path(__file__).parent / "vsa-ii.toml"
 FRICTION_NM = 0.004
 
 
-class Recorder:
+class Recorder(ObjectSink):
     """Takes what the daemon would publish, and writes the samples to a CSV file."""
 
     def __init__(self, path: Path) -> None:

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import can
 
+from drivelink._core import Tick
+from drivelink.cycle.loop import ObjectSink
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.jointfile import JointFile, parse
 from drivelink.simulate import network_from_joint, open_sim_bus
@@ -71,12 +73,17 @@ def vsa(**options: str) -> JointFile:
     return parse(vsa_text(**options))
 
 
-class Collector:
+class Collector(ObjectSink):
     """A sink that keeps everything."""
 
     def __init__(self) -> None:
         self.estimates: list[tuple[Estimate, int]] = []
         self.samples: list[tuple[Sample, int]] = []
+        self.payloads: list[tuple[bytes, bytes | None]] = []
+
+    def put(self, tick: Tick) -> None:
+        self.payloads.append((tick.estimate_payload, tick.sample_payload))
+        super().put(tick)
 
     def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
         self.estimates.append((estimate, stamp_ns))

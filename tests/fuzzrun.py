@@ -12,12 +12,12 @@ import can
 from daemonkit import vsa_text
 from fuzzbus import MIXES, FuzzBus
 
+from drivelink._core import Assembler, Chain
 from drivelink.canopen.configure import configure_joints
 from drivelink.canopen.layout import NodeLayout, Signal
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cycle.acquisition import Assembler
-from drivelink.cycle.chain import Chain, build
-from drivelink.cycle.loop import CycleLoop, Lane
+from drivelink.cycle.chain import build
+from drivelink.cycle.loop import CycleLoop, Lane, ObjectSink
 from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor
 from drivelink.jointfile import JointFile, parse
@@ -76,7 +76,7 @@ class _Port:
         self._bus.send_message(msg)
 
 
-class _Judge:
+class _Judge(ObjectSink):
     """The sink: holds every VALID sample against what the nodes measured at its SYNC."""
 
     def __init__(self, run: FuzzRun) -> None:

@@ -7,10 +7,9 @@ import struct
 import pytest
 from canlayouts import COUNT_RAD, LINK_RAD, TORQUE_NM, VSA, drive, encoder, link, pdo, vsa_cycle
 
+from drivelink._core import Assembler
 from drivelink.canopen.layout import MappedObject, NodeLayout, Signal, TpdoLayout
-from drivelink.cycle.acquisition import Assembler
-from drivelink.cycle.frames import make_decoder
-from drivelink.cycle.syncclock import SyncClock
+from drivelink.cycle.syncclock import LATE, SyncClock, measure_period
 from drivelink.errors import DriveError
 from estimator.sample import Sample, Status
 
@@ -346,21 +345,25 @@ def test_can_fd_frames_may_be_padded() -> None:
 
 def test_objects_of_any_length_are_decoded_bit_by_bit() -> None:
     rng = random.Random(3)
+    signals = [Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE, Signal.MOTOR_VELOCITY, Signal.LINK_POSITION]
     for _ in range(200):
-        objects, word, shift, truth = [], 0, 0, []
-        while True:
-            bits, signed = rng.randint(1, 32), rng.random() < 0.5
-            if shift + bits > 64:
-                break
+        objects, word, shift, truth = [], 0, 0, {}
+        for signal in rng.sample([*signals, Signal.OTHER, Signal.OTHER], 6):
+            bits, signed = rng.randint(1, 10), rng.random() < 0.5
             low = -(1 << bits - 1) if signed else 0
-            value = rng.randint(low, low + (1 << bits) - 1)
-            objects.append(
-                MappedObject(signal=Signal.OTHER, index=0x2000, subindex=0, bits=bits, signed=signed)
-            )
-            word |= (value & (1 << bits) - 1) << shift
+            truth[signal] = rng.randint(low, low + (1 << bits) - 1)
+            objects.append(MappedObject(signal=signal, index=0x2000, subindex=0, bits=bits, signed=signed))
+            word |= (truth[signal] & (1 << bits) - 1) << shift
             shift += bits
-            truth.append(value)
-        assert make_decoder(tuple(objects))(word.to_bytes(8, "little")) == tuple(truth)
+        tpdo = TpdoLayout(cob_id=0x181, objects=tuple(objects))
+        assembler = Assembler((NodeLayout(node_id=1, motor=0, tpdos=(tpdo,)),), 1)
+        (sample,) = run(assembler, [(SYNC, b""), (0x181, word.to_bytes(tpdo.length, "little"))])
+        assert [
+            sample.motor_position_rad[0],
+            sample.motor_torque_nm[0],
+            sample.motor_velocity_rad_s[0],
+            sample.link_position_rad,
+        ] == [truth[signal] for signal in signals]
 
 
 def test_a_layout_that_cannot_make_a_sample_is_refused_in_a_line() -> None:
@@ -426,3 +429,51 @@ class TestSyncClock:
         clock = SyncClock(0.001)
         read = [k if k < 10 else max(k, 40) for k in range(60)]
         assert {clock.jump(k * MS, at * MS) for k, at in enumerate(read)} == {1}
+
+    @pytest.mark.parametrize("rate", [1.0, 1.008, 0.992])
+    def test_jitter_of_half_a_period_is_no_gap_and_no_second_master(self, rate: float) -> None:
+        rng = random.Random(11)
+        clock = SyncClock(0.001)
+        jumps = [clock.jump(round((100 + k * rate + rng.uniform(-0.5, 0.5)) * MS)) for k in range(20_000)]
+        assert sum(jump != 1 for jump in jumps) < 0.01 * len(jumps)  # a third of them by the nearest period
+
+    def test_a_sync_taken_for_lost_that_comes_after_all_is_late(self) -> None:
+        clock = SyncClock(0.001)
+        assert [clock.jump(t * MS // 10) for t in (0, 10, 20, 38, 41, 50, 60)] == [1, 1, 1, 2, LATE, 1, 1]
+
+    def test_the_answers_to_a_late_sync_are_of_no_sample_and_spoil_none(self) -> None:
+        assembler = Assembler(VSA, 2)
+        frames = [(SYNC, b""), *vsa_cycle(1)]
+        assert len(run(assembler, frames)) == 1
+        for jump, samples in ((2, 1), (LATE, 0), (1, 1), (1, 1)):
+            found = [assembler.feed(SYNC, b"", jump), *(assembler.feed(*frame) for frame in vsa_cycle(2))]
+            assert sum(sample is not None for sample in found) == samples
+            assert assembler.flags == 0
+        assert assembler.sequence == 4
+
+
+class TestMeasuredPeriod:
+    @pytest.mark.parametrize("factor", [1.02, 1.04, 1.25, 1.5, 2.0, 3.0, 0.5])
+    @pytest.mark.parametrize("jitter", [0.0, 0.05, 0.5])
+    def test_a_period_that_is_not_the_expected_one_is_found(self, factor: float, jitter: float) -> None:
+        for seed in range(20):
+            rng = random.Random(seed)
+            stamps = [round((k + rng.uniform(-jitter, jitter)) * factor * MS) for k in range(256)]
+            found = measure_period(stamps, 0.001)
+            assert found is not None and not found.same
+            assert found.period_s == pytest.approx(factor * 1e-3, rel=0.005)
+
+    @pytest.mark.parametrize("lost", [0.0, 0.03, 0.1])
+    def test_jitter_lost_syncs_and_stalls_are_no_other_period(self, lost: float) -> None:
+        for seed in range(20):
+            rng = random.Random(seed)
+            stamps = [
+                round((k + rng.uniform(0, 0.2) + (3.0 if 40 <= k < 43 else 0.0)) * MS)
+                for k in range(300)
+                if rng.random() >= lost
+            ]
+            assert measure_period(sorted(stamps)[:64], 0.001) == (0.001, True)
+
+    def test_too_few_stamps_tell_nothing(self) -> None:
+        assert measure_period([k * MS for k in range(7)], 0.001) is None
+        assert measure_period([5] * 100, 0.001) is None

@@ -13,11 +13,12 @@ from zenohkit import free_endpoint, make_estimate, make_joint, ready, script, un
 
 import drivelink
 from drivelink.errors import ZenohError
+from drivelink.jointfile import parse
 from drivelink.pubsub import wire
 from drivelink.pubsub.feed import Arrivals
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_client, open_session
-from estimator.sample import Status
+from estimator.sample import Estimate, Status, TransmissionEstimate
 
 STALE_S = 0.3  # generous, so that a busy machine does not make things stale in between
 
@@ -69,6 +70,36 @@ def test_the_latest_value_comes_without_waiting(publisher, joint):
     assert joint.observable
     assert not joint.stale
     assert joint.state == "live"
+
+
+@pytest.mark.parametrize("bit", ["MODEL_ALARM", "DRIVE_FAULT", "UNTIMED", "RESTARTED", "NODE_RESTARTED"])
+def test_an_estimate_that_its_status_speaks_against_is_not_usable(publisher, joint, bit):
+    good = Status.VALID | Status.OBSERVABLE
+    publish(publisher, 1, status=good)
+    until(lambda: joint.received == 1)
+    assert joint.usable and joint.valid
+    publish(publisher, 2, status=good | Status[bit])
+    until(lambda: joint.received == 2)
+    assert joint.valid and not joint.usable
+    publish(publisher, 3, status=Status.OBSERVABLE)
+    until(lambda: joint.received == 3)
+    assert not joint.usable
+
+
+def test_a_rigid_joint_says_that_its_stiffness_is_not_given(endpoint):
+    """Valid for its torque: without the bit a client refuses NaN that is called valid."""
+    text = f'name = "elbow"\n[[motor]]\ninertia_kg_m2 = 0.125\n[motor.transmission]\nmodel = "none"\n[zenoh]\nendpoint = "{endpoint}"'
+    session = open_session(parse(text).zenoh, Path())
+    try:
+        publisher = JointPublisher(session, parse(text))
+        with drivelink.subscribe("elbow", endpoint=endpoint) as joint:
+            connected(joint)
+            nan = math.nan
+            rigid = Estimate(1, int(Status.VALID), 2.0, nan, nan, (TransmissionEstimate(2.0, nan, nan, nan),))
+            until(lambda: publisher.put_estimate(rigid, time.time_ns()) or joint.valid)
+            assert joint.latest().status & Status.PARTIAL and math.isnan(joint.latest().stiffness_nm_rad)
+    finally:
+        close_session(session)
 
 
 def test_waiting_gives_the_next_cycle_once(publisher, joint):

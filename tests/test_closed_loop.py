@@ -19,6 +19,7 @@ import pytest
 
 from drivelink import cli, jointfile
 from drivelink.cycle.lockstep import run_lockstep
+from drivelink.cycle.loop import ObjectSink
 from drivelink.jointfile import JointFile
 from drivelink.simulate import network_from_joint, open_sim_bus, world_from_joint
 from estimator.sample import Estimate, FloatArray, Sample, Status
@@ -61,7 +62,7 @@ START_S = 1_700_000_000
 CALIBRATION, SUSPECT, CHECK = 1, 2, 3  # three motions: what is judged live is not what was recorded
 
 
-class Live:
+class Live(ObjectSink):
     """A sink that watches from outside, with a watch that only measures."""
 
     def __init__(self, joint: JointFile) -> None:

@@ -6,13 +6,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from daemonkit import Collector, Listener, Rig, rig, running, served, vsa, vsa_text
 from zenohkit import free_endpoint, until
 
+from drivelink._core import SYNC_COB_ID
 from drivelink.canopen.guard import check_frame
-from drivelink.cycle.acquisition import SYNC_COB_ID
 from drivelink.cycle.chain import make_chain
 from drivelink.cycle.joining import join_bus
 from drivelink.cycle.lockstep import run_lockstep
@@ -307,7 +308,34 @@ def test_a_joint_file_with_an_error_leaves_the_model_as_it_is(tmp_path: Path) ->
     made.close()
 
 
-def test_the_raw_frames_of_a_run_give_its_estimates_back_bit_for_bit() -> None:
+def test_a_flood_of_reloads_begins_one_in_a_while_and_forgets_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 1000.0
+    begun: list[float] = []
+    clock = SimpleNamespace(monotonic=lambda: now_s, sleep=time.sleep)
+    made = reloadable(tmp_path)
+    monkeypatch.setattr(reload, "time", clock)
+    (reloader,) = made.daemon._reloaders
+    monkeypatch.setattr(
+        reloader, "_prepare", lambda: begun.append(now_s) or setattr(reloader, "_thread", None)
+    )
+    for k in range(300):  # 30 a second, for ten seconds
+        now_s = 1000.0 + k / 30
+        reloader.request()
+        reloader.check()
+        while reloader._thread is not None:
+            pass
+    assert 9 <= len(begun) <= 11
+    now_s += 10.0
+    reloader.check()  # the last request is still there
+    while reloader._thread is not None:
+        pass
+    assert begun[-1] == now_s
+    made.close()
+
+
+def test_the_raw_frames_of_a_run_give_the_published_bytes_back_bit_for_bit() -> None:
     joint = vsa()
     with rig(joint) as made:
         listener = Listener(joint)
@@ -317,9 +345,14 @@ def test_the_raw_frames_of_a_run_give_its_estimates_back_bit_for_bit() -> None:
         made.faults.at(1200, lambda: made.faults.reboot(made.node(1)))
         made.run(3000)
         chain = make_chain(joint, layouts)
-        again = [e for frame in listener.frames() if (e := chain.feed(*frame)) is not None]
-        assert len(again) == len(made.collector.estimates)
-        assert repr(again) == repr([estimate for estimate, _ in made.collector.estimates])
+        again, stamp_ns = [], made.collector.estimates[0][1] - MS
+        for cob_id, data in listener.frames():
+            stamp_ns += MS * (cob_id == SYNC_COB_ID)
+            tick = chain.feed(cob_id, data, 1, stamp_ns)
+            if tick is not None:
+                again.append((tick.estimate_payload, tick.sample_payload))
+        assert len(again) == 3000
+        assert again == made.collector.payloads
         listener.close()
 
 
@@ -334,6 +367,7 @@ def test_lockstep_is_the_same_cycle_without_the_daemon_around_it() -> None:
     bus.shutdown()
 
 
+MS = 1_000_000
 SINGLE = """
 name = "wrist"
 [[motor]]
@@ -405,7 +439,8 @@ def test_an_exception_in_one_joint_takes_that_one_to_a_fault_and_the_others_go_o
     with two_joints() as made:
         made.run_lockstep(100)
         elbow, wrist = made.loop.lanes
-        sound, wrist.chain.estimator = wrist.chain.estimator, Broken()
+        sound = wrist.chain.estimator
+        wrist.chain.exchange(Broken(), None)
         collector = wrist.sink = Collector()
         made.run_lockstep(200)
         first, second = made.documents()
@@ -415,7 +450,7 @@ def test_an_exception_in_one_joint_takes_that_one_to_a_fault_and_the_others_go_o
         assert len(collector.estimates) == 199  # one for each cycle after that of the exception
         assert [e.sequence for e, _ in collector.estimates] == list(range(100, 299))
         assert all(e.status & Status.STALE and not e.status & Status.VALID for e, _ in collector.estimates)
-        wrist.chain.estimator = sound  # as a joint file written again does it
+        wrist.chain.exchange(sound, None)  # as a joint file written again does it
         made.run_lockstep(100)
         assert made.documents()[1]["state"] == "running"
         assert elbow.estimates == 400
@@ -423,7 +458,7 @@ def test_an_exception_in_one_joint_takes_that_one_to_a_fault_and_the_others_go_o
 
 def test_an_exception_in_publishing_or_beside_the_cycle_is_said_and_the_loop_goes_on() -> None:
     class Full:
-        def put_estimate(self, _estimate: object, _stamp_ns: int) -> None:
+        def put(self, _tick: object) -> None:
             raise RuntimeError("no session")
 
     def task() -> None:

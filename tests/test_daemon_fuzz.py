@@ -6,7 +6,7 @@ import pytest
 from canlayouts import LINK_RAD, TORQUE_NM, VSA, link, vsa_cycle
 from daemonkit import rig
 
-from drivelink.cycle.acquisition import Assembler
+from drivelink._core import Assembler
 from drivelink.cycle.framesource import Frame
 from estimator.sample import Status
 

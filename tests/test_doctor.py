@@ -342,7 +342,8 @@ def sync(period_s, jitter_s=0.0, count=500):
     ("stamps", "bus", "severity", "expected"),
     [
         (sync(0.001), {"sync": "follow"}, Severity.OK, "every 1.000 ms"),
-        (sync(0.002), {"sync": "follow"}, Severity.ERROR, "the joint file says 1 ms"),
+        (sync(0.002), {"sync": "follow", "period_s": 0.001}, Severity.ERROR, "the joint file says 1 ms"),
+        (sync(0.002), {"sync": "follow"}, Severity.OK, "every 2.000 ms"),
         ([], {"sync": "follow"}, Severity.ERROR, "nobody makes SYNC"),
         ([], {}, Severity.OK, "drivelink run will"),
         (sync(0.001), {}, Severity.WARNING, "another master makes it"),

@@ -1,7 +1,9 @@
 """Another master's SYNC: its counter jumps, it is left out, comes twice, and clocks are set; nothing shifts."""
 
 import itertools
+import random
 import time
+from functools import partial
 
 import pytest
 from fuzzrun import FuzzRun
@@ -33,6 +35,18 @@ class Follower:
             self.run.bus.sync(self.stamp_ns, bytes([self.counter]))
             self.run.loop.receive()
         self.run.supervisor.check()
+
+    def jittering(self, count: int, deviation, period_ns: float = PERIOD_NS) -> None:
+        """SYNCs that are off by so much, in periods, each from where it is due."""
+        start_ns = self.stamp_ns
+        for k in range(1, count + 1):
+            self.stamp_ns = round(start_ns + k * period_ns + deviation() * period_ns)
+            self.counter = self.counter % 10 + 1
+            self.run.bus.sync(self.stamp_ns, bytes([self.counter]))
+            self.run.loop.clock = partial(int, self.stamp_ns)
+            self.run.loop.receive()
+            if k % 50 == 0:
+                self.run.supervisor.check()
 
     @property
     def events(self) -> list[str]:
@@ -94,3 +108,60 @@ def test_a_second_masters_sync_spoils_its_cycle_only() -> None:
     assert [sequence for sequence, _, _ in follower.found][-90:] == list(range(110, 200))
     assert follower.run.loop.foreign_syncs == 1
     assert not follower.found[-1][1] & Status.BUS_FAULT
+
+
+@pytest.mark.parametrize("most", [0.1, 0.25, 0.4, 0.5])
+def test_one_master_that_jitters_by_up_to_half_a_period_is_one_master(
+    most: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    follower, draw = Follower(), random.Random(7)
+    monkeypatch.setattr(time, "monotonic_ns", lambda: follower.stamp_ns)
+    follower.jittering(100, lambda: 0.0)
+    follower.jittering(5000, lambda: draw.uniform(-most, most))
+    assert follower.run.loop.foreign_syncs <= 1
+    assert not any("master" in text for text in follower.events)
+    taught = [status for _, status, _ in follower.found if not status & Status.UNTIMED]
+    assert len(taught) > 0.97 * 5100
+    numbered = [b[0] - a[0] for a, b in itertools.pairwise(follower.found)]
+    assert sum(step != 1 for step in numbered) <= 0.01 * len(numbered)
+    assert follower.found[-1][0] == pytest.approx(5099, abs=1)  # the numbers keep to time
+
+
+def test_a_master_that_stalls_and_catches_up_in_a_burst_is_no_second_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    follower = Follower()
+    monkeypatch.setattr(time, "monotonic_ns", lambda: follower.stamp_ns)
+    late = itertools.chain.from_iterable(
+        itertools.repeat([0.0] * 488 + [max(0.0, 12 - k * 0.95) for k in range(12)])
+    )
+    follower.jittering(5000, lambda: next(late))
+    assert follower.run.loop.foreign_syncs == 0
+    assert follower.run.loop.late_syncs >= 90
+    assert not any("master" in text for text in follower.events)
+    assert not any(status & Status.UNTIMED for _, status, _ in follower.found)
+    assert all(len(ticks) == 1 for _, _, ticks in follower.found)  # never two SYNCs in one sample
+
+
+def test_a_second_master_is_named_when_following_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    follower = Follower()
+    monkeypatch.setattr(time, "monotonic_ns", lambda: follower.stamp_ns)
+    follower.jittering(200, lambda: 0.0)
+    for _ in range(100):
+        follower.jittering(1, lambda: 0.0)
+        follower.run.bus.sync(follower.stamp_ns + PERIOD_NS // 3)
+        follower.run.loop.receive()
+    follower.run.supervisor.check()
+    assert any(text.startswith("a second master makes SYNC too") for text in follower.events)
+
+
+def test_a_master_that_changes_its_period_is_named_with_both(monkeypatch: pytest.MonkeyPatch) -> None:
+    follower = Follower()
+    monkeypatch.setattr(time, "monotonic_ns", lambda: follower.stamp_ns)
+    follower.jittering(1500, lambda: 0.0)
+    assert follower.run.supervisor.sync_period_s == 0.001
+    follower.jittering(2500, lambda: 0.0, 1.5 * PERIOD_NS)
+    text = "SYNC comes every 1.5 ms now, 1 ms is in use"
+    assert any(active.startswith(text) for active in follower.run.events.active.values())
+    follower.jittering(2500, lambda: 0.0)
+    assert "SYNC comes every 1 ms again" in follower.events

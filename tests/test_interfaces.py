@@ -14,8 +14,8 @@ import pytest
 from daemonkit import running, vsa
 from zenohkit import until
 
+from drivelink._core import Chain
 from drivelink.canopen.bus import open_bus
-from drivelink.cycle.chain import Chain
 from drivelink.cycle.framesource import BusLostError
 from drivelink.cycle.sources import open_source
 from drivelink.daemon.service import Daemon, ServedJoint

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import socket
 import threading
 import urllib.error
 import urllib.request
@@ -19,11 +20,11 @@ from rich.console import Console
 
 from drivelink import cli
 from drivelink.monitor.braille import DotPlot, number, sparkline
-from drivelink.monitor.history import GrowingCurve, History
-from drivelink.monitor.statuslines import status_lines, status_text
+from drivelink.monitor.history import GrowingCurve, History, usual_range
+from drivelink.monitor.statuslines import shape, status_lines, status_text
 from drivelink.monitor.view import JointView, joints_table
 from drivelink.monitor.watcher import Watcher
-from drivelink.monitor.web import WebView, snapshot
+from drivelink.monitor.web import MAX_CONNECTIONS, WebView, snapshot
 from drivelink.pubsub.session import close_session, open_client
 from estimator.sample import Estimate, Status, TransmissionEstimate
 
@@ -287,3 +288,113 @@ def test_a_port_that_is_taken_is_one_line(web: WebView, capsys: pytest.CaptureFi
     assert cli.main(["monitor", "--web", "--port", port, "--endpoint", zenohkit.free_endpoint()]) == 2
     err = capsys.readouterr().err
     assert "cannot be served" in err and err.count("\n") == 1
+
+
+def test_the_page_serves_so_many_connections_and_leaves_those_that_say_nothing(
+    web: WebView, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("drivelink.monitor.web._Handler.timeout", 0.5)
+    address = ("127.0.0.1", int(web.url.rsplit(":", 1)[1].strip("/")))
+    idle = [socket.create_connection(address, timeout=10) for _ in range(MAX_CONNECTIONS)]
+    with socket.create_connection(address, timeout=10) as refused:
+        assert zenohkit.until(lambda: refused.recv(100)).startswith(b"HTTP/1.1 503")
+    for connection in idle:
+        assert connection.recv(100) == b""  # closed, having said nothing
+        connection.close()
+    zenohkit.until(lambda: get(web.url)[0] == 200)
+
+
+def test_a_daemon_that_is_gone_leaves_no_green_and_no_live_numbers() -> None:
+    view = filled()
+    view.gone, view.silent_s = True, 12.0
+    text = "\n".join(lines(view))
+    assert "daemon gone, last estimate 12 s ago" in text
+    assert "operational" not in text and "● valid" not in text
+    told = snapshot(view, False, {})
+    assert not told["live"] and told["estimate"]["flags"] == [(view.state, "bold red")]
+    assert "daemon gone" in view.line() and "observable" not in view.line()
+
+
+def test_a_silent_daemon_is_not_shown_as_live() -> None:
+    view = filled()
+    view.silent_s = 3.0
+    assert not view.live and "no estimates, last estimate 3 s ago" in "\n".join(lines(view))
+
+
+def test_what_is_not_valid_is_a_gap_in_every_curve() -> None:
+    history = History()
+    for k, status in enumerate([3] * 10 + [0] * 5 + [3] * 10):
+        history.add(estimate(k, 1, status=status), 0.05 * k)
+    view = JointView("elbow")
+    view.history = history
+    moments = snapshot(view, True, {})["moments"]
+    assert [moment[1] is None for moment in moments] == [False] * 10 + [True] * 5 + [False] * 10
+
+
+def test_one_wild_value_does_not_flatten_an_axis() -> None:
+    low, high = usual_range([math.sin(0.1 * k) for k in range(500)] + [1e6, math.nan, -1e9])
+    assert -3.0 < low < -0.9 and 0.9 < high < 3.0
+    curve = GrowingCurve()
+    for k in range(200):
+        curve.add(1e-3 * k, 100.0, 1.0)
+    curve.add(1e6, 100.0, 1.0)
+    for k in range(200):
+        curve.add(1e-3 * k, 100.0, 1.0)
+    assert len(curve.points()) > 40  # the wild place has not made the others coarse
+    assert usual_range([]) == pytest.approx((math.nan, math.nan), nan_ok=True)
+
+
+ALARM = STATUS | {
+    "transmissions": [{}],
+    "residual_alarm": {"active": True, "residual_nm": [0.09, 0.01], "floor_nm": [0.03, 0.02], "ratio": 3.0,
+                       "location": "transmission"},
+}  # fmt: skip
+IMPROVED = {"provenance": {"diagnosis": {"error_before_relative": 0.081, "error_after_relative": 0.012}}}
+
+
+def test_the_residual_is_a_gauge_against_its_baseline_before_and_after() -> None:
+    shown = shape(ALARM, IMPROVED)
+    assert [(b.name, round(b.ratio, 6)) for b in shown.balances] == [("motor", 3.0), ("link", 0.5)]
+    text = "\n".join(line.plain for line in status_lines(ALARM, 130, IMPROVED))
+    assert "motor ██████████ 3.0" in text and "link ██▌░░░░░░░ 0.50" in text  # half a bar is the baseline
+    assert "effects: 8.1 → 1.2 %" in text
+    view = filled()
+    view.status, view.model = ALARM, IMPROVED
+    assert view.history.residuals[-1][1] == pytest.approx(3.0)
+    told = snapshot(view, True, {})
+    assert told["status"]["balances"][0][3] == pytest.approx(3.0) and told["residuals"]
+    assert "residual 3.0" in view.line() and "8.1 % before its effects, 1.2 % after" in view.line()
+
+
+def test_every_view_says_what_to_do_on_a_model_alarm() -> None:
+    view = filled()
+    view.status = ALARM
+    told = snapshot(view, True, {})["status"]
+    assert "do not control on it; drivelink diagnose tells why" in "\n".join(lines(view, 80))
+    for text in (view.line(), "\n".join(lines(view, 240)), told["advice"]):
+        assert "likely at the transmission" in text and "drivelink diagnose" in text
+    view.status = STATUS
+    assert "diagnose" not in view.line() and not snapshot(view, True, {})["status"]["alarm"]
+
+
+def test_no_column_of_the_table_is_cut_off() -> None:
+    far = filled()
+    for k in range(10):
+        e = estimate(9000 + k)
+        view_of = e._replace(
+            stiffness_nm_rad=-1.23456e7, stiffness_std_nm_rad=9.87e6, flexibility_torque_nm=-1e-5
+        )
+        far.update(view_of, 100.0 + k)
+    for width in (60, 80, 100, 120, 160):
+        shown = lines(joints_table({"elbow": filled(), "wrist": filled(1), "far": far}, width), width)
+        assert all(len(line) <= width for line in shown)
+        assert not any("…" in line for line in shown), shown
+
+
+def test_the_legend_explains_every_line_and_fits() -> None:
+    view = filled()
+    view.help = True
+    shown = lines(view, 120, 40)
+    for part in ("stiffness", "95 %", "dotted", "residual", "baseline", "observable", "? back"):
+        assert any(part in line for line in shown), part
+    assert len(lines(view, 80, 24)) <= 24

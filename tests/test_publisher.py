@@ -3,6 +3,7 @@
 import json
 import math
 import signal
+import threading
 import time
 from pathlib import Path
 
@@ -90,13 +91,41 @@ def test_a_new_subscriber_gets_the_last_status_and_model_at_once(publisher, clie
         until(lambda s=subscriber, e=expected: e.encode() in received(s).payload.to_bytes())
 
 
-def test_model_status_and_schema_answer_queries_with_json(publisher, client, joint):
+@pytest.fixture
+def answering(publisher):
+    """Answers as the daemon's housekeeping does."""
+    over = threading.Event()
+
+    def answer():
+        while not over.wait(0.05):
+            publisher.answer()
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    yield
+    over.set()
+    thread.join()
+
+
+def test_a_flood_of_queries_waits_for_the_slack_and_most_of_it_is_dropped(publisher, client):
+    """Nothing is answered but by `answer`, which takes one query of each key."""
+    answers = [client.get("drivelink/elbow/model", timeout=5.0) for _ in range(500)]
+    time.sleep(0.3)  # for all of them to have come
+    for _ in range(20):
+        publisher.answer()
+    told = [reply for answer in answers for reply in answer if reply.ok]
+    assert 1 <= len(told) <= 20
+    assert json.loads(told[-1].ok.payload.to_bytes())["joint"] == "elbow"
+
+
+def test_model_status_and_schema_answer_queries_with_json(publisher, client, joint, answering):
     publisher.put_status({"state": "running"})
     assert ask(client, "drivelink/elbow/model") == json.loads(to_json(describe_model(joint)))
     assert ask(client, "drivelink/elbow/status") == {"state": "running"}
     assert ask(client, "drivelink/elbow/schema") == schema()
-    publisher.put_model({"changed": True})
-    assert ask(client, "drivelink/elbow/model") == {"changed": True}
+    changed = make_joint("elbow", joint.zenoh.endpoint, '[provenance]\nfitted = "2026-01-01"\n')
+    publisher.put_joint(changed)
+    assert ask(client, "drivelink/elbow/model")["provenance"] == {"fitted": "2026-01-01"}
 
 
 def test_the_model_says_its_effects_and_where_it_comes_from(endpoint):
@@ -138,7 +167,7 @@ def test_the_liveliness_token_comes_and_goes_with_the_publisher(publisher, clien
     until(lambda: not alive())
 
 
-def test_nothing_that_others_write_changes_what_the_daemon_says(publisher, client):
+def test_nothing_that_others_write_changes_what_the_daemon_says(publisher, client, answering):
     """No key is read: whoever writes into them changes neither the answers nor the daemon's own stream."""
     publisher.put_status({"state": "running"})
     before = {name: ask(client, f"drivelink/elbow/{name}") for name in ("status", "model", "schema")}

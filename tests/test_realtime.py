@@ -12,12 +12,11 @@ from pathlib import Path
 import pytest
 from canlayouts import VSA, vsa_cycle
 
+from drivelink._core import Assembler, Chain
 from drivelink.cycle import pacing, realtime
-from drivelink.cycle.acquisition import Assembler
-from drivelink.cycle.chain import Chain
 from drivelink.cycle.framesource import Frame
 from drivelink.cycle.housekeeping import Housekeeping
-from drivelink.cycle.loop import CycleLoop, Lane
+from drivelink.cycle.loop import CycleLoop, Lane, ObjectSink
 from drivelink.daemon.systemd_notify import notify, watchdog_period_s
 from estimator.sample import Estimate, Sample
 
@@ -100,7 +99,7 @@ class Last:
         return []
 
 
-class Stamps:
+class Stamps(ObjectSink):
     def __init__(self, stop_after: int) -> None:
         self.stop_after = stop_after
         self.seen: list[tuple[int, int]] = []

@@ -83,7 +83,7 @@ class Recorded:
     def replayed(self, suffix: str, frames: bool | None = None) -> list[Estimate]:
         path = self.folder / f"r{suffix}"
         playback = open_playback(path, self.joint, self.folder, frames=frames)
-        return [played.estimate for played in playback]
+        return [played.tick.estimate for played in playback]
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +138,7 @@ def test_what_begins_anew_or_is_not_learned_from_does_so_in_the_replay_of_sample
 def test_a_process_that_reads_ahead_reads_the_same(recorded: Recorded, suffix: str) -> None:
     path = recorded.folder / f"r{suffix}"
     playback = open_playback(path, recorded.joint, recorded.folder, frames=True, ahead=True)
-    assert [bits(one.estimate) for one in playback] == [bits(e) for e in recorded.live]
+    assert [bits(one.tick.estimate) for one in playback] == [bits(e) for e in recorded.live]
     assert not multiprocessing.active_children()
 
 
@@ -201,7 +201,7 @@ def test_frames_recorded_from_a_running_daemon_are_decoded_by_its_model_document
             sink.frame(BEGIN_NS + cycle * 1_000_000, message.arbitration_id, bytes(message.data))
         live = [sample for sample, _ in rig.collector.samples[skipped:]]
     sink.close()
-    played = [one.sample for one in open_playback(path, joint, tmp_path, frames=True)]
+    played = [one.tick.sample for one in open_playback(path, joint, tmp_path, frames=True)]
     assert len(live) == 100
     assert [repr(one[1:]) for one in played if one is not None] == [repr(one[1:]) for one in live]
 
@@ -336,7 +336,7 @@ def test_publish_sends_every_estimate_to_a_subscriber(tmp_path: Path) -> None:
             if estimate.sequence == 1999:
                 break
         assert subscription.status["state"] == "ended"
-    local = [p.estimate for p in open_playback(recording, joint, tmp_path)]
+    local = [p.tick.estimate for p in open_playback(recording, joint, tmp_path)]
     by_sequence = {e.sequence: bits(e) for e in local}
     # The replay begins when the subscriber is there: nothing is missing.
     received = [bits(Estimate(e.sequence, e.status, *e[3:])) for e in got]

@@ -110,6 +110,47 @@ def test_nobody_else_gets_in(configure, serve, kind, changes):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("kind", ["tls", "mtls"])
+def test_the_controllers_certificate_cannot_play_the_daemon(configure, serve, kind):
+    """The authority is the right one; the certificate may not serve, and is not good for the host's name."""
+    certificate = [("daemon.pem", "controller.pem"), ("daemon.key", "controller.key")]
+    _, publisher = serve(configure(f"daemon-{kind}.json5", *certificate))
+    config = configure(f"controller-{kind}.json5", ("timeout_ms: 5000", "timeout_ms: 500"))
+    with pytest.raises(ZenohError), drivelink.subscribe("elbow", config=config) as joint:
+        for sequence in range(1, 50):
+            publisher.put_estimate(make_estimate(sequence), time.time_ns())
+            time.sleep(0.01)
+        assert not joint.received and joint.status is None and joint.model is None
+        raise ZenohError("refused")
+
+
+@pytest.mark.parametrize("pinned", [True, False])
+def test_another_server_of_the_plant_cannot_play_the_daemon(configure, serve, certificates, pinned):
+    """Its certificate is of the same authority, may serve, and is good for the same host: only its name differs."""
+    shell = (EXAMPLES / "certificates.sh").read_text(encoding="utf-8")
+    body = shell[shell.index("new=") : shell.index("openssl req -x509")] + shell[shell.index("issue() {") :]
+    body = body[: body.index("issue daemon")] + "issue other serverAuth DNS:other,DNS:localhost"
+    subprocess.run(["sh", "-euc", body], cwd=certificates, check=True, capture_output=True)
+    certificate = [("daemon.pem", "other.pem"), ("daemon.key", "other.key")]
+    _, publisher = serve(configure("daemon-mtls.json5", *certificate))
+    change = () if pinned else (("enabled: true,\n    default", "enabled: false,\n    default"),)
+    with drivelink.subscribe("elbow", config=configure("controller-mtls.json5", *change)) as joint:
+        if not pinned:  # so the test would see it
+            put_until(publisher, lambda: joint.received)
+            return
+        for sequence in range(1, 100):
+            publisher.put_estimate(make_estimate(sequence), time.time_ns())
+            time.sleep(0.01)
+        assert not joint.received and joint.state == "waiting" and joint.status is None
+
+
+def test_the_keys_are_readable_by_their_owner_only(certificates):
+    assert all(
+        (certificates / name).stat().st_mode & 0o077 == 0
+        for name in ("ca.key", "daemon.key", "controller.key")
+    )
+
+
 @pytest.mark.parametrize("controlled", [True, False])
 def test_a_controller_can_subscribe_but_not_publish_into_the_daemons_keys(configure, serve, controlled):
     """With access control nothing gets in; without, it does: so the test would see it."""
@@ -120,7 +161,14 @@ def test_a_controller_can_subscribe_but_not_publish_into_the_daemons_keys(config
     )
     with (
         drivelink.subscribe("elbow", config=configure("controller-mtls.json5")) as joint,
-        zenoh.open(zenoh.Config.from_file(configure("controller-mtls.json5"))) as intruder,
+        # an intruder with a controller's certificate keeps to no rules of its own
+        zenoh.open(
+            zenoh.Config.from_file(
+                configure(
+                    "controller-mtls.json5", ("enabled: true,\n    default", "enabled: false,\n    default")
+                )
+            )
+        ) as intruder,
     ):
         put_until(publisher, lambda: joint.valid)
         forged = wire.encode_estimate(make_estimate(999_999), 0)

@@ -14,8 +14,8 @@ import os
 import sys
 from typing import Protocol
 
-from drivelink import __version__
 from drivelink.errors import DrivelinkError, UsageError
+from drivelink.version import __version__
 from estimator.errors import EstimatorError
 
 __all__ = ["ALONE", "VERBS", "add_map", "main", "make_parser"]
@@ -31,6 +31,7 @@ VERBS = {
     "diagnose": "trace what the model leaves unexplained to a physical effect, and add it",
     "fleet": "fit and diagnose many recordings of many joints, here or on a cluster; a table, trends, a page",
     "doctor": "what keeps this machine, bus or drive from doing the job, and the fix",
+    "service": "run the daemon of a joint as a systemd service, from boot on",
     "new": "write a commented joint file, from a few questions or from what is on the bus",
     "completion": "what a shell needs to complete verbs, options and files",
 }

@@ -110,6 +110,7 @@ class Watch:
         self.received = 0
         self.summary: Summary | None = None
         self._view = JointView(joint.name, subtitle="simulated, on the virtual bus")
+        self._view.footer = "Ctrl-C ends"
         self._console = console
         self._live = live
         self._period_s = joint.bus.period_s

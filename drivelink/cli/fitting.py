@@ -15,12 +15,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from drivelink import __version__, jointfile, plots, recording
+from drivelink import jointfile, plots, recording
 from drivelink.errors import RecordingError, UsageError
 from drivelink.floor import floor_entry
 from drivelink.jointfile import JointFile, JointText
 from drivelink.outfile import check_target, write_whole
 from drivelink.recording.columnmap import parse_column_map
+from drivelink.version import __version__
 from estimator.batch import TransmissionFit, fit
 from estimator.diagnosis import calibrate
 from estimator.errors import EstimatorError
@@ -145,6 +146,11 @@ def _remarks(one: TransmissionFit) -> list[str]:
     remarks = []
     if not one.excited:
         remarks.append("the motion hardly tells the stiffness: record one with more deflection")
+    if not one.stiffens:
+        remarks.append(
+            "the stiffness is not above zero, or its interval is not: no spring is like that. "
+            "Check the signs of position and torque, and the inertia"
+        )
     if abs(one.link_delay_s) > 0.0:
         remarks.append(f"link encoder aligned: it was {1e3 * one.link_delay_s:.3f} ms late")
     std = one.nuisance_std
@@ -185,6 +191,12 @@ def _write(args: argparse.Namespace, source: JointText, fits: list[TransmissionF
     if weak:
         raise RecordingError(
             f"{args.recording}: --write: expected a motion that tells the stiffness of motor {weak[0]}"
+        )
+    unusable = [number for number, one in enumerate(fits, start=1) if one.model != RIGID and not one.stiffens]
+    if unusable:
+        raise RecordingError(
+            f"{args.recording}: --write: expected a stiffness above zero, interval included, over all "
+            f"deflections of the recording; that of motor {unusable[0]} is not"
         )
     model = calibrate(record, _fitted(source.joint, fits))
     motors: list[dict[str, Any]] = []

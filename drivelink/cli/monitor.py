@@ -13,6 +13,8 @@ from rich.text import Text
 
 from drivelink import jointfile
 from drivelink.errors import UsageError
+from drivelink.monitor.keys import Keys
+from drivelink.monitor.statuslines import shape
 from drivelink.monitor.view import joints_table
 from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.web import WebView
@@ -83,30 +85,43 @@ def _where(args: argparse.Namespace) -> tuple[str | None, str, Path | None, str]
 
 
 def _show(watcher: Watcher, end: float, where: str) -> None:
-    """The view in the terminal, until the end or Ctrl-C."""
+    """The view in the terminal, until the end, `q` or Ctrl-C; `?` shows what the lines mean."""
     console = Console()
     begin = time.monotonic()
-    with Live(console=console, screen=True, auto_refresh=False, transient=True) as live:
+    helping = False
+    with Keys() as keys, Live(console=console, screen=True, auto_refresh=False, transient=True) as live:
         while time.monotonic() < end:
             frame_end = time.monotonic() + _FRAME_S
             while (left := frame_end - time.monotonic()) > 0:
                 watcher.poll()
-                time.sleep(min(_POLL_S, left))
-            live.update(_picture(watcher, console, where, time.monotonic() - begin), refresh=True)
+                for key in keys.pressed():
+                    if key in "qQ":
+                        return
+                    helping = helping != (key in "?hH")
+                time.sleep(max(0.0, min(_POLL_S, left)))
+            live.update(_picture(watcher, console, where, time.monotonic() - begin, helping), refresh=True)
 
 
-def _picture(watcher: Watcher, console: Console, where: str, waited_s: float) -> RenderableType:
+def _picture(
+    watcher: Watcher, console: Console, where: str, waited_s: float, helping: bool = False
+) -> RenderableType:
     views = watcher.views
     if not views or not any(view.history.latest for view in views.values()):
         hint = ""
         if waited_s > _HINT_S:
             hint = "\n\nIs a daemon running?   drivelink run JOINT   or   drivelink demo"
-        return Text(f"waiting for {where} …{hint}", style="dim")
-    if len(views) == 1:
-        return next(iter(views.values()))
-    table = joints_table(views, console.size.width)
-    footer = Text("drivelink monitor NAME shows one joint with its curves · Ctrl-C ends", style="dim")
-    return Group(table, Text(""), footer)
+        return Text(f"waiting for {where} …{hint}\n\nq ends", style="dim")
+    for view in views.values():
+        view.help, view.footer = helping, "? legend · q ends"
+    if len(views) == 1 or helping:
+        return next(view for _, view in sorted(views.items()))
+    alarms = [Text(f"{name}: {shape(view.status).advice}", style="bold red")
+              for name, view in sorted(views.items()) if view.live and shape(view.status).alarm]  # fmt: skip
+    footer = Text(
+        "± is half the 95 % interval · drivelink monitor NAME: one joint with its curves · ? legend · q ends"
+    )
+    footer.stylize("dim")
+    return Group(joints_table(views, console.size.width), Text(""), *alarms, footer)
 
 
 def _print(watcher: Watcher, end: float, every_s: float) -> None:

@@ -210,6 +210,8 @@ class _Teller:
         counts = [f"{n} {kind}s" for kind, n in self._recorder.sink.counts.items() if n] or ["nothing yet"]
         missed = self._missed()
         lost = f", {missed} cycles without sample" if missed else ""
+        refused = sum(tap.refused for tap in self._recorder.taps if isinstance(tap, ZenohTap))
+        lost += f", {refused} messages of others left out" if refused else ""
         lost += f", no samples: {why}" if (why := self._why()) else ""
         return f"{', '.join(counts)} in {time.monotonic() - self._begin:.0f} s{lost}"
 

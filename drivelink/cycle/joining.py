@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import can
 
+from drivelink._core import SYNC_COB_ID
 from drivelink.canopen.configure import Configurator, configure_joints
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.canopen.roles import roles
-from drivelink.cycle.acquisition import SYNC_COB_ID
 from drivelink.cycle.busport import BusPort
+from drivelink.cycle.syncclock import MEASURED_SYNCS, measure_period
 from drivelink.errors import BusError, DriveError
-from drivelink.jointfile import JointFile
+from drivelink.jointfile import BusSection, JointFile
 
 __all__ = ["Joined", "join_bus"]
 
 Joined = tuple[Configurator | PassiveConfigurator, tuple[tuple[NodeLayout, ...], ...]]
 Idle = Callable[[], object]
+
+logger = logging.getLogger(__name__)
 
 _PATIENCE_S = 5.0  # for another master's SYNC, and for the frames that answer it
 _LISTEN_S = 0.05  # for a SYNC that should not be there; at least three periods
@@ -37,6 +41,9 @@ def join_bus(
 ) -> Joined:
     """Get the layouts of all nodes, by configuring them or by listening.
 
+    Where another master makes SYNC its period is measured, and stands in the `bus` of the configurator that
+    is returned. Where the joint file says another one, that is said.
+
     Args:
         port: the bus, read by nobody else meanwhile.
         joints: joint files whose bus sections agree.
@@ -52,14 +59,16 @@ def join_bus(
     if section.configure:
         configurator, layouts = configure_joints(port, joints, folders, idle=idle)
         if section.sync == "follow":
-            _await(port, _Expected(section.channel, ()), idle, patience_s)
+            stamps = _await(port, _Expected(section.channel, ()), idle, patience_s)
+            configurator.bus = _timed(section, stamps)
         return configurator, layouts
     passive = PassiveConfigurator(joints, folders)
     if section.sync == "produce":
         _refuse_sync(port, section.period_s, section.channel, idle)
     _learn(port, passive, idle, patience_s)
     if section.sync == "follow":
-        _await(port, _Expected(section.channel, passive.layouts.values()), idle, patience_s, passive)
+        expected = _Expected(section.channel, passive.layouts.values())
+        passive.bus = _timed(section, _await(port, expected, idle, patience_s, passive))
     by_joint = tuple(
         tuple(passive.layouts[role.node_id] for role in roles(joint, folder))
         for joint, folder in zip(joints, folders, strict=True)
@@ -67,8 +76,27 @@ def join_bus(
     return passive, by_joint
 
 
-def _frames(port: BusPort, idle: Idle | None, seconds: float) -> Iterator[tuple[int, bytes]]:
-    """Data frames with 11-bit identifiers, for so long; and now and then (-1, b"") when nothing comes."""
+def _timed(section: BusSection, stamps_ns: Sequence[int]) -> BusSection:
+    """The bus section with the period that the master's SYNCs have."""
+    measured = measure_period(stamps_ns, section.period_s)
+    if measured is None or measured.same:
+        return section
+    stated = "period_s" in section.model_fields_set
+    logger.log(
+        logging.WARNING if stated else logging.INFO,
+        "%s: SYNC comes every %.4g ms%s",
+        section.channel,
+        measured.period_s * 1e3,
+        f", the joint file says {section.period_s * 1e3:g} ms: {measured.period_s * 1e3:.4g} ms is used; "
+        f"set bus.period_s = {measured.period_s:.4g}, or leave it out"
+        if stated
+        else "",
+    )
+    return section.model_copy(update={"period_s": measured.period_s})
+
+
+def _frames(port: BusPort, idle: Idle | None, seconds: float) -> Iterator[tuple[int, bytes, int]]:
+    """Data frames with 11-bit identifiers and their stamps in ns, for so long; -1 when nothing comes."""
     end_s = time.monotonic() + seconds
     while (left_s := end_s - time.monotonic()) > 0:
         if idle is not None:
@@ -78,13 +106,13 @@ def _frames(port: BusPort, idle: Idle | None, seconds: float) -> Iterator[tuple[
         except (can.CanError, OSError) as error:
             raise BusError(f"the bus cannot be read: {error}") from error
         if message is None:
-            yield -1, b""
+            yield -1, b"", 0
         elif not (message.is_extended_id or message.is_error_frame or message.is_remote_frame):
-            yield message.arbitration_id, bytes(message.data)
+            yield message.arbitration_id, bytes(message.data), int(message.timestamp * 1e9)
 
 
 def _refuse_sync(port: BusPort, period_s: float, channel: str, idle: Idle | None) -> None:
-    syncs = sum(cob_id == SYNC_COB_ID for cob_id, _ in _frames(port, idle, max(_LISTEN_S, 3 * period_s)))
+    syncs = sum(cob_id == SYNC_COB_ID for cob_id, *_ in _frames(port, idle, max(_LISTEN_S, 3 * period_s)))
     if syncs > 1:
         raise BusError(f'another master already makes SYNC on {channel}: set bus.sync = "follow", or stop it')
 
@@ -93,7 +121,7 @@ def _learn(port: BusPort, passive: PassiveConfigurator, idle: Idle | None, patie
     """Listen until the mapping of every node is known."""
     if not passive.busy:
         return
-    for cob_id, data in _frames(port, idle, patience_s):
+    for cob_id, data, _ in _frames(port, idle, patience_s):
         _overhear(passive, cob_id, data)
         if not passive.busy:
             return
@@ -103,7 +131,7 @@ def _learn(port: BusPort, passive: PassiveConfigurator, idle: Idle | None, patie
 def _overhear(passive: PassiveConfigurator, cob_id: int, data: bytes) -> bool:
     """Take a frame; whether the layout of a node has changed by it."""
     now_s = time.monotonic()
-    if cob_id > 0:
+    if cob_id >= 0:
         passive.feed(cob_id, data, now_s)
     return bool(passive.poll(now_s))
 
@@ -155,12 +183,21 @@ def _await(
     idle: Idle | None,
     patience_s: float,
     passive: PassiveConfigurator | None = None,
-) -> None:
-    """Listen until everything expected has been heard; a mapping that changes meanwhile is learnt."""
-    for cob_id, data in _frames(port, idle, patience_s):
+) -> list[int]:
+    """Listen until everything expected has been heard; a mapping that changes meanwhile is learnt.
+
+    Returns:
+        Stamps of the SYNCs, enough of them to tell their period where they come often enough.
+    """
+    stamps: list[int] = []
+    for cob_id, data, stamp_ns in _frames(port, idle, patience_s):
         if passive is not None and _overhear(passive, cob_id, data):
             expected = _Expected(expected.channel, passive.layouts.values(), expected.synced)
         expected.take(cob_id, data)
-        if expected.met:
-            return
-    raise expected.failure(patience_s)
+        if cob_id == SYNC_COB_ID:
+            stamps.append(stamp_ns)
+        if expected.met and len(stamps) >= MEASURED_SYNCS:
+            return stamps
+    if not expected.met:
+        raise expected.failure(patience_s)
+    return stamps

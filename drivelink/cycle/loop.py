@@ -8,19 +8,20 @@ from __future__ import annotations
 
 import logging
 import time
+from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Protocol
 
-from drivelink.cycle.acquisition import SYNC_COB_ID
-from drivelink.cycle.chain import Chain
+from drivelink._core import SYNC_COB_ID, Chain, Tick
 from drivelink.cycle.framesource import BusLostError, Frame, FrameSource, LostSource
 from drivelink.cycle.housekeeping import Housekeeping
 from drivelink.cycle.meter import Meter
-from drivelink.cycle.syncclock import SyncClock
+from drivelink.cycle.syncclock import LATE, MEASURED_SYNCS, SyncClock
 from estimator.sample import Estimate, Sample
 
-__all__ = ["CycleLoop", "Lane", "Sink"]
+__all__ = ["CycleLoop", "Lane", "ObjectSink", "Sink"]
 
 logger = logging.getLogger(__name__)
 
@@ -32,11 +33,27 @@ _CLOCK_STEP_NS = 20_000_000  # NTP slews by less between two looks; more than th
 class Sink(Protocol):
     """Where estimates and samples go."""
 
-    def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
-        """Publish an estimate."""
+    def put(self, tick: Tick) -> None:
+        """Publish a cycle: its estimate first, then its sample where it has one."""
 
+
+class ObjectSink(ABC):
+    """A sink that takes Python objects instead of the bytes for zenoh."""
+
+    def put(self, tick: Tick) -> None:
+        """See Sink."""
+        self.put_estimate(tick.estimate, tick.stamp_ns)
+        sample = tick.sample
+        if sample is not None:
+            self.put_sample(sample, tick.stamp_ns)
+
+    @abstractmethod
+    def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
+        """Take an estimate and the UNIX time of its SYNC."""
+
+    @abstractmethod
     def put_sample(self, sample: Sample, stamp_ns: int) -> None:
-        """Publish a sample."""
+        """Take what it was made from."""
 
 
 class Lane:
@@ -101,6 +118,8 @@ class CycleLoop:
         cycles: SYNCs since the start.
         overruns: periods left out because this process was late.
         foreign_syncs: SYNCs of another master while we make it, or that were not due.
+        late_syncs: SYNCs of the master we follow that came when their period was over.
+        sync_stamps: of the last SYNCs, when following.
         counter_jumps: SYNCs whose counter did not follow the one before.
         clock_step_ns: by how much the system's clock was last set.
         clock_steps: how often that happened.
@@ -128,7 +147,8 @@ class CycleLoop:
         self.on_lost: Callable[[str], None] = lambda _reason: None
         self.on_fault: Callable[[str, Exception], None] = _log_fault
         self.housekeeping.on_fault = lambda error: self.on_fault("housekeeping", error)
-        self.cycles = self.overruns = self.foreign_syncs = self.counter_jumps = 0
+        self.cycles = self.overruns = self.foreign_syncs = self.late_syncs = self.counter_jumps = 0
+        self.sync_stamps: deque[int] = deque(maxlen=MEASURED_SYNCS)
         self.clock_step_ns = self.clock_steps = 0
         self.silent = False
         self.lateness = Meter()
@@ -140,7 +160,6 @@ class CycleLoop:
         self._lanes_of: dict[int, list[Lane]] = {}
         self.reroute()
         self.unix_ns = time.time_ns() - time.monotonic_ns()
-        self._stamp_ns = self._before_ns = 0
         self.sync_ns = self.received_ns = time.monotonic_ns()
         self.stopped = False
 
@@ -243,9 +262,9 @@ class CycleLoop:
                 self._foreign_sync(data, stamp_ns, now_ns)
                 continue
             for lane in lanes_of.get(cob_id, ()):
-                estimate = self._feed(lane, cob_id, data)
-                if estimate is not None:
-                    self._publish(lane, estimate, now_ns)
+                tick = self._feed(lane, cob_id, data)
+                if tick is not None:
+                    self._publish(lane, tick, now_ns)
                     lane.response.add(now_ns - self.sync_ns)
             if cob_id in listeners:
                 try:
@@ -258,9 +277,12 @@ class CycleLoop:
             self.foreign_syncs += 1
             self._sync(data, 0, 0, now_ns)
             return
+        self.sync_stamps.append(stamp_ns)
         jump = self._sync_clock.jump(stamp_ns, now_ns)
         if jump == 0:
             self.foreign_syncs += 1
+        elif jump == LATE:
+            self.late_syncs += 1
         else:
             self.lateness.add(abs(now_ns - self.sync_ns - jump * self.period_ns) if self.cycles else 0)
             self.sync_ns = now_ns
@@ -271,24 +293,23 @@ class CycleLoop:
         self._sync(data, stamp_ns, jump, now_ns)
 
     def _sync(self, data: bytes, stamp_ns: int, jump: int, now_ns: int) -> None:
-        if jump:
+        if jump > 0:
             self.cycles += 1
-            self._before_ns, self._stamp_ns = self._stamp_ns, stamp_ns
             self.silent = False
         for lane in self.lanes:
             if lane.fault:
-                estimate = self._carry_on_faulted(lane, jump)
+                tick = self._carry_on_faulted(lane, jump, stamp_ns)
             else:
-                estimate = self._feed(lane, SYNC_COB_ID, data, jump)
-            if estimate is not None:
-                self._publish(lane, estimate, now_ns)
+                tick = self._feed(lane, SYNC_COB_ID, data, jump, stamp_ns)
+            if tick is not None:
+                self._publish(lane, tick, now_ns)
         for follow in self.after_sync:
             follow()
 
-    def _feed(self, lane: Lane, cob_id: int, data: bytes, jump: int = 1) -> Estimate | None:
+    def _feed(self, lane: Lane, cob_id: int, data: bytes, jump: int = 1, stamp_ns: int = 0) -> Tick | None:
         """A frame for one joint; an exception ends its estimates, and nobody else's."""
         try:
-            return lane.chain.feed(cob_id, data, jump)
+            return lane.chain.feed(cob_id, data, jump, stamp_ns)
         except Exception as error:  # noqa: BLE001 - see above
             lane.fault = f"{type(error).__name__}: {error}"
             lane.broken = lane.chain.estimator
@@ -296,34 +317,28 @@ class CycleLoop:
             self.on_fault(lane.name, error)
             return None
 
-    def _carry_on_faulted(self, lane: Lane, jump: int) -> Estimate | None:
+    def _carry_on_faulted(self, lane: Lane, jump: int, stamp_ns: int) -> Tick | None:
         """What a joint in fault has to say at a SYNC: that its last estimate is not fresh."""
         chain = lane.chain
         if chain.estimator is not lane.broken:  # the joint file was mended
             lane.fault, lane.broken = "", None
             self.reroute()
-        if chain.estimate is None or not jump:
+        if chain.estimate is None or jump <= 0:
             return None
-        return chain.carry_on(chain.estimate.sequence + jump)
+        return chain.carry_on(chain.estimate.sequence + jump, stamp_ns=stamp_ns)
 
-    def _publish(self, lane: Lane, estimate: Estimate, since_ns: int) -> None:
-        chain, sink = lane.chain, lane.sink
-        current = estimate.sequence == chain.assembler.sequence
-        stamp_ns = self._stamp_ns if current or lane.fault else self._before_ns
-        sample = chain.sample
-        if sample is None:
-            lane.stale += 1
-        else:
-            lane.estimates += 1
-        if sink is not None:
+    def _publish(self, lane: Lane, tick: Tick, since_ns: int) -> None:
+        if lane.sink is not None:
             try:
-                sink.put_estimate(estimate, stamp_ns)
-                if sample is not None:
-                    sink.put_sample(sample, stamp_ns)
+                lane.sink.put(tick)
             except Exception as error:  # noqa: BLE001 - the other joints' go out all the same
                 self.on_fault(lane.name, error)
-        if current:
+        if tick.current:
             lane.work.add(time.monotonic_ns() - since_ns)
+        if tick.fresh:
+            lane.estimates += 1
+        else:
+            lane.stale += 1
 
     def wait(self, timeout_s: float) -> None:
         """Wait for frames and receive them; a bus that is lost ends the wait."""
@@ -341,6 +356,6 @@ class CycleLoop:
         """No SYNC for a while: say that what was last published is not fresh."""
         self.silent = True
         for lane in self.lanes:
-            estimate = lane.chain.carry_on(lane.chain.assembler.sequence)
-            if estimate is not None:
-                self._publish(lane, estimate, time.monotonic_ns())
+            tick = lane.chain.carry_on(lane.chain.assembler.sequence)
+            if tick is not None:
+                self._publish(lane, tick, time.monotonic_ns())

@@ -2,30 +2,119 @@
 
 from __future__ import annotations
 
-__all__ = ["SyncClock"]
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivelink._core import LATE
+
+FloatArray = NDArray[np.float64]
+
+__all__ = ["LATE", "MEASURED_SYNCS", "MeasuredPeriod", "SyncClock", "measure_period"]
+
+MEASURED_SYNCS = 64  # tell the period to 0.2 % where they jitter by half of it, to 0.01 % where by a fortieth
+_FEWEST = 8
+_SAME = 0.01  # two periods are the same: the inertia torque is then 2 % off, less than inertias are known to
+_JITTERY = 0.15  # median deviation of the steps, in periods
+_SIGMAS = 3.0
 
 _CLOCK_STEP_NS = 50_000_000  # stamps and receptions differ by less, unless one clock was set
+
+
+class MeasuredPeriod(NamedTuple):
+    """The period of a master.
+
+    Attributes:
+        period_s: that SYNC really has; the expected one, where the stamps cannot tell the two apart.
+        same: whether it is the expected one.
+    """
+
+    period_s: float
+    same: bool
+
+
+def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPeriod | None:
+    """The period of the SYNCs with these stamps, jitter and lost ones notwithstanding.
+
+    The slope of a straight line through the stamps over their numbers; as the round value that is within
+    three of its standard deviations.
+
+    Args:
+        stamps_ns: of SYNCs one after the other.
+        expected_s: what the joint file says, or would have said.
+
+    Returns:
+        None where there are fewer than eight stamps, or they stand still.
+    """
+    if len(stamps_ns) < _FEWEST:
+        return None
+    stamps = ((np.asarray(stamps_ns, dtype=np.int64) - stamps_ns[0]) * 1e-9).astype(np.float64)
+    gaps = np.diff(stamps)
+    period_s = float(np.median(gaps))
+    steps = gaps / expected_s
+    on_grid = float(np.median(np.abs(steps - np.rint(steps)))) < _JITTERY
+    if on_grid and period_s > 1.5 * expected_s and abs(float(np.quantile(steps, 0.1)) - 1) < 3 * _SAME:
+        period_s = expected_s  # most of its SYNCs are lost
+    if period_s <= 0:
+        return None
+    if float(np.median(np.abs(gaps - period_s))) > _JITTERY * period_s:
+        # A step of nearly two periods may be jitter alone: what is lost is seen where it is more.
+        lost = np.where(gaps > 2.2 * period_s, np.rint(gaps / period_s) - 1, 0)
+        slope, std = _slope(np.concatenate(([0.0], np.cumsum(1 + lost))), stamps)
+    else:
+        slope, std = period_s, period_s
+        for _ in range(2):  # each time numbered by a better period
+            clock = SyncClock(slope)
+            jumps = np.array([clock.jump(stamp_ns) for stamp_ns in stamps_ns])
+            if np.count_nonzero(jumps > 0) >= _FEWEST:
+                slope, std = _slope(np.cumsum(np.maximum(jumps, 0))[jumps > 0], stamps[jumps > 0])
+    tolerance = _SIGMAS * std
+    if abs(slope - expected_s) <= max(_SAME * expected_s, tolerance):
+        return MeasuredPeriod(expected_s, True)
+    rounded = (float(f"{slope:.{digits}g}") for digits in range(1, 6))
+    found = next((r for r in rounded if abs(r - slope) <= max(tolerance, 1e-3 * slope)), slope)
+    return MeasuredPeriod(found, False)
+
+
+def _slope(numbers: FloatArray, times_s: FloatArray) -> tuple[float, float]:
+    """Of a straight line through times over numbers, and its standard deviation."""
+    n, t = numbers - numbers.mean(), times_s - times_s.mean()
+    slope = float(n @ t / (n @ n))
+    return slope, float(np.sqrt(np.mean((t - slope * n) ** 2) / (n @ n)))
 
 
 class SyncClock:
     """How many periods lie between one SYNC and the next, from their stamps.
 
-    It follows the drift between the two clocks, so that a stamp is always compared with where this SYNC
-    was due, not with the jitter of the one before.
+    A phase-locked loop of second order: a stamp is compared with where this SYNC was due, on the average of
+    all before it, not with the jitter of the last one. It is quick at first and slow later, when jitter of
+    half a period must not move it. Rates within two per cent of the expected one are followed. A SYNC is
+    taken for the next one unless it is off by half a period, or by more where its master jitters more.
 
     Args:
         period_s: the communication cycle.
     """
 
-    _FOLLOW = 0.05  # of the deviation, per SYNC: a drift of 100 ppm stays below 0.2 % of a period
+    _SLOWEST = 0.01  # of the deviation, per SYNC: jitter of half a period then moves it by 2 % of a period
+    _OFF_RATE = 0.02
+    _SIGMAS = 2.2  # that a SYNC may be off; uniform jitter ends at 1.73, the rest is for the loop's own
+    _MOST_OFF = 0.8  # periods: what is off by a whole one is another SYNC
 
     def __init__(self, period_s: float) -> None:
-        self._period_ns = period_s * 1e9
+        self._expected_ns = self._period_ns = period_s * 1e9
         self._due_ns: float | None = None
         self._last = (0, 0)
+        self._count = 0
+        self._variance = 0.0  # of the deviations, periods squared
+        self._skipped = 0  # periods that the last SYNCs have left out: they may only be late
 
     def jump(self, stamp_ns: int, monotonic_ns: int | None = None) -> int:
         """Periods since the SYNC before: 1 is normal, more is a gap, 0 is a SYNC that was not due.
+
+        A SYNC that comes after its period was taken for lost is `LATE`: the master catches up, it is no
+        second one.
 
         Args:
             stamp_ns: when the SYNC was on the bus, by any clock, even one that is set from time to time.
@@ -42,10 +131,29 @@ class SyncClock:
                 self._due_ns += elapsed - seen
         self._last = (stamp_ns, monotonic_ns or 0)
         deviation = (stamp_ns - self._due_ns) / self._period_ns
-        periods = round(deviation)
-        if periods < 0:  # the clock was set back, and nothing tells by how much
+        off = deviation - 1.0
+        most_off = min(max(0.5, self._SIGMAS * self._variance**0.5), self._MOST_OFF)
+        if off < -1.5:  # the clock was set back, and nothing tells by how much
             self._due_ns = float(stamp_ns)
             return 1
-        if periods:
-            self._due_ns += (periods + self._FOLLOW * (deviation - periods)) * self._period_ns
+        if off < -most_off:
+            if not self._skipped:
+                return 0
+            self._skipped -= 1
+            return LATE
+        periods = 1 if off < most_off else max(2, round(deviation))
+        self._skipped = periods - 1
+        self._follow(deviation - periods, periods)
         return periods
+
+    def _follow(self, error: float, periods: int) -> None:
+        """The SYNC came so many periods after it was due."""
+        assert self._due_ns is not None
+        self._count += 1
+        phase = max(1.0 / (self._count + 1), self._SLOWEST)
+        rate = min(phase, 0.1) ** 2 / (2.0 - min(phase, 0.1))  # Benedict and Bordner, 1962
+        self._due_ns += (periods + phase * error) * self._period_ns
+        period = self._period_ns + rate * error / periods * self._period_ns
+        off = self._OFF_RATE * self._expected_ns
+        self._period_ns = min(max(period, self._expected_ns - off), self._expected_ns + off)
+        self._variance += max(phase, 0.02) * (error**2 - self._variance)

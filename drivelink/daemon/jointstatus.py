@@ -8,7 +8,6 @@ import time
 from collections.abc import Generator
 from typing import Any
 
-from drivelink import __version__
 from drivelink.canopen.emcy import emergency_text
 from drivelink.cycle.framesource import LostSource
 from drivelink.cycle.loop import CycleLoop, Lane
@@ -16,6 +15,7 @@ from drivelink.cycle.realtime import RealTime
 from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor
 from drivelink.jointfile import JointFile
+from drivelink.version import __version__
 from estimator.sample import Status
 
 __all__ = ["JointStatus"]
@@ -145,6 +145,8 @@ class JointStatus:
             "lost_sends": source.lost_sends,
             "errors": dict(source.errors),
             "foreign_syncs": self._loop.foreign_syncs,
+            "late_syncs": self._loop.late_syncs,
+            "sync_period_s": self._supervisor.sync_period_s,
             "sync_counter_jumps": self._loop.counter_jumps,
         }
 

@@ -9,13 +9,14 @@ steps in each slack than there are new samples: the exchange comes, however slow
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from drivelink.cycle.chain import Built, Chain
+from drivelink._core import Chain
+from drivelink.cycle.chain import Built
 from drivelink.daemon.status import EventLog
 from drivelink.errors import DrivelinkError
 from drivelink.jointfile import JointFile, load
@@ -24,6 +25,7 @@ from estimator.sample import Sample
 
 __all__ = ["Reloader"]
 
+_EVERY_S = 1.0  # between the beginnings of two reloads: a file or a signal that flaps costs little
 _STEPS = 5  # of the new estimator in one go; then the cycle gets its turn
 _PAUSE_S = 0.0005
 _BEHIND = 4  # samples that the cycle itself may catch up with at the exchange
@@ -55,12 +57,13 @@ class Reloader:
     ) -> None:
         self._path = path
         self._joint = joint
-        self._chain = chain
+        self._chain, self._history = chain, chain.history
         self._build = build
         self._publish = publish
         self._events = events
         self._seen = self._signature()
         self._requested = False
+        self._next_s = -math.inf
         self._thread: threading.Thread | None = None
         self._turn = threading.Lock()  # the new estimator is stepped by one thread at a time
         self._ready: tuple[JointFile, Built, int] | None = None
@@ -72,12 +75,13 @@ class Reloader:
 
     def check(self) -> None:
         """In the slack: begin to reload when the file has changed."""
-        if self._thread is not None:
+        if self._thread is not None or time.monotonic() < self._next_s:
             return
         signature = self._signature()
         if (signature == self._seen or signature is None) and not self._requested:
             return
         self._seen, self._requested, self._slacks = signature, False, 0
+        self._next_s = time.monotonic() + _EVERY_S
         self._thread = threading.Thread(target=self._prepare, name="reload", daemon=True)
         self._thread.start()
 
@@ -87,14 +91,13 @@ class Reloader:
             return
         try:
             joint, (estimator, watch), sequence = self._ready
-            unseen = _after(self._chain.history, sequence)
-            if len(unseen) > _BEHIND:
+            if self._history.behind(sequence) > _BEHIND:
                 self._slacks += 1
                 if self._slacks > _PATIENCE:
-                    self._lead(joint, (estimator, watch), unseen[:_AID])
+                    self._lead(joint, (estimator, watch), self._history.after(sequence, _AID))
                 return
             self._ready = self._thread = None
-            self._chain.exchange(estimator, watch, unseen)
+            self._chain.exchange(estimator, watch, self._history.after(sequence))
         finally:
             self._turn.release()
         self._joint = joint
@@ -127,7 +130,7 @@ class Reloader:
             with self._turn:
                 if self._thread is not mine or self._slacks > _PATIENCE:
                     return
-                sequence = self._lead(joint, built, _after(list(self._chain.history), sequence)[:_STEPS])
+                sequence = self._lead(joint, built, self._history.after(sequence, _STEPS))
             time.sleep(_PAUSE_S)
 
     def _lead(self, joint: JointFile, built: Built, samples: Sequence[Sample]) -> int:
@@ -153,14 +156,3 @@ class Reloader:
             )
         if joint.arrangement != self._joint.arrangement:
             raise DrivelinkError(f"arrangement: expected {self._joint.arrangement}, as it was at the start")
-
-
-def _after(history: Sequence[Sample] | deque[Sample], sequence: int) -> list[Sample]:
-    """The samples that came after one of that number."""
-    found: list[Sample] = []
-    for sample in reversed(history):
-        if sample.sequence <= sequence:
-            break
-        found.append(sample)
-    found.reverse()
-    return found

@@ -19,11 +19,12 @@ from typing import Any
 
 import zenoh
 
+from drivelink._core import Chain
 from drivelink.canopen.bus import open_bus
 from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle import pacing, realtime
 from drivelink.cycle.busport import BusPort
-from drivelink.cycle.chain import Chain, build, make_chain
+from drivelink.cycle.chain import build, make_chain
 from drivelink.cycle.joining import join_bus
 from drivelink.cycle.loop import CycleLoop, Lane
 from drivelink.cycle.sources import open_source
@@ -35,7 +36,7 @@ from drivelink.daemon.supervision import Supervisor
 from drivelink.daemon.systemd_notify import notify, watchdog_period_s
 from drivelink.errors import UsageError
 from drivelink.jointfile import JointFile
-from drivelink.pubsub.publisher import JointPublisher, describe_model
+from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_session
 
 __all__ = ["Daemon", "ServedJoint", "check_agreement"]
@@ -44,6 +45,7 @@ logger = logging.getLogger("drivelink")
 
 _STATUS_S = 0.25
 _CHECK_S = 0.05
+_ANSWER_S = 0.05
 _FILE_S = 0.2
 _COLLECT_S = 5.0
 _HISTORY_S = 2.0  # of samples that a new estimator starts from
@@ -112,9 +114,10 @@ class Daemon:
             self._configurator, layouts = join_bus(
                 self._port, [s.joint for s in joints], [s.folder for s in joints], idle=devices
             )
+            self._section = self._configurator.bus  # with the period that another master's SYNC really has
             keep = round(_HISTORY_S / self._section.period_s)
             self._lanes = [
-                Lane(served.joint.name, make_chain(served.joint, mine, keep=keep), publisher)
+                Lane(served.joint.name, make_chain(self._timed(served.joint), mine, keep=keep), publisher)
                 for served, mine, publisher in zip(joints, layouts, self._publishers, strict=True)
             ]
             self.loop = self._make_loop()
@@ -123,11 +126,11 @@ class Daemon:
             )
             load = self._configurator.load().fraction
             self._status = [
-                JointStatus(served.joint, self.loop, lane, self._supervisor, self.events, load)
+                JointStatus(self._timed(served.joint), self.loop, lane, self._supervisor, self.events, load)
                 for served, lane in zip(joints, self._lanes, strict=True)
             ]
             for served, mine, publisher in zip(joints, layouts, self._publishers, strict=True):
-                _republish(publisher, mine)(served.joint)
+                self._republish(publisher, mine)(served.joint)
             self._reloaders = self._make_reloaders(layouts)
             self._plan_housekeeping()
             self.loop.source.narrow(self.loop.receive_ids())
@@ -230,7 +233,14 @@ class Daemon:
 
     def _make_reloaders(self, layouts: Sequence[tuple[NodeLayout, ...]]) -> list[Reloader]:
         return [
-            Reloader(served.path, served.joint, lane.chain, build, _republish(publisher, mine), self.events)
+            Reloader(
+                served.path,
+                served.joint,
+                lane.chain,
+                lambda joint: build(self._timed(joint)),
+                self._republish(publisher, mine),
+                self.events,
+            )
             for served, lane, publisher, mine in zip(
                 self._joints, self._lanes, self._publishers, layouts, strict=True
             )
@@ -248,12 +258,26 @@ class Daemon:
         for publisher, status in zip(self._publishers, self._status, strict=True):
             if publisher is not None:
                 housekeeping.every(_STATUS_S, partial(_put_status, publisher, status))
+                housekeeping.every(_ANSWER_S, publisher.answer)
         for reloader in self._reloaders:
             housekeeping.urgent.append(reloader.step)
             housekeeping.every(_FILE_S, reloader.check)
         watchdog_s = watchdog_period_s()
         if watchdog_s is not None:
             housekeeping.every(watchdog_s, lambda: notify("WATCHDOG=1"))
+
+    def _timed(self, joint: JointFile) -> JointFile:
+        """A joint file with the period that SYNC has."""
+        return joint.model_copy(update={"bus": self._section})
+
+    def _republish(
+        self, publisher: JointPublisher | None, layouts: tuple[NodeLayout, ...]
+    ) -> Callable[[JointFile], None]:
+        def publish(joint: JointFile) -> None:
+            if publisher is not None:
+                publisher.put_joint(self._timed(joint), layouts)
+
+        return publish
 
     def _check_bus(self) -> None:
         if self._keeper.check():
@@ -267,16 +291,6 @@ class Daemon:
     def _check_end(self) -> None:
         if self._end_ns is not None and time.monotonic_ns() >= self._end_ns:
             self.loop.stop()
-
-
-def _republish(
-    publisher: JointPublisher | None, layouts: tuple[NodeLayout, ...]
-) -> Callable[[JointFile], None]:
-    def publish(joint: JointFile) -> None:
-        if publisher is not None:
-            publisher.put_model(describe_model(joint, layouts))
-
-    return publish
 
 
 def _put_status(publisher: JointPublisher, status: JointStatus) -> Generator[None]:

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from drivelink._core import NodeCounters
 from drivelink.canopen.configure import Configurator
 from drivelink.canopen.emcy import drive_state, parse_emergency
 from drivelink.canopen.layout import NodeLayout
@@ -18,7 +19,7 @@ from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.following import MapFollower
 from drivelink.cycle.framesource import LostSource
 from drivelink.cycle.loop import CycleLoop, Lane
-from drivelink.cycle.nodestate import NodeCounters
+from drivelink.cycle.syncclock import MEASURED_SYNCS, measure_period
 from drivelink.daemon.status import EventLog
 from drivelink.errors import DriveError
 
@@ -29,6 +30,7 @@ logger = logging.getLogger(__name__)
 _NS = 1_000_000_000
 _SILENT_NS = _NS // 2  # without a PDO, until the node is configured again
 _RETRY_NS = _NS  # between two attempts
+_MANY_SYNCS = 3  # not due within a second: a second master; one master alone is late now and then
 _HEARTBEATS_LOST = 3.5  # of them missing: the node is gone
 _STATES = {0x00: "boot-up", 0x04: "stopped", 0x05: "operational", 0x7F: "pre-operational"}
 _OPERATIONAL = 0x05
@@ -99,6 +101,9 @@ class Supervisor:
         layouts: of each lane's nodes.
         events: where it is said.
         configurator: configures nodes again, or, passive, learns that somebody else has.
+
+    Attributes:
+        sync_period_s: of the master that is followed, as last measured; None: not yet, or SYNC is ours.
     """
 
     def __init__(
@@ -113,7 +118,10 @@ class Supervisor:
         self._configurator = configurator
         self._follower: MapFollower | None = None
         self._foreign_syncs = self._counter_jumps = self._lost_sends = self._clock_steps = 0
-        self._bus_offs = self._restarts = 0
+        self._bus_offs = self._restarts = self._measured_ns = 0
+        self._off_period = 0  # measurements in a row
+        self._foreign_ns: list[int] = []  # when SYNCs came that were not due
+        self.sync_period_s: float | None = None
         loop.on_fault = self._say_fault
         self._nodes: dict[int, _Watched] = {}
         for lane, mine in layouts.items():
@@ -163,7 +171,7 @@ class Supervisor:
                 "drive_state": str(drive_state(statuswords[node])) if node in statuswords else None,
                 "fault": node in faults,
                 "emergency": f"0x{faults[node]:04X}" if faults.get(node) else None,
-                **{name: getattr(counted, name) for name in counted.__slots__},
+                **counted.as_dict(),
             }
         return status
 
@@ -309,16 +317,8 @@ class Supervisor:
 
     def _check_bus(self) -> None:
         loop = self._loop
-        if loop.foreign_syncs != self._foreign_syncs:
-            self._foreign_syncs = loop.foreign_syncs
-            self._events.begin(
-                "foreign sync",
-                "another master makes SYNC: its cycles are not used; "
-                'set bus.sync = "follow", or stop the other one',
-                logging.ERROR,
-            )
-        else:
-            self._events.end("foreign sync", "the other master makes no SYNC any more")
+        self._check_foreign_syncs()
+        self._check_period()
         if loop.counter_jumps != self._counter_jumps:
             self._counter_jumps = loop.counter_jumps
             self._events.say(f"the SYNC counter jumped, {self._counter_jumps} times so far")
@@ -342,6 +342,47 @@ class Supervisor:
             self._events.end("full queue", "the transmit queue drains again")
 
         self._check_controller()
+
+    def _check_foreign_syncs(self) -> None:
+        """Whether two masters make SYNC; when following, one that is not due now and then proves nothing."""
+        loop, now = self._loop, self._loop.clock()
+        if loop.foreign_syncs != self._foreign_syncs:
+            self._foreign_ns += [now] * (loop.foreign_syncs - self._foreign_syncs)
+            self._foreign_syncs = loop.foreign_syncs
+        self._foreign_ns = [at for at in self._foreign_ns[-_MANY_SYNCS:] if now - at < _NS]
+        if loop.produce and self._foreign_ns:
+            what = (
+                "another master makes SYNC: its cycles are not used; "
+                'set bus.sync = "follow", or stop the other one'
+            )
+        elif len(self._foreign_ns) >= _MANY_SYNCS:
+            what = "a second master makes SYNC too: its cycles are not used; stop one of the two"
+        else:
+            self._events.end("foreign sync", "the other master makes no SYNC any more")
+            return
+        self._events.begin("foreign sync", what, logging.ERROR)
+
+    def _check_period(self) -> None:
+        """Whether the master that is followed still keeps the period that the estimators work with."""
+        loop, now = self._loop, self._loop.clock()
+        if loop.produce or now - self._measured_ns < _NS or len(loop.sync_stamps) < MEASURED_SYNCS:
+            return
+        self._measured_ns = now
+        used_s = loop.period_ns / _NS
+        measured = measure_period(list(loop.sync_stamps), used_s)
+        if measured is None:
+            return
+        self.sync_period_s = measured.period_s
+        self._off_period = 0 if measured.same else self._off_period + 1
+        if measured.same:
+            self._events.end("period", f"SYNC comes every {used_s * 1e3:g} ms again")
+        elif self._off_period > 1:  # once may have been a stall
+            self._events.begin(
+                "period",
+                f"SYNC comes every {measured.period_s * 1e3:.4g} ms now, {used_s * 1e3:g} ms is in use: "
+                "cycles are lost or doubled until the master returns to it or the daemon is restarted",
+                logging.ERROR,
+            )
 
     def _check_controller(self) -> None:
         errors = self._loop.source.errors

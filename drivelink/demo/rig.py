@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from drivelink import jointfile
+from drivelink._core import Tick
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.errors import DrivelinkError
 from drivelink.monitor.history import TruthLike
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.simulate import network_from_joint, open_sim_bus, world_from_joint
-from estimator.sample import Estimate, Sample
 
 __all__ = ["Failure", "Summary", "TruePoint", "serve"]
 
@@ -70,17 +70,13 @@ class TruthTap:
         self._connection = connection
         self._points: list[TruePoint] = []
 
-    def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
+    def put(self, tick: Tick) -> None:
         """Publish, then note the truth: the world stands still until the next SYNC."""
-        self._publisher.put_estimate(estimate, stamp_ns)
+        self._publisher.put(tick)
         truth = self._world.truth()
-        self._points.append(TruePoint(estimate.sequence, truth.flexibility_torque_nm, truth.stiffness_nm_rad))
+        self._points.append(TruePoint(tick.sequence, truth.flexibility_torque_nm, truth.stiffness_nm_rad))
         if len(self._points) >= _BATCH:
             self.flush()
-
-    def put_sample(self, sample: Sample, stamp_ns: int) -> None:
-        """Publish a sample."""
-        self._publisher.put_sample(sample, stamp_ns)
 
     def flush(self) -> None:
         """Send what has been noted."""

@@ -70,7 +70,7 @@ def judge_sync(
             f"{text}: another master makes it, no drivelink daemon is alive",
             'bus.sync = "follow", or stop the other master',
         )
-    elif abs(period_s - bus.period_s) > 0.02 * bus.period_s:
+    elif "period_s" in bus.model_fields_set and abs(period_s - bus.period_s) > 0.02 * bus.period_s:
         section.say(
             Severity.ERROR,
             "SYNC",

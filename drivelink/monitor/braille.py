@@ -7,7 +7,9 @@ from collections.abc import Sequence
 
 from rich.text import Text
 
-__all__ = ["DotPlot", "number", "sparkline"]
+from drivelink.monitor.history import usual_range
+
+__all__ = ["DotPlot", "gauge", "number", "sparkline"]
 
 _BARS = "▁▂▃▄▅▆▇█"
 # Bit of the dot at column c (0, 1) and row r (0 on top) of a braille character.
@@ -27,7 +29,10 @@ def number(value: float, digits: int = 4) -> str:
 
 
 def sparkline(values: Sequence[float], width: int) -> str:
-    """The last values as bars, at most `width` of them: the mean of each share; blank where not finite."""
+    """The last values as bars, at most `width` of them: the mean of each share; blank where not finite.
+
+    What lies beyond the usual range gets the lowest or the highest bar.
+    """
     if not values or width < 1:
         return ""
     share = max(1, math.ceil(len(values) / width))
@@ -35,12 +40,20 @@ def sparkline(values: Sequence[float], width: int) -> str:
     for start in range(0, len(values), share):
         finite = [value for value in values[start : start + share] if math.isfinite(value)]
         means.append(sum(finite) / len(finite) if finite else math.nan)
-    known = [mean for mean in means if math.isfinite(mean)]
-    if not known:
+    low, high = usual_range(means)
+    if not math.isfinite(low):
         return " " * len(means)
-    low, span = min(known), max(known) - min(known)
-    scale = (len(_BARS) - 1) / span if span > 1e-9 * max(abs(low), 1e-300) else 0.0
-    return "".join(_BARS[round((m - low) * scale)] if math.isfinite(m) else " " for m in means)
+    scale = (len(_BARS) - 1) / (high - low) if high - low > 1e-9 * max(abs(low), 1e-300) else 0.0
+    return "".join(
+        _BARS[round((min(max(m, low), high) - low) * scale)] if math.isfinite(m) else " " for m in means
+    )
+
+
+def gauge(value: float, full: float, width: int) -> str:
+    """A bar of so many characters that is full at `full`; empty where the value is not finite."""
+    eighths = round(8 * width * min(max(value / full, 0.0), 1.0)) if math.isfinite(value) else 0
+    whole, rest = divmod(eighths, 8)
+    return ("█" * whole + (" ▏▎▍▌▋▊▉"[rest] if rest else "")).ljust(width, "░")
 
 
 class DotPlot:
@@ -61,6 +74,7 @@ class DotPlot:
         self._x, self._y = _opened(*x), _opened(*y)
         self._cells = [[0] * self.columns for _ in range(self.rows)]
         self._styles = [[""] * self.columns for _ in range(self.rows)]
+        self._marks: dict[tuple[int, int], str] = {}
         self._note = ""
 
     def curve(self, points: Sequence[tuple[float, float]], style: str, every: int = 1) -> None:
@@ -89,6 +103,14 @@ class DotPlot:
         self.curve([(x, low if low >= below else math.nan) for x, low, _ in points], style, every=3)
         self.curve([(x, high if high <= above else math.nan) for x, _, high in points], style, every=3)
 
+    def mark(self, x: float, y: float, style: str) -> None:
+        """One point that stands out, in place of the dots there; outside the plot there is none."""
+        if math.isfinite(x) and math.isfinite(y):
+            across, down = self._place(x, y)
+            column, row = math.floor(across / 2), math.floor(down / 4)
+            if 0 <= column < self.columns and 0 <= row < self.rows:
+                self._marks[row, column] = style
+
     def note(self, text: str) -> None:
         """Say why there is nothing to see, in place of the axes."""
         self._note = text
@@ -106,19 +128,22 @@ class DotPlot:
             label = {0: number(self._y[1], 3), self.rows - 1: number(self._y[0], 3)}.get(row, "")
             text.append(f"\n{label:>{self.LABEL}}", style="dim")
             text.append("┤" if label else "│", style="dim")
-            for dots, style in zip(cells, styles, strict=True):
-                text.append(chr(_BLANK + dots) if dots else " ", style=style)
+            for column, (dots, style) in enumerate(zip(cells, styles, strict=True)):
+                mark = self._marks.get((row, column))
+                if mark is not None:
+                    text.append("●", style=mark)
+                else:
+                    text.append(chr(_BLANK + dots) if dots else " ", style=style)
         low, high = number(self._x[0], 3), f"{number(self._x[1], 3)} {x_unit}".rstrip()
         axis = low + high.rjust(self.columns - len(low))
         text.append("\n" + " " * (self.LABEL + 1) + axis, style="dim")
         return text
 
     def _place(self, x: float, y: float) -> tuple[float, float]:
+        """Column and row of the dot; what is far outside comes to lie just outside."""
         (x0, x1), (y0, y1) = self._x, self._y
-        return (
-            (x - x0) / (x1 - x0) * (2 * self.columns - 1),
-            (y1 - y) / (y1 - y0) * (4 * self.rows - 1),
-        )
+        across, down = min(max((x - x0) / (x1 - x0), -0.1), 1.1), min(max((y1 - y) / (y1 - y0), -0.1), 1.1)
+        return across * (2 * self.columns - 1), down * (4 * self.rows - 1)
 
     def _dot(self, column: float, row: float, style: str) -> None:
         c, r = round(column), round(row)
@@ -129,7 +154,7 @@ class DotPlot:
 
 def _opened(low: float, high: float) -> tuple[float, float]:
     """A range that is none is opened around its value."""
-    if not (math.isfinite(low) and math.isfinite(high)):
+    if not math.isfinite(high - low):
         return 0.0, 1.0
     if high - low <= 1e-9 * max(abs(low), abs(high)):
         half = 0.05 * abs(low) or 1.0

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 from estimator.sample import Status, TransmissionEstimate
 
-__all__ = ["EstimateLike", "GrowingCurve", "History", "Moment", "TruthLike"]
+__all__ = ["EstimateLike", "GrowingCurve", "History", "Moment", "TruthLike", "usual_range"]
 
 _BINS = 160
 _USABLE = int(Status.VALID | Status.OBSERVABLE)
@@ -72,25 +73,29 @@ class Moment(NamedTuple):
 
 
 class GrowingCurve:
-    """Stiffness over deflection, the latest value of each place; the range grows with what has been seen."""
+    """Stiffness over deflection, the latest value of each place.
+
+    Places are as wide as it takes for at most `_BINS` of them to be occupied: a wild value takes one place
+    and leaves the others as fine as they were.
+    """
 
     def __init__(self) -> None:
-        self._low = 0.0
-        self._width = 0.0  # of one bin; 0: nothing seen yet
-        self._bins: list[tuple[float, float, float] | None] = [None] * _BINS
+        self._width = 0.0  # of one place; 0: nothing seen yet
+        self._places: dict[int, tuple[float, float, float]] = {}
 
     def add(self, deflection_rad: float, stiffness_nm_rad: float, std_nm_rad: float) -> None:
         """Enter one estimate; what is not finite is left out."""
         if not (math.isfinite(deflection_rad) and math.isfinite(stiffness_nm_rad)):
             return
         if self._width == 0.0:
-            self._width = max(abs(deflection_rad), 1e-9) / _BINS * 2.0
-            self._low = deflection_rad - self._width * _BINS / 2
-        place = int((deflection_rad - self._low) // self._width)
-        while not 0 <= place < _BINS:
-            self._double(upwards=place >= _BINS)
-            place = int((deflection_rad - self._low) // self._width)
-        self._bins[place] = (deflection_rad, stiffness_nm_rad, std_nm_rad)
+            self._width = max(abs(deflection_rad), 1e-9) / _BINS
+        place = deflection_rad / self._width
+        if not math.isfinite(place):
+            return
+        self._places[math.floor(place)] = (deflection_rad, stiffness_nm_rad, std_nm_rad)
+        while len(self._places) > _BINS:
+            self._width *= 2.0
+            self._places = {place // 2: point for place, point in self._places.items()}
 
     def points(self) -> list[tuple[float, float, float]]:
         """(deflection, stiffness, standard deviation), by deflection.
@@ -98,7 +103,7 @@ class GrowingCurve:
         Left out is what its neighbours have outdated: a value from before the estimator knew the curve, at a
         place where the joint has hardly been since, stands out by its standard deviation.
         """
-        points = [point for point in self._bins if point is not None]
+        points = [point for _, point in sorted(self._places.items())]
         stds = [std for _, _, std in points]
         kept = []
         for k, point in enumerate(points):
@@ -107,14 +112,6 @@ class GrowingCurve:
                 kept.append(point)
         return kept
 
-    def _double(self, upwards: bool) -> None:
-        pairs = [b if b is not None else a for a, b in zip(self._bins[::2], self._bins[1::2], strict=True)]
-        empty: list[tuple[float, float, float] | None] = [None] * (_BINS // 2)
-        self._bins = pairs + empty if upwards else empty + pairs
-        if not upwards:
-            self._low -= self._width * _BINS
-        self._width *= 2.0
-
 
 class History:
     """The last seconds of a joint and its curve.
@@ -122,23 +119,33 @@ class History:
     Args:
         seconds: how far back it reaches.
         points: how many moments it keeps of them.
+
+    Attributes:
+        moments: thinned estimates, oldest first.
+        curves: stiffness over deflection of each transmission.
+        latest: the newest estimate.
+        residuals: (time of the newest estimate then, s; largest residual over its baseline).
     """
 
     def __init__(self, seconds: float = 12.0, points: int = 600) -> None:
         self.seconds = seconds
         self.moments: deque[Moment] = deque(maxlen=points)
         self.curves: tuple[GrowingCurve, ...] = ()
+        self.residuals: deque[tuple[float, float]] = deque(maxlen=points)
         self.latest: EstimateLike | None = None
         self._apart_s = seconds / points
 
     def add(self, estimate: EstimateLike, time_s: float, truth: TruthLike | None = None) -> None:
         """Enter one estimate; `time_s` is that of its SYNC, of any origin."""
+        if self.latest is not None and len(self.latest.transmissions) != len(estimate.transmissions):
+            self.moments.clear()  # another joint has taken the name
         self.latest = estimate
         moments = self.moments
         if moments:
             since = time_s - moments[-1].time_s
             if since < 0.0:  # the daemon was started anew
                 moments.clear()
+                self.residuals.clear()
             elif since < 0.999 * self._apart_s:
                 return
         moments.append(
@@ -158,6 +165,11 @@ class History:
             for curve, one in zip(self.curves, estimate.transmissions, strict=True):
                 curve.add(one.deflection_rad, one.stiffness_nm_rad, one.stiffness_std_nm_rad)
 
+    def add_residual(self, ratio: float) -> None:
+        """Enter what the model leaves unexplained now, over its baseline."""
+        if self.moments and math.isfinite(ratio):
+            self.residuals.append((self.moments[-1].time_s, ratio))
+
     def window(self) -> list[Moment]:
         """The moments not older than `seconds` before the last one."""
         if not self.moments:
@@ -175,6 +187,26 @@ class History:
             _relative([(m.stiffness_nm_rad, m.true_stiffness_nm_rad) for m in window]),
             _relative([(m.torque_nm, m.true_torque_nm) for m in window]),
         )
+
+
+def usual_range(values: Sequence[float], most: float = 0.02) -> tuple[float, float]:
+    """The range that a plot shows: of all values but the outermost, which stretch it by half at most.
+
+    Args:
+        values: what is drawn; what is not finite is left out.
+        most: share of the values that counts as outermost, both ends together.
+
+    Returns:
+        (low, high); (nan, nan) where there is nothing finite.
+    """
+    known = sorted(value for value in values if math.isfinite(value))
+    if not known:
+        return math.nan, math.nan
+    out = math.ceil(most / 2 * len(known)) if len(known) > 4 else 0
+    low, high = known[out], known[-1 - out]
+    reach = 0.5 * (high - low)
+    low, high = max(known[0], low - reach), min(known[-1], high + reach)
+    return (low, high) if math.isfinite(high - low) else (math.nan, math.nan)
 
 
 def _relative(pairs: list[tuple[float, float]]) -> float:

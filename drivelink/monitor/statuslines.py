@@ -1,49 +1,244 @@
-"""The status message of a joint in words: cycle and timing, nodes, what is wrong."""
+"""The status and model documents of a joint in words: cycle, nodes, residual, what is wrong, what to do.
+
+`shape` takes out of the documents what views show, each part checked for its type: whatever a document of
+another version or of somebody else holds, a view gets texts and finite numbers. Terminal, web page and plain
+lines are made from that.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any, NamedTuple
 
 from rich.text import Text
 
-from drivelink.monitor.braille import number
+from drivelink.monitor.braille import gauge, number
+from drivelink.pubsub.inbound import clean_text
 
-__all__ = ["status_lines", "status_text"]
+__all__ = ["MODEL_ALARM_ADVICE", "Balance", "Event", "Node", "Shown", "shape", "status_lines", "status_text"]
+
+MODEL_ALARM_ADVICE = (
+    "the model is not sufficient: do not control on its numbers; record a minute of motion "
+    "(drivelink record), then drivelink diagnose names the effect and writes a better joint file"
+)
+_SHORT_ADVICE = "model alarm: do not control on it; drivelink diagnose tells why"
+_MOST = 16  # entries of a list that a view shows
+_WORDS = 200  # characters of one entry
+_GAUGE = 10  # characters
+_FULL = 2.0  # times its baseline where a gauge is full
 
 
-def status_text(status: Mapping[str, Any]) -> str:
-    """The cycle in a few plain words; what the message does not say is left out."""
-    return " · ".join(part for part in (_cycle(status), _cpu(status)) if part)
+class Node(NamedTuple):
+    """A node of the bus: its id, what it says, whether that is well."""
+
+    id: str
+    text: str
+    good: bool
 
 
-def _cpu(status: Mapping[str, Any]) -> str:
-    cpu = status.get("cpu_fraction")
-    return f"cpu {100 * cpu:.0f} %" if isinstance(cpu, int | float) else ""
+class Event(NamedTuple):
+    """Something that has happened: UNIX time, s; words; how often."""
+
+    time_s: float
+    text: str
+    times: int
 
 
-def _cycle(status: Mapping[str, Any]) -> str:
+class Balance(NamedTuple):
+    """What a torque balance leaves unexplained, and what it left where the model was fitted, N·m."""
+
+    name: str
+    residual_nm: float
+    baseline_nm: float
+
+    @property
+    def ratio(self) -> float:
+        """Residual over baseline."""
+        return self.residual_nm / self.baseline_nm
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shown:
+    """What views show of the documents; empty where these do not say.
+
+    Attributes:
+        state: in a word.
+        rate, missed, cpu, load: of the cycle; texts.
+        times: (name, 99th percentile, µs).
+        nodes: of the bus.
+        wrong: faults and conditions that hold now.
+        alarm: whether the model alarm is on.
+        location: where the effect that the model lacks is likely to sit.
+        residual_nm: of the whole model, N·m; None where the estimator has none.
+        balances: residual against baseline, one a motor and one of the link.
+        improved: relative error before and after the effects that diagnose has found.
+        events: the last ones, newest first.
+        recording: where to.
+    """
+
+    state: str = ""
+    rate: str = ""
+    missed: str = ""
+    cpu: str = ""
+    load: str = ""
+    times: tuple[tuple[str, float], ...] = ()
+    nodes: tuple[Node, ...] = ()
+    wrong: tuple[str, ...] = ()
+    alarm: bool = False
+    location: str = ""
+    residual_nm: float | None = None
+    balances: tuple[Balance, ...] = ()
+    improved: tuple[float, float] | None = None
+    events: tuple[Event, ...] = ()
+    recording: str = ""
+
+    @property
+    def ratio(self) -> float | None:
+        """The largest residual over its baseline."""
+        return max((balance.ratio for balance in self.balances), default=None)
+
+    @property
+    def advice(self) -> str:
+        """What to do about the model alarm; empty while there is none."""
+        where = f" (likely at the {self.location})" if self.location else ""
+        return f"model alarm{where}: {MODEL_ALARM_ADVICE}" if self.alarm else ""
+
+
+def shape(status: Mapping[str, Any], model: Mapping[str, Any] | None = None) -> Shown:
+    """What views show of a status and a model document, whatever these hold."""
+    alarm = _part(status, "residual_alarm")
+    transmissions = status.get("transmissions")
+    motors = min(len(transmissions), 2) if isinstance(transmissions, list) else 1
+    times = [(name, _number(_part(status, key).get("p99_us"))) for key, name in _TIMES]
+    wrong = dict.fromkeys((*_texts(status.get("drive_faults")), *_texts(status.get("conditions"))))
+    rate, cpu, load = (_number(v) for v in (status.get("rate_hz"), status.get("cpu_fraction"),
+                                            _part(status, "bus").get("load")))  # fmt: skip
+    missed, cycles = _number(status.get("missed_cycles")), _number(status.get("cycles"))
+    total = f" of {cycles:.0f}" if cycles is not None else ""
+    return Shown(
+        state=_text(status.get("state")),
+        rate=f"{rate:.0f} Hz" if rate is not None else "",
+        missed=f"{missed:.0f}{total}" if missed is not None else "",
+        cpu=f"{100 * cpu:.0f} %" if cpu is not None else "",
+        load=f"{100 * load:.0f} %" if load is not None else "",
+        times=tuple((name, p99) for name, p99 in times if p99 is not None),
+        nodes=tuple(_node(*entry) for entry in islice(_part(status, "nodes").items(), _MOST)),
+        wrong=tuple(wrong),
+        alarm=alarm.get("active") is True,
+        location=_text(alarm.get("location")),
+        residual_nm=_number(status.get("residual_nm")),
+        balances=_balances(alarm, motors),
+        improved=_improved(model or {}),
+        events=_events(status.get("events")),
+        recording=_text(status.get("recording")),
+    )
+
+
+_TIMES = (("latency", "work"), ("response", "answer"), ("jitter", "late"))
+
+
+def _part(document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    """A part of a document, empty where it is none."""
+    part = document.get(key)
+    return part if isinstance(part, Mapping) else {}
+
+
+def _number(value: Any) -> float | None:
+    """A finite number of a document, which holds no other ones."""
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def _text(value: Any) -> str:
+    return clean_text(value, _WORDS) if isinstance(value, str) else ""
+
+
+def _texts(value: Any) -> list[str]:
+    return [_text(item) for item in value[:_MOST] if _text(item)] if isinstance(value, list) else []
+
+
+def _node(name: str, node: Any) -> Node:
+    """One entry of `nodes`."""
+    if not isinstance(node, Mapping):
+        return Node(_text(name), _text(node), False)
+    state, fault = _text(node.get("state")), bool(node.get("fault"))
+    emergency = _text(node.get("emergency"))
+    text = f"{state}{' FAULT' if fault else ''}{f' EMCY {emergency}' if emergency else ''}"
+    return Node(_text(name), text, state == "operational" and not fault)
+
+
+def _events(value: Any) -> tuple[Event, ...]:
+    events = []
+    for event in reversed(value[-_MOST:]) if isinstance(value, list) else ():
+        time_s = _number(event.get("time")) if isinstance(event, Mapping) else None
+        if time_s is not None and 0.0 <= time_s < 1e11:
+            events.append(Event(time_s, _text(event.get("text")), int(_number(event.get("count")) or 1)))
+    return tuple(events)
+
+
+def _balances(alarm: Mapping[str, Any], motors: int) -> tuple[Balance, ...]:
+    """Residual and baseline of each motor's balance and of the link's, where both are known."""
+    residuals, baselines = alarm.get("residual_nm"), alarm.get("floor_nm")
+    if not isinstance(residuals, list) or not isinstance(baselines, list):
+        return ()
+    pairs = [(_number(r), _number(b)) for r, b in zip(residuals[:3], baselines[:3], strict=False)]
+    names = ["motor"] if motors == 1 else [f"motor {i + 1}" for i in range(motors)]
+    return tuple(
+        Balance(name, residual, baseline)
+        for name, (residual, baseline) in zip([*names, "link"], pairs, strict=False)
+        if residual is not None and baseline is not None and residual >= 0.0 and baseline > 0.0
+    )
+
+
+def _improved(model: Mapping[str, Any]) -> tuple[float, float] | None:
+    """Relative error of the torque before and after what diagnose added, from the model's provenance."""
+    found = _part(_part(model, "provenance"), "diagnosis")
+    before, after = _number(found.get("error_before_relative")), _number(found.get("error_after_relative"))
+    return None if before is None or after is None else (before, after)
+
+
+def status_text(status: Mapping[str, Any], model: Mapping[str, Any] | None = None) -> str:
+    """The cycle, the residual and what to do in plain words; what the documents do not say is left out."""
+    shown = shape(status, model)
+    return " · ".join(part for part in (_cycle(shown), _cpu(shown), _residual(shown), shown.advice) if part)
+
+
+def _cpu(shown: Shown) -> str:
+    return f"cpu {shown.cpu}" if shown.cpu else ""
+
+
+def _cycle(shown: Shown) -> str:
     """Rate, missed cycles, and what takes how long; short enough for 80 columns."""
-    parts = []
-    if isinstance(rate := status.get("rate_hz"), int | float):
-        parts.append(f"{rate:.0f} Hz")
-    if isinstance(missed := status.get("missed_cycles"), int):
-        parts.append(f"missed {missed}")
-    times = []
-    for key, name in (("latency", "work"), ("response", "answer"), ("jitter", "late")):
-        p99 = _of(status, key).get("p99_us")
-        if isinstance(p99, int | float):
-            times.append(f"{name} {p99:.0f}")
-    if times:
-        parts.append(f"p99 {', '.join(times)} µs")
-    return " · ".join(parts)
+    times = ", ".join(f"{name} {p99:.0f}" for name, p99 in shown.times)
+    missed = f"missed {shown.missed.split(' ')[0]}" if shown.missed else ""
+    return " · ".join(part for part in (shown.rate, missed, f"p99 {times} µs" if times else "") if part)
 
 
-def status_lines(status: Mapping[str, Any], width: int) -> list[Text]:
-    """At most three lines of so many characters: cycle and timing, nodes, what is wrong."""
+def _residual(shown: Shown) -> str:
+    """What the model leaves, in words; before and after where diagnose has improved it."""
+    if shown.ratio is not None:
+        text = f"residual {number(shown.ratio, 2)} × baseline"
+    elif shown.residual_nm is not None:
+        text = f"residual {number(shown.residual_nm, 3)} N·m"
+    else:
+        return ""
+    if shown.improved is not None:
+        before, after = shown.improved
+        text += f" ({100 * before:.1f} % before its effects, {100 * after:.1f} % after)"
+    return text
+
+
+def status_lines(status: Mapping[str, Any], width: int, model: Mapping[str, Any] | None = None) -> list[Text]:
+    """At most five lines of so many characters: cycle, nodes, residual, what to do, what is wrong."""
     if not status:
         return []
-    lines = [_line("cycle", _cycle(status), width), _nodes(status, width), _wrong(status, width)]
+    shown = shape(status, model)
+    lines = [_line("cycle", _cycle(shown), width), _nodes(shown, width), _gauges(shown, width)]
+    if shown.alarm:
+        advice = shown.advice if len(shown.advice) + 11 <= width else _SHORT_ADVICE
+        lines.append(_line("look here", advice, width, "bold red"))
+    lines.append(_line("look here", "; ".join(shown.wrong), width, "bold red"))
     return [line for line in lines if line is not None]
 
 
@@ -57,40 +252,37 @@ def _line(label: str, text: str, width: int, style: str = "") -> Text | None:
     return line
 
 
-def _nodes(status: Mapping[str, Any], width: int) -> Text | None:
-    nodes = _of(status, "nodes")
-    if not nodes:
+def _nodes(shown: Shown, width: int) -> Text | None:
+    if not shown.nodes:
         return None
     line = Text(no_wrap=True)
     line.append(f"{'nodes':<11}", style="dim")
-    for name, node in nodes.items():
-        state = str(node.get("state", "")) if isinstance(node, Mapping) else str(node)
-        fault = isinstance(node, Mapping) and bool(node.get("fault"))
-        good = state == "operational" and not fault
-        line.append(f"{name} ", style="bold")
-        line.append(f"{state}{' FAULT' if fault else ''}  ", style="green" if good else "bold red")
-    load = _of(status, "bus").get("load")
-    if isinstance(load, int | float):
-        line.append(f"bus {100 * load:.0f} %  ", style="dim")
-    line.append(_cpu(status), style="dim")
+    for node in shown.nodes:
+        line.append(f"{node.id} ", style="bold")
+        line.append(f"{node.text}  ", style="green" if node.good else "bold red")
+    if shown.load:
+        line.append(f"bus {shown.load}  ", style="dim")
+    line.append(_cpu(shown), style="dim")
     line.truncate(width, overflow="ellipsis")
     return line
 
 
-def _wrong(status: Mapping[str, Any], width: int) -> Text | None:
-    """What is wrong now; where nothing is, the residual."""
-    found = [str(text) for key in ("drive_faults", "conditions") for text in status.get(key) or ()]
-    if _of(status, "residual_alarm").get("active"):
-        found.append("the model is not sufficient: drivelink diagnose tells why")
-    if found:
-        return _line("look here", "; ".join(dict.fromkeys(found)), width, "bold red")
-    residual = status.get("residual_nm")
-    if isinstance(residual, int | float):
-        return _line("residual", f"{number(residual, 3)} N·m", width)
-    return None
-
-
-def _of(status: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    """A part of the message, empty where it is none."""
-    part = status.get(key)
-    return part if isinstance(part, Mapping) else {}
+def _gauges(shown: Shown, width: int) -> Text | None:
+    """The residual of each balance against its baseline: the bar is half full at the baseline."""
+    if not shown.balances:
+        return _line("residual", _residual(shown).removeprefix("residual "), width)
+    line = Text(no_wrap=True)
+    line.append(f"{'residual':<11}", style="dim")
+    for balance in shown.balances:
+        style = "bold red" if shown.alarm and balance.ratio == shown.ratio else "green"
+        if len(shown.balances) > 1:
+            line.append(f"{balance.name} ", style="dim")
+        line.append(gauge(balance.ratio, _FULL, _GAUGE), style=style)
+        line.append(f" {number(balance.ratio, 2)} ×  ")
+    line.append("of the baseline  ", style="dim")
+    if shown.improved is not None:
+        line.append(
+            "effects: {:.1f} → {:.1f} %".format(*(100 * part for part in shown.improved)), style="dim"
+        )
+    line.truncate(width, overflow="ellipsis")
+    return line

@@ -19,8 +19,8 @@ from rich.table import Table
 from rich.text import Text
 
 from drivelink.monitor.braille import DotPlot, number, sparkline
-from drivelink.monitor.history import EstimateLike, History, TruthLike
-from drivelink.monitor.statuslines import status_lines, status_text
+from drivelink.monitor.history import EstimateLike, History, TruthLike, usual_range
+from drivelink.monitor.statuslines import MODEL_ALARM_ADVICE, shape, status_lines, status_text
 from estimator.sample import Status
 
 __all__ = ["JointView", "joints_table"]
@@ -40,6 +40,21 @@ _FLAGS = (  # bit, what is shown when set, style
     (Status.INPUT_REJECTED, "input rejected", "yellow"),
     (Status.GAP, "gap", "yellow"),
     (Status.RESTARTED, "restarted", "yellow"),
+    (Status.UNTIMED, "untimed", "yellow"),
+    (Status.NODE_RESTARTED, "node restarted", "yellow"),
+)
+SILENT_S = 1.0  # without an estimate, after which what is shown is called the last there was
+_HELP = (
+    ("stiffness", "of the joint, N·m/rad, ± half its 95 % interval"),
+    ("torque", "flexibility torque of the joint, N·m"),
+    ("deflection", "φ = q − θ of each transmission, rad"),
+    ("left plot", "stiffness over deflection, its 95 % band dotted, ● now; cyan motor 1, magenta 2"),
+    ("right plot", "flexibility torque over time; yellow: truth of a simulation; gaps: not valid"),
+    ("cycle", "99th percentiles, µs: work, answer (SYNC to last frame), SYNC late by"),
+    ("residual", "what the model leaves, times its baseline (where it was fitted): half a bar is 1"),
+    ("valid", "the numbers may be used; not valid: do not control on them"),
+    ("observable", "the motion tells the stiffness; else it is held, and its interval widens"),
+    ("model alarm", MODEL_ALARM_ADVICE),
 )
 
 
@@ -55,7 +70,10 @@ class JointView:
     Attributes:
         history: everything the view remembers.
         status: the joint's status message; empty until there is one.
+        model: the model message, likewise.
         gone: the daemon was there and is not any more.
+        silent_s: time since the last estimate.
+        help: show what the lines mean in place of the plots.
         footer: a line at the lower edge, e.g. how to leave.
     """
 
@@ -64,10 +82,13 @@ class JointView:
     ) -> None:
         self.name = name
         self.subtitle = subtitle
-        self.footer = "Ctrl-C ends"
+        self.footer = ""
         self.history = History(seconds)
-        self.status: Mapping[str, Any] = {}
+        self._status: Mapping[str, Any] = {}
+        self.model: Mapping[str, Any] = {}
         self.gone = False
+        self.silent_s = 0.0
+        self.help = False
         self._height = height
 
     def update(self, estimate: EstimateLike, time_s: float, truth: TruthLike | None = None) -> None:
@@ -75,9 +96,39 @@ class JointView:
         self.history.add(estimate, time_s, truth)
 
     @property
+    def status(self) -> Mapping[str, Any]:
+        """The joint's status message."""
+        return self._status
+
+    @status.setter
+    def status(self, status: Mapping[str, Any]) -> None:
+        if status is self._status:
+            return
+        self._status = status
+        ratio = shape(status).ratio
+        if ratio is not None:
+            self.history.add_residual(ratio)
+
+    @property
+    def live(self) -> bool:
+        """Whether the numbers are of now."""
+        return not self.gone and self.silent_s < SILENT_S
+
+    @property
     def state(self) -> str:
-        """What the daemon says of itself, or that it is gone."""
-        return "daemon gone" if self.gone else str(self.status.get("state", ""))
+        """What the daemon says of itself, or that it is gone or silent."""
+        if self.live:
+            return shape(self.status).state
+        since = f", last estimate {self.silent_s:.0f} s ago" if self.silent_s >= SILENT_S else ""
+        return f"{'daemon gone' if self.gone else 'no estimates'}{since}"
+
+    @property
+    def flags(self) -> list[tuple[str, str]]:
+        """What the newest estimate's status bits say, each with its style; of one that is past only that."""
+        estimate = self.history.latest
+        if estimate is None:
+            return []
+        return flags(estimate.status) if self.live else [(self.state, "bold red")]
 
     def line(self) -> str:
         """The joint in one plain line, for pipes and logs."""
@@ -89,13 +140,13 @@ class JointView:
             f"stiffness {number(estimate.stiffness_nm_rad)} ± {number(_half(estimate), 2)} N·m/rad,",
             f"torque {number(estimate.flexibility_torque_nm)} N·m,",
             "deflection " + " ".join(number(one.deflection_rad, 3) for one in estimate.transmissions),
-            "rad, " + ", ".join(text for text, _ in flags(estimate.status)),
+            "rad, " + ", ".join(text for text, _ in self.flags),
         ]
         stiffness, _ = self.history.relative_errors()
         if math.isfinite(stiffness):
             parts[-1] += f", stiffness error {100 * stiffness:.2f} %"
-        if self.status:
-            parts[-1] += f", {status_text(self.status)}"
+        if self.status and self.live:
+            parts[-1] += f", {status_text(self.status, self.model)}"
         return " ".join(parts)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -103,19 +154,22 @@ class JointView:
         height = self._height or min(console.size.height - 1, 24)
         title = Text.assemble((self.name, "bold"), f" · {self.subtitle}" if self.subtitle else "")
         if self.state:
-            title.append(f" · {self.state}", style="bold red" if self.gone else "")
-        numbers, below = self._numbers(width - 4), status_lines(self.status, width - 4)
+            title.append(f" · {self.state}", style="" if self.live else "bold red")
+        numbers = self._numbers(width - 4)
+        below = status_lines(self.status, width - 4, self.model) if self.live else []
         if self.history.latest is not None:
             below.append(self._flags())
         room = height - 2 - numbers.row_count - len(below) - 1
         body: list[RenderableType] = [numbers, Text("")]
-        if room >= 5 and self.history.latest is not None:
+        if self.help:
+            body, below = [self._legend()], []
+        elif room >= 5 and self.history.latest is not None:
             body.append(self._plots(width - 4, room))
         yield Panel(
             Group(*body, *below),
             title=title,
             title_align="left",
-            subtitle=self.footer,
+            subtitle=Text(self.footer, style="dim") if self.footer else None,
             subtitle_align="right",
             padding=(0, 1),
             width=width,
@@ -135,18 +189,19 @@ class JointView:
         last = window[-1]
         errors = self.history.relative_errors()
         spark = max(6, width - 69)
+        ink = ESTIMATE if self.live else "dim"
         known = math.isfinite(last.true_stiffness_nm_rad)
         half = _half(estimate)
         band = f" ± {number(half, 2)}" if math.isfinite(half) else ""
         for label, value, extra, unit, true, error, series in (
             ("stiffness", last.stiffness_nm_rad, band, "N·m/rad", last.true_stiffness_nm_rad, errors[0],
-             [m.stiffness_nm_rad for m in window]),
+             [m.stiffness_nm_rad if m.valid else math.nan for m in window]),
             ("torque", last.torque_nm, "", "N·m", last.true_torque_nm, errors[1],
-             [m.torque_nm for m in window]),
+             [m.torque_nm if m.valid else math.nan for m in window]),
         ):  # fmt: skip
             table.add_row(
                 label,
-                Text.assemble((number(value), f"bold {ESTIMATE}"), extra, f" {unit}"),
+                Text.assemble((number(value), f"bold {ink}"), extra, f" {unit}"),
                 Text.assemble(
                     "truth ",
                     (number(true), TRUTH),
@@ -154,7 +209,7 @@ class JointView:
                 )
                 if known
                 else "",
-                Text(sparkline(series, spark), style=ESTIMATE),
+                Text(sparkline(series, spark), style=ink),
             )
         deflection = "   ".join(number(one.deflection_rad, 4) for one in estimate.transmissions)
         table.add_row("deflection", f"{deflection} rad", self._each(estimate) if not known else "", "")
@@ -166,6 +221,17 @@ class JointView:
             return ""
         return "each " + " | ".join(number(one.stiffness_nm_rad) for one in estimate.transmissions)
 
+    @staticmethod
+    def _legend() -> Table:
+        """What the lines of the view mean."""
+        table = Table.grid(padding=(0, 1, 0, 0))
+        table.add_column(no_wrap=True, style="bold")
+        table.add_column(overflow="fold")
+        for label, meaning in _HELP:
+            table.add_row(label, meaning)
+        table.add_row("", Text("? back · q ends", style="dim"))
+        return table
+
     def _plots(self, width: int, height: int) -> Table:
         half = (width - 2) // 2
         grid = Table.grid(padding=(0, 2, 0, 0))
@@ -175,35 +241,37 @@ class JointView:
     def _curve_plot(self, width: int, height: int) -> Text:
         curves = [curve.points() for curve in self.history.curves]
         points = [point for curve in curves for point in curve]
-        stiffness = [point[1] for point in points]
-        margin = 0.15 * (max(stiffness) - min(stiffness)) + 0.02 * abs(max(stiffness)) if stiffness else 0.0
-        y = (min(stiffness) - margin, max(stiffness) + margin) if stiffness else (math.nan, math.nan)
-        x = (min(p[0] for p in points), max(p[0] for p in points)) if points else (math.nan, math.nan)
+        low, high = usual_range([point[1] for point in points])
+        margin = 0.15 * (high - low) + 0.02 * abs(high)
+        x = usual_range([point[0] for point in points])
+        y = (low - margin, high + margin)
         plot = DotPlot(width, height, x, y)
         for k, curve in enumerate(curves):
             plot.band([(p, s - _SIGMA_95 * d, s + _SIGMA_95 * d) for p, s, d in curve], BAND)
             plot.curve([(p, s) for p, s, _ in curve], ESTIMATE if k == 0 else _SECOND)
+        if self.live and self.history.latest is not None and points:
+            for one in self.history.latest.transmissions:
+                plot.mark(one.deflection_rad, one.stiffness_nm_rad, "bold")
         if not points:
             plot.note("not observable yet")
-        title = "stiffness against deflection"
-        return plot.render(title if width >= 38 else "stiffness", "rad")
+        title = "stiffness over deflection, N·m/rad"
+        return plot.render(title if width >= 41 else "stiffness, N·m/rad", "rad")
 
     def _torque_plot(self, width: int, height: int) -> Text:
         window = self.history.window()
         end = window[-1].time_s if window else 0.0
-        values = [v for m in window for v in (m.torque_nm, m.true_torque_nm) if math.isfinite(v)]
-        y = (min(values), max(values)) if values else (math.nan, math.nan)
+        values = [v for m in window if m.valid for v in (m.torque_nm, m.true_torque_nm) if math.isfinite(v)]
+        y = usual_range(values)
         plot = DotPlot(width, height, (-self.history.seconds, 0.0), y)
         plot.curve([(m.time_s - end, m.true_torque_nm) for m in window], TRUTH)
-        plot.curve([(m.time_s - end, m.torque_nm) for m in window], ESTIMATE)
+        plot.curve([(m.time_s - end, m.torque_nm if m.valid else math.nan) for m in window], ESTIMATE)
         if not values:
-            plot.note("no torque yet")
-        return plot.render("torque over time", "s")
+            plot.note("nothing valid yet")
+        return plot.render("torque over time, N·m", "s")
 
     def _flags(self) -> Text:
-        estimate = self.history.latest
         text = Text(no_wrap=True)
-        for label, style in flags(estimate.status if estimate else 0):
+        for label, style in self.flags:
             text.append(f"● {label}  ", style=style)
         return text
 
@@ -218,31 +286,35 @@ def flags(status: int) -> list[tuple[str, str]]:
 
 
 def joints_table(views: Mapping[str, JointView], width: int) -> Table:
-    """Several joints, one line each, for a terminal of so many columns."""
+    """Several joints, one line each, for a terminal of so many columns: every column is whole or left out."""
+    sparks = width - 100
+    columns = [("joint", 10), ("stiffness / N·m/rad", 19), ("torque / N·m", 12)]
+    if width >= 80:
+        columns.append(("deflection / rad", 16))
     table = Table(expand=True, box=None, pad_edge=False)
-    for heading in ("joint", "stiffness / N·m/rad", "torque / N·m", "deflection / rad"):
-        table.add_column(heading, no_wrap=True)
-    table.add_column("state", no_wrap=True, ratio=1)
+    for heading, least in columns:
+        table.add_column(heading, no_wrap=True, min_width=least)
+    if sparks >= 8:
+        table.add_column("last seconds", no_wrap=True, min_width=sparks)
+    table.add_column("state", ratio=1, overflow="fold", min_width=12)
     for name, view in sorted(views.items()):
         estimate = view.history.latest
-        state = view.state or "–"
+        ink = ESTIMATE if view.live else "dim"
+        cells = [Text(name, style="bold")]
         if estimate is None:
-            table.add_row(Text(name, style="bold"), "–", "–", "–", state)
-            continue
-        window = view.history.window()
-        spark = sparkline([m.stiffness_nm_rad for m in window], max(6, width - 72))
-        worst = [(label, style) for label, style in flags(estimate.status) if style != "green"]
-        if view.gone:
-            worst = [(state, "bold red")]
-        table.add_row(
-            Text(name, style="bold"),
-            Text.assemble(
-                (number(estimate.stiffness_nm_rad), ESTIMATE), f" ± {number(_half(estimate), 2)} ", spark
-            ),
-            number(estimate.flexibility_torque_nm),
-            " ".join(number(one.deflection_rad, 3) for one in estimate.transmissions),
-            Text(*worst[0]) if worst else Text(state if state != "–" else "valid", style="green"),
-        )
+            cells += [Text("–")] * (len(table.columns) - 2) + [Text(view.state or "–")]
+        else:
+            deflection = " ".join(number(one.deflection_rad, 3) for one in estimate.transmissions)
+            half = number(_half(estimate), 2)
+            cells.append(Text.assemble((number(estimate.stiffness_nm_rad), ink), f" ± {half}"))
+            cells.append(Text(number(estimate.flexibility_torque_nm)))
+            cells += [Text(deflection)] if width >= 80 else []
+            if sparks >= 8:
+                series = [m.stiffness_nm_rad if m.valid else math.nan for m in view.history.window()]
+                cells.append(Text(sparkline(series, sparks), style=ink))
+            worst = [(label, style) for label, style in view.flags if style != "green"]
+            cells.append(Text(*worst[0]) if worst else Text(view.state or "valid", style="green"))
+        table.add_row(*cells)
     return table
 
 

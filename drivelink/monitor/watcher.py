@@ -1,8 +1,13 @@
-"""What daemons say on zenoh, gathered for the live views: joints come and go, views are kept up to date."""
+"""What daemons say on zenoh, gathered for the live views: joints come and go, views are kept up to date.
+
+A joint's numbers are those of one daemon, chosen as a controller's subscription chooses it, and everything
+passes `drivelink.pubsub.inbound`: nothing that is on the network ends a view or fills its memory.
+"""
 
 from __future__ import annotations
 
-import json
+import time
+from collections import deque
 from typing import Any
 
 import zenoh
@@ -10,11 +15,30 @@ import zenoh.ext
 
 from drivelink.errors import ZenohError
 from drivelink.monitor.view import JointView
-from drivelink.pubsub.wire import decode_estimate
+from drivelink.pubsub.identity import MAX_CLAIMS, DaemonIdentity, source_of
+from drivelink.pubsub.inbound import DECODERS, clean_text
 
-__all__ = ["Watcher"]
+__all__ = ["MAX_JOINTS", "Watcher"]
 
+MAX_JOINTS = 64  # shown at once; more than anybody reads, and a rogue that makes names up fills no memory
 _QUEUE = 8192
+_NAME = 64  # characters of a joint's name that are shown
+_STALE_S = 1.0  # after which another session may take over where no token says who the daemon is
+
+
+class _Joint:
+    """One joint: whose messages are taken, and what is shown of it."""
+
+    def __init__(self, name: str) -> None:
+        self.identity = DaemonIdentity()
+        self.view = JointView(clean_text(name, _NAME))
+        self.heard_s = -float("inf")
+        self.estimate_s = -float("inf")
+
+    @property
+    def useful(self) -> bool:
+        """Whether a daemon is, or says anything."""
+        return self.identity.bound is not None and self.identity.alive
 
 
 class Watcher:
@@ -23,72 +47,109 @@ class Watcher:
     Args:
         session: an open session; it stays open.
         prefix: first part of every key.
-        joint: only this one; None: every joint that there is.
+        joint: only this one; None: every joint that there is, up to MAX_JOINTS.
 
     Attributes:
-        views: by the joint's name, those seen so far.
-        alive: names of the joints whose daemon is there.
         received: estimates taken in.
+        refused: messages of others, or that cannot be.
     """
 
     def __init__(self, session: zenoh.Session, prefix: str = "drivelink", joint: str | None = None) -> None:
-        self.views: dict[str, JointView] = {}
-        self.alive: set[str] = set()
-        self.received = 0
+        self.received = self.refused = 0
+        self._prefix = prefix + "/"
+        self._joints: dict[str, _Joint] = {}
+        self._claims: deque[tuple[str, str, bool]] = deque()  # tokens that came since the last poll
         ring = zenoh.handlers.RingChannel
         key = f"{prefix}/{joint or '*'}"
         history = zenoh.ext.HistoryConfig(max_samples=1, detect_late_publishers=True)
         try:
-            self._estimates: Any = session.declare_subscriber(f"{key}/estimate", ring(_QUEUE))
-            self._status: Any = zenoh.ext.declare_advanced_subscriber(
-                session, f"{key}/status", ring(256), history=history
-            )
+            self._streams: list[tuple[str, Any]] = [
+                ("estimate", session.declare_subscriber(f"{key}/estimate", ring(_QUEUE)))
+            ]
+            for name in ("status", "model"):
+                subscriber = zenoh.ext.declare_advanced_subscriber(
+                    session, f"{key}/{name}", ring(256), history=history
+                )
+                self._streams.append((name, subscriber))
+            heard = zenoh.handlers.Callback(self._token, indirect=False)
             self._tokens: Any = session.liveliness().declare_subscriber(
-                f"{key}/alive", ring(256), history=True
+                f"{key}/alive/**", heard, history=True
             )
         except zenoh.ZError as error:
             raise ZenohError(f"{key}: cannot be subscribed to: {error}") from error
         if joint is not None:
-            self._view(joint)
+            self._joint(joint)
+
+    @property
+    def views(self) -> dict[str, JointView]:
+        """By the joint's name, those seen so far."""
+        return {joint.view.name: joint.view for joint in self._joints.values()}
+
+    @property
+    def alive(self) -> set[str]:
+        """Names of the joints whose daemon is there."""
+        return {joint.view.name for joint in self._joints.values() if joint.identity.alive}
 
     def poll(self) -> None:
         """Take in everything that has come since."""
-        while (token := self._tokens.try_recv()) is not None:
-            name = _joint(token)
-            if token.kind == zenoh.SampleKind.PUT:
-                self.alive.add(name)
-                self._view(name)
-            else:
-                self.alive.discard(name)
-        while (document := self._status.try_recv()) is not None:
-            try:
-                status: Any = json.loads(document.payload.to_bytes())
-            except ValueError:
-                continue
-            if isinstance(status, dict):
-                self._view(_joint(document)).status = status
-        while (message := self._estimates.try_recv()) is not None:
-            try:
-                estimate = decode_estimate(message.payload.to_bytes())
-            except ZenohError:
-                continue
-            self.received += 1
-            self._view(_joint(message)).update(estimate, estimate.stamp_ns * 1e-9)
-        for name, view in self.views.items():
-            view.gone = name not in self.alive and view.history.latest is not None
+        while self._claims:
+            name, session, there = self._claims.popleft()
+            joint = self._joint(name)
+            if joint is not None:
+                joint.identity.token(session, there)
+        now_s = time.monotonic()
+        for kind, subscriber in self._streams:
+            while (sample := subscriber.try_recv()) is not None:
+                self._take(kind, sample, now_s)
+        for joint in self._joints.values():
+            view = joint.view
+            view.gone = not joint.identity.alive and view.history.latest is not None
+            view.silent_s = now_s - joint.estimate_s if view.history.latest is not None else 0.0
 
     def close(self) -> None:
         """Stop following."""
-        for subscriber in (self._estimates, self._status, self._tokens):
+        for subscriber in (self._tokens, *(subscriber for _, subscriber in self._streams)):
             subscriber.undeclare()
 
-    def _view(self, name: str) -> JointView:
-        view = self.views.get(name)
-        if view is None:
-            view = self.views[name] = JointView(name)
-        return view
+    def _take(self, kind: str, sample: zenoh.Sample, now_s: float) -> None:
+        joint = self._joint(self._name(sample))
+        if joint is None or not joint.identity.accepts(source_of(sample), now_s - joint.heard_s > _STALE_S):
+            self.refused += 1
+            return
+        try:
+            message = DECODERS[kind](sample.payload.to_bytes())
+        except ZenohError:
+            self.refused += 1
+            return
+        joint.heard_s = now_s
+        if kind == "status":
+            joint.view.status = message
+        elif kind == "model":
+            joint.view.model = message
+        else:
+            self.received += 1
+            joint.estimate_s = now_s
+            joint.view.update(message, message.stamp_ns * 1e-9)
 
+    def _token(self, token: zenoh.Sample) -> None:
+        """In zenoh's thread."""
+        name = self._name(token)
+        session = str(token.key_expr).removeprefix(f"{self._prefix}{name}/alive").lstrip("/")
+        if len(self._claims) < 4 * MAX_CLAIMS:
+            self._claims.append((name, session, token.kind == zenoh.SampleKind.PUT))
 
-def _joint(sample: zenoh.Sample) -> str:
-    """The joint's name, the part of the key before the last."""
-    return str(sample.key_expr).split("/")[-2]
+    def _name(self, sample: zenoh.Sample) -> str:
+        """The joint's name: what follows the prefix in the key."""
+        return str(sample.key_expr).removeprefix(self._prefix).split("/", 1)[0]
+
+    def _joint(self, name: str) -> _Joint | None:
+        """The joint of that name; None where there is no room for one more."""
+        joint = self._joints.get(name)
+        if joint is None:
+            if len(self._joints) >= MAX_JOINTS:
+                idle = next((key for key, other in self._joints.items() if not other.useful), None)
+                if idle is None:
+                    return None
+                del self._joints[idle]
+            joint = self._joints[name] = _Joint(name)
+        return joint

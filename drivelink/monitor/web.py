@@ -10,17 +10,23 @@ import json
 import math
 import threading
 import time
+from contextlib import suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from typing import Any
 
 from drivelink.errors import UsageError
-from drivelink.monitor.view import JointView, flags
+from drivelink.monitor.braille import number
+from drivelink.monitor.history import Moment
+from drivelink.monitor.statuslines import Shown, shape
+from drivelink.monitor.view import JointView
 from drivelink.monitor.watcher import Watcher
 
-__all__ = ["WebView", "snapshot"]
+__all__ = ["MAX_CONNECTIONS", "WebView", "snapshot"]
 
+MAX_CONNECTIONS = 16
+_PATIENCE_S = 5.0  # with a browser that sends or takes nothing
 _EVENT_S = 0.1
 _LOCAL_HOSTS = frozenset({"localhost", "127.0.0.1", "[::1]"})
 _POLICY = (
@@ -53,11 +59,10 @@ class WebView:
             web = view
 
         try:
-            self._server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
+            self._server = _Server(("127.0.0.1", port), Handler)
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
             raise UsageError(f"--port {port}: cannot be served: {reason}") from error
-        self._server.daemon_threads = True
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True)
         self._thread.start()
         self.url = f"http://127.0.0.1:{self._server.server_address[1]}/"
@@ -94,20 +99,30 @@ class WebView:
 
 
 def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str, Any]:
-    """What the page is told of one joint; what is not finite is null."""
+    """What the page is told of one joint; what is not finite is null, and so is what is not valid.
+
+    Args:
+        view: of the joint.
+        alive: whether its daemon is there.
+        since: times of the newest moment and residual that the page has, by joint; brought forward.
+    """
     history, estimate = view.history, view.history.latest
     last = since.get(view.name, -math.inf)
     window = history.window()
     if window and window[-1].time_s < last:  # the daemon was started anew
         last = -math.inf
     fresh = [moment for moment in window if moment.time_s > last]
+    residuals = [pair for pair in history.residuals if pair[0] > last]
     if fresh:
         since[view.name] = fresh[-1].time_s
     told: dict[str, Any] = {
         "alive": alive,
-        "status": view.status,
+        "live": view.live,
+        "state": view.state,
+        "status": _describe(shape(view.status, view.model)),
         "restart": last == -math.inf,
-        "moments": [[_finite(value) for value in moment[:4]] for moment in fresh],
+        "moments": [_moment(moment) for moment in fresh],
+        "residuals": residuals,
         "curves": [[[_finite(v) for v in point] for point in curve.points()] for curve in history.curves],
     }
     if estimate is not None:
@@ -116,15 +131,78 @@ def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str,
             "std": _finite(estimate.stiffness_std_nm_rad),
             "torque": _finite(estimate.flexibility_torque_nm),
             "transmissions": [[_finite(value) for value in one] for one in estimate.transmissions],
-            "flags": flags(estimate.status),
+            "flags": view.flags,
         }
     return told
+
+
+def _moment(moment: Moment) -> list[float | None]:
+    """[time, torque, stiffness, standard deviation]; a gap in the curves where it is not valid."""
+    if not moment.valid:
+        return [moment.time_s, None, None, None]
+    return [_finite(value) for value in moment[:4]]
+
+
+def _describe(shown: Shown) -> dict[str, Any]:
+    """The status in the rows that the page shows."""
+    return {
+        "cycle": [
+            ("rate", shown.rate),
+            *((f"{name}, p99", f"{number(p99, 3)} µs") for name, p99 in shown.times),
+            ("missed cycles", shown.missed),
+            ("load of the bus", shown.load),
+            ("cpu", shown.cpu),
+            ("recording", shown.recording),
+        ],
+        "nodes": shown.nodes,
+        "wrong": shown.wrong,
+        "events": shown.events,
+        "alarm": shown.alarm,
+        "advice": shown.advice,
+        "residual_nm": shown.residual_nm,
+        "balances": [(b.name, b.residual_nm, b.baseline_nm, b.ratio) for b in shown.balances],
+        "improved": shown.improved,
+    }
+
+
+class _Server(ThreadingHTTPServer):
+    """A thread a connection, and no more connections than a few people's browsers need."""
+
+    daemon_threads = True
+    request_queue_size = 2 * MAX_CONNECTIONS
+
+    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
+        self._room = threading.BoundedSemaphore(MAX_CONNECTIONS)
+        super().__init__(address, handler)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Serve a connection, or refuse it where there are too many."""
+        if self._room.acquire(blocking=False):
+            super().process_request(request, client_address)
+            return
+        with suppress(OSError):
+            request.settimeout(0.1)
+            request.sendall(
+                b"HTTP/1.1 503 Service Unavailable\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
+            )
+        self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Serve a connection to its end."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._room.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A connection that ends in the middle is nothing to write about."""
 
 
 class _Handler(BaseHTTPRequestHandler):
     """One request: the page, or the stream of events."""
 
     web: WebView
+    timeout = _PATIENCE_S
     protocol_version = "HTTP/1.1"
     server_version = "drivelink"
     sys_version = ""
@@ -145,12 +223,14 @@ class _Handler(BaseHTTPRequestHandler):
         """Say nothing."""
 
     def _page(self) -> None:
+        self.close_connection = True
         page = files("drivelink.monitor").joinpath("page.html").read_bytes()
         self.send_response(HTTPStatus.OK)
         self.send_header("Content-Type", "text/html; charset=utf-8")
         self.send_header("Content-Length", str(len(page)))
         self.send_header("Content-Security-Policy", _POLICY)
         self.send_header("X-Content-Type-Options", "nosniff")
+        self.send_header("Connection", "close")
         self.end_headers()
         self.wfile.write(page)
 
@@ -168,7 +248,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self.wfile.write(b"data: " + self.web.event(since) + b"\n\n")
                 self.wfile.flush()
                 self.web.wait(max(0.0, _EVENT_S - (time.monotonic() - begin)))
-        except (BrokenPipeError, ConnectionResetError):
+        except OSError:  # the browser has left, or takes nothing any more
             return
 
 

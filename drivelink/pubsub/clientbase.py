@@ -5,7 +5,6 @@ Estimates queue up in zenoh, outside the interpreter, and are taken in when some
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import time
@@ -20,6 +19,8 @@ from numpy.typing import NDArray
 
 from drivelink.errors import ZenohError
 from drivelink.pubsub.feed import WAKE, Feed, State
+from drivelink.pubsub.identity import source_of
+from drivelink.pubsub.inbound import DECODERS
 from drivelink.pubsub.session import close_session, one_line, open_client
 from drivelink.pubsub.wire import ESTIMATE, EstimateMessage
 from estimator.sample import Status
@@ -27,6 +28,16 @@ from estimator.sample import Status
 __all__ = ["ENDPOINT", "Client"]
 
 ENDPOINT = "tcp/127.0.0.1:7447"
+# Of these bits a usable estimate has only VALID.
+_USABLE = int(
+    Status.VALID
+    | Status.MODEL_ALARM
+    | Status.RESTARTED
+    | Status.DRIVE_FAULT
+    | Status.STALE
+    | Status.UNTIMED
+    | Status.NODE_RESTARTED
+)
 _NAME = re.compile(r"[^*$#?\s/]+(/[^*$#?\s/]+)*")
 
 
@@ -54,8 +65,8 @@ class Client:
         self._depth = depth
         self._owned = session is None
         self._session = open_client(endpoint, config) if session is None else session
-        self._feed = Feed(self.key + "/alive", depth, stale_after_s, time.monotonic_ns())
-        self._documents: dict[str, dict[str, Any]] = {}
+        self._feed = Feed(depth, stale_after_s, time.monotonic_ns())
+        self._documents: dict[str, tuple[str | None, dict[str, Any]]] = {}  # who wrote it, and what
         self._closed = False
         try:
             self._declare()
@@ -66,7 +77,10 @@ class Client:
     def _declare(self) -> None:
         ring = zenoh.handlers.RingChannel
         liveliness = self._session.liveliness()
-        self._tokens = liveliness.declare_subscriber(f"{self.key}/alive/**", ring(64), history=True)
+        # In zenoh's thread (indirect=False), which never keeps the process from ending: no token is dropped,
+        # however many there are.
+        heard = zenoh.handlers.Callback(self._liveliness, indirect=False)
+        self._tokens = liveliness.declare_subscriber(f"{self.key}/alive/**", heard, history=True)
         self._estimates = self._declare_estimates(self.key + "/estimate")
         history = zenoh.ext.HistoryConfig(max_samples=1, detect_late_publishers=True)
         self._latched = {
@@ -128,6 +142,13 @@ class Client:
         return self._feed.stale(time.monotonic_ns())
 
     @property
+    def usable(self) -> bool:
+        """Fresh, valid, and nothing in its status speaks against it: what a controller checks."""
+        self._drain()
+        latest = self._feed.latest
+        return latest is not None and latest.status & _USABLE == Status.VALID and not self.stale
+
+    @property
     def valid(self) -> bool:
         """The latest estimate is fresh, and its numbers may be used."""
         return self._fresh(Status.VALID)
@@ -157,9 +178,20 @@ class Client:
 
     @property
     def foreign(self) -> int:
-        """Messages on the estimate's key that the daemon did not write; they are not used."""
+        """Messages on the joint's keys that its daemon did not write, or that cannot be true: not used."""
         self._drain()
-        return self._feed.foreign
+        return self._feed.identity.refused + self._feed.unusable
+
+    @property
+    def daemon(self) -> str | None:
+        """The zenoh session whose messages are used; None until one is known."""
+        self._drain()
+        return self._feed.identity.bound
+
+    @property
+    def rivals(self) -> int:
+        """Other sessions that claim to be the daemon of this joint; nothing of them is used."""
+        return self._feed.identity.rivals
 
     @property
     def status(self) -> dict[str, Any] | None:
@@ -192,18 +224,23 @@ class Client:
         return latest is not None and bool(latest.status & bit) and not self.stale
 
     def _document(self, name: str) -> dict[str, Any] | None:
+        self._drain()
+        identity = self._feed.identity
         with suppress(zenoh.ZError):
             while (sample := self._latched[name].try_recv()) is not None:
-                with suppress(ValueError):
-                    self._documents[name] = json.loads(sample.payload.to_bytes())
-        return self._documents.get(name)
+                if self._feed.trusts(source_of(sample), time.monotonic_ns()):
+                    try:
+                        self._documents[name] = identity.bound, DECODERS[name](sample.payload.to_bytes())
+                    except ZenohError:
+                        self._feed.unusable += 1
+        writer, document = self._documents.get(name, (None, None))
+        return document if writer == identity.bound else None
 
     def _drain(self) -> None:
         """Take in everything that zenoh has queued."""
         if self._closed:
             return
         with suppress(zenoh.ZError):  # closed meanwhile by another thread
-            self._learn()
             samples: list[zenoh.Sample] = []
             while len(samples) < self._depth and (sample := self._pop()) is not None:
                 samples.append(sample)
@@ -215,21 +252,16 @@ class Client:
             if len(samples) < self._depth:
                 self._feed.arrivals.empty(now_ns)
 
-    def _learn(self) -> None:
-        while (token := self._tokens.try_recv()) is not None:
-            self._feed.liveliness(token)
+    def _liveliness(self, token: zenoh.Sample) -> None:
+        session = str(token.key_expr).removeprefix(f"{self.key}/alive").lstrip("/")
+        self._feed.identity.token(session, token.kind == zenoh.SampleKind.PUT)
 
     def _admit(self, sample: zenoh.Sample, now_ns: int, overrun: bool = False) -> None:
         payload = sample.payload.to_bytes()
         if not payload and (attachment := sample.attachment) and attachment.to_bytes() == WAKE:
             return
-        feed = self._feed
-        if not feed.trusts(sample, now_ns):
-            self._learn()  # its token may have come meanwhile
-            if not feed.trusts(sample, now_ns):
-                feed.foreign += 1
-                return
-        feed.admit(payload, now_ns, overrun)
+        if self._feed.trusts(source_of(sample), now_ns):
+            self._feed.admit(payload, now_ns, overrun)
 
     def _newest(self) -> EstimateMessage | None:
         unread = self._feed.unread

@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections import deque
 from enum import StrEnum
 
-import zenoh
-
 from drivelink.errors import ZenohError
-from drivelink.pubsub.wire import EstimateMessage, decode_estimate
+from drivelink.pubsub.identity import DaemonIdentity
+from drivelink.pubsub.inbound import DECODERS
+from drivelink.pubsub.wire import EstimateMessage
 from estimator.sample import Status
 
 __all__ = ["WAKE", "Arrivals", "Feed", "State"]
@@ -23,6 +23,7 @@ _DRIFT = 1e-4  # what two clocks may run apart: 100 ppm
 _STALE_PERIODS = 5
 _STALE_AT_LEAST_NS = 20_000_000
 _STALE_UNKNOWN_NS = 500_000_000  # until two estimates have told the period
+_LONGEST_PERIOD_NS = 1_000_000_000  # no drive cycles slower; a stamp that jumps does not make anything fresh
 
 
 class State(StrEnum):
@@ -79,55 +80,25 @@ class Feed:
         received: estimates admitted.
         gaps: cycles that the daemon made and that never came, or that it lost itself.
         skipped: cycles that came and were dropped here because nobody read them in time.
-        foreign: messages on the key that the daemon did not write, or that are no estimates.
+        unusable: messages of the daemon that are no estimates, or are called valid and cannot be.
+        identity: whose messages are taken.
     """
 
-    def __init__(self, alive_key: str, depth: int, stale_after_s: float | None, now_ns: int) -> None:
+    def __init__(self, depth: int, stale_after_s: float | None, now_ns: int) -> None:
         self.latest: EstimateMessage | None = None
         self.unread: deque[tuple[bytes, EstimateMessage]] = deque(maxlen=depth)
-        self.received = self.gaps = self.skipped = self.foreign = 0
+        self.received = self.gaps = self.skipped = self.unusable = 0
         self.arrivals = Arrivals(now_ns)
-        self._alive_key = alive_key
+        self.identity = DaemonIdentity()
         self._depth = depth
         self._stale_after_ns = None if stale_after_s is None else int(stale_after_s * 1e9)
         self._period_ns = 0
-        self._seen = False  # whether the daemon was ever there
-        self._alive = False
-        self._owners: set[str] = set()  # sessions that say they are this joint's daemon
-        self._source: zenoh.ZenohId | None = None  # session that wrote the latest estimate
-        self._trusted = False  # whether a token vouches for that one
-        self._anew = True  # whether the next estimate is the first of its session
+        self._source: str | None = None  # session that wrote the latest estimate
 
-    def liveliness(self, sample: zenoh.Sample) -> None:
-        """A liveliness token of the daemon appeared or vanished."""
-        key = str(sample.key_expr)
-        there = sample.kind == zenoh.SampleKind.PUT
-        if key == self._alive_key:
-            self._alive = there
-            self._seen = self._seen or there
-            return
-        session = key.rpartition("/")[2]
-        (self._owners.add if there else self._owners.discard)(session)
-        self._trusted = False
-
-    def trusts(self, sample: zenoh.Sample, now_ns: int) -> bool:
-        """Whether the sample comes from the session whose token says that it is the daemon.
-
-        Without such a token (a plain publisher, or access control) it is whoever writes, until it is stale.
-        """
-        info = sample.source_info
-        source = info.source_id.zid if info else None
-        if self._trusted and source == self._source:
-            return True
-        if self._owners:
-            trusted = source is not None and str(source) in self._owners
-        else:
-            trusted = self.latest is None or source == self._source or self.stale(now_ns)
-        if trusted:
-            self._anew = source != self._source
-            self._source = source
-            self._trusted = bool(self._owners)
-        return trusted
+    def trusts(self, source: str, now_ns: int) -> bool:
+        """Whether a message of this session is the daemon's; see `DaemonIdentity.accepts`."""
+        identity = self.identity
+        return identity.accepts(source, source != identity.bound and self.stale(now_ns))
 
     def admit(self, payload: bytes, now_ns: int, overrun: bool) -> EstimateMessage | None:
         """Take one message of a trusted source; None: it is not an estimate.
@@ -138,21 +109,19 @@ class Feed:
             overrun: whether older messages were dropped here, unread, before this one.
         """
         try:
-            message = decode_estimate(payload)
+            message: EstimateMessage = DECODERS["estimate"](payload)
         except ZenohError:
-            self.foreign += 1
+            self.unusable += 1
             return None
-        if self._anew:
-            self._anew = False
-        else:
+        if self._source == self.identity.bound:
             self._count(message, overrun)
+        self._source = self.identity.bound
         self.arrivals.came(message.stamp_ns, now_ns)
         self.received += 1
         if len(self.unread) == self._depth:
             self.skipped += 1
         self.unread.append((payload, message))
         self.latest = message
-        self._seen = True
         return message
 
     def _count(self, message: EstimateMessage, overrun: bool) -> None:
@@ -170,7 +139,7 @@ class Feed:
             self.gaps += step - 1
         elapsed_ns = message.stamp_ns - before.stamp_ns
         if elapsed_ns > 0:
-            self._period_ns = elapsed_ns // step
+            self._period_ns = min(elapsed_ns // step, _LONGEST_PERIOD_NS)
 
     def stale(self, now_ns: int) -> bool:
         """Whether the latest estimate is too old to act on, or says so itself."""
@@ -186,6 +155,6 @@ class Feed:
         """The daemon's state, seen from here."""
         if not self.stale(now_ns):
             return State.LIVE
-        if self._alive:
+        if self.identity.alive:
             return State.STALE if self.latest is not None else State.WAITING
-        return State.GONE if self._seen else State.WAITING
+        return State.GONE if self.identity.seen else State.WAITING

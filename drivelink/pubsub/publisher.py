@@ -5,7 +5,8 @@ the sample next to it in a queue of its own. `status` and `model` are latched: a
 history gets the last one at once, and so does a query, which also answers `schema`. Of the joints of one
 daemon the last one's messages are express: each sends what waits in its queue, so that a cycle of many
 joints leaves in one batch. Nothing here listens to anything but those queries: no key changes what the
-daemon does.
+daemon does. Queries wait in zenoh until the slack answers them, a few at a time: a flood of them costs the
+cycle nothing, and drops those that nobody got round to.
 """
 
 from __future__ import annotations
@@ -21,14 +22,16 @@ from typing import TYPE_CHECKING, Any
 import zenoh
 import zenoh.ext
 
-from drivelink import __version__
+from drivelink._core import Tick, encode_estimate, encode_sample
 from drivelink.canopen.layout import NodeLayout, layout_document
 from drivelink.errors import ZenohError
 from drivelink.jointfile import JointFile, MotorSection
 from drivelink.pubsub.session import one_line
-from drivelink.pubsub.wire import ESTIMATE, SAMPLE, STATUS_BITS, encode_estimate, encode_sample
+from drivelink.pubsub.wire import ESTIMATE, SAMPLE, STATUS_BITS
+from drivelink.version import __version__
 from estimator.model import Effect
 from estimator.sample import Estimate, Sample, Status
+from estimator.transmissions import RIGID
 
 if TYPE_CHECKING:
     from drivelink.pubsub.ros2 import Ros2Publisher
@@ -36,6 +39,8 @@ if TYPE_CHECKING:
 __all__ = ["JointPublisher", "describe_model", "schema", "to_json"]
 
 _CLAIM_TIMEOUT_S = 1.0
+_QUERIES = 8  # that wait for an answer, of each key; zenoh drops the oldest beyond
+_PARTIAL = int(Status.PARTIAL)
 _JSON = zenoh.Encoding.APPLICATION_JSON
 
 
@@ -62,6 +67,8 @@ class JointPublisher:
         self._congestion_control = control.BLOCK if lossless else control.DROP
         self._express = express
         self._documents: dict[str, bytes] = {}
+        self._questions: list[tuple[str, Any]] = []
+        self._partial = False
         self._entities: list[Any] = []
         self._ros2: Ros2Publisher | None = None
         try:
@@ -70,7 +77,7 @@ class JointPublisher:
             self._sample = self._stream("sample", SAMPLE.schema, zenoh.Priority.INTERACTIVE_HIGH)
             self._latched = {name: self._latch(name) for name in ("status", "model")}
             self._answer("schema", to_json(schema()))
-            self.put_model(describe_model(joint))
+            self.put_joint(joint)
             self._ros2 = self._open_ros2(joint)
             self._alive(self.key + "/alive")
         except zenoh.ZError as error:
@@ -83,6 +90,20 @@ class JointPublisher:
         self._estimate_source = zenoh.SourceInfo(self._estimate.id, 0)
         self._sample_source = zenoh.SourceInfo(self._sample.id, 0)
 
+    def put(self, tick: Tick) -> None:
+        """Publish one cycle, its estimate before its sample; never waits for a subscriber."""
+        if self._partial:
+            tick = tick.flagged(_PARTIAL)
+        self._estimate.put(tick.estimate_payload, source_info=self._estimate_source)
+        payload = tick.sample_payload
+        if payload is not None:
+            self._sample.put(payload, source_info=self._sample_source)
+        if self._ros2 is not None:
+            self._ros2.latest = tick.estimate
+            sample = tick.sample
+            if sample is not None:
+                self._ros2.put_cycle(self._ros2.latest, sample, tick.stamp_ns)
+
     def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
         """Publish the estimate of one cycle; never waits for a subscriber.
 
@@ -90,6 +111,8 @@ class JointPublisher:
             estimate: of this cycle.
             stamp_ns: UNIX time of its SYNC, ns.
         """
+        if self._partial:
+            estimate = estimate._replace(status=int(estimate.status) | _PARTIAL)
         self._estimate.put(encode_estimate(estimate, stamp_ns), source_info=self._estimate_source)
         if self._ros2 is not None:
             self._ros2.latest = estimate
@@ -109,12 +132,29 @@ class JointPublisher:
     def put_status(self, status: Mapping[str, Any]) -> None:
         """Publish the daemon's state; what is not finite becomes null."""
         self._put_document("status", status)
+        self.answer()
         if self._ros2 is not None:
             self._ros2.put_status(status, time.time_ns())
 
-    def put_model(self, model: Mapping[str, Any]) -> None:
-        """Publish the model in use; to be called when it changes."""
-        self._put_document("model", model)
+    def put_joint(self, joint: JointFile, layouts: Sequence[NodeLayout] = ()) -> None:
+        """Publish the model in use; to be called when it changes.
+
+        Args:
+            joint: the joint file in use.
+            layouts: of its nodes, once they are known.
+        """
+        rigid = any(motor.transmission.model == RIGID for motor in joint.motor)
+        self._partial = rigid or joint.estimator.mode == "paper"
+        self._put_document("model", describe_model(joint, layouts))
+
+    def answer(self) -> None:
+        """Answer one waiting query of each key; to be called in the slack, some twenty times a second."""
+        for name, queryable in self._questions:
+            with suppress(zenoh.ZError):
+                query = queryable.try_recv()
+                if query is not None:
+                    with query:
+                        query.reply(f"{self.key}/{name}", self._documents[name], encoding=_JSON, express=True)
 
     def close(self) -> None:
         """Take the keys off zenoh, the liveliness token first; a second time does nothing."""
@@ -176,17 +216,12 @@ class JointPublisher:
         return publisher
 
     def _answer(self, name: str, document: bytes) -> None:
-        """Answer queries of a key with its document, in zenoh's thread: no thread of Python's."""
-        key = f"{self.key}/{name}"
-        documents = self._documents
-        documents[name] = document
-
-        def reply(query: zenoh.Query) -> None:
-            with query:
-                query.reply(key, documents[name], encoding=_JSON, express=True)
-
-        handler = zenoh.handlers.Callback(reply, indirect=False)
-        self._entities.append(self._session.declare_queryable(key, handler, complete=True))
+        """Answer queries of a key with its document, from `answer`."""
+        self._documents[name] = document
+        ring: Any = zenoh.handlers.RingChannel(_QUERIES)
+        queryable = self._session.declare_queryable(f"{self.key}/{name}", ring, complete=True)
+        self._entities.append(queryable)
+        self._questions.append((name, queryable))
 
     def _put_document(self, name: str, document: Mapping[str, Any]) -> None:
         payload = to_json(document)

@@ -9,17 +9,18 @@ microcontroller. The tables below are the only statement of the layout: the stru
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import chain
 from struct import Struct
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from drivelink._core import encode_estimate, encode_sample
 from drivelink.errors import ZenohError
-from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
+from estimator.sample import Sample, Status, TransmissionEstimate
 
 __all__ = [
     "ESTIMATE",
@@ -38,7 +39,7 @@ __all__ = [
 
 MAX_ELEMENTS = 8  # transmissions or motors in one message; below 128 the varint is one byte
 _STRUCT_CODES = {"u64": "Q", "u32": "I", "f64": "d"}
-_U32 = 0xFFFF_FFFF
+_VALID, _PARTIAL = int(Status.VALID), int(Status.PARTIAL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,6 +161,7 @@ STATUS_BITS: Mapping[str, str] = MappingProxyType(
         "STALE": "the estimate is carried on without fresh measurements",
         "UNTIMED": "another master made SYNC: values may be of another moment; nothing is learned from them",
         "NODE_RESTARTED": "positions may have started anew: with this sample the estimator begins anew",
+        "PARTIAL": "what is NaN is not given: stiffness of a rigid joint, standard deviation in mode paper",
     }
 )
 
@@ -204,43 +206,43 @@ _make_message = EstimateMessage._make
 _make_transmission = TransmissionEstimate._make
 
 
-def encode_estimate(estimate: Estimate, stamp_ns: int) -> bytes:
-    """The bytes of `<prefix>/<joint>/estimate`.
-
-    Args:
-        estimate: at most MAX_ELEMENTS transmissions.
-        stamp_ns: UNIX time of its SYNC, ns.
-    """
-    sequence, status, torque, stiffness, std, transmissions = estimate
-    count = len(transmissions)
-    numbers = chain.from_iterable(transmissions)
-    return _ESTIMATES[count].pack(sequence, stamp_ns, status & _U32, torque, stiffness, std, count, *numbers)
-
-
 def decode_estimate(payload: bytes) -> EstimateMessage:
     """Read the bytes of `<prefix>/<joint>/estimate`.
 
     Raises:
-        ZenohError: these are no such bytes.
+        ZenohError: these are no such bytes, or they are called valid and hold a number that no joint has:
+            not finite, a negative stiffness or standard deviation. NaN is taken where PARTIAL says so.
     """
     count = _count(payload, _ESTIMATE_COUNTS, ESTIMATE)
     *head, told = _ESTIMATE_HEAD.unpack_from(payload)
     _require_count(told, count, ESTIMATE)
     elements = tuple(map(_make_transmission, _TRANSMISSION.iter_unpack(payload[_ESTIMATE_HEAD.size :])))
-    return _make_message((*head, elements))
+    message = _make_message((*head, elements))
+    if message.status & _VALID and not _usable(message):
+        raise ZenohError(f"{ESTIMATE.schema}: called valid, but not every number in it is one")
+    return message
 
 
-def encode_sample(sample: Sample, stamp_ns: int) -> bytes:
-    """The bytes of `<prefix>/<joint>/sample`.
+def _usable(message: EstimateMessage) -> bool:
+    """Whether every number may be used: finite, stiffness and standard deviation not negative."""
+    _, _, status, torque, stiffness, std, transmissions = message
+    partial = bool(status & _PARTIAL)
+    if not (math.isfinite(torque) and _magnitude(stiffness, partial) and _magnitude(std, partial)):
+        return False
+    for own_torque, own_stiffness, own_std, deflection in transmissions:
+        if not (
+            math.isfinite(own_torque)
+            and _magnitude(own_stiffness, partial)
+            and _magnitude(own_std, partial)
+            and (math.isfinite(deflection) or (partial and deflection != deflection))
+        ):
+            return False
+    return True
 
-    Args:
-        sample: of at most MAX_ELEMENTS motors.
-        stamp_ns: UNIX time of its SYNC, ns.
-    """
-    sequence, position, velocity, torque, link, link_velocity, external = sample
-    count = len(position)
-    numbers = [number for motor in zip(position, velocity, torque, strict=True) for number in motor]
-    return _SAMPLES[count].pack(sequence, stamp_ns, link, link_velocity, external, count, *numbers)
+
+def _magnitude(number: float, partial: bool) -> bool:
+    """Whether it is finite and not negative, or NaN where that is said."""
+    return 0.0 <= number < math.inf or (partial and number != number)
 
 
 def decode_sample(payload: bytes) -> SampleMessage:

@@ -8,25 +8,28 @@ from __future__ import annotations
 
 import json
 import logging
+from array import array
 from collections.abc import Iterator
 from contextlib import suppress
-from itertools import chain, islice, pairwise
+from itertools import chain, islice
 from pathlib import Path
-from statistics import median
 
 import numpy as np
 
+from drivelink._core import SYNC_COB_ID, Assembler
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cycle.acquisition import SYNC_COB_ID, Assembler
 from drivelink.cycle.chain import make_assembler
 from drivelink.cycle.following import MapFollower
+from drivelink.cycle.syncclock import measure_period
 from drivelink.errors import DriveError, RecordingError
 from drivelink.jointfile import JointFile
-from drivelink.recording.canlog import CAN_SUFFIXES, NO_STAMP, Frame, read_frames
+from drivelink.recording.canlog import CAN_SUFFIXES, NO_STAMP, Frame, in_order, read_frames
+from drivelink.recording.columns import sample_columns, sample_row
 from drivelink.recording.cycles import Cycle
 from drivelink.recording.grid import report_gaps
-from drivelink.recording.mapping import recorded_layouts
+from drivelink.recording.limits import require_samples
+from drivelink.recording.mapping import recorded_layouts, side_file
 from drivelink.recording.mcapfile import read_messages
 from drivelink.recording.syncnumbers import numbered_ahead, numbered_at_once
 from estimator.sample import FloatArray, Record
@@ -38,7 +41,6 @@ _LOG = logging.getLogger("drivelink.recording")
 _SDO = range(0x581, 0x680)
 _OF_MAPS = frozenset({0, *_SDO, *range(0x701, 0x780)})  # NMT, SDO, boot-up
 _QUIET_SYNCS = 500  # without a change of the configuration: it is over
-_PERIOD_TOLERANCE = 0.03
 _PEEK = 20_000  # messages that tell whether an MCAP file has samples
 
 
@@ -84,7 +86,9 @@ class FrameLog:
 
         def frames() -> Iterator[Frame]:
             mcap = path.suffix.lower() == ".mcap"
-            return _mcap_frames(path) if mcap else read_frames(path, channel, joint.bus.channel)
+            return (
+                in_order(_mcap_frames(path), path) if mcap else read_frames(path, channel, joint.bus.channel)
+            )
 
         self._frames = frames()
         self._follow = joint.bus.sync == "follow"
@@ -106,15 +110,22 @@ class FrameLog:
             raise RecordingError(f"{path}: {error}") from error
 
     def cycles(self) -> Iterator[Cycle]:
-        """The cycles that the frames make; once."""
+        """The cycles that the frames make; once.
+
+        Raises:
+            RecordingError: the recording is broken, or they make no sample.
+        """
         assembler = self._assembler
         follower = self._follower() if self._passive else None
         numbered = numbered_at_once if self._follow else numbered_ahead
         stamp_now = stamp_before = 0
+        heard: set[int] = set()
+        samples = False
         for (stamp_ns, can_id, data, _), jump in numbered(chain(self._head, self._frames), self.period_s):
             was = assembler.sequence
             sample = assembler.feed(can_id, data, jump)
-            if can_id == SYNC_COB_ID and jump:
+            heard.add(can_id)
+            if can_id == SYNC_COB_ID and jump > 0:
                 stamp_before, stamp_now = stamp_now, stamp_ns
             if follower is not None and (can_id in _OF_MAPS or can_id == SYNC_COB_ID):
                 follower.feed(can_id, data)
@@ -122,10 +133,24 @@ class FrameLog:
                 self._relayout(can_id, data, assembler)
             if sample is not None:
                 stamp_ns = stamp_before if assembler.sequence != was else stamp_now
+                samples = True
                 yield Cycle(sample.sequence, stamp_ns, sample, assembler.flags)
-            elif assembler.missed >= 0:
-                missed, assembler.missed = assembler.missed, -1
+            elif can_id == SYNC_COB_ID and jump and (missed := assembler.missed) >= 0:
                 yield Cycle(missed, stamp_before, None, assembler.flags)
+        if not samples:
+            raise RecordingError(f"{self._path}: no complete sample in it{self._absent(heard)}")
+
+    def _absent(self, heard: set[int]) -> str:
+        """Which frames of the mapping never came."""
+        absent = [
+            f"0x{tpdo.cob_id:03X} of node {layout.node_id}"
+            for layout in self._listener.layouts.values()
+            for tpdo in layout.tpdos
+            if tpdo.cob_id not in heard
+        ]
+        if not absent:
+            return ""
+        return f": expected frames {', '.join(absent)}, got none (another node id, channel or mapping?)"
 
     def _follower(self) -> MapFollower:
         """Somebody else maps the nodes: the maps are followed as the daemon follows them."""
@@ -164,33 +189,30 @@ class FrameLog:
         """Raise where the mapping of a node is not known."""
         if self._listener.busy:
             reason = next(iter(self._listener.missing.values()))
-            raise RecordingError(f"{self._path}: {reason} (nor is it configured by SDO in the recording)")
+            raise RecordingError(
+                f"{self._path}: {reason} (nor is it configured by SDO in the recording, nor is "
+                f"there a {side_file(self._path).name} beside it)"
+            )
 
     def _period(self, syncs: list[int], configured_s: float) -> float:
         """The period that the recorded SYNCs have: the configured one, where they agree."""
         if len(syncs) < 3:
             raise RecordingError(
-                f"{self._path}: expected SYNC frames (0x080) to tell the time of a sample, got {len(syncs)}"
+                f"{self._path}: expected SYNC frames (0x080), which tell the time of a sample, got "
+                f"{len(syncs)}: record the whole bus, no filter set, while its master sends SYNC"
             )
         if syncs[0] == NO_STAMP:
             return configured_s
-        steps_s = sorted((b - a) * 1e-9 for a, b in pairwise(syncs))
-        measured_s = median(steps_s)
-        # A master that is often late leaves SYNCs out: then the shorter steps tell.
-        short_s = steps_s[len(steps_s) // 10]
-        if measured_s <= 0 or any(
-            abs(s / configured_s - 1) <= _PERIOD_TOLERANCE for s in (measured_s, short_s)
-        ):
+        measured = measure_period([stamp for stamp in syncs if stamp != NO_STAMP], configured_s)
+        if measured is None or measured.same:
             return configured_s
-        rounded = float(f"{measured_s:.2g}")
-        period_s = rounded if abs(rounded / measured_s - 1) <= _PERIOD_TOLERANCE else measured_s
         _LOG.warning(
             "%s: SYNC comes every %.4g s, not every %.4g s as bus.period_s says: taken as it comes",
             self._path,
-            period_s,
+            measured.period_s,
             configured_s,
         )
-        return period_s
+        return measured.period_s
 
     def _relayout(self, can_id: int, data: bytes, assembler: Assembler) -> None:
         """A node is given another mapping in the middle of the recording."""
@@ -210,25 +232,35 @@ def read_frame_record(path: Path, joint: JointFile | None, base_dir: Path, chann
     if joint is None:
         raise RecordingError(f"{path}: a raw CAN recording needs the joint file that says what is in it")
     log = FrameLog(path, joint, base_dir, channel)
-    samples = [cycle.sample for cycle in log.cycles() if cycle.sample is not None]
-    if len(samples) < 3:
-        raise RecordingError(f"{path}: expected at least 3 complete samples, got {len(samples)}")
-    sequence = np.array([sample.sequence for sample in samples], dtype=np.int64)
-    report_gaps(sequence, log.period_s, str(path))
+    motors = len(joint.motor)
+    sequence, values = array("q"), array("d")
+    for cycle in log.cycles():
+        if (sample := cycle.sample) is not None:
+            sequence.append(sample.sequence)
+            values.extend(sample_row(sample, log.period_s))
+            require_samples(sample.sequence - sequence[0] + 1, str(path))
+    if len(sequence) < 3:
+        raise RecordingError(f"{path}: expected at least 3 complete samples, got {len(sequence)}")
+    number = np.frombuffer(sequence, dtype=np.int64)
+    report_gaps(number, log.period_s, str(path))
+    names = sample_columns(motors)
+    table = np.frombuffer(values, dtype=np.float64).reshape(-1, len(names))
+    columns = {name: np.ascontiguousarray(table[:, k]) for k, name in enumerate(names)}
 
-    def optional(values: list[float]) -> FloatArray | None:
-        column = np.array(values, dtype=np.float64)
+    def motor(name: str) -> FloatArray:
+        return np.stack([columns[f"motor{i}_{name}"] for i in range(1, motors + 1)], axis=1)
+
+    def known(column: FloatArray) -> FloatArray | None:
         return column if np.any(np.isfinite(column)) else None
 
-    velocity = np.array([sample.motor_velocity_rad_s for sample in samples], dtype=np.float64)
     return Record(
         period_s=log.period_s,
-        sequence=sequence,
-        motor_position_rad=np.array([sample.motor_position_rad for sample in samples], dtype=np.float64),
-        motor_torque_nm=np.array([sample.motor_torque_nm for sample in samples], dtype=np.float64),
-        motor_velocity_rad_s=velocity if np.any(np.isfinite(velocity)) else None,
-        link_position_rad=optional([sample.link_position_rad for sample in samples]),
-        link_velocity_rad_s=optional([sample.link_velocity_rad_s for sample in samples]),
+        sequence=number,
+        motor_position_rad=motor("position_rad"),
+        motor_torque_nm=motor("torque_nm"),
+        motor_velocity_rad_s=known(motor("velocity_rad_s")),
+        link_position_rad=known(columns["link_position_rad"]),
+        link_velocity_rad_s=known(columns["link_velocity_rad_s"]),
     )
 
 

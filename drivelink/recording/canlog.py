@@ -1,4 +1,4 @@
-"""Raw CAN logs as they are found: candump in its variants, BLF, ASC, PCAN .trc, whatever python-can reads.
+"""Raw CAN logs as they are found: candump in its variants, BLF, ASC, PCAN .trc, by python-can's readers.
 
 Frames come out as plain tuples in the order of the file. Only data frames with 11-bit identifiers are
 CANopen: all others are left out.
@@ -18,17 +18,25 @@ from typing import IO, Any, NamedTuple
 import can
 
 from drivelink.errors import RecordingError
+from drivelink.recording.boundedlog import AscText, BlfBytes, TrcText
+from drivelink.recording.limits import MAX_LINE_BYTES
 
-__all__ = ["CAN_SUFFIXES", "NO_STAMP", "Frame", "read_frames"]
+__all__ = ["CAN_SUFFIXES", "NO_STAMP", "Frame", "in_order", "read_frames"]
 
 _LOG = logging.getLogger("drivelink.recording")
 
 _READERS: dict[str, Any] = {".blf": can.BLFReader, ".asc": can.ASCReader, ".trc": can.TRCReader}
+_BOUNDED: dict[Any, Any] = {can.BLFReader: BlfBytes, can.ASCReader: AscText, can.TRCReader: TrcText}
 CAN_SUFFIXES = frozenset({".log", ".candump", *_READERS})
 NO_STAMP = -1
 _EXTENDED_DIGITS = 8
+_LAST_ID = 0x7FF
+_LONGEST = 64  # bytes of a frame: those of CAN XL are no CANopen
+_LINE = 16 << 10  # bytes; candump's longest, of CAN XL, has 6 KiB
 _BLOCK = 1 << 18  # bytes read at once
 _HOPELESS = 20  # strange lines at the beginning: it is no log
+_DISORDER_NS = 1_000_000_000  # by which stamps of frames in one file may be out of order
+_GAP_NS = 1_000_000_000
 _LOOK_AHEAD = 2000  # frames that decide what the stamps mean, and which channels there are
 
 
@@ -49,15 +57,18 @@ class Frame(NamedTuple):
 
 
 # (1436509052.249713) vcan0 044#2A366C2BBA R          candump -L, to the letter
-_PLAIN = re.compile(r"^\((\d+)\.(\d{6})\) (\S+) ([0-9A-F]{3})#((?:[0-9A-F]{2})*)(?: [RT])?\n", re.MULTILINE)
+_PLAIN = re.compile(
+    r"^\((\d{1,11})\.(\d{6})\) (\S+) ([0-9A-F]{3})#((?:[0-9A-F]{2})*)(?: [RT])?\n", re.MULTILINE
+)
 # … brackets or none
 _COMPACT = re.compile(
-    rb"^[ \t]*(?:\(?(\d+)[.,](\d+)\)?[ \t]+)?(\S+)[ \t]+([0-9A-Fa-f]+)#(#[0-9A-Fa-f])?([0-9A-Fa-f.]*)(R?)"
+    rb"^[ \t]*(?:\(?(\d{1,11})[.,](\d+)\)?[ \t]+)?(\S+)[ \t]+([0-9A-Fa-f]{1,8})#"
+    rb"(#[0-9A-Fa-f])?([0-9A-Fa-f.]*)(R?)"
 )
 #  (1436509052.249713)  vcan0  RX - -  044   [5]  2A 36 6C 2B BA   '*6l+.'
 _SPACED = re.compile(
-    rb"^[ \t]*(?:\(?(\d+)[.,](\d+)\)?[ \t]+)?(\S+)[ \t]+(?:[RT]X[ \t]+[-BE ]+[ \t]+)?([0-9A-Fa-f]+)[ \t]+"
-    rb"\[ ?0?(\d+)\][ \t]*((?:[0-9A-Fa-f]{2}(?:[ \t]+|$))*)(.*)"
+    rb"^[ \t]*(?:\(?(\d{1,11})[.,](\d+)\)?[ \t]+)?(\S+)[ \t]+(?:[RT]X[ \t]+[-BE ]+[ \t]+)?"
+    rb"([0-9A-Fa-f]{1,8})[ \t]+\[ ?0?(\d{1,4})\][ \t]*((?:[0-9A-Fa-f]{2}(?:[ \t]+|$))*)(.*)"
 )
 #  (2026-01-31 09:41:02.249713)  …                     candump -t A
 _DATE = re.compile(rb"^[ \t]*\((\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d)\.(\d+)\)")
@@ -77,10 +88,32 @@ def read_frames(path: Path, channel: str | None = None, configured: str = "") ->
     frames = _text_frames(path) if path.suffix.lower() in (".log", ".candump") else _library_frames(path)
     head = list(islice(frames, _LOOK_AHEAD))
     chosen = channel or _channel(head, configured, path)
-    whole = chain(head, frames)
-    if chosen is None:
-        return whole
-    return (frame for frame in whole if _same_channel(frame.channel, chosen))
+    whole: Iterator[Frame] = chain(head, frames)
+    if chosen is not None:
+        whole = (frame for frame in whole if _same_channel(frame.channel, chosen))
+    return in_order(whole, path)
+
+
+def in_order(frames: Iterable[Frame], path: Path) -> Iterator[Frame]:
+    """Frames whose stamps go on where they jump back: a clock that was set, or two logs in one file.
+
+    How long it took nobody knows: it is a gap, of a second, and said.
+    """
+    offset = last = 0
+    for frame in frames:
+        stamp_ns = frame.stamp_ns + offset
+        if last - stamp_ns > _DISORDER_NS and frame.stamp_ns != NO_STAMP:
+            _LOG.warning(
+                "%s: the stamps jump back by %.4g s at %.6f s: taken as a gap of %g s",
+                path,
+                (last - stamp_ns) * 1e-9,
+                frame.stamp_ns * 1e-9,
+                _GAP_NS * 1e-9,
+            )
+            offset += last + _GAP_NS - stamp_ns
+            stamp_ns = last + _GAP_NS
+        last = max(last, stamp_ns)
+        yield frame._replace(stamp_ns=stamp_ns) if offset and frame.stamp_ns != NO_STAMP else frame
 
 
 def _channel(head: list[Frame], configured: str, path: Path) -> str | None:
@@ -118,9 +151,13 @@ def _parsed(file: IO[bytes], path: Path) -> Iterator[Frame]:
     """The lines that are data frames with 11-bit identifiers; what is no frame at all is counted."""
     tolerant = _Lines()
     while block := file.read(_BLOCK):
-        block += file.readline()
+        block += file.readline(MAX_LINE_BYTES)
+        if not block.endswith(b"\n"):
+            end = block.rfind(b"\n") + 1
+            _require_end(file, len(block) - end, path)
+            block = block[:end]
         plain = _PLAIN.findall(block.decode("latin-1"))
-        if len(plain) == block.count(b"\n"):
+        if plain and len(plain) == block.count(b"\n"):
             tolerant.skip(len(plain))
             yield from _plain_frames(plain)
         else:
@@ -140,11 +177,23 @@ def _parsed(file: IO[bytes], path: Path) -> Iterator[Frame]:
         )
 
 
+def _require_end(file: IO[bytes], length: int, path: Path) -> None:
+    """What has no end is the last line: it is left out, nothing tells whether its last byte is whole.
+
+    Raises:
+        RecordingError: it is no last line: more than a line may have, and more follows.
+    """
+    if length >= MAX_LINE_BYTES or file.read(1):
+        raise RecordingError(f"{path}: expected lines of at most {MAX_LINE_BYTES >> 10} KiB")
+    _LOG.warning("%s: the last line has no end and is left out: it may be cut off", path)
+
+
 def _plain_frames(lines: list[tuple[str, ...]]) -> Iterator[Frame]:
     """The frames of a block in which every line is as candump -L writes it: much quicker than one by one."""
     seconds, micros, channels, ids, data = zip(*lines, strict=True)
     stamps = [int(s + us) * 1000 for s, us in zip(seconds, micros, strict=True)]
-    return map(Frame, stamps, [int(i, 16) for i in ids], map(bytes.fromhex, data), channels)
+    frames = map(Frame, stamps, [int(i, 16) for i in ids], map(bytes.fromhex, data), channels)
+    return (frame for frame in frames if frame.can_id <= _LAST_ID and len(frame.data) <= _LONGEST)
 
 
 class _Lines:
@@ -178,7 +227,7 @@ class _Lines:
             if line.isspace() or line.lstrip().startswith((b"#", b";")):
                 continue
             try:
-                frame = self._either(line)
+                frame = self._either(line) if len(line) <= _LINE else _no_frame()
             except ValueError:
                 self.strange += 1
                 shown = repr(line.strip()[:60].decode(errors="replace"))
@@ -199,14 +248,20 @@ class _Lines:
             return self._parse(line)
 
 
+def _no_frame() -> Frame:
+    raise ValueError
+
+
 def _compact(line: bytes) -> Frame | None:
     match = _COMPACT.match(line) or _COMPACT.match(_undated(line))
     if match is None:
         raise ValueError
     seconds, fraction, channel, can_id, _fd_flags, data, remote = match.groups()
-    if len(can_id) == _EXTENDED_DIGITS or remote:
+    if len(can_id) == _EXTENDED_DIGITS or int(can_id, 16) > _LAST_ID or remote:
         return None
     payload = bytes.fromhex(data.replace(b".", b"").decode())
+    if len(payload) > _LONGEST:
+        return None
     return Frame(_stamp(seconds, fraction), int(can_id, 16), payload, channel.decode(errors="replace"))
 
 
@@ -215,7 +270,9 @@ def _spaced(line: bytes) -> Frame | None:
     if match is None:
         raise ValueError
     seconds, fraction, channel, can_id, length, data, rest = match.groups()
-    if len(can_id) == _EXTENDED_DIGITS or rest.startswith((b"remote", b"ERRORFRAME")):
+    if len(can_id) == _EXTENDED_DIGITS or int(can_id, 16) > _LAST_ID or int(length) > _LONGEST:
+        return None
+    if rest.startswith((b"remote", b"ERRORFRAME")):
         return None
     payload = bytes.fromhex(data.decode())
     if len(payload) < int(length):
@@ -264,16 +321,20 @@ def _library_frames(path: Path) -> Iterator[Frame]:
     count = 0
     try:
         # Opened here: a reader that finds the file strange would leave it open.
-        with path.open("rb") if kind is can.BLFReader else path.open(errors="replace") as file:
-            for message in kind(file):
+        with path.open("rb") as file:
+            for message in kind(_BOUNDED[kind](file, path)):
                 if message.is_extended_id or message.is_error_frame or message.is_remote_frame:
+                    continue
+                if message.arbitration_id > _LAST_ID or len(message.data) > _LONGEST:
                     continue
                 count += 1
                 stamp_ns = round(message.timestamp * 1e9)
                 yield Frame(stamp_ns, message.arbitration_id, bytes(message.data), str(message.channel))
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except RecordingError:
+        raise
     except Exception as error:  # readers raise whatever a broken byte leads them to
         if not count:
-            raise RecordingError(f"{path}: cannot be read as {path.suffix} log: {error}") from error
-        _LOG.warning("%s: broken after %d frames (%s): what follows is left out", path, count, error)
+            raise RecordingError(f"{path}: cannot be read as {path.suffix} log: {str(error)[:80]}") from error
+        _LOG.warning("%s: broken after %d frames (%.80s): what follows is left out", path, count, error)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from drivelink.errors import RecordingError
 from drivelink.jointfile import JointFile
 from drivelink.recording.grid import find_grid, report_gaps
+from drivelink.recording.limits import require_samples
 from estimator.errors import EstimatorError
 from estimator.sample import FloatArray, Record, Sample
 
@@ -100,6 +101,8 @@ def record_from_columns(
     velocity = None if all(v is None for v in velocities) else stacked(present)
     sequence = grid.sequence[rows]
     report_gaps(sequence, grid.period_s, where)
+    if not keep_nan:  # what takes it tick by tick has no room for the gaps
+        require_samples(int(sequence[-1]) + 1, where)
     optional = {name: values[rows] for name in _LINK if (values := column(name)) is not None}
     try:
         return Record(

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Iterator
 from itertools import islice
 from typing import NamedTuple
 
-from drivelink.cycle.chain import Chain
+from drivelink._core import Chain, Tick
 from drivelink.errors import DrivelinkError
-from estimator.sample import Estimate, Sample
+from estimator.sample import Sample
 
 __all__ = ["Cycle", "batches", "estimated"]
 
@@ -31,19 +31,19 @@ class Cycle(NamedTuple):
     flags: int
 
 
-def estimated(cycles: Iterable[Cycle], chain: Chain) -> Iterator[tuple[Cycle, Estimate]]:
-    """The cycles with what the chain makes of them, as the live loop would have published it.
+def estimated(cycles: Iterable[Cycle], chain: Chain) -> Iterator[Tick]:
+    """What the chain makes of the cycles, as the live loop would have published it.
 
     Reading and estimating take turns of many cycles: a processor that does one thing for a while is quicker
     than one that changes between them every cycle.
     """
     for batch in batches(cycles):
         for cycle in batch:
-            sequence, _, sample, flags = cycle
+            sequence, stamp_ns, sample, flags = cycle
             if sample is not None:
-                yield cycle, chain.take(sample, flags)
-            elif (estimate := chain.carry_on(sequence, flags)) is not None:
-                yield cycle, estimate
+                yield chain.take(sample, flags, stamp_ns)
+            elif (tick := chain.carry_on(sequence, flags, stamp_ns)) is not None:
+                yield tick
 
 
 def batches(cycles: Iterable[Cycle]) -> Iterator[list[Cycle]]:

@@ -22,7 +22,7 @@ MAX_LINE_BYTES = 1 << 20  # of a line of text
 MAX_BLOCK_BYTES = 64 << 20  # an MCAP chunk or a BLF container, unpacked; tools write up to 8 MiB
 
 
-def require_samples(count: int, where: str, longest_gap: str = "") -> None:
+def require_samples(count: int, where: str) -> None:
     """Refuse more samples, or periods with their gaps, than are read as a whole.
 
     Raises:
@@ -31,5 +31,5 @@ def require_samples(count: int, where: str, longest_gap: str = "") -> None:
     if count > MAX_SAMPLES:
         raise RecordingError(
             f"{where}: expected at most {MAX_SAMPLES} periods from the first sample to the last, "
-            f"got {count}{longest_gap}: split it"
+            f"got {count}: split it, at a gap if there is one"
         )

@@ -50,7 +50,8 @@ class EstimatesFile:
 
     def take(self, played: Played) -> None:
         """Write one row."""
-        time_s, _, estimate, _ = played
+        time_s, tick = played
+        estimate = tick.estimate
         totals = (estimate.flexibility_torque_nm, estimate.stiffness_nm_rad, estimate.stiffness_std_nm_rad)
         row = estimate_row(time_s, estimate.status, totals, estimate.transmissions)
         self._rows.append(self._line % row)
@@ -116,9 +117,7 @@ class Publication:
         if self._publisher is None:
             return
         stamp_ns = self._begin_unix_ns + round(passed_s / (self._speed or 1.0) * 1e9)
-        self._publisher.put_estimate(played.estimate, stamp_ns)
-        if played.sample is not None:
-            self._publisher.put_sample(played.sample, stamp_ns)
+        self._publisher.put(played.tick.stamped(stamp_ns))
         if passed_s >= self._status_due_s:
             self._status_due_s = passed_s + _STATUS_EVERY_S * (self._speed or 1.0)
             self._status("replay", passed_s)
@@ -151,11 +150,12 @@ class Summary:
         if not self.count:
             self._first_s = played.time_s
         self.count += 1
-        estimate = played.estimate
-        self.valid += estimate.status & _VALID != 0
-        self.observable += estimate.status & _OBSERVABLE != 0
+        status = played.tick.status
+        self.valid += status & _VALID != 0
+        self.observable += status & _OBSERVABLE != 0
         self._last = played
         if self._keep:
+            estimate = played.tick.estimate
             totals = (
                 estimate.flexibility_torque_nm, estimate.stiffness_nm_rad, estimate.stiffness_std_nm_rad
             )  # fmt: skip
@@ -166,7 +166,7 @@ class Summary:
         if self._last is None:
             return "no cycle in it"
         seconds = self._last.time_s - self._first_s
-        estimate = self._last.estimate
+        estimate = self._last.tick.estimate
         half = 1.96 * estimate.stiffness_std_nm_rad
         return (
             f"{self.count} cycles, {seconds:.6g} s, in {took_s:.3g} s "
@@ -178,7 +178,7 @@ class Summary:
 
     def document(self) -> dict[str, Any]:
         """The replay for machines; what is not finite is None."""
-        estimate = self._last.estimate if self._last is not None else None
+        estimate = self._last.tick.estimate if self._last is not None else None
         end = {
             name: value if estimate is not None and math.isfinite(value := getattr(estimate, name)) else None
             for name in ("stiffness_nm_rad", "stiffness_std_nm_rad", "flexibility_torque_nm")

@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from drivelink.cycle.acquisition import Assembler
-from drivelink.cycle.chain import Chain, build
+from drivelink._core import Assembler, Chain, Tick
+from drivelink.cycle.chain import build
 from drivelink.jointfile import JointFile
 from drivelink.recording import read
 from drivelink.recording.ahead import FrameLogAhead
@@ -17,7 +17,7 @@ from drivelink.recording.canframes import FrameLog, is_frame_log
 from drivelink.recording.columnmap import ColumnMap
 from drivelink.recording.cycles import Cycle, estimated
 from drivelink.recording.mcapsamples import recorded_cycles
-from estimator.sample import Estimate, Sample
+from estimator.sample import Sample
 
 __all__ = ["Playback", "Played", "open_playback"]
 
@@ -27,15 +27,12 @@ class Played(NamedTuple):
 
     Attributes:
         time_s: of its SYNC, as the recording counts time.
-        stamp_ns: UNIX time of its SYNC, where the recording has it; else `time_s` in nanoseconds.
-        estimate: as the daemon would have published it.
-        sample: what it was made from; None where the last estimate was carried on.
+        tick: as the daemon would have published it, stamped with the UNIX time of its SYNC, where the
+            recording has it; else with `time_s` in nanoseconds.
     """
 
     time_s: float
-    stamp_ns: int
-    estimate: Estimate
-    sample: Sample | None
+    tick: Tick
 
 
 class Playback:
@@ -125,9 +122,9 @@ def open_playback(
 def _from_samples(samples: Iterable[Sample], times: list[float], chain: Chain) -> Iterator[Played]:
     take = chain.take
     for time_s, sample in zip(times, samples, strict=True):
-        yield Played(time_s, round(time_s * 1e9), take(sample), sample)
+        yield Played(time_s, take(sample, 0, round(time_s * 1e9)))
 
 
 def _from_cycles(cycles: Iterable[Cycle], chain: Chain, period_s: float) -> Iterator[Played]:
-    for (sequence, stamp_ns, sample, _), estimate in estimated(cycles, chain):
-        yield Played(sequence * period_s, stamp_ns, estimate, sample)
+    for tick in estimated(cycles, chain):
+        yield Played(tick.sequence * period_s, tick)

@@ -6,6 +6,8 @@ written waits in zenoh's and the kernel's queues; what these drop is counted, no
 
 from __future__ import annotations
 
+import json
+import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -17,16 +19,17 @@ import can
 import zenoh
 import zenoh.ext
 
+from drivelink._core import SYNC_COB_ID, Assembler
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cycle.acquisition import SYNC_COB_ID, Assembler
 from drivelink.cycle.chain import make_assembler
 from drivelink.cycle.following import MapFollower
 from drivelink.cycle.framesource import BusLostError
 from drivelink.cycle.sources import open_source
 from drivelink.errors import BusError, DriveError, ZenohError
 from drivelink.jointfile import JointFile
-from drivelink.pubsub.wire import decode_estimate, decode_sample
+from drivelink.pubsub.identity import DaemonIdentity, source_of
+from drivelink.pubsub.inbound import DECODERS
 from drivelink.recording.canlog import Frame
 from drivelink.recording.sinks import Sink
 from drivelink.recording.syncnumbers import SyncNumbering
@@ -37,6 +40,7 @@ __all__ = ["BusTap", "Gate", "Recorder", "ZenohTap"]
 _QUEUE = 30_000  # messages of a key that may wait: half a minute at 1 kHz
 _FLUSH_S = 1.0
 _POLL_S = 0.005
+_STALE_S = 1.0  # after which another session may take over where no token says who the daemon is
 
 
 class Gate:
@@ -59,7 +63,7 @@ class Gate:
 
 
 class ZenohTap:
-    """What a daemon publishes of a joint.
+    """What a daemon publishes of a joint: of one daemon, and nothing that cannot be of this joint.
 
     Args:
         session: an open session; it stays open.
@@ -77,9 +81,12 @@ class ZenohTap:
     ) -> None:
         self._sink = sink
         self._gate = gate or Gate(sink)
-        self.missed = 0
+        self.missed = self._impossible = 0
         self.newest_s = 0.0
         self._sequence = -1
+        self._motors = len(joint.motor)
+        self._identity = DaemonIdentity()
+        self._heard_s = -math.inf
         key = f"{joint.zenoh.prefix}/{joint.name}"
         ring = zenoh.handlers.RingChannel
         history = zenoh.ext.HistoryConfig(max_samples=1, detect_late_publishers=True)
@@ -97,25 +104,44 @@ class ZenohTap:
             )
             self._streams.append((subscriber, self._document))
 
+        # In zenoh's thread (indirect=False), which never keeps the process from ending.
+        heard = zenoh.handlers.Callback(self._token, indirect=False)
+        tokens: Any = session.liveliness().declare_subscriber(f"{key}/alive/**", heard, history=True)
+        self._tokens = tokens
+
+    @property
+    def refused(self) -> int:
+        """Messages of others, or that are no message of this joint: not recorded."""
+        return self._identity.refused + self._impossible
+
     def poll(self) -> None:
         """Take everything that has come."""
+        now_s = time.monotonic()
         for subscriber, take in self._streams:
             while (sample := subscriber.try_recv()) is not None:
-                take(sample)
+                if not self._identity.accepts(source_of(sample), now_s - self._heard_s > _STALE_S):
+                    continue
+                self._heard_s = now_s
+                try:
+                    take(sample)
+                except ZenohError:
+                    self._impossible += 1
 
     def finish(self) -> None:
         """Nothing waits here."""
 
     def close(self) -> None:
         """Stop listening."""
-        for subscriber, _ in self._streams:
+        for subscriber in (self._tokens, *(subscriber for subscriber, _ in self._streams)):
             subscriber.undeclare()
 
+    def _token(self, token: zenoh.Sample) -> None:
+        session = str(token.key_expr).rpartition("/alive")[2].lstrip("/")
+        self._identity.token(session, token.kind == zenoh.SampleKind.PUT)
+
     def _sample(self, message: zenoh.Sample) -> None:
-        try:
-            sample, stamp_ns = decode_sample(message.payload.to_bytes())
-        except ZenohError:
-            return
+        sample, stamp_ns = DECODERS["sample"](message.payload.to_bytes())
+        self._require_motors(len(sample.motor_position_rad))
         step = sample.sequence - self._sequence
         if self._sequence >= 0 and step > 1:
             self.missed += step - 1
@@ -124,14 +150,18 @@ class ZenohTap:
         self._gate.sample(self, sample, stamp_ns)
 
     def _estimate(self, message: zenoh.Sample) -> None:
-        try:
-            self._sink.estimate(decode_estimate(message.payload.to_bytes()))
-        except ZenohError:
-            return
+        estimate = DECODERS["estimate"](message.payload.to_bytes())
+        self._require_motors(len(estimate.transmissions))
+        self._sink.estimate(estimate)
 
     def _document(self, message: zenoh.Sample) -> None:
         name = str(message.key_expr).rpartition("/")[2]
-        self._sink.document(name, message.payload.to_bytes(), time.time_ns())
+        document = DECODERS[name](message.payload.to_bytes())
+        self._sink.document(name, json.dumps(document).encode(), time.time_ns())
+
+    def _require_motors(self, motors: int) -> None:
+        if motors != self._motors:
+            raise ZenohError(f"expected {self._motors} motors, got {motors}")
 
 
 class BusTap:
@@ -165,7 +195,7 @@ class BusTap:
         self._assembler: Assembler | None = None
         self._follower: MapFollower | None = None
         self._lacking = ""  # what the mapping lacks, where it is known
-        self._numbering = SyncNumbering(joint.bus.period_s)
+        self._numbering = SyncNumbering(joint.bus.period_s, measure=True)
         self._stamp_ns = 0
         self.frames = 0
 
@@ -226,7 +256,7 @@ class BusTap:
                 self._lacking, self._listener = str(error), None
                 return
         before_ns = self._stamp_ns
-        if cob_id == SYNC_COB_ID and jump:
+        if cob_id == SYNC_COB_ID and jump > 0:
             self._stamp_ns = stamp_ns
         sample = self._assembler.feed(cob_id, data, jump)
         if self._follower is not None:

@@ -15,7 +15,6 @@ from typing import Any
 import can
 from mcap.writer import CompressionType, IndexType, Writer
 
-from drivelink import __version__
 from drivelink.errors import RecordingError
 from drivelink.jointfile import JointFile
 from drivelink.outfile import check_target, write_whole
@@ -24,6 +23,7 @@ from drivelink.recording.columns import sample_columns, sample_row
 from drivelink.recording.mapping import side_file
 from drivelink.recording.messages import TOPICS, estimate_encoder, message_schema, sample_encoder
 from drivelink.recording.safefile import SafeFile
+from drivelink.version import __version__
 from estimator.sample import Sample
 
 __all__ = ["CanSink", "CsvSink", "McapSink", "Sink"]

@@ -7,14 +7,17 @@ cannot know.
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Iterable, Iterator
 
-from drivelink.cycle.acquisition import SYNC_COB_ID
-from drivelink.cycle.syncclock import SyncClock
+from drivelink._core import SYNC_COB_ID
+from drivelink.cycle.syncclock import SyncClock, measure_period
 from drivelink.recording.canlog import NO_STAMP, Frame
 
 __all__ = ["SyncNumbering", "numbered_ahead", "numbered_at_once"]
+
+_LOG = logging.getLogger("drivelink.recording")
 
 _AHEAD = 64  # SYNCs that are looked at before one is numbered
 _EXTRA = -0.5  # periods before it was due: a SYNC of another master
@@ -44,10 +47,13 @@ class SyncNumbering:
 
     Args:
         period_s: the communication cycle.
+        measure: take the period that the first SYNCs have, where that is another one.
     """
 
-    def __init__(self, period_s: float) -> None:
+    def __init__(self, period_s: float, *, measure: bool = False) -> None:
         self._period_ns = period_s * 1e9
+        self._measure = measure
+        self._last: int | None = None
         self._due_ns: float | None = None
         self._cycles: deque[list[Frame]] = deque()  # each SYNC that waits, and what follows it
         self._stamps: deque[int] = deque()  # of these SYNCs
@@ -72,14 +78,24 @@ class SyncNumbering:
         sync, *others = self._cycles.popleft()
         return [(sync, self._jump()), *[(frame, 1) for frame in others]]
 
+    def _take_measure(self, stamps: list[int]) -> None:
+        measured = measure_period(stamps, self._period_ns * 1e-9) if NO_STAMP not in stamps else None
+        if measured is not None and not measured.same:
+            _LOG.warning("SYNC comes every %.4g ms: samples are numbered by that", measured.period_s * 1e3)
+            self._period_ns = measured.period_s * 1e9
+
     def _jump(self) -> int:
         """The jump of the first SYNC that waits."""
-        stamps, period_ns = self._stamps, self._period_ns
+        stamps = self._stamps
+        if self._measure:
+            self._measure = False
+            self._take_measure(list(stamps))
+        period_ns = self._period_ns
         stamp = stamps.popleft()
         if stamp == NO_STAMP:
             return 1
-        due = self._due_ns
-        if due is None:
+        due, last, self._last = self._due_ns, self._last, stamp
+        if due is None or (last is not None and stamp < last - period_ns):  # the clock was set back
             earliest = min([float(stamp), *(s - (k + 1) * period_ns for k, s in enumerate(stamps))])
             self._due_ns = earliest + period_ns
             return 1

@@ -18,6 +18,7 @@ extern "C" {
 enum {
     DRIVELINK_VALID = 1 << 0,      /* the numbers may be used */
     DRIVELINK_OBSERVABLE = 1 << 1, /* the motion at hand tells the stiffness */
+    DRIVELINK_PARTIAL = 1 << 13,   /* what is NaN is not given: a rigid joint's stiffness, mode paper's std */
     DRIVELINK_MAX_TRANSMISSIONS = 8
 };
 
@@ -53,7 +54,31 @@ static inline double drivelink_double(const uint8_t **at) {
     return value;
 }
 
-/* Read a payload into *estimate; false, and nothing to be used, for anything that is no estimate. */
+static inline bool drivelink_finite(double number) { return number - number == 0.0; }
+
+/* A stiffness or standard deviation: finite and not negative, or NaN where the status says that it is not given. */
+static inline bool drivelink_magnitude(double number, uint32_t status) {
+    return (drivelink_finite(number) && number >= 0.0) || ((status & DRIVELINK_PARTIAL) != 0 && number != number);
+}
+
+/* Whether every number may be used. */
+static inline bool drivelink_usable(const drivelink_estimate *estimate) {
+    const uint32_t status = estimate->status;
+    bool good = drivelink_finite(estimate->flexibility_torque_nm) &&
+                drivelink_magnitude(estimate->stiffness_nm_rad, status) &&
+                drivelink_magnitude(estimate->stiffness_std_nm_rad, status);
+    for (size_t i = 0; good && i < estimate->transmissions; i++) {
+        const drivelink_transmission *one = &estimate->transmission[i];
+        const double deflection = one->deflection_rad;
+        good = drivelink_finite(one->flexibility_torque_nm) && drivelink_magnitude(one->stiffness_nm_rad, status) &&
+               drivelink_magnitude(one->stiffness_std_nm_rad, status) &&
+               (drivelink_finite(deflection) || ((status & DRIVELINK_PARTIAL) != 0 && deflection != deflection));
+    }
+    return good;
+}
+
+/* Read a payload into *estimate. False, and nothing to be used, for anything that is no estimate, or that is called
+ * valid and holds a number that no joint has: not finite, or a negative stiffness. Not for -ffast-math. */
 static inline bool drivelink_decode_estimate(const uint8_t *payload, size_t length, drivelink_estimate *estimate) {
     const size_t head = 8 + 8 + 4 + 3 * 8, element = 4 * 8;
     if (length < head + 1) return false;
@@ -73,7 +98,7 @@ static inline bool drivelink_decode_estimate(const uint8_t *payload, size_t leng
         estimate->transmission[i].stiffness_std_nm_rad = drivelink_double(&at);
         estimate->transmission[i].deflection_rad = drivelink_double(&at);
     }
-    return true;
+    return (estimate->status & DRIVELINK_VALID) == 0 || drivelink_usable(estimate);
 }
 
 #ifdef __cplusplus

@@ -2,6 +2,7 @@
 
 The bytes come from zenoh's own serializer, not from drivelink's structs. One line a vector: name, bytes in
 hexadecimal, then the numbers they stand for, in the order of the wire, the length of the sequence included.
+`refused.txt` has names and bytes of what is no estimate, or is called valid and cannot be.
 
     python tests/golden/make.py
 """
@@ -26,7 +27,8 @@ ESTIMATES = {
         1.5,
         [(9.25, 30.5, 1.0, 0.3), (-10.0, 30.5, 1.125, -0.328125)],
     ),
-    "held": (2, 2_000_000, 0x00000405, 1e-300, 5e-324, math.inf, [(1e-300, 5e-324, math.inf, -0.0)]),
+    "held": (2, 2_000_000, 0x00000404, 1e-300, 5e-324, math.inf, [(1e-300, 5e-324, math.inf, -0.0)]),
+    "torque_only": (4, 4_000_000, 0x2001, 2.5, math.nan, math.nan, [(2.5, math.nan, math.nan, math.nan)]),
     "invalid": (3, 3_000_000, 0, math.nan, math.nan, math.nan, [(math.nan, math.nan, math.nan, 0.125)]),
     "extremes": (
         MAX_U64,
@@ -37,6 +39,30 @@ ESTIMATES = {
         1 / 3,
         [(0.1, 0.2, 0.3, 0.4)] * 3,
     ),
+}
+# What a client must not take: bytes that are no estimate, and numbers that cannot be called valid.
+_WHOLE = (1, 2, 3, 12.5, 812.25, 4.0, [(12.5, 812.25, 4.0, 0.0153)])
+_HEAD = bytes(44)
+REFUSED = {
+    "empty": b"",
+    "cut_in_the_head": _HEAD[:-1],
+    "without_a_length": _HEAD,
+    "length_without_elements": _HEAD + b"\x01",
+    "length_of_2_to_the_28": _HEAD + b"\xff\xff\xff\x7f" + b"\x00",
+    "length_of_2_to_the_63": _HEAD + b"\xff" * 8 + b"\x7f",
+    "length_that_does_not_end": _HEAD + b"\xff" * 5,
+    "length_of_2_in_two_bytes": _HEAD + b"\x82\x00" + bytes(64),
+    "nine_transmissions": _HEAD + b"\x09" + bytes(9 * 32),
+    "one_byte_more": _HEAD + b"\x01" + bytes(33),
+}
+WRONG = {  # place in the message, numbers that it cannot have while it is called valid
+    "torque": ((3, None), (math.nan, math.inf, -math.inf)),
+    "stiffness": ((4, None), (math.nan, math.inf, -1.0)),
+    "std": ((5, None), (math.nan, math.inf, -1e-9)),
+    "own_torque": ((6, 0), (math.nan, -math.inf)),
+    "own_stiffness": ((6, 1), (math.nan, math.inf, -1.0)),
+    "own_std": ((6, 2), (math.nan, -math.inf)),
+    "deflection": ((6, 3), (math.nan, math.inf)),
 }
 SAMPLES = {
     "single": (1, 1_700_000_000_000_000_000, 0.5, math.nan, math.nan, [(0.4847, math.nan, 12.0)]),
@@ -75,10 +101,28 @@ def line(name, payload, values):
     return " ".join([name, bytes(payload).hex(), *map(repr, numbers)]) + "\n"
 
 
+def refused():
+    """Name and bytes of everything that a client must refuse."""
+    yield from REFUSED.items()
+    for what, ((place, inner), numbers) in WRONG.items():
+        for number in numbers:
+            values = list(_WHOLE)
+            if inner is None:
+                values[place] = number
+            else:
+                values[place] = [tuple(number if i == inner else v for i, v in enumerate(_WHOLE[place][0]))]
+            yield f"valid_with_{what}_of_{number:g}", bytes(estimate(*values))
+    partial = (4, 4, 0x2001, 2.5, math.inf, math.nan, [])
+    yield "valid_and_partial_with_stiffness_of_inf", bytes(estimate(*partial))
+
+
 def main():
     for file, serialize, vectors in (("estimate.txt", estimate, ESTIMATES), ("sample.txt", sample, SAMPLES)):
         text = "".join(line(name, serialize(*values), values) for name, values in vectors.items())
         (HERE / file).write_text(text, encoding="ascii")
+    # "-" stands for no bytes
+    text = "".join(f"{name} {payload.hex() or '-'}\n" for name, payload in refused())
+    (HERE / "refused.txt").write_text(text, encoding="ascii")
 
 
 if __name__ == "__main__":

@@ -4,5 +4,12 @@
 
 #![cfg_attr(not(feature = "python"), forbid(unsafe_code))]
 
+pub mod assembler;
+pub mod frames;
+pub mod layout;
+pub mod node;
+pub mod pipeline;
 #[cfg(feature = "python")]
 pub mod python;
+pub mod status;
+pub mod wire;

@@ -2,7 +2,7 @@
 
 use crate::error::Error;
 use crate::model::Model;
-use crate::sample::{Estimate, Sample, TransmissionEstimate, MOTORS};
+use crate::sample::{Estimate, MOTORS, Sample, TransmissionEstimate};
 use crate::settings::Settings;
 
 /// What both modes offer.

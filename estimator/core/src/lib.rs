@@ -5,5 +5,10 @@
 
 #![cfg_attr(not(feature = "python"), forbid(unsafe_code))]
 
+pub mod error;
+pub mod estimator;
+pub mod model;
 #[cfg(feature = "python")]
 pub mod python;
+pub mod sample;
+pub mod settings;

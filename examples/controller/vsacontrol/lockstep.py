@@ -9,17 +9,16 @@ from typing import Any, NamedTuple
 
 import can
 
+from drivelink._core import Tick
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.wire import (
     EstimateMessage,
     decode_estimate,
     decode_sample,
-    encode_estimate,
-    encode_sample,
 )
 from drivelink.simulate import nodes_from_joint, open_sim_bus, world_from_joint
-from estimator.sample import Estimate, Sample
+from estimator.sample import Sample
 from sim.faults import Faults
 from sim.network import Network
 from vsacontrol.controller import Controller
@@ -132,13 +131,11 @@ class Rig:
         self._bus.shutdown()
         self._sim_bus.shutdown()
 
-    def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
+    def put(self, tick: Tick) -> None:
         """The daemon publishes; over the wire's own bytes."""
-        self._estimates.append(decode_estimate(encode_estimate(estimate, stamp_ns)))
-
-    def put_sample(self, sample: Sample, stamp_ns: int) -> None:
-        """The daemon publishes; over the wire's own bytes."""
-        self._samples.append(decode_sample(encode_sample(sample, stamp_ns)).sample)
+        self._estimates.append(decode_estimate(tick.estimate_payload))
+        if tick.sample_payload is not None:
+            self._samples.append(decode_sample(tick.sample_payload).sample)
 
     def run(
         self,

@@ -1,12 +1,42 @@
 //! The bytes of `<prefix>/<joint>/estimate`: what `zenoh_ext::z_serialize` makes of a tuple.
 
+use std::fmt;
+
 use zenoh::bytes::ZBytes;
-use zenoh_ext::{z_deserialize, ZDeserializeError};
+use zenoh_ext::z_deserialize;
 
 /// Status bit 0: the numbers may be used.
 pub const VALID: u32 = 1 << 0;
 /// Status bit 1: the motion at hand tells the stiffness.
 pub const OBSERVABLE: u32 = 1 << 1;
+
+/// Status bit 13: what is NaN is not given (stiffness of a rigid joint, standard deviation of mode paper).
+pub const PARTIAL: u32 = 1 << 13;
+/// Transmissions in one message; their number is one byte.
+pub const MAX_TRANSMISSIONS: usize = 8;
+
+const HEAD: usize = 8 + 8 + 4 + 3 * 8;
+const ELEMENT: usize = 4 * 8;
+
+/// Why a payload is not used.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Refused {
+    /// The bytes are no estimate.
+    NoEstimate,
+    /// It is called valid and holds a number that no joint has: not finite, or a negative stiffness.
+    NotValid,
+}
+
+impl fmt::Display for Refused {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(match self {
+            Refused::NoEstimate => "no estimate",
+            Refused::NotValid => "called valid, but not every number in it is one",
+        })
+    }
+}
+
+impl std::error::Error for Refused {}
 
 /// One transmission of the joint.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -32,11 +62,18 @@ pub struct Estimate {
 type Wire = (u64, u64, u32, f64, f64, f64, Vec<(f64, f64, f64, f64)>);
 
 impl Estimate {
-    /// Read a payload; an error for anything that is no estimate.
-    pub fn decode(payload: &ZBytes) -> Result<Self, ZDeserializeError> {
+    /// Read a payload; an error for anything that is no estimate, or is called valid and cannot be.
+    ///
+    /// The number of transmissions is held against the payload's length before anything is allocated for it.
+    pub fn decode(payload: &ZBytes) -> Result<Self, Refused> {
+        let bytes = payload.to_bytes();
+        let count = usize::from(*bytes.get(HEAD).ok_or(Refused::NoEstimate)?);
+        if count > MAX_TRANSMISSIONS || bytes.len() != HEAD + 1 + count * ELEMENT {
+            return Err(Refused::NoEstimate);
+        }
         let (sequence, stamp_ns, status, torque, stiffness, std, transmissions) =
-            z_deserialize::<Wire>(payload)?;
-        Ok(Self {
+            z_deserialize::<Wire>(payload).map_err(|_| Refused::NoEstimate)?;
+        let estimate = Self {
             sequence,
             stamp_ns,
             status,
@@ -52,7 +89,26 @@ impl Estimate {
                     deflection_rad: deflection,
                 })
                 .collect(),
-        })
+        };
+        if estimate.valid() && !estimate.usable() {
+            return Err(Refused::NotValid);
+        }
+        Ok(estimate)
+    }
+
+    /// Whether every number is finite, stiffness and standard deviation not negative.
+    fn usable(&self) -> bool {
+        let absent = |number: f64| self.status & PARTIAL != 0 && number.is_nan();
+        let magnitude = |number: f64| (number.is_finite() && number >= 0.0) || absent(number);
+        self.flexibility_torque_nm.is_finite()
+            && magnitude(self.stiffness_nm_rad)
+            && magnitude(self.stiffness_std_nm_rad)
+            && self.transmissions.iter().all(|one| {
+                one.flexibility_torque_nm.is_finite()
+                    && magnitude(one.stiffness_nm_rad)
+                    && magnitude(one.stiffness_std_nm_rad)
+                    && (one.deflection_rad.is_finite() || absent(one.deflection_rad))
+            })
     }
 
     pub fn valid(&self) -> bool {

@@ -29,7 +29,7 @@ fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
         let estimate = match Estimate::decode(sample.payload()) {
             Ok(estimate) => estimate,
             Err(error) => {
-                eprintln!("not an estimate: {error}");
+                eprintln!("not used: {error}");
                 continue;
             }
         };

@@ -41,9 +41,15 @@ fn golden_vectors_decode_to_their_numbers() {
     }
 }
 
+/// Among them a length of 2^63 transmissions in 53 bytes: decoding must not allocate by it.
 #[test]
-fn what_is_no_estimate_is_an_error() {
-    for payload in [vec![], vec![0; 44], vec![7; 200]] {
-        assert!(Estimate::decode(&ZBytes::from(payload)).is_err());
+fn what_is_no_estimate_or_cannot_be_valid_is_refused() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/refused.txt");
+    let text = std::fs::read_to_string(path).unwrap();
+    assert!(text.lines().count() >= 20);
+    for line in text.lines() {
+        let (name, payload) = line.split_once(' ').unwrap();
+        let payload = if payload == "-" { vec![] } else { bytes(payload) };
+        assert!(Estimate::decode(&ZBytes::from(payload)).is_err(), "{name}");
     }
 }

@@ -1,0 +1,509 @@
+//! Frames in, one sample per SYNC out (CiA 301, 7.2.2 and 7.2.5).
+//!
+//! Frames after SYNC k and before SYNC k+1 belong to sample k. The sample is given out with the last frame it needs. A
+//! frame that does not come leaves a gap: counted by node, never filled with an older value. What comes after a missing
+//! frame may be the missing one, late: for a while such cycles are judged only at their end, where a second frame shows
+//! the first to have been late, and are flagged.
+//!
+//! No clock is read here: the same frames in the same order give the same samples, live or from a log. How many periods
+//! have passed since the last SYNC is told by whoever has its stamp.
+
+use estimator_core::sample::{MOTORS, Sample};
+
+use crate::frames::Slot;
+use crate::layout;
+use crate::node::Node;
+use crate::status::{BUS_FAULT, DRIVE_FAULT, NODE_RESTARTED, UNTIMED};
+
+/// Identifier of SYNC.
+pub const SYNC_COB_ID: u32 = 0x080;
+/// Identifiers of CAN base frames.
+const COB_IDS: usize = 0x800;
+/// The jump of a SYNC that was counted as lost before it came.
+pub const LATE: i64 = -1;
+/// Cycles for which two different frames in one cycle discredit their sender.
+const CONFLICT_CYCLES: u32 = 20;
+/// Frames that may come late in one go, after a stall of somebody.
+const MOST_OWED: u32 = 10;
+/// Cycles after a missing frame or a SYNC too many in which what comes may be one period late.
+const DOUBT_CYCLES: u32 = 100;
+
+/// Who wants the frames of an identifier.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Receiver {
+    Nobody,
+    Slot(usize),
+    Sync,
+    Command,
+    Heartbeat(usize),
+    Error(usize),
+}
+
+/// Makes the samples of one joint from the frames of its nodes.
+#[derive(Clone, Debug)]
+pub struct Assembler {
+    motors: usize,
+    active: bool,
+    hold_periods: i64,
+    values: [f64; 3 * MOTORS + 2], // m positions, m velocities, m torques, link position, link velocity
+    nodes: Vec<Node>,
+    slots: Vec<Slot>,
+    receivers: Vec<Receiver>,
+    open: bool,
+    spoiled: bool,
+    cycle_fault: bool,
+    restart: bool,
+    unnumbered: bool,
+    faulted: u32,
+    untimed: u32, // cycles for which SYNCs of another master discredit the samples
+    awaited: usize,
+    /// Number of the current SYNC, from 0; -1 before the first.
+    pub sequence: i64,
+    /// Number of the cycle the last SYNC closed without a sample, if it had none.
+    pub missed: Option<i64>,
+    /// Service bits of the status that hold for the sample just given, or the cycle just missed.
+    pub flags: u32,
+    /// SYNCs that were not due: another master makes them, or a frame is repeated.
+    pub extra_syncs: u64,
+}
+
+impl Assembler {
+    /// The assembler of a joint with so many motors.
+    ///
+    /// `active`: whether we configure the nodes. Then a node that rebooted is believed again when it is started again;
+    /// else `trust` alone makes it so. `hold_periods`: how long the last value of a TPDO that is not
+    /// sent on SYNC may be used while nothing at all is heard of its node; and how long one that is sent on SYNC may
+    /// fail before a node that we configure is not believed any more, since it may have lost its mapping meanwhile.
+    ///
+    /// # Errors
+    /// Two frames with one identifier, or a motor without position or torque.
+    pub fn new(
+        layouts: &[layout::Node],
+        motors: usize,
+        active: bool,
+        hold_periods: i64,
+    ) -> Result<Assembler, String> {
+        if motors > MOTORS {
+            return Err(format!("expected at most {MOTORS} motors, got {motors}"));
+        }
+        let mut assembler = Assembler {
+            motors,
+            active,
+            hold_periods,
+            values: [f64::NAN; 3 * MOTORS + 2],
+            nodes: Vec::new(),
+            slots: Vec::new(),
+            receivers: Vec::new(),
+            open: false,
+            spoiled: false,
+            cycle_fault: false,
+            restart: false,
+            unnumbered: false,
+            faulted: 0,
+            untimed: 0,
+            awaited: 0,
+            sequence: -1,
+            missed: None,
+            flags: 0,
+            extra_syncs: 0,
+        };
+        for layout in layouts {
+            if !assembler.nodes.iter().any(|node| node.node_id == layout.node_id) {
+                assembler.nodes.push(Node::new(layout.node_id, active));
+            }
+            assembler.add(layout)?;
+        }
+        assembler.check()?;
+        assembler.arrange();
+        Ok(assembler)
+    }
+
+    /// How many motors the joint has.
+    #[must_use]
+    pub fn motors(&self) -> usize {
+        self.motors
+    }
+
+    /// Identifiers that concern this joint, SYNC aside.
+    pub fn cob_ids(&self) -> impl Iterator<Item = u32> + '_ {
+        (0u32..).zip(&self.receivers).filter_map(|(cob_id, receiver)| {
+            (*receiver != Receiver::Nobody && *receiver != Receiver::Sync).then_some(cob_id)
+        })
+    }
+
+    /// The joint's nodes.
+    #[must_use]
+    pub fn nodes(&self) -> &[Node] {
+        &self.nodes
+    }
+
+    /// Whether any frame carries the link position.
+    #[must_use]
+    pub fn has_link(&self) -> bool {
+        self.carries(3 * self.motors)
+    }
+
+    /// Whether this cycle has given its sample: nothing more is expected before the next SYNC.
+    #[must_use]
+    pub fn complete(&self) -> bool {
+        !self.open
+    }
+
+    /// Nodes that the current cycle still waits for, some of them twice.
+    pub fn missing_nodes(&self) -> impl Iterator<Item = u32> + '_ {
+        self.slots
+            .iter()
+            .filter(|slot| slot.timed() && !slot.arrived)
+            .map(|slot| self.nodes[slot.node].node_id)
+    }
+
+    /// Take one frame in the order of the bus, SYNC included; the sample that it completes, if it does.
+    ///
+    /// `jump`: for a SYNC, whole periods since the one before; 0: one that was not due; [`LATE`]: one whose period is
+    /// over.
+    pub fn feed(&mut self, cob_id: u32, data: &[u8], jump: i64) -> Option<Sample> {
+        match self.receivers.get(cob_id as usize)? {
+            Receiver::Nobody => None,
+            Receiver::Slot(slot) => self.pdo(*slot, data),
+            Receiver::Sync => self.sync(jump),
+            Receiver::Command => {
+                if let [command, addressed] = *data {
+                    for node in 0..self.nodes.len() {
+                        if addressed == 0 || u32::from(addressed) == self.nodes[node].node_id {
+                            let (node, slots) = self.node_and_slots(node);
+                            node.command(command, addressed, slots);
+                        }
+                    }
+                }
+                self.note_news();
+                None
+            }
+            Receiver::Heartbeat(node) => {
+                if let [state] = *data {
+                    let (node, slots) = self.node_and_slots(*node);
+                    node.heartbeat(state, slots);
+                }
+                self.note_news();
+                None
+            }
+            Receiver::Error(node) => {
+                if let [low, high, _, _, _, _, _, _] = *data {
+                    self.nodes[*node].error(u16::from_le_bytes([low, high]));
+                }
+                self.note_news();
+                None
+            }
+        }
+    }
+
+    /// A SYNC: close the cycle and open the next one; the sample if it was only now certain.
+    pub fn sync(&mut self, jump: i64) -> Option<Sample> {
+        if jump == LATE {
+            return self.open_unnumbered();
+        }
+        if jump <= 0 {
+            self.extra_syncs += 1;
+            self.spoiled = true; // what comes now answers that SYNC, or ours: nobody can tell
+            self.untimed = DOUBT_CYCLES;
+            for slot in self.slots.iter_mut().filter(|slot| slot.timed()) {
+                slot.suspect = DOUBT_CYCLES; // nor of those that come after ours
+            }
+            return None;
+        }
+        let sample = self.close(jump);
+        self.untimed = self.untimed.saturating_sub(1);
+        self.sequence += jump;
+        self.open = true;
+        self.spoiled = false;
+        self.cycle_fault = false;
+        self.await_all();
+        sample
+    }
+
+    /// Our own master's SYNC, too late for a number: what answers it is of no sample, and spoils none.
+    fn open_unnumbered(&mut self) -> Option<Sample> {
+        let sample = self.close(0);
+        self.await_all();
+        self.unnumbered = true;
+        sample
+    }
+
+    fn await_all(&mut self) {
+        self.awaited = 0;
+        for slot in &mut self.slots {
+            slot.arrived = false;
+            self.awaited += usize::from(slot.timed());
+        }
+    }
+
+    fn close(&mut self, jump: i64) -> Option<Sample> {
+        let was_open = std::mem::replace(&mut self.open, false);
+        let unnumbered = std::mem::replace(&mut self.unnumbered, false);
+        self.missed = None;
+        for slot in self.slots.iter_mut().filter(|slot| slot.needed() && !slot.arrived) {
+            slot.silent += jump;
+            if self.active && slot.every > 0 && slot.silent > self.hold_periods {
+                self.nodes[slot.node].trusted = false; // nobody knows what it has lived through
+            }
+        }
+        if !was_open {
+            if unnumbered {
+                self.note_missing();
+            }
+            return None;
+        }
+        if self.usable() {
+            for slot in self.slots.iter_mut().filter(|slot| slot.timed() && slot.suspect > 0) {
+                slot.suspect -= 1;
+                slot.owed = if slot.suspect > 0 { slot.owed } else { 0 };
+                self.cycle_fault = true;
+            }
+            return Some(self.sample());
+        }
+        let all_arrived = self.slots.iter().all(|slot| slot.arrived || !slot.timed());
+        if self.note_missing() || self.spoiled || all_arrived {
+            self.missed = Some(self.sequence);
+            self.flags = BUS_FAULT | self.faulted;
+        }
+        None
+    }
+
+    /// Count what has not come though it was due; whether there is any.
+    fn note_missing(&mut self) -> bool {
+        let mut missing = false;
+        for slot in self.slots.iter_mut().filter(|slot| slot.timed()) {
+            if !slot.arrived && slot.silent >= slot.every {
+                self.nodes[slot.node].counters.missing += 1;
+                slot.suspect = DOUBT_CYCLES;
+                slot.owed = (slot.owed + 1).min(MOST_OWED);
+                missing = true;
+            } else if self.spoiled {
+                slot.suspect = DOUBT_CYCLES;
+            }
+        }
+        missing
+    }
+
+    /// Whether everything a sample needs is there, and nothing speaks against it.
+    fn usable(&self) -> bool {
+        !self.spoiled
+            && self.slots.iter().all(|slot| {
+                if slot.timed() {
+                    slot.arrived && slot.conflict == 0
+                } else {
+                    !slot.held()
+                        || slot.heard && slot.silent <= self.hold_periods && self.nodes[slot.node].trusted
+                }
+            })
+    }
+
+    /// Whether no frame of this cycle can be that of an earlier one.
+    fn certain(&self) -> bool {
+        !self.slots.iter().any(|slot| slot.timed() && slot.suspect > 0)
+    }
+
+    fn pdo(&mut self, index: usize, data: &[u8]) -> Option<Sample> {
+        let slot = &self.slots[index];
+        let (every, needed) = (slot.every, slot.needed());
+        let node = &mut self.nodes[slot.node];
+        if !slot.fits(data.len()) {
+            node.counters.wrong_length += 1;
+            self.cycle_fault = true;
+            return None;
+        }
+        if !node.trusted {
+            node.counters.ignored += 1;
+            return None;
+        }
+        if self.sequence < 0 {
+            return None;
+        }
+        if slot.arrived && every > 0 {
+            if !self.repeated(index, data) {
+                return None;
+            }
+        } else {
+            let slot = &mut self.slots[index];
+            slot.conflict = slot.conflict.saturating_sub(1);
+        }
+        self.decode(index, data);
+        let slot = &mut self.slots[index];
+        if !slot.arrived && every > 0 && needed {
+            self.awaited = self.awaited.saturating_sub(1);
+        }
+        slot.arrived = true;
+        slot.heard = true;
+        slot.silent = 0;
+        self.nodes[slot.node].counters.received += 1;
+        if self.awaited > 0 || !self.open || !needed {
+            return None;
+        }
+        let any_timed = self.slots.iter().any(Slot::timed);
+        (any_timed && self.usable() && self.certain()).then(|| self.sample())
+    }
+
+    /// Whether a further frame in one cycle is the one that belongs to it.
+    fn repeated(&mut self, index: usize, data: &[u8]) -> bool {
+        let slot = &mut self.slots[index];
+        let counters = &mut self.nodes[slot.node].counters;
+        let same = slot.repeats(data);
+        if slot.suspect > 0 && same {
+            counters.duplicate += 1; // the same once more settles nothing
+            return false;
+        }
+        if slot.suspect > 0 && slot.conflict == 0 {
+            // The first was a late one of a cycle before.
+            slot.owed = slot.owed.saturating_sub(1);
+            if slot.owed == 0 {
+                slot.suspect = 0;
+            }
+            counters.late += 1;
+            self.cycle_fault = true;
+            return true;
+        }
+        counters.duplicate += 1;
+        if !same && !self.spoiled {
+            slot.conflict = CONFLICT_CYCLES; // two nodes answer, or somebody babbles: believe neither
+            self.spoiled = true;
+            counters.conflicting += 1;
+        }
+        false
+    }
+
+    fn decode(&mut self, index: usize, data: &[u8]) {
+        let slot = &mut self.slots[index];
+        let statusword = slot.store(data);
+        for field in &mut slot.fields {
+            self.values[field.target] = field.take(data);
+        }
+        let node = &mut self.nodes[slot.node];
+        if statusword.is_some() && statusword != node.statusword {
+            node.take_statusword(statusword.unwrap_or_default());
+            self.note_news();
+        }
+    }
+
+    fn sample(&mut self) -> Sample {
+        self.open = false;
+        let mut flags = self.faulted;
+        if self.cycle_fault {
+            flags |= BUS_FAULT;
+        }
+        if self.untimed > 0 {
+            flags |= UNTIMED;
+        }
+        if std::mem::replace(&mut self.restart, false) {
+            flags |= NODE_RESTARTED;
+        }
+        self.flags = flags;
+        let m = self.motors;
+        let of_motors = |first: usize| {
+            std::array::from_fn(|motor| if motor < m { self.values[first + motor] } else { f64::NAN })
+        };
+        Sample {
+            sequence: self.sequence as u64,
+            motor_position: of_motors(0),
+            motor_velocity: of_motors(m),
+            motor_torque: of_motors(2 * m),
+            link_position: self.values[3 * m],
+            link_velocity: self.values[3 * m + 1],
+            external_torque: f64::NAN,
+        }
+    }
+
+    /// From now on `trust` alone makes a node believed again: somebody else may start it too.
+    pub fn supervise(&mut self) {
+        for node in &mut self.nodes {
+            node.supervised = true;
+        }
+    }
+
+    /// Do not use what a node sends until it is started again.
+    pub fn distrust(&mut self, node_id: u32) {
+        for node in self.nodes.iter_mut().filter(|node| node.node_id == node_id) {
+            node.trusted = false;
+        }
+    }
+
+    /// A node has been configured and started.
+    pub fn trust(&mut self, node_id: u32) {
+        if let Some(node) = self.nodes.iter().position(|node| node.node_id == node_id) {
+            let (node, slots) = self.node_and_slots(node);
+            node.trust(slots);
+        }
+    }
+
+    /// A node has been configured differently: from now on its frames are read by this layout.
+    ///
+    /// # Errors
+    /// As for `new`; then everything is as it was.
+    pub fn relayout(&mut self, layout: &layout::Node) -> Result<(), String> {
+        let before = self.slots.clone();
+        self.slots.retain(|slot| self.nodes[slot.node].node_id != layout.node_id);
+        let changed = self.add(layout).and_then(|()| self.check());
+        match changed {
+            Ok(()) => self.restart = true, // what is decoded anew may jump
+            Err(_) => self.slots = before,
+        }
+        self.arrange();
+        changed
+    }
+
+    fn add(&mut self, layout: &layout::Node) -> Result<(), String> {
+        let node_id = layout.node_id;
+        let Some(node) = self.nodes.iter().position(|node| node.node_id == node_id) else {
+            return Err(format!("node {node_id}: expected a node of this joint"));
+        };
+        for tpdo in &layout.tpdos {
+            if self.slots.iter().any(|slot| slot.cob_id == tpdo.cob_id) {
+                return Err(format!("node {node_id}: COB-ID 0x{:03X} is used by two TPDOs", tpdo.cob_id));
+            }
+            self.slots.push(Slot::new(tpdo, node, layout.motor, self.motors));
+        }
+        Ok(())
+    }
+
+    fn check(&self) -> Result<(), String> {
+        for motor in 0..self.motors {
+            for (target, what) in [(motor, "position"), (2 * self.motors + motor, "torque")] {
+                if !self.carries(target) {
+                    return Err(format!("motor {}: no TPDO carries its {what}", motor + 1));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn carries(&self, target: usize) -> bool {
+        self.slots.iter().flat_map(|slot| &slot.fields).any(|field| field.target == target)
+    }
+
+    fn arrange(&mut self) {
+        self.receivers.clear();
+        self.receivers.resize(COB_IDS, Receiver::Nobody);
+        self.receivers[0] = Receiver::Command;
+        for (node, of) in self.nodes.iter().enumerate() {
+            self.receivers[(0x700 + of.node_id as usize) % COB_IDS] = Receiver::Heartbeat(node);
+            self.receivers[(0x080 + of.node_id as usize) % COB_IDS] = Receiver::Error(node);
+        }
+        self.receivers[SYNC_COB_ID as usize] = Receiver::Sync;
+        for (slot, of) in self.slots.iter().enumerate() {
+            self.receivers[of.cob_id as usize % COB_IDS] = Receiver::Slot(slot);
+        }
+        self.awaited = self.slots.iter().filter(|slot| slot.timed() && !slot.arrived).count();
+    }
+
+    fn node_and_slots(&mut self, node: usize) -> (&mut Node, impl Iterator<Item = &mut Slot>) {
+        (&mut self.nodes[node], self.slots.iter_mut().filter(move |slot| slot.node == node))
+    }
+
+    fn note_news(&mut self) {
+        self.faulted = 0;
+        for node in &mut self.nodes {
+            if node.faulted || node.emergency != 0 {
+                self.faulted = DRIVE_FAULT;
+            }
+            self.restart |= std::mem::replace(&mut node.restarted, false);
+        }
+    }
+}

@@ -1,0 +1,59 @@
+//! Which frame carries which signal, at what scale: what the configuration of the nodes came to.
+
+/// What a mapped object means to the joint.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Signal {
+    /// θ of the node's motor.
+    MotorPosition,
+    /// θ' of the node's motor.
+    MotorVelocity,
+    /// τ of the node's motor.
+    MotorTorque,
+    /// 0x6041.
+    Statusword,
+    /// q.
+    LinkPosition,
+    /// q'.
+    LinkVelocity,
+    /// Mapped by the drive, not used by us.
+    Other,
+}
+
+/// One object in a TPDO.
+#[derive(Clone, Debug)]
+pub struct MappedObject {
+    /// What it means.
+    pub signal: Signal,
+    /// Its length in the frame, at most 64 for a signal that is used.
+    pub bits: u32,
+    /// Whether two's complement.
+    pub signed: bool,
+    /// SI units at the joint side per count.
+    pub scale: f64,
+    /// SI units, subtracted after scaling.
+    pub offset: f64,
+    /// Counts after which it rolls over; 0: never.
+    pub range: i128,
+}
+
+/// One TPDO: its identifier and the objects in it, in order from bit 0.
+#[derive(Clone, Debug)]
+pub struct Tpdo {
+    /// Identifier of the frame, 11 bits.
+    pub cob_id: u32,
+    /// What is in it.
+    pub objects: Vec<MappedObject>,
+    /// 1 to 240: every so many SYNCs; else when the drive pleases.
+    pub transmission_type: u32,
+}
+
+/// One node of a joint.
+#[derive(Clone, Debug)]
+pub struct Node {
+    /// 1 to 127.
+    pub node_id: u32,
+    /// Which motor it drives.
+    pub motor: Option<usize>,
+    /// Its frames.
+    pub tpdos: Vec<Tpdo>,
+}

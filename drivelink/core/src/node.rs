@@ -1,0 +1,130 @@
+//! What the bus says about a node besides its PDOs: NMT commands, boot-up, heartbeat, EMCY (CiA 301, 7.2.8).
+//!
+//! Made from frames alone, so that a replayed log comes to the same judgement as the live run.
+
+use crate::frames::Slot;
+
+const START: u8 = 0x01;
+const RESETS: [u8; 2] = [0x81, 0x82]; // node, communication
+const FAULT_BIT: i64 = 0x0008; // of the statusword
+
+/// What became of one node's frames since the start.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counters {
+    /// PDOs of this node that were used.
+    pub received: u64,
+    /// Frames that had not come when the next SYNC came.
+    pub missing: u64,
+    /// Of these, frames that came in the cycle after.
+    pub late: u64,
+    /// Frames beyond the one a cycle needs.
+    pub duplicate: u64,
+    /// Of the cycles with such frames, those in which they differed; not used.
+    pub conflicting: u64,
+    /// Frames that do not carry what is mapped; not used.
+    pub wrong_length: u64,
+    /// Frames sent after a reboot, before the node was configured and started again.
+    pub ignored: u64,
+    /// Boot-up messages.
+    pub reboots: u64,
+    /// EMCY messages that report an error.
+    pub emergencies: u64,
+}
+
+/// One node's standing: whether its frames are believed, and whether it reports a fault.
+///
+/// A node that was reset may send its default PDOs, which look like ours and mean something else: it is not believed
+/// before it has been started again.
+#[derive(Clone, Debug)]
+pub struct Node {
+    /// 1 to 127.
+    pub node_id: u32,
+    /// Whether we configure the nodes. We start each by its own number when it is configured; a start of all nodes is
+    /// somebody else's, and says nothing of their mapping. In a log, a start by its own number is taken for ours.
+    /// Where somebody else configures them no start tells anything: see `drivelink.cycle.following`.
+    active: bool,
+    /// Somebody knows for sure when it is configured, and calls `trust`: no frame tells.
+    pub supervised: bool,
+    /// What became of its frames.
+    pub counters: Counters,
+    /// Whether its PDOs are used.
+    pub trusted: bool,
+    /// As last heard.
+    pub statusword: Option<i64>,
+    /// The fault bit of it.
+    pub faulted: bool,
+    /// Code of the last EMCY, 0 after its reset.
+    pub emergency: u16,
+    /// Its position counters may have started anew; for whoever reads it to clear.
+    pub restarted: bool,
+}
+
+impl Node {
+    /// A node that is believed.
+    pub fn new(node_id: u32, active: bool) -> Node {
+        Node {
+            node_id,
+            active,
+            supervised: false,
+            counters: Counters::default(),
+            trusted: true,
+            statusword: None,
+            faulted: false,
+            emergency: 0,
+            restarted: false,
+        }
+    }
+
+    /// From now on its frames mean what its layout says; `slots` are its own.
+    pub fn trust<'a>(&mut self, slots: impl Iterator<Item = &'a mut Slot>) {
+        self.trusted = true;
+        for slot in slots {
+            slot.silent = 0;
+            slot.owed = 0;
+        }
+    }
+
+    /// An NMT command that is addressed to this node, or to all.
+    pub fn command<'a>(&mut self, command: u8, addressed: u8, slots: impl Iterator<Item = &'a mut Slot>) {
+        if command == START && self.active && !self.supervised && addressed != 0 {
+            self.trust(slots);
+        } else if RESETS.contains(&command) {
+            self.trusted = false;
+            self.restarted = true; // it will; its boot-up message may get lost
+        }
+    }
+
+    /// Boot-up (state 0) or heartbeat.
+    pub fn heartbeat<'a>(&mut self, state: u8, slots: impl Iterator<Item = &'a mut Slot>) {
+        let state = state & 0x7F;
+        if state == 0 {
+            self.counters.reboots += 1;
+            self.trusted = false;
+            self.faulted = false;
+            self.emergency = 0;
+            self.statusword = None;
+            self.restarted = true;
+            slots.for_each(Slot::forget);
+            return;
+        }
+        for slot in slots.filter(|slot| slot.every == 0) {
+            slot.silent = 0;
+        }
+    }
+
+    /// EMCY: a fault, until it is reset with code 0 or the statusword leaves its fault state.
+    pub fn error(&mut self, code: u16) {
+        self.emergency = if code & 0xFF00 != 0 { code } else { 0 };
+        self.counters.emergencies += u64::from(self.emergency != 0);
+    }
+
+    /// The statusword has changed (CiA 402-2, 8.4.2).
+    pub fn take_statusword(&mut self, statusword: i64) {
+        self.statusword = Some(statusword);
+        let faulted = statusword & FAULT_BIT != 0;
+        if self.faulted && !faulted {
+            self.emergency = 0;
+        }
+        self.faulted = faulted;
+    }
+}

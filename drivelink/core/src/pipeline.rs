@@ -1,0 +1,195 @@
+//! One joint from frames to the bytes for zenoh. The one path for live, lockstep and replay.
+//!
+//! What the service knows of the estimate's quality is added to the status here: drive faults, missing frames, and
+//! estimates carried on without fresh measurements.
+
+use estimator_core::estimator::Estimator;
+use estimator_core::sample::status::{MODEL_ALARM, RESTARTED, VALID};
+use estimator_core::sample::{Estimate, Sample};
+
+use crate::assembler::{Assembler, SYNC_COB_ID};
+use crate::status::{NODE_RESTARTED, STALE, UNTIMED};
+use crate::wire::{Payload, encode_estimate, encode_sample};
+
+/// Why an estimator could not step: never the compiled one, perhaps one that somebody registered.
+pub type Failure = Box<dyn std::error::Error + Send + Sync>;
+
+/// What the pipeline needs of an estimator.
+pub trait Step: Send {
+    /// The estimate at this sample.
+    ///
+    /// # Errors
+    /// The estimator is not ours, and failed.
+    fn step(&mut self, sample: &Sample) -> Result<Estimate, Failure>;
+
+    /// Forget everything that was learned.
+    ///
+    /// # Errors
+    /// As for `step`.
+    fn reset(&mut self) -> Result<(), Failure>;
+
+    /// The next sample may not be of its moment: use it, but learn nothing from it.
+    ///
+    /// # Errors
+    /// As for `step`.
+    fn distrust(&mut self) -> Result<(), Failure>;
+
+    /// Whether the watch over the model's residual raises the alarm, after this step.
+    ///
+    /// # Errors
+    /// As for `step`.
+    fn alarm(&mut self, _sample: &Sample, _estimate: &Estimate) -> Result<bool, Failure> {
+        Ok(false)
+    }
+}
+
+impl Step for Estimator {
+    fn step(&mut self, sample: &Sample) -> Result<Estimate, Failure> {
+        Ok(Estimator::step(self, sample))
+    }
+
+    fn reset(&mut self) -> Result<(), Failure> {
+        Estimator::reset(self);
+        Ok(())
+    }
+
+    fn distrust(&mut self) -> Result<(), Failure> {
+        Estimator::distrust(self);
+        Ok(())
+    }
+}
+
+/// What a frame leads to.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Due {
+    /// A sample to be estimated, with the service bits that hold for it.
+    Sample(Sample, u32),
+    /// A cycle of this number that gave no sample, with its service bits.
+    Missed(i64, u32),
+}
+
+/// What is published of one cycle.
+#[derive(Clone, Copy, Debug)]
+pub struct Tick {
+    /// Of the cycle; stale where it is the last one carried on.
+    pub estimate: Estimate,
+    /// What it was made from; `None` where it is carried on.
+    pub sample: Option<Sample>,
+    /// Of the joint.
+    pub motors: usize,
+    /// UNIX time of its SYNC.
+    pub stamp_ns: i64,
+    /// Whether the cycle is that of the last SYNC.
+    pub current: bool,
+}
+
+impl Tick {
+    /// The bytes of `<prefix>/<joint>/estimate`.
+    #[must_use]
+    pub fn estimate_payload(&self) -> Payload {
+        let e = &self.estimate;
+        let joint = [e.flexibility_torque, e.stiffness, e.stiffness_std];
+        encode_estimate(e.sequence, self.stamp_ns as u64, e.status, joint, &e.transmissions[..e.motors])
+    }
+
+    /// The bytes of `<prefix>/<joint>/sample`.
+    #[must_use]
+    pub fn sample_payload(&self) -> Option<Payload> {
+        self.sample.map(|sample| encode_sample(&sample, self.motors, self.stamp_ns as u64))
+    }
+}
+
+/// What goes on from one cycle to the next, the assembler and the estimator aside.
+#[derive(Clone, Debug, Default)]
+pub struct Pipeline {
+    sync_ns: i64,
+    sync_before_ns: i64,
+    sequence: i64,
+    last: Option<Tick>,
+    /// Cycles that gave no sample.
+    pub missed: u64,
+}
+
+impl Pipeline {
+    /// Take one frame, see [`Assembler::feed`]; `stamp_ns`: for a SYNC, its UNIX time.
+    pub fn feed(
+        &mut self,
+        assembler: &mut Assembler,
+        cob_id: u32,
+        data: &[u8],
+        jump: i64,
+        stamp_ns: i64,
+    ) -> Option<Due> {
+        if cob_id == SYNC_COB_ID && jump > 0 {
+            self.sync_before_ns = std::mem::replace(&mut self.sync_ns, stamp_ns);
+        }
+        let sample = assembler.feed(cob_id, data, jump);
+        self.sequence = assembler.sequence;
+        if let Some(sample) = sample {
+            return Some(Due::Sample(sample, assembler.flags));
+        }
+        let missed = assembler.missed.take()?;
+        self.missed += 1;
+        Some(Due::Missed(missed, assembler.flags))
+    }
+
+    /// What to publish of a sample's estimate, see [`estimate`].
+    pub fn take(
+        &mut self,
+        sample: &Sample,
+        motors: usize,
+        estimate: Estimate,
+        stamp_ns: Option<i64>,
+    ) -> Tick {
+        self.publish(estimate, Some(*sample), motors, stamp_ns)
+    }
+
+    /// The last estimate under a new number: stale, not valid; `None` where there never was one.
+    pub fn carry_on(&mut self, sequence: i64, flags: u32, stamp_ns: Option<i64>) -> Option<Tick> {
+        let Tick { mut estimate, motors, .. } = self.last?;
+        estimate.sequence = sequence as u64;
+        // Neither is true of an estimate that is carried on.
+        estimate.status = estimate.status & !(VALID | NODE_RESTARTED) | STALE | flags;
+        Some(self.publish(estimate, None, motors, stamp_ns))
+    }
+
+    /// What was published last.
+    #[must_use]
+    pub fn last(&self) -> Option<&Tick> {
+        self.last.as_ref()
+    }
+
+    fn publish(
+        &mut self,
+        estimate: Estimate,
+        sample: Option<Sample>,
+        motors: usize,
+        stamp_ns: Option<i64>,
+    ) -> Tick {
+        let current = estimate.sequence as i64 == self.sequence;
+        let stamp_ns = stamp_ns.unwrap_or(if current { self.sync_ns } else { self.sync_before_ns });
+        let tick = Tick { estimate, sample, motors, stamp_ns, current };
+        self.last = Some(tick);
+        tick
+    }
+}
+
+/// The estimate at a sample for which these service bits hold, the bits included.
+///
+/// # Errors
+/// The estimator failed.
+pub fn estimate(estimator: &mut dyn Step, sample: &Sample, mut flags: u32) -> Result<Estimate, Failure> {
+    if flags & NODE_RESTARTED != 0 {
+        estimator.reset()?;
+        flags |= RESTARTED;
+    }
+    if flags & UNTIMED != 0 {
+        estimator.distrust()?;
+    }
+    let mut estimate = estimator.step(sample)?;
+    if estimator.alarm(sample, &estimate)? {
+        flags |= MODEL_ALARM;
+    }
+    estimate.status |= flags;
+    Ok(estimate)
+}

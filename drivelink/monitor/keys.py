@@ -1,0 +1,40 @@
+"""Single keys of the terminal, without waiting for Enter; the terminal is as before when it is over."""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+import termios
+import tty
+from types import TracebackType
+from typing import Any, Self
+
+__all__ = ["Keys"]
+
+
+class Keys:
+    """Keys that are pressed in the terminal on standard input; none where that is no terminal."""
+
+    def __init__(self) -> None:
+        self._before: list[Any] | None = None
+        self._terminal = -1
+
+    def __enter__(self) -> Self:
+        if sys.stdin.isatty():
+            self._terminal = sys.stdin.fileno()
+            self._before = termios.tcgetattr(self._terminal)
+            tty.setcbreak(self._terminal)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._before is not None:
+            termios.tcsetattr(self._terminal, termios.TCSADRAIN, self._before)
+
+    def pressed(self) -> str:
+        """The keys pressed since; an arrow or function key gives its bytes' characters."""
+        if self._before is None or not select.select([self._terminal], [], [], 0)[0]:
+            return ""
+        return os.read(self._terminal, 64).decode("utf-8", "replace")

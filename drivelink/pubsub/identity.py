@@ -1,0 +1,110 @@
+"""Whose messages are taken: a joint has one daemon, and everything of it comes from that one's session.
+
+A daemon names its zenoh session in the liveliness token `<prefix>/<joint>/alive/<zid>`, and every message of
+a joint carries the session that wrote it. `DaemonIdentity` holds the two against each other: it takes the
+messages of one session whose token vouches for it, and stays with that session until its token is gone.
+Where no token is (a plain publisher, or access control that lets none through), it takes whoever writes
+first, until that is stale.
+
+A session can forge its identity. What stops that is TLS and access control: docs/zenoh-security.md.
+"""
+
+from __future__ import annotations
+
+import re
+
+import zenoh
+
+__all__ = ["MAX_CLAIMS", "DaemonIdentity", "source_of"]
+
+MAX_CLAIMS = (
+    4096  # tokens remembered of one joint; from there on tokens decide nothing: a flood locks nobody out
+)
+_ZID = re.compile(r"[0-9a-f]{1,32}")
+
+
+def source_of(sample: zenoh.Sample) -> str:
+    """The session that wrote a sample, "" where it does not say."""
+    info = sample.source_info
+    return str(info.source_id.zid) if info else ""
+
+
+class DaemonIdentity:
+    """The daemon of one joint, as far as its subscriber can tell.
+
+    Tokens may be entered from zenoh's thread; everything else is the subscriber's.
+
+    Attributes:
+        bound: the session whose messages are taken, None before the first.
+        refused: messages of others.
+    """
+
+    def __init__(self) -> None:
+        self.bound: str | None = None
+        self.refused = 0
+        self._vouched = False  # whether a token vouched for the bound session, at least once
+        self._claims: set[str] = set()
+        self._plain = False  # whether the token without a session is there
+        self._overflow = False
+        self._seen = False
+
+    @property
+    def claims(self) -> frozenset[str]:
+        """Sessions that say they are this joint's daemon."""
+        return frozenset(self._claims)
+
+    @property
+    def rivals(self) -> int:
+        """How many sessions claim to be this joint's daemon beside the one that is taken."""
+        claims = self._claims
+        return max(0, len(claims) - (1 if self.bound in claims or self.bound is None else 0))
+
+    @property
+    def alive(self) -> bool:
+        """Whether the daemon's token is there: of the session that is taken, else of any."""
+        if self._vouched:
+            return self.bound in self._claims
+        return self._plain or bool(self._claims)
+
+    @property
+    def seen(self) -> bool:
+        """Whether a daemon was ever there."""
+        return self._seen or self.bound is not None
+
+    def token(self, session: str, there: bool) -> None:
+        """A liveliness token appeared or vanished.
+
+        Args:
+            session: what follows `alive/` in its key; "" for the joint's own token.
+            there: whether it appeared.
+        """
+        self._seen = self._seen or there
+        if not session:
+            self._plain = there
+        elif not there:
+            self._claims.discard(session)
+        elif _ZID.fullmatch(session):
+            if len(self._claims) < MAX_CLAIMS:
+                self._claims.add(session)
+            else:
+                self._overflow = True
+
+    def accepts(self, source: str, stale: bool) -> bool:
+        """Whether a message of this session is the daemon's; the first one accepted binds to its session.
+
+        Args:
+            source: as by `source_of`.
+            stale: whether nothing fresh has come from the bound session.
+        """
+        claims = self._claims
+        if source == self.bound and (self._vouched or source in claims or not claims):
+            self._vouched = self._vouched or source in claims
+            return True
+        free = self.bound is None or (self.bound not in claims if self._vouched else bool(claims) or stale)
+        vouched = source in claims or not claims or (self._overflow and stale)
+        if not (free and vouched):
+            self.refused += 1
+            return False
+        self.bound = source
+        self._vouched = source in claims
+        return True

@@ -1,0 +1,113 @@
+"""What comes in from the network, made safe in one place: bounded before it is parsed, checked, stripped.
+
+Everything that others have written (a daemon, or whoever says so) passes here before a client hands it out, a
+view shows it or a recorder keeps it. The binary messages are as long as their layout says; a JSON document is
+bounded in bytes, depth, elements and text, its numbers are finite, and its texts hold nothing that moves a
+terminal's cursor, turns the direction of writing, or is half a character.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import unicodedata
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any
+
+from drivelink.errors import ZenohError
+from drivelink.pubsub.wire import decode_estimate, decode_sample
+
+__all__ = ["DECODERS", "clean_text", "decode_document"]
+
+MAX_BYTES = 1 << 20  # of a document; a status has some 3 kB, a model with its nodes some 10 kB
+MAX_DEPTH = 16
+MAX_ELEMENTS = 20_000  # numbers, texts and containers of a document
+MAX_TEXT = 4096  # characters of one text
+MAX_KEY = 256  # characters of a name
+_LARGEST_INTEGER = 1 << 64
+_TOO_DEEP = f"document: expected at most {MAX_DEPTH} levels"
+# Control and format characters (direction, zero width), halves of characters, private and unassigned ones.
+_UNSHOWABLE = frozenset({"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"})
+
+
+def clean_text(text: str, length: int = MAX_TEXT) -> str:
+    """The text in one line without what a terminal or browser would take for more than characters.
+
+    Args:
+        text: of the network.
+        length: characters at most.
+    """
+    text = text[: length + 1]
+    if not text.isascii() or not text.isprintable():
+        text = "".join(_shown(character) for character in text)
+    return text if len(text) <= length else text[: length - 1] + "…"
+
+
+def _shown(character: str) -> str:
+    if character in "\t\n\r":
+        return " "
+    return "" if unicodedata.category(character) in _UNSHOWABLE else character
+
+
+def decode_document(payload: bytes) -> dict[str, Any]:
+    """Read a JSON document: `status`, `model`.
+
+    What is not finite in it is None, as on the wire; integers beyond 64 bits, too.
+
+    Raises:
+        ZenohError: it is too large, too deep, no JSON, or no object.
+    """
+    if len(payload) > MAX_BYTES:
+        raise ZenohError(f"document: expected at most {MAX_BYTES} bytes, got {len(payload)}")
+    try:
+        document = json.loads(payload.decode("utf-8"))
+    except RecursionError:
+        raise ZenohError(_TOO_DEEP) from None
+    except ValueError as error:
+        raise ZenohError("document: expected JSON in UTF-8") from error
+    if not isinstance(document, dict):
+        raise ZenohError("document: expected a JSON object")
+    cleaned: dict[str, Any] = _Cleaner().clean(document, 0)
+    return cleaned
+
+
+class _Cleaner:
+    """Makes a parsed document safe, counting its elements."""
+
+    def __init__(self) -> None:
+        self._left = MAX_ELEMENTS
+
+    def clean(self, value: Any, depth: int) -> Any:
+        """The value made safe.
+
+        Raises:
+            ZenohError: it has too many elements or levels.
+        """
+        self._left -= 1
+        if self._left < 0:
+            raise ZenohError(f"document: expected at most {MAX_ELEMENTS} elements")
+        if isinstance(value, str):
+            return clean_text(value)
+        if isinstance(value, bool) or value is None:
+            return value
+        if isinstance(value, int):
+            return value if abs(value) <= _LARGEST_INTEGER else None
+        if isinstance(value, float):
+            return value if math.isfinite(value) else None
+        if depth == MAX_DEPTH:
+            raise ZenohError(_TOO_DEEP)
+        if isinstance(value, list):
+            return [self.clean(item, depth + 1) for item in value]
+        return {clean_text(key, MAX_KEY): self.clean(item, depth + 1) for key, item in value.items()}
+
+
+# The payloads of a joint's keys, by the last part of the key.
+DECODERS: Mapping[str, Callable[[bytes], Any]] = MappingProxyType(
+    {
+        "estimate": decode_estimate,
+        "sample": decode_sample,
+        "status": decode_document,
+        "model": decode_document,
+    }
+)

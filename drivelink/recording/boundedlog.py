@@ -1,0 +1,150 @@
+"""Files of other tools as python-can's readers are given them: bounded, and in the form that they know.
+
+Its readers take lines and containers of any length, take a PCAN trace of an unknown version for one of
+version 1.0, and pass over the difference between relative and absolute stamps of an ASC file.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import re
+import zlib
+from pathlib import Path
+from typing import IO
+
+from drivelink.errors import RecordingError
+from drivelink.recording.limits import MAX_BLOCK_BYTES, MAX_LINE_BYTES
+
+__all__ = ["AscText", "BlfBytes", "TrcText"]
+
+_LOG = logging.getLogger("drivelink.recording")
+
+_DEFLATE_RATIO = 1032  # of zlib at its best
+_CONTAINER_HEAD = 16  # bytes of a BLF container before what is packed
+_STAMP = re.compile(r"^[ \t]*(\d{1,12}\.\d{1,12})(?=[ \t])")
+_RELATIVE = re.compile(r"^\s*base\s+\w+\s+timestamps\s+relative", re.IGNORECASE)
+# time CANFD channel Rx identifier [name] BRS ESI DLC length duration bits flags …, of a frame without data
+_EMPTY_FD = re.compile(
+    r"^\s*(\S+)\s+CANFD\s+(\d+)\s+(\w+)\s+(\w+)(?:\s+\w*[^\W01]\w*)?\s+[01]\s+[01]\s+0\s+0"
+    r"\s+\d+\s+\d+\s+([0-9A-Fa-f]+)(?:\s|$)"
+)
+_REMOTE = 0x10  # among these flags
+_TRC_VERSIONS = ("1.0", "1.1", "1.2", "1.3", "2.0", "2.1")
+
+
+class BlfBytes(io.BufferedIOBase):
+    """The bytes of a BLF file, no more at once than may be, packed or unpacked.
+
+    Args:
+        file: open for reading bytes.
+        path: begins every message.
+    """
+
+    def __init__(self, file: IO[bytes], path: Path) -> None:
+        super().__init__()
+        self._file, self._path = file, path
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """So many bytes.
+
+        Raises:
+            RecordingError: they are, or unpack to, more than may be.
+        """
+        if size is None or not 0 <= size <= MAX_BLOCK_BYTES:
+            raise self._too_large()
+        data = self._file.read(size)
+        if len(data) * _DEFLATE_RATIO > MAX_BLOCK_BYTES:
+            unpacker = zlib.decompressobj()
+            try:
+                unpacker.decompress(data[_CONTAINER_HEAD:], MAX_BLOCK_BYTES)
+            except zlib.error:
+                return data  # not packed
+            if unpacker.unconsumed_tail:
+                raise self._too_large()
+        return data
+
+    def _too_large(self) -> RecordingError:
+        return RecordingError(
+            f"{self._path}: expected containers of at most {MAX_BLOCK_BYTES >> 20} MiB, got a larger one"
+        )
+
+
+class _Text(io.TextIOBase):
+    """The lines of a log; a last one without its end is left out, it may be cut off.
+
+    Args:
+        file: open for reading bytes.
+        path: begins every message.
+    """
+
+    def __init__(self, file: IO[bytes], path: Path) -> None:
+        super().__init__()
+        self._file, self._path = file, path
+        self._number = 0
+
+    def readline(self, size: int = -1, /) -> str:  # type: ignore[override]
+        """The next line, as the reader knows it; "" at the end.
+
+        Raises:
+            RecordingError: it is longer than a line may be, or of a version that nobody knows.
+        """
+        line = self._file.readline(MAX_LINE_BYTES + 1)
+        self._number += 1
+        if len(line) > MAX_LINE_BYTES:
+            raise RecordingError(
+                f"{self._path}: line {self._number}: expected at most {MAX_LINE_BYTES >> 10} KiB"
+            )
+        if not line.endswith(b"\n"):
+            if line.strip():
+                _LOG.warning("%s: the last line has no end and is left out: it may be cut off", self._path)
+            return ""
+        return self._known(line.decode(errors="replace"))
+
+    def _known(self, line: str) -> str:
+        """The line in the form that the reader knows."""
+        raise NotImplementedError
+
+
+class AscText(_Text):
+    """An ASC file; stamps that count from the line before count from the beginning."""
+
+    def __init__(self, file: IO[bytes], path: Path) -> None:
+        super().__init__(file, path)
+        self._relative = False
+        self._total = 0.0
+
+    def _known(self, line: str) -> str:
+        if _RELATIVE.match(line):
+            self._relative = True
+        elif self._relative and (stamp := _STAMP.match(line)):
+            self._total += float(stamp[1])
+            line = f"{self._total:.9f}{line[stamp.end() :]}"
+        if (empty := _EMPTY_FD.match(line)) and not int(empty[5], 16) & _REMOTE:
+            return f"{empty[1]} {empty[2]} {empty[4]} {empty[3]} d 0\n"  # else it is taken for a remote frame
+        return line
+
+
+class TrcText(_Text):
+    """A PCAN trace; version 1.2 lacks the empty column that 1.3 has before the length."""
+
+    def __init__(self, file: IO[bytes], path: Path) -> None:
+        super().__init__(file, path)
+        self._without_column = False
+
+    def _known(self, line: str) -> str:
+        line = line.lstrip("\ufeff")
+        if line.startswith(";$FILEVERSION"):
+            version = line.partition("=")[2].strip()
+            if version not in _TRC_VERSIONS:
+                raise RecordingError(
+                    f"{self._path}: expected a PCAN trace of version {', '.join(_TRC_VERSIONS)}, "
+                    f"got {version[:20]!r}"
+                )
+            if version == "1.2":
+                self._without_column = True
+                return ";$FILEVERSION=1.3\n"
+        elif self._without_column and not line.startswith(";"):
+            cells = line.split(maxsplit=5)
+            return " ".join([*cells[:5], "-", *cells[5:]]).rstrip() + "\n" if len(cells) > 5 else line
+        return line

@@ -1,0 +1,161 @@
+"""The systemd unit of a joint, and the network files that set its CAN interface up.
+
+The unit runs the installed `drivelink` on the joint file where both are. What of them lies below a home
+directory, which the unit otherwise does not see, is let in read-only.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+import sys
+import sysconfig
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import drivelink
+from drivelink.errors import UsageError
+from drivelink.jointfile import JointFile
+
+__all__ = ["UNITS", "Installation", "installation", "network_files", "unit_name"]
+
+UNITS = Path("etc/systemd/system")
+NETWORKS = Path("etc/systemd/network")
+_HOMES = (Path("/home"), Path("/root"), Path("/run/user"))
+_SERIAL = ("slcan", "serial", "seeedstudio", "robotell")
+_NAME = re.compile(r"[A-Za-z0-9_.-]+")
+_BARE = re.compile(r"[A-Za-z0-9_./:@+-]+")
+
+
+@dataclass(frozen=True, slots=True)
+class Installation:
+    """What is written for a joint: files by their path below the root, and the unit's name."""
+
+    unit: str
+    files: dict[Path, str]
+
+
+def unit_name(joint: str) -> str:
+    """The unit of a joint.
+
+    Raises:
+        UsageError: the name is none that systemd takes.
+    """
+    if not _NAME.fullmatch(joint):
+        raise UsageError(f'joint name: a unit takes letters, digits, ".", "-" and "_", got "{joint}"')
+    return f"drivelink@{joint}.service"
+
+
+def installation(
+    joint: JointFile,
+    path: Path,
+    executable: Path,
+    *,
+    allow: Sequence[str] = (),
+    credentials: Sequence[str] = (),
+) -> Installation:
+    """The files that run a joint as a service.
+
+    Args:
+        joint: the joint file's content.
+        path: where it is.
+        executable: the installed `drivelink`.
+        allow: addresses beside this machine that may connect, e.g. "10.0.0.0/24".
+        credentials: "NAME=FILE": keys that the unit hands to the daemon as
+            `/run/credentials/drivelink@JOINT.service/NAME`.
+
+    Raises:
+        UsageError: something of it cannot be in a unit.
+    """
+    unit, path = unit_name(joint.name), path.absolute()
+    interface, channel = joint.bus.interface, joint.bus.channel
+    if interface == "virtual":
+        raise UsageError(
+            f'{path}: bus.interface = "virtual" lives inside one process: expected a bus, e.g. "socketcan"'
+        )
+    can = interface == "socketcan"
+    if can and not re.fullmatch(r"[A-Za-z0-9_.-]{1,15}", channel):
+        raise UsageError(f'{path}: bus.channel: expected the name of a network interface, got "{channel}"')
+    serial = interface in _SERIAL
+    seen = _below_home([path.parent, executable.parent, *_python()])
+    values = {
+        "name": joint.name,
+        "device": f"sys-subsystem-net-devices-{_escape(channel)}.device" if can else "",
+        "executable": _plain(executable),
+        "joint": _plain(path),
+        "folder": _plain(path.parent),
+        "paths": "\n".join(f"BindReadOnlyPaths={_plain(place)}" for place in seen),
+        "devices": "DeviceAllow=char-ttyACM rw\nDeviceAllow=char-ttyUSB rw\nSupplementaryGroups=dialout"
+        if serial
+        else "PrivateDevices=yes",
+        "addresses": " ".join(("localhost", *map(_address, allow))),
+        "credentials": "\n".join(f"LoadCredential={_credential(text)}" for text in credentials),
+    }
+    text = files("drivelink.systemd").joinpath("unit.service").read_text(encoding="utf-8")
+    for key, value in values.items():
+        text = text.replace("{{" + key + "}}", value)
+    written = {UNITS / unit: re.sub(r"\n{3,}", "\n\n", text)}
+    if can:
+        written |= _network(channel, joint.bus.bitrate)
+    return Installation(unit, written)
+
+
+def network_files(channel: str) -> tuple[Path, ...]:
+    """Where the files of a CAN interface are, those that there may be."""
+    return tuple(NETWORKS / f"80-drivelink-{channel}.{kind}" for kind in ("network", "netdev"))
+
+
+def _network(channel: str, bitrate: int) -> dict[Path, str]:
+    """The interface as systemd-networkd sets it up: bit rate, and up again after bus-off."""
+    network, netdev = network_files(channel)
+    head = "# Written by `drivelink service install`.\n"
+    if channel.startswith("vcan"):
+        return {
+            netdev: f"{head}[NetDev]\nName={channel}\nKind=vcan\n",
+            network: f"{head}[Match]\nName={channel}\n\n[Link]\nRequiredForOnline=no\n",
+        }
+    can = f"[CAN]\nBitRate={bitrate}\nRestartSec=100ms\n"
+    return {network: f"{head}[Match]\nName={channel}\n\n[Link]\nRequiredForOnline=no\n\n{can}"}
+
+
+def _python() -> Iterable[Path]:
+    """Where this Python and the package are."""
+    yield Path(sys.prefix)
+    yield Path(sys.base_prefix)
+    yield Path(sysconfig.get_paths()["purelib"])
+    yield Path(drivelink.__file__).resolve().parent.parent
+
+
+def _below_home(places: Iterable[Path]) -> list[Path]:
+    """Those below a home directory, none twice or inside another."""
+    below = {place.resolve() for place in places} | set(places)
+    below = {place for place in below if any(home in place.parents for home in _HOMES)}
+    return sorted(place for place in below if not below & set(place.parents))
+
+
+def _plain(path: Path) -> str:
+    """A path as it stands in a unit, where spaces and percent signs mean something."""
+    if not _BARE.fullmatch(str(path)):
+        raise UsageError(f"{path}: expected a path without spaces and special characters for a unit")
+    return str(path)
+
+
+def _escape(channel: str) -> str:
+    """A name as systemd writes it in the name of a unit."""
+    return channel.replace("-", "\\x2d")
+
+
+def _address(text: str) -> str:
+    try:
+        return str(ipaddress.ip_network(text, strict=False))
+    except ValueError as error:
+        raise UsageError(f"--allow: expected an address like 10.0.0.7 or 10.0.0.0/24, got {text}") from error
+
+
+def _credential(text: str) -> str:
+    name, equals, file = text.partition("=")
+    if not equals or not _NAME.fullmatch(name) or not file:
+        raise UsageError(f"--credential: expected NAME=FILE, got {text}")
+    return f"{name}:{_plain(Path(file).absolute())}"

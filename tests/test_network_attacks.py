@@ -1,0 +1,381 @@
+"""What others put on the network: nobody but a joint's daemon speaks for it, and no message ends anything."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import time
+from contextlib import contextmanager
+from pathlib import Path
+from struct import pack
+
+import pytest
+import zenoh
+from rich.console import Console
+from zenohkit import free_endpoint, make_estimate, make_joint, make_sample, until
+
+import drivelink
+from drivelink.errors import ZenohError
+from drivelink.monitor.statuslines import shape, status_lines, status_text
+from drivelink.monitor.view import JointView, joints_table
+from drivelink.monitor.watcher import MAX_JOINTS, Watcher
+from drivelink.monitor.web import snapshot
+from drivelink.pubsub import inbound, wire
+from drivelink.pubsub.identity import MAX_CLAIMS, DaemonIdentity
+from drivelink.pubsub.publisher import JointPublisher, to_json
+from drivelink.pubsub.session import close_session, daemon_config, open_client, open_session
+from drivelink.recording.formats import open_sink
+from drivelink.recording.recorder import ZenohTap
+from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
+
+GOOD = int(Status.VALID | Status.OBSERVABLE)
+
+DOCUMENTS = {
+    "deep": b'{"a":' * 100_000 + b"1" + b"}" * 100_000,
+    "deep lists": b"[" * 200_000,
+    "no object": b"[1, 2]",
+    "no JSON": b"\xff\xfe{",
+    "NaN": b'{"residual_nm": NaN, "rate_hz": Infinity, "cpu_fraction": 1e999, "cycles": -Infinity}',
+    "huge integers": b'{"missed_cycles": 1' + b"0" * 4000 + b', "rate_hz": 1' + b"0" * 400 + b"}",
+    "integer too long": b'{"a": ' + b"9" * 100_000 + b"}",
+    "lone surrogates": b'{"state": "\\ud800", "conditions": ["\\udfff\\ud83d"], "\\ud800": 1}',
+    "escapes": b'{"state": "\\u001b[2J\\u001b]0;owned\\u0007", "conditions": ["\\u009b31m\\u202e"]}',
+    "markup": b'{"state": "[/bold][link=x]", "conditions": ["[/]"], "nodes": {"[red": {"state": "[/red]"}}}',
+    "wrong types": b'{"state": 3, "nodes": [1], "bus": 7, "latency": "x", "conditions": 5, "events": {"a": 1},'
+    b' "drive_faults": {"x": 1}, "residual_alarm": [], "transmissions": 9, "missed_cycles": "many"}',
+    "wrong types inside": b'{"nodes": {"1": null, "2": {"state": [], "emergency": {}}}, "conditions": [[], {}, 1],'
+    b' "events": [1, null, {"time": "x"}, {"time": 1e300, "text": 1}, {"time": 1, "text": [], "count": "a"}],'
+    b' "residual_alarm": {"active": 1, "residual_nm": ["x", null], "floor_nm": [0, -1]}}',
+    "many": json.dumps(
+        {"conditions": ["x" * 5000] * 200, "nodes": dict.fromkeys(range(15_000), "up")}
+    ).encode(),
+    "too many": json.dumps({"a": [0] * 30_000}).encode(),
+    "too large": b'{"a": "' + b"x" * (1 << 20) + b'"}',
+    "booleans": b'{"rate_hz": true, "missed_cycles": false, "residual_nm": true}',
+}
+
+
+def raw_estimate(*numbers: float, status: int = GOOD, sequence: int = 1, stamp_ns: int = 1) -> bytes:
+    return pack("<QQI3dB" + "4d" * ((len(numbers) - 3) // 4), sequence, stamp_ns, status, *numbers[:3],
+                (len(numbers) - 3) // 4, *numbers[3:])  # fmt: skip
+
+
+ESTIMATES = {
+    "another motor count": raw_estimate(*[1.0] * 11),
+    "none": raw_estimate(1.0, 1.0, 1.0),
+    "eight": raw_estimate(*[1.0] * 35),
+    "far away": raw_estimate(1.0, 700.0, 1.0, 1.0, 700.0, 1.0, 1e308),
+    "far away, the other side": raw_estimate(-1e308, 1e308, 1e308, 1e308, 1e308, 1e308, -1e308),
+    "of another time": raw_estimate(*[1.0] * 7, stamp_ns=2**64 - 1, sequence=2**64 - 1),
+    "called valid": raw_estimate(*[math.nan] * 7),
+    "NaN": raw_estimate(*[math.nan] * 7, status=0),
+    "infinite": raw_estimate(*[math.inf] * 7, status=2),
+    "all bits": raw_estimate(*[1.0] * 7, status=2**32 - 1),
+    "a length": bytes(44) + b"\xff" * 9,
+}
+
+
+@contextmanager
+def rogue(endpoint: str):
+    """A session like a daemon's: it listens, so that everybody connects to it."""
+    session = zenoh.open(daemon_config(endpoint, listen=False))
+    try:
+        until(lambda: session.info.peers_zid())
+        yield session
+    finally:
+        session.close()
+
+
+@pytest.fixture
+def endpoint():
+    return free_endpoint()
+
+
+@pytest.fixture
+def publisher(endpoint):
+    joint = make_joint("elbow", endpoint)
+    session = open_session(joint.zenoh, Path())
+    yield JointPublisher(session, joint)
+    close_session(session)
+
+
+def publish(publisher, sequence=[0]):  # noqa: B006  (counts through the test)
+    sequence[0] += 1
+    publisher.put_estimate(make_estimate(sequence[0]), time.time_ns())
+    publisher.put_sample(make_sample(sequence[0]), time.time_ns())
+    time.sleep(0.002)
+    return True
+
+
+def source(session, key):
+    """A publisher of the session, and what says so in its messages, as drivelink's own do."""
+    entity = session.declare_publisher(key)
+    return entity, zenoh.SourceInfo(entity.id, 0)
+
+
+# The documents and numbers by themselves
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_whatever_a_document_holds_it_is_refused_in_a_line_or_made_safe(name):
+    try:
+        document = inbound.decode_document(DOCUMENTS[name])
+    except ZenohError as error:
+        assert "\n" not in str(error) and len(str(error)) < 100
+        return
+    text = json.dumps(document, allow_nan=False, ensure_ascii=False)
+    text.encode("utf-8")  # no half characters
+    assert not any(c in text for c in "\x1b\x07\x9b‮\x00")
+    view = JointView("elbow")
+    view.status = document
+    view.update(make_estimate(1), 1.0)
+    for width in (20, 80, 200):
+        console = Console(width=width, height=24, file=io.StringIO(), force_terminal=True)
+        with console.capture() as shown:
+            console.print(view)
+            console.print(joints_table({"elbow": view}, width))
+        assert "owned\x07" not in shown.get()
+        assert all(len(line.plain) <= width for line in status_lines(document, width))
+    assert json.dumps(snapshot(view, True, {}), allow_nan=False)
+    assert len(status_text(document)) < 2000 and shape(document)
+
+
+def test_what_is_well_formed_stays_as_it_is():
+    document = {
+        "state": "running",
+        "rate_hz": 999.5,
+        "missed": 0,
+        "deep": [{"a": [None, True, -1.5]}],
+        "e": "φ · N·m",
+    }
+    assert inbound.decode_document(to_json(document)) == document
+
+
+@pytest.mark.parametrize("name", ESTIMATES)
+def test_no_estimate_ends_a_view(name):
+    view = JointView("elbow")
+    for k in range(50):
+        view.update(make_estimate(k), k * 0.05)
+    try:
+        message = inbound.DECODERS["estimate"](ESTIMATES[name])
+    except ZenohError:
+        return
+    for _ in range(3):
+        view.update(message, message.stamp_ns * 1e-9)
+    for k in range(50, 100):
+        view.update(make_estimate(k), k * 0.05)
+    console = Console(width=80, height=24)
+    with console.capture():
+        console.print(view)
+    assert "nan" not in view.line() and json.dumps(snapshot(view, True, {}), allow_nan=False)
+
+
+# Who says so
+
+
+def test_tokens_of_others_lock_nobody_out(publisher, endpoint):
+    """200 sessions that say they are the daemon, and write nothing; then a new subscriber."""
+    with rogue(endpoint) as intruder:
+        tokens = [intruder.liveliness().declare_token(f"drivelink/elbow/alive/{k:032x}") for k in range(200)]
+        time.sleep(0.3)
+        with drivelink.subscribe("elbow", endpoint=endpoint) as joint:
+            until(lambda: publish(publisher) and joint.valid)
+            assert joint.daemon == str(publisher._session.zid())
+            until(lambda: publish(publisher) and joint.rivals == 200)
+        assert len(tokens) == 200
+
+
+def test_more_tokens_than_are_remembered_lock_nobody_out_either():
+    identity = DaemonIdentity()
+    for number in range(MAX_CLAIMS + 10):
+        identity.token(f"{number:x}", True)
+    identity.token("abcdef0123456789", True)  # the daemon's, too late to be remembered
+    assert identity.accepts("abcdef0123456789", stale=True)
+    assert len(identity.claims) == MAX_CLAIMS
+
+
+@pytest.mark.parametrize("claims", [False, True])
+def test_a_subscriber_stays_with_its_daemon_whatever_another_session_writes(publisher, endpoint, claims):
+    """Estimates, status and model of a session that claims to be the daemon, or does not: none is used."""
+    publisher.put_status({"state": "running"})
+    with drivelink.subscribe("elbow", endpoint=endpoint, stale_after_s=10.0) as joint:
+        until(lambda: publish(publisher) and joint.valid and joint.status and joint.model)
+        with rogue(endpoint) as intruder:
+            until(lambda: len(joint._session.info.peers_zid()) > 1)
+            token = (
+                intruder.liveliness().declare_token(f"drivelink/elbow/alive/{intruder.zid()}")
+                if claims
+                else None
+            )
+            writers = {
+                name: source(intruder, f"drivelink/elbow/{name}") for name in ("estimate", "status", "model")
+            }
+            forged = {"estimate": wire.encode_estimate(make_estimate(999_999), time.time_ns()),
+                      "status": b'{"state": "forged"}', "model": b'{"joint": "forged"}'}  # fmt: skip
+
+            def attacked():
+                publish(publisher)
+                for name, (writer, info) in writers.items():
+                    writer.put(forged[name], source_info=info)
+                assert joint.latest().sequence != 999_999
+                assert joint.status == {"state": "running"} and joint.model["joint"] == "elbow"
+                return joint.foreign > 100
+
+            until(attacked)
+            assert joint.rivals == int(claims)
+            assert joint.daemon == str(publisher._session.zid())
+            del token
+
+
+def test_another_daemon_follows_when_the_token_of_the_first_is_gone():
+    identity = DaemonIdentity()
+    identity.token("", True)
+    identity.token("a1", True)
+    identity.token("b2", True)
+    assert identity.accepts("a1", stale=False)
+    assert not identity.accepts("b2", stale=True)  # silent, but its token is there
+    identity.token("a1", False)
+    assert not identity.alive and identity.accepts("b2", stale=False) and identity.alive
+    assert not identity.accepts("a1", stale=True)
+    assert not identity.accepts("c3", stale=True)
+
+
+def test_without_tokens_the_first_writer_is_taken_until_it_is_stale():
+    identity = DaemonIdentity()
+    assert identity.accepts("", stale=True) and not identity.accepts("b2", stale=False)
+    assert identity.accepts("b2", stale=True)
+    identity.token("c3", True)  # from here on a token decides
+    assert not identity.accepts("b2", stale=False)
+    assert identity.accepts("c3", stale=False)
+
+
+def test_the_monitor_and_the_recorder_take_a_joint_from_its_daemon_only(publisher, endpoint, tmp_path):
+    joint = make_joint("elbow", endpoint)
+    session = open_client(endpoint)
+    sink = open_sink(tmp_path / "r.mcap", joint)
+    heard: list = []
+    sink.document = lambda name, payload, stamp_ns: heard.append(json.loads(payload))  # type: ignore[method-assign]
+    watcher, tap = Watcher(session), ZenohTap(session, joint, sink)
+    publisher.put_status({"state": "running"})
+
+    def polled():
+        publish(publisher)
+        watcher.poll()
+        tap.poll()
+        return watcher.views.get("elbow")
+
+    until(lambda: (view := polled()) and view.history.latest and view.status and sink.counts["estimate"] > 5)
+    with rogue(endpoint) as intruder:
+        until(lambda: len(session.info.peers_zid()) > 1)
+        writers = {
+            name: source(intruder, f"drivelink/elbow/{name}") for name in ("estimate", "sample", "status")
+        }
+        sample = wire.encode_sample(Sample(999_999, (9.0,), (9.0,), (9.0,), 9.0), 1)
+        forged = {"estimate": wire.encode_estimate(make_estimate(999_999), 1), "sample": sample,
+                  "status": b'{"state": "forged"}'}  # fmt: skip
+
+        def attacked():
+            for name, (writer, info) in writers.items():
+                writer.put(forged[name], source_info=info)
+            view = polled()
+            assert view.history.latest.sequence != 999_999 and view.status == {"state": "running"}
+            return watcher.refused > 50 and tap.refused > 50
+
+        until(attacked)
+    assert {"state": "forged"} not in heard and {"state": "running"} in heard
+    assert tap.missed < 999_000
+    tap.close()
+    watcher.close()
+    close_session(session)
+    sink.close()
+
+
+# A daemon that is none, whose every message is an attack
+
+
+def test_nothing_that_is_published_ends_the_monitor_the_recorder_or_a_client(endpoint, tmp_path):
+    joint = make_joint("elbow", endpoint)
+    writer = open_session(joint.zenoh, Path())
+    session = open_client(endpoint)
+    sinks = [open_sink(tmp_path / name, joint) for name in ("r.mcap", "r.csv")]
+    taps = [ZenohTap(session, joint, sink) for sink in sinks]
+    watcher = Watcher(session)
+    since: dict[str, float] = {}
+    with drivelink.subscribe("elbow", session=session) as client:
+        eight = Estimate(1, GOOD, 1.0, 1.0, 1.0, (TransmissionEstimate(1.0, 1.0, 1.0, 0.1),) * 8)
+        samples = [
+            wire.encode_sample(Sample(1, (1.0,) * n, (1.0,) * n, (1.0,) * n, 1.0), 1) for n in (0, 1, 2, 8)
+        ]
+        samples += [
+            b"",
+            b"\xff" * 41,
+            pack("<QQ3dB3d", 2**64 - 1, 2**64 - 1, *[math.inf] * 3, 1, *[math.nan] * 3),
+        ]
+        attacks = [("estimate", payload) for payload in ESTIMATES.values()]
+        attacks += [("estimate", wire.encode_estimate(eight, 1))]
+        attacks += [(key, payload) for key in ("status", "model") for payload in DOCUMENTS.values()]
+        attacks += [("sample", payload) for payload in samples]
+        publishers = {
+            name: source(writer, f"drivelink/elbow/{name}")
+            for name in ("estimate", "sample", "status", "model")
+        }
+
+        def put(name, payload):
+            entity, info = publishers[name]
+            entity.put(payload, source_info=info)
+            time.sleep(0.002)
+
+        good = wire.encode_estimate(make_estimate(1), time.time_ns())
+        until(lambda: put("estimate", good) or client.received)
+        for name, payload in attacks:
+            put(name, payload)
+            watcher.poll()
+            for tap in taps:
+                tap.poll()
+            for view in watcher.views.values():
+                assert view.line() and json.dumps(snapshot(view, True, since), allow_nan=False)
+            assert client.latest() and (client.status, client.model)
+        last = wire.encode_estimate(make_estimate(77), time.time_ns())
+        until(lambda: put("estimate", last) or (client.latest().sequence == 77 and client.valid))
+        until(
+            lambda: (
+                put("estimate", last)
+                or watcher.poll()
+                or watcher.views["elbow"].history.latest.sequence == 77
+            )
+        )
+        assert client.foreign >= 4  # its queues of documents keep the newest only
+    for tap in taps:
+        tap.poll()
+        assert tap.refused >= 4
+        tap.close()
+    for sink in sinks:
+        sink.flush()
+        sink.close()
+    watcher.close()
+    close_session(session)
+    close_session(writer)
+    rows = (tmp_path / "r.csv").read_text().splitlines()
+    assert len(rows) >= 2 and len({row.count(",") for row in rows}) == 1
+
+
+def test_names_that_are_made_up_fill_no_memory_and_reach_no_terminal(publisher, endpoint):
+    session = open_client(endpoint)
+    watcher = Watcher(session)
+    with rogue(endpoint) as intruder:
+        until(lambda: session.info.peers_zid())
+        tokens = [
+            intruder.liveliness().declare_token(f"drivelink/\x1b[2J[bold]{k}/alive") for k in range(300)
+        ]
+
+        def polled():
+            publish(publisher)
+            watcher.poll()
+            return len(watcher.views) == MAX_JOINTS and watcher.views.get("elbow")
+
+        until(lambda: (view := polled()) and view.history.latest)
+        assert not any("\x1b" in name for name in watcher.views)
+        assert len(tokens) == 300
+    watcher.close()
+    close_session(session)

@@ -1,0 +1,42 @@
+"""Whole cycles lost at random: what is made up of single periods is no reason to learn nothing.
+
+A gap of more than one cycle used to empty the filters: nothing was learned for half a second. With every tenth cycle
+lost there is such a gap each tenth of a second, so nothing was ever learned, and the search for a late encoder, which
+began anew at each gap, never ended. What a gap costs follows from the straight line across it: (w n T)²/12 of the
+amplitude, for n periods T in a filter of bandwidth w.
+"""
+
+import numpy as np
+import onlinekit as kit
+import pytest
+
+SECONDS = 12.0
+SETTLED = 3000
+
+
+@pytest.mark.parametrize(("share", "least"), [(0.003, 0.99), (0.03, 0.95), (0.1, 0.8)])
+@pytest.mark.parametrize("name", ["constant", "quadratic", "vsa-ii"])
+def test_cycles_lost_at_random_cost_little_and_make_nothing_wrong(name, share, least):
+    motion = kit.motion(name, SECONDS)
+    for seed in range(2):
+        samples, kept = kit.without(motion.samples, share, seed)
+        told, _ = kit.play(kit.declared(name), samples)
+        assert not np.any(kit.wrong(told, motion.stiffness_nm_rad[kept]))
+        late = kept > SETTLED
+        assert np.mean(told.valid[late]) >= least
+        learning = told.status[late] & kit.OBSERVABLE > 0
+        assert np.mean(learning) > 0.8
+
+
+def test_a_late_link_encoder_is_found_while_cycles_are_lost():
+    late_by = 3
+    motion = kit.motion("vsa-ii", SECONDS)
+    samples = [
+        sample._replace(link_position_rad=motion.samples[max(k - late_by, 0)].link_position_rad)
+        for k, sample in enumerate(motion.samples)
+    ]
+    left, kept = kit.without(samples, 0.05, 1)
+    told, _ = kit.play(kit.declared("vsa-ii"), left)
+    end = kept > SETTLED + 5000
+    assert np.mean(told.valid[end]) > 0.95
+    assert not np.any(kit.wrong(told, motion.stiffness_nm_rad[kept])[end])

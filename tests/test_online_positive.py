@@ -1,0 +1,105 @@
+"""A stiffness that is not above zero, or whose interval holds zero, is never valid and never written.
+
+In paper mode whatever was a number was valid: 99.9 % of recordings of real machines in which its stiffness changed its
+sign again and again. It has no standard deviation there, but it has a scatter, and what scatters across zero says
+nothing.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onlinekit as kit
+import pytest
+
+from drivelink import jointfile, recording
+from drivelink.errors import JointFileError
+from estimator import EstimatorSettings, Motor, Record, Transmission, fit, make_estimator
+from estimator.errors import EstimatorError
+from sim.cases import CASES, case
+
+ROOT = Path(__file__).resolve().parents[1]
+DATA = Path(os.environ.get("DRIVELINK_DATA", ROOT.parent / "shared" / "data"))
+measured = pytest.mark.skipif(
+    not (DATA / "kuka_kr300").exists(), reason=f"no measured data in {DATA} (see $DRIVELINK_DATA)"
+)
+
+
+def unusable(told):
+    """Valid although the stiffness, or the end of its interval, is not above zero; no interval counts as none."""
+    std = np.where(np.isnan(told.std_nm_rad), 0.0, told.std_nm_rad)
+    return told.valid & ~(told.stiffness_nm_rad - 1.96 * std > 0.0)
+
+
+@pytest.mark.parametrize("method", ["mbe", "bbe"])
+@pytest.mark.parametrize("mode", ["paper", "robust"])
+@pytest.mark.parametrize("name", CASES)
+def test_what_is_valid_is_above_zero(name, mode, method):
+    motion = kit.motion(name, 6.0)
+    told, _ = kit.play(kit.declared(name, parameters={}), motion.samples, mode=mode, method=method)
+    assert not np.any(unusable(told))
+
+
+def test_a_paper_stiffness_that_changes_its_sign_is_hardly_ever_valid():
+    motion = kit.motion("vsa-ii", 8.0)
+    told, _ = kit.play(kit.declared("vsa-ii"), motion.samples, mode="paper")
+    assert np.mean(told.stiffness_nm_rad <= 0.0) > 0.2
+    assert np.mean(told.valid) < 0.01
+
+
+def test_a_paper_stiffness_that_holds_still_is_valid():
+    motion = kit.motion("constant", 10.0)
+    told, _ = kit.play(kit.declared("constant"), motion.samples, mode="paper", method="mbe")
+    late = slice(6000, None)
+    assert np.mean(told.valid[late]) > 0.95
+    assert told.stiffness_nm_rad[late] == pytest.approx(motion.stiffness_nm_rad[late], rel=0.01)
+
+
+@measured
+@pytest.mark.parametrize("mode", ["paper", "robust"])
+@pytest.mark.parametrize("axis", [2, 3])
+def test_on_a_measured_axis_too(axis, mode):
+    joint = jointfile.load(ROOT / "examples" / f"kuka_axis{axis}.toml")
+    record = recording.read(DATA / "kuka_kr300" / f"axis{axis}_A.csv", joint)
+    estimator = make_estimator(joint.model(), EstimatorSettings(mode=mode), record.period_s)
+    rows = [estimator.step(sample)[:5] for sample in record.samples()]
+    _, status, torque, stiffness, std = np.array(rows).T
+    told = kit.Told(status.astype(int), torque, stiffness, std)
+    assert not np.any(unusable(told))
+
+
+@pytest.mark.parametrize("coefficients", [(-5.0,), (-1.0, 200.0), (0.0, 0.0)])
+def test_a_declared_stiffness_below_zero_is_refused(coefficients):
+    transmission = Transmission(parameters={"coefficients_nm_rad": coefficients})
+    model = replace(kit.declared("constant"), motors=(Motor(inertia_kg_m2=0.1, transmission=transmission),))
+    with pytest.raises(EstimatorError, match="expected a stiffness above 0"):
+        make_estimator(model, EstimatorSettings(), kit.PERIOD_S)
+
+
+def test_a_fit_with_the_torque_reversed_is_called_what_it_is():
+    motion = kit.motion("constant", 12.0)
+    plant = case("constant").plant.motors[0]
+    told = []
+    for sign in (1.0, -1.0):
+        record = Record(
+            period_s=kit.PERIOD_S,
+            sequence=np.arange(len(motion.samples)),
+            motor_position_rad=np.array([s.motor_position_rad for s in motion.samples]),
+            motor_torque_nm=sign * np.array([s.motor_torque_nm for s in motion.samples]),
+            link_position_rad=sign * np.array([s.link_position_rad for s in motion.samples]),
+        )
+        told.append(fit(record, kit.declared("constant", parameters={}))[0].stiffens)
+    assert plant.spring.model == "linear"
+    assert told == [True, False]
+
+
+def test_a_joint_file_with_a_stiffness_below_zero_is_neither_read_nor_written():
+    text = (
+        'name = "a"\n[[motor]]\ninertia_kg_m2 = 0.1\n'
+        '[motor.transmission]\nmodel = "linear"\nparameters = { k_nm_rad = -5.0 }\n'
+    )
+    with pytest.raises(JointFileError, match=r"motor.*expected a stiffness above 0 N·m/rad, got -5"):
+        jointfile.parse(text)

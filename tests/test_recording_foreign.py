@@ -1,0 +1,271 @@
+"""Raw logs as other tools write them: what is decoded is what was put in, or a line says what is missing.
+
+The texts and bytes below are made here from the formats' descriptions, not by a library that also reads them.
+Each holds two joints, nodes of strangers, remote, extended and error frames, and begins in the middle.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from drivelink.errors import DrivelinkError
+from drivelink.jointfile import parse
+from drivelink.recording import read
+from drivelink.recording.playback import open_playback
+
+COUNTS = 65536
+CYCLES = 400
+BEGIN_S = 1_736_000_000.25
+
+
+def joint_text(name: str, node: int, mapped: bool = True) -> str:
+    tpdo = (
+        f'[[motor.drive.tpdo]]\ncob_id = {0x180 + node}\nobjects = ["0x6064:00:32", "0x60E4:01:32"]\n'
+        f'[[motor.drive.tpdo]]\ncob_id = {0x280 + node}\nobjects = ["0x6077:00:16"]\n'
+    )
+    return (
+        f'name = "{name}"\n[[motor]]\ninertia_kg_m2 = 0.1\n[motor.transmission]\nmodel = "linear"\n'
+        f"[motor.drive]\nnode_id = {node}\ncounts_per_rev = {COUNTS}\nrated_torque_nm = 2.0\n"
+        f"{tpdo if mapped else ''}[link.encoder]\ncounts_per_rev = {COUNTS}\n"
+        '[bus]\nchannel = "can0"\nconfigure = false\nsync = "follow"\n'
+    )
+
+
+class Line(NamedTuple):
+    """One frame on the bus."""
+
+    time_s: float
+    can_id: int
+    data: bytes
+    kind: str = "data"  # data, remote, extended, error
+
+
+def truth(node: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(cycles,) counts of motor and link, torque in thousandths of 2 N·m."""
+    k = np.arange(CYCLES)
+    motor = np.round(9000 * np.sin(0.02 * k * node)).astype(int)
+    link = np.round(8000 * np.sin(0.02 * k * node - 0.1)).astype(int)
+    return motor, link, np.round(300 * np.cos(0.02 * k * node)).astype(int)
+
+
+def bus() -> list[Line]:
+    signals = {node: truth(node) for node in (1, 5)}
+    lines = [
+        Line(-2e-4, 0x285, struct.pack("<h", 7)),
+        Line(-1e-4, 0x701, b"\x05"),
+    ]  # in the middle of a cycle
+    for k in range(CYCLES):
+        t = k * 1e-3
+        lines.append(Line(t, 0x080, b""))
+        for node, (motor, link, torque) in signals.items():
+            lines.append(Line(t + 1e-4 * node, 0x180 + node, struct.pack("<ii", motor[k], link[k])))
+            lines.append(Line(t + 1e-4 * node + 5e-5, 0x280 + node, struct.pack("<h", torque[k])))
+        if k % 10 == 0:
+            lines.append(Line(t + 7e-4, 0x18A, b"\x01\x02\x03"))  # a stranger
+            lines.append(Line(t + 7.1e-4, 0x0081, struct.pack("<HB5x", 0x1000, 1)))
+            lines.append(Line(t + 7.2e-4, 0x181, b"", "remote"))
+            lines.append(Line(t + 7.3e-4, 0x18FEF100, b"\xff" * 8, "extended"))
+            lines.append(Line(t + 7.4e-4, 0, b"", "error"))
+    return lines
+
+
+def spaced(data: bytes) -> str:
+    return data.hex(" ").upper()
+
+
+def candump(lines: list[Line], *, width: int = 3) -> bytes:
+    out = []
+    for t, can_id, data, kind in lines:
+        payload = "R" if kind == "remote" else data.hex().upper()
+        name = f"{can_id:08X}" if kind == "extended" else f"{can_id:0{width}X}"
+        if kind == "error":
+            name, payload = "20000004", "0004000000000000"
+        out.append(f"({BEGIN_S + t:.6f}) can0 {name}#{payload}\n")
+    return "".join(out).encode()
+
+
+def vector_asc(lines: list[Line], *, base: str = "hex", stamps: str = "absolute", fd: bool = False) -> bytes:
+    out = [
+        "date Sat Jan 4 02:13:20.250 pm 2025\r\n",
+        f"base {base}  timestamps {stamps}\r\n",
+        "internal events logged\r\n",
+        "// version 13.0.0\r\n",
+        "Begin Triggerblock Sat Jan 4 02:13:20.250 pm 2025\r\n",
+        "   0.000000 Start of measurement\r\n",
+    ]
+    before = begin = lines[0].time_s
+    for number, (t, can_id, data, kind) in enumerate(lines):
+        stamp = t - begin if stamps == "absolute" else t - before
+        before = t
+        name = (f"{can_id:X}" if base == "hex" else f"{can_id}") + ("x" if kind == "extended" else "")
+        payload = spaced(data) if base == "hex" else " ".join(map(str, data))
+        if kind == "error":
+            text = "1  ErrorFrame"
+        elif kind == "remote":
+            text = f"1  {name:15} Rx   r"
+        elif fd:
+            text = f"CANFD   1 Rx {name:>11}  1 0 {len(data):x} {len(data):>2} {payload}   102203  130 303000 0 0 0 0 0"
+        else:
+            text = f"1  {name:15} Rx   d {len(data)} {payload}  Length = 122000 BitCount = 63 ID = {can_id}"
+        out.append(f"{stamp:11.6f} {text}\r\n")
+        if number % 100 == 50:
+            passed = stamp if stamps == "absolute" else 0.0
+            out.append(f"{passed:11.6f} 1  Statistic: D 100 R 1 XD 1 XR 0 E 1 O 0 B 12.50%\r\n")
+    return "".join([*out, "End TriggerBlock\r\n"]).encode("cp1252")
+
+
+def peak_trc(lines: list[Line], version: str) -> bytes:
+    out = [";##########################################################################\r\n"]
+    if version != "1.0":
+        out = [f";$FILEVERSION={version}\r\n", ";$STARTTIME=45661.5928269676\r\n"]
+    if version[0] == "2":
+        out.append(
+            f";$COLUMNS=N,O,T,{'B,' if version == '2.1' else ''}I,d,{'R,' if version == '2.1' else ''}L,D\r\n"
+        )
+    out.append(";   PCAN-View, the file is as it is\r\n;\r\n")
+    for number, (t, can_id, data, kind) in enumerate(lines, 1):
+        ms = (t - lines[0].time_s) * 1e3
+        name = f"{can_id:08X}" if kind == "extended" else f"{can_id:04X}"
+        bytes_ = "RTR" if kind == "remote" else spaced(data)
+        if kind == "error":
+            if version == "1.0":
+                out.append(f"{number:6})  {ms:10.1f}  FFFFFFFF  4  00 00 00 08  BUSHEAVY\r\n")
+            elif version[0] == "2":
+                out.append(
+                    f"{number:7}  {ms:12.3f} ER {'1 ' if version == '2.1' else ''}    -    Rx {'- ' if version == '2.1' else ''} 5    04 02 00 00 00\r\n"
+                )
+            else:
+                bus_ = "1  " if version in ("1.2", "1.3") else ""
+                out.append(
+                    f"{number:6})  {ms:12.3f} {bus_}Error 0008 {'- ' if version == '1.3' else ''}4 00 19 08 08\r\n"
+                )
+            continue
+        out.append({
+            "1.0": f"{number:6})  {ms:10.3f}  {name}  {len(data)}  {bytes_}\r\n",
+            "1.1": f"{number:6})  {ms:12.3f}  Rx     {name}  {len(data)}  {bytes_}\r\n",
+            "1.2": f"{number:6})  {ms:12.3f} 1  Rx     {name}  {len(data)}  {bytes_}\r\n",
+            "1.3": f"{number:6})  {ms:12.3f} 1  Rx     {name} -  {len(data)}    {bytes_}\r\n",
+            "2.0": f"{number:7}  {ms:12.3f} {'RR' if kind == 'remote' else 'DT'}     {name} Rx {len(data)}  {bytes_}\r\n",
+            "2.1": f"{number:7}  {ms:12.3f} {'RR' if kind == 'remote' else 'DT'} 1      {name} Rx -  {len(data)}    {bytes_}\r\n",
+        }[version])  # fmt: skip
+    return "".join(out).encode("cp1252")
+
+
+def vector_blf(lines: list[Line]) -> bytes:
+    """Objects of the header's version 1 in containers that are not packed; one object reaches into the next."""
+    objects = b""
+    for t, can_id, data, kind in lines:
+        if kind == "error":
+            body, number = struct.pack("<HHL", 1, 0, 0), 2
+        else:
+            flags = 0x80 if kind == "remote" else 0
+            marked = can_id | (0x80000000 if kind == "extended" else 0)
+            body, number = struct.pack("<HBBL8s", 1, flags, len(data), marked, data), 1
+        stamp = round((t - lines[0].time_s) * 1e9)
+        head = struct.pack("<4sHHLLLHHQ", b"LOBJ", 32, 1, 32 + len(body), number, 2, 0, 0, stamp)
+        objects += head + body
+    out = bytearray()
+    for at in range(0, len(objects), 5000):
+        part = objects[at : at + 5000]
+        out += struct.pack("<4sHHLL", b"LOBJ", 16, 1, 32 + len(part), 10)
+        out += struct.pack("<H6xL4x", 0, len(part)) + part
+        out += b"\0" * (len(part) % 4)
+    times = struct.pack("<8H", 2025, 1, 6, 4, 14, 13, 20, 250)
+    header = struct.pack("<4sLBBBBBBBBQQLL", b"LOGG", 144, 5, 0, 0, 0, 2, 6, 8, 1, 144 + len(out), 0, 0, 0)
+    return (header + times * 2).ljust(144, b"\0") + bytes(out)
+
+
+TOOLS: dict[str, tuple[str, Callable[[list[Line]], bytes]]] = {
+    "candump -L": (".log", candump),
+    "ASC, absolute stamps": (".asc", vector_asc),
+    "ASC, relative stamps": (".asc", lambda lines: vector_asc(lines, stamps="relative")),
+    "ASC, decimal": (".asc", lambda lines: vector_asc(lines, base="dec")),
+    "ASC, CAN FD": (".asc", lambda lines: vector_asc(lines, fd=True)),
+    **{f"TRC {v}": (".trc", lambda lines, v=v: peak_trc(lines, v)) for v in ("1.0", "1.1", "1.2", "1.3", "2.0", "2.1")},
+    "BLF": (".blf", vector_blf),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("node", [1, 5])
+@pytest.mark.parametrize("tool", TOOLS)
+def test_what_a_tool_wrote_is_decoded_as_it_was(tool: str, node: int, tmp_path: Path) -> None:
+    suffix, write = TOOLS[tool]
+    path = tmp_path / f"r{suffix}"
+    path.write_bytes(write(bus()))
+    record = read(path, parse(joint_text("a", node)))
+    motor, link, torque = truth(node)
+    assert len(record) == CYCLES and np.array_equal(np.diff(record.sequence), np.ones(CYCLES - 1))
+    scale = 2.0 * math.pi / COUNTS
+    # The first counts of an incremental encoder are its zero as they are: nothing is subtracted.
+    assert record.motor_position_rad[:, 0] == pytest.approx(motor * scale, rel=1e-12, abs=1e-15)
+    assert record.link_position_rad == pytest.approx(link * scale, rel=1e-12, abs=1e-15)
+    assert record.motor_torque_nm[:, 0] == pytest.approx(torque * 2e-3, rel=1e-12, abs=1e-15)
+    assert record.period_s == 1e-3
+
+
+@pytest.mark.parametrize("jump_s", [3600.0, -3600.0, -2.5, 1e6])
+def test_a_clock_that_is_set_makes_a_gap_and_loses_nothing(
+    jump_s: float, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "r.log"
+    half = CYCLES // 2 * 1e-3 - 1e-4
+    path.write_bytes(
+        candump([line._replace(time_s=line.time_s + (jump_s if line.time_s > half else 0)) for line in bus()])
+    )
+    with caplog.at_level(logging.WARNING, "drivelink.recording"):
+        samples = [
+            one.sample for one in open_playback(path, parse(joint_text("a", 1)), tmp_path) if one.sample
+        ]
+    motor, _, _ = truth(1)
+    found = [one.motor_position_rad[0] for one in samples]
+    assert found == pytest.approx((motor * 2.0 * math.pi / COUNTS).tolist(), rel=1e-12, abs=1e-15)
+    steps = np.diff([one.sequence for one in samples])
+    expected = jump_s * 1e3 + 1 if jump_s > 0 else 1000
+    assert np.count_nonzero(steps != 1) == 1 and steps.max() == pytest.approx(
+        expected, rel=1e-4, abs=2
+    )  # 200 SYNCs with stamps in microseconds tell the period to 1e-4 of it
+    if jump_s < 0:
+        assert "the stamps jump back by" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("spoil", "mapped", "said"),
+    [
+        (lambda lines: lines, False, ("mapping", "tpdo")),
+        (
+            lambda lines: [line for line in lines if line.can_id != 0x080],
+            True,
+            ("SYNC frames (0x080)", "record"),
+        ),
+        (
+            lambda lines: [line for line in lines if line.can_id not in (0x181, 0x281)],
+            True,
+            ("0x181 of node 1", "got none"),
+        ),
+    ],
+)
+def test_what_is_missing_is_one_line_that_says_how_to_give_it(
+    spoil: Callable[[list[Line]], list[Line]], mapped: bool, said: tuple[str, ...], tmp_path: Path
+) -> None:
+    path = tmp_path / "r.log"
+    path.write_bytes(candump(spoil(bus())))
+    with pytest.raises(DrivelinkError) as caught:
+        read(path, parse(joint_text("a", 1, mapped)))
+    assert "\n" not in str(caught.value) and all(word in str(caught.value) for word in said), str(
+        caught.value
+    )
+
+
+def test_a_trace_of_an_unknown_version_is_not_guessed_at(tmp_path: Path) -> None:
+    path = tmp_path / "r.trc"
+    path.write_bytes(peak_trc(bus(), "2.1").replace(b"=2.1", b"=3.0"))
+    with pytest.raises(DrivelinkError, match=r"expected a PCAN trace of version 1\.0, .*, got '3\.0'"):
+        read(path, parse(joint_text("a", 1)))

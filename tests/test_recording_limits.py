@@ -1,0 +1,317 @@
+"""Recordings that lie about their size, that are cut, or that are damaged: one line, and little memory."""
+
+from __future__ import annotations
+
+import io
+import logging
+import random
+import resource
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import can
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+
+from drivelink.errors import DrivelinkError, RecordingError
+from drivelink.jointfile import parse
+from drivelink.recording import read
+from drivelink.recording.canlog import read_frames
+from drivelink.recording.formats import open_sink
+from drivelink.recording.mapping import joint_of
+from drivelink.recording.mcapfile import read_messages
+from drivelink.recording.playback import open_playback
+from estimator.sample import Sample
+
+TEXT = """\
+name = "elbow"
+[[motor]]
+inertia_kg_m2 = 0.1
+[motor.transmission]
+model = "linear"
+[motor.drive]
+node_id = 1
+counts_per_rev = 65536
+rated_torque_nm = 1.0
+[[motor.drive.tpdo]]
+cob_id = 0x181
+objects = ["0x6064:00:32", "0x60E4:01:32"]
+[[motor.drive.tpdo]]
+cob_id = 0x281
+objects = ["0x6077:00:16"]
+[link.encoder]
+counts_per_rev = 65536
+"""
+JOINT = parse(TEXT)
+HEADER = "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad\n"
+GIB = 1 << 30
+MOST_MIB = 300  # that reading may take; each bomb unpacks to a GiB
+
+
+def peak_mib() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
+
+
+def one_line(caught: pytest.ExceptionInfo[RecordingError]) -> str:
+    text = str(caught.value)
+    assert "\n" not in text and len(text) < 600
+    return text
+
+
+def zstd_bomb(size: int, told: bool) -> bytes:
+    out = io.BytesIO()
+    packer = zstandard.ZstdCompressor()
+    with packer.stream_writer(out, size=size if told else -1, closefd=False) as writer:
+        for _ in range(size >> 24):
+            writer.write(bytes(1 << 24))
+    return out.getvalue()
+
+
+def lz4_bomb(size: int) -> bytes:
+    with lz4.frame.LZ4FrameCompressor() as packer:
+        parts = [packer.begin()]
+        parts += [packer.compress(bytes(1 << 24)) for _ in range(size >> 24)]
+        return b"".join([*parts, packer.flush()])
+
+
+def chunk(compression: bytes, packed: bytes, size: int) -> bytes:
+    body = struct.pack("<QQQII", 0, 0, size, 0, len(compression)) + compression
+    body += struct.pack("<Q", len(packed)) + packed
+    return struct.pack("<BQ", 0x06, len(body)) + body
+
+
+@pytest.mark.parametrize("honest", [True, False])
+@pytest.mark.parametrize(
+    ("compression", "packed"),
+    [
+        (b"zstd", lambda: zstd_bomb(GIB, told=True)),
+        (b"zstd", lambda: zstd_bomb(GIB, told=False)),
+        (b"lz4", lambda: lz4_bomb(GIB)),
+    ],
+)
+def test_an_mcap_chunk_that_unpacks_without_end_takes_no_memory(
+    compression: bytes, packed: Callable[[], bytes], honest: bool, tmp_path: Path
+) -> None:
+    path = tmp_path / "r.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n" + chunk(compression, packed(), GIB if honest else 1000))
+    before = peak_mib()
+    with pytest.raises(RecordingError) as caught:
+        read(path, JOINT)
+    line = one_line(caught)
+    assert ("at most 64 MiB unpacked, got 1024 MiB" if honest else "no samples in it") in line
+    assert peak_mib() - before < MOST_MIB
+
+
+def test_a_blf_container_that_unpacks_without_end_takes_no_memory(tmp_path: Path) -> None:
+    path = tmp_path / "r.blf"
+    log_of(path, frames(10))
+    packer = zlib.compressobj(1)
+    packed = b"".join([*(packer.compress(bytes(1 << 24)) for _ in range(GIB >> 24)), packer.flush()])
+    container = struct.pack("<H6xL4x", 2, GIB % (1 << 32)) + packed
+    path.write_bytes(
+        path.read_bytes() + struct.pack("<4sHHLL", b"LOBJ", 16, 1, 16 + len(container), 10) + container
+    )
+    before = peak_mib()
+    with pytest.raises(RecordingError, match="expected containers of at most 64 MiB"):
+        list(read_frames(path))
+    assert peak_mib() - before < MOST_MIB
+
+
+def test_a_hundred_thousand_columns_are_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    path.write_text(",".join(f"c{k}" for k in range(100_000)) + "," + HEADER + "0," * 100_003 + "0\n")
+    with pytest.raises(RecordingError, match="expected at most 4096 columns, got 100004"):
+        read(path, JOINT)
+
+
+def test_of_many_columns_only_the_known_ones_are_held(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "r.csv"
+    with path.open("w") as file:
+        file.write(",".join(f"c{k}" for k in range(4000)) + "," + HEADER)
+        for k in range(2000):
+            file.write("text," * 4000 + f"{k * 1e-3:.3f},{k * 0.1},1.0,{k * 0.1}\n")
+    before = peak_mib()
+    record = read(path, JOINT)
+    assert np.array_equal(record.link_position_rad, np.arange(2000) * 0.1)
+    assert peak_mib() - before < MOST_MIB
+    (said,) = [m for m in caplog.messages if "ignored" in m]
+    assert said.endswith("c11, … (4000 in all)")
+
+
+@pytest.mark.parametrize("name", ["r.csv", "r.log", "r.asc", "r.trc"])
+@pytest.mark.parametrize("begin", [b"", HEADER.encode()])
+def test_a_line_without_an_end_is_one_line(name: str, begin: bytes, tmp_path: Path) -> None:
+    path = tmp_path / name
+    with path.open("wb") as file:
+        file.write(begin)
+        for _ in range(200):
+            file.write(b"(1.000000) can0 181#" + b"0" * (1 << 20))
+    before = peak_mib()
+    with pytest.raises(RecordingError) as caught:
+        read(path, JOINT)
+    assert "at most 1024 KiB" in one_line(caught)
+    assert peak_mib() - before < MOST_MIB
+
+
+def test_a_gap_of_a_million_seconds_is_replayed_and_not_fitted(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    times = [k * 1e-3 for k in range(500)] + [1e6 + k * 1e-3 for k in range(500)]
+    path.write_text(HEADER + "".join(f"{t!r},{t % 1!r},1.0,{t % 1!r}\n" for t in times))
+    with pytest.raises(RecordingError) as caught:
+        read(path, JOINT)
+    assert "expected at most 10000000 periods" in one_line(caught) and "got 1000000500" in str(caught.value)
+    assert sum(1 for _ in open_playback(path, JOINT, tmp_path)) == 1000
+    log = tmp_path / "r.log"
+    log_of(log, [(s + (10**15 if k >= 1800 else 0), i, d) for k, (s, i, d) in enumerate(frames(1200))])
+    with pytest.raises(RecordingError, match="expected at most 10000000 periods"):
+        read(log, JOINT)
+    assert sum(1 for _ in open_playback(log, JOINT, tmp_path)) > 1100
+
+
+# Damage
+
+
+def frames(cycles: int) -> list[tuple[int, int, bytes]]:
+    """(stamp in ns, identifier, data) of SYNC and one drive."""
+    found = []
+    for k in range(cycles):
+        stamp = 1_700_000_000_000_000_000 + k * 1_000_000
+        found.append((stamp, 0x080, b""))
+        found.append((stamp + 200_000, 0x181, struct.pack("<ii", 10 * k, 11 * k)))
+        found.append((stamp + 400_000, 0x281, struct.pack("<h", 100)))
+    return found
+
+
+def log_of(path: Path, wanted: list[tuple[int, int, bytes]]) -> None:
+    sink = open_sink(path, JOINT, TEXT)
+    for stamp, can_id, data in wanted:
+        sink.frame(stamp, can_id, data)
+    sink.close()
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One short recording in every format."""
+    folder = tmp_path_factory.mktemp("whole")
+    for suffix in (".mcap", ".csv", ".log", ".blf", ".asc", ".trc"):
+        sink = open_sink(folder / f"r{suffix}", JOINT, TEXT, str(folder))
+        for k, (stamp, can_id, data) in enumerate(frames(100)):
+            if can_id == 0x080:
+                sink.sample(Sample(k // 3, (0.1 * k,), (0.0,), (1.0,), 0.1 * k), stamp)
+            sink.frame(stamp, can_id, data)
+            if k % 50 == 49:
+                sink.flush()
+        sink.close()
+    return folder
+
+
+def taken(path: Path) -> None:
+    """Everything that reads a recording."""
+    for work in (
+        lambda: read(path, JOINT),
+        lambda: sum(1 for _ in open_playback(path, JOINT, path.parent)),
+        lambda: sum(1 for _ in open_playback(path, JOINT, path.parent, frames=True)),
+        lambda: joint_of(path, None),
+    ):
+        try:
+            work()
+        except DrivelinkError as error:
+            assert "\n" not in str(error) and len(str(error)) < 700, str(error)[:900]
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".csv", ".log", ".blf", ".asc", ".trc"])
+def test_damaged_recordings_are_read_or_refused_in_one_line(
+    suffix: str, whole: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Bytes flipped, cut, doubled, filled with others: never anything but a line."""
+    caplog.set_level(logging.CRITICAL)
+    good, rng = (whole / f"r{suffix}").read_bytes(), random.Random(18)
+    path = tmp_path / f"r{suffix}"
+    for _ in range(120):
+        data = bytearray(good)
+        for _ in range(rng.randrange(1, 4)):
+            at = rng.randrange(len(data))
+            kind = rng.randrange(4)
+            if kind == 0:
+                data[at] ^= 1 << rng.randrange(8)
+            elif kind == 1:
+                del data[at:]
+                data += b"\n" * rng.randrange(2)
+            elif kind == 2:
+                data[at:at] = data[rng.randrange(len(data)) :][: rng.randrange(1, 200)]
+            else:
+                data[at : at + 8] = rng.choice([b"\xff" * 8, b"\0" * 8, b"9" * 8, b"-inf,nan"])
+            data = data or bytearray(b"\0")
+        path.write_bytes(data)
+        taken(path)
+
+
+def test_every_bit_of_an_mcap_length_may_be_wrong(whole: Path, tmp_path: Path) -> None:
+    good, path = (whole / "r.mcap").read_bytes(), tmp_path / "r.mcap"
+    at, lengths = 8, []
+    while at + 9 <= len(good):
+        lengths.append(at + 1)
+        at += 9 + struct.unpack_from("<Q", good, at + 1)[0]
+    for place in lengths[:12]:
+        for bit in range(64):
+            data = bytearray(good)
+            data[place + bit // 8] ^= 1 << bit % 8
+            path.write_bytes(data)
+            for _ in read_messages(path):
+                pass
+
+
+@pytest.mark.parametrize("suffix", [".log", ".asc", ".trc"])
+def test_no_cut_of_a_log_makes_another_frame(
+    suffix: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / f"r{suffix}"
+    log_of(path, frames(12))
+    good, truth = path.read_bytes(), list(read_frames(path))
+    assert len(truth) == 36
+    for end in range(good.index(b"181") + 60, len(good)):
+        path.write_bytes(good[:end])
+        found = list(read_frames(path))
+        assert found == truth[: len(found)] and len(found) >= good[:end].count(b"\n") - 40
+    path.write_bytes(good[: good.rindex(b"181") + 12])
+    caplog.clear()
+    list(read_frames(path))
+    assert "the last line has no end and is left out" in caplog.text
+
+
+def test_messages_of_others_in_an_mcap_file_are_one_line(whole: Path, tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    for topic, text in (
+        ("sample", b"[" * 50_000),
+        ("sample", b'{"time_s": "x", "motor1_position_rad": []}'),
+        ("sample", b" " * 100_000 + b"{}"),
+        ("can", b'{"id": 1e9, "data": "00"}'),
+        ("can", b'{"id": 1}'),
+        ("mapping", b'{"joint": "elbow", "nodes": [1]}'),
+        ("joint", b"[]"),
+    ):
+        name = f"/elbow/{topic}".encode()
+        body = (
+            struct.pack("<HHI", 1, 0, len(name))
+            + name
+            + struct.pack("<I", 4)
+            + b"json"
+            + struct.pack("<I", 0)
+        )
+        records = struct.pack("<BQ", 0x04, len(body)) + body
+        body = struct.pack("<HIQQ", 1, 0, 0, 0) + text
+        path.write_bytes(b"\x89MCAP0\r\n" + records + struct.pack("<BQ", 0x05, len(body)) + body)
+        taken(path)
+
+
+def test_a_reader_of_others_reads_our_logs(whole: Path) -> None:
+    """The mapping is kept beside a log, so that a log is what its format says, and nothing else."""
+    for suffix in (".log", ".blf", ".asc", ".trc"):
+        with can.LogReader(whole / f"r{suffix}") as reader:
+            assert sum(1 for _ in reader) == 300

@@ -1,0 +1,150 @@
+"""The systemd service: what is written, what systemd says of it, and what is left after uninstall."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from drivelink import cli
+from drivelink.jointfile import parse
+from drivelink.systemd.unit import installation
+
+JOINT = """\
+name = "elbow"
+[[motor]]
+inertia_kg_m2 = 0.125
+[motor.transmission]
+model = "linear"
+parameters = {{ k_nm_rad = 700.0 }}
+[bus]
+interface = "{interface}"
+channel = "{channel}"
+bitrate = 500000
+"""
+UNIT = Path("etc/systemd/system/drivelink@elbow.service")
+NETWORK = Path("etc/systemd/network/80-drivelink-can0.network")
+
+
+@pytest.fixture
+def joint(tmp_path: Path) -> Path:
+    path = tmp_path / "elbow.toml"
+    path.write_text(JOINT.format(interface="socketcan", channel="can0"), encoding="utf-8")
+    return path
+
+
+def service(*words: object) -> int:
+    return cli.main(["service", *map(str, words)])
+
+
+def test_install_writes_the_unit_and_the_interface_and_uninstall_leaves_nothing(
+    joint: Path, tmp_path: Path
+) -> None:
+    root = tmp_path / "root"
+    assert service("install", joint, "--root", root) == 0
+    unit = (root / UNIT).read_text()
+    assert f" run {joint}" in unit and f"WorkingDirectory={tmp_path}" in unit and "{{" not in unit
+    assert "After=network.target sys-subsystem-net-devices-can0.device" in unit
+    network = (root / NETWORK).read_text()
+    assert "Name=can0" in network and "BitRate=500000" in network and "RestartSec=100ms" in network
+    assert service("install", joint, "--root", root) == 0  # the same again
+    assert service("uninstall", joint, "--root", root) == 0
+    assert [path for path in root.rglob("*") if path.is_file()] == []
+
+
+def test_what_somebody_has_changed_is_replaced_only_when_asked(
+    joint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = tmp_path / "root"
+    service("install", joint, "--root", root)
+    (root / UNIT).write_text("mine")
+    assert service("install", joint, "--root", root) == 2
+    assert "--force replaces it" in capsys.readouterr().err and (root / UNIT).read_text() == "mine"
+    assert service("install", joint, "--root", root, "--force") == 0
+    assert (root / UNIT).read_text() != "mine"
+
+
+def test_a_second_joint_on_the_interface_keeps_its_network_file(joint: Path, tmp_path: Path) -> None:
+    root, other = tmp_path / "root", tmp_path / "knee.toml"
+    other.write_text(joint.read_text().replace("elbow", "knee"))
+    service("install", joint, "--root", root)
+    service("install", other, "--root", root)
+    assert service("uninstall", "elbow", "--root", root) == 0
+    assert (root / NETWORK).exists() and not (root / UNIT).exists()
+    assert service("uninstall", other, "--root", root) == 0
+    assert not (root / NETWORK).exists()
+
+
+@pytest.mark.parametrize(
+    ("interface", "channel", "words", "message"),
+    [
+        ("virtual", "x", [], "lives inside one process"),
+        ("socketcan", "can0/../x", [], "expected the name of a network interface"),
+        ("socketcan", "can0", ["--allow", "everybody"], "expected an address like"),
+        ("socketcan", "can0", ["--credential", "key"], "expected NAME=FILE"),
+    ],
+)
+def test_what_cannot_be_a_service_is_one_line(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    interface: str,
+    channel: str,
+    words: list[str],
+    message: str,
+) -> None:
+    path = tmp_path / "elbow.toml"
+    path.write_text(JOINT.format(interface=interface, channel=channel), encoding="utf-8")
+    assert service("install", path, "--root", tmp_path / "root", *words) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert not (tmp_path / "root").exists()
+
+
+def test_a_home_installation_is_let_in_and_keys_come_as_credentials(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The unit sees nothing below /home but these, and they read-only."""
+    monkeypatch.setattr("sys.prefix", "/home/eva/venv")
+    monkeypatch.setattr("sys.base_prefix", "/home/eva/.pyenv/versions/3.12")
+    text = JOINT.format(interface="slcan", channel="/dev/ttyACM0")
+    path = Path("/home/eva/robots/elbow.toml")
+    made = installation(
+        parse(text),
+        path,
+        Path("/home/eva/venv/bin/drivelink"),
+        allow=["10.0.0.0/24"],
+        credentials=["daemon.key=/etc/ssl/private/daemon.key"],
+    )
+    (unit,) = made.files.values()
+    bound = re.findall(r"^BindReadOnlyPaths=(.*)$", unit, re.MULTILINE)
+    assert {"/home/eva/venv", "/home/eva/.pyenv/versions/3.12", "/home/eva/robots"} <= set(bound)
+    assert "/home/eva/venv/bin" not in bound and "ProtectHome=tmpfs" in unit
+    assert "IPAddressAllow=localhost 10.0.0.0/24\n" in unit
+    assert "LoadCredential=daemon.key:/etc/ssl/private/daemon.key" in unit
+    assert "DeviceAllow=char-ttyACM rw" in unit and "PrivateDevices=yes" not in unit
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
+@pytest.mark.parametrize(("interface", "channel"), [("socketcan", "can0"), ("slcan", "/dev/ttyACM0")])
+def test_systemd_finds_the_unit_right_and_little_exposed(
+    tmp_path: Path, interface: str, channel: str
+) -> None:
+    """At most 2.0 of 10, with what a daemon needs: real-time scheduling, CAN and IP sockets."""
+    path = tmp_path / "elbow.toml"
+    path.write_text(JOINT.format(interface=interface, channel=channel), encoding="utf-8")
+    service("install", path, "--root", tmp_path, "--credential", f"key={path}")
+    unit = str(tmp_path / UNIT)
+    verified = subprocess.run(
+        ["systemd-analyze", "verify", unit], capture_output=True, text=True, check=False
+    )
+    assert verified.returncode == 0, verified.stderr
+    told = subprocess.run(
+        ["systemd-analyze", "security", "--offline=true", "--threshold=20", unit],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert told.returncode == 0, told.stdout
+    level = re.search(r"exposure level .*: ([\d.]+)", told.stdout)
+    assert level is not None and float(level[1]) <= 2.0

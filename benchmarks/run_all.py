@@ -90,6 +90,11 @@ SECTIONS = (
         json_file=False,
         markdown=False,
     ),
+    Section(
+        name="compiled",
+        title="The compiled core beside the last interpreted commit",
+        quick=("--seconds", "5", "--rounds", "1"),
+    ),
     Section(name="paper_table", title="The paper's table", json_file=False, markdown=False),
     Section(name="sensitivity", title="Sensitivity", json_file=False, markdown=False),
     Section(

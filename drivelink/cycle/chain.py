@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -13,8 +14,9 @@ from drivelink.jointfile import JointFile
 from estimator import Estimator, make_estimator
 from estimator.sample import Estimate, Sample
 
-__all__ = ["Built", "Watch", "build", "make_assembler", "make_chain"]
+__all__ = ["Built", "Watch", "build", "make_assembler", "make_chain", "rehearse"]
 
+_REHEARSED = 500  # samples: half a second, in which an estimator has begun to learn
 _HOLD_S, _HOLD_PERIODS = 0.25, 10  # of silence, and at least so many, see `Assembler`
 
 
@@ -59,3 +61,18 @@ def make_chain(joint: JointFile, layouts: Sequence[NodeLayout], *, keep: int = 0
         DriveError: the layouts lack something that the joint's model needs.
     """
     return Chain(make_assembler(joint, layouts), *build(joint), keep=keep)
+
+
+def rehearse(joint: JointFile) -> None:
+    """Step an estimator and a watch like this joint's: nothing is then done for the first time in the loop.
+
+    What is loaded, allocated or started with the first use (a library's threads, say) is there afterwards.
+    """
+    chain = Chain(Assembler((), 0), *build(joint))
+    motors = len(joint.motor)
+    for k in range(_REHEARSED):
+        theta, nothing = tuple(0.01 * math.sin(0.05 * k + i) for i in range(motors)), (math.nan,) * motors
+        tick = chain.take(Sample(k, theta, nothing, theta, 0.0))
+        assert tick.estimate_payload and tick.sample_payload and tick.estimate and tick.sample  # made once
+    chain.carry_on(_REHEARSED)
+    chain.estimator.parameters()

@@ -24,7 +24,7 @@ from drivelink.canopen.bus import open_bus
 from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle import pacing, realtime
 from drivelink.cycle.busport import BusPort
-from drivelink.cycle.chain import build, make_chain
+from drivelink.cycle.chain import build, make_chain, rehearse
 from drivelink.cycle.joining import join_bus
 from drivelink.cycle.loop import CycleLoop, Lane
 from drivelink.cycle.sources import open_source
@@ -133,6 +133,7 @@ class Daemon:
                 self._republish(publisher, mine)(served.joint)
             self._reloaders = self._make_reloaders(layouts)
             self._plan_housekeeping()
+            self._rehearse()
             self.loop.source.narrow(self.loop.receive_ids())
         except BaseException:
             self._closing.close()
@@ -278,6 +279,13 @@ class Daemon:
                 publisher.put_joint(self._timed(joint), layouts)
 
         return publish
+
+    def _rehearse(self) -> None:
+        """Do once, before the loop, what it will do: nothing is done for the first time in a cycle."""
+        for served in self._joints:
+            rehearse(served.joint)
+        self.documents()
+        self._publish_status("starting")
 
     def _check_bus(self) -> None:
         if self._keeper.check():

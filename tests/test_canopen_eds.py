@@ -10,6 +10,7 @@ from canopenkit import Slave, Wire, joint_text, sheet_objects
 
 from drivelink.canopen import Signal, configure
 from drivelink.canopen.eds import load_eds
+from drivelink.canopen.pdo import describe
 from drivelink.errors import DriveError
 from drivelink.jointfile import parse
 
@@ -206,3 +207,26 @@ def test_the_shipped_sheets_load_without_a_word(path):
     found = load_eds(path, 5)
     assert found.problems == []
     assert found.tpdos()
+
+
+def test_roboteqs_name_for_the_node_id_is_understood(tmp_path):
+    path = tmp_path / "roboteq.eds"
+    path.write_text(
+        "[1800sub1]\nDataType=7\nAccessType=rw\nDefaultValue=$MY_NODE_ID+0x180\n"
+        "[1801sub1]\nDataType=7\nAccessType=rw\nDefaultValue=0x280+$MY_NODE_ID\n"
+    )
+    sheet = load_eds(path, 5)
+    assert (sheet.value(0x1800, 1), sheet.value(0x1801, 1)) == (0x185, 0x285)
+    assert not any("no number" in problem for problem in sheet.problems)
+
+
+def test_a_map_that_the_sheet_does_not_tell_is_unknown_and_not_empty(tmp_path):
+    path = tmp_path / "untold.eds"
+    maps = {0x1A00: ("", ""), 0x1A01: ("DefaultValue=0", ""), 0x1A02: ("DefaultValue=2", "")}
+    text = ""
+    for index, (count, first) in maps.items():
+        text += f"[{index - 0x200:X}sub1]\nDataType=7\nAccessType=rw\nDefaultValue=0x{index - 0x1880:X}\n"
+        text += f"[{index:X}sub0]\nDataType=5\nAccessType=rw\n{count}\n"
+        text += f"[{index:X}sub1]\nDataType=7\nAccessType=rw\n{first}\n"
+    path.write_text(text)
+    assert describe(load_eds(path).tpdos()) == "TPDO1 = unknown; TPDO2 = empty; TPDO3 = unknown"

@@ -200,3 +200,24 @@ def test_absolute_encoders_tell_resolution_and_where_they_start_again(told, coun
     (candidate,) = offer(roles(parse(text))[1], told, GENERIC).candidates[Signal.LINK_POSITION]
     assert candidate.scale == pytest.approx(math.tau / counts)
     assert candidate.modulus == modulus
+
+
+EPOS2 = {(0x2210, 1): 500, (0x6410, 1): 2000}  # pulses a turn; no 0x6075, 0x6076, 0x608F, 0x3000
+
+
+def test_epos2_tells_its_current_in_milliamperes_and_its_encoder_in_pulses():
+    drive = "torque_constant_nm_a = 0.03\nrated_current_a = 2.0\ngear_ratio = 50.0\nvelocity = true"
+    result = offered(EPOS2, MAXON, drive=drive)
+    assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.tau / (4 * 500 * 50))
+    current = result.candidates[Signal.MOTOR_TORQUE][0]
+    assert [c.address for c in result.candidates[Signal.MOTOR_TORQUE]].count((0x6078, 0)) == 1
+    assert (current.address, current.bits, current.signed) == ((0x6078, 0), 16, True)
+    assert current.scale == pytest.approx(1e-3 * 0.03 * 50)  # whatever the rated current is
+    assert scale(result, Signal.MOTOR_VELOCITY) == pytest.approx(math.tau / 60 / 50)
+
+
+def test_epos4_is_not_taken_for_its_predecessor():
+    told = {(0x3000, 5): 4096, (0x2210, 1): 500}
+    result = offered(told, MAXON, drive="torque_constant_nm_a = 0.03\ngear_ratio = 50.0")
+    assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.tau / (4096 * 50))
+    assert result.candidates[Signal.MOTOR_TORQUE][0].address == (0x30D1, 2)

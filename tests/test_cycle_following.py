@@ -228,3 +228,27 @@ def test_a_log_gives_the_samples_of_the_live_run(tmp_path: Path) -> None:
     replayed = [master.run.ticks_of(cycle.sample) for cycle in log.cycles() if cycle.sample is not None]
     assert replayed == [told for _, told in master.valid[begun:]]
     assert len(replayed) > 700
+
+
+def test_a_node_without_heartbeat_after_its_reset_is_operational_when_it_sends(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    master = Master()
+    run = master.run
+    monkeypatch.setattr(run.loop, "clock", lambda: master.stamp_ns)
+    read_scales(master)
+    master.write(2, 0x1017, 0, 50, 2)
+    master.syncs(500)  # of the adopted layout's heartbeat nothing is heard
+    master.nmt(RESET_NODE, 2)
+    for node in run.bus.nodes:
+        answer = node.answer
+        monkeypatch.setattr(node, "answer", lambda tick, a=answer: [f for f in a(tick) if f[0] < 0x700])
+    assert run.supervisor.node_status(run.loop.lanes[0])["2"]["state"] == "boot-up"
+    master.syncs(100)
+    master.map(2, 1, POSITION, TORQUE, STATUSWORD)
+    master.nmt(START, 2)
+    for _ in range(20):
+        master.syncs(100)
+    status = run.supervisor.node_status(run.loop.lanes[0])["2"]
+    assert (status["state"], status["heartbeat_age_s"]) == ("operational", None)
+    assert "node 2: heartbeat lost" not in master.conditions

@@ -472,3 +472,19 @@ def test_helpers():
     assert percentile([3.0, 1.0, 2.0], 0.5) == 2.0
     finding = Finding(severity=Severity.WARNING, subject="a", text="b", fix="c")
     assert str(finding) == "a: b [c]"
+
+
+@pytest.mark.parametrize("mappable", [0, 1])
+def test_an_encoder_whose_position_cannot_be_mapped_does_not_pass(tmp_path, mappable):
+    path = tmp_path / "encoder.eds"
+    path.write_text(
+        "[1000]\nDataType=7\nAccessType=ro\nDefaultValue=0x20196\n"
+        f"[6004]\nParameterName=Position\nDataType=7\nAccessType=ro\nPDOMapping={mappable}\n"
+        "[1800sub1]\nDataType=7\nAccessType=rw\nDefaultValue=0x181\n"
+        "[1800sub2]\nDataType=5\nAccessType=rw\nDefaultValue=1\n"
+        "[1A00sub0]\nDataType=5\nAccessType=rw\nDefaultValue=0\n[1A00sub1]\nDataType=7\nAccessType=rw\n"
+    )
+    assert main(["doctor", "--eds", str(path)]) == (0 if mappable else 1)
+    said = texts(examine_eds(path), Severity.ERROR)
+    assert said == [] or any("0x6004:00 is there, but cannot be mapped into a TPDO" in line for line in said)
+    assert bool(said) != bool(mappable)

@@ -19,6 +19,7 @@ from drivelink.canopen.bus import open_bus
 from drivelink.cycle.framesource import BusLostError
 from drivelink.cycle.sources import open_source
 from drivelink.daemon.service import Daemon, ServedJoint
+from drivelink.errors import BusError
 from drivelink.jointfile import BusSection, JointFile
 from drivelink.simulate import network_from_joint, open_sim_bus
 from estimator.sample import Status
@@ -189,3 +190,30 @@ def test_error_frames_of_any_interface_are_counted_by_kind() -> None:
 def test_a_lost_bus_is_one_line_whatever_python_can_puts_into_its_message() -> None:
     said = "Failed to receive: [Errno 104] Connection reset by peer  Traceback (most recent call last):\n  File ...\n"
     assert str(BusLostError(said)) == "Failed to receive: [Errno 104] Connection reset by peer"
+
+
+def test_a_second_daemon_under_another_name_is_refused_on_socketcand() -> None:
+    joint = joint_on("socketcand", "can0", f'host = "127.0.0.1", port = {free_port()}')
+    with devices(joint):
+        daemon = Daemon([ServedJoint(joint=joint)], publish=False, real_time=False)
+        with running(daemon):
+            until(lambda: is_valid(daemon.chains[0]))
+            other = joint.model_copy(update={"name": "other"})
+            reboots = [c.reboots for c in daemon.chains[0].assembler.counters.values()]
+            with pytest.raises(BusError, match="another master already makes SYNC"):
+                Daemon([ServedJoint(joint=other)], publish=False, real_time=False)
+            assert [c.reboots for c in daemon.chains[0].assembler.counters.values()] == reboots
+            assert not any("configured again" in e["text"] for e in daemon.events.recent())
+
+
+def test_a_socketcand_server_that_says_nothing_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivelink.canopen.bus._CONNECT_S", 0.2)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        section = BusSection(
+            interface="socketcand",
+            channel="can0",
+            options={"host": "127.0.0.1", "port": server.getsockname()[1]},
+        )
+        with pytest.raises(BusError, match=r"the server says nothing for 0.2 s"):
+            open_bus(section)
+    assert socket.getdefaulttimeout() is None

@@ -21,7 +21,7 @@ from can.interfaces import VALID_INTERFACES
 from drivelink.errors import BusError
 from drivelink.jointfile import BusSection
 
-__all__ = ["interface_is_up", "open_bus", "receive_buffer_frames"]
+__all__ = ["interface_is_up", "listening_s", "open_bus", "receive_buffer_frames"]
 
 logger = logging.getLogger(__name__)
 
@@ -31,7 +31,9 @@ _BUFFER_S = 0.5  # of a full bus; the longest stall that must lose nothing
 _SHORTEST_FRAME_BITS = 55
 _SOCKETCAND_PORT = 29536
 _SOCKETCAND_HOST = "127.0.0.1"  # where `drivelink sim` serves one, unless told otherwise
-_CONNECT_S = 3.0
+_CONNECT_S = 3.0  # for the connection, and for each answer of the greeting
+_DELIVERY_S = {"virtual": 0.05, "socketcan": 0.05}  # a frame is there as soon as it is sent
+_SLOWEST_DELIVERY_S = 0.5  # servers and adapters hold frames back for a while after they are opened
 _SYS_NET = Path("/sys/class/net")
 _IFF_UP = 1
 _WITHOUT_BITRATE = frozenset({"virtual", "socketcan", "socketcand", "udp_multicast"})
@@ -61,7 +63,7 @@ def open_bus(section: BusSection) -> can.BusABC:
     if section.interface == "socketcand":
         _check_socketcand(section)
     try:
-        with _quiet():
+        with _quiet(), _connecting(section):
             bus = can.Bus(ignore_config=True, **_arguments(section))
     except can.CanError as error:
         raise BusError(f"{where} cannot be opened: {_reason(error)}") from error
@@ -69,6 +71,8 @@ def open_bus(section: BusSection) -> can.BusABC:
         raise BusError(f"{where} cannot be opened: {_reason(error)}") from error
     except (TypeError, ValueError, KeyError, ImportError) as error:
         raise BusError(f"{where} cannot be opened, check bus.channel and bus.options: {error}") from error
+    if section.interface == "socketcand":
+        bus._SocketCanDaemonBus__socket.settimeout(None)  # type: ignore[attr-defined]
     if section.interface == "socketcan":
         _size_receive_buffer(bus, section)
     return bus
@@ -120,7 +124,7 @@ def _check_socketcan(section: BusSection) -> None:
 
 
 def _check_socketcand(section: BusSection) -> None:
-    """Whether anybody listens: python-can would try for ten seconds, and leave a socket open."""
+    """Whether a socketcand answers: python-can would try for ten seconds, or wait for ever."""
     host, port = (
         section.options.get("host", _SOCKETCAND_HOST),
         section.options.get("port", _SOCKETCAND_PORT),
@@ -131,9 +135,36 @@ def _check_socketcand(section: BusSection) -> None:
             f"got {section.options or 'none'}"
         )
     try:
-        socket.create_connection((host, port), timeout=_CONNECT_S).close()
+        with socket.create_connection((host, port), timeout=_CONNECT_S) as connection:
+            greeting = connection.recv(64)
+    except TimeoutError as error:
+        raise BusError(
+            f"socketcand {host}:{port}: nobody accepts, or the server says nothing for {_CONNECT_S:g} s: "
+            "is it a socketcand?"
+        ) from error
     except OSError as error:
         raise BusError(f"socketcand {host}:{port} cannot be opened: {_reason(error)}") from error
+    if b"<" not in greeting:
+        raise BusError(f"socketcand {host}:{port}: expected its greeting, got {greeting[:20]!r}: is it one?")
+
+
+@contextlib.contextmanager
+def _connecting(section: BusSection) -> Iterator[None]:
+    """A server that falls silent must not hold the start up: python-can waits for ever."""
+    if section.interface != "socketcand":
+        yield
+        return
+    before = socket.getdefaulttimeout()
+    socket.setdefaulttimeout(_CONNECT_S)
+    try:
+        yield
+    finally:
+        socket.setdefaulttimeout(before)
+
+
+def listening_s(section: BusSection) -> float:
+    """How long to listen for frames that come every period, until silence on this bus is certain."""
+    return max(_DELIVERY_S.get(section.interface, _SLOWEST_DELIVERY_S), 3 * section.period_s)
 
 
 def interface_is_up(name: str) -> bool:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from drivelink.canopen.blocking import POLL_S, FrameBus, Idle, receive, run_program, sender
+from drivelink.canopen.bus import listening_s
 from drivelink.canopen.busload import COMFORTABLE, BusLoad, bus_load, check_capacity
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.mapping import NMT_START
@@ -23,11 +24,10 @@ from drivelink.errors import BusError, DriveError
 from drivelink.finding import log_findings
 from drivelink.jointfile import BusSection, JointFile
 
-__all__ = ["Configurator", "configure", "configure_joints"]
+__all__ = ["Configurator", "configure", "configure_joints", "refuse_foreign_sync"]
 
 logger = logging.getLogger(__name__)
 
-_FOREIGN_SYNC_S = 0.05
 _DEVICE_TYPE = 0x1000  # what a node is asked for first
 
 
@@ -159,7 +159,7 @@ def configure_joints(
     """
     section = joints[0].bus
     if section.sync == "produce":
-        _refuse_foreign_sync(bus, section, idle)
+        refuse_foreign_sync(bus, section, idle)
     configurator = _actively(bus, joints, base_dirs, idle)
     load = configurator.load()
     check_capacity(load, section.period_s)
@@ -219,13 +219,13 @@ def _configure_one(configurator: Configurator, node: int, bus: FrameBus, idle: I
         ) from error
 
 
-def _refuse_foreign_sync(bus: FrameBus, section: BusSection, idle: Idle | None) -> None:
+def refuse_foreign_sync(bus: FrameBus, section: BusSection, idle: Idle | None) -> None:
     """Two masters must not both make SYNC.
 
     Raises:
         BusError: somebody else does.
     """
-    heard = _listen(bus, max(_FOREIGN_SYNC_S, 3 * section.period_s), idle)
+    heard = _listen(bus, listening_s(section), idle)
     syncs = sum(1 for cob_id in heard if cob_id == 0x80)
     if syncs > 1:
         raise BusError(

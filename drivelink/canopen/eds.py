@@ -41,7 +41,7 @@ _TYPES = {
 }
 _NO_NUMBER = frozenset({0x08, 0x09, 0x0A, 0x0B, 0x0C, 0x0D, 0x0F, 0x11})  # floats, strings, times, domain
 _OBJECT = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?")
-_NODE = re.compile(r"\$nodeid", re.IGNORECASE)
+_NODE = re.compile(r"\$(my_)?node_?id", re.IGNORECASE)  # $NODEID, and Roboteq's $MY_NODE_ID
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -65,6 +65,7 @@ def offer(role: Role, told: Mapping[Address, int], vendor: Vendor) -> Offer:
         vendor: its maker.
     """
     result = Offer()
+    vendor = vendor.generation(told)
     if role.drive is not None:
         _Drive(role, role.drive, told, vendor, result).offer()
     if role.encoder is not None:
@@ -166,7 +167,7 @@ class _Drive:
             counts = self._told.get(self._vendor.counts_per_rev, 0)
             if counts > 1:
                 index, subindex = self._vendor.counts_per_rev
-                return float(counts), f"0x{index:04X}:{subindex:02X}"
+                return float(counts * self._vendor.counts_factor), f"0x{index:04X}:{subindex:02X}"
         return None, ""
 
     def _position(self, counts: float | None, gear: float) -> None:
@@ -239,28 +240,26 @@ class _Drive:
         constant = self._torque_constant(rated_torque, rated_current)
         if rated_torque is None and constant is not None and rated_current is not None:
             rated_torque = constant * rated_current  # Nanotec: no 0x6076, the torque of the rated current
+        own = self._vendor.current
+        own_unit = own is not None and own.address == (0x6078, 0)  # and then no rated values either
         by_torque: list[Candidate] = []
         by_current: list[Candidate] = []
         if rated_torque is not None:
             by_torque.append(_torque_candidate((0x6077, 0), 16, direction * gear * rated_torque / 1000))
         if constant is not None:
             per_ampere = direction * gear * constant
-            if rated_current is not None:
+            if rated_current is not None and not own_unit:
                 by_current.append(_torque_candidate((0x6078, 0), 16, per_ampere * rated_current / 1000))
             if drive.current_object:
                 address = object_address(drive.current_object, f"{self._role.key}.current_object")
                 stated = _torque_candidate(address, 32, per_ampere * drive.current_unit_a)
                 by_current.insert(0, stated)
-            if self._vendor.current:
-                by_current.append(
-                    _torque_candidate(
-                        self._vendor.current.address, 32, per_ampere * self._vendor.current.unit_a
-                    )
-                )
+            if own is not None:
+                by_current.append(_torque_candidate(own.address, own.bits, per_ampere * own.unit_a))
         sources = {
             "torque": by_torque,
             "current": by_current,
-            "auto": by_current + by_torque if drive.current_object else by_torque + by_current,
+            "auto": by_current + by_torque if drive.current_object or own_unit else by_torque + by_current,
         }
         chosen = tuple(dict.fromkeys(sources[drive.torque_source]))
         if chosen:
@@ -277,6 +276,8 @@ class _Drive:
         unit = self._told.get((0x60A9, 0))
         if unit:
             told = velocity_unit_rad_s(unit, counts)
+        if told is None and self._vendor.velocity_rad_s is not None:
+            told, source = self._vendor.velocity_rad_s, self._vendor.name
         if told is None and self._vendor.velocity_counts_s is not None and counts is not None:
             told, source = self._vendor.velocity_counts_s * math.tau / counts, self._vendor.name
         stated = self._drive.velocity_rad_s_per_count

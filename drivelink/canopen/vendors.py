@@ -6,6 +6,8 @@ is said in the joint file instead (`current_object`, `velocity_rad_s_per_count`,
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 __all__ = ["GENERIC", "VENDORS", "CurrentObject", "Vendor", "vendor_of"]
@@ -20,10 +22,12 @@ class CurrentObject:
     Attributes:
         address: index and subindex.
         unit_a: amperes per count.
+        bits: its length.
     """
 
     address: Address
     unit_a: float
+    bits: int = 32
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,9 +42,13 @@ class Vendor:
         torque_constant: object with the torque constant in µN·m/A.
         nominal_current: object with the nominal current in mA.
         rated_torque_micro: whether 0x6076 may be in µN·m.
+        counts_factor: what that one is multiplied by: 4 where it counts the pulses of a quadrature encoder.
+        velocity_rad_s: rad/s per count of 0x606C, where 0x60A9 does not tell.
         velocity_counts_s: counts per second and count of 0x606C, where 0x60A9 does not tell.
         sensorless: object of 0x60E4 that is computed and no encoder.
         toggling_statusword_bits: bits of 0x6041 that change by themselves.
+        others: (object, its like): the maker's drives that have this object and not `counts_per_rev` are
+            another generation.
     """
 
     name: str
@@ -50,17 +58,38 @@ class Vendor:
     torque_constant: Address | None = None
     nominal_current: Address | None = None
     rated_torque_micro: bool = False
+    counts_factor: int = 1
+    velocity_rad_s: float | None = None
     velocity_counts_s: float | None = None
     sensorless: Address | None = None
     toggling_statusword_bits: int = 0
+    others: tuple[tuple[Address, Vendor], ...] = ()
 
     def objects(self) -> tuple[Address, ...]:
         """Vendor objects that are read for units."""
         single = (self.counts_per_rev, self.torque_constant, self.nominal_current)
-        return tuple(address for address in single if address) + (self.gear or ())
+        own = tuple(address for address in single if address) + (self.gear or ())
+        return own + tuple(address for _, other in self.others for address in other.objects())
+
+    def generation(self, told: Mapping[Address, int]) -> Vendor:
+        """This maker's way in the drive that has told these objects."""
+        if self.counts_per_rev not in told:
+            for marker, other in self.others:
+                if marker in told:
+                    return other
+        return self
 
 
 GENERIC = Vendor(name="")
+
+# Firmware specification of EPOS2: 0x6078 in mA, no 0x6075 to 0x6077, 0x2210:01 in pulses, 0x606C in rpm.
+_EPOS2 = Vendor(
+    name="maxon",
+    current=CurrentObject(address=(0x6078, 0), unit_a=1e-3, bits=16),
+    counts_per_rev=(0x2210, 1),
+    counts_factor=4,
+    velocity_rad_s=math.tau / 60,
+)
 
 VENDORS = {
     0x000000FB: Vendor(
@@ -71,6 +100,7 @@ VENDORS = {
         torque_constant=(0x3001, 5),
         nominal_current=(0x3001, 1),
         rated_torque_micro=True,
+        others=(((0x2210, 1), _EPOS2),),
     ),
     0x0000009A: Vendor(name="Elmo", velocity_counts_s=1.0),
     0x000000AB: Vendor(name="Copley", velocity_counts_s=0.1),

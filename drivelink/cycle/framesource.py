@@ -17,6 +17,7 @@ import can
 
 __all__ = [
     "MOST_FRAMES",
+    "OVERFLOW",
     "BusLostError",
     "BusSource",
     "Frame",
@@ -28,6 +29,7 @@ __all__ = [
     "note_error",
 ]
 
+OVERFLOW = "receive overflow"  # of `FrameSource.errors`: frames that were lost because nobody read them
 MOST_FRAMES = 256  # taken in one go, so that a babbling node cannot hold the loop up
 
 
@@ -91,7 +93,7 @@ def note_error(errors: dict[str, int], can_id: int, data: bytes) -> None:
     """Count an error frame by its kinds, which are bits of its identifier."""
     kinds = [kind for bit, kind in _ERROR_KINDS.items() if can_id & bit] or ["other"]
     if can_id & 0x004 and data[1:2] and data[1] & 0x01:
-        kinds.append("receive overflow")
+        kinds.append(OVERFLOW)
     for kind in kinds:
         errors[kind] = errors.get(kind, 0) + 1
 

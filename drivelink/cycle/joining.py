@@ -10,7 +10,7 @@ from pathlib import Path
 import can
 
 from drivelink._core import SYNC_COB_ID
-from drivelink.canopen.configure import Configurator, configure_joints
+from drivelink.canopen.configure import Configurator, configure_joints, refuse_foreign_sync
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.canopen.roles import roles
@@ -27,7 +27,6 @@ Idle = Callable[[], object]
 logger = logging.getLogger(__name__)
 
 _PATIENCE_S = 5.0  # for another master's SYNC, and for the frames that answer it
-_LISTEN_S = 0.05  # for a SYNC that should not be there; at least three periods
 _POLL_S = 0.01
 
 
@@ -64,7 +63,7 @@ def join_bus(
         return configurator, layouts
     passive = PassiveConfigurator(joints, folders)
     if section.sync == "produce":
-        _refuse_sync(port, section.period_s, section.channel, idle)
+        refuse_foreign_sync(port, section, idle)
     _learn(port, passive, idle, patience_s)
     if section.sync == "follow":
         expected = _Expected(section.channel, passive.layouts.values())
@@ -109,12 +108,6 @@ def _frames(port: BusPort, idle: Idle | None, seconds: float) -> Iterator[tuple[
             yield -1, b"", 0
         elif not (message.is_extended_id or message.is_error_frame or message.is_remote_frame):
             yield message.arbitration_id, bytes(message.data), int(message.timestamp * 1e9)
-
-
-def _refuse_sync(port: BusPort, period_s: float, channel: str, idle: Idle | None) -> None:
-    syncs = sum(cob_id == SYNC_COB_ID for cob_id, *_ in _frames(port, idle, max(_LISTEN_S, 3 * period_s)))
-    if syncs > 1:
-        raise BusError(f'another master already makes SYNC on {channel}: set bus.sync = "follow", or stop it')
 
 
 def _learn(port: BusPort, passive: PassiveConfigurator, idle: Idle | None, patience_s: float) -> None:

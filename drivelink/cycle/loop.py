@@ -27,6 +27,7 @@ logger = logging.getLogger(__name__)
 
 Listener = Callable[[int, bytes], None]
 
+_MOST_BEHIND_NS = 10_000_000_000  # what seems to be more is a stamp of another clock
 _CLOCK_STEP_NS = 20_000_000  # NTP slews by less between two looks; more than that is a clock that was set
 
 
@@ -118,6 +119,7 @@ class CycleLoop:
         cycles: SYNCs since the start.
         overruns: periods left out because this process was late.
         foreign_syncs: SYNCs of another master while we make it, or that were not due.
+        behind: SYNCs, when following, that this process has read more than a period after their stamp.
         late_syncs: SYNCs of the master we follow that came when their period was over.
         sync_stamps: of the last SYNCs, when following.
         counter_jumps: SYNCs whose counter did not follow the one before.
@@ -147,6 +149,7 @@ class CycleLoop:
         self.on_lost: Callable[[str], None] = lambda _reason: None
         self.on_fault: Callable[[str, Exception], None] = _log_fault
         self.housekeeping.on_fault = lambda error: self.on_fault("housekeeping", error)
+        self.behind = 0
         self.cycles = self.overruns = self.foreign_syncs = self.late_syncs = self.counter_jumps = 0
         self.sync_stamps: deque[int] = deque(maxlen=MEASURED_SYNCS)
         self.clock_step_ns = self.clock_steps = 0
@@ -278,6 +281,8 @@ class CycleLoop:
             self._sync(data, 0, 0, now_ns)
             return
         self.sync_stamps.append(stamp_ns)
+        behind_ns = now_ns + self.unix_ns - stamp_ns
+        self.behind += self.period_ns < behind_ns < _MOST_BEHIND_NS
         jump = self._sync_clock.jump(stamp_ns, now_ns)
         if jump == 0:
             self.foreign_syncs += 1

@@ -6,13 +6,16 @@ import errno
 import select
 import socket
 import struct
+import sys
 import time
 from collections.abc import Iterable
 from typing import Any
 
-from drivelink.cycle.framesource import MOST_FRAMES, BusLostError, Frame, note_error
+from drivelink.cycle.framesource import MOST_FRAMES, OVERFLOW, BusLostError, Frame, note_error
 
 __all__ = ["SocketCanSource"]
+
+_SO_RXQ_OVFL = 40  # socket(7): with each frame, how many were dropped; not in the socket module
 
 
 class SocketCanSource:
@@ -28,6 +31,8 @@ class SocketCanSource:
         self._bus = bus
         self._socket: socket.socket = bus.socket
         self._socket.setblocking(False)
+        self._socket.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
+        self._dropped = 0
         self._buffer = bytearray(72)
         self._sent: dict[tuple[int, bytes], bytes] = {}
         self.lost_sends = 0
@@ -46,14 +51,19 @@ class SocketCanSource:
         receive, buffer = self._socket.recvmsg_into, self._buffer
         try:
             while len(frames) < MOST_FRAMES:
-                size, ancillary, _flags, _address = receive([buffer], 64)
+                size, ancillary, _flags, _address = receive([buffer], 128)
                 layout = self._FRAME if size == 16 else self._FD_FRAME
                 can_id, length, *_, data = layout.unpack_from(buffer)
                 if can_id & self._FLAGS:
                     if can_id & self._ERROR:
                         note_error(self.errors, can_id, data)
                     continue
-                seconds, nanoseconds = self._TIME.unpack_from(ancillary[0][2]) if ancillary else (0, 0)
+                seconds = nanoseconds = 0
+                for _level, kind, content in ancillary:
+                    if kind == _SO_RXQ_OVFL:
+                        self._note_dropped(content)
+                    elif len(content) >= self._TIME.size:
+                        seconds, nanoseconds = self._TIME.unpack_from(content)
                 stamp = seconds * 1_000_000_000 + nanoseconds or time.time_ns()
                 frames.append(Frame(can_id, data[:length], stamp))
         except BlockingIOError:
@@ -61,6 +71,13 @@ class SocketCanSource:
         except (OSError, ValueError) as error:
             raise BusLostError(_reason(error)) from error
         return frames
+
+    def _note_dropped(self, content: bytes) -> None:
+        """How many frames the kernel has dropped since the socket was opened, told with the next one."""
+        dropped = int.from_bytes(content[:4], sys.byteorder)
+        if dropped != self._dropped:
+            self.errors[OVERFLOW] = self.errors.get(OVERFLOW, 0) + (dropped - self._dropped) % (1 << 32)
+            self._dropped = dropped
 
     def send(self, cob_id: int, data: bytes) -> None:
         """See FrameSource."""

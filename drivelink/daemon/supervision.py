@@ -17,7 +17,7 @@ from drivelink.canopen.emcy import drive_state, parse_emergency
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.following import MapFollower
-from drivelink.cycle.framesource import LostSource
+from drivelink.cycle.framesource import OVERFLOW, LostSource
 from drivelink.cycle.loop import CycleLoop, Lane
 from drivelink.cycle.syncclock import MEASURED_SYNCS, measure_period
 from drivelink.daemon.status import EventLog
@@ -34,7 +34,7 @@ _MANY_SYNCS = 3  # not due within a second: a second master; one master alone is
 _HEARTBEATS_LOST = 3.5  # of them missing: the node is gone
 _STATES = {0x00: "boot-up", 0x04: "stopped", 0x05: "operational", 0x7F: "pre-operational"}
 _OPERATIONAL = 0x05
-_STOPPED = 0x04
+_BOOT_UP, _STOPPED = 0x00, 0x04
 _COUNTED = (  # counter of a node; by how much it grows at least, and what is said then; and when it rests
     ("missing", 1, "frames are missing", "frames arrive again, {} were missing so far"),
     (
@@ -72,6 +72,7 @@ class _Watched:
         "layout",
         "received",
         "seen_ns",
+        "sent",
         "started",
         "state",
     )
@@ -90,6 +91,7 @@ class _Watched:
             0  # since when frames have been missing and come several in one cycle; 0: they do not
         )
         self.received = counters.received
+        self.sent = counters.received + counters.ignored
         self.counted = {name: (getattr(counters, name), -_NS) for name, *_ in _COUNTED}
 
 
@@ -119,6 +121,7 @@ class Supervisor:
         self._follower: MapFollower | None = None
         self._foreign_syncs = self._counter_jumps = self._lost_sends = self._clock_steps = 0
         self._bus_offs = self._restarts = self._measured_ns = 0
+        self._slow = self._slow_ns = 0
         self._off_period = 0  # measurements in a row
         self._foreign_ns: list[int] = []  # when SYNCs came that were not due
         self.sync_period_s: float | None = None
@@ -279,6 +282,10 @@ class Supervisor:
                 if name == "conflicting":
                     watched.bunched_ns = 0
                 self._events.end(f"{name} {node}", f"node {node}: {stopped.format(count)}")
+        if counters.received + counters.ignored != watched.sent:
+            watched.sent = counters.received + counters.ignored
+            if watched.state == _BOOT_UP or now - watched.heartbeat_ns > _NS:
+                watched.state = _OPERATIONAL  # no node sends PDOs otherwise, and it says nothing else
         if counters.received != watched.received:
             watched.received, watched.seen_ns = counters.received, now
             watched.started = False
@@ -319,6 +326,7 @@ class Supervisor:
         loop = self._loop
         self._check_foreign_syncs()
         self._check_period()
+        self._check_speed()
         if loop.counter_jumps != self._counter_jumps:
             self._counter_jumps = loop.counter_jumps
             self._events.say(f"the SYNC counter jumped, {self._counter_jumps} times so far")
@@ -383,6 +391,28 @@ class Supervisor:
                 "cycles are lost or doubled until the master returns to it or the daemon is restarted",
                 logging.ERROR,
             )
+
+    def _check_speed(self) -> None:
+        """Whether this machine keeps up with the cycle."""
+        loop, now = self._loop, self._loop.clock()
+        unread = loop.source.errors.get(OVERFLOW, 0)
+        total = loop.overruns + loop.behind + unread
+        if total > self._slow:
+            self._slow, self._slow_ns = total, now
+            counted = [
+                f"{loop.overruns} cycles left out so far" if loop.overruns else "",
+                f"{loop.behind} SYNCs read more than a period late" if loop.behind else "",
+                f"{unread} frames lost unread" if unread else "",
+            ]
+            self._events.begin(
+                "too slow",
+                f"this machine is too slow for the cycle of {loop.period_ns / 1e6:g} ms: "
+                f"{', '.join(filter(None, counted))}; drivelink doctor says what keeps it",
+            )
+        elif now - self._slow_ns > _NS:
+            self._slow = total  # of a bus that was opened anew the count begins anew
+            text = f"this machine keeps up with the cycle again; {loop.overruns} cycles were left out"
+            self._events.end("too slow", text)
 
     def _check_controller(self) -> None:
         errors = self._loop.source.errors

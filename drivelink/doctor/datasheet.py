@@ -28,7 +28,8 @@ _OBJECTS: dict[Signal, tuple[tuple[int, int], ...]] = {
     Signal.LINK_POSITION: ((0x60E4, 1), (0x60E4, 0)),
 }
 _CIA406: dict[Signal, tuple[tuple[int, int], ...]] = {Signal.LINK_POSITION: ((0x6004, 0),)}
-_NEEDED = {Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE}
+_NEEDED = {Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE}  # of a drive
+_NEEDED_OF_ENCODER = {Signal.LINK_POSITION}
 _UNTOLD = {
     Signal.MOTOR_POSITION: "the file gives no counts per motor revolution (0x608F)",
     Signal.MOTOR_TORQUE: "the file gives no value for rated torque (0x6076) or rated current (0x6075)",
@@ -57,7 +58,7 @@ def examine_sheet(section: Section, path: Path) -> None:
     role = _role(sheet)
     mappable = {signal: objects for signal, objects in available.items() if objects}
     mappable.pop(Signal.MOTOR_VELOCITY, None)  # not mapped unless the joint file asks for it
-    if any(not available[signal] for signal in _NEEDED & available.keys()):
+    if any(not available[signal] for signal in _needed(sheet) & available.keys()):
         return
     _units(section, sheet)
     try:
@@ -102,6 +103,10 @@ def _is_encoder(sheet: DataSheet) -> bool:
     return (sheet.value(0x1000) or 0) & 0xFFFF == 406 or (
         (0x6004, 0) in sheet.objects and (0x6064, 0) not in sheet.objects
     )
+
+
+def _needed(sheet: DataSheet) -> set[Signal]:
+    return _NEEDED_OF_ENCODER if _is_encoder(sheet) else _NEEDED
 
 
 def _role(sheet: DataSheet) -> Role:
@@ -152,10 +157,11 @@ def _say_signal(
         section.ok(name, text)
     elif there:
         parts = [f"0x{i:04X}:{s:02X}" for i, s in there]
-        severity = Severity.ERROR if signal in _NEEDED else Severity.INFO
+        severity = Severity.ERROR if signal in _needed(sheet) else Severity.INFO
         section.say(severity, name, f"{', '.join(parts)} is there, but cannot be mapped into a TPDO")
     else:
-        section.say(Severity.ERROR if signal in _NEEDED else Severity.INFO, name, "no object that gives it")
+        severity = Severity.ERROR if signal in _needed(sheet) else Severity.INFO
+        section.say(severity, name, "no object that gives it")
 
 
 def _more(signal: Signal, sheet: DataSheet, usable: list[tuple[int, int]]) -> str:

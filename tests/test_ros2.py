@@ -7,16 +7,31 @@ from pathlib import Path
 import pytest
 import xxhash
 import zenoh
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from zenoh.ext import Int64, z_serialize
 from zenohkit import free_endpoint, make_joint, until
 
 from drivelink.pubsub.publisher import JointPublisher
-from drivelink.pubsub.ros2 import TYPE_HASHES, Ros2Publisher, joint_state, stiffness_array
+from drivelink.pubsub.ros2 import (
+    TYPE_HASHES,
+    Ros2Publisher,
+    dynamic_joint_state,
+    interfaces,
+    joint_state,
+    stiffness_array,
+)
 from drivelink.pubsub.session import close_session, open_client, open_session
 from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
+STORE.register(  # as ros2_control has them
+    get_types_from_msg("string[] interface_names\nfloat64[] values", "control_msgs/msg/InterfaceValue")
+    | get_types_from_msg(
+        "std_msgs/Header header\nstring[] joint_names\ncontrol_msgs/InterfaceValue[] interface_values",
+        "control_msgs/msg/DynamicJointState",
+    )
+)
+DYNAMIC = "control_msgs::msg::dds_::DynamicJointState_"
 STAMP_NS = 1_700_000_000_123_456_789
 STATE = "sensor_msgs::msg::dds_::JointState_"
 ARRAY = "std_msgs::msg::dds_::Float64MultiArray_"
@@ -98,6 +113,34 @@ def test_stiffness_is_a_labelled_matrix(transmissions):
     assert bytes(STORE.serialize_cdr(message, message.__msgtype__)) == payload
 
 
+@pytest.mark.parametrize("transmissions", [0, 1, 2])
+@pytest.mark.parametrize("name", ["e", "elbow", "elbow_7"])
+def test_stiffness_comes_with_stamp_and_validity_in_the_message_of_ros2_control(name, transmissions):
+    numbers = [float(n) for n in range(6 + 3 * transmissions)]
+    payload = dynamic_joint_state(name, transmissions)(7, 8, *numbers)
+    message = STORE.deserialize_cdr(payload, "control_msgs/msg/DynamicJointState")
+    assert (message.header.stamp.sec, message.header.stamp.nanosec, message.joint_names) == (7, 8, [name])
+    (values,) = message.interface_values
+    assert tuple(values.interface_names) == interfaces(transmissions)
+    assert values.values.tolist() == numbers
+    assert bytes(STORE.serialize_cdr(message, message.__msgtype__)) == payload
+
+
+@pytest.mark.parametrize(("status", "valid"), [(Status.VALID, 1.0), (Status.OBSERVABLE, 0.0)])
+def test_a_stiffness_says_of_which_moment_it_is_and_whether_it_is_valid(ros2, status, valid):
+    publisher, client = ros2()
+    put = lambda: publisher.put_cycle(estimate(status=status), sample(), STAMP_NS)  # noqa: E731
+    key = f"0/dynamic_joint_states/{DYNAMIC}/{TYPE_HASHES[DYNAMIC]}"
+    message = STORE.deserialize_cdr(
+        receive(client, key, put).payload.to_bytes(), "control_msgs/msg/DynamicJointState"
+    )
+    assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == STAMP_NS
+    (values,) = message.interface_values
+    told = dict(zip(values.interface_names, values.values.tolist(), strict=True))
+    assert (told["stiffness_nm_rad"], told["stiffness_std_nm_rad"], told["valid"]) == (61.0, 1.75, valid)
+    assert told["transmission2_stiffness_nm_rad"] == 31.0
+
+
 def test_a_cycle_arrives_where_a_ros_node_listens(ros2):
     publisher, client = ros2()
     put = lambda: publisher.put_cycle(estimate(), sample(), STAMP_NS)  # noqa: E731
@@ -111,17 +154,18 @@ def test_a_cycle_arrives_where_a_ros_node_listens(ros2):
     assert message.data.reshape(3, 2).tolist() == [[61.0, 1.75], [30.0, 1.0], [31.0, 1.5]]
 
 
-def test_the_graph_shows_one_node_with_three_publishers(ros2):
+def test_the_graph_shows_one_node_with_four_publishers(ros2):
     _, client = ros2('namespace = "robot/arm"\ndomain = 7')
-    until(lambda: len(tokens(client, 7)) == 4)
+    until(lambda: len(tokens(client, 7)) == 5)
     node, *publishers = sorted(tokens(client, 7), key=lambda key: "/MP/" in key)
     root, domain, zid, node_id, entity_id, kind, *names = node.split("/")
     assert (root, domain, kind, node_id) == ("@ros2_lv", "7", "NN", entity_id)
     assert names == ["%", "%robot%arm", "drivelink_elbow"]
-    assert len(publishers) == 3
+    assert len(publishers) == 4
     assert {key.split("/")[9] for key in publishers} == {
         "%robot%arm%joint_states",
         "%robot%arm%elbow%stiffness",
+        "%robot%arm%dynamic_joint_states",
         "%diagnostics",
     }
     for key in publishers:
@@ -135,9 +179,9 @@ def test_the_graph_shows_one_node_with_three_publishers(ros2):
 def test_two_joints_of_one_session_are_two_nodes(ros2):
     _, client = ros2()
     ros2(name="knee")
-    until(lambda: len(tokens(client)) == 8)
+    until(lambda: len(tokens(client)) == 10)
     identities = [tuple(key.split("/")[2:5]) for key in tokens(client)]
-    assert len(set(identities)) == 8
+    assert len(set(identities)) == 10
 
 
 def test_the_attachment_carries_sequence_time_and_the_publishers_identity(ros2):
@@ -149,7 +193,7 @@ def test_the_attachment_carries_sequence_time_and_the_publishers_identity(ros2):
     assert attachment == z_serialize((Int64(sequence), Int64(STAMP_NS), gid)).to_bytes()
     assert (stamp_ns, length) == (STAMP_NS, 16)
     assert sequence >= 1
-    (token,) = [key for key in tokens(client) if "%joint_states" in key]
+    (token,) = [key for key in tokens(client) if "/%joint_states" in key]
     digest = xxhash.xxh3_128(token.encode()).digest()  # big-endian: high 64 bits, then low
     assert gid == digest[:7:-1] + digest[7::-1]
 
@@ -249,10 +293,11 @@ def test_the_joints_publisher_serves_ros_where_the_joint_file_asks_for_it():
         publisher.put_estimate(estimate(), STAMP_NS)
         publisher.put_sample(sample(), STAMP_NS)
         publisher.put_status({"state": "running"})
-        topics = {str(until(subscriber.try_recv).key_expr).rpartition("/")[0] for _ in range(3)}
+        topics = {str(until(subscriber.try_recv).key_expr).rpartition("/")[0] for _ in range(4)}
         assert topics == {
             f"0/joint_states/{STATE}",
             f"0/elbow/stiffness/{ARRAY}",
+            f"0/dynamic_joint_states/{DYNAMIC}",
             f"0/diagnostics/{DIAGNOSTICS}",
         }
         publisher.close()

@@ -2,12 +2,15 @@
 
 import logging
 import random
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from drivelink.cycle.meter import Meter
 from drivelink.daemon.status import EventLog
+from drivelink.daemon.supervision import Supervisor
+from estimator.sample import Estimate, Status
 
 
 def test_percentiles_are_those_of_the_durations() -> None:
@@ -77,3 +80,30 @@ def test_the_last_events_are_kept_and_no_more() -> None:
     for k in range(1000):
         events.say(f"event {k}")
     assert [event["text"] for event in events.recent()] == [f"event {k}" for k in range(984, 1000)]
+
+
+def test_the_log_says_when_the_model_alarm_comes_and_goes_and_what_to_do(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    told = {"residual_nm": [0.09, 0.01], "floor_nm": [0.03, 0.02], "location": "transmission"}
+    watch = SimpleNamespace(describe=lambda: told)
+    supervisor = Supervisor.__new__(Supervisor)
+    supervisor._events, supervisor._alarmed = EventLog(logging.getLogger("drivelink")), set()
+    for status in (
+        Status.VALID,
+        Status.VALID | Status.MODEL_ALARM,
+        Status.MODEL_ALARM,
+        Status.VALID,
+        Status.VALID,
+    ):
+        chain = SimpleNamespace(estimate=Estimate(1, int(status), 1.0, 1.0, 1.0, ()), watch=watch)
+        supervisor._check_model(SimpleNamespace(name="elbow", chain=chain))  # type: ignore[arg-type]
+        if status == Status.MODEL_ALARM:
+            told |= {"residual_nm": [0.02, 0.01], "location": ""}
+    begun, over = [record.getMessage() for record in caplog.records]
+    assert begun.startswith(
+        "elbow: model alarm: the residual is 3 times its baseline, likely at the transmission"
+    )
+    assert "drivelink diagnose" in begun
+    assert over == "elbow: the model alarm is over: the residual is 0.67 times its baseline"

@@ -13,7 +13,7 @@ from drivelink.cycle.framesource import LostSource
 from drivelink.cycle.loop import CycleLoop, Lane
 from drivelink.cycle.realtime import RealTime
 from drivelink.daemon.status import EventLog
-from drivelink.daemon.supervision import Supervisor
+from drivelink.daemon.supervision import Supervisor, residual_text
 from drivelink.jointfile import JointFile
 from drivelink.version import __version__
 from estimator.sample import Status
@@ -185,4 +185,6 @@ class JointStatus:
                 f"; a cycle's work p99 {work['p99_us']:.0f} µs, SYNC late by p99 {jitter['p99_us']:.0f} µs"
             )
         residual = lane.chain.estimator.residual_nm
-        return text + (f"; residual {residual:.3g} N·m" if math.isfinite(residual) else "")
+        if math.isfinite(residual):
+            text += f"; residual {residual:.3g} N·m" + residual_text(lane.chain.watch)
+        return text

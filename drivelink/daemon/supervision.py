@@ -7,6 +7,7 @@ step by step in the slack. A passive daemon only watches. Every event is said on
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -16,14 +17,16 @@ from drivelink.canopen.configure import Configurator
 from drivelink.canopen.emcy import drive_state, parse_emergency
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
+from drivelink.cycle.chain import Watch
 from drivelink.cycle.following import MapFollower
 from drivelink.cycle.framesource import OVERFLOW, LostSource
 from drivelink.cycle.loop import CycleLoop, Lane
 from drivelink.cycle.syncclock import MEASURED_SYNCS, measure_period
 from drivelink.daemon.status import EventLog
 from drivelink.errors import DriveError
+from estimator.sample import Status
 
-__all__ = ["Supervisor"]
+__all__ = ["Supervisor", "residual_text"]
 
 logger = logging.getLogger(__name__)
 
@@ -52,6 +55,7 @@ _COUNTED = (  # counter of a node; by how much it grows at least, and what is sa
 )
 
 
+_MODEL_ALARM = int(Status.MODEL_ALARM)
 _BUNCHED = (
     "some frames are missing, others come several in one cycle and are not used: "
     "this machine or the bus is too slow for the cycle, or another device has its node id"
@@ -117,6 +121,7 @@ class Supervisor:
     ) -> None:
         self._loop = loop
         self._events = events
+        self._alarmed: set[str] = set()  # joints whose model alarm is on
         self._configurator = configurator
         self._follower: MapFollower | None = None
         self._foreign_syncs = self._counter_jumps = self._lost_sends = self._clock_steps = 0
@@ -217,6 +222,7 @@ class Supervisor:
             self._check_faults(node, watched)
         for lane in self._loop.lanes:
             self._check_lane(lane)
+            self._check_model(lane)
         if self._follower is not None:
             self._check_maps(self._follower)
         self._check_bus()
@@ -248,6 +254,25 @@ class Supervisor:
             )
         else:
             self._events.end(f"joint {lane.name}", f"{lane.name}: estimates begin anew")
+
+    def _check_model(self, lane: Lane) -> None:
+        """Say when the model alarm comes and goes, by how much, and what to do."""
+        estimate, watch = lane.chain.estimate, lane.chain.watch
+        if estimate is None:
+            return
+        alarm = bool(estimate.status & _MODEL_ALARM)
+        if alarm == (lane.name in self._alarmed):
+            return
+        if alarm:
+            self._alarmed.add(lane.name)
+            self._events.say(
+                f"{lane.name}: model alarm{residual_text(watch)}: do not control on its numbers; "
+                "record a minute of motion, then drivelink diagnose names the effect",
+                logging.WARNING,
+            )
+        else:
+            self._alarmed.discard(lane.name)
+            self._events.say(f"{lane.name}: the model alarm is over{residual_text(watch)}")
 
     def _say_fault(self, where: str, error: Exception) -> None:
         logger.debug("%s", where, exc_info=error)
@@ -462,3 +487,12 @@ def _maps(layout: NodeLayout) -> str:
         f"0x{tpdo.cob_id:03X} = " + " ".join(f"{o.index:04X}:{o.subindex:02X}" for o in tpdo.objects)
         for tpdo in layout.tpdos
     )
+
+
+def residual_text(watch: Watch | None) -> str:
+    """What the model leaves unexplained against its baseline, in words, as far as it is known."""
+    described = watch.describe() if watch is not None else {}
+    residuals, baselines = described.get("residual_nm") or (), described.get("floor_nm") or ()
+    ratios = [r / b for r, b in zip(residuals, baselines, strict=False) if b > 0.0 and math.isfinite(r)]
+    where = f", likely at the {described['location']}" if described.get("location") else ""
+    return f": the residual is {max(ratios):.2g} times its baseline{where}" if ratios else ""

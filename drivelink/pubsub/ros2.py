@@ -21,7 +21,15 @@ from drivelink.jointfile import JointFile, Ros2Section
 from drivelink.pubsub.session import one_line
 from estimator.sample import Estimate, Sample, Status
 
-__all__ = ["TYPE_HASHES", "Ros2Publisher", "diagnostic_array", "joint_state", "stiffness_array"]
+__all__ = [
+    "TYPE_HASHES",
+    "Ros2Publisher",
+    "diagnostic_array",
+    "dynamic_joint_state",
+    "interfaces",
+    "joint_state",
+    "stiffness_array",
+]
 
 TYPE_HASHES = {
     "sensor_msgs::msg::dds_::JointState_": (
@@ -29,6 +37,9 @@ TYPE_HASHES = {
     ),
     "std_msgs::msg::dds_::Float64MultiArray_": (
         "RIHS01_1025ddc6b9552d191f89ef1a8d2f60f3d373e28b283d8891ddcc974e8c55397f"
+    ),
+    "control_msgs::msg::dds_::DynamicJointState_": (
+        "RIHS01_18024c98a62697680f581108eeed40b28fb4542fa0ac5a8e36f56c62b6813d26"
     ),
     "diagnostic_msgs::msg::dds_::DiagnosticArray_": (
         "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"
@@ -41,6 +52,11 @@ _ATTACHMENT = Struct("<qqB16s")  # sequence number, UNIX ns, length of the GID, 
 _NS = 1_000_000_000
 _VELOCITY_FILTER_S = 0.005  # of the differentiated position, where no link velocity is measured
 _entities = count()
+_FLAGS = (
+    ("valid", int(Status.VALID)),
+    ("observable", int(Status.OBSERVABLE)),
+    ("model_alarm", int(Status.MODEL_ALARM)),
+)
 _OK, _WARN, _ERROR, _STALE = range(4)  # levels of diagnostic_msgs/DiagnosticStatus
 
 
@@ -116,6 +132,23 @@ def stiffness_array(transmissions: int) -> Any:
     return template.number("I", 0).doubles(2 * len(rows)).packer()
 
 
+def dynamic_joint_state(name: str, transmissions: int) -> Any:
+    """Packer of control_msgs/DynamicJointState of one joint: (s, ns, *values of `interfaces`) to bytes."""
+    template = Template().header("").number("I", 1).text(name).number("I", 1)
+    names = interfaces(transmissions)
+    template.number("I", len(names))
+    for interface in names:
+        template.text(interface)
+    return template.doubles(len(names)).packer()
+
+
+def interfaces(transmissions: int) -> tuple[str, ...]:
+    """What a DynamicJointState holds of a joint: numbers, flags (1 or 0), each transmission's numbers."""
+    numbers = ("flexibility_torque_nm", "stiffness_nm_rad", "stiffness_std_nm_rad")
+    own = (f"transmission{i + 1}_{number}" for i in range(transmissions) for number in numbers)
+    return (*numbers, *(name for name, _ in _FLAGS), *own)
+
+
 def diagnostic_array(
     stamp_ns: int, level: int, name: str, message: str, hardware: str, values: Mapping[str, str]
 ) -> bytes:
@@ -174,7 +207,8 @@ class _Node:
 class Ros2Publisher:
     """JointState and stiffness of every n-th cycle, diagnostics once a second.
 
-    Topics: `<namespace>/joint_states`, `<namespace>/<joint>/stiffness`, `/diagnostics`.
+    Topics: `<namespace>/joint_states`, `<namespace>/<joint>/stiffness`, `<namespace>/dynamic_joint_states`,
+    `/diagnostics`.
 
     Args:
         session: the daemon's session, which it does not close.
@@ -200,13 +234,15 @@ class Ros2Publisher:
             kinds = tuple(TYPE_HASHES)
             self._states = _Topic(session, node, f"{node.namespace}/joint_states", kinds[0])
             self._stiffness = _Topic(session, node, f"{node.namespace}/{name}/stiffness", kinds[1])
-            self._diagnostics = _Topic(session, node, "/diagnostics", kinds[2])
+            self._dynamic = _Topic(session, node, f"{node.namespace}/dynamic_joint_states", kinds[2])
+            self._diagnostics = _Topic(session, node, "/diagnostics", kinds[3])
         except zenoh.ZError as error:
             raise ZenohError(f"ros2 of joint {joint.name}: {one_line(error)}") from error
-        for topic in (self._states, self._stiffness, self._diagnostics):
+        for topic in (self._states, self._stiffness, self._dynamic, self._diagnostics):
             self._entities.extend(topic.entities)
         self._pack_state = joint_state(joint.name)
         self._pack_stiffness = [stiffness_array(transmissions) for transmissions in range(3)]
+        self._pack_dynamic = [dynamic_joint_state(joint.name, transmissions) for transmissions in range(3)]
         self._velocity_rad_s = 0.0
         self._before: tuple[int, float] | None = None
         self._told_ns: int | None = None
@@ -230,6 +266,11 @@ class Ros2Publisher:
         second, ns = divmod(stamp_ns, _NS)
         effort = estimate.flexibility_torque_nm
         self._states.put(self._pack_state(second, ns, position, velocity, effort), stamp_ns)
+        values = [*estimate[2:5], *(float(bool(estimate.status & bit)) for _, bit in _FLAGS)]
+        for transmission in estimate.transmissions:
+            values += transmission[:3]
+        packed = self._pack_dynamic[len(estimate.transmissions)](second, ns, *values)
+        self._dynamic.put(packed, stamp_ns)
         pairs = [estimate.stiffness_nm_rad, estimate.stiffness_std_nm_rad]
         for transmission in estimate.transmissions:
             pairs += transmission[1:3]

@@ -222,7 +222,9 @@ def test_a_clock_that_is_set_makes_a_gap_and_loses_nothing(
     )
     with caplog.at_level(logging.WARNING, "drivelink.recording"):
         samples = [
-            one.sample for one in open_playback(path, parse(joint_text("a", 1)), tmp_path) if one.sample
+            one.tick.sample
+            for one in open_playback(path, parse(joint_text("a", 1)), tmp_path)
+            if one.tick.sample
         ]
     motor, _, _ = truth(1)
     found = [one.motor_position_rad[0] for one in samples]

@@ -12,6 +12,7 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -25,6 +26,8 @@ from drivelink.recording.formats import open_sink
 from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import read_messages
 from drivelink.recording.mcapsamples import recorded_cycles
+from drivelink.recording.messages import message_schema
+from drivelink.recording.viewlayouts import write_layouts
 from estimator.sample import Sample, Status, TransmissionEstimate
 
 TEXT = 'name = "elbow"\n[[motor]]\ninertia_kg_m2 = 0.1\n'
@@ -251,3 +254,45 @@ def count(path: Path) -> int:
     if path.suffix == ".csv":
         return len(read(path, parse(TEXT + '[motor.transmission]\nmodel = "none"\n')))
     return sum(1 for _ in read_frames(path))
+
+
+def test_an_estimate_says_what_a_view_draws(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    sink = open_sink(path, JOINT)
+    one = (TransmissionEstimate(1.0, 150.0, 2.0, 0.01),)
+    for k, status in ((1, 3), (2, 2)):
+        sink.estimate(EstimateMessage(k, BEGIN_NS + k, status, 1.0, 150.0, 2.0, one))
+    sink.estimate(estimate(3))  # without a standard deviation
+    sink.close()
+    first, second, third = (json.loads(m.data) for m in read_messages(path, frozenset({"estimate"})))
+    assert third["motor1_stiffness_low_nm_rad"] is None
+    assert (first["valid"], second["valid"]) == (1, 0)
+    for part in ("", "motor1_"):
+        value, std = first[f"{part}stiffness_nm_rad"], first[f"{part}stiffness_std_nm_rad"]
+        assert first[f"{part}stiffness_low_nm_rad"] == pytest.approx(value - 1.96 * std)
+        assert first[f"{part}stiffness_high_nm_rad"] == pytest.approx(value + 1.96 * std)
+
+
+@pytest.mark.parametrize("motors", [1, 2])
+def test_the_layouts_for_foxglove_and_plotjuggler_plot_what_is_recorded(motors: int, tmp_path: Path) -> None:
+    joint = (
+        JOINT
+        if motors == 1
+        else parse('name = "elbow"\narrangement = "antagonistic"\n' + "[[motor]]\ninertia_kg_m2 = 0.1\n" * 2)
+    )
+    fox, jug = write_layouts(joint, tmp_path / "views")
+    fields = {
+        f"/elbow/{topic}/{name}"
+        for topic in ("sample", "estimate")
+        for name in json.loads(message_schema(topic, motors))["properties"]
+    }
+    layout = json.loads(fox.read_text())
+    paths = [p["value"] for panel in layout["configById"].values() for p in panel["paths"]]
+    assert {path.replace(".", "/") for path in paths} <= fields and len(paths) > 6
+    curves = [curve.attrib["name"] for curve in ElementTree.parse(jug).iter("curve")]
+    assert set(curves) <= fields and len(curves) == len(paths)
+    placed, rest = [], layout["layout"]
+    while isinstance(rest, dict):
+        placed.append(rest["first"])
+        rest = rest["second"]
+    assert [*placed, rest] == list(layout["configById"])

@@ -167,6 +167,27 @@ def test_a_bus_is_recorded_by_listening_only(suffix: str, tmp_path: Path) -> Non
     assert len(record) >= 148  # the first cycle's SYNC may come before the mapping is at rest
 
 
+def test_a_bus_is_recorded_by_the_mapping_that_the_daemon_tells(tmp_path: Path) -> None:
+    """The recorder begins when the drives are configured: nothing of the mapping is on the bus any more."""
+    joint = daemonkit.vsa()
+    path = tmp_path / "r.csv"
+    with daemonkit.rig(joint) as rig:
+        rig.run(20)
+        bus = open_bus(joint.bus)
+        sink = open_sink(path, joint)
+        tap = BusTap(bus, joint, sink, tmp_path, layouts=list(rig.daemon.layouts.values()))
+        tap._source = InRealTime(tap._source)
+        with Recorder(sink, [tap]) as recorder:
+            for _ in range(150):
+                rig.run(1)
+                tap.poll()
+            recorder.run(lambda: True)
+        samples = [sample for sample, _ in rig.collector.samples]
+        bus.shutdown()
+    found = [tuple(row) for row in read(path, joint).motor_position_rad.tolist()]
+    assert len(found) >= 148 and found == [s.motor_position_rad for s in samples][-len(found) :]
+
+
 def test_a_mapping_without_the_link_makes_no_samples_and_says_so(tmp_path: Path) -> None:
     joint = daemonkit.vsa()
     nobody_told_of_the_link = joint.model_copy(

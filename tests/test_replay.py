@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import csv
 import gc
+import json
 import logging
 import multiprocessing
 import signal
 import struct
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import can
@@ -21,12 +23,16 @@ import pytest
 import zenohkit
 
 from drivelink import cli, jointfile
+from drivelink.canopen.layout import NodeLayout
+from drivelink.cli.record import _daemon_layouts
 from drivelink.errors import DrivelinkError, RecordingError
 from drivelink.jointfile import JointFile, parse
-from drivelink.pubsub.publisher import describe_model, to_json
+from drivelink.pubsub.publisher import JointPublisher, describe_model, to_json
+from drivelink.pubsub.session import close_session, open_client, open_session
 from drivelink.pubsub.wire import EstimateMessage
 from drivelink.recording import read
 from drivelink.recording.formats import open_sink
+from drivelink.recording.mapping import mapping_document, recorded_layouts
 from drivelink.recording.playback import open_playback
 from drivelink.recording.sinks import Sink
 from estimator.sample import Estimate, Status
@@ -204,6 +210,86 @@ def test_frames_recorded_from_a_running_daemon_are_decoded_by_its_model_document
     played = [one.tick.sample for one in open_playback(path, joint, tmp_path, frames=True)]
     assert len(live) == 100
     assert [repr(one[1:]) for one in played if one is not None] == [repr(one[1:]) for one in live]
+
+
+def asked_over_zenoh(
+    joint: JointFile, layouts: list[NodeLayout], endpoint: str, folder: Path
+) -> Sequence[NodeLayout]:
+    """What `record` is told of the mapping by a daemon, beside a stranger who tells another one."""
+    serving, asking, stranger = (
+        open_session(joint.zenoh, folder),
+        open_client(endpoint),
+        open_client(endpoint),
+    )
+    publisher, ended = JointPublisher(serving, joint), threading.Event()
+    publisher.put_joint(joint, layouts)
+    key = f"{publisher.key}/model"
+    lie = to_json(describe_model(joint, layouts[:1]))
+    lying = stranger.declare_queryable(key, lambda query: query.reply(key, lie), complete=True)
+
+    def answer() -> None:
+        while not ended.wait(0.05):
+            publisher.answer()
+
+    answering = threading.Thread(target=answer)
+    answering.start()
+    try:
+        zenohkit.until(lambda: _daemon_layouts(asking, joint))
+        return _daemon_layouts(asking, joint)
+    finally:
+        ended.set()
+        answering.join()
+        lying.undeclare()
+        publisher.close()
+        for session in (asking, stranger, serving):
+            close_session(session)
+
+
+@pytest.mark.parametrize("suffix", [".log", ".blf", ".asc", ".trc", ".mcap"])
+def test_a_recording_begun_beside_a_running_daemon_replays_by_what_the_daemon_says(
+    suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The daemon configured the drives before the recording began: it is asked for the mapping, over zenoh."""
+    endpoint = zenohkit.free_endpoint()
+    text = daemonkit.vsa_text(endpoint=endpoint)
+    joint = parse(text)
+    path = tmp_path / f"late{suffix}"
+    with can.Bus(interface="virtual", channel=joint.bus.channel) as tap, daemonkit.rig(joint) as rig:
+        rig.run(20)
+        known = asked_over_zenoh(joint, list(rig.daemon.layouts.values()), endpoint, tmp_path)
+        sink = open_sink(path, joint, text, str(tmp_path))
+        sink.mapping(mapping_document(joint.name, known, text, str(tmp_path), daemon=True), BEGIN_NS)
+        while tap.recv(0) is not None:
+            pass
+        skipped, cycle = len(rig.collector.samples), 0
+        rig.run(100)
+        while (message := tap.recv(0)) is not None:
+            cycle += message.arbitration_id == 0x080
+            sink.frame(BEGIN_NS + cycle * 1_000_000, message.arbitration_id, bytes(message.data))
+        live = [sample for sample, _ in rig.collector.samples[skipped:]]
+    sink.close()
+    played = [one.tick.sample for one in open_playback(path, joint, tmp_path, frames=True)]
+    assert len(live) == 100
+    assert [repr(one[1:]) for one in played if one is not None] == [repr(one[1:]) for one in live]
+    # The joint file is kept as well: nothing else is needed to replay it.
+    assert cli.main(["replay", str(path), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert (document["joint"], document["cycles"]) == ("elbow", 100)
+
+
+def test_what_a_daemon_said_counts_more_than_a_file_beside_the_recording(tmp_path: Path) -> None:
+    joint = daemonkit.vsa()
+    with daemonkit.rig(joint) as rig:
+        layouts = list(rig.daemon.layouts.values())
+    sink = open_sink(tmp_path / "r.mcap", joint)
+    sink.mapping(mapping_document(joint.name, layouts[:1]), 0)
+    sink.document("model", to_json(describe_model(joint, layouts)), 1)
+    sink.close()
+    assert len(recorded_layouts(tmp_path / "r.mcap", joint.name, daemon=False)) == 1
+    assert len(recorded_layouts(tmp_path / "r.mcap", joint.name, daemon=True)) == len(layouts)
+    (tmp_path / "r.log.mapping.json").write_text('{"joint": "elbow", "nodes": 7}')
+    with pytest.raises(RecordingError, match="what it knows of the mapping cannot be read"):
+        recorded_layouts(tmp_path / "r.log", joint.name, daemon=False)
 
 
 def test_a_log_with_another_period_is_taken_as_it_comes(

@@ -22,11 +22,13 @@ from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.errors import BusError, DrivelinkError, UsageError, ZenohError
 from drivelink.jointfile import JointFile, JointText
 from drivelink.outfile import check_target
+from drivelink.pubsub.inbound import DECODERS
 from drivelink.pubsub.session import close_session, open_client
 from drivelink.recording.formats import open_sink
 from drivelink.recording.mapping import layouts_from, mapping_document
 from drivelink.recording.recorder import BusTap, Gate, Recorder, ZenohTap
 from drivelink.recording.sinks import Sink
+from drivelink.recording.viewlayouts import write_layouts
 
 _ALIVE_S = 1.0  # in which a daemon answers
 _SAY_EVERY_S = 10.0
@@ -47,6 +49,7 @@ file that can be read up to the last second.
 examples:
   drivelink record elbow.toml --out elbow.mcap
   drivelink record elbow.toml --out elbow.log --seconds 60
+  drivelink record elbow.toml --out elbow.mcap --layouts views/
 """
 
 
@@ -64,6 +67,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="listen to the daemon, to the bus, or to what is there (default)",
     )
     parser.add_argument("--force", action="store_true", help="replace a file that exists")
+    parser.add_argument(
+        "--layouts",
+        type=Path,
+        metavar="DIR",
+        help="write layouts of Foxglove and PlotJuggler there",
+    )
     parser.add_argument("--json", action="store_true", help="print what was recorded as one JSON object")
 
 
@@ -74,6 +83,8 @@ def run(args: argparse.Namespace) -> int:
     check_target(args.out, [args.joint], force=args.force)
     if args.seconds is not None and not args.seconds > 0:
         raise UsageError(f"--seconds: expected a number above 0, got {args.seconds:g}")
+    if args.layouts is not None:
+        write_layouts(joint, args.layouts)
     stopped = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopped.set())
@@ -123,7 +134,8 @@ def _add_taps(recorder: Recorder, source: str, text: JointText, stack: ExitStack
         _say(f"without raw CAN: {error}")
         return
     stack.callback(bus.shutdown)
-    tap_bus = BusTap(bus, joint, sink, None if alive or "sample" not in sink.wants else folder, gate)
+    no_samples = alive or "sample" not in sink.wants
+    tap_bus = BusTap(bus, joint, sink, None if no_samples else folder, gate, known)
     recorder.taps.append(tap_bus)
     if tap_bus.missing:
         _say(f"no samples until the mapping is heard on the bus: {tap_bus.missing}")
@@ -168,12 +180,22 @@ def _session(joint: JointFile, folder: Path, needed: bool) -> zenoh.Session | No
 
 
 def _daemon_layouts(session: zenoh.Session, joint: JointFile) -> Sequence[NodeLayout]:
-    """How the running daemon has the nodes of the joint mapped; () if it does not say."""
-    key = f"{joint.zenoh.prefix}/{joint.name}/model"
-    for reply in session.get(key, timeout=_ALIVE_S):
-        with suppress(ValueError):
-            if reply.ok and (layouts := layouts_from(reply.ok.payload.to_bytes(), joint.name)):
-                return layouts
+    """How the running daemon has the nodes of the joint mapped; () if it does not say.
+
+    Only a session whose liveliness token says that it is the daemon is believed; of several, none.
+    """
+    key = f"{joint.zenoh.prefix}/{joint.name}"
+    tokens = session.liveliness().get(f"{key}/alive/*", timeout=_ALIVE_S)
+    daemons = {str(reply.ok.key_expr).rpartition("/")[2] for reply in tokens if reply.ok}
+    if len(daemons) > 1:
+        _say(f"{len(daemons)} sessions say that they serve {joint.name}: none is asked for the mapping")
+        return ()
+    for reply in session.get(f"{key}/model", timeout=_ALIVE_S):
+        source = str(reply.replier_id.zid) if reply.replier_id else ""
+        if reply.ok and source in daemons:
+            with suppress(ValueError, ZenohError):
+                document = DECODERS["model"](reply.ok.payload.to_bytes())
+                return layouts_from(json.dumps(document).encode(), joint.name)
     return ()
 
 

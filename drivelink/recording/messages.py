@@ -28,7 +28,8 @@ __all__ = [
 TOPICS = ("sample", "estimate", "status", "model", "joint", "mapping", "can")
 
 _PER_MOTOR = ("flexibility_torque_nm", "stiffness_nm_rad", "stiffness_std_nm_rad", "deflection_rad")
-_OBSERVABLE = int(Status.OBSERVABLE)
+_VALID, _OBSERVABLE = int(Status.VALID), int(Status.OBSERVABLE)
+_SIGMA_95 = 1.96
 
 
 def estimate_columns(motors: int) -> tuple[str, ...]:
@@ -54,6 +55,20 @@ def estimate_row(
     return (time_s, *totals, observable, *(value for one in transmissions for value in one))
 
 
+def _band_columns(motors: int) -> tuple[str, ...]:
+    """Names of what a view draws beside an estimate, in the order of `_band_row`."""
+    each = ("", *(f"motor{i}_" for i in range(1, motors + 1)))
+    return ("valid", *(f"{part}stiffness_{edge}_nm_rad" for part in each for edge in ("low", "high")))
+
+
+def _band_row(message: EstimateMessage) -> tuple[float, ...]:
+    """Whether it is valid, and the edges of the bands of 95 %: of the joint, then of each transmission."""
+    stiffnesses = [(message.stiffness_nm_rad, message.stiffness_std_nm_rad)]
+    stiffnesses += [(one.stiffness_nm_rad, one.stiffness_std_nm_rad) for one in message.transmissions]
+    edges = [x + side * _SIGMA_95 * std for x, std in stiffnesses for side in (-1.0, 1.0)]
+    return (1 if message.status & _VALID else 0, *edges)
+
+
 def sample_encoder(motors: int, period_s: float) -> Callable[[Sample], bytes]:
     """The function that makes a sample's message."""
     fill = _template(("sequence",), sample_columns(motors))
@@ -66,12 +81,12 @@ def sample_encoder(motors: int, period_s: float) -> Callable[[Sample], bytes]:
 
 def estimate_encoder(motors: int, period_s: float) -> Callable[[EstimateMessage], bytes]:
     """The function that makes an estimate's message."""
-    fill = _template(("sequence", "status"), estimate_columns(motors))
+    fill = _template(("sequence", "status"), (*estimate_columns(motors), *_band_columns(motors)))
 
     def encode(message: EstimateMessage) -> bytes:
         totals = (message.flexibility_torque_nm, message.stiffness_nm_rad, message.stiffness_std_nm_rad)
         row = estimate_row(message.sequence * period_s, message.status, totals, message.transmissions)
-        return fill((message.sequence, message.status, *row))
+        return fill((message.sequence, message.status, *row, *_band_row(message)))
 
     return encode
 
@@ -102,7 +117,11 @@ def message_schema(topic: str, motors: int) -> bytes:
     if topic == "sample":
         properties = {"sequence": integer, **_numbers(sample_columns(motors))}
     elif topic == "estimate":
-        properties = {"sequence": integer, "status": integer, **_numbers(estimate_columns(motors))}
+        properties = {
+            "sequence": integer,
+            "status": integer,
+            **_numbers((*estimate_columns(motors), *_band_columns(motors))),
+        }
     elif topic == "can":
         properties = {"id": integer, "data": text | {"description": "bytes, two hex digits each"}}
     elif topic == "mapping":

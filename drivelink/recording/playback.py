@@ -95,7 +95,6 @@ def open_playback(
             the frames where there are none.
         channel: of a raw CAN log with several.
         ahead: have raw frames read by a process of its own: worth its start where there are many.
-
         names: columns of a CSV or MF4 file that have other names or units there.
 
     Raises:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -173,6 +173,7 @@ class BusTap:
         sink: where it goes.
         base_dir: folder of the joint file; None: no samples are made.
         gate: decides between its samples and others.
+        layouts: of its nodes, where a daemon told them.
 
     Attributes:
         frames: received so far.
@@ -186,12 +187,15 @@ class BusTap:
         sink: Sink,
         base_dir: Path | None,
         gate: Gate | None = None,
+        layouts: Sequence[NodeLayout] = (),
     ) -> None:
         self._gate = gate or Gate(sink)
         self._source = open_source(bus)
         self._sink = sink
         self._joint = joint
         self._listener = PassiveConfigurator([joint], [base_dir]) if base_dir is not None else None
+        if self._listener is not None:
+            self._listener.adopt(layouts)
         self._assembler: Assembler | None = None
         self._follower: MapFollower | None = None
         self._lacking = ""  # what the mapping lacks, where it is known

@@ -1,0 +1,118 @@
+"""Layouts of Foxglove and PlotJuggler for a joint's MCAP recordings: stiffness, torques, positions, bits."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree import ElementTree
+
+from drivelink.jointfile import JointFile
+from drivelink.outfile import write_whole
+
+__all__ = ["write_layouts"]
+
+_COLOURS = ("#0072b2", "#9ec9e2", "#9ec9e2", "#d55e00", "#009e73")
+
+
+def _plots(motors: int) -> list[tuple[str, str, list[str]]]:
+    """(title, topic, fields) of each plot; its first field is drawn strongest."""
+    numbers = range(1, motors + 1)
+    band = ["stiffness_nm_rad", "stiffness_low_nm_rad", "stiffness_high_nm_rad"]
+    return [
+        ("Stiffness and its band of 95 %", "estimate", band),
+        ("Flexibility torque", "estimate", ["flexibility_torque_nm"]),
+        ("Deflection", "estimate", [f"motor{i}_deflection_rad" for i in numbers]),
+        ("Motor torque", "sample", [f"motor{i}_torque_nm" for i in numbers]),
+        ("Positions", "sample", ["link_position_rad", *(f"motor{i}_position_rad" for i in numbers)]),
+        ("Valid, observable", "estimate", ["valid", "observable"]),
+    ]
+
+
+def write_layouts(joint: JointFile, folder: Path) -> list[Path]:
+    """Write `foxglove.json` and `plotjuggler.xml`.
+
+    Args:
+        joint: the joint; its name is part of the topics.
+        folder: where they go.
+
+    Raises:
+        OSError: they cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    plots = _plots(len(joint.motor))
+    made = []
+    for name, text in (
+        ("foxglove.json", _foxglove(joint.name, plots)),
+        ("plotjuggler.xml", _plotjuggler(joint.name, plots)),
+    ):
+        write_whole(folder / name, text, force=True)
+        made.append(folder / name)
+    return made
+
+
+def _foxglove(joint: str, plots: Sequence[tuple[str, str, list[str]]]) -> str:
+    panels = {
+        f"Plot!{number}": {
+            "title": title,
+            "paths": [
+                {
+                    "value": f"/{joint}/{topic}.{field}",
+                    "label": field,
+                    "enabled": True,
+                    "timestampMethod": "receiveTime",
+                    "color": colour,
+                }
+                for field, colour in zip(fields, _COLOURS, strict=False)
+            ],
+            "showXAxisLabels": True,
+            "showYAxisLabels": True,
+            "showLegend": True,
+            "legendDisplay": "floating",
+            "isSynced": True,
+            "xAxisVal": "timestamp",
+        }
+        for number, (title, topic, fields) in enumerate(plots)
+    }
+    document = {
+        "configById": panels,
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": {"speed": 1},
+        "layout": _column(list(panels)),
+    }
+    return json.dumps(document, indent=1) + "\n"
+
+
+def _column(panels: list[str]) -> object:
+    """Panels one below the other, of equal height."""
+    if len(panels) == 1:
+        return panels[0]
+    share = 100.0 / len(panels)
+    return {
+        "first": panels[0],
+        "second": _column(panels[1:]),
+        "direction": "column",
+        "splitPercentage": round(share, 1),
+    }
+
+
+def _plotjuggler(joint: str, plots: Sequence[tuple[str, str, list[str]]]) -> str:
+    root = ElementTree.Element("root")
+    window = ElementTree.SubElement(root, "tabbed_widget", {"name": "Main Window", "parent": "main_window"})
+    tab = ElementTree.SubElement(window, "Tab", containers="1", tab_name=joint)
+    container = ElementTree.SubElement(tab, "Container")
+    sizes = ";".join([f"{1 / len(plots):.4f}"] * len(plots))
+    splitter = ElementTree.SubElement(
+        container, "DockSplitter", count=str(len(plots)), orientation="-", sizes=sizes
+    )
+    for title, topic, fields in plots:
+        area = ElementTree.SubElement(splitter, "DockArea", name=title)
+        plot = ElementTree.SubElement(area, "plot", mode="TimeSeries", style="Lines")
+        ElementTree.SubElement(plot, "limitY")
+        for field, colour in zip(fields, _COLOURS, strict=False):
+            ElementTree.SubElement(plot, "curve", color=colour, name=f"/{joint}/{topic}/{field}")
+    ElementTree.SubElement(window, "currentTabIndex", index="0")
+    ElementTree.SubElement(root, "use_relative_time_offset", enabled="1")
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"

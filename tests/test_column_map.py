@@ -1,0 +1,186 @@
+"""`--map`: columns of others under our names and in our units; and results for machines, pure."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivelink import cli
+from drivelink.errors import RecordingError, UsageError
+from drivelink.jointfile import parse
+from drivelink.recording import read
+from drivelink.recording.columnmap import UNITS, parse_column_map
+from drivelink.recording.formats import open_sink
+from drivelink.recording.mf4file import write_mf4
+
+TEXT = """\
+name = "sine"
+[[motor]]
+inertia_kg_m2 = 0.125
+viscous_damping_nm_s_rad = 0.8
+[motor.transmission]
+model = "linear"
+"""
+JOINT = parse(TEXT)
+MAP = [
+    "t=time_s:ms",
+    "theta [°]=motor1_position_rad:deg",
+    "i=motor1_torque_nm:-0.05",
+    "q=link_position_rad:mrad",
+]
+
+
+def motion(n: int = 8000) -> np.ndarray:
+    """(n, 4) time, motor position, torque, link position of a sprung joint: 150 N·m/rad, two tones."""
+    t = np.arange(n) * 0.002
+    rates = np.array([[3.0], [7.1]])
+    theta = (np.array([[0.2], [0.1]]) * np.sin(rates * t)).sum(axis=0)
+    speed = (np.array([[0.2], [0.1]]) * rates * np.cos(rates * t)).sum(axis=0)
+    push = (-np.array([[0.2], [0.1]]) * rates**2 * np.sin(rates * t)).sum(axis=0)
+    q = 1.3 * theta
+    return np.column_stack((t, theta, 0.125 * push + 0.8 * speed - 150.0 * (q - theta), q))
+
+
+def ours(path: Path) -> Path:
+    header = "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad"
+    np.savetxt(path, motion(), fmt="%.17g", delimiter=",", header=header, comments="")
+    return path
+
+
+def theirs(path: Path, header: str = "t;theta [°];i;q;state") -> Path:
+    """The same with names, units and signs of its own, decimal commas, and a column of words."""
+    rows = [header]
+    for t, theta, tau, q in motion().tolist():
+        numbers = (t * 1e3, math.degrees(theta), tau / -0.05, q * 1e3)
+        rows.append(";".join([*(repr(x).replace(".", ",") for x in numbers), "running"]))
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def test_columns_of_others_are_read_in_our_names_and_units(tmp_path: Path) -> None:
+    record = read(theirs(tmp_path / "rig.csv"), JOINT, names=parse_column_map(MAP))
+    same = read(ours(tmp_path / "r.csv"), JOINT)
+    assert record.period_s == same.period_s and np.array_equal(record.sequence, same.sequence)
+    for name in ("motor_position_rad", "motor_torque_nm", "link_position_rad"):
+        assert np.allclose(getattr(record, name), getattr(same, name), rtol=1e-14, atol=1e-15)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("asammdf") is None, reason="needs asammdf")
+def test_channels_of_an_mf4_file_are_mapped_too(tmp_path: Path) -> None:
+    record = read(ours(tmp_path / "r.csv"), JOINT)
+    write_mf4(tmp_path / "r.mf4", record)
+    turned = read(
+        tmp_path / "r.mf4", None, names=parse_column_map(["link_position_rad=motor1_position_rad:deg"])
+    )
+    assert np.allclose(turned.motor_position_rad[:, 0], np.radians(record.link_position_rad), rtol=1e-14)
+
+
+def test_a_column_that_is_mapped_takes_the_place_of_one_that_has_the_name(tmp_path: Path) -> None:
+    path = ours(tmp_path / "r.csv")
+    swapped = parse_column_map(
+        ["link_position_rad=motor1_position_rad", "motor1_position_rad=link_position_rad"]
+    )
+    record, same = read(path, JOINT, names=swapped), read(path, JOINT)
+    assert np.array_equal(record.motor_position_rad[:, 0], same.link_position_rad)
+    assert np.array_equal(record.link_position_rad, same.motor_position_rad[:, 0])
+
+
+def test_units_are_those_of_physics() -> None:
+    assert UNITS["_rad_s"]["rpm"] * 60 == UNITS["_rad"]["rev"] == 360 * UNITS["_rad"]["deg"] == 2 * math.pi
+    assert parse_column_map(["a=b=time_s:us"])["time_s"] == ("a=b", 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("q", "expected SOURCE=COLUMN"),
+        ("=time_s", "expected SOURCE=COLUMN"),
+        ("q=link_angle", "with COLUMN one of"),
+        ("q=link_position_rad:degree", "expected one of rad, mrad, urad, deg, rev"),
+        ("q=link_position_rad:0", "or a factor"),
+        ("q=link_position_rad:inf", "or a factor"),
+    ],
+)
+def test_a_mapping_that_cannot_be_is_one_line(text: str, line: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        parse_column_map([text])
+    assert line in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_what_a_mapping_asks_for_in_vain_is_one_line(tmp_path: Path) -> None:
+    names = parse_column_map([*MAP[:3], "angle=link_position_rad"])
+    with pytest.raises(RecordingError, match="--map angle=link_position_rad: no such column, found"):
+        read(theirs(tmp_path / "rig.csv"), JOINT, names=names)
+    with pytest.raises(UsageError, match="given twice"):
+        parse_column_map(["a=time_s", "b=time_s"])
+    open_sink(tmp_path / "r.mcap", JOINT).close()
+    with pytest.raises(UsageError, match="only CSV and MF4 files have columns to be named"):
+        read(tmp_path / "r.mcap", JOINT, names=names)
+
+
+@pytest.mark.parametrize("verb", ["replay", "fit", "diagnose"])
+def test_every_verb_that_reads_takes_the_mapping(
+    verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    joint = tmp_path / "sine.toml"
+    joint.write_text(TEXT)
+    options = [word for text in MAP for word in ("--map", text)]
+    out = ["--out", str(tmp_path / "out")] if verb == "diagnose" else []
+    command = [verb, str(theirs(tmp_path / "rig.csv")), "--joint", str(joint), *options, *out]
+    assert cli.main(command) == 0, capsys.readouterr().err
+
+
+# --json, and the joint that a recording carries
+
+
+def only_json(capsys: pytest.CaptureFixture[str]) -> dict:
+    out = capsys.readouterr().out
+    assert out.count("\n") == 1
+    return json.loads(out)
+
+
+def test_fit_takes_the_joint_from_a_recording_that_carries_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bus = "[bus]\nperiod_s = 0.002\n"
+    path, target = tmp_path / "r.mcap", tmp_path / "fitted.toml"
+    joint = parse(TEXT + bus)
+    sink = open_sink(path, joint, TEXT + bus + '[provenance]\nremark = "kept"\n', str(tmp_path))
+    for sample in read(ours(tmp_path / "r.csv"), joint).samples():
+        sink.sample(sample, sample.sequence * 2_000_000)
+    sink.close()
+    assert cli.main(["fit", str(path), "--json", "--out", str(tmp_path / "d"), "--write", str(target)]) == 0
+    document = only_json(capsys)
+    assert document == json.loads((tmp_path / "d" / "fit.json").read_text())
+    (one,) = document["transmissions"]
+    assert one["parameters"]["k_nm_rad"] == pytest.approx(150.0, rel=1e-3)  # noise-free
+    assert 'remark = "kept"' in target.read_text() and "k_nm_rad" in target.read_text()
+    assert cli.main(["diagnose", str(path), "--out", str(tmp_path / "d")]) == 0
+    assert json.loads((tmp_path / "d" / "report.json").read_text())["verdict"] == "sufficient"
+
+
+def test_replay_prints_one_json_object_and_nothing_else(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    joint, out = tmp_path / "sine.toml", tmp_path / "e.csv"
+    joint.write_text(TEXT)
+    arguments = ["replay", str(ours(tmp_path / "r.csv")), "--joint", str(joint), "--out", str(out), "--json"]
+    assert cli.main(arguments) == 0
+    document = only_json(capsys)
+    assert document["cycles"] == 8000 and document["estimates"] == str(out)
+    assert document["end"]["stiffness_nm_rad"] == pytest.approx(150.0, rel=0.01)
+    assert document["seconds"] == pytest.approx(15.998)
+
+
+def test_without_a_joint_a_recording_that_carries_none_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = ours(tmp_path / "r.csv")
+    for verb in ("fit", "diagnose", "replay"):
+        assert cli.main([verb, str(path)]) == 2
+        assert "--joint: expected the joint file that" in capsys.readouterr().err

@@ -488,3 +488,22 @@ def test_an_encoder_whose_position_cannot_be_mapped_does_not_pass(tmp_path, mapp
     said = texts(examine_eds(path), Severity.ERROR)
     assert said == [] or any("0x6004:00 is there, but cannot be mapped into a TPDO" in line for line in said)
     assert bool(said) != bool(mappable)
+
+
+def test_on_a_passive_bus_the_map_of_a_data_sheet_is_offered_to_paste(rig, tmp_path):
+    (tmp_path / "encoder.eds").write_text(
+        "[1000]\nDataType=7\nAccessType=ro\nDefaultValue=0x20196\n"
+        "[6004]\nDataType=7\nAccessType=ro\nPDOMapping=1\n[6501]\nDataType=7\nAccessType=ro\nDefaultValue=65536\n"
+        "[1800sub1]\nDataType=7\nAccessType=const\nDefaultValue=$NODEID+0x180\n"
+        "[1800sub2]\nDataType=5\nAccessType=const\nDefaultValue=1\n"
+        "[1A00sub0]\nDataType=5\nAccessType=const\nDefaultValue=1\n"
+        "[1A00sub1]\nDataType=7\nAccessType=const\nDefaultValue=0x60040020\n"
+    )
+    text = joint_on(rig, encoder='eds = "encoder.eds"')
+    text = text.replace("[bus]", '[bus]\nconfigure = false\nsync = "follow"')
+    said = " ".join(texts(examine(parse(text), tmp_path, 0.1)))
+    line = 'tpdo = [{ cob_id = 0x189, objects = ["0x6004:00:32"], default = true }]'
+    assert f"in [link.encoder] {line}" in said
+    pasted = parse(text.replace("eds =", f"{line}\neds ="))
+    assert "has this map" not in said
+    assert "0x6004" not in " ".join(texts(examine(pasted, tmp_path, 0.1), Severity.WARNING))

@@ -13,7 +13,7 @@ from drivelink.errors import RecordingError
 from drivelink.jointfile import parse
 from drivelink.recording.canlog import NO_STAMP, Frame, read_frames
 from drivelink.recording.formats import open_sink
-from drivelink.recording.syncnumbers import numbered_ahead, numbered_at_once
+from drivelink.recording.syncnumbers import SyncNumbering, numbered_ahead, numbered_at_once
 
 JOINT = parse('name = "j"\n[[motor]]\ninertia_kg_m2 = 0.1\n[bus]\nchannel = "can0"\n')
 FRAME = Frame(1_436_509_052_249_713_000, 0x181, bytes.fromhex("2A366C2BBA"), "can0")
@@ -231,3 +231,12 @@ def test_syncs_that_are_not_due_are_told() -> None:
 
 def test_a_clock_that_drifts_makes_no_gap() -> None:
     assert jumps([k * 1.0002 for k in range(20_000)]) == [1] * 20_000
+
+
+@pytest.mark.parametrize("factor", [1.04, 1.5, 3.0])
+def test_a_recorder_numbers_by_the_period_that_sync_has(factor: float) -> None:
+    numbering = SyncNumbering(1e-3, measure=True)
+    frames = syncs([k * factor for k in range(300)])
+    jumps = [jump for frame in frames for _, jump in numbering.push(frame)]
+    jumps += [jump for _, jump in numbering.rest()]
+    assert jumps == [1] * 300

@@ -338,6 +338,8 @@ class PassiveConfigurator:
             if len(data) == 1 and data[0] & 0x7F == 0:
                 one.restart()
         elif 0x180 >> 7 <= function <= 0x480 >> 7 and function & 1:
+            if cob_id not in one.heard and one.role.node_id in self.missing:
+                one.listener.changes += 1  # what is missing can be said better now
             one.heard[cob_id] = len(data)
 
     def poll(self, now_s: float) -> list[tuple[int, NodeLayout | DriveError]]:

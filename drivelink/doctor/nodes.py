@@ -256,13 +256,18 @@ def _overhear(
 ) -> None:
     """A bus that may not be touched: only listen."""
     configurator = PassiveConfigurator([joint], [base_dir])
-    traffic = listen(
-        bus, seconds, lambda message: configurator.feed(message.arbitration_id, bytes(message.data), 0.0)
-    )
-    configurator.poll(0.0)
+
+    def take(message: can.Message) -> None:
+        if not (message.is_extended_id or message.is_remote_frame or message.is_error_frame):
+            configurator.feed(message.arbitration_id, bytes(message.data), 0.0)
+            configurator.poll(0.0)
+
+    traffic = listen(bus, seconds, take)
     _judge_traffic(section, traffic, joint.bus, daemons)
     for error in configurator.missing.values():
         section.say(Severity.ERROR, joint.bus.channel, str(error))
+    for node, doubt in configurator.doubts.items():
+        section.say(Severity.WARNING, f"node {node}", doubt)
     for node, layout in configurator.layouts.items():
         section.findings += layout.findings
         for tpdo in layout.tpdos:

@@ -138,7 +138,11 @@ class FrameLog:
             elif can_id == SYNC_COB_ID and jump and (missed := assembler.missed) >= 0:
                 yield Cycle(missed, stamp_before, None, assembler.flags)
         if not samples:
-            raise RecordingError(f"{self._path}: no complete sample in it{self._absent(heard)}")
+            doubts = list(follower.doubts.values()) if follower is not None else []
+            why = f": {doubts[0]}" if doubts else self._absent(heard)
+            raise RecordingError(f"{self._path}: no complete sample in it{why}")
+        for doubt in follower.doubts.values() if follower is not None else ():
+            _LOG.warning("%s: at its end, %s", self._path, doubt)
 
     def _absent(self, heard: set[int]) -> str:
         """Which frames of the mapping never came."""

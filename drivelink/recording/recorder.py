@@ -211,7 +211,10 @@ class BusTap:
     @property
     def missing(self) -> str:
         """Why no samples can be made."""
-        return str(next(iter(self._listener.missing.values()), "")) if self._listener else self._lacking
+        if self._listener is None:
+            return self._lacking
+        told = [*map(str, self._listener.missing.values()), *self._listener.doubts.values()]
+        return told[0] if told else ""
 
     def poll(self) -> None:
         """Take everything that has come.

@@ -18,6 +18,9 @@ extern "C" {
 enum {
     DRIVELINK_VALID = 1 << 0,      /* the numbers may be used */
     DRIVELINK_OBSERVABLE = 1 << 1, /* the motion at hand tells the stiffness */
+    DRIVELINK_MODEL_ALARM = 1 << 4, /* the model is not sufficient */
+    /* What must be clear beside it: model alarm, restarted, drive fault, stale, untimed, node restarted. */
+    DRIVELINK_AGAINST = 1 << 4 | 1 << 6 | 1 << 8 | 1 << 10 | 1 << 11 | 1 << 12,
     DRIVELINK_PARTIAL = 1 << 13,   /* what is NaN is not given: a rigid joint's stiffness, mode paper's std */
     DRIVELINK_MAX_TRANSMISSIONS = 8
 };
@@ -61,8 +64,8 @@ static inline bool drivelink_magnitude(double number, uint32_t status) {
     return (drivelink_finite(number) && number >= 0.0) || ((status & DRIVELINK_PARTIAL) != 0 && number != number);
 }
 
-/* Whether every number may be used. */
-static inline bool drivelink_usable(const drivelink_estimate *estimate) {
+/* Whether every number is one that a joint can have. */
+static inline bool drivelink_plausible(const drivelink_estimate *estimate) {
     const uint32_t status = estimate->status;
     bool good = drivelink_finite(estimate->flexibility_torque_nm) &&
                 drivelink_magnitude(estimate->stiffness_nm_rad, status) &&
@@ -98,7 +101,12 @@ static inline bool drivelink_decode_estimate(const uint8_t *payload, size_t leng
         estimate->transmission[i].stiffness_std_nm_rad = drivelink_double(&at);
         estimate->transmission[i].deflection_rad = drivelink_double(&at);
     }
-    return (estimate->status & DRIVELINK_VALID) == 0 || drivelink_usable(estimate);
+    return (estimate->status & DRIVELINK_VALID) == 0 || drivelink_plausible(estimate);
+}
+
+/* What a controller checks of an estimate that is fresh: valid, and nothing in its status speaks against it. */
+static inline bool drivelink_usable(const drivelink_estimate *estimate) {
+    return (estimate->status & (DRIVELINK_VALID | DRIVELINK_AGAINST)) == DRIVELINK_VALID;
 }
 
 #ifdef __cplusplus

@@ -23,11 +23,11 @@ bool show(const z_loaned_sample_t *sample, uint64_t *last, uint64_t *gaps) {
     *last = estimate.sequence;
     const auto now = std::chrono::system_clock::now().time_since_epoch();
     const int64_t now_ns = std::chrono::duration_cast<std::chrono::nanoseconds>(now).count();
-    std::printf("%" PRIu64 " %.3f N·m, %.1f ± %.1f N·m/rad, valid %d, observable %d, %" PRId64
+    std::printf("%" PRIu64 " %.3f N·m, %.1f ± %.1f N·m/rad, valid %d, observable %d, usable %d, %" PRId64
                 " µs after its SYNC, %" PRIu64 " gaps\n",
                 estimate.sequence, estimate.flexibility_torque_nm, estimate.stiffness_nm_rad,
                 estimate.stiffness_std_nm_rad, (estimate.status & DRIVELINK_VALID) != 0,
-                (estimate.status & DRIVELINK_OBSERVABLE) != 0,
+                (estimate.status & DRIVELINK_OBSERVABLE) != 0, drivelink_usable(&estimate),
                 (now_ns - static_cast<int64_t>(estimate.stamp_ns)) / 1000, *gaps);
     return true;
 }

@@ -10,6 +10,8 @@ pub const VALID: u32 = 1 << 0;
 /// Status bit 1: the motion at hand tells the stiffness.
 pub const OBSERVABLE: u32 = 1 << 1;
 
+/// What must be clear beside VALID: model alarm, restarted, drive fault, stale, untimed, node restarted.
+pub const AGAINST: u32 = 1 << 4 | 1 << 6 | 1 << 8 | 1 << 10 | 1 << 11 | 1 << 12;
 /// Status bit 13: what is NaN is not given (stiffness of a rigid joint, standard deviation of mode paper).
 pub const PARTIAL: u32 = 1 << 13;
 /// Transmissions in one message; their number is one byte.
@@ -90,14 +92,19 @@ impl Estimate {
                 })
                 .collect(),
         };
-        if estimate.valid() && !estimate.usable() {
+        if estimate.valid() && !estimate.plausible() {
             return Err(Refused::NotValid);
         }
         Ok(estimate)
     }
 
+    /// What a controller checks of an estimate that is fresh: valid, and nothing in its status speaks against it.
+    pub fn usable(&self) -> bool {
+        self.status & (VALID | AGAINST) == VALID
+    }
+
     /// Whether every number is finite, stiffness and standard deviation not negative.
-    fn usable(&self) -> bool {
+    fn plausible(&self) -> bool {
         let absent = |number: f64| self.status & PARTIAL != 0 && number.is_nan();
         let magnitude = |number: f64| (number.is_finite() && number >= 0.0) || absent(number);
         self.flexibility_torque_nm.is_finite()

@@ -37,13 +37,14 @@ fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
         last = Some(estimate.sequence);
         let now_ns = SystemTime::now().duration_since(UNIX_EPOCH)?.as_nanos() as i128;
         println!(
-            "{} {:.3} N·m, {:.1} ± {:.1} N·m/rad, valid {}, observable {}, {} µs after its SYNC, {} gaps",
+            "{} {:.3} N·m, {:.1} ± {:.1} N·m/rad, valid {}, observable {}, usable {}, {} µs after its SYNC, {} gaps",
             estimate.sequence,
             estimate.flexibility_torque_nm,
             estimate.stiffness_nm_rad,
             estimate.stiffness_std_nm_rad,
             estimate.valid(),
             estimate.observable(),
+            estimate.usable(),
             (now_ns - i128::from(estimate.stamp_ns)) / 1000,
             gaps
         );

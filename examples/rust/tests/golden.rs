@@ -28,6 +28,7 @@ fn golden_vectors_decode_to_their_numbers() {
         assert_eq!(estimate.sequence, numbers[0].parse::<u64>().unwrap(), "{name}");
         assert_eq!(estimate.stamp_ns, numbers[1].parse::<u64>().unwrap(), "{name}");
         assert_eq!(estimate.status, numbers[2].parse::<u32>().unwrap(), "{name}");
+        assert_eq!(estimate.usable(), estimate.status & 0x1d51 == 1, "{name}");
         assert!(same(estimate.flexibility_torque_nm, numbers[3]), "{name}");
         assert!(same(estimate.stiffness_nm_rad, numbers[4]), "{name}");
         assert!(same(estimate.stiffness_std_nm_rad, numbers[5]), "{name}");

@@ -33,6 +33,7 @@ __all__ = [
     "JointText",
     "LinkSection",
     "MotorSection",
+    "RecordingSection",
     "Ros2Section",
     "SimSection",
     "TpdoSection",
@@ -53,6 +54,10 @@ _MARK = "# drivelink wrote this file, and ends it with a check line: a part of i
 _CHECK = re.compile(r"^# drivelink check: sha256 ([0-9a-f]{16})$\n?", re.MULTILINE)
 
 Direction = Literal[1, -1]
+_COLUMN = (
+    "time_s|motor[12]_(position_rad|velocity_rad_s|torque_nm|current_a)"
+    "|link_position_rad|link_velocity_rad_s|external_torque_nm"
+)
 
 
 class _Section(BaseModel):
@@ -164,11 +169,13 @@ class MotorSection(_Section):
 
     def motor(self) -> Motor:
         """What the estimator is told of it."""
+        drive = self.drive
         return Motor(
             inertia_kg_m2=self.inertia_kg_m2,
             viscous_damping_nm_s_rad=self.viscous_damping_nm_s_rad,
             transmission=self.transmission,
             effects=self.effect,
+            gear_ratio=drive.gear_ratio if drive and "gear_ratio" in drive.model_fields_set else None,
         )
 
 
@@ -214,6 +221,24 @@ class BusSection(_Section):
         return self.model_copy(update=changes)
 
 
+class RecordingSection(_Section):
+    """What recordings of this joint need before they are in SI at the joint side."""
+
+    scale: dict[str, float] = Field(
+        default_factory=dict,
+        description="factors of columns, e.g. { link_position_rad = -1, motor1_torque_nm = 0.001 }",
+    )
+
+    @model_validator(mode="after")
+    def _columns(self) -> Self:
+        for name, factor in self.scale.items():
+            if not re.fullmatch(_COLUMN, name):
+                raise ValueError(f'scale: expected names of columns like "motor1_position_rad", got "{name}"')
+            if factor == 0.0:
+                raise ValueError(f"scale.{name}: expected a factor other than 0")
+        return self
+
+
 class ZenohSection(_Section):
     """Where the estimates go."""
 
@@ -257,6 +282,7 @@ class JointFile(_Section):
     motor: tuple[MotorSection, ...] = Field(min_length=1, max_length=2, description="one, or two for a VSA")
     link: LinkSection = Field(LinkSection(), description="the link side")
     bus: BusSection = Field(BusSection(), description="the CAN bus")
+    recording: RecordingSection = Field(RecordingSection(), description="how recordings are read")
     estimator: EstimatorSettings = Field(
         default_factory=EstimatorSettings, description="mode, bandwidths, gains"
     )
@@ -297,6 +323,7 @@ class JointFile(_Section):
             motors=tuple(section.motor() for section in self.motor),
             link=self.link.dynamics,
             link_effects=self.link.effect,
+            period_s=self.bus.period_s if "period_s" in self.bus.model_fields_set else None,
         )
 
 

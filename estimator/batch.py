@@ -17,6 +17,7 @@ from estimator.align import prepare
 from estimator.declared import corrected
 from estimator.errors import EstimatorError
 from estimator.flexibility import Polynomial, TransmissionModel
+from estimator.gate import refuse
 from estimator.leastsquares import search_shape
 from estimator.model import JointModel, Motor, ParameterValue
 from estimator.sample import FloatArray, Record
@@ -97,12 +98,14 @@ def fit(record: Record, model: JointModel, bandwidth_rad_s: float | None = None)
 
     Raises:
         EstimatorError: the recording lacks what is needed, is too short, or nothing moves in it.
+        GateError: its units, signs, gear ratio or time do not fit the joint.
     """
     if record.motors != len(model.motors):
         raise EstimatorError(f"recording: expected {len(model.motors)} motor(s), got {record.motors}")
     if model.has_deflection and record.link_position_rad is None:
         raise EstimatorError("recording: expected link_position_rad, as the transmission is flexible")
     bandwidth = bandwidth_rad_s or min(60.0, 0.12 / record.period_s)
+    refuse(record, model)
     record = corrected(record, model)
     return [_fit_motor(record, i, motor, bandwidth) for i, motor in enumerate(model.motors)]
 

@@ -80,12 +80,15 @@ class Motor:
         viscous_damping_nm_s_rad: D_theta >= 0.
         transmission: the model of tau_e(phi).
         effects: what the model has been given besides, with motor, transmission or measurement location.
+        gear_ratio: motor revolutions per joint revolution, where it is known: everything else is at the joint
+            already, and the gate looks for a recording that is not.
     """
 
     inertia_kg_m2: float
     viscous_damping_nm_s_rad: float = 0.0
     transmission: Transmission = field(default_factory=Transmission)
     effects: tuple[Effect, ...] = ()
+    gear_ratio: float | None = None
 
     def __post_init__(self) -> None:
         require_finite(0.0, strict=True, inertia_kg_m2=self.inertia_kg_m2)
@@ -130,12 +133,14 @@ class JointModel:
         motors: one motor, or two for a variable-stiffness joint.
         link: the link dynamics where they are known; they make the external residual (eq 12) available.
         link_effects: effects located at the link or in its encoder.
+        period_s: sampling period as declared, where it is: a recording's may be another, but not by much.
     """
 
     arrangement: Arrangement
     motors: tuple[Motor, ...]
     link: LinkDynamics | None = None
     link_effects: tuple[Effect, ...] = ()
+    period_s: float | None = None
 
     def __post_init__(self) -> None:
         expected = 1 if self.arrangement == "single" else 2

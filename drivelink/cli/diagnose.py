@@ -12,12 +12,14 @@ from rich.table import Table
 from drivelink import augment, recording, report
 from drivelink.cli import add_map
 from drivelink.errors import RecordingError, UsageError
+from drivelink.gate import refusal
 from drivelink.outfile import check_target
 from drivelink.progress import Meter
 from drivelink.recording.columnmap import parse_column_map
 from drivelink.recording.mapping import joint_of
 from estimator.diagnosis import Diagnosis, diagnose
 from estimator.errors import EstimatorError
+from estimator.gate import GateError
 
 _EPILOG = """\
 examples:
@@ -73,6 +75,9 @@ def run(args: argparse.Namespace) -> int:
             outcome = diagnose(
                 record, joint.model(), args.bandwidth_hz, validation, lambda _: meter.advance()
             )
+        except GateError as error:
+            path = args.recording if error.record is record else args.validate
+            raise refusal(path, joint, error.findings, str(error)) from error
         except EstimatorError as error:
             raise RecordingError(f"{args.recording}: {error}") from error
     args.out.mkdir(parents=True, exist_ok=True)

@@ -18,6 +18,7 @@ from rich.table import Table
 from drivelink import jointfile, plots, recording
 from drivelink.errors import RecordingError, UsageError
 from drivelink.floor import floor_entry
+from drivelink.gate import refusal
 from drivelink.jointfile import JointFile, JointText
 from drivelink.outfile import check_target, write_whole
 from drivelink.recording.columnmap import parse_column_map
@@ -25,6 +26,7 @@ from drivelink.version import __version__
 from estimator.batch import TransmissionFit, fit
 from estimator.diagnosis import calibrate
 from estimator.errors import EstimatorError
+from estimator.gate import GateError
 from estimator.model import Effect, JointModel, ParameterValue, Transmission
 from estimator.sample import Record
 from estimator.transmissions import MODELS, RIGID
@@ -52,6 +54,8 @@ def fit_recording(args: argparse.Namespace, source: JointText, folder: Path | No
     bandwidth = None if args.bandwidth_hz is None else 2.0 * math.pi * args.bandwidth_hz
     try:
         fits = fit(record, joint.model(), bandwidth)
+    except GateError as error:
+        raise refusal(args.recording, joint, error.findings, str(error)) from error
     except EstimatorError as error:
         raise RecordingError(f"{args.recording}: {error}") from error
     document, made = _as_json(fits), []

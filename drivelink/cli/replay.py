@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -13,15 +15,18 @@ import zenoh
 
 from drivelink.cli import add_map
 from drivelink.errors import UsageError
+from drivelink.gate import Gathered, gate
 from drivelink.jointfile import JointFile
 from drivelink.outfile import check_target
 from drivelink.progress import Meter
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_session
+from drivelink.recording import read
+from drivelink.recording.canframes import is_frame_log
 from drivelink.recording.columnmap import parse_column_map
 from drivelink.recording.mapping import joint_of
 from drivelink.recording.outputs import EstimatesFile, Publication, Summary
-from drivelink.recording.playback import Playback, open_playback
+from drivelink.recording.playback import Playback, Played, open_playback
 
 _INTERRUPTED = 130
 _METER_EVERY = 512
@@ -52,6 +57,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--realtime", action="store_true", help="at the speed of the recording")
     parser.add_argument("--speed", type=float, metavar="X", help="X times the speed of the recording")
     parser.add_argument(
+        "--strict", action="store_true", help="refuse what has wrong units, signs or gears; else only warn"
+    )
+    parser.add_argument(
         "--frames", action="store_true", help="of an MCAP file, decode the raw CAN frames, not the samples"
     )
     parser.add_argument("--channel", help="of a raw CAN log with several, the one the joint is on")
@@ -67,6 +75,9 @@ def run(args: argparse.Namespace) -> int:
     source = joint_of(args.file, args.joint)
     joint, base_dir = source.joint, source.folder
     names = parse_column_map(args.map)
+    if args.strict:
+        record = read(args.file, joint, base_dir=base_dir, channel=args.channel, names=names)
+        gate(args.file, joint, record)
     if args.out is not None:
         check_target(args.out, [args.file, *([args.joint] if args.joint else [])], force=args.force)
     playback = open_playback(
@@ -80,9 +91,10 @@ def run(args: argparse.Namespace) -> int:
     )
     summary = Summary(playback.motors, keep=args.plots is not None)
     begin = time.perf_counter()
+    gathered = Gathered(joint, playback.period_s)
     interrupted = False
     with ExitStack() as stack:
-        takers = [summary.take]
+        takers: list[Callable[[Played], None]] = [summary.take, gathered.take]
         if args.out is not None:
             rows = EstimatesFile(args.out, playback.motors, force=args.force)
             stack.callback(rows.close)
@@ -100,10 +112,20 @@ def run(args: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             interrupted = True
     took_s = time.perf_counter() - begin
+    live = is_frame_log(args.file, True if args.frames else None)
+    warnings = [] if args.strict or interrupted else gathered.remarks(live=live)
+    for line in warnings:
+        print(f"{args.file}: warning: {line}", file=sys.stderr)
     made = summary.plot(args.plots, f"{joint.name}: {args.file.name}") if args.plots and summary.count else []
     if args.json:
         files = {"estimates": str(args.out) if args.out else None, "plots": [str(path) for path in made]}
-        document = {"recording": str(args.file), "joint": joint.name, **summary.document(), **files}
+        document = {
+            "recording": str(args.file),
+            "joint": joint.name,
+            **summary.document(),
+            **files,
+            "warnings": warnings,
+        }
         print(json.dumps({**document, "took_s": round(took_s, 3), "interrupted": interrupted}))
         return _INTERRUPTED if interrupted else 0
     print(f"{args.file}: {summary.text(took_s)}")

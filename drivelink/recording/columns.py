@@ -68,6 +68,7 @@ def record_from_columns(
     columns = {**columns, **dict.fromkeys(ignored, np.empty(0))}
     if unknown := [name for name in columns if name not in KNOWN]:
         _LOG.warning("%s: ignored column(s) %s", where, _some(unknown))
+    columns = _scaled(columns, joint)
     motors = _motors(columns, joint)
     _require(columns, "time_s", where)
     nominal = joint.bus.period_s if joint else None
@@ -116,6 +117,12 @@ def record_from_columns(
         )
     except EstimatorError as error:
         raise RecordingError(f"{where}: {error}") from error
+
+
+def _scaled(columns: Mapping[str, FloatArray], joint: JointFile | None) -> Mapping[str, FloatArray]:
+    """Columns times the factors of the joint file's [recording]."""
+    factors = joint.recording.scale if joint else {}
+    return {name: values * factors.get(name, 1.0) for name, values in columns.items()} if factors else columns
 
 
 def _repeats(columns: Mapping[str, FloatArray]) -> NDArray[np.bool_]:

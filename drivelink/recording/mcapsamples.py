@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +28,15 @@ _MESSAGE_BYTES = 64 << 10  # of a sample or an estimate: ours have some 500
 _APART = 64  # cycles that a sample and its estimate may be apart in the file
 
 
-def recorded_cycles(path: Path, motors: int) -> Iterator[Cycle]:
+def recorded_cycles(path: Path, motors: int, scale: Mapping[str, float] | None = None) -> Iterator[Cycle]:
     """The cycles of a recording in order of their number.
 
     A sample gets the flags of its estimate; an estimate that was carried on is a cycle without sample.
+
+    Args:
+        path: the recording.
+        motors: how many the joint has.
+        scale: factors by column, as `[recording]` of the joint file gives them.
 
     Raises:
         RecordingError: no samples in it.
@@ -42,6 +47,9 @@ def recorded_cycles(path: Path, motors: int) -> Iterator[Cycle]:
         try:
             fields = _fields(message.data)
             if message.topic.endswith("/sample"):
+                for name, factor in (scale or {}).items():
+                    if isinstance(fields.get(name), float):
+                        fields[name] *= factor
                 sample = read_sample(fields, motors)
                 found = True
                 before = waiting.get(sample.sequence)

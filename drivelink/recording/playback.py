@@ -106,7 +106,7 @@ def open_playback(
         return Playback(joint, period_s, None, lambda chain: _from_cycles(log.cycles(), chain, period_s))
     if path.suffix.lower() == ".mcap":
         period_s = joint.bus.period_s
-        recorded = recorded_cycles(path, len(joint.motor))
+        recorded = recorded_cycles(path, len(joint.motor), joint.recording.scale)
         return Playback(joint, period_s, None, lambda chain: _from_cycles(recorded, chain, period_s))
     record = read(path, joint, keep_nan=True, names=names)
     times = record.time_s.tolist()

@@ -13,13 +13,13 @@ import numpy as np
 
 from estimator.diagnosis.bandwidth import choose_bandwidth, rough_stiffness, torque_rms, weights
 from estimator.diagnosis.candidates import Candidate
-from estimator.diagnosis.checks import check
 from estimator.diagnosis.frame import Corrections, Frame, Signals
 from estimator.diagnosis.known import declared_corrections
 from estimator.diagnosis.regression import Blocks, Rows
 from estimator.diagnosis.search import corrected
 from estimator.diagnosis.select import Selection, Term, Tracer
 from estimator.effects import LIBRARY
+from estimator.gate import check
 from estimator.model import Effect, JointModel
 from estimator.sample import FloatArray, Record
 

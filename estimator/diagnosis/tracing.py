@@ -8,10 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimator.diagnosis.bandwidth import choose_bandwidth, rough_stiffness, torque_rms, weights
-from estimator.diagnosis.checks import check
 from estimator.diagnosis.curves import FreeCurve, any_time, best_curve, trusting
 from estimator.diagnosis.excitation import advice_for, poor
-from estimator.diagnosis.faults import refuse_faults
 from estimator.diagnosis.frame import Frame, Signals
 from estimator.diagnosis.known import declared_corrections
 from estimator.diagnosis.locate import places_left, the_place
@@ -24,6 +22,7 @@ from estimator.diagnosis.search import Found, additions, search
 from estimator.diagnosis.select import Selection, Tracer
 from estimator.effects import EffectType
 from estimator.errors import EstimatorError
+from estimator.gate import check, refuse
 from estimator.model import JointModel, ParameterValue
 from estimator.sample import FloatArray, Record
 
@@ -74,10 +73,13 @@ def diagnose(
 
     Raises:
         EstimatorError: the recording does not allow one.
+        GateError: units, signs, gear ratio or time of a recording do not fit the joint.
     """
-    check(record, model)
-    if validation is not None:
-        check(validation, model)
+    for each in (record,) if validation is None else (record, validation):
+        check(each, model)
+    progress("units and signs")
+    for each in (record,) if validation is None else (record, validation):
+        refuse(each, model)
     progress("bandwidth")
     bandwidth = bandwidth_hz or choose_bandwidth(record, model)
     if not 0.0 < bandwidth <= 0.4 / record.period_s:
@@ -85,8 +87,6 @@ def diagnose(
             f"bandwidth: expected more than 0 and at most {0.4 / record.period_s:g} Hz, got {bandwidth:g}"
         )
     tracer = _tracer(record, model, bandwidth, held=0 if validation is not None else _HELD)
-    progress("units and signs")
-    refuse_faults(record, model, tracer, bandwidth)
     progress("place")
     place = the_place(places_left(tracer))
     whole = tracer

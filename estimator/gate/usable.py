@@ -1,4 +1,4 @@
-"""What is wrong with a recording before any effect is looked for: one line each."""
+"""Whether a recording can tell anything: long enough, complete, finite, moving. One line each."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ABSURD = 1e12
 
 
 def check(record: Record, model: JointModel) -> None:
-    """Refuse what no diagnosis can be made of.
+    """Refuse what no model can be fitted to.
 
     Raises:
         EstimatorError: too short, constant, not finite, channels missing.

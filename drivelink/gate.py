@@ -1,0 +1,214 @@
+"""What the gate found wrong with units, signs, gears or time, as lines for people and for the joint file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from drivelink.errors import RecordingError
+from drivelink.jointfile import JointFile
+from drivelink.recording.canframes import is_frame_log
+from drivelink.recording.playback import Played
+from estimator.errors import EstimatorError
+from estimator.gate import Change, Finding, GateError, examine, refuse
+from estimator.model import JointModel
+from estimator.sample import Record, Sample
+
+__all__ = ["Correction", "Gathered", "corrections", "gate", "refusal", "text_of"]
+
+_ON_THE_BUS = (".drive", ".encoder")
+_LONGEST_S = 60.0  # of a run that is looked at: more tells no more about units and signs
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Correction:
+    """One key of the joint file and what it should be.
+
+    Attributes:
+        table: where it stands, e.g. "motor[1].drive" or "recording.scale".
+        key: its name.
+        value: what to write; None: not known here, only the factor is.
+        factor: value to be over value now.
+    """
+
+    table: str
+    key: str
+    value: float | int | None
+    factor: float
+
+    def __str__(self) -> str:
+        if self.value is None:
+            return f"{self.table}.{self.key}: {self.factor:.7g} times what the drive tells"
+        return f"{self.table}.{self.key} = {self.value:.7g}"
+
+
+def refusal(path: Path, joint: JointFile, findings: Sequence[Finding], message: str) -> RecordingError:
+    """The refusal of a recording in one line, with what to paste into the joint file."""
+    return RecordingError(f"{path}: {message}; {text_of(joint, findings, live=is_frame_log(path))}")
+
+
+def gate(path: Path, joint: JointFile, record: Record) -> None:
+    """Refuse a recording whose units, signs, gears or time do not fit the joint.
+
+    Raises:
+        RecordingError: in one line, what is wrong and what to paste into the joint file.
+    """
+    try:
+        refuse(record, joint.model())
+    except GateError as error:
+        raise refusal(path, joint, error.findings, str(error)) from error
+
+
+class Gathered:
+    """The first minute of what goes by, sample by sample, to be looked at afterwards.
+
+    Args:
+        joint: whose samples they are.
+        period_s: between them.
+    """
+
+    def __init__(self, joint: JointFile, period_s: float) -> None:
+        self._joint, self._period_s = joint, period_s
+        self._most = round(_LONGEST_S / period_s)
+        self._samples: list[Sample] = []
+
+    def take(self, played: Played) -> None:
+        """One more cycle."""
+        sample = played.tick.sample if len(self._samples) < self._most else None
+        if sample is not None:
+            self._samples.append(sample)
+
+    def remarks(self, *, live: bool) -> list[str]:
+        """What is wrong, a line each, with what to paste; nothing, where nothing can be told."""
+        model = self._joint.model()
+        record = _record(self._samples, model, self._period_s)
+        try:
+            findings = [] if record is None else examine(record, model)
+        except EstimatorError:
+            return []
+        fix = text_of(self._joint, findings, live=live)
+        return [f"{', and '.join(map(str, findings))}; {fix}"] if findings else []
+
+
+def _record(samples: Sequence[Sample], model: JointModel, period_s: float) -> Record | None:
+    rows = [s for s in samples if np.all(np.isfinite((*s.motor_position_rad, *s.motor_torque_nm)))]
+    linked = model.has_deflection
+    rows = [s for s in rows if not linked or math.isfinite(s.link_position_rad)]
+    sequence = np.array([s.sequence for s in rows], dtype=np.int64)
+    if len(rows) < 2 or np.any(np.diff(sequence) < 1):  # numbers that begin anew: two runs in one file
+        return None
+    return Record(
+        period_s=period_s,
+        sequence=sequence,
+        motor_position_rad=np.array([s.motor_position_rad for s in rows]),
+        motor_torque_nm=np.array([s.motor_torque_nm for s in rows]),
+        link_position_rad=np.array([s.link_position_rad for s in rows]) if linked else None,
+    )
+
+
+def text_of(joint: JointFile, findings: Sequence[Finding], *, live: bool) -> str:
+    """The correction, ready to be pasted.
+
+    Args:
+        joint: as it is.
+        findings: of the gate.
+        live: whether the numbers came straight from the drives, by the joint file's scales.
+    """
+    found = corrections(joint, findings, live=live)
+    scale = ", ".join(f"{c.key} = {c.value:.7g}" for c in found if c.table == "recording.scale")
+    parts = [f"{c}" for c in found if c.table != "recording.scale"]
+    if scale:
+        parts.insert(0, f"at the top of the joint file: recording.scale = {{ {scale} }}")
+    text = "; ".join(parts)
+    if not live and any(motor.drive for motor in joint.motor):
+        keys = [f"{c}" for c in corrections(joint, findings, live=True) if c.table.endswith(_ON_THE_BUS)]
+        if keys:
+            text += f" (for what drivelink itself reads from the drives: {'; '.join(keys)})"
+    return text
+
+
+def corrections(joint: JointFile, findings: Sequence[Finding], *, live: bool) -> list[Correction]:
+    """What to change in the joint file.
+
+    Args:
+        joint: as it is.
+        findings: of the gate.
+        live: by the keys of drives and encoder, which recordings of frames and `run` go by; else by the
+            factors of `[recording]`, which files with columns are read with.
+    """
+    changes = {change.channel: change for finding in findings for change in finding.changes}
+    found: list[Correction] = []
+    for number, motor in enumerate(joint.motor, start=1):
+        position, torque = changes.get(f"motor{number}_position"), changes.get(f"motor{number}_torque")
+        inertia = changes.get(f"motor{number}_inertia")
+        if inertia is not None:
+            value = motor.inertia_kg_m2 * inertia.factor
+            found.append(_new(f"motor[{number}]", "inertia_kg_m2", value, inertia.factor))
+        if live and motor.drive is not None:
+            found += _of_drive(joint, number, position, torque)
+        else:
+            found += [_column(joint, change, number) for change in (position, torque) if change is not None]
+    link, time = changes.get("link_position"), changes.get("time")
+    if link is not None:
+        found.append(_of_link(joint, link) if live and joint.link.encoder else _column(joint, link))
+    if time is not None:
+        found.append(_column(joint, time))
+    return found
+
+
+def _new(table: str, key: str, value: float | int | None, factor: float) -> Correction:
+    return Correction(table=table, key=key, value=value, factor=factor)
+
+
+def _column(joint: JointFile, change: Change, number: int = 0) -> Correction:
+    """A factor for a column, on top of the one that is there."""
+    names = {"time": "time_s", "link_position": "link_position_rad"}
+    names |= {f"motor{number}_position": f"motor{number}_position_rad"}
+    scale = joint.recording.scale
+    torque = f"motor{number}_torque_nm"
+    if change.channel == f"motor{number}_torque" and f"motor{number}_current_a" in scale:
+        torque = f"motor{number}_current_a"
+    name = names.get(change.channel, torque)
+    return _new("recording.scale", name, change.factor * scale.get(name, 1.0), change.factor)
+
+
+def _of_drive(
+    joint: JointFile, number: int, position: Change | None, torque: Change | None
+) -> list[Correction]:
+    """The keys of a motor's drive: directions, counts, gear ratio, torque's scale."""
+    drive, table = joint.motor[number - 1].drive, f"motor[{number}].drive"
+    assert drive is not None
+    a = position.factor if position else 1.0
+    b = torque.factor if torque else 1.0
+    found = []
+    now = drive.torque_direction or drive.direction
+    if a < 0.0:
+        found.append(_new(table, "direction", -drive.direction, -1.0))
+    if b < 0.0 or (a < 0.0 and drive.torque_direction is None):
+        wanted = -now if b < 0.0 else now
+        if wanted != (-drive.direction if a < 0.0 else drive.direction) or drive.torque_direction is not None:
+            found.append(_new(table, "torque_direction", wanted, b))
+    a, b = abs(a), abs(b)
+    if abs(a * b - 1.0) < 1e-9 and a != 1.0:  # both by the gear
+        return [*found, _new(table, "gear_ratio", drive.gear_ratio / a, 1.0 / a)]
+    if a != 1.0:
+        counts = None if drive.counts_per_rev is None else drive.counts_per_rev / a
+        found.append(_new(table, "counts_per_rev", counts, 1.0 / a))
+    if b != 1.0:
+        key = "rated_torque_nm" if drive.rated_torque_nm is not None else "torque_constant_nm_a"
+        now_scale = getattr(drive, key)
+        found.append(_new(table, key, None if now_scale is None else now_scale * b, b))
+    return found
+
+
+def _of_link(joint: JointFile, link: Change) -> Correction:
+    encoder = joint.link.encoder
+    assert encoder is not None
+    if link.factor < 0.0:
+        return _new("link.encoder", "direction", -encoder.direction, -1.0)
+    counts = None if encoder.counts_per_rev is None else encoder.counts_per_rev / link.factor
+    return _new("link.encoder", "counts_per_rev", counts, 1.0 / link.factor)

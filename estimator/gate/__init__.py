@@ -1,0 +1,9 @@
+"""The gate before any fit: can a recording tell anything, and do units, signs, gears and time fit."""
+
+from __future__ import annotations
+
+from estimator.gate.causes import Change, Kind
+from estimator.gate.judge import Finding, GateError, examine, refuse
+from estimator.gate.usable import check
+
+__all__ = ["Change", "Finding", "GateError", "Kind", "check", "examine", "refuse"]

@@ -1,0 +1,144 @@
+"""What is commonly wrong with a first installation: one cause, and what it does to which channel."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from estimator.gate.evidence import Scales
+from estimator.model import JointModel
+
+__all__ = ["Cause", "Change", "Kind", "causes", "scales"]
+
+Kind = Literal["unit", "sign", "gear", "period"]
+
+_DEGREE = math.pi / 180.0
+_MILLI = 1e-3
+# What each kind costs beforehand, in nats: one installation in fifty has it.
+_COST = 4.0
+_RARE = 1.0  # nats more for what hardly anybody does
+_FREE_RATIO = 6.0  # and what a ratio costs that is read off the data: decades of it against a few per cent
+_GEARED = 3.0  # ratios nearer to one than this are the transmission's bending, not a gear
+_LINK, _TIME = "link_position", "time"
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What one channel needs.
+
+    Attributes:
+        channel: "motor1_position", "motor1_torque", "motor1_inertia", …, "link_position" or "time".
+        factor: true value over recorded (or declared) value.
+    """
+
+    channel: str
+    factor: float
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """One thing that is wrong.
+
+    Attributes:
+        kind: of it.
+        what: in words, e.g. "looks like degrees".
+        changes: of the channels that it touches.
+        cost: nats that speak against it beforehand.
+    """
+
+    kind: Kind
+    what: str
+    changes: tuple[Change, ...]
+    cost: float = _COST
+
+    @property
+    def channels(self) -> frozenset[str]:
+        """What it touches."""
+        return frozenset(change.channel for change in self.changes)
+
+
+def scales(found: Sequence[Cause], motor: int) -> Scales:
+    """What they do together to the balance of one motor."""
+    factors = {change.channel: change.factor for cause in found for change in cause.changes}
+    own = f"motor{motor + 1}_"
+    return Scales(
+        position=factors.get(f"{own}position", 1.0),
+        torque=factors.get(f"{own}torque", 1.0),
+        link=factors.get(_LINK, 1.0),
+        time=factors.get(_TIME, 1.0),
+        inertia=factors.get(f"{own}inertia", 1.0),
+    )
+
+
+def causes(model: JointModel, linked: bool, ratios: Sequence[float | None]) -> list[Cause]:
+    """Every cause that is looked for.
+
+    Args:
+        model: the joint as declared.
+        linked: whether there is a link position.
+        ratios: link over motor position as each balance has it; None: it does not tell.
+    """
+    names = [f"motor{i + 1}" for i in range(len(model.motors))]
+    positions = [f"{name}_position" for name in names]
+    torques = [f"{name}_torque" for name in names]
+    found = [Cause("period", "looks like milliseconds, expected s", (Change(_TIME, _MILLI),))]
+    found += _units(positions, torques, linked)
+    found += _signs(positions, torques, linked)
+    for name, motor, ratio in zip(names, model.motors, ratios, strict=True):
+        found += _gears(name, motor.gear_ratio, ratio, linked)
+    return found
+
+
+def _all(channels: Sequence[str], factor: float) -> tuple[Change, ...]:
+    return tuple(Change(channel, factor) for channel in channels)
+
+
+def _units(positions: list[str], torques: list[str], linked: bool) -> list[Cause]:
+    degrees, small, large = "looks like degrees, expected rad", "N·mm", "kN·m"
+    everywhere = [*positions, _LINK] if linked else positions
+    groups = [everywhere, *([[_LINK]] if linked else [])]
+    groups += [[position] for position in positions] if len(everywhere) > 1 else []
+    if linked and len(positions) > 1:
+        groups.append(positions)
+    found = [Cause("unit", degrees, _all(group, _DEGREE)) for group in groups]
+    for group in (torques, *([[t] for t in torques] if len(torques) > 1 else [])):
+        found.append(Cause("unit", f"looks like {small}, expected N·m", _all(group, _MILLI)))
+        found.append(Cause("unit", f"looks like {large}, expected N·m", _all(group, 1e3), _COST + _RARE))
+    return found
+
+
+def _signs(positions: list[str], torques: list[str], linked: bool) -> list[Cause]:
+    wrong = "has the wrong sign"
+    found = [Cause("sign", wrong, _all([channel], -1.0)) for channel in (*positions, *torques)]
+    if linked:
+        found.append(Cause("sign", wrong, _all([_LINK], -1.0)))
+    if len(positions) > 1:  # of a single joint it is the link's sign
+        found += [Cause("sign", wrong, _all(pair, -1.0)) for pair in zip(positions, torques, strict=True)]
+    return found
+
+
+def _gears(name: str, gear: float | None, ratio: float | None, linked: bool) -> list[Cause]:
+    position, torque = f"{name}_position", f"{name}_torque"
+    found = []
+    if gear is not None and abs(math.log(gear)) > math.log(_GEARED):
+        shaft, twice = "is of the motor shaft, expected the joint's side", "has the gear ratio in it twice"
+        for what, n in ((shaft, gear), (twice, 1.0 / gear)):
+            found.append(Cause("gear", what, (Change(position, 1.0 / n), Change(torque, n))))
+            found.append(Cause("gear", what, (Change(position, 1.0 / n),)))
+            found.append(Cause("gear", what, (Change(torque, n),)))
+            if linked:
+                found.append(Cause("gear", what, (Change(_LINK, 1.0 / n),), _COST + _RARE))
+        rotor = "is the rotor's own, expected the joint's side"
+        found.append(Cause("gear", rotor, (Change(f"{name}_inertia", gear * gear),)))
+    elif ratio is not None and ratio != 0.0 and _is_gear(abs(ratio)):
+        what = "does not belong to the link's (wrong gear ratio?)"
+        found.append(Cause("gear", what, (Change(position, abs(ratio)),), _COST + _FREE_RATIO))
+    return found
+
+
+def _is_gear(ratio: float) -> bool:
+    """Whether two positions are apart by more than bending, and not by degrees."""
+    units = (1.0, _DEGREE, 1.0 / _DEGREE)
+    return all(abs(math.log(ratio / unit)) > math.log(_GEARED if unit == 1.0 else 1.3) for unit in units)

@@ -1,0 +1,305 @@
+"""How well one motor's balance (eq 5) explains its torque, under a hypothesis about scales and signs.
+
+With theta = a theta_m, q = c q_m, tau = b tau_m of what was recorded, eq 5 in recorded quantities is
+
+    tau_m = (a/b) (B theta_m'' + D theta_m') + (F_c/b) sgn(a theta_m')
+            - f(c q_m - a theta_m)/b + offset + d tau_m'
+
+with everything positive that physics wants positive: the declared inertia B within a factor, D, the
+friction F_c and the slope of f anywhere. The transmission is any rising curve; a late link encoder adds
+q', a late torque tau', cogging and cables any curve of theta_m but a straight line. All channels pass the
+same filters. Errors are relative to the recorded torque, so hypotheses are compared on the same data.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from estimator.filters import StateVariableFilter
+from estimator.model import Motor
+from estimator.sample import FloatArray, Record
+
+__all__ = ["Balance", "Fit", "Scales"]
+
+INERTIA_FACTOR = 3.0  # declared inertias are that good, or gravely wrong: rotor alone, or a unit
+_ORDER = 4  # of the shared filter: two derivatives, and steep enough beyond its bandwidth
+_BANDS = 5  # each with an error of its own: friction is slow, inertia is fast
+_OCTAVES = 3.0  # ratio of neighbouring bandwidths
+_NOISE = 0.1  # of a band's acceleration that may be the encoder's noise: the inertia looks that much smaller
+_ROWS = 2000  # of each band; more tell no more about scales
+_ROUNDS = 4  # of weights from what is left and what is left under the weights
+_MOST = 60_000  # samples that are looked at; a longer recording is thinned to these by averages
+_RATIO = 0.06  # that two encoders' scales may differ by, beside the hypothesis' own factors
+_SEGMENTS = 8  # straight pieces of the transmission's curve
+_FRICTION_SPEED = 0.02  # of the largest velocity: over which Coulomb friction changes its sign
+_FLOOR = 0.01  # of the torque's rms: no balance of a real joint closes better
+_GAP = 3  # periods that are bridged without a trace
+
+
+class Scales(NamedTuple):
+    """True value over recorded value: of a motor's position and torque, the link's position, and time.
+
+    `inertia` is the same of the declared inertia.
+    """
+
+    position: float = 1.0
+    torque: float = 1.0
+    link: float = 1.0
+    time: float = 1.0
+    inertia: float = 1.0
+
+
+class Fit(NamedTuple):
+    """What one hypothesis makes of a balance.
+
+    Attributes:
+        errors: (bands,) rms of what is left over the whole torque's, not below what real joints reach.
+        error: the same of all bands together.
+        inertia: the motor's over the declared one, hypothesis' units.
+        stiffness_nm_rad: mean slope of the transmission's curve, in the hypothesis' units; 0: rigid.
+        deflection: rms of the deflection over that of the link's and motor's motion, hypothesis' units.
+    """
+
+    errors: FloatArray
+    error: float
+    inertia: float
+    stiffness_nm_rad: float
+    deflection: float
+
+
+class Balance:
+    """One motor's balance, filtered once into bands; hypotheses are fitted to it as they come.
+
+    Args:
+        record: the recording.
+        index: of the motor.
+        motor: as declared.
+        lever: index of the motor whose spring has its lever set by this one (serial joints).
+    """
+
+    def __init__(self, record: Record, index: int, motor: Motor, lever: int | None = None) -> None:
+        self.motor = motor
+        self.period_s = record.period_s
+        self._theta = _gridded(record, record.motor_position_rad[:, index])
+        tau = _gridded(record, record.motor_torque_nm[:, index])
+        link = record.link_position_rad
+        needed = motor.flexible or lever is not None
+        self._q = None if link is None or not needed else _gridded(record, link)
+        self._filters = _filters(self._theta)
+        self._rows = _rows(record, self._filters[-1].settling_periods)
+        _, self._velocity, self._acceleration = self._through(self._theta, 2)
+        torque, rate = self._through(tau, 1, held=True)
+        self.torque_rms = float(np.std(torque.sum(axis=0)))
+        self.arc = float(np.std(_detrended(self._theta)))
+        self._unit = self.torque_rms or 1.0
+        self._target, self._rate = torque / self._unit, rate / self._unit
+        self._position = [self._through(x)[0] for x in _pieces(self._theta)[1:]]
+        self._sign = self._through(_sense(self._theta, self._filters[0]))[0]
+        self._link_rate = None if self._q is None else self._through(self._q, 1)[1]
+        self._loads: list[FloatArray] = []
+        if lever is not None and self._q is not None:
+            phi = self._q - _gridded(record, record.motor_position_rad[:, lever])
+            self._loads = [self._through(phi**k)[0] for k in (1, 2)]
+        self._springs: dict[float, tuple[list[FloatArray], float]] = {}
+        self.ratio = self._ratio()
+        self._fits: dict[tuple[float, ...], Fit] = {}
+        self._best: tuple[float, FloatArray] = (math.inf, self._target)
+
+    def _through(self, x: FloatArray, derivatives: int = 0, *, held: bool = False) -> list[FloatArray]:
+        """The signal and its derivatives (per sample) in every band, (bands, rows) each, without means."""
+        passed = [f.apply(x, derivatives, held=held) for f in self._filters]
+        out = []
+        for order in range(derivatives + 1):
+            each = [one[order][self._rows] for one in passed]
+            bands = [wide - narrow for wide, narrow in pairwise(each)]
+            stacked = np.stack([*bands, each[-1]])
+            out.append(stacked - stacked.mean(axis=1, keepdims=True))
+        return out
+
+    def fit(self, scales: Scales) -> Fit:
+        """The best balance that this hypothesis allows."""
+        a, b, c, time, inertia = scales
+        B = self.motor.inertia_kg_m2 * inertia * (a / b) / (self.period_s * time) ** 2 / self._unit
+        flexible = self.motor.flexible and self._q is not None
+        ratio = a / c if flexible else a
+        key = (ratio, math.copysign(1.0, a * b), math.copysign(1.0, c * b) if flexible else 0.0, B)
+        if key not in self._fits:
+            self._fits[key] = self._solve(a, b, c, B)
+        fit = self._fits[key]
+        return fit._replace(stiffness_nm_rad=fit.stiffness_nm_rad * abs(b / c))
+
+    def _solve(self, a: float, b: float, c: float, B: float) -> Fit:
+        free = (-math.inf, math.inf)
+        low, high = sorted((B / INERTIA_FACTOR, B * INERTIA_FACTOR))
+        sense = math.copysign(1.0, a * b)
+        columns = [
+            (self._acceleration, low, high),
+            (sense * self._velocity, 0.0, math.inf),
+            (sense * self._sign, 0.0, math.inf),
+            (self._rate, *free),
+        ]
+        first, deflection = len(columns), 0.0
+        if self.motor.flexible and self._link_rate is not None:
+            ramps, deflection = self._spring(a / c)
+            columns += [(-math.copysign(1.0, b * c) * x, 0.0, math.inf) for x in ramps]
+            columns.append((self._link_rate, *free))
+            columns += [(x, *free) for x in self._position]
+        else:
+            angle = a * self._theta  # gravity of whatever moves with a rigid joint
+            loads = [self._through(x)[0] for x in (np.sin(angle), np.cos(angle))]
+            columns += [(x, *free) for x in (*loads, *self._loads)]
+        x, left = _bounded(columns, self._target)
+        slope = 0.0
+        if self.motor.flexible:
+            pieces = x[first : first + _SEGMENTS + 2]
+            slope = float(np.mean(pieces[:_SEGMENTS]) + np.sum(pieces[_SEGMENTS:])) * self._unit
+        errors = np.hypot(left.std(axis=1), _FLOOR)
+        score = float(np.sum(np.log(errors)))
+        if score < self._best[0]:
+            self._best = score, left
+        return Fit(errors, float(left.sum(axis=0).std()), float(x[0]) / B, slope, deflection)
+
+    def _spring(self, ratio: float) -> tuple[list[FloatArray], float]:
+        """Pieces of a rising curve of q_m - ratio theta_m; its size over the motion's.
+
+        Two straight ones more, of the ratio a little less and a little more: any scale error of an encoder in
+        between is a sum of the two with positive weights.
+        """
+        if ratio not in self._springs:
+            assert self._q is not None
+            phi = self._q - ratio * self._theta
+            ramps = [self._through(x)[0] for x in _pieces(phi)]
+            ends = (ratio * (1.0 - _RATIO), ratio * (1.0 + _RATIO))
+            ramps += [self._through(self._q - end * self._theta)[0] for end in ends]
+            moved = math.hypot(float(self._q.std()), abs(ratio) * float(self._theta.std()))
+            self._springs[ratio] = (ramps, float(phi.std()) / max(moved, 1e-300))
+        return self._springs[ratio]
+
+    def _ratio(self) -> float | None:
+        """Link over motor position as the balance has it: the torque knows q_m and theta_m apart."""
+        if self._q is None or not self.motor.flexible or self._link_rate is None:
+            return None
+        free = (-math.inf, math.inf)
+        q, theta = (self._through(x)[0] for x in (self._q, self._theta))
+        nuisances = (self._acceleration, self._velocity, self._sign, self._rate, self._link_rate)
+        x, _ = _bounded([(c, *free) for c in (*nuisances, q, theta)], self._target)
+        return float(-x[-1] / x[-2]) if x[-2] else None
+
+    @property
+    def independent(self) -> FloatArray:
+        """(bands,) effective number of independent samples in what the best hypothesis leaves.
+
+        n / sum r_k² over all lags, with the autocorrelation r of each band's residual.
+        """
+        return np.array([_independent(x) for x in self._best[1]])
+
+
+def _pieces(x: FloatArray) -> list[FloatArray]:
+    """Straight pieces between evenly spaced knots: sums of them are any curve of x."""
+    low, high = np.quantile(x, (0.002, 0.998))
+    width = max((high - low) / _SEGMENTS, 1e-300)
+    unders = [-np.inf, *[0.0] * (_SEGMENTS - 1)]
+    overs = [*[width] * (_SEGMENTS - 1), np.inf]
+    return [
+        np.clip(x - (low + k * width), under, over)
+        for k, (under, over) in enumerate(zip(unders, overs, strict=True))
+    ]
+
+
+def _independent(x: FloatArray) -> float:
+    size = 1 << (2 * len(x) - 1).bit_length()
+    r = np.fft.irfft(np.abs(np.fft.rfft(x - x.mean(), size)) ** 2)[: max(2, len(x) // 4)]
+    r = r / max(r[0], 1e-300)
+    return float(len(x) / (2.0 * float(r @ r) - 1.0))
+
+
+def _bounded(
+    columns: list[tuple[FloatArray, float, float]], target: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Least squares within bounds, every band weighted by what it leaves: (x, left (bands, rows))."""
+    A = np.stack([c[0] for c in columns], axis=-1)
+    size = np.sqrt(np.mean(A**2, axis=(0, 1)))
+    size[size == 0.0] = 1.0
+    A = A / size
+    low, high = (np.array([c[k] for c in columns]) * size for k in (1, 2))
+    joined = np.concatenate((A, target[..., None]), axis=-1)
+    grams = np.matmul(np.swapaxes(joined, 1, 2), joined) / A.shape[1]
+    weights = 1.0 / np.maximum(grams[:, -1, -1], _FLOOR**2)
+    k = A.shape[-1]
+    for _ in range(_ROUNDS):
+        gram = np.einsum("b,bij->ij", weights, grams)
+        values, vectors = np.linalg.eigh(gram[:k, :k])
+        keep = values > 1e-12 * values[-1]
+        root = np.sqrt(values[keep])
+        R = root[:, None] * vectors[:, keep].T
+        x = lsq_linear(R, (vectors[:, keep].T @ gram[:k, k]) / root, (low, high), method="bvls").x
+        full = np.append(-x, 1.0)
+        weights = 1.0 / (np.einsum("i,bij,j->b", full, grams, full) + _FLOOR**2)
+    return x / size, target - A @ x
+
+
+def _gridded(record: Record, x: FloatArray) -> FloatArray:
+    """Bridged by lines over gaps, without its mean."""
+    grid = np.arange(record.sequence[0], record.sequence[-1] + 1)
+    good = np.isfinite(x)
+    return np.asarray(np.interp(grid, record.sequence[good], x[good]))
+
+
+def _detrended(x: FloatArray) -> FloatArray:
+    """Without its straight line: what is left of a turning motion is what goes to and fro."""
+    k = np.arange(len(x)) - 0.5 * (len(x) - 1)
+    return np.asarray(x - x.mean() - k * (float(k @ x) / max(float(k @ k), 1.0)))
+
+
+def _rows(record: Record, settling: int) -> NDArray[np.intp]:
+    """Rows that are looked at: not the filter's start, not gaps."""
+    sequence = record.sequence - record.sequence[0]
+    usable = np.ones(int(sequence[-1]) + 1, dtype=bool)
+    for k in np.flatnonzero(np.diff(sequence) > _GAP):
+        usable[sequence[k] : sequence[k + 1] + 1] = False
+    usable[: min(settling, len(usable) // 4)] = False
+    rows = np.flatnonzero(usable)
+    return rows[:: max(1, len(rows) // _ROWS)]
+
+
+def _sense(theta: FloatArray, filter_: StateVariableFilter) -> FloatArray:
+    """Direction of the motion: tanh of the velocity over a small share of its largest."""
+    velocity = filter_.apply(theta, 1)[1]
+    largest = float(np.max(np.abs(velocity))) or 1.0
+    return np.asarray(np.tanh(velocity / (_FRICTION_SPEED * largest)))
+
+
+def _noise(x: FloatArray) -> float:
+    """Standard deviation of a position's noise: white, from third differences; or its steps, if larger."""
+    steps = np.abs(np.diff(x))
+    steps = steps[steps > 1e-9 * max(float(np.ptp(x)), 1e-300)]
+    step = float(np.min(steps)) if len(steps) else 0.0
+    return max(float(np.sqrt(np.mean(np.diff(x, 3) ** 2) / 20.0)), step / math.sqrt(12.0))
+
+
+def _filters(theta: FloatArray) -> list[StateVariableFilter]:
+    """From the widest whose upper band has an acceleration that is no noise, downwards."""
+    noise = _noise(theta)
+
+    def acceleration(w: float) -> tuple[FloatArray, FloatArray]:
+        f = StateVariableFilter(_ORDER, w, 1.0)
+        return f.apply(theta, 2)[2], f.impulse(f.settling_periods)[:, 2]
+
+    w, least = 1.0, 60.0 / len(theta)
+    wide, pulse = acceleration(w)
+    while w / _OCTAVES > least:
+        narrow, other = acceleration(w / _OCTAVES)
+        pulse = np.pad(pulse, (0, len(other) - len(pulse)))
+        if noise**2 * float(np.sum((pulse - other) ** 2)) < _NOISE * float(
+            np.var((wide - narrow)[len(other) :])
+        ):
+            break
+        w, wide, pulse = w / _OCTAVES, narrow, other
+    widths = [w / _OCTAVES**k for k in range(_BANDS)]
+    return [StateVariableFilter(_ORDER, x, 1.0) for x in widths if x > least or x == w]

@@ -1,0 +1,266 @@
+"""Which hypothesis about units, signs, gears and time explains a recording: the one gate before any fit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import numpy as np
+
+from estimator.errors import EstimatorError
+from estimator.gate.causes import Cause, Change, Kind, causes, scales
+from estimator.gate.evidence import Balance, Fit, Scales
+from estimator.model import JointModel, Motor
+from estimator.sample import FloatArray, Record
+from estimator.transmissions import transmission_model
+
+__all__ = ["Finding", "GateError", "examine", "refuse"]
+
+_DECISIVE = 6.0  # nats over "as declared": 400 to 1
+_LEAST_ROWS = 300  # a shorter recording tells nothing to nobody
+_ALIKE = 3.0  # nats (20 to 1) between causes that the data do not tell apart
+_LEFT = 0.8  # of the torque that a joint put right may leave: what explains less explains nothing
+# Errors of the model are alike in every period of a motion: no band counts for more than so many samples.
+_INDEPENDENT = 30.0
+_RIGID = (
+    8.0  # samples that the size of the deflection counts for: transmissions bend little against the motion
+)
+# Where joints are, as decades about a centre (one standard deviation). None decides by itself.
+_INERTIA = 1.5  # factor: how far a declared inertia is usually off, other effects that imitate it included
+_ACCELERATION = (30.0, 10.0)  # rad/s², factor: rms torque over motor inertia, from robots to small drives
+_FREQUENCY = (10.0, 6.0)  # Hz, factor: sqrt(K/B)/(2 pi)
+_NO_SPRING = 4.5  # nats against a flexible joint without a stiffness
+_DECLARED_STIFFNESS = 2.0  # factor
+_ARC = (2.0 * math.pi, 3.0)  # rad, factor: of a motion to and fro
+_DECLARED_PERIOD = 4.0  # factor: of the sampling period against the declared one
+_PERIOD = (3e-3, 8.0)  # s, factor: of a sampling period where none is declared
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """One thing that is wrong with a recording or with what is declared.
+
+    Attributes:
+        kind: "unit", "sign", "gear" or "period".
+        what: in words, e.g. "looks like degrees, expected rad".
+        changes: true over recorded value, channel by channel: the correction.
+        motors: of the joint.
+        log_odds: nats by which the joint put right is likelier than as declared, all findings together.
+        left_before: rms of what the balance leaves of the torque as declared.
+        left_after: and put right.
+        alternatives: other causes that explain the data as well.
+    """
+
+    kind: Kind
+    what: str
+    changes: tuple[Change, ...]
+    motors: int
+    log_odds: float
+    left_before: float
+    left_after: float
+    alternatives: tuple[tuple[Change, ...], ...] = ()
+
+    @property
+    def subject(self) -> str:
+        """What is concerned, in words: "motor 1's torque", "the positions"."""
+        return _named(self.changes, self.motors)
+
+    def __str__(self) -> str:
+        text = f"{self.subject} {self.what}"
+        if len(self.changes) > 1:
+            for one, many in (("looks", "look"), ("has", "have"), ("is", "are"), ("does", "do")):
+                text = text.replace(f" {one} ", f" {many} ", 1)
+        others = [_named(changes, self.motors) for changes in self.alternatives]
+        if others := [name for name in dict.fromkeys(others) if name != self.subject]:
+            text += f" (or else: {' or '.join(others)}; this motion does not tell)"
+        return text
+
+
+def _named(changes: Sequence[Change], motors: int) -> str:
+    names = [change.channel.partition("_") for change in changes]
+    kinds = {kind or whose for whose, _, kind in names}
+    whose = [w for w, _, _ in names]
+    if kinds == {"position"} and len(names) > 1:
+        return "the positions" if "link" in whose else "the motor positions"
+    if len(kinds) == 1 and len(names) > 1:
+        return f"the motor {kinds.pop()}s"
+    words = {"time": "time", "link": "the link position"}
+    if motors == 1:
+        words["motor1"] = "the motor"
+    parts = []
+    for w, _, kind in names:
+        who = words.get(w) or f"the {w.replace('motor', 'motor ')}"
+        parts.append(f"{who} {kind}" if w.startswith("motor") else who)
+    return " and ".join(parts)
+
+
+class GateError(EstimatorError):
+    """Units, signs, gear ratio or time of a recording do not fit the joint as declared.
+
+    Attributes:
+        findings: what is wrong, with the correction of each channel.
+        record: with which recording.
+    """
+
+    def __init__(self, findings: Sequence[Finding], record: Record) -> None:
+        self.findings = tuple(findings)
+        self.record = record
+        first = self.findings[0]
+        what = ", and ".join(str(finding) for finding in self.findings)
+        super().__init__(
+            f"{what}: the torque balance leaves {first.left_before:.0%} of the torque as declared, "
+            f"{first.left_after:.1%} with that put right"
+        )
+
+
+@dataclass(slots=True)
+class _Joint:
+    """A recording's balances, and what is known of the joint beside them."""
+
+    record: Record
+    model: JointModel
+    balances: dict[int, Balance]
+    counts: dict[int, FloatArray] = field(default_factory=dict)
+
+    def fits(self, found: Sequence[Cause]) -> dict[int, tuple[Scales, Fit]]:
+        out = {}
+        for i, balance in self.balances.items():
+            s = scales(found, i)
+            out[i] = (s, balance.fit(s))
+        return out
+
+    def evidence(self, found: Sequence[Cause]) -> float:
+        """log of probability, up to a constant: likelihood, and how usual such a joint is."""
+        total = -sum(cause.cost for cause in found)
+        for i, (s, fit) in self.fits(found).items():
+            total -= float(self.counts[i] @ np.log(fit.errors))
+            total -= self._unusual(i, s, fit)
+        period_s = self.record.period_s * scales(found, 0).time
+        if self.model.period_s is not None:
+            return total - _off(period_s / self.model.period_s, _DECLARED_PERIOD)
+        return total - _off(period_s / _PERIOD[0], _PERIOD[1])
+
+    def _unusual(self, i: int, s: Scales, fit: Fit) -> float:
+        motor, balance = self.model.motors[i], self.balances[i]
+        B = motor.inertia_kg_m2 * s.inertia
+        total = _off(abs(s.torque) * balance.torque_rms / B / _ACCELERATION[0], _ACCELERATION[1])
+        total += _off(fit.inertia, _INERTIA)
+        total += _off(max(abs(s.position) * balance.arc / _ARC[0], 1.0), _ARC[1])
+        if not motor.flexible:
+            return total
+        total += _RIGID * math.log(max(fit.deflection, 1e-6))
+        if fit.stiffness_nm_rad <= 0.0:
+            return total + _NO_SPRING
+        total += _off(math.sqrt(fit.stiffness_nm_rad / B) / (2.0 * math.pi * _FREQUENCY[0]), _FREQUENCY[1])
+        declared = _declared_stiffness(motor)
+        if declared is not None:  # heavy tails: a declared value can be a mere guess
+            x = math.log(fit.stiffness_nm_rad / declared) / math.log(_DECLARED_STIFFNESS)
+            total += 2.0 * math.log1p(x * x / 3.0)
+        return total
+
+    def left(self, found: Sequence[Cause]) -> float:
+        """The largest share of a motor's torque that its balance leaves."""
+        return max(fit.error for _, fit in self.fits(found).values())
+
+
+def examine(record: Record, model: JointModel) -> list[Finding]:
+    """What is wrong with units, signs, gear ratios or time of a recording; nothing, where nothing is.
+
+    Every hypothesis is one or two causes. It is weighed by how well the declared motor inertia (within a
+    factor), any rising transmission curve, friction that brakes and small delays explain each motor's torque
+    (eq 5, `Balance`), and by how usual a joint it makes. What is found beats "as declared" decisively, and
+    explains the torque.
+
+    Args:
+        record: the recording.
+        model: the joint as declared, with gear ratios and sampling period where they are.
+
+    Raises:
+        EstimatorError: the recording has other motors than the model.
+    """
+    if record.motors != len(model.motors):
+        raise EstimatorError(f"recording: expected {len(model.motors)} motor(s), got {record.motors}")
+    if len(record) < _LEAST_ROWS:
+        return []
+    joint = _Joint(record, model, _balances(record, model))
+    if not joint.balances:
+        return []
+    ratios = [joint.balances[i].ratio if i in joint.balances else None for i in range(len(model.motors))]
+    single = causes(model, record.link_position_rad is not None and model.has_deflection, ratios)
+    hypotheses: list[tuple[Cause, ...]] = [(), *((cause,) for cause in single)]
+    hypotheses += [pair for pair in combinations(single, 2) if not pair[0].channels & pair[1].channels]
+    for found in hypotheses:
+        joint.fits(found)
+    joint.counts = {i: np.minimum(b.independent, _INDEPENDENT) for i, b in joint.balances.items()}
+    weighed = sorted(((joint.evidence(h), h) for h in hypotheses), key=lambda e: -e[0])
+    best, found = weighed[0]
+    odds = best - joint.evidence(())
+    after = joint.left(found)
+    if odds < _DECISIVE or after > _LEFT:
+        return []
+    alike = [h for e, h in weighed[1:] if best - e < _ALIKE and len(h) == len(found)]
+    before, motors = joint.left(()), record.motors
+    return [_finding(found, k, alike, odds, before, after, motors) for k in range(len(found))]
+
+
+def refuse(record: Record, model: JointModel) -> None:
+    """Raise what is wrong with units, signs, gear ratios or time of a recording, if anything is.
+
+    Raises:
+        GateError: with the findings of `examine`.
+    """
+    findings = examine(record, model)
+    if findings:
+        raise GateError(findings, record)
+
+
+def _finding(
+    found: tuple[Cause, ...],
+    number: int,
+    alike: list[tuple[Cause, ...]],
+    odds: float,
+    before: float,
+    after: float,
+    motors: int,
+) -> Finding:
+    cause, rest = found[number], set(found) - {found[number]}
+    others = [next(iter(set(h) - rest)).changes for h in alike if len(set(h) - rest) == 1]
+    return Finding(
+        kind=cause.kind,
+        what=cause.what,
+        changes=cause.changes,
+        motors=motors,
+        log_odds=odds,
+        left_before=before,
+        left_after=after,
+        alternatives=tuple(dict.fromkeys(others)),
+    )
+
+
+def _balances(record: Record, model: JointModel) -> dict[int, Balance]:
+    """Those of the motors that move and have a torque."""
+    found = {}
+    for i, motor in enumerate(model.motors):
+        lever = 0 if model.arrangement == "serial" and i == 1 else None
+        theta, tau = record.motor_position_rad[:, i], record.motor_torque_nm[:, i]
+        if np.nanstd(theta) > 0.0 and np.nanstd(tau) > 0.0:
+            found[i] = Balance(record, i, motor, lever)
+    return found
+
+
+def _declared_stiffness(motor: Motor) -> float | None:
+    law = transmission_model(motor.transmission)
+    if law is None or not motor.transmission.parameters:
+        return None
+    try:
+        k = float(law.stiffness(np.zeros(1), law.alpha(motor.transmission.parameters))[0])
+    except (AttributeError, EstimatorError, KeyError, TypeError):
+        return None
+    return k if k > 0.0 else None
+
+
+def _off(ratio: float, factor: float) -> float:
+    """Nats that a ratio costs which is usually one, give or take a factor."""
+    return 0.5 * (math.log(max(ratio, 1e-30)) / math.log(factor)) ** 2

@@ -1,0 +1,259 @@
+"""Units, signs, gears and time: what is wrong is found and named, what is right passes.
+
+The tolerance of a factor found is 5 %: what is not a unit or a declared gear ratio is read off the motion.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import gatekit
+import numpy as np
+import pytest
+
+from drivelink import jointfile, recording
+from drivelink.cli import main
+from drivelink.gate import corrections
+from drivelink.jointfile import parse
+from estimator import JointModel, Motor, Record, Transmission
+from estimator.batch import fit
+from estimator.diagnosis import diagnose
+from estimator.gate import Change, Finding, GateError, examine
+
+ROOT = Path(__file__).resolve().parents[1]
+DATA = Path(os.environ.get("DRIVELINK_DATA", ROOT.parent / "shared" / "data"))
+DEGREE = 180.0 / math.pi
+UW = JointModel(
+    arrangement="single",
+    motors=(Motor(inertia_kg_m2=5.878e-4, transmission=Transmission(model="linear")),),
+    period_s=0.005,
+)
+MEASURED = (
+    *((f"kuka_kr300/axis{axis}_{run}.csv", f"kuka_axis{axis}") for axis in (2, 3) for run in "AB"),
+    *((f"emps/{run}.csv", "emps") for run in ("train", "pulses")),
+    *((f"uw_sea/uw_{run}.csv", "") for run in ("InnerLoop", "DoubleLoopReference", "DoubleLoopDisturbance")),
+)
+# What these recordings do not tell. The inertia takes 2 % of axis 3's torque, whose balance leaves 12 %.
+UNTOLD = {(f"kuka_kr300/axis3_{run}.csv", "torque in N·mm") for run in "AB"}
+# InnerLoop was recorded with the link held: a deflection is a motor position there.
+OF_A_HELD_LINK = {"torque in N·mm", "time in ms"}
+needs_data = pytest.mark.skipif(
+    not (DATA / "emps" / "train.csv").exists(), reason=f"no measured data in {DATA} (see $DRIVELINK_DATA)"
+)
+
+
+def same(a: float, b: float) -> bool:
+    return abs(a / b - 1.0) < 0.05
+
+
+def named(findings: list[Finding], factors: dict[str, float]) -> bool:
+    """Whether the findings, or what they say cannot be told from them, undo these factors."""
+    options = [[f.changes for f in findings]]
+    for k, finding in enumerate(findings):
+        options += [[*options[0][:k], other, *options[0][k + 1 :]] for other in finding.alternatives]
+    return any(
+        gatekit.named_rightly(factors, {c.channel: c.factor for group in option for c in group}, same)
+        for option in options
+    )
+
+
+@pytest.mark.parametrize("first", [100, 106, 112])
+@pytest.mark.parametrize("kind", gatekit.KINDS)
+def test_a_healthy_joint_passes(kind: str, first: int) -> None:
+    """Eighteen random joints of each kind: undeclared effects, late channels, inertia up to a fifth off."""
+    for seed in range(first, first + 6):
+        drawn = gatekit.draw(kind, seed, seconds=6.0)
+        assert examine(drawn.record, drawn.model) == [], (kind, seed)
+
+
+@pytest.mark.parametrize("kind", gatekit.KINDS)
+def test_each_fault_is_named(kind: str) -> None:
+    drawn = gatekit.draw(kind, 0, effects=False)
+    for name, factors in gatekit.faults(drawn).items():
+        findings = examine(gatekit.faulty(drawn.record, factors), drawn.model)
+        assert named(findings, factors), (kind, name, findings)
+
+
+def test_one_reversed_motor_of_a_pair_is_found() -> None:
+    drawn = gatekit.draw("antagonistic", 1)
+    both = {"motor2_position": -1.0, "motor2_torque": -1.0}
+    (finding,) = examine(gatekit.faulty(drawn.record, both), drawn.model)
+    assert (finding.kind, {c.channel: c.factor for c in finding.changes}) == ("sign", both)
+
+
+@pytest.mark.parametrize(
+    "factors",
+    [
+        {"motor1_position": DEGREE, "link_position": DEGREE, "motor1_torque": -1.0},
+        {"motor1_torque": 1e3, "link_position": -1.0},
+    ],
+)
+def test_two_faults_at_once_are_named(factors: dict[str, float]) -> None:
+    drawn = gatekit.draw("soft", 2)
+    assert named(examine(gatekit.faulty(drawn.record, factors), drawn.model), factors)
+
+
+@pytest.fixture(scope="module")
+def degrees() -> gatekit.Drawn:
+    drawn = gatekit.draw("soft", 3)
+    wrong = gatekit.faulty(drawn.record, {"motor1_position": DEGREE, "link_position": DEGREE})
+    return replace(drawn, record=wrong)
+
+
+def test_fit_and_diagnose_refuse_by_the_same_words(degrees: gatekit.Drawn) -> None:
+    said = []
+    for verb in (fit, diagnose):
+        with pytest.raises(GateError, match="the positions look like degrees, expected rad") as caught:
+            verb(degrees.record, degrees.model)
+        said.append(str(caught.value))
+    assert said[0] == said[1]
+
+
+def test_a_recording_too_short_to_tell_is_not_judged(degrees: gatekit.Drawn) -> None:
+    r = degrees.record
+    assert r.link_position_rad is not None
+    short = Record(
+        period_s=r.period_s,
+        sequence=r.sequence[:200],
+        motor_position_rad=r.motor_position_rad[:200],
+        motor_torque_nm=r.motor_torque_nm[:200],
+        link_position_rad=r.link_position_rad[:200],
+    )
+    assert examine(short, degrees.model) == []
+
+
+JOINT = """\
+name = "elbow"
+{scale}
+[[motor]]
+inertia_kg_m2 = {inertia}
+[motor.transmission]
+model = "polynomial"
+"""
+
+
+def _written(drawn: gatekit.Drawn, folder: Path, scale: str = "") -> tuple[Path, Path]:
+    r = drawn.record
+    assert r.link_position_rad is not None
+    table = np.column_stack([r.time_s, r.motor_position_rad, r.motor_torque_nm, r.link_position_rad])
+    header = "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad"
+    np.savetxt(folder / "run.csv", table, delimiter=",", header=header, comments="")
+    text = JOINT.format(scale=scale, inertia=drawn.model.motors[0].inertia_kg_m2)
+    (folder / "elbow.toml").write_text(text, encoding="utf-8")
+    return folder / "run.csv", folder / "elbow.toml"
+
+
+def test_the_line_to_paste_cures(
+    degrees: gatekit.Drawn, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, joint = _written(degrees, tmp_path)
+    for verb in (["fit"], ["diagnose", "--out", str(tmp_path)], ["replay", "--strict"]):
+        assert main([*verb, str(run), "--joint", str(joint)]) == 3
+        (line,) = [x for x in capsys.readouterr().err.splitlines() if "degrees" in x]
+    paste = line[line.index("recording.scale = {") : line.index("}") + 1]
+    assert paste.count("0.01745329") == 2
+    _written(degrees, tmp_path, scale=paste)
+    assert main(["fit", str(run), "--joint", str(joint)]) == 0
+
+
+def test_replay_warns_and_goes_on(
+    degrees: gatekit.Drawn, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, joint = _written(degrees, tmp_path)
+    assert main(["replay", str(run), "--joint", str(joint), "--out", str(tmp_path / "estimates.csv")]) == 0
+    assert "warning: the positions look like degrees" in capsys.readouterr().err
+    assert (tmp_path / "estimates.csv").exists()
+
+
+DRIVES = """\
+name = "elbow"
+arrangement = "antagonistic"
+[[motor]]
+inertia_kg_m2 = 0.1
+[motor.drive]
+node_id = 1
+[[motor]]
+inertia_kg_m2 = 0.1
+[motor.drive]
+node_id = 2
+gear_ratio = 50.0
+counts_per_rev = 4096.0
+torque_constant_nm_a = 40.0
+[link.encoder]
+node_id = 1
+"""
+
+
+@pytest.mark.parametrize(
+    ("changes", "lines"),
+    [
+        ({"motor1_torque": -1.0}, ["motor[1].drive.torque_direction = -1"]),
+        (
+            {"motor1_position": -1.0},
+            ["motor[1].drive.direction = -1", "motor[1].drive.torque_direction = 1"],
+        ),
+        ({"motor2_position": -1.0, "motor2_torque": -1.0}, ["motor[2].drive.direction = -1"]),
+        ({"motor2_torque": 1e-3}, ["motor[2].drive.torque_constant_nm_a = 0.04"]),
+        ({"motor2_position": 0.02, "motor2_torque": 50.0}, ["motor[2].drive.gear_ratio = 2500"]),
+        ({"motor2_position": 50.0}, ["motor[2].drive.counts_per_rev = 81.92"]),
+        ({"link_position": -1.0}, ["link.encoder.direction = -1"]),
+        ({"motor1_inertia": 2500.0}, ["motor[1].inertia_kg_m2 = 250"]),
+    ],
+)
+def test_what_comes_from_drives_is_corrected_at_the_drive(
+    changes: dict[str, float], lines: list[str]
+) -> None:
+    finding = Finding(
+        kind="sign",
+        what="",
+        changes=tuple(Change(k, v) for k, v in changes.items()),
+        motors=2,
+        log_odds=10.0,
+        left_before=1.0,
+        left_after=0.0,
+    )
+    assert [str(c) for c in corrections(parse(DRIVES), [finding], live=True)] == lines
+
+
+def _measured(path: str, joint: str) -> tuple[Record, JointModel]:
+    if not joint:
+        return recording.read(DATA / path), UW
+    declared = jointfile.load(ROOT / "examples" / f"{joint}.toml")
+    record = recording.read(DATA / path, declared)
+    return record, replace(declared.model(), period_s=record.period_s)
+
+
+@needs_data
+@pytest.mark.parametrize(("path", "joint"), MEASURED)
+def test_a_real_machine_passes_as_it_is_and_no_fault_of_it_does(path: str, joint: str) -> None:
+    record, model = _measured(path, joint)
+    assert examine(record, model) == []
+    for name, factors in _faults(record).items():
+        if (path, name) in UNTOLD or ("InnerLoop" in path and name not in OF_A_HELD_LINK):
+            continue
+        findings = examine(gatekit.faulty(record, factors), model)
+        assert findings, name
+        if record.link_position_rad is not None:  # with one encoder, only scales of inertia can be told
+            assert named(findings, factors), (name, findings)
+
+
+def _faults(record: Record) -> dict[str, dict[str, float]]:
+    linked = record.link_position_rad is not None
+    found = {
+        "positions in degrees": {"motor1_position": DEGREE} | ({"link_position": DEGREE} if linked else {}),
+        "torque in N·mm": {"motor1_torque": 1e3},
+        "time in ms": {"time": 1e3},
+        "position reversed": {"motor1_position": -1.0},
+        "torque reversed": {"motor1_torque": -1.0},
+        "position at the shaft": {"motor1_position": 100.0},
+    }
+    if linked:
+        found |= {
+            "motor in degrees": {"motor1_position": DEGREE},
+            "link in degrees": {"link_position": DEGREE},
+            "link reversed": {"link_position": -1.0},
+        }
+    return found

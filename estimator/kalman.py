@@ -32,16 +32,22 @@ class ColouredKalman:
         std: its standard deviations, (n,): no more uncertainty than this is ever assumed.
         noise: standard deviation of e assumed at the start.
         forgetting: growth of P from one update to the next, at least 1.
+        steady: places, counted from the end (negative), of parameters that are not forgotten.
 
     Attributes:
         caution: how much larger a variance is than Sigma has it, as few independent errors have told it.
     """
 
-    def __init__(self, mean: FloatArray, std: FloatArray, noise: float, forgetting: float) -> None:
+    def __init__(
+        self, mean: FloatArray, std: FloatArray, noise: float, forgetting: float, steady: tuple[int, ...] = ()
+    ) -> None:
         self.x = mean.astype(np.float64)
         self.ceiling = np.square(std)
         self.noise = noise * noise
-        self._growth = forgetting
+        self._growth, self._steady = forgetting, steady
+        root = np.full(mean.size, math.sqrt(forgetting))
+        root[list(steady)] = 1.0
+        self._grow = np.outer(root, root)
         self._n = n = mean.size
         self.P = np.diag(self.ceiling)
         self._Ph: FloatArray | None = None  # of the equation at hand, while P is as it was
@@ -105,18 +111,18 @@ class ColouredKalman:
         `account` follows, at leisure, but before the next equation.
         """
         Ph = self._Ph if self._Ph is not None else self.P @ h
-        spread = self._growth * float(h @ Ph)
+        spread = float(h @ Ph)
         if spread < 0.0:  # rounding has eaten a variance
             self.repair()
             Ph = self.P @ h
-            spread = self._growth * float(h @ Ph)
+            spread = float(h @ Ph)
         self._Ph = None
         noise = max(self.noise, floor)
-        gain = Ph * (self._growth / (spread + noise))
+        gain = Ph / (spread + noise)
         self.x += gain * innovation
         P = self.P
         P -= gain[:, None] * Ph
-        P *= self._growth
+        P *= self._grow
         self._pending = (h, gain, noise)
 
     def prepare(self) -> None:
@@ -205,7 +211,7 @@ class ColouredKalman:
             change: their slopes by the old ones, (m, n).
         """
         self.account()
-        new = ColouredKalman(mean, std, math.sqrt(self._assumed), self._growth)
+        new = ColouredKalman(mean, std, math.sqrt(self._assumed), self._growth, self._steady)
         new.noise, new._count, new.caution = self.noise, self._count, self.caution
         new._r[:], new._past[:] = self._r, self._past
         new.P = change @ self.P @ change.T

@@ -236,7 +236,8 @@ class Regression:
         if self._cut_off:
             std[n - 1] = _CUT_OFF_SHARE
         std[n:] = self._nuisance_std()
-        self.filter = ColouredKalman(mean, std, _NOISE_SHARE, self._forgetting)
+        steady = () if self._black_box else (NUISANCES.index("inertia") - len(NUISANCES),)
+        self.filter = ColouredKalman(mean, std, _NOISE_SHARE, self._forgetting, steady)
         self._remember_tangent()
 
     def adopt(self, alpha: FloatArray, slopes: FloatArray, model: TransmissionModel) -> None:

@@ -42,6 +42,8 @@ _RESTED_S = 0.05  # without motion: from then on the interval grows
 _WIDEST = 0.02  # … up to this
 _ASTRAY_S = 1.0  # of updates with parameters that cannot be, after which it starts anew
 _EXPLAINED_S = 0.3  # over which the curve is held against the balance
+_SURPRISING = 3.0  # standard deviations, on average over that: the balance is not explained any more
+_TWICE = 2.0  # times that: the most that one innovation counts, and what it counts during a flush
 _FIRST_S = 0.12  # of updates that are not held against a curve which has only begun
 _VARIES_S = 2.0  # over which the balance's variance is taken: a constant torque tells no stiffness …
 _VARIED_S = 30.0  # … and how long a lively phase is remembered
@@ -131,6 +133,7 @@ class Track:
         self._taken: tuple[FloatArray, float] | None = None
         self._delay_at = 0
         self._pending: tuple[FloatArray, float, float, bool, bool, float] | None = None
+        self._surprise = 1.0  # mean square of the innovations over what is foreseen of it
         self._mean = self._varies = self._varied = self._missed_square = 0.0
         self._missing = self._strange = 0
         self._contradicted = False  # whether the data want another motor than the declared one
@@ -245,9 +248,11 @@ class Track:
             self._hold_against(y, innovation, telling)
         spread = kalman.spread(h)
         self._watch(innovation, spread, kalman.noise, usable, late_s)
+        if usable and self._updates >= self._settled:
+            self._compare(innovation, kalman.noise + spread)
         if telling and self._flush <= 0.0:
             self._held_s = 0.0
-            if self._follow <= 0.0:
+            if self._follow <= 0.0 and not self.suspicious:
                 kalman.learn_noise(innovation, spread)
             self._taken = h, innovation
         kalman.remember(innovation, spread)
@@ -304,6 +309,20 @@ class Track:
         elif telling and self._follow <= 0.0:
             self._missing += 1
 
+    def _compare(self, innovation: float, foreseen: float) -> None:
+        """The normalised innovation squared, averaged."""
+        most = (_TWICE * _SURPRISING) ** 2
+        square = most if self._flush > 0.0 else innovation * innovation / (foreseen + _ALARM_SHARE**2)
+        self._surprise += min(1.0, self._dt / _EXPLAINED_S) * (min(square, most) - self._surprise)
+
+    @property
+    def suspicious(self) -> bool:
+        """Whether the balance is not explained within its own interval.
+
+        That interval is the one of good times: the noise is not learned from what is suspicious.
+        """
+        return self._surprise > _SURPRISING**2
+
     @property
     def explains(self) -> bool:
         """Whether the curve leaves only a part of the balance unexplained."""
@@ -325,7 +344,7 @@ class Track:
         self._reach = _BEYOND * self.regression.deflection_peak
         if not isinstance(self._basis, Polynomial):
             self._reach = min(self._reach, _EDGE * self._basis.reach(self.regression.alpha[1:].tolist()))
-        if self._contradicted or not self.explains:
+        if self._contradicted or self.suspicious or not self.explains:
             self._reach = 0.0
 
     def _watch(self, innovation: float, spread: float, noise: float, usable: bool, late_s: float) -> None:

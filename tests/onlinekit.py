@@ -5,13 +5,14 @@ Everything goes through the public interface, `make_estimator(...).step`, so it 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from drivelink._core import Assembler, Chain
+from drivelink.cycle.chain import Watch
 from estimator import (
     Estimator,
     EstimatorSettings,
@@ -24,6 +25,8 @@ from estimator import (
 )
 from sim.cases import case
 from sim.effects import PlantEffect
+from sim.plant import JointPlant
+from sim.springs import Spring
 from sim.world import record
 
 VALID, OBSERVABLE = int(Status.VALID), int(Status.OBSERVABLE)
@@ -61,6 +64,7 @@ def motion(
     bits: int | None = None,
     noise: bool = True,
     effects: Sequence[PlantEffect] = (),
+    step: tuple[float, float] | None = None,
 ) -> Motion:
     """One of the paper's cases in rich motion.
 
@@ -72,6 +76,7 @@ def motion(
         bits: of the encoders at motor and link alike, per revolution of the joint; None: the case's own.
         noise: whether current and encoders have any besides their steps (one count where `bits` is given).
         effects: physics that the case does not have.
+        step: (time, factor) of a change of the stiffness.
     """
     given = case(name)
     drives, encoder = given.drives, given.encoder
@@ -82,7 +87,14 @@ def motion(
         drives = tuple(replace(d, current_noise_a=0.0, current_resolution_a=1e-9) for d in drives)
     rich = given.rich if excitation is None else excitation
     world = replace(given, drives=drives, encoder=encoder).world(excitation=rich, effects=effects, seed=seed)
-    rows = record(world, seconds)
+    if step is None:
+        rows = record(world, seconds)
+    else:
+        before = record(world, step[0])
+        world.advance()
+        world.alter(plant=_stiffer(given.plant, step[1]))
+        after = record(world, seconds - step[0])
+        rows = {name: np.concatenate([before[name], after[name]]) for name in before}
     motors = range(1, len(drives) + 1)
 
     def stacked(quantity: str) -> list[tuple[float, ...]]:
@@ -103,6 +115,19 @@ def motion(
     return Motion(samples, rows["truth_stiffness_nm_rad"], rows["truth_flexibility_torque_nm"])
 
 
+def _stiffer(plant: JointPlant, factor: float) -> JointPlant:
+    """The joint with springs that are stiffer by a factor."""
+    motors = []
+    for motor in plant.motors:
+        parameters = dict(motor.spring.parameters)
+        for key in ("k_nm_rad", "coefficients_nm_rad"):
+            if key in parameters:
+                scaled = factor * np.asarray(parameters[key])
+                parameters[key] = tuple(scaled.tolist()) if scaled.ndim else float(scaled)
+        motors.append(replace(motor, spring=Spring(model=motor.spring.model, parameters=parameters)))
+    return replace(plant, motors=tuple(motors))
+
+
 def declared(name: str, **transmission: Any) -> JointModel:
     """The model of a case as a joint file would declare it; `transmission` as for `Transmission`."""
     plant = case(name).plant
@@ -119,12 +144,15 @@ def declared(name: str, **transmission: Any) -> JointModel:
     return JointModel(arrangement=plant.arrangement, motors=motors)
 
 
-def play(model: JointModel, samples: Iterable[Sample], **settings: Any) -> tuple[Told, Estimator]:
-    """An estimator's word on these samples, and the estimator."""
+def play(
+    model: JointModel, samples: Iterable[Sample], *, watch: Watch | None = None, **settings: Any
+) -> tuple[Told, Estimator]:
+    """An estimator's word on these samples, with a watch's as the service adds it, and the estimator."""
     estimator = make_estimator(model, EstimatorSettings(**settings), PERIOD_S)
+    chain = Chain(Assembler((), 0), estimator, watch)  # what it is given are samples already
     rows = []
     for sample in samples:
-        e = estimator.step(sample)
+        e = chain.take(sample).estimate
         rows.append((e.status, e.flexibility_torque_nm, e.stiffness_nm_rad, e.stiffness_std_nm_rad))
     status, torque, stiffness, std = np.array(rows).T
     return Told(status.astype(int), torque, stiffness, std), estimator
@@ -141,8 +169,3 @@ def without(samples: Sequence[Sample], share: float, seed: int) -> tuple[list[Sa
     """The samples with whole cycles lost at random, and the places of those that are left."""
     kept = np.flatnonzero(np.random.default_rng(seed).random(len(samples)) >= share)
     return [samples[k] for k in kept], kept
-
-
-def nothing_lost(sample: Sample) -> bool:
-    """Whether a sample holds what its joint needs."""
-    return all(map(math.isfinite, (*sample.motor_position_rad, *sample.motor_torque_nm)))

@@ -17,7 +17,7 @@ import pytest
 
 from drivelink import jointfile, recording
 from drivelink.errors import JointFileError
-from estimator import EstimatorSettings, Motor, Record, Transmission, fit, make_estimator
+from estimator import EstimatorSettings, Motor, Record, Status, Transmission, fit, make_estimator
 from estimator.errors import EstimatorError
 from sim.cases import CASES, case
 
@@ -103,3 +103,22 @@ def test_a_joint_file_with_a_stiffness_below_zero_is_neither_read_nor_written():
     )
     with pytest.raises(JointFileError, match=r"motor.*expected a stiffness above 0 N·m/rad, got -5"):
         jointfile.parse(text)
+
+
+class _Alarm:
+    """A watch whose alarm is always on."""
+
+    def step(self, sample, estimate, residual_nm):
+        return True
+
+    def describe(self):
+        return {}
+
+
+def test_valid_and_the_model_alarm_do_not_stand_together():
+    motion = kit.motion("constant", 3.0)
+    quiet, _ = kit.play(kit.declared("constant"), motion.samples)
+    alarmed, _ = kit.play(kit.declared("constant"), motion.samples, watch=_Alarm())
+    assert np.any(quiet.valid)
+    assert np.all(alarmed.status & int(Status.MODEL_ALARM))
+    assert not np.any(alarmed.valid)

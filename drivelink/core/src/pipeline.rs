@@ -189,6 +189,7 @@ pub fn estimate(estimator: &mut dyn Step, sample: &Sample, mut flags: u32) -> Re
     let mut estimate = estimator.step(sample)?;
     if estimator.alarm(sample, &estimate)? {
         flags |= MODEL_ALARM;
+        estimate.status &= !VALID; // a model that is not sufficient makes no number that may be used
     }
     estimate.status |= flags;
     Ok(estimate)

@@ -1,0 +1,223 @@
+"""Plausible lies of one signal, and true changes of the joint: what is wrong and still called valid?
+
+Health first, then one fault, in lockstep on the project's simulated joints, through the public interface. A fault is
+a function of the signal's values from its begin on. Signals are motor position, motor torque and link position; of a
+joint with two motors it is the first one's.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import lru_cache, partial
+from typing import NamedTuple
+
+import numpy as np
+import onlinekit as kit
+
+from estimator import JointModel, Record, fit
+from estimator.diagnosis import calibrate
+from estimator.model import Transmission
+from estimator.sample import Sample, Status
+from estimator.watch import Floor, ResidualWatch, measure_floor
+
+__all__ = ["FAULTS", "JOINTS", "SIGNALS", "STEPS", "Fault", "Outcome", "faults", "outcome", "stepped"]
+
+SIGNALS = ("motor", "torque", "link")
+JOINTS = ("constant", "vsa-ii", "vsa-ii fitted")
+STEPS = (0.5, 0.7, 1.4, 2.0, 3.0)  # true changes of the stiffness
+FLAGS = int(Status.CHANGED | Status.MODEL_ALARM | Status.INPUT_REJECTED | Status.RESTARTED | Status.GAP)
+T = kit.PERIOD_S
+
+Values = np.ndarray
+Spoil = Callable[
+    [Values, float, np.random.Generator], Values
+]  # (values, largest healthy one, random) -> values
+
+
+class Fault(NamedTuple):
+    """A fault: its kind with its size, the signals that it hits, what it does."""
+
+    name: str
+    signals: tuple[str, ...]
+    spoil: Spoil
+
+
+class Outcome(NamedTuple):
+    """Samples from the begin of a fault on: valid ones, wrong ones of these, those without any flag at all."""
+
+    samples: int
+    valid: int
+    wrong: int
+    silent: int
+
+
+def _frozen_noisy(x: Values, size: float, rng: np.random.Generator, share: float) -> Values:
+    return x[0] + share * size * rng.normal(size=len(x))
+
+
+def _stuck(x: Values, size: float, rng: np.random.Generator) -> Values:
+    return np.full_like(x, x[0])
+
+
+def _drift(x: Values, size: float, rng: np.random.Generator, per_s: float) -> Values:
+    return x + per_s * T * np.arange(len(x))
+
+
+def _offset(x: Values, size: float, rng: np.random.Generator, share: float) -> Values:
+    return x + share * size
+
+
+def _gain(x: Values, size: float, rng: np.random.Generator, factor: float) -> Values:
+    return factor * x
+
+
+def _gain_drifts(x: Values, size: float, rng: np.random.Generator, to: float) -> Values:
+    return x * np.linspace(1.0, to, len(x))
+
+
+def _slip(x: Values, size: float, rng: np.random.Generator, share: float, every_s: float) -> Values:
+    steps = np.arange(len(x)) // round(every_s / T) if every_s else np.ones(len(x))
+    return x + share * size * steps
+
+
+def _spikes(x: Values, size: float, rng: np.random.Generator, rate: float) -> Values:
+    hit = rng.random(len(x)) < rate
+    return x + np.where(hit, rng.choice([-1.0, 1.0], len(x)) * size, 0.0)
+
+
+def _late(x: Values, size: float, rng: np.random.Generator, periods: int) -> Values:
+    return np.concatenate([np.full(periods, x[0]), x[:-periods]])
+
+
+def _noise(x: Values, size: float, rng: np.random.Generator, share: float) -> Values:
+    return x + share * size * rng.normal(size=len(x))
+
+
+def _coarse(x: Values, size: float, rng: np.random.Generator, share: float) -> Values:
+    return np.round(x / (share * size)) * share * size
+
+
+def _slow(x: Values, size: float, rng: np.random.Generator, periods: int) -> Values:
+    return x[np.arange(len(x)) // periods * periods]
+
+
+def faults() -> Iterator[Fault]:
+    """All of them."""
+    for signal in SIGNALS:
+        one = (signal,)
+        yield Fault("frozen with noise", one, partial(_frozen_noisy, share=1e-4))
+        yield Fault("stuck", one, _stuck)
+        for per_s in (0.01, 0.1) if signal != "torque" else ():
+            yield Fault(f"drift {per_s:g} rad/s", one, partial(_drift, per_s=per_s))
+        for share in (0.02, 0.1):
+            yield Fault(f"offset {share:.0%}", one, partial(_offset, share=share))
+        for factor in (0.75, 0.9, 1.1, 1.25):
+            yield Fault(f"gain {factor:g}", one, partial(_gain, factor=factor))
+        yield Fault("gain drifts to 1.25", one, partial(_gain_drifts, to=1.25))
+        yield Fault("sign", one, partial(_gain, factor=-1.0))
+        for periods in (1, 3, 10):
+            yield Fault(f"late by {periods}", one, partial(_late, periods=periods))
+        for rate in (1e-3, 1e-2, 0.1):
+            yield Fault(f"spikes {rate:g}", one, partial(_spikes, rate=rate))
+        yield Fault("noise 1 %", one, partial(_noise, share=0.01))
+        yield Fault("steps of 2 %", one, partial(_coarse, share=0.02))
+        yield Fault("every 10th", one, partial(_slow, periods=10))
+        if signal != "torque":
+            yield Fault("slips once", one, partial(_slip, share=0.1, every_s=0.0))
+            yield Fault("slips each second", one, partial(_slip, share=0.02, every_s=1.0))
+    yield Fault("late by 3", ("motor", "torque"), partial(_late, periods=3))
+    yield Fault("gain 0.9", ("motor", "link"), partial(_gain, factor=0.9))
+    yield Fault("noise 1 %", SIGNALS, partial(_noise, share=0.01))
+
+
+FAULTS = tuple(faults())
+
+
+@lru_cache(maxsize=8)
+def _healthy(name: str, seconds: float, seed: int) -> kit.Motion:
+    return kit.motion(name, seconds, seed=seed)
+
+
+@lru_cache(maxsize=2)
+def _fitted(name: str) -> tuple[JointModel, Floor]:
+    """As `fit --write` leaves it: fitted and calibrated on another run, with the floor of its model."""
+    motion = kit.motion(name, 20.0, seed=99)
+    record = Record(
+        period_s=T,
+        sequence=np.arange(len(motion.samples)),
+        motor_position_rad=np.array([s.motor_position_rad for s in motion.samples]),
+        motor_torque_nm=np.array([s.motor_torque_nm for s in motion.samples]),
+        link_position_rad=np.array([s.link_position_rad for s in motion.samples]),
+    )
+    declared = kit.declared(name, parameters={})
+    motors = tuple(
+        replace(motor, transmission=Transmission(model=one.model, parameters=one.parameters))
+        for motor, one in zip(declared.motors, fit(record, declared), strict=True)
+    )
+    model = calibrate(record, replace(declared, motors=motors))
+    return model, measure_floor(record, model)
+
+
+def _spoilt(samples: list[Sample], begin: int, fault: Fault, seed: int) -> list[Sample]:
+    rng = np.random.default_rng([seed, zlib.crc32(f"{fault.name} {fault.signals}".encode())])
+    out = samples[:begin]
+    columns = {
+        "motor": np.array([s.motor_position_rad[0] for s in samples]),
+        "torque": np.array([s.motor_torque_nm[0] for s in samples]),
+        "link": np.array([s.link_position_rad for s in samples]),
+    }
+    for signal in fault.signals:
+        x = columns[signal]
+        columns[signal][begin:] = fault.spoil(x[begin:].copy(), float(np.max(np.abs(x[:begin]))), rng)
+    for k in range(begin, len(samples)):
+        s = samples[k]
+        out.append(
+            s._replace(
+                motor_position_rad=(float(columns["motor"][k]), *s.motor_position_rad[1:]),
+                motor_torque_nm=(float(columns["torque"][k]), *s.motor_torque_nm[1:]),
+                link_position_rad=float(columns["link"][k]),
+            )
+        )
+    return out
+
+
+def outcome(joint: str, fault: Fault | None, health_s: float, fault_s: float, seed: int = 0) -> Outcome:
+    """Health, then the fault (None: more health)."""
+    name = joint.removesuffix(" fitted")
+    motion = _healthy(name, health_s + fault_s, seed)
+    begin = round(health_s / T)
+    samples = motion.samples if fault is None else _spoilt(motion.samples, begin, fault, seed)
+    return _count(joint, samples, motion.stiffness_nm_rad, begin)
+
+
+def stepped(
+    joint: str, factor: float, health_s: float, after_s: float, seed: int = 0
+) -> tuple[Outcome, float]:
+    """A true change of the stiffness; also the share of the last two seconds that is valid and within 5 %."""
+    name = joint.removesuffix(" fitted")
+    motion = kit.motion(name, health_s + after_s, seed=seed, step=(health_s, factor))
+    begin = round(health_s / T)
+    told = _told(joint, motion.samples)
+    end = slice(-round(2.0 / T), None)
+    off = np.abs(told.stiffness_nm_rad[end] / motion.stiffness_nm_rad[end] - 1.0)
+    followed = float(np.mean(told.valid[end] & (off < 0.05)))
+    return _count(joint, motion.samples, motion.stiffness_nm_rad, begin, told), followed
+
+
+def _told(joint: str, samples: list[Sample]) -> kit.Told:
+    name = joint.removesuffix(" fitted")
+    if joint == name:
+        return kit.play(kit.declared(name), samples)[0]
+    model, floor = _fitted(name)
+    return kit.play(model, samples, watch=ResidualWatch(model, T, floor))[0]
+
+
+def _count(
+    joint: str, samples: list[Sample], truth: np.ndarray, begin: int, told: kit.Told | None = None
+) -> Outcome:
+    told = told or _told(joint, samples)
+    wrong = kit.wrong(told, truth)[begin:]
+    silent = wrong & (told.status[begin:] & FLAGS == 0)
+    return Outcome(len(wrong), int(told.valid[begin:].sum()), int(wrong.sum()), int(silent.sum()))

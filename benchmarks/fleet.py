@@ -188,29 +188,33 @@ def judged(folder: Path, report: dict[str, Any]) -> dict[str, Any]:
 
 
 def run_throughput(args: argparse.Namespace) -> dict[str, Any]:
+    """Recordings a second on one worker and on two, in turns; and the share of the time the workers worked.
+
+    The ratio is that of this machine: with other work on its cores it falls. The share of work does not.
+    """
     folder = prepared(args)
-    files = sorted((folder / "recordings").iterdir())[: args.recordings]
+    files = [str(path) for path in sorted((folder / "recordings").iterdir())[: args.recordings]]
     rate: dict[int, list[float]] = {1: [], 2: []}
+    busy: dict[int, list[float]] = {1: [], 2: []}
+    base = ["--joints", str(folder / "joints")]
     for round_ in range(args.rounds):
         for workers in (1, 2):
-            with cluster(folder, workers) as address:
-                out = folder / f"throughput-{os.getpid()}-{round_}-{workers}"
-                command = ["fleet", *map(str, files), "--joints", str(folder / "joints"), "--out", str(out)]
-                with contextlib.redirect_stdout(io.StringIO()):
-                    cli.main(
-                        [*command[:1], str(files[0]), *command[-4:-1], f"{out}-warm", "--scheduler", address]
-                    )
-                    begin = time.monotonic()
-                    assert cli.main([*command, "--scheduler", address]) == 0
-                rate[workers].append(len(files) / (time.monotonic() - begin))
+            out = folder / f"throughput-{os.getpid()}-{round_}-{workers}"
+            with cluster(folder, workers) as address, contextlib.redirect_stdout(io.StringIO()):
+                where = ["--scheduler", address]
+                assert cli.main(["fleet", *files[:4], *base, "--out", f"{out}-warm", *where]) == 0
+                begin = time.monotonic()
+                assert cli.main(["fleet", *files, *base, "--out", str(out), *where]) == 0
+                seconds = time.monotonic() - begin
+            rate[workers].append(len(files) / seconds)
+            worked = sum(row["wall_s"] for row in read_rows(Store(str(out))))
+            busy[workers].append(worked / (workers * seconds))
     one, two = (statistics.median(rate[k]) for k in (1, 2))
     return {
-        "recordings": len(files),
-        "one_a_s": one,
-        "two_a_s": two,
-        "ratio": two / one,
+        "recordings": len(files), "one_a_s": one, "two_a_s": two, "ratio": two / one,
+        "busy_one": statistics.median(busy[1]), "busy_two": statistics.median(busy[2]),
         "load": os.getloadavg()[0],
-    }
+    }  # fmt: skip
 
 
 def run_cpu(args: argparse.Namespace) -> dict[str, Any]:
@@ -316,25 +320,27 @@ NOISES = {
 
 
 def run_memory(args: argparse.Namespace) -> dict[str, Any]:
-    """Peak memory of fit and diagnose over the size of the file, each size in a process of its own."""
-    result = {}
-    for seconds in (50.0, 200.0):
+    """Peak memory of fit and diagnose of a small and of a large recording, each in a process of its own.
+
+    Its rise over that of the file's size is what `drivelink/fleet/pieces.py` plans with.
+    """
+    sizes, peaks = [], []
+    for seconds in (50.0, 400.0):
         with tempfile.TemporaryDirectory() as folder:
             fleet_world.make(Path(folder), 1, 1, seconds, args.seed)
             (path,) = (Path(folder) / "recordings").iterdir()
             joint = Path(folder) / "joints" / "axis000.toml"
             code = (
-                "import sys, resource; from drivelink import cli; import drivelink.report, estimator.batch;"
-                "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024; before = peak();"
+                "import sys, resource; from drivelink import cli;"
                 "[cli.main([v, sys.argv[1], '--joint', sys.argv[2], '--out', sys.argv[3]]) for v in "
-                "('fit', 'diagnose')]; print(before, peak())"
+                "('fit', 'diagnose')]; print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)"
             )
-            done = subprocess.run(
-                [sys.executable, "-c", code, path, joint, folder], capture_output=True, text=True, check=True
-            )
-            before, peak = map(int, done.stdout.split()[-2:])
-            result[f"{path.stat().st_size / 1e6:.1f} MB"] = round((peak - before) / path.stat().st_size, 1)
-    return result
+            command = [sys.executable, "-c", code, path, joint, folder]
+            done = subprocess.run(command, capture_output=True, text=True, check=True)
+            sizes.append(path.stat().st_size)
+            peaks.append(int(done.stdout.split()[-1]))
+    rise = (peaks[1] - peaks[0]) / (sizes[1] - sizes[0])
+    return {"file_mb": [s / 1e6 for s in sizes], "peak_mib": [p / 2**20 for p in peaks], "bytes_a_byte": rise}
 
 
 RUNS = {

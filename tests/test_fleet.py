@@ -150,6 +150,44 @@ def test_another_version_is_refused(fleet: Path, joints: Joints) -> None:
     assert "expected drivelink 0.0.0 on worker" in task.process(asked, joints).rows[0]["error"]
 
 
+# Storage
+
+
+def test_a_remote_storage_holds_recordings_and_results(fleet: Path, joints: Joints) -> None:
+    """fsspec's own in-memory file system stands for the protocols that benchmarks/fleet_storage.py tries for real."""
+    import fsspec
+
+    fs, local = fsspec.filesystem("memory"), fleet / "recordings" / "elbow-2026-01-05.csv"
+    fs.pipe_file("/plant/night/elbow-2026-01-05.csv", local.read_bytes())
+    fs.pipe_file("/plant/night/readme.txt", b"no recording")
+    for pattern in (
+        "memory://plant/night",
+        "memory://plant/*/*.csv",
+        "memory://plant/night/elbow-2026-01-05.csv",
+    ):
+        (found,), empty = storage.find([pattern])
+        assert found.size == local.stat().st_size
+        assert not empty
+    outcome = task.process(task.Task(source=found, version=__version__), joints)
+    (row,), (here,) = outcome.rows, done(local, joints).rows
+    assert row["parameters"] == here["parameters"]
+    assert row["id"] == here["id"]
+    with Table(Store("memory://plant/out")) as one:
+        one.append([row])
+    assert [r["id"] for r in read_rows(Store("memory://plant/out"))] == [row["id"]]
+
+
+def test_a_frame_log_brings_the_file_beside_it_along(tmp_path: Path) -> None:
+    import fsspec
+
+    fs = fsspec.filesystem("memory")
+    fs.pipe_file("/logs/r.log", b"(1.0) can0 080#\n")
+    fs.pipe_file("/logs/r.log.mapping.json", b"{}")
+    ((found,), _) = storage.find(["memory://logs/r.log"])
+    with storage.fetched(found) as (path, _):
+        assert (path.parent / "r.log.mapping.json").read_bytes() == b"{}"
+
+
 # Joints and times
 
 

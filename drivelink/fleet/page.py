@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 from collections.abc import Iterable, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -136,18 +137,24 @@ def _frame(one: dict[str, Any], left: float, width: float, height: float) -> _Fr
 
 def _axes(frame: _Frame, one: dict[str, Any], height: float) -> str:
     parts = []
-    for k in range(5):
-        value = frame.low + (frame.high - frame.low) * (k + 0.5) / 5
+    for value in _ticks(frame.low, frame.high):
         y = frame.y(value)
         parts.append(
             f'<line x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}" stroke="#e4e4e4"/>'
         )
-        parts.append(f'<text x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{value:.5g}</text>')
+        parts.append(f'<text x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{value:.6g}</text>')
     points = one["series"]
     first, last = points[0]["time"][:10], points[-1]["time"][:10]
     parts.append(f'<text x="{_LEFT}" y="{height - 5:.1f}">{first}</text>')
     parts.append(f'<text x="{_WIDTH - _RIGHT}" y="{height - 5:.1f}" text-anchor="end">{last}</text>')
     return "".join(parts)
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Round values between two, some four to eight of them."""
+    power = 10.0 ** math.floor(math.log10((high - low) / 4.0))
+    step = max(factor * power for factor in (1.0, 2.0, 5.0) if factor * power <= (high - low) / 4.0)
+    return [k * step for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
 
 
 def _bands(one: dict[str, Any], frame: _Frame) -> str:

@@ -26,7 +26,8 @@ __all__ = ["Piece", "pieces"]
 # recordings with an effect (benchmarks/fleet.py memory) and rounded up; compressed formats hold more a byte.
 _EXPANSION = {".csv": 12.0, ".log": 12.0, ".candump": 12.0, ".asc": 12.0, ".trc": 12.0, ".blf": 40.0}
 _EXPANSION_OTHER = 40.0
-_BASE_BYTES = 250 << 20  # a worker before its first recording: interpreter, libraries, Dask
+_BASE_BYTES = 550 << 20  # a worker after many small recordings: interpreter, libraries, Dask, caches
+_LEAST_BYTES = 64 << 20  # planned with in any case: a part is to tell something
 _USED = 0.7  # share of the limit that is planned with: Dask pauses a worker at 0.8 and ends it at 0.95
 
 
@@ -66,11 +67,8 @@ def pieces(path: Path, joint: JointFile, base_dir: Path, limit_bytes: float) -> 
 def _parts(path: Path, limit_bytes: float) -> int:
     if limit_bytes <= 0:
         return 1
-    budget = _USED * limit_bytes - _BASE_BYTES
+    budget = max(_USED * limit_bytes - _BASE_BYTES, min(_LEAST_BYTES, limit_bytes))
     needed = path.stat().st_size * _EXPANSION.get(path.suffix.lower(), _EXPANSION_OTHER)
-    if budget <= 0:
-        least = math.ceil(_BASE_BYTES / _USED / (1 << 20))
-        raise RecordingError(f"expected more than {least} MiB of memory for each worker")
     return max(1, math.ceil(needed / budget))
 
 

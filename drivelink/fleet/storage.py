@@ -90,7 +90,7 @@ def _listed(pattern: str) -> list[Source]:
         raise FleetError(f"{pattern}: cannot be listed: {_line(error)}") from error
     single = path in entries and len(entries) == 1
     return [
-        _source(_url(pattern, str(name)), info)
+        _source(_url(pattern, fs, str(name)), info)
         for name, info in entries.items()
         if info.get("type", "file") == "file" and (single or _is_recording(str(name)))
     ]
@@ -129,15 +129,15 @@ def _opened(url: str) -> tuple[Any, str]:
     return fs, str(path)
 
 
-def _url(pattern: str, path: str) -> str:
-    """The address of what was listed: some file systems return paths without their host."""
+def _url(pattern: str, fs: Any, path: str) -> str:
+    """The address of what was listed: file systems name it without protocol, some without its host too."""
     if "://" in path:
         return path
     if "://" not in pattern or pattern.startswith(("file://", "local://")):
         return path
     split = urlsplit(pattern)
-    host = split.netloc if path.startswith("/") else ""
-    return f"{split.scheme}://{host}{path}"
+    addresses = (f"{split.scheme}://{host}{path}" for host in (split.netloc, ""))
+    return next(url for url in addresses if fs._strip_protocol(url) == path)
 
 
 def _line(error: BaseException) -> str:

@@ -300,9 +300,9 @@ def _sentence(
             amount, std = 100.0 * change["amount_relative"], 100.0 * change["amount_std_relative"]
             day = change["since"][:10]
             if change["kind"] == "step":
-                said.append(f"{of} stepped by {amount:+.1f} ± {1.96 * std:.1f} % on {day}.")
+                said.append(f"{of} stepped by {_signed(amount)} ± {1.96 * std:.1f} % on {day}.")
             else:
-                said.append(f"{of} has drifted by {amount:+.1f} ± {1.96 * std:.1f} % since {day}.")
+                said.append(f"{of} has drifted by {_signed(amount)} ± {1.96 * std:.1f} % since {day}.")
     for effect in effects:
         if effect["significant"]:
             names = " or ".join(n.replace("_", " ") for n in effect["names"][:2])
@@ -317,6 +317,10 @@ def _sentence(
     if state == "undecided":
         return "The motion does not tell the stiffness or what could be missing: record a richer one."
     return "Steady."
+
+
+def _signed(value: float) -> str:
+    return f"{value:+.1f}".replace("-", "−")
 
 
 def _spaced(place: str) -> str:

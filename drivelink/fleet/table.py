@@ -81,6 +81,7 @@ SCHEMA = pa.schema(
         ("accepted_model", pa.string()),
         ("report", pa.string()),
         ("cpu_s", pa.float64()),
+        ("wall_s", pa.float64()),
         ("worker", pa.string()),
         ("version", pa.string()),
         ("written", pa.timestamp("us", tz="UTC")),
@@ -289,11 +290,12 @@ def read_rows(store: Store, columns: list[str] | None = None) -> list[dict[str, 
 
 def _read(store: Store, part: str, columns: list[str] | None = None) -> Any:
     """A part; columns that it lacks, written by an older version, are empty."""
+    wanted = SCHEMA if columns is None else pa.schema([SCHEMA.field(name) for name in columns])
     try:
-        table = pq.read_table(io.BytesIO(store.read(part)))
+        file = pq.ParquetFile(io.BytesIO(store.read(part)))
+        table = file.read([name for name in wanted.names if name in file.schema_arrow.names])
     except pa.ArrowException as error:
         raise FleetError(f"{store.url}/{part}: expected a Parquet file of drivelink: {error}") from error
-    wanted = SCHEMA if columns is None else pa.schema([SCHEMA.field(name) for name in columns])
     arrays = [
         table.column(field.name).cast(field.type)
         if field.name in table.column_names

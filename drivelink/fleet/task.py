@@ -82,7 +82,7 @@ def process(task: Task, joints: Joints) -> Outcome:
         task: what to do.
         joints: the fleet's joints.
     """
-    begin = time.process_time()
+    begin, start = time.process_time(), time.monotonic()
     row: dict[str, Any] = broken_row(task, "")
     with _notes() as notes:
         try:
@@ -108,6 +108,7 @@ def process(task: Task, joints: Joints) -> Outcome:
             return _broken(row, f"unexpected {type(error).__name__}: {error}", notes, begin)
     for one in rows:
         one["cpu_s"] = (time.process_time() - begin) / len(rows)
+        one["wall_s"] = (time.monotonic() - start) / len(rows)
     return Outcome("done", rows, reports, notes)
 
 

@@ -127,7 +127,8 @@ def test_a_recording_larger_than_the_memory_is_cut_into_parts(
     (record,) = kit.World([{}]).run()
     path = fleetkit.write_csv(record, tmp_path / "elbow.csv")
     monkeypatch.setattr(pieces, "_BASE_BYTES", 0)
-    outcome = done(path, joints, limit_bytes=10.0 * path.stat().st_size)
+    monkeypatch.setattr(pieces, "_LEAST_BYTES", 0)
+    outcome = done(path, joints, limit_bytes=30.0 * path.stat().st_size)
     assert [(row["part"], row["parts"]) for row in outcome.rows] == [(1, 2), (2, 2)]
     assert sum(row["samples"] for row in outcome.rows) == len(record)
     assert outcome.rows[1]["time"] - outcome.rows[0]["time"] > timedelta(seconds=1)

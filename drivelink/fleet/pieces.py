@@ -22,10 +22,11 @@ from estimator.sample import Record
 
 __all__ = ["Piece", "pieces"]
 
-# Peak memory of reading, fit, diagnosis and report over the size of the file, measured on one-motor
-# recordings with an effect (benchmarks/fleet.py memory) and rounded up; compressed formats hold more a byte.
-_EXPANSION = {".csv": 12.0, ".log": 12.0, ".candump": 12.0, ".asc": 12.0, ".trc": 12.0, ".blf": 40.0}
-_EXPANSION_OTHER = 40.0
+# Rise of the peak memory of fit, diagnosis and report over that of the file's size. Of a CSV it is measured
+# (22 at 500 Hz, benchmarks/fleet.py memory; less at a higher rate) and rounded up. A text log has about as
+# many bytes a sample, compressed formats have a fraction.
+_EXPANSION = {".csv": 30.0, ".log": 30.0, ".candump": 30.0, ".asc": 30.0, ".trc": 30.0}
+_EXPANSION_OTHER = 100.0
 _BASE_BYTES = 550 << 20  # a worker after many small recordings: interpreter, libraries, Dask, caches
 _LEAST_BYTES = 64 << 20  # planned with in any case: a part is to tell something
 _USED = 0.7  # share of the limit that is planned with: Dask pauses a worker at 0.8 and ends it at 0.95

@@ -30,7 +30,6 @@ from drivelink.recording.playback import Playback, Played, open_playback
 
 _INTERRUPTED = 130
 _METER_EVERY = 512
-_LARGE = 2_000_000  # bytes: a recording that is worth a process that reads it
 _SUBSCRIBER_S = 1.5
 
 _EPILOG = """\
@@ -86,7 +85,6 @@ def run(args: argparse.Namespace) -> int:
         base_dir,
         frames=True if args.frames else None,
         channel=args.channel,
-        ahead=args.file.exists() and args.file.stat().st_size > _LARGE,
         names=names,
     )
     summary = Summary(playback.motors, keep=args.plots is not None)

@@ -9,14 +9,15 @@ from __future__ import annotations
 import json
 import logging
 from array import array
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from itertools import chain, islice
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
-from drivelink._core import SYNC_COB_ID, Assembler
+from drivelink._core import SYNC_COB_ID, Assembler, Chain, Tick
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.chain import make_assembler
@@ -65,6 +66,9 @@ def is_frame_log(path: Path, frames: bool | None = None) -> bool:
     return kinds == {"can"}
 
 
+_Fed = TypeVar("_Fed", Cycle, Tick)
+
+
 class FrameLog:
     """A raw CAN recording of a joint.
 
@@ -76,6 +80,7 @@ class FrameLog:
 
     Attributes:
         period_s: the communication cycle, as the SYNCs in it tell.
+        assembler: makes the samples.
 
     Raises:
         RecordingError: no SYNC or no frames in it, or the mapping of a node is not known or lacks something.
@@ -105,7 +110,7 @@ class FrameLog:
         self.period_s = self._period(syncs, joint.bus.period_s)
         timed = joint.model_copy(update={"bus": joint.bus.model_copy(update={"period_s": self.period_s})})
         try:
-            self._assembler = make_assembler(timed, tuple(self._listener.layouts.values()))
+            self.assembler = make_assembler(timed, tuple(self._listener.layouts.values()))
         except DriveError as error:
             raise RecordingError(f"{path}: {error}") from error
 
@@ -115,28 +120,52 @@ class FrameLog:
         Raises:
             RecordingError: the recording is broken, or they make no sample.
         """
-        assembler = self._assembler
+        assembler = self.assembler
+        stamp_now = stamp_before = 0
+
+        def feed(can_id: int, data: bytes, jump: int, stamp_ns: int) -> Cycle | None:
+            nonlocal stamp_now, stamp_before
+            was = assembler.sequence
+            sample = assembler.feed(can_id, data, jump)
+            if can_id == SYNC_COB_ID and jump > 0:
+                stamp_before, stamp_now = stamp_now, stamp_ns
+            if sample is not None:
+                stamp_ns = stamp_before if assembler.sequence != was else stamp_now
+                return Cycle(sample.sequence, stamp_ns, sample, assembler.flags)
+            if can_id == SYNC_COB_ID and jump and (missed := assembler.missed) >= 0:
+                return Cycle(missed, stamp_before, None, assembler.flags)
+            return None
+
+        return self._fed(feed)
+
+    def ticks(self, joint_chain: Chain) -> Iterator[Tick]:
+        """What is published of the cycles; once.
+
+        Args:
+            joint_chain: made with `assembler`.
+
+        Raises:
+            RecordingError: as for `cycles`.
+        """
+        return self._fed(joint_chain.feed)
+
+    def _fed(self, feed: Callable[[int, bytes, int, int], _Fed | None]) -> Iterator[_Fed]:
+        """What becomes of the frames."""
+        assembler = self.assembler
         follower = self._follower() if self._passive else None
         numbered = numbered_at_once if self._follow else numbered_ahead
-        stamp_now = stamp_before = 0
         heard: set[int] = set()
         samples = False
         for (stamp_ns, can_id, data, _), jump in numbered(chain(self._head, self._frames), self.period_s):
-            was = assembler.sequence
-            sample = assembler.feed(can_id, data, jump)
+            fed = feed(can_id, data, jump, stamp_ns)
             heard.add(can_id)
-            if can_id == SYNC_COB_ID and jump > 0:
-                stamp_before, stamp_now = stamp_now, stamp_ns
             if follower is not None and (can_id in _OF_MAPS or can_id == SYNC_COB_ID):
                 follower.feed(can_id, data)
             elif can_id in _SDO:
                 self._relayout(can_id, data, assembler)
-            if sample is not None:
-                stamp_ns = stamp_before if assembler.sequence != was else stamp_now
-                samples = True
-                yield Cycle(sample.sequence, stamp_ns, sample, assembler.flags)
-            elif can_id == SYNC_COB_ID and jump and (missed := assembler.missed) >= 0:
-                yield Cycle(missed, stamp_before, None, assembler.flags)
+            if fed is not None:
+                samples = samples or fed.sample is not None
+                yield fed
         if not samples:
             doubts = list(follower.doubts.values()) if follower is not None else []
             why = f": {doubts[0]}" if doubts else self._absent(heard)
@@ -159,7 +188,7 @@ class FrameLog:
     def _follower(self) -> MapFollower:
         """Somebody else maps the nodes: the maps are followed as the daemon follows them."""
         layouts = self._listener.layouts
-        return MapFollower(self._listener, dict.fromkeys(layouts, self._assembler), layouts)
+        return MapFollower(self._listener, dict.fromkeys(layouts, self.assembler), layouts)
 
     def _learn_configuration(self) -> tuple[list[int], bool]:
         """Listen to the SDO transfers until the mapping is known and at rest.

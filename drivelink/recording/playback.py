@@ -12,10 +12,9 @@ from drivelink._core import Assembler, Chain, Tick
 from drivelink.cycle.chain import build
 from drivelink.jointfile import JointFile
 from drivelink.recording import read
-from drivelink.recording.ahead import FrameLogAhead
 from drivelink.recording.canframes import FrameLog, is_frame_log
 from drivelink.recording.columnmap import ColumnMap
-from drivelink.recording.cycles import Cycle, estimated
+from drivelink.recording.cycles import estimated
 from drivelink.recording.mcapsamples import recorded_cycles
 from estimator.sample import Sample
 
@@ -51,12 +50,14 @@ class Playback:
         period_s: float,
         total: int | None,
         cycles: Callable[[Chain], Iterator[Played]],
+        assembler: Assembler | None = None,
     ) -> None:
         self.motors = len(joint.motor)
         self.period_s = period_s
         self.total = total
         timed = joint.model_copy(update={"bus": joint.bus.model_copy(update={"period_s": period_s})})
-        self.chain = Chain(Assembler((), 0), *build(timed))  # what it is given are samples already
+        # Without an assembler what it is given are samples already.
+        self.chain = Chain(assembler or Assembler((), 0), *build(timed))
         self._cycles = cycles
 
     def __iter__(self) -> Iterator[Played]:
@@ -82,7 +83,6 @@ def open_playback(
     *,
     frames: bool | None = None,
     channel: str | None = None,
-    ahead: bool = False,
     names: ColumnMap | None = None,
 ) -> Playback:
     """Open a recording of any format for playing.
@@ -94,20 +94,21 @@ def open_playback(
         frames: of an MCAP file, play the raw frames (True) or the samples (False); None: the samples, and
             the frames where there are none.
         channel: of a raw CAN log with several.
-        ahead: have raw frames read by a process of its own: worth its start where there are many.
         names: columns of a CSV or MF4 file that have other names or units there.
 
     Raises:
         RecordingError: it cannot be read, or lacks what is needed.
     """
     if is_frame_log(path, frames):
-        log = (FrameLogAhead if ahead else FrameLog)(path, joint, base_dir, channel)
+        log = FrameLog(path, joint, base_dir, channel)
         period_s = log.period_s
-        return Playback(joint, period_s, None, lambda chain: _from_cycles(log.cycles(), chain, period_s))
+        return Playback(
+            joint, period_s, None, lambda chain: _played(log.ticks(chain), period_s), log.assembler
+        )
     if path.suffix.lower() == ".mcap":
         period_s = joint.bus.period_s
         recorded = recorded_cycles(path, len(joint.motor), joint.recording.scale)
-        return Playback(joint, period_s, None, lambda chain: _from_cycles(recorded, chain, period_s))
+        return Playback(joint, period_s, None, lambda chain: _played(estimated(recorded, chain), period_s))
     record = read(path, joint, keep_nan=True, names=names)
     times = record.time_s.tolist()
     return Playback(
@@ -124,6 +125,6 @@ def _from_samples(samples: Iterable[Sample], times: list[float], chain: Chain) -
         yield Played(time_s, take(sample, 0, round(time_s * 1e9)))
 
 
-def _from_cycles(cycles: Iterable[Cycle], chain: Chain, period_s: float) -> Iterator[Played]:
-    for tick in estimated(cycles, chain):
+def _played(ticks: Iterable[Tick], period_s: float) -> Iterator[Played]:
+    for tick in ticks:
         yield Played(tick.sequence * period_s, tick)

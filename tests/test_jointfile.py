@@ -2,6 +2,8 @@
 
 import logging
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -179,7 +181,8 @@ def test_a_copy_of_a_written_file_has_one_check_line(written: Path) -> None:
 
 def test_the_daemon_does_not_take_a_part_of_a_joint_file_over(written: Path) -> None:
     events = EventLog(logging.getLogger("drivelink.test"))
-    reloader = Reloader(written, jointfile.load(written), None, None, None, events)  # type: ignore[arg-type]
+    chain: Any = SimpleNamespace(history=None)  # never reached
+    reloader = Reloader(written, jointfile.load(written), chain, chain, chain, events)
     written.write_bytes(written.read_bytes()[:-40])
     reloader._prepare()
     (said,) = [event["text"] for event in events.recent()]

@@ -276,6 +276,17 @@ def test_the_page_draws_live_plots_in_a_browser(web: WebView, tmp_path: Path) ->
                 "if (d[i + 3] > 200 && d[i + 2] - d[i] > 80) n++; return n; })()"
             )
             assert browser.wait_for(f"{drawn} > 100 ? {drawn} : 0")  # blue: the curve
+            # the residual of the status is there as a gauge, the pointer reads the curve, pause holds it
+            assert browser.wait_for("document.getElementById('gauges').textContent").startswith("residual")
+            point = (
+                "new MouseEvent('mousemove', {clientX: r.right - 60, clientY: r.top + 100, bubbles: true})"
+            )
+            browser.wait_for(
+                "(() => { const c = document.getElementById('torqueplot'), r = c.getBoundingClientRect();"
+                f"c.dispatchEvent({point}); return document.getElementById('tip').textContent; }})()"
+            )
+            browser.wait_for("(pause(), document.getElementById('link').textContent === 'paused')")
+            browser.wait_for("(joints.elbow.moments.at(-1)[0] - frozen.elbow.moments.at(-1)[0]) > 0.2")
             browser.screenshot(tmp_path / "page.png")
             assert (tmp_path / "page.png").stat().st_size > 20_000
     finally:

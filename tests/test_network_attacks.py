@@ -304,9 +304,7 @@ def test_nothing_that_is_published_ends_the_monitor_the_recorder_or_a_client(end
     since: dict[str, float] = {}
     with drivelink.subscribe("elbow", session=session) as client:
         eight = Estimate(1, GOOD, 1.0, 1.0, 1.0, (TransmissionEstimate(1.0, 1.0, 1.0, 0.1),) * 8)
-        samples = [
-            wire.encode_sample(Sample(1, (1.0,) * n, (1.0,) * n, (1.0,) * n, 1.0), 1) for n in (0, 1, 2, 8)
-        ]
+        samples = [pack(f"<QQ3dB{3 * n}d", 1, 1, *[1.0] * 3, n, *[1.0] * 3 * n) for n in (0, 1, 2, 8)]
         samples += [
             b"",
             b"\xff" * 41,

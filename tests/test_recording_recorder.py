@@ -91,7 +91,7 @@ def test_a_daemon_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> None:
         assert "no daemon serves elbow yet: waiting" in process.stderr.readline()
         with zenohkit.script("elbow", endpoint) as daemon:
             zenohkit.ready(daemon)
-            zenohkit.until(lambda: out.read_text().count("\n") > 20)
+            zenohkit.until(lambda: out.exists() and out.read_text().count("\n") > 20)
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=20)
         assert process.returncode == 0

@@ -26,7 +26,7 @@ def main(name: str, endpoint: str, more: str = "", how: str = "") -> None:
         publisher.put_estimate(make_estimate(sequence), now_ns)
         publisher.put_sample(make_sample(sequence), now_ns)
         if sequence % 50 == 1:
-            publisher.put_status({"state": "running", "cycles": sequence})
+            publisher.put_status({"state": "running", "cycles": sequence, "residual_nm": 0.003})
         if how == "raise" and sequence == 20:
             raise RuntimeError("uncaught")
         time.sleep(0.005)

@@ -81,6 +81,10 @@ class JointStatus:
                 self._timing[name] = meter.recent()
                 yield
 
+    def begin(self) -> None:
+        """Percentiles are due with the next document, whatever was asked before."""
+        self._asked = 0
+
     def document(self, state: str = "") -> dict[str, Any]:
         """The state of the joint now.
 

@@ -285,6 +285,8 @@ class Daemon:
         for served in self._joints:
             rehearse(served.joint)
         self.documents()
+        for status in self._status:
+            status.begin()
         self._publish_status("starting")
 
     def _check_bus(self) -> None:

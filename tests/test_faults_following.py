@@ -165,3 +165,19 @@ def test_a_master_that_changes_its_period_is_named_with_both(monkeypatch: pytest
     assert any(active.startswith(text) for active in follower.run.events.active.values())
     follower.jittering(2500, lambda: 0.0)
     assert "SYNC comes every 1 ms again" in follower.events
+
+
+def test_a_master_that_goes_on_from_where_it_was_late_is_no_second_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    follower, draw, late = Follower(), random.Random(5), 0.0
+    monkeypatch.setattr(time, "monotonic_ns", lambda: follower.stamp_ns)
+
+    def walk() -> float:  # as the kernel's broadcast manager does it
+        nonlocal late
+        late += draw.uniform(0.2, 0.5) if draw.random() < 0.2 else 0.0
+        return late
+
+    follower.jittering(5000, walk)
+    assert not any("master makes" in text for text in follower.events)
+    assert follower.run.loop.skipped_periods > 100  # time without a SYNC is a gap

@@ -120,6 +120,7 @@ class CycleLoop:
         overruns: periods left out because this process was late.
         foreign_syncs: SYNCs of another master while we make it, or that were not due.
         behind: SYNCs, when following, that this process has read more than a period after their stamp.
+        skipped_periods: in which no SYNC came, when following.
         late_syncs: SYNCs of the master we follow that came when their period was over.
         sync_stamps: of the last SYNCs, when following.
         counter_jumps: SYNCs whose counter did not follow the one before.
@@ -149,7 +150,7 @@ class CycleLoop:
         self.on_lost: Callable[[str], None] = lambda _reason: None
         self.on_fault: Callable[[str, Exception], None] = _log_fault
         self.housekeeping.on_fault = lambda error: self.on_fault("housekeeping", error)
-        self.behind = 0
+        self.behind = self.skipped_periods = 0
         self.cycles = self.overruns = self.foreign_syncs = self.late_syncs = self.counter_jumps = 0
         self.sync_stamps: deque[int] = deque(maxlen=MEASURED_SYNCS)
         self.clock_step_ns = self.clock_steps = 0
@@ -289,6 +290,7 @@ class CycleLoop:
         elif jump == LATE:
             self.late_syncs += 1
         else:
+            self.skipped_periods += jump - 1
             self.lateness.add(abs(now_ns - self.sync_ns - jump * self.period_ns) if self.cycles else 0)
             self.sync_ns = now_ns
         if len(data) == 1:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -33,7 +34,7 @@ logger = logging.getLogger(__name__)
 _NS = 1_000_000_000
 _SILENT_NS = _NS // 2  # without a PDO, until the node is configured again
 _RETRY_NS = _NS  # between two attempts
-_MANY_SYNCS = 3  # not due within a second: a second master; one master alone is late now and then
+_MANY_SYNCS = 3  # more than there are periods, in a second
 _HEARTBEATS_LOST = 3.5  # of them missing: the node is gone
 _STATES = {0x00: "boot-up", 0x04: "stopped", 0x05: "operational", 0x7F: "pre-operational"}
 _OPERATIONAL = 0x05
@@ -124,11 +125,11 @@ class Supervisor:
         self._alarmed: set[str] = set()  # joints whose model alarm is on
         self._configurator = configurator
         self._follower: MapFollower | None = None
-        self._foreign_syncs = self._counter_jumps = self._lost_sends = self._clock_steps = 0
+        self._counter_jumps = self._lost_sends = self._clock_steps = 0
         self._bus_offs = self._restarts = self._measured_ns = 0
         self._slow = self._slow_ns = 0
         self._off_period = 0  # measurements in a row
-        self._foreign_ns: list[int] = []  # when SYNCs came that were not due
+        self._foreign = deque([(loop.clock(), 0, 0)])  # in the last second: SYNCs not due, periods without
         self.sync_period_s: float | None = None
         loop.on_fault = self._say_fault
         self._nodes: dict[int, _Watched] = {}
@@ -377,18 +378,22 @@ class Supervisor:
         self._check_controller()
 
     def _check_foreign_syncs(self) -> None:
-        """Whether two masters make SYNC; when following, one that is not due now and then proves nothing."""
+        """Whether two masters make SYNC.
+
+        When following, those that are not due prove nothing by themselves: one master alone makes some where
+        it leaves out as many periods. Two make more than there are periods.
+        """
         loop, now = self._loop, self._loop.clock()
-        if loop.foreign_syncs != self._foreign_syncs:
-            self._foreign_ns += [now] * (loop.foreign_syncs - self._foreign_syncs)
-            self._foreign_syncs = loop.foreign_syncs
-        self._foreign_ns = [at for at in self._foreign_ns[-_MANY_SYNCS:] if now - at < _NS]
-        if loop.produce and self._foreign_ns:
+        self._foreign.append((now, loop.foreign_syncs, loop.skipped_periods))
+        while now - self._foreign[0][0] > _NS:
+            self._foreign.popleft()
+        _, foreign, skipped = self._foreign[0]
+        if loop.produce and loop.foreign_syncs > foreign:
             what = (
                 "another master makes SYNC: its cycles are not used; "
                 'set bus.sync = "follow", or stop the other one'
             )
-        elif len(self._foreign_ns) >= _MANY_SYNCS:
+        elif (loop.foreign_syncs - foreign) - (loop.skipped_periods - skipped) >= _MANY_SYNCS:
             what = "a second master makes SYNC too: its cycles are not used; stop one of the two"
         else:
             self._events.end("foreign sync", "the other master makes no SYNC any more")

@@ -118,6 +118,10 @@ def test_units_and_signs_are_checked_before_anything_else(
     (row,) = done(wrong, joints).rows
     assert row["status"] == "error"
     assert "degree" in row["error"]
+    assert "recording.scale = { link_position" in row["error"]  # the line to paste, as `diagnose` says it
+    before = source(wrong)
+    outcome = done(fleet / "recordings" / "elbow-2026-01-06.csv", joints, previous=before)
+    assert (outcome.kind, outcome.rows[0]["validated_on"]) == ("done", task.HELD_OUT)
 
 
 def test_a_recording_larger_than_the_memory_is_cut_into_parts(

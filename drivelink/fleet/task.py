@@ -21,10 +21,12 @@ from drivelink.fleet.analysis import Analysis, TransmissionRow, analyse
 from drivelink.fleet.joints import Joint, Joints
 from drivelink.fleet.pieces import Piece, pieces
 from drivelink.fleet.storage import Source, fetched
+from drivelink.gate import gate, refusal
 from drivelink.recording.canlog import CAN_SUFFIXES, read_frames
 from drivelink.recording.mcapfile import read_messages
 from drivelink.report import Title
 from estimator.errors import EstimatorError
+from estimator.gate import GateError
 from estimator.sample import Record
 
 __all__ = ["HELD_OUT", "Outcome", "Task", "broken_row", "named_time", "process", "recorded_time"]
@@ -84,6 +86,7 @@ def process(task: Task, joints: Joints) -> Outcome:
     """
     begin, start = time.process_time(), time.monotonic()
     row: dict[str, Any] = broken_row(task, "")
+    where = task.source.url
     with _notes() as notes:
         try:
             if task.version != __version__:
@@ -91,7 +94,7 @@ def process(task: Task, joints: Joints) -> Outcome:
                     f"expected drivelink {task.version} on worker {socket.gethostname()}, got {__version__}"
                 )
             with fetched(task.source) as (path, digest):
-                row["digest"] = digest
+                row["digest"], where = digest, str(path)  # a copy, where it comes from elsewhere
                 joint = joints.of(path, task.source.url)
                 row |= {"joint": joint.name, "accepted_model": joint.digest}
                 if (digest, joint.name) in task.done:
@@ -101,7 +104,7 @@ def process(task: Task, joints: Joints) -> Outcome:
                     return Outcome("early", [], [], [])
                 rows, reports = _results(task, joint, path, row)
         except (DrivelinkError, EstimatorError, OSError) as error:
-            return _broken(row, str(error).replace(task.source.url + ": ", ""), notes, begin)
+            return _broken(row, str(error).replace(f"{where}: ", ""), notes, begin)
         except MemoryError:
             return _broken(row, "does not fit into the memory of a worker", notes, begin)
         except Exception as error:  # noqa: BLE001 - one recording never ends the run
@@ -154,7 +157,10 @@ def _results(
             title = Title(
                 joint.name, _part_name(task.source.name, piece), None if validation is None else where
             )
-            analysis = analyse(piece.record, file, validation, title)
+            try:
+                analysis = analyse(piece.record, file, validation, title)
+            except GateError as error:
+                raise refusal(path, file, error.findings, str(error)) from error
             suffix = f"-{piece.part}" if piece.parts > 1 else ""
             folder = f"diagnoses/{joint.name}/{row['digest'][:24]}{suffix}"
             common = row | _of_joint(analysis, piece, where) | {"report": f"{folder}/report.html"}
@@ -211,7 +217,9 @@ def _validation(task: Task, joint: Joint, base: Path) -> Iterator[Record | None]
     record = None
     try:
         with fetched(task.previous) as (path, _):
-            record = recording.read(path, joint.file, base_dir=base)
+            read = recording.read(path, joint.file, base_dir=base)
+            gate(path, joint.file, read)
+            record = read
     except (RecordingError, OSError) as error:
         logging.getLogger("drivelink.fleet").warning("validated on held-out blocks: %s", error)
     yield record

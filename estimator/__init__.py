@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from estimator.online import Estimator, make_estimator
     from estimator.sample import Estimate, Record, Sample, Status, TransmissionEstimate
     from estimator.settings import EstimatorSettings
-    from estimator.transmissions import MODELS, register
+    from estimator.transmissions import MODELS, register, register_table
 
 __all__ = [
     "MODELS",
@@ -37,6 +37,7 @@ __all__ = [
     "fit",
     "make_estimator",
     "register",
+    "register_table",
 ]
 
 _PLACES = {
@@ -46,7 +47,7 @@ _PLACES = {
     "online": ("Estimator", "make_estimator"),
     "sample": ("Estimate", "Record", "Sample", "Status", "TransmissionEstimate"),
     "settings": ("EstimatorSettings",),
-    "transmissions": ("MODELS", "register"),
+    "transmissions": ("MODELS", "register", "register_table"),
 }
 _LAZY = {name: f"estimator.{module}" for module, names in _PLACES.items() for name in names}
 

@@ -1,8 +1,6 @@
-"""Declared effects where they are more than a torque to be compensated: elastic ones, and whole recordings.
+"""Declared effects over whole recordings.
 
-An effect of the transmission that depends on the deflection alone is part of what the transmission
-transmits: tau_e,total = f(phi) + x(phi), sigma_total = d tau_e,total / d phi. For a recording, readings are
-corrected sample by sample as on line, and x_motor - x_transmission comes as one array.
+Readings are corrected sample by sample as on line, and x_motor - x_transmission comes as one array.
 """
 
 from __future__ import annotations
@@ -18,47 +16,9 @@ from estimator.filters import linear_filter
 from estimator.model import JointModel, Motor
 from estimator.sample import FloatArray, Record
 
-__all__ = ["Elastic", "corrected", "effect_torque"]
+__all__ = ["corrected", "effect_torque"]
 
-_STEP = 1e-6  # rad: of the central difference; effects are polynomials or kinks of the deflection
 _LIGHT_RATIO = 5.0  # bandwidth of velocities that effects are formed from, over that of the regression
-_NOWHERE = Coordinates(*(0.0 for _ in Coordinates._fields))
-
-
-class Elastic:
-    """The declared effects of one transmission that depend on its deflection alone.
-
-    Args:
-        motor: the motor's model with its effects.
-
-    Attributes:
-        active: whether there is any.
-    """
-
-    def __init__(self, motor: Motor) -> None:
-        self._terms = []
-        for effect in motor.effects:
-            kind = LIBRARY.get(effect.name)
-            if kind is None or kind.location != "transmission" or kind.coordinate != "deflection":
-                continue
-            if kind.terms is None:  # one with a memory: hysteresis is no stiffness
-                continue
-            for values in elements(effect)[1]:
-                self._terms.append((kind.terms, values, [values[name] for name in kind.linear]))
-        self.active = bool(self._terms)
-
-    def torque(self, phi: float) -> float:
-        """x_transmission(phi), N·m."""
-        total, c = 0.0, _NOWHERE._replace(deflection=phi)
-        for terms, values, weights in self._terms:
-            for weight, term in zip(weights, terms(c, values, math), strict=True):
-                total += weight * term
-        return total
-
-    def at(self, phi: float) -> tuple[float, float]:
-        """(torque, stiffness) at a deflection: what is to be added to those of the model."""
-        slope = (self.torque(phi + _STEP) - self.torque(phi - _STEP)) / (2.0 * _STEP)
-        return self.torque(phi), slope
 
 
 def corrected(record: Record, model: JointModel) -> Record:

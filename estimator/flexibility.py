@@ -1,7 +1,7 @@
 """Models of a transmission's flexibility torque, tau_e = f(phi, alpha) (eqs 17-21, 24).
 
 Every model is odd in phi (eq 2) and gives torque, stiffness sigma = df/dphi (eq 18) and the Jacobian
-df/dalpha (eq 25).
+df/dalpha (eq 25). The laws are those of `estimator._core`, which the on-line estimator uses as well.
 """
 
 from __future__ import annotations
@@ -14,15 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from estimator._core import TransmissionLaw
 from estimator.errors import EstimatorError
 from estimator.model import ParameterValue
 from estimator.sample import FloatArray
 
-__all__ = ["Exponential", "Function", "Linear", "Polynomial", "TransmissionModel", "VsaII"]
+__all__ = ["Exponential", "Function", "Linear", "Polynomial", "Table", "TransmissionModel", "VsaII"]
 
 _STEP = 6.0e-6  # relative step of central differences, about eps**(1/3)
-_STEEPEST = 50.0  # largest exponent of an exponential spring
-_EDGE = 1.0 - 1e-9  # how near to its end the arcsine of the VSA-II is taken
 
 
 class TransmissionModel(ABC):
@@ -58,10 +57,6 @@ class TransmissionModel(ABC):
         """(torque, stiffness), in one go where that is faster."""
         return self.torque(phi, alpha), self.stiffness(phi, alpha)
 
-    def tangent(self, phi: ArrayLike, alpha: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """(Jacobian, stiffness), in one go where that is faster."""
-        return self.jacobian(phi, alpha), self.stiffness(phi, alpha)
-
     @abstractmethod
     def jacobian(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
         """df/dalpha, (..., n) (eq 25)."""
@@ -77,18 +72,6 @@ class TransmissionModel(ABC):
     def at(self, phi: float, alpha: Sequence[float]) -> tuple[float, float]:
         """(torque, stiffness) at one deflection: what a tick needs, without arrays where that is faster."""
         return float(self.torque(phi, alpha)), float(self.stiffness(phi, alpha))
-
-    def stiffness_slopes(self, phi: float, alpha: Sequence[float]) -> tuple[list[float], float]:
-        """(dsigma/dalpha, dsigma/dphi) at one deflection, by differences: what sigma's variance needs."""
-        step = _STEP * max(abs(phi), 1e-3)
-        by_phi = (self.at(phi + step, alpha)[1] - self.at(phi - step, alpha)[1]) / (2.0 * step)
-        by_alpha = []
-        for i, value in enumerate(alpha):
-            step = _STEP * max(abs(value), 1e-3)
-            more, less = [*alpha], [*alpha]
-            more[i], less[i] = value + step, value - step
-            by_alpha.append((self.at(phi, more)[1] - self.at(phi, less)[1]) / (2.0 * step))
-        return by_alpha, by_phi
 
     def reach(self, shape: Sequence[float] = ()) -> float:
         """Largest |phi| for which the model is defined, rad."""
@@ -117,58 +100,59 @@ class TransmissionModel(ABC):
         """
 
 
-class Polynomial(TransmissionModel):
+class _Law(TransmissionModel):
+    """A model whose law is compiled; `law` is its evaluation over arrays."""
+
+    law: TransmissionLaw
+
+    def torque(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
+        """Flexibility torque (eq 17)."""
+        return self.both(phi, alpha)[0]
+
+    def stiffness(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
+        """Its derivative (eq 18)."""
+        return self.both(phi, alpha)[1]
+
+    def both(self, phi: ArrayLike, alpha: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """See TransmissionModel."""
+        phi = np.asarray(phi, dtype=np.float64)
+        torque, stiffness = np.empty(phi.shape), np.empty(phi.shape)
+        self.law.evaluate(phi.ravel(), _listed(alpha), torque.reshape(-1), stiffness.reshape(-1))
+        return torque, stiffness
+
+    def jacobian(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
+        """Its Jacobian (eq 25)."""
+        phi, listed = np.asarray(phi, dtype=np.float64), _listed(alpha)
+        out = np.empty((*phi.shape, len(listed)))
+        self.law.jacobian(phi.ravel(), listed, out.reshape(-1))
+        return out
+
+    def stiffness_jacobian(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
+        """See TransmissionModel."""
+        phi, listed = np.asarray(phi, dtype=np.float64), _listed(alpha)
+        out = np.empty((*phi.shape, len(listed)))
+        self.law.stiffness_jacobian(phi.ravel(), listed, out.reshape(-1))
+        return out
+
+    def at(self, phi: float, alpha: Sequence[float]) -> tuple[float, float]:
+        """See TransmissionModel."""
+        return self.law.at(phi, alpha)
+
+    def reach(self, shape: Sequence[float] = ()) -> float:
+        """Where the arcsine of a VSA-II, an exponential spring or a table ends."""
+        return self.law.reach(shape) if shape or not self.shape_names else math.inf
+
+
+class Polynomial(_Law):
     """Odd powers up to phi^(2p-1) (eqs 21, 24); alpha = coefficients in N·m/rad^(2h-1)."""
 
     name = "polynomial"
     linear: int | None = None
+    law = TransmissionLaw("polynomial")
 
     def basis(self, phi: ArrayLike, shape: Sequence[float] = (), order: int = 1) -> FloatArray:
         """See TransmissionModel."""
-        phi = np.asarray(phi, dtype=np.float64)
-        columns = np.empty((*phi.shape, order))
-        power, square = phi, phi * phi
-        for h in range(order):
-            columns[..., h] = power
-            power = power * square
-        return columns
-
-    def torque(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """Flexibility torque (eq 17)."""
-        phi = np.asarray(phi, dtype=np.float64)
-        return np.asarray(_horner(phi * phi, np.asarray(alpha, dtype=np.float64)) * phi)
-
-    def stiffness(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """Its derivative (eq 18)."""
-        phi, alpha = np.asarray(phi, dtype=np.float64), np.asarray(alpha, dtype=np.float64)
-        return _horner(phi * phi, alpha * (2.0 * np.arange(alpha.shape[-1]) + 1.0))
-
-    def jacobian(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """Its Jacobian (eq 25)."""
-        return self.basis(phi, order=np.asarray(alpha).shape[-1])
-
-    def stiffness_jacobian(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """Jacobian of the stiffness."""
-        order = np.asarray(alpha).shape[-1]
-        square = np.square(np.asarray(phi, dtype=np.float64))[..., None]
-        return np.asarray(square ** np.arange(order) * (2.0 * np.arange(order) + 1.0))
-
-    def at(self, phi: float, alpha: Sequence[float]) -> tuple[float, float]:
-        """Both by Horner's rule."""
-        square, torque, stiffness = phi * phi, 0.0, 0.0
-        for h in range(len(alpha) - 1, -1, -1):
-            torque = torque * square + alpha[h]
-            stiffness = stiffness * square + (2 * h + 1) * alpha[h]
-        return torque * phi, stiffness
-
-    def stiffness_slopes(self, phi: float, alpha: Sequence[float]) -> tuple[list[float], float]:
-        """Both in closed form."""
-        power, by_alpha, by_phi = 1.0, [], 0.0
-        for h, value in enumerate(alpha):
-            by_alpha.append((2 * h + 1) * power * power)
-            by_phi += (2 * h + 1) * 2 * h * value * power * power / (phi or 1.0)
-            power *= phi
-        return by_alpha, by_phi
+        return self.jacobian(phi, np.zeros(order))
 
     def parameters(self, alpha: ArrayLike) -> dict[str, ParameterValue]:
         """Alpha by name."""
@@ -185,6 +169,7 @@ class Linear(Polynomial):
 
     name = "linear"
     linear = 1
+    law = TransmissionLaw("linear")
 
     def parameters(self, alpha: ArrayLike) -> dict[str, ParameterValue]:
         """Alpha by name."""
@@ -215,7 +200,7 @@ class _Shaped(TransmissionModel):
         return values
 
 
-class VsaII(_Shaped):
+class VsaII(_Shaped, _Law):
     """One transmission of the VSA-II (eqs 19, 20): f = 2 k beta beta', beta = arcsin(C sin(phi/2)) - phi/2.
 
     alpha = (k, C), C > 1; defined for |phi| < 2 arcsin(1/C).
@@ -225,110 +210,30 @@ class VsaII(_Shaped):
     shape_names = ("c",)
     shape_bounds = ((1.0, 20.0),)
     shape_start = (1.1,)
-
-    @staticmethod
-    def _parts(phi: FloatArray, c: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """(C sin(phi/2) kept inside its domain, cos(phi/2), sqrt(1 - (C sin)²), beta)."""
-        half = 0.5 * phi
-        sine = np.minimum(np.maximum(c * np.sin(half), -_EDGE), _EDGE)
-        root = np.sqrt(1.0 - sine * sine)
-        return sine, np.cos(half), root, np.arcsin(sine) - half
-
-    def torque(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """Flexibility torque (eq 17)."""
-        k, c = _split(alpha)
-        _, cosine, root, beta = self._parts(np.asarray(phi, dtype=np.float64), c)
-        return np.asarray(k * beta * (c * cosine / root - 1.0))
-
-    def stiffness(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """Its derivative (eq 18)."""
-        return self.both(phi, alpha)[1]
-
-    def both(self, phi: ArrayLike, alpha: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """See TransmissionModel."""
-        k, c = _split(alpha)
-        sine, cosine, root, beta = self._parts(np.asarray(phi, dtype=np.float64), c)
-        slope = 0.5 * (c * cosine / root - 1.0)
-        return np.asarray(2.0 * k * beta * slope), self._stiffness(k, c, sine, root, beta, slope)
-
-    @staticmethod
-    def _stiffness(
-        k: float, c: float, sine: FloatArray, root: FloatArray, beta: FloatArray, slope: FloatArray
-    ) -> FloatArray:
-        """2 k (beta'² + beta beta''); slope is beta'."""
-        bend = (0.25 * (c * c - 1.0)) * sine / (root * root * root)
-        return np.asarray((2.0 * k) * (slope * slope + beta * bend))
-
-    def jacobian(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """Its Jacobian (eq 25)."""
-        k, c = _split(alpha)
-        sine, cosine, root, beta = self._parts(np.asarray(phi, dtype=np.float64), c)
-        return self._jacobian(k, c, sine, cosine, root, beta)[0]
-
-    def tangent(self, phi: ArrayLike, alpha: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """See TransmissionModel."""
-        k, c = _split(alpha)
-        sine, cosine, root, beta = self._parts(np.asarray(phi, dtype=np.float64), c)
-        jacobian, slope = self._jacobian(k, c, sine, cosine, root, beta)
-        return jacobian, self._stiffness(k, c, sine, root, beta, slope)
-
-    @staticmethod
-    def _jacobian(
-        k: float, c: float, sine: FloatArray, cosine: FloatArray, root: FloatArray, beta: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """(Jacobian, beta')."""
-        slope = 0.5 * (c * cosine / root - 1.0)
-        slope_c = 0.5 * cosine / (root * root * root)
-        out = np.empty((*sine.shape, 2))
-        out[..., 0] = 2.0 * beta * slope
-        out[..., 1] = (2.0 * k) * (sine / (c * root) * slope + beta * slope_c)
-        return out, slope
-
-    def at(self, phi: float, alpha: Sequence[float]) -> tuple[float, float]:
-        """Both from one evaluation of the arcsine."""
-        k, c = alpha
-        sine = min(max(c * math.sin(0.5 * phi), -_EDGE), _EDGE)
-        root = math.sqrt(1.0 - sine * sine)
-        beta = math.asin(sine) - 0.5 * phi
-        slope = 0.5 * (c * math.cos(0.5 * phi) / root - 1.0)
-        bend = 0.25 * sine * (c * c - 1.0) / root**3
-        return 2.0 * k * beta * slope, 2.0 * k * (slope * slope + beta * bend)
-
-    def reach(self, shape: Sequence[float] = ()) -> float:
-        """Where the arcsine ends."""
-        return 2.0 * math.asin(1.0 / shape[0]) if shape and shape[0] > 1.0 else math.pi
+    law = TransmissionLaw("vsa-ii")
 
 
-class Exponential(_Shaped):
+class Exponential(_Shaped, _Law):
     """f = sign(phi) (k/b) (exp(b|phi|) - 1), so sigma = k exp(b|phi|); alpha = (k, b)."""
 
     name = "exponential"
     shape_names = ("b_per_rad",)
     shape_bounds = ((1e-6, 1e6),)
     shape_start = (1.0,)
+    law = TransmissionLaw("exponential")
 
-    def torque(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """Flexibility torque (eq 17)."""
-        k, b = _split(alpha)
-        phi = np.asarray(phi, dtype=np.float64)
-        return np.asarray(np.sign(phi) * (k / b) * np.expm1(_exponent(b, phi)))
 
-    def stiffness(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """Its derivative (eq 18)."""
-        k, b = _split(alpha)
-        return np.asarray(k * np.exp(_exponent(b, np.asarray(phi, dtype=np.float64))))
+class Table(_Shaped, _Law):
+    """f = k g(phi), g an odd table with a cubic between its points; alpha = (k,). Made by `register_table`.
 
-    def reach(self, shape: Sequence[float] = ()) -> float:
-        """Beyond this the torque is no spring's, and soon no number."""
-        return _STEEPEST / shape[0] if shape and shape[0] > 0.0 else math.inf
+    Attributes:
+        points: deflections in rad, growing from above 0, and the torque at each of them in N·m.
+    """
 
-    def jacobian(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """Its Jacobian (eq 25)."""
-        k, b = _split(alpha)
-        phi = np.asarray(phi, dtype=np.float64)
-        x = _exponent(b, phi)
-        by_b = np.sign(phi) * (k / b**2) * (x * np.exp(x) - np.expm1(x))
-        return np.stack([np.sign(phi) * np.expm1(x) / b, by_b], axis=-1)
+    def __init__(self, name: str, deflection_rad: Sequence[float], torque_nm: Sequence[float]) -> None:
+        self.name = name
+        self.points = [float(x) for x in deflection_rad], [float(x) for x in torque_nm]
+        self.law = TransmissionLaw.table(*self.points)
 
 
 class Function(_Shaped):
@@ -368,20 +273,9 @@ class Function(_Shaped):
         return np.stack(columns, axis=-1)
 
 
-def _horner(square: FloatArray, coefficients: FloatArray) -> FloatArray:
-    value = np.zeros_like(square) + coefficients[..., -1]
-    for h in range(coefficients.shape[-1] - 2, -1, -1):
-        value = value * square + coefficients[..., h]
-    return value
-
-
-def _exponent(b: float, phi: FloatArray) -> FloatArray:
-    return np.minimum(b * np.abs(phi), 600.0)
-
-
-def _split(alpha: ArrayLike) -> tuple[float, float]:
-    k, shape = alpha if isinstance(alpha, tuple) else np.asarray(alpha, dtype=np.float64)
-    return float(k), float(shape)
+def _listed(alpha: ArrayLike) -> list[float]:
+    listed: list[float] = np.asarray(alpha, dtype=np.float64).ravel().tolist()
+    return listed
 
 
 def _expect_names(model: str, parameters: Mapping[str, Any], names: tuple[str, ...]) -> None:

@@ -1,14 +1,17 @@
-"""The one way to get an estimator that runs tick by tick, in either mode."""
+"""The one way to get an estimator that runs tick by tick: a protocol before `estimator._core`."""
 
 from __future__ import annotations
 
+import math
 from typing import Any, Protocol
 
-from estimator.model import JointModel, require_finite
-from estimator.paper import PaperEstimator
-from estimator.robust import RobustEstimator
+import numpy as np
+
+from estimator import _core
+from estimator.model import JointModel, Motor, require_finite
 from estimator.sample import Estimate, Sample
 from estimator.settings import EstimatorSettings
+from estimator.transmissions import MODELS, RIGID, UNKNOWN, transmission_model
 
 __all__ = ["Estimator", "make_estimator"]
 
@@ -36,6 +39,41 @@ class Estimator(Protocol):
         """Current {"model", "parameters", "std"} of each transmission, names as in the joint file."""
 
 
+class _Compiled:
+    """`estimator._core.Estimator` with parameters by their names."""
+
+    def __init__(self, model: JointModel, settings: EstimatorSettings, period_s: float) -> None:
+        self._core = _core.Estimator(model, settings, period_s)
+        self._model = model
+        self.step = self._core.step
+        self.reset = self._core.reset
+        self.distrust = self._core.distrust
+
+    @property
+    def residual_nm(self) -> float:
+        """See `Estimator`."""
+        return self._core.residual_nm
+
+    def parameters(self) -> list[dict[str, Any]]:
+        """See `Estimator`."""
+        return [self._named(i, motor) for i, motor in enumerate(self._model.motors)]
+
+    def _named(self, i: int, motor: Motor) -> dict[str, Any]:
+        told, polynomial, values, std = self._core.alpha(i)
+        if not motor.flexible:
+            return {"model": RIGID, "parameters": {}, "std": {}}
+        if not told:
+            black_box = {"stiffness_nm_rad": values[0]} if values and math.isfinite(values[0]) else {}
+            return {"model": UNKNOWN, "parameters": black_box, "std": {}}
+        declared = transmission_model(motor.transmission)
+        model = MODELS["polynomial"] if polynomial or declared is None else declared
+        return {
+            "model": model.name,
+            "parameters": model.parameters(np.array(values)),
+            "std": model.parameters(np.array(std)),
+        }
+
+
 def make_estimator(model: JointModel, settings: EstimatorSettings, period_s: float) -> Estimator:
     """The estimator that the settings ask for.
 
@@ -43,6 +81,4 @@ def make_estimator(model: JointModel, settings: EstimatorSettings, period_s: flo
         EstimatorError: the model names a transmission that does not exist, or contradicts itself.
     """
     require_finite(0.0, strict=True, period_s=period_s)
-    if settings.mode == "paper":
-        return PaperEstimator(model, settings, period_s)
-    return RobustEstimator(model, settings, period_s)
+    return _Compiled(model, settings, period_s)

@@ -57,6 +57,12 @@ PRIORS: dict[str, Prior] = {
     "deflection_offset": Prior(
         1.0, "deflection", "zero between the encoders", "two encoders are seldom set to one zero"
     ),
+    "declared_zero": Prior(
+        0.003,
+        "deflection",
+        "zero between the encoders where the joint file states it",
+        "what is left once it has been set; on line it widens where the balance strains against it",
+    ),
     "encoder_delay": Prior(
         1.0, "period", "delay of the link position", "it is sampled within a cycle and sent in the next one"
     ),

@@ -2,30 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
+
+from estimator import _core
 from estimator.sample import FloatArray
 
-__all__ = ["regressor", "regressor_step"]
-
-
-def regressor_step(
-    stiffness: float, residual: float, rate: float, k_r: float, k_max: float | None = None
-) -> float:
-    """One step of eq 32, with the saturation of eq 33 where k_max is given.
-
-    sigma(k+1) = sigma(k) + K_R (r_sigma phi' - sigma(k) phi'²). Eq 33 limits the product K_R phi'² of this
-    step only: K_R itself is kept (read literally, (33) would lower it for good).
-
-    Args:
-        stiffness: sigma(k) in N·m/rad.
-        residual: r_sigma(k) in N·m/s.
-        rate: phi'(k) in rad/s.
-        k_r: K_R in s²/rad².
-        k_max: K_max < 2, or None for eq 32 alone.
-    """
-    energy = rate * rate
-    if k_max is not None and k_r * energy > k_max:
-        k_r = k_max / energy
-    return stiffness + k_r * (residual * rate - stiffness * energy)
+__all__ = ["regressor"]
 
 
 def regressor(
@@ -33,11 +17,12 @@ def regressor(
 ) -> FloatArray:
     """Eq 32 (and 33) over a recording; element k is the estimate that used samples up to k.
 
+    sigma(k+1) = sigma(k) + K_R (r_sigma phi' - sigma(k) phi'²). Eq 33 limits the product K_R phi'² of each
+    step only: K_R itself is kept (read literally, (33) would lower it for good).
+
     Without k_max the recursion may diverge, as in the paper's figure 2: the result then holds inf or nan.
     """
-    out = residual.copy()
-    stiffness = start
-    for k, (r, v) in enumerate(zip(residual.tolist(), rate.tolist(), strict=True)):
-        stiffness = regressor_step(stiffness, r, v, k_r, k_max)
-        out[k] = stiffness
+    out = np.empty(len(residual))
+    limit = math.inf if k_max is None else k_max
+    _core.regressor(np.ravel(residual), np.ravel(rate), k_r, limit, start, out)
     return out

@@ -1,7 +1,7 @@
 """The residuals of the paper: the flexibility torque from momenta, without differentiating or sensing it.
 
-`momentum` integrates the known part of a balance exactly for a held torque; `FirstOrder` and
-`SecondOrder` turn it into eqs 14-16 and 28-30 tick by tick, `first_order` and `second_order` over arrays.
+`motor_balance` integrates the known part of a balance exactly for a held torque; `first_order` and
+`second_order` turn it into eqs 14-16 and 28-30 over arrays. Tick by tick they are in the paper mode.
 """
 
 from __future__ import annotations
@@ -13,8 +13,6 @@ from estimator.model import LinkDynamics
 from estimator.sample import FloatArray
 
 __all__ = [
-    "FirstOrder",
-    "SecondOrder",
     "external_balance",
     "first_order",
     "match_first_order",
@@ -99,80 +97,3 @@ def match_second_order(signal: FloatArray, k1: float, k2: float, period_s: float
     """s K1/(s² + K2 s + K1) of a deflection: phi' through the filter of eq 30 (bilinear transform)."""
     b, a = tustin_biquad((0.0, k1, 0.0), (1.0, k2, k1), period_s)
     return linear_filter(b, a, signal - signal[0])
-
-
-class _Balance:
-    """y of `motor_balance` tick by tick, bridging gaps with the torque that was held."""
-
-    def __init__(self, inertia_kg_m2: float, damping_nm_s_rad: float, period_s: float) -> None:
-        self._B, self._D, self._T = inertia_kg_m2, damping_nm_s_rad, period_s
-        self.reset()
-
-    def reset(self) -> None:
-        self._origin: float | None = None
-        self._integral = 0.0
-        self._torque = 0.0
-
-    def update(self, position: float, velocity: float, torque: float, periods: int) -> float:
-        self._integral += self._torque * self._T * periods
-        self._torque = torque
-        value = self._B * velocity + self._D * position - self._integral
-        if self._origin is None:
-            self._origin = value
-        return value - self._origin
-
-
-class FirstOrder:
-    """The residual r_tau_e of eq 14, one tick at a time."""
-
-    def __init__(
-        self, inertia_kg_m2: float, damping_nm_s_rad: float, k_tau_rad_s: float, period_s: float
-    ) -> None:
-        self._balance = _Balance(inertia_kg_m2, damping_nm_s_rad, period_s)
-        self._K, self._T = k_tau_rad_s, period_s
-        self.reset()
-
-    def reset(self) -> None:
-        """Start anew from r = 0."""
-        self._balance.reset()
-        self.value = 0.0
-        self._last = 0.0
-
-    def update(self, position: float, velocity: float, torque: float, periods: int = 1) -> float:
-        """r_tau_e at this sample, N·m; `periods` since the last one (more than one after a gap)."""
-        y = self._balance.update(position, velocity, torque, periods)
-        a = first_order_pole(self._K, self._T * periods)
-        self.value = a * self.value + (1.0 - a) * (y - self._last) / (self._T * periods)
-        self._last = y
-        return self.value
-
-
-class SecondOrder:
-    """The residual r_sigma of eq 28, one tick at a time (bilinear transform, transposed direct form)."""
-
-    def __init__(
-        self, inertia_kg_m2: float, damping_nm_s_rad: float, k1: float, k2: float, period_s: float
-    ) -> None:
-        self._balance = _Balance(inertia_kg_m2, damping_nm_s_rad, period_s)
-        b, a = tustin_biquad((k1, 0.0, 0.0), (1.0, k2, k1), period_s)
-        self._b, self._a = tuple(b.tolist()), tuple(a.tolist())
-        self.reset()
-
-    def reset(self) -> None:
-        """Start anew from r = 0."""
-        self._balance.reset()
-        self.value = 0.0
-        self._last = self._w1 = self._w2 = 0.0
-
-    def update(self, position: float, velocity: float, torque: float, periods: int = 1) -> float:
-        """r_sigma at this sample, N·m/s; a gap is bridged along a straight line of y."""
-        y = self._balance.update(position, velocity, torque, periods)
-        slope = (y - self._last) / periods
-        (b0, b1, b2), (_, a1, a2) = self._b, self._a
-        for k in range(1, periods + 1):
-            u = self._last + k * slope
-            self.value = b0 * u + self._w1
-            self._w1 = b1 * u - a1 * self.value + self._w2
-            self._w2 = b2 * u - a2 * self.value
-        self._last = y
-        return self.value

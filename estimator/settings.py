@@ -24,6 +24,7 @@ class EstimatorSettings:
         k_sigma_2_rad_s: K_sigma,2 of eq 28.
         k_r_s2_rad2: K_R of eq 32.
         k_max: K_max < 2 of eq 33.
+        false_alarms_per_hour: of the robust mode's `changed`; more of them find smaller changes.
     """
 
     __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "strict": True}
@@ -36,6 +37,7 @@ class EstimatorSettings:
     k_sigma_2_rad_s: float = 1.0
     k_r_s2_rad2: float = 1900.0
     k_max: float = 1.9
+    false_alarms_per_hour: float = 1.0
 
     def __post_init__(self) -> None:
         require_finite(
@@ -47,5 +49,6 @@ class EstimatorSettings:
             k_sigma_2_rad_s=self.k_sigma_2_rad_s,
             k_r_s2_rad2=self.k_r_s2_rad2,
             k_max=self.k_max,
+            false_alarms_per_hour=self.false_alarms_per_hour,
         )
         require(self.k_max < 2.0, f"k_max: expected a number in (0, 2), got {self.k_max}")

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from estimator.errors import EstimatorError
-from estimator.flexibility import Exponential, Function, Linear, Polynomial, TransmissionModel, VsaII
+from estimator.flexibility import Exponential, Function, Linear, Polynomial, Table, TransmissionModel, VsaII
 from estimator.model import Transmission
 
-__all__ = ["MODELS", "RIGID", "UNKNOWN", "TransmissionModel", "register", "transmission_model"]
+__all__ = [
+    "MODELS",
+    "RIGID",
+    "UNKNOWN",
+    "TransmissionModel",
+    "register",
+    "register_table",
+    "transmission_model",
+]
 
 RIGID = "none"  # no deflection: the torque is what the motor's balance leaves
 UNKNOWN = "unknown"  # flexible, but no model of it: black-box estimation
@@ -72,6 +80,25 @@ def register(
     if not np.allclose(slope, difference, rtol=1e-6, atol=1e-7 * float(np.max(np.abs(difference)))):
         raise EstimatorError(f'transmission "{name}": stiffness: expected the derivative of torque (eq 18)')
     MODELS[name] = model
+    return model
+
+
+def register_table(
+    name: str, deflection_rad: Sequence[float], torque_nm: Sequence[float]
+) -> TransmissionModel:
+    """Add a measured curve under a name for the joint file: k_nm_rad (1: as measured) times the table.
+
+    Args:
+        name: its name.
+        deflection_rad: growing, the first above 0; the curve is odd and goes through 0.
+        torque_nm: the torque at each of them.
+
+    Raises:
+        EstimatorError: the name is taken, or the points are no curve.
+    """
+    if name in MODELS or name in (RIGID, UNKNOWN):
+        raise EstimatorError(f'transmission "{name}": expected a new name, this one is taken')
+    MODELS[name] = model = Table(name, deflection_rad, torque_nm)
     return model
 
 

@@ -6,9 +6,9 @@ import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
 
-from estimator.bank import FilterBank
+from estimator import EstimatorSettings, JointModel, Motor, Sample, Transmission, make_estimator
 from estimator.filters import StateVariableFilter, _exponential, critically_damped
-from estimator.residuals import FirstOrder, SecondOrder, first_order, motor_balance, second_order
+from estimator.residuals import first_order, motor_balance
 
 T = 1e-3
 
@@ -33,40 +33,21 @@ def test_a_held_torque_is_filtered_exactly():
     assert out[1:] == pytest.approx(1 - np.exp(-bandwidth * t) * (1 + bandwidth * t), abs=1e-10)
 
 
-@pytest.mark.parametrize("block", [1, 10])
-def test_filters_of_a_whole_recording_and_of_blocks_agree(block):
-    rng = np.random.default_rng(1)
-    x = np.cumsum(rng.normal(size=(801, 2)), axis=0)
-    bank = FilterBank(1, 1, 0, 60.0, T, block)
-    bank.rest(x[0, :1].tolist(), x[0, 1:].tolist())
-    ticks, lightly = [], []
-    for rows in np.split(x[1:], 800 // block):
-        lightly.append(bank.pass_light(rows[:, :1], rows[:, 1:]).copy())
-        bank.pass_main(np.zeros((block, 0)))
-        ticks.append(bank.outputs())
-    light = StateVariableFilter(3, 300.0, T)
-    main = StateVariableFilter(4, 60.0, T)
-    for channel, held in ((0, False), (1, True)):
-        first = light.apply(x[:, channel], 2, held=held)
-        expected = main.apply(first[0], 2)
-        for derivative in range(3):
-            got = np.array([tick[derivative][channel] for tick in ticks])
-            scale = np.max(np.abs(expected[derivative]))
-            assert got == pytest.approx(expected[derivative][block::block], abs=1e-8 * scale)
-            along = np.concatenate([path[derivative, :, channel] for path in lightly])
-            scale = np.max(np.abs(first[derivative]))
-            assert along == pytest.approx(first[derivative][1:], abs=1e-8 * scale)
-
-
-def test_residuals_over_arrays_and_tick_by_tick_agree():
+def test_the_paper_modes_residual_is_that_over_arrays():
     rng = np.random.default_rng(2)
-    theta = np.cumsum(rng.normal(size=500)) * 1e-3
-    omega, tau = rng.normal(size=500), rng.normal(size=500)
-    y = motor_balance(0.05, 0.01, theta, omega, tau, T)
-    one, two = FirstOrder(0.05, 0.01, 300.0, T), SecondOrder(0.05, 0.01, 300.0, 20.0, T)
-    ticks = [(one.update(*row), two.update(*row)) for row in zip(theta, omega, tau, strict=True)]
-    assert np.array(ticks)[:, 0] == pytest.approx(first_order(y, 300.0, T), abs=1e-9)
-    assert np.array(ticks)[:, 1] == pytest.approx(second_order(y, 300.0, 20.0, T), abs=1e-7)
+    n, inertia, damping = 500, 0.05, 0.01
+    t = np.arange(n) * T
+    theta, omega = 0.2 * np.sin(9.0 * t), 1.8 * np.cos(9.0 * t)
+    tau = rng.normal(size=n)
+    motor = Motor(
+        inertia_kg_m2=inertia, viscous_damping_nm_s_rad=damping, transmission=Transmission(model="none")
+    )
+    model = JointModel(arrangement="single", motors=(motor,))
+    paper = make_estimator(model, EstimatorSettings(mode="paper", k_tau_rad_s=300.0), T)
+    rows = zip(theta.tolist(), omega.tolist(), tau.tolist(), strict=True)
+    told = [paper.step(Sample(k, (x,), (v,), (u,)))[2] for k, (x, v, u) in enumerate(rows)]
+    y = motor_balance(inertia, damping, theta, omega, tau, T)
+    assert np.array(told) == pytest.approx(first_order(y, 300.0, T), abs=1e-9)
 
 
 @pytest.mark.parametrize("held", [False, True])

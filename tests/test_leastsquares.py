@@ -1,4 +1,4 @@
-"""Array least squares: linear, nonlinear, projected, recursive: the same answer by every way."""
+"""Array least squares: linear, nonlinear, projected: the same answer by every way."""
 
 import numpy as np
 import pytest
@@ -6,33 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimator import MODELS, EstimatorError
-from estimator.leastsquares import fit_alpha, fit_polynomial, fit_projected, polynomial_columns, solve
-from estimator.recursive import RecursiveLeastSquares
-
-
-@settings(max_examples=25, deadline=None)
-@given(st.integers(0, 10_000), st.integers(1, 4), st.floats(0.9, 1.0))
-def test_recursive_and_batch_are_the_same_for_any_weights_and_forgetting(seed, size, forgetting):
-    rng = np.random.default_rng(seed)
-    J, r, w = rng.normal(size=(60, size)), rng.normal(size=60), rng.uniform(0.1, 2.0, 60)
-    recursive = RecursiveLeastSquares(size, forgetting)
-    for row, value, weight in zip(J, r, w, strict=True):
-        recursive.update(row, value, weight)
-    total = np.sqrt(w * forgetting ** np.arange(59, -1, -1))
-    batch = solve(J * total[:, None], r * total)
-    assert recursive.alpha == pytest.approx(batch.alpha, rel=1e-8, abs=1e-10)
-    assert recursive.sum_of_squares == pytest.approx(batch.sum_of_squares, rel=1e-8)
-
-
-def test_recursive_keeps_powers_of_a_small_deflection():
-    phi = np.random.default_rng(3).uniform(-1e-3, 1e-3, 400)
-    alpha = np.array([8000.0, 1e8, 1e13])
-    recursive = RecursiveLeastSquares(3)
-    columns = polynomial_columns(phi, 3)
-    for row, value in zip(columns, columns @ alpha, strict=True):
-        recursive.update(row, value)
-    # The columns differ by 1e12 in size: normal equations would have lost every digit.
-    assert recursive.alpha == pytest.approx(alpha, rel=1e-6)
+from estimator.leastsquares import fit_alpha, fit_polynomial, fit_projected, polynomial_columns
 
 
 @settings(max_examples=20, deadline=None)

@@ -1,14 +1,20 @@
 //! The estimator of a joint: one `step` a tick.
 
 use crate::error::Error;
+use crate::laws::Law;
 use crate::model::Model;
-use crate::sample::{Estimate, MOTORS, Sample, TransmissionEstimate};
-use crate::settings::Settings;
+use crate::paper::Paper;
+use crate::robust::Robust;
+use crate::sample::{Estimate, Sample};
+use crate::settings::{Mode, Priors, Settings};
 
-/// What both modes offer.
+/// Both modes behind one interface.
 #[derive(Clone, Debug)]
-pub struct Estimator {
-    motors: usize,
+pub enum Estimator {
+    /// See [`Paper`].
+    Paper(Box<Paper>),
+    /// See [`Robust`].
+    Robust(Box<Robust>),
 }
 
 impl Estimator {
@@ -16,36 +22,63 @@ impl Estimator {
     ///
     /// # Errors
     /// The model contradicts itself, or names what does not exist.
-    pub fn new(model: &Model, _settings: &Settings, period_s: f64) -> Result<Estimator, Error> {
+    pub fn new(
+        model: &Model,
+        settings: &Settings,
+        priors: &Priors,
+        period_s: f64,
+    ) -> Result<Estimator, Error> {
         model.check()?;
         if !(period_s > 0.0 && period_s.is_finite()) {
             return Err(Error(format!("period_s: expected a finite number > 0, got {period_s}")));
         }
-        Ok(Estimator { motors: model.motors.len() })
+        Ok(match settings.mode {
+            Mode::Paper => Estimator::Paper(Box::new(Paper::new(model, settings, period_s))),
+            Mode::Robust => Estimator::Robust(Box::new(Robust::new(model, settings, priors, period_s)?)),
+        })
     }
 
     /// The estimate at this sample, whatever floats it holds.
+    ///
+    /// `sequence` counts periods: a jump by more than one is a gap of whole periods.
     pub fn step(&mut self, sample: &Sample) -> Estimate {
-        Estimate {
-            sequence: sample.sequence,
-            status: 0,
-            flexibility_torque: f64::NAN,
-            stiffness: f64::NAN,
-            stiffness_std: f64::NAN,
-            transmissions: [TransmissionEstimate::NOTHING; MOTORS],
-            motors: self.motors,
+        match self {
+            Estimator::Paper(paper) => paper.step(sample),
+            Estimator::Robust(robust) => robust.step(sample),
         }
     }
 
     /// Forget everything that was learned.
-    pub fn reset(&mut self) {}
+    pub fn reset(&mut self) {
+        match self {
+            Estimator::Paper(paper) => paper.reset(),
+            Estimator::Robust(robust) => robust.reset(),
+        }
+    }
 
     /// The next sample may not be of its moment: use it, but learn nothing from it.
-    pub fn distrust(&mut self) {}
+    pub fn distrust(&mut self) {
+        if let Estimator::Robust(robust) = self {
+            robust.distrust();
+        }
+    }
 
     /// What the model left unexplained of the torque balance at the last sample, N·m; NaN: unknown.
     #[must_use]
     pub fn residual(&self) -> f64 {
-        f64::NAN
+        match self {
+            Estimator::Paper(_) => f64::NAN,
+            Estimator::Robust(robust) => robust.residual(),
+        }
+    }
+
+    /// Current parameters of one motor's transmission and their standard deviations, and their law.
+    ///
+    /// Without a law: the paper's black box gives its stiffness alone, the robust one nothing.
+    pub fn parameters(&self, motor: usize, values: &mut Vec<f64>, std: &mut Vec<f64>) -> Option<Law> {
+        match self {
+            Estimator::Paper(paper) => paper.parameters(motor, values, std),
+            Estimator::Robust(robust) => robust.parameters(motor, values, std).cloned(),
+        }
     }
 }

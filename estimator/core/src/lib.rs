@@ -1,14 +1,32 @@
 //! Flexibility torque and stiffness from motor signals: the mathematics that runs every cycle.
 //!
-//! Numbers in, numbers out: no clock, no file, no socket, no allocation after construction. Equation numbers are
-//! those of "Residual-based Stiffness Estimation in Robots with Flexible Transmissions".
+//! Numbers in, numbers out: no clock, no file, no socket, no allocation after construction, no panic on a
+//! tick. Equation numbers are those of "Residual-based Stiffness Estimation in Robots with Flexible
+//! Transmissions". SI units, joint side, the paper's signs: φ = q − θ, and τ_e = f(φ) acts on the motor as
+//! +τ_e.
 
 #![cfg_attr(not(feature = "python"), forbid(unsafe_code))]
+#![allow(clippy::needless_range_loop)] // matrices read better by their indices
 
+pub mod align;
+pub mod deflection;
+pub mod delay;
+pub mod effects;
 pub mod error;
 pub mod estimator;
+pub mod filters;
+pub mod guard;
+pub mod handover;
+pub mod kalman;
+pub mod laws;
 pub mod model;
-#[cfg(feature = "python")]
-pub mod python;
+pub mod monitor;
+pub mod noise;
+pub mod paper;
+pub mod robust;
 pub mod sample;
 pub mod settings;
+pub mod track;
+
+#[cfg(feature = "python")]
+pub mod python;

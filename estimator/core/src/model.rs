@@ -1,16 +1,51 @@
 //! What an estimator is told about a joint: the known terms of eqs 4-7.
 
+use crate::effects::Element;
 use crate::error::Error;
+use crate::laws::{Law, PARAMETERS};
 
 /// How the transmissions act on the link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Arrangement {
     /// One motor.
     Single,
-    /// Both transmissions pull at the link: torques and stiffnesses add (eqs 9, 11).
+    /// Both transmissions pull at the link, φ_i = q − θ_i: torques and stiffnesses add (eqs 9, 11).
     Antagonistic,
-    /// The first moves the link, the second sets the stiffness.
+    /// The first motor moves the link through its transmission, the second one, in series with it, only sets
+    /// the lever that makes the stiffness (as in the AwAS, Jafari et al., IROS 2010): the joint's torque and
+    /// stiffness are the first transmission's, and the second's is rigid.
     Serial,
+}
+
+/// A transmission as it is declared.
+#[derive(Clone, Debug)]
+pub enum Transmission {
+    /// No deflection: the torque is what the motor's balance leaves.
+    Rigid,
+    /// Flexible, but no law of it: black-box estimation.
+    Unknown,
+    /// A law, the order of a polynomial's that is declared, and α where it is known.
+    Elastic {
+        /// The law.
+        law: Law,
+        /// p of eq 24; `None`: chosen from the data.
+        order: Option<usize>,
+        /// Known parameters; empty: estimated from nothing.
+        parameters: Vec<f64>,
+    },
+}
+
+/// The motor side of one transmission, eq 5 or 7, reflected to the joint.
+#[derive(Clone, Debug)]
+pub struct Motor {
+    /// B, kg·m².
+    pub inertia: f64,
+    /// D_θ, N·m·s/rad.
+    pub damping: f64,
+    /// See [`Transmission`].
+    pub transmission: Transmission,
+    /// What the model has been given besides.
+    pub effects: Vec<Element>,
 }
 
 /// The link side, eq 4 or 6, with g(q) = gravity · sin(q + gravity_phase).
@@ -26,7 +61,7 @@ pub struct Link {
     pub gravity_phase: f64,
 }
 
-/// A joint; see [`crate::estimator::Estimator::new`].
+/// A joint.
 #[derive(Clone, Debug)]
 pub struct Model {
     /// See [`Arrangement`].
@@ -35,27 +70,52 @@ pub struct Model {
     pub motors: Vec<Motor>,
     /// The link dynamics where they are known.
     pub link: Option<Link>,
+    /// Effects at the link or in its encoder.
+    pub link_effects: Vec<Element>,
 }
 
-/// The motor side of one transmission, eq 5 or 7, reflected to the joint.
-#[derive(Clone, Debug)]
-pub struct Motor {
-    /// B, kg·m².
-    pub inertia: f64,
-    /// D_θ, N·m·s/rad.
-    pub damping: f64,
+impl Motor {
+    /// Whether its transmission deflects.
+    #[must_use]
+    pub fn flexible(&self) -> bool {
+        !matches!(self.transmission, Transmission::Rigid)
+    }
 }
 
 impl Model {
+    /// Whether any transmission is flexible, so that a link position is needed.
+    #[must_use]
+    pub fn has_deflection(&self) -> bool {
+        self.motors.iter().any(Motor::flexible)
+    }
+
     /// Whether its parts agree with each other.
     ///
     /// # Errors
-    /// The number of motors is not that of the arrangement.
+    /// The number of motors is not that of the arrangement; in a serial one the second is flexible; a law has
+    /// another number of parameters.
     pub fn check(&self) -> Result<(), Error> {
         let expected = if self.arrangement == Arrangement::Single { 1 } else { 2 };
-        if self.motors.len() == expected {
-            return Ok(());
+        if self.motors.len() != expected {
+            return Err(Error(format!("motors: expected {expected}, got {}", self.motors.len())));
         }
-        Err(Error(format!("expected {expected} motor(s), got {}", self.motors.len())))
+        if self.arrangement == Arrangement::Serial && self.motors[1].flexible() {
+            let why = "the second motor sets the stiffness of the first";
+            return Err(Error(format!(
+                "arrangement = \"serial\": motor[2].transmission.model: expected \"none\" ({why})"
+            )));
+        }
+        for motor in &self.motors {
+            let Transmission::Elastic { law, order, parameters } = &motor.transmission else { continue };
+            let (got, fixed) = (parameters.len(), 1 + law.shapes().len());
+            let fits = match law {
+                Law::Polynomial => got < PARAMETERS && order.unwrap_or(1) < PARAMETERS,
+                _ => got == 0 || got == fixed,
+            };
+            if !fits || fixed > PARAMETERS {
+                return Err(Error(format!("transmission: parameters: got {got}, expected {fixed}")));
+            }
+        }
+        Ok(())
     }
 }

@@ -1,13 +1,549 @@
-//! The Python module `estimator._core`.
+//! The binding: what Python's objects of `estimator.model` and `estimator.settings` are here.
+//!
+//! `drivelink._core` uses the conversions too.
+
+use std::fmt;
+use std::sync::Arc;
+
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::sync::PyOnceLock;
+use pyo3::types::{PyDict, PyTuple, PyType};
+
+use crate::effects::Element;
+use crate::error::Error;
+use crate::laws::{Foreign, Law, Shape, Table};
+use crate::model::{Arrangement, Link, Model, Motor, Transmission};
+use crate::sample::{Estimate, MOTORS, Sample};
+use crate::settings::{Method, Mode, Priors, Settings};
+
+impl From<Error> for PyErr {
+    fn from(error: Error) -> PyErr {
+        let message = error.to_string();
+        Python::attach(|py| {
+            let class = py.import("estimator.errors").and_then(|module| module.getattr("EstimatorError"));
+            match class.and_then(|class| class.call1((&message,))) {
+                Ok(error) => PyErr::from_value(error),
+                Err(_) => PyValueError::new_err(message),
+            }
+        })
+    }
+}
+
+/// A law of Python's: two callables g(φ, *shape) and ∂g/∂φ on arrays.
+struct Callables {
+    torque: Py<PyAny>,
+    stiffness: Py<PyAny>,
+}
+
+impl fmt::Debug for Callables {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str("Callables")
+    }
+}
+
+impl Foreign for Callables {
+    fn evaluate(&self, phi: &[f64], shape: &[f64], torque: &mut [f64], stiffness: &mut [f64]) {
+        Python::attach(|py| {
+            for (function, out) in [(&self.torque, torque), (&self.stiffness, stiffness)] {
+                if let Err(error) = call(py, function, phi, shape, out) {
+                    out.fill(f64::NAN);
+                    error.write_unraisable(py, Some(function.bind(py)));
+                }
+            }
+        });
+    }
+}
+
+fn call(py: Python<'_>, function: &Py<PyAny>, phi: &[f64], shape: &[f64], out: &mut [f64]) -> PyResult<()> {
+    let numpy = py.import("numpy")?;
+    let mut arguments = vec![numpy.call_method1("array", (phi.to_vec(),))?];
+    for value in shape {
+        arguments.push(value.into_pyobject(py)?.into_any());
+    }
+    let told = function.bind(py).call1(PyTuple::new(py, arguments)?)?;
+    let wide = numpy.call_method1("broadcast_to", (told, (phi.len(),)))?;
+    let values: Vec<f64> = wide.call_method1("astype", ("float64",))?.call_method0("tolist")?.extract()?;
+    out.copy_from_slice(&values);
+    Ok(())
+}
+
+fn tabulated(deflection: &[f64], torque: &[f64]) -> Result<Law, Error> {
+    let expected =
+        "expected as many deflections as torques, all finite, the deflections growing from above 0";
+    let table = Table::new(deflection, torque).ok_or_else(|| Error(format!("table: {expected}")))?;
+    Ok(Law::Tabulated(Arc::new(table)))
+}
+
+/// The law of a model of `estimator.transmissions.MODELS`.
+///
+/// # Errors
+/// It is of no kind that is known here.
+pub fn law(model: &Bound<'_, PyAny>) -> PyResult<Law> {
+    let name: String = model.getattr("name")?.extract()?;
+    Ok(match name.as_str() {
+        "linear" => Law::Linear,
+        "polynomial" => Law::Polynomial,
+        "vsa-ii" => Law::VsaII,
+        "exponential" => Law::Exponential,
+        _ if model.hasattr("points")? => {
+            let (deflection, torque): (Vec<f64>, Vec<f64>) = model.getattr("points")?.extract()?;
+            tabulated(&deflection, &torque)?
+        }
+        _ => {
+            let bounds: Vec<(f64, f64)> = model.getattr("shape_bounds")?.extract()?;
+            let starts: Vec<f64> = model.getattr("shape_start")?.extract()?;
+            let shapes: Vec<Shape> = (bounds.iter().zip(starts))
+                .map(|((low, high), start)| Shape { low: *low, high: *high, start })
+                .collect();
+            let torque = model.getattr("_torque")?.unbind();
+            let stiffness = model.getattr("_stiffness")?.unbind();
+            Law::Foreign(Arc::new(Callables { torque, stiffness }), shapes.into())
+        }
+    })
+}
+
+fn elements(effects: &Bound<'_, PyAny>) -> PyResult<Vec<Element>> {
+    let take_apart = effects.py().import("estimator.effects")?.getattr("elements")?;
+    let mut all = Vec::new();
+    for effect in effects.try_iter()? {
+        let effect = effect?;
+        let name: String = effect.getattr("name")?.extract()?;
+        for values in take_apart.call1((&effect,))?.get_item(1)?.try_iter()? {
+            let values: Vec<f64> = values?
+                .cast_into::<PyDict>()?
+                .values()
+                .iter()
+                .map(|v| v.extract())
+                .collect::<PyResult<_>>()?;
+            all.push(Element::new(&name, &values)?);
+        }
+    }
+    Ok(all)
+}
+
+fn transmission(declared: &Bound<'_, PyAny>) -> PyResult<Transmission> {
+    let py = declared.py();
+    let name: String = declared.getattr("model")?.extract()?;
+    let known = py.import("estimator.transmissions")?.getattr("transmission_model")?.call1((declared,))?;
+    if known.is_none() {
+        return Ok(if name == "none" { Transmission::Rigid } else { Transmission::Unknown });
+    }
+    let parameters = declared.getattr("parameters")?;
+    let parameters = if parameters.is_truthy()? {
+        known.call_method1("alpha", (parameters,))?.call_method0("tolist")?.extract()?
+    } else {
+        Vec::new()
+    };
+    let order = declared.getattr("order")?.extract()?;
+    Ok(Transmission::Elastic { law: law(&known)?, order, parameters })
+}
+
+/// A model from an `estimator.model.JointModel`.
+///
+/// # Errors
+/// A transmission or an effect is not known, or contradicts itself: an `EstimatorError`.
+pub fn model(joint: &Bound<'_, PyAny>) -> PyResult<Model> {
+    let arrangement: String = joint.getattr("arrangement")?.extract()?;
+    let mut motors = Vec::new();
+    for motor in joint.getattr("motors")?.try_iter()? {
+        let motor = motor?;
+        motors.push(Motor {
+            inertia: motor.getattr("inertia_kg_m2")?.extract()?,
+            damping: motor.getattr("viscous_damping_nm_s_rad")?.extract()?,
+            transmission: transmission(&motor.getattr("transmission")?)?,
+            effects: elements(&motor.getattr("effects")?)?,
+        });
+    }
+    let link = joint.getattr("link")?;
+    let link = if link.is_none() {
+        None
+    } else {
+        Some(Link {
+            inertia: link.getattr("inertia_kg_m2")?.extract()?,
+            damping: link.getattr("viscous_damping_nm_s_rad")?.extract()?,
+            gravity: link.getattr("gravity_nm")?.extract()?,
+            gravity_phase: link.getattr("gravity_phase_rad")?.extract()?,
+        })
+    };
+    let arrangement = match arrangement.as_str() {
+        "antagonistic" => Arrangement::Antagonistic,
+        "serial" => Arrangement::Serial,
+        _ => Arrangement::Single,
+    };
+    Ok(Model { arrangement, motors, link, link_effects: elements(&joint.getattr("link_effects")?)? })
+}
+
+/// Settings from an `estimator.settings.EstimatorSettings`.
+///
+/// # Errors
+/// It is none.
+pub fn settings(given: &Bound<'_, PyAny>) -> PyResult<Settings> {
+    let mode: String = given.getattr("mode")?.extract()?;
+    let method: String = given.getattr("method")?.extract()?;
+    let number = |name: &str| -> PyResult<f64> { given.getattr(name)?.extract() };
+    Ok(Settings {
+        mode: if mode == "paper" { Mode::Paper } else { Mode::Robust },
+        method: match method.as_str() {
+            "mbe" => Method::Mbe,
+            "bbe" => Method::Bbe,
+            _ => Method::Auto,
+        },
+        bandwidth: number("bandwidth_rad_s")?,
+        k_tau: number("k_tau_rad_s")?,
+        k_sigma_1: number("k_sigma_1_rad2_s2")?,
+        k_sigma_2: number("k_sigma_2_rad_s")?,
+        k_r: number("k_r_s2_rad2")?,
+        k_max: number("k_max")?,
+        false_alarms_per_hour: number("false_alarms_per_hour")?,
+    })
+}
+
+/// The priors of `estimator.priors`.
+///
+/// # Errors
+/// One is missing.
+pub fn priors(py: Python<'_>) -> PyResult<Priors> {
+    let table = py.import("estimator.priors")?.getattr("PRIORS")?;
+    let std = |name: &str| -> PyResult<f64> { table.get_item(name)?.getattr("std")?.extract() };
+    Ok(Priors {
+        motor_inertia: std("motor_inertia")?,
+        viscous_damping: std("viscous_damping")?,
+        viscous_damping_floor: std("viscous_damping_floor")?,
+        coulomb_friction: std("coulomb_friction")?,
+        torque_offset: std("torque_offset")?,
+        deflection_offset: std("declared_zero")?,
+        encoder_delay: std("encoder_delay")?,
+    })
+}
+
+/// An estimator from Python's model and settings.
+///
+/// # Errors
+/// See [`model`]; a period that is no positive number.
+pub fn estimator(
+    joint: &Bound<'_, PyAny>,
+    given: &Bound<'_, PyAny>,
+    period_s: f64,
+) -> PyResult<crate::estimator::Estimator> {
+    let priors = priors(joint.py())?;
+    Ok(crate::estimator::Estimator::new(&model(joint)?, &settings(given)?, &priors, period_s)?)
+}
+
+fn several(tuple: &Bound<'_, PyTuple>, place: usize) -> PyResult<([f64; MOTORS], usize)> {
+    let values = tuple.get_borrowed_item(place)?;
+    let values = values.cast::<PyTuple>()?;
+    let mut out = [f64::NAN; MOTORS];
+    for (i, out) in out.iter_mut().enumerate().take(values.len()) {
+        *out = values.get_borrowed_item(i)?.extract()?;
+    }
+    Ok((out, values.len()))
+}
+
+/// A sample from an `estimator.sample.Sample`, and how many motors it is of.
+///
+/// # Errors
+/// It is none.
+pub fn sample(given: &Bound<'_, PyAny>) -> PyResult<(Sample, usize)> {
+    let tuple = given.cast::<PyTuple>()?;
+    let number = |place: usize| -> PyResult<f64> { tuple.get_borrowed_item(place)?.extract() };
+    let (motor_position, motors) = several(tuple, 1)?;
+    let (motor_torque, torques) = several(tuple, 3)?;
+    let sequence: i64 = tuple.get_borrowed_item(0)?.extract()?;
+    let sample = Sample {
+        sequence: sequence as u64,
+        motor_position,
+        motor_velocity: several(tuple, 2)?.0,
+        motor_torque,
+        link_position: number(4)?,
+        link_velocity: number(5)?,
+        external_torque: number(6)?,
+    };
+    Ok((sample, motors.min(torques)))
+}
+
+/// The named tuples that an estimate becomes.
+struct Tuples {
+    make: Py<PyAny>,
+    estimate: Py<PyType>,
+    transmission: Py<PyType>,
+}
+
+static TUPLES: PyOnceLock<Tuples> = PyOnceLock::new();
+
+/// An `estimator.sample.Estimate`.
+///
+/// # Errors
+/// Python's classes cannot be had.
+pub fn estimate<'py>(py: Python<'py>, told: &Estimate) -> PyResult<Bound<'py, PyAny>> {
+    let tuples = TUPLES.get_or_try_init(py, || -> PyResult<Tuples> {
+        let module = py.import("estimator.sample")?;
+        Ok(Tuples {
+            make: py.get_type::<PyTuple>().getattr("__new__")?.unbind(),
+            estimate: module.getattr("Estimate")?.cast_into()?.unbind(),
+            transmission: module.getattr("TransmissionEstimate")?.cast_into()?.unbind(),
+        })
+    })?;
+    let make = tuples.make.bind(py);
+    let part = |i: usize| -> PyResult<Bound<'py, PyAny>> {
+        let t = &told.transmissions[i];
+        let values = (t.flexibility_torque, t.stiffness, t.stiffness_std, t.deflection);
+        make.call1((&tuples.transmission, values))
+    };
+    let parts = if told.motors == 1 {
+        PyTuple::new(py, [part(0)?])?
+    } else {
+        PyTuple::new(py, [part(0)?, part(1)?])?
+    };
+    let sequence = told.sequence as i64;
+    let totals = (told.flexibility_torque, told.stiffness, told.stiffness_std);
+    make.call1((&tuples.estimate, (sequence, told.status, totals.0, totals.1, totals.2, parts)))
+}
 
 /// What `estimator._core` offers.
 #[cfg(feature = "extension-module")]
 #[pyo3::pymodule(name = "_core")]
 mod extension {
+    use pyo3::buffer::PyBuffer;
+    use pyo3::exceptions::PyValueError;
     use pyo3::prelude::*;
+
+    use crate::effects::{Coordinates, Element};
+    use crate::laws::{Law, PARAMETERS};
+    use crate::sample::{Estimate, Sample, TransmissionEstimate};
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
         module.add("__version__", env!("CARGO_PKG_VERSION"))
+    }
+
+    /// The on-line estimator of a joint, in either mode; see `estimator.online.Estimator`.
+    #[pyclass]
+    struct Estimator {
+        inner: crate::estimator::Estimator,
+        motors: usize,
+    }
+
+    #[pymethods]
+    impl Estimator {
+        #[new]
+        fn new(model: &Bound<'_, PyAny>, settings: &Bound<'_, PyAny>, period_s: f64) -> PyResult<Estimator> {
+            let inner = super::estimator(model, settings, period_s)?;
+            Ok(Estimator { inner, motors: model.getattr("motors")?.len()? })
+        }
+
+        /// The estimate at this sample.
+        fn step<'py>(&mut self, sample: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
+            let (mut taken, motors) = super::sample(sample)?;
+            if motors != self.motors {
+                taken.motor_position[0] = f64::NAN; // no sample of this joint: rejected
+            }
+            let told = self.inner.step(&taken);
+            super::estimate(sample.py(), &told)
+        }
+
+        /// Forget everything that was learned.
+        fn reset(&mut self) {
+            self.inner.reset();
+        }
+
+        /// The next sample may not be of its moment: use it, but learn nothing from it.
+        fn distrust(&mut self) {
+            self.inner.distrust();
+        }
+
+        /// What the model left unexplained of the torque balance at the last sample; nan: unknown.
+        #[getter]
+        fn residual_nm(&self) -> f64 {
+            self.inner.residual()
+        }
+
+        /// (whether they are of a law, whether that is a polynomial, α, its standard deviations) of one motor.
+        fn alpha(&self, motor: usize) -> PyResult<(bool, bool, Vec<f64>, Vec<f64>)> {
+            if motor >= self.motors {
+                return Err(PyValueError::new_err(format!("motor: expected 0 to {}", self.motors - 1)));
+            }
+            let (mut values, mut std) = (Vec::new(), Vec::new());
+            let law = self.inner.parameters(motor, &mut values, &mut std);
+            let polynomial = matches!(law, Some(Law::Polynomial));
+            Ok((law.is_some(), polynomial, values, std))
+        }
+
+        /// Seconds that each of so many ticks takes, the samples being taken again and again in turn.
+        fn time_ticks(&mut self, samples: Vec<Bound<'_, PyAny>>, ticks: usize) -> PyResult<Vec<f64>> {
+            let taken: Vec<Sample> =
+                samples.iter().map(|one| Ok(super::sample(one)?.0)).collect::<PyResult<_>>()?;
+            let nothing = TransmissionEstimate::NOTHING;
+            let mut last: Option<Estimate> = None;
+            let mut seconds = Vec::with_capacity(ticks);
+            for k in 0..ticks {
+                let mut sample = taken[k % taken.len()];
+                sample.sequence = k as u64;
+                let start = std::time::Instant::now();
+                last = Some(self.inner.step(&sample));
+                seconds.push(start.elapsed().as_secs_f64());
+            }
+            debug_assert!(last.is_none_or(|last| last.transmissions[0] != nothing));
+            Ok(seconds)
+        }
+    }
+
+    /// A transmission's law over arrays of float64; α as `estimator.flexibility` has it.
+    #[pyclass(frozen)]
+    struct TransmissionLaw {
+        law: Law,
+    }
+
+    fn slice(py: Python<'_>, buffer: &PyBuffer<f64>) -> PyResult<Vec<f64>> {
+        buffer.to_vec(py)
+    }
+
+    fn check(law: &Law, alpha: &[f64]) -> PyResult<()> {
+        let (got, expected) = (alpha.len(), 1 + law.shapes().len());
+        let fits = if law.is_polynomial() { (1..=PARAMETERS).contains(&got) } else { got == expected };
+        if fits { Ok(()) } else { Err(PyValueError::new_err(format!("alpha: got {got} numbers"))) }
+    }
+
+    #[pymethods]
+    impl TransmissionLaw {
+        /// By its name: linear, polynomial, vsa-ii, exponential.
+        #[new]
+        fn new(name: &str) -> PyResult<TransmissionLaw> {
+            let law = match name {
+                "linear" => Law::Linear,
+                "polynomial" => Law::Polynomial,
+                "vsa-ii" => Law::VsaII,
+                "exponential" => Law::Exponential,
+                _ => return Err(PyValueError::new_err(format!("law: expected a known name, got {name}"))),
+            };
+            Ok(TransmissionLaw { law })
+        }
+
+        /// An odd curve through points, see `estimator.flexibility.Table`.
+        #[staticmethod]
+        fn table(deflection: Vec<f64>, torque: Vec<f64>) -> PyResult<TransmissionLaw> {
+            Ok(TransmissionLaw { law: super::tabulated(&deflection, &torque)? })
+        }
+
+        /// Torque and stiffness at each φ into arrays of its size.
+        fn evaluate(
+            &self,
+            py: Python<'_>,
+            phi: PyBuffer<f64>,
+            alpha: Vec<f64>,
+            torque: PyBuffer<f64>,
+            stiffness: PyBuffer<f64>,
+        ) -> PyResult<()> {
+            check(&self.law, &alpha)?;
+            let phi = slice(py, &phi)?;
+            let (mut values, mut slopes) = (vec![0.0; phi.len()], vec![0.0; phi.len()]);
+            self.law.along(&phi, &alpha, &mut values, &mut slopes);
+            torque.copy_from_slice(py, &values)?;
+            stiffness.copy_from_slice(py, &slopes)
+        }
+
+        /// ∂f/∂α at each φ into an array (size of φ, size of α).
+        fn jacobian(
+            &self,
+            py: Python<'_>,
+            phi: PyBuffer<f64>,
+            alpha: Vec<f64>,
+            out: PyBuffer<f64>,
+        ) -> PyResult<()> {
+            check(&self.law, &alpha)?;
+            let phi = slice(py, &phi)?;
+            let mut rows = vec![0.0; phi.len() * alpha.len()];
+            self.law.jacobian_along(&phi, &alpha, &mut rows);
+            out.copy_from_slice(py, &rows)
+        }
+
+        /// ∂σ/∂α at each φ into an array (size of φ, size of α).
+        fn stiffness_jacobian(
+            &self,
+            py: Python<'_>,
+            phi: PyBuffer<f64>,
+            alpha: Vec<f64>,
+            out: PyBuffer<f64>,
+        ) -> PyResult<()> {
+            check(&self.law, &alpha)?;
+            let phi = slice(py, &phi)?;
+            let mut rows = vec![0.0; phi.len() * alpha.len()];
+            for (phi, row) in phi.iter().zip(rows.chunks_exact_mut(alpha.len().max(1))) {
+                self.law.stiffness_slopes(*phi, &alpha, row);
+            }
+            out.copy_from_slice(py, &rows)
+        }
+
+        /// (torque, stiffness) at one φ.
+        fn at(&self, phi: f64, alpha: Vec<f64>) -> PyResult<(f64, f64)> {
+            check(&self.law, &alpha)?;
+            Ok(self.law.at(phi, &alpha))
+        }
+
+        /// Largest |φ| for which it is defined, rad.
+        fn reach(&self, shape: Vec<f64>) -> f64 {
+            if shape.len() == self.law.shapes().len() { self.law.reach(&shape) } else { f64::INFINITY }
+        }
+    }
+
+    /// Eq 32, and eq 33 where K_max is finite, over a recording: σ after each sample into `out`.
+    #[pyfunction]
+    fn regressor(
+        py: Python<'_>,
+        residual: PyBuffer<f64>,
+        rate: PyBuffer<f64>,
+        k_r: f64,
+        k_max: f64,
+        start: f64,
+        out: PyBuffer<f64>,
+    ) -> PyResult<()> {
+        let (residual, rate) = (slice(py, &residual)?, slice(py, &rate)?);
+        let mut stiffness = start;
+        let told: Vec<f64> = (residual.iter().zip(&rate))
+            .map(|(residual, rate)| {
+                stiffness = crate::paper::regressor_step(stiffness, *residual, *rate, k_r, k_max);
+                stiffness
+            })
+            .collect();
+        out.copy_from_slice(py, &told)
+    }
+
+    /// The terms of one element of an effect, unweighted, at arrays of coordinates.
+    ///
+    /// `coordinates`: 13 rows, one a field of `estimator.effects.Coordinates`; `out`: one row a term.
+    #[pyfunction]
+    fn effect_terms(
+        py: Python<'_>,
+        name: &str,
+        values: Vec<f64>,
+        coordinates: PyBuffer<f64>,
+        out: PyBuffer<f64>,
+    ) -> PyResult<()> {
+        let element = Element::new(name, &values)?;
+        let table = slice(py, &coordinates)?;
+        let n = table.len() / 13;
+        let terms = element.kind.terms();
+        let mut told = vec![0.0; n * terms];
+        for k in 0..n {
+            let at = |field: usize| table[field * n + k];
+            let c = Coordinates {
+                position: at(0),
+                velocity: at(1),
+                acceleration: at(2),
+                deflection: at(3),
+                deflection_rate: at(4),
+                flexibility_torque: at(5),
+                stiffness: at(6),
+                torque: at(7),
+                torque_rate: at(8),
+                link_position: at(9),
+                link_velocity: at(10),
+                link_acceleration: at(11),
+                time: at(12),
+            };
+            let now = element.terms(&c);
+            (0..terms).for_each(|term| told[term * n + k] = now[term]);
+        }
+        out.copy_from_slice(py, &told)
     }
 }

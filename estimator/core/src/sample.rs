@@ -1,5 +1,7 @@
 //! What goes into an estimator and what comes out of it, one tick at a time.
 
+use crate::model::Arrangement;
+
 /// Motors of a joint, at most.
 pub const MOTORS: usize = 2;
 
@@ -80,4 +82,31 @@ pub struct Estimate {
     pub transmissions: [TransmissionEstimate; MOTORS],
     /// How many motors the joint has.
     pub motors: usize,
+}
+
+/// The joint's estimate from its transmissions' own (eqs 9, 11); variances of independent ones add.
+#[must_use]
+pub fn joint_estimate(
+    arrangement: Arrangement,
+    sequence: u64,
+    status: u32,
+    transmissions: [TransmissionEstimate; MOTORS],
+    motors: usize,
+) -> Estimate {
+    let [first, second] = transmissions;
+    let mut joint = Estimate {
+        sequence,
+        status,
+        flexibility_torque: first.flexibility_torque,
+        stiffness: first.stiffness,
+        stiffness_std: first.stiffness_std,
+        transmissions,
+        motors,
+    };
+    if arrangement == Arrangement::Antagonistic {
+        joint.flexibility_torque += second.flexibility_torque;
+        joint.stiffness += second.stiffness;
+        joint.stiffness_std = first.stiffness_std.hypot(second.stiffness_std);
+    }
+    joint
 }

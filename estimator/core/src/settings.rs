@@ -39,6 +39,8 @@ pub struct Settings {
     pub k_r: f64,
     /// K_max < 2 of eq 33.
     pub k_max: f64,
+    /// Of the robust mode's CHANGED.
+    pub false_alarms_per_hour: f64,
 }
 
 impl Default for Settings {
@@ -52,6 +54,26 @@ impl Default for Settings {
             k_sigma_2: 1.0,
             k_r: 1900.0,
             k_max: 1.9,
+            false_alarms_per_hour: 1.0,
         }
     }
+}
+
+/// What is believed about a joint before any data: standard deviations, from `estimator.priors`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Priors {
+    /// Of B, relative to what is declared.
+    pub motor_inertia: f64,
+    /// Of D, relative to what is declared …
+    pub viscous_damping: f64,
+    /// … plus this share of torque over speed.
+    pub viscous_damping_floor: f64,
+    /// Of undeclared dry friction, as a share of the torque.
+    pub coulomb_friction: f64,
+    /// Of a constant torque, likewise.
+    pub torque_offset: f64,
+    /// Of the zero between the encoders, as a share of the deflection.
+    pub deflection_offset: f64,
+    /// Of the link encoder's delay, periods.
+    pub encoder_delay: f64,
 }

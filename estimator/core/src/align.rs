@@ -1,0 +1,92 @@
+//! Channels that are late against each other, shifted back onto one time.
+
+use crate::sample::MOTORS;
+
+const LONGEST: usize = 12; // periods
+
+/// What is measured of a joint at one tick: q, θ_i, τ_i.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Inputs {
+    /// q, rad.
+    pub link: f64,
+    /// θ, rad.
+    pub motor: [f64; MOTORS],
+    /// τ, N·m.
+    pub torque: [f64; MOTORS],
+}
+
+impl Inputs {
+    /// Everything a share of the way to `to`.
+    #[must_use]
+    pub fn towards(&self, to: &Inputs, share: f64) -> Inputs {
+        let mut out = *self;
+        out.link += share * (to.link - self.link);
+        for i in 0..MOTORS {
+            out.motor[i] += share * (to.motor[i] - self.motor[i]);
+            out.torque[i] += share * (to.torque[i] - self.torque[i]);
+        }
+        out
+    }
+}
+
+/// Delays the motors' channels (or the link's) by a fraction of periods, so that all are equally late.
+#[derive(Clone, Debug)]
+pub struct Alignment {
+    /// By how many periods the link is later than the motors.
+    pub periods: f64,
+    past: [Inputs; LONGEST + 2], // a ring
+    newest: usize,
+}
+
+impl Default for Alignment {
+    fn default() -> Alignment {
+        Alignment { periods: 0.0, past: [Inputs::default(); LONGEST + 2], newest: 0 }
+    }
+}
+
+impl Alignment {
+    /// The link is so many periods later than has been assumed so far; returns how much of it is taken on.
+    pub fn shift(&mut self, periods: f64) -> f64 {
+        let new = (self.periods + periods).clamp(-(LONGEST as f64), LONGEST as f64);
+        let taken = new - self.periods;
+        self.periods = new;
+        taken
+    }
+
+    /// All channels as of the same (past) time; after a restart as if they had been there for ever.
+    pub fn align(&mut self, inputs: &Inputs, restart: bool) -> Inputs {
+        let length = self.past.len();
+        self.newest = (self.newest + 1) % length;
+        self.past[self.newest] = *inputs;
+        if restart {
+            self.past = [*inputs; LONGEST + 2];
+        }
+        let lag = self.periods.abs();
+        let whole = lag as usize;
+        let newer = &self.past[(self.newest + length - whole) % length];
+        let older = &self.past[(self.newest + length - whole - 1) % length];
+        let late = newer.towards(older, lag - whole as f64);
+        if self.periods > 0.0 {
+            Inputs { link: inputs.link, ..late }
+        } else {
+            Inputs { link: late.link, ..*inputs }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_ramp_is_delayed_by_fractions_of_periods() {
+        let mut alignment = Alignment::default();
+        alignment.shift(2.25);
+        let mut out = Inputs::default();
+        for k in 0..20 {
+            let k = f64::from(k);
+            out = alignment.align(&Inputs { link: k, motor: [k; 2], torque: [k; 2] }, k == 0.0);
+        }
+        assert!((out.motor[0] - 16.75).abs() < 1e-12 && (out.link - 19.0).abs() < 1e-12);
+    }
+}

@@ -1,0 +1,273 @@
+//! The deflection of this moment: what a controller wants, without the delay of the regression's filter.
+//!
+//! A steady-state Kalman filter with the states [θ, θ′, φ, φ′, φ″]: the motor moves by its own equation (eq
+//! 5, with the stiffness that has been estimated), the deflection by a random third derivative, and θ and
+//! q = θ + φ are measured. Where encoders are coarse it so leans on the torque balance, where they are fine
+//! on the encoders. Its covariance is iterated at the update rate, not at every tick.
+//!
+//! That covariance is a model's: of white noise and of a white third derivative, at a bandwidth with limits.
+//! Fine encoders break it, as their steps are neither. So the innovations of φ are held against it: where
+//! their mean square e² is more than the S = P + R it foresees, the covariance is e²/S times as large (the
+//! normalised innovation squared of Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking
+//! and Navigation", 2001, section 5.4).
+
+const STATES: usize = 5;
+type State = [f64; STATES];
+type Covariance = [State; STATES];
+
+const JERK_S: f64 = 1.0; // over which the mean square of φ‴ is taken
+const JERK_HOLD_S: f64 = 30.0; // how long a lively phase is remembered
+const LIVELY: f64 = 8.0; // the regression's filter hides this much of the square of φ‴
+const CORRELATION_S: f64 = 0.05; // of the third derivative and of unmodelled torques
+const SLOWEST: f64 = 0.5; // bandwidth for φ, over that of the regression's filter …
+const FASTEST: f64 = 10.0; // … and the largest one
+const UNSETTLED: f64 = 6.0; // time constants of the plain filter until a new start is forgotten
+const PLAIN: f64 = 3.0; // its bandwidth, over that of the regression's filter
+const STIFF: f64 = 0.3; // σ T²/B above which the motor's equation is not integrated any more
+
+/// See the module; fed every tick, tuned at every update.
+#[derive(Clone, Debug)]
+pub struct DeflectionFilter {
+    inertia: f64,
+    damping: f64,
+    w: f64,
+    period: f64,
+    average: f64,
+    fade: f64,
+    settling: i64,
+    plain: [State; 2],
+    gains: [State; 2], // by θ and by φ
+    x: State,
+    p: Option<Covariance>,
+    modelled: bool, // whether the motor's equation is of use
+    pull: f64,      // what half a period of φ′ adds to the motor's mean acceleration
+    jerk: f64,
+    peak: f64,
+    squares: [f64; 2], // mean squares of the velocities of motor and link
+    counted: f64,
+    missed: f64, // mean square of φ's innovation, over what is foreseen
+    foreseen: f64,
+    /// Periods until the last start is forgotten.
+    pub unsettled: i64,
+}
+
+/// What one update of the estimation tells a deflection filter.
+#[derive(Clone, Copy, Debug)]
+pub struct Tuning {
+    /// φ‴ of the regression's filter.
+    pub jerk: f64,
+    /// Variance of θ.
+    pub motor_noise: f64,
+    /// Variance of q.
+    pub link_noise: f64,
+    /// B as it has turned out to be.
+    pub inertia: f64,
+    /// D likewise.
+    pub damping: f64,
+    /// σ; 0 where it is not known yet.
+    pub stiffness: f64,
+    /// rms of what the motor's equation leaves unexplained; ∞: it is not used at all.
+    pub unmodelled: f64,
+}
+
+impl DeflectionFilter {
+    /// Of a motor with this inertia and damping; `bandwidth`: of the regression's filter; `dt_s`: between
+    /// two updates.
+    #[must_use]
+    pub fn new(inertia: f64, damping: f64, bandwidth: f64, period: f64, dt_s: f64) -> DeflectionFilter {
+        // Before anything is known: both positions through g-h-k filters.
+        let p = (-PLAIN * bandwidth * period).exp();
+        let (g, h) = (1.0 - p * p * p, 1.5 * (1.0 - p) * (1.0 - p) * (1.0 + p) / period);
+        let k = (1.0 - p).powi(3) / (period * period);
+        let plain = [[g, h, 0.0, 0.0, 0.0], [0.0, 0.0, g, h, k]];
+        let settling = (UNSETTLED / (PLAIN * bandwidth * period)).ceil() as i64;
+        DeflectionFilter {
+            inertia,
+            damping,
+            w: bandwidth,
+            period,
+            average: (dt_s / JERK_S).min(1.0),
+            fade: (-dt_s / JERK_HOLD_S).exp(),
+            settling,
+            plain,
+            gains: plain,
+            x: [0.0; STATES],
+            p: None,
+            modelled: false,
+            pull: 0.0,
+            jerk: 0.0,
+            peak: 0.0,
+            squares: [0.0; 2],
+            counted: 0.0,
+            missed: 1.0,
+            foreseen: f64::INFINITY,
+            unsettled: settling,
+        }
+    }
+
+    /// Forget everything.
+    pub fn reset(&mut self) {
+        (self.jerk, self.peak, self.p, self.modelled) = (0.0, 0.0, None, false);
+        (self.gains, self.pull, self.squares, self.counted) = (self.plain, 0.0, [0.0; 2], 0.0);
+        (self.missed, self.foreseen) = (1.0, f64::INFINITY);
+        self.restart(0.0, 0.0);
+    }
+
+    /// At rest here, as far as one knows: until the rates have been found, plain filters.
+    pub fn restart(&mut self, theta: f64, phi: f64) {
+        self.x = [theta, 0.0, phi, 0.0, 0.0];
+        self.unsettled = self.settling;
+    }
+
+    /// φ, a little ahead of the last sample.
+    #[must_use]
+    pub fn at(&self, ahead_s: f64) -> f64 {
+        self.x[2] + ahead_s * (self.x[3] + 0.5 * ahead_s * self.x[4])
+    }
+
+    /// Velocity of the link at the last sample, rad/s.
+    #[must_use]
+    pub fn link_rate(&self) -> f64 {
+        self.x[1] + self.x[3]
+    }
+
+    /// Variance of φ: the filter's, as its own innovations bear it out, or that of as many counts as pass
+    /// while it averages.
+    ///
+    /// A quantised position errs alike until the next count, so in a memory 1/w there are 1 + rate/(w count)
+    /// independent errors that average out.
+    #[must_use]
+    pub fn variance(&self) -> f64 {
+        self.p.map_or(0.0, |p| (p[2][2] * self.missed.max(1.0)).max(self.counted))
+    }
+
+    /// One period later: measured θ and φ, and the torque that acted, τ + τ_e − x, N·m.
+    pub fn update(&mut self, theta: f64, phi: f64, torque: f64) {
+        let t = self.period;
+        let [x0, x1, x2, x3, x4] = self.x;
+        let plain = self.unsettled > 0;
+        let modelled = self.modelled && !plain;
+        let a = if modelled {
+            (torque - self.damping * x1) / self.inertia + self.pull * x3 // eq 5
+        } else {
+            0.0
+        };
+        let ahead = [x0 + t * (x1 + 0.5 * t * a), x1 + t * a, x2 + t * (x3 + 0.5 * t * x4), x3 + t * x4, x4];
+        let (e, f) = (theta - ahead[0], phi - ahead[2]);
+        let [g, h] = if plain { &self.plain } else { &self.gains };
+        for i in 0..STATES {
+            self.x[i] = ahead[i] + g[i] * e + h[i] * f;
+        }
+        if plain {
+            self.unsettled -= 1;
+        } else {
+            self.missed += t / JERK_S * (f * f / self.foreseen - self.missed);
+        }
+    }
+
+    /// One step towards the steady-state gains.
+    pub fn tune(&mut self, told: &Tuning) {
+        let (t, w) = (self.period, self.w);
+        (self.inertia, self.damping) = (told.inertia, told.damping);
+        self.jerk += self.average * (LIVELY * told.jerk * told.jerk - self.jerk);
+        self.peak = (self.fade * self.peak).max(self.jerk);
+        let noise = told.motor_noise + told.link_noise;
+        if !(noise > 0.0 && self.peak > 0.0 && told.unmodelled < f64::INFINITY) {
+            return;
+        }
+        let density = noise * t;
+        let natural = (self.jerk.max(0.1 * self.peak) * CORRELATION_S / density).powf(1.0 / 6.0);
+        let natural = natural.clamp(SLOWEST * w, FASTEST * w);
+        self.count_steps(told, natural);
+        let mut c = told.stiffness.max(0.0) / self.inertia;
+        let mut drift = (told.unmodelled / self.inertia).powi(2) * CORRELATION_S;
+        if !(c * t * t < STIFF && drift < noise * w.powi(4) * 1e6) {
+            (c, drift) = (0.0, noise * w.powi(4));
+        }
+        self.modelled = c > 0.0;
+        self.pull = 0.5 * c * t;
+        let mut start = [[0.0; STATES]; STATES];
+        for (i, power) in [0, 2, 0, 2, 4].into_iter().enumerate() {
+            start[i][i] = noise * w.powi(power);
+        }
+        let before = self.p.unwrap_or(start);
+        let moved = self.moved(&before, c, drift * t, density * natural.powi(6) * t);
+        // Kalman gains for measured θ and φ = q − θ, whose noises share θ's.
+        let (s00, s01, s11) =
+            (moved[0][0] + told.motor_noise, moved[0][2] - told.motor_noise, moved[2][2] + noise);
+        let determinant = s00 * s11 - s01 * s01;
+        if !(determinant > 0.0 && determinant < f64::INFINITY) {
+            self.p = None;
+            return;
+        }
+        let mut after = moved;
+        for i in 0..STATES {
+            let (theta, phi) = (moved[i][0], moved[i][2]);
+            self.gains[0][i] = (s11 * theta - s01 * phi) / determinant;
+            self.gains[1][i] = (s00 * phi - s01 * theta) / determinant;
+            for j in 0..STATES {
+                after[i][j] -= self.gains[0][i] * moved[0][j] + self.gains[1][i] * moved[2][j];
+            }
+        }
+        self.foreseen = s11;
+        self.p = Some(after);
+    }
+
+    /// F P F' + Q over one period; `c`: σ/B, `drift`: what θ′ gains, `jerk`: what φ″ gains.
+    fn moved(&self, p: &Covariance, c: f64, drift: f64, jerk: f64) -> Covariance {
+        let t = self.period;
+        let pull = c * t;
+        let mut f = [[0.0; STATES]; STATES];
+        for i in 0..STATES {
+            f[i][i] = 1.0;
+        }
+        (f[0][1], f[0][2]) = (t, 0.5 * t * pull);
+        (f[1][1], f[1][2]) = (1.0 - t * self.damping / self.inertia, pull);
+        (f[2][3], f[2][4], f[3][4]) = (t, 0.5 * t * t, t);
+        let (mut half, mut out) = ([[0.0; STATES]; STATES], [[0.0; STATES]; STATES]);
+        for i in 0..STATES {
+            for j in 0..STATES {
+                half[i][j] = (0..STATES).map(|k| f[i][k] * p[k][j]).sum();
+            }
+        }
+        for i in 0..STATES {
+            for j in 0..=i {
+                let sum: f64 = (0..STATES).map(|k| half[i][k] * f[j][k]).sum();
+                (out[i][j], out[j][i]) = (sum, sum);
+            }
+        }
+        out[1][1] += drift;
+        out[4][4] += jerk;
+        out
+    }
+
+    /// The variance of φ that quantisation leaves, were all noise quantisation.
+    fn count_steps(&mut self, told: &Tuning, memory_rad_s: f64) {
+        let rates = [self.x[1], self.x[1] + self.x[3]];
+        self.counted = 0.0;
+        for (i, noise) in [told.motor_noise, told.link_noise].into_iter().enumerate() {
+            self.squares[i] += self.average * (rates[i] * rates[i] - self.squares[i]);
+            if noise > 0.0 {
+                let counts = (self.squares[i] / (12.0 * noise)).sqrt() / memory_rad_s;
+                self.counted += noise / (1.0 + counts);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_deflection_that_bends_steadily_is_followed_without_delay() {
+        let mut filter = DeflectionFilter::new(0.1, 0.5, 60.0, 1e-3, 0.03);
+        filter.restart(0.0, 0.0);
+        for k in 1..3000 {
+            let t = f64::from(k) * 1e-3;
+            filter.update(0.2 * t, 0.1 * t + 0.3 * t * t, 0.0);
+        }
+        assert!((filter.at(0.0) - (0.1 * 2.999 + 0.3 * 2.999 * 2.999)).abs() < 1e-6);
+        assert!((filter.link_rate() - (0.2 + 0.1 + 0.6 * 2.999)).abs() < 1e-4);
+    }
+}

@@ -1,0 +1,364 @@
+//! What stands between the wire and the mathematics: gaps, values that are no numbers, positions that jump.
+
+use crate::model::Model;
+use crate::sample::{MOTORS, Sample, status};
+
+const PLACES: usize = MOTORS + 1;
+const CHANNELS: usize = 2 * MOTORS + 1;
+
+const PATIENCE: u32 = 8; // samples at a new place before a jump is believed, at least …
+const PATIENCE_S: f64 = 0.016; // … and so long
+const MARGIN: f64 = 12.0; // times the largest curvature seen lately
+const PEAK_S: f64 = 2.0; // how long a curvature is remembered
+const FLOOR_RAD: f64 = 1e-3; // no jump is smaller than this
+const COUNTS: f64 = 3.0; // counts of an encoder are no jump either
+const FIRST: u32 = 8; // samples after a start that are not judged
+const TORQUE_MARGIN: f64 = 10.0; // times the acceleration that the largest torque seen gives the motor
+const STILL_S: f64 = 0.02; // a channel that repeats itself for less is never frozen
+const STOPPED_COUNTS: f64 = 10.0; // … nor is a position that was slower than so many counts in that time
+const LEARNING_S: f64 = 2.0; // after the start: how long channels usually repeat themselves
+const LONGEST_GAP_S: f64 = 0.025; // what is longer is not bridged
+const ABSURD: f64 = 1e6; // rad: no position
+const WILD_RAD_S2: f64 = 100.0; // acceleration of the bare motor below which no torque is a surprise …
+const WILD: f64 = 10.0; // … above which it is, if so many times the largest seen
+const TORQUE_S: f64 = 60.0; // how long the largest torque is remembered for that
+const REACH: f64 = 3.0; // times the largest velocity seen: how far a position may be after a gap
+
+/// What the guard made of a sample.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Accepted {
+    /// Since the last sample that was accepted; 0: this one is not to be used.
+    pub periods: u32,
+    /// The filters cannot be carried on over what happened.
+    pub restart: bool,
+    /// GAP, INPUT_REJECTED, RESTARTED.
+    pub status: u32,
+    /// A channel has stood still for longer than it ever did while others move.
+    pub frozen: bool,
+    /// With a restart: by how much each position has moved its zero, motors, then the link.
+    pub jumps: Option<[f64; PLACES]>,
+}
+
+/// Decides of each sample whether it can be used, and how far it is from the last one that was.
+///
+/// A position jumps when it leaves the straight line through the last two by more than acceleration can
+/// explain: the largest lately seen, what the torque can give, and an absolute floor. A single jump is left
+/// out and bridged; where the new place persists, it is the encoder's zero that has moved, and the filters
+/// start anew from there. After a gap a place that no velocity seen so far leads to is a jump, too. A torque
+/// may jump, but one that would throw the bare motor about and is many times the largest one seen is left
+/// out unless it persists. A channel is frozen when it repeats itself exactly for longer than it has ever
+/// done in good times, while a position moves; a position only if it stopped out of motion: a link that
+/// comes to rest while the motors go on, as under a controller, is no fault.
+#[derive(Clone, Debug)]
+pub struct Guard {
+    motors: usize,
+    flexible: bool,
+    period: f64,
+    fade: f64,
+    fade_torque: f64,
+    longest: i64,
+    patience: u32,
+    gain: f64,
+    tame: [f64; MOTORS],
+    still: u32,
+    learning: u32,
+    memory: Memory,
+}
+
+#[derive(Clone, Debug)]
+struct Memory {
+    sequence: Option<u64>,
+    places: [f64; PLACES],
+    slopes: [f64; PLACES],
+    peaks: [f64; PLACES],
+    steps: [f64; PLACES],   // smallest change seen of each position: its resolution
+    limits: [f64; PLACES],  // bends that are jumps
+    fastest: [f64; PLACES], // changes in a period
+    rates: [f64; PLACES],   // mean change in a period, of late
+    stopped_at: [f64; PLACES],
+    astray: [bool; PLACES],
+    values: Option<[f64; CHANNELS]>,
+    runs: [u32; CHANNELS],
+    usual: [u32; CHANNELS],
+    torque: f64,
+    largest: [f64; MOTORS],
+    wild: u32,
+    seen: u32,
+    samples: u32,
+    rejected: u32,
+    motion: f64,
+    frozen: bool,
+}
+
+const FRESH: Memory = Memory {
+    sequence: None,
+    places: [0.0; PLACES],
+    slopes: [0.0; PLACES],
+    peaks: [0.0; PLACES],
+    steps: [f64::INFINITY; PLACES],
+    limits: [f64::INFINITY; PLACES],
+    fastest: [0.0; PLACES],
+    rates: [0.0; PLACES],
+    stopped_at: [0.0; PLACES],
+    astray: [false; PLACES],
+    values: None,
+    runs: [0; CHANNELS],
+    usual: [0; CHANNELS],
+    torque: 0.0,
+    largest: [0.0; MOTORS],
+    wild: 0,
+    seen: 0,
+    samples: 0,
+    rejected: 0,
+    motion: 0.0,
+    frozen: false,
+};
+
+impl Guard {
+    /// A guard of this joint's samples.
+    #[must_use]
+    pub fn new(model: &Model, period_s: f64) -> Guard {
+        let periods = |seconds: f64| (seconds / period_s).round();
+        let lightest = model.motors.iter().map(|motor| motor.inertia).fold(f64::INFINITY, f64::min);
+        let mut tame = [f64::INFINITY; MOTORS];
+        model.motors.iter().zip(&mut tame).for_each(|(motor, tame)| *tame = WILD_RAD_S2 * motor.inertia);
+        Guard {
+            motors: model.motors.len(),
+            flexible: model.has_deflection(),
+            period: period_s,
+            fade: (-period_s / PEAK_S).exp(),
+            fade_torque: (-period_s / TORQUE_S).exp(),
+            longest: periods(LONGEST_GAP_S).max(3.0) as i64,
+            patience: PATIENCE.max(periods(PATIENCE_S) as u32),
+            gain: TORQUE_MARGIN * period_s * period_s / lightest,
+            tame,
+            still: periods(STILL_S).max(4.0) as u32,
+            learning: periods(LEARNING_S) as u32,
+            memory: FRESH,
+        }
+    }
+
+    /// Forget everything.
+    pub fn reset(&mut self) {
+        self.memory = FRESH;
+    }
+
+    /// Smallest change seen of each position (motors, then the link): its resolution, rad; ∞ before any.
+    #[must_use]
+    pub fn resolution(&self) -> &[f64; PLACES] {
+        &self.memory.steps
+    }
+
+    fn watched(&self) -> usize {
+        self.motors + usize::from(self.flexible)
+    }
+
+    /// Judge one sample.
+    pub fn check(&mut self, sample: &Sample) -> Accepted {
+        let rejected = Accepted { status: status::INPUT_REJECTED, ..Accepted::default() };
+        let mut places = [0.0; PLACES];
+        places[..self.motors].copy_from_slice(&sample.motor_position[..self.motors]);
+        if self.flexible {
+            places[self.motors] = sample.link_position;
+        }
+        let size: f64 = places[..self.watched()].iter().map(|x| x.abs()).sum();
+        let impossible = size.is_nan() || size >= ABSURD;
+        if impossible || self.is_wild(&sample.motor_torque) {
+            return rejected;
+        }
+        let Some(last) = self.memory.sequence else { return self.begin(sample.sequence, places, 0, None) };
+        let periods = sample.sequence.wrapping_sub(last) as i64;
+        if periods <= 0 {
+            return self.begin(sample.sequence, places, status::RESTARTED, None);
+        }
+        if periods > self.longest {
+            return self.after_gap(sample.sequence, places, periods);
+        }
+        self.memory.samples = self.memory.samples.saturating_add(1);
+        self.review();
+        let was_frozen = self.memory.frozen;
+        let frozen = self.stands_still(&places, &sample.motor_torque);
+        if self.jumped(&places, periods as f64) {
+            self.memory.rejected += 1;
+            if was_frozen {
+                // It was the frozen value that was wrong.
+                return self.begin(sample.sequence, places, rejected.status | status::RESTARTED, None);
+            }
+            if self.memory.rejected < self.patience {
+                return Accepted { frozen, ..rejected };
+            }
+            let m = &self.memory;
+            let mut jumps = [0.0; PLACES];
+            for i in 0..self.watched() {
+                if m.astray[i] && m.runs[i] < PATIENCE - 2 {
+                    jumps[i] = places[i] - m.places[i] - periods as f64 * m.slopes[i];
+                }
+            }
+            return self.begin(sample.sequence, places, rejected.status | status::RESTARTED, Some(jumps));
+        }
+        let m = &mut self.memory;
+        (m.sequence, m.places) = (Some(sample.sequence), places);
+        m.seen = m.seen.saturating_add(1);
+        m.rejected = 0;
+        let gap = if periods > 1 { status::GAP } else { 0 };
+        let still = if frozen { status::INPUT_REJECTED } else { 0 };
+        Accepted { periods: periods as u32, restart: false, status: gap | still, frozen, jumps: None }
+    }
+
+    fn begin(
+        &mut self,
+        sequence: u64,
+        places: [f64; PLACES],
+        status: u32,
+        jumps: Option<[f64; PLACES]>,
+    ) -> Accepted {
+        let m = &mut self.memory;
+        (m.sequence, m.places) = (Some(sequence), places);
+        m.slopes = [0.0; PLACES];
+        m.rates = [0.0; PLACES];
+        m.astray = [false; PLACES];
+        (m.values, m.frozen, m.seen, m.rejected) = (None, false, 0, 0);
+        self.review();
+        Accepted { periods: 1, restart: true, status, frozen: false, jumps }
+    }
+
+    /// Whether a torque is no finite number, or beyond anything seen and new.
+    fn is_wild(&mut self, torques: &[f64; MOTORS]) -> bool {
+        let m = &mut self.memory;
+        for i in 0..self.motors {
+            let size = torques[i].abs();
+            if !size.is_finite() {
+                return true;
+            }
+            if size >= self.tame[i].max(WILD * m.largest[i]) {
+                m.wild += 1;
+                if m.wild < self.patience || size > ABSURD * self.tame[i] {
+                    return true;
+                }
+            }
+            m.largest[i] = m.largest[i].max(size);
+            m.torque = m.torque.max(size);
+        }
+        m.wild = 0;
+        false
+    }
+
+    /// What has been seen fades, and with it what is too much.
+    fn review(&mut self) {
+        let m = &mut self.memory;
+        m.torque *= self.fade;
+        m.largest = m.largest.map(|size| self.fade_torque * size);
+        let floor = FLOOR_RAD.max(self.gain * m.torque);
+        for i in 0..PLACES {
+            m.peaks[i] *= self.fade;
+            let step = if m.steps[i].is_finite() { COUNTS * m.steps[i] } else { f64::INFINITY };
+            m.limits[i] = floor.max(MARGIN * m.peaks[i]).max(step);
+        }
+    }
+
+    /// The first sample after a gap too long to be bridged; its place is to be one that can be reached.
+    fn after_gap(&mut self, sequence: u64, places: [f64; PLACES], periods: i64) -> Accepted {
+        let mut flags = status::GAP | status::RESTARTED;
+        let mut jumps = [0.0; PLACES];
+        let m = &mut self.memory;
+        if m.samples > self.learning {
+            for i in 0..self.motors + usize::from(self.flexible) {
+                let off = places[i] - m.places[i];
+                if off.abs() > FLOOR_RAD + REACH * m.fastest[i] * periods as f64 {
+                    jumps[i] = off;
+                }
+            }
+            if jumps.iter().any(|jump| *jump != 0.0) {
+                m.rejected += 1;
+                if m.rejected < self.patience {
+                    return Accepted { status: status::INPUT_REJECTED | status::GAP, ..Accepted::default() };
+                }
+                flags |= status::INPUT_REJECTED;
+            }
+        }
+        let any = jumps.iter().any(|jump| *jump != 0.0);
+        self.begin(sequence, places, flags, any.then_some(jumps))
+    }
+
+    /// Whether a channel is frozen: everything at rest is no fault, one encoder count now and then no motion.
+    fn stands_still(&mut self, places: &[f64; PLACES], torques: &[f64; MOTORS]) -> bool {
+        let watched = self.watched();
+        let count = watched + self.motors;
+        let m = &mut self.memory;
+        let mut values = [0.0; CHANNELS];
+        values[..watched].copy_from_slice(&places[..watched]);
+        values[watched..count].copy_from_slice(&torques[..self.motors]);
+        let Some(old) = m.values.replace(values) else {
+            m.runs = [0; CHANNELS];
+            return false;
+        };
+        let (mut moving, mut frozen) = (0.0, false);
+        for i in 0..count {
+            if values[i] == old[i] {
+                m.runs[i] += 1;
+                let run = m.runs[i];
+                if run == 1 && i < watched {
+                    m.stopped_at[i] = m.rates[i];
+                }
+                if m.samples < self.learning {
+                    m.usual[i] = m.usual[i].max(run);
+                }
+                // A torque always counts as one that was moving before.
+                let stopped_dead =
+                    i >= watched || m.stopped_at[i] * f64::from(self.still) > STOPPED_COUNTS * m.steps[i];
+                frozen |= run > self.still && run > 3 * m.usual[i] && stopped_dead;
+            } else {
+                m.runs[i] = 0;
+                if i < watched {
+                    moving = 1.0;
+                }
+            }
+        }
+        m.motion += 0.05 * (moving - m.motion);
+        m.frozen = frozen && m.motion > 0.2;
+        m.frozen
+    }
+
+    fn jumped(&mut self, places: &[f64; PLACES], periods: f64) -> bool {
+        let watched = self.watched();
+        let m = &mut self.memory;
+        let checked = m.seen >= FIRST || (m.seen >= 2 && m.samples > self.learning);
+        if m.rejected == 0 {
+            m.astray = [false; PLACES];
+        }
+        let (mut jumped, mut slopes) = (false, [0.0; PLACES]);
+        for i in 0..watched {
+            let change = places[i] - m.places[i];
+            slopes[i] = change / periods;
+            let bend = (slopes[i] - m.slopes[i]).abs();
+            if checked && bend > m.limits[i] {
+                m.astray[i] = true;
+                jumped = true;
+            }
+            if jumped {
+                continue;
+            }
+            let size = change.abs();
+            m.rates[i] += 0.1 * (size - m.rates[i]);
+            if size > 0.0 && size < m.steps[i] {
+                m.steps[i] = size;
+            }
+            m.fastest[i] = m.fastest[i].max(size / periods);
+            if bend > m.peaks[i] && m.seen > 0 {
+                // The first two samples make the first slope.
+                m.peaks[i] = bend;
+                m.limits[i] = m.limits[i].max(MARGIN * bend);
+            }
+        }
+        if !jumped {
+            m.slopes = slopes;
+        }
+        jumped
+    }
+
+    /// T.
+    #[must_use]
+    pub fn period(&self) -> f64 {
+        self.period
+    }
+}

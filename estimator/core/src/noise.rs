@@ -1,0 +1,74 @@
+//! How noisy are the encoders? From the third differences of what they read, and never less than the
+//! rounding of a count: uniform, so its variance is a twelfth of the count's square.
+
+const MEMORY_S: f64 = 2.0; // over which the noise is measured
+const OUTLIER: f64 = 100.0; // times the variance: no noise
+const THIRD: f64 = 0.05; // the third difference of white noise has 20 times its variance
+
+/// Variance of the noise of one smooth signal.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct NoiseMeter {
+    past: [f64; 3], // newest first
+    known: u8,
+    seen: f64,
+    measured: f64,
+}
+
+impl NoiseMeter {
+    /// The signal goes on elsewhere.
+    pub fn restart(&mut self) {
+        (self.known, self.seen) = (0, 0.0);
+    }
+
+    /// One sample.
+    pub fn see(&mut self, value: f64, period_s: f64) {
+        let [a, b, c] = self.past;
+        self.past = [value, a, b];
+        if self.known < 3 {
+            self.known += 1;
+            return;
+        }
+        self.seen += 1.0;
+        let third = value - 3.0 * a + 3.0 * b - c;
+        let square = THIRD * third * third;
+        if self.measured == 0.0 {
+            // Before anything is known: an average over what has been seen.
+            self.measured += square / self.seen.max(1.0);
+            return;
+        }
+        let gain = (period_s / MEMORY_S).max(1.0 / self.seen).min(1.0);
+        self.measured += gain * (square.min(OUTLIER * self.measured) - self.measured);
+    }
+
+    /// rad², with the resolution that has been seen (∞: none).
+    #[must_use]
+    pub fn variance(&self, resolution: f64) -> f64 {
+        let rounding = if resolution.is_finite() { resolution * resolution / 12.0 } else { 0.0 };
+        self.measured.max(rounding)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_parabola_has_no_noise_but_that_of_its_counts() {
+        let mut meter = NoiseMeter::default();
+        for k in 0..500 {
+            meter.see(1e-4 * f64::from(k * k), 1e-3);
+        }
+        assert!(meter.variance(f64::INFINITY) < 1e-18);
+        assert!((meter.variance(1e-3) - 1e-6 / 12.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn alternating_noise_is_measured() {
+        // ±a has third differences of ±8 a: 64/20 of its variance.
+        let mut meter = NoiseMeter::default();
+        for k in 0..5000 {
+            meter.see(if k % 2 == 0 { 0.1 } else { -0.1 }, 1e-3);
+        }
+        assert!((meter.variance(f64::INFINITY) / 0.01 - 3.2).abs() < 1e-6);
+    }
+}

@@ -1,0 +1,402 @@
+//! Mode "paper": eqs 14, 28, 32, 33 as printed, correctly discretised, one tick at a time.
+//!
+//! Faithful on purpose: regressors are not filtered like the residual, velocities are taken as the drive
+//! gives them (a difference of positions where it gives none). What that costs on a real drive's signals is
+//! what the robust mode is for.
+
+use crate::filters::{first_order_pole, tustin_biquad};
+use crate::guard::Guard;
+use crate::laws::{Alpha, Law, PARAMETERS, powers};
+use crate::model::{Arrangement, Model, Motor, Transmission};
+use crate::sample::{Estimate, MOTORS, Sample, TransmissionEstimate, joint_estimate, status};
+use crate::settings::{Method, Settings};
+
+const EXCITED_RAD2_S2: f64 = 1e-6; // mean square of φ′ above which K_R φ′² teaches anything
+const ENERGY_S: f64 = 0.5; // over which that mean is taken
+const SCATTER_S: f64 = 0.5; // over which the stiffness's mean and scatter are taken
+const SIGMA_95: f64 = 1.96; // a 95 % interval, which may not hold zero
+
+/// y = B θ′ + D θ − ∫τ, whose derivative is τ_e (from eq 5); the torque is held from sample to sample.
+#[derive(Clone, Debug)]
+struct Balance {
+    inertia: f64,
+    damping: f64,
+    period: f64,
+    origin: Option<f64>,
+    integral: f64,
+    torque: f64,
+}
+
+impl Balance {
+    fn update(&mut self, position: f64, velocity: f64, torque: f64, periods: f64) -> f64 {
+        self.integral += self.torque * self.period * periods;
+        self.torque = torque;
+        let value = self.inertia * velocity + self.damping * position - self.integral;
+        value - *self.origin.get_or_insert(value)
+    }
+}
+
+/// r_τe of eq 14, K s/(s + K) y: r_k = a r_(k−1) + (1 − a)(y_k − y_(k−1))/T, exact for a straight y.
+#[derive(Clone, Debug)]
+struct FirstOrder {
+    balance: Balance,
+    k: f64,
+    value: f64,
+    last: f64,
+}
+
+impl FirstOrder {
+    fn update(&mut self, position: f64, velocity: f64, torque: f64, periods: f64) -> f64 {
+        let y = self.balance.update(position, velocity, torque, periods);
+        let span = self.balance.period * periods;
+        let a = first_order_pole(self.k, span);
+        self.value = a * self.value + (1.0 - a) * (y - self.last) / span;
+        self.last = y;
+        self.value
+    }
+}
+
+/// r_σ of eq 28, K1 s²/(s² + K2 s + K1) y by the bilinear transform; a gap is bridged along a straight y.
+#[derive(Clone, Debug)]
+struct SecondOrder {
+    balance: Balance,
+    b: [f64; 3],
+    a: [f64; 3],
+    value: f64,
+    last: f64,
+    w: [f64; 2],
+}
+
+impl SecondOrder {
+    fn update(&mut self, position: f64, velocity: f64, torque: f64, periods: u32) -> f64 {
+        let y = self.balance.update(position, velocity, torque, f64::from(periods));
+        let slope = (y - self.last) / f64::from(periods);
+        for k in 1..=periods {
+            let u = self.last + f64::from(k) * slope;
+            self.value = self.b[0] * u + self.w[0];
+            self.w[0] = self.b[1] * u - self.a[1] * self.value + self.w[1];
+            self.w[1] = self.b[2] * u - self.a[2] * self.value;
+        }
+        self.last = y;
+        self.value
+    }
+}
+
+/// σ(k+1) = σ(k) + K_R (r_σ φ′ − σ(k) φ′²) (eq 32); eq 33 limits the product K_R φ′² of this step only:
+/// read literally, it would lower K_R for good.
+#[must_use]
+pub fn regressor_step(stiffness: f64, residual: f64, rate: f64, k_r: f64, k_max: f64) -> f64 {
+    let energy = rate * rate;
+    let k_r = if k_r * energy > k_max { k_max / energy } else { k_r };
+    stiffness + k_r * (residual * rate - stiffness * energy)
+}
+
+/// Least squares in α one row at a time (eqs 22, 23), the same answer as the batch.
+///
+/// Kept as the triangular square root of the normal equations (QR by Givens rotations), so that columns of
+/// very different size (φ, φ³, φ⁵ …) cost no more accuracy than they do in a batch QR.
+#[derive(Clone, Debug)]
+pub struct RecursiveLeastSquares {
+    size: usize,
+    r: [[f64; PARAMETERS + 1]; PARAMETERS],
+    error: f64,
+    rows: f64,
+}
+
+impl RecursiveLeastSquares {
+    /// For so many coefficients.
+    #[must_use]
+    pub fn new(size: usize) -> RecursiveLeastSquares {
+        RecursiveLeastSquares { size, r: [[0.0; PARAMETERS + 1]; PARAMETERS], error: 0.0, rows: 0.0 }
+    }
+
+    /// Take in one row J_j and its right-hand side r_j.
+    pub fn update(&mut self, row: &[f64], value: f64) {
+        let n = self.size;
+        let mut new = [0.0; PARAMETERS + 1];
+        new[..n].copy_from_slice(&row[..n]);
+        new[n] = value;
+        for i in 0..n {
+            if new[i] == 0.0 {
+                continue;
+            }
+            let old = &mut self.r[i];
+            let norm = old[i].hypot(new[i]);
+            let (c, s) = (old[i] / norm, new[i] / norm);
+            for j in i..=n {
+                (old[j], new[j]) = (c * old[j] + s * new[j], c * new[j] - s * old[j]);
+            }
+        }
+        self.error += new[n] * new[n];
+        self.rows += 1.0;
+    }
+
+    /// Coefficients; 0 where the rows so far do not tell them.
+    #[must_use]
+    pub fn alpha(&self) -> Alpha {
+        let mut alpha = [0.0; PARAMETERS];
+        for i in (0..self.size).rev() {
+            let row = &self.r[i];
+            if row[i] > 0.0 {
+                let rest: f64 = (i + 1..self.size).map(|j| row[j] * alpha[j]).sum();
+                alpha[i] = (row[self.size] - rest) / row[i];
+            }
+        }
+        alpha
+    }
+
+    /// Standard deviation of slopes · α if the rows' errors were independent; NaN where it is not told.
+    #[must_use]
+    pub fn std(&self, slopes: &[f64]) -> f64 {
+        let n = self.size;
+        if self.rows <= n as f64 {
+            return f64::NAN;
+        }
+        // |R^-T slopes|, by forward substitution.
+        let (mut solved, mut square) = ([0.0; PARAMETERS], 0.0);
+        for i in 0..n {
+            let rest: f64 = (0..i).map(|j| self.r[j][i] * solved[j]).sum();
+            solved[i] = (slopes[i] - rest) / self.r[i][i];
+            square += solved[i] * solved[i];
+        }
+        (square * self.error / (self.rows - n as f64)).sqrt()
+    }
+}
+
+/// One motor with its transmission.
+#[derive(Clone, Debug)]
+struct Part {
+    period: f64,
+    rigid: bool,
+    settings: Settings,
+    torque: FirstOrder,
+    slope: SecondOrder,
+    squares: RecursiveLeastSquares,
+    by_model: bool,
+    stiffness: f64,
+    mean: f64, // of the stiffness, and its mean square about it
+    scatter: f64,
+    energy: f64,
+    theta: f64,
+    q: f64,
+    held: TransmissionEstimate,
+}
+
+impl Part {
+    fn new(motor: &Motor, settings: &Settings, period: f64) -> Part {
+        let balance = Balance {
+            inertia: motor.inertia,
+            damping: motor.damping,
+            period,
+            origin: None,
+            integral: 0.0,
+            torque: 0.0,
+        };
+        let (polynomial, order) = match &motor.transmission {
+            Transmission::Elastic { law: Law::Linear, .. } => (true, 1),
+            Transmission::Elastic { law, order, .. } => (law.is_polynomial(), order.unwrap_or(2)),
+            _ => (false, 2),
+        };
+        let (k1, k2) = (settings.k_sigma_1, settings.k_sigma_2);
+        let (b, a) = tustin_biquad([k1, 0.0, 0.0], [1.0, k2, k1], period);
+        Part {
+            period,
+            rigid: !motor.flexible(),
+            settings: *settings,
+            torque: FirstOrder { balance: balance.clone(), k: settings.k_tau, value: 0.0, last: 0.0 },
+            slope: SecondOrder { balance, b, a, value: 0.0, last: 0.0, w: [0.0; 2] },
+            squares: RecursiveLeastSquares::new(order),
+            by_model: polynomial && settings.method == Method::Mbe,
+            stiffness: 0.0,
+            mean: 0.0,
+            scatter: 0.0,
+            energy: 0.0,
+            theta: f64::NAN,
+            q: f64::NAN,
+            held: TransmissionEstimate::NOTHING,
+        }
+    }
+
+    fn reset(&mut self) {
+        self.stiffness = 0.0;
+        (self.mean, self.scatter) = (0.0, 0.0);
+        self.energy = 0.0;
+        self.squares = RecursiveLeastSquares::new(self.squares.size);
+        self.restart();
+    }
+
+    fn restart(&mut self) {
+        for balance in [&mut self.torque.balance, &mut self.slope.balance] {
+            (balance.origin, balance.integral, balance.torque) = (None, 0.0, 0.0);
+        }
+        (self.torque.value, self.torque.last) = (0.0, 0.0);
+        (self.slope.value, self.slope.last, self.slope.w) = (0.0, 0.0, [0.0; 2]);
+        (self.theta, self.q) = (f64::NAN, f64::NAN);
+        self.held = TransmissionEstimate::NOTHING;
+    }
+
+    fn update(&mut self, theta: f64, omega: f64, tau: f64, q: f64, q_rate: f64, periods: u32) {
+        let span = self.period * f64::from(periods);
+        let omega = if omega.is_finite() { omega } else { (theta - self.theta) / span };
+        if omega.is_nan() {
+            // The first position alone gives no velocity to start from.
+            (self.theta, self.q) = (theta, q);
+            return;
+        }
+        let torque = self.torque.update(theta, omega, tau, f64::from(periods)); // eq 14
+        self.theta = theta;
+        if self.rigid {
+            self.held = TransmissionEstimate { flexibility_torque: torque, ..TransmissionEstimate::NOTHING };
+            return;
+        }
+        let difference = if self.q.is_nan() { 0.0 } else { (q - self.q) / span };
+        let q_rate = if q_rate.is_finite() { q_rate } else { difference };
+        self.q = q;
+        let (phi, rate) = (q - theta, q_rate - omega);
+        let slope = self.slope.update(theta, omega, tau, periods); // eq 28
+        self.energy += (span / ENERGY_S).min(1.0) * (rate * rate - self.energy);
+        if self.by_model {
+            let (mut row, n) = ([0.0; PARAMETERS], self.squares.size);
+            powers(phi, &mut row[..n]);
+            self.squares.update(&row, torque); // eqs 22, 23
+            let alpha = self.squares.alpha();
+            self.stiffness = Law::Polynomial.at(phi, &alpha[..n]).1;
+        } else {
+            let (k_r, k_max) = (self.settings.k_r, self.settings.k_max);
+            let next = regressor_step(self.stiffness, slope, rate, k_r, k_max); // eqs 32, 33
+            self.stiffness = if next.is_finite() { next } else { 0.0 };
+        }
+        let (gain, off) = ((span / SCATTER_S).min(1.0), self.stiffness - self.mean);
+        self.mean += gain * off;
+        self.scatter += gain * (off * off - self.scatter);
+        self.held = TransmissionEstimate {
+            flexibility_torque: torque,
+            stiffness: self.stiffness,
+            stiffness_std: f64::NAN,
+            deflection: phi,
+        };
+    }
+
+    /// Whether the torque is a number and the stiffness is told to be positive.
+    ///
+    /// The paper's stiffness has no standard deviation. Its scatter is the least that it is uncertain by: where
+    /// mean and scatter leave zero inside 95 %, nothing is told, not even the sign.
+    fn of_use(&self) -> bool {
+        let told = self.stiffness > 0.0 && self.mean > SIGMA_95 * self.scatter.sqrt();
+        self.held.flexibility_torque.is_finite() && (self.rigid || told)
+    }
+
+    fn observable(&self) -> bool {
+        !self.rigid && self.energy > EXCITED_RAD2_S2
+    }
+}
+
+/// The paper's estimator for a whole joint.
+#[derive(Clone, Debug)]
+pub struct Paper {
+    arrangement: Arrangement,
+    guard: Guard,
+    parts: Vec<Part>,
+}
+
+impl Paper {
+    /// For a model that has been checked.
+    #[must_use]
+    pub fn new(model: &Model, settings: &Settings, period_s: f64) -> Paper {
+        Paper {
+            arrangement: model.arrangement,
+            guard: Guard::new(model, period_s),
+            parts: model.motors.iter().map(|motor| Part::new(motor, settings, period_s)).collect(),
+        }
+    }
+
+    /// Forget everything.
+    pub fn reset(&mut self) {
+        self.guard.reset();
+        self.parts.iter_mut().for_each(Part::reset);
+    }
+
+    /// The coefficients of each transmission's polynomial with their standard deviations, or the black box's
+    /// stiffness alone.
+    pub fn parameters(&self, motor: usize, values: &mut Vec<f64>, std: &mut Vec<f64>) -> Option<Law> {
+        let part = &self.parts[motor];
+        if !part.by_model {
+            values.push(part.stiffness);
+            return None;
+        }
+        let n = part.squares.size;
+        values.extend_from_slice(&part.squares.alpha()[..n]);
+        for i in 0..n {
+            let mut one = [0.0; PARAMETERS];
+            one[i] = 1.0;
+            std.push(part.squares.std(&one[..n]));
+        }
+        Some(Law::Polynomial)
+    }
+
+    /// The estimate at this sample, whatever floats it holds.
+    pub fn step(&mut self, sample: &Sample) -> Estimate {
+        let accepted = self.guard.check(sample);
+        let mut flags = accepted.status;
+        if accepted.restart {
+            self.parts.iter_mut().for_each(Part::restart);
+        }
+        if accepted.periods > 0 {
+            for (i, part) in self.parts.iter_mut().enumerate() {
+                let (theta, omega) = (sample.motor_position[i], sample.motor_velocity[i]);
+                let (tau, q) = (sample.motor_torque[i], sample.link_position);
+                part.update(theta, omega, tau, q, sample.link_velocity, accepted.periods);
+            }
+        }
+        if self.parts.iter().all(Part::of_use) {
+            flags |= status::VALID;
+        }
+        let flexible = self.parts.iter().any(|part| !part.rigid);
+        if accepted.periods > 0 && flexible && self.parts.iter().all(|p| p.rigid || p.observable()) {
+            flags |= status::OBSERVABLE;
+        }
+        let mut held = [TransmissionEstimate::NOTHING; MOTORS];
+        self.parts.iter().zip(&mut held).for_each(|(part, held)| *held = part.held);
+        joint_estimate(self.arrangement, sample.sequence, flags, held, self.parts.len())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_residual_of_a_constant_torque_rises_as_its_filter_does() {
+        // A motor held at rest against a constant torque: τ_e = −τ, through K/(s + K) (eq 15).
+        let (k, period, tau) = (300.0, 1e-3, 2.0);
+        let balance =
+            Balance { inertia: 0.1, damping: 0.2, period, origin: None, integral: 0.0, torque: 0.0 };
+        let mut residual = FirstOrder { balance, k, value: 0.0, last: 0.0 };
+        for n in 0..50 {
+            let expected = -tau * (1.0 - (-k * period * f64::from(n)).exp());
+            assert!((residual.update(0.4, 0.0, tau, 1.0) - expected).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn recursive_least_squares_find_the_coefficients_of_exact_rows() {
+        let mut squares = RecursiveLeastSquares::new(2);
+        for k in 1..20 {
+            let phi = 0.01 * f64::from(k);
+            squares.update(&[phi, phi * phi * phi], 150.0 * phi + 1500.0 * phi * phi * phi);
+        }
+        let alpha = squares.alpha();
+        assert!((alpha[0] - 150.0).abs() < 1e-8 && (alpha[1] - 1500.0).abs() < 1e-6);
+        assert!(squares.std(&[1.0, 0.0]) < 1e-6);
+    }
+
+    #[test]
+    fn the_saturated_regressor_stays_stable_where_the_plain_one_would_not() {
+        // With K_R φ′² limited to K_max < 2 the error shrinks by 1 − K_max a step.
+        let mut stiffness = 0.0;
+        for _ in 0..200 {
+            stiffness = regressor_step(stiffness, 50.0 * 3.0, 3.0, 1900.0, 1.9);
+        }
+        assert!((stiffness - 50.0).abs() < 1e-6);
+    }
+}

@@ -1,0 +1,355 @@
+//! Mode "robust": the joint's estimator for the signals real drives give.
+//!
+//! Each tick, in order: guard the input, correct the readings, bridge gaps, align the channels, filter them,
+//! follow the deflection; every so many ticks, as the errors' correlation allows, the balance of a motor
+//! becomes an equation of its recursive estimation; torque and stiffness are read off the curve.
+
+use crate::align::{Alignment, Inputs};
+use crate::delay::{DelaySearch, Known};
+use crate::effects::{Corrections, MotorEffects};
+use crate::error::Error;
+use crate::guard::Guard;
+use crate::laws::Law;
+use crate::model::{Arrangement, Model};
+use crate::noise::NoiseMeter;
+use crate::sample::{Estimate, MOTORS, Sample, TransmissionEstimate, joint_estimate, status};
+use crate::settings::{Priors, Settings};
+use crate::track::{Channel, Filters, Moment, Track};
+
+const SAID_S: f64 = 0.5; // how long a restart is reported
+const TRUST_S: f64 = 0.02; // how long an estimate is carried over rejected samples
+const FORESEEN_S: f64 = 0.04; // how far ahead a deflection is told from its last motion
+const HOME: f64 = 0.01; // of a jump: what is as near to the first zero is that zero again
+const UPDATE_S: f64 = 0.03; // between two equations of a motor, at the usual bandwidth; shorter above it …
+const UPDATE_PHASE: f64 = 1.8; // … so that the bandwidth turns by no more than this, rad
+const SETTLE_DELAYS: f64 = 4.5; // filter delays after which a wrong start is forgotten
+const BRIDGED: f64 = 0.4; // rad that the filter turns by in a gap: a longer one is not learned from
+const SMALL_DELAY: f64 = 0.1; // periods: left to the regression
+
+/// See the module.
+#[derive(Clone, Debug)]
+pub struct Robust {
+    arrangement: Arrangement,
+    flexible: bool,
+    motors: usize,
+    period: f64,
+    filters: Filters,
+    every: u64, // periods between two equations of a motor
+    settle: i64,
+    guard: Guard,
+    corrections: Corrections,
+    alignment: Alignment,
+    search: DelaySearch,
+    lead: usize, // the motor whose balance tells the link encoder's delay
+    tracks: Vec<Track>,
+    link: Channel,
+    noise: [NoiseMeter; MOTORS + 1],
+    zeros: Inputs, // where the encoders' zeros have moved to
+    last: Inputs,
+    tick: u64,
+    unsettled: i64, // periods for which the filters still hold something wrong
+    said: i64,
+    rejected: i64,
+    started: bool,
+    sequence: u64, // of the last sample that was used
+    estimate: Option<Estimate>,
+}
+
+impl Robust {
+    /// For a model that has been checked.
+    ///
+    /// # Errors
+    /// An effect is where it does not belong.
+    pub fn new(model: &Model, settings: &Settings, priors: &Priors, period_s: f64) -> Result<Robust, Error> {
+        let filters = Filters::new(settings.bandwidth, period_s);
+        let update_s = UPDATE_S.min(UPDATE_PHASE / settings.bandwidth);
+        let every = 2 * (0.5 * update_s / period_s).round().max(1.0) as u64;
+        let effects: Vec<MotorEffects> =
+            model.motors.iter().map(|motor| MotorEffects::new(&motor.effects)).collect::<Result<_, _>>()?;
+        let corrections = Corrections::new(&effects, &model.link_effects, period_s)?;
+        let dt = every as f64 * period_s;
+        let tracks: Vec<Track> = (model.motors.iter().zip(effects))
+            .map(|(motor, effects)| Track::new(motor, effects, settings, priors, &filters, period_s, dt))
+            .collect();
+        let lead = model.motors.iter().position(|motor| motor.flexible()).unwrap_or(0);
+        let known = Known {
+            inertia: model.motors[lead].inertia,
+            damping: model.motors[lead].damping,
+            inertia_std: priors.motor_inertia,
+            damping_std: priors.viscous_damping,
+            damping_share: priors.viscous_damping_floor,
+        };
+        let mut made = Robust {
+            arrangement: model.arrangement,
+            flexible: model.has_deflection(),
+            motors: model.motors.len(),
+            period: period_s,
+            filters,
+            every,
+            settle: (SETTLE_DELAYS * filters.delay / period_s).ceil() as i64,
+            guard: Guard::new(model, period_s),
+            corrections,
+            alignment: Alignment::default(),
+            search: DelaySearch::new(&known, filters.main.bandwidth, period_s),
+            lead,
+            tracks,
+            link: Channel::rest(0.0),
+            noise: [NoiseMeter::default(); MOTORS + 1],
+            zeros: Inputs::default(),
+            last: Inputs::default(),
+            tick: 0,
+            unsettled: 0,
+            said: 0,
+            rejected: 0,
+            started: false,
+            sequence: 0,
+            estimate: None,
+        };
+        made.reset();
+        Ok(made)
+    }
+
+    /// Forget everything.
+    pub fn reset(&mut self) {
+        self.guard.reset();
+        self.corrections.reset();
+        self.alignment = Alignment::default();
+        self.search.reset();
+        self.tracks.iter_mut().for_each(Track::reset);
+        self.noise = [NoiseMeter::default(); MOTORS + 1];
+        (self.zeros, self.last) = (Inputs::default(), Inputs::default());
+        (self.tick, self.unsettled, self.said, self.rejected) = (0, self.settle, 0, 0);
+        (self.started, self.sequence, self.estimate) = (false, 0, None);
+    }
+
+    /// The next sample may not be of its moment: learn nothing until the filters have forgotten it.
+    pub fn distrust(&mut self) {
+        self.unsettled = self.settle;
+        self.search.begin();
+    }
+
+    /// Largest misfit among the motors' balances at the last update, N·m; NaN until there is a model.
+    #[must_use]
+    pub fn residual(&self) -> f64 {
+        self.tracks.iter().map(|track| track.misfit().abs()).fold(f64::NAN, f64::max)
+    }
+
+    /// Parameters of one motor's transmission and their standard deviations; the law they belong to.
+    pub fn parameters(&self, motor: usize, values: &mut Vec<f64>, std: &mut Vec<f64>) -> Option<&Law> {
+        self.tracks[motor].parameters(values, std)
+    }
+
+    /// The estimate at this sample, whatever floats it holds.
+    pub fn step(&mut self, sample: &Sample) -> Estimate {
+        // Can it be used, and how far is it from the last one that was?
+        let accepted = self.guard.check(sample);
+        if accepted.periods == 0 {
+            return self.carry(sample.sequence, accepted.status);
+        }
+        self.rejected = 0;
+        let corrected = self.corrections.correct(sample);
+        let mut inputs = Inputs {
+            link: if self.flexible { corrected.link_position } else { 0.0 },
+            motor: corrected.motor_position,
+            torque: corrected.motor_torque,
+        };
+        for i in self.motors..MOTORS {
+            (inputs.motor[i], inputs.torque[i]) = (0.0, 0.0);
+        }
+        if let Some(jumps) = accepted.jumps {
+            self.move_zeros(jumps, &inputs, sample.sequence);
+        }
+        self.sequence = sample.sequence;
+        inputs.link -= self.zeros.link;
+        (0..MOTORS).for_each(|i| inputs.motor[i] -= self.zeros.motor[i]);
+        if accepted.frozen {
+            self.distrust();
+        }
+        // All channels as of one moment, and every period between the last sample and this one.
+        let inputs = self.alignment.align(&inputs, accepted.restart);
+        if accepted.restart {
+            self.restart(&inputs);
+        } else {
+            let (from, periods) = (self.last, f64::from(accepted.periods));
+            for k in 1..accepted.periods {
+                self.advance(&from.towards(&inputs, f64::from(k) / periods));
+            }
+            self.advance(&inputs);
+            // A motion at the bandwidth w loses (w n T)²/12 of its amplitude by a straight line.
+            if periods > 2.0 && periods * self.period * self.filters.main.bandwidth > BRIDGED {
+                self.distrust();
+            }
+        }
+        self.conclude(sample.sequence, accepted.status)
+    }
+
+    /// One period: filters, deflections, and, when its turn has come, what a motor's balance teaches.
+    fn advance(&mut self, now: &Inputs) {
+        let usable = self.unsettled <= 0;
+        self.tick += 1;
+        self.link.smooth(&self.filters, now.link);
+        self.noise[self.motors].see(now.link, self.period);
+        let time = self.tick as f64 * self.period;
+        for (i, track) in self.tracks.iter_mut().enumerate() {
+            let (theta, torque, before) = (now.motor[i], now.torque[i], self.last.torque[i]);
+            track.feed(&self.filters, theta, now.link - theta, torque, before, usable);
+            track.feed_effects(&self.filters, &self.link, time);
+            self.noise[i].see(theta, self.period);
+        }
+        self.last = *now;
+        self.unsettled -= 1;
+        let turn = self.every / self.motors as u64;
+        if self.tick % turn == 0 {
+            let i = (self.tick / turn % self.motors as u64) as usize;
+            self.update(i, usable);
+        }
+        if self.flexible {
+            let (motor, torque) = (now.motor[self.lead], now.torque[self.lead]);
+            if let Some(late) = self.search.see(now.link, motor, torque, usable) {
+                self.realign(late);
+            }
+        }
+    }
+
+    /// One equation of one motor, and what follows from it.
+    fn update(&mut self, i: usize, usable: bool) {
+        let resolution = *self.guard.resolution();
+        let m = self.motors;
+        let noise = [self.noise[i].variance(resolution[i]), self.noise[m].variance(resolution[m])];
+        let track = &mut self.tracks[i];
+        if track.is_rigid() {
+            return;
+        }
+        if track.update(&self.filters, &Moment { link: self.link.main, usable, noise }) {
+            self.unsettled = self.settle;
+            return;
+        }
+        if !usable || !self.search.looked() {
+            return;
+        }
+        if let Some(late) = track.take_delay() {
+            let taken = self.alignment.shift(late);
+            track.shift_delay(taken);
+            self.unsettled = self.settle;
+            self.search.begin();
+        }
+    }
+
+    /// The link encoder has been found late by so many periods: what was learned is void.
+    fn realign(&mut self, late: f64) {
+        if late.abs() < SMALL_DELAY {
+            return;
+        }
+        self.alignment.shift(late);
+        self.unsettled = self.settle;
+        for (i, track) in self.tracks.iter_mut().enumerate() {
+            track.relearn();
+            track.deflection.restart(self.last.motor[i], self.last.link - self.last.motor[i]);
+        }
+    }
+
+    /// Everything that has a past begins anew where the joint is now; what has been learned is kept.
+    fn restart(&mut self, now: &Inputs) {
+        self.link = Channel::rest(now.link);
+        for (i, track) in self.tracks.iter_mut().enumerate() {
+            track.restart(now.motor[i], now.link - now.motor[i], now.torque[i]);
+        }
+        self.noise.iter_mut().for_each(NoiseMeter::restart);
+        self.search.restart(now.link, now.motor[self.lead], now.torque[self.lead]);
+        self.last = *now;
+        self.unsettled = self.settle;
+        self.said = if self.started { (SAID_S / self.period).round() as i64 } else { 0 };
+        self.started = true;
+    }
+
+    /// Encoders have moved their zeros: go on as if they had not.
+    fn move_zeros(&mut self, mut jumps: [f64; MOTORS + 1], inputs: &Inputs, sequence: u64) {
+        let m = self.motors;
+        let ahead =
+            (sequence.wrapping_sub(self.sequence) as f64 + self.alignment.periods.abs()) * self.period;
+        // A deflection that went on as it was measures a jump; the guard is coarse.
+        let link = inputs.link - self.zeros.link;
+        for i in 0..m {
+            let track = &self.tracks[i];
+            if ahead > FORESEEN_S || track.is_rigid() || track.deflection.unsettled > 0 {
+                continue;
+            }
+            let off = link - (inputs.motor[i] - self.zeros.motor[i]) - track.deflection.at(ahead);
+            if jumps[i] != 0.0 && jumps[m] == 0.0 {
+                jumps[i] = -off;
+            } else if jumps[m] != 0.0 && jumps[i] == 0.0 {
+                jumps[m] = off;
+            }
+        }
+        let moved = |zero: f64, jump: f64| {
+            // One that jumps back has come home exactly.
+            let moved = zero + jump;
+            if moved.abs() < HOME * jump.abs() { 0.0 } else { moved }
+        };
+        for i in 0..m {
+            self.zeros.motor[i] = moved(self.zeros.motor[i], jumps[i]);
+        }
+        if self.flexible {
+            self.zeros.link = moved(self.zeros.link, jumps[m]);
+        }
+        self.tracks.iter_mut().for_each(Track::reopen_shift);
+    }
+
+    /// What is said of a sample that was used.
+    fn conclude(&mut self, sequence: u64, flags: u32) -> Estimate {
+        let (mut flags, mut valid, mut observable) = (flags, true, self.flexible && self.unsettled <= 0);
+        let (parts, of_use) = self.read(0.0);
+        for (track, of_use) in self.tracks.iter().zip(of_use) {
+            valid &= of_use;
+            if !track.is_rigid() {
+                valid &= track.deflection.unsettled <= 0;
+                observable &= track.excited();
+                if track.changed() {
+                    flags |= status::CHANGED;
+                }
+            }
+        }
+        if valid && flags & status::INPUT_REJECTED == 0 {
+            flags |= status::VALID;
+            if observable {
+                flags |= status::OBSERVABLE;
+            }
+        }
+        if self.said > 0 {
+            self.said -= 1;
+            flags |= status::RESTARTED;
+        }
+        let estimate = joint_estimate(self.arrangement, sequence, flags, parts, self.motors);
+        self.estimate = Some(estimate);
+        estimate
+    }
+
+    /// What is said where the sample cannot be used: the last estimate, for a while.
+    fn carry(&mut self, sequence: u64, flags: u32) -> Estimate {
+        self.rejected += 1;
+        let since = self.rejected as f64 * self.period;
+        let Some(last) = self.estimate else {
+            let (parts, _) = self.read(0.0);
+            return joint_estimate(self.arrangement, sequence, flags, parts, self.motors);
+        };
+        let mut flags = flags | last.status & (status::CHANGED | status::RESTARTED);
+        if since > TRUST_S {
+            return Estimate { sequence, status: flags, ..last };
+        }
+        let (parts, of_use) = self.read(since);
+        if of_use.iter().all(|of_use| *of_use) {
+            flags |= last.status & status::VALID;
+        }
+        joint_estimate(self.arrangement, sequence, flags, parts, self.motors)
+    }
+
+    /// Each transmission's estimate, so long after the last sample, and whether it is of use.
+    fn read(&mut self, since_s: f64) -> ([TransmissionEstimate; MOTORS], [bool; MOTORS]) {
+        let ahead = since_s + self.alignment.periods.abs() * self.period; // what waits for the latest channel
+        let (mut parts, mut of_use) = ([TransmissionEstimate::NOTHING; MOTORS], [true; MOTORS]);
+        for (i, track) in self.tracks.iter_mut().enumerate() {
+            (parts[i], of_use[i]) = track.estimate(ahead, self.filters.delay);
+        }
+        (parts, of_use)
+    }
+}

@@ -1,0 +1,134 @@
+"""What changes is found, what only is not declared is no change, and what was fitted is not left for a wrong value."""
+
+import joints
+import numpy as np
+import onlinekit as kit
+import pytest
+
+from estimator import (
+    EstimatorSettings,
+    JointModel,
+    Motor,
+    Record,
+    Status,
+    Transmission,
+    fit,
+    make_estimator,
+    register_table,
+)
+from estimator.transmissions import MODELS
+
+T = 1e-3
+N = 3
+
+
+def run(seconds, *, scale_at=(np.inf, 1.0), coulomb=0.0, seed=11):
+    """N soft joints in rich motion: what an estimator says of each, and the truth."""
+    rng = np.random.default_rng(seed)
+    n = round(seconds / T)
+    K = rng.uniform(80, 220, (N, 1))
+    alpha = np.stack([K, K * rng.uniform(10, 60, (N, 1))], axis=-1)
+    B, D = rng.uniform(0.08, 0.2, (N, 1)), rng.uniform(0.4, 1.2, (N, 1))
+    M, Dq, gravity = np.full(N, 0.45), np.full(N, 0.3), np.full(N, 3.0)
+    plants = joints.Plants(
+        *joints.polynomial(alpha), B, D, M, Dq, gravity, coulomb=coulomb, scale_at=scale_at
+    )
+    truth = joints.simulate(plants, joints.sweep(rng, n, N, 1, T, np.full((1, N, 1), 7.0), 3.0), T)
+    told = []
+    for j in range(N):
+        record = joints.record(
+            truth,
+            j,
+            T,
+            motor_counts=8192,
+            link_bits=17,
+            velocity_rad_s=None,
+            torque_noise=rng.normal(0, 0.04, (n, 1)),
+        )
+        estimator = make_estimator(joints.joint_model(B[j, 0], D[j, 0]), EstimatorSettings(), T)
+        told.append(np.array([estimator.step(sample)[:5] for sample in record.samples()]))
+    return told, truth
+
+
+def changed(out):
+    return out[:, 1].astype(int) & int(Status.CHANGED) > 0
+
+
+def valid(out):
+    return out[:, 1].astype(int) & int(Status.VALID) > 0
+
+
+@pytest.mark.parametrize("factor", [0.8, 0.9, 1.25])
+def test_a_step_of_the_stiffness_is_announced_and_followed_and_not_valid_meanwhile(factor):
+    at = 7000
+    told, truth = run(9.0, scale_at=(at * T, factor))
+    for j, out in enumerate(told):
+        assert not np.any(changed(out)[:at])
+        found = at + int(np.argmax(changed(out)[at:]))
+        assert changed(out)[found] and found < at + 250
+        error = np.abs(out[:, 3] / truth.sigma[:, j, 0] - 1)
+        assert np.median(error[at + 500 :]) < 0.02
+        # From the alarm on nothing is valid that is off by more than its interval.
+        beyond = valid(out) & (error > 0.1) & (error * truth.sigma[:, j, 0] > 5 * out[:, 4])
+        assert not np.any(beyond[found:])
+
+
+def test_friction_that_nobody_declared_is_no_change_but_widens_the_interval():
+    """0.3 N·m is 3 to 5 % of the torque: it comes in bursts, at reversals."""
+    widths = []
+    for coulomb in (0.0, 0.3):
+        told, truth = run(14.0, coulomb=coulomb)
+        late = slice(5000, None)
+        for j, out in enumerate(told):
+            assert not np.any(changed(out))
+            assert np.mean(valid(out)[late]) > 0.95
+            off = np.abs(out[late, 3] - truth.sigma[late, j, 0])
+            assert np.mean(off < 3.0 * out[late, 4]) > 0.9
+        widths.append(np.median([np.median(out[late, 4] / out[late, 3]) for out in told]))
+    assert widths[1] > 1.2 * widths[0]
+
+
+def test_a_fitted_spring_is_not_left_for_a_wrong_one():
+    fitted = kit.motion("constant", 30.0)
+    record = Record(
+        period_s=kit.PERIOD_S,
+        sequence=np.arange(len(fitted.samples)),
+        motor_position_rad=np.array([s.motor_position_rad for s in fitted.samples]),
+        motor_torque_nm=np.array([s.motor_torque_nm for s in fitted.samples]),
+        link_position_rad=np.array([s.link_position_rad for s in fitted.samples]),
+    )
+    found = fit(record, kit.declared("constant", parameters={}))
+    for seed in (1, 2):
+        motion = kit.motion("constant", 8.0, seed=seed)
+        told, _ = kit.play(kit.declared("constant", parameters=found[0].parameters), motion.samples)
+        assert not np.any(kit.wrong(told, motion.stiffness_nm_rad))
+        assert np.mean(told.valid[4000:]) > 0.99
+
+
+def test_a_measured_curve_is_a_model_too():
+    """A table of tau_e, declared; the spring is 15 % stiffer than it was measured."""
+    name = "table-for-test"
+    phi = np.linspace(0.02, 0.8, 40)
+    register_table(name, phi, 100.0 * phi + 400.0 * phi**3)
+    try:
+        rng = np.random.default_rng(4)
+        n = 6000
+        alpha = 1.15 * np.array([[[100.0, 400.0]]])
+        B, D = np.full((1, 1), 0.12), np.full((1, 1), 0.8)
+        plants = joints.Plants(
+            *joints.polynomial(alpha), B, D, np.full(1, 0.45), np.full(1, 0.3), np.full(1, 3.0)
+        )
+        truth = joints.simulate(plants, joints.sweep(rng, n, 1, 1, T, np.full((1, 1, 1), 7.0), 3.0), T)
+        record = joints.record(truth, 0, T, motor_counts=16384, link_bits=18, velocity_rad_s=None)
+        transmission = Transmission(model=name, parameters={"k_nm_rad": 1.0})
+        motor = Motor(inertia_kg_m2=0.12, viscous_damping_nm_s_rad=0.8, transmission=transmission)
+        model = JointModel(arrangement="single", motors=(motor,))
+        estimator = make_estimator(model, EstimatorSettings(), T)
+        out = np.array([estimator.step(sample)[:5] for sample in record.samples()])
+        late = slice(3000, None)
+        # A cubic between points of the table is good to a few parts in ten thousand.
+        assert out[late, 3] == pytest.approx(truth.sigma[late, 0, 0], rel=5e-3)
+        assert np.mean(valid(out)[late]) > 0.95
+        assert estimator.parameters()[0]["parameters"]["k_nm_rad"] == pytest.approx(1.15, rel=2e-3)
+    finally:
+        del MODELS[name]

@@ -3,7 +3,8 @@ from typing import Any
 
 from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle.chain import Watch
-from estimator.online import Estimator
+from estimator._core import Estimator as _Core
+from estimator.online import Estimator as _Estimator
 from estimator.sample import Estimate, Sample
 
 LATE: int
@@ -187,6 +188,9 @@ class Tick:
     def stamped(self, stamp_ns: int) -> Tick:
         """The same at another time."""
 
+class Estimator(_Core):
+    """`estimator._core.Estimator`, as this module has it."""
+
 class History:
     """The last samples of a joint, for a new estimator to start from; any thread may read them."""
 
@@ -220,12 +224,12 @@ class Chain:
     """
 
     def __init__(
-        self, assembler: Assembler, estimator: Estimator, watch: Watch | None = None, *, keep: int = 0
+        self, assembler: Assembler, estimator: _Estimator, watch: Watch | None = None, *, keep: int = 0
     ) -> None: ...
     @property
     def assembler(self) -> Assembler: ...
     @property
-    def estimator(self) -> Estimator: ...
+    def estimator(self) -> _Estimator: ...
     @property
     def watch(self) -> Watch | None: ...
     @property

@@ -42,24 +42,30 @@ class Estimator(Protocol):
 class _Compiled:
     """`estimator._core.Estimator` with parameters by their names."""
 
-    def __init__(self, model: JointModel, settings: EstimatorSettings, period_s: float) -> None:
-        self._core = _core.Estimator(model, settings, period_s)
+    def __init__(
+        self,
+        model: JointModel,
+        settings: EstimatorSettings,
+        period_s: float,
+        core: type[_core.Estimator],
+    ) -> None:
+        self.core = core(model, settings, period_s)
         self._model = model
-        self.step = self._core.step
-        self.reset = self._core.reset
-        self.distrust = self._core.distrust
+        self.step = self.core.step
+        self.reset = self.core.reset
+        self.distrust = self.core.distrust
 
     @property
     def residual_nm(self) -> float:
         """See `Estimator`."""
-        return self._core.residual_nm
+        return self.core.residual_nm
 
     def parameters(self) -> list[dict[str, Any]]:
         """See `Estimator`."""
         return [self._named(i, motor) for i, motor in enumerate(self._model.motors)]
 
     def _named(self, i: int, motor: Motor) -> dict[str, Any]:
-        told, polynomial, values, std = self._core.alpha(i)
+        told, polynomial, values, std = self.core.alpha(i)
         if not motor.flexible:
             return {"model": RIGID, "parameters": {}, "std": {}}
         if not told:
@@ -74,11 +80,23 @@ class _Compiled:
         }
 
 
-def make_estimator(model: JointModel, settings: EstimatorSettings, period_s: float) -> Estimator:
+def make_estimator(
+    model: JointModel,
+    settings: EstimatorSettings,
+    period_s: float,
+    core: type[_core.Estimator] = _core.Estimator,
+) -> Estimator:
     """The estimator that the settings ask for.
+
+    Args:
+        model: of the joint.
+        settings: which estimator, and how it is to work.
+        period_s: of the samples.
+        core: the compiled class. Every extension module has one of its own, which it calls without Python in
+            between.
 
     Raises:
         EstimatorError: the model names a transmission that does not exist, or contradicts itself.
     """
     require_finite(0.0, strict=True, period_s=period_s)
-    return _Compiled(model, settings, period_s)
+    return _Compiled(model, settings, period_s, core)

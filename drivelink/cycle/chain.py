@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, Protocol
 
+from drivelink import _core
 from drivelink._core import Assembler, Chain
 from drivelink.canopen.layout import NodeLayout
 from drivelink.errors import DriveError
@@ -35,7 +36,8 @@ Built = tuple[Estimator, Watch | None]
 
 def build(joint: JointFile) -> Built:
     """Estimator and watch of a joint."""
-    return make_estimator(joint.model(), joint.estimator, joint.bus.period_s), make_watch(joint)
+    estimator = make_estimator(joint.model(), joint.estimator, joint.bus.period_s, core=_core.Estimator)
+    return estimator, make_watch(joint)
 
 
 def make_assembler(joint: JointFile, layouts: Sequence[NodeLayout]) -> Assembler:

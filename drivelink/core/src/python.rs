@@ -5,6 +5,7 @@
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use estimator_core::python::Estimator;
 use estimator_core::sample::{Estimate, MOTORS, Sample, TransmissionEstimate};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
@@ -536,16 +537,29 @@ impl History {
     }
 }
 
-/// An estimator with Python's protocol, and the watch over its residual.
-struct PythonEstimator {
+/// The estimator of a chain, and the watch over its residual.
+struct Driver {
     estimator: Py<PyAny>,
+    /// What it is made of, where that is the compiled one: it is called without Python in between.
+    compiled: Option<Py<Estimator>>,
     watch: Option<Py<PyAny>>,
     motors: usize,
 }
 
-impl Step for PythonEstimator {
+impl Driver {
+    fn new(py: Python<'_>, estimator: Py<PyAny>, watch: Option<Py<PyAny>>) -> Driver {
+        let core = estimator.bind(py).getattr("core").ok();
+        let compiled = core.and_then(|core| core.cast_into().ok()).map(Bound::unbind);
+        Driver { estimator, compiled, watch, motors: 0 }
+    }
+}
+
+impl Step for Driver {
     fn step(&mut self, sample: &Sample) -> Result<Estimate, Failure> {
         Python::attach(|py| {
+            if let Some(compiled) = &self.compiled {
+                return Ok(compiled.try_borrow_mut(py).map_err(PyErr::from)?.inner.step(sample));
+            }
             let sample = sample_object(py, sample, self.motors)?;
             estimate_from(&self.estimator.bind(py).call_method1("step", (sample,))?)
         })
@@ -578,7 +592,7 @@ struct Chain {
     assembler: Py<Assembler>,
     history: Py<History>,
     state: Mutex<Pipeline>,
-    driver: Mutex<PythonEstimator>, // held while Python runs: by the cycle's thread only
+    driver: Mutex<Driver>, // held while Python runs: by the cycle's thread only
     objects: Mutex<(Py<PyAny>, Option<Py<PyAny>>)>, // estimator and watch, for whoever asks
 }
 
@@ -619,7 +633,7 @@ impl Chain {
             assembler,
             history: Py::new(py, History { keep, kept: Mutex::new(VecDeque::with_capacity(keep)) })?,
             state: Mutex::default(),
-            driver: Mutex::new(PythonEstimator { estimator, watch, motors: 0 }),
+            driver: Mutex::new(Driver::new(py, estimator, watch)),
             objects: Mutex::new(objects),
         })
     }
@@ -705,10 +719,11 @@ impl Chain {
             }
         }
         let objects = (estimator.clone_ref(py), watch.as_ref().map(|watch| watch.clone_ref(py)));
+        let next = Driver::new(py, estimator, watch);
         let Ok(mut driver) = self.driver.try_lock() else {
             return Err(PyRuntimeError::new_err("two threads feed one joint"));
         };
-        let before = std::mem::replace(&mut *driver, PythonEstimator { estimator, watch, motors: 0 });
+        let before = std::mem::replace(&mut *driver, next);
         drop(driver);
         let shown = std::mem::replace(&mut *lock(&self.objects), objects);
         drop((before, shown)); // their destructors may run Python code
@@ -723,7 +738,7 @@ mod extension {
     use super::*;
 
     #[pymodule_export]
-    use super::{Assembler, Chain, History, NodeCounters, Tick, encode_estimate, encode_sample};
+    use super::{Assembler, Chain, Estimator, History, NodeCounters, Tick, encode_estimate, encode_sample};
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

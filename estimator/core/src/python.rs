@@ -14,7 +14,7 @@ use crate::effects::Element;
 use crate::error::Error;
 use crate::laws::{Foreign, Law, Shape, Table};
 use crate::model::{Arrangement, Link, Model, Motor, Transmission};
-use crate::sample::{Estimate, MOTORS, Sample};
+use crate::sample::{Estimate, MOTORS, Sample, TransmissionEstimate};
 use crate::settings::{Method, Mode, Priors, Settings};
 
 impl From<Error> for PyErr {
@@ -300,6 +300,78 @@ pub fn estimate<'py>(py: Python<'py>, told: &Estimate) -> PyResult<Bound<'py, Py
     make.call1((&tuples.estimate, (sequence, told.status, totals.0, totals.1, totals.2, parts)))
 }
 
+/// The on-line estimator of a joint, in either mode; see `estimator.online.Estimator`.
+#[pyclass]
+pub struct Estimator {
+    /// The mathematics.
+    pub inner: crate::estimator::Estimator,
+    motors: usize,
+}
+
+#[pymethods]
+impl Estimator {
+    #[new]
+    fn new(model: &Bound<'_, PyAny>, settings: &Bound<'_, PyAny>, period_s: f64) -> PyResult<Estimator> {
+        let inner = estimator(model, settings, period_s)?;
+        Ok(Estimator { inner, motors: model.getattr("motors")?.len()? })
+    }
+
+    /// The estimate at this sample.
+    fn step<'py>(&mut self, sample: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
+        let (mut taken, motors) = self::sample(sample)?;
+        if motors != self.motors {
+            taken.motor_position[0] = f64::NAN; // no sample of this joint: rejected
+        }
+        let told = self.inner.step(&taken);
+        estimate(sample.py(), &told)
+    }
+
+    /// Forget everything that was learned.
+    fn reset(&mut self) {
+        self.inner.reset();
+    }
+
+    /// The next sample may not be of its moment: use it, but learn nothing from it.
+    fn distrust(&mut self) {
+        self.inner.distrust();
+    }
+
+    /// What the model left unexplained of the torque balance at the last sample; nan: unknown.
+    #[getter]
+    fn residual_nm(&self) -> f64 {
+        self.inner.residual()
+    }
+
+    /// (whether they are of a law, whether that is a polynomial, α, its standard deviations) of one motor.
+    fn alpha(&self, motor: usize) -> PyResult<(bool, bool, Vec<f64>, Vec<f64>)> {
+        if motor >= self.motors {
+            return Err(PyValueError::new_err(format!("motor: expected 0 to {}", self.motors - 1)));
+        }
+        let (mut values, mut std) = (Vec::new(), Vec::new());
+        let law = self.inner.parameters(motor, &mut values, &mut std);
+        let polynomial = matches!(law, Some(Law::Polynomial));
+        Ok((law.is_some(), polynomial, values, std))
+    }
+
+    /// Seconds that each of so many ticks takes, the samples being taken again and again in turn.
+    fn time_ticks(&mut self, samples: Vec<Bound<'_, PyAny>>, ticks: usize) -> PyResult<Vec<f64>> {
+        let taken: Vec<Sample> =
+            samples.iter().map(|one| Ok(self::sample(one)?.0)).collect::<PyResult<_>>()?;
+        let nothing = TransmissionEstimate::NOTHING;
+        let mut last: Option<Estimate> = None;
+        let mut seconds = Vec::with_capacity(ticks);
+        for k in 0..ticks {
+            let mut sample = taken[k % taken.len()];
+            sample.sequence = k as u64;
+            let start = std::time::Instant::now();
+            last = Some(self.inner.step(&sample));
+            seconds.push(start.elapsed().as_secs_f64());
+        }
+        debug_assert!(last.is_none_or(|last| last.transmissions[0] != nothing));
+        Ok(seconds)
+    }
+}
+
 /// What `estimator._core` offers.
 #[cfg(feature = "extension-module")]
 #[pyo3::pymodule(name = "_core")]
@@ -310,82 +382,13 @@ mod extension {
 
     use crate::effects::{Coordinates, Element};
     use crate::laws::{Law, PARAMETERS};
-    use crate::sample::{Estimate, Sample, TransmissionEstimate};
+
+    #[pymodule_export]
+    use super::Estimator;
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
         module.add("__version__", env!("CARGO_PKG_VERSION"))
-    }
-
-    /// The on-line estimator of a joint, in either mode; see `estimator.online.Estimator`.
-    #[pyclass]
-    struct Estimator {
-        inner: crate::estimator::Estimator,
-        motors: usize,
-    }
-
-    #[pymethods]
-    impl Estimator {
-        #[new]
-        fn new(model: &Bound<'_, PyAny>, settings: &Bound<'_, PyAny>, period_s: f64) -> PyResult<Estimator> {
-            let inner = super::estimator(model, settings, period_s)?;
-            Ok(Estimator { inner, motors: model.getattr("motors")?.len()? })
-        }
-
-        /// The estimate at this sample.
-        fn step<'py>(&mut self, sample: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
-            let (mut taken, motors) = super::sample(sample)?;
-            if motors != self.motors {
-                taken.motor_position[0] = f64::NAN; // no sample of this joint: rejected
-            }
-            let told = self.inner.step(&taken);
-            super::estimate(sample.py(), &told)
-        }
-
-        /// Forget everything that was learned.
-        fn reset(&mut self) {
-            self.inner.reset();
-        }
-
-        /// The next sample may not be of its moment: use it, but learn nothing from it.
-        fn distrust(&mut self) {
-            self.inner.distrust();
-        }
-
-        /// What the model left unexplained of the torque balance at the last sample; nan: unknown.
-        #[getter]
-        fn residual_nm(&self) -> f64 {
-            self.inner.residual()
-        }
-
-        /// (whether they are of a law, whether that is a polynomial, α, its standard deviations) of one motor.
-        fn alpha(&self, motor: usize) -> PyResult<(bool, bool, Vec<f64>, Vec<f64>)> {
-            if motor >= self.motors {
-                return Err(PyValueError::new_err(format!("motor: expected 0 to {}", self.motors - 1)));
-            }
-            let (mut values, mut std) = (Vec::new(), Vec::new());
-            let law = self.inner.parameters(motor, &mut values, &mut std);
-            let polynomial = matches!(law, Some(Law::Polynomial));
-            Ok((law.is_some(), polynomial, values, std))
-        }
-
-        /// Seconds that each of so many ticks takes, the samples being taken again and again in turn.
-        fn time_ticks(&mut self, samples: Vec<Bound<'_, PyAny>>, ticks: usize) -> PyResult<Vec<f64>> {
-            let taken: Vec<Sample> =
-                samples.iter().map(|one| Ok(super::sample(one)?.0)).collect::<PyResult<_>>()?;
-            let nothing = TransmissionEstimate::NOTHING;
-            let mut last: Option<Estimate> = None;
-            let mut seconds = Vec::with_capacity(ticks);
-            for k in 0..ticks {
-                let mut sample = taken[k % taken.len()];
-                sample.sequence = k as u64;
-                let start = std::time::Instant::now();
-                last = Some(self.inner.step(&sample));
-                seconds.push(start.elapsed().as_secs_f64());
-            }
-            debug_assert!(last.is_none_or(|last| last.transmissions[0] != nothing));
-            Ok(seconds)
-        }
     }
 
     /// A transmission's law over arrays of float64; α as `estimator.flexibility` has it.

@@ -9,16 +9,14 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
 import onlinekit as kit
 
-from estimator import JointModel, Record, fit
-from estimator.diagnosis import calibrate
-from estimator.model import Transmission
+from estimator import JointModel, Record
+from estimator.identify import identify
 from estimator.sample import Sample, Status
 from estimator.watch import Floor, ResidualWatch, measure_floor
 
@@ -152,11 +150,7 @@ def _fitted(name: str) -> tuple[JointModel, Floor]:
         link_position_rad=np.array([s.link_position_rad for s in motion.samples]),
     )
     declared = kit.declared(name, parameters={})
-    motors = tuple(
-        replace(motor, transmission=Transmission(model=one.model, parameters=one.parameters))
-        for motor, one in zip(declared.motors, fit(record, declared), strict=True)
-    )
-    model = calibrate(record, replace(declared, motors=motors))
+    model = identify(record, declared).model
     return model, measure_floor(record, model)
 
 

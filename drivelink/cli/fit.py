@@ -17,8 +17,9 @@ examples:
   drivelink fit healthy.csv --joint elbow.toml --out fit/ --plots --write elbow-fitted.toml
   drivelink fit healthy.mcap --json                   a recording of drivelink carries its joint file
 
---write puts the transmission's parameters, and the motor's inertia and damping as far as the recording
-tells them, into a copy of the joint file; `run`, `replay` and `diagnose` start from there.
+What is printed, and what fit.json says, is what --write puts into a copy of the joint file: parameters of
+the transmission, inertia and damping of the motor, link dynamics where they are declared, and delays and
+zeros of the readings, as effects. `run`, `replay` and `diagnose` start from there.
 """
 
 

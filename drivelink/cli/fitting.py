@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -23,11 +23,11 @@ from drivelink.jointfile import JointFile, JointText
 from drivelink.outfile import check_target, write_whole
 from drivelink.recording.columnmap import parse_column_map
 from drivelink.version import __version__
-from estimator.batch import TransmissionFit, fit
-from estimator.diagnosis import calibrate
+from estimator.batch import TransmissionFit
 from estimator.errors import EstimatorError
 from estimator.gate import GateError
-from estimator.model import Effect, JointModel, ParameterValue, Transmission
+from estimator.identify import Identified, identify
+from estimator.model import Effect, Motor, ParameterValue
 from estimator.sample import Record
 from estimator.transmissions import MODELS, RIGID
 
@@ -53,12 +53,12 @@ def fit_recording(args: argparse.Namespace, source: JointText, folder: Path | No
     record = recording.read(args.recording, joint, base_dir=source.folder, names=names)
     bandwidth = None if args.bandwidth_hz is None else 2.0 * math.pi * args.bandwidth_hz
     try:
-        fits = fit(record, joint.model(), bandwidth)
+        found = identify(record, joint.model(), bandwidth)
     except GateError as error:
         raise refusal(args.recording, joint, error.findings, str(error)) from error
     except EstimatorError as error:
         raise RecordingError(f"{args.recording}: {error}") from error
-    document, made = _as_json(fits), []
+    document, made = _as_json(found), []
     if args.out is not None:
         made.append(args.out / "fit.json")
         _folder(args.out)
@@ -66,14 +66,14 @@ def fit_recording(args: argparse.Namespace, source: JointText, folder: Path | No
         write_whole(made[0], json.dumps(document, indent=2) + "\n", force=True)
     if folder is not None:
         _folder(folder)
-        made.append(_plot(fits, joint, folder))
+        made.append(_plot(found.fits, joint, folder))
     if args.write is not None:
-        _write(args, source, fits, record)
+        _write(args, source, found, record)
         made.append(args.write)
     if args.json:
         print(json.dumps(document))
         return
-    _print(fits)
+    _print(found)
     for path in made:
         print(f"wrote {path}")
 
@@ -86,56 +86,87 @@ def _inputs(args: argparse.Namespace) -> list[Path]:
     return [args.recording, *([args.joint] if args.joint else [])]
 
 
-def _as_json(fits: list[TransmissionFit]) -> dict[str, Any]:
-    return {"transmissions": [_entry(one) for one in fits]}
+def _as_json(found: Identified) -> dict[str, Any]:
+    pairs = zip(found.fits, found.model.motors, strict=True)
+    document: dict[str, Any] = {"transmissions": [_entry(one, motor) for one, motor in pairs]}
+    link = _link(found)
+    if link:
+        document["link"] = link
+    return document
 
 
-def _entry(one: TransmissionFit) -> dict[str, Any]:
+def _entry(one: TransmissionFit, motor: Motor) -> dict[str, Any]:
     entry: dict[str, Any] = {"model": one.model, "parameters": one.parameters, "std": one.std}
+    entry["motor"] = {
+        "inertia_kg_m2": motor.inertia_kg_m2,
+        "viscous_damping_nm_s_rad": motor.viscous_damping_nm_s_rad,
+    }
+    if motor.effects:
+        entry["effects"] = [_effect(effect) for effect in motor.effects]
     if one.model == RIGID:
         return entry
     std = one.nuisance_std
-    entry["motor"] = {
-        "inertia_kg_m2": one.inertia_kg_m2,
-        "inertia_std_kg_m2": std["inertia"],
-        "viscous_damping_nm_s_rad": one.viscous_damping_nm_s_rad,
-        "viscous_damping_std_nm_s_rad": std["damping"],
-        "coulomb_nm": one.coulomb_nm,
-        "offset_nm": one.offset_nm,
-    }
-    entry["alignment"] = {
-        "link_delay_s": one.link_delay_s,
-        "torque_skew_s": one.torque_skew_s,
-        "deflection_offset_rad": one.deflection_offset_rad,
-    }
+    entry["motor"] |= {"inertia_std_kg_m2": std["inertia"], "viscous_damping_std_nm_s_rad": std["damping"]}
+    entry["unmodelled"] = {"coulomb_nm": one.coulomb_nm, "offset_nm": one.offset_nm}
     entry["error_rms_nm"] = one.error_rms_nm
     entry["error_relative"] = one.error_rms_nm / one.torque_rms_nm
     entry["excited"] = one.excited
     return entry
 
 
-def _print(fits: list[TransmissionFit]) -> None:
+def _link(found: Identified) -> dict[str, Any]:
+    """[link] as found: its dynamics, and the effects at it and in its encoder."""
+    link: dict[str, Any] = {}
+    if found.model.link is not None:
+        link["dynamics"] = asdict(found.model.link)
+    if found.model.link_effects:
+        link["effect"] = [_effect(effect) for effect in found.model.link_effects]
+    return link
+
+
+def _print(found: Identified) -> None:
     console = Console()
-    for number, one in enumerate(fits, start=1):
-        if one.model == RIGID:
-            console.print(f"motor {number}: rigid, nothing to fit")
-            continue
-        table = Table(title=f"motor {number}: {one.model}", title_justify="left")
-        for column in ("parameter", "value", "± (95 %)"):
-            table.add_column(column, justify="left" if column == "parameter" else "right")
+    for number, (one, motor) in enumerate(zip(found.fits, found.model.motors, strict=True), start=1):
+        table = _table(f"motor {number}: {'rigid' if one.model == RIGID else one.model}")
         for name, value in one.parameters.items():
             for label, x, sigma in _rows(name, value, one.std[name]):
                 table.add_row(label, f"{x:.6g}", f"{_SIGMA_95 * sigma:.2g}")
-        std = one.nuisance_std
-        table.add_row("inertia_kg_m2", f"{one.inertia_kg_m2:.6g}", f"{_SIGMA_95 * std['inertia']:.2g}")
-        damping = f"{_SIGMA_95 * std['damping']:.2g}"
-        table.add_row("viscous_damping_nm_s_rad", f"{one.viscous_damping_nm_s_rad:.6g}", damping)
+        for name, key in (("inertia_kg_m2", "inertia"), ("viscous_damping_nm_s_rad", "damping")):
+            told = key in one.nuisance_std
+            shown = f"{_SIGMA_95 * one.nuisance_std[key]:.2g}" if told else ""
+            table.add_row(name, f"{getattr(motor, name):.6g}", shown)
+        _add_effects(table, motor.effects)
         console.print(table)
+        if one.model == RIGID:
+            continue
         share = one.error_rms_nm / one.torque_rms_nm
         left = f"{one.error_rms_nm:.3g} N·m rms left, {100 * share:.2f} % of the flexibility torque"
         print(f"  torque balance: {left}")
         for line in _remarks(one):
             print(f"  {line}")
+    link = found.model.link
+    if link is not None or found.model.link_effects:
+        table = _table("link")
+        for name, x in asdict(link).items() if link is not None else ():
+            table.add_row(name, f"{x:.6g}", "")
+        _add_effects(table, found.model.link_effects)
+        console.print(table)
+    if found.doubt:
+        print(f"  link dynamics and readings stay as declared: {found.doubt}")
+
+
+def _table(title: str) -> Table:
+    table = Table(title=title, title_justify="left")
+    for column in ("parameter", "value", "± (95 %)"):
+        table.add_column(column, justify="left" if column == "parameter" else "right")
+    return table
+
+
+def _add_effects(table: Table, effects: Iterable[Effect]) -> None:
+    for effect in effects:
+        for name, value in effect.parameters.items():
+            for label, x, _ in _rows(f"{effect.name}.{name}", value, value):
+                table.add_row(label, f"{x:.6g}", "")
 
 
 def _rows(name: str, value: ParameterValue, std: ParameterValue) -> list[tuple[str, float, float]]:
@@ -155,11 +186,7 @@ def _remarks(one: TransmissionFit) -> list[str]:
             "the stiffness is not above zero, or its interval is not: no spring is like that. "
             "Check the signs of position and torque, and the inertia"
         )
-    if abs(one.link_delay_s) > 0.0:
-        remarks.append(f"link encoder aligned: it was {1e3 * one.link_delay_s:.3f} ms late")
     std = one.nuisance_std
-    if abs(one.torque_skew_s) > 4.0 * std["torque_skew"] and abs(one.torque_skew_s) > 2e-5:
-        remarks.append(f"torque aligned: it was {1e3 * one.torque_skew_s:.3f} ms late")
     if abs(one.coulomb_nm) > max(4.0 * std["coulomb"], 0.01 * one.torque_rms_nm):
         remarks.append(
             f"friction that the model lacks, about {one.coulomb_nm:.3g} N·m: `drivelink diagnose` tells which"
@@ -190,7 +217,8 @@ def _plot(fits: list[TransmissionFit], joint: JointFile, folder: Path) -> Path:
     return plots.save(figure, folder / "fit.png")
 
 
-def _write(args: argparse.Namespace, source: JointText, fits: list[TransmissionFit], record: Record) -> None:
+def _write(args: argparse.Namespace, source: JointText, found: Identified, record: Record) -> None:
+    fits = found.fits
     weak = [number for number, one in enumerate(fits, start=1) if one.model != RIGID and not one.excited]
     if weak:
         raise RecordingError(
@@ -202,7 +230,9 @@ def _write(args: argparse.Namespace, source: JointText, fits: list[TransmissionF
             f"{args.recording}: --write: expected a stiffness above zero, interval included, over all "
             f"deflections of the recording; that of motor {unusable[0]} is not"
         )
-    model = calibrate(record, _fitted(source.joint, fits))
+    if found.doubt:
+        raise RecordingError(f"{args.recording}: --write: {found.doubt}")
+    model = found.model
     motors: list[dict[str, Any]] = []
     for motor in model.motors:
         change: dict[str, Any] = {
@@ -219,11 +249,7 @@ def _write(args: argparse.Namespace, source: JointText, fits: list[TransmissionF
             change["effect"] = [_effect(effect) for effect in motor.effects]
         motors.append(change)
     changes: dict[str, Any] = {"motor": motors}
-    link: dict[str, Any] = {}
-    if model.link is not None:
-        link["dynamics"] = asdict(model.link)
-    if model.link_effects:
-        link["effect"] = [_effect(effect) for effect in model.link_effects]
+    link = _link(found)
     if link:
         changes["link"] = link
     provenance = {
@@ -237,19 +263,6 @@ def _write(args: argparse.Namespace, source: JointText, fits: list[TransmissionF
     }
     changes["provenance"] = provenance
     jointfile.write_model(source, args.write, changes, force=args.force)
-
-
-def _fitted(joint: JointFile, fits: list[TransmissionFit]) -> JointModel:
-    """The declared model with the transmissions as fitted: where the calibration of all of it begins."""
-    model = joint.model()
-    motors = []
-    for motor, one in zip(model.motors, fits, strict=True):
-        if one.model != RIGID:
-            order = int(one.alpha.size) if one.model == "polynomial" else motor.transmission.order
-            transmission = Transmission(model=one.model, order=order, parameters=one.parameters)
-            motor = replace(motor, transmission=transmission)
-        motors.append(motor)
-    return replace(model, motors=tuple(motors))
 
 
 def _effect(effect: Effect) -> dict[str, Any]:

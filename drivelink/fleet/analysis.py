@@ -13,8 +13,9 @@ import numpy as np
 
 from drivelink import report
 from drivelink.jointfile import JointFile
-from estimator.batch import TransmissionFit, fit
+from estimator.batch import TransmissionFit
 from estimator.diagnosis import Diagnosis, diagnose
+from estimator.identify import identify
 from estimator.model import ParameterValue
 from estimator.sample import FloatArray, Record
 from estimator.transmissions import MODELS, RIGID
@@ -87,7 +88,7 @@ def analyse(record: Record, joint: JointFile, validation: Record | None, title: 
     """
     model = joint.model()
     outcome = diagnose(record, model, validation=validation)  # its gate comes before any fit
-    fits = fit(record, model)
+    fits = identify(record, model).fits
     document = report.as_json(outcome)
     errors = outcome.validation
     return Analysis(

@@ -1,0 +1,183 @@
+"""What `fit` prints, what fit.json says, and what `--write` writes are the same numbers."""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import diagnosiskit as kit
+import gatekit
+import numpy as np
+import pytest
+
+from drivelink.cli import main
+from estimator.sample import Record
+
+LATE_S, ZERO_RAD = 6e-4, 0.004
+MOTOR = """\
+[[motor]]
+inertia_kg_m2 = {inertia}
+viscous_damping_nm_s_rad = {damping}
+[motor.transmission]
+model = "{model}"
+"""
+ONE = 'name = "elbow"\n' + MOTOR.format(
+    inertia=1.01 * kit.INERTIA, damping=0.98 * kit.DAMPING, model="{model}"
+)
+LINK = f"""\
+[link.dynamics]
+inertia_kg_m2 = {1.02 * kit.LINK_INERTIA}
+viscous_damping_nm_s_rad = {kit.LINK_DAMPING}
+gravity_nm = {0.98 * kit.GRAVITY}
+"""
+
+
+def _save(record: Record, path: Path) -> None:
+    m = record.motors
+    names = ["time_s", *(f"motor{i + 1}_{x}" for x in ("position_rad", "torque_nm") for i in range(m))]
+    assert record.link_position_rad is not None
+    columns = [record.time_s, record.motor_position_rad, record.motor_torque_nm, record.link_position_rad]
+    header = ",".join([*names, "link_position_rad"])
+    np.savetxt(path, np.column_stack(columns), delimiter=",", header=header, comments="")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("written")
+    worlds = kit.World([{}, {"late_s": LATE_S, "zero_rad": ZERO_RAD}]).run()
+    for name, record in zip(("clean", "skewed"), worlds, strict=True):
+        _save(record, folder / f"{name}.csv")
+    pair = gatekit.draw("antagonistic", 1, seconds=12.0, effects=False)
+    _save(pair.record, folder / "pair.csv")
+    texts = (
+        MOTOR.format(inertia=m.inertia_kg_m2, damping=m.viscous_damping_nm_s_rad, model="polynomial")
+        for m in pair.model.motors
+    )
+    rigid = gatekit.draw("none", 1, seconds=12.0, effects=False)
+    names = "time_s,motor1_position_rad,motor1_torque_nm"
+    columns = [rigid.record.time_s, rigid.record.motor_position_rad, rigid.record.motor_torque_nm]
+    np.savetxt(folder / "rigid.csv", np.column_stack(columns), delimiter=",", header=names, comments="")
+    (m,) = rigid.model.motors
+    text = MOTOR.format(inertia=m.inertia_kg_m2, damping=m.viscous_damping_nm_s_rad, model="none")
+    (folder / "rigid.toml").write_text('name = "rigid"\n' + text)
+    (folder / "pair.toml").write_text('name = "pair"\narrangement = "antagonistic"\n' + "".join(texts))
+    return folder
+
+
+def _fit(
+    folder: Path, run: str, joint: str, capsys: pytest.CaptureFixture[str]
+) -> tuple[Any, Any, list[Any]]:
+    """Written file, fit.json, and the printed tables as [(name, text of the value)] each."""
+    target = folder / "written.toml"
+    asked = ["fit", str(folder / f"{run}.csv"), "--joint", str(folder / joint), "--out", str(folder)]
+    assert main(asked) == 0
+    alone, said = (folder / "fit.json").read_text(), capsys.readouterr().out
+    assert main([*asked, "--write", str(target), "--force"]) == 0
+    assert (folder / "fit.json").read_text() == alone
+    printed = capsys.readouterr().out
+    assert _tables(printed) == _tables(said)
+    return tomllib.loads(target.read_text()), json.loads(alone), _tables(printed)
+
+
+def _tables(text: str) -> list[list[tuple[str, str]]]:
+    tables: list[list[tuple[str, str]]] = []
+    for line in text.splitlines():
+        if line.startswith("┏"):
+            tables.append([])
+        if line.startswith("│"):
+            name, value, _ = (cell.strip() for cell in line.strip("│").split("│"))
+            tables[-1].append((name, value))
+    return tables
+
+
+def _numbers(table: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
+    """Names as printed and values of a table of the written file."""
+    for key, value in table.items():
+        many = isinstance(value, list) and key != "effect"
+        for i, x in enumerate(value, start=1) if many else ():
+            yield f"{prefix}{key}[{i}]", x
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            yield f"{prefix}{key}", value
+
+
+def _of_motor(motor: Any) -> dict[str, float]:
+    found = dict(_numbers(motor)) | dict(_numbers(motor["transmission"].get("parameters", {})))
+    return found | _of_effects(motor)
+
+
+def _of_effects(owner: Any) -> dict[str, float]:
+    effects = owner.get("effect", [])
+    return {k: v for e in effects for k, v in _numbers(e["parameters"], f"{e['name']}.")}
+
+
+def _same(printed: list[tuple[str, str]], written: dict[str, float]) -> None:
+    assert {name for name, _ in printed} == set(written)
+    for name, text in printed:
+        assert text == f"{written[name]:.6g}", name
+
+
+@pytest.mark.parametrize("run", ["clean", "skewed"])
+@pytest.mark.parametrize("link", ["", LINK], ids=["no link dynamics", "link dynamics"])
+@pytest.mark.parametrize("model", ["linear", "polynomial"])
+def test_what_is_printed_is_what_is_written(
+    model: str, link: str, run: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "joint.toml").write_text(ONE.format(model=model) + link)
+    written, told, tables = _fit(folder, run, "joint.toml", capsys)
+    (motor,) = written["motor"]
+    _same(tables[0], _of_motor(motor))
+    (entry,) = told["transmissions"]
+    assert entry["parameters"] == motor["transmission"].get("parameters", {})
+    assert {k: entry["motor"][k] for k in ("inertia_kg_m2", "viscous_damping_nm_s_rad")} == dict(
+        _numbers(motor)
+    )
+    assert entry.get("effects", []) == motor.get("effect", [])
+    owner = written.get("link", {})
+    assert told.get("link", {}) == owner
+    if owner:
+        _same(tables[1], dict(_numbers(owner.get("dynamics", {}))) | _of_effects(owner))
+    else:
+        assert len(tables) == 1
+
+
+def test_both_motors_of_a_pair_are_written_as_printed(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written, told, tables = _fit(folder, "pair", "pair.toml", capsys)
+    for table, motor, entry in zip(tables, written["motor"], told["transmissions"], strict=False):
+        _same(table, _of_motor(motor))
+        assert entry["parameters"] == motor["transmission"]["parameters"]
+        assert entry.get("effects", []) == motor.get("effect", [])
+
+
+def test_a_rigid_joint_is_written_as_printed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    written, told, (table,) = _fit(folder, "rigid", "rigid.toml", capsys)
+    (motor,) = written["motor"]
+    _same(table, _of_motor(motor))
+    assert told["transmissions"][0]["motor"] == dict(_numbers(motor))
+
+
+@pytest.mark.parametrize("link", ["", LINK], ids=["no link dynamics", "link dynamics"])
+def test_skew_and_zero_of_the_readings_are_written_and_fitted_again_they_stay(
+    link: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "joint.toml").write_text(ONE.format(model="linear") + link)
+    written, first, _ = _fit(folder, "skewed", "joint.toml", capsys)
+    # Encoders round down: half of their steps is part of the zero that is read.
+    (zero,) = (
+        e["parameters"]["offset_rad"]
+        for e in written["motor"][0]["effect"]
+        if e["name"] == "deflection_offset"
+    )
+    assert zero == pytest.approx(ZERO_RAD, abs=kit.MOTOR_LSB + kit.LINK_LSB)
+    (late,) = (e["parameters"]["delay_s"] for e in written["link"]["effect"])
+    assert late == pytest.approx(LATE_S, rel=0.05)
+    k, std = (first["transmissions"][0][x]["k_nm_rad"] for x in ("parameters", "std"))
+    assert k == pytest.approx(kit.STIFFNESS, rel=2e-3)
+    (folder / "again.toml").write_text((folder / "written.toml").read_text())
+    _, second, _ = _fit(folder, "skewed", "again.toml", capsys)
+    assert math.isclose(second["transmissions"][0]["parameters"]["k_nm_rad"], k, abs_tol=std)

@@ -18,7 +18,7 @@ __all__ = ["configure", "run"]
 _EPILOG = """\
 examples:
   drivelink doctor                     this machine: real time, memory, CAN, zenoh
-  drivelink doctor elbow.toml          also the bus, each node, its mapping, units and signs; moves nothing
+  drivelink doctor elbow.toml          also the bus, nodes, mappings, units, signs of positions; moves nothing
   drivelink doctor --eds drive.eds     before buying: what a drive can give
 """
 

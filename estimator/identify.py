@@ -23,6 +23,9 @@ __all__ = ["Identified", "identify"]
 
 _SURE = 4.0  # standard deviations from zero at which a delay is kept: chance makes one of 16 000
 _LEAST_DELAY_S = 2e-5  # and how much of it: less shifts no estimate that anybody could see
+# Readings put right lower the error of the motor's balance; by less than this it rises where they hardly
+# change and are interpolated anew.
+_WORSE = 1.01
 _READINGS = ("torque_delay", "deflection_offset", "encoder_delay")
 
 
@@ -58,14 +61,18 @@ def identify(record: Record, model: JointModel, bandwidth_rad_s: float | None = 
     try:
         calibrated = calibrate(record, _fitted(aligned, fits, usable_only=True))
     except EstimatorError as error:
-        return Identified(fits=fits, model=_fitted(model, fits), doubt=str(error))
+        return Identified(fits=fits, model=_fitted(aligned, fits), doubt=str(error))
     motors = (
         replace(mine, effects=found.effects) if mine.flexible else found
         for mine, found in zip(model.motors, calibrated.motors, strict=True)
     )
     found = replace(model, motors=tuple(motors), link=calibrated.link, link_effects=calibrated.link_effects)
     if _readings(found) != _readings(model):
-        fits = fit(record, found, bandwidth_rad_s)
+        again = fit(record, found, bandwidth_rad_s)
+        if any(b.error_rms_nm > _WORSE * a.error_rms_nm for a, b in zip(fits, again, strict=True)):
+            doubt = "the zeros and delays that suit them best spoil the motor's balance" if model.link else ""
+            return Identified(fits=fits, model=_fitted(aligned, fits), doubt=doubt)
+        fits = again
     return Identified(fits=fits, model=_fitted(_aligned(found, fits), fits))
 
 

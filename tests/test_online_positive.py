@@ -19,6 +19,7 @@ from drivelink import jointfile, recording
 from drivelink.errors import JointFileError
 from estimator import EstimatorSettings, Motor, Record, Status, Transmission, fit, make_estimator
 from estimator.errors import EstimatorError
+from estimator.gate import GateError
 from sim.cases import CASES, case
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -79,11 +80,12 @@ def test_a_declared_stiffness_below_zero_is_refused(coefficients):
         make_estimator(model, EstimatorSettings(), kit.PERIOD_S)
 
 
-def test_a_fit_with_the_torque_reversed_is_called_what_it_is():
+def test_a_fit_with_the_torque_reversed_is_refused():
     motion = kit.motion("constant", 12.0)
     plant = case("constant").plant.motors[0]
-    told = []
-    for sign in (1.0, -1.0):
+    assert plant.spring.model == "linear"
+
+    def fitted(sign):
         record = Record(
             period_s=kit.PERIOD_S,
             sequence=np.arange(len(motion.samples)),
@@ -91,9 +93,11 @@ def test_a_fit_with_the_torque_reversed_is_called_what_it_is():
             motor_torque_nm=sign * np.array([s.motor_torque_nm for s in motion.samples]),
             link_position_rad=sign * np.array([s.link_position_rad for s in motion.samples]),
         )
-        told.append(fit(record, kit.declared("constant", parameters={}))[0].stiffens)
-    assert plant.spring.model == "linear"
-    assert told == [True, False]
+        return fit(record, kit.declared("constant", parameters={}))[0]
+
+    assert fitted(1.0).stiffens
+    with pytest.raises(GateError, match="wrong sign"):
+        fitted(-1.0)
 
 
 def test_a_joint_file_with_a_stiffness_below_zero_is_neither_read_nor_written():

@@ -406,7 +406,7 @@ def test_publish_sends_every_estimate_to_a_subscriber(tmp_path: Path) -> None:
             got.append(estimate)
             if estimate.sequence == 1999:
                 break
-        assert subscription.status["state"] == "ended"
+        zenohkit.until(lambda: subscription.status["state"] == "ended")
     local = [p.tick.estimate for p in open_playback(recording, joint, tmp_path)]
     by_sequence = {e.sequence: bits(e) for e in local}
     # The replay begins when the subscriber is there: nothing is missing.

@@ -124,7 +124,7 @@ def _readings(outcome: Diagnosis, motor: int | None) -> list[dict[str, Any]]:
 
 def _transmission(joint: JointFile, outcome: Diagnosis, motor: int) -> dict[str, Any]:
     """The transmission's refitted parameters; nothing where it is rigid or was not named."""
-    parameters = outcome.transmissions[motor]
+    parameters = outcome.transmissions[motor].parameters
     if not parameters or outcome.verdict in ("insufficient_excitation", "unexplained"):
         return {}
     section = joint.motor[motor].transmission

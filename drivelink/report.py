@@ -69,7 +69,14 @@ def as_json(outcome: Diagnosis) -> dict[str, Any]:
         "bandwidth_hz": outcome.bandwidth_hz,
         "effects": [_effect(finding, unlisted) for finding in outcome.effects],
         "error": {"train": outcome.train._asdict(), "validation": outcome.validation._asdict()},
-        "transmissions": [dict(parameters) for parameters in outcome.transmissions],
+        "transmissions": [one._asdict() for one in outcome.transmissions],
+        "recordings": [
+            {
+                "train": one.train._asdict(),
+                "validation": None if one.validation is None else one.validation._asdict(),
+            }
+            for one in outcome.recordings
+        ],
         "alignment": dict(outcome.alignment),
         "candidates": [rival._asdict() for rival in outcome.rivals],
         "advice": list(outcome.advice),
@@ -107,8 +114,9 @@ def _points(curve: Curve) -> dict[str, list[float]]:
 
 def sentence(outcome: Diagnosis) -> str:
     """The verdict in one sentence."""
+    lower = outcome.validation.after_rms_nm <= outcome.validation.before_rms_nm
     fall = (
-        f"the torque balance's error on data that took no part falls from "
+        f"the torque balance's error on data that took no part {'falls' if lower else 'rises'} from "
         f"{outcome.validation.before_relative:.2%} to {outcome.validation.after_relative:.2%}"
     )
     names = " and ".join(title_of(finding) for finding in outcome.effects)
@@ -144,7 +152,8 @@ def _place(finding: Finding) -> str:
 def value_text(value: ParameterValue, std: ParameterValue | None) -> str:
     """A parameter with its 95 % interval."""
     if isinstance(value, tuple):
-        return ", ".join(f"{x:.5g}" for x in value)
+        deviations = std if isinstance(std, tuple) else (None,) * len(value)
+        return ", ".join(value_text(x, s) for x, s in zip(value, deviations, strict=True))
     if isinstance(std, float) and std > 0.0:
         return f"{value:.5g} ± {_SIGMA_95 * std:.2g}"
     return f"{value:.5g}"
@@ -190,11 +199,11 @@ def _effects(outcome: Diagnosis) -> str:
         for name, value in finding.parameters.items():
             text = html.escape(value_text(value, finding.std.get(name)))
             rows.append(f"<tr><td><code>{html.escape(name)}</code></td><td>{text}</td></tr>")
-    for number, parameters in enumerate(outcome.transmissions, start=1):
-        if parameters:
+    for number, one in enumerate(outcome.transmissions, start=1):
+        if one.parameters:
             rows.append(f'<tr class="effect"><th colspan="2">transmission {number}, refitted</th></tr>')
-        for name, value in parameters.items():
-            text = value_text(value, None)
+        for name, value in one.parameters.items():
+            text = value_text(value, one.std[name])
             rows.append(f"<tr><td><code>{html.escape(name)}</code></td><td>{text}</td></tr>")
     if outcome.alignment:
         rows.append('<tr class="effect"><th colspan="2">taken out of the readings</th></tr>')

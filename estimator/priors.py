@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple
 __all__ = ["PRIORS", "Prior", "Scale"]
 
 Scale = Literal[
+    "absolute",  # nothing: in the unit of the quantity
     "declared",  # the declared value itself
     "torque",  # rms of the motor torque without its mean, N·m
     "torque over speed",  # that torque over the largest motor speed, N·m·s/rad
@@ -78,6 +79,22 @@ PRIORS: dict[str, Prior] = {
     "gravity": Prior(0.1, "declared", "amplitude of gravity", "as the link's inertia"),
     "effect": Prior(
         0.3, "torque", "torque of a missing effect", "larger ones are the joint's main physics, and declared"
+    ),
+    "declared": Prior(
+        0.01, "declared", "a declared number, link dynamics declared too", "a rig that has been calibrated"
+    ),
+    "anchor": Prior(
+        0.3, "declared", "an inertia that is called wrong", "inertias are the anchor of all torques"
+    ),
+    "torque_scale": Prior(0.1, "absolute", "relative error of a torque scale called wrong", "as the anchor"),
+    "late": Prior(
+        0.005, "absolute", "delay or lag beyond a sample, s", "current filters and fieldbus cycles"
+    ),
+    "encoder_scale": Prior(
+        0.02, "absolute", "scale error of an encoder", "encoders count; gear ratios are rounded"
+    ),
+    "encoder_eccentricity": Prior(
+        0.01, "absolute", "error of an encoder, rad", "mounting, well below a degree"
     ),
     "transmission": Prior(
         10.0, "torque", "flexibility torque at the deflections seen", "wide: the data tell it"

@@ -17,7 +17,7 @@ NAMES = {
     "motor": (
         "coulomb_friction stribeck_friction asymmetric_friction presliding_friction load_dependent_friction "
         "viscous_damping quadratic_damping cogging torque_offset torque_constant torque_saturation "
-        "torque_drift motor_inertia torque_delay"
+        "torque_drift motor_inertia torque_delay torque_lag back_driving_loss"
     ),
     "transmission": (
         "hysteresis backlash asymmetric_stiffness higher_order_stiffness transmission_damping kinematic_error"

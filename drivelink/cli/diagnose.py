@@ -37,7 +37,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _EPILOG
-    parser.add_argument("recording", type=Path, metavar="RECORDING", help="measured data: CSV, MCAP, CAN log")
+    parser.add_argument(
+        "recording",
+        type=Path,
+        nargs="+",
+        metavar="RECORDING",
+        help="measured data of one joint: CSV, MCAP, CAN log; of several each is validated by the others",
+    )
     parser.add_argument(
         "--joint", type=Path, metavar="JOINT", help="joint file; left out: the one that the recording carries"
     )
@@ -59,34 +65,36 @@ def run(args: argparse.Namespace) -> int:
     """Do the job; return the exit status."""
     if args.bandwidth_hz is not None and not 0.0 < args.bandwidth_hz < math.inf:
         raise UsageError(f"--bandwidth-hz: expected a number above 0, got {args.bandwidth_hz:g}")
-    source = joint_of(args.recording, args.joint)
+    source = joint_of(args.recording[0], args.joint)
     joint, base, names = source.joint, source.folder, parse_column_map(args.map)
-    inputs = [path for path in (args.recording, args.validate, args.joint) if path is not None]
+    inputs = [path for path in (*args.recording, args.validate, args.joint) if path is not None]
     if args.write is not None:  # the joint file itself may be brought up to date
-        check_target(args.write, inputs[: 1 if args.validate is None else 2], force=args.force)
+        check_target(args.write, [path for path in inputs if path != args.joint], force=args.force)
     for name in ("report.json", "report.html"):
         check_target(args.out / name, inputs, force=True)
-    record = recording.read(args.recording, joint, base_dir=base, names=names)
+    records = [recording.read(path, joint, base_dir=base, names=names) for path in args.recording]
     validation = None
     if args.validate is not None:
         validation = recording.read(args.validate, joint, base_dir=base, names=names)
+    named = ", ".join(path.name for path in args.recording)
     with Meter("diagnose") as meter:
         try:
             outcome = diagnose(
-                record, joint.model(), args.bandwidth_hz, validation, lambda _: meter.advance()
+                records, joint.model(), args.bandwidth_hz, validation, lambda _: meter.advance()
             )
         except GateError as error:
-            path = args.recording if error.record is record else args.validate
+            both = zip((*args.recording, args.validate), (*records, validation), strict=True)
+            path = next(name for name, one in both if one is error.record)
             raise refusal(path, joint, error.findings, str(error)) from error
         except EstimatorError as error:
-            raise RecordingError(f"{args.recording}: {error}") from error
+            raise RecordingError(f"{named}: {error}") from error
     args.out.mkdir(parents=True, exist_ok=True)
-    title = report.Title(joint.name, args.recording.name, args.validate.name if args.validate else None)
+    title = report.Title(joint.name, named, args.validate.name if args.validate else None)
     _print(outcome)
     for path in report.write(outcome, title, args.out):
         print(f"wrote {path}")
     if args.write is not None:
-        augment.write(source, args.write, outcome, record, args.recording.name, force=args.force)
+        augment.write(source, args.write, outcome, records[0], named, force=args.force)
         print(f"wrote {args.write}")
     return 0
 
@@ -107,6 +115,10 @@ def _print(outcome: Diagnosis) -> None:
             print(f"    {name} = {report.value_text(value, finding.std.get(name))}")
         if finding.alternatives:
             print(f"    could also be: {', '.join(finding.alternatives)}")
+    for number, refitted in enumerate(outcome.transmissions, start=1):
+        for name, value in refitted.parameters.items():
+            text = report.value_text(value, refitted.std[name])
+            print(f"  transmission {number}, refitted: {name} = {text}")
     for name, value in outcome.alignment.items():
         print(f"  taken out of the readings: {name} = {value:.4g}")
     for line in (*outcome.notes, *outcome.advice):

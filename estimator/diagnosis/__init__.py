@@ -1,7 +1,29 @@
 """Tracing a residual to its effect: locate, select, judge."""
 
 from estimator.diagnosis.calibration import calibrate
-from estimator.diagnosis.result import Curve, Diagnosis, Errors, Finding, Rival, Series, Verdict
+from estimator.diagnosis.result import (
+    Curve,
+    Diagnosis,
+    Errors,
+    Finding,
+    RecordingErrors,
+    Refitted,
+    Rival,
+    Series,
+    Verdict,
+)
 from estimator.diagnosis.tracing import diagnose
 
-__all__ = ["Curve", "Diagnosis", "Errors", "Finding", "Rival", "Series", "Verdict", "calibrate", "diagnose"]
+__all__ = [
+    "Curve",
+    "Diagnosis",
+    "Errors",
+    "Finding",
+    "RecordingErrors",
+    "Refitted",
+    "Rival",
+    "Series",
+    "Verdict",
+    "calibrate",
+    "diagnose",
+]

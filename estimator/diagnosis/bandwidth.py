@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import fft
 
-from estimator.diagnosis.frame import Frame, Signals
+from estimator.diagnosis.frame import Signals
 from estimator.diagnosis.spectral import lowpass
 from estimator.model import JointModel
 from estimator.sample import FloatArray, Record
@@ -19,7 +19,6 @@ _LEAST_HZ = 12.0
 _MOST_HZ = 25.0
 _NYQUIST = 0.2  # of the sampling rate, at most
 _NOISE = 0.004  # of the torque's rms, at most
-_MODEL = 0.001  # of the torque's rms: no model is better than this
 
 
 def torque_rms(record: Record) -> float:
@@ -80,9 +79,3 @@ def equation_noise(signals: Signals, model: JointModel, stiffness: list[float], 
             variance += signals.noise(spectrum, each * narrow)
         variances.append(variance)
     return np.asarray(np.sqrt(np.array(variances)))
-
-
-def weights(frame: Frame, stiffness: list[float], torque: float) -> FloatArray:
-    """One over the expected error of each equation: the channels' noise and what no model can do."""
-    noise = equation_noise(frame.signals, frame.model, stiffness, frame.linked)
-    return np.asarray(1.0 / np.hypot(noise, _MODEL * torque))

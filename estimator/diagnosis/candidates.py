@@ -12,16 +12,19 @@ from estimator.effects import LIBRARY, Coordinates, EffectType
 from estimator.effects.memory import trace
 from estimator.sample import FloatArray
 
-__all__ = ["Candidate", "columns", "grid", "least_periods", "members"]
+__all__ = ["Candidate", "bounds_of", "columns", "grid", "least_periods", "members", "reach_of", "spread_of"]
 
 Values = Mapping[str, float]
 
 # Laws of friction and hysteresis with memory: Dahl, Bouc-Wen, elastic up to the limit.
 LAWS = ((1.0, 1.0), (2.0, 0.5), (50.0, 1.0))
-_LEAST_PERIODS = 1.0  # of a position ripple within the range of motion
+_LEAST_PERIODS = 2.0  # of a position ripple within the range of motion: fewer are a bend
 _MOST_WAVES = 900
+_QUICKEST = 0.04  # of the recording: a drift that is over sooner is another scale
+_SMOOTHEST = 0.05  # of the largest velocity
+# Without a second equation for the same torque its scale is that of inertia and stiffness together.
+_FREE_ZEROS = ("torque_offset", "deflection_offset")  # fitted anyway where nothing ties them
 _SCALES = ("torque_constant", "torque_saturation", "torque_drift")
-_OWN_SHARE = 0.4  # of the torque's rms
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,41 +63,35 @@ def _possible(frame: Frame) -> list[Candidate]:
     external = frame.linked
     for kind in LIBRARY.values():
         if kind.location == "link":
-            if external:
+            smooth = "smoothing_rad_s" in kind.nonlinear
+            if external and (not smooth or _reverses(frame.motors[0].link_velocity)):
                 found.append(Candidate(kind, None))
         elif kind.channel == "link_position":
             if any(frame.flexible):
                 found.append(Candidate(kind, None))
         else:
-            if kind.channel == "deflection" and sum(frame.flexible) > 1:
+            if kind.channel == "deflection" and sum(frame.flexible) > 1 and frame.linked:
                 found.append(Candidate(kind, None))
             found += [
                 Candidate(kind, i)
                 for i in range(len(frame.motors))
                 if (frame.flexible[i] or not _needs_deflection(kind))
-                and (kind.name not in _SCALES or _scale_shows(frame, i))
+                and ("smoothing_rad_s" not in kind.nonlinear or _reverses(frame.motors[i].velocity))
+                and (frame.linked or kind.name not in (*_SCALES, *_FREE_ZEROS))
             ]
     return found
 
 
-def _scale_shows(frame: Frame, motor: int) -> bool:
-    """Whether a wrong torque scale would show.
-
-    Without the link's dynamics only the known inertia tells the torque's scale from that of the stiffness;
-    where it takes little torque, a smaller scale merely shrinks everything, the error included.
-    """
-    if frame.linked or not frame.flexible[motor]:
-        return True
-    c = frame.motors[motor]
-    own = frame.model.motors[motor].inertia_kg_m2 * c.acceleration
-    return float(np.std(own)) > _OWN_SHARE * float(np.std(c.torque))
+def _reverses(velocity: FloatArray) -> bool:
+    """Whether a motion has both directions: dry friction is a constant torque in only one."""
+    return bool(np.quantile(velocity, 0.05) < 0.0 < np.quantile(velocity, 0.95))
 
 
 def _needs_deflection(kind: EffectType) -> bool:
     return (
         kind.location == "transmission"
         or kind.channel == "deflection"
-        or kind.name == "load_dependent_friction"
+        or kind.name in ("load_dependent_friction", "back_driving_loss")
     )
 
 
@@ -173,13 +170,21 @@ def grid(frame: Frame, candidate: Candidate, smoothing_rad_s: float) -> list[dic
     c = frame.motors[candidate.motor or 0]
     fixed = {p.name: float(p.default) for p in kind.parameters if not p.linear and p.default is not None}
     if "smoothing_rad_s" in kind.nonlinear:
-        fixed["smoothing_rad_s"] = smoothing_rad_s
-    if kind.name == "stribeck_friction":
-        fast = np.maximum(_rms(c.velocity) * np.geomspace(0.04, 0.8, 7), 4.0 * smoothing_rad_s)
-        return _vary(fixed, "stribeck_velocity_rad_s", fast)
+        _, most = bounds_of(frame, candidate, "smoothing_rad_s")
+        smooth = smoothing_rad_s * np.array([1.0, 5.0, 25.0])
+        smooth = smooth[smooth <= max(most, smoothing_rad_s)]
+        if kind.name == "stribeck_friction":
+            fast = _rms(c.velocity) * np.geomspace(0.04, 0.8, 7)
+            return [
+                {**fixed, "smoothing_rad_s": float(s), "stribeck_velocity_rad_s": float(v)}
+                for s in smooth
+                for v in fast
+                if v > 3.0 * s
+            ]
+        return _vary(fixed, "smoothing_rad_s", smooth)
     if kind.law is not None:
         path = c.position if kind.location == "motor" else c.deflection
-        scales = _spread(path) * np.geomspace(0.004, 0.5, 8)
+        scales = _spread(path) * np.geomspace(0.0002, 0.5, 11)
         return [{"displacement_rad": float(d), "exponent": n, "shape": b} for n, b in LAWS for d in scales]
     if kind.name in ("cogging", "kinematic_error"):
         return _vary(fixed, "periods_per_rev", _waves(frame, c))
@@ -189,7 +194,7 @@ def grid(frame: Frame, candidate: Candidate, smoothing_rad_s: float) -> list[dic
         declared = _declared_power(frame, candidate.motor or 0)
         return _vary(fixed, "power", np.array([p for p in (3.0, 5.0, 7.0) if p > declared][:2]))
     if kind.name == "torque_drift":
-        return _vary(fixed, "time_constant_s", c.time[-1] * np.geomspace(0.04, 1.0, 6))
+        return _vary(fixed, "time_constant_s", c.time[-1] * np.geomspace(_QUICKEST, 1.0, 6))
     if kind.name == "contact":
         places = np.quantile(c.link_position, np.linspace(0.04, 0.96, 12))
         return [{"position_rad": float(x), "side": side} for side in (1.0, -1.0) for x in places]
@@ -227,6 +232,48 @@ def _declared_power(frame: Frame, motor: int) -> float:
     coefficients = transmission.parameters.get("coefficients_nm_rad")
     order = transmission.order or (len(coefficients) if isinstance(coefficients, tuple) else 1)
     return 2.0 * order - 1.0
+
+
+def reach_of(frame: Frame, candidate: Candidate, name: str) -> float | None:
+    """Prior standard deviation of a nonlinear parameter, in its unit; None: a factor of e either way."""
+    c = frame.motors[candidate.motor or 0]
+    if name == "periods_per_rev":
+        waves = _waves(frame, c)
+        return float(np.ptp(waves) / 12.0**0.5) if len(waves) > 1 else 1.0
+    if name == "position_rad":
+        return float(_spread(c.link_position) / 12.0**0.5)
+    if name == "half_gap_rad":
+        return float(np.max(np.abs(c.deflection)) / 12.0**0.5)
+    return None
+
+
+def bounds_of(frame: Frame, candidate: Candidate, name: str) -> tuple[float, float]:
+    """Where a positive nonlinear parameter keeps its meaning: resolved, and within the motion."""
+    c = frame.motors[candidate.motor or 0]
+    fast = float(np.max(np.abs(c.link_velocity if candidate.motor is None else c.velocity)))
+    if name == "smoothing_rad_s":
+        return 0.0, _SMOOTHEST * fast  # smoothed more, a sign is damping
+    if name == "stribeck_velocity_rad_s":
+        return 0.0, fast
+    if name == "exponent":
+        return 1.0, 20.0
+    if name == "shape":
+        return 0.05, 1.0
+    if name == "displacement_rad":
+        return 0.0, _spread(c.position if candidate.kind.location == "motor" else c.deflection)
+    if name == "time_constant_s":
+        return _QUICKEST * float(c.time[-1]), float(c.time[-1])
+    return 0.0, np.inf
+
+
+def spread_of(frame: Frame, candidate: Candidate, name: str) -> float:
+    """How far a nonlinear parameter may move in one step about where it is: between points of its grid."""
+    c = frame.motors[candidate.motor or 0]
+    if name == "periods_per_rev":
+        return 0.5 * np.pi / max(_spread(c.position), 1e-300)
+    if name == "position_rad":
+        return _spread(c.link_position) / 12.0
+    return float(np.max(np.abs(c.deflection))) / 9.0
 
 
 def _rms(x: FloatArray) -> float:

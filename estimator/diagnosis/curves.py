@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.signal import lfilter
 
 from estimator.diagnosis.frame import Frame
-from estimator.diagnosis.regression import Rows
-from estimator.diagnosis.select import Selection, Tracer
+from estimator.diagnosis.hypothesis import Extra, Fitted
+from estimator.diagnosis.search import Search
 from estimator.effects import Coordinates
 from estimator.sample import FloatArray
 
-__all__ = ["FreeCurve", "any_time", "best_curve", "trusting"]
+__all__ = ["best_curve"]
 
 _DEGREE = 3
 _KNOTS = 20
@@ -25,35 +24,9 @@ _MOST_HARMONICS = 15
 _FINE = 24  # steps in which a line's frequency is refined
 _SLOW = 10
 _LAGS_S = (0.05, 0.1, 0.2, 0.4, 0.8)
-_PIECE_S = 0.25  # between the knots of a free function of time
 _SIGN = 0.02  # smoothing of a direction, of the rms velocity
 
 Basis = Callable[[Coordinates], FloatArray]
-
-
-class FreeCurve(NamedTuple):
-    """A free curve beside a model.
-
-    Attributes:
-        location: motor, transmission or link.
-        motor: index of the motor; None at the link.
-        coordinates: what it depends on.
-        basis: the curve's basis (n, k) on a grid's coordinates.
-        selection: base and curve, fitted.
-        error: its cross-validated error; no block counts more than without the curve, as one that goes
-            where no other block has been says nothing against it.
-    """
-
-    location: str
-    motor: int | None
-    coordinates: tuple[str, ...]
-    basis: Basis
-    selection: Selection
-    error: float
-
-    def columns(self, frame: Frame) -> FloatArray:
-        """Stacked columns on a recording."""
-        return _stacked(frame, self.location, self.motor, self.basis(frame.motors[self.motor or 0]))
 
 
 class _Splines:
@@ -72,58 +45,27 @@ class _Splines:
         return np.asarray(BSpline.design_matrix(inside, self._t, _DEGREE).toarray())
 
 
-def best_curve(tracer: Tracer, beside: Selection) -> FreeCurve | None:
-    """The location and coordinates whose free curve leaves the least beside a model."""
-    best: FreeCurve | None = None
-    for location, motor in [tracer.within] if tracer.within else _places(tracer.frame):
-        for coordinates, basis in _bases(tracer, location, motor or 0):
-            curve = _fitted(tracer, beside, location, motor, coordinates, basis)
-            if best is None or curve.error < best.error:
+def best_curve(search: Search, beside: Fitted, place: tuple[str, int | None] | None = None) -> Fitted | None:
+    """The free curve with the most evidence beside a model, over all places and coordinates.
+
+    Args:
+        search: the recordings.
+        beside: the model.
+        place: location and motor where something is missing for sure: the curve that leaves least there.
+    """
+    problem = search.problem
+    frame = problem.at(beside.corrections, beside.base)[0]
+    best: Fitted | None = None
+    for location, motor in [place] if place else _places(frame):
+        for coordinates, basis in _bases(frame, beside, location, motor or 0):
+            curve = problem.with_curve(beside, Extra(location, motor, coordinates, basis))
+            if best is None:
+                best = curve
+            elif place:
+                best = min(best, curve, key=lambda c: float(np.sum(np.log(c.posterior.sigma))))
+            elif search.advantage(curve, best) > 0.0:
                 best = curve
     return best
-
-
-def trusting(tracer: Tracer, beside: Selection, curve: FreeCurve) -> FreeCurve:
-    """The same curve, the base fitted to the equations in which nothing else is left.
-
-    What a curve leaves at a motor or at the link is not noise; without this it would bend the stiffness.
-    """
-    if curve.location == "transmission":
-        return curve
-    rows, last = tracer.rows, tracer.frame.equations - 1
-    touched = last if curve.location == "link" else curve.motor or 0
-    left = tracer.left(curve.selection, curve.columns).reshape(tracer.frame.equations, -1)[touched]
-    noise = float(np.sqrt(np.mean(left[rows.blocks.index >= 0] ** 2))) * rows.weights[touched]
-    if noise <= 1.0:
-        return curve
-    weights = rows.weights.copy()
-    weights[touched] /= noise
-    doubting = Tracer(
-        tracer.frame,
-        Rows(rows.blocks, tracer.frame.equations, weights),
-        tracer.smoothing_rad_s,
-        tracer.base,
-        tracer.within,
-    )
-    again = _fitted(
-        doubting, doubting.evaluate(beside.terms), curve.location, curve.motor, curve.coordinates, curve.basis
-    )
-    return again._replace(error=curve.error)
-
-
-def _fitted(
-    tracer: Tracer,
-    beside: Selection,
-    location: str,
-    motor: int | None,
-    coordinates: tuple[str, ...],
-    basis: Basis,
-) -> FreeCurve:
-    columns = _stacked(tracer.frame, location, motor, basis(tracer.frame.motors[motor or 0]))
-    design = np.column_stack((beside.design, tracer.rows.weighted(columns)))
-    selection = Selection(beside.terms, tracer.rows.fit(design, tracer.target, columns.shape[1]), design)
-    error = float(np.minimum(selection.fit.cross, beside.fit.cross).sum())
-    return FreeCurve(location, motor, coordinates, basis, selection, error)
 
 
 def _places(frame: Frame) -> list[tuple[str, int | None]]:
@@ -132,9 +74,9 @@ def _places(frame: Frame) -> list[tuple[str, int | None]]:
     return places + ([("link", None)] if frame.linked else [])
 
 
-def _bases(tracer: Tracer, location: str, motor: int) -> list[tuple[tuple[str, ...], Basis]]:
+def _bases(frame: Frame, beside: Fitted, location: str, motor: int) -> list[tuple[tuple[str, ...], Basis]]:
     """Bases for one place, with the names of their coordinates."""
-    c = tracer.frame.motors[motor]
+    c = frame.motors[motor]
     place, rate, *others = {
         "motor": ("position", "velocity"),
         "transmission": ("deflection", "deflection_rate", "position"),
@@ -145,7 +87,7 @@ def _bases(tracer: Tracer, location: str, motor: int) -> list[tuple[tuple[str, .
     ]
     v = getattr(c, rate)
     slow = _Splines(c.time, _SLOW)
-    if location == "motor" and tracer.frame.linked:
+    if location == "motor" and frame.linked:
         made.append((("torque",), _beyond_scale(_Splines(c.torque, _KNOTS))))
         made.append((("position", "torque"), _scaled("torque", "position", _Splines(c.position, _KNOTS), c)))
     smoothing = max(_SIGN * float(np.sqrt(np.mean(v * v))), 1e-12)
@@ -157,16 +99,9 @@ def _bases(tracer: Tracer, location: str, motor: int) -> list[tuple[tuple[str, .
         made.append((("deflection", "deflection_rate"), _creeping))
         path = _Splines(c.link_position, _COARSE)
         made.append((("deflection", "link_position"), _scaled("deflection", "link_position", path, c, True)))
-    made.append((("time",), _waves(tracer, *_line(tracer, location, motor))))
+    made.append((("time",), _waves(frame, beside, *_line(frame, beside, location, motor))))
     made.append((("time",), _over("time", slow)))
     return made
-
-
-def any_time(tracer: Tracer, beside: Selection, location: str, motor: int | None) -> FreeCurve:
-    """A free function of time at a place: it explains what is there whatever it is, and predicts nothing."""
-    time = tracer.frame.motors[motor or 0].time
-    basis = _over("time", _Splines(time, max(_SLOW, int((time[-1] - time[0]) / _PIECE_S))))
-    return _fitted(tracer, beside, location, motor, ("time",), basis)
 
 
 def _over(name: str, splines: _Splines) -> Basis:
@@ -226,16 +161,15 @@ def _fading(splines: _Splines, smoothing: float, c: Coordinates) -> Basis:
     return basis
 
 
-def _waves(tracer: Tracer, frequency: float, resolution: float, equation: int) -> Basis:
+def _waves(frame: Frame, beside: Fitted, frequency: float, resolution: float, equation: int) -> Basis:
     """A line and its harmonics, the line refined; both in rad/s."""
-    frame = tracer.frame
     most = 2.0 * np.pi * frame.signals.bandwidth_hz / frequency
     count = int(np.clip(most, _LEAST_HARMONICS, _MOST_HARMONICS))
 
     def made(time: FloatArray, w: float) -> FloatArray:
         return np.stack([f(k * w * time) for k in range(1, count + 1) for f in (np.sin, np.cos)], axis=1)
 
-    residual = tracer.balance().reshape(frame.equations, -1)[equation]
+    residual = _residual(frame, beside, equation)
     time = frame.motors[0].time[:: _step_of(frame)][: len(frame.signals.keep)][frame.signals.keep]
 
     def left(w: float) -> float:
@@ -252,27 +186,20 @@ def _step_of(frame: Frame) -> int:
     return round(frame.signals.narrow.period_s / frame.signals.light.period_s)
 
 
-def _stacked(frame: Frame, location: str, motor: int | None, basis: FloatArray) -> FloatArray:
-    columns = []
-    for wave in basis.T:
-        if location == "motor":
-            columns.append(frame.column(motor, -wave, None))
-        elif location == "transmission":
-            columns.append(frame.column(motor, wave, wave if frame.pulls[motor or 0] else None))
-        else:
-            columns.append(frame.column(None, None, wave))
-    return np.stack(columns, axis=1)
+def _residual(frame: Frame, beside: Fitted, equation: int) -> FloatArray:
+    """What a model leaves of one balance of the first recording."""
+    left = beside.regression.residual(beside.posterior.x)
+    return left[equation * frame.rows : (equation + 1) * frame.rows]
 
 
-def _line(tracer: Tracer, location: str, motor: int) -> tuple[float, float, int]:
+def _line(frame: Frame, beside: Fitted, location: str, motor: int) -> tuple[float, float, int]:
     """The strongest spectral line of one equation's residual that harmonics may belong to.
 
     Returns:
         Its frequency and the resolution, rad/s, and the equation.
     """
-    frame = tracer.frame
     equation = frame.equations - 1 if location == "link" else motor
-    part = tracer.balance().reshape(frame.equations, -1)[equation]
+    part = _residual(frame, beside, equation)
     period = frame.signals.narrow.period_s
     window = np.hanning(len(part))
     size = 4 * len(part)

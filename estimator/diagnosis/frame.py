@@ -35,6 +35,8 @@ class Corrections:
 
     Attributes:
         torque_delay_s: per motor, the torque acts so much later than reported.
+        torque_lag_s: per motor, time constant by which the acting torque lags the reported one, in first
+            order; negative: the reported one lags.
         offset_rad: per motor, deflection that is read when there is none.
         encoder_delay_s: the link position is read so much later than the rest.
         encoder_sin_rad: the link reading has sin(q) times this too much.
@@ -43,6 +45,7 @@ class Corrections:
     """
 
     torque_delay_s: tuple[float, ...]
+    torque_lag_s: tuple[float, ...]
     offset_rad: tuple[float, ...]
     encoder_delay_s: float = 0.0
     encoder_sin_rad: float = 0.0
@@ -52,7 +55,8 @@ class Corrections:
     @classmethod
     def none(cls, motors: int) -> Corrections:
         """Readings as they are."""
-        return cls(torque_delay_s=(0.0,) * motors, offset_rad=(0.0,) * motors)
+        none = (0.0,) * motors
+        return cls(torque_delay_s=none, torque_lag_s=none, offset_rad=none)
 
 
 class Signals:
@@ -121,6 +125,12 @@ class Signals:
         return float(np.sqrt(self.noise(self.theta[motor], response)))
 
 
+def _lag(frequency_hz: FloatArray, time_constant_s: float) -> NDArray[Any]:
+    """1 / (1 + s T), or its inverse where T is negative."""
+    lag = 1.0 + 2j * np.pi * frequency_hz * abs(time_constant_s)
+    return lag if time_constant_s < 0.0 else 1.0 / lag
+
+
 def light_response(signals: Signals) -> FloatArray:
     """Response of G."""
     return lowpass(signals.light.frequency_hz, min(_LIGHT * signals.bandwidth_hz, 0.45 / signals.period_s))
@@ -166,6 +176,7 @@ class Frame:
         for i, spectrum in enumerate(signals.theta):
             theta, velocity, acceleration = (band.apply(spectrum, light, order) for order in range(3))
             delay = corrections.torque_delay_s[i]
+            acting = hold * _lag(f, corrections.torque_lag_s[i])
             motors.append(
                 Coordinates(
                     position=theta,
@@ -175,8 +186,8 @@ class Frame:
                     deflection_rate=link[1] - velocity if flexible[i] else zero,
                     flexibility_torque=zero,
                     stiffness=zero,
-                    torque=band.apply(signals.tau[i], hold, 0, delay),
-                    torque_rate=band.apply(signals.tau[i], hold, 1, delay),
+                    torque=band.apply(signals.tau[i], acting, 0, delay),
+                    torque_rate=band.apply(signals.tau[i], acting, 1, delay),
                     link_position=link[0],
                     link_velocity=link[1],
                     link_acceleration=link[2],
@@ -231,6 +242,11 @@ class Frame:
         """B theta" + D theta' - tau on the grid, which is tau_e by eq 5."""
         motor, c = self.model.motors[i], self.motors[i]
         own = motor.inertia_kg_m2 * c.acceleration + motor.viscous_damping_nm_s_rad * c.velocity
+        link = self.model.link
+        if link is not None and not self.flexible[i] and i == 0:
+            # Rigid: the link moves with the motor.
+            own = own + link.inertia_kg_m2 * c.acceleration + link.viscous_damping_nm_s_rad * c.velocity
+            own = own + link.gravity_nm * np.sin(c.position + link.gravity_phase_rad)
         return np.asarray(own - c.torque)
 
     def target(self) -> FloatArray:

@@ -12,18 +12,27 @@ from estimator.sample import FloatArray
 
 __all__ = ["declared_corrections", "declared_torque"]
 
-_READINGS = ("torque_delay", "deflection_offset", "encoder_delay", "encoder_scale", "encoder_eccentricity")
+_READINGS = (
+    "torque_delay",
+    "torque_lag",
+    "deflection_offset",
+    "encoder_delay",
+    "encoder_scale",
+    "encoder_eccentricity",
+)
 
 
 def declared_corrections(model: JointModel) -> Corrections:
     """Corrections of the readings by the model's own effects."""
-    delays, offsets = [], []
+    delays, lags, offsets = [], [], []
     for motor in model.motors:
         delays.append(_sum(motor.effects, "torque_delay", "delay_s"))
+        lags.append(_sum(motor.effects, "torque_lag", "time_constant_s"))
         offsets.append(_sum(motor.effects, "deflection_offset", "offset_rad"))
     link = model.link_effects
     return Corrections(
         torque_delay_s=tuple(delays),
+        torque_lag_s=tuple(lags),
         offset_rad=tuple(offsets),
         encoder_delay_s=_sum(link, "encoder_delay", "delay_s"),
         encoder_sin_rad=_sum(link, "encoder_eccentricity", "sin_rad"),

@@ -1,190 +1,226 @@
-"""A selection as findings: parameters with intervals, alternatives, curves, errors."""
+"""A fitted hypothesis as findings: parameters with intervals, curves, transmissions, readings."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimator.diagnosis.candidates import columns
-from estimator.diagnosis.curves import FreeCurve
-from estimator.diagnosis.frame import Frame
-from estimator.diagnosis.result import Curve, Errors, Finding, Rival
-from estimator.diagnosis.search import Found, additions, taken_out, without
-from estimator.diagnosis.select import Term
+from estimator.diagnosis.covariance import hac_covariance
+from estimator.diagnosis.hypothesis import Fitted, Problem, curve_columns
+from estimator.diagnosis.result import Curve, Finding, Refitted, Rival, Series
+from estimator.diagnosis.search import Search
+from estimator.effects import LIBRARY
 from estimator.model import ParameterValue
 from estimator.sample import FloatArray
 
-__all__ = ["curve_of", "curve_of_free", "errors", "findings", "rivals"]
+__all__ = ["alignment_of", "curves_of", "findings_of", "rivals_of", "series_of", "transmissions_of"]
 
-FloatMask = NDArray[np.bool_]
-
-_TIE = 1.18  # squared error of an alternative over that of the chosen effect
-_SCATTER = 2.0  # or within so many standard errors of the blocks' differences
-_STEP = 1e-3
-_FIXED = ("side", "power", "exponent", "shape")
+_SKEW = 1.05  # periods: more than one sample is a delay, less an everyday skew
+_SURE = 3.0  # standard deviations from zero at which a reading's error is told
+_ALL = 2.0  # times what else is left: a constant torque is then all there is to tell
+_CHANNELS = {"torque_delay": "torque_delay_s", "deflection_offset": "deflection_offset_rad"}
 
 
-def findings(found: Found) -> list[Finding]:
-    """The terms as findings, the one that explains most first."""
-    deviations = _deviations(found)
+def findings_of(
+    problem: Problem, found: Fitted, null: Fitted, alternatives: list[tuple[str, ...]]
+) -> list[Finding]:
+    """The effects, the one that explains most first; delays of more than a sample among them."""
+    std = np.sqrt(np.maximum(np.diag(hac_covariance(found)), 0.0))
     made = []
-    for k, term in enumerate(found.selection.terms):
-        rest = without(found, k)
-        share = (rest.selection.error - found.selection.error) / max(rest.selection.error, 1e-300)
-        parameters, std = _parameters(found, k, deviations)
-        made.append(
-            (
-                rest.selection.error - found.selection.error,
-                Finding(
-                    name=term.candidate.kind.name,
-                    location=term.candidate.kind.location,
-                    motor=term.candidate.motor,
-                    parameters=parameters,
-                    std=std,
-                    alternatives=_alternatives(found, rest, term),
-                    share=float(share),
-                ),
-            )
+    total = float(np.sum(null.posterior.sigma**2))
+    for k, term in enumerate(found.terms):
+        kind = term.candidate.kind
+        mine = [j for j, s in enumerate(found.slots) if s.kind == "term" and s.place == k]
+        shapes = {
+            s.name: float(std[j]) for j, s in enumerate(found.slots) if s.kind == "shape" and s.place == k
+        }
+        deviation: dict[str, ParameterValue] = dict(
+            zip(kind.linear, (float(std[j]) for j in mine), strict=True)
         )
+        deviation.update({name: _absolute(problem, found, k, name, x) for name, x in shapes.items()})
+        torque = found.regression.design[:, mine] @ found.posterior.x[mine]
+        share = float(np.mean(torque**2)) / max(total, 1e-300)
+        finding = Finding(
+            name=kind.name,
+            location=kind.location,
+            motor=term.candidate.motor,
+            parameters={**dict(zip(kind.linear, term.weights, strict=True)), **term.values},
+            std=deviation,
+            alternatives=alternatives[k],
+            share=min(share, 1.0),
+        )
+        if not _everyday(problem, finding):
+            made.append((share, finding))
+    for slot, x, sigma in zip(found.slots, found.posterior.x, std, strict=True):
+        value = slot.taken + float(x)
+        late = slot.name in ("encoder_delay", "torque_delay") and abs(value) > _SKEW * problem.period_s
+        if slot.kind == "everyday" and late and abs(value) > _SURE * sigma:
+            kind = LIBRARY[slot.name]
+            made.append((0.0, Finding(
+                name=slot.name, location=kind.location, motor=slot.motor, parameters={"delay_s": value},
+                std={"delay_s": float(sigma)}, alternatives=(), share=0.0,
+            )))  # fmt: skip
+    made += [(0.0, f) for f in _offsets(problem, found, std)] if not made else []
     made.sort(key=lambda pair: -pair[0])
     return [finding for _, finding in made]
 
 
-def _alternatives(found: Found, rest: Found, term: Term) -> tuple[str, ...]:
-    """Other effects that leave as little."""
-    names = []
-    for other in sorted(additions(rest), key=lambda o: o.selection.error):
-        candidate = other.selection.terms[-1].candidate
-        if candidate.key == term.candidate.key:
+def _offsets(problem: Problem, found: Fitted, std: FloatArray) -> list[Finding]:
+    """A constant torque that is all there is: without link dynamics, an offset of torque or of encoders."""
+    if problem.frames[0].linked:
+        return []
+    for i, flexible in enumerate(problem.frames[0].flexible):
+        mine = [
+            j for j, s in enumerate(found.slots)
+            if s.kind == "everyday" and s.motor == i and s.name in ("torque_offset", "deflection_offset")
+        ]  # fmt: skip
+        constant = found.regression.design[:, mine] @ (
+            found.posterior.x[mine] + np.array([found.slots[j].taken for j in mine])
+        )
+        left = found.regression.residual(found.posterior.x)
+        if not flexible or float(np.mean(constant**2)) < _ALL**2 * float(np.mean(left**2)):
             continue
-        more = other.selection.fit.cross - found.selection.fit.cross
-        spread = float(np.std(more, ddof=1) * np.sqrt(len(more)))
-        fall = rest.selection.error - found.selection.error
-        close = other.selection.error < _TIE * found.selection.error
-        if (close or more.sum() < _SCATTER * spread) and more.sum() < 0.1 * fall:
-            names.append(candidate.kind.name)
-    return tuple(dict.fromkeys(n for n in names if n != term.candidate.kind.name))
+        size = -float(np.mean(constant[problem.group % problem.equations == i]))
+        deviation = float(np.hypot.reduce(std[[j for j in mine if found.slots[j].name == "torque_offset"]]))
+        return [
+            Finding(
+                name="torque_offset", location="motor", motor=i, parameters={"torque_nm": size},
+                std={"torque_nm": deviation}, alternatives=("deflection_offset",), share=0.0,
+            )
+        ]  # fmt: skip
+    return []
 
 
-def _deviations(found: Found) -> list[tuple[FloatArray, dict[str, float]]]:
-    """Per term: standard deviations of its linear, and of its nonlinear parameters."""
-    tracer, selection = found.tracer, found.selection
-    extra, owners = [], []
-    place = tracer.base_design.shape[1]
-    for k, term in enumerate(selection.terms):
-        weights = selection.fit.coefficients[place : place + term.width]
-        place += term.width
-        for name in term.values:
-            if name in _FIXED:
-                continue
-            step = _STEP * (abs(term.values[name]) or 1.0)
-            up = tracer.columns(term.candidate, {**term.values, name: term.values[name] + step})
-            down = tracer.columns(term.candidate, {**term.values, name: term.values[name] - step})
-            extra.append(((up - down) @ weights) / (2 * step))
-            owners.append((k, name))
-    design = np.column_stack([selection.design, *extra]) if extra else selection.design
-    std = np.sqrt(np.maximum(np.diag(tracer.rows.fit(design, tracer.target).covariance), 0.0))
-    made = []
-    place = tracer.base_design.shape[1]
-    for k, term in enumerate(selection.terms):
-        nonlinear = {
-            name: float(std[selection.design.shape[1] + j]) for j, (o, name) in enumerate(owners) if o == k
-        }
-        made.append((std[place : place + term.width], nonlinear))
-        place += term.width
-    return made
+def _everyday(problem: Problem, finding: Finding) -> bool:
+    """Whether a delay is a skew of up to a sample: it is aligned and reported, not diagnosed."""
+    if finding.name not in ("encoder_delay", "torque_delay"):
+        return False
+    delay = finding.parameters["delay_s"]
+    return isinstance(delay, float) and abs(delay) <= _SKEW * problem.period_s
 
 
-def _parameters(
-    found: Found, k: int, deviations: list[tuple[FloatArray, dict[str, float]]]
-) -> tuple[dict[str, ParameterValue], dict[str, ParameterValue]]:
-    selection, term = found.selection, found.selection.terms[k]
-    place = found.tracer.base_design.shape[1] + sum(t.width for t in selection.terms[:k])
-    linear = selection.fit.coefficients[place : place + term.width] + taken_out(found.tracer.frame, term)
-    parameters: dict[str, ParameterValue] = dict(
-        zip(term.candidate.kind.linear, (float(x) for x in linear), strict=True)
-    )
-    parameters.update(term.values)
-    std: dict[str, ParameterValue] = dict(
-        zip(term.candidate.kind.linear, (float(x) for x in deviations[k][0]), strict=True)
-    )
-    std.update(deviations[k][1])
-    return parameters, std
+def _absolute(problem: Problem, found: Fitted, k: int, name: str, x: float) -> float:
+    """Standard deviation of a nonlinear parameter in its unit, from that of its slot."""
+    return x * problem.unit_of(found.terms[k], name)
 
 
-def rivals(singles: list[Found], scale: float) -> list[Rival]:
-    """Where each candidate stands alone, best first, as error relative to `scale` (weighted)."""
+def alignment_of(problem: Problem, after: Fitted, effects: list[Finding]) -> dict[str, float]:
+    """What was taken out of the readings as everyday, by channel."""
+    told = {(f.name, f.motor) for f in effects}
+    pairs: dict[str, float] = {}
+    std = np.sqrt(np.maximum(np.diag(hac_covariance(after)), 0.0))
+    for slot, x, sigma in zip(after.slots, after.posterior.x, std, strict=True):
+        if abs(slot.taken + float(x)) < _SURE * sigma:
+            continue
+        if (
+            slot.kind not in ("everyday", "term")
+            or slot.run not in (None, 0)
+            or (slot.name, slot.motor) in told
+        ):
+            continue
+        if slot.name == "encoder_delay":
+            pairs["link_position_delay_s"] = slot.taken + float(x)
+        elif slot.name in _CHANNELS:
+            pairs[f"motor{(slot.motor or 0) + 1}_{_CHANNELS[slot.name]}"] = slot.taken + float(x)
+    return pairs
+
+
+def transmissions_of(problem: Problem, after: Fitted) -> tuple[tuple[Refitted, ...], list[str]]:
+    """Each motor's transmission, and doubts about them.
+
+    A stiffness that is not above zero, or whose interval includes zero, is no stiffness: its parameters are
+    left out, and a doubt says so.
+    """
+    covariance = hac_covariance(after)
+    made: list[Refitted] = []
+    doubts = []
+    for i, model in enumerate(after.base.models(problem.frames[0])):
+        mine = [j for j, s in enumerate(after.slots) if s.kind == "base" and s.motor == i]
+        if model is None:
+            made.append(Refitted("none", {}, {}))
+            continue
+        alpha = np.array([after.slots[j].taken + after.posterior.x[j] for j in mine])
+        own = covariance[np.ix_(mine, mine)]
+        phi = problem.frames[0].motors[i].deflection
+        middle = float(np.median(np.abs(phi)))
+        slope = np.asarray(model.stiffness_jacobian(np.array([middle]), alpha))[0]
+        stiffness = float(np.asarray(model.stiffness(np.array([middle]), alpha))[0])
+        std = float(np.sqrt(max(slope @ own @ slope, 0.0)))
+        if not stiffness - 1.96 * std > 0.0 or any(after.posterior.bound[mine]):
+            doubts.append(
+                f"the stiffness of motor {i + 1} is not told: {stiffness:.4g} ± {1.96 * std:.2g} N·m/rad "
+                "includes zero"
+            )
+            made.append(Refitted(model.name, {}, {}))
+            continue
+        std_of_alpha = np.sqrt(np.maximum(np.diag(own), 0.0))
+        made.append(Refitted(model.name, model.parameters(alpha), model.parameters(std_of_alpha)))
+    return tuple(made), doubts
+
+
+def rivals_of(search: Search) -> list[Rival]:
+    """Where each promising effect stands alone, best first, as error relative to the torque."""
     standing = []
-    for found in singles:
-        rows = found.tracer.rows.train.sum()
-        candidate = found.selection.terms[-1].candidate
-        error = float(np.sqrt(found.selection.error / rows)) / scale
+    for found in search.singles():
+        candidate = found.terms[-1].candidate
+        left = found.regression.residual(found.posterior.x)
+        motors = search.problem.group % search.problem.equations < len(search.problem.model.motors)
+        error = float(np.sqrt(np.mean(left[motors] ** 2))) / search.problem.torque_rms
         standing.append(Rival(candidate.kind.name, candidate.kind.location, candidate.motor, error))
     return sorted(standing, key=lambda rival: rival.error_relative)
 
 
-def errors(frame: Frame, before: FloatArray, after: FloatArray, rows: FloatMask, demean: bool) -> Errors:
-    """Errors of the motors' balances over some rows, and relative to their torques.
+def curves_of(problem: Problem, after: Fitted) -> tuple[Curve, ...]:
+    """Residual without each effect against what reveals it, and the effect, on the first recording."""
+    frame = problem.at(after.corrections, after.base)[0]
+    rows = np.arange(frame.rows)
+    left = after.regression.residual(after.posterior.x)
+    made = []
+    for k, term in enumerate(after.terms):
+        kind, motor = term.candidate.kind, term.candidate.motor
+        mine = [j for j, s in enumerate(after.slots) if s.kind == "term" and s.place == k]
+        fitted = columns(frame, term.candidate, term.values) @ np.array(term.weights)
+        own = after.regression.design[: len(fitted), mine] @ after.posterior.x[mine]
+        equation = frame.equations - 1 if kind.location == "link" else motor or 0
+        pick = rows + equation * frame.rows
+        sign = -1.0 if kind.location == "motor" else 1.0
+        made.append(
+            Curve(
+                name=kind.name,
+                coordinates=(kind.coordinate,),
+                x=frame.project(getattr(frame.motors[motor or 0], kind.coordinate)),
+                residual_nm=sign * (left[pick] + own[pick]),
+                fitted_nm=sign * (own[pick] if kind.channel != "torque" else fitted[pick]),
+            )
+        )
+    if after.extra is not None:
+        extra = after.extra
+        mine = [j for j, s in enumerate(after.slots) if s.kind == "curve"]
+        own = curve_columns(frame, extra) @ after.posterior.x[mine]
+        equation = frame.equations - 1 if extra.location == "link" else extra.motor or 0
+        pick = rows + equation * frame.rows
+        sign = -1.0 if extra.location == "motor" else 1.0
+        x = [frame.project(getattr(frame.motors[extra.motor or 0], name)) for name in extra.coordinates]
+        made = [
+            Curve(
+                name="unlisted",
+                coordinates=extra.coordinates,
+                x=x[0],
+                second=x[1] if len(x) > 1 else None,
+                residual_nm=sign * (left[pick] + own[pick]),
+                fitted_nm=sign * own[pick],
+            )
+        ]
+    return tuple(made)
 
-    Args:
-        frame: the recording.
-        before: what the declared model leaves, all rows, stacked.
-        after: what the augmented model leaves.
-        rows: (n,) which rows of one equation.
-        demean: whether a constant is free, and taken off all.
-    """
-    motors = len(frame.motors)
-    torque = np.stack([frame.project(c.torque) for c in frame.motors])
-    parts = [x.reshape(frame.equations, -1)[:motors] for x in (before, after)]
-    sizes = []
-    for part in (*parts, torque):
-        chosen = part[:, rows]
-        if demean:
-            chosen = chosen - chosen.mean(axis=1, keepdims=True)
-        sizes.append(float(np.sqrt(np.mean(chosen**2))))
-    scale = max(sizes[2], 1e-300)
-    return Errors(sizes[0], sizes[1], sizes[0] / scale, sizes[1] / scale)
 
-
-def curve_of_free(found: Found, free: FreeCurve) -> Curve:
-    """Residual of the declared model against the coordinates of a free curve, with the curve."""
-    tracer, frame = found.tracer, found.tracer.frame
-    columns_of = free.columns(frame)
-    fitted = columns_of @ free.selection.fit.coefficients[-columns_of.shape[1] :]
-    residual = tracer.left(free.selection, free.columns) + fitted
-    equation = frame.equations - 1 if free.location == "link" else free.motor or 0
-    sign = -1.0 if free.location == "motor" else 1.0
-    c = frame.motors[free.motor or 0]
-    pick = slice(equation * frame.rows, (equation + 1) * frame.rows)
-    x = [frame.project(getattr(c, name)) for name in free.coordinates]
-    return Curve(
-        name="unlisted",
-        coordinates=free.coordinates,
-        x=x[0],
-        second=x[1] if len(x) > 1 else None,
-        residual_nm=sign * residual[pick],
-        fitted_nm=sign * fitted[pick],
-    )
-
-
-def curve_of(found: Found, k: int) -> Curve:
-    """Residual without a term against the coordinate that reveals it, with the term, on the rows."""
-    tracer, selection = found.tracer, found.selection
-    frame, term = tracer.frame, selection.terms[k]
-    made = columns(frame, term.candidate, term.values)
-    place = tracer.base_design.shape[1] + sum(t.width for t in selection.terms[:k])
-    fitted = made @ (
-        selection.fit.coefficients[place : place + term.width] + taken_out(found.tracer.frame, term)
-    )
-    residual = tracer.left(selection) + fitted
-    equation = frame.equations - 1 if term.candidate.kind.location == "link" else term.candidate.motor or 0
-    sign = -1.0 if term.candidate.kind.location == "motor" else 1.0
-    coordinate = getattr(frame.motors[term.candidate.motor or 0], term.candidate.kind.coordinate)
-    pick = slice(equation * frame.rows, (equation + 1) * frame.rows)
-    return Curve(
-        name=term.candidate.kind.name,
-        coordinates=(term.candidate.kind.coordinate,),
-        x=frame.project(coordinate),
-        residual_nm=sign * residual[pick],
-        fitted_nm=sign * fitted[pick],
+def series_of(problem: Problem, before: Fitted, after: Fitted) -> Series:
+    """Torque of the first motor over time, and what is left of it."""
+    frame = problem.frames[0]
+    keep = frame.signals.keep
+    return Series(
+        time_s=np.flatnonzero(keep).astype(np.float64) * frame.signals.narrow.period_s,
+        torque_nm=frame.project(frame.motors[0].torque),
+        before_nm=before.regression.residual(before.posterior.x)[: frame.rows],
+        after_nm=after.regression.residual(after.posterior.x)[: frame.rows],
     )

@@ -8,7 +8,17 @@ from typing import Literal, NamedTuple
 from estimator.model import ParameterValue
 from estimator.sample import FloatArray
 
-__all__ = ["Curve", "Diagnosis", "Errors", "Finding", "Rival", "Series", "Verdict"]
+__all__ = [
+    "Curve",
+    "Diagnosis",
+    "Errors",
+    "Finding",
+    "RecordingErrors",
+    "Refitted",
+    "Rival",
+    "Series",
+    "Verdict",
+]
 
 Verdict = Literal["effect", "sufficient", "unexplained", "insufficient_excitation"]
 
@@ -87,6 +97,21 @@ class Series:
     after_nm: FloatArray
 
 
+class Refitted(NamedTuple):
+    """One transmission as refitted; empty where it is rigid or the data do not tell its stiffness."""
+
+    model: str
+    parameters: dict[str, ParameterValue]
+    std: dict[str, ParameterValue]
+
+
+class RecordingErrors(NamedTuple):
+    """Errors of one recording: where it was fitted, and where it took no part (None: it always did)."""
+
+    train: Errors
+    validation: Errors | None
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Diagnosis:
     """The outcome.
@@ -98,13 +123,14 @@ class Diagnosis:
         train: errors on the training data.
         validation: errors on data that took no part.
         floor_nm: per motor, rms of what the augmented model leaves of the torque balance.
-        transmissions: parameters per motor, refitted with the effects.
+        transmissions: per motor, refitted with the effects.
         alignment: skew and offset between channels that were taken out; names carry the unit.
         rivals: the candidates' standing, best first.
         curves: one for each effect.
         series: of the first motor, on the training recording.
         advice: which motion would distinguish what could not be distinguished.
         notes: what else is to be said, a line each.
+        recordings: errors of each recording.
     """
 
     verdict: Verdict
@@ -113,10 +139,11 @@ class Diagnosis:
     train: Errors
     validation: Errors
     floor_nm: tuple[float, ...]
-    transmissions: tuple[dict[str, ParameterValue], ...]
+    transmissions: tuple[Refitted, ...]
     alignment: dict[str, float] = field(default_factory=dict)
     rivals: tuple[Rival, ...] = ()
     curves: tuple[Curve, ...] = ()
     series: Series | None = None
     advice: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    recordings: tuple[RecordingErrors, ...] = ()

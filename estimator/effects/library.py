@@ -55,6 +55,12 @@ def _load_dependent(c: Coordinates, p: Values, m: ModuleType) -> Out:
     return (m.fabs(c.flexibility_torque) * _sign(c.velocity, p, m),)
 
 
+def _back_driving(c: Coordinates, p: Values, m: ModuleType) -> Out:
+    sign = _sign(c.velocity, p, m)
+    # tau_e acts on the motor as +tau_e: the link drives while it has the velocity's sign.
+    return (0.5 * (m.fabs(c.flexibility_torque) * sign + c.flexibility_torque * m.fabs(sign)),)
+
+
 def _waves(c: Coordinates, p: Values, m: ModuleType) -> Out:
     angle = p["periods_per_rev"] * c.position
     return m.sin(angle), m.cos(angle)
@@ -226,6 +232,28 @@ _MOTOR = (
         parameters=(Parameter("delay_s", "the torque acts later than reported by"),),
         terms=lambda c, p, m: (c.torque_rate,),
         description="the torque acts later than it is reported",
+    ),
+    EffectType(
+        name="torque_lag",
+        location="motor",
+        channel="motor_torque",
+        coordinate="torque_rate",
+        parameters=(
+            Parameter("time_constant_s", "by which the acting torque lags; negative: the reported one does"),
+        ),
+        terms=lambda c, p, m: (c.torque_rate,),
+        description="reported and acting torque are apart by a first-order lag",
+    ),
+    EffectType(
+        name="back_driving_loss",
+        location="motor",
+        coordinate="velocity",
+        parameters=(
+            Parameter("coefficient", "loss per flexibility torque while the link drives"),
+            _SMOOTHING,
+        ),
+        terms=_back_driving,
+        description="the gear loses torque while the link drives the motor",
     ),
 )
 

@@ -11,6 +11,7 @@
 //! normalised innovation squared of Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking
 //! and Navigation", 2001, section 5.4).
 
+const ASTRAY: f64 = 10.0; // rad, and times what is measured: no prediction of one period is so far off
 const STATES: usize = 5;
 type State = [f64; STATES];
 type Covariance = [State; STATES];
@@ -154,6 +155,11 @@ impl DeflectionFilter {
         };
         let ahead = [x0 + t * (x1 + 0.5 * t * a), x1 + t * a, x2 + t * (x3 + 0.5 * t * x4), x3 + t * x4, x4];
         let (e, f) = (theta - ahead[0], phi - ahead[2]);
+        if !(f.abs() < ASTRAY * (1.0 + phi.abs()) && e.is_finite()) {
+            self.modelled = false; // a stiffness that cannot be has made the motion model unstable
+            self.restart(theta, phi);
+            return;
+        }
         let [g, h] = if plain { &self.plain } else { &self.gains };
         for i in 0..STATES {
             self.x[i] = ahead[i] + g[i] * e + h[i] * f;
@@ -173,6 +179,7 @@ impl DeflectionFilter {
         self.peak = (self.fade * self.peak).max(self.jerk);
         let noise = told.motor_noise + told.link_noise;
         if !(noise > 0.0 && self.peak > 0.0 && told.unmodelled < f64::INFINITY) {
+            self.modelled = false; // nothing is known of the motor's balance: it tells nothing of its motion
             return;
         }
         let density = noise * t;

@@ -1,9 +1,10 @@
-"""The measured machines: diagnosis of EMPS and two axes of a KUKA robot, with their reports.
+"""Measured machines: what `diagnose` leaves on another recording, beside thirty lines of least squares.
 
-    python benchmarks/real_data.py [--data DIR] [--out DIR] [--json FILE]
+    python benchmarks/real_data.py [--data DIR] [--shaft-line DIR] [--out DIR] [--json FILE]
 
-The recordings are not part of the project: DIR (or $DRIVELINK_DATA, or ../shared/data) holds emps/ and
-kuka_kr300/ as docs/diagnosis.md describes them.
+The recordings are not part of the project: DIR (or $DRIVELINK_DATA, or ../shared/data) holds emps/,
+kuka_kr300/ and uw_sea/. --shaft-line names a folder with Ice_excitation1.csv … and their motor files of
+github.com/aksel-ilveskero/Shaftline-Torque-Estimation, if it has been fetched; it has a torque sensor.
 """
 
 from __future__ import annotations
@@ -15,75 +16,151 @@ import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from drivelink import jointfile, recording, report
+from drivelink.jointfile import JointFile
 from drivelink.progress import track
 from estimator.diagnosis import diagnose
+from estimator.diagnosis.frame import Corrections, Frame, Signals
+from estimator.model import JointModel
+from estimator.sample import FloatArray, Record
 
 ROOT = Path(__file__).resolve().parents[1]
+JOINT = """
+name = "{name}"
+arrangement = "single"
+[[motor]]
+inertia_kg_m2 = {inertia}
+viscous_damping_nm_s_rad = {damping}
+transmission = {{ model = "linear" }}
+[bus]
+period_s = {period}
+"""
+UW = JOINT.format(name="uw_sea", inertia=5.878e-4, damping=0.0, period=0.005)
+SHAFT = JOINT.format(name="shaft_line", inertia=0.0086, damping=0.003, period=0.001)
 
 
 class Run(NamedTuple):
-    """One diagnosis: joint file, training and validation data, bandwidth, what others got there."""
+    """One diagnosis: machine, training and validation data, bandwidth, stiffness that is known of it."""
 
     joint: str
     train: str
     validation: str
     bandwidth_hz: float
-    published: str
+    known_nm_rad: float | None
 
 
 RUNS = (
-    Run("emps", "emps/train.csv", "emps/pulses.csv", 40.0, "4.08 % train, 5.98 % pulses"),
-    Run(
-        "kuka_axis3",
-        "kuka_kr300/axis3_A.csv",
-        "kuka_kr300/axis3_B.csv",
-        15.0,
-        "25 % A, 23 % B with a velocity term of the wrong sign",
-    ),
-    Run(
-        "kuka_axis2",
-        "kuka_kr300/axis2_A.csv",
-        "kuka_kr300/axis2_B.csv",
-        15.0,
-        "37 % A, 44 % B with a velocity term of the wrong sign",
+    Run("emps", "emps/train.csv", "emps/pulses.csv", 40.0, None),
+    Run("kuka_axis3", "kuka_kr300/axis3_A.csv", "kuka_kr300/axis3_B.csv", 15.0, 4.10e6),
+    Run("kuka_axis3", "kuka_kr300/axis3_B.csv", "kuka_kr300/axis3_A.csv", 15.0, 4.10e6),
+    Run("kuka_axis2", "kuka_kr300/axis2_A.csv", "kuka_kr300/axis2_B.csv", 15.0, 7.52e6),
+    Run("kuka_axis2", "kuka_kr300/axis2_B.csv", "kuka_kr300/axis2_A.csv", 15.0, 7.52e6),
+    *(
+        Run("uw_sea", f"uw_sea/uw_{a}.csv", f"uw_sea/uw_{b}.csv", 10.0, 0.462)
+        for a in ("InnerLoop", "DoubleLoopReference", "DoubleLoopDisturbance")
+        for b in ("InnerLoop", "DoubleLoopReference", "DoubleLoopDisturbance")
+        if a != b
     ),
 )
+SHAFT_RUNS = tuple(
+    Run("shaft_line", str(a), str(b), 20.0, 35.7) for a in (1, 2, 3) for b in (1, 2, 3) if a != b
+)
+
+
+def baseline(train: Record, validation: Record, model: JointModel, bandwidth_hz: float) -> float:
+    """Relative error of least squares: inertia, viscous and Coulomb friction, offset, one stiffness."""
+    (a, y), (b, z) = (_columns(record, model, bandwidth_hz) for record in (train, validation))
+    scale = np.linalg.norm(a, axis=0)
+    error = z - b @ (np.linalg.lstsq(a / scale, y, rcond=1e-10)[0] / scale)
+    return float(np.std(error) / np.std(z))
+
+
+def _columns(record: Record, model: JointModel, bandwidth_hz: float) -> tuple[FloatArray, FloatArray]:
+    frame = Frame.make(model, Signals(record, bandwidth_hz), Corrections.none(1))
+    c = frame.motors[0]
+    sign = np.tanh(c.velocity / (0.02 * np.max(np.abs(c.velocity))))
+    columns = [c.acceleration, c.velocity, sign, np.ones_like(sign)]
+    columns += [-c.deflection] if frame.flexible[0] else []
+    return np.stack([frame.project(x) for x in columns], axis=1), frame.project(c.torque)
+
+
+def joint_of(run: Run) -> JointFile:
+    """The joint as it is declared."""
+    inline = {"uw_sea": UW, "shaft_line": SHAFT}
+    if run.joint in inline:
+        return jointfile.parse(inline[run.joint])
+    return jointfile.load(ROOT / "examples" / f"{run.joint}.toml")
+
+
+def shaft_record(folder: Path, number: str) -> Record:
+    """Both encoders and the motor's torque, which has a clock of its own, on one grid of a millisecond."""
+    rows = np.genfromtxt(folder / f"Ice_excitation{number}.csv", delimiter=",", skip_header=1)
+    motor = np.genfromtxt(folder / f"Ice_excitation{number}_motor.csv", delimiter=",", skip_header=1)
+    time = np.arange(max(rows[0, 0], motor[0, 0]), min(rows[-1, 0], motor[-1, 0]), 1e-3)
+    return Record(
+        period_s=1e-3,
+        sequence=np.arange(len(time)),
+        motor_position_rad=np.radians(np.interp(time, rows[:, 0], rows[:, 1]))[:, None],
+        motor_torque_nm=np.interp(time, motor[:, 0], motor[:, 2])[:, None],
+        link_position_rad=np.radians(np.interp(time, rows[:, 0], rows[:, 2])),
+    )
 
 
 def diagnosed(run: Run, data: Path, out: Path) -> dict[str, Any]:
     """Diagnose one machine and write its reports."""
-    joint = jointfile.load(ROOT / "examples" / f"{run.joint}.toml")
-    train, validation = (recording.read(data / name, joint) for name in (run.train, run.validation))
+    joint = joint_of(run)
+    if run.joint == "shaft_line":
+        train, validation = (shaft_record(data, number) for number in (run.train, run.validation))
+    else:
+        train, validation = (recording.read(data / name, joint) for name in (run.train, run.validation))
     outcome = diagnose(train, joint.model(), run.bandwidth_hz, validation)
-    folder = out / run.joint
+    folder = out / f"{run.joint}-{Path(run.train).stem}-{Path(run.validation).stem}"
     folder.mkdir(parents=True, exist_ok=True)
-    title = report.Title(run.joint, Path(run.train).name, Path(run.validation).name)
-    report.write(outcome, title, folder)
-    return {"joint": run.joint, "published": run.published, **report.as_json(outcome)}
+    report.write(outcome, report.Title(run.joint, Path(run.train).name, Path(run.validation).name), folder)
+    return {
+        **run._asdict(),
+        "baseline_relative": baseline(train, validation, joint.model(), run.bandwidth_hz),
+        **report.as_json(outcome),
+    }
+
+
+def _stiffness(one: dict[str, Any]) -> str:
+    parameters, std = one["transmissions"][0]["parameters"], one["transmissions"][0]["std"]
+    if not parameters:
+        return "-"
+    return f"{parameters['k_nm_rad']:.3g} ± {1.96 * std['k_nm_rad']:.1g} (95 %) / {one['known_nm_rad']:.3g}"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     default = Path(os.environ.get("DRIVELINK_DATA", ROOT.parent / "shared" / "data"))
     parser.add_argument("--data", type=Path, default=default, metavar="DIR")
+    parser.add_argument("--shaft-line", type=Path, metavar="DIR", help="recordings of the shaft line")
     parser.add_argument("--out", type=Path, default=Path("real_data"), metavar="DIR", help="reports go there")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all outcomes there")
     args = parser.parse_args()
     if not (args.data / RUNS[0].train).exists():
-        sys.exit(f"real_data: no measured data in {args.data}: expected emps/ and kuka_kr300/ there")
-    outcomes = [diagnosed(run, args.data, args.out) for run in track(RUNS, "diagnose")]
-    print("| machine | found | taken out | train | validation | elsewhere |\n|---|---|---|---|---|---|")
+        sys.exit(f"real_data: no measured data in {args.data}: expected emps/, kuka_kr300/ and uw_sea/ there")
+    jobs = [(run, args.data) for run in RUNS]
+    jobs += [(run, args.shaft_line) for run in SHAFT_RUNS] if args.shaft_line else []
+    outcomes = [diagnosed(run, data, args.out) for run, data in track(jobs, "diagnose")]
+    print("| machine | train → other | baseline | before → after | of baseline | found | stiffness / known |")
+    print("|---|---|---|---|---|---|---|")
+    ratios = []
     for one in outcomes:
-        error = one["error"]
+        error = one["error"]["validation"]
+        ratios.append(error["after_relative"] / one["baseline_relative"])
         found = ", ".join(effect["name"] for effect in one["effects"]) or one["verdict"]
-        readings = ", ".join(f"{name} {value:.3g}" for name, value in one["alignment"].items()) or "-"
+        names = f"{Path(one['train']).stem} → {Path(one['validation']).stem}"
+        fall = f"{error['before_relative']:.1%} → {error['after_relative']:.1%}"
         print(
-            f"| {one['joint']} | {found} | {readings} "
-            f"| {error['train']['before_relative']:.1%} → {error['train']['after_relative']:.2%} "
-            f"| {error['validation']['before_relative']:.1%} → {error['validation']['after_relative']:.2%} "
-            f"| {one['published']} |"
+            f"| {one['joint']}, {one['bandwidth_hz']:g} Hz | {names} | {one['baseline_relative']:.1%} "
+            f"| {fall} | {ratios[-1]:.2f} | {found} | {_stiffness(one)} |"
         )
+    mean = np.exp(np.mean(np.log(ratios)))
+    print(f"\nerror over the baseline's: geometric mean {mean:.2f}, worst {max(ratios):.2f}")
     if args.json:
         args.json.write_text(json.dumps(outcomes, indent=2) + "\n", encoding="utf-8")
 

@@ -40,25 +40,8 @@ class Candidate:
         return self.kind.name, self.motor
 
 
-def members(frame: Frame, within: tuple[str, int | None] | None = None) -> list[Candidate]:
-    """The effects that this joint can have and these data could show.
-
-    Args:
-        frame: the recording.
-        within: the only place there is anything to explain: location and motor; None: anywhere.
-    """
-    return [c for c in _possible(frame) if within is None or _is_at(c, *within)]
-
-
-def _is_at(candidate: Candidate, location: str, motor: int | None) -> bool:
-    """Whether an effect acts at a place; errors of the encoders' readings act like a transmission."""
-    own = candidate.kind.location
-    if own == "measurement":
-        return location == "transmission"
-    return own == location and candidate.motor == motor
-
-
-def _possible(frame: Frame) -> list[Candidate]:
+def members(frame: Frame) -> list[Candidate]:
+    """The effects that this joint can have and these data could show."""
     found = []
     external = frame.linked
     for kind in LIBRARY.values():

@@ -174,36 +174,6 @@ class Regression:
         """(n,) what is left of every row."""
         return np.asarray(self.target - self.design @ x)
 
-    def cross_validated(self, posterior: Posterior, times: FloatArray) -> FloatArray:
-        """(blocks,) squared error of each block's rows under a fit without them, in units of the noise."""
-        x0, scale = posterior.x * self._scale, self._scale
-        std, mean = self.std * scale, self.mean * scale
-        free = ~posterior.bound
-        weight = 1.0 / (times * posterior.sigma**2)
-        scaled = self.design / scale
-        own = []
-        for b in range(int(self.block.max()) + 1):
-            gram, side = np.zeros((len(x0), len(x0))), np.zeros(len(x0))
-            for g, w in enumerate(weight):
-                rows = (self.block == b) & (self.group == g)
-                a = scaled[rows]
-                gram += w * (a.T @ a)
-                side += w * (a.T @ self.target[rows])
-            own.append((gram, side))
-        total = np.diag(1.0 / std**2) + sum(g for g, _ in own)
-        target = mean / std**2 + sum(s for _, s in own)
-        errors = np.empty(len(own))
-        for b, (gram, side) in enumerate(own):
-            x = np.where(free, 0.0, x0)
-            rest, right = total - gram, target - side
-            x[free] = np.linalg.solve(
-                rest[np.ix_(free, free)], right[free] - rest[np.ix_(free, ~free)] @ x[~free]
-            )
-            rows = self.block == b
-            error = (self.target[rows] - scaled[rows] @ x) / posterior.sigma[self.group[rows]]
-            errors[b] = float(error @ error)
-        return errors
-
     def autocorrelation_times(self, x: FloatArray) -> FloatArray:
         """(groups,) autocorrelation times of what is left, in rows."""
         residual = self.residual(x)

@@ -226,7 +226,6 @@ class Problem:
         self.smoothing_rad_s = max(
             signals.velocity_noise(i) for signals in self.signals for i in range(len(model.motors))
         )
-        self._memo: dict[tuple[object, ...], FloatArray] = {}
 
     @property
     def period_s(self) -> float:

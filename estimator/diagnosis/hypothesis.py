@@ -511,7 +511,8 @@ class Problem:
         if name in ("torque_delay", "encoder_delay"):
             return (std * frames[0].signals.period_s,)
         if name == "torque_offset":
-            return (0.0,) if linked else (std * self.torque_rms,)
+            # A healthy joint's constant is the zero between its encoders: both together are not told apart.
+            return (0.0,) if linked or self.calibrating else (std * self.torque_rms,)
         if name == "deflection_offset":
             phi = frames[0].motors[candidate.motor or 0].deflection
             return (0.0,) if linked and not self.calibrating else (std * float(np.ptp(phi)),)

@@ -100,7 +100,7 @@ def build(
     """Make an excitation from a table as it stands in a joint file.
 
     Args:
-        table: `kind` and its keys (see `docs/simulation.md`); an empty table is "rich".
+        table: `kind` and its keys (see `docs/reference/simulation.md`); an empty table is "rich".
         motors: number of motors.
         amplitude_nm: default of the key of that name; None: the key is required.
         where: begins every message.

@@ -14,11 +14,12 @@ from drivelink import cli, jointfile
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
-PAGES = sorted(DOCS.glob("*.md"))
+REFERENCE = DOCS / "reference"
+PAGES = sorted(DOCS.rglob("*.md"))
 
 
-def generator(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+def generator() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("generate", DOCS / "generate.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -31,19 +32,25 @@ def subparsers() -> dict[str, argparse.ArgumentParser]:
 
 
 def test_the_joint_file_reference_is_current() -> None:
-    page = (DOCS / "joint-file.md").read_text(encoding="utf-8")
-    assert page == generator("generate_reference").joint_file_page(), "run python docs/generate_reference.py"
+    page = (REFERENCE / "joint-file.md").read_text(encoding="utf-8")
+    assert page == generator().joint_file_page(), "run python docs/generate.py"
+
+
+def test_the_wire_reference_is_current() -> None:
+    page = (REFERENCE / "wire.md").read_text(encoding="utf-8")
+    assert page == generator().wire_page(), "run python docs/generate.py"
+    assert "| 0x002 | observable |" in page
 
 
 def test_every_verb_and_option_is_in_the_command_reference() -> None:
     """Not word for word: how help is wrapped differs between versions of Python."""
-    page = (DOCS / "commands.md").read_text(encoding="utf-8")
+    page = (REFERENCE / "commands.md").read_text(encoding="utf-8")
     for verb, parser in subparsers().items():
         section = page.partition(f"## `drivelink {verb}`")[2].partition("\n## ")[0]
         assert section, verb
         for action in parser._actions:
             for option in action.option_strings or [str(action.metavar or action.dest)]:
-                assert option in section, f"{verb} {option}: run python docs/generate_reference.py"
+                assert option in section, f"{verb} {option}: run python docs/generate.py"
 
 
 def test_every_verb_explains_each_of_its_arguments() -> None:
@@ -56,7 +63,7 @@ def test_every_verb_explains_each_of_its_arguments() -> None:
     assert not silent
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(DOCS)))
 def test_files_that_a_page_names_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     named = re.findall(r"`((?:examples|benchmarks|docs|tests|sim|estimator|drivelink)/[\w./*-]+)`", text)
@@ -64,7 +71,7 @@ def test_files_that_a_page_names_exist(page: Path) -> None:
     assert not missing
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(DOCS)))
 def test_commands_that_a_page_shows_can_be_parsed(page: Path) -> None:
     parser = cli.make_parser(list(cli.VERBS))
     for line in re.findall(

@@ -507,7 +507,7 @@ def test_the_examples_of_the_documentation_read_the_table(
 ) -> None:
     pytest.importorskip("duckdb")
     pytest.importorskip("pandas")
-    text = (Path(__file__).parent.parent / "docs" / "fleet.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parent.parent / "docs" / "how-to" / "fleet.md").read_text(encoding="utf-8")
     examples = [block.split("```")[0] for block in text.split("```python\n")[1:]]
     assert len(examples) == 2
     with Table(Store(str(tmp_path / "fleet"))) as one:
@@ -516,7 +516,7 @@ def test_the_examples_of_the_documentation_read_the_table(
         one.append([row("bad", None, status="error", error="broken", recording="bad.csv")])
     monkeypatch.chdir(tmp_path)
     for example in examples:
-        exec(compile(example, "docs/fleet.md", "exec"), {})
+        exec(compile(example, "docs/how-to/fleet.md", "exec"), {})
     said = capsys.readouterr().out
     assert "elbow" in said
     assert "bad.csv" in said

@@ -1,6 +1,5 @@
 """The bytes on zenoh: against zenoh's own serializer (golden vectors), and back."""
 
-import runpy
 import struct
 from pathlib import Path
 
@@ -133,11 +132,3 @@ def test_a_status_that_carries_higher_bits_fits_its_field():
 
 def test_every_status_bit_is_described():
     assert list(wire.STATUS_BITS) == [bit.name for bit in Status]
-
-
-def test_the_documented_layout_is_the_codes():
-    docs = Path(__file__).parent.parent / "docs"
-    generator = runpy.run_path(str(docs / "generate_wire.py"))
-    page = (docs / "wire.md").read_text(encoding="utf-8")
-    assert generator["generate"](page) == page, "run python docs/generate_wire.py"
-    assert "| 0x002 | observable |" in page

@@ -6,7 +6,7 @@ messages of one session whose token vouches for it, and stays with that session 
 Where no token is (a plain publisher, or access control that lets none through), it takes whoever writes
 first, until that is stale.
 
-A session can forge its identity. What stops that is TLS and access control: docs/zenoh-security.md.
+A session can forge its identity. What stops that is TLS and access control: docs/how-to/secure-zenoh.md.
 """
 
 from __future__ import annotations

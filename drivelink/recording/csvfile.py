@@ -34,7 +34,7 @@ _BLOCK = 1 << 22  # bytes read at once
 def read_csv(
     path: Path, joint: JointFile | None = None, keep_nan: bool = False, names: ColumnMap | None = None
 ) -> Record:
-    """Read a CSV recording (columns as in docs/recordings.md).
+    """Read a CSV recording (columns as in docs/reference/recordings.md).
 
     Raises:
         RecordingError: it cannot be read, or lacks what is needed.

@@ -1,7 +1,7 @@
 """What a recording may ask of this machine's memory, checked before it is taken.
 
 A file says itself how long its parts are, and may say anything. None of these bounds is near what a real
-recording has; docs/recordings.md states them.
+recording has; docs/reference/recordings.md states them.
 """
 
 from __future__ import annotations

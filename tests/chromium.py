@@ -79,6 +79,21 @@ class Chromium:
             time.sleep(0.1)
         raise TimeoutError(script)
 
+    def prefer(self, *, dark: bool) -> None:
+        """The colours that the reader prefers."""
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self._call("Emulation.setEmulatedMedia", features=[scheme])
+
+    def resize(self, width: int, height: int) -> None:
+        """Another screen, e.g. a phone's."""
+        self._call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=width < 600,
+        )
+
     def screenshot(self, path: Path) -> None:
         path.write_bytes(base64.b64decode(self._call("Page.captureScreenshot")["data"]))
 

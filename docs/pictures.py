@@ -1,0 +1,200 @@
+"""Draws every picture of the documentation anew, from the programs themselves: `python docs/pictures.py`.
+
+Takes some minutes and needs Chromium. `--only demo web` draws some of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fcntl
+import os
+import pty
+import re
+import select
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+import termios
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pyte
+import tomlkit
+from rich.console import Console
+from rich.style import Style
+from rich.text import Text
+
+ROOT = Path(__file__).parent.parent
+PICTURES = ROOT / "docs" / "pictures"
+sys.path.insert(0, str(ROOT / "tests"))
+
+from chromium import Chromium  # noqa: E402
+
+COLUMNS, LINES = 80, 24
+DRIVELINK = (sys.executable, "-m", "drivelink")
+# rich's own template, without the web fonts it loads from another host.
+SVG = """\
+<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}">
+<style>
+.{unique_id}-matrix {{ font-family: ui-monospace, Menlo, Consolas, "DejaVu Sans Mono", monospace;
+  font-size: {char_height}px; line-height: {line_height}px }}
+.{unique_id}-title {{ font-size: 18px; font-weight: bold; font-family: system-ui, sans-serif }}
+{styles}
+</style>
+<defs><clipPath id="{unique_id}-clip-terminal">
+<rect x="0" y="0" width="{terminal_width}" height="{terminal_height}"/></clipPath>{lines}</defs>
+{chrome}
+<g transform="translate({terminal_x}, {terminal_y})" clip-path="url(#{unique_id}-clip-terminal)">
+{backgrounds}<g class="{unique_id}-matrix">{matrix}</g></g>
+</svg>
+"""
+
+
+def terminal(command: tuple[str, ...], seconds: float, title: str, path: Path) -> None:
+    """Run a command in a terminal of 80 by 24 for some seconds, and draw what the terminal then shows."""
+    screen = pyte.Screen(COLUMNS, LINES)
+    stream = pyte.ByteStream(screen)
+    master, slave = pty.openpty()
+    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", LINES, COLUMNS, 0, 0))
+    environment = os.environ | {"TERM": "xterm-256color", "COLORTERM": "", "NO_COLOR": ""}
+    environment.pop("NO_COLOR")
+    process = subprocess.Popen(
+        command, stdin=slave, stdout=slave, stderr=subprocess.DEVNULL, env=environment, start_new_session=True
+    )
+    os.close(slave)
+    end = time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0:
+        if select.select([master], [], [], left)[0]:
+            stream.feed(os.read(master, 65536))
+    text = picture(screen)
+    process.send_signal(signal.SIGINT)
+    while process.poll() is None:
+        if select.select([master], [], [], 0.2)[0]:
+            try:
+                os.read(master, 65536)
+            except OSError:  # the other end is closed
+                break
+    process.wait(timeout=30)
+    os.close(master)
+    console = Console(record=True, width=COLUMNS, file=open(os.devnull, "w"), force_terminal=True)  # noqa: SIM115
+    console.print(text, end="")
+    path.write_text(console.export_svg(title=title, code_format=SVG, unique_id=path.stem), encoding="utf-8")
+
+
+def picture(screen: pyte.Screen) -> Text:
+    """What a terminal shows, without its empty last lines."""
+    text = Text()
+    used = [k for k in range(screen.lines) if any(c.data.strip() for c in screen.buffer[k].values())]
+    for row in range(max(used, default=0) + 1):
+        for column in range(screen.columns):
+            char = screen.buffer[row][column]
+            text.append(char.data, Style(color=colour(char.fg), bold=char.bold, reverse=char.reverse))
+        text.append("\n")
+    return text
+
+
+def colour(name: str) -> str | None:
+    """A colour of pyte's by its name in rich."""
+    if name == "default":
+        return None
+    if re.fullmatch("[0-9a-f]{6}", name):
+        return f"#{name}"
+    name = name.replace("brown", "yellow")
+    return re.sub("^bright", "bright_", name)
+
+
+@contextmanager
+def joint(folder: Path) -> Iterator[Path]:
+    """A simulated VSA-II, its daemon, and their joint file, apart from everything else on this machine."""
+    path = folder / "elbow.toml"
+    subprocess.run([*DRIVELINK, "new", str(path), "--case", "vsa-ii"], check=True, stdout=subprocess.DEVNULL)
+    text = tomlkit.parse(path.read_text(encoding="utf-8"))
+    text["name"] = "elbow"
+    bus = {"interface": "socketcand", "channel": "vcan0", "period_s": 0.002}
+    text["bus"] = bus | {"options": {"host": "127.0.0.1", "port": free_port()}}
+    text["zenoh"] = {"endpoint": f"tcp/127.0.0.1:{free_port()}"}
+    path.write_text(tomlkit.dumps(text), encoding="utf-8")
+    with running("sim", str(path)):
+        time.sleep(3.0)
+        with running("run", str(path)):
+            yield path
+
+
+def free_port() -> int:
+    """A TCP port that nobody uses."""
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return int(s.getsockname()[1])
+
+
+@contextmanager
+def running(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """A command of drivelink beside this one."""
+    process = subprocess.Popen([*DRIVELINK, *arguments], stdout=subprocess.PIPE, text=True)
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=30)
+
+
+def pages(url: str, name: str, ready: str, height: int) -> None:
+    """A page in light and in dark mode."""
+    with tempfile.TemporaryDirectory() as profile:
+        with Chromium(Path(profile), width=1200, height=height) as browser:
+            browser.open(url)
+            for dark in (False, True):
+                browser.prefer(dark=dark)
+                browser.wait_for(ready, 60.0)
+                time.sleep(1.0)
+                browser.screenshot(PICTURES / f"{name}{'-dark' if dark else ''}.png")
+
+
+def demo() -> None:
+    """`drivelink demo` in a terminal."""
+    terminal((*DRIVELINK, "demo", "--seconds", "20"), 17.0, "drivelink demo", PICTURES / "demo.svg")
+
+
+def views() -> None:
+    """`drivelink monitor` in the terminal and in the browser."""
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        path = stack.enter_context(joint(folder))
+        web = stack.enter_context(running("monitor", str(path), "--web", "--port", "0"))
+        assert web.stdout is not None
+        address = re.search(r"http://\S+", web.stdout.readline())
+        assert address is not None
+        command = (*DRIVELINK, "monitor", str(path))
+        terminal(command, 25.0, "drivelink monitor elbow", PICTURES / "monitor.svg")
+        pages(address[0], "web", "document.readyState === 'complete'", 900)
+
+
+def loop() -> None:
+    """What `fit` and `diagnose` draw, from the example that closes the loop."""
+    with tempfile.TemporaryDirectory() as folder:
+        script = ROOT / "examples" / "close_the_loop.py"
+        subprocess.run([sys.executable, str(script), folder], check=True, stdout=subprocess.DEVNULL)
+        (PICTURES / "fit.png").write_bytes((Path(folder) / "fit.png").read_bytes())
+        pages(f"file://{folder}/report.html", "report", "document.readyState === 'complete'", 1000)
+
+
+DRAWN: dict[str, Callable[[], None]] = {"demo": demo, "views": views, "loop": loop}
+
+
+def main() -> None:
+    """Draw all, or those that are named."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", nargs="+", choices=DRAWN, default=list(DRAWN), help="these only")
+    PICTURES.mkdir(exist_ok=True)
+    for name in parser.parse_args().only:
+        print(f"{name} …", flush=True)
+        DRAWN[name]()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+"""The built documentation: strict, complete, and nothing in it is loaded from another host."""
+
+from __future__ import annotations
+
+import functools
+import http.server
+import importlib.util
+import re
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import chromium
+import pytest
+
+ROOT = Path(__file__).parent.parent
+NEEDED = ("mkdocs", "material", "mkdocstrings", "latex2mathml")
+pytestmark = pytest.mark.skipif(
+    not all(importlib.util.find_spec(name) for name in NEEDED), reason="needs the extra docs"
+)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-d", str(folder)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture
+def address(site: Path) -> Iterator[str]:
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            pass
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=site))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_address[1]}"
+    server.shutdown()
+    server.server_close()
+
+
+def test_no_page_loads_anything_from_another_host(site: Path) -> None:
+    pages = list(site.rglob("*.html"))
+    assert len(pages) > 30
+    loaded = re.compile(
+        r'(?:<(?:script|img|iframe|source|video)[^>]*?\ssrc=|<link[^>]*?rel="(?!canonical|edit)[^"]*"[^>]*?href=)'
+        r'"?((?:https?:)?//[^"\s>]+)'
+    )
+    styles = re.compile(r"(?:@import|url\()\s*['\"]?((?:https?:)?//[^'\")]+)")
+    found = {
+        f"{path.relative_to(site)}: {url}"
+        for path in [*pages, *site.rglob("*.css")]
+        for url in (loaded if path.suffix == ".html" else styles).findall(path.read_text(encoding="utf-8"))
+    }
+    assert not found
+
+
+def test_formulas_diagrams_and_the_help_of_commands_are_rendered(site: Path) -> None:
+    estimation = (site / "explanation" / "estimation.html").read_text(encoding="utf-8")
+    assert "<math" in estimation
+    assert "arithmatex" not in estimation
+    assert '<svg role="img"' in (site / "architecture.html").read_text(encoding="utf-8")
+    assert "usage: drivelink diagnose" in (site / "reference" / "commands.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.skipif(chromium.EXECUTABLE is None, reason="needs Chromium")
+def test_in_a_browser_nothing_is_asked_of_another_host_and_a_phone_shows_whole_pages(
+    site: Path, address: str, tmp_path: Path
+) -> None:
+    pages = ["index.html", "architecture.html", "explanation/estimation.html", "reference/python.html"]
+    with chromium.Chromium(tmp_path / "profile") as browser:
+        browser.resize(390, 844)
+        for page in pages:
+            browser.open(f"{address}/{page}")
+            hosts = browser.evaluate(
+                "performance.getEntriesByType('resource').map(entry => new URL(entry.name).origin)"
+            )
+            assert set(hosts) <= {address}, page
+            assert browser.evaluate("document.documentElement.scrollWidth") <= 390, page

@@ -4,7 +4,7 @@
 
 Every joint, motion and effect is drawn from its seed: soft joints of 80 to 220 N·m/rad with encoders and
 torque noise as drives have them, effects of 3 to 30 % of the torque. The world is `sim`, which shares no code
-with the estimator; the accuracy that counts was measured with other simulators still (docs/explanation/diagnosis.md).
+with the estimator.
 """
 
 from __future__ import annotations

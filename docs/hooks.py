@@ -1,7 +1,7 @@
 """Hooks of the documentation's build: the commands' help, formulas as MathML, diagrams as part of the page.
 
-Browsers render MathML themselves, so formulas need no script. A diagram inside the page takes the page's colours,
-in light and dark mode.
+Browsers render MathML themselves, so formulas need no script. A diagram inside the page takes the page's
+colours, in light and dark mode.
 """
 
 from __future__ import annotations

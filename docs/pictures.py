@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import fcntl
+import io
 import os
 import pty
 import re
@@ -61,8 +62,8 @@ def terminal(command: tuple[str, ...], seconds: float, title: str, path: Path) -
     stream = pyte.ByteStream(screen)
     master, slave = pty.openpty()
     fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", LINES, COLUMNS, 0, 0))
-    environment = os.environ | {"TERM": "xterm-256color", "COLORTERM": "", "NO_COLOR": ""}
-    environment.pop("NO_COLOR")
+    environment = {k: v for k, v in os.environ.items() if k not in ("NO_COLOR", "COLORTERM", "CI")}
+    environment |= {"TERM": "xterm-256color"}
     process = subprocess.Popen(
         command, stdin=slave, stdout=slave, stderr=subprocess.DEVNULL, env=environment, start_new_session=True
     )
@@ -81,7 +82,7 @@ def terminal(command: tuple[str, ...], seconds: float, title: str, path: Path) -
                 break
     process.wait(timeout=30)
     os.close(master)
-    console = Console(record=True, width=COLUMNS, file=open(os.devnull, "w"), force_terminal=True)  # noqa: SIM115
+    console = Console(record=True, width=COLUMNS, file=io.StringIO(), force_terminal=True)
     console.print(text, end="")
     path.write_text(console.export_svg(title=title, code_format=SVG, unique_id=path.stem), encoding="utf-8")
 
@@ -145,14 +146,16 @@ def running(*arguments: str) -> Iterator[subprocess.Popen[str]]:
 
 def pages(url: str, name: str, ready: str, height: int) -> None:
     """A page in light and in dark mode."""
-    with tempfile.TemporaryDirectory() as profile:
-        with Chromium(Path(profile), width=1200, height=height) as browser:
-            browser.open(url)
-            for dark in (False, True):
-                browser.prefer(dark=dark)
-                browser.wait_for(ready, 60.0)
-                time.sleep(1.0)
-                browser.screenshot(PICTURES / f"{name}{'-dark' if dark else ''}.png")
+    with (
+        tempfile.TemporaryDirectory() as profile,
+        Chromium(Path(profile), width=1200, height=height) as browser,
+    ):
+        browser.open(url)
+        for dark in (False, True):
+            browser.prefer(dark=dark)
+            browser.wait_for(ready, 60.0)
+            time.sleep(1.0)
+            browser.screenshot(PICTURES / f"{name}{'-dark' if dark else ''}.png")
 
 
 def demo() -> None:

@@ -7,8 +7,9 @@
 //! the gains, Σ is what is published.
 
 use crate::laws::PARAMETERS;
+use crate::linear_algebra::{congruent, dot, is_positive, symmetric, times};
 
-/// Parameters besides the transmission's, see [`crate::track`].
+/// Parameters besides the transmission's, see [`crate::transmission`].
 pub const NUISANCES: usize = 6;
 /// Parameters, at most.
 pub const SIZE: usize = PARAMETERS + NUISANCES;
@@ -106,30 +107,30 @@ impl Kalman {
 
     /// Variance of h x as P has it.
     #[must_use]
-    pub fn spread(&self, h: &Vector) -> f64 {
+    pub fn predicted_variance(&self, h: &Vector) -> f64 {
         dot(h, &times(&self.p, h)).max(0.0)
     }
 
     /// Weight of an innovation under noise with the tails of a t distribution: 1 on average, → 0 far out.
     #[must_use]
-    pub fn weight(&self, innovation: f64, spread: f64) -> f64 {
-        (TAILS + 1.0) / (TAILS + innovation * innovation / (self.noise + spread))
+    pub fn weight(&self, innovation: f64, predicted_variance: f64) -> f64 {
+        (TAILS + 1.0) / (TAILS + innovation * innovation / (self.noise + predicted_variance))
     }
 
     /// The share of an innovation that is noise, one that sticks out counting less.
     ///
-    /// Of an innovation's variance, noise and spread, the noise has its share:
-    /// innovation² noise/(noise + spread) has the noise for its mean.
-    fn noisy(&self, innovation: f64, spread: f64) -> f64 {
-        let weight = self.weight(innovation, spread).min(1.0);
-        innovation * (weight * self.noise / (self.noise + spread)).sqrt()
+    /// Of an innovation's variance, noise and what P predicts, the noise has its share:
+    /// innovation² noise/(noise + predicted_variance) has the noise for its mean.
+    fn noisy(&self, innovation: f64, predicted_variance: f64) -> f64 {
+        let weight = self.weight(innovation, predicted_variance).min(1.0);
+        innovation * (weight * self.noise / (self.noise + predicted_variance)).sqrt()
     }
 
     /// Take one innovation into the noise's autocorrelation.
-    pub fn learn_noise(&mut self, innovation: f64, spread: f64) {
+    pub fn learn_noise(&mut self, innovation: f64, predicted_variance: f64) {
         self.count += 1.0;
         let gain = (QUICK / (self.count + QUICK)).max(1.0 / MEMORY);
-        let e = self.noisy(innovation, spread);
+        let e = self.noisy(innovation, predicted_variance);
         // As many parameters as there have been equations explain anything: the start is not believed.
         let least = self.assumed * 0.5f64.powf(self.count / HALVED);
         self.noise = (self.noise + gain * (e * e - self.noise)).max(least);
@@ -139,9 +140,9 @@ impl Kalman {
     }
 
     /// Shift the record of past innovations; after `learn_noise`, which wants those before this one.
-    pub fn remember(&mut self, innovation: f64, spread: f64) {
+    pub fn remember(&mut self, innovation: f64, predicted_variance: f64) {
         self.past.copy_within(..LAGS - 1, 1);
-        self.past[0] = self.noisy(innovation, spread);
+        self.past[0] = self.noisy(innovation, predicted_variance);
     }
 
     /// What Σ is multiplied by: noise that is a t variable has a larger variance than its scale squared, and
@@ -164,16 +165,16 @@ impl Kalman {
     pub fn update(&mut self, h: &Vector, innovation: f64, floor: f64) {
         let n = self.n;
         let mut ph = times(&self.p, h);
-        let mut spread = dot(h, &ph);
-        if spread < 0.0 {
+        let mut predicted_variance = dot(h, &ph);
+        if predicted_variance < 0.0 {
             self.repair();
             ph = times(&self.p, h);
-            spread = dot(h, &ph).max(0.0);
+            predicted_variance = dot(h, &ph).max(0.0);
         }
-        let noise = self.noise.max(floor) / self.weight(innovation, spread).min(1.0);
+        let noise = self.noise.max(floor) / self.weight(innovation, predicted_variance).min(1.0);
         let mut gain = [0.0; SIZE];
         for i in 0..n {
-            gain[i] = ph[i] / (spread + noise);
+            gain[i] = ph[i] / (predicted_variance + noise);
             self.x[i] += gain[i] * innovation;
         }
         for i in 0..n {
@@ -373,66 +374,6 @@ impl Kalman {
     }
 }
 
-/// a · b.
-#[must_use]
-pub fn dot(a: &Vector, b: &Vector) -> f64 {
-    a.iter().zip(b).map(|(a, b)| a * b).sum()
-}
-
-/// M v.
-#[must_use]
-pub fn times(matrix: &Matrix, vector: &Vector) -> Vector {
-    let mut out = [0.0; SIZE];
-    for (out, row) in out.iter_mut().zip(matrix) {
-        *out = dot(row, vector);
-    }
-    out
-}
-
-/// C M C'.
-fn congruent(change: &Matrix, matrix: &Matrix) -> Matrix {
-    let mut half = [[0.0; SIZE]; SIZE]; // M C', row by row of C
-    for (out, row) in half.iter_mut().zip(change) {
-        *out = times(matrix, row);
-    }
-    let mut out = [[0.0; SIZE]; SIZE];
-    for i in 0..SIZE {
-        for j in 0..SIZE {
-            out[i][j] = dot(&change[i], &half[j]);
-        }
-    }
-    out
-}
-
-fn symmetric(matrix: &mut Matrix, n: usize) {
-    for i in 0..n {
-        for j in 0..i {
-            let mean = 0.5 * (matrix[i][j] + matrix[j][i]);
-            (matrix[i][j], matrix[j][i]) = (mean, mean);
-        }
-    }
-}
-
-/// Whether a Cholesky factorisation succeeds; what is known exactly is no direction.
-fn is_positive(matrix: &Matrix, n: usize) -> bool {
-    let mut lower = [[0.0; SIZE]; SIZE];
-    for i in 0..n {
-        for j in 0..=i {
-            let rest: f64 = (0..j).map(|k| lower[i][k] * lower[j][k]).sum();
-            let left = matrix[i][j] - rest;
-            if i == j {
-                if left <= 0.0 && matrix[i][i] != 0.0 {
-                    return false;
-                }
-                lower[i][i] = left.max(0.0).sqrt();
-            } else if lower[j][j] > 0.0 {
-                lower[i][j] = left / lower[j][j];
-            }
-        }
-    }
-    true
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -445,10 +386,10 @@ mod tests {
             (h[0], h[1]) = ((0.3 * f64::from(k)).sin(), (0.7 * f64::from(k)).cos());
             let y = 2.0 * h[0] - 3.0 * h[1];
             let innovation = kalman.innovation(&h, y);
-            let spread = kalman.spread(&h);
-            kalman.learn_noise(innovation, spread);
+            let predicted_variance = kalman.predicted_variance(&h);
+            kalman.learn_noise(innovation, predicted_variance);
             kalman.update(&h, innovation, 1e-10);
-            kalman.remember(innovation, spread);
+            kalman.remember(innovation, predicted_variance);
         }
         assert!((kalman.x[0] - 2.0).abs() < 1e-4 && (kalman.x[1] + 3.0).abs() < 1e-4);
         assert!(kalman.sigma[0][0] < 1e-6);
@@ -467,10 +408,10 @@ mod tests {
             let mut h = [0.0; SIZE];
             h[0] = 1.0;
             let innovation = kalman.innovation(&h, y);
-            let spread = kalman.spread(&h);
-            kalman.learn_noise(innovation, spread);
+            let predicted_variance = kalman.predicted_variance(&h);
+            kalman.learn_noise(innovation, predicted_variance);
             kalman.update(&h, innovation, 1e-10);
-            kalman.remember(innovation, spread);
+            kalman.remember(innovation, predicted_variance);
         }
         assert!((kalman.p[0][0] * 2000.0 - 1.0).abs() < 0.15, "{}", kalman.p[0][0] * 2000.0);
         assert!((kalman.sigma[0][0] * 2000.0 - 1.0).abs() < 0.6, "{}", kalman.sigma[0][0] * 2000.0);
@@ -483,12 +424,12 @@ mod tests {
         let mut h = [0.0; SIZE];
         (h[0], h[1]) = (0.4, -0.2);
         kalman.update(&h, 0.3, 1e-10);
-        let before = (dot(&h, &kalman.x), kalman.spread(&h));
+        let before = (dot(&h, &kalman.x), kalman.predicted_variance(&h));
         let mut ratio = [1.0; SIZE];
         (ratio[0], ratio[1]) = (2.0, 5.0);
         kalman.rescale(&ratio, 3.0);
         (h[0], h[1]) = (0.4 / 2.0, -0.2 / 5.0);
         assert!((dot(&h, &kalman.x) - before.0).abs() < 1e-12);
-        assert!((kalman.spread(&h) - before.1).abs() < 1e-12);
+        assert!((kalman.predicted_variance(&h) - before.1).abs() < 1e-12);
     }
 }

@@ -9,24 +9,28 @@
 #![allow(clippy::needless_range_loop)] // matrices read better by their indices
 
 pub mod align;
+pub mod change_detection;
 pub mod deflection;
 pub mod delay;
 pub mod effects;
 pub mod error;
 pub mod estimator;
 pub mod filters;
-pub mod guard;
-pub mod handover;
+pub mod identification;
 pub mod kalman;
 pub mod laws;
+pub mod linear_algebra;
+pub mod linearisation;
 pub mod model;
-pub mod monitor;
+pub mod model_switch;
 pub mod noise;
 pub mod paper;
 pub mod robust;
 pub mod sample;
+pub mod sample_validator;
 pub mod settings;
-pub mod track;
+pub mod signals;
+pub mod transmission;
 
 #[cfg(feature = "python")]
 pub mod python;

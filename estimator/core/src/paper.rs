@@ -5,10 +5,10 @@
 //! what the robust mode is for.
 
 use crate::filters::{first_order_pole, tustin_biquad};
-use crate::guard::Guard;
 use crate::laws::{Alpha, Law, PARAMETERS, powers};
 use crate::model::{Arrangement, Model, Motor, Transmission};
 use crate::sample::{Estimate, MOTORS, Sample, TransmissionEstimate, joint_estimate, status};
+use crate::sample_validator::SampleValidator;
 use crate::settings::{Method, Settings};
 
 const EXCITED_RAD2_S2: f64 = 1e-6; // mean square of φ′ above which K_R φ′² teaches anything
@@ -295,7 +295,7 @@ impl Part {
 #[derive(Clone, Debug)]
 pub struct Paper {
     arrangement: Arrangement,
-    guard: Guard,
+    validator: SampleValidator,
     parts: Vec<Part>,
 }
 
@@ -305,14 +305,14 @@ impl Paper {
     pub fn new(model: &Model, settings: &Settings, period_s: f64) -> Paper {
         Paper {
             arrangement: model.arrangement,
-            guard: Guard::new(model, period_s),
+            validator: SampleValidator::new(model, period_s),
             parts: model.motors.iter().map(|motor| Part::new(motor, settings, period_s)).collect(),
         }
     }
 
     /// Forget everything.
     pub fn reset(&mut self) {
-        self.guard.reset();
+        self.validator.reset();
         self.parts.iter_mut().for_each(Part::reset);
     }
 
@@ -336,7 +336,7 @@ impl Paper {
 
     /// The estimate at this sample, whatever floats it holds.
     pub fn step(&mut self, sample: &Sample) -> Estimate {
-        let accepted = self.guard.check(sample);
+        let accepted = self.validator.check(sample);
         let mut flags = accepted.status;
         if accepted.restart {
             self.parts.iter_mut().for_each(Part::restart);

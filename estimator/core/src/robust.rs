@@ -1,6 +1,6 @@
 //! Mode "robust": the joint's estimator for the signals real drives give.
 //!
-//! Each tick, in order: guard the input, correct the readings, bridge gaps, align the channels, filter them,
+//! Each tick, in order: validate the input, correct the readings, bridge gaps, align the channels, filter them,
 //! follow the deflection; every so many ticks, as the errors' correlation allows, the balance of a motor
 //! becomes an equation of its recursive estimation; torque and stiffness are read off the curve.
 
@@ -8,13 +8,14 @@ use crate::align::{Alignment, Inputs};
 use crate::delay::{DelaySearch, Known};
 use crate::effects::{Corrections, MotorEffects};
 use crate::error::Error;
-use crate::guard::Guard;
 use crate::laws::Law;
 use crate::model::{Arrangement, Model};
 use crate::noise::NoiseMeter;
 use crate::sample::{Estimate, MOTORS, Sample, TransmissionEstimate, joint_estimate, status};
+use crate::sample_validator::SampleValidator;
 use crate::settings::{Priors, Settings};
-use crate::track::{Channel, Filters, Moment, Track};
+use crate::signals::{Channel, Filters};
+use crate::transmission::{Moment, TransmissionEstimator};
 
 const SAID_S: f64 = 0.5; // how long a restart is reported
 const TRUST_S: f64 = 0.02; // how long an estimate is carried over rejected samples
@@ -36,12 +37,12 @@ pub struct Robust {
     filters: Filters,
     every: u64, // periods between two equations of a motor
     settle: i64,
-    guard: Guard,
+    validator: SampleValidator,
     corrections: Corrections,
     alignment: Alignment,
     search: DelaySearch,
     lead: usize, // the motor whose balance tells the link encoder's delay
-    tracks: Vec<Track>,
+    transmissions: Vec<TransmissionEstimator>,
     link: Channel,
     noise: [NoiseMeter; MOTORS + 1],
     zeros: Inputs, // where the encoders' zeros have moved to
@@ -68,8 +69,10 @@ impl Robust {
             model.motors.iter().map(|motor| MotorEffects::new(&motor.effects)).collect::<Result<_, _>>()?;
         let corrections = Corrections::new(&effects, &model.link_effects, period_s)?;
         let dt = every as f64 * period_s;
-        let tracks: Vec<Track> = (model.motors.iter().zip(effects))
-            .map(|(motor, effects)| Track::new(motor, effects, settings, priors, &filters, period_s, dt))
+        let transmissions: Vec<TransmissionEstimator> = (model.motors.iter().zip(effects))
+            .map(|(motor, effects)| {
+                TransmissionEstimator::new(motor, effects, settings, priors, &filters, period_s, dt)
+            })
             .collect();
         let lead = model.motors.iter().position(|motor| motor.flexible()).unwrap_or(0);
         let known = Known {
@@ -87,12 +90,12 @@ impl Robust {
             filters,
             every,
             settle: (SETTLE_DELAYS * filters.delay / period_s).ceil() as i64,
-            guard: Guard::new(model, period_s),
+            validator: SampleValidator::new(model, period_s),
             corrections,
             alignment: Alignment::default(),
             search: DelaySearch::new(&known, filters.main.bandwidth, period_s),
             lead,
-            tracks,
+            transmissions,
             link: Channel::rest(0.0),
             noise: [NoiseMeter::default(); MOTORS + 1],
             zeros: Inputs::default(),
@@ -111,11 +114,11 @@ impl Robust {
 
     /// Forget everything.
     pub fn reset(&mut self) {
-        self.guard.reset();
+        self.validator.reset();
         self.corrections.reset();
         self.alignment = Alignment::default();
         self.search.reset();
-        self.tracks.iter_mut().for_each(Track::reset);
+        self.transmissions.iter_mut().for_each(TransmissionEstimator::reset);
         self.noise = [NoiseMeter::default(); MOTORS + 1];
         (self.zeros, self.last) = (Inputs::default(), Inputs::default());
         (self.tick, self.unsettled, self.said, self.rejected) = (0, self.settle, 0, 0);
@@ -131,18 +134,18 @@ impl Robust {
     /// Largest misfit among the motors' balances at the last update, N·m; NaN until there is a model.
     #[must_use]
     pub fn residual(&self) -> f64 {
-        self.tracks.iter().map(|track| track.misfit().abs()).fold(f64::NAN, f64::max)
+        self.transmissions.iter().map(|transmission| transmission.misfit().abs()).fold(f64::NAN, f64::max)
     }
 
     /// Parameters of one motor's transmission and their standard deviations; the law they belong to.
     pub fn parameters(&self, motor: usize, values: &mut Vec<f64>, std: &mut Vec<f64>) -> Option<&Law> {
-        self.tracks[motor].parameters(values, std)
+        self.transmissions[motor].parameters(values, std)
     }
 
     /// The estimate at this sample, whatever floats it holds.
     pub fn step(&mut self, sample: &Sample) -> Estimate {
         // Can it be used, and how far is it from the last one that was?
-        let accepted = self.guard.check(sample);
+        let accepted = self.validator.check(sample);
         if accepted.periods == 0 {
             return self.carry(sample.sequence, accepted.status);
         }
@@ -190,10 +193,10 @@ impl Robust {
         self.link.smooth(&self.filters, now.link);
         self.noise[self.motors].see(now.link, self.period);
         let time = self.tick as f64 * self.period;
-        for (i, track) in self.tracks.iter_mut().enumerate() {
+        for (i, transmission) in self.transmissions.iter_mut().enumerate() {
             let (theta, torque, before) = (now.motor[i], now.torque[i], self.last.torque[i]);
-            track.feed(&self.filters, theta, now.link - theta, torque, before, usable);
-            track.feed_effects(&self.filters, &self.link, time);
+            transmission.feed(&self.filters, theta, now.link - theta, torque, before, usable);
+            transmission.feed_effects(&self.filters, &self.link, time);
             self.noise[i].see(theta, self.period);
         }
         self.last = *now;
@@ -213,23 +216,23 @@ impl Robust {
 
     /// One equation of one motor, and what follows from it.
     fn update(&mut self, i: usize, usable: bool) {
-        let resolution = *self.guard.resolution();
+        let resolution = *self.validator.resolution();
         let m = self.motors;
         let noise = [self.noise[i].variance(resolution[i]), self.noise[m].variance(resolution[m])];
-        let track = &mut self.tracks[i];
-        if track.is_rigid() {
+        let transmission = &mut self.transmissions[i];
+        if transmission.is_rigid() {
             return;
         }
-        if track.update(&self.filters, &Moment { link: self.link.main, usable, noise }) {
+        if transmission.update(&self.filters, &Moment { link: self.link.main, usable, noise }) {
             self.unsettled = self.settle;
             return;
         }
         if !usable || !self.search.looked() {
             return;
         }
-        if let Some(late) = track.take_delay() {
+        if let Some(late) = transmission.take_delay() {
             let taken = self.alignment.shift(late);
-            track.shift_delay(taken);
+            transmission.shift_delay(taken);
             self.unsettled = self.settle;
             self.search.begin();
         }
@@ -242,17 +245,17 @@ impl Robust {
         }
         self.alignment.shift(late);
         self.unsettled = self.settle;
-        for (i, track) in self.tracks.iter_mut().enumerate() {
-            track.relearn();
-            track.deflection.restart(self.last.motor[i], self.last.link - self.last.motor[i]);
+        for (i, transmission) in self.transmissions.iter_mut().enumerate() {
+            transmission.relearn();
+            transmission.deflection.restart(self.last.motor[i], self.last.link - self.last.motor[i]);
         }
     }
 
     /// Everything that has a past begins anew where the joint is now; what has been learned is kept.
     fn restart(&mut self, now: &Inputs) {
         self.link = Channel::rest(now.link);
-        for (i, track) in self.tracks.iter_mut().enumerate() {
-            track.restart(now.motor[i], now.link - now.motor[i], now.torque[i]);
+        for (i, transmission) in self.transmissions.iter_mut().enumerate() {
+            transmission.restart(now.motor[i], now.link - now.motor[i], now.torque[i]);
         }
         self.noise.iter_mut().for_each(NoiseMeter::restart);
         self.search.restart(now.link, now.motor[self.lead], now.torque[self.lead]);
@@ -267,14 +270,14 @@ impl Robust {
         let m = self.motors;
         let ahead =
             (sequence.wrapping_sub(self.sequence) as f64 + self.alignment.periods.abs()) * self.period;
-        // A deflection that went on as it was measures a jump; the guard is coarse.
+        // A deflection that went on as it was measures a jump; the validator is coarse.
         let link = inputs.link - self.zeros.link;
         for i in 0..m {
-            let track = &self.tracks[i];
-            if ahead > FORESEEN_S || track.is_rigid() || track.deflection.unsettled > 0 {
+            let transmission = &self.transmissions[i];
+            if ahead > FORESEEN_S || transmission.is_rigid() || transmission.deflection.unsettled > 0 {
                 continue;
             }
-            let off = link - (inputs.motor[i] - self.zeros.motor[i]) - track.deflection.at(ahead);
+            let off = link - (inputs.motor[i] - self.zeros.motor[i]) - transmission.deflection.at(ahead);
             if jumps[i] != 0.0 && jumps[m] == 0.0 {
                 jumps[i] = -off;
             } else if jumps[m] != 0.0 && jumps[i] == 0.0 {
@@ -292,19 +295,19 @@ impl Robust {
         if self.flexible {
             self.zeros.link = moved(self.zeros.link, jumps[m]);
         }
-        self.tracks.iter_mut().for_each(Track::reopen_shift);
+        self.transmissions.iter_mut().for_each(TransmissionEstimator::reopen_deflection_offset);
     }
 
     /// What is said of a sample that was used.
     fn conclude(&mut self, sequence: u64, flags: u32) -> Estimate {
         let (mut flags, mut valid, mut observable) = (flags, true, self.flexible && self.unsettled <= 0);
         let (parts, of_use) = self.read(0.0);
-        for (track, of_use) in self.tracks.iter().zip(of_use) {
+        for (transmission, of_use) in self.transmissions.iter().zip(of_use) {
             valid &= of_use;
-            if !track.is_rigid() {
-                valid &= track.deflection.unsettled <= 0;
-                observable &= track.excited();
-                if track.changed() {
+            if !transmission.is_rigid() {
+                valid &= transmission.deflection.unsettled <= 0;
+                observable &= transmission.excited();
+                if transmission.changed() {
                     flags |= status::CHANGED;
                 }
             }
@@ -347,8 +350,8 @@ impl Robust {
     fn read(&mut self, since_s: f64) -> ([TransmissionEstimate; MOTORS], [bool; MOTORS]) {
         let ahead = since_s + self.alignment.periods.abs() * self.period; // what waits for the latest channel
         let (mut parts, mut of_use) = ([TransmissionEstimate::NOTHING; MOTORS], [true; MOTORS]);
-        for (i, track) in self.tracks.iter_mut().enumerate() {
-            (parts[i], of_use[i]) = track.estimate(ahead, self.filters.delay);
+        for (i, transmission) in self.transmissions.iter_mut().enumerate() {
+            (parts[i], of_use[i]) = transmission.estimate(ahead, self.filters.delay);
         }
         (parts, of_use)
     }

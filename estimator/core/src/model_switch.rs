@@ -1,7 +1,7 @@
 //! From a polynomial that has been estimated to the nonlinear law it approximates, with its slopes.
 
 use crate::laws::{Alpha, Law, PARAMETERS, powers};
-use crate::track::solve;
+use crate::linear_algebra::solve;
 
 const POINTS: usize = 24;
 const MARGIN: f64 = 1.02; // how far beyond the deflections a law has to go on

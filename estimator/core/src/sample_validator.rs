@@ -24,7 +24,7 @@ const WILD: f64 = 10.0; // … above which it is, if so many times the largest s
 const TORQUE_S: f64 = 60.0; // how long the largest torque is remembered for that
 const REACH: f64 = 3.0; // times the largest velocity seen: how far a position may be after a gap
 
-/// What the guard made of a sample.
+/// What the validator made of a sample.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Accepted {
     /// Since the last sample that was accepted; 0: this one is not to be used.
@@ -50,7 +50,7 @@ pub struct Accepted {
 /// done in good times, while a position moves; a position only if it stopped out of motion: a link that
 /// comes to rest while the motors go on, as under a controller, is no fault.
 #[derive(Clone, Debug)]
-pub struct Guard {
+pub struct SampleValidator {
     motors: usize,
     flexible: bool,
     period: f64,
@@ -114,15 +114,15 @@ const FRESH: Memory = Memory {
     frozen: false,
 };
 
-impl Guard {
-    /// A guard of this joint's samples.
+impl SampleValidator {
+    /// A validator of this joint's samples.
     #[must_use]
-    pub fn new(model: &Model, period_s: f64) -> Guard {
+    pub fn new(model: &Model, period_s: f64) -> SampleValidator {
         let periods = |seconds: f64| (seconds / period_s).round();
         let lightest = model.motors.iter().map(|motor| motor.inertia).fold(f64::INFINITY, f64::min);
         let mut tame = [f64::INFINITY; MOTORS];
         model.motors.iter().zip(&mut tame).for_each(|(motor, tame)| *tame = WILD_RAD_S2 * motor.inertia);
-        Guard {
+        SampleValidator {
             motors: model.motors.len(),
             flexible: model.has_deflection(),
             period: period_s,

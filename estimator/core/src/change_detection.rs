@@ -1,6 +1,6 @@
 //! Is the balance explained? One test on normalised innovations, with a declared rate of false alarms.
 //!
-//! An innovation's variance is foreseen: noise and the parameters' spread. Divided by it, the mean square of
+//! An innovation's variance is foreseen: noise and what the parameters add. Divided by it, the mean square of
 //! a few innovations, which span the filter's correlation time, is that of a heavy-tailed variable, a t
 //! distribution's: usual noise is Gaussian, what real joints add is not. The alarm is its quantile at the
 //! rate of false alarms that is asked for. After one, nothing is learned until what was before the change
@@ -21,7 +21,7 @@ const MOST: f64 = 36.0; // that one innovation counts, and as much while the fil
 
 /// See the module.
 #[derive(Clone, Debug)]
-pub struct Monitor {
+pub struct ChangeDetection {
     dt: f64,
     flush_s: f64,
     limit_square: f64,
@@ -39,12 +39,12 @@ enum Phase {
     Following { since_s: f64 },
 }
 
-impl Monitor {
+impl ChangeDetection {
     /// For updates dt_s apart, of filters that delay a slow signal by `delay_s`.
     #[must_use]
-    pub fn new(false_alarms_per_hour: f64, dt_s: f64, delay_s: f64) -> Monitor {
+    pub fn new(false_alarms_per_hour: f64, dt_s: f64, delay_s: f64) -> ChangeDetection {
         let limit = t_quantile(TAILS, false_alarms_per_hour * dt_s / 3600.0);
-        Monitor {
+        ChangeDetection {
             dt: dt_s,
             flush_s: FLUSH_DELAYS * delay_s,
             limit_square: limit * limit,
@@ -71,10 +71,10 @@ impl Monitor {
     /// One innovation, in units of the torque; returns whether the parameters are to be opened up now.
     ///
     /// `settled`: whether there is a curve to be held against.
-    pub fn watch(&mut self, innovation: f64, spread: f64, noise: f64, settled: bool) -> bool {
+    pub fn watch(&mut self, innovation: f64, predicted_variance: f64, noise: f64, settled: bool) -> bool {
         let flushing = matches!(self.phase, Phase::Flushing { .. });
         if settled {
-            let square = innovation * innovation / (noise + spread + LEAST * LEAST);
+            let square = innovation * innovation / (noise + predicted_variance + LEAST * LEAST);
             let counted = if flushing { MOST } else { square.min(MOST) };
             self.surprise += (self.dt / EXPLAINED_S).min(1.0) * (counted - self.surprise);
             self.surprised_s = if self.surprise > SURPRISING { self.surprised_s + self.dt } else { 0.0 };
@@ -89,7 +89,7 @@ impl Monitor {
             return true;
         }
         self.squares.copy_within(..EXPLAINED - 1, 1);
-        self.squares[0] = (innovation * innovation, noise + spread);
+        self.squares[0] = (innovation * innovation, noise + predicted_variance);
         self.known = (self.known + 1).min(EXPLAINED);
         if let Phase::Following { since_s } = &mut self.phase {
             *since_s += self.dt;
@@ -183,7 +183,7 @@ mod tests {
 
     #[test]
     fn a_step_raises_the_alarm_and_its_end_is_explained() {
-        let mut monitor = Monitor::new(1.0, 0.03, 0.08);
+        let mut monitor = ChangeDetection::new(1.0, 0.03, 0.08);
         for _ in 0..100 {
             assert!(!monitor.watch(0.01, 0.0, 1e-4, true) && !monitor.changed());
         }

@@ -1,0 +1,457 @@
+//! One motor and its transmission on line: fed every tick, learning at every update, read off at any time.
+
+use crate::change_detection::ChangeDetection;
+use crate::deflection::{DeflectionFilter, Tuning};
+use crate::effects::{Coordinates, MotorEffects};
+use crate::identification::OnlineIdentification;
+use crate::laws::Law;
+use crate::model::Motor;
+use crate::sample::TransmissionEstimate;
+use crate::settings::{Priors, Settings};
+use crate::signals::{Channel, Excitation, Filters, Signals};
+
+const DUE_S: f64 = 0.1; // of updates between two looks at a nonlinear law's linearisation
+const USEFUL: f64 = 0.25; // relative standard deviation of the stiffness up to which it is of use
+const DRIFT: f64 = 1e-4; // relative growth of the standard deviation per second held
+const RESTED_S: f64 = 0.05; // without motion: from then on the interval grows …
+const WIDEST: f64 = 0.02; // … up to this
+const ASTRAY_S: f64 = 1.0; // of updates with parameters that cannot be, after which it starts anew
+const VARIES_S: f64 = 2.0; // over which the balance's variance is taken: a constant torque tells nothing …
+const VARIED_S: f64 = 30.0; // … and how long a lively phase is remembered
+const QUIET: f64 = 0.25; // of the liveliest variance: the least that misses are held against
+const EXPLAINED_S: f64 = 0.3; // over which the curve is held against the balance
+const UNEXPLAINED: f64 = 0.04; // share of that variance that the curve may miss …
+const UNEXPLAINED_LOCAL: f64 = 0.5; // … and the black box, which sees the derivative of both
+const FIRST_S: f64 = 0.12; // of updates that are not held against a curve which has only begun
+const BEYOND: f64 = 1.5; // times the largest deflection behind the filter: no more is known of the curve
+const EDGE: f64 = 0.98; // of where a law ends
+
+/// What a transmission's estimator learns from at one update, beside its own channels.
+#[derive(Clone, Copy, Debug)]
+pub struct Moment {
+    /// F G of q and its derivatives.
+    pub link: [f64; 4],
+    /// Whether the filters hold nothing wrong.
+    pub usable: bool,
+    /// Variance of θ's and of q's noise, rad².
+    pub noise: [f64; 2],
+}
+
+/// How much of the balance's variation the curve leaves over.
+#[derive(Clone, Copy, Debug, Default)]
+struct Fit {
+    mean: f64,
+    varies: f64,
+    varied: f64,
+    missed: f64,
+}
+
+impl Fit {
+    fn see(&mut self, y: f64, innovation: f64, dt: f64) {
+        let share = (dt / VARIES_S).min(1.0);
+        self.mean += share * (y - self.mean);
+        self.varies += share * ((y - self.mean).powi(2) - self.varies);
+        self.varied = (self.varied * (1.0 - dt / VARIED_S)).max(self.varies);
+        self.missed += (dt / EXPLAINED_S).min(1.0) * (innovation * innovation - self.missed);
+    }
+
+    fn is_good(&self, share: f64) -> bool {
+        self.missed <= share * self.varies.max(QUIET * self.varied)
+    }
+}
+
+/// Estimation of one transmission (or of a rigid one's torque).
+#[derive(Clone, Debug)]
+pub struct TransmissionEstimator {
+    inertia: f64,
+    damping: f64,
+    period: f64,
+    dt: f64,
+    rigid: bool,
+    effects: MotorEffects,
+    rate_gain: f64,
+    signals: Signals,
+    /// x_motor − x_transmission, the latest that is known, N·m.
+    pub effect: f64,
+    /// The deflection of this moment.
+    pub deflection: DeflectionFilter,
+    identification: OnlineIdentification,
+    changes: ChangeDetection,
+    excitation: Excitation,
+    excited: bool,
+    fit: Fit,
+    impossible: u32,
+    missing: u32,
+    misfit: f64,
+    // What is published.
+    told: bool,
+    std: f64,
+    reach: f64,
+    held_s: f64,
+    trusted: bool,
+    lead: f64,
+    acting: f64,
+    stiffness: f64,
+    unmodelled: f64,
+    inertia_now: f64,
+    damping_now: f64,
+}
+
+impl TransmissionEstimator {
+    /// Of one motor of a model that has been checked; `dt_s`: between two updates.
+    #[must_use]
+    pub fn new(
+        motor: &Motor,
+        effects: MotorEffects,
+        settings: &Settings,
+        priors: &Priors,
+        filters: &Filters,
+        period_s: f64,
+        dt_s: f64,
+    ) -> TransmissionEstimator {
+        let bandwidth = filters.main.bandwidth;
+        let identification = OnlineIdentification::new(motor, settings, priors, period_s, dt_s);
+        let mut made = TransmissionEstimator {
+            inertia: motor.inertia,
+            damping: motor.damping,
+            period: period_s,
+            dt: dt_s,
+            rigid: !motor.flexible(),
+            effects,
+            rate_gain: filters.rate_gain(period_s),
+            signals: Signals::new(filters, period_s, identification.is_nonlinear()),
+            effect: 0.0,
+            deflection: DeflectionFilter::new(motor.inertia, motor.damping, bandwidth, period_s, dt_s / 2.0),
+            identification,
+            changes: ChangeDetection::new(settings.false_alarms_per_hour, dt_s, filters.delay),
+            excitation: Excitation::default(),
+            excited: false,
+            fit: Fit::default(),
+            impossible: 0,
+            missing: 0,
+            misfit: f64::NAN,
+            told: false,
+            std: f64::NAN,
+            reach: 0.0,
+            held_s: 0.0,
+            trusted: false,
+            lead: f64::NAN,
+            acting: 0.0,
+            stiffness: 0.0,
+            unmodelled: f64::INFINITY,
+            inertia_now: motor.inertia,
+            damping_now: motor.damping,
+        };
+        made.reset();
+        made
+    }
+
+    /// Forget everything.
+    pub fn reset(&mut self) {
+        self.effects.motor.reset();
+        self.effects.transmission.reset();
+        self.signals.reset();
+        self.deflection.reset();
+        self.excitation = Excitation::default();
+        (self.effect, self.lead, self.misfit) = (0.0, f64::NAN, f64::NAN);
+        self.relearn();
+    }
+
+    /// Forget what has been learned of the transmission.
+    pub fn relearn(&mut self) {
+        self.identification.reset();
+        self.changes.reset();
+        (self.impossible, self.missing, self.fit) = (0, 0, Fit::default());
+        (self.told, self.std, self.reach, self.held_s, self.trusted) = (false, f64::NAN, 0.0, 0.0, false);
+        (self.acting, self.stiffness, self.unmodelled) = (0.0, 0.0, f64::INFINITY);
+        (self.inertia_now, self.damping_now) = (self.inertia, self.damping);
+    }
+
+    /// Filters at rest where the joint is now; what has been learned is kept.
+    pub fn restart(&mut self, theta: f64, phi: f64, torque: f64) {
+        self.signals.restart(theta, torque);
+        if !self.rigid {
+            self.signals.rest_basis(self.identification.law(), phi);
+            self.deflection.restart(theta, phi);
+        }
+    }
+
+    /// Whether its transmission is rigid.
+    #[must_use]
+    pub fn is_rigid(&self) -> bool {
+        self.rigid
+    }
+
+    /// Whether the joint has changed and is being followed.
+    #[must_use]
+    pub fn changed(&self) -> bool {
+        self.changes.changed()
+    }
+
+    /// Whether the motion at hand tells the stiffness.
+    #[must_use]
+    pub fn excited(&self) -> bool {
+        self.excited
+    }
+
+    /// What the model left unexplained at the last update, N·m.
+    #[must_use]
+    pub fn misfit(&self) -> f64 {
+        self.misfit
+    }
+
+    // -- every tick --------------------------------------------------------------------------------
+
+    /// One period: the deflection of this moment, and every channel through the filters.
+    ///
+    /// `before`: the torque that has acted over the period.
+    pub fn feed(&mut self, filters: &Filters, theta: f64, phi: f64, torque: f64, before: f64, usable: bool) {
+        if !self.rigid {
+            self.deflection.update(theta, phi, before + self.acting - self.effect);
+            let (law, slots) = (self.identification.law(), self.identification.slots);
+            self.signals.feed_basis(filters, law, phi, slots);
+        }
+        self.signals.feed_motor(filters, theta, torque, usable);
+    }
+
+    /// x_motor − x_transmission of the declared effects, from lightly filtered values of q and of the motor.
+    pub fn feed_effects(&mut self, filters: &Filters, link: &Channel, time: f64) {
+        if self.effects.is_empty() {
+            return;
+        }
+        let position = &self.signals.position;
+        let phi = link.light[0] - position.light[0];
+        let (flexibility_torque, stiffness) = self.curve(phi);
+        let c = Coordinates {
+            position: position.light[0] - self.effects.offset,
+            velocity: position.light[1],
+            acceleration: position.light[2],
+            deflection: phi,
+            deflection_rate: link.light[1] - position.light[1],
+            flexibility_torque,
+            stiffness,
+            torque: self.signals.torque.light[0],
+            time,
+            ..Coordinates::default()
+        };
+        self.effect = self.effects.balance(&c, self.period);
+        self.signals.effects.pass(filters, self.effect);
+    }
+
+    /// (τ_e, σ) at a deflection as it is measured; zeros before anything is known.
+    fn curve(&self, phi: f64) -> (f64, f64) {
+        let learned = &self.identification;
+        if self.told {
+            return learned.law().law.at(phi + learned.deflection_offset(), learned.alpha());
+        }
+        learned.declared().map_or((0.0, 0.0), |(law, known)| law.at(phi, known))
+    }
+
+    // -- every update ------------------------------------------------------------------------------
+
+    /// Everything that is learned from the filtered signals of this moment.
+    ///
+    /// Returns whether the estimate has long been where it cannot be and has begun anew.
+    pub fn update(&mut self, filters: &Filters, now: &Moment) -> bool {
+        // Does the motion tell the stiffness?
+        let motor = self.signals.position.main;
+        let resolution = (now.noise[0] + now.noise[1]).sqrt();
+        let rate = now.link[1] - motor[1];
+        self.excited = self.excitation.update(rate, self.rate_gain * resolution, now.usable, self.dt);
+        self.identification.observe_noise(resolution);
+        if now.usable {
+            self.identification.observe_scale(&self.signals, &now.link);
+        }
+        if self.identification.kalman().is_none() && now.usable && self.excited {
+            self.identification.start();
+        }
+        // The balance (eq 5) as one equation: has the joint changed? What does it teach?
+        let mut astray = false;
+        if self.identification.kalman().is_some() {
+            self.learn(now);
+            astray = self.is_astray();
+            if astray {
+                self.relearn();
+            }
+        }
+        if now.usable {
+            self.deflection.tune(&Tuning {
+                jerk: now.link[3] - motor[3],
+                motor_noise: now.noise[0],
+                link_noise: now.noise[1],
+                inertia: self.inertia_now,
+                damping: self.damping_now,
+                stiffness: self.stiffness,
+                unmodelled: self.unmodelled,
+            });
+        }
+        if self.identification.kalman().is_some() {
+            if now.usable {
+                self.follow_law(filters);
+            }
+            self.publish();
+        }
+        astray
+    }
+
+    /// One equation: the test of its innovation, the noise, the parameters.
+    fn learn(&mut self, now: &Moment) {
+        let (h, y) = self.identification.equation(&self.signals, &now.link);
+        let Some(kalman) = self.identification.kalman() else { return };
+        let (innovation, predicted) = (kalman.innovation(&h, y), kalman.predicted_variance(&h));
+        let noise = kalman.noise;
+        self.misfit = innovation * self.identification.torque_unit();
+        self.held_s += self.dt;
+        let updates = self.identification.updates();
+        if now.usable && updates >= self.identification.updates_in(FIRST_S) {
+            self.fit.see(y, innovation, self.dt);
+        }
+        if now.usable {
+            let settled = updates >= (1.0 / self.dt) as u32;
+            if self.changes.watch(innovation, predicted, noise, settled) {
+                self.identification.open_up();
+            }
+        } else {
+            self.changes.pause();
+        }
+        if now.usable && self.excited && self.changes.may_learn() {
+            self.held_s = 0.0;
+            self.identification.learn(&h, innovation, predicted, self.changes.may_learn_noise());
+        } else {
+            self.identification.pass_over(innovation, predicted);
+        }
+    }
+
+    /// Whether the curve leaves only a part of the balance unexplained.
+    fn explains(&self) -> bool {
+        self.fit.is_good(if self.identification.black_box { UNEXPLAINED_LOCAL } else { UNEXPLAINED })
+    }
+
+    /// Whether the estimate has long been where it cannot be: no way back by small steps.
+    fn is_astray(&mut self) -> bool {
+        let long = self.identification.updates_in(ASTRAY_S);
+        if !self.identification.kalman().is_some_and(|kalman| kalman.is_finite()) {
+            return true;
+        }
+        self.impossible = if self.identification.is_possible() { 0 } else { self.impossible + 1 };
+        if self.explains() {
+            self.missing = 0;
+        } else if self.excited && self.changes.may_learn_noise() {
+            self.missing += 1;
+        }
+        self.impossible > long || self.missing > long
+    }
+
+    /// The nonlinear law instead of the polynomial, or linearised anew, when it is due.
+    fn follow_law(&mut self, filters: &Filters) {
+        let updates = self.identification.updates();
+        let due = updates > 0 && updates % self.identification.updates_in(DUE_S) == 0 && self.excited;
+        if due && self.signals.has_past() && self.identification.switch_model() {
+            self.signals.recompute_basis(filters, self.identification.law());
+        }
+    }
+
+    // -- what it says ------------------------------------------------------------------------------
+
+    /// What the ticks until the next update say, and how sure it is.
+    fn publish(&mut self) {
+        let learned = &mut self.identification;
+        learned.conclude();
+        self.told = true;
+        let motor = learned.motor();
+        if let Some((inertia, damping)) = motor {
+            (self.inertia_now, self.damping_now) = (inertia, damping);
+        }
+        let noise = learned.kalman().map_or(f64::NAN, |kalman| kalman.noise.sqrt() * learned.torque_unit());
+        self.unmodelled = noise.hypot(learned.coulomb_friction());
+        let link_rate = self.deflection.link_rate();
+        let phi = self.deflection.at(0.0) + learned.deflection_offset() + learned.late() * link_rate;
+        self.std = learned.stiffness_std(phi, link_rate, self.deflection.variance());
+        self.reach = BEYOND * learned.largest_deflection();
+        if !learned.law().is_polynomial() {
+            self.reach = self.reach.min(EDGE * learned.law().law.reach(&learned.alpha()[1..]));
+        }
+        if motor.is_none() || !self.explains() || !self.changes.explained() {
+            self.reach = 0.0;
+        }
+    }
+
+    /// How many periods later than assumed the link is, where that has become clear.
+    pub fn take_delay(&mut self) -> Option<f64> {
+        self.identification.take_delay()
+    }
+
+    /// The channels have been aligned by so much more.
+    pub fn shift_delay(&mut self, periods: f64) {
+        self.identification.shift_delay(periods);
+    }
+
+    /// An encoder has moved its zero.
+    pub fn reopen_deflection_offset(&mut self) {
+        self.identification.reopen_deflection_offset();
+    }
+
+    /// The estimate at a deflection a little ahead of the last sample, and whether it is of use.
+    ///
+    /// `delay`: of the filters; the torque behind them is brought up to the present by its own slope.
+    pub fn estimate(&mut self, ahead_s: f64, delay: f64) -> (TransmissionEstimate, bool) {
+        let signals = &self.signals;
+        let (motor, tau, x) = (&signals.position.main, &signals.torque.main, &signals.effects.main);
+        let value = self.inertia * motor[2] + self.damping * motor[1] + x[0] - tau[0];
+        let rate = self.inertia * motor[3] + self.damping * motor[2] + x[1] - tau[1];
+        self.lead = value + (delay + ahead_s) * rate;
+        let nothing = TransmissionEstimate::NOTHING;
+        if self.rigid {
+            let torque = self.lead;
+            return (TransmissionEstimate { flexibility_torque: torque, ..nothing }, torque.is_finite());
+        }
+        let (now, learned) = (self.deflection.at(ahead_s), &self.identification);
+        if !self.told {
+            let (mut torque, mut stiffness) = (self.lead, f64::NAN);
+            if let Some((law, known)) = learned.declared() {
+                let more = self.effects.spring(now);
+                (torque, stiffness) = law.at(now, known);
+                (torque, stiffness) = (torque + more.0, stiffness + more.1);
+            }
+            let estimate =
+                TransmissionEstimate { flexibility_torque: torque, stiffness, deflection: now, ..nothing };
+            return (estimate, false);
+        }
+        let off = learned.deflection_offset() + learned.late() * self.deflection.link_rate();
+        let phi = now + off;
+        let law = &learned.law().law;
+        let (mut torque, mut stiffness) = law.at(phi, learned.alpha());
+        let acted =
+            if ahead_s == 0.0 { torque } else { law.at(self.deflection.at(0.0) + off, learned.alpha()).0 };
+        self.acting = acted - learned.torque_offset();
+        let more = self.effects.spring(phi);
+        (torque, stiffness) = (torque + more.0, stiffness + more.1);
+        let mut std = self.std;
+        if self.held_s > RESTED_S {
+            std = std.hypot((DRIFT * self.held_s).min(WIDEST) * stiffness);
+        }
+        let valid = std > 0.0 && std < USEFUL * stiffness && phi.abs() < self.reach;
+        if valid && !learned.black_box {
+            self.trusted = true;
+        } else if self.reach == 0.0 {
+            self.trusted = false;
+        }
+        self.stiffness = if self.trusted { stiffness } else { 0.0 };
+        if !self.trusted {
+            self.acting = self.lead;
+            torque = self.lead + more.0;
+        }
+        let estimate = TransmissionEstimate {
+            flexibility_torque: torque,
+            stiffness,
+            stiffness_std: std,
+            deflection: phi,
+        };
+        (estimate, valid)
+    }
+
+    /// The law's parameters with their standard deviations; `None` before any, or without a law.
+    pub fn parameters(&self, values: &mut Vec<f64>, std: &mut Vec<f64>) -> Option<&Law> {
+        if self.told { self.identification.parameters(values, std) } else { None }
+    }
+}

@@ -109,12 +109,19 @@ def colour(name: str) -> str | None:
     return re.sub("^bright", "bright_", name)
 
 
+def closed_loop(folder: Path) -> Path:
+    """The folder of the example that records, fits and diagnoses, run once."""
+    if not (folder / "report.html").exists():
+        script = ROOT / "examples" / "close_the_loop.py"
+        subprocess.run([sys.executable, str(script), str(folder)], check=True, stdout=subprocess.DEVNULL)
+    return folder
+
+
 @contextmanager
 def joint(folder: Path) -> Iterator[Path]:
-    """A simulated VSA-II, its daemon, and their joint file, apart from everything else on this machine."""
-    path = folder / "elbow.toml"
-    subprocess.run([*DRIVELINK, "new", str(path), "--case", "vsa-ii"], check=True, stdout=subprocess.DEVNULL)
-    text = tomlkit.parse(path.read_text(encoding="utf-8"))
+    """A simulated VSA-II with a fitted model, and its daemon, apart from everything else on this machine."""
+    path = folder / "live.toml"
+    text = tomlkit.parse((closed_loop(folder) / "elbow.toml").read_text(encoding="utf-8"))
     text["name"] = "elbow"
     bus = {"interface": "socketcand", "channel": "vcan0", "period_s": 0.002}
     text["bus"] = bus | {"options": {"host": "127.0.0.1", "port": free_port()}}
@@ -144,29 +151,26 @@ def running(*arguments: str) -> Iterator[subprocess.Popen[str]]:
         process.communicate(timeout=30)
 
 
-def pages(url: str, name: str, ready: str, height: int) -> None:
+def pages(url: str, name: str, height: int, wait_s: float = 1.0) -> None:
     """A page in light and in dark mode."""
-    with (
-        tempfile.TemporaryDirectory() as profile,
-        Chromium(Path(profile), width=1200, height=height) as browser,
-    ):
+    with tempfile.TemporaryDirectory() as profile, Chromium(Path(profile)) as browser:
+        browser.resize(1200, height)
         browser.open(url)
+        time.sleep(wait_s)
         for dark in (False, True):
             browser.prefer(dark=dark)
-            browser.wait_for(ready, 60.0)
             time.sleep(1.0)
             browser.screenshot(PICTURES / f"{name}{'-dark' if dark else ''}.png")
 
 
-def demo() -> None:
+def demo(_: Path) -> None:
     """`drivelink demo` in a terminal."""
     terminal((*DRIVELINK, "demo", "--seconds", "20"), 17.0, "drivelink demo", PICTURES / "demo.svg")
 
 
-def views() -> None:
+def views(folder: Path) -> None:
     """`drivelink monitor` in the terminal and in the browser."""
     with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         path = stack.enter_context(joint(folder))
         web = stack.enter_context(running("monitor", str(path), "--web", "--port", "0"))
         assert web.stdout is not None
@@ -174,19 +178,16 @@ def views() -> None:
         assert address is not None
         command = (*DRIVELINK, "monitor", str(path))
         terminal(command, 25.0, "drivelink monitor elbow", PICTURES / "monitor.svg")
-        pages(address[0], "web", "document.readyState === 'complete'", 900)
+        pages(address[0], "web", 1100, wait_s=35.0)
 
 
-def loop() -> None:
-    """What `fit` and `diagnose` draw, from the example that closes the loop."""
-    with tempfile.TemporaryDirectory() as folder:
-        script = ROOT / "examples" / "close_the_loop.py"
-        subprocess.run([sys.executable, str(script), folder], check=True, stdout=subprocess.DEVNULL)
-        (PICTURES / "fit.png").write_bytes((Path(folder) / "fit.png").read_bytes())
-        pages(f"file://{folder}/report.html", "report", "document.readyState === 'complete'", 1000)
+def loop(folder: Path) -> None:
+    """What `fit` and `diagnose` draw."""
+    (PICTURES / "fit.png").write_bytes((closed_loop(folder) / "fit.png").read_bytes())
+    pages(f"file://{folder}/report.html", "report", 1000)
 
 
-DRAWN: dict[str, Callable[[], None]] = {"demo": demo, "views": views, "loop": loop}
+DRAWN: dict[str, Callable[[Path], None]] = {"demo": demo, "views": views, "loop": loop}
 
 
 def main() -> None:
@@ -194,9 +195,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="+", choices=DRAWN, default=list(DRAWN), help="these only")
     PICTURES.mkdir(exist_ok=True)
-    for name in parser.parse_args().only:
-        print(f"{name} …", flush=True)
-        DRAWN[name]()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job would ignore Ctrl-C
+    with tempfile.TemporaryDirectory() as folder:
+        for name in parser.parse_args().only:
+            print(f"{name} …", flush=True)
+            DRAWN[name](Path(folder))
 
 
 if __name__ == "__main__":

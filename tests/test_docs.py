@@ -66,6 +66,12 @@ def test_files_that_a_page_names_exist(page: Path) -> None:
     assert not missing
 
 
+@pytest.mark.parametrize("page", [ROOT / "README.md", *PAGES], ids=lambda page: str(page.relative_to(ROOT)))
+def test_pages_and_pictures_that_a_page_links_to_exist(page: Path) -> None:
+    links = re.findall(r"\]\(([\w./-]+)(?:#[\w-]*)?\)", page.read_text(encoding="utf-8"))
+    assert not [link for link in links if not (page.parent / link).exists()]
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(DOCS)))
 def test_commands_that_a_page_shows_can_be_parsed(page: Path) -> None:
     parser = cli.make_parser(list(cli.VERBS))

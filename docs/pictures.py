@@ -123,7 +123,7 @@ def joint(folder: Path) -> Iterator[Path]:
     path = folder / "live.toml"
     text = tomlkit.parse((closed_loop(folder) / "elbow.toml").read_text(encoding="utf-8"))
     text["name"] = "elbow"
-    bus = {"interface": "socketcand", "channel": "vcan0", "period_s": 0.002}
+    bus = {"interface": "socketcand", "channel": "vcan0", "period_s": 0.005}
     text["bus"] = bus | {"options": {"host": "127.0.0.1", "port": free_port()}}
     text["zenoh"] = {"endpoint": f"tcp/127.0.0.1:{free_port()}"}
     path.write_text(tomlkit.dumps(text), encoding="utf-8")

@@ -13,7 +13,8 @@ import os
 import re
 import types
 import typing
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from enum import IntFlag
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +23,11 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from drivelink import cli, jointfile
-from drivelink.pubsub.wire import ESTIMATE, SAMPLE, STATUS_BITS, Field, Layout
+from drivelink.pubsub.wire import ESTIMATE, EXTERNAL, EXTERNAL_BITS, SAMPLE, STATUS_BITS, Field, Layout
 from estimator.effects import LIBRARY
 from estimator.errors import EstimatorError
 from estimator.flexibility import TransmissionModel
-from estimator.sample import Status
+from estimator.sample import ExternalStatus, Status
 from estimator.transmissions import MODELS
 from sim.effects import LISTED, UNLISTED, Definition
 
@@ -226,6 +227,8 @@ def layout_table(layout: Layout) -> str:
     for field in layout.head:
         rows.append(_row(str(offset), field))
         offset += SIZES[field.type]
+    if not layout.elements:
+        return "\n".join([*rows, "", f"{offset} bytes."])
     rows.append(f"| {offset} | u8 | number of {layout.elements} | n, a LEB128 varint; one byte below 128 |")
     first = offset + 1
     size = layout.size(1) - layout.size(0)
@@ -241,11 +244,11 @@ def _row(offset: str, field: Field, prefix: str = "") -> str:
     return f"| {offset} | {field.type} | `{prefix}{field.name}` | {field.meaning} |"
 
 
-def bits_table() -> str:
+def bits_table(flags: type[IntFlag], meanings: Mapping[str, str]) -> str:
     """One row a status bit."""
     rows = ["| bit | mask | name | meaning |", "|---|---|---|---|"]
-    for name, meaning in STATUS_BITS.items():
-        bit = Status[name]
+    for name, meaning in meanings.items():
+        bit = flags[name]
         rows.append(f"| {bit.bit_length() - 1} | 0x{int(bit):03X} | {name.lower()} | {meaning} |")
     return "\n".join(rows)
 
@@ -280,7 +283,13 @@ def wire_page() -> str:
     """docs/reference/wire.md."""
     return filled(
         "wire.md",
-        {"estimate": layout_table(ESTIMATE), "sample": layout_table(SAMPLE), "status bits": bits_table()},
+        {
+            "estimate": layout_table(ESTIMATE),
+            "external": layout_table(EXTERNAL),
+            "sample": layout_table(SAMPLE),
+            "status bits": bits_table(Status, STATUS_BITS),
+            "external bits": bits_table(ExternalStatus, EXTERNAL_BITS),
+        },
     )
 
 

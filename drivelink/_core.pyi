@@ -5,7 +5,7 @@ from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle.chain import Watch
 from estimator._core import Estimator as _Core
 from estimator.online import Estimator as _Estimator
-from estimator.sample import Estimate, Sample
+from estimator.sample import Estimate, External, Sample
 
 LATE: int
 SYNC_COB_ID: int
@@ -16,6 +16,14 @@ def encode_estimate(estimate: Estimate, stamp_ns: int) -> bytes:
 
     Args:
         estimate: of at most 8 transmissions.
+        stamp_ns: UNIX time of its SYNC.
+    """
+
+def encode_external(external: External, stamp_ns: int) -> bytes:
+    """The bytes of `<prefix>/<joint>/external`; see `drivelink.pubsub.wire.EXTERNAL`.
+
+    Args:
+        external: of one cycle.
         stamp_ns: UNIX time of its SYNC.
     """
 
@@ -159,8 +167,10 @@ class Tick:
         current: whether it is the cycle of the last SYNC.
         fresh: whether it has a sample; else the last estimate is carried on.
         estimate: as an object.
+        external: likewise; None where nothing is declared of the link.
         sample: likewise; None where it is not fresh.
         estimate_payload: the bytes of `<prefix>/<joint>/estimate`.
+        external_payload: the bytes of `<prefix>/<joint>/external`; None where there is none.
         sample_payload: the bytes of `<prefix>/<joint>/sample`; None where it is not fresh.
     """
 
@@ -177,9 +187,13 @@ class Tick:
     @property
     def estimate(self) -> Estimate: ...
     @property
+    def external(self) -> External | None: ...
+    @property
     def sample(self) -> Sample | None: ...
     @property
     def estimate_payload(self) -> bytes: ...
+    @property
+    def external_payload(self) -> bytes | None: ...
     @property
     def sample_payload(self) -> bytes | None: ...
     def flagged(self, status: int) -> Tick:
@@ -219,6 +233,7 @@ class Chain:
         watch: likewise.
         history: the last samples.
         estimate: the last one, None before the first.
+        external: likewise; None too where nothing is declared of the link.
         sample: what the last estimate was made from; None where it was carried on.
         missed: cycles that gave no sample.
     """
@@ -236,6 +251,8 @@ class Chain:
     def history(self) -> History: ...
     @property
     def estimate(self) -> Estimate | None: ...
+    @property
+    def external(self) -> External | None: ...
     @property
     def sample(self) -> Sample | None: ...
     @property

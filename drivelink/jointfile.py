@@ -183,7 +183,9 @@ class LinkSection(_Section):
     """The link side."""
 
     encoder: EncoderSection | None = Field(None, description="the link encoder")
-    dynamics: LinkDynamics | None = Field(None, description="makes the external residual (eq 12) available")
+    dynamics: LinkDynamics | None = Field(
+        None, description="makes the external torque and the external residual (eq 12) available"
+    )
     effect: tuple[Effect, ...] = Field((), description="effects at the link or in its encoder")
 
 

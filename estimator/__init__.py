@@ -14,7 +14,15 @@ if TYPE_CHECKING:
     from estimator.errors import EstimatorError
     from estimator.model import Effect, JointModel, LinkDynamics, Motor, Transmission
     from estimator.online import Estimator, make_estimator
-    from estimator.sample import Estimate, Record, Sample, Status, TransmissionEstimate
+    from estimator.sample import (
+        Estimate,
+        External,
+        ExternalStatus,
+        Record,
+        Sample,
+        Status,
+        TransmissionEstimate,
+    )
     from estimator.settings import EstimatorSettings
     from estimator.transmissions import MODELS, register, register_table
 
@@ -25,6 +33,8 @@ __all__ = [
     "Estimator",
     "EstimatorError",
     "EstimatorSettings",
+    "External",
+    "ExternalStatus",
     "JointModel",
     "LinkDynamics",
     "Motor",
@@ -45,7 +55,15 @@ _PLACES = {
     "errors": ("EstimatorError",),
     "model": ("Effect", "JointModel", "LinkDynamics", "Motor", "Transmission"),
     "online": ("Estimator", "make_estimator"),
-    "sample": ("Estimate", "Record", "Sample", "Status", "TransmissionEstimate"),
+    "sample": (
+        "Estimate",
+        "External",
+        "ExternalStatus",
+        "Record",
+        "Sample",
+        "Status",
+        "TransmissionEstimate",
+    ),
     "settings": ("EstimatorSettings",),
     "transmissions": ("MODELS", "register", "register_table"),
 }

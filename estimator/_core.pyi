@@ -4,7 +4,7 @@ from numpy import float64
 from numpy.typing import NDArray
 
 from estimator.model import JointModel
-from estimator.sample import Estimate, Sample
+from estimator.sample import Estimate, External, Sample
 from estimator.settings import EstimatorSettings
 
 Numbers = NDArray[float64]
@@ -18,6 +18,10 @@ class Estimator:
     def distrust(self) -> None: ...
     @property
     def residual_nm(self) -> float: ...
+    @property
+    def external(self) -> External | None: ...
+    @property
+    def consistency(self) -> tuple[float, float] | None: ...
     def alpha(self, motor: int) -> tuple[bool, bool, list[float], list[float]]: ...
     def time_ticks(self, samples: Sequence[Sample], ticks: int) -> list[float]: ...
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
 from estimator.errors import EstimatorError
+from estimator.priors import PRIORS
 
 __all__ = ["Arrangement", "Effect", "JointModel", "LinkDynamics", "Motor", "ParameterValue", "Transmission"]
 
@@ -109,6 +110,9 @@ class LinkDynamics:
         viscous_damping_nm_s_rad: D_q >= 0.
         gravity_nm: amplitude of the gravity torque.
         gravity_phase_rad: where gravity vanishes, as an angle added to q.
+        inertia_std_kg_m2: standard deviation of M; None: 10 % of it.
+        viscous_damping_std_nm_s_rad: of D_q; None: 20 % of it.
+        gravity_std_nm: of the gravity torque, in amount and direction alike; None: 10 % of its amplitude.
     """
 
     __pydantic_config__: ClassVar[dict[str, Any]] = _STRICT
@@ -117,11 +121,29 @@ class LinkDynamics:
     viscous_damping_nm_s_rad: float = 0.0
     gravity_nm: float = 0.0
     gravity_phase_rad: float = 0.0
+    inertia_std_kg_m2: float | None = None
+    viscous_damping_std_nm_s_rad: float | None = None
+    gravity_std_nm: float | None = None
 
     def __post_init__(self) -> None:
         require_finite(0.0, strict=True, inertia_kg_m2=self.inertia_kg_m2)
         require_finite(0.0, viscous_damping_nm_s_rad=self.viscous_damping_nm_s_rad)
         require_finite(-math.inf, gravity_nm=self.gravity_nm, gravity_phase_rad=self.gravity_phase_rad)
+        for name in ("inertia_std_kg_m2", "viscous_damping_std_nm_s_rad", "gravity_std_nm"):
+            std = getattr(self, name)
+            if std is not None:
+                require_finite(0.0, **{name: std})
+
+    def uncertainty(self) -> tuple[float, float, float]:
+        """Standard deviations of M (kg·m²), D_q (N·m·s/rad), gravity (N·m): as declared, or by the priors."""
+        declared = (self.inertia_std_kg_m2, self.viscous_damping_std_nm_s_rad, self.gravity_std_nm)
+        values = (self.inertia_kg_m2, self.viscous_damping_nm_s_rad, abs(self.gravity_nm))
+        shares = (PRIORS[name].std for name in ("link_inertia", "link_viscous_damping", "gravity"))
+        inertia, damping, gravity = (
+            share * value if std is None else std
+            for std, share, value in zip(declared, shares, values, strict=True)
+        )
+        return inertia, damping, gravity
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from estimator import _core
 from estimator.model import JointModel, Motor, require_finite
-from estimator.sample import Estimate, Sample
+from estimator.sample import Consistency, Estimate, External, Sample
 from estimator.settings import EstimatorSettings
 from estimator.transmissions import MODELS, RIGID, UNKNOWN, transmission_model
 
@@ -22,6 +22,17 @@ class Estimator(Protocol):
     @property
     def residual_nm(self) -> float:
         """What the model left unexplained of the torque balance at the last sample; nan: unknown."""
+
+    @property
+    def external(self) -> External | None:
+        """What the world does to the link, by the last sample.
+
+        None: no link dynamics are declared, or there was no sample yet. Never valid where nothing deflects.
+        """
+
+    @property
+    def consistency(self) -> Consistency | None:
+        """Whether both sides of the joint have told one flexibility torque of late; None: not known."""
 
     def step(self, sample: Sample) -> Estimate:
         """The estimate at this sample. Never raises, whatever floats the sample holds.
@@ -59,6 +70,17 @@ class _Compiled:
     def residual_nm(self) -> float:
         """See `Estimator`."""
         return self.core.residual_nm
+
+    @property
+    def external(self) -> External | None:
+        """See `Estimator`."""
+        return self.core.external
+
+    @property
+    def consistency(self) -> Consistency | None:
+        """See `Estimator`."""
+        told = self.core.consistency
+        return None if told is None else Consistency(*told)
 
     def parameters(self) -> list[dict[str, Any]]:
         """See `Estimator`."""

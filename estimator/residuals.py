@@ -1,7 +1,8 @@
 """The residuals of the paper: the flexibility torque from momenta, without differentiating or sensing it.
 
 `motor_balance` integrates the known part of a balance exactly for a held torque; `first_order` and
-`second_order` turn it into eqs 14-16 and 28-30 over arrays. Tick by tick they are in the paper mode.
+`second_order` turn it into eqs 14-16 and 28-30 over arrays. Tick by tick they are in the paper mode, as are
+eqs 12 and 13.
 """
 
 from __future__ import annotations
@@ -9,11 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from estimator.filters import first_order_pole, held_integral, linear_filter, tustin_biquad
-from estimator.model import LinkDynamics
 from estimator.sample import FloatArray
 
 __all__ = [
-    "external_balance",
     "first_order",
     "match_first_order",
     "match_second_order",
@@ -47,26 +46,8 @@ def motor_balance(
     return np.asarray(balance - balance[0])
 
 
-def external_balance(
-    link: LinkDynamics,
-    position: FloatArray,
-    velocity: FloatArray,
-    external_torque: FloatArray,
-    period_s: float,
-) -> FloatArray:
-    """y = M q' + D_q q - integral(tau_k - g(q)), whose derivative is -tau_e,t (from eqs 4, 6).
-
-    tau_k and g are smooth, so the integral is the trapezoidal one.
-    """
-    load = external_torque - link.gravity_nm * np.sin(position + link.gravity_phase_rad)
-    integral = np.zeros_like(load)
-    np.cumsum(0.5 * period_s * (load[1:] + load[:-1]), out=integral[1:])
-    balance = link.inertia_kg_m2 * velocity + link.viscous_damping_nm_s_rad * position - integral
-    return np.asarray(balance - balance[0])
-
-
 def first_order(balance: FloatArray, k_tau_rad_s: float, period_s: float) -> FloatArray:
-    """r of eq 14 (or 12): K s/(s + K) y, which is tau_e (or -tau_e,t) through K/(s + K) (eqs 13, 15, 16).
+    """r of eq 14: K s/(s + K) y, which is tau_e through K/(s + K) (eqs 15, 16).
 
     r_k = a r_(k-1) + (1 - a) (y_k - y_(k-1)) / T with a = exp(-K T): exact for a straight y.
     """

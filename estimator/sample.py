@@ -16,7 +16,17 @@ from numpy.typing import NDArray
 
 from estimator.errors import EstimatorError
 
-__all__ = ["Estimate", "FloatArray", "Record", "Sample", "Status", "TransmissionEstimate"]
+__all__ = [
+    "Consistency",
+    "Estimate",
+    "External",
+    "ExternalStatus",
+    "FloatArray",
+    "Record",
+    "Sample",
+    "Status",
+    "TransmissionEstimate",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -81,6 +91,47 @@ class Estimate(NamedTuple):
     stiffness_nm_rad: float
     stiffness_std_nm_rad: float
     transmissions: tuple[TransmissionEstimate, ...]
+
+
+class ExternalStatus(IntFlag):
+    """Quality of one external torque."""
+
+    VALID = 1 << 0  # the numbers may be used
+    CONTACT = 1 << 1  # something touches the link; only where valid
+
+
+class External(NamedTuple):
+    """What the world does to the link at one SYNC; NaN where nothing is known.
+
+    Attributes:
+        sequence: as in `Sample`.
+        status: bits of `ExternalStatus`.
+        external_torque_nm: +tau_k of eqs 4, 6, from the motor side's flexibility torque.
+        external_torque_std_nm: its standard deviation.
+        link_flexibility_torque_nm: tau_e,t from the link side, -r of eqs 12, 13.
+        difference_nm: tau_e,t of the motor side less that, filtered alike: what the model leaves, or a torque
+            on the link that nobody measured.
+    """
+
+    sequence: int
+    status: int
+    external_torque_nm: float
+    external_torque_std_nm: float
+    link_flexibility_torque_nm: float
+    difference_nm: float
+
+
+class Consistency(NamedTuple):
+    """Flexibility torque from the motor side and from the link's, over the last ten seconds or so.
+
+    Attributes:
+        difference_rms_nm: of the one less the other; small against the second where the model is right, and
+            nothing touched the link that was not measured.
+        link_flexibility_torque_rms_nm: of the link side's.
+    """
+
+    difference_rms_nm: float
+    link_flexibility_torque_rms_nm: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

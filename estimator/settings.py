@@ -25,6 +25,13 @@ class EstimatorSettings:
         k_r_s2_rad2: K_R of eq 32.
         k_max: K_max < 2 of eq 33.
         false_alarms_per_hour: of the robust mode's `changed`; more of them find smaller changes.
+        external_bandwidth_rad_s: of the filter behind which robust mode has the external torque; in mode
+            "paper" that is K_tau_e.
+        external_bias_s: time constant of a bias that follows the external torque and is taken off it, as a
+            payload or a wrong gravity would be; what pushes for so long fades with it. None: no bias.
+        contact_torque_nm: least external torque that is called a contact; None: 5 % of the largest torque
+            that the joint has carried.
+        contact_false_alarms_per_hour: of the contact bit; more of them find smaller contacts.
     """
 
     __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "strict": True}
@@ -38,6 +45,10 @@ class EstimatorSettings:
     k_r_s2_rad2: float = 1900.0
     k_max: float = 1.9
     false_alarms_per_hour: float = 1.0
+    external_bandwidth_rad_s: float = 200.0
+    external_bias_s: float | None = None
+    contact_torque_nm: float | None = None
+    contact_false_alarms_per_hour: float = 1.0
 
     def __post_init__(self) -> None:
         require_finite(
@@ -50,5 +61,11 @@ class EstimatorSettings:
             k_r_s2_rad2=self.k_r_s2_rad2,
             k_max=self.k_max,
             false_alarms_per_hour=self.false_alarms_per_hour,
+            external_bandwidth_rad_s=self.external_bandwidth_rad_s,
+            contact_false_alarms_per_hour=self.contact_false_alarms_per_hour,
         )
+        if self.external_bias_s is not None:
+            require_finite(0.0, strict=True, external_bias_s=self.external_bias_s)
+        if self.contact_torque_nm is not None:
+            require_finite(0.0, contact_torque_nm=self.contact_torque_nm)
         require(self.k_max < 2.0, f"k_max: expected a number in (0, 2), got {self.k_max}")

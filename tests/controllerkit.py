@@ -46,7 +46,7 @@ def declared() -> JointFile:
 
 
 @contextmanager
-def running(seconds: float = 0.5, channel: str | None = None):
+def running(seconds: float = 0.5, channel: str | None = None, settings: Settings = QUICK):
     """A rig in the midst of its reference: the controller has been in phase `run` for so long."""
     joint = declared()
     acting = Decoupler(joint=joint_of(joint))
@@ -55,7 +55,7 @@ def running(seconds: float = 0.5, channel: str | None = None):
         acting,
         Reference(WAYPOINTS["decoupling"]),
         joint.bus.period_s,
-        settings=QUICK,
+        settings=settings,
         excitation=GENTLE,
     )
     rig = Rig(joint, controller, channel=channel)

@@ -22,6 +22,7 @@ from drivelink.cycle import realtime
 from drivelink.simulate import nodes_from_joint, open_sim_bus, world_from_joint
 from sim.canopen.statemachine import PowerState
 from sim.effects import parse
+from sim.excitation import build
 from sim.faults import Faults
 from sim.network import Network
 
@@ -230,7 +231,7 @@ def go_through_faults(plant: Plant) -> list[dict]:
         "a drive in fault": (lambda: plant.faults.emergency(plant.network.nodes[0], 0x2310), lambda: None),
         "zenoh cut": (plant.relay.open.clear, plant.relay.open.set),
         "an undeclared effect": (
-            lambda: plant.world.alter(effects=[parse("contact=2.0,position_rad=-0.5")]),
+            lambda: plant.world.alter(effects=[parse("torque_offset=0.04,motor=2")]),
             lambda: plant.world.alter(effects=[]),
         ),
         "daemon killed": (plant.daemon.kill, plant.start_daemon),
@@ -238,4 +239,34 @@ def go_through_faults(plant: Plant) -> list[dict]:
     plant.reaches("run")
     for why in acts:
         safe(why)
+    return told
+
+
+WALL = "contact=3.0,position_rad={:.4f},side={:d}"
+
+
+def go_through_contacts(plant: Plant) -> list[dict]:
+    """A wall, a push and a clamp on the running joint, and back to moving; the events of its reactions."""
+    world, told = plant.world, []
+
+    def wall(*sides: int) -> None:
+        q = world.truth().link_position_rad
+        world.alter(effects=[parse(WALL.format(q, side)) for side in sides])
+
+    def push(torque_nm: float) -> None:
+        world.excitation = build({"kind": "none", "external": {"kind": "none", "offset_nm": torque_nm}}, 2)
+
+    acts = {
+        "a wall": (lambda: wall(1 if world.truth().link_velocity_rad_s > 0.0 else -1), lambda: wall()),
+        "a push": (lambda: push(0.12), lambda: push(0.0)),
+        "a clamp": (lambda: wall(1, -1), lambda: wall()),
+    }
+    plant.reaches("run")
+    for what, (begin, end) in acts.items():
+        before, begin_s = len(plant.events), time.monotonic()
+        begin()
+        event = plant.reaches("react", before)
+        told.append({"touch": what, "took_s": event["time_s"] - begin_s, **event})
+        end()
+        plant.reaches("run", len(plant.events))
     return told

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zenoh
-from zenohkit import free_endpoint, make_estimate, make_joint, ready, script, until
+from zenohkit import free_endpoint, make_estimate, make_external, make_joint, ready, script, until
 
 import drivelink
 from drivelink.errors import ZenohError
@@ -100,6 +100,36 @@ def test_a_rigid_joint_says_that_its_stiffness_is_not_given(endpoint):
             assert joint.latest().status & Status.PARTIAL and math.isnan(joint.latest().stiffness_nm_rad)
     finally:
         close_session(session)
+
+
+def test_the_external_torque_comes_with_its_estimate(publisher, joint):
+    assert joint.external is None and not joint.contact
+    publish(publisher, 1)
+    publisher.put_external(make_external(1, status=3), time.time_ns())
+    external = until(lambda: joint.external)
+    assert (external.sequence, external.external_torque_nm, external.external_torque_std_nm) == (
+        1,
+        0.01,
+        0.25,
+    )
+    assert external.valid and joint.contact
+    publish(publisher, 3)
+    publisher.put_external(make_external(3, status=1), time.time_ns())
+    until(lambda: joint.external.sequence == 3)
+    assert not joint.contact
+
+
+def test_an_external_torque_of_other_cycles_is_not_told(publisher, joint):
+    publish(publisher, 1)
+    publisher.put_external(make_external(1, status=3), time.time_ns())
+    until(lambda: joint.contact)
+    publish(publisher, 40)
+    until(lambda: joint.latest().sequence == 40)
+    assert joint.external is None and not joint.contact
+    publisher.put_external(make_external(40, status=3), time.time_ns())
+    until(lambda: joint.contact)
+    until(lambda: joint.stale)  # nothing more comes
+    assert joint.external is None and not joint.contact
 
 
 def test_waiting_gives_the_next_cycle_once(publisher, joint):

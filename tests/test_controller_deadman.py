@@ -26,7 +26,7 @@ class Daemon:
         self.now_s = 100.0
         self.silent_from_s = math.inf
         self.last_s = -math.inf
-        self.status = None
+        self.status = self.external = None
         self._sequence = 0
         self._sample: bytes | None = None
 

@@ -53,10 +53,7 @@ def test_a_drive_that_reboots_is_configured_by_both_masters_and_taken_up_again()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "effect",
-    ["torque_offset=0.04,motor=2", "contact=2.0,position_rad=0.05", "coulomb_friction=0.05"],
-)
+@pytest.mark.parametrize("effect", ["torque_offset=0.04,motor=2", "coulomb_friction=0.05"])
 def test_an_undeclared_effect_in_the_middle_of_a_motion_and_its_end(effect):
     with kit.running() as rig:
         rig.world.alter(effects=[parse(effect)])

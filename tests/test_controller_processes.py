@@ -8,19 +8,41 @@ told: the machine may be doing something else.
 import socket
 
 import pytest
-from controllerprocesses import Plant, go_through_faults
+from controllerprocesses import Plant, go_through_contacts, go_through_faults
 from zenohkit import until
+
+
+def start(folder, *options):
+    """The three processes, the drives being in this one."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    where = f'{{ host = "127.0.0.1", port = {port}, tcp_tune = true }}'
+    bus = f'interface = "socketcand"\nchannel = "vsa"\noptions = {where}\nperiod_s = 0.002'
+    # The example's own 10 ms belong to a machine of its own: here others may hold a core for longer.
+    return Plant(folder, bus, "--deadline", "0.08", *options)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("reaction", ["stop", "retract", "soften"])
+def test_it_reacts_to_a_wall_a_push_and_a_clamp_in_three_processes(tmp_path, capsys, reaction):
+    plant = start(tmp_path, "--reaction", reaction)
+    try:
+        told = go_through_contacts(plant)
+        assert plant.end_controller() == 0
+        until(lambda: not plant.enabled())
+    finally:
+        plant.close()
+    assert [event["reason"] for event in told] == [f"contact: {reaction}"] * 3
+    with capsys.disabled():
+        for event in told:
+            print(f"\n{event['touch']}: {event['reason']} after {1e3 * event['took_s']:.0f} ms", end="")
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_each_fault_and_the_way_back_in_three_processes(tmp_path, capsys):
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    options = f'{{ host = "127.0.0.1", port = {port}, tcp_tune = true }}'
-    bus = f'interface = "socketcand"\nchannel = "vsa"\noptions = {options}\nperiod_s = 0.002'
-    # The example's own 10 ms belong to a machine of its own: here others may hold a core for longer.
-    plant = Plant(tmp_path, bus, "--deadline", "0.08")
+    plant = start(tmp_path)
     try:
         told = go_through_faults(plant)
         assert plant.end_controller() == 0

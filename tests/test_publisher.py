@@ -11,7 +11,16 @@ import numpy as np
 import pytest
 import zenoh
 import zenoh.ext
-from zenohkit import free_endpoint, make_estimate, make_joint, make_sample, ready, script, until
+from zenohkit import (
+    free_endpoint,
+    make_estimate,
+    make_external,
+    make_joint,
+    make_sample,
+    ready,
+    script,
+    until,
+)
 
 from drivelink.pubsub import wire
 from drivelink.pubsub.publisher import JointPublisher, describe_model, schema, to_json
@@ -78,6 +87,17 @@ def test_estimate_and_sample_arrive_as_the_contract_says(publisher, client):
     assert message.congestion_control == zenoh.CongestionControl.DROP
     assert message.source_info.source_id.zid == client.info.peers_zid()[0]
     assert received(samples).payload.to_bytes() == wire.encode_sample(make_sample(7), 123)
+
+
+def test_an_external_torque_arrives_as_the_contract_says(publisher, client):
+    externals = client.declare_subscriber("drivelink/elbow/external", zenoh.handlers.RingChannel(4))
+    message = until(lambda: publisher.put_external(make_external(7, status=3), 123) or externals.try_recv())
+    assert message.payload.to_bytes() == wire.encode_external(make_external(7, status=3), 123)
+    assert len(message.payload.to_bytes()) == 36
+    assert str(message.encoding) == "zenoh/serialized;drivelink.external/1"
+    assert message.express
+    assert message.priority == zenoh.Priority.REAL_TIME
+    assert message.congestion_control == zenoh.CongestionControl.DROP
 
 
 def test_a_new_subscriber_gets_the_last_status_and_model_at_once(publisher, client):

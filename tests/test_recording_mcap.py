@@ -20,7 +20,7 @@ from mcap.reader import NonSeekingReader, make_reader
 
 from drivelink.errors import RecordingError
 from drivelink.jointfile import parse
-from drivelink.pubsub.wire import EstimateMessage
+from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from drivelink.recording import read
 from drivelink.recording.formats import open_sink
 from drivelink.recording.mapping import joint_of
@@ -46,12 +46,24 @@ def estimate(k: int, status: int = 3) -> EstimateMessage:
     return EstimateMessage(k, BEGIN_NS + k * 1_000_000, status, k / 3, 700.0 + k, 3.0, (one,))
 
 
+def external(k: int) -> ExternalMessage:
+    valid = k >= 5
+    return ExternalMessage(
+        k,
+        BEGIN_NS + k * 1_000_000,
+        (1 if valid else 0) | (2 if k >= 400 else 0),
+        k / 7 if valid else math.nan,
+        0.5,
+    )
+
+
 def record(path: Path, n: int = 500, close: bool = True) -> None:
     sink = open_sink(path, JOINT, TEXT, "somewhere")
     for k in range(n):
         stamp_ns = BEGIN_NS + k * 1_000_000
         sink.sample(sample(k), stamp_ns)
         sink.estimate(estimate(k))
+        sink.external(external(k))
         sink.frame(stamp_ns, 0x181, struct.pack("<iH", k, 7))
         if k % 100 == 99:
             sink.document("status", b'{"state": "running"}', stamp_ns)
@@ -117,7 +129,7 @@ def test_an_independent_reader_finds_channels_schemas_and_messages_that_obey_the
             check(strict(message.data.decode()), json.loads(schema.data), channel.topic)
             counts[channel.topic] = counts.get(channel.topic, 0) + 1
     assert counts == {
-        "/elbow/sample": 500, "/elbow/estimate": 500, "/elbow/can": 500, "/elbow/status": 5, "/elbow/joint": 1
+        "/elbow/sample": 500, "/elbow/estimate": 500, "/elbow/external": 500, "/elbow/can": 500, "/elbow/status": 5, "/elbow/joint": 1
     }  # fmt: skip
     assert summary is not None and summary.statistics is not None
     assert summary.statistics.message_start_time == BEGIN_NS
@@ -131,7 +143,7 @@ def test_without_its_end_everything_flushed_is_there_for_both_readers(tmp_path: 
     with path.open("rb") as file, pytest.raises(Exception):  # noqa: B017  (the end is missing, and it says so)
         for _ in NonSeekingReader(file).iter_messages(log_time_order=False):
             found += 1
-    assert found == 1506
+    assert found == 2006
 
 
 def test_cut_off_anywhere_it_gives_what_is_whole(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import xxhash
 import zenoh
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from zenoh.ext import Int64, z_serialize
-from zenohkit import free_endpoint, make_joint, until
+from zenohkit import free_endpoint, make_external, make_joint, until
 
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.ros2 import (
@@ -19,6 +19,7 @@ from drivelink.pubsub.ros2 import (
     interfaces,
     joint_state,
     stiffness_array,
+    wrench,
 )
 from drivelink.pubsub.session import close_session, open_client, open_session
 from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
@@ -35,6 +36,8 @@ DYNAMIC = "control_msgs::msg::dds_::DynamicJointState_"
 STAMP_NS = 1_700_000_000_123_456_789
 STATE = "sensor_msgs::msg::dds_::JointState_"
 ARRAY = "std_msgs::msg::dds_::Float64MultiArray_"
+WRENCH = "geometry_msgs::msg::dds_::WrenchStamped_"
+LINKED = "[link.dynamics]\ninertia_kg_m2 = 0.4\n"
 DIAGNOSTICS = "diagnostic_msgs::msg::dds_::DiagnosticArray_"
 
 
@@ -54,8 +57,8 @@ def ros2():
     sessions = []
     publishers = []  # what is dropped leaves the graph
 
-    def start(table="", name="elbow"):
-        joint = make_joint(name, endpoint, f"[ros2]\n{table}")
+    def start(table="", name="elbow", link=""):
+        joint = make_joint(name, endpoint, f"{link}[ros2]\n{table}")
         if not sessions:
             sessions.append(open_session(joint.zenoh, Path()))
             sessions.append(open_client(endpoint))
@@ -152,6 +155,48 @@ def test_a_cycle_arrives_where_a_ros_node_listens(ros2):
     array = receive(client, f"0/elbow/stiffness/{ARRAY}/{TYPE_HASHES[ARRAY]}", put)
     message = STORE.deserialize_cdr(array.payload.to_bytes(), "std_msgs/msg/Float64MultiArray")
     assert message.data.reshape(3, 2).tolist() == [[61.0, 1.75], [30.0, 1.0], [31.0, 1.5]]
+
+
+@pytest.mark.parametrize("name", ["e", "el", "elbow", "elbow_7"])
+def test_a_wrench_is_the_bytes_that_rosbags_writes_whatever_the_alignment(name):
+    payload = wrench(name)(7, 8, -1.5)
+    message = STORE.deserialize_cdr(payload, "geometry_msgs/msg/WrenchStamped")
+    assert (message.header.stamp.sec, message.header.stamp.nanosec, message.header.frame_id) == (7, 8, name)
+    torque = message.wrench.torque
+    assert (torque.x, torque.y, torque.z, message.wrench.force.z) == (0.0, 0.0, -1.5, 0.0)
+    assert bytes(STORE.serialize_cdr(message, message.__msgtype__)) == payload
+
+
+def test_the_external_torque_is_a_stamped_wrench_about_z_where_it_is_valid(ros2):
+    publisher, client = ros2(link=LINKED)
+    key = f"0/elbow/external_torque/{WRENCH}/{TYPE_HASHES[WRENCH]}"
+    subscriber = client.declare_subscriber(key, zenoh.handlers.RingChannel(64))
+
+    def put(status=3):
+        publisher.external = make_external(5, status)
+        publisher.put_cycle(estimate(), sample(), STAMP_NS)
+        return subscriber.try_recv()
+
+    message = STORE.deserialize_cdr(until(put).payload.to_bytes(), "geometry_msgs/msg/WrenchStamped")
+    assert message.wrench.torque.z == 0.05
+    assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == STAMP_NS
+    dynamic = client.declare_subscriber(
+        f"0/dynamic_joint_states/{DYNAMIC}/{TYPE_HASHES[DYNAMIC]}", zenoh.handlers.RingChannel(64)
+    )
+    told = until(lambda: put() and dynamic.try_recv())
+    (values,) = STORE.deserialize_cdr(
+        told.payload.to_bytes(), "control_msgs/msg/DynamicJointState"
+    ).interface_values
+    named = dict(zip(values.interface_names, values.values.tolist(), strict=True))
+    assert (named["external_torque_nm"], named["external_torque_std_nm"]) == (0.05, 0.25)
+    assert (named["external_valid"], named["contact"]) == (1.0, 1.0)
+    time.sleep(0.1)
+    while subscriber.try_recv() is not None:
+        pass
+    for _ in range(5):
+        assert put(0) is None
+    time.sleep(0.1)
+    assert subscriber.try_recv() is None  # nothing that is not valid
 
 
 def test_the_graph_shows_one_node_with_four_publishers(ros2):

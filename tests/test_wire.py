@@ -1,5 +1,6 @@
 """The bytes on zenoh: against zenoh's own serializer (golden vectors), and back."""
 
+import math
 import struct
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from zenoh.ext import Float64, UInt32, UInt64, z_deserialize, z_serialize
 
 from drivelink.errors import ZenohError
 from drivelink.pubsub import wire
-from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
+from estimator.sample import Estimate, External, ExternalStatus, Sample, Status, TransmissionEstimate
 
 GOLDEN = Path(__file__).parent / "golden"
 NUMBER = st.floats(allow_nan=False)
@@ -55,8 +56,8 @@ def test_an_estimate_is_the_bytes_that_zenoh_serializes(payload, numbers):
     assert message.observable == bool(status & 2)
 
 
-def refused():
-    lines = (GOLDEN / "refused.txt").read_text(encoding="ascii").splitlines()
+def refused(file="refused.txt"):
+    lines = (GOLDEN / file).read_text(encoding="ascii").splitlines()
     return [pytest.param(bytes.fromhex(p.replace("-", "")), id=name) for name, p in map(str.split, lines)]
 
 
@@ -64,6 +65,25 @@ def refused():
 def test_what_is_no_estimate_or_cannot_be_valid_is_refused(payload):
     with pytest.raises(ZenohError):
         wire.decode_estimate(payload)
+
+
+@pytest.mark.parametrize(("payload", "numbers"), vectors("external.txt"))
+def test_an_external_torque_is_the_bytes_that_zenoh_serializes(payload, numbers):
+    sequence, stamp_ns, status, torque, std = numbers
+    external = External(sequence, status, torque, std, math.nan, math.nan)
+    assert wire.encode_external(external, stamp_ns) == payload
+    message = wire.decode_external(payload)
+    assert message[:3] == (sequence, stamp_ns, status)
+    assert same(message[3:], [torque, std])
+    assert (message.valid, message.contact) == (bool(status & 1), bool(status & 2))
+    kind = tuple[UInt64, UInt64, UInt32, Float64, Float64]
+    assert same(z_deserialize(kind, zenoh.ZBytes(payload))[3:], [torque, std])
+
+
+@pytest.mark.parametrize("payload", refused("refused_external.txt"))
+def test_what_is_no_external_torque_or_cannot_be_valid_is_refused(payload):
+    with pytest.raises(ZenohError, match=r"^drivelink\.external/1: "):
+        wire.decode_external(payload)
 
 
 @pytest.mark.parametrize(("payload", "numbers"), vectors("sample.txt"))
@@ -132,3 +152,4 @@ def test_a_status_that_carries_higher_bits_fits_its_field():
 
 def test_every_status_bit_is_described():
     assert list(wire.STATUS_BITS) == [bit.name for bit in Status]
+    assert list(wire.EXTERNAL_BITS) == [bit.name for bit in ExternalStatus]

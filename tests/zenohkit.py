@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from drivelink.jointfile import JointFile, parse
-from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
+from estimator.sample import Estimate, External, Sample, Status, TransmissionEstimate
 
 HERE = Path(__file__).parent
 LIMIT_S = 20.0  # patience with a loaded machine; nothing is asserted about time itself
@@ -32,6 +32,10 @@ def make_joint(name: str, endpoint: str, more: str = "") -> JointFile:
 def make_estimate(sequence: int, status: int = Status.VALID | Status.OBSERVABLE, motors: int = 1) -> Estimate:
     each = (TransmissionEstimate(sequence * 0.5, 700.0, 3.0, sequence * 0.001),) * motors
     return Estimate(sequence, int(status), sequence * 0.5, 700.0, 3.0, each)
+
+
+def make_external(sequence: int, status: int = 1) -> External:
+    return External(sequence, status, 0.01 * sequence, 0.25, 1.0, 2.0)
 
 
 def make_sample(sequence: int) -> Sample:

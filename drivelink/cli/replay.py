@@ -94,7 +94,8 @@ def run(args: argparse.Namespace) -> int:
     with ExitStack() as stack:
         takers: list[Callable[[Played], None]] = [summary.take, gathered.take]
         if args.out is not None:
-            rows = EstimatesFile(args.out, playback.motors, force=args.force)
+            linked = joint.link.dynamics is not None
+            rows = EstimatesFile(args.out, playback.motors, linked=linked, force=args.force)
             stack.callback(rows.close)
             takers.append(rows.take)
         if args.publish or speed is not None:

@@ -76,5 +76,6 @@ def rehearse(joint: JointFile) -> None:
         theta, nothing = tuple(0.01 * math.sin(0.05 * k + i) for i in range(motors)), (math.nan,) * motors
         tick = chain.take(Sample(k, theta, nothing, theta, 0.0))
         assert tick.estimate_payload and tick.sample_payload and tick.estimate and tick.sample  # made once
+        assert (tick.external_payload is None) == (tick.external is None)
     chain.carry_on(_REHEARSED)
     chain.estimator.parameters()

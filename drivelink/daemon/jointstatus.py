@@ -16,7 +16,7 @@ from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor, residual_text
 from drivelink.jointfile import JointFile
 from drivelink.version import __version__
-from estimator.sample import Status
+from estimator.sample import ExternalStatus, Status
 
 __all__ = ["JointStatus"]
 
@@ -120,6 +120,7 @@ class JointStatus:
             "transmissions": lane.chain.estimator.parameters(),
             "residual_nm": lane.chain.estimator.residual_nm,
             "residual_alarm": self._alarm(),
+            "external": self._external(),
             "conditions": sorted(events.active.values()),
             "events": events.recent(),
         }
@@ -170,6 +171,25 @@ class JointStatus:
         estimate = self._lane.chain.estimate
         active = estimate is not None and bool(estimate.status & Status.MODEL_ALARM)
         return {"active": active, **(watch.describe() if watch is not None else {})}
+
+    def _external(self) -> dict[str, Any] | None:
+        """What touches the link, and whether both sides of the joint tell one flexibility torque."""
+        told = self._lane.chain.external
+        if told is None:
+            return None
+        return {
+            "valid": bool(told.status & ExternalStatus.VALID),
+            "contact": bool(told.status & ExternalStatus.CONTACT),
+            "torque_nm": told.external_torque_nm,
+            "torque_std_nm": told.external_torque_std_nm,
+            "link_flexibility_torque_nm": told.link_flexibility_torque_nm,
+            "difference_nm": told.difference_nm,
+            **self._consistency(),
+        }
+
+    def _consistency(self) -> dict[str, float]:
+        consistency = getattr(self._lane.chain.estimator, "consistency", None)
+        return {} if consistency is None else consistency._asdict()
 
     def _real_time(self) -> dict[str, bool]:
         obtained = self.real_time

@@ -10,9 +10,10 @@ from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
+from drivelink.pubsub.wire import ExternalMessage
 from estimator.sample import Status, TransmissionEstimate
 
-__all__ = ["EstimateLike", "GrowingCurve", "History", "Moment", "TruthLike", "usual_range"]
+__all__ = ["EstimateLike", "GrowingCurve", "History", "Moment", "Touch", "TruthLike", "usual_range"]
 
 _BINS = 160
 _USABLE = int(Status.VALID | Status.OBSERVABLE)
@@ -72,6 +73,16 @@ class Moment(NamedTuple):
     valid: bool
 
 
+class Touch(NamedTuple):
+    """What the world did to the link at one instant."""
+
+    time_s: float
+    torque_nm: float
+    std_nm: float
+    valid: bool
+    contact: bool
+
+
 class GrowingCurve:
     """Stiffness over deflection, the latest value of each place.
 
@@ -125,6 +136,8 @@ class History:
         curves: stiffness over deflection of each transmission.
         latest: the newest estimate.
         residuals: (time of the newest estimate then, s; largest residual over its baseline).
+        touches: thinned external torques, oldest first; empty where nothing is declared of the link.
+        touch: the newest one.
     """
 
     def __init__(self, seconds: float = 12.0, points: int = 600) -> None:
@@ -132,6 +145,8 @@ class History:
         self.moments: deque[Moment] = deque(maxlen=points)
         self.curves: tuple[GrowingCurve, ...] = ()
         self.residuals: deque[tuple[float, float]] = deque(maxlen=points)
+        self.touches: deque[Touch] = deque(maxlen=points)
+        self.touch: Touch | None = None
         self.latest: EstimateLike | None = None
         self._apart_s = seconds / points
 
@@ -146,6 +161,7 @@ class History:
             if since < 0.0:  # the daemon was started anew
                 moments.clear()
                 self.residuals.clear()
+                self.touches.clear()
             elif since < 0.999 * self._apart_s:
                 return
         moments.append(
@@ -164,6 +180,24 @@ class History:
         if estimate.status & _USABLE == _USABLE:
             for curve, one in zip(self.curves, estimate.transmissions, strict=True):
                 curve.add(one.deflection_rad, one.stiffness_nm_rad, one.stiffness_std_nm_rad)
+
+    def add_external(self, message: ExternalMessage, time_s: float) -> None:
+        """Enter one external torque; a contact is never thinned out."""
+        self.touch = Touch(
+            time_s,
+            message.external_torque_nm,
+            message.external_torque_std_nm,
+            message.valid,
+            message.contact,
+        )
+        last = self.touches[-1] if self.touches else None
+        if last is not None and time_s < last.time_s:  # the daemon was started anew
+            self.touches.clear()
+        elif last is not None and time_s - last.time_s < 0.999 * self._apart_s:
+            begins = self.touch.contact and not last.contact
+            if not begins:
+                return
+        self.touches.append(self.touch)
 
     def add_residual(self, ratio: float) -> None:
         """Enter what the model leaves unexplained now, over its baseline."""

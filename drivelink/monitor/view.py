@@ -21,6 +21,7 @@ from rich.text import Text
 from drivelink.monitor.braille import DotPlot, number, sparkline
 from drivelink.monitor.history import EstimateLike, History, TruthLike, usual_range
 from drivelink.monitor.statuslines import MODEL_ALARM_ADVICE, shape, status_lines, status_text
+from drivelink.pubsub.wire import ExternalMessage
 from estimator.sample import Status
 
 __all__ = ["JointView", "joints_table"]
@@ -47,11 +48,13 @@ SILENT_S = 1.0  # without an estimate, after which what is shown is called the l
 _HELP = (
     ("stiffness", "of the joint, N·m/rad, ± half its 95 % interval"),
     ("torque", "flexibility torque of the joint, N·m"),
+    ("external", "torque of the world on the link, N·m, ± half its 95 % interval"),
     ("deflection", "φ = q − θ of each transmission, rad"),
     ("left plot", "stiffness over deflection, its 95 % band dotted, ● now; cyan motor 1, magenta 2"),
     ("right plot", "flexibility torque over time; yellow: truth of a simulation; gaps: not valid"),
     ("cycle", "99th percentiles, µs: work, answer (SYNC to last frame), SYNC late by"),
     ("residual", "what the model leaves, times its baseline (where it was fitted): half a bar is 1"),
+    ("contact", "something touches the link"),
     ("valid", "the numbers may be used; not valid: do not control on them"),
     ("observable", "the motion tells the stiffness; else it is held, and its interval widens"),
     ("model alarm", MODEL_ALARM_ADVICE),
@@ -95,6 +98,10 @@ class JointView:
         """Enter one estimate and, in a simulation, the truth at the same instant."""
         self.history.add(estimate, time_s, truth)
 
+    def update_external(self, message: ExternalMessage, time_s: float) -> None:
+        """Enter one external torque."""
+        self.history.add_external(message, time_s)
+
     @property
     def status(self) -> Mapping[str, Any]:
         """The joint's status message."""
@@ -128,7 +135,10 @@ class JointView:
         estimate = self.history.latest
         if estimate is None:
             return []
-        return flags(estimate.status) if self.live else [(self.state, "bold red")]
+        if not self.live:
+            return [(self.state, "bold red")]
+        touch = self.history.touch
+        return flags(estimate.status) + ([("contact", "yellow")] if touch and touch.contact else [])
 
     def line(self) -> str:
         """The joint in one plain line, for pipes and logs."""
@@ -139,6 +149,7 @@ class JointView:
             f"{self.name}:",
             f"stiffness {number(estimate.stiffness_nm_rad)} ± {number(_half(estimate), 2)} N·m/rad,",
             f"torque {number(estimate.flexibility_torque_nm)} N·m,",
+            *self._external_words(),
             "deflection " + " ".join(number(one.deflection_rad, 3) for one in estimate.transmissions),
             "rad, " + ", ".join(text for text, _ in self.flags),
         ]
@@ -148,6 +159,12 @@ class JointView:
         if self.status and self.live:
             parts[-1] += f", {status_text(self.status, self.model)}"
         return " ".join(parts)
+
+    def _external_words(self) -> list[str]:
+        touch = self.history.touch
+        if touch is None:
+            return []
+        return [f"external {number(touch.torque_nm)} N·m," if touch.valid else "external not valid,"]
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         width = options.max_width
@@ -211,9 +228,26 @@ class JointView:
                 else "",
                 Text(sparkline(series, spark), style=ink),
             )
+        self._add_external(table, spark, ink)
         deflection = "   ".join(number(one.deflection_rad, 4) for one in estimate.transmissions)
         table.add_row("deflection", f"{deflection} rad", self._each(estimate) if not known else "", "")
         return table
+
+    def _add_external(self, table: Table, spark: int, ink: str) -> None:
+        """The row of the external torque, where its link is declared."""
+        touch = self.history.touch
+        if touch is None:
+            return
+        series = [t.torque_nm if t.valid else math.nan for t in self.history.touches]
+        value = number(touch.torque_nm) if touch.valid else "not valid"
+        band = f" ± {number(_SIGMA_95 * touch.std_nm, 2)} N·m" if touch.valid else ""
+        contact = Text("contact", style="bold yellow") if touch.contact and self.live else Text("")
+        table.add_row(
+            "external",
+            Text.assemble((value, f"bold {ink}"), band),
+            contact,
+            Text(sparkline(series, spark), style=ink),
+        )
 
     @staticmethod
     def _each(estimate: EstimateLike) -> str:

@@ -64,7 +64,8 @@ class Watcher:
         history = zenoh.ext.HistoryConfig(max_samples=1, detect_late_publishers=True)
         try:
             self._streams: list[tuple[str, Any]] = [
-                ("estimate", session.declare_subscriber(f"{key}/estimate", ring(_QUEUE)))
+                (name, session.declare_subscriber(f"{key}/{name}", ring(_QUEUE)))
+                for name in ("estimate", "external")
             ]
             for name in ("status", "model"):
                 subscriber = zenoh.ext.declare_advanced_subscriber(
@@ -126,6 +127,8 @@ class Watcher:
             joint.view.status = message
         elif kind == "model":
             joint.view.model = message
+        elif kind == "external":
+            joint.view.update_external(message, message.stamp_ns * 1e-9)
         else:
             self.received += 1
             joint.estimate_s = now_s

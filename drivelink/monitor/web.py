@@ -18,7 +18,7 @@ from typing import Any
 
 from drivelink.errors import UsageError
 from drivelink.monitor.braille import number
-from drivelink.monitor.history import Moment
+from drivelink.monitor.history import Moment, Touch
 from drivelink.monitor.statuslines import Shown, shape
 from drivelink.monitor.view import JointView
 from drivelink.monitor.watcher import Watcher
@@ -113,6 +113,8 @@ def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str,
         last = -math.inf
     fresh = [moment for moment in window if moment.time_s > last]
     residuals = [pair for pair in history.residuals if pair[0] > last]
+    newest = fresh[-1].time_s if fresh else last
+    touches = [touch for touch in history.touches if last < touch.time_s <= newest]
     if fresh:
         since[view.name] = fresh[-1].time_s
     told: dict[str, Any] = {
@@ -123,6 +125,8 @@ def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str,
         "restart": last == -math.inf,
         "moments": [_moment(moment) for moment in fresh],
         "residuals": residuals,
+        "touches": [_touch(touch) for touch in touches],
+        "external": _touch(history.touch) if history.touch else None,
         "curves": [[[_finite(v) for v in point] for point in curve.points()] for curve in history.curves],
     }
     if estimate is not None:
@@ -141,6 +145,13 @@ def _moment(moment: Moment) -> list[float | None]:
     if not moment.valid:
         return [moment.time_s, None, None, None]
     return [_finite(value) for value in moment[:4]]
+
+
+def _touch(touch: Touch) -> list[float | bool | None]:
+    """[time, external torque, standard deviation, contact]; a gap in the curve where it is not valid."""
+    if not touch.valid:
+        return [touch.time_s, None, None, False]
+    return [touch.time_s, _finite(touch.torque_nm), _finite(touch.std_nm), touch.contact]
 
 
 def _describe(shown: Shown) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from drivelink.pubsub.feed import WAKE, Feed, State
 from drivelink.pubsub.identity import source_of
 from drivelink.pubsub.inbound import DECODERS
 from drivelink.pubsub.session import close_session, one_line, open_client
-from drivelink.pubsub.wire import ESTIMATE, EstimateMessage
+from drivelink.pubsub.wire import ESTIMATE, EstimateMessage, ExternalMessage
 from estimator.sample import Status
 
 __all__ = ["ENDPOINT", "Client"]
@@ -38,6 +38,7 @@ _USABLE = int(
     | Status.UNTIMED
     | Status.NODE_RESTARTED
 )
+_TOGETHER = 5  # cycles that an estimate and an external torque may be apart, as either may be lost
 _NAME = re.compile(r"[^*$#?\s/]+(/[^*$#?\s/]+)*")
 
 
@@ -67,6 +68,7 @@ class Client:
         self._session = open_client(endpoint, config) if session is None else session
         self._feed = Feed(depth, stale_after_s, time.monotonic_ns())
         self._documents: dict[str, tuple[str | None, dict[str, Any]]] = {}  # who wrote it, and what
+        self._external: tuple[str | None, ExternalMessage] | None = None  # who wrote it, and what
         self._closed = False
         try:
             self._declare()
@@ -82,6 +84,7 @@ class Client:
         heard = zenoh.handlers.Callback(self._liveliness, indirect=False)
         self._tokens = liveliness.declare_subscriber(f"{self.key}/alive/**", heard, history=True)
         self._estimates = self._declare_estimates(self.key + "/estimate")
+        self._externals = self._session.declare_subscriber(self.key + "/external", ring(1))
         history = zenoh.ext.HistoryConfig(max_samples=1, detect_late_publishers=True)
         self._latched = {
             name: zenoh.ext.declare_advanced_subscriber(
@@ -159,6 +162,33 @@ class Client:
         return self._fresh(Status.OBSERVABLE)
 
     @property
+    def external(self) -> ExternalMessage | None:
+        """What the world does to the link, by the newest message, without waiting.
+
+        None: none came that belongs to the latest estimates; the joint file may say nothing of the link.
+        """
+        self._drain()
+        feed = self._feed
+        with suppress(zenoh.ZError):
+            while (sample := self._externals.try_recv()) is not None:
+                if feed.trusts(source_of(sample), time.monotonic_ns()):
+                    try:
+                        message = DECODERS["external"](sample.payload.to_bytes())
+                        self._external = feed.identity.bound, message
+                    except ZenohError:
+                        feed.unusable += 1
+        writer, newest = self._external or (None, None)
+        if newest is None or feed.latest is None or writer != feed.identity.bound or self.stale:
+            return None
+        return newest if abs(feed.latest.sequence - newest.sequence) <= _TOGETHER else None
+
+    @property
+    def contact(self) -> bool:
+        """Something touches the link, by a fresh and valid message."""
+        external = self.external
+        return external is not None and external.contact
+
+    @property
     def gaps(self) -> int:
         """Cycles that are missing in what came, by their sequence numbers."""
         self._drain()
@@ -206,7 +236,7 @@ class Client:
     def close(self) -> None:
         """Leave; a second time does nothing."""
         self._closed = True
-        for name in ("_estimates", "_tokens"):
+        for name in ("_estimates", "_externals", "_tokens"):
             self._undeclare(getattr(self, name, None))
         for subscriber in getattr(self, "_latched", {}).values():
             self._undeclare(subscriber)

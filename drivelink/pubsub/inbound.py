@@ -16,7 +16,7 @@ from types import MappingProxyType
 from typing import Any
 
 from drivelink.errors import ZenohError
-from drivelink.pubsub.wire import decode_estimate, decode_sample
+from drivelink.pubsub.wire import decode_estimate, decode_external, decode_sample
 
 __all__ = ["DECODERS", "clean_text", "decode_document"]
 
@@ -106,6 +106,7 @@ class _Cleaner:
 DECODERS: Mapping[str, Callable[[bytes], Any]] = MappingProxyType(
     {
         "estimate": decode_estimate,
+        "external": decode_external,
         "sample": decode_sample,
         "status": decode_document,
         "model": decode_document,

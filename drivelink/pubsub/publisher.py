@@ -17,20 +17,21 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
+from enum import IntFlag
 from typing import TYPE_CHECKING, Any
 
 import zenoh
 import zenoh.ext
 
-from drivelink._core import Tick, encode_estimate, encode_sample
+from drivelink._core import Tick, encode_estimate, encode_external, encode_sample
 from drivelink.canopen.layout import NodeLayout, layout_document
 from drivelink.errors import ZenohError
 from drivelink.jointfile import JointFile, MotorSection
 from drivelink.pubsub.session import one_line
-from drivelink.pubsub.wire import ESTIMATE, SAMPLE, STATUS_BITS
+from drivelink.pubsub.wire import ESTIMATE, EXTERNAL, EXTERNAL_BITS, SAMPLE, STATUS_BITS
 from drivelink.version import __version__
 from estimator.model import Effect
-from estimator.sample import Estimate, Sample, Status
+from estimator.sample import Estimate, External, ExternalStatus, Sample, Status
 from estimator.transmissions import RIGID
 
 if TYPE_CHECKING:
@@ -74,6 +75,7 @@ class JointPublisher:
         try:
             self._claim(joint.name)
             self._estimate = self._stream("estimate", ESTIMATE.schema, zenoh.Priority.REAL_TIME)
+            self._external = self._stream("external", EXTERNAL.schema, zenoh.Priority.REAL_TIME)
             self._sample = self._stream("sample", SAMPLE.schema, zenoh.Priority.INTERACTIVE_HIGH)
             self._latched = {name: self._latch(name) for name in ("status", "model")}
             self._answer("schema", to_json(schema()))
@@ -88,18 +90,22 @@ class JointPublisher:
             raise
         # who writes; the message carries its own sequence number
         self._estimate_source = zenoh.SourceInfo(self._estimate.id, 0)
+        self._external_source = zenoh.SourceInfo(self._external.id, 0)
         self._sample_source = zenoh.SourceInfo(self._sample.id, 0)
 
     def put(self, tick: Tick) -> None:
-        """Publish one cycle, its estimate before its sample; never waits for a subscriber."""
+        """Publish one cycle: estimate, external torque, sample; never waits for a subscriber."""
         if self._partial:
             tick = tick.flagged(_PARTIAL)
         self._estimate.put(tick.estimate_payload, source_info=self._estimate_source)
+        payload = tick.external_payload
+        if payload is not None:
+            self._external.put(payload, source_info=self._external_source)
         payload = tick.sample_payload
         if payload is not None:
             self._sample.put(payload, source_info=self._sample_source)
         if self._ros2 is not None:
-            self._ros2.latest = tick.estimate
+            self._ros2.latest, self._ros2.external = tick.estimate, tick.external
             sample = tick.sample
             if sample is not None:
                 self._ros2.put_cycle(self._ros2.latest, sample, tick.stamp_ns)
@@ -116,6 +122,17 @@ class JointPublisher:
         self._estimate.put(encode_estimate(estimate, stamp_ns), source_info=self._estimate_source)
         if self._ros2 is not None:
             self._ros2.latest = estimate
+
+    def put_external(self, external: External, stamp_ns: int) -> None:
+        """Publish what the world does to the link in one cycle; never waits for a subscriber.
+
+        Args:
+            external: of this cycle.
+            stamp_ns: UNIX time of its SYNC, ns.
+        """
+        self._external.put(encode_external(external, stamp_ns), source_info=self._external_source)
+        if self._ros2 is not None:
+            self._ros2.external = external
 
     def put_sample(self, sample: Sample, stamp_ns: int) -> None:
         """Publish what was measured in one cycle; never waits for a subscriber.
@@ -274,12 +291,18 @@ def schema() -> dict[str, Any]:
         "schema": "drivelink.schema/1",
         "version": __version__,
         "estimate": ESTIMATE.describe(),
+        "external": EXTERNAL.describe(),
         "sample": SAMPLE.describe(),
-        "status_bits": [
-            {"bit": Status[name].bit_length() - 1, "name": name.lower(), "meaning": meaning}
-            for name, meaning in STATUS_BITS.items()
-        ],
+        "status_bits": _bits(Status, STATUS_BITS),
+        "external_bits": _bits(ExternalStatus, EXTERNAL_BITS),
     }
+
+
+def _bits(flags: type[IntFlag], meanings: Mapping[str, str]) -> list[dict[str, Any]]:
+    return [
+        {"bit": flags[name].bit_length() - 1, "name": name.lower(), "meaning": meaning}
+        for name, meaning in meanings.items()
+    ]
 
 
 def to_json(document: Mapping[str, Any]) -> bytes:

@@ -19,7 +19,7 @@ import zenoh
 from drivelink.errors import ZenohError
 from drivelink.jointfile import JointFile, Ros2Section
 from drivelink.pubsub.session import one_line
-from estimator.sample import Estimate, Sample, Status
+from estimator.sample import Estimate, External, ExternalStatus, Sample, Status
 
 __all__ = [
     "TYPE_HASHES",
@@ -29,6 +29,7 @@ __all__ = [
     "interfaces",
     "joint_state",
     "stiffness_array",
+    "wrench",
 ]
 
 TYPE_HASHES = {
@@ -44,6 +45,9 @@ TYPE_HASHES = {
     "diagnostic_msgs::msg::dds_::DiagnosticArray_": (
         "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"
     ),
+    "geometry_msgs::msg::dds_::WrenchStamped_": (
+        "RIHS01_8dc3deaf06b2ab281f9f9a742a8961c328ca7cec16e3fd6586d3a5c83fa78f77"
+    ),
 }
 _HUMBLE_HASH = "TypeHashNotSupported"
 _QOS = "::,10:,:,:,,"  # reliable, volatile, keep last 10
@@ -57,6 +61,7 @@ _FLAGS = (
     ("observable", int(Status.OBSERVABLE)),
     ("model_alarm", int(Status.MODEL_ALARM)),
 )
+_LINK = ("external_torque_nm", "external_torque_std_nm", "external_valid", "contact")
 _OK, _WARN, _ERROR, _STALE = range(4)  # levels of diagnostic_msgs/DiagnosticStatus
 
 
@@ -132,21 +137,40 @@ def stiffness_array(transmissions: int) -> Any:
     return template.number("I", 0).doubles(2 * len(rows)).packer()
 
 
-def dynamic_joint_state(name: str, transmissions: int) -> Any:
+def dynamic_joint_state(name: str, transmissions: int, linked: bool = False) -> Any:
     """Packer of control_msgs/DynamicJointState of one joint: (s, ns, *values of `interfaces`) to bytes."""
     template = Template().header("").number("I", 1).text(name).number("I", 1)
-    names = interfaces(transmissions)
+    names = interfaces(transmissions, linked)
     template.number("I", len(names))
     for interface in names:
         template.text(interface)
     return template.doubles(len(names)).packer()
 
 
-def interfaces(transmissions: int) -> tuple[str, ...]:
-    """What a DynamicJointState holds of a joint: numbers, flags (1 or 0), each transmission's numbers."""
+def interfaces(transmissions: int, linked: bool = False) -> tuple[str, ...]:
+    """What a DynamicJointState holds of a joint: numbers, flags (1 or 0), each transmission's numbers.
+
+    Args:
+        transmissions: how many it has.
+        linked: whether its link dynamics are declared: the external torque comes last.
+    """
     numbers = ("flexibility_torque_nm", "stiffness_nm_rad", "stiffness_std_nm_rad")
     own = (f"transmission{i + 1}_{number}" for i in range(transmissions) for number in numbers)
-    return (*numbers, *(name for name, _ in _FLAGS), *own)
+    return (*numbers, *(name for name, _ in _FLAGS), *own, *(_LINK if linked else ()))
+
+
+def wrench(frame_id: str) -> Any:
+    """Packer of geometry_msgs/WrenchStamped, z being the joint's axis: (s, ns, torque) to bytes."""
+    template = Template().header(frame_id)
+    for _ in range(6):
+        template.number("d")
+    packing = template.packer()
+
+    def message(second: int, ns: int, torque_nm: float) -> bytes:
+        data: bytes = packing(second, ns, 0.0, 0.0, 0.0, 0.0, 0.0, torque_nm)
+        return data
+
+    return message
 
 
 def diagnostic_array(
@@ -205,10 +229,11 @@ class _Node:
 
 
 class Ros2Publisher:
-    """JointState and stiffness of every n-th cycle, diagnostics once a second.
+    """JointState, stiffness and external torque of every n-th cycle, diagnostics once a second.
 
     Topics: `<namespace>/joint_states`, `<namespace>/<joint>/stiffness`, `<namespace>/dynamic_joint_states`,
-    `/diagnostics`.
+    `/diagnostics`; where link dynamics are declared, `<namespace>/<joint>/external_torque`: a wrench about z
+    of the frame `<joint>`, of valid cycles only.
 
     Args:
         session: the daemon's session, which it does not close.
@@ -216,6 +241,7 @@ class Ros2Publisher:
 
     Attributes:
         latest: the newest estimate, which diagnostics judge.
+        external: what the world does to the link in the cycle to be put next; None: nothing is known.
 
     Raises:
         ZenohError: zenoh refuses a key.
@@ -236,17 +262,26 @@ class Ros2Publisher:
             self._stiffness = _Topic(session, node, f"{node.namespace}/{name}/stiffness", kinds[1])
             self._dynamic = _Topic(session, node, f"{node.namespace}/dynamic_joint_states", kinds[2])
             self._diagnostics = _Topic(session, node, "/diagnostics", kinds[3])
+            self._wrench = (
+                _Topic(session, node, f"{node.namespace}/{name}/external_torque", kinds[4])
+                if joint.link.dynamics is not None
+                else None
+            )
         except zenoh.ZError as error:
             raise ZenohError(f"ros2 of joint {joint.name}: {one_line(error)}") from error
-        for topic in (self._states, self._stiffness, self._dynamic, self._diagnostics):
-            self._entities.extend(topic.entities)
+        for topic in (self._states, self._stiffness, self._dynamic, self._diagnostics, self._wrench):
+            if topic is not None:
+                self._entities.extend(topic.entities)
         self._pack_state = joint_state(joint.name)
         self._pack_stiffness = [stiffness_array(transmissions) for transmissions in range(3)]
-        self._pack_dynamic = [dynamic_joint_state(joint.name, transmissions) for transmissions in range(3)]
+        linked = self._wrench is not None
+        self._pack_dynamic = [dynamic_joint_state(joint.name, count, linked) for count in range(3)]
+        self._pack_wrench = wrench(joint.name)
         self._velocity_rad_s = 0.0
         self._before: tuple[int, float] | None = None
         self._told_ns: int | None = None
         self.latest: Estimate | None = None
+        self.external: External | None = None
 
     def put_cycle(self, estimate: Estimate, sample: Sample, stamp_ns: int) -> None:
         """Publish one cycle; cheap enough for the loop.
@@ -269,12 +304,25 @@ class Ros2Publisher:
         values = [*estimate[2:5], *(float(bool(estimate.status & bit)) for _, bit in _FLAGS)]
         for transmission in estimate.transmissions:
             values += transmission[:3]
+        if self._wrench is not None:
+            values += self._touch(second, ns, stamp_ns)
         packed = self._pack_dynamic[len(estimate.transmissions)](second, ns, *values)
         self._dynamic.put(packed, stamp_ns)
         pairs = [estimate.stiffness_nm_rad, estimate.stiffness_std_nm_rad]
         for transmission in estimate.transmissions:
             pairs += transmission[1:3]
         self._stiffness.put(self._pack_stiffness[len(estimate.transmissions)](*pairs), stamp_ns)
+
+    def _touch(self, second: int, ns: int, stamp_ns: int) -> tuple[float, ...]:
+        """Publish the wrench where it is valid; the values of the external torque's interfaces."""
+        told = self.external
+        if told is None or self._wrench is None:
+            return (math.nan, math.nan, 0.0, 0.0)
+        valid = bool(told.status & ExternalStatus.VALID)
+        if valid:
+            self._wrench.put(self._pack_wrench(second, ns, told.external_torque_nm), stamp_ns)
+        contact = bool(told.status & ExternalStatus.CONTACT)
+        return (told.external_torque_nm, told.external_torque_std_nm, float(valid), float(contact))
 
     def put_status(self, status: Mapping[str, Any], stamp_ns: int) -> None:
         """Publish diagnostics, once a second however often it is called.

@@ -1,4 +1,4 @@
-"""The bytes of `estimate` and `sample` on zenoh.
+"""The bytes of `estimate`, `external` and `sample` on zenoh.
 
 Zenoh's serialization of a tuple of fixed-width numbers is the packed little-endian struct, and that of a
 sequence is its length as a LEB128 varint before the elements. So each message is one precompiled struct
@@ -18,22 +18,27 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drivelink._core import encode_estimate, encode_sample
+from drivelink._core import encode_estimate, encode_external, encode_sample
 from drivelink.errors import ZenohError
-from estimator.sample import Sample, Status, TransmissionEstimate
+from estimator.sample import ExternalStatus, Sample, Status, TransmissionEstimate
 
 __all__ = [
     "ESTIMATE",
+    "EXTERNAL",
+    "EXTERNAL_BITS",
     "MAX_ELEMENTS",
     "SAMPLE",
     "STATUS_BITS",
     "EstimateMessage",
+    "ExternalMessage",
     "Field",
     "Layout",
     "SampleMessage",
     "decode_estimate",
+    "decode_external",
     "decode_sample",
     "encode_estimate",
+    "encode_external",
     "encode_sample",
 ]
 
@@ -53,47 +58,52 @@ class Field:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
-    """A message: fixed fields, then a sequence of equal elements.
+    """A message: fixed fields, then a sequence of equal elements, where it has one.
 
     Attributes:
         schema: name and version, carried in the zenoh encoding.
         head: the fixed fields, from byte 0.
-        elements: name of the sequence.
+        elements: name of the sequence; empty: there is none, nor its length.
         element: the fields of one element.
     """
 
     schema: str
     head: tuple[Field, ...]
-    elements: str
-    element: tuple[Field, ...]
+    elements: str = ""
+    element: tuple[Field, ...] = ()
 
-    def struct(self, count: int) -> Struct:
+    def struct(self, count: int = 0) -> Struct:
         """The whole message with `count` elements, the one-byte length between head and elements included."""
-        return Struct("<" + _codes(self.head) + "B" + _codes(self.element) * count)
+        length = "B" if self.elements else ""
+        return Struct("<" + _codes(self.head) + length + _codes(self.element) * count)
 
-    def size(self, count: int) -> int:
+    def size(self, count: int = 0) -> int:
         """Bytes of a message with `count` elements."""
         return self.struct(count).size
 
-    def dtype(self, count: int) -> np.dtype[np.void]:
+    def dtype(self, count: int = 0) -> np.dtype[np.void]:
         """The message as a numpy record: `np.frombuffer(payload, layout.dtype(1))`."""
-        element = np.dtype([(field.name, _numpy(field)) for field in self.element])
         head = [(field.name, _numpy(field)) for field in self.head]
+        if not self.elements:
+            return np.dtype(head)
+        element = np.dtype([(field.name, _numpy(field)) for field in self.element])
         return np.dtype([*head, ("count", "u1"), (self.elements, element, (count,))])
 
     def describe(self) -> dict[str, Any]:
         """The layout as plain data, for the `schema` key."""
-        return {
+        described: dict[str, Any] = {
             "schema": self.schema,
             "encoding": "zenoh/serialized",
             "byte_order": "little-endian",
             "fields": [_describe(field) for field in self.head],
-            "sequence": {
+        }
+        if self.elements:
+            described["sequence"] = {
                 "name": self.elements,
                 "length": "LEB128 varint (one byte below 128)",
                 "fields": [_describe(field) for field in self.element],
-            },
-        }
+            }
+        return described
 
 
 def _codes(fields: tuple[Field, ...]) -> str:
@@ -127,6 +137,17 @@ ESTIMATE = Layout(
         Field("stiffness_nm_rad", "f64", "of this transmission, N·m/rad"),
         Field("stiffness_std_nm_rad", "f64", "its standard deviation, N·m/rad"),
         Field("deflection_rad", "f64", "φ = q − θ, rad"),
+    ),
+)
+
+EXTERNAL = Layout(
+    schema="drivelink.external/1",
+    head=(
+        _SEQUENCE,
+        _STAMP,
+        Field("status", "u32", "bit 0 valid, bit 1 contact, see below"),
+        Field("external_torque_nm", "f64", "torque of the environment on the link, +τ_k of eqs 4, 6, N·m"),
+        Field("external_torque_std_nm", "f64", "its standard deviation, N·m"),
     ),
 )
 
@@ -166,6 +187,14 @@ STATUS_BITS: Mapping[str, str] = MappingProxyType(
 )
 
 
+EXTERNAL_BITS: Mapping[str, str] = MappingProxyType(
+    {
+        "VALID": "the numbers may be used; never where the estimate of the same cycle is not valid",
+        "CONTACT": "something touches the link; only where valid",
+    }
+)
+
+
 class EstimateMessage(NamedTuple):
     """One estimate as it came over the wire: an `Estimate` and the UNIX time of its SYNC."""
 
@@ -188,6 +217,26 @@ class EstimateMessage(NamedTuple):
         return bool(self.status & Status.OBSERVABLE)
 
 
+class ExternalMessage(NamedTuple):
+    """What the world does to the link at one SYNC, as it came over the wire."""
+
+    sequence: int
+    stamp_ns: int
+    status: int
+    external_torque_nm: float
+    external_torque_std_nm: float
+
+    @property
+    def valid(self) -> bool:
+        """Status bit 0: the numbers may be used."""
+        return bool(self.status & ExternalStatus.VALID)
+
+    @property
+    def contact(self) -> bool:
+        """Status bit 1: something touches the link."""
+        return bool(self.status & ExternalStatus.CONTACT)
+
+
 class SampleMessage(NamedTuple):
     """One sample as it came over the wire, and the UNIX time of its SYNC."""
 
@@ -201,6 +250,7 @@ _ESTIMATE_COUNTS = {layout.size: count for count, layout in enumerate(_ESTIMATES
 _SAMPLE_COUNTS = {layout.size: count for count, layout in enumerate(_SAMPLES)}
 _ESTIMATE_HEAD = ESTIMATE.struct(0)
 _TRANSMISSION = Struct("<" + _codes(ESTIMATE.element))
+_EXTERNAL = EXTERNAL.struct()
 _SAMPLE_HEAD = len(SAMPLE.head)
 _make_message = EstimateMessage._make
 _make_transmission = TransmissionEstimate._make
@@ -243,6 +293,25 @@ def _usable(message: EstimateMessage) -> bool:
 def _magnitude(number: float, partial: bool) -> bool:
     """Whether it is finite and not negative, or NaN where that is said."""
     return 0.0 <= number < math.inf or (partial and number != number)
+
+
+def decode_external(payload: bytes) -> ExternalMessage:
+    """Read the bytes of `<prefix>/<joint>/external`.
+
+    Raises:
+        ZenohError: these are no such bytes; or they are called valid and hold what is not finite, or a
+            negative standard deviation; or they say contact and are not valid.
+    """
+    if len(payload) != _EXTERNAL.size:
+        raise ZenohError(f"{EXTERNAL.schema}: expected {_EXTERNAL.size} bytes, got {len(payload)}")
+    message = ExternalMessage._make(_EXTERNAL.unpack(payload))
+    if message.valid:
+        torque, std = message.external_torque_nm, message.external_torque_std_nm
+        if not (math.isfinite(torque) and 0.0 <= std < math.inf):
+            raise ZenohError(f"{EXTERNAL.schema}: called valid, but not every number in it is one")
+    elif message.contact:
+        raise ZenohError(f"{EXTERNAL.schema}: says contact, but is not valid")
+    return message
 
 
 def decode_sample(payload: bytes) -> SampleMessage:

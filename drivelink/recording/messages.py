@@ -11,24 +11,28 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from drivelink.pubsub.wire import EstimateMessage
+from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from drivelink.recording.columns import sample_columns, sample_row
-from estimator.sample import Sample, Status, TransmissionEstimate
+from estimator.sample import External, Sample, Status, TransmissionEstimate
 
 __all__ = [
     "TOPICS",
     "estimate_columns",
     "estimate_encoder",
     "estimate_row",
+    "external_columns",
+    "external_encoder",
+    "external_row",
     "message_schema",
     "read_sample",
     "sample_encoder",
 ]
 
-TOPICS = ("sample", "estimate", "status", "model", "joint", "mapping", "can")
+TOPICS = ("sample", "estimate", "external", "status", "model", "joint", "mapping", "can")
 
 _PER_MOTOR = ("flexibility_torque_nm", "stiffness_nm_rad", "stiffness_std_nm_rad", "deflection_rad")
 _VALID, _OBSERVABLE = int(Status.VALID), int(Status.OBSERVABLE)
+_EXTERNAL = ("external_torque_nm", "external_torque_std_nm")
 _SIGMA_95 = 1.96
 
 
@@ -53,6 +57,25 @@ def estimate_row(
     """An estimate as the values of `estimate_columns`."""
     observable = 1 if status & _OBSERVABLE else 0
     return (time_s, *totals, observable, *(value for one in transmissions for value in one))
+
+
+def external_columns() -> tuple[str, ...]:
+    """Names of what an estimate of a joint with declared link dynamics says besides, see `external_row`."""
+    return (
+        *_EXTERNAL,
+        "external_valid",
+        "contact",
+        "link_flexibility_torque_nm",
+        "flexibility_difference_nm",
+    )
+
+
+def external_row(external: External | None) -> tuple[float, ...]:
+    """What the world does to the link as the values of `external_columns`."""
+    if external is None:
+        return (math.nan, math.nan, 0, 0, math.nan, math.nan)
+    _, status, torque, std, link_torque, difference = external
+    return (torque, std, status & 1, status >> 1 & 1, link_torque, difference)
 
 
 def _band_columns(motors: int) -> tuple[str, ...]:
@@ -91,6 +114,22 @@ def estimate_encoder(motors: int, period_s: float) -> Callable[[EstimateMessage]
     return encode
 
 
+def external_encoder(period_s: float) -> Callable[[ExternalMessage], bytes]:
+    """The function that makes an external torque's message."""
+    fill = _template(("sequence", "status"), _external_names())
+
+    def encode(message: ExternalMessage) -> bytes:
+        torque, std = message.external_torque_nm, message.external_torque_std_nm
+        row = (message.sequence * period_s, torque, std, int(message.valid), int(message.contact))
+        return fill((message.sequence, message.status, *row))
+
+    return encode
+
+
+def _external_names() -> tuple[str, ...]:
+    return ("time_s", *_EXTERNAL, "valid", "contact")
+
+
 def read_sample(message: Mapping[str, Any], motors: int) -> Sample:
     """The sample that a message was made from, bit for bit; null is NaN again."""
 
@@ -122,6 +161,8 @@ def message_schema(topic: str, motors: int) -> bytes:
             "status": integer,
             **_numbers((*estimate_columns(motors), *_band_columns(motors))),
         }
+    elif topic == "external":
+        properties = {"sequence": integer, "status": integer, **_numbers(_external_names())}
     elif topic == "can":
         properties = {"id": integer, "data": text | {"description": "bytes, two hex digits each"}}
     elif topic == "mapping":

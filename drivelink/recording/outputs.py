@@ -14,7 +14,12 @@ import numpy as np
 from drivelink.errors import RecordingError
 from drivelink.outfile import NewFile
 from drivelink.pubsub.publisher import JointPublisher
-from drivelink.recording.messages import estimate_columns, estimate_row
+from drivelink.recording.messages import (
+    estimate_columns,
+    estimate_row,
+    external_columns,
+    external_row,
+)
 from drivelink.recording.playback import Played
 from estimator.sample import FloatArray, Status
 
@@ -32,14 +37,16 @@ class EstimatesFile:
     Args:
         path: the file.
         motors: of the joint.
+        linked: whether its link dynamics are declared: the external torque has columns of its own.
         force: whether it may take the place of another file.
 
     Raises:
         RecordingError: it cannot be opened or, later, written; what was there is there still.
     """
 
-    def __init__(self, path: Path, motors: int, *, force: bool = False) -> None:
-        columns = estimate_columns(motors)
+    def __init__(self, path: Path, motors: int, *, linked: bool = False, force: bool = False) -> None:
+        columns = estimate_columns(motors) + (external_columns() if linked else ())
+        self._linked = linked
         self._path = path
         self._line = ",".join(["%r"] * len(columns)) + "\n"
         self._rows = [",".join(columns) + "\n"]
@@ -54,7 +61,7 @@ class EstimatesFile:
         estimate = tick.estimate
         totals = (estimate.flexibility_torque_nm, estimate.stiffness_nm_rad, estimate.stiffness_std_nm_rad)
         row = estimate_row(time_s, estimate.status, totals, estimate.transmissions)
-        self._rows.append(self._line % row)
+        self._rows.append(self._line % (row + external_row(tick.external) if self._linked else row))
         if len(self._rows) >= _ROWS:
             self._write()
 

@@ -95,6 +95,8 @@ class ZenohTap:
             wanted["sample"] = self._sample
         if "estimate" in sink.wants:
             wanted["estimate"] = self._estimate
+        if "external" in sink.wants:
+            wanted["external"] = self._external
         self._streams: list[tuple[Any, Callable[[zenoh.Sample], None]]] = [
             (session.declare_subscriber(f"{key}/{name}", ring(_QUEUE)), take) for name, take in wanted.items()
         ]
@@ -153,6 +155,9 @@ class ZenohTap:
         estimate = DECODERS["estimate"](message.payload.to_bytes())
         self._require_motors(len(estimate.transmissions))
         self._sink.estimate(estimate)
+
+    def _external(self, message: zenoh.Sample) -> None:
+        self._sink.external(DECODERS["external"](message.payload.to_bytes()))
 
     def _document(self, message: zenoh.Sample) -> None:
         name = str(message.key_expr).rpartition("/")[2]

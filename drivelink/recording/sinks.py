@@ -18,10 +18,16 @@ from mcap.writer import CompressionType, IndexType, Writer
 from drivelink.errors import RecordingError
 from drivelink.jointfile import JointFile
 from drivelink.outfile import check_target, write_whole
-from drivelink.pubsub.wire import EstimateMessage
+from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from drivelink.recording.columns import sample_columns, sample_row
 from drivelink.recording.mapping import side_file
-from drivelink.recording.messages import TOPICS, estimate_encoder, message_schema, sample_encoder
+from drivelink.recording.messages import (
+    TOPICS,
+    estimate_encoder,
+    external_encoder,
+    message_schema,
+    sample_encoder,
+)
 from drivelink.recording.safefile import SafeFile
 from drivelink.version import __version__
 from estimator.sample import Sample
@@ -34,7 +40,7 @@ class Sink:
 
     Attributes:
         counts: how many of each kind it has taken.
-        wants: which kinds it takes: "sample", "estimate", "document", "frame".
+        wants: which kinds it takes: "sample", "estimate", "external", "document", "frame".
     """
 
     wants: frozenset[str] = frozenset()
@@ -48,6 +54,9 @@ class Sink:
 
     def estimate(self, message: EstimateMessage) -> None:
         """Take one estimate."""
+
+    def external(self, message: ExternalMessage) -> None:
+        """Take one external torque."""
 
     def document(self, name: str, payload: bytes, stamp_ns: int) -> None:
         """Take a JSON document: status, model."""
@@ -92,7 +101,7 @@ class CsvSink(Sink):
 class McapSink(Sink):
     """Everything, as MCAP with one JSON channel `/<joint>/<topic>` for each of `TOPICS`."""
 
-    wants = frozenset({"sample", "estimate", "document", "frame"})
+    wants = frozenset({"sample", "estimate", "external", "document", "frame"})
 
     def __init__(
         self, path: Path, joint: JointFile, joint_text: str = "", folder: str = "", *, force: bool = False
@@ -101,6 +110,7 @@ class McapSink(Sink):
         motors, period_s = len(joint.motor), joint.bus.period_s
         self._encode_sample: Callable[[Sample], bytes] = sample_encoder(motors, period_s)
         self._encode_estimate = estimate_encoder(motors, period_s)
+        self._encode_external = external_encoder(period_s)
         self._writer: Any = Writer(  # of its methods, some are not annotated
             self._file,  # type: ignore[arg-type]
             chunk_size=4 << 20,
@@ -129,6 +139,11 @@ class McapSink(Sink):
         """Take one estimate."""
         self._put("estimate", message.stamp_ns, self._encode_estimate(message))
         self.counts["estimate"] += 1
+
+    def external(self, message: ExternalMessage) -> None:
+        """Take one external torque."""
+        self._put("external", message.stamp_ns, self._encode_external(message))
+        self.counts["external"] += 1
 
     def document(self, name: str, payload: bytes, stamp_ns: int) -> None:
         """Take a JSON document: status, model."""

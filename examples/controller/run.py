@@ -17,7 +17,7 @@ from pathlib import Path
 
 from vsacontrol.controller import Controller
 from vsacontrol.laws import ControlLaw, Decoupler, Regulator
-from vsacontrol.phases import Settings
+from vsacontrol.phases import Reaction, Settings
 from vsacontrol.plant import joint_of
 from vsacontrol.process import Process
 from vsacontrol.references import WAYPOINTS, Reference
@@ -35,6 +35,9 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--deadline", type=float, default=default.deadline_s, help="dead-man, s")
     parser.add_argument("--identify", type=float, default=default.identify_s, help="identification, s")
     parser.add_argument("--torque", type=float, default=default.torque_nm, help="limit, N·m at the joint")
+    parser.add_argument(
+        "--reaction", type=Reaction, choices=[*Reaction], default=default.reaction, help="to a contact"
+    )
     return parser.parse_args()
 
 
@@ -43,7 +46,9 @@ def main() -> None:
     file = jointfile.load(args.joint)
     joint = joint_of(file)
     law: ControlLaw = Decoupler(joint=joint) if args.law == "decoupling" else Regulator(joint=joint)
-    settings = Settings(deadline_s=args.deadline, identify_s=args.identify, torque_nm=args.torque)
+    settings = Settings(
+        deadline_s=args.deadline, identify_s=args.identify, torque_nm=args.torque, reaction=args.reaction
+    )
     reference = Reference(WAYPOINTS[args.law])
     controller = Controller(joint, law, reference, file.bus.period_s, settings=settings)
     process = Process(file, args.joint.parent, controller, settings=settings, report=sys.stdout)

@@ -1,4 +1,4 @@
-/* The bytes of <prefix>/<joint>/estimate, in C99 and C++, without any library.
+/* The bytes of <prefix>/<joint>/estimate and /external, in C99 and C++, without any library.
  *
  * Zenoh-serialized: packed, little-endian; the transmissions are a sequence, its length a LEB128 varint.
  * Works on any host byte order and alignment, allocates nothing.
@@ -42,6 +42,21 @@ typedef struct {
     size_t transmissions;
     drivelink_transmission transmission[DRIVELINK_MAX_TRANSMISSIONS];
 } drivelink_estimate;
+
+/* What the world does to the link; its status is of its own. */
+enum {
+    DRIVELINK_EXTERNAL_VALID = 1 << 0,   /* the numbers may be used */
+    DRIVELINK_EXTERNAL_CONTACT = 1 << 1, /* something touches the link; only where valid */
+    DRIVELINK_EXTERNAL_BYTES = 8 + 8 + 4 + 2 * 8
+};
+
+typedef struct {
+    uint64_t sequence;
+    uint64_t stamp_ns; /* UNIX time of the SYNC */
+    uint32_t status;
+    double external_torque_nm;
+    double external_torque_std_nm;
+} drivelink_external;
 
 static inline uint64_t drivelink_unsigned(const uint8_t **at, size_t bytes) {
     uint64_t value = 0;
@@ -102,6 +117,21 @@ static inline bool drivelink_decode_estimate(const uint8_t *payload, size_t leng
         estimate->transmission[i].deflection_rad = drivelink_double(&at);
     }
     return (estimate->status & DRIVELINK_VALID) == 0 || drivelink_plausible(estimate);
+}
+
+/* Read a payload into *external. False, and nothing to be used, for anything that is no external torque, that is
+ * called valid and holds what is not finite or a negative standard deviation, or that says contact and is not valid. */
+static inline bool drivelink_decode_external(const uint8_t *payload, size_t length, drivelink_external *external) {
+    if (length != DRIVELINK_EXTERNAL_BYTES) return false;
+    const uint8_t *at = payload;
+    external->sequence = drivelink_unsigned(&at, 8);
+    external->stamp_ns = drivelink_unsigned(&at, 8);
+    external->status = (uint32_t)drivelink_unsigned(&at, 4);
+    external->external_torque_nm = drivelink_double(&at);
+    external->external_torque_std_nm = drivelink_double(&at);
+    if ((external->status & DRIVELINK_EXTERNAL_VALID) == 0)
+        return (external->status & DRIVELINK_EXTERNAL_CONTACT) == 0;
+    return drivelink_finite(external->external_torque_nm) && drivelink_magnitude(external->external_torque_std_nm, 0);
 }
 
 /* What a controller checks of an estimate that is fresh: valid, and nothing in its status speaks against it. */

@@ -48,14 +48,27 @@ bool check(const std::vector<uint8_t> &payload, const std::vector<std::string> &
     return good && !drivelink_decode_estimate(payload.data(), payload.size() - 1, &estimate);
 }
 
+bool check_external(const std::vector<uint8_t> &payload, const std::vector<std::string> &numbers) {
+    drivelink_external external;
+    return drivelink_decode_external(payload.data(), payload.size(), &external) &&
+           external.sequence == std::stoull(numbers[0]) && external.stamp_ns == std::stoull(numbers[1]) &&
+           external.status == std::stoull(numbers[2]) && same(external.external_torque_nm, numbers[3]) &&
+           same(external.external_torque_std_nm, numbers[4]);
+}
+
+bool taken(const std::vector<uint8_t> &data, bool of_link) {
+    drivelink_estimate estimate;
+    drivelink_external external;
+    return of_link ? drivelink_decode_external(data.data(), data.size(), &external)
+                   : drivelink_decode_estimate(data.data(), data.size(), &estimate);
+}
+
 // Everything in the file is to be refused; what was not is counted in wrong.
-int refuse(const std::string &path, int &wrong) {
+int refuse(const std::string &path, bool of_link, int &wrong) {
     std::ifstream file(path);
     int vectors = 0;
     for (std::string name, payload; file >> name >> payload; vectors++) {
-        drivelink_estimate estimate;
-        const auto data = bytes(payload == "-" ? "" : payload);
-        if (drivelink_decode_estimate(data.data(), data.size(), &estimate)) {
+        if (taken(bytes(payload == "-" ? "" : payload), of_link)) {
             std::cerr << name << ": not refused\n";
             wrong++;
         }
@@ -63,12 +76,11 @@ int refuse(const std::string &path, int &wrong) {
     return vectors;
 }
 
-}  // namespace
-
-int main(int argc, char **argv) {
-    const std::string folder = argc > 1 ? argv[1] : "../../tests/golden";
-    std::ifstream file(folder + "/estimate.txt");
-    int vectors = 0, wrong = 0;
+// Everything in the file is to be decoded to its numbers; what was not is counted in wrong.
+template <typename Check>
+int decode(const std::string &path, Check check, int &wrong) {
+    std::ifstream file(path);
+    int vectors = 0;
     for (std::string line; std::getline(file, line); vectors++) {
         std::istringstream words(line);
         std::string name, payload;
@@ -79,7 +91,18 @@ int main(int argc, char **argv) {
             wrong++;
         }
     }
-    const int refused = refuse(folder + "/refused.txt", wrong);
+    return vectors;
+}
+
+}  // namespace
+
+int main(int argc, char **argv) {
+    const std::string folder = argc > 1 ? argv[1] : "../../tests/golden";
+    int wrong = 0;
+    const int vectors =
+        decode(folder + "/estimate.txt", check, wrong) + decode(folder + "/external.txt", check_external, wrong);
+    const int refused =
+        refuse(folder + "/refused.txt", false, wrong) + refuse(folder + "/refused_external.txt", true, wrong);
     std::cout << vectors << " vectors, " << refused << " to be refused, " << wrong << " wrong\n";
     return vectors == 0 || refused == 0 || wrong != 0;
 }

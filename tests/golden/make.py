@@ -2,7 +2,8 @@
 
 The bytes come from zenoh's own serializer, not from drivelink's structs. One line a vector: name, bytes in
 hexadecimal, then the numbers they stand for, in the order of the wire, the length of the sequence included.
-`refused.txt` has names and bytes of what is no estimate, or is called valid and cannot be.
+`refused.txt` has names and bytes of what is no estimate, or is called valid and cannot be, and
+`refused_external.txt` the same of external torques.
 
     python tests/golden/make.py
 """
@@ -78,6 +79,33 @@ SAMPLES = {
 }
 
 
+EXTERNALS = {
+    "push": (123_456, 1_795_000_000_123_456_789, 3, -0.75, 0.015625),
+    "free": (1, 1_700_000_000_000_000_000, 1, 0.1, 1 / 3),
+    "nothing": (0, 0, 0, math.nan, math.nan),
+    "settling": (2, 2_000_000, 0, 5e-324, math.inf),
+    "extremes": (MAX_U64, MAX_U64, 2**32 - 1, -1.7976931348623157e308, 0.0),
+}
+REFUSED_EXTERNALS = {
+    "empty": b"",
+    "one_byte_less": bytes(35),
+    "one_byte_more": bytes(37),
+    "an_estimate": _HEAD + b"\x00",
+}
+WRONG_EXTERNALS = {
+    "valid_with_torque_of_nan": (1, 2, 1, math.nan, 1.0),
+    "valid_with_torque_of_inf": (1, 2, 1, -math.inf, 1.0),
+    "valid_with_std_of_nan": (1, 2, 3, 1.0, math.nan),
+    "valid_with_std_of_inf": (1, 2, 1, 1.0, math.inf),
+    "valid_with_std_of_-1": (1, 2, 1, 1.0, -1.0),
+    "contact_and_not_valid": (1, 2, 2, 1.0, 1.0),
+}
+
+
+def external(sequence, stamp_ns, status, torque, std):
+    return z_serialize((UInt64(sequence), UInt64(stamp_ns), UInt32(status), Float64(torque), Float64(std)))
+
+
 def estimate(sequence, stamp_ns, status, torque, stiffness, std, transmissions):
     head = (
         UInt64(sequence),
@@ -120,9 +148,19 @@ def main():
     for file, serialize, vectors in (("estimate.txt", estimate, ESTIMATES), ("sample.txt", sample, SAMPLES)):
         text = "".join(line(name, serialize(*values), values) for name, values in vectors.items())
         (HERE / file).write_text(text, encoding="ascii")
-    # "-" stands for no bytes
-    text = "".join(f"{name} {payload.hex() or '-'}\n" for name, payload in refused())
-    (HERE / "refused.txt").write_text(text, encoding="ascii")
+    text = "".join(
+        " ".join([name, bytes(external(*values)).hex(), *map(repr, values)]) + "\n"
+        for name, values in EXTERNALS.items()
+    )
+    (HERE / "external.txt").write_text(text, encoding="ascii")
+    wrong = {name: bytes(external(*values)) for name, values in WRONG_EXTERNALS.items()}
+    for file, vectors in (
+        ("refused.txt", dict(refused())),
+        ("refused_external.txt", REFUSED_EXTERNALS | wrong),
+    ):
+        # "-" stands for no bytes
+        text = "".join(f"{name} {payload.hex() or '-'}\n" for name, payload in vectors.items())
+        (HERE / file).write_text(text, encoding="ascii")
 
 
 if __name__ == "__main__":

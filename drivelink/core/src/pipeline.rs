@@ -4,12 +4,13 @@
 //! estimates carried on without fresh measurements.
 
 use estimator_core::estimator::Estimator;
+use estimator_core::external::External;
 use estimator_core::sample::status::{MODEL_ALARM, RESTARTED, VALID};
 use estimator_core::sample::{Estimate, Sample};
 
 use crate::assembler::{Assembler, SYNC_COB_ID};
 use crate::status::{NODE_RESTARTED, STALE, UNTIMED};
-use crate::wire::{Payload, encode_estimate, encode_sample};
+use crate::wire::{Payload, encode_estimate, encode_external, encode_sample};
 
 /// Why an estimator could not step: never the compiled one, perhaps one that somebody registered.
 pub type Failure = Box<dyn std::error::Error + Send + Sync>;
@@ -41,6 +42,14 @@ pub trait Step: Send {
     fn alarm(&mut self, _sample: &Sample, _estimate: &Estimate) -> Result<bool, Failure> {
         Ok(false)
     }
+
+    /// What the world does to the link, by the last sample; `None`: nothing is declared of the link.
+    ///
+    /// # Errors
+    /// As for `step`.
+    fn external(&mut self) -> Result<Option<External>, Failure> {
+        Ok(None)
+    }
 }
 
 impl Step for Estimator {
@@ -56,6 +65,10 @@ impl Step for Estimator {
     fn distrust(&mut self) -> Result<(), Failure> {
         Estimator::distrust(self);
         Ok(())
+    }
+
+    fn external(&mut self) -> Result<Option<External>, Failure> {
+        Ok(Estimator::external(self))
     }
 }
 
@@ -73,6 +86,8 @@ pub enum Due {
 pub struct Tick {
     /// Of the cycle; stale where it is the last one carried on.
     pub estimate: Estimate,
+    /// What the world does to the link, where that is estimated; valid only where the estimate is.
+    pub external: Option<External>,
     /// What it was made from; `None` where it is carried on.
     pub sample: Option<Sample>,
     /// Of the joint.
@@ -90,6 +105,12 @@ impl Tick {
         let e = &self.estimate;
         let joint = [e.flexibility_torque, e.stiffness, e.stiffness_std];
         encode_estimate(e.sequence, self.stamp_ns as u64, e.status, joint, &e.transmissions[..e.motors])
+    }
+
+    /// The bytes of `<prefix>/<joint>/external`.
+    #[must_use]
+    pub fn external_payload(&self) -> Option<Payload> {
+        self.external.map(|external| encode_external(&external, self.stamp_ns as u64))
     }
 
     /// The bytes of `<prefix>/<joint>/sample`.
@@ -138,19 +159,20 @@ impl Pipeline {
         &mut self,
         sample: &Sample,
         motors: usize,
-        estimate: Estimate,
+        told: (Estimate, Option<External>),
         stamp_ns: Option<i64>,
     ) -> Tick {
-        self.publish(estimate, Some(*sample), motors, stamp_ns)
+        self.publish(told, Some(*sample), motors, stamp_ns)
     }
 
     /// The last estimate under a new number: stale, not valid; `None` where there never was one.
     pub fn carry_on(&mut self, sequence: i64, flags: u32, stamp_ns: Option<i64>) -> Option<Tick> {
-        let Tick { mut estimate, motors, .. } = self.last?;
+        let Tick { mut estimate, external, motors, .. } = self.last?;
         estimate.sequence = sequence as u64;
         // Neither is true of an estimate that is carried on.
         estimate.status = estimate.status & !(VALID | NODE_RESTARTED) | STALE | flags;
-        Some(self.publish(estimate, None, motors, stamp_ns))
+        let external = external.map(|external| external.void(estimate.sequence));
+        Some(self.publish((estimate, external), None, motors, stamp_ns))
     }
 
     /// What was published last.
@@ -161,24 +183,28 @@ impl Pipeline {
 
     fn publish(
         &mut self,
-        estimate: Estimate,
+        (estimate, external): (Estimate, Option<External>),
         sample: Option<Sample>,
         motors: usize,
         stamp_ns: Option<i64>,
     ) -> Tick {
         let current = estimate.sequence as i64 == self.sequence;
         let stamp_ns = stamp_ns.unwrap_or(if current { self.sync_ns } else { self.sync_before_ns });
-        let tick = Tick { estimate, sample, motors, stamp_ns, current };
+        let tick = Tick { estimate, external, sample, motors, stamp_ns, current };
         self.last = Some(tick);
         tick
     }
 }
 
-/// The estimate at a sample for which these service bits hold, the bits included.
+/// The estimate at a sample for which these service bits hold, the bits included, and what touches the link.
 ///
 /// # Errors
 /// The estimator failed.
-pub fn estimate(estimator: &mut dyn Step, sample: &Sample, mut flags: u32) -> Result<Estimate, Failure> {
+pub fn estimate(
+    estimator: &mut dyn Step,
+    sample: &Sample,
+    mut flags: u32,
+) -> Result<(Estimate, Option<External>), Failure> {
     if flags & NODE_RESTARTED != 0 {
         estimator.reset()?;
         flags |= RESTARTED;
@@ -192,5 +218,7 @@ pub fn estimate(estimator: &mut dyn Step, sample: &Sample, mut flags: u32) -> Re
         estimate.status &= !VALID; // a model that is not sufficient makes no number that may be used
     }
     estimate.status |= flags;
-    Ok(estimate)
+    let valid = estimate.status & VALID != 0;
+    let external = estimator.external()?.map(|told| if valid { told } else { told.void(told.sequence) });
+    Ok((estimate, external))
 }

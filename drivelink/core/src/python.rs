@@ -5,7 +5,8 @@
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use estimator_core::python::Estimator;
+use estimator_core::external::External;
+use estimator_core::python::{Estimator, external as external_object};
 use estimator_core::sample::{Estimate, MOTORS, Sample, TransmissionEstimate};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
@@ -176,6 +177,25 @@ fn encode_sample<'py>(
 ) -> PyResult<Bound<'py, PyBytes>> {
     let (sample, motors) = sample_from(sample)?;
     Ok(PyBytes::new(py, wire::encode_sample(&sample, motors, stamp_ns).bytes()))
+}
+
+/// The fields of an `External`.
+type ExternalFields = (u64, u32, f64, f64, f64, f64);
+
+fn external_of(fields: ExternalFields) -> External {
+    let (sequence, status, torque, torque_std, link_torque, difference) = fields;
+    External { sequence, status, torque, torque_std, link_torque, difference }
+}
+
+/// The bytes of `<prefix>/<joint>/external`.
+#[pyfunction]
+fn encode_external<'py>(
+    py: Python<'py>,
+    external: &Bound<'py, PyAny>,
+    stamp_ns: u64,
+) -> PyResult<Bound<'py, PyBytes>> {
+    let external = external_of(external.extract()?);
+    Ok(PyBytes::new(py, wire::encode_external(&external, stamp_ns).bytes()))
 }
 
 // --- layouts --------------------------------------------------------------------------------------------------------
@@ -466,6 +486,11 @@ impl Tick {
     }
 
     #[getter]
+    fn external<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
+        self.core.external.map(|external| external_object(py, &external)).transpose()
+    }
+
+    #[getter]
     fn sample<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
         self.core.sample.map(|sample| sample_object(py, &sample, self.core.motors)).transpose()
     }
@@ -483,6 +508,11 @@ impl Tick {
     #[getter]
     fn estimate_payload<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
         PyBytes::new(py, self.core.estimate_payload().bytes())
+    }
+
+    #[getter]
+    fn external_payload<'py>(&self, py: Python<'py>) -> Option<Bound<'py, PyBytes>> {
+        self.core.external_payload().map(|payload| PyBytes::new(py, payload.bytes()))
     }
 
     #[getter]
@@ -584,6 +614,18 @@ impl Step for Driver {
         })
         .map_err(Failure::from)
     }
+
+    fn external(&mut self) -> Result<Option<External>, Failure> {
+        Python::attach(|py| -> PyResult<Option<External>> {
+            if let Some(compiled) = &self.compiled {
+                return Ok(compiled.try_borrow(py).map_err(PyErr::from)?.inner.external());
+            }
+            // An estimator that somebody registered may have none.
+            let Ok(told) = self.estimator.getattr(py, "external") else { return Ok(None) };
+            Ok(told.extract::<Option<ExternalFields>>(py)?.map(external_of))
+        })
+        .map_err(Failure::from)
+    }
 }
 
 /// Frames of one joint in, estimates and their bytes out.
@@ -605,7 +647,7 @@ impl Chain {
         flags: u32,
         stamp_ns: Option<i64>,
     ) -> PyResult<pipeline::Tick> {
-        let estimate = {
+        let told = {
             let Ok(mut driver) = self.driver.try_lock() else {
                 return Err(PyRuntimeError::new_err("two threads feed one joint"));
             };
@@ -613,7 +655,7 @@ impl Chain {
             pipeline::estimate(&mut *driver, sample, flags).map_err(to_python)?
         };
         self.history.get().push(*sample, motors);
-        Ok(lock(&self.state).take(sample, motors, estimate, stamp_ns))
+        Ok(lock(&self.state).take(sample, motors, told, stamp_ns))
     }
 }
 
@@ -667,6 +709,12 @@ impl Chain {
     fn estimate<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
         let last = lock(&self.state).last().copied();
         last.map(|tick| estimate_object(py, &tick.estimate)).transpose()
+    }
+
+    #[getter]
+    fn external<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
+        let last = lock(&self.state).last().copied();
+        last.and_then(|tick| tick.external).map(|told| external_object(py, &told)).transpose()
     }
 
     #[getter]
@@ -738,7 +786,10 @@ mod extension {
     use super::*;
 
     #[pymodule_export]
-    use super::{Assembler, Chain, Estimator, History, NodeCounters, Tick, encode_estimate, encode_sample};
+    use super::{
+        Assembler, Chain, Estimator, History, NodeCounters, Tick, encode_estimate, encode_external,
+        encode_sample,
+    };
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

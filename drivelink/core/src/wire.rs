@@ -1,6 +1,7 @@
-//! The bytes of `estimate` and `sample` on zenoh: packed little-endian numbers, and before the elements of a sequence
+//! The bytes of `estimate`, `external` and `sample` on zenoh: packed little-endian numbers, and before the elements of a sequence
 //! its length as a LEB128 varint. `drivelink/pubsub/wire.py` states the layout for people and decodes it.
 
+use estimator_core::external::External;
 use estimator_core::sample::{Sample, TransmissionEstimate};
 
 /// Elements of the sequence in one message, at most: the length is one byte.
@@ -60,6 +61,15 @@ pub fn encode_estimate(
     for each in transmissions {
         payload.f64(each.flexibility_torque).f64(each.stiffness).f64(each.stiffness_std).f64(each.deflection);
     }
+    payload
+}
+
+/// The bytes of `<prefix>/<joint>/external`.
+#[must_use]
+pub fn encode_external(external: &External, stamp_ns: u64) -> Payload {
+    let mut payload = Payload::new();
+    payload.put(external.sequence.to_le_bytes()).put(stamp_ns.to_le_bytes());
+    payload.put(external.status.to_le_bytes()).f64(external.torque).f64(external.torque_std);
     payload
 }
 

@@ -253,6 +253,12 @@ impl Element {
         }
     }
 
+    /// Whether its torque acts on the link (x_link of eq 4).
+    #[must_use]
+    pub fn acts_on_link(&self) -> bool {
+        self.kind.place() == Place::Link
+    }
+
     /// x of an element without a memory.
     #[must_use]
     pub fn torque(&self, c: &Coordinates) -> f64 {
@@ -388,9 +394,9 @@ impl MotorEffects {
         self.motor.is_empty() && self.transmission.is_empty()
     }
 
-    /// x_motor − x_transmission of eq 5.
-    pub fn balance(&mut self, c: &Coordinates, period_s: f64) -> f64 {
-        self.motor.torque(c, period_s) - self.transmission.torque(c, period_s)
+    /// x_motor and x_transmission of eq 5.
+    pub fn balance(&mut self, c: &Coordinates, period_s: f64) -> (f64, f64) {
+        (self.motor.torque(c, period_s), self.transmission.torque(c, period_s))
     }
 
     /// (torque, stiffness) of what depends on the deflection alone: part of what the transmission transmits.

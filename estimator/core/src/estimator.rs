@@ -1,6 +1,7 @@
 //! The estimator of a joint: one `step` a tick.
 
 use crate::error::Error;
+use crate::external::External;
 use crate::laws::Law;
 use crate::model::Model;
 use crate::paper::Paper;
@@ -33,7 +34,7 @@ impl Estimator {
             return Err(Error(format!("period_s: expected a finite number > 0, got {period_s}")));
         }
         Ok(match settings.mode {
-            Mode::Paper => Estimator::Paper(Box::new(Paper::new(model, settings, period_s))),
+            Mode::Paper => Estimator::Paper(Box::new(Paper::new(model, settings, priors, period_s))),
             Mode::Robust => Estimator::Robust(Box::new(Robust::new(model, settings, priors, period_s)?)),
         })
     }
@@ -69,6 +70,24 @@ impl Estimator {
         match self {
             Estimator::Paper(_) => f64::NAN,
             Estimator::Robust(robust) => robust.residual(),
+        }
+    }
+
+    /// What the world does to the link, by the last sample; `None` where no link dynamics are declared.
+    #[must_use]
+    pub fn external(&self) -> Option<External> {
+        match self {
+            Estimator::Paper(paper) => paper.external(),
+            Estimator::Robust(robust) => robust.external(),
+        }
+    }
+
+    /// rms of what the two sides' flexibility torques differ by and of the link's, over some seconds, N·m.
+    #[must_use]
+    pub fn consistency(&self) -> Option<[f64; 2]> {
+        match self {
+            Estimator::Paper(paper) => paper.consistency(),
+            Estimator::Robust(robust) => robust.consistency(),
         }
     }
 

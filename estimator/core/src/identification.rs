@@ -621,16 +621,31 @@ impl OnlineIdentification {
     /// Standard deviation of σ at φ, from the covariance of α, of the delay and the offset, and of φ.
     #[must_use]
     pub fn stiffness_std(&self, phi: f64, link_rate: f64, phi_variance: f64) -> f64 {
-        let Some(kalman) = &self.kalman else { return f64::NAN };
         let (n, mut row) = (self.law.size, [0.0; SIZE]);
         let slope = self.law.law.stiffness_slopes(phi, &self.values[..n], &mut row[..n]);
         (row[n + DELAY], row[n + DEFLECTION_OFFSET]) = (slope * link_rate, slope);
-        for (entry, unit) in row.iter_mut().zip(&self.units.of) {
-            *entry *= unit;
+        (self.variance_of(row) + slope * slope * phi_variance).sqrt()
+    }
+
+    /// Variance of f at a φ that is known, likewise.
+    #[must_use]
+    pub fn torque_variance(&self, phi: f64, link_rate: f64) -> f64 {
+        let (n, mut row) = (self.law.size, [0.0; SIZE]);
+        self.law.law.jacobian(phi, &self.values[..n], &mut row[..n]);
+        let stiffness = self.law.law.at(phi, &self.values[..n]).1;
+        (row[n + DELAY], row[n + DEFLECTION_OFFSET]) = (stiffness * link_rate, stiffness);
+        self.variance_of(row)
+    }
+
+    /// Variance of what has these slopes by the parameters; NaN before there are any.
+    fn variance_of(&self, mut slopes: Vector) -> f64 {
+        let Some(kalman) = &self.kalman else { return f64::NAN };
+        for (slope, unit) in slopes.iter_mut().zip(&self.units.of) {
+            *slope *= unit;
         }
-        let honest = UNSEEN * UNSEEN * kalman.variance_over_scale() * dot(&row, &times(&kalman.sigma, &row));
-        let least = LEAST_VARIANCE * dot(&row, &times(&kalman.p, &row));
-        (honest.max(least).max(0.0) + slope * slope * phi_variance).sqrt()
+        let sandwich = dot(&slopes, &times(&kalman.sigma, &slopes));
+        let honest = UNSEEN * UNSEEN * kalman.variance_over_scale() * sandwich;
+        honest.max(LEAST_VARIANCE * dot(&slopes, &times(&kalman.p, &slopes))).max(0.0)
     }
 
     /// The law's parameters with their standard deviations; `None` before any, or without a law.

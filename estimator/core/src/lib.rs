@@ -15,6 +15,7 @@ pub mod delay;
 pub mod effects;
 pub mod error;
 pub mod estimator;
+pub mod external;
 pub mod filters;
 pub mod identification;
 pub mod kalman;

@@ -59,6 +59,12 @@ pub struct Link {
     pub gravity: f64,
     /// Where gravity vanishes, as an angle added to q, rad.
     pub gravity_phase: f64,
+    /// Standard deviation of M, kg·m².
+    pub inertia_std: f64,
+    /// Of D_q, N·m·s/rad.
+    pub damping_std: f64,
+    /// Of gravity, N·m, in amount and direction alike.
+    pub gravity_std: f64,
 }
 
 /// A joint.

@@ -4,12 +4,13 @@
 //! gives them (a difference of positions where it gives none). What that costs on a real drive's signals is
 //! what the robust mode is for.
 
+use crate::external::{External, PaperMomentum};
 use crate::filters::{first_order_pole, tustin_biquad};
 use crate::laws::{Alpha, Law, PARAMETERS, powers};
 use crate::model::{Arrangement, Model, Motor, Transmission};
 use crate::sample::{Estimate, MOTORS, Sample, TransmissionEstimate, joint_estimate, status};
 use crate::sample_validator::SampleValidator;
-use crate::settings::{Method, Settings};
+use crate::settings::{Method, Priors, Settings};
 
 const EXCITED_RAD2_S2: f64 = 1e-6; // mean square of φ′ above which K_R φ′² teaches anything
 const ENERGY_S: f64 = 0.5; // over which that mean is taken
@@ -297,16 +298,20 @@ pub struct Paper {
     arrangement: Arrangement,
     validator: SampleValidator,
     parts: Vec<Part>,
+    link: Option<PaperMomentum>,
+    external: Option<External>,
 }
 
 impl Paper {
     /// For a model that has been checked.
     #[must_use]
-    pub fn new(model: &Model, settings: &Settings, period_s: f64) -> Paper {
+    pub fn new(model: &Model, settings: &Settings, priors: &Priors, period_s: f64) -> Paper {
         Paper {
             arrangement: model.arrangement,
             validator: SampleValidator::new(model, period_s),
             parts: model.motors.iter().map(|motor| Part::new(motor, settings, period_s)).collect(),
+            link: PaperMomentum::new(model, settings, priors, period_s),
+            external: None,
         }
     }
 
@@ -314,6 +319,20 @@ impl Paper {
     pub fn reset(&mut self) {
         self.validator.reset();
         self.parts.iter_mut().for_each(Part::reset);
+        self.link.iter_mut().for_each(PaperMomentum::reset);
+        self.external = None;
+    }
+
+    /// What the world does to the link, by the last sample; `None` where no link dynamics are declared.
+    #[must_use]
+    pub fn external(&self) -> Option<External> {
+        self.external
+    }
+
+    /// See [`PaperMomentum::consistency`].
+    #[must_use]
+    pub fn consistency(&self) -> Option<[f64; 2]> {
+        self.link.as_ref()?.consistency()
     }
 
     /// The coefficients of each transmission's polynomial with their standard deviations, or the black box's
@@ -340,6 +359,7 @@ impl Paper {
         let mut flags = accepted.status;
         if accepted.restart {
             self.parts.iter_mut().for_each(Part::restart);
+            self.link.iter_mut().for_each(PaperMomentum::restart);
         }
         if accepted.periods > 0 {
             for (i, part) in self.parts.iter_mut().enumerate() {
@@ -357,7 +377,18 @@ impl Paper {
         }
         let mut held = [TransmissionEstimate::NOTHING; MOTORS];
         self.parts.iter().zip(&mut held).for_each(|(part, held)| *held = part.held);
-        joint_estimate(self.arrangement, sample.sequence, flags, held, self.parts.len())
+        let estimate = joint_estimate(self.arrangement, sample.sequence, flags, held, self.parts.len());
+        if let Some(link) = &mut self.link {
+            let pulls = if self.arrangement == Arrangement::Antagonistic { self.parts.len() } else { 1 };
+            let balance = self.parts[..pulls].iter().map(|part| part.torque.last).sum();
+            let valid = flags & status::VALID != 0;
+            self.external = Some(if accepted.periods > 0 {
+                link.update(sample, accepted.periods, estimate.flexibility_torque, balance, valid)
+            } else {
+                link.carry(sample.sequence)
+            });
+        }
+        estimate
     }
 }
 

@@ -12,6 +12,7 @@ use pyo3::types::{PyDict, PyTuple, PyType};
 
 use crate::effects::Element;
 use crate::error::Error;
+use crate::external::External;
 use crate::laws::{Foreign, Law, Shape, Table};
 use crate::model::{Arrangement, Link, Model, Motor, Transmission};
 use crate::sample::{Estimate, MOTORS, Sample, TransmissionEstimate};
@@ -159,11 +160,15 @@ pub fn model(joint: &Bound<'_, PyAny>) -> PyResult<Model> {
     let link = if link.is_none() {
         None
     } else {
+        let (inertia_std, damping_std, gravity_std) = link.call_method0("uncertainty")?.extract()?;
         Some(Link {
             inertia: link.getattr("inertia_kg_m2")?.extract()?,
             damping: link.getattr("viscous_damping_nm_s_rad")?.extract()?,
             gravity: link.getattr("gravity_nm")?.extract()?,
             gravity_phase: link.getattr("gravity_phase_rad")?.extract()?,
+            inertia_std,
+            damping_std,
+            gravity_std,
         })
     };
     let arrangement = match arrangement.as_str() {
@@ -196,6 +201,10 @@ pub fn settings(given: &Bound<'_, PyAny>) -> PyResult<Settings> {
         k_r: number("k_r_s2_rad2")?,
         k_max: number("k_max")?,
         false_alarms_per_hour: number("false_alarms_per_hour")?,
+        external_bandwidth: number("external_bandwidth_rad_s")?,
+        external_bias_s: given.getattr("external_bias_s")?.extract()?,
+        contact_torque: given.getattr("contact_torque_nm")?.extract()?,
+        contact_false_alarms_per_hour: number("contact_false_alarms_per_hour")?,
     })
 }
 
@@ -267,23 +276,29 @@ struct Tuples {
     make: Py<PyAny>,
     estimate: Py<PyType>,
     transmission: Py<PyType>,
+    external: Py<PyType>,
 }
 
 static TUPLES: PyOnceLock<Tuples> = PyOnceLock::new();
+
+fn tuples(py: Python<'_>) -> PyResult<&'static Tuples> {
+    TUPLES.get_or_try_init(py, || -> PyResult<Tuples> {
+        let module = py.import("estimator.sample")?;
+        Ok(Tuples {
+            make: py.get_type::<PyTuple>().getattr("__new__")?.unbind(),
+            estimate: module.getattr("Estimate")?.cast_into()?.unbind(),
+            transmission: module.getattr("TransmissionEstimate")?.cast_into()?.unbind(),
+            external: module.getattr("External")?.cast_into()?.unbind(),
+        })
+    })
+}
 
 /// An `estimator.sample.Estimate`.
 ///
 /// # Errors
 /// Python's classes cannot be had.
 pub fn estimate<'py>(py: Python<'py>, told: &Estimate) -> PyResult<Bound<'py, PyAny>> {
-    let tuples = TUPLES.get_or_try_init(py, || -> PyResult<Tuples> {
-        let module = py.import("estimator.sample")?;
-        Ok(Tuples {
-            make: py.get_type::<PyTuple>().getattr("__new__")?.unbind(),
-            estimate: module.getattr("Estimate")?.cast_into()?.unbind(),
-            transmission: module.getattr("TransmissionEstimate")?.cast_into()?.unbind(),
-        })
-    })?;
+    let tuples = tuples(py)?;
     let make = tuples.make.bind(py);
     let part = |i: usize| -> PyResult<Bound<'py, PyAny>> {
         let t = &told.transmissions[i];
@@ -298,6 +313,17 @@ pub fn estimate<'py>(py: Python<'py>, told: &Estimate) -> PyResult<Bound<'py, Py
     let sequence = told.sequence as i64;
     let totals = (told.flexibility_torque, told.stiffness, told.stiffness_std);
     make.call1((&tuples.estimate, (sequence, told.status, totals.0, totals.1, totals.2, parts)))
+}
+
+/// An `estimator.sample.External`.
+///
+/// # Errors
+/// Python's classes cannot be had.
+pub fn external<'py>(py: Python<'py>, told: &External) -> PyResult<Bound<'py, PyAny>> {
+    let tuples = tuples(py)?;
+    let torques = (told.torque, told.torque_std, told.link_torque, told.difference);
+    let values = (told.sequence as i64, told.status, torques.0, torques.1, torques.2, torques.3);
+    tuples.make.bind(py).call1((&tuples.external, values))
 }
 
 /// The on-line estimator of a joint, in either mode; see `estimator.online.Estimator`.
@@ -340,6 +366,18 @@ impl Estimator {
     #[getter]
     fn residual_nm(&self) -> f64 {
         self.inner.residual()
+    }
+
+    /// What the world does to the link, by the last sample.
+    #[getter]
+    fn external<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
+        self.inner.external().map(|told| external(py, &told)).transpose()
+    }
+
+    /// (rms of what the two sides' flexibility torques differ by, of the link's) over some seconds.
+    #[getter]
+    fn consistency(&self) -> Option<(f64, f64)> {
+        self.inner.consistency().map(|[difference, torque]| (difference, torque))
     }
 
     /// (whether they are of a law, whether that is a polynomial, α, its standard deviations) of one motor.

@@ -8,6 +8,7 @@ use crate::align::{Alignment, Inputs};
 use crate::delay::{DelaySearch, Known};
 use crate::effects::{Corrections, MotorEffects};
 use crate::error::Error;
+use crate::external::{Carried, External, LinkMomentum};
 use crate::laws::Law;
 use crate::model::{Arrangement, Model};
 use crate::noise::NoiseMeter;
@@ -44,9 +45,12 @@ pub struct Robust {
     lead: usize, // the motor whose balance tells the link encoder's delay
     transmissions: Vec<TransmissionEstimator>,
     link: Channel,
+    momentum: Option<LinkMomentum>,
+    external: Option<External>,
     noise: [NoiseMeter; MOTORS + 1],
     zeros: Inputs, // where the encoders' zeros have moved to
     last: Inputs,
+    measured: f64, // τ_k
     tick: u64,
     unsettled: i64, // periods for which the filters still hold something wrong
     said: i64,
@@ -97,9 +101,12 @@ impl Robust {
             lead,
             transmissions,
             link: Channel::rest(0.0),
+            momentum: LinkMomentum::new(model, settings, period_s),
+            external: None,
             noise: [NoiseMeter::default(); MOTORS + 1],
             zeros: Inputs::default(),
             last: Inputs::default(),
+            measured: f64::NAN,
             tick: 0,
             unsettled: 0,
             said: 0,
@@ -119,6 +126,8 @@ impl Robust {
         self.alignment = Alignment::default();
         self.search.reset();
         self.transmissions.iter_mut().for_each(TransmissionEstimator::reset);
+        self.momentum.iter_mut().for_each(LinkMomentum::reset);
+        self.external = None;
         self.noise = [NoiseMeter::default(); MOTORS + 1];
         (self.zeros, self.last) = (Inputs::default(), Inputs::default());
         (self.tick, self.unsettled, self.said, self.rejected) = (0, self.settle, 0, 0);
@@ -128,7 +137,20 @@ impl Robust {
     /// The next sample may not be of its moment: learn nothing until the filters have forgotten it.
     pub fn distrust(&mut self) {
         self.unsettled = self.settle;
+        self.momentum.iter_mut().for_each(LinkMomentum::distrust);
         self.search.begin();
+    }
+
+    /// What the world does to the link, by the last sample; `None` where no link dynamics are declared.
+    #[must_use]
+    pub fn external(&self) -> Option<External> {
+        self.external
+    }
+
+    /// See [`LinkMomentum::consistency`].
+    #[must_use]
+    pub fn consistency(&self) -> Option<[f64; 2]> {
+        self.momentum.as_ref()?.consistency()
     }
 
     /// Largest misfit among the motors' balances at the last update, N·m; NaN until there is a model.
@@ -151,6 +173,7 @@ impl Robust {
         }
         self.rejected = 0;
         let corrected = self.corrections.correct(sample);
+        self.measured = corrected.external_torque;
         let mut inputs = Inputs {
             link: if self.flexible { corrected.link_position } else { 0.0 },
             motor: corrected.motor_position,
@@ -199,6 +222,11 @@ impl Robust {
             transmission.feed_effects(&self.filters, &self.link, time);
             self.noise[i].see(theta, self.period);
         }
+        if self.momentum.is_some() {
+            let carried = self.carried(now).map(|carried| carried.torque);
+            let measured = self.measured;
+            self.momentum.iter_mut().for_each(|momentum| momentum.feed(now.link, carried, measured));
+        }
         self.last = *now;
         self.unsettled -= 1;
         let turn = self.every / self.motors as u64;
@@ -212,6 +240,17 @@ impl Robust {
                 self.realign(late);
             }
         }
+    }
+
+    /// What the transmissions do to the link; `None` where a curve is not trusted.
+    fn carried(&self, now: &Inputs) -> Option<Carried> {
+        let pulls = if self.arrangement == Arrangement::Antagonistic { self.motors } else { 1 };
+        let mut all = Carried::default();
+        for (i, transmission) in self.transmissions[..pulls].iter().enumerate() {
+            let noise = self.noise[i].variance(self.validator.resolution()[i]);
+            all = all.and(transmission.carried(now.link - now.motor[i], noise)?);
+        }
+        Some(all)
     }
 
     /// One equation of one motor, and what follows from it.
@@ -258,6 +297,8 @@ impl Robust {
             transmission.restart(now.motor[i], now.link - now.motor[i], now.torque[i]);
         }
         self.noise.iter_mut().for_each(NoiseMeter::restart);
+        let carried = self.carried(now).map_or(0.0, |carried| carried.torque);
+        self.momentum.iter_mut().for_each(|momentum| momentum.restart(now.link, carried));
         self.search.restart(now.link, now.motor[self.lead], now.torque[self.lead]);
         self.last = *now;
         self.unsettled = self.settle;
@@ -322,6 +363,13 @@ impl Robust {
             self.said -= 1;
             flags |= status::RESTARTED;
         }
+        if self.momentum.is_some() {
+            let valid = flags & status::VALID != 0;
+            let carried = self.carried(&self.last).unwrap_or_default();
+            let noise = self.noise[self.motors].variance(self.validator.resolution()[self.motors]);
+            self.external =
+                self.momentum.as_mut().map(|momentum| momentum.conclude(sequence, &carried, noise, valid));
+        }
         let estimate = joint_estimate(self.arrangement, sequence, flags, parts, self.motors);
         self.estimate = Some(estimate);
         estimate
@@ -330,6 +378,7 @@ impl Robust {
     /// What is said where the sample cannot be used: the last estimate, for a while.
     fn carry(&mut self, sequence: u64, flags: u32) -> Estimate {
         self.rejected += 1;
+        self.external = self.momentum.as_ref().map(|momentum| momentum.carry(sequence));
         let since = self.rejected as f64 * self.period;
         let Some(last) = self.estimate else {
             let (parts, _) = self.read(0.0);

@@ -41,6 +41,14 @@ pub struct Settings {
     pub k_max: f64,
     /// Of the robust mode's CHANGED.
     pub false_alarms_per_hour: f64,
+    /// Of the filter that the link's momentum passes in robust mode, rad/s.
+    pub external_bandwidth: f64,
+    /// Time constant of the bias that follows the external torque, s; `None`: there is no bias.
+    pub external_bias_s: Option<f64>,
+    /// Least external torque that is called a contact, N·m; `None`: a share of the torque that is carried.
+    pub contact_torque: Option<f64>,
+    /// Of the contact bit.
+    pub contact_false_alarms_per_hour: f64,
 }
 
 impl Default for Settings {
@@ -55,6 +63,10 @@ impl Default for Settings {
             k_r: 1900.0,
             k_max: 1.9,
             false_alarms_per_hour: 1.0,
+            external_bandwidth: 200.0,
+            external_bias_s: None,
+            contact_torque: None,
+            contact_false_alarms_per_hour: 1.0,
         }
     }
 }

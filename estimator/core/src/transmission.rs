@@ -3,6 +3,7 @@
 use crate::change_detection::ChangeDetection;
 use crate::deflection::{DeflectionFilter, Tuning};
 use crate::effects::{Coordinates, MotorEffects};
+use crate::external::Carried;
 use crate::identification::OnlineIdentification;
 use crate::laws::Law;
 use crate::model::Motor;
@@ -73,6 +74,7 @@ pub struct TransmissionEstimator {
     signals: Signals,
     /// x_motor − x_transmission, the latest that is known, N·m.
     pub effect: f64,
+    transmitted: f64, // x_transmission
     /// The deflection of this moment.
     pub deflection: DeflectionFilter,
     identification: OnlineIdentification,
@@ -86,6 +88,7 @@ pub struct TransmissionEstimator {
     // What is published.
     told: bool,
     std: f64,
+    torque_variance: f64,
     reach: f64,
     held_s: f64,
     trusted: bool,
@@ -121,6 +124,7 @@ impl TransmissionEstimator {
             rate_gain: filters.rate_gain(period_s),
             signals: Signals::new(filters, period_s, identification.is_nonlinear()),
             effect: 0.0,
+            transmitted: 0.0,
             deflection: DeflectionFilter::new(motor.inertia, motor.damping, bandwidth, period_s, dt_s / 2.0),
             identification,
             changes: ChangeDetection::new(settings.false_alarms_per_hour, dt_s, filters.delay),
@@ -132,6 +136,7 @@ impl TransmissionEstimator {
             misfit: f64::NAN,
             told: false,
             std: f64::NAN,
+            torque_variance: f64::NAN,
             reach: 0.0,
             held_s: 0.0,
             trusted: false,
@@ -153,7 +158,8 @@ impl TransmissionEstimator {
         self.signals.reset();
         self.deflection.reset();
         self.excitation = Excitation::default();
-        (self.effect, self.lead, self.misfit) = (0.0, f64::NAN, f64::NAN);
+        (self.effect, self.transmitted) = (0.0, 0.0);
+        (self.lead, self.misfit) = (f64::NAN, f64::NAN);
         self.relearn();
     }
 
@@ -234,7 +240,8 @@ impl TransmissionEstimator {
             time,
             ..Coordinates::default()
         };
-        self.effect = self.effects.balance(&c, self.period);
+        let (motor, transmission) = self.effects.balance(&c, self.period);
+        (self.effect, self.transmitted) = (motor - transmission, transmission);
         self.signals.effects.pass(filters, self.effect);
     }
 
@@ -367,6 +374,7 @@ impl TransmissionEstimator {
         let link_rate = self.deflection.link_rate();
         let phi = self.deflection.at(0.0) + learned.deflection_offset() + learned.late() * link_rate;
         self.std = learned.stiffness_std(phi, link_rate, self.deflection.variance());
+        self.torque_variance = learned.torque_variance(phi, link_rate);
         self.reach = BEYOND * learned.largest_deflection();
         if !learned.law().is_polynomial() {
             self.reach = self.reach.min(EDGE * learned.law().law.reach(&learned.alpha()[1..]));
@@ -448,6 +456,26 @@ impl TransmissionEstimator {
             deflection: phi,
         };
         (estimate, valid)
+    }
+
+    /// What it does to the link at a deflection as it is measured; `None` where no curve is trusted.
+    ///
+    /// `noise`: variance of θ's noise, rad².
+    #[must_use]
+    pub fn carried(&self, phi: f64, noise: f64) -> Option<Carried> {
+        if !self.trusted {
+            return None;
+        }
+        let learned = &self.identification;
+        let phi = phi + learned.deflection_offset() + learned.late() * self.deflection.link_rate();
+        let (torque, stiffness) = learned.law().law.at(phi, learned.alpha());
+        let stiffness = stiffness + self.effects.spring(phi).1;
+        Some(Carried {
+            torque: torque + self.transmitted,
+            variance: self.torque_variance,
+            stiffness,
+            reading: stiffness * stiffness * noise,
+        })
     }
 
     /// The law's parameters with their standard deviations; `None` before any, or without a law.

@@ -10,12 +10,12 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from drivelink.pubsub.wire import EstimateMessage
+from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from estimator.sample import Sample, Status
 from vsacontrol.identify import Excitation
 from vsacontrol.laws import ControlLaw, Regulator
 from vsacontrol.monitor import MismatchMonitor, Moment
-from vsacontrol.phases import SAFE_TORQUES, Drives, Event, Phase, Settings
+from vsacontrol.phases import SAFE_TORQUES, Drives, Event, Phase, Reaction, Settings
 from vsacontrol.plant import Joint, State
 from vsacontrol.references import Reference, Waypoint
 from vsacontrol.springs import Law, springs_of
@@ -24,6 +24,7 @@ from vsacontrol.tracking import StateTracker
 __all__ = ["Controller"]
 
 _DOUBTS = Status.CHANGED | Status.MODEL_ALARM
+_STEERED = (Phase.APPROACH, Phase.RUN, Phase.REACT)  # phases in which the springs' model steers the joint
 _DISPUTED = 0.7  # share of a tolerated mismatch above which no identification ends
 _AHEAD_PERIODS = 1.5  # from a sample to the middle of the period in which the torque that follows acts
 
@@ -45,7 +46,7 @@ class Controller:
         phase: the present one.
         events: changes of phase.
         reference_s: time in the reference at the last sample.
-        mismatch: undeclared torque at the last sample, as a share of what is tolerated.
+        mismatch: undeclared torque at a motor at the last sample, as a share of what is tolerated.
     """
 
     def __init__(
@@ -76,6 +77,7 @@ class Controller:
         self._fresh_s = self._valid_s = self._fault_s = self._disputed_s = -math.inf
         self._begin_s = 0.0  # of this phase, in bus time
         self._bus_s = 0.0
+        self._contact_s = -math.inf  # bus time of the last contact
         self._mismatched = 0
         self._last = self._faded_from = SAFE_TORQUES
         self._doubtful = self._known = False
@@ -95,7 +97,13 @@ class Controller:
         self._estimated = springs_of(transmissions) or self._estimated
 
     def cycle(
-        self, estimate: EstimateMessage, sample: Sample, drives: Drives, now_s: float, age_s: float = 0.0
+        self,
+        estimate: EstimateMessage,
+        sample: Sample,
+        drives: Drives,
+        now_s: float,
+        age_s: float = 0.0,
+        external: ExternalMessage | None = None,
     ) -> tuple[float, float]:
         """One SYNC's estimate and sample in, the torques that follow from them out.
 
@@ -105,6 +113,7 @@ class Controller:
             drives: what the master knows.
             now_s: monotonic time.
             age_s: of the estimate, which may have waited on its way.
+            external: what the world does to the link, by the newest message; None: it is not told.
         """
         periods = 0 if self._sequence is None else sample.sequence - self._sequence
         self._sequence = sample.sequence
@@ -119,12 +128,17 @@ class Controller:
             return self._go_safe(fault, now_s)
         if self.phase is Phase.RUN:
             self.reference_s += max(0, periods) * self._period_s
+        if external is not None and external.contact:
+            self._contact_s = self._bus_s
+            if self.phase in (Phase.APPROACH, Phase.RUN):
+                self._begin_reaction(estimate, sample, external, now_s)
         self._move_on(estimate, sample, drives, now_s)
         torques = self._torques(state)
         if not all(map(math.isfinite, torques)):
             return self._go_safe("the law has no solution here", now_s)
         bound = self._settings.torque_nm
-        share = min(1.0, (self._bus_s - self._begin_s) / self._settings.fade_s)
+        elapsed_s = self._bus_s - self._begin_s
+        share = 1.0 if self.phase is Phase.REACT else min(1.0, elapsed_s / self._settings.fade_s)
         faded = (f + share * (t - f) for f, t in zip(self._faded_from, torques, strict=True))
         one, two = (max(-bound, min(bound, torque)) for torque in faded)
         self._last = one, two
@@ -155,11 +169,11 @@ class Controller:
             return "estimates are stale"
         if drives.faulted or status & Status.DRIVE_FAULT:
             return "a drive reports a fault"
-        if self.phase in (Phase.IDENTIFY, Phase.APPROACH, Phase.RUN) and not drives.enabled:
+        if self.phase in (Phase.IDENTIFY, *_STEERED) and not drives.enabled:
             return "a drive is not enabled"
         if status & Status.RESTARTED and self.phase is not Phase.WAITING:
             return "positions have started anew"
-        if self.phase not in (Phase.APPROACH, Phase.RUN):
+        if self.phase not in _STEERED:
             return ""
         if now_s - self._valid_s > self._settings.deadline_s:
             return "estimates are not valid"
@@ -184,8 +198,7 @@ class Controller:
             sample.motor_torque_nm,
             modelled,
         )
-        motor_nm, link_nm = self._monitor.step(moment)
-        self.mismatch = max(motor_nm / settings.motor_mismatch_nm, link_nm / settings.link_mismatch_nm)
+        self.mismatch = self._monitor.step(moment) / settings.motor_mismatch_nm
         self._mismatched = self._mismatched + 1 if self.mismatch > 1.0 else 0
         if self.mismatch > _DISPUTED:
             self._disputed_s = now_s
@@ -232,6 +245,8 @@ class Controller:
             if elapsed_s >= enough_s and self._certain(estimate, now_s):
                 self._doubtful = False
                 self._begin_approach(estimate, sample, now_s)
+        elif self.phase is Phase.REACT and self._bus_s - self._contact_s >= self._settings.clear_s:
+            self._begin_approach(estimate, sample, now_s)
         elif self.phase is Phase.APPROACH and elapsed_s >= self._approach.length_s:
             self._enter(Phase.RUN, now_s)
 
@@ -253,6 +268,20 @@ class Controller:
         self._approach = Reference([here, there])
         self._enter(Phase.APPROACH, now_s)
 
+    def _begin_reaction(
+        self, estimate: EstimateMessage, sample: Sample, external: ExternalMessage, now_s: float
+    ) -> None:
+        """Stop, give way or soften where the link is now, until nothing has touched it for a while."""
+        settings, q, sigma = self._settings, sample.link_position_rad, estimate.stiffness_nm_rad
+        way_s, there = settings.retract_s, q
+        if settings.reaction is Reaction.RETRACT:
+            there += math.copysign(settings.retract_rad, external.external_torque_nm)
+        elif settings.reaction is Reaction.SOFTEN:
+            sigma = settings.soft_nm_rad
+        begin = Waypoint(0.0, 0.0, q, estimate.stiffness_nm_rad)
+        self._approach = Reference([begin, Waypoint(way_s, 0.0, there, sigma)])
+        self._enter(Phase.REACT, now_s, f"contact: {settings.reaction}")
+
     def _torques(self, state: State) -> tuple[float, float]:
         elapsed_s = self._bus_s - self._begin_s
         ahead_s = _AHEAD_PERIODS * self._period_s
@@ -261,7 +290,7 @@ class Controller:
         springs = self.springs
         if springs is None:
             return SAFE_TORQUES
-        if self.phase is Phase.APPROACH:
+        if self.phase in (Phase.APPROACH, Phase.REACT):
             return self._approach_law.torques(state, self._approach.at(elapsed_s + ahead_s), springs)
         if self.phase is Phase.RUN:
             return self._law.torques(state, self.reference.at(self.reference_s + ahead_s), springs)

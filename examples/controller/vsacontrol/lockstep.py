@@ -14,7 +14,9 @@ from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.wire import (
     EstimateMessage,
+    ExternalMessage,
     decode_estimate,
+    decode_external,
     decode_sample,
 )
 from drivelink.simulate import nodes_from_joint, open_sim_bus, world_from_joint
@@ -74,6 +76,7 @@ class Rig:
         world: the joint as it is.
         last_estimate_s: when an estimate last reached the controller.
         commands: target torques of the drives on the bus, with their time.
+        external: the newest external torque.
     """
 
     def __init__(
@@ -105,6 +108,7 @@ class Rig:
         self.master = Master(wiring_of(joint), self._send, limit_nm=torque_nm)
         self._estimates: list[EstimateMessage] = []
         self._samples: list[Sample] = []
+        self.external: ExternalMessage | None = None
         self._cycles = 0
         self.cut = False  # zenoh: nothing reaches the controller
         self.last_estimate_s = 0.0
@@ -134,6 +138,8 @@ class Rig:
     def put(self, tick: Tick) -> None:
         """The daemon publishes; over the wire's own bytes."""
         self._estimates.append(decode_estimate(tick.estimate_payload))
+        if tick.external_payload is not None:
+            self.external = decode_external(tick.external_payload)
         if tick.sample_payload is not None:
             self._samples.append(decode_sample(tick.sample_payload).sample)
 
@@ -187,7 +193,7 @@ class Rig:
         fresh = [s for s in samples if s.sequence == estimates[-1].sequence]
         if not fresh:
             return self.controller.watch(drives, self.now_s)
-        return self.controller.cycle(estimates[-1], fresh[-1], drives, self.now_s)
+        return self.controller.cycle(estimates[-1], fresh[-1], drives, self.now_s, external=self.external)
 
     def _status(self) -> dict[str, Any]:
         assert self.daemon is not None

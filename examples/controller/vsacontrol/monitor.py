@@ -1,9 +1,8 @@
-"""Does the joint still do what the daemon's model says? A fast answer, beside the daemon's thorough one.
+"""Does a motor still do what the daemon's model says? A fast answer, beside the daemon's thorough one.
 
 The paper's residual (eq 14) is a first-order image of the flexibility torque. What the daemon's model says of
-the same torque, sent through the same filter, must agree with it; where it does not, some torque acts that
-nobody declared. The link's balance (eq 6) is looked at in the same way: an obstacle, somebody
-who pushes it.
+the same torque, sent through the same filter, must agree with it; where it does not, some torque acts at the
+motor that nobody declared. What touches the link is told by the daemon.
 """
 
 from __future__ import annotations
@@ -12,8 +11,6 @@ import math
 from typing import NamedTuple
 
 from vsacontrol.plant import Joint
-
-_STRIDE = 2  # periods of a difference at the link: its counts are coarse against its inertia
 
 __all__ = ["MismatchMonitor", "Moment"]
 
@@ -37,14 +34,14 @@ class Moment(NamedTuple):
 
 
 class MismatchMonitor:
-    """The filtered difference between measured and modelled flexibility torque, per motor and of the link.
+    """The filtered difference between measured and modelled flexibility torque, per motor.
 
     With y = B theta' + D theta - int tau, the residual's exact discretisation is r_k = a r_(k-1) + (1 - a)
     (y_k - y_(k-1)) / T, a = exp(-K T); the difference quotient is taken symmetrically about a SYNC, where
     the torques held before and after it act by halves.
 
     Args:
-        joint: the declared inertias, dampings and gravity.
+        joint: the declared inertias and dampings.
         period_s: T.
         gain_rad_s: K of eq 14.
     """
@@ -58,44 +55,30 @@ class MismatchMonitor:
     def restart(self) -> None:
         """Forget the past: positions start anew, or there is a gap."""
         self._past: list[Moment] = []
-        self._differences = [0.0, 0.0, 0.0]
+        self._differences = [0.0, 0.0]
 
-    def step(self, moment: Moment) -> tuple[float, float]:
+    def step(self, moment: Moment) -> float:
         """Take one cycle.
 
         Returns:
-            The size of the difference at the motors (the larger one) and at the link, N·m; 0 until known.
+            The size of the difference, the larger one of two motors, N·m; 0 until known.
         """
         past = self._past
         known = math.isfinite(moment.q + sum(moment.theta) + sum(moment.tau) + sum(moment.modelled))
         if not known or (past and moment.sequence != past[-1].sequence + 1):
             self.restart()
             past = self._past
-        elif len(past) == _STRIDE * 2:
-            self._motors(past[-2], past[-1], moment)
-            self._link(past[0], past[_STRIDE], moment)
-        self._past = [*past, moment][-_STRIDE * 2 :] if known else []
-        one, two, link = map(abs, self._differences)
-        return max(one, two), link
+        elif len(past) == 2:
+            self._compare(past[0], past[1], moment)
+        self._past = [*past, moment][-2:] if known else []
+        return max(map(abs, self._differences))
 
-    def _motors(self, before: Moment, at: Moment, after: Moment) -> None:
-        joint = self._joint
+    def _compare(self, before: Moment, at: Moment, after: Moment) -> None:
+        """B theta'' + D theta' - tau at the middle one of three cycles against tau_e as modelled."""
+        joint, T = self._joint, self._T
         motors = zip(joint.motor_inertia_kg_m2, joint.motor_damping_nm_s_rad, strict=True)
         for i, (B, D) in enumerate(motors):
-            moved = self._inertial(B, D, self._T, (before.theta[i], at.theta[i], after.theta[i]))
-            found = moved - 0.5 * (before.tau[i] + at.tau[i])
-            self._note(i, found - at.modelled[i])
-
-    def _link(self, before: Moment, at: Moment, after: Moment) -> None:
-        joint = self._joint
-        M, Dq = joint.link_inertia_kg_m2, joint.link_damping_nm_s_rad
-        moved = self._inertial(M, Dq, _STRIDE * self._T, (before.q, at.q, after.q))
-        self._note(2, -moved - joint.gravity(at.q) - sum(at.modelled))
-
-    @staticmethod
-    def _inertial(J: float, D: float, step_s: float, x: tuple[float, float, float]) -> float:
-        """J x'' + D x' at the middle one of three positions."""
-        return J * (x[2] - 2.0 * x[1] + x[0]) / (step_s * step_s) + D * (x[2] - x[0]) / (2.0 * step_s)
-
-    def _note(self, which: int, difference: float) -> None:
-        self._differences[which] += (1.0 - self._keep) * (difference - self._differences[which])
+            a, b, c = before.theta[i], at.theta[i], after.theta[i]
+            moved = B * (c - 2.0 * b + a) / (T * T) + D * (c - a) / (2.0 * T)
+            difference = moved - 0.5 * (before.tau[i] + at.tau[i]) - at.modelled[i]
+            self._differences[i] += (1.0 - self._keep) * (difference - self._differences[i])

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-__all__ = ["SAFE_TORQUES", "Drives", "Event", "Phase", "Settings"]
+__all__ = ["SAFE_TORQUES", "Drives", "Event", "Phase", "Reaction", "Settings"]
 
 SAFE_TORQUES = (0.0, 0.0)
 
@@ -18,7 +18,16 @@ class Phase(StrEnum):
     IDENTIFY = "identify"  # moves open loop so that the daemon learns the springs
     APPROACH = "approach"  # goes to where the reference is
     RUN = "run"  # follows the reference
+    REACT = "react"  # something touches the link
     SAFE = "safe"  # safe torque, because of a fault
+
+
+class Reaction(StrEnum):
+    """What the controller does about a contact."""
+
+    STOP = "stop"  # stays where it is, as stiff as it is
+    RETRACT = "retract"  # gives way, the way it was pushed
+    SOFTEN = "soften"  # stays where it is, as soft as the joint can be
 
 
 class Drives(NamedTuple):
@@ -62,8 +71,12 @@ class Settings:
         deflection_rad: limit of |phi_i|.
         speed_rad_s: limit of the link's speed.
         motor_mismatch_nm: undeclared torque at a motor from which the model is not believed.
-        link_mismatch_nm: undeclared torque at the link that is taken for a contact.
-        mismatch_cycles: for which either must last.
+        mismatch_cycles: for which it must last.
+        reaction: to a contact, which the daemon tells.
+        retract_rad: how far it gives way, in `retract_s`.
+        retract_s: see there.
+        soft_nm_rad: total stiffness of the softened joint.
+        clear_s: without a contact before it goes on.
         certainty: relative standard deviation of the stiffness that ends an identification.
     """
 
@@ -80,6 +93,10 @@ class Settings:
     deflection_rad: float = 1.1
     speed_rad_s: float = 15.0
     motor_mismatch_nm: float = 0.01
-    link_mismatch_nm: float = 0.02
     mismatch_cycles: int = 3
+    reaction: Reaction = Reaction.STOP
+    retract_rad: float = 0.15
+    retract_s: float = 0.3
+    soft_nm_rad: float = 0.4
+    clear_s: float = 0.5
     certainty: float = 0.02

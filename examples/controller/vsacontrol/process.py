@@ -101,7 +101,8 @@ class Process:
         else:
             self._learn()
             age_s = self._estimates.age_s
-            torques = self._controller.cycle(estimate, sample, drives, now_s, age_s)
+            external = self._estimates.external
+            torques = self._controller.cycle(estimate, sample, drives, now_s, age_s, external)
         self._command(torques, now_s)
         self._master.poll(now_s, may_configure=self._estimates.age_s < _LIVE_S)
         self._tell()

@@ -1,4 +1,4 @@
-//! The bytes of `<prefix>/<joint>/estimate`: what `zenoh_ext::z_serialize` makes of a tuple.
+//! The bytes of `<prefix>/<joint>/estimate` and `…/external`: what `zenoh_ext::z_serialize` makes of a tuple.
 
 use std::fmt;
 
@@ -39,6 +39,48 @@ impl fmt::Display for Refused {
 }
 
 impl std::error::Error for Refused {}
+
+/// What the world does to the link at one SYNC.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct External {
+    pub sequence: u64,
+    pub stamp_ns: u64,
+    pub status: u32,
+    pub external_torque_nm: f64,
+    pub external_torque_std_nm: f64,
+}
+
+impl External {
+    /// Read a payload; an error for anything that is no external torque, is called valid and cannot be, or says
+    /// contact and is not valid.
+    pub fn decode(payload: &ZBytes) -> Result<Self, Refused> {
+        let (sequence, stamp_ns, status, torque, std) =
+            z_deserialize::<(u64, u64, u32, f64, f64)>(payload).map_err(|_| Refused::NoEstimate)?;
+        let external = Self {
+            sequence,
+            stamp_ns,
+            status,
+            external_torque_nm: torque,
+            external_torque_std_nm: std,
+        };
+        let plausible = torque.is_finite() && std.is_finite() && std >= 0.0;
+        if if external.valid() { plausible } else { !external.contact() } {
+            Ok(external)
+        } else {
+            Err(Refused::NotValid)
+        }
+    }
+
+    /// Status bit 0: the numbers may be used.
+    pub fn valid(&self) -> bool {
+        self.status & 1 != 0
+    }
+
+    /// Status bit 1: something touches the link.
+    pub fn contact(&self) -> bool {
+        self.status & 2 != 0
+    }
+}
 
 /// One transmission of the joint.
 #[derive(Debug, Clone, Copy, PartialEq)]

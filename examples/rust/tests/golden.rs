@@ -1,6 +1,6 @@
-//! The golden byte vectors that every language reads: `tests/golden/estimate.txt` of the repository.
+//! The golden byte vectors that every language reads: `tests/golden` of the repository.
 
-use drivelink_wire::Estimate;
+use drivelink_wire::{Estimate, External};
 use zenoh::bytes::ZBytes;
 
 fn bytes(hexadecimal: &str) -> Vec<u8> {
@@ -52,5 +52,29 @@ fn what_is_no_estimate_or_cannot_be_valid_is_refused() {
         let (name, payload) = line.split_once(' ').unwrap();
         let payload = if payload == "-" { vec![] } else { bytes(payload) };
         assert!(Estimate::decode(&ZBytes::from(payload)).is_err(), "{name}");
+    }
+}
+
+#[test]
+fn external_torques_decode_to_their_numbers_or_are_refused() {
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden");
+    let text = std::fs::read_to_string(format!("{folder}/external.txt")).unwrap();
+    assert!(text.lines().count() >= 5);
+    for line in text.lines() {
+        let words: Vec<&str> = line.split(' ').collect();
+        let (name, numbers) = (words[0], &words[2..]);
+        let external = External::decode(&ZBytes::from(bytes(words[1]))).unwrap();
+        assert_eq!(external.sequence, numbers[0].parse::<u64>().unwrap(), "{name}");
+        assert_eq!(external.stamp_ns, numbers[1].parse::<u64>().unwrap(), "{name}");
+        assert_eq!(external.status, numbers[2].parse::<u32>().unwrap(), "{name}");
+        assert!(same(external.external_torque_nm, numbers[3]), "{name}");
+        assert!(same(external.external_torque_std_nm, numbers[4]), "{name}");
+    }
+    let text = std::fs::read_to_string(format!("{folder}/refused_external.txt")).unwrap();
+    assert!(text.lines().count() >= 10);
+    for line in text.lines() {
+        let (name, payload) = line.split_once(' ').unwrap();
+        let payload = if payload == "-" { vec![] } else { bytes(payload) };
+        assert!(External::decode(&ZBytes::from(payload)).is_err(), "{name}");
     }
 }

@@ -1,0 +1,307 @@
+"""What touches the link: pushes injected and found again, free motion left alone, and when nothing may be said."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drivelink._core import Assembler, Chain
+from estimator import (
+    EstimatorError,
+    EstimatorSettings,
+    ExternalStatus,
+    JointModel,
+    LinkDynamics,
+    Motor,
+    Sample,
+    Status,
+    Transmission,
+    make_estimator,
+)
+from estimator.filters import StateVariableFilter, first_order_pole, linear_filter
+from sim.effects import parse
+from sim.excitation import build
+from sim.plant import JointPlant, LinkPlant, MotorPlant
+from sim.sensors import DriveHardware, LinkEncoder
+from sim.springs import Spring
+from sim.world import World, record
+
+T = 1e-3
+VALID, CONTACT = int(ExternalStatus.VALID), int(ExternalStatus.CONTACT)
+GRAVITY_NM = 6.0
+PUSHES = ((8.0, 1.5), (9.0, -1.5), (10.0, 0.8), (11.0, -3.0))  # begin, torque; each lasts PUSH_S
+PUSH_S = 0.4
+LEARNED = 6000  # samples of free motion after which the spring is known
+W = EstimatorSettings().external_bandwidth_rad_s
+LINK = LinkDynamics(
+    inertia_kg_m2=0.4,
+    viscous_damping_nm_s_rad=0.1,
+    gravity_nm=GRAVITY_NM,
+    inertia_std_kg_m2=0.0,
+    viscous_damping_std_nm_s_rad=0.0,
+    gravity_std_nm=0.0,
+)
+
+
+def world(seed=1, external=None, effects=()):
+    """A series elastic joint behind a gear with dry friction, in rich motion."""
+    spring = Spring(model="polynomial", parameters={"coefficients_nm_rad": (150.0, 1500.0)})
+    table = {"kind": "rich", "amplitude_nm": 8.0, "low_hz": 0.15, "high_hz": 4.0}
+    excitation = build(table | {"centring_nm_rad": 10.0, "centring_nm_s_rad": 1.0}, 1)
+    return World(
+        JointPlant(
+            arrangement="single",
+            motors=(MotorPlant(inertia_kg_m2=0.125, viscous_damping_nm_s_rad=0.8, spring=spring),),
+            link=LinkPlant(inertia_kg_m2=0.4, viscous_damping_nm_s_rad=0.1, gravity_nm=GRAVITY_NM),
+        ),
+        (
+            DriveHardware(
+                counts_per_rev=4096.0,
+                gear_ratio=50.0,
+                torque_constant_nm_a=0.05,
+                rated_current_a=6.0,
+                current_noise_a=0.012,
+            ),
+        ),
+        LinkEncoder(counts_per_rev=2.0**17),
+        excitation=replace(excitation, external=external),
+        effects=[parse(text) for text in ("coulomb_friction=0.75", *effects)],
+        period_s=T,
+        seed=seed,
+    )
+
+
+def push(t):
+    return sum(size for begin, size in PUSHES if begin <= t < begin + PUSH_S)
+
+
+def model(link=LINK, **transmission):
+    given = {"model": "polynomial", "order": 2} | transmission
+    motor = Motor(inertia_kg_m2=0.125, viscous_damping_nm_s_rad=0.8, transmission=Transmission(**given))
+    return JointModel(arrangement="single", motors=(motor,), link=link)
+
+
+def samples(rows, measured=False):
+    names = ("motor1_position_rad", "motor1_torque_nm", "link_position_rad", "external_torque_nm")
+    for k, (theta, tau, q, external) in enumerate(zip(*(rows[n].tolist() for n in names), strict=True)):
+        yield Sample(k, (theta,), (math.nan,), (tau,), q, math.nan, external if measured else math.nan)
+
+
+class Told:
+    """What an estimator said of every sample."""
+
+    def __init__(self, joint, rows, *, measured=False, **settings):
+        self.estimator = make_estimator(joint, EstimatorSettings(**settings), T)
+        estimates, told = [], []
+        for sample in samples(rows, measured):
+            estimates.append(self.estimator.step(sample)[:3])
+            told.append(self.estimator.external)
+        self.estimate_valid = np.array([int(e[1]) & int(Status.VALID) > 0 for e in estimates])
+        self.flexibility = np.array([e[2] for e in estimates])
+        self.status = np.array([e.status for e in told])
+        self.valid, self.contact = self.status & VALID > 0, self.status & CONTACT > 0
+        self.torque, self.std, self.link_torque, self.difference = np.array([e[2:] for e in told]).T
+
+
+@pytest.fixture(scope="module")
+def pushed():
+    return record(world(external=push), 12.0)
+
+
+@pytest.fixture(scope="module")
+def free():
+    return record(world(seed=2), 20.0)
+
+
+@pytest.fixture(scope="module")
+def told(pushed):
+    return Told(model(), pushed, contact_torque_nm=0.2)
+
+
+def filtered(x):
+    """The truth as the estimate has it: through the same filter."""
+    return StateVariableFilter(3, W, T).apply(x)[0]
+
+
+def test_the_torque_of_a_push_is_found_within_three_per_cent_of_it(pushed, told):
+    for begin, size in PUSHES:
+        # 60 ms are four delays of the filter: what it still lacks of a step then is 0.05 %
+        window = slice(round((begin + 0.06) / T), round((begin + PUSH_S) / T))
+        assert told.valid[window].all()
+        off = told.torque[window] - size
+        assert abs(np.mean(off)) < 0.03 * abs(size), (begin, size, np.mean(off))
+        # What is left around that is the noise that the link encoder's steps make of 0.4 kg·m²: 0.045 N·m.
+        assert np.sqrt(np.mean(off**2)) < 0.03 * abs(size) + 0.05
+
+
+def test_the_standard_deviation_is_that_of_the_error(pushed, told):
+    """It holds its error, and is not much larger either: a controller's threshold is made of it."""
+    use = told.valid & (np.arange(len(told.torque)) > LEARNED)
+    off = (told.torque - filtered(pushed["external_torque_nm"]))[use] / told.std[use]
+    assert np.mean(np.abs(off) < 1.96) > 0.90
+    assert np.sqrt(np.mean(off**2)) > 0.2
+
+
+def test_a_contact_is_raised_by_pushes_and_by_nothing_else(told):
+    for begin, _ in PUSHES:
+        at = round(begin / T)
+        assert not told.contact[at - 200 : at].any()
+        first = int(np.argmax(told.contact[at : at + 400]))
+        assert told.contact[at + first] and first <= 20, (begin, first)  # 20 ms
+        assert not told.contact[at + round((PUSH_S + 0.1) / T)]
+    assert not told.contact[:8000].any()
+
+
+@pytest.mark.parametrize("error", [0.02, -0.05, 0.10])
+def test_a_link_that_is_off_by_what_is_declared_raises_no_contact(free, error):
+    link = replace(
+        LINK,
+        inertia_kg_m2=(1.0 + error) * 0.4,
+        gravity_nm=(1.0 + error) * GRAVITY_NM,
+        inertia_std_kg_m2=abs(error) * 0.4,
+        gravity_std_nm=abs(error) * GRAVITY_NM,
+    )
+    told = Told(model(link), free, contact_torque_nm=0.0)
+    assert np.mean(told.valid[LEARNED:]) > 0.9
+    assert not told.contact.any()
+    # It is wrong by what it says: errors that do not average out are in the standard deviation.
+    off = np.abs(told.torque / told.std)[told.valid]
+    assert 0.1 < np.sqrt(np.mean(off**2)) < 1.5
+
+
+def test_friction_at_the_link_below_the_least_torque_is_no_contact():
+    rows = record(world(seed=3, effects=("link_coulomb_friction=0.15",)), 14.0)
+    assert not Told(model(), rows, contact_torque_nm=0.35).contact.any()
+    assert Told(model(), rows, contact_torque_nm=0.0).contact.any()  # it is there to be found
+
+
+def test_a_bias_takes_a_payload_in_and_lets_a_lasting_push_fade():
+    """A constant torque fades as exp(-t/bias_s): here to 13.5 % in 4 s, which is what it costs."""
+    begin, size = 9.0, 2.0
+    rows = record(world(seed=4, external=lambda t: size * (t >= begin)), 14.0)
+    with_bias = Told(model(), rows, contact_torque_nm=0.5, external_bias_s=2.0)
+    without = Told(model(), rows, contact_torque_nm=0.5)
+    at = round((begin + 4.0) / T)
+    assert without.torque[at] == pytest.approx(size, rel=0.05)
+    assert with_bias.torque[at] == pytest.approx(size * math.exp(-2.0), abs=0.05 * size)
+    assert with_bias.contact[round(begin / T) + 30] and not with_bias.contact[at]
+    assert without.contact[at]
+
+
+def test_the_flexibility_torque_from_the_link_side_is_the_true_one(pushed):
+    """Eqs 12, 13 in robust mode: with tau_k measured, -r is tau_e behind the filter and the difference is nothing."""
+    told = Told(model(), pushed, measured=True)
+    use = slice(LEARNED, None)
+    truth = filtered(pushed["truth_flexibility_torque_nm"])[use]
+    # tau_k is held over a period, where the filter takes it as straight: half a period, at a push's edges only
+    off = told.link_torque[use] - truth
+    # 0.04 N·m of encoder noise are 1.6 % of it.
+    assert np.sqrt(np.mean(off**2)) < 0.02 * np.sqrt(np.mean(truth**2))
+    assert np.sqrt(np.mean(told.difference[use] ** 2)) < 0.02 * np.sqrt(np.mean(truth**2))
+    consistency = told.estimator.consistency
+    # its ten seconds begin while the spring is still being learned
+    assert consistency.difference_rms_nm < 0.05 * consistency.link_flexibility_torque_rms_nm
+
+
+def test_mode_paper_has_equation_13_and_the_same_external_torque(pushed):
+    """-r of eq 12 is tau_e,t through K/(s + K); noise of the differenced position is averaged away over 50 ms."""
+    told = Told(model(), pushed, measured=True, mode="paper", k_tau_rad_s=100.0)
+    a = first_order_pole(100.0, T)
+    truth = linear_filter([1.0 - a], [1.0, -a], pushed["truth_flexibility_torque_nm"])
+    smooth = np.ones(50) / 50
+    off = np.convolve(told.link_torque - truth, smooth, "same")[1000:-1000]
+    assert np.sqrt(np.mean(off**2)) < 0.02 * np.sqrt(np.mean(truth**2))
+    # The motor's dry friction is in tau_e of eq 14, and so in the external torque: no better than that.
+    push_found = np.mean(told.torque[round(11.1 / T) : round(11.4 / T)])
+    assert push_found == pytest.approx(-3.0, abs=0.75 + 0.3)
+
+
+def test_it_is_valid_only_where_the_estimate_is_and_the_filter_has_settled(told):
+    assert not (told.valid & ~told.estimate_valid).any()
+    assert not (told.contact & ~told.valid).any()
+    assert not told.valid[:100].any()
+    assert np.all(np.isfinite(told.torque[told.valid]) & (told.std[told.valid] > 0.0))
+
+
+def test_nothing_is_said_where_nothing_is_declared(free):
+    estimator = make_estimator(model(None), EstimatorSettings(), T)
+    for sample in samples({name: column[:50] for name, column in free.items()}):
+        estimator.step(sample)
+        assert estimator.external is None and estimator.consistency is None
+
+
+def test_a_rigid_transmission_tells_nothing_of_the_link(free):
+    estimator = make_estimator(model(model="none", order=None), EstimatorSettings(), T)
+    for sample in samples({name: column[:500] for name, column in free.items()}):
+        estimator.step(sample)
+        assert estimator.external.status == 0 and math.isnan(estimator.external.external_torque_nm)
+
+
+def test_after_a_restart_it_settles_anew(free):
+    estimator = make_estimator(model(), EstimatorSettings(), T)
+    rows = list(samples({name: column[:9000] for name, column in free.items()}))
+    for sample in rows[:8000]:
+        estimator.step(sample)
+    assert estimator.external.status & VALID
+    estimator.step(rows[8200])  # a gap too long to be bridged
+    assert estimator.external.status == 0
+    for sample in rows[8201:8900]:
+        estimator.step(sample)
+    assert estimator.external.status & VALID
+
+
+def test_a_cycle_without_a_sample_says_so(free):
+    chain = Chain(Assembler((), 0), make_estimator(model(), EstimatorSettings(), T))
+    tick = None
+    for sample in samples({name: column[:8000] for name, column in free.items()}):
+        tick = chain.take(sample)
+    assert tick.external.status & VALID and tick.external_payload is not None
+    carried = chain.carry_on(8000)
+    assert (carried.external.sequence, carried.external.status) == (8000, 0)
+    assert carried.external.external_torque_nm == tick.external.external_torque_nm
+
+
+def test_a_service_bit_that_takes_the_estimates_validity_takes_this_one_too(free):
+    class Alarm:
+        def step(self, *_):
+            return True
+
+        def describe(self):
+            return {}
+
+    chain = Chain(Assembler((), 0), make_estimator(model(), EstimatorSettings(), T), Alarm())
+    for sample in samples({name: column[:8000] for name, column in free.items()}):
+        assert chain.take(sample).external.status == 0
+
+
+@pytest.mark.parametrize("sample", [{"q": math.nan}, {"q": 1e300}, {"tau": math.inf}])
+def test_whatever_a_sample_holds_nothing_wrong_is_called_valid(free, sample):
+    estimator = make_estimator(model(), EstimatorSettings(), T)
+    rows = list(samples({name: column[:8000] for name, column in free.items()}))
+    for row in rows[:-5]:
+        estimator.step(row)
+    for row in rows[-5:]:
+        spoiled = row._replace(
+            link_position_rad=sample.get("q", row.link_position_rad),
+            motor_torque_nm=(sample.get("tau", row.motor_torque_nm[0]),),
+        )
+        estimator.step(spoiled)
+        assert estimator.external.status == 0
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("external_bandwidth_rad_s", 0.0), ("contact_torque_nm", -1.0), ("external_bias_s", 0.0)],
+)
+def test_a_setting_that_cannot_be_is_one_line(key, value):
+    with pytest.raises(EstimatorError, match=f"{key}: expected a finite number"):
+        EstimatorSettings(**{key: value})
+
+
+def test_an_uncertainty_that_is_not_declared_is_the_priors():
+    link = LinkDynamics(inertia_kg_m2=2.0, viscous_damping_nm_s_rad=0.5, gravity_nm=-6.0)
+    assert link.uncertainty() == pytest.approx((0.2, 0.1, 0.6))
+    assert replace(link, gravity_std_nm=0.0).uncertainty()[2] == 0.0
+    with pytest.raises(EstimatorError, match="gravity_std_nm: expected a finite number >= 0"):
+        replace(link, gravity_std_nm=-1.0)

@@ -13,7 +13,6 @@ import pty
 import re
 import select
 import signal
-import socket
 import struct
 import subprocess
 import sys
@@ -21,11 +20,10 @@ import tempfile
 import termios
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import pyte
-import tomlkit
 from rich.console import Console
 from rich.style import Style
 from rich.text import Text
@@ -109,37 +107,6 @@ def colour(name: str) -> str | None:
     return re.sub("^bright", "bright_", name)
 
 
-def closed_loop(folder: Path) -> Path:
-    """The folder of the example that records, fits and diagnoses, run once."""
-    if not (folder / "report.html").exists():
-        script = ROOT / "examples" / "close_the_loop.py"
-        subprocess.run([sys.executable, str(script), str(folder)], check=True, stdout=subprocess.DEVNULL)
-    return folder
-
-
-@contextmanager
-def joint(folder: Path) -> Iterator[Path]:
-    """A simulated VSA-II with a fitted model, and its daemon, apart from everything else on this machine."""
-    path = folder / "live.toml"
-    text = tomlkit.parse((closed_loop(folder) / "elbow.toml").read_text(encoding="utf-8"))
-    text["name"] = "elbow"
-    bus = {"interface": "socketcand", "channel": "vcan0", "period_s": 0.005}
-    text["bus"] = bus | {"options": {"host": "127.0.0.1", "port": free_port()}}
-    text["zenoh"] = {"endpoint": f"tcp/127.0.0.1:{free_port()}"}
-    path.write_text(tomlkit.dumps(text), encoding="utf-8")
-    with running("sim", str(path)):
-        time.sleep(3.0)
-        with running("run", str(path)):
-            yield path
-
-
-def free_port() -> int:
-    """A TCP port that nobody uses."""
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return int(s.getsockname()[1])
-
-
 @contextmanager
 def running(*arguments: str) -> Iterator[subprocess.Popen[str]]:
     """A command of drivelink beside this one."""
@@ -168,22 +135,25 @@ def demo(_: Path) -> None:
     terminal((*DRIVELINK, "demo", "--seconds", "20"), 17.0, "drivelink demo", PICTURES / "demo.svg")
 
 
-def views(folder: Path) -> None:
-    """`drivelink monitor` in the terminal and in the browser."""
-    with ExitStack() as stack:
-        path = stack.enter_context(joint(folder))
-        web = stack.enter_context(running("monitor", str(path), "--web", "--port", "0"))
+def views(_: Path) -> None:
+    """`drivelink monitor` in the terminal and in the browser, beside a demo."""
+    with (
+        running("demo", "--seconds", "100", "--headless"),
+        running("monitor", "vsa-ii", "--web", "--port", "0") as web,
+    ):
         assert web.stdout is not None
         address = re.search(r"http://\S+", web.stdout.readline())
         assert address is not None
-        command = (*DRIVELINK, "monitor", str(path))
-        terminal(command, 25.0, "drivelink monitor elbow", PICTURES / "monitor.svg")
+        command = (*DRIVELINK, "monitor", "vsa-ii")
+        terminal(command, 25.0, "drivelink monitor vsa-ii", PICTURES / "monitor.svg")
         pages(address[0], "web", 1100, wait_s=35.0)
 
 
 def loop(folder: Path) -> None:
-    """What `fit` and `diagnose` draw."""
-    (PICTURES / "fit.png").write_bytes((closed_loop(folder) / "fit.png").read_bytes())
+    """What `fit` and `diagnose` draw, from the example that closes the loop."""
+    script = ROOT / "examples" / "close_the_loop.py"
+    subprocess.run([sys.executable, str(script), str(folder)], check=True, stdout=subprocess.DEVNULL)
+    (PICTURES / "fit.png").write_bytes((folder / "fit.png").read_bytes())
     pages(f"file://{folder}/report.html", "report", 1000)
 
 

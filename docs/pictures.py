@@ -123,6 +123,7 @@ def pages(url: str, name: str, height: int, wait_s: float = 1.0) -> None:
     with tempfile.TemporaryDirectory() as profile, Chromium(Path(profile)) as browser:
         browser.resize(1200, height)
         browser.open(url)
+        browser.evaluate("document.documentElement.style.scrollbarWidth = 'none'")
         time.sleep(wait_s)
         for dark in (False, True):
             browser.prefer(dark=dark)
@@ -146,7 +147,7 @@ def views(_: Path) -> None:
         assert address is not None
         command = (*DRIVELINK, "monitor", "vsa-ii")
         terminal(command, 25.0, "drivelink monitor vsa-ii", PICTURES / "monitor.svg")
-        pages(address[0], "web", 1100, wait_s=35.0)
+        pages(address[0], "web", 900, wait_s=35.0)
 
 
 def loop(folder: Path) -> None:

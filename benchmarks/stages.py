@@ -1,17 +1,19 @@
 """What each stage of a cycle costs as joints are added, and how many joints one core carries.
 
-    python benchmarks/stages.py [--cycles N] [--json FILE]
+    python benchmarks/stages.py [--cycles N] [--joints N] [--ticks N] [--json FILE]
 
 Recorded frames of the simulated devices are laid into the queues of virtual buses; then the daemon's own
 parts take them, at 1 kHz in one thread with real-time scheduling where the system allows, and publish to a
 subscriber in another process. CPU of the thread, by stage; CPU of the whole process a cycle, with zenoh's
 threads and the sleeping, without the laying of frames. The floor receives, unpacks and puts the same bytes.
+With --ticks, the memory that the pipeline of a two-motor joint takes as so many cycles go through it.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import resource
 import statistics
 import time
 from functools import partial
@@ -36,7 +38,7 @@ from drivelink.pubsub.wire import encode_estimate, encode_sample
 from drivelink.simulate import network_from_joint, open_sim_bus
 
 STAGES = ("receive", "decode", "estimate", "encode", "put")
-CASES = ((1, 1), (1, 2), (2, 2), (4, 2), (8, 2))  # joints, motors of each
+CASES = ((1, 1), (1, 2), (2, 2), (4, 2), (8, 2), (16, 2))  # joints, motors of each
 SETTLE = 500  # cycles at the start that are not counted
 
 Cycles = list[list[can.Message]]
@@ -171,13 +173,36 @@ def flat_out(parts: list[Clocked], recorded: Cycles) -> float:
     return len(recorded) / cpu_s
 
 
-def measure(cycles: int) -> list[dict[str, Any]]:
-    """One row a number of joints."""
+def resident_bytes() -> int:
+    """Memory of this process."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * resource.getpagesize()
+
+
+def memory(ticks: int) -> dict[str, int]:
+    """Growth over so many cycles of a two-motor joint, frames to bytes, after a tenth of them."""
+    which = joint("robust", free_endpoint(), motors=2)
+    recorded, layouts = frames_of(which, 5000)
+    cycles = [[(frame.arbitration_id, bytes(frame.data)) for frame in frames] for frames in recorded]
+    chain = make_chain(which, tuple(layouts.values()))
+    start = 0
+    for k in range(ticks):
+        if k == ticks // 10:
+            start = resident_bytes()
+        chain.feed(SYNC_COB_ID, b"")
+        for cob_id, data in cycles[k % len(cycles)]:
+            tick = chain.feed(cob_id, data)
+        assert tick is not None and tick.estimate_payload
+    return {"ticks": ticks, "growth_bytes": resident_bytes() - start}
+
+
+def measure(cycles: int, most: int) -> list[dict[str, Any]]:
+    """One row a number of joints, up to `most`."""
     rows = []
     recordings = {
         motors: frames_of(joint("robust", free_endpoint(), motors=motors), cycles) for motors in (1, 2)
     }
-    for joints, motors in CASES:
+    for joints, motors in (case for case in CASES if case[0] <= most):
         endpoint = free_endpoint()
         session = open_session(joint("robust", endpoint).zenoh, Path())
         reader = subscriber(endpoint)
@@ -229,12 +254,18 @@ def main() -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--cycles", type=int, default=5000)
+    parser.add_argument("--joints", type=int, default=16, metavar="N", help="at most (at least 4)")
+    parser.add_argument("--ticks", type=int, default=0, metavar="N", help="also memory over so many cycles")
     parser.add_argument("--json", type=Path, help="also write the numbers there")
     args = parser.parse_args()
-    rows = measure(args.cycles)
+    rows = measure(args.cycles, args.joints)
     print(report(rows))
+    found: dict[str, Any] = {"rows": rows, "joints_per_core": carried(rows)}
+    if args.ticks:
+        found["memory"] = memory(args.ticks)
+        print(f"\nMemory over {args.ticks:.2g} cycles: {found['memory']['growth_bytes'] / 1024:+.0f} KiB")
     if args.json:
-        args.json.write_text(json.dumps({"rows": rows, "joints_per_core": carried(rows)}, indent=1))
+        args.json.write_text(json.dumps(found, indent=1))
 
 
 if __name__ == "__main__":

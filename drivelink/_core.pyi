@@ -4,6 +4,7 @@ from typing import Any
 from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle.chain import Watch
 from estimator._core import Estimator as _Core
+from estimator._core import ModelMonitor as _ModelMonitor
 from estimator.online import Estimator as _Estimator
 from estimator.sample import Estimate, External, Sample
 
@@ -204,6 +205,9 @@ class Tick:
 
 class Estimator(_Core):
     """`estimator._core.Estimator`, as this module has it."""
+
+class ModelMonitor(_ModelMonitor):
+    """`estimator._core.ModelMonitor`, as this module has it."""
 
 class History:
     """The last samples of a joint, for a new estimator to start from; any thread may read them."""

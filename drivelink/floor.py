@@ -1,14 +1,15 @@
-"""The floor of a joint's model, kept with it in the joint file, and the watch that compares with it."""
+"""The residual baseline of a joint's model, kept with it in the joint file, and the monitor that uses it."""
 
 from __future__ import annotations
 
 from typing import Any
 
+from drivelink import _core
 from drivelink.jointfile import JointFile
 from estimator.errors import EstimatorError
 from estimator.model import JointModel
+from estimator.model_monitor import ModelMonitor, ResidualBaseline, can_monitor, measure_baseline
 from estimator.sample import Record
-from estimator.watch import Floor, ResidualWatch, measure_floor, watchable
 
 __all__ = ["floor_entry", "make_watch"]
 
@@ -16,20 +17,21 @@ _KEY = "floor"
 
 
 def floor_entry(record: Record, model: JointModel) -> dict[str, Any]:
-    """What [provenance] keeps of a model's floor; nothing where it cannot be measured."""
-    if not watchable(model):
+    """What [provenance] keeps of a model's baseline; nothing where it cannot be measured."""
+    if not can_monitor(model):
         return {}
     try:
-        return {_KEY: measure_floor(record, model).as_dict()}
+        return {_KEY: measure_baseline(record, model).as_dict()}
     except EstimatorError:
         return {}
 
 
-def make_watch(joint: JointFile) -> ResidualWatch | None:
-    """The watch of a joint, where its model is complete and its floor is known."""
+def make_watch(joint: JointFile) -> ModelMonitor | None:
+    """The monitor of a joint's model, where that is complete and its baseline is known."""
     entry = joint.provenance.get(_KEY)
-    floor = Floor.from_dict(entry) if isinstance(entry, dict) else None
+    baseline = ResidualBaseline.from_dict(entry) if isinstance(entry, dict) else None
     model = joint.model()
-    if floor is None or not watchable(model):
+    if baseline is None or not can_monitor(model):
         return None
-    return ResidualWatch(model, joint.bus.period_s, floor)
+    rate = joint.estimator.false_alarms_per_hour
+    return ModelMonitor(model, joint.bus.period_s, baseline, rate, core=_core.ModelMonitor)

@@ -3,12 +3,14 @@ from collections.abc import Sequence
 from numpy import float64
 from numpy.typing import NDArray
 
+from estimator.effects import Coordinates
 from estimator.model import JointModel
 from estimator.sample import Estimate, External, Sample
 from estimator.settings import EstimatorSettings
 
 Numbers = NDArray[float64]
 
+STOP_EXPONENT: float
 __version__: str
 
 class Estimator:
@@ -41,7 +43,64 @@ class TransmissionLaw:
     def at(self, phi: float, alpha: Sequence[float]) -> tuple[float, float]: ...
     def reach(self, shape: Sequence[float]) -> float: ...
 
-def effect_terms(name: str, values: Sequence[float], coordinates: Numbers, out: Numbers) -> None: ...
+class OnlineEffects:
+    """The effects of a joint's model tick by tick.
+
+    `correct` comes first, on the raw sample: delays are made equal by delaying the channels that are ahead,
+    errors of link encoder and torque are removed, the offset between the encoders goes into the motor
+    position. `torques` gives x_motor and x_transmission of each motor and x_link, N·m, from coordinates that
+    have passed one filter; zeros where they are absurd or not finite.
+
+    Args:
+        model: of the joint.
+        period_s: of the samples.
+
+    Attributes:
+        active: whether the model has any effect.
+
+    Raises:
+        EstimatorError: an effect is wrong, or is where it does not belong.
+    """
+
+    def __init__(self, model: JointModel, period_s: float) -> None: ...
+    @property
+    def active(self) -> bool: ...
+    def reset(self) -> None: ...
+    def correct(self, sample: Sample) -> Sample: ...
+    def torques(
+        self, motors: Sequence[Coordinates], link: Coordinates
+    ) -> tuple[list[float], list[float], float]: ...
+
+class ModelMonitor:
+    def __init__(
+        self,
+        model: JointModel,
+        period_s: float,
+        baseline: tuple[Sequence[float], Sequence[float], Sequence[float], int] | None,
+        false_alarms_per_hour: float,
+    ) -> None: ...
+    @property
+    def monitoring(self) -> bool: ...
+    def step(self, sample: Sample) -> bool: ...
+    def reset(self) -> None: ...
+    @property
+    def alarm(self) -> bool: ...
+    @property
+    def seconds(self) -> int: ...
+    @property
+    def residual_nm(self) -> tuple[float, ...]: ...
+    @property
+    def torque_nm(self) -> tuple[float, ...]: ...
+    @property
+    def ratio(self) -> tuple[float, float]: ...
+    def location(self) -> str: ...
+
+def effect_kinds() -> list[
+    tuple[str, str, str, str, list[tuple[str, str, bool, float | None]], bool, str]
+]: ...
+def effect_terms(
+    name: str, values: Sequence[float], coordinates: Sequence[Numbers], out: Numbers
+) -> None: ...
 def regressor(
     residual: Numbers,
     rate: Numbers,

@@ -6,12 +6,10 @@ Readings are corrected sample by sample as on line, and x_motor - x_transmission
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
 from estimator.effects import LIBRARY, Coordinates, OnlineEffects, elements
-from estimator.effects.memory import trace
 from estimator.filters import linear_filter
 from estimator.model import JointModel, Motor
 from estimator.sample import FloatArray, Record
@@ -59,14 +57,7 @@ def effect_torque(
         sign = 1.0 if kind.location == "motor" else -1.0
         for values in each:
             weights = [values[name] for name in kind.linear]
-            columns: tuple[Any, ...]
-            if kind.terms is not None:
-                columns = kind.terms(c, values, np)
-            else:
-                moved = c.position if kind.location == "motor" else c.deflection
-                columns = (trace(moved / values["displacement_rad"], values["exponent"], values["shape"]),)
-            for weight, column in zip(weights, columns, strict=True):
-                total = total + sign * weight * column
+            total += sign * np.dot(weights, kind.terms(c, values))
     return total
 
 

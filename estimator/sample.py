@@ -60,7 +60,7 @@ class Status(IntFlag):
     OBSERVABLE = 1 << 1  # the motion at hand tells the stiffness; else it is held, with a wider interval
     GAP = 1 << 2  # samples were missing before this one and have been bridged
     CHANGED = 1 << 3  # innovation alarm: the joint changed, the estimate is following
-    MODEL_ALARM = 1 << 4  # residual above the model's own floor: the model is not sufficient
+    MODEL_ALARM = 1 << 4  # the residual is above the model's own baseline: the model is not sufficient
     INPUT_REJECTED = 1 << 5  # this sample was not finite, jumped or froze, and was not used
     RESTARTED = 1 << 6  # the estimator started anew at or shortly before this sample
     DRIVE_FAULT = 1 << 8  # a drive reports a fault or is not in operation-capable state

@@ -24,7 +24,8 @@ class EstimatorSettings:
         k_sigma_2_rad_s: K_sigma,2 of eq 28.
         k_r_s2_rad2: K_R of eq 32.
         k_max: K_max < 2 of eq 33.
-        false_alarms_per_hour: of the robust mode's `changed`; more of them find smaller changes.
+        false_alarms_per_hour: of the robust mode's `changed`, and of the model alarm; more of them find
+            smaller changes.
         external_bandwidth_rad_s: of the filter behind which robust mode has the external torque; in mode
             "paper" that is K_tau_e.
         external_bias_s: time constant of a bias that follows the external torque and is taken off it, as a

@@ -17,8 +17,8 @@ import onlinekit as kit
 
 from estimator import JointModel, Record
 from estimator.identify import identify
+from estimator.model_monitor import ModelMonitor, ResidualBaseline, measure_baseline
 from estimator.sample import Sample, Status
-from estimator.watch import Floor, ResidualWatch, measure_floor
 
 __all__ = ["FAULTS", "JOINTS", "SIGNALS", "STEPS", "Fault", "Outcome", "faults", "outcome", "stepped"]
 
@@ -139,8 +139,8 @@ def _healthy(name: str, seconds: float, seed: int) -> kit.Motion:
 
 
 @lru_cache(maxsize=2)
-def _fitted(name: str) -> tuple[JointModel, Floor]:
-    """As `fit --write` leaves it: fitted and calibrated on another run, with the floor of its model."""
+def _fitted(name: str) -> tuple[JointModel, ResidualBaseline]:
+    """As `fit --write` leaves it: fitted and calibrated on another run, with its model's baseline."""
     motion = kit.motion(name, 20.0, seed=99)
     record = Record(
         period_s=T,
@@ -151,7 +151,7 @@ def _fitted(name: str) -> tuple[JointModel, Floor]:
     )
     declared = kit.declared(name, parameters={})
     model = identify(record, declared).model
-    return model, measure_floor(record, model)
+    return model, measure_baseline(record, model)
 
 
 def _spoilt(samples: list[Sample], begin: int, fault: Fault, seed: int) -> list[Sample]:
@@ -204,8 +204,8 @@ def _told(joint: str, samples: list[Sample]) -> kit.Told:
     name = joint.removesuffix(" fitted")
     if joint == name:
         return kit.play(kit.declared(name), samples)[0]
-    model, floor = _fitted(name)
-    return kit.play(model, samples, watch=ResidualWatch(model, T, floor))[0]
+    model, baseline = _fitted(name)
+    return kit.play(model, samples, watch=ModelMonitor(model, T, baseline))[0]
 
 
 def _count(

@@ -22,8 +22,8 @@ from drivelink.cycle.lockstep import run_lockstep
 from drivelink.cycle.loop import ObjectSink
 from drivelink.jointfile import JointFile
 from drivelink.simulate import network_from_joint, open_sim_bus, world_from_joint
+from estimator.model_monitor import ModelMonitor
 from estimator.sample import Estimate, FloatArray, Sample, Status
-from estimator.watch import ResidualWatch
 
 _channels = itertools.count()
 
@@ -63,10 +63,10 @@ CALIBRATION, SUSPECT, CHECK = 1, 2, 3  # three motions: what is judged live is n
 
 
 class Live(ObjectSink):
-    """A sink that watches from outside, with a watch that only measures."""
+    """A sink that watches from outside, with a monitor that only measures."""
 
     def __init__(self, joint: JointFile) -> None:
-        self._watch = ResidualWatch(joint.model(), joint.bus.period_s, None)
+        self._monitor = ModelMonitor(joint.model(), joint.bus.period_s, None)
         self._estimate: Estimate | None = None
         self._residuals: list[tuple[float, ...]] = []
         self._alarms: list[bool] = []
@@ -77,8 +77,8 @@ class Live(ObjectSink):
 
     def put_sample(self, sample: Sample, stamp_ns: int) -> None:
         assert self._estimate is not None
-        self._watch.step(sample, self._estimate, math.nan)
-        self._residuals.append(self._watch.residual_nm)
+        self._monitor.step(sample, self._estimate, math.nan)
+        self._residuals.append(self._monitor.residual_nm)
 
     def residual_nm(self) -> FloatArray:
         """Mean over the second half of the run of each balance's residual: the motor's, then the link's."""

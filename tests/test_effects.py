@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from estimator.effects import LIBRARY, Coordinates, OnlineEffects, elements
-from estimator.effects.memory import advance, trace
+from estimator import EstimatorSettings, make_estimator
+from estimator.effects import LIBRARY, STOP_EXPONENT, Coordinates, OnlineEffects, elements
 from estimator.errors import EstimatorError
 from estimator.model import Effect, JointModel, Motor, Transmission
 from estimator.sample import Sample
@@ -49,33 +49,65 @@ def test_every_name_of_the_contract_is_there_at_its_location() -> None:
     }
 
 
-@pytest.mark.parametrize("name", sorted(n for n, k in LIBRARY.items() if k.terms is not None))
+NOWHERE = Coordinates(*(0.0 for _ in Coordinates._fields))
+
+
+@pytest.mark.parametrize("name", sorted(n for n, k in LIBRARY.items() if not k.remembers))
 def test_a_term_is_the_same_for_arrays_and_for_numbers(name: str) -> None:
     kind, values = LIBRARY[name], _values(name)
     rng = np.random.default_rng(3)
     table = rng.standard_normal((len(Coordinates._fields), 40))
-    assert kind.terms is not None
-    arrays = kind.terms(Coordinates(*table), values, np)
+    arrays = kind.terms(Coordinates(*table), values)
     assert len(arrays) == len(kind.linear)
     for k, column in enumerate(table.T):
-        numbers = kind.terms(Coordinates(*column.tolist()), values, math)
-        np.testing.assert_allclose([a[k] for a in arrays], numbers, rtol=1e-12, atol=1e-12)
+        numbers = kind.terms(Coordinates(*column.tolist()), values)
+        np.testing.assert_allclose(arrays[:, k], numbers[:, 0], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", sorted(n for n, k in LIBRARY.items() if not k.remembers and not k.on_link))
+def test_a_tick_has_the_term_of_the_library(name: str) -> None:
+    """What a motor's effect adds on line is its terms over arrays, weighted."""
+    kind, values = LIBRARY[name], _values(name)
+    if kind.channel != "torque":
+        pytest.skip("corrects a reading")
+    c = Coordinates(*np.random.default_rng(5).standard_normal(len(Coordinates._fields)).tolist())
+    weights = np.array([values[parameter] for parameter in kind.linear])
+    x = OnlineEffects(_joint(Effect(name=name, parameters=values)), 1e-3).torques([c], NOWHERE)
+    assert sum(x[0]) + sum(x[1]) == pytest.approx(float(weights @ kind.terms(c, values)[:, 0]))
+
+
+@pytest.mark.parametrize("name", sorted(LIBRARY))
+def test_every_effect_that_a_joint_file_may_hold_runs_on_line(name: str) -> None:
+    joint = _joint(Effect(name=name, parameters=_values(name)))
+    estimator = make_estimator(joint, EstimatorSettings(), 1e-3)
+    for k in range(50):
+        angle = 0.2 * math.sin(0.05 * k)
+        estimate = estimator.step(Sample(k, (angle,), (math.nan,), (angle,), 1.1 * angle))
+    assert math.isfinite(estimate.flexibility_torque_nm)
 
 
 @pytest.mark.parametrize(("exponent", "shape"), [(1.0, 1.0), (2.0, 0.5), (1.5, 0.7), (50.0, 1.0)])
-def test_memory_traced_over_a_path_is_memory_carried_step_by_step(exponent: float, shape: float) -> None:
+def test_memory_over_a_path_is_the_law_integrated_in_small_steps(exponent: float, shape: float) -> None:
     rng = np.random.default_rng(4)
-    path = np.cumsum(0.05 * rng.standard_normal(3000)) + np.sin(np.arange(3000) / 90.0)
-    state, states = 0.0, [0.0]
-    for increment in np.diff(path):
-        state = float(advance(state, increment, exponent, shape))
-        states.append(state)
-    # The step takes the law's slope at its middle, the trace looks it up on a table of 0.002.
-    np.testing.assert_allclose(trace(path, exponent, shape), states, atol=2e-3)
+    path = np.cumsum(0.05 * rng.standard_normal(900)) + np.sin(np.arange(900) / 90.0)
+    z, states, small = 0.0, [0.0], 100
+    for increment in np.diff(path).tolist():
+        for _ in range(small):
+            sign, u = math.copysign(1.0, increment), abs(increment) / small
+            y = z * sign
+            rate = 1.0 - abs(y) ** (exponent - 1.0) * (shape * y + (1.0 - shape) * abs(y))
+            z = sign * (min(y + u, 1.0) if exponent >= STOP_EXPONENT else y + u * rate)
+        states.append(z)
+    values = {"displacement_rad": 1.0, "exponent": exponent, "shape": shape}
+    terms = LIBRARY["hysteresis"].terms(NOWHERE._replace(deflection=path), values)
+    np.testing.assert_allclose(terms[0], states, atol=2e-3)
 
 
 def test_dahl_friction_is_exact_for_any_increment() -> None:
-    assert advance(0.2, 3.0, 1.0, 1.0) == pytest.approx(1.0 - 0.8 * math.exp(-3.0), abs=1e-9)
+    path = 0.1 * np.cumsum([0.0, -math.log(0.8), 3.0])
+    values = {"displacement_rad": 0.1, "exponent": 1.0, "shape": 1.0}
+    z = LIBRARY["presliding_friction"].terms(NOWHERE._replace(position=path), values)[0]
+    assert z[1:] == pytest.approx([0.2, 1.0 - 0.8 * math.exp(-3.0)], abs=1e-9)
 
 
 def test_on_line_torques_have_the_signs_of_the_balances() -> None:
@@ -87,11 +119,11 @@ def test_on_line_torques_have_the_signs_of_the_balances() -> None:
         ),
         1e-3,
     )
-    sample = Sample(0, (0.3,), (math.nan,), (1.0,), 0.4)
-    x = effects.torques(sample, (1.0,), (0.0,), (0.1,), (0.2,), (10.0,), 0.0)
-    assert x.motor_nm == pytest.approx((0.5,))
-    assert x.transmission_nm == pytest.approx((0.1,))
-    assert x.link_nm == pytest.approx(2.4)  # the link's velocity is that of motor and deflection together
+    c = NOWHERE._replace(velocity=1.0, deflection=0.1, deflection_rate=0.2, link_velocity=1.2)
+    motor, transmission, link = effects.torques([c], c)
+    assert motor == pytest.approx([0.5])
+    assert transmission == pytest.approx([0.1])
+    assert link == pytest.approx(2.4)
 
 
 def test_correct_undoes_what_the_sensors_did() -> None:
@@ -130,17 +162,29 @@ def test_delays_bring_all_channels_to_the_latest_one() -> None:
     assert gap.motor_position_rad == pytest.approx((12.5,))
 
 
+def test_a_torque_that_acts_with_a_lag_is_the_mean_of_what_acts_in_each_period() -> None:
+    lag_s = 0.006
+    effects = OnlineEffects(_joint(Effect(name="torque_lag", parameters={"time_constant_s": lag_s})), 1e-3)
+    acting = [
+        effects.correct(Sample(k, (0.0,), (0.0,), (float(k >= 1),), 0.0)).motor_torque_nm[0]
+        for k in range(40)
+    ]
+    # The mean of 1 - exp(-t/T) from (k - 1) to k milliseconds after the step.
+    t = 1e-3 * np.arange(40)
+    mean = 1.0 - (np.exp(-t[:-1] / lag_s) - np.exp(-t[1:] / lag_s)) * lag_s / 1e-3
+    np.testing.assert_allclose(acting[1:], mean, atol=1e-12)
+
+
 def test_absurd_values_add_no_torque_and_raise_nothing() -> None:
     every = [Effect(name=n, parameters=_values(n)) for n in LIBRARY]
     effects = OnlineEffects(_joint(*every), 1e-3)
     for value in (math.nan, math.inf, -1e300, 1e12):
-        sample = effects.correct(Sample(1, (value,), (value,), (value,), value))
-        x = effects.torques(sample, (value,), (value,), (value,), (value,), (value,), 0.0)
-        assert x.motor_nm == (0.0,)
-    fresh = effects.torques(
-        Sample(2, (0.1,), (0.0,), (0.1,), 0.1), (0.1,), (0.0,), (0.01,), (0.0,), (1.0,), 0.1
-    )
-    assert all(map(math.isfinite, (*fresh.motor_nm, *fresh.transmission_nm, fresh.link_nm)))
+        effects.correct(Sample(1, (value,), (value,), (value,), value))
+        c = Coordinates(*(value for _ in Coordinates._fields))
+        assert effects.torques([c], c)[0] == [0.0]
+    c = Coordinates(*(0.1 for _ in Coordinates._fields))
+    motor, transmission, link = effects.torques([c], c)
+    assert all(map(math.isfinite, (*motor, *transmission, link)))
 
 
 def test_arrays_of_parameters_are_sums_of_elements() -> None:
@@ -148,10 +192,8 @@ def test_arrays_of_parameters_are_sums_of_elements() -> None:
         name="cogging", parameters={"sin_nm": (1.0, 0.5), "cos_nm": 0.0, "periods_per_rev": (6.0, 12.0)}
     )
     assert [v["periods_per_rev"] for v in elements(waves)[1]] == [6.0, 12.0]
-    x = OnlineEffects(_joint(waves), 1e-3).torques(
-        Sample(0, (0.3,), (0.0,), (0.0,), 0.3), (0.0,), (0.0,), (0.0,), (0.0,), (0.0,), 0.0
-    )
-    assert x.motor_nm[0] == pytest.approx(math.sin(1.8) + 0.5 * math.sin(3.6))
+    motor, *_ = OnlineEffects(_joint(waves), 1e-3).torques([NOWHERE._replace(position=0.3)], NOWHERE)
+    assert motor[0] == pytest.approx(math.sin(1.8) + 0.5 * math.sin(3.6))
 
 
 @pytest.mark.parametrize(
@@ -165,3 +207,9 @@ def test_arrays_of_parameters_are_sums_of_elements() -> None:
 def test_a_wrong_effect_is_one_line(effect: Effect, message: str) -> None:
     with pytest.raises(EstimatorError, match=message):
         elements(effect)
+
+
+def test_a_scale_that_is_not_above_zero_is_one_line() -> None:
+    effect = Effect(name="coulomb_friction", parameters={"torque_nm": 1.0, "smoothing_rad_s": 0.0})
+    with pytest.raises(EstimatorError, match="smoothing_rad_s: expected a number above 0, got 0"):
+        OnlineEffects(_joint(effect), 1e-3)

@@ -9,7 +9,6 @@ import numpy as np
 
 from estimator.diagnosis.frame import Frame
 from estimator.effects import LIBRARY, Coordinates, EffectType
-from estimator.effects.memory import trace
 from estimator.sample import FloatArray
 
 __all__ = ["Candidate", "bounds_of", "columns", "grid", "least_periods", "members", "reach_of", "spread_of"]
@@ -83,7 +82,7 @@ def columns(frame: Frame, candidate: Candidate, values: Values) -> FloatArray:
     kind = candidate.kind
     motor = candidate.motor or 0
     c = frame.motors[motor]
-    terms = _terms(kind, c, values)
+    terms = kind.terms(c, values)
     if kind.channel == "link_position":
         return np.stack([_reading(frame, term) for term in terms], axis=1)
     made = []
@@ -100,14 +99,6 @@ def columns(frame: Frame, candidate: Candidate, values: Values) -> FloatArray:
         else:
             made.append(frame.column(None, None, term))
     return np.stack(made, axis=1)
-
-
-def _terms(kind: EffectType, c: Coordinates, values: Values) -> tuple[FloatArray, ...]:
-    if kind.law is not None:
-        path = c.position if kind.location == "motor" else c.deflection
-        return (trace(path / values["displacement_rad"], values["exponent"], values["shape"]),)
-    assert kind.terms is not None
-    return kind.terms(c, values, np)
 
 
 def _zero(frame: Frame, error: FloatArray) -> FloatArray:
@@ -165,7 +156,7 @@ def grid(frame: Frame, candidate: Candidate, smoothing_rad_s: float) -> list[dic
                 if v > 3.0 * s
             ]
         return _vary(fixed, "smoothing_rad_s", smooth)
-    if kind.law is not None:
+    if kind.remembers:
         path = c.position if kind.location == "motor" else c.deflection
         scales = _spread(path) * np.geomspace(0.0002, 0.5, 11)
         return [{"displacement_rad": float(d), "exponent": n, "shape": b} for n, b in LAWS for d in scales]

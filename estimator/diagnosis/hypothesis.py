@@ -18,8 +18,7 @@ from estimator.diagnosis.candidates import Candidate, bounds_of, columns, reach_
 from estimator.diagnosis.evidence import Posterior, Regression, Scale
 from estimator.diagnosis.frame import Corrections, Frame, Signals
 from estimator.diagnosis.known import declared_corrections, declared_torque
-from estimator.effects import LIBRARY, Coordinates
-from estimator.effects.memory import STOP_EXPONENT
+from estimator.effects import LIBRARY, STOP_EXPONENT, Coordinates
 from estimator.model import JointModel
 from estimator.priors import PRIORS
 from estimator.sample import FloatArray, Record

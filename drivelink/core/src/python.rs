@@ -6,8 +6,9 @@ use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use estimator_core::external::External;
-use estimator_core::python::{Estimator, external as external_object};
+use estimator_core::python::{Estimator, ModelMonitor, external as external_object};
 use estimator_core::sample::{Estimate, MOTORS, Sample, TransmissionEstimate};
+use pyo3::PyClass;
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
@@ -567,20 +568,25 @@ impl History {
     }
 }
 
-/// The estimator of a chain, and the watch over its residual.
+/// The estimator of a chain, and the monitor of its model: compiled ones are called without Python in between.
 struct Driver {
     estimator: Py<PyAny>,
-    /// What it is made of, where that is the compiled one: it is called without Python in between.
     compiled: Option<Py<Estimator>>,
     watch: Option<Py<PyAny>>,
+    monitor: Option<Py<ModelMonitor>>,
     motors: usize,
+}
+
+/// What a Python object is made of, where that is a class of this module.
+fn core_of<T: PyClass>(py: Python<'_>, object: &Py<PyAny>) -> Option<Py<T>> {
+    object.bind(py).getattr("core").ok()?.cast_into().ok().map(Bound::unbind)
 }
 
 impl Driver {
     fn new(py: Python<'_>, estimator: Py<PyAny>, watch: Option<Py<PyAny>>) -> Driver {
-        let core = estimator.bind(py).getattr("core").ok();
-        let compiled = core.and_then(|core| core.cast_into().ok()).map(Bound::unbind);
-        Driver { estimator, compiled, watch, motors: 0 }
+        let compiled = core_of(py, &estimator);
+        let monitor = watch.as_ref().and_then(|watch| core_of(py, watch));
+        Driver { estimator, compiled, watch, monitor, motors: 0 }
     }
 }
 
@@ -607,6 +613,9 @@ impl Step for Driver {
     fn alarm(&mut self, sample: &Sample, estimate: &Estimate) -> Result<bool, Failure> {
         let Some(watch) = &self.watch else { return Ok(false) };
         Python::attach(|py| {
+            if let Some(monitor) = &self.monitor {
+                return Ok(monitor.try_borrow_mut(py).map_err(PyErr::from)?.inner.step(sample));
+            }
             let residual = self.estimator.getattr(py, "residual_nm")?;
             let sample = sample_object(py, sample, self.motors)?;
             let estimate = estimate_object(py, estimate)?;
@@ -787,8 +796,8 @@ mod extension {
 
     #[pymodule_export]
     use super::{
-        Assembler, Chain, Estimator, History, NodeCounters, Tick, encode_estimate, encode_external,
-        encode_sample,
+        Assembler, Chain, Estimator, History, ModelMonitor, NodeCounters, Tick, encode_estimate,
+        encode_external, encode_sample,
     };
 
     #[pymodule_init]

@@ -10,6 +10,7 @@
 
 pub mod align;
 pub mod change_detection;
+pub mod corrections;
 pub mod deflection;
 pub mod delay;
 pub mod effects;
@@ -20,9 +21,12 @@ pub mod filters;
 pub mod identification;
 pub mod kalman;
 pub mod laws;
+pub mod library;
 pub mod linear_algebra;
 pub mod linearisation;
+pub mod memory;
 pub mod model;
+pub mod model_monitor;
 pub mod model_switch;
 pub mod noise;
 pub mod paper;
@@ -31,6 +35,7 @@ pub mod sample;
 pub mod sample_validator;
 pub mod settings;
 pub mod signals;
+pub mod student;
 pub mod transmission;
 
 #[cfg(feature = "python")]

@@ -10,11 +10,12 @@ use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
 use pyo3::types::{PyDict, PyTuple, PyType};
 
-use crate::effects::Element;
+use crate::effects::{Coordinates, Element, JointEffects};
 use crate::error::Error;
 use crate::external::External;
 use crate::laws::{Foreign, Law, Shape, Table};
 use crate::model::{Arrangement, Link, Model, Motor, Transmission};
+use crate::model_monitor::Baseline;
 use crate::sample::{Estimate, MOTORS, Sample, TransmissionEstimate};
 use crate::settings::{Method, Mode, Priors, Settings};
 
@@ -410,6 +411,155 @@ impl Estimator {
     }
 }
 
+/// The effects of a joint's model tick by tick; see `estimator.effects`.
+#[pyclass]
+pub struct OnlineEffects {
+    inner: JointEffects,
+    active: bool,
+    motors: usize,
+}
+
+#[pymethods]
+impl OnlineEffects {
+    #[new]
+    fn new(model: &Bound<'_, PyAny>, period_s: f64) -> PyResult<OnlineEffects> {
+        let model = self::model(model)?;
+        let active = !model.link_effects.is_empty() || model.motors.iter().any(|m| !m.effects.is_empty());
+        Ok(OnlineEffects { inner: JointEffects::new(&model, period_s)?, active, motors: model.motors.len() })
+    }
+
+    /// Whether the model has any effect.
+    #[getter]
+    fn active(&self) -> bool {
+        self.active
+    }
+
+    /// Forget memories, delayed samples, the time since the start.
+    fn reset(&mut self) {
+        self.inner.reset();
+    }
+
+    /// The sample as perfect sensors would have given it, with the same sequence number.
+    fn correct<'py>(&mut self, sample: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
+        let py = sample.py();
+        let corrected = self.inner.corrections.correct(&self::sample(sample)?.0);
+        let each = |values: &[f64; MOTORS]| PyTuple::new(py, &values[..self.motors]);
+        let class = py.import("estimator.sample")?.getattr("Sample")?;
+        class.call1((
+            corrected.sequence as i64,
+            each(&corrected.motor_position)?,
+            each(&corrected.motor_velocity)?,
+            each(&corrected.motor_torque)?,
+            corrected.link_position,
+            corrected.link_velocity,
+            corrected.external_torque,
+        ))
+    }
+
+    /// (x_motor and x_transmission of each motor, x_link) at one tick's `Coordinates`.
+    fn torques(
+        &mut self,
+        motors: Vec<[f64; Coordinates::NAMES.len()]>,
+        link: [f64; Coordinates::NAMES.len()],
+    ) -> PyResult<(Vec<f64>, Vec<f64>, f64)> {
+        if motors.len() != self.motors {
+            return Err(PyValueError::new_err(format!("motors: expected {} Coordinates", self.motors)));
+        }
+        let coordinates = |numbers: &[f64; Coordinates::NAMES.len()]| Coordinates::from_fn(|k| numbers[k]);
+        let each: Vec<Coordinates> = motors.iter().map(coordinates).collect();
+        let x = self.inner.torques(&each, &coordinates(&link));
+        Ok((x.motor[..self.motors].to_vec(), x.transmission[..self.motors].to_vec(), x.link))
+    }
+}
+
+/// Residuals, torques, standard deviations of logarithms, seconds.
+type BaselineNumbers = (Vec<f64>, Vec<f64>, Vec<f64>, usize);
+
+/// The monitor of a joint's model; see `estimator.model_monitor.ModelMonitor`.
+#[pyclass]
+pub struct ModelMonitor {
+    /// The mathematics.
+    pub inner: crate::model_monitor::ModelMonitor,
+    #[pyo3(get)]
+    monitoring: bool,
+    motors: usize,
+}
+
+#[pymethods]
+impl ModelMonitor {
+    /// A baseline that is of another joint is not used.
+    #[new]
+    fn new(
+        model: &Bound<'_, PyAny>,
+        period_s: f64,
+        baseline: Option<BaselineNumbers>,
+        false_alarms_per_hour: f64,
+    ) -> PyResult<ModelMonitor> {
+        let model = self::model(model)?;
+        let balances = crate::model_monitor::balances(&model);
+        let baseline =
+            baseline.filter(|told| told.0.len() == balances).map(|(residual, torque, log_std, seconds)| {
+                let padded =
+                    |values: Vec<f64>| std::array::from_fn(|b| values.get(b).copied().unwrap_or(1.0));
+                Baseline {
+                    residual: padded(residual),
+                    torque: padded(torque),
+                    log_std: padded(log_std),
+                    seconds,
+                }
+            });
+        let inner =
+            crate::model_monitor::ModelMonitor::new(&model, baseline, false_alarms_per_hour, period_s)?;
+        Ok(ModelMonitor { inner, monitoring: baseline.is_some(), motors: model.motors.len() })
+    }
+
+    /// Take one sample; whether the alarm is on.
+    fn step(&mut self, sample: &Bound<'_, PyAny>) -> PyResult<bool> {
+        let (taken, motors) = self::sample(sample)?;
+        Ok(if motors == self.motors { self.inner.step(&taken) } else { self.inner.alarm() })
+    }
+
+    /// Forget everything but the model and its baseline.
+    fn reset(&mut self) {
+        self.inner.reset();
+    }
+
+    /// Whether the alarm is on.
+    #[getter]
+    fn alarm(&self) -> bool {
+        self.inner.alarm()
+    }
+
+    /// Whole seconds that have been judged.
+    #[getter]
+    fn seconds(&self) -> u64 {
+        self.inner.seconds()
+    }
+
+    /// Rms of each balance over the last whole second, N·m.
+    #[getter]
+    fn residual_nm<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
+        PyTuple::new(py, &self.inner.found().residual[..self.inner.balances()])
+    }
+
+    /// Rms of the torque that it is to be compared with, N·m.
+    #[getter]
+    fn torque_nm<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
+        PyTuple::new(py, &self.inner.found().torque[..self.inner.balances()])
+    }
+
+    /// (residual over what is foreseen, that which raises the alarm) of the balance that is nearest to it.
+    #[getter]
+    fn ratio(&self) -> (f64, f64) {
+        (self.inner.found().ratio, self.inner.found().limit)
+    }
+
+    /// Where the effect that the model lacks is likely to sit.
+    fn location(&self) -> &'static str {
+        self.inner.location()
+    }
+}
+
 /// What `estimator._core` offers.
 #[cfg(feature = "extension-module")]
 #[pyo3::pymodule(name = "_core")]
@@ -418,14 +568,19 @@ mod extension {
     use pyo3::exceptions::PyValueError;
     use pyo3::prelude::*;
 
-    use crate::effects::{Coordinates, Element};
     use crate::laws::{Law, PARAMETERS};
+    use crate::library::{Coordinates, Element, LIBRARY, Parameter, Role};
 
     #[pymodule_export]
-    use super::Estimator;
+    use super::{Estimator, ModelMonitor, OnlineEffects};
+
+    type EffectParameter = (&'static str, &'static str, bool, Option<f64>);
+    type EffectKind =
+        (&'static str, &'static str, &'static str, &'static str, Vec<EffectParameter>, bool, &'static str);
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
+        module.add("STOP_EXPONENT", crate::memory::STOP_EXPONENT)?;
         module.add("__version__", env!("CARGO_PKG_VERSION"))
     }
 
@@ -549,42 +704,50 @@ mod extension {
         out.copy_from_slice(py, &told)
     }
 
-    /// The terms of one element of an effect, unweighted, at arrays of coordinates.
+    /// (name, location, channel, coordinate, parameters, whether it remembers, description) of every effect.
+    #[pyfunction]
+    fn effect_kinds() -> Vec<EffectKind> {
+        let parameter = |p: &Parameter| (p.name, p.meaning, p.role == Role::Linear, p.default);
+        (LIBRARY.iter())
+            .map(|kind| {
+                let (location, channel) = kind.place.names();
+                let parameters = kind.parameters.iter().map(parameter).collect();
+                let remembers = matches!(kind.law, crate::library::Law::Memory { .. });
+                (kind.name, location, channel, kind.coordinate, parameters, remembers, kind.description)
+            })
+            .collect()
+    }
+
+    /// The terms of one element of an effect, unweighted, over consecutive moments.
     ///
-    /// `coordinates`: 13 rows, one a field of `estimator.effects.Coordinates`; `out`: one row a term.
+    /// `coordinates`: the fields of `estimator.effects.Coordinates`, each of n numbers or of one; `out`: n
+    /// numbers a term.
     #[pyfunction]
     fn effect_terms(
         py: Python<'_>,
         name: &str,
         values: Vec<f64>,
-        coordinates: PyBuffer<f64>,
+        coordinates: Vec<PyBuffer<f64>>,
         out: PyBuffer<f64>,
     ) -> PyResult<()> {
         let element = Element::new(name, &values)?;
-        let table = slice(py, &coordinates)?;
-        let n = table.len() / 13;
+        let fields: Vec<_> = coordinates.iter().filter_map(|field| field.as_slice(py)).collect();
+        let n = fields.iter().map(|field| field.len()).max().unwrap_or(0);
         let terms = element.kind.terms();
-        let mut told = vec![0.0; n * terms];
-        for k in 0..n {
-            let at = |field: usize| table[field * n + k];
-            let c = Coordinates {
-                position: at(0),
-                velocity: at(1),
-                acceleration: at(2),
-                deflection: at(3),
-                deflection_rate: at(4),
-                flexibility_torque: at(5),
-                stiffness: at(6),
-                torque: at(7),
-                torque_rate: at(8),
-                link_position: at(9),
-                link_velocity: at(10),
-                link_acceleration: at(11),
-                time: at(12),
-            };
-            let now = element.terms(&c);
-            (0..terms).for_each(|term| told[term * n + k] = now[term]);
+        let whole = fields.len() == Coordinates::NAMES.len()
+            && fields.iter().all(|field| field.len() == n || field.len() == 1)
+            && out.item_count() == n * terms;
+        if !whole || n == 0 {
+            return Err(PyValueError::new_err("coordinates: expected arrays of one size, all contiguous"));
         }
+        let moments = (0..n).map(|k| {
+            Coordinates::from_fn(|field| {
+                let numbers = fields[field];
+                numbers[if numbers.len() == 1 { 0 } else { k }].get()
+            })
+        });
+        let mut told = vec![0.0; n * terms];
+        element.along(moments, &mut told.chunks_exact_mut(n).collect::<Vec<_>>());
         out.copy_from_slice(py, &told)
     }
 }

@@ -34,7 +34,7 @@ pub mod status {
     pub const GAP: u32 = 1 << 2;
     /// Innovation alarm: the joint changed, the estimate is following.
     pub const CHANGED: u32 = 1 << 3;
-    /// Residual above the model's own floor: the model is not sufficient.
+    /// Residual above the model's own baseline: the model is not sufficient.
     pub const MODEL_ALARM: u32 = 1 << 4;
     /// This sample was not finite, jumped or froze, and was not used.
     pub const INPUT_REJECTED: u32 = 1 << 5;

@@ -1,0 +1,223 @@
+//! What a model's effects do to readings: a sample as perfect sensors would have given it.
+
+use crate::effects::{MotorEffects, link_sum};
+use crate::error::Error;
+use crate::library::{ABSURD, Coordinates, Element, Place};
+use crate::sample::{MOTORS, Sample};
+
+/// The torque that acts, where the reported one is apart from it by a first-order lag of signed time constant.
+///
+/// T₀ > 0: the reported torque is held from its sample to the next, the acting one follows it with T₀; what
+/// acts in a period is its mean. T₀ < 0: the reported torque follows, so the acting one is ahead by its slope.
+#[derive(Clone, Copy, Debug)]
+struct Lag {
+    periods: f64, // T₀ / T
+    behind: f64,  // the torque that lags
+    reported: f64,
+    started: bool,
+}
+
+impl Lag {
+    fn new(periods: f64) -> Lag {
+        Lag { periods, behind: 0.0, reported: 0.0, started: false }
+    }
+
+    fn acting(&mut self, reported: f64, after: f64) -> f64 {
+        if self.periods == 0.0 || reported.abs() >= ABSURD || reported.is_nan() {
+            return reported;
+        }
+        if !self.started {
+            (self.behind, self.reported, self.started) = (reported, reported, true);
+        }
+        let before = std::mem::replace(&mut self.reported, reported);
+        if self.periods < 0.0 {
+            return reported - self.periods * (reported - before) / after;
+        }
+        self.behind = before + (self.behind - before) * (-after / self.periods).exp();
+        reported + (self.behind - reported) * -(-1.0 / self.periods).exp_m1() * self.periods
+    }
+}
+
+/// What makes a sample one of perfect sensors.
+#[derive(Clone, Debug)]
+pub struct Corrections {
+    period: f64,
+    active: bool,
+    reading: Vec<Element>,
+    drive: [Vec<Element>; MOTORS],
+    offset: [f64; MOTORS],
+    lag: [Lag; MOTORS],
+    // The torque acts its delay later than reported, the link position is read late: with the largest of
+    // these delays as common, motor positions wait that long, the rest what is left of it. In periods.
+    delayed: bool,
+    motor: f64,
+    link: f64,
+    torque: [f64; MOTORS],
+    first: Option<u64>,
+    last: u64,
+    past: Vec<Sample>,
+    newest: usize,
+    known: usize,
+}
+
+impl Corrections {
+    /// Of a joint's motors and of its link.
+    ///
+    /// # Errors
+    /// An effect of the link belongs to a motor.
+    pub fn new(motors: &[MotorEffects], link: &[Element], period_s: f64) -> Result<Corrections, Error> {
+        link_sum(link)?;
+        let at = |place: Place| link.iter().filter(move |element| element.kind.place == place);
+        let reading: Vec<Element> = at(Place::LinkReading).copied().collect();
+        let encoder_delay: f64 = at(Place::LinkDelay).map(|element| element.values[0]).sum();
+        let (mut drive, mut offset, mut delays): ([Vec<Element>; MOTORS], _, _) =
+            (Default::default(), [0.0; MOTORS], [0.0; MOTORS]);
+        let mut lag = [Lag::new(0.0); MOTORS];
+        for (i, motor) in motors.iter().enumerate() {
+            drive[i].clone_from(&motor.drive);
+            offset[i] = motor.offset;
+            delays[i] = motor.delay;
+            lag[i] = Lag::new(motor.lag / period_s);
+        }
+        let common = delays.iter().fold(encoder_delay.max(0.0), |latest, delay| latest.max(-delay));
+        let torque = delays.map(|delay| (common + delay) / period_s);
+        let (motor, late) = (common / period_s, (common - encoder_delay) / period_s);
+        let longest = torque.iter().fold(motor.max(late), |a, b| a.max(*b));
+        let delayed = encoder_delay != 0.0 || delays.iter().any(|delay| *delay != 0.0);
+        let nothing = Sample {
+            sequence: 0,
+            motor_position: [f64::NAN; MOTORS],
+            motor_velocity: [f64::NAN; MOTORS],
+            motor_torque: [f64::NAN; MOTORS],
+            link_position: f64::NAN,
+            link_velocity: f64::NAN,
+            external_torque: f64::NAN,
+        };
+        Ok(Corrections {
+            period: period_s,
+            active: delayed
+                || !reading.is_empty()
+                || motors.iter().any(|m| !m.drive.is_empty() || m.offset != 0.0 || m.lag != 0.0),
+            reading,
+            drive,
+            offset,
+            lag,
+            delayed,
+            motor,
+            link: late,
+            torque,
+            first: None,
+            last: 0,
+            past: vec![nothing; longest as usize + 2],
+            newest: 0,
+            known: 0,
+        })
+    }
+
+    /// Whether they change anything.
+    #[must_use]
+    pub fn active(&self) -> bool {
+        self.active
+    }
+
+    /// Forget delayed samples and the time since the start.
+    pub fn reset(&mut self) {
+        self.first = None;
+        self.known = 0;
+        self.lag = self.lag.map(|lag| Lag::new(lag.periods));
+    }
+
+    /// The sample as perfect sensors would have given it.
+    pub fn correct(&mut self, sample: &Sample) -> Sample {
+        if !self.active {
+            return *sample;
+        }
+        if self.first.is_none() {
+            self.last = sample.sequence;
+        }
+        let first = *self.first.get_or_insert(sample.sequence);
+        let after = (sample.sequence.wrapping_sub(self.last) as f64).max(1.0);
+        self.last = sample.sequence;
+        let mut out = if self.delayed { self.delay(sample) } else { *sample };
+        let read = out.link_position;
+        if !self.reading.is_empty() && read.abs() < ABSURD {
+            out.link_position = read - self.error(read - self.error(read));
+        }
+        let time = sample.sequence.wrapping_sub(first) as f64 * self.period;
+        for (i, elements) in self.drive.iter().enumerate() {
+            let torque = out.motor_torque[i];
+            if torque.abs() < ABSURD {
+                let c = Coordinates { torque, time, ..Coordinates::default() };
+                let acting = torque - elements.iter().map(|e| e.torque(&c)).sum::<f64>();
+                out.motor_torque[i] = self.lag[i].acting(acting, after);
+            }
+            out.motor_position[i] += self.offset[i];
+        }
+        out
+    }
+
+    fn error(&self, link_position: f64) -> f64 {
+        let c = Coordinates { link_position, ..Coordinates::default() };
+        self.reading.iter().map(|element| element.torque(&c)).sum()
+    }
+
+    fn delay(&mut self, sample: &Sample) -> Sample {
+        self.newest = (self.newest + 1) % self.past.len();
+        self.past[self.newest] = *sample;
+        self.known = (self.known + 1).min(self.past.len());
+        let mut out = *sample;
+        let (a, b, share) = self.at(sample.sequence, self.motor);
+        let mix = |old: f64, new: f64, share: f64| if share == 0.0 { old } else { old + share * (new - old) };
+        for i in 0..MOTORS {
+            out.motor_position[i] = mix(a.motor_position[i], b.motor_position[i], share);
+            out.motor_velocity[i] = mix(a.motor_velocity[i], b.motor_velocity[i], share);
+        }
+        out.external_torque = mix(a.external_torque, b.external_torque, share);
+        for i in 0..MOTORS {
+            let (a, b, share) = self.at(sample.sequence, self.torque[i]);
+            out.motor_torque[i] = mix(a.motor_torque[i], b.motor_torque[i], share);
+        }
+        let (a, b, share) = self.at(sample.sequence, self.link);
+        out.link_position = mix(a.link_position, b.link_position, share);
+        out.link_velocity = mix(a.link_velocity, b.link_velocity, share);
+        out
+    }
+
+    /// The samples around a time so many periods ago, and the share of the newer one.
+    fn at(&self, now: u64, periods: f64) -> (&Sample, &Sample, f64) {
+        let mut newer = &self.past[self.newest];
+        for k in 0..self.known {
+            let older = &self.past[(self.newest + self.past.len() - k) % self.past.len()];
+            let age = now.wrapping_sub(older.sequence) as f64;
+            if age >= periods {
+                let span = newer.sequence.wrapping_sub(older.sequence) as f64;
+                let share = if span > 0.0 { (age - periods) / span } else { 0.0 };
+                return (older, newer, share);
+            }
+            newer = older;
+        }
+        (newer, newer, 0.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_torque_that_lags_a_ramp_is_late_by_its_time_constant() {
+        for after in [1.0, 3.0] {
+            let (mut acting, mut reported) = (Lag::new(7.0), Lag::new(-7.0));
+            let (mut late, mut early) = (0.0, 0.0);
+            for k in 0..400 {
+                let torque = f64::from(k) * after;
+                (late, early) = (acting.acting(torque, after), reported.acting(torque, after));
+            }
+            let torque = 399.0 * after;
+            // The reported ramp is a stair held for `after` periods: the mean over the first of them.
+            let share = (-1f64 / 7.0).exp_m1() / (-after / 7.0).exp_m1();
+            assert!((late - (torque - 7.0 * after * share)).abs() < 1e-6);
+            assert!((early - (torque + 7.0)).abs() < 1e-6);
+        }
+    }
+}

@@ -1,0 +1,562 @@
+//! Is the model still sufficient? Its residual beside what it left when it was fitted.
+//!
+//! The balances of eqs 5 and 4 are formed with the model's own parameters and effects, not with those that
+//! the estimator adapts. All channels pass one light filter that gives derivatives, the balances a second one.
+//!
+//! Of each second the mean square S of a balance is foreseen: what the healthy recording's seconds had, more
+//! where there is more torque, as errors of a model grow with it. x = ln(S/foreseen) of N healthy seconds has
+//! the standard deviation s; one more second is then Student's t with N − 1 degrees of freedom about 0 with
+//! the variance s² (1 + 1/N), and another motion than the recorded one adds its own. The alarm is the quantile
+//! of x at the rate of false alarms that is declared, shared by the balances and by the seconds of an hour.
+
+use crate::effects::{Coordinates, JointEffects, Torques};
+use crate::error::Error;
+use crate::filters::StateVariableFilter;
+use crate::laws::Law;
+use crate::model::{Arrangement, Link, Model, Transmission};
+use crate::sample::{MOTORS, Sample};
+use crate::student::t_quantile;
+
+/// Balances of a joint, at most: of its motors, then of its link.
+pub const BALANCES: usize = MOTORS + 1;
+
+const WINDOW_S: f64 = 1.0; // over which a mean square is taken: several periods of usual motions
+const NARROW_RAD_S: f64 = 60.0; // the usual bandwidth of the estimator
+const LIGHT_RATIO: f64 = 3.0; // laws that bend are formed from signals with so much more bandwidth
+const SETTLED: f64 = 30.0; // rad of the narrow filter's bandwidth until a start at rest is forgotten
+const BRIDGED: f64 = 0.4; // rad that it turns by in a gap: over a longer one the monitor begins anew
+const MOTION: f64 = 0.35; // standard deviation of x between one motion and another one
+const LEAST: f64 = 0.003; // of the torque: what filters, sampling and rounding leave of a true model
+const ABSURD: f64 = 1e9;
+
+const TORQUE: usize = MOTORS; // channels: motor positions, motor torques, link position, external torque
+const LINK: usize = 2 * MOTORS;
+const EXTERNAL: usize = LINK + 1;
+const CHANNELS: usize = EXTERNAL + 1;
+
+/// What a sufficient model leaves of each balance, from the seconds of a healthy recording.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Baseline {
+    /// Usual rms of each second, N·m.
+    pub residual: [f64; BALANCES],
+    /// Rms of the torque at which that was, N·m.
+    pub torque: [f64; BALANCES],
+    /// s: standard deviation of the logarithm of a second's mean square.
+    pub log_std: [f64; BALANCES],
+    /// N.
+    pub seconds: usize,
+}
+
+/// What was found in the last whole second.
+#[derive(Clone, Copy, Debug)]
+pub struct Found {
+    /// Rms of each balance, N·m.
+    pub residual: [f64; BALANCES],
+    /// Rms of the torque it is to be compared with, N·m.
+    pub torque: [f64; BALANCES],
+    /// Largest of residual over foreseen, and the one that raises the alarm there.
+    pub ratio: f64,
+    /// See `ratio`.
+    pub limit: f64,
+    /// ∫ of each motor's residual times the link's over the second, N²·m².
+    cross: [f64; MOTORS],
+    /// The foreseen mean squares.
+    foreseen: [f64; BALANCES],
+}
+
+impl Found {
+    const NOTHING: Found = Found {
+        residual: [f64::NAN; BALANCES],
+        torque: [f64::NAN; BALANCES],
+        ratio: f64::NAN,
+        limit: f64::NAN,
+        cross: [f64::NAN; MOTORS],
+        foreseen: [f64::NAN; BALANCES],
+    };
+}
+
+#[derive(Clone, Debug)]
+struct MotorSide {
+    inertia: f64,
+    damping: f64,
+    flexible: bool,
+    law: Option<(Law, Vec<f64>)>, // None: its torque is not known
+}
+
+/// See the module.
+#[derive(Clone, Debug)]
+pub struct ModelMonitor {
+    motors: Vec<MotorSide>,
+    flexible: bool,
+    link: Option<Link>,
+    linked: bool, // whether the link has a balance
+    pulls: usize, // transmissions that act on the link (eqs 4, 9)
+    effects: JointEffects,
+    light: StateVariableFilter<3>,
+    narrow: StateVariableFilter<2>,
+    baseline: Option<Baseline>,
+    limit: [f64; BALANCES], // of x
+    settle: u64,
+    window: u64,
+    bridged: u64,
+    period: f64,
+
+    last: Option<u64>,
+    inputs: [f64; CHANNELS],
+    torque: [f64; MOTORS], // as it acts since the last sample
+    channels: [[f64; 3]; CHANNELS],
+    raw: [f64; 2 * BALANCES], // balances, then the torques they are compared with
+    filtered: [[f64; 2]; 2 * BALANCES],
+    squares: [f64; 2 * BALANCES],
+    cross: [f64; MOTORS],
+    ticks: u64,
+    found: Found,
+    seconds: u64,
+    alarm: bool,
+}
+
+/// How many balances a joint has: of its motors, then of its link where its dynamics are known.
+#[must_use]
+pub fn balances(model: &Model) -> usize {
+    model.motors.len() + usize::from(model.link.is_some() && model.has_deflection())
+}
+
+impl ModelMonitor {
+    /// For a model with its transmissions' parameters, and its baseline; without one it only measures.
+    ///
+    /// # Errors
+    /// The model contradicts itself, or an effect is where it does not belong.
+    pub fn new(
+        model: &Model,
+        baseline: Option<Baseline>,
+        false_alarms_per_hour: f64,
+        period_s: f64,
+    ) -> Result<ModelMonitor, Error> {
+        model.check()?;
+        let motors: Vec<MotorSide> = (model.motors.iter())
+            .map(|motor| MotorSide {
+                inertia: motor.inertia,
+                damping: motor.damping,
+                flexible: motor.flexible(),
+                law: match &motor.transmission {
+                    Transmission::Elastic { law, parameters, .. } if !parameters.is_empty() => {
+                        Some((law.clone(), parameters.clone()))
+                    }
+                    _ => None,
+                },
+            })
+            .collect();
+        let linked = model.link.is_some() && model.has_deflection();
+        let balances = balances(model);
+        let narrow = StateVariableFilter::new(NARROW_RAD_S.min(1.0 / (LIGHT_RATIO * period_s)), period_s);
+        let periods = |rad: f64| (rad / (narrow.bandwidth * period_s)).ceil() as u64;
+        let limit = baseline.map_or([f64::INFINITY; BALANCES], |baseline| {
+            let n = baseline.seconds as f64;
+            let chance = false_alarms_per_hour * WINDOW_S / 3600.0 / balances as f64;
+            // The quantile's probability is that of both tails.
+            let t = t_quantile((n - 1.0).max(1.0), 2.0 * chance);
+            baseline.log_std.map(|s| t * (s * s * (1.0 + 1.0 / n) + MOTION * MOTION).sqrt())
+        });
+        let mut made = ModelMonitor {
+            flexible: model.has_deflection(),
+            link: model.link,
+            linked,
+            pulls: if model.arrangement == Arrangement::Antagonistic { motors.len() } else { 1 },
+            effects: JointEffects::new(model, period_s)?,
+            light: StateVariableFilter::new(LIGHT_RATIO * narrow.bandwidth, period_s),
+            baseline,
+            limit,
+            settle: periods(SETTLED),
+            window: (WINDOW_S / period_s).round().max(1.0) as u64,
+            bridged: periods(BRIDGED),
+            period: period_s,
+            narrow,
+            motors,
+            last: None,
+            inputs: [0.0; CHANNELS],
+            torque: [0.0; MOTORS],
+            channels: [[0.0; 3]; CHANNELS],
+            raw: [0.0; 2 * BALANCES],
+            filtered: [[0.0; 2]; 2 * BALANCES],
+            squares: [0.0; 2 * BALANCES],
+            cross: [0.0; MOTORS],
+            ticks: 0,
+            found: Found::NOTHING,
+            seconds: 0,
+            alarm: false,
+        };
+        made.reset();
+        Ok(made)
+    }
+
+    /// Forget everything but the model and its baseline.
+    pub fn reset(&mut self) {
+        self.effects.reset();
+        self.last = None;
+        self.seconds = 0;
+        self.alarm = false;
+        self.found = Found::NOTHING;
+    }
+
+    /// See [`balances`].
+    #[must_use]
+    pub fn balances(&self) -> usize {
+        self.motors.len() + usize::from(self.linked)
+    }
+
+    /// Whether the alarm is on.
+    #[must_use]
+    pub fn alarm(&self) -> bool {
+        self.alarm
+    }
+
+    /// What was found in the last second; NaN before a whole one, and after a gap.
+    #[must_use]
+    pub fn found(&self) -> &Found {
+        &self.found
+    }
+
+    /// Whole seconds that have been judged.
+    #[must_use]
+    pub fn seconds(&self) -> u64 {
+        self.seconds
+    }
+
+    /// Take one sample as it was measured; whether the alarm is on. What is no measurement is passed over.
+    pub fn step(&mut self, sample: &Sample) -> bool {
+        let channels = self.inputs_of(sample);
+        if !channels.iter().all(|value| value.abs() < ABSURD) {
+            return self.alarm;
+        }
+        let periods = self.last.map_or(0, |last| sample.sequence.wrapping_sub(last));
+        let goes_on = (1..=self.bridged.max(1)).contains(&periods);
+        if !goes_on {
+            self.effects.reset();
+        }
+        let corrected = self.effects.corrections.correct(sample);
+        let mut now = self.inputs_of(&corrected);
+        self.last = Some(sample.sequence);
+        if !goes_on {
+            self.restart(&now);
+            return self.alarm;
+        }
+        let (from, acted) = (self.inputs, self.torque);
+        for k in 1..periods {
+            let share = k as f64 / periods as f64;
+            let mut between: [f64; CHANNELS] = std::array::from_fn(|c| from[c] + share * (now[c] - from[c]));
+            between[TORQUE..LINK].copy_from_slice(&acted);
+            self.advance(&between);
+        }
+        // A torque acts from its sample to the next: around this moment it is half the old, half the new one.
+        for i in 0..MOTORS {
+            self.torque[i] = now[TORQUE + i];
+            now[TORQUE + i] = 0.5 * (acted[i] + now[TORQUE + i]);
+        }
+        self.advance(&now);
+        self.alarm
+    }
+
+    fn inputs_of(&self, sample: &Sample) -> [f64; CHANNELS] {
+        let mut channels = [0.0; CHANNELS];
+        let motors = self.motors.len();
+        channels[..motors].copy_from_slice(&sample.motor_position[..motors]);
+        channels[TORQUE..TORQUE + motors].copy_from_slice(&sample.motor_torque[..motors]);
+        if self.flexible {
+            channels[LINK] = sample.link_position;
+        }
+        if self.link.is_some() && sample.external_torque.is_finite() {
+            channels[EXTERNAL] = sample.external_torque;
+        }
+        channels
+    }
+
+    fn restart(&mut self, now: &[f64; CHANNELS]) {
+        self.inputs = *now;
+        self.torque.copy_from_slice(&now[TORQUE..LINK]);
+        self.channels = now.map(StateVariableFilter::<3>::rest);
+        self.raw = [0.0; 2 * BALANCES];
+        self.filtered = [[0.0; 2]; 2 * BALANCES];
+        self.found = Found::NOTHING;
+        self.ticks = 0;
+        self.begin_second();
+    }
+
+    fn begin_second(&mut self) {
+        self.squares = [0.0; 2 * BALANCES];
+        self.cross = [0.0; MOTORS];
+    }
+
+    /// One period: filters, balances, and at the end of a second its judgement.
+    fn advance(&mut self, now: &[f64; CHANNELS]) {
+        for (state, (before, now)) in self.channels.iter_mut().zip(self.inputs.iter().zip(now)) {
+            self.light.smooth.apply(state, *before, *now);
+        }
+        self.inputs = *now;
+        self.ticks += 1;
+        let raw = self.balance();
+        if !raw.iter().all(|value| value.abs() < ABSURD) {
+            self.last = None; // outside the law's range: begin anew
+            return;
+        }
+        for (state, (before, now)) in self.filtered.iter_mut().zip(self.raw.iter().zip(&raw)) {
+            self.narrow.smooth.apply(state, *before, *now);
+        }
+        self.raw = raw;
+        if self.ticks <= self.settle {
+            return;
+        }
+        for (square, state) in self.squares.iter_mut().zip(&self.filtered) {
+            *square += state[0] * state[0];
+        }
+        let link = self.filtered[self.motors.len()][0];
+        for (cross, state) in self.cross.iter_mut().zip(&self.filtered) {
+            *cross += state[0] * link;
+        }
+        if (self.ticks - self.settle) % self.window == 0 {
+            self.judge();
+            self.begin_second();
+        }
+    }
+
+    /// The balances with the model's own numbers, and the torques they are compared with.
+    fn balance(&mut self) -> [f64; 2 * BALANCES] {
+        let motors = self.motors.len();
+        let [q, link_rate, link_acceleration] = self.channels[LINK];
+        let (mut each, mut torques) = ([Coordinates::default(); MOTORS], [0.0; MOTORS]);
+        let time = self.ticks as f64 * self.period;
+        let at_link = Coordinates {
+            link_position: q,
+            link_velocity: link_rate,
+            link_acceleration,
+            time,
+            ..Coordinates::default()
+        };
+        for (i, side) in self.motors.iter().enumerate() {
+            let [theta, velocity, acceleration] = self.channels[i];
+            let [torque, torque_rate, _] = self.channels[TORQUE + i];
+            let phi = if side.flexible { q - theta } else { 0.0 };
+            let (flexibility, stiffness) = side.law.as_ref().map_or((0.0, 0.0), |(law, a)| law.at(phi, a));
+            torques[i] = flexibility;
+            each[i] = Coordinates {
+                position: theta,
+                velocity,
+                acceleration,
+                deflection: phi,
+                deflection_rate: if side.flexible { link_rate - velocity } else { 0.0 },
+                flexibility_torque: flexibility,
+                stiffness,
+                torque,
+                torque_rate,
+                ..at_link
+            };
+        }
+        let x: Torques = self.effects.torques(&each[..motors], &at_link);
+        let mut raw = [0.0; 2 * BALANCES];
+        let external = self.channels[EXTERNAL][0];
+        for (i, side) in self.motors.iter().enumerate() {
+            let c = &each[i];
+            // B θ″ + D θ′ + x_motor − τ_e − x_transmission − τ (eq 5)
+            let own = side.inertia * c.acceleration + side.damping * c.velocity;
+            raw[i] = own + x.motor[i] - torques[i] - x.transmission[i] - c.torque;
+            raw[BALANCES + i] = c.torque;
+        }
+        let Some(link) = self.link else { return raw };
+        let load = |position: f64, rate: f64, acceleration: f64| {
+            let gravity = link.gravity * (position + link.gravity_phase).sin();
+            link.inertia * acceleration + link.damping * rate + gravity
+        };
+        if self.linked {
+            // τ_k − (M q″ + D_q q′ + g(q) + τ_e + x_transmission + x_link) (eqs 4, 6)
+            let through: f64 = (0..self.pulls).map(|i| torques[i] + x.transmission[i]).sum();
+            raw[motors] = external - load(q, link_rate, link_acceleration) - through - x.link;
+            raw[BALANCES + motors] = through;
+        } else {
+            // Rigid: the link moves with the first motor.
+            let c = &each[0];
+            raw[0] += load(c.position, c.velocity, c.acceleration) + x.link - external;
+        }
+        raw
+    }
+
+    /// One second: its rms beside what is foreseen of it.
+    fn judge(&mut self) {
+        let (balances, window) = (self.balances(), self.window as f64);
+        let mean = self.squares.map(|sum| sum / window);
+        let found = &mut self.found;
+        for b in 0..BALANCES {
+            (found.residual[b], found.torque[b]) = (mean[b].sqrt(), mean[BALANCES + b].sqrt());
+        }
+        found.cross = self.cross.map(|sum| sum / window);
+        self.seconds += 1;
+        let Some(baseline) = &self.baseline else { return };
+        let largest = found.torque.iter().fold(0.0f64, |a, b| a.max(*b));
+        let (mut worst, mut alarm) = (f64::NEG_INFINITY, false);
+        for b in 0..balances {
+            let growth = (found.torque[b] / baseline.torque[b]).max(1.0);
+            found.foreseen[b] = (baseline.residual[b] * growth).powi(2) + (LEAST * largest).powi(2);
+            let x = (mean[b] / found.foreseen[b]).ln();
+            alarm |= x > self.limit[b];
+            if x - self.limit[b] > worst {
+                worst = x - self.limit[b];
+                (found.ratio, found.limit) = ((0.5 * x).exp(), (0.5 * self.limit[b]).exp());
+            }
+        }
+        self.alarm = alarm;
+    }
+
+    /// Where the effect that the model lacks is likely to sit: the place that explains most of both balances.
+    ///
+    /// An effect of the motor or of the link is in its own balance alone, one of the transmission is the same
+    /// torque in both. What each of these leaves is compared in units of what is foreseen.
+    #[must_use]
+    pub fn location(&self) -> &'static str {
+        let Found { residual, foreseen, cross, .. } = &self.found;
+        let motors = self.motors.len();
+        let foreseen = foreseen.map(|square| if square > 0.0 { square } else { 1.0 });
+        let over = |b: usize| residual[b] * residual[b] / foreseen[b];
+        let worst = (1..motors).fold(0, |worst, i| if over(i) > over(worst) { i } else { worst });
+        if !self.linked {
+            return if self.motors[worst].flexible { "motor or transmission" } else { "motor" };
+        }
+        let both = residual[worst].powi(2) + residual[motors].powi(2) - 2.0 * cross[worst];
+        let left = [
+            ("motor", over(motors)),
+            ("link", over(worst)),
+            ("transmission", both / (foreseen[worst] + foreseen[motors])),
+        ];
+        left.iter().fold(left[0], |least, one| if one.1 < least.1 { *one } else { least }).0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::effects::Element;
+    use crate::model::Motor;
+
+    const T: f64 = 1e-3;
+
+    fn model(effects: Vec<Element>) -> Model {
+        Model {
+            arrangement: Arrangement::Single,
+            motors: vec![Motor {
+                inertia: 0.1,
+                damping: 0.5,
+                transmission: Transmission::Elastic {
+                    law: Law::Linear,
+                    order: None,
+                    parameters: vec![100.0],
+                },
+                effects,
+            }],
+            link: Some(Link {
+                inertia: 0.3,
+                damping: 0.2,
+                gravity: 0.0,
+                gravity_phase: 0.0,
+                inertia_std: 0.0,
+                damping_std: 0.0,
+                gravity_std: 0.0,
+            }),
+            link_effects: Vec::new(),
+        }
+    }
+
+    /// θ and q are sines and the torques follow from eqs 5 and 4, with torques that the model lacks.
+    fn sample(k: u64, lacks: [f64; 3]) -> Sample {
+        let (t, w) = (k as f64 * T, 7.0f64);
+        let (theta, velocity, acceleration) = ((w * t).sin(), w * (w * t).cos(), -w * w * (w * t).sin());
+        let q = 1.2 * theta;
+        let wave = (3.0 * w * t).sin(); // what is lacking changes as quickly as this
+        let [motor, transmission, link] = lacks.map(|size| size * wave);
+        let through = 100.0 * (q - theta) + transmission;
+        let torque = 0.1 * acceleration + 0.5 * velocity + motor - through;
+        let external = 0.3 * 1.2 * acceleration + 0.2 * 1.2 * velocity + through + link;
+        Sample {
+            sequence: k,
+            motor_position: [theta, f64::NAN],
+            motor_velocity: [f64::NAN; MOTORS],
+            motor_torque: [torque, f64::NAN],
+            link_position: q,
+            link_velocity: f64::NAN,
+            external_torque: external,
+        }
+    }
+
+    fn baseline() -> Baseline {
+        Baseline {
+            residual: [0.1; BALANCES],
+            torque: [15.0; BALANCES],
+            log_std: [0.3; BALANCES],
+            seconds: 30,
+        }
+    }
+
+    fn monitor(effects: Vec<Element>) -> ModelMonitor {
+        ModelMonitor::new(&model(effects), Some(baseline()), 1.0, T).unwrap()
+    }
+
+    #[test]
+    fn a_true_model_leaves_little_and_a_missing_torque_is_measured_and_placed() {
+        for (lacks, place) in
+            [([3.0, 0.0, 0.0], "motor"), ([0.0, 3.0, 0.0], "transmission"), ([0.0, 0.0, 3.0], "link")]
+        {
+            let mut monitor = monitor(Vec::new());
+            for k in 0..4000 {
+                assert!(!monitor.step(&sample(k, [0.0; 3])));
+            }
+            assert!(monitor.found().ratio < 1.0);
+            (4000..7000).for_each(|k| {
+                monitor.step(&sample(k, lacks));
+            });
+            assert!(monitor.alarm());
+            assert_eq!(monitor.location(), place);
+            // A sine of 3 N·m at 21 rad/s behind (180/(s + 180))³ (60/(s + 60))².
+            let gain = |w: f64, n: i32| (1.0 + (21.0 / w).powi(2)).powf(-0.5 * f64::from(n));
+            let rms = 3.0 / 2f64.sqrt() * gain(180.0, 3) * gain(60.0, 2);
+            let b = usize::from(place == "link");
+            assert!((monitor.found().residual[b] / rms - 1.0).abs() < 0.05);
+        }
+    }
+
+    #[test]
+    fn an_effect_that_the_model_has_is_no_residual() {
+        let element = Element::new("viscous_damping", &[-0.5]).unwrap();
+        let mut with = monitor(vec![element]);
+        let mut without = monitor(Vec::new());
+        for k in 0..3000 {
+            let mut sample = sample(k, [0.0; 3]);
+            sample.motor_torque[0] -= 0.5 * 7.0 * (7.0 * k as f64 * T).cos();
+            with.step(&sample);
+            without.step(&sample);
+        }
+        assert!(with.found().residual[0] < 0.1 * without.found().residual[0]);
+    }
+
+    #[test]
+    fn the_rate_of_false_alarms_is_the_declared_one() {
+        // ln S of a second is normal about the baseline's as long as MOTION stands for the rest of it: the
+        // limit is exceeded as often as t says, which for many seconds is the normal distribution's tail.
+        let many = Baseline { log_std: [0.0; BALANCES], seconds: 10_001, ..baseline() };
+        let monitor = ModelMonitor::new(&model(Vec::new()), Some(many), 36.0, T).unwrap();
+        // 36 an hour and two balances: 0.5 % of the seconds, beyond 2.576 standard deviations.
+        assert!((monitor.limit[0] / MOTION - 2.576).abs() < 2e-3);
+    }
+
+    #[test]
+    fn gaps_are_bridged_or_begin_anew_and_what_is_no_measurement_is_passed_over() {
+        let mut monitor = monitor(Vec::new());
+        for k in (0..4000).filter(|k| k % 10 != 3 && k % 10 != 4) {
+            monitor.step(&sample(k, [0.0; 3]));
+        }
+        assert!(monitor.found().ratio < 1.0);
+        for value in [f64::NAN, f64::INFINITY, -1e300] {
+            let mut bad = sample(4000, [0.0; 3]);
+            bad.link_position = value;
+            assert!(!monitor.step(&bad));
+        }
+        assert!(!monitor.found().residual[0].is_nan());
+        monitor.step(&sample(9000, [0.0; 3]));
+        assert!(monitor.found().residual[0].is_nan());
+    }
+}

@@ -1,0 +1,196 @@
+"""The library of physical effects: what each one is, and its terms over arrays and on line.
+
+Names, places, parameters and laws are those of `estimator/core/src/library.rs`, which a tick uses as well.
+
+Signs: with x in N·m, B theta" + D theta' + x_motor - tau_e(phi) - x_transmission = tau and
+M q" + D_q q' + g(q) + tau_e + x_transmission + x_link = tau_k. x is the sum over an effect's terms, each
+times its linear parameter. A measured torque has x too much: the torque that acts is tau - x. A reading
+has its error too much: the true position is the reading less the error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, cast
+
+import numpy as np
+
+from estimator import _core
+from estimator._core import STOP_EXPONENT, OnlineEffects
+from estimator.errors import EstimatorError
+from estimator.model import Effect
+from estimator.sample import FloatArray
+
+__all__ = [
+    "LIBRARY",
+    "STOP_EXPONENT",
+    "Channel",
+    "Coordinates",
+    "EffectType",
+    "Location",
+    "OnlineEffects",
+    "Parameter",
+    "elements",
+]
+
+Location = Literal["motor", "transmission", "link", "measurement"]
+Channel = Literal["torque", "motor_torque", "deflection", "link_position"]
+
+
+class Coordinates(NamedTuple):
+    """What a term may depend on: numbers of one tick, or arrays over a recording, all filtered alike.
+
+    Attributes:
+        position: theta, rad.
+        velocity: theta', rad/s.
+        acceleration: theta'', rad/s².
+        deflection: phi = q - theta, rad.
+        deflection_rate: phi', rad/s.
+        flexibility_torque: tau_e(phi), N·m.
+        stiffness: d tau_e / d phi, N·m/rad.
+        torque: the motor's measured torque tau, N·m.
+        torque_rate: its derivative, N·m/s.
+        link_position: q, rad.
+        link_velocity: q', rad/s.
+        link_acceleration: q'', rad/s².
+        time: since the start, s.
+    """
+
+    position: Any
+    velocity: Any
+    acceleration: Any
+    deflection: Any
+    deflection_rate: Any
+    flexibility_torque: Any
+    stiffness: Any
+    torque: Any
+    torque_rate: Any
+    link_position: Any
+    link_velocity: Any
+    link_acceleration: Any
+    time: Any
+
+
+class Parameter(NamedTuple):
+    """One parameter of an effect.
+
+    Attributes:
+        name: with its unit, as it stands in a joint file.
+        meaning: in words.
+        linear: whether the effect is proportional to it; the k-th linear parameter weighs the k-th term.
+        default: its value where a joint file leaves it out; None: it must be given.
+    """
+
+    name: str
+    meaning: str
+    linear: bool
+    default: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class EffectType:
+    """One kind of effect.
+
+    Attributes:
+        name: as in joint files and reports.
+        location: the part of the joint it belongs to.
+        channel: what it acts on: the torque balance of its location; the motor torque's measurement; the
+            deflection (the zero between the encoders); the link encoder's reading.
+        coordinate: the coordinate that reveals it, a field of `Coordinates`.
+        parameters: its parameters.
+        remembers: whether it depends on the path that led here.
+        description: for reports, in a few words.
+    """
+
+    name: str
+    location: Location
+    channel: Channel
+    coordinate: str
+    parameters: tuple[Parameter, ...]
+    remembers: bool
+    description: str
+
+    @property
+    def linear(self) -> tuple[str, ...]:
+        """Names of the linear parameters, in the order of the terms."""
+        return tuple(p.name for p in self.parameters if p.linear)
+
+    @property
+    def nonlinear(self) -> tuple[str, ...]:
+        """Names of the parameters that enter nonlinearly."""
+        return tuple(p.name for p in self.parameters if not p.linear)
+
+    @property
+    def on_link(self) -> bool:
+        """Whether a joint file holds it under [[link.effect]] and not under [[motor.effect]]."""
+        return self.location == "link" or self.channel == "link_position"
+
+    def terms(self, c: Coordinates, values: Mapping[str, float]) -> FloatArray:
+        """Its terms over consecutive moments, unweighted.
+
+        Channel "torque": torques; "motor_torque": what the measured torque has too much; "deflection" and
+        "link_position": what the reading has too much, rad. What remembers starts from nothing.
+
+        Args:
+            c: arrays (n,), or numbers where they do not change.
+            values: of the nonlinear parameters.
+
+        Returns:
+            (k, n), one row a linear parameter.
+        """
+        fields = [np.ascontiguousarray(field, dtype=np.float64).reshape(-1) for field in c]
+        listed = [1.0 if p.linear else values[p.name] for p in self.parameters]
+        out = np.empty((len(self.linear), max(map(len, fields))))
+        _core.effect_terms(self.name, listed, fields, out.reshape(-1))
+        return out
+
+
+LIBRARY: dict[str, EffectType] = {
+    name: EffectType(
+        name,
+        cast(Location, location),
+        cast(Channel, channel),
+        coordinate,
+        tuple(Parameter(*p) for p in parameters),
+        remembers,
+        description,
+    )
+    for name, location, channel, coordinate, parameters, remembers, description in _core.effect_kinds()
+}
+
+
+def elements(effect: Effect) -> tuple[EffectType, list[dict[str, float]]]:
+    """An effect as its type and one set of plain numbers per element.
+
+    A parameter given as an array makes a sum of elements, e.g. cogging with two harmonics; plain numbers
+    beside it belong to every element. What is left out takes its default.
+
+    Raises:
+        EstimatorError: no such effect or parameter, a parameter missing, arrays of unequal length.
+    """
+    kind = LIBRARY.get(effect.name)
+    if kind is None:
+        raise EstimatorError(f'effect "{effect.name}": expected one of {", ".join(sorted(LIBRARY))}')
+    values: dict[str, float | tuple[float, ...]] = {}
+    for parameter in kind.parameters:
+        value = effect.parameters.get(parameter.name, parameter.default)
+        if value is None:
+            raise EstimatorError(
+                f'effect "{effect.name}": expected parameter {parameter.name}, it is missing'
+            )
+        values[parameter.name] = value
+    unknown = sorted(set(effect.parameters) - set(values))
+    if unknown:
+        raise EstimatorError(
+            f'effect "{effect.name}": unknown parameter {unknown[0]}, expected {", ".join(values)}'
+        )
+    lengths = {len(value) for value in values.values() if isinstance(value, tuple)}
+    if len(lengths) > 1:
+        raise EstimatorError(
+            f'effect "{effect.name}": expected arrays of equal length, got {sorted(lengths)}'
+        )
+    count = lengths.pop() if lengths else 1
+    return kind, [
+        {name: v[i] if isinstance(v, tuple) else v for name, v in values.items()} for i in range(count)
+    ]

@@ -1,0 +1,177 @@
+"""On line: is the model still sufficient? Its residual beside what it left when it was fitted.
+
+The arithmetic is `estimator/core/src/model_monitor.rs`, which says what is tested, and how.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from estimator import _core
+from estimator.errors import EstimatorError
+from estimator.model import JointModel, require, require_finite
+from estimator.sample import Estimate, Record, Sample
+from estimator.settings import EstimatorSettings
+
+__all__ = ["ModelMonitor", "ResidualBaseline", "can_monitor", "measure_baseline"]
+
+_SETTINGS = EstimatorSettings()
+_LONGEST_S = 120.0  # of a recording that a baseline is measured on
+_LEAST_SECONDS = 2  # that a standard deviation takes
+_NOTHING = 1e-12  # N·m: a second without residual or torque has a logarithm too
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResidualBaseline:
+    """What a sufficient model leaves of each balance, from the seconds of a healthy recording.
+
+    Attributes:
+        residual_nm: (motors, then the link where its dynamics are known) usual rms of a second.
+        torque_nm: rms of each balance's torque at which that was; more torque lets the residual rise with it.
+        log_std: standard deviation of the logarithm of a second's mean square.
+        seconds: how many there were.
+    """
+
+    residual_nm: tuple[float, ...]
+    torque_nm: tuple[float, ...]
+    log_std: tuple[float, ...]
+    seconds: int
+
+    def __post_init__(self) -> None:
+        sizes = {len(self.residual_nm), len(self.torque_nm), len(self.log_std)}
+        require(len(sizes) == 1, "baseline: expected as many residuals as torques and standard deviations")
+        require(self.seconds >= _LEAST_SECONDS, f"seconds: expected {_LEAST_SECONDS} or more")
+        for residual, torque, std in zip(self.residual_nm, self.torque_nm, self.log_std, strict=True):
+            require_finite(0.0, strict=True, residual_nm=residual, torque_nm=torque)
+            require_finite(0.0, log_std=std)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For the joint file."""
+        return {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(self).items()}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> ResidualBaseline | None:
+        """From the joint file; None where it holds none that makes sense."""
+        try:
+            return cls(
+                residual_nm=tuple(float(x) for x in values["residual_nm"]),
+                torque_nm=tuple(float(x) for x in values["torque_nm"]),
+                log_std=tuple(float(x) for x in values["log_std"]),
+                seconds=int(values["seconds"]),
+            )
+        except (KeyError, TypeError, ValueError, EstimatorError):
+            return None
+
+
+def can_monitor(model: JointModel) -> bool:
+    """Whether every transmission's torque is known from the model alone."""
+    return all(m.transmission.model == "none" or m.transmission.parameters for m in model.motors)
+
+
+def measure_baseline(record: Record, model: JointModel) -> ResidualBaseline:
+    """The baseline of a model on a recording that it is sufficient for (at most its first two minutes).
+
+    Raises:
+        EstimatorError: the recording has less than two whole seconds after the filters have settled.
+    """
+    monitor = ModelMonitor(model, record.period_s, None)
+    residuals, torques, seconds = [], [], 0
+    for sample in record.samples():
+        if sample.sequence - record.sequence[0] > _LONGEST_S / record.period_s:
+            break
+        monitor.core.step(sample)
+        if monitor.core.seconds > seconds:
+            seconds = monitor.core.seconds
+            residuals.append(monitor.residual_nm)
+            torques.append(monitor.torque_nm)
+    require(len(residuals) >= _LEAST_SECONDS, "baseline: expected a recording of more than 3 s")
+    residual, torque = np.maximum(residuals, _NOTHING), np.maximum(torques, _NOTHING)
+    usual = np.sqrt(np.mean(torque**2, axis=0))
+    logarithm = 2.0 * np.log(residual / np.maximum(torque / usual, 1.0))
+    return ResidualBaseline(
+        residual_nm=tuple(np.exp(0.5 * np.mean(logarithm, axis=0)).tolist()),
+        torque_nm=tuple(usual.tolist()),
+        log_std=tuple(np.std(logarithm, axis=0, ddof=1).tolist()),
+        seconds=len(residuals),
+    )
+
+
+class ModelMonitor:
+    """Raises the model alarm, and says where the missing effect is likely to sit.
+
+    Args:
+        model: as declared, transmission parameters included.
+        period_s: of the samples.
+        baseline: what the model left when it was fitted; None: only measure.
+        false_alarms_per_hour: that a sufficient model may raise.
+        core: the compiled class. Every extension module has one of its own, which it calls without Python in
+            between.
+
+    Raises:
+        EstimatorError: the model contradicts itself.
+    """
+
+    def __init__(
+        self,
+        model: JointModel,
+        period_s: float,
+        baseline: ResidualBaseline | None,
+        false_alarms_per_hour: float = _SETTINGS.false_alarms_per_hour,
+        core: type[_core.ModelMonitor] = _core.ModelMonitor,
+    ) -> None:
+        told = None
+        if baseline is not None:
+            told = (baseline.residual_nm, baseline.torque_nm, baseline.log_std, baseline.seconds)
+        self.core = core(model, period_s, told, false_alarms_per_hour)
+        self.baseline = baseline if self.core.monitoring else None
+
+    def step(self, sample: Sample, estimate: Estimate, residual_nm: float) -> bool:
+        """Take one sample as it was measured; the monitor does not trust what adapts.
+
+        Returns:
+            Whether the alarm is on.
+        """
+        return self.core.step(sample)
+
+    def reset(self) -> None:
+        """Forget everything but the model and its baseline."""
+        self.core.reset()
+
+    @property
+    def residual_nm(self) -> tuple[float, ...]:
+        """Rms of each balance over the last whole second; nan before the first."""
+        return self.core.residual_nm
+
+    @property
+    def torque_nm(self) -> tuple[float, ...]:
+        """Rms of the torque that it is to be compared with."""
+        return self.core.torque_nm
+
+    @property
+    def settled(self) -> bool:
+        """Whether they mean something."""
+        return not math.isnan(self.residual_nm[0])
+
+    def location(self) -> str:
+        """Where the effect that the model lacks is likely to sit."""
+        return self.core.location()
+
+    def describe(self) -> dict[str, Any]:
+        """What it found: residual and baseline per balance, their ratio against its limit, the location."""
+        found: dict[str, Any] = {"watching": self.baseline is not None}
+        if self.settled:
+            found["residual_nm"] = list(self.residual_nm)
+        if self.baseline is None:
+            return found
+        found["floor_nm"] = list(self.baseline.residual_nm)
+        ratio, limit = self.core.ratio
+        if math.isfinite(ratio) and math.isfinite(limit):
+            found |= {"ratio": ratio, "limit": limit}
+        if self.core.alarm:
+            found["location"] = self.location()
+        return found

@@ -1,0 +1,106 @@
+"""The model's monitor: silent while the model is sufficient, an alarm with the right place when it is not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import diagnosiskit as kit
+import pytest
+
+from estimator.diagnosis import calibrate
+from estimator.model import JointModel
+from estimator.model_monitor import ModelMonitor, ResidualBaseline, can_monitor, measure_baseline
+from estimator.sample import Estimate, Record, Sample
+
+NOTHING = Estimate(0, 0, 0.0, 0.0, 0.0, ())
+PLACES = {"coulomb_nm": "motor", "hysteresis_nm": "transmission", "gravity_nm": "link"}
+
+
+@pytest.fixture(scope="module")
+def runs() -> dict[str, Record]:
+    effects = {
+        "healthy": {},
+        "again": {},
+        "coulomb_nm": {"coulomb_nm": 0.4},
+        "gravity_nm": {"gravity_nm": 0.8},
+    }
+    effects["hysteresis_nm"] = {"hysteresis_nm": 0.6, "hysteresis_rad": 0.01}
+    return dict(zip(effects, kit.World(list(effects.values())).run(), strict=True))
+
+
+@pytest.fixture(scope="module")
+def fitted(runs: dict[str, Record]) -> tuple[JointModel, ResidualBaseline]:
+    model = calibrate(runs["healthy"], kit.model())
+    return model, measure_baseline(runs["healthy"], model)
+
+
+def _play(monitor: ModelMonitor, record: Record, first: int = 0) -> list[bool]:
+    assert record.link_position_rad is not None
+    alarms = []
+    for k in range(len(record)):
+        theta, tau = record.motor_position_rad[k, 0], record.motor_torque_nm[k, 0]
+        q = float(record.link_position_rad[k])
+        alarms.append(monitor.step(Sample(first + k, (theta,), (math.nan,), (tau,), q), NOTHING, 0.0))
+    return alarms
+
+
+def test_a_balance_leaves_the_torque_of_the_effect_that_is_missing(
+    runs: dict[str, Record], fitted: tuple[JointModel, ResidualBaseline]
+) -> None:
+    monitor = ModelMonitor(fitted[0], kit.PERIOD_S, fitted[1])
+    _play(monitor, runs["coulomb_nm"])
+    # Friction of 0.4 N·m is a square wave: the filters take its edges, and it is not all of the residual.
+    assert 0.25 < monitor.residual_nm[0] < 0.45
+    assert monitor.describe()["ratio"] > monitor.describe()["limit"] > 1.0
+
+
+def test_no_alarm_while_the_model_is_sufficient(
+    runs: dict[str, Record], fitted: tuple[JointModel, ResidualBaseline]
+) -> None:
+    monitor = ModelMonitor(fitted[0], kit.PERIOD_S, fitted[1])
+    assert not any(_play(monitor, runs["again"]))
+    assert monitor.settled
+    assert monitor.describe()["watching"]
+
+
+@pytest.mark.parametrize("effect", PLACES)
+def test_an_effect_raises_the_alarm_and_its_place_is_named(
+    effect: str, runs: dict[str, Record], fitted: tuple[JointModel, ResidualBaseline]
+) -> None:
+    monitor = ModelMonitor(fitted[0], kit.PERIOD_S, fitted[1])
+    alarms = _play(monitor, runs[effect])
+    assert alarms.index(True) < 4000  # filters that settle for 0.5 s, then whole seconds
+    assert monitor.describe()["location"] == PLACES[effect]
+
+
+def test_the_alarm_ends_when_the_effect_is_gone(
+    runs: dict[str, Record], fitted: tuple[JointModel, ResidualBaseline]
+) -> None:
+    monitor = ModelMonitor(fitted[0], kit.PERIOD_S, fitted[1])
+    assert _play(monitor, runs["coulomb_nm"])[-1]
+    assert not _play(monitor, runs["again"], first=len(runs["again"]) + 100)[-1]
+
+
+def test_bad_samples_neither_raise_nor_alarm(
+    runs: dict[str, Record], fitted: tuple[JointModel, ResidualBaseline]
+) -> None:
+    monitor = ModelMonitor(fitted[0], kit.PERIOD_S, fitted[1])
+    for value in (math.nan, math.inf, -1e300):
+        assert not monitor.step(Sample(0, (value,), (value,), (value,), value), NOTHING, math.nan)
+    assert not any(_play(monitor, runs["again"], first=10))
+
+
+def test_a_baseline_survives_the_joint_file(fitted: tuple[JointModel, ResidualBaseline]) -> None:
+    assert ResidualBaseline.from_dict(fitted[1].as_dict()) == fitted[1]
+    assert ResidualBaseline.from_dict({"residual_nm": "x"}) is None
+
+
+def test_a_transmission_without_parameters_cannot_be_monitored(
+    fitted: tuple[JointModel, ResidualBaseline],
+) -> None:
+    assert can_monitor(fitted[0])
+    assert not can_monitor(kit.model())
+    motor = kit.model().motors[0]
+    rigid = replace(motor, transmission=replace(motor.transmission, model="none"))
+    assert can_monitor(JointModel(arrangement="single", motors=(rigid,)))

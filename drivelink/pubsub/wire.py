@@ -174,7 +174,7 @@ STATUS_BITS: Mapping[str, str] = MappingProxyType(
         "OBSERVABLE": "the motion at hand tells the stiffness; otherwise it is held, with a wider interval",
         "GAP": "samples were missing before this one and have been bridged",
         "CHANGED": "innovation alarm: the joint changed, the estimate is following",
-        "MODEL_ALARM": "the residual is above what the model left when it was fitted: it is not sufficient any more",
+        "MODEL_ALARM": "the residual is above the model's own baseline: the model is not sufficient",
         "INPUT_REJECTED": "this sample was not finite, jumped or froze, and was not used",
         "RESTARTED": "the estimator started anew at or shortly before this sample",
         "DRIVE_FAULT": "a drive reports a fault or is not operational",

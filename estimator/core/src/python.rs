@@ -731,19 +731,19 @@ mod extension {
         out: PyBuffer<f64>,
     ) -> PyResult<()> {
         let element = Element::new(name, &values)?;
-        let fields: Vec<_> = coordinates.iter().filter_map(|field| field.as_slice(py)).collect();
-        let n = fields.iter().map(|field| field.len()).max().unwrap_or(0);
+        let fields: Vec<_> = coordinates.iter().map(|field| slice(py, field)).collect::<PyResult<_>>()?;
+        let n = fields.iter().map(Vec::len).max().unwrap_or(0);
         let terms = element.kind.terms();
         let whole = fields.len() == Coordinates::NAMES.len()
             && fields.iter().all(|field| field.len() == n || field.len() == 1)
             && out.item_count() == n * terms;
         if !whole || n == 0 {
-            return Err(PyValueError::new_err("coordinates: expected arrays of one size, all contiguous"));
+            return Err(PyValueError::new_err("coordinates: expected arrays of one size"));
         }
         let moments = (0..n).map(|k| {
             Coordinates::from_fn(|field| {
-                let numbers = fields[field];
-                numbers[if numbers.len() == 1 { 0 } else { k }].get()
+                let numbers = &fields[field];
+                numbers[if numbers.len() == 1 { 0 } else { k }]
             })
         });
         let mut told = vec![0.0; n * terms];

@@ -14,11 +14,11 @@ from drivelink.jointfile import JointFile
 from drivelink.recording.canframes import is_frame_log
 from drivelink.recording.playback import Played
 from estimator.errors import EstimatorError
-from estimator.gate import Change, Finding, GateError, examine, refuse
+from estimator.gate import Change, Finding, GateError, Judgement, judge, refuse
 from estimator.model import JointModel
 from estimator.sample import Record, Sample
 
-__all__ = ["Correction", "Gathered", "corrections", "gate", "refusal", "text_of"]
+__all__ = ["Correction", "Gathered", "corrections", "gate", "record_of", "refusal", "text_of"]
 
 _ON_THE_BUS = (".drive", ".encoder")
 _LONGEST_S = 60.0  # of a run that is looked at: more tells no more about units and signs
@@ -76,25 +76,39 @@ class Gathered:
         self._most = round(_LONGEST_S / period_s)
         self._samples: list[Sample] = []
 
+    def add(self, sample: Sample) -> None:
+        """One more sample."""
+        if len(self._samples) < self._most:
+            self._samples.append(sample)
+
     def take(self, played: Played) -> None:
-        """One more cycle."""
+        """One more cycle of a replay."""
         sample = played.tick.sample if len(self._samples) < self._most else None
         if sample is not None:
             self._samples.append(sample)
 
-    def remarks(self, *, live: bool) -> list[str]:
-        """What is wrong, a line each, with what to paste; nothing, where nothing can be told."""
+    def judgement(self) -> Judgement:
+        """What the samples say of units and signs."""
         model = self._joint.model()
-        record = _record(self._samples, model, self._period_s)
+        record = record_of(self._samples, model, self._period_s)
+        return (
+            Judgement(reason="no samples in one run of numbers") if record is None else judge(record, model)
+        )
+
+    def remarks(self, *, live: bool) -> list[str]:
+        """What is wrong, with what to paste, or what the motion does not tell; a line each."""
         try:
-            findings = [] if record is None else examine(record, model)
+            judgement = self.judgement()
         except EstimatorError:
             return []
-        fix = text_of(self._joint, findings, live=live)
-        return [f"{', and '.join(map(str, findings))}; {fix}"] if findings else []
+        if judgement.findings:
+            fix = text_of(self._joint, judgement.findings, live=live)
+            return [f"{', and '.join(map(str, judgement.findings))}; {fix}"]
+        return [judgement.remark] if judgement.untold else []
 
 
-def _record(samples: Sequence[Sample], model: JointModel, period_s: float) -> Record | None:
+def record_of(samples: Sequence[Sample], model: JointModel, period_s: float) -> Record | None:
+    """The samples as a recording, without those that are not complete; None where they are not one run."""
     rows = [s for s in samples if np.all(np.isfinite((*s.motor_position_rad, *s.motor_torque_nm)))]
     linked = model.has_deflection
     rows = [s for s in rows if not linked or math.isfinite(s.link_position_rad)]
@@ -118,29 +132,30 @@ def text_of(joint: JointFile, findings: Sequence[Finding], *, live: bool) -> str
         findings: of the gate.
         live: whether the numbers came straight from the drives, by the joint file's scales.
     """
-    found = corrections(joint, findings, live=live)
+    changes = [change for finding in findings for change in finding.changes]
+    found = corrections(joint, changes, live=live)
     scale = ", ".join(f"{c.key} = {c.value:.7g}" for c in found if c.table == "recording.scale")
     parts = [f"{c}" for c in found if c.table != "recording.scale"]
     if scale:
         parts.insert(0, f"at the top of the joint file: recording.scale = {{ {scale} }}")
     text = "; ".join(parts)
     if not live and any(motor.drive for motor in joint.motor):
-        keys = [f"{c}" for c in corrections(joint, findings, live=True) if c.table.endswith(_ON_THE_BUS)]
+        keys = [f"{c}" for c in corrections(joint, changes, live=True) if c.table.endswith(_ON_THE_BUS)]
         if keys:
             text += f" (for what drivelink itself reads from the drives: {'; '.join(keys)})"
     return text
 
 
-def corrections(joint: JointFile, findings: Sequence[Finding], *, live: bool) -> list[Correction]:
+def corrections(joint: JointFile, needed: Sequence[Change], *, live: bool) -> list[Correction]:
     """What to change in the joint file.
 
     Args:
         joint: as it is.
-        findings: of the gate.
+        needed: what the channels need.
         live: by the keys of drives and encoder, which recordings of frames and `run` go by; else by the
             factors of `[recording]`, which files with columns are read with.
     """
-    changes = {change.channel: change for finding in findings for change in finding.changes}
+    changes = {change.channel: change for change in needed}
     found: list[Correction] = []
     for number, motor in enumerate(joint.motor, start=1):
         position, torque = changes.get(f"motor{number}_position"), changes.get(f"motor{number}_torque")

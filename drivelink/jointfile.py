@@ -281,6 +281,9 @@ class JointFile(_Section):
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", description="part of the key expression")
     arrangement: Arrangement = Field("single", description="how the transmissions act on the link")
+    axis: Literal["rotary", "linear"] = Field(
+        "rotary", description="linear: every rad in a name is a metre, every N·m a newton; reports say so"
+    )
     motor: tuple[MotorSection, ...] = Field(min_length=1, max_length=2, description="one, or two for a VSA")
     link: LinkSection = Field(LinkSection(), description="the link side")
     bus: BusSection = Field(BusSection(), description="the CAN bus")

@@ -9,7 +9,10 @@ from drivelink.canopen.vendors import vendor_of
 from drivelink.errors import DriveError
 from drivelink.jointfile import JointFile, parse
 
-__all__ = ["Answers", "answers_from_bus", "joint_text"]
+__all__ = ["GCM2", "Answers", "answers_from_bus", "joint_text"]
+
+GCM2 = 1e-7  # kg·m² a g·cm²
+_PLACEHOLDER = 0.1  # kg·m², where the inertia is not known
 
 
 @dataclass(slots=True, kw_only=True)
@@ -19,8 +22,10 @@ class Answers:
     Attributes:
         name: of the joint.
         arrangement: single, antagonistic or serial.
-        inertia_kg_m2: of each motor, joint side.
-        viscous_damping_nm_s_rad: of each motor, joint side.
+        inertia_kg_m2: of each motor, joint side; None: not known, a placeholder is written.
+        rotor_inertia_gcm2: of each motor, as its data sheet has it; reflected through the gear.
+        torque_constant_mnm_a: likewise; None: the drive reports a torque.
+        viscous_damping_nm_s_rad: of each motor, joint side; 0 where it is not known.
         model: of the transmission.
         nodes: node ids of the drives, motor by motor.
         gear_ratio: motor revolutions per joint revolution; None: read from the drive.
@@ -34,8 +39,10 @@ class Answers:
 
     name: str = "joint"
     arrangement: str = "single"
-    inertia_kg_m2: float = 0.1
-    viscous_damping_nm_s_rad: float = 0.1
+    inertia_kg_m2: float | None = None
+    rotor_inertia_gcm2: float | None = None
+    torque_constant_mnm_a: float | None = None
+    viscous_damping_nm_s_rad: float = 0.0
     model: str = "polynomial"
     nodes: list[int] = field(default_factory=list)
     gear_ratio: float | None = None
@@ -50,6 +57,21 @@ class Answers:
     def motors(self) -> int:
         """How many."""
         return 1 if self.arrangement == "single" else 2
+
+    @property
+    def joint_inertia_kg_m2(self) -> float | None:
+        """Of each motor at the joint side, as given or by the data sheet."""
+        if self.inertia_kg_m2 is not None or self.rotor_inertia_gcm2 is None:
+            return self.inertia_kg_m2
+        return self.rotor_inertia_gcm2 * GCM2 * (self.gear_ratio or 1.0) ** 2
+
+    @property
+    def conversion(self) -> str:
+        """How the inertia came about, in words; empty where it was given at the joint side."""
+        if self.rotor_inertia_gcm2 is None or self.inertia_kg_m2 is not None:
+            return ""
+        gear = f" × {self.gear_ratio:g}²" if self.gear_ratio else ""
+        return f"{self.rotor_inertia_gcm2:g} g·cm²{gear} = {self.joint_inertia_kg_m2:.6g} kg·m²"
 
 
 def joint_text(answers: Answers) -> str:
@@ -95,10 +117,24 @@ def _motor(answers: Answers, index: int, node: int) -> str:
         if answers.gear_ratio is None
         else f"gear_ratio = {answers.gear_ratio:g}  # motor revolutions per joint revolution"
     )
+    inertia = answers.joint_inertia_kg_m2
+    origin = "rotor inertia times gear ratio squared"
+    if inertia is None:
+        inertia, origin = _PLACEHOLDER, f"PLACEHOLDER, put in yours: {origin}"
+    elif answers.conversion:
+        origin = answers.conversion
+    damping = answers.viscous_damping_nm_s_rad
+    unknown = "" if damping else "; not known: fit finds it"
+    constant = (
+        "# torque_constant_nm_a = 0.05  # where the torque has to come from the current\n"
+        if answers.torque_constant_mnm_a is None
+        else f"torque_constant_nm_a = {answers.torque_constant_mnm_a * 1e-3:.6g}"
+        f"  # at the shaft: {answers.torque_constant_mnm_a:g} mN·m/A\n"
+    )
     return (
         f"[[motor]]  # motor {index + 1}\n"
-        f"inertia_kg_m2 = {answers.inertia_kg_m2:g}  # joint side: rotor inertia times gear ratio squared\n"
-        f"viscous_damping_nm_s_rad = {answers.viscous_damping_nm_s_rad:g}  # joint side\n"
+        f"inertia_kg_m2 = {inertia:.6g}  # joint side: {origin}\n"
+        f"viscous_damping_nm_s_rad = {damping:g}  # joint side{unknown}\n"
         "[motor.transmission]\n"
         f'model = "{answers.model}"  # form of the flexibility torque; "none" if rigid\n'
         "# order = 2  # of a polynomial; left out: chosen from the data\n"
@@ -107,7 +143,7 @@ def _motor(answers: Answers, index: int, node: int) -> str:
         f"{gear}\n"
         "# counts_per_rev = 16384  # at the motor; left out: the drive's (0x608F)\n"
         "# rated_torque_nm = 0.5  # left out: the drive's (0x6076)\n"
-        "# torque_constant_nm_a = 0.05  # where the torque has to come from the current\n"
+        f"{constant}"
         "# direction = -1  # where the motor counts against the joint\n"
         '# eds = "drive.eds"  # only needed where the drive may not be asked (configure = false)\n'
     )

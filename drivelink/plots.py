@@ -61,6 +61,12 @@ STYLE: dict[Any, Any] = {
     "svg.hashsalt": "drivelink",  # the same figure is the same file
     "svg.fonttype": "none",
 }
+_INK = ("#000000", "#222222")
+_THEMED = {
+    **dict.fromkeys(_INK, "currentColor"),
+    "#dddddd": "var(--grid, #dddddd)",
+    **{color: f"var(--curve-{k}, {color})" for k, color in enumerate(COLORS, 1) if color not in _INK},
+}
 _MAX_POINTS = 4000  # a curve of more points is thinned to the extremes of each pixel column
 _BINS = 240
 _MIN_IN_BIN = 1
@@ -149,12 +155,18 @@ def save(figure: Figure, path: Path) -> Path:
 
 
 def svg_text(figure: Figure) -> str:
-    """The figure as SVG, to be put inline into an HTML page."""
+    """The figure as SVG, to be put inline into an HTML page: without paper, ink as the page's text.
+
+    A page may define `--curve-1`, `--curve-2`, … and `--grid` for a theme of its own.
+    """
     buffer = io.StringIO()
     with rc_context(STYLE):
-        figure.savefig(buffer, format="svg", metadata={"Date": None})
+        figure.savefig(buffer, format="svg", metadata={"Date": None}, transparent=True)
     text = buffer.getvalue()
-    return text[text.index("<svg") :]
+    text = text[text.index("<svg") :].replace("<svg", '<svg fill="currentColor"', 1)
+    for color, themed in _THEMED.items():
+        text = text.replace(f": {color}", f": {themed}")
+    return text
 
 
 def _draw(axes: Axes, curve: Curve, name: str, k: int) -> None:

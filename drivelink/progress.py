@@ -38,6 +38,7 @@ class Meter:
         self.done = 0
         self._what = what
         self._total = total
+        self._stage = ""
         self._console = console or Console(stderr=True)
         self._begin = time.monotonic()
         self._next_line = self._begin + _LINE_S
@@ -53,6 +54,11 @@ class Meter:
         if self._bar is not None:
             self._bar.update(self._task, completed=self.done)
             self._bar.stop()
+
+    def stage(self, text: str) -> None:
+        """One step more, and what is being done now: "bandwidth"."""
+        self._stage = text
+        self.advance()
 
     def advance(self, items: int = 1) -> None:
         """So many items more are done."""
@@ -76,16 +82,19 @@ class Meter:
                 console=self._console,
                 transient=True,
             )
-            self._task = self._bar.add_task(self._what, total=self._total)
+            self._task = self._bar.add_task(self._title(), total=self._total)
             self._bar.start()
-        self._bar.update(self._task, completed=done)
+        self._bar.update(self._task, completed=done, description=self._title())
+
+    def _title(self) -> str:
+        return f"{self._what} ({self._stage})" if self._stage else self._what
 
     def _line(self, now: float) -> None:
         if now < self._next_line:
             return
         self._next_line = now + _LINE_S
-        share = f"{100 * self.done / self._total:.0f} %" if self._total else f"{self.done}"
-        self._console.print(f"{self._what}: {share} after {now - self._begin:.0f} s", highlight=False)
+        share = f"{100 * self.done / self._total:.0f} %" if self._total else f"{self.done} steps"
+        self._console.print(f"{self._title()}: {share} after {now - self._begin:.0f} s", highlight=False)
 
 
 def track(

@@ -12,17 +12,18 @@ import numpy as np
 
 from drivelink import plots
 from drivelink.outfile import write_whole
-from estimator.diagnosis import Curve, Diagnosis, Errors, Finding
+from drivelink.output.units import Units
+from estimator.diagnosis import Curve, Diagnosis, Errors, Finding, StiffnessCurve
 from estimator.effects import LIBRARY
-from estimator.model import ParameterValue
 from estimator.sample import FloatArray
 
-__all__ = ["Title", "as_json", "sentence", "title_of", "value_text", "write"]
+__all__ = ["Title", "as_json", "sentence", "title_of", "unexplained", "write"]
 
 _SCHEMA = "drivelink.diagnosis/1"
-_SIGMA_95 = 1.96
 _CURVE_POINTS = 200
 _RIVALS = 8
+_WIDTH = 9.6  # inches of a plot as wide as the page
+_COLUMN = 5.4  # and of one in half of it
 _AXES = {
     "position": "motor position / rad",
     "velocity": "motor velocity / (rad/s)",
@@ -45,6 +46,7 @@ class Title(NamedTuple):
     joint: str
     recording: str
     validation: str | None
+    linear: bool = False
 
 
 def write(outcome: Diagnosis, title: Title, folder: Path) -> list[Path]:
@@ -138,6 +140,18 @@ def sentence(outcome: Diagnosis) -> str:
     )
 
 
+def unexplained(outcome: Diagnosis, units: Units | None = None) -> str:
+    """What is left, in one sentence."""
+    unit = (units or Units(False)).shown("N·m")
+    left = outcome.validation
+    text = f"{left.after_relative:.2%} of the torque ({left.after_rms_nm:.3g} {unit} rms) stays unexplained"
+    if outcome.verdict == "unexplained":
+        return f"{text} even with the free curve, which has no name in the library."
+    if outcome.verdict == "insufficient_excitation":
+        return f"{text}; this motion does not tell whether anything is missing."
+    return f"{text}: noise, or effects too small to be told from it in these data."
+
+
 def title_of(finding: Finding) -> str:
     """An effect in words, with its place."""
     if finding.name == "unlisted":
@@ -149,18 +163,9 @@ def _place(finding: Finding) -> str:
     return finding.location if not finding.motor else f"{finding.location} {finding.motor + 1}"
 
 
-def value_text(value: ParameterValue, std: ParameterValue | None) -> str:
-    """A parameter with its 95 % interval."""
-    if isinstance(value, tuple):
-        deviations = std if isinstance(std, tuple) else (None,) * len(value)
-        return ", ".join(value_text(x, s) for x, s in zip(value, deviations, strict=True))
-    if isinstance(std, float) and std > 0.0:
-        return f"{value:.5g} ± {_SIGMA_95 * std:.2g}"
-    return f"{value:.5g}"
-
-
 def page(outcome: Diagnosis, title: Title) -> str:
     """The report as one self-contained page."""
+    units = Units(title.linear)
     template = Template(Path(__file__).with_name("report.html").read_text(encoding="utf-8"))
     return template.substitute(
         title=html.escape(title.joint),
@@ -170,68 +175,73 @@ def page(outcome: Diagnosis, title: Title) -> str:
         verdict=outcome.verdict.replace("_", " "),
         verdict_class=outcome.verdict,
         sentence=html.escape(sentence(outcome)),
+        unexplained=html.escape(unexplained(outcome, units)),
         errors="".join(
-            _error_row(n, e) for n, e in (("training", outcome.train), ("validation", outcome.validation))
+            _error_row(n, e, units)
+            for n, e in (("training", outcome.train), ("validation", outcome.validation))
         ),
-        effects=_effects(outcome),
-        curves=_curves(outcome),
+        effects=_effects(outcome, units),
+        curves=_curves(outcome, units),
+        stiffness="".join(_stiffness_figure(one, units) for one in outcome.stiffness),
         rivals=_rivals_figure(outcome),
-        series=_series_figure(outcome),
+        series=_series_figure(outcome, units),
         doubts=_doubts(outcome),
     )
 
 
-def _error_row(name: str, errors: Errors) -> str:
+def _error_row(name: str, errors: Errors, units: Units) -> str:
     bar = 100.0 * min(errors.after_rms_nm / max(errors.before_rms_nm, 1e-300), 1.0)
+    unit = units.shown("N·m")
     return (
-        f"<tr><th>{name}</th><td>{errors.before_rms_nm:.4g} N·m</td><td>{errors.before_relative:.2%}</td>"
-        f"<td>{errors.after_rms_nm:.4g} N·m</td><td>{errors.after_relative:.2%}</td>"
+        f"<tr><th>{name}</th><td>{errors.before_rms_nm:.4g} {unit}</td><td>{errors.before_relative:.2%}</td>"
+        f"<td>{errors.after_rms_nm:.4g} {unit}</td><td>{errors.after_relative:.2%}</td>"
         f'<td class="bar"><span style="width:{bar:.1f}%"></span></td></tr>'
     )
 
 
-def _effects(outcome: Diagnosis) -> str:
+def _effects(outcome: Diagnosis, units: Units) -> str:
     rows = []
     for finding in outcome.effects:
         rows.append(f'<tr class="effect"><th colspan="2">{html.escape(title_of(finding))}</th></tr>')
         if finding.name in LIBRARY:
             rows.append(f'<tr><td colspan="2">{html.escape(LIBRARY[finding.name].description)}</td></tr>')
         for name, value in finding.parameters.items():
-            text = html.escape(value_text(value, finding.std.get(name)))
+            text = html.escape(units.value(name, value, finding.std.get(name)))
             rows.append(f"<tr><td><code>{html.escape(name)}</code></td><td>{text}</td></tr>")
     for number, one in enumerate(outcome.transmissions, start=1):
         if one.parameters:
             rows.append(f'<tr class="effect"><th colspan="2">transmission {number}, refitted</th></tr>')
         for name, value in one.parameters.items():
-            text = value_text(value, one.std[name])
+            text = units.value(name, value, one.std[name])
             rows.append(f"<tr><td><code>{html.escape(name)}</code></td><td>{text}</td></tr>")
     if outcome.alignment:
         rows.append('<tr class="effect"><th colspan="2">taken out of the readings</th></tr>')
     for name, value in outcome.alignment.items():
-        rows.append(f"<tr><td><code>{name}</code></td><td>{value:.4g}</td></tr>")
+        rows.append(f"<tr><td><code>{name}</code></td><td>{units.value(name, value, None)}</td></tr>")
     return "".join(rows)
 
 
-def _curves(outcome: Diagnosis) -> str:
+def _curves(outcome: Diagnosis, units: Units) -> str:
     if not outcome.curves:
         return ""
-    return "<h2>What reveals it</h2>" + "".join(_curve_figure(curve) for curve in outcome.curves)
+    return "<h2>What reveals it</h2>" + "".join(_curve_figure(curve, units) for curve in outcome.curves)
 
 
-def _curve_figure(curve: Curve) -> str:
-    figure, (axes,) = plots.new_figure(height=3.0)
+def _curve_figure(curve: Curve, units: Units) -> str:
+    figure, (axes,) = plots.new_figure(width=_WIDTH, height=3.2)
+    across, torque = units.label(_AXES[curve.coordinates[0]]), units.label("torque / N·m")
     axes.plot(curve.x, curve.residual_nm, ".", color="#aaaaaa", markersize=2.5, rasterized=True)
     order = np.argsort(curve.x)
     name = curve.name.replace("_", " ")
     if curve.second is None and _is_function(curve):
         curves = {"left by the model": _medians(curve.x, curve.residual_nm)}
         curves[name] = _medians(curve.x, curve.fitted_nm)
-        plots.xy(axes, curves, _AXES[curve.coordinates[0]], "torque / N·m")
+        plots.xy(axes, curves, across, torque)
     else:
         axes.plot(curve.x[order], curve.fitted_nm[order], ".", color=plots.COLORS[1], markersize=2.0)
         axes.plot([], [], ".", color="#aaaaaa", label="left by the model")
         axes.plot([], [], ".", color=plots.COLORS[1], label=name)
-        plots.xy(axes, {}, _AXES[curve.coordinates[0]], "torque / N·m")
+        plots.xy(axes, {}, across, torque)
     return f"<figure>{plots.svg_text(figure)}<figcaption>{_caption(curve)}</figcaption></figure>"
 
 
@@ -256,32 +266,55 @@ def _is_function(curve: Curve) -> bool:
     return float(np.std(left)) < 0.35 * float(np.std(curve.fitted_nm)) + 1e-300
 
 
+def _stiffness_figure(curve: StiffnessCurve, units: Units) -> str:
+    """Stiffness over deflection, before and after, each with its 95 % band."""
+    figure, (axes,) = plots.new_figure(width=_WIDTH, height=3.0)
+    phi = curve.deflection_rad
+    curves = {
+        "as declared": plots.Curve(phi, curve.before_nm_rad, curve.before_std_nm_rad),
+        "refitted": plots.Curve(phi, curve.after_nm_rad, curve.after_std_nm_rad),
+    }
+    plots.xy(axes, curves, units.label("deflection / rad"), units.label("stiffness / (N·m/rad)"))
+    caption = f"Stiffness of transmission {curve.motor + 1}, with 95 % bands."
+    return f"<figure>{plots.svg_text(figure)}<figcaption>{caption}</figcaption></figure>"
+
+
 def _rivals_figure(outcome: Diagnosis) -> str:
     if not outcome.rivals:
         return ""
     shown = outcome.rivals[:_RIVALS]
-    figure, (axes,) = plots.new_figure(height=0.5 + 0.3 * len(shown))
-    names = [r.name.replace("_", " ") + (f" {r.motor + 1}" if r.motor else "") for r in shown]
+    figure, (axes,) = plots.new_figure(width=_COLUMN, height=0.7 + 0.3 * len(shown))
+    chosen = {(finding.name, finding.motor) for finding in outcome.effects}
+    won = [(r.name, r.motor) in chosen for r in shown]
+    names = [
+        ("▶ " if mine else "") + r.name.replace("_", " ") + (f" {r.motor + 1}" if r.motor else "")
+        for r, mine in zip(shown, won, strict=True)
+    ]
     values = [100.0 * r.error_relative for r in shown]
     place = np.arange(len(shown))
-    axes.barh(place, values, color="#cccccc", edgecolor="#222222", linewidth=0.8)
+    fills = [plots.COLORS[1] if mine else "#bbbbbb" for mine in won]
+    axes.barh(place, values, color=fills, edgecolor="#222222", linewidth=0.8)
     axes.set_yticks(place, names)
+    for label, mine in zip(axes.get_yticklabels(), won, strict=True):
+        label.set_fontweight("bold" if mine else "normal")
     axes.invert_yaxis()
     plots.xy(axes, {}, "error left with this effect alone / % of the torque (weighted)", "")
-    return f"<figure>{plots.svg_text(figure)}</figure>"
+    caption = "▶ chosen" if any(won) else "None was chosen."
+    return f"<figure>{plots.svg_text(figure)}<figcaption>{caption}</figcaption></figure>"
 
 
-def _series_figure(outcome: Diagnosis) -> str:
+def _series_figure(outcome: Diagnosis, units: Units) -> str:
     series = outcome.series
     if series is None:
         return ""
-    figure, axes = plots.new_figure(rows=2, height=2.2)
-    plots.over_time(axes[0], {"measured": plots.Curve(series.time_s, series.torque_nm)}, "torque / N·m")
+    figure, axes = plots.new_figure(rows=2, width=_WIDTH, height=2.2)
+    torque = units.label("torque / N·m")
+    plots.over_time(axes[0], {"measured": plots.Curve(series.time_s, series.torque_nm)}, torque)
     curves = {
         "left before": plots.Curve(series.time_s, series.before_nm),
         "left after": plots.Curve(series.time_s, series.after_nm),
     }
-    plots.over_time(axes[1], curves, "torque / N·m")
+    plots.over_time(axes[1], curves, torque)
     return f"<figure>{plots.svg_text(figure)}</figure>"
 
 

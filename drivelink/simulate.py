@@ -8,17 +8,22 @@ The truth is one of the paper's cases (`sim.case`), or what the joint file's mod
 from __future__ import annotations
 
 import errno
+import math
 import re
-from collections.abc import Mapping, Sequence
+import socket
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import can
 
+from drivelink.canopen.blocking import sender
 from drivelink.canopen.bus import open_bus
+from drivelink.canopen.scan import listen
 from drivelink.errors import BusError, JointFileError, UsageError
-from drivelink.jointfile import BusSection, JointFile, SimSection
+from drivelink.jointfile import BusSection, JointFile, MotorSection, SimSection
 from estimator.model import LinkDynamics
 from sim.bench import Bench
 from sim.canopen.cia402_objects import DriveData
@@ -43,10 +48,13 @@ from sim.world import World
 __all__ = [
     "CASE_NAMES",
     "QUIRK_NAMES",
+    "JoinedBus",
+    "assumptions",
     "bench_from_joints",
     "network_from_joint",
     "nodes_from_joint",
     "open_sim_bus",
+    "require_free",
     "world_from_joint",
 ]
 
@@ -54,6 +62,19 @@ CASE_NAMES = tuple(CASES)
 QUIRK_NAMES = tuple(PROFILES)
 
 _LOCAL = ("127.0.0.1", "localhost", "::1")
+_ANSWER_S = 0.3  # for the slowest node, as in `drivelink.canopen.scan`
+
+# Springs of a joint file that declares none, by stiffness at rest and order: `new` makes such files.
+_NATURAL_HZ = 5.0  # sqrt(K/B)/(2 pi): a soft joint, which shows what drivelink estimates
+_STIFFENED_RAD = 0.15  # where the stiffness of a hardening one has doubled
+_ASSUMED: dict[str, Callable[[float, int], dict[str, float | tuple[float, ...]]]] = {
+    "linear": lambda k, _: {"k_nm_rad": k},
+    "polynomial": lambda k, order: {
+        "coefficients_nm_rad": (k, k / (3.0 * _STIFFENED_RAD**2), *[0.0] * order)[:order]
+    },
+    "exponential": lambda k, _: {"k_nm_rad": k, "b_per_rad": math.log(2.0) / _STIFFENED_RAD},
+    "vsa-ii": lambda k, _: {"k_nm_rad": 2.0 * k / (1.75 - 1.0) ** 2, "c": 1.75},  # the paper's C (eq 20)
+}
 
 # World
 
@@ -64,6 +85,7 @@ def world_from_joint(
     effects: Sequence[str] = (),
     case_name: str | None = None,
     seed: int | None = None,
+    file: Path | None = None,
 ) -> World:
     """The world that a joint file describes, at rest.
 
@@ -72,6 +94,7 @@ def world_from_joint(
         effects: "NAME=VALUE" as `sim --effect` takes them, besides those of the file.
         case_name: one of the paper's cases instead of `sim.case`.
         seed: of the sensor noise, instead of `sim.seed`.
+        file: the joint file, for messages.
 
     Raises:
         JointFileError: the file lacks something, or says something that cannot be.
@@ -96,14 +119,46 @@ def world_from_joint(
             seed=section.seed if seed is None else seed,
         )
     except SimError as error:
-        raise JointFileError(f"{joint.name}: sim: {error}") from error
+        raise JointFileError(f"{file or joint.name}: sim: {error}") from error
+
+
+def assumptions(joint: JointFile) -> list[str]:
+    """What the world of a joint file takes where the file does not say, a line each."""
+    if joint.sim is not None and joint.sim.case is not None:
+        return []
+    lines = []
+    for index, motor in enumerate(joint.motor, start=1):
+        transmission = motor.transmission
+        if transmission.model != "none" and not transmission.parameters and transmission.model in _ASSUMED:
+            k = _assumed_stiffness(motor)
+            lines.append(
+                f"motor[{index}].transmission has no parameters: simulated with {k:.3g} N·m/rad at rest, "
+                f"{_NATURAL_HZ:g} Hz with the motor's inertia"
+            )
+    if joint.link.dynamics is None:
+        lines.append("no [link.dynamics]: simulated with twice the first motor's inertia at the link")
+    return lines
+
+
+def _assumed_stiffness(motor: MotorSection) -> float:
+    return motor.inertia_kg_m2 * (2.0 * math.pi * _NATURAL_HZ) ** 2
+
+
+def _spring(motor: MotorSection, index: int) -> Spring:
+    """The transmission as declared; where its parameters are not, one that suits the motor."""
+    transmission = motor.transmission
+    if transmission.model == "none" or transmission.parameters:
+        return Spring(model=transmission.model, parameters=transmission.parameters)
+    if transmission.model not in _ASSUMED:
+        raise SimError(
+            f"motor[{index}].transmission.parameters: expected them, no spring is assumed for this model"
+        )
+    k, order = _assumed_stiffness(motor), transmission.order or 2
+    return Spring(model=transmission.model, parameters=_ASSUMED[transmission.model](k, order))
 
 
 def _plant(joint: JointFile) -> JointPlant:
     """The joint as its model says; without link dynamics the link weighs twice the first motor."""
-    for index, motor in enumerate(joint.motor, start=1):
-        if motor.transmission.model != "none" and not motor.transmission.parameters:
-            raise SimError(f"expected sim.case, or parameters in motor[{index}].transmission")
     link = joint.link.dynamics or LinkDynamics(inertia_kg_m2=2.0 * joint.motor[0].inertia_kg_m2)
     return JointPlant(
         arrangement=joint.arrangement,
@@ -111,9 +166,9 @@ def _plant(joint: JointFile) -> JointPlant:
             MotorPlant(
                 inertia_kg_m2=motor.inertia_kg_m2,
                 viscous_damping_nm_s_rad=motor.viscous_damping_nm_s_rad,
-                spring=Spring(model=motor.transmission.model, parameters=motor.transmission.parameters),
+                spring=_spring(motor, index),
             )
-            for motor in joint.motor
+            for index, motor in enumerate(joint.motor, start=1)
         ),
         link=LinkPlant(
             inertia_kg_m2=link.inertia_kg_m2,
@@ -195,13 +250,16 @@ def _scale(joint: JointFile, given: Case | None) -> LinkEncoder | None:
 # Devices
 
 
-def nodes_from_joint(joint: JointFile, world: World, *, quirks: str | None = None) -> tuple[Node, ...]:
+def nodes_from_joint(
+    joint: JointFile, world: World, *, quirks: str | None = None, file: Path | None = None
+) -> tuple[Node, ...]:
     """The drives and the encoder of a joint.
 
     Args:
         joint: the joint file.
         world: what they measure.
         quirks: name of a profile instead of `sim.quirks`.
+        file: the joint file, for messages.
 
     Raises:
         JointFileError: a motor without a drive, or an unknown profile in the file.
@@ -219,7 +277,7 @@ def nodes_from_joint(joint: JointFile, world: World, *, quirks: str | None = Non
     for index, motor in enumerate(joint.motor):
         if motor.drive is None:
             raise JointFileError(
-                f"{joint.name}: motor[{index + 1}].drive: expected this table to simulate it"
+                f"{file or joint.name}: motor[{index + 1}].drive: expected this table to simulate it"
             )
         data = _drive_data(world, index, motor.drive.node_id == host)
         nodes.append(Cia402Drive(motor.drive.node_id, world, index, data, own))
@@ -263,7 +321,7 @@ def open_sim_bus(section: BusSection) -> can.BusABC:
     """Open the bus of a joint file from the devices' side.
 
     For `interface = "socketcand"` at an address of this machine that nobody serves yet, serve it: the
-    daemon, or a second simulation, then connects to it.
+    daemon, or a second simulation, then connects to it. Where somebody does, it is a `JoinedBus`.
 
     Raises:
         BusError: it cannot be opened.
@@ -278,7 +336,78 @@ def open_sim_bus(section: BusSection) -> can.BusABC:
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
                 raise BusError(f"socketcand at {host}:{port} cannot be served: {error.strerror}") from error
-    return open_bus(section)
+    bus = open_bus(section)
+    return JoinedBus(bus) if section.interface == "socketcand" else bus
+
+
+class JoinedBus(can.BusABC):
+    """A socketcand bus that another process serves; when that ends, it says so.
+
+    python-can's own client then returns at once, without a frame, for ever.
+
+    Args:
+        bus: python-can's client.
+
+    Attributes:
+        lost: whether the server has closed the connection.
+        on_lost: called then.
+    """
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self._is_shutdown = False
+        self._bus = bus
+        self._socket: socket.socket = bus._SocketCanDaemonBus__socket  # type: ignore[attr-defined]
+        self.lost = False
+        self.on_lost: Callable[[], object] = lambda: None
+        self.channel_info = bus.channel_info
+        super().__init__(channel=bus.channel_info)
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Send a frame."""
+        self._bus.send(msg, timeout)
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        found = self._bus._recv_internal(timeout)
+        if found[0] is None and self._closed():
+            self.lost = True
+            self.on_lost()
+            raise can.CanOperationError("the server has closed the connection")
+        return found
+
+    def _closed(self) -> bool:
+        try:
+            return self._socket.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b""
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
+
+    def shutdown(self) -> None:
+        """Close the connection."""
+        super().shutdown()
+        self._bus.shutdown()
+
+
+def require_free(bus: can.BusABC, node_ids: Sequence[int], section: BusSection) -> None:
+    """Ask whether anybody has one of the simulated devices' node ids already.
+
+    Raises:
+        BusError: somebody has: another simulation of the same joint, or real drives.
+    """
+    if section.interface == "virtual" or isinstance(bus, SocketcandServer):
+        return  # nobody else can be there
+    question = bytes([0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0])  # upload 0x1000, mandatory in CiA 301
+    send = sender(bus)
+    for node in node_ids:
+        send(0x600 + node, question)
+    answered = {cob_id - 0x580 for cob_id in listen(bus, _ANSWER_S).counts if 0x581 <= cob_id <= 0x5FF}
+    taken = sorted(answered.intersection(node_ids))
+    if taken:
+        nodes = ", ".join(f"node {node}" for node in taken)
+        raise BusError(
+            f"{section.interface} {section.channel}: {nodes} is on the bus already: another `drivelink sim`, "
+            "or real drives; end it, or use another --channel"
+        )
 
 
 def bench_from_joints(
@@ -288,6 +417,7 @@ def bench_from_joints(
     case_name: str | None = None,
     quirks: str | None = None,
     seed: int | None = None,
+    files: Sequence[Path] = (),
 ) -> Bench:
     """Worlds and devices of several joints; arguments as for `world_from_joint`, `nodes_from_joint`.
 
@@ -295,8 +425,14 @@ def bench_from_joints(
         JointFileError: a joint file cannot be simulated.
         UsageError: two devices have the same node id, or an argument is wrong.
     """
-    worlds = [world_from_joint(j, effects=effects, case_name=case_name, seed=seed) for j in joints]
-    nodes = [nodes_from_joint(j, w, quirks=quirks) for j, w in zip(joints, worlds, strict=True)]
+    paths: Sequence[Path | None] = files or [None] * len(joints)
+    named = list(zip(joints, paths, strict=True))
+    worlds = [
+        world_from_joint(j, effects=effects, case_name=case_name, seed=seed, file=path) for j, path in named
+    ]
+    nodes = [
+        nodes_from_joint(j, w, quirks=quirks, file=path) for (j, path), w in zip(named, worlds, strict=True)
+    ]
     try:
         return Bench([joint.name for joint in joints], worlds, nodes)
     except SimError as error:

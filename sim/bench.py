@@ -49,6 +49,15 @@ class Bench:
         """Serve the bus in this thread until `stop` is set."""
         self.network(bus).serve(stop)
 
+    def devices(self) -> dict[str, dict[str, list[int]]]:
+        """Node ids of the drives and encoders, by joint."""
+        found: dict[str, dict[str, list[int]]] = {}
+        for name, group in self._groups:
+            kinds = found.setdefault(name, {"drive": [], "encoder": []})
+            for node in group:
+                kinds["drive" if isinstance(node, Cia402Drive) else "encoder"].append(node.node_id)
+        return found
+
     def describe(self) -> str:
         """Joints and node ids in a few words."""
         parts = []

@@ -42,8 +42,8 @@ class Drawn:
     gears: tuple[float, ...]
 
 
-def draw(kind: str, seed: int, *, effects: bool = True, seconds: float = 8.0) -> Drawn:
-    """The joint of that kind and seed, recorded in a rich motion."""
+def draw(kind: str, seed: int, *, effects: bool = True, seconds: float = 8.0, held: bool = False) -> Drawn:
+    """The joint of that kind and seed, recorded in a rich motion; with its link held, if told so."""
     rng = np.random.default_rng((KINDS.index(kind), seed))
 
     def between(low: float, high: float) -> float:
@@ -84,6 +84,8 @@ def draw(kind: str, seed: int, *, effects: bool = True, seconds: float = 8.0) ->
     }
     gain = between(0.3, 3.0)
     rig |= {key: gain * rig[key] for key in ("centring_nm_rad", "centring_nm_s_rad")}
+    if held:
+        plant = replace(plant, link=replace(link, inertia_kg_m2=1e6 * link_inertia, gravity_nm=0.0))
     world = World(
         plant,
         (drive,) * motors,

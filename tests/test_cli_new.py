@@ -72,6 +72,7 @@ def test_an_existing_file_is_kept_unless_forced(tmp_path, capsys):
         (["--encoder", "left"], "--encoder"),
         (["--encoder", "128"], "--encoder"),
         (["--scan", "--passive"], "--passive forbids"),
+        (["--inertia", "1", "--rotor-inertia", "1"], "--rotor-inertia"),
     ],
 )
 def test_a_wrong_answer_is_one_line_and_no_file(tmp_path, arguments, expected, capsys, monkeypatch):
@@ -83,15 +84,61 @@ def test_a_wrong_answer_is_one_line_and_no_file(tmp_path, arguments, expected, c
     assert list(tmp_path.iterdir()) == []
 
 
-def test_questions_are_asked_where_somebody_can_answer(tmp_path, monkeypatch):
-    replies = iter(
-        ["duble", "antagonistic", "heavy", "0.5", "", "", "socketcan", "can3", "200", "7", "8", "drive"]
+@pytest.mark.parametrize("model", ["polynomial", "linear", "exponential", "vsa-ii", "none"])
+@pytest.mark.parametrize("arrangement", ["single", "antagonistic", "serial"])
+def test_sim_accepts_every_new_file_and_says_what_it_assumes(tmp_path, model, arrangement, capsys):
+    if arrangement != "single" and model == "none":
+        assert main(["new", str(tmp_path / "no.toml"), "--arrangement", arrangement, "--model", model]) == 2
+        assert "expected a flexible one" in capsys.readouterr().err
+        return
+    made(
+        tmp_path,
+        "--model",
+        model,
+        "--arrangement",
+        arrangement,
+        "--encoder",
+        "none" if model == "none" else "9",
     )
+    path = str(tmp_path / "elbow.toml")
+    capsys.readouterr()
+    assert main(["sim", path, "--interface", "virtual", "--seconds", "0.1"]) == 0
+    said = capsys.readouterr()
+    assert "ready on virtual" in said.out
+    if model != "none":
+        assert f"{path}: motor[1].transmission has no parameters: simulated with" in said.err
+
+
+def test_the_inertia_of_a_data_sheet_goes_through_the_gear(tmp_path, capsys):
+    joint = made(tmp_path, "--rotor-inertia", "48.2", "--gear", "100", "--torque-constant", "53.8")
+    assert joint.motor[0].inertia_kg_m2 == pytest.approx(48.2e-7 * 100**2)
+    assert joint.motor[0].drive.torque_constant_nm_a == pytest.approx(0.0538)
+    assert "48.2 g·cm² × 100² = 0.0482 kg·m²" in capsys.readouterr().out
+    assert "48.2 g·cm² × 100²" in (tmp_path / "elbow.toml").read_text()
+
+
+def test_an_inertia_that_nobody_told_is_marked_as_a_placeholder(tmp_path, capsys):
+    made(tmp_path)
+    assert "placeholder" in capsys.readouterr().out
+    assert "PLACEHOLDER" in (tmp_path / "elbow.toml").read_text()
+
+
+def test_questions_are_asked_where_somebody_can_answer(tmp_path, monkeypatch, capsys):
+    questions = []
+    text = "duble,antagonistic,,50,,heavy,48.2,,,,socketcan,can3,200,7,8,drive"
+    replies = iter(text.split(","))
+
+    def answer(question):
+        questions.append(question)
+        return next(replies)
+
     monkeypatch.setattr("sys.stdin.isatty", lambda: True)
-    monkeypatch.setattr("builtins.input", lambda question: next(replies))
+    monkeypatch.setattr("builtins.input", answer)
     joint = made(tmp_path)
     assert joint.arrangement == "antagonistic"
-    assert joint.motor[0].inertia_kg_m2 == 0.5
+    assert sum("g·cm²" in question for question in questions) == 3  # Enter and words are no inertia
+    assert joint.motor[0].inertia_kg_m2 == pytest.approx(48.2e-7 * 50**2)
+    assert "48.2 g·cm² × 50² = 0.01205 kg·m²" in capsys.readouterr().out
     assert joint.bus.channel == "can3"
     assert [motor.drive.node_id for motor in joint.motor] == [7, 8]
 

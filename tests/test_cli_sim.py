@@ -131,6 +131,35 @@ def test_a_missing_file_and_joints_of_different_buses(
     assert "expected the same bus.channel" in said[1]
 
 
+def test_a_second_simulation_of_the_same_nodes_is_refused(
+    file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with simulation(file):
+        assert main(["sim", str(file), "--seconds", "1"]) == 4
+    said = capsys.readouterr().err.splitlines()
+    assert "joined" in said[0]
+    assert "node 1, node 2 is on the bus already: another `drivelink sim`" in said[1]
+
+
+def test_a_second_simulation_ends_with_the_first_and_burns_nothing(file: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.toml"
+    text = file.read_text(encoding="utf-8").replace('"wrist"', '"elbow"')
+    other.write_text(text.replace("node_id = 1", "node_id = 11").replace("node_id = 2", "node_id = 12"))
+    with simulation(file) as (server, _), simulation(other) as (process, ready):
+        assert "elbow" in ready
+        server.kill()
+        assert process.wait(PATIENCE_S) == 4
+        assert process.stderr is not None
+        assert "the process that served it has ended" in process.stderr.read()
+
+
+def test_what_a_file_lacks_names_the_file(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = file.read_text(encoding="utf-8").replace("[motor.drive]\nnode_id = 2", "", 1)
+    file.write_text(text, encoding="utf-8")
+    assert main(["sim", str(file), "--interface", "virtual"]) == 2
+    assert f"{file}: motor[2].drive: expected this table" in capsys.readouterr().err
+
+
 def test_a_second_simulation_joins_the_first_as_a_client(file: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.toml"
     text = file.read_text(encoding="utf-8").replace('"wrist"', '"elbow"')

@@ -2,9 +2,11 @@ import itertools
 import json
 import math
 import socket
+from dataclasses import replace
 from pathlib import Path
 
 import can
+import daemonkit
 import pytest
 from canopenkit import Slave, Wire, drive_objects, joint_text
 from rich.console import Console
@@ -13,19 +15,29 @@ from drivelink.canopen.blocking import run_program
 from drivelink.canopen.guard import check_frame
 from drivelink.canopen.layout import Signal
 from drivelink.canopen.node import survey_node
+from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.canopen.roles import roles
 from drivelink.canopen.scan import listen, scan
 from drivelink.cli import main
 from drivelink.doctor import Report, Section, examine, examine_eds
 from drivelink.doctor.interface import examine_interface, judge_link
 from drivelink.doctor.machine import examine_machine, percentile
-from drivelink.doctor.motion import MotionSample, judge_motion, sample_motion, slope
+from drivelink.doctor.motion import (
+    MotionReader,
+    MotionSample,
+    judge_gathered,
+    judge_motion,
+    record_of_motion,
+    slope,
+)
+from drivelink.doctor.sampletap import SampleTap
 from drivelink.doctor.syncs import Daemons, judge_sync
 from drivelink.finding import Finding, Severity
 from drivelink.jointfile import BusSection, parse
 from drivelink.simulate import network_from_joint
 
 REPOSITORY = Path(__file__).parents[1]
+CHANNELS = itertools.count()
 OURS = sorted((REPOSITORY / "sim/eds").glob("*.eds"))
 
 
@@ -63,9 +75,9 @@ endpoint = "tcp/127.0.0.1:{free_port()}"
 
 
 @pytest.fixture
-def rig(request):
+def rig():
     """A simulated drive and encoder, served by a thread on a virtual bus."""
-    channel = request.node.name
+    channel = f"doctor-{next(CHANNELS)}"
     with can.Bus(interface="virtual", channel=channel) as bus:
         network = network_from_joint(parse(joint_on(channel)), bus)
         network.start()
@@ -99,6 +111,94 @@ def test_a_healthy_bus_is_found_healthy_and_nothing_is_written(rig):
         check_frame(cob_id, data)
         assert cob_id != 0
         assert data[0] >> 5 in (2, 3, 4)
+
+
+def live(rig, change=lambda text: text, seconds=4.0):
+    """What the doctor says of the moving joint, its joint file changed."""
+    report = examine(parse(change(joint_on(rig))), Path(), seconds)
+    (section,) = [section for section in report.sections if section.title == "Units and signs"]
+    return section
+
+
+def test_a_moving_joint_passes_the_gate_that_recordings_pass(rig):
+    (finding,) = live(rig).findings
+    assert finding.severity is Severity.OK, finding
+    assert "positions and torque fit in unit and sign" in finding.text
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said", "line"),
+    [
+        (
+            "node_id = 5",
+            "node_id = 5\ntorque_direction = -1",
+            "the motor torque has the wrong sign",
+            "motor[1].drive.torque_direction = 1",
+        ),
+        (
+            "torque_constant_nm_a = 0.05",
+            'torque_constant_nm_a = 50.0\ntorque_source = "current"',
+            "the motor torque looks like N·mm",
+            "motor[1].drive.torque_constant_nm_a = 0.05",
+        ),
+        (
+            "node_id = 9",
+            "node_id = 9\ndirection = -1",
+            "the link position has the wrong sign",
+            "link.encoder.direction = 1",
+        ),
+    ],
+)
+def test_a_fault_of_a_moving_joint_is_named_with_the_line_to_paste(rig, old, new, said, line):
+    (finding,) = live(rig, lambda text: text.replace(old, new, 1)).findings
+    assert finding.severity is Severity.ERROR, finding
+    assert said in finding.text
+    assert line in finding.fix
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_a_bus_that_may_not_be_touched_is_judged_by_its_frames(direction):
+    text = daemonkit.vsa_text() + '[sim.excitation]\nkind = "rich"\n'
+    frames = []
+    with daemonkit.rig(parse(text)) as made:
+        channel, layouts = made.joint.bus.channel, list(made.daemon.layouts.values())
+        with can.Bus(interface="virtual", channel=channel) as spy:
+            for _ in range(16):
+                made.run(500)
+                while (message := spy.recv(0.0)) is not None:
+                    frames.append(message)
+    encoder = f'source = "cia406"\ndirection = {direction}'
+    passive = text.replace("[bus]", '[bus]\nconfigure = false\nsync = "follow"')
+    joint = parse(passive.replace('source = "cia406"', encoder))
+    configurator = PassiveConfigurator([joint])
+    configurator.adopt(layouts)
+    for layout in layouts:  # the map is the real one, what the joint file says of the encoder is not
+        if layout.motor is None and direction < 0:
+            configurator.adopt([turned(layout)])
+    tap, syncs = SampleTap(joint, configurator), 0
+    for message in frames:
+        syncs += message.arbitration_id == 0x80
+        message.timestamp = 1e9 + 1e-3 * syncs
+        tap.take(message)
+    section = Section("Units and signs")
+    judge_gathered(section, tap.joint, tap.gathered)
+    assert tap.samples > 7000
+    (finding,) = section.findings
+    if direction < 0:
+        assert finding.severity is Severity.ERROR
+        assert "the link position has the wrong sign" in finding.text
+        assert "link.encoder.direction = 1" in finding.fix
+    else:
+        assert finding.severity is Severity.OK, finding
+
+
+def turned(layout):
+    """The layout of an encoder whose sign is believed to be the other one."""
+    tpdos = tuple(
+        replace(tpdo, objects=tuple(replace(mapped, scale=-mapped.scale) for mapped in tpdo.objects))
+        for tpdo in layout.tpdos
+    )
+    return replace(layout, tpdos=tpdos)
 
 
 def test_units_that_disagree_are_named_with_both_numbers(rig):
@@ -394,7 +494,7 @@ def test_a_value_that_is_not_there_before_the_drive_runs_is_left_out():
     slave._sdo = lambda data: (
         b"\x80" + data[1:4] + b"\x22\0\0\x08" if data[1:3] == b"\x6c\x60" else answer(data)
     )
-    samples = run_program(sample_motion(found, 0.05), Wire([slave]))
+    samples = run_program(MotionReader([found]).program(0.05), Wire([slave]))[5]
     assert samples
     assert all(Signal.MOTOR_VELOCITY not in sample.values for sample in samples)
     assert all(Signal.MOTOR_POSITION in sample.values for sample in samples)
@@ -410,7 +510,7 @@ def moving(ratio=1.0, link=None, amplitude=0.5):
         }
         if link is not None:
             values[Signal.LINK_POSITION] = link * amplitude * math.sin(3 * t)
-        samples.append(MotionSample(t, values))
+        samples.append(MotionSample(t, values, dict.fromkeys(values, t), dict.fromkeys(values, 0.001)))
     return samples
 
 
@@ -443,9 +543,30 @@ def test_positions_are_sampled_over_the_roll_over():
         slave.objects[0x6064, 0].value = (0x7FFFFFF0 + k) & 0xFFFFFFFF
         return 0.01 * k
 
-    samples = run_program(sample_motion(told, 1.0, clock), Wire([slave]))
+    samples = run_program(MotionReader([told], clock).program(1.0), Wire([slave]))[5]
     positions = [sample.values[Signal.MOTOR_POSITION] for sample in samples]
     assert all(0 < after - before < 1e-4 for before, after in itertools.pairwise(positions))
+
+
+def test_values_read_one_after_the_other_are_put_on_one_grid():
+    """Each at its own time: a sine that is read late by half a turn is no other sine."""
+    found, _ = survey(link="[link.encoder]\ncounts_per_rev = 65536")
+    signals = (Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE, Signal.LINK_POSITION)
+    samples = []
+    for k in range(500):
+        times = {signal: 0.01 * k + 0.003 * j for j, signal in enumerate(signals)}
+        values = {signal: math.sin(2.0 * times[signal]) for signal in signals}
+        waits = dict.fromkeys(signals, 0.001)
+        if not k % 7:  # an answer that was long in coming, its time a bad guess
+            times[signals[1]] += 0.05
+            waits[signals[1]] = 0.1
+        samples.append(MotionSample(times[signals[0]], values, times, waits))
+    record = record_of_motion([found], {5: samples}, 1, True)
+    assert record.period_s == pytest.approx(0.01)
+    # a straight line between two readings is off by at most (2 rad/s)² (0.01 s)² / 8, by four times that
+    # where one between them is left out
+    assert abs(record.motor_torque_nm[:, 0] - record.motor_position_rad[:, 0]).max() < 2.5e-4
+    assert abs(record.link_position_rad - record.motor_position_rad[:, 0]).max() < 1e-4
 
 
 def test_scanning_asks_every_id_and_hears_who_is_there():

@@ -21,7 +21,7 @@ from drivelink.jointfile import parse
 from estimator import JointModel, Motor, Record, Transmission
 from estimator.batch import fit
 from estimator.diagnosis import diagnose
-from estimator.gate import Change, Finding, GateError, examine
+from estimator.gate import Change, Finding, GateError, examine, judge
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("DRIVELINK_DATA", ROOT.parent / "shared" / "data"))
@@ -77,6 +77,32 @@ def test_each_fault_is_named(kind: str) -> None:
         assert named(findings, factors), (kind, name, findings)
 
 
+@pytest.mark.parametrize("kind", gatekit.KINDS)
+def test_a_rich_motion_tells_every_sign_and_the_unit_of_the_link(kind: str) -> None:
+    told = [judge(d.record, d.model) for d in (gatekit.draw(kind, seed, seconds=6.0) for seed in (7, 8))]
+    for judgement in told:
+        assert judgement.reason == "" and judgement.left < 0.3
+        assert not any("sign" in text and "link" in text for text in judgement.untold), judgement.untold
+
+
+def test_of_a_link_that_is_held_it_is_said_that_its_sign_cannot_be_told() -> None:
+    drawn = gatekit.draw("soft", 4, held=True)
+    judgement = judge(drawn.record, drawn.model)
+    assert judgement.findings == ()
+    assert any("sign" in text and "link" in text for text in judgement.untold), judgement
+    assert "this motion does not tell" in judgement.remark
+    reversed_link = gatekit.faulty(drawn.record, {"link_position": -1.0})
+    untold = judge(reversed_link, drawn.model).untold
+    assert any("sign" in text and "link" in text for text in untold), untold
+
+
+def test_a_torque_that_is_only_noise_tells_nothing() -> None:
+    drawn = gatekit.draw("soft", 5)
+    noise = np.random.default_rng(1).normal(0.0, 1e-3, drawn.record.motor_torque_nm.shape)
+    judgement = judge(replace(drawn.record, motor_torque_nm=noise), drawn.model)
+    assert judgement.findings == () and "of the torque" in judgement.reason
+
+
 def test_one_reversed_motor_of_a_pair_is_found() -> None:
     drawn = gatekit.draw("antagonistic", 1)
     both = {"motor2_position": -1.0, "motor2_torque": -1.0}
@@ -123,6 +149,7 @@ def test_a_recording_too_short_to_tell_is_not_judged(degrees: gatekit.Drawn) -> 
         link_position_rad=r.link_position_rad[:200],
     )
     assert examine(short, degrees.model) == []
+    assert "200 samples" in judge(short, degrees.model).remark
 
 
 JOINT = """\
@@ -206,16 +233,8 @@ node_id = 1
 def test_what_comes_from_drives_is_corrected_at_the_drive(
     changes: dict[str, float], lines: list[str]
 ) -> None:
-    finding = Finding(
-        kind="sign",
-        what="",
-        changes=tuple(Change(k, v) for k, v in changes.items()),
-        motors=2,
-        log_odds=10.0,
-        left_before=1.0,
-        left_after=0.0,
-    )
-    assert [str(c) for c in corrections(parse(DRIVES), [finding], live=True)] == lines
+    needed = [Change(channel, factor) for channel, factor in changes.items()]
+    assert [str(c) for c in corrections(parse(DRIVES), needed, live=True)] == lines
 
 
 def _measured(path: str, joint: str) -> tuple[Record, JointModel]:
@@ -230,9 +249,18 @@ def _measured(path: str, joint: str) -> tuple[Record, JointModel]:
 @pytest.mark.parametrize(("path", "joint"), MEASURED)
 def test_a_real_machine_passes_as_it_is_and_no_fault_of_it_does(path: str, joint: str) -> None:
     record, model = _measured(path, joint)
-    assert examine(record, model) == []
+    healthy = judge(record, model)
+    assert healthy.findings == ()
+    if "InnerLoop" in path:
+        assert any("link" in text for text in healthy.untold), healthy
     for name, factors in _faults(record).items():
-        if (path, name) in UNTOLD or ("InnerLoop" in path and name not in OF_A_HELD_LINK):
+        if (path, name) in UNTOLD:
+            doubt = judge(gatekit.faulty(record, factors), model).remark
+            assert "does not tell" in doubt and "unit of the motor torque" in doubt, (name, doubt)
+            continue
+        if "InnerLoop" in path and name not in OF_A_HELD_LINK:
+            judgement = judge(gatekit.faulty(record, factors), model)
+            assert judgement.findings or judgement.untold, name  # it is not passed in silence
             continue
         findings = examine(gatekit.faulty(record, factors), model)
         assert findings, name

@@ -55,6 +55,16 @@ def test_long_work_without_a_terminal_is_a_line_now_and_then(clock: Clock) -> No
     assert lines[0] == "fit: 16 % after 5 s" and 5 <= len(lines) <= 6
 
 
+def test_progress_says_what_is_being_done(clock: Clock) -> None:
+    for terminal in (True, False):
+        shown = console(terminal)
+        with Meter("diagnose run.csv", None, shown) as meter:
+            for stage in ("bandwidth", "search"):
+                clock.now_s += 6.0
+                meter.stage(stage)
+        assert "diagnose run.csv (bandwidth)" in text(shown) and "(search)" in text(shown)
+
+
 def test_long_work_on_a_terminal_is_a_bar_that_goes_away(clock: Clock) -> None:
     shown = console(terminal=True)
     with Meter("fit", 100, shown) as meter:

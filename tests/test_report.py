@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import diagnosiskit as kit
@@ -83,6 +84,32 @@ def test_an_unlisted_effect_comes_with_its_curve(folder: Path) -> None:
     effect = _diagnose(folder, "bump")["effects"][0]
     assert (effect["name"], effect["location"], effect["coordinates"]) == ("unlisted", "motor", ["position"])
     assert len(effect["curve"]["position"]) == len(effect["curve"]["torque_nm"]) > 100
+
+
+def test_json_is_pure_and_what_the_file_says(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    report = _diagnose(folder, "coulomb", "joint.toml", "--json")
+    assert json.loads(capsys.readouterr().out) == report
+
+
+def test_the_report_has_units_bands_the_winner_and_what_is_left(folder: Path) -> None:
+    _diagnose(folder, "coulomb")
+    page = (folder / "coulomb-joint.toml" / "report.html").read_text(encoding="utf-8")
+    assert "of the torque (" in page and "rms) stays unexplained" in page
+    assert "▶ coulomb friction" in page
+    assert page.count("▶ ") == 2  # the one that was chosen, and what the mark means
+    assert "Stiffness of transmission 1, with 95 % bands" in page and ">refitted</text>" in page
+    assert re.search(r"<code>torque_nm</code></td><td>0\.\d+ ± \S+ N·m</td>", page)
+    assert re.search(r"<code>k_nm_rad</code></td><td>\S+ ± \S+ N·m/rad</td>", page)
+    assert "prefers-color-scheme: dark" in page and "currentColor" in page and "#ffffff" not in page
+
+
+def test_of_a_linear_axis_the_report_speaks_of_newtons_and_metres(folder: Path) -> None:
+    (folder / "slide.toml").write_text(JOINT.replace("[[motor]]", 'axis = "linear"\n[[motor]]', 1))
+    _diagnose(folder, "coulomb", "slide.toml")
+    page = (folder / "coulomb-slide.toml" / "report.html").read_text(encoding="utf-8")
+    assert re.search(r"<code>torque_nm</code></td><td>\S+ ± \S+ N</td>", page)
+    assert re.search(r"<code>k_nm_rad</code></td><td>\S+ ± \S+ N/m</td>", page)
+    assert "N·m" not in page and "/ rad" not in page and "m/s" in page
 
 
 def test_the_page_is_self_contained_and_says_the_verdict(folder: Path) -> None:

@@ -75,6 +75,20 @@ def test_what_comes_and_goes_is_counted_not_repeated(caplog: pytest.LogCaptureFi
     assert caplog.records[-1].getMessage() == "the cable is loose (499 more times before)"
 
 
+def test_the_same_with_other_figures_is_the_same(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    clock = [0.0]
+    events = log(clock)
+    for k in range(500):
+        clock[0] = 0.1 * k
+        events.begin("slow", f"{k} cycles left out so far")
+        events.end("slow", f"it keeps up again; {k} were left out")
+        events.say(f"the counter jumped, {k} times so far", key="jumped")
+    assert len(caplog.records) == 3 * 5 and len(events.recent()) == 15
+    assert events.recent()[-1]["text"] == "the counter jumped, 499 times so far"
+    assert sum(event["count"] for event in events.recent()) == 1500
+
+
 def test_the_last_events_are_kept_and_no_more() -> None:
     events = log([0.0])
     for k in range(1000):

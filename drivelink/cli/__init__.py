@@ -12,13 +12,16 @@ import importlib
 import logging
 import os
 import sys
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from drivelink.errors import DrivelinkError, UsageError
 from drivelink.version import __version__
 from estimator.errors import EstimatorError
 
-__all__ = ["ALONE", "VERBS", "add_map", "main", "make_parser"]
+if TYPE_CHECKING:
+    from drivelink.jointfile import JointFile
+
+__all__ = ["ALONE", "VERBS", "add_bus", "add_map", "main", "make_parser", "moved"]
 
 VERBS = {
     "demo": "simulated drive on the virtual bus, daemon, subscriber, live view: the whole chain",
@@ -98,7 +101,10 @@ def main(argv: list[str] | None = None) -> int:
         if not argv:
             make_parser([]).print_help(sys.stderr)
             return UsageError.exit_status
-        args = make_parser([verb]).parse_args(argv)
+        parser = make_parser([verb])
+        args, unknown = parser.parse_known_args(argv)
+        if unknown:  # argparse itself would show the usage of the whole program
+            _verb_parser(parser, verb).error(f"unrecognized arguments: {' '.join(unknown)}")
         return int(args.run(args))
     except DrivelinkError as error:
         return _fail(verb, error, error.exit_status)
@@ -114,6 +120,14 @@ def main(argv: list[str] | None = None) -> int:
         return _INTERRUPTED
 
 
+def _verb_parser(parser: argparse.ArgumentParser, verb: str) -> argparse.ArgumentParser:
+    """The parser of one verb."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction) and verb in action.choices:
+            return action.choices[verb]  # type: ignore[no-any-return]
+    return parser
+
+
 def add_map(parser: argparse.ArgumentParser) -> None:
     """Add `--map`, for the verbs that read recordings."""
     parser.add_argument(
@@ -124,6 +138,17 @@ def add_map(parser: argparse.ArgumentParser) -> None:
         help="take a column of a CSV or MF4 file for one of ours, e.g. q_link=link_position_rad:deg; "
         "a factor may stand for UNIT, e.g. tau=motor1_torque_nm:-0.05; may be repeated",
     )
+
+
+def add_bus(parser: argparse.ArgumentParser) -> None:
+    """Add `--interface` and `--channel`, for the verbs that use a bus."""
+    parser.add_argument("--interface", metavar="I", help="python-can interface instead of the joint file's")
+    parser.add_argument("--channel", metavar="C", help="channel instead of the joint file's, e.g. can0")
+
+
+def moved(joint: JointFile, args: argparse.Namespace) -> JointFile:
+    """The joint on the interface and channel of the command line."""
+    return joint.model_copy(update={"bus": joint.bus.moved(args.interface, args.channel)})
 
 
 def _fail(verb: str, error: object, status: int) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 
 import shtab
 
@@ -20,6 +21,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _EPILOG
     parser.add_argument("shell", choices=shtab.SUPPORTED_SHELLS, help="the shell")
+    parser.add_argument("--json", action="store_true", help="print shell and script as one JSON object")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -28,7 +30,8 @@ def run(args: argparse.Namespace) -> int:
     for action in parser._subparsers._group_actions:  # type: ignore[union-attr]
         for subparser in action.choices.values():  # type: ignore[union-attr]
             _complete_files(subparser)
-    print(shtab.complete(parser, shell=args.shell))
+    script = shtab.complete(parser, shell=args.shell)
+    print(json.dumps({"shell": args.shell, "script": script}) if args.json else script)
     return 0
 
 

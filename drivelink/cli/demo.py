@@ -41,7 +41,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--seconds", type=_seconds, default=10.0, metavar="S", help="of the run (default: 10)"
     )
     parser.add_argument("--headless", action="store_true", help="plain lines instead of the live view")
-    parser.add_argument("--json", action="store_true", help="end with one line of JSON; implies --headless")
+    parser.add_argument("--json", action="store_true", help="print one line of JSON and nothing else")
 
 
 def _seconds(text: str) -> float:
@@ -63,8 +63,9 @@ def run(args: argparse.Namespace) -> int:
     summary = watch.summary
     if summary is None:
         raise DrivelinkError("the simulated drive and the daemon ended without a word")
-    console.print(closing_table(args.case, watch.comparison, summary, watch.received))
-    if args.json:
+    if not args.json:
+        console.print(closing_table(args.case, watch.comparison, summary, watch.received, joint.bus.period_s))
+    else:
         print(json.dumps(as_json(args.case, watch.comparison, summary, watch.received)))
     return 130 if interrupted else 0
 

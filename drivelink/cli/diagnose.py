@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from drivelink.cli import add_map
 from drivelink.errors import RecordingError, UsageError
 from drivelink.gate import refusal
 from drivelink.outfile import check_target
+from drivelink.output.units import Units
 from drivelink.progress import Meter
 from drivelink.recording.columnmap import parse_column_map
 from drivelink.recording.mapping import joint_of
@@ -59,6 +61,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--force", action="store_true", help="replace the file of --write if it exists")
     add_map(parser)
+    parser.add_argument("--json", action="store_true", help="print what report.json says, and nothing else")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -77,11 +80,9 @@ def run(args: argparse.Namespace) -> int:
     if args.validate is not None:
         validation = recording.read(args.validate, joint, base_dir=base, names=names)
     named = ", ".join(path.name for path in args.recording)
-    with Meter("diagnose") as meter:
+    with Meter(f"diagnose {named}") as meter:
         try:
-            outcome = diagnose(
-                records, joint.model(), args.bandwidth_hz, validation, lambda _: meter.advance()
-            )
+            outcome = diagnose(records, joint.model(), args.bandwidth_hz, validation, meter.stage)
         except GateError as error:
             both = zip((*args.recording, args.validate), (*records, validation), strict=True)
             path = next(name for name, one in both if one is error.record)
@@ -89,37 +90,44 @@ def run(args: argparse.Namespace) -> int:
         except EstimatorError as error:
             raise RecordingError(f"{named}: {error}") from error
     args.out.mkdir(parents=True, exist_ok=True)
-    title = report.Title(joint.name, named, args.validate.name if args.validate else None)
-    _print(outcome)
-    for path in report.write(outcome, title, args.out):
-        print(f"wrote {path}")
+    validated = args.validate.name if args.validate else None
+    title = report.Title(joint.name, named, validated, joint.axis == "linear")
+    made = report.write(outcome, title, args.out)
     if args.write is not None:
         augment.write(source, args.write, outcome, records[0], named, force=args.force)
-        print(f"wrote {args.write}")
+        made.append(args.write)
+    if args.json:
+        print(json.dumps(report.as_json(outcome)))
+        return 0
+    _print(outcome, Units(title.linear))
+    for path in made:
+        print(f"wrote {path}")
     return 0
 
 
-def _print(outcome: Diagnosis) -> None:
+def _print(outcome: Diagnosis, units: Units) -> None:
     console = Console()
     console.print(report.sentence(outcome), highlight=False, soft_wrap=True)
+    console.print(report.unexplained(outcome, units), highlight=False, soft_wrap=True)
     table = Table()
     for column in ("error of the torque balance", "before", "after"):
         table.add_column(column, justify="left" if column.startswith("error") else "right")
     for name, one in (("training", outcome.train), ("validation", outcome.validation)):
-        before = f"{one.before_rms_nm:.4g} N·m  {one.before_relative:.2%}"
-        table.add_row(name, before, f"{one.after_rms_nm:.4g} N·m  {one.after_relative:.2%}")
+        unit = units.shown("N·m")
+        before = f"{one.before_rms_nm:.4g} {unit}  {one.before_relative:.2%}"
+        table.add_row(name, before, f"{one.after_rms_nm:.4g} {unit}  {one.after_relative:.2%}")
     console.print(table)
     for finding in outcome.effects:
         print(f"  {report.title_of(finding)}")
         for name, value in finding.parameters.items():
-            print(f"    {name} = {report.value_text(value, finding.std.get(name))}")
+            print(f"    {name} = {units.value(name, value, finding.std.get(name))}")
         if finding.alternatives:
             print(f"    could also be: {', '.join(finding.alternatives)}")
     for number, refitted in enumerate(outcome.transmissions, start=1):
         for name, value in refitted.parameters.items():
-            text = report.value_text(value, refitted.std[name])
+            text = units.value(name, value, refitted.std[name])
             print(f"  transmission {number}, refitted: {name} = {text}")
     for name, value in outcome.alignment.items():
-        print(f"  taken out of the readings: {name} = {value:.4g}")
+        print(f"  taken out of the readings: {name} = {units.value(name, value, None)}")
     for line in (*outcome.notes, *outcome.advice):
         print(f"  {line}")

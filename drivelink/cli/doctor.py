@@ -4,21 +4,30 @@ from __future__ import annotations
 
 import argparse
 import json
+import select
+import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import TextIO
 
 from rich.console import Console
 
+from drivelink.cli import add_bus, moved
 from drivelink.doctor import examine, examine_eds
+from drivelink.doctor.byhand import check_by_hand
+from drivelink.doctor.livevalues import live_values
 from drivelink.errors import UsageError
 from drivelink.finding import Severity
-from drivelink.jointfile import load
+from drivelink.jointfile import JointFile, load
 
 __all__ = ["configure", "run"]
 
 _EPILOG = """\
 examples:
   drivelink doctor                     this machine: real time, memory, CAN, zenoh
-  drivelink doctor elbow.toml          also the bus, nodes, mappings, units, signs of positions; moves nothing
+  drivelink doctor elbow.toml          also the bus, nodes, mappings, units; moves nothing. While the joint
+                                       moves under its controller: units and signs of positions and torque
+  drivelink doctor elbow.toml --move   you move the joint, it says how, and ticks each sign and scale off
   drivelink doctor --eds drive.eds     before buying: what a drive can give
 """
 
@@ -34,6 +43,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seconds", type=float, default=3.0, metavar="S", help="for each measurement (default: %(default)s)"
     )
+    parser.add_argument(
+        "--move", action="store_true", help="what to do by hand, and what each sign and scale turns out to be"
+    )
+    add_bus(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -42,14 +55,61 @@ def run(args: argparse.Namespace) -> int:
     if not 0 < args.seconds <= 3600:
         raise UsageError(f"--seconds: expected more than 0 and at most 3600, got {args.seconds:g}")
     if args.eds is not None:
-        if args.joint is not None:
+        if args.joint is not None or args.move:
             raise UsageError("expected either JOINT or --eds FILE")
         report = examine_eds(args.eds)
     else:
-        joint = load(args.joint) if args.joint is not None else None
+        joint = moved(load(args.joint), args) if args.joint is not None else None
+        if args.move:
+            return _by_hand(joint, args)
         report = examine(joint, args.joint.parent if args.joint else Path(), args.seconds)
     if args.json:
         print(json.dumps(report.as_dict(), ensure_ascii=False))
     else:
         report.show(Console())
     return 1 if report.worst is Severity.ERROR else 0
+
+
+def _by_hand(joint: JointFile | None, args: argparse.Namespace) -> int:
+    """Lead through the checks; 1 where a sign or scale is wrong."""
+    if joint is None:
+        raise UsageError("--move: expected a joint file")
+    with live_values(joint, args.joint.parent) as values:
+        done = check_by_hand(joint, values, _Terminal(sys.stderr if args.json else sys.stdout))
+    told = done.as_dict()
+    if args.json:
+        print(json.dumps(told, ensure_ascii=False))
+        return 0 if told["good"] else 1
+    if done.paste:
+        print(f"Put into {args.joint}:")
+    for line in done.paste:
+        print(f"  {line}")
+    if told["good"]:
+        checked = sum(mark.good is True for mark in done.marks)
+        print(f"{checked} checked and right, {len(done.marks) - checked} not checked")
+    return 0 if told["good"] else 1
+
+
+class _Terminal:
+    """The person at the terminal."""
+
+    def __init__(self, out: TextIO) -> None:
+        self._out = out
+
+    def say(self, text: str) -> None:
+        """Print a line."""
+        print(text, file=self._out, flush=True)
+
+    def ask(self, text: str, meanwhile: Callable[[], None]) -> str:
+        """Print a question, and read a line without waiting for it.
+
+        Raises:
+            UsageError: there is nobody to answer.
+        """
+        print(f"> {text}", file=self._out, flush=True)
+        while not select.select([sys.stdin], [], [], 0)[0]:
+            meanwhile()
+        line = sys.stdin.readline()
+        if not line:
+            raise UsageError("--move: nobody answers: run it in a terminal")
+        return line.strip()

@@ -81,6 +81,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="Q",
         help="false discovery rate of the changes (default: 0.05)",
     )
+    parser.add_argument("--json", action="store_true", help="print what fleet.json says, and nothing else")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -95,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
     if args.recordings[0] == _REPORT and args.joints is None:
         if len(args.recordings) != 2:
             raise UsageError("fleet report: expected one folder of results")
-        _report(args.recordings[1], args.fdr)
+        _report(args.recordings[1], args.fdr, as_json=args.json)
         return 0
     return _run(args)
 
@@ -151,8 +152,9 @@ def _run(args: argparse.Namespace) -> int:
             raise
     if said > _WARNINGS:
         print(f"and {said - _WARNINGS} lines more", file=sys.stderr)
-    print(_summary(counts))
-    _report(args.out, args.fdr)
+    if not args.json:
+        print(_summary(counts))
+    _report(args.out, args.fdr, as_json=args.json)
     return 0
 
 
@@ -168,7 +170,7 @@ def _summary(counts: Counts) -> str:
     return f"{counts.found} recording{'s' * (counts.found != 1)}: {', '.join(parts)}"
 
 
-def _report(folder: str, rate: float) -> None:
+def _report(folder: str, rate: float, *, as_json: bool) -> None:
     from drivelink.fleet import page, summary, table
     from drivelink.fleet.storage import Store
 
@@ -176,6 +178,9 @@ def _report(folder: str, rate: float) -> None:
     document = summary.summarise(table.read_rows(store, summary.COLUMNS), rate)
     store.write("fleet.json", (json.dumps(document, indent=1) + "\n").encode())
     store.write("fleet.html", page.page(document).encode())
+    if as_json:
+        print(json.dumps(document))
+        return
     for joint in document["joints"]:
         if joint["state"] == "changing":
             print(f"  {joint['joint']}: {joint['sentence']}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import time
 from pathlib import Path
@@ -17,7 +18,7 @@ from drivelink.monitor.keys import Keys
 from drivelink.monitor.statuslines import shape
 from drivelink.monitor.view import joints_table
 from drivelink.monitor.watcher import Watcher
-from drivelink.monitor.web import WebView
+from drivelink.monitor.web import WebView, document
 from drivelink.pubsub.clientbase import ENDPOINT
 from drivelink.pubsub.session import close_session, open_client
 
@@ -46,12 +47,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--endpoint", help=f"where a daemon or router listens (default {ENDPOINT})")
     parser.add_argument("--config", type=Path, help="zenoh configuration file (JSON5) instead")
     parser.add_argument("--prefix", help='first part of every key (default "drivelink")')
+    parser.add_argument(
+        "--json", action="store_true", help="in place of a plain line: one JSON object a joint and line"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Do the job; return the exit status."""
     if args.port < 0 or args.port > 65535:
         raise UsageError(f"--port: expected 0 to 65535, got {args.port}")
+    if args.web and args.json:
+        raise UsageError("expected either --web or --json")
     name, endpoint, config, prefix = _where(args)
     session = open_client(endpoint, config)
     try:
@@ -60,10 +66,10 @@ def run(args: argparse.Namespace) -> int:
         try:
             if args.web:
                 _serve(watcher, args.port, end)
-            elif sys.stdout.isatty():
+            elif sys.stdout.isatty() and not args.json:
                 _show(watcher, end, f"{prefix}/{name or '*'} at {config or endpoint}")
             else:
-                _print(watcher, end, args.every)
+                _print(watcher, end, args.every, as_json=args.json)
         except KeyboardInterrupt:
             pass
         finally:
@@ -124,15 +130,20 @@ def _picture(
     return Group(joints_table(views, console.size.width), Text(""), *alarms, footer)
 
 
-def _print(watcher: Watcher, end: float, every_s: float) -> None:
-    """A plain line for each joint, again and again."""
+def _print(watcher: Watcher, end: float, every_s: float, *, as_json: bool) -> None:
+    """A plain line, or a JSON object, for each joint, again and again."""
     due = time.monotonic() + every_s
     while time.monotonic() < end:
         watcher.poll()
         if time.monotonic() >= due:
             due += every_s
-            lines = [view.line() for _, view in sorted(watcher.views.items())] or ["no joint yet"]
-            print("\n".join(lines), flush=True)
+            views = [view for _, view in sorted(watcher.views.items())]
+            if as_json:
+                lines = [json.dumps(document(view), allow_nan=False) for view in views]
+            else:
+                lines = [view.line() for view in views] or ["no joint yet"]
+            for line in lines:
+                print(line, flush=True)
         time.sleep(_POLL_S)
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import json
+import math
 import sys
 from collections.abc import Callable
 from importlib import resources
@@ -22,11 +24,12 @@ __all__ = ["configure", "run"]
 
 _CASES = ("constant", "quadratic", "vsa-ii")
 _ARRANGEMENTS = ("single", "antagonistic", "serial")
-_MODELS = ("polynomial", "linear", "vsa-ii", "none")
+_MODELS = ("polynomial", "linear", "exponential", "vsa-ii", "none")
 
 _EPILOG = """\
 examples:
   drivelink new elbow.toml                            asks what no drive can tell
+  drivelink new elbow.toml --rotor-inertia 48 --gear 100 --torque-constant 53
   drivelink new elbow.toml --scan --channel can0      node ids and encoder from what answers on the bus
   drivelink new vsa.toml --case vsa-ii                one of the paper's joints, for `sim` and `run`
 """
@@ -41,7 +44,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scan", action="store_true", help="take the nodes from what answers on the bus")
     parser.add_argument("--name", help="of the joint")
     parser.add_argument("--arrangement", choices=_ARRANGEMENTS, help="how the motors act on the joint")
-    parser.add_argument("--inertia", type=float, metavar="KG_M2", help="of each motor, joint side")
+    parser.add_argument(
+        "--rotor-inertia", type=float, metavar="G_CM2", help="of each motor, g·cm², as its data sheet has it"
+    )
+    parser.add_argument("--inertia", type=float, metavar="KG_M2", help="instead: of each motor, joint side")
+    parser.add_argument(
+        "--torque-constant",
+        type=float,
+        metavar="MNM_A",
+        help="of each motor, mN·m/A, where the drive reports no torque",
+    )
     parser.add_argument("--damping", type=float, metavar="NM_S_RAD", help="of each motor, joint side")
     parser.add_argument("--model", choices=_MODELS, help="of the transmission")
     parser.add_argument("--node", type=int, action="append", metavar="ID", help="of a drive; twice for a VSA")
@@ -52,17 +64,26 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bitrate", type=int, help="bit/s (default: 1000000)")
     parser.add_argument("--passive", action="store_true", help="another master is in charge of the bus")
     parser.add_argument("--force", action="store_true", help="replace PATH if it exists")
+    parser.add_argument("--json", action="store_true", help="print what was made as one JSON object")
 
 
 def run(args: argparse.Namespace) -> int:
     """Ask what is not given, where somebody can answer, and write the file."""
-    text, name = _case_text(args) if args.case else _new_text(args)
+    if args.inertia is not None and args.rotor_inertia is not None:
+        raise UsageError("expected either --inertia or --rotor-inertia")
+    text, name, remarks = _case_text(args) if args.case else _new_text(args)
     if str(args.path) == "-":
-        print(text, end="")
+        print(json.dumps({"joint": name, "text": text}) if args.json else text, end="\n" if args.json else "")
         return 0
     path = args.path or Path(f"{name}.toml")
     check_target(path, force=args.force)
     write_whole(path, text, force=args.force)
+    if args.json:
+        document = {"joint": name, "path": str(path), "remarks": remarks, "next": _next(args, path)}
+        print(json.dumps(document, ensure_ascii=False))
+        return 0
+    for remark in remarks:
+        print(remark)
     print(f"{path} written; next: {_next(args, path)}")
     return 0
 
@@ -74,7 +95,7 @@ def _next(args: argparse.Namespace, path: Path) -> str:
     return f"drivelink sim {path}{here}, and in another terminal drivelink run {path}{here}"
 
 
-def _case_text(args: argparse.Namespace) -> tuple[str, str]:
+def _case_text(args: argparse.Namespace) -> tuple[str, str, list[str]]:
     """A copy of the shipped joint, comments kept, with the flags that make sense for it."""
     source = resources.files("drivelink") / "joints" / f"{args.case}.toml"
     document: Any = tomlkit.parse(source.read_text(encoding="utf-8"))
@@ -85,14 +106,16 @@ def _case_text(args: argparse.Namespace) -> tuple[str, str]:
         if value is not None:
             document["bus"][key] = value
     text = tomlkit.dumps(document)
-    return text, parse(text, "these answers").name
+    return text, parse(text, "these answers").name, []
 
 
-def _new_text(args: argparse.Namespace) -> tuple[str, str]:
+def _new_text(args: argparse.Namespace) -> tuple[str, str, list[str]]:
     given = {
         "name": args.name,
         "arrangement": args.arrangement,
         "inertia_kg_m2": args.inertia,
+        "rotor_inertia_gcm2": args.rotor_inertia,
+        "torque_constant_mnm_a": args.torque_constant,
         "viscous_damping_nm_s_rad": args.damping,
         "model": args.model,
         "nodes": args.node,
@@ -108,9 +131,17 @@ def _new_text(args: argparse.Namespace) -> tuple[str, str]:
         answers.name = given["name"] = args.path.stem
     if args.scan:
         answers = _scanned(answers)
-    elif sys.stdin.isatty() and str(args.path) != "-":
+    elif sys.stdin.isatty() and str(args.path) != "-" and not args.json:
         _ask(answers, {key for key, value in given.items() if value is not None})
-    return joint_text(answers), answers.name
+    if answers.motors > 1 and answers.model == "none":
+        raise UsageError(f"transmission: expected a flexible one of {answers.arrangement} motors, got none")
+    text = joint_text(answers)
+    remarks = [f"motor inertia at the joint: {answers.conversion}"] if answers.conversion else []
+    if answers.joint_inertia_kg_m2 is None:
+        remarks.append(
+            "motor.inertia_kg_m2 is a placeholder: --rotor-inertia (g·cm²) and --gear, or --inertia, tell it"
+        )
+    return text, answers.name, remarks
 
 
 def _encoder(text: str | None) -> str | None:
@@ -147,9 +178,19 @@ def _one_of(*choices: str) -> Callable[[str], str]:
 
 def _number(reply: str) -> float:
     try:
-        return float(reply)
+        value = float(reply)
     except ValueError:
-        raise UsageError(f"expected a number, got {reply}") from None
+        value = math.nan
+    if not math.isfinite(value):
+        raise UsageError(f"expected a number, got {reply}")
+    return value
+
+
+def _positive(reply: str) -> float:
+    value = _number(reply)
+    if value <= 0.0:
+        raise UsageError(f"expected a number above 0, got {reply}")
+    return value
 
 
 def _node_id(reply: str) -> int:
@@ -161,12 +202,14 @@ def _node_id(reply: str) -> int:
 _QUESTIONS: tuple[tuple[str, str, Callable[[str], Any]], ...] = (
     ("name", "Name of the joint", str),
     ("arrangement", ", ".join(_ARRANGEMENTS), _one_of(*_ARRANGEMENTS)),
+    ("gear_ratio", "Gear ratio: motor revolutions per joint revolution, 1 for a direct drive", _positive),
+    ("rotor_inertia_gcm2", "Rotor inertia of the motor, g·cm² (its data sheet)", _positive),
     (
-        "inertia_kg_m2",
-        "Motor inertia at the joint side, kg·m² (rotor inertia times gear ratio squared)",
-        _number,
+        "torque_constant_mnm_a",
+        "Torque constant of the motor, mN·m/A (its data sheet; Enter: the drive reports its torque)",
+        _positive,
     ),
-    ("viscous_damping_nm_s_rad", "Motor damping at the joint side, N·m·s/rad", _number),
+    ("viscous_damping_nm_s_rad", "Motor damping at the joint side, N·m·s/rad (0: not known)", _number),
     ("model", f"Transmission: {', '.join(_MODELS)}", _one_of(*_MODELS)),
     ("interface", "CAN interface (python-can)", str),
     ("channel", "Channel", str),
@@ -177,8 +220,12 @@ def _ask(answers: Answers, known: set[str]) -> None:
     """A question for each thing that is not known; Enter keeps the default."""
     try:
         for key, question, check in _QUESTIONS:
-            if key not in known:
-                setattr(answers, key, _asked(question, getattr(answers, key), check))
+            if key in known or (key == "rotor_inertia_gcm2" and "inertia_kg_m2" in known):
+                continue
+            needed = key in ("gear_ratio", "rotor_inertia_gcm2")  # nobody else knows them
+            setattr(answers, key, _asked(question, getattr(answers, key), check, needed=needed))
+            if key == "rotor_inertia_gcm2":
+                print(f"  at the joint: {answers.conversion}")
         if "nodes" not in known:
             for motor in range(1, answers.motors + 1):
                 answers.nodes.append(_asked(f"Node id of the drive of motor {motor}", motor, _node_id))
@@ -189,12 +236,15 @@ def _ask(answers: Answers, known: set[str]) -> None:
         raise UsageError("the questions were left unanswered; options answer them, too: --help") from None
 
 
-def _asked(question: str, default: Any, check: Callable[[str], Any]) -> Any:
-    """What is answered, asked for again until it can be; the default for an empty line."""
+def _asked(question: str, default: Any, check: Callable[[str], Any], *, needed: bool = False) -> Any:
+    """What is answered, asked for again until it can be; an empty line is the default, where there is one."""
     while True:
-        reply = input(f"{question} [{default}]: ").strip()
-        if not reply:
+        reply = input(f"{question}: " if default is None else f"{question} [{default}]: ").strip()
+        if not reply and not needed:
             return default
+        if not reply:
+            print("expected a number: there is no default for it")
+            continue
         try:
             return check(reply)
         except UsageError as error:

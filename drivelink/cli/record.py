@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from drivelink import jointfile
 from drivelink.canopen.bus import open_bus
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
+from drivelink.cli import add_bus, moved
 from drivelink.errors import BusError, DrivelinkError, UsageError, ZenohError
 from drivelink.jointfile import JointFile, JointText
 from drivelink.outfile import check_target
@@ -66,6 +68,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         default="auto",
         help="listen to the daemon, to the bus, or to what is there (default)",
     )
+    add_bus(parser)
     parser.add_argument("--force", action="store_true", help="replace a file that exists")
     parser.add_argument(
         "--layouts",
@@ -79,6 +82,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Do the job; return the exit status."""
     source = jointfile.load_text(args.joint)
+    source = replace(source, joint=moved(source.joint, args))
     joint = source.joint
     check_target(args.out, [args.joint], force=args.force)
     if args.seconds is not None and not args.seconds > 0:

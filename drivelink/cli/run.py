@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import logging
 import signal
 import sys
@@ -13,9 +14,9 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from drivelink.cli import ALONE
+from drivelink.cli import ALONE, add_bus, moved
 from drivelink.errors import UsageError
-from drivelink.jointfile import JointFile, load
+from drivelink.jointfile import BusSection, load
 
 if TYPE_CHECKING:
     from drivelink.daemon.service import Daemon
@@ -46,8 +47,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seconds", type=float, metavar="S", help="end after so long; left out: run until stopped"
     )
-    parser.add_argument("--interface", metavar="I", help="python-can interface instead of the joint file's")
-    parser.add_argument("--channel", metavar="C", help="channel instead of the joint file's, e.g. can0")
+    add_bus(parser)
     parser.add_argument("--no-publish", action="store_true", help="compute, but publish nothing")
     parser.add_argument(
         "--no-realtime",
@@ -55,6 +55,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="do not ask for real-time scheduling and locked memory",
     )
     parser.add_argument("--log-level", choices=_LEVELS, default="info", help="what goes to stderr")
+    parser.add_argument(
+        "--json",
+        action="store_true",
+        help="print one JSON object when it is ready, and one at the end: the joints' last status",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -62,10 +67,11 @@ def run(args: argparse.Namespace) -> int:
     if args.seconds is not None and not args.seconds > 0:
         raise UsageError(f"--seconds: expected a number > 0, got {args.seconds:g}")
     _set_up_logging(args.log_level)
-    loaded = [_loaded(path, args.interface, args.channel) for path in args.joints]
+    loaded = [moved(load(path), args) for path in args.joints]
     if loaded[0].bus.interface == "virtual":
         logging.getLogger(__name__).warning(ALONE)
     from drivelink.daemon.service import Daemon, ServedJoint  # a wrong joint file is said before this second
+    from drivelink.pubsub.publisher import to_json
 
     joints = [ServedJoint(joint=joint, path=path) for joint, path in zip(loaded, args.joints, strict=True)]
     with (
@@ -74,26 +80,28 @@ def run(args: argparse.Namespace) -> int:
     ):
         stopped.append(daemon)
         section = joints[0].joint.bus
-        names = ", ".join(served.joint.name for served in joints)
-        print(
-            f"drivelink run: {names} on {section.interface} {section.channel}, "
-            f"{1 / section.period_s:g} Hz, ready",
-            flush=True,
-        )
+        _say_ready([served.joint.name for served in joints], section, args)
         ended = threading.Event()
-        if sys.stdout.isatty():
+        if sys.stdout.isatty() and not args.json:
             threading.Thread(target=_show, args=(daemon, ended), daemon=True).start()
         try:
             daemon.run(args.seconds)
         finally:
             ended.set()
-    print(daemon.summary(), flush=True)
+        last = daemon.documents() if args.json else []
+        end = to_json({"event": "end", "joints": last}).decode() if args.json else daemon.summary()
+    print(end, flush=True)
     return 0
 
 
-def _loaded(path: Path, interface: str | None, channel: str | None) -> JointFile:
-    joint = load(path)
-    return joint.model_copy(update={"bus": joint.bus.moved(interface, channel)})
+def _say_ready(names: list[str], bus: BusSection, args: argparse.Namespace) -> None:
+    rate_hz = 1 / bus.period_s
+    if args.json:
+        where = {"interface": bus.interface, "channel": bus.channel, "rate_hz": rate_hz}
+        print(json.dumps({"event": "ready", "joints": names, **where}), flush=True)
+        return
+    where_text = f"{bus.interface} {bus.channel}, {rate_hz:g} Hz"
+    print(f"drivelink run: {', '.join(names)} on {where_text}, ready", flush=True)
 
 
 def _set_up_logging(level: str) -> None:

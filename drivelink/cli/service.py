@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import shutil
 import subprocess
@@ -46,6 +47,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--credential", action="append", default=[], metavar="NAME=FILE", help="a key that zenoh.config names"
     )
     parser.add_argument("--force", action="store_true", help="replace files that are there and differ")
+    parser.add_argument("--json", action="store_true", help="print what was done as one JSON object")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -67,7 +69,8 @@ def _install(args: argparse.Namespace, root: Path) -> int:
     for place, text in made.files.items():
         (root / place).parent.mkdir(parents=True, exist_ok=True)
         (root / place).write_text(text, encoding="utf-8")
-        print(root / place)
+        if not args.json:
+            print(root / place)
     if joint.zenoh.config and not args.allow:
         print("only this machine may connect: --allow ADDRESS lets others in", file=sys.stderr)
     if args.root is None:
@@ -75,8 +78,15 @@ def _install(args: argparse.Namespace, root: Path) -> int:
         if len(made.files) > 1:
             _systemctl("restart", "systemd-networkd.service")
         _systemctl("enable", "--now", made.unit)
+    if args.json:
+        _print_json(made.unit, "written", [root / place for place in made.files], args.root is None)
+    elif args.root is None:
         print(f"{made.unit} runs: journalctl -fu {made.unit}")
     return 0
+
+
+def _print_json(unit: str, what: str, files: list[Path], running: bool) -> None:
+    print(json.dumps({"unit": unit, what: [str(path) for path in files], "running": running}))
 
 
 def _uninstall(args: argparse.Namespace, root: Path) -> int:
@@ -91,14 +101,19 @@ def _uninstall(args: argparse.Namespace, root: Path) -> int:
     if args.root is None:
         _systemctl("disable", "--now", unit)
     there.unlink()
-    print(f"removed {there}")
+    removed = [there]
     others = any((root / UNITS).glob("drivelink@*.service"))
     for place in network_files(channel) if channel and not others else ():
         if (root / place).exists():
             (root / place).unlink()
-            print(f"removed {root / place}")
+            removed.append(root / place)
     if args.root is None:
         _systemctl("daemon-reload")
+    if args.json:
+        _print_json(unit, "removed", removed, False)
+        return 0
+    for path in removed:
+        print(f"removed {path}")
     return 0
 
 

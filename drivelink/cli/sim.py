@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import signal
 import sys
@@ -12,11 +13,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from drivelink.cli import ALONE
+from drivelink.cli import ALONE, add_bus
 from drivelink.cycle.realtime import PRIORITY, acquire, release
-from drivelink.errors import UsageError
+from drivelink.errors import BusError, UsageError
 from drivelink.jointfile import BusSection, JointFile, load
-from drivelink.simulate import CASE_NAMES, QUIRK_NAMES, bench_from_joints, open_sim_bus
+from drivelink.simulate import (
+    CASE_NAMES,
+    QUIRK_NAMES,
+    JoinedBus,
+    assumptions,
+    bench_from_joints,
+    open_sim_bus,
+    require_free,
+)
 
 _EPILOG = """\
 examples:
@@ -42,13 +51,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--case", choices=CASE_NAMES, help="one of the paper's cases as the world")
     parser.add_argument("--quirks", metavar="NAME", help=f"drives that behave like: {', '.join(QUIRK_NAMES)}")
-    parser.add_argument("--interface", help="python-can interface instead of the joint file's")
-    parser.add_argument("--channel", help="channel instead of the joint file's")
+    add_bus(parser)
     parser.add_argument("--seconds", type=float, metavar="S", help="end by itself after so long")
     parser.add_argument("--seed", type=int, help="of the sensor noise")
     parser.add_argument(
         "--write-eds", type=Path, metavar="DIR", help="write the EDS file of every simulated node and go on"
     )
+    parser.add_argument("--json", action="store_true", help="say as one JSON object when it is ready")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -58,18 +67,36 @@ def run(args: argparse.Namespace) -> int:
     joints = [load(path) for path in args.joints]
     section = _bus_section(joints, args)
     bench = bench_from_joints(
-        joints, effects=args.effect, case_name=args.case, quirks=args.quirks, seed=args.seed
+        joints,
+        effects=args.effect,
+        case_name=args.case,
+        quirks=args.quirks,
+        seed=args.seed,
+        files=args.joints,
     )
+    for joint, path in zip(joints, args.joints, strict=True):
+        for line in () if args.case else assumptions(joint):
+            print(f"drivelink sim: {path}: {line}", file=sys.stderr)
     if args.write_eds:
         bench.write_eds(args.write_eds)
     if section.interface == "virtual":
         print(ALONE, file=sys.stderr)
     stop = threading.Event()
     with _until_signal(stop), open_sim_bus(section) as bus, _ending(stop, args.seconds):
+        if isinstance(bus, JoinedBus):
+            print(f"drivelink sim: {bus.channel_info}: served by another process, joined", file=sys.stderr)
+            bus.on_lost = stop.set
+        require_free(bus, [node.node_id for node in bench.nodes], section)
         where = f"{section.interface} {section.channel}"
-        print(f"drivelink sim: ready on {where}: {bench.describe()}; Ctrl-C ends it", flush=True)
+        if args.json:
+            about = {"interface": section.interface, "channel": section.channel, "devices": bench.devices()}
+            print(json.dumps({"event": "ready", **about}), flush=True)
+        else:
+            print(f"drivelink sim: ready on {where}: {bench.describe()}; Ctrl-C ends it", flush=True)
         with _prompt():
             bench.serve(bus, stop)
+        if isinstance(bus, JoinedBus) and bus.lost:
+            raise BusError(f"{bus.channel_info}: the process that served it has ended")
     return 0
 
 

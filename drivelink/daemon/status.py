@@ -14,7 +14,8 @@ __all__ = ["EventLog"]
 class EventLog:
     """What has happened, said once: in the log, and among the last events of the status.
 
-    A condition has a key. It is said when it begins, not while it lasts, and said again when it ends.
+    A condition has a key. It is said when it begins, not while it lasts, and said again when it ends. What
+    comes again within ten seconds, be it with other figures, is counted and not logged.
 
     Args:
         logger: where the lines go.
@@ -31,7 +32,7 @@ class EventLog:
         self._clock = clock
         self._recent: deque[dict[str, Any]] = deque(maxlen=keep)
         self._active: dict[str, str] = {}
-        self._said: dict[str, tuple[float, int]] = {}
+        self._said: dict[str, tuple[dict[str, Any], float, int]] = {}  # event, when it was logged, since then
 
     @property
     def active(self) -> dict[str, str]:
@@ -42,33 +43,39 @@ class EventLog:
         """The last events, oldest first: {"time", "text", "count"}."""
         return [dict(event) for event in self._recent]
 
-    def say(self, text: str, level: int = logging.INFO) -> None:
-        """Something that has happened, once."""
-        self._note(text, level)
+    def say(self, text: str, level: int = logging.INFO, key: str = "") -> None:
+        """Something that has happened, once.
+
+        Args:
+            text: what.
+            level: of the log line.
+            key: the same of texts that say the same with other figures; left out: the text itself.
+        """
+        self._note(key or text, text, level)
 
     def begin(self, key: str, text: str, level: int = logging.WARNING) -> None:
         """A condition holds; what follows while it holds is not said."""
         if key in self._active:
             return
         self._active[key] = text
-        self._note(text, level)
+        self._note(f"{key} begins", text, level)
 
     def end(self, key: str, text: str = "", level: int = logging.INFO) -> None:
         """A condition holds no more."""
         if self._active.pop(key, None) is not None and text:
-            self._note(text, level)
+            self._note(f"{key} ends", text, level)
 
-    def _note(self, text: str, level: int) -> None:
+    def _note(self, key: str, text: str, level: int) -> None:
         now = self._clock()
-        since, count = self._said.get(text, (-self._QUIET_S, 0))
+        event, since, count = self._said.get(key, ({}, -self._QUIET_S, 0))
         if 0 <= now - since < self._QUIET_S:
-            self._said[text] = (since, count + 1)
-            for event in self._recent:
-                if event["text"] == text:
-                    event["count"] += 1
+            self._said[key] = (event, since, count + 1)
+            event["text"] = text  # its figures of now
+            event["count"] += 1
             return
         if len(self._said) > 256:
             self._said.clear()
-        self._said[text] = (now, 0)
+        event = {"time": now, "text": text, "count": 1}
+        self._said[key] = (event, now, 0)
         self._logger.log(level, "%s", f"{text} ({count} more times before)" if count else text)
-        self._recent.append({"time": now, "text": text, "count": 1})
+        self._recent.append(event)

@@ -355,12 +355,15 @@ class Supervisor:
         self._check_speed()
         if loop.counter_jumps != self._counter_jumps:
             self._counter_jumps = loop.counter_jumps
-            self._events.say(f"the SYNC counter jumped, {self._counter_jumps} times so far")
+            self._events.say(
+                f"the SYNC counter jumped, {self._counter_jumps} times so far", key="SYNC counter jumped"
+            )
         if loop.clock_steps != self._clock_steps:
             self._clock_steps = loop.clock_steps
             self._events.say(
                 f"the system's clock was set by {loop.clock_step_ns / _NS:+.3f} s: stamps follow it, "
-                "the cycle does not"
+                "the cycle does not",
+                key="clock set",
             )
         if loop.silent:
             self._events.begin("no sync", "no SYNC on the bus: the estimates are stale", logging.ERROR)

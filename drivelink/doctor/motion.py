@@ -1,13 +1,15 @@
-"""Units and signs, checked against each other: what positions say of the velocity, and the link of the motor.
+"""Units and signs, checked against each other: positions, velocity and torque of the nodes, as they answer.
 
-The drive is only read; whoever wants to know more turns the shaft by hand meanwhile.
+The drives are only read; whoever wants to know more moves the joint meanwhile, by hand or by its controller.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from drivelink.canopen.candidates import Candidate
 from drivelink.canopen.layout import Signal
@@ -15,56 +17,188 @@ from drivelink.canopen.node import NodeSurvey
 from drivelink.canopen.sdo import Program, Read, SdoAbort
 from drivelink.doctor.report import Section
 from drivelink.finding import Severity
+from drivelink.gate import Gathered, corrections
+from drivelink.jointfile import JointFile
+from estimator.errors import EstimatorError
+from estimator.gate import Judgement, check, judge
+from estimator.sample import FloatArray, Record
 
-__all__ = ["MotionSample", "judge_motion", "sample_motion", "slope"]
+__all__ = [
+    "MotionReader",
+    "MotionSample",
+    "judge_gathered",
+    "judge_motion",
+    "judge_record",
+    "record_of_motion",
+    "slope",
+]
 
-_READ = (Signal.MOTOR_POSITION, Signal.MOTOR_VELOCITY, Signal.LINK_POSITION)
+_READ = (Signal.MOTOR_POSITION, Signal.MOTOR_VELOCITY, Signal.MOTOR_TORQUE, Signal.LINK_POSITION)
 _WINDOW_S = 0.02  # differences over less are mostly quantisation
 _LEAST_COUNTS = 50  # that have to pass for a judgement
 _TOLERANCE = 0.15  # relative; velocities are filtered in the drive
 _LINK_TOLERANCE = 0.35  # the transmission bends
+_PROMPT = 1.5  # times the usual wait for an answer: what came later tells less of when it was read
+_LONGER = "move the joint during the check, by its controller (--seconds 20 gives more time)"
 
 
 @dataclass(frozen=True, slots=True)
 class MotionSample:
-    """What one node said at one time.
+    """What one node said in one turn.
 
     Attributes:
         time_s: monotonic, of its position.
         values: SI at the joint side, by signal.
+        times_s: monotonic, of each value: in the middle between question and answer.
+        waits_s: time between the two.
     """
 
     time_s: float
     values: dict[Signal, float]
+    times_s: dict[Signal, float]
+    waits_s: dict[Signal, float]
 
 
-def sample_motion(
-    survey: NodeSurvey, seconds: float, clock: Callable[[], float] = time.monotonic
-) -> Program[list[MotionSample]]:
-    """Read positions and velocity of one node as fast as it answers; writes nothing."""
-    chosen = {signal: survey.available[signal][0] for signal in _READ if survey.available.get(signal)}
-    counters = {signal: _Unwrapped(candidate) for signal, candidate in chosen.items()}
-    samples: list[MotionSample] = []
-    end_s = clock() + seconds
-    while clock() < end_s and chosen:
-        values = {}
-        stamp_s = clock()
-        for signal, candidate in chosen.items():
-            before_s = clock()
-            try:
-                data = yield Read(survey.role.node_id, *candidate.address)
-            except SdoAbort:  # some have no value before the drive runs
-                continue
-            values[signal] = counters[signal].take(data)
-            if signal is Signal.MOTOR_POSITION:
-                stamp_s = (before_s + clock()) / 2
-        samples.append(MotionSample(stamp_s, values))
-    everywhere = set(chosen).intersection(*(sample.values for sample in samples))
+class MotionReader:
+    """Reads positions, velocity and torque of nodes, in turn, as fast as they answer; writes nothing.
+
+    Args:
+        surveys: of the nodes.
+        clock: monotonic seconds.
+    """
+
+    def __init__(self, surveys: Sequence[NodeSurvey], clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._counters = {
+            survey.role.node_id: {
+                signal: _Unwrapped(survey.available[signal][0])
+                for signal in _READ
+                if survey.available.get(signal)
+            }
+            for survey in surveys
+        }
+
+    def program(self, seconds: float) -> Program[dict[int, list[MotionSample]]]:
+        """The samples of so many seconds, by node id; only signals that every one of a node's has."""
+        clock = self._clock
+        samples: dict[int, list[MotionSample]] = {node: [] for node in self._counters}
+        end_s = clock() + seconds
+        while clock() < end_s and any(self._counters.values()):
+            for node, counters in self._counters.items():
+                values, times_s, waits_s = {}, {}, {}
+                begin_s = clock()
+                for signal, counter in counters.items():
+                    before_s = clock()
+                    try:
+                        data = yield Read(node, *counter.address)
+                    except SdoAbort:  # some have no value before the drive runs
+                        continue
+                    values[signal] = counter.take(data)
+                    waits_s[signal] = clock() - before_s
+                    times_s[signal] = before_s + waits_s[signal] / 2
+                at_s = times_s.get(Signal.MOTOR_POSITION, begin_s)
+                samples[node].append(MotionSample(at_s, values, times_s, waits_s))
+        return {node: _complete(found) for node, found in samples.items()}
+
+
+def _complete(samples: list[MotionSample]) -> list[MotionSample]:
+    """Only what every sample has."""
+    if not samples:
+        return []
+    everywhere = set(samples[0].values).intersection(*(sample.values for sample in samples))
     return [
-        MotionSample(sample.time_s, {signal: sample.values[signal] for signal in everywhere})
+        replace(sample, values={signal: sample.values[signal] for signal in everywhere})
         for sample in samples
         if everywhere
     ]
+
+
+def record_of_motion(
+    surveys: Sequence[NodeSurvey], samples: Mapping[int, Sequence[MotionSample]], motors: int, linked: bool
+) -> Record | None:
+    """What the nodes said, as a recording with one period: each value was read at a time of its own.
+
+    An answer that was long in coming is left out: nobody knows when within that time it was made.
+
+    Args:
+        surveys: of the nodes.
+        samples: what they said, by node id.
+        motors: how many the joint has.
+        linked: whether the link position is needed.
+
+    Returns:
+        The recording; None where a channel is missing or there are less than three turns.
+    """
+    told: dict[tuple[Signal, int | None], tuple[FloatArray, FloatArray]] = {}
+    for survey in surveys:
+        mine = samples.get(survey.role.node_id, ())
+        for signal in mine[0].values if mine else ():
+            waits = np.array([sample.waits_s[signal] for sample in mine])
+            prompt = waits <= _PROMPT * np.median(waits)
+            times = np.array([sample.times_s[signal] for sample in mine])[prompt]
+            values = np.array([sample.values[signal] for sample in mine])[prompt]
+            told[signal, None if signal is Signal.LINK_POSITION else survey.role.motor] = (times, values)
+    needed = [(signal, i) for signal in (Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE) for i in range(motors)]
+    wanted: list[tuple[Signal, int | None]] = [*needed, *([(Signal.LINK_POSITION, None)] if linked else [])]
+    if any(key not in told or len(told[key][0]) < 3 for key in wanted):
+        return None
+    begin = max(float(told[key][0][0]) for key in wanted)
+    end = min(float(told[key][0][-1]) for key in wanted)
+    period_s = float(np.median(np.diff(told[wanted[0]][0])))
+    if not (end - begin > 2.0 * period_s > 0.0):
+        return None
+    grid = begin + period_s * np.arange(int((end - begin) / period_s) + 1)
+
+    def column(signal: Signal, motor: int | None) -> FloatArray:
+        return np.asarray(np.interp(grid, *told[signal, motor]))
+
+    return Record(
+        period_s=period_s,
+        sequence=np.arange(len(grid)),
+        motor_position_rad=np.stack([column(Signal.MOTOR_POSITION, i) for i in range(motors)], axis=1),
+        motor_torque_nm=np.stack([column(Signal.MOTOR_TORQUE, i) for i in range(motors)], axis=1),
+        link_position_rad=column(Signal.LINK_POSITION, None) if linked else None,
+    )
+
+
+def judge_record(section: Section, joint: JointFile, record: Record | None) -> None:
+    """Units and signs of a joint that moves, by the gate that recordings pass (eq 5)."""
+    if record is None:
+        section.say(Severity.INFO, joint.name, "units and signs of torque: not every channel was read")
+        return
+    model = replace(joint.model(), period_s=record.period_s)
+    try:
+        check(record, model)
+        judgement = judge(record, model)
+    except EstimatorError as error:
+        section.say(Severity.INFO, joint.name, f"units and signs cannot be checked: {error}", _LONGER)
+        return
+    section.facts["samples"] = len(record)
+    _say_judgement(section, joint, judgement)
+
+
+def judge_gathered(section: Section, joint: JointFile, gathered: Gathered) -> None:
+    """The same of samples that frames on the bus made."""
+    try:
+        _say_judgement(section, joint, gathered.judgement())
+    except EstimatorError as error:
+        section.say(Severity.INFO, joint.name, str(error))
+
+
+def _say_judgement(section: Section, joint: JointFile, judgement: Judgement) -> None:
+    section.facts["torque_left"] = None if np.isnan(judgement.left) else judgement.left
+    if judgement.findings:
+        needed = [change for finding in judgement.findings for change in finding.changes]
+        first = judgement.findings[0]
+        text = ", and ".join(map(str, judgement.findings))
+        text += f": the torque balance leaves {first.left_before:.0%}, {first.left_after:.1%} put right"
+        fix = "; ".join(map(str, corrections(joint, needed, live=True)))
+        section.say(Severity.ERROR, joint.name, text, f"in the joint file: {fix}")
+    elif judgement.remark:
+        section.say(Severity.INFO, joint.name, judgement.remark, f"{_LONGER}; or drivelink doctor --move")
+    else:
+        text = f"positions and torque fit in unit and sign: the torque balance leaves {judgement.left:.1%}"
+        section.ok(joint.name, text)
 
 
 class _Unwrapped:
@@ -75,7 +209,13 @@ class _Unwrapped:
         self._last: int | None = None
         self._total = 0
 
+    @property
+    def address(self) -> tuple[int, int]:
+        """Of the object."""
+        return self._candidate.address
+
     def take(self, data: bytes) -> float:
+        """The value of what was read."""
         data = data[: max(1, self._candidate.bits // 8)]
         count = int.from_bytes(data, "little", signed=self._candidate.signed)
         if self._candidate.wraps:
@@ -94,12 +234,12 @@ def slope(x: Sequence[float], y: Sequence[float]) -> float:
     return sum(a * b for a, b in zip(x, y, strict=True)) / square if square else 0.0
 
 
-def judge_motion(section: Section, survey: NodeSurvey, samples: Sequence[MotionSample]) -> None:
-    """Compare what the samples say of each other."""
+def judge_motion(section: Section, survey: NodeSurvey, samples: Sequence[MotionSample]) -> bool:
+    """Compare what the samples say of each other; whether the motor moved."""
     subject, key = survey.role.subject, survey.role.key
     position = next(iter(survey.available.get(Signal.MOTOR_POSITION, ())), None)
     if position is None or len(samples) < 3 or Signal.MOTOR_POSITION not in samples[0].values:
-        return
+        return False
     times = [sample.time_s for sample in samples]
     motor = [sample.values[Signal.MOTOR_POSITION] for sample in samples]
     section.facts[f"{subject} travel_rad"] = max(motor) - min(motor)
@@ -108,9 +248,9 @@ def judge_motion(section: Section, survey: NodeSurvey, samples: Sequence[MotionS
             Severity.INFO,
             subject,
             "stands still: signs and units could not be checked against each other",
-            "turn the joint by hand during the check (--seconds 10 gives more time)",
+            "turn the joint by hand during the check (--seconds 10: more time), or drivelink doctor --move",
         )
-        return
+        return False
     if Signal.MOTOR_VELOCITY in samples[0].values:
         velocity = [sample.values[Signal.MOTOR_VELOCITY] for sample in samples]
         _judge_velocity(section, subject, key, *_differences(times, motor, velocity))
@@ -118,6 +258,7 @@ def judge_motion(section: Section, survey: NodeSurvey, samples: Sequence[MotionS
         link = [sample.values[Signal.LINK_POSITION] for sample in samples]
         moved, followed = _steps(times, motor), _steps(times, link)
         _judge_link(section, subject, slope(moved, followed))
+    return True
 
 
 def _steps(times: Sequence[float], values: Sequence[float]) -> list[float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,8 +22,9 @@ from drivelink.canopen.roles import Role, roles
 from drivelink.canopen.scan import FoundNode, Traffic, identify, listen, scan
 from drivelink.canopen.vendors import vendor_of
 from drivelink.doctor.datasheet import planned_entries
-from drivelink.doctor.motion import judge_motion, sample_motion
+from drivelink.doctor.motion import MotionReader, judge_gathered, judge_motion, judge_record, record_of_motion
 from drivelink.doctor.report import Report, Section
+from drivelink.doctor.sampletap import SampleTap
 from drivelink.doctor.syncs import Daemons, judge_sync
 from drivelink.errors import BusError, DriveError, JointFileError
 from drivelink.finding import Finding, Severity
@@ -56,7 +57,7 @@ def examine_bus(
         if joint.bus.configure:
             _ask(report, section, bus, joint, base_dir, seconds, daemons)
         else:
-            _overhear(section, SilentBus(bus), joint, base_dir, seconds, daemons)
+            _overhear(report, section, SilentBus(bus), joint, base_dir, seconds, daemons)
     except (BusError, DriveError, JointFileError) as error:
         section.say(Severity.ERROR, joint.bus.channel, str(error))
     finally:
@@ -87,13 +88,14 @@ def _ask(
             "nobody answers and nobody is heard",
             "power the drives; check cable, termination, bit rate and node ids",
         )
-    layouts = []
+    layouts, surveys = [], {}
     for role in mine.values():
         if role.node_id in found:
-            planned = _examine_node(
-                report.section(f"Node {role.node_id}"), bus, joint, role, traffic, seconds
-            )
+            own = report.section(f"Node {role.node_id}")
+            survey, planned = _examine_node(own, bus, joint, role, traffic)
             layouts += [planned] if planned else []
+            if survey is not None:
+                surveys[own.title] = survey
         else:
             section.say(
                 Severity.ERROR,
@@ -102,6 +104,29 @@ def _ask(
                 f"power it, or correct {role.key}.node_id",
             )
     _judge_load(section, layouts, joint.bus)
+    if surveys:
+        _watch_motion(report, bus, joint, surveys, seconds)
+
+
+def _watch_motion(
+    report: Report, bus: can.BusABC, joint: JointFile, surveys: Mapping[str, NodeSurvey], seconds: float
+) -> None:
+    """What the nodes say of a motion, each of itself, and all together; by title of the nodes' sections."""
+    sections = {section.title: section for section in report.sections}
+    nodes = list(surveys.values())
+    together = report.section("Units and signs")
+    try:
+        samples = run_program(MotionReader(nodes).program(seconds), bus, timeout_s=joint.bus.sdo_timeout_s)
+    except DriveError as error:
+        together.say(Severity.ERROR, joint.name, str(error))
+        return
+    moving = False
+    for title, survey in surveys.items():
+        if survey.role.motor is not None:
+            moving |= judge_motion(sections[title], survey, samples[survey.role.node_id])
+    if moving:
+        linked = joint.model().has_deflection
+        judge_record(together, joint, record_of_motion(nodes, samples, len(joint.motor), linked))
 
 
 def _list(nodes: Sequence[int]) -> str:
@@ -120,9 +145,9 @@ def _describe_node(node: FoundNode) -> str:
 
 
 def _examine_node(
-    section: Section, bus: can.BusABC, joint: JointFile, role: Role, traffic: Traffic, seconds: float
-) -> NodeLayout | None:
-    """One node of the joint; its frames as they would be."""
+    section: Section, bus: can.BusABC, joint: JointFile, role: Role, traffic: Traffic
+) -> tuple[NodeSurvey | None, NodeLayout | None]:
+    """One node of the joint: what it says of itself, its frames as they would be."""
     subject = role.subject
     node = _identify(bus, joint.bus, role.node_id)
     state = traffic.heartbeats.get(role.node_id, "no heartbeat")
@@ -136,19 +161,11 @@ def _examine_node(
         )
     except DriveError as error:
         section.say(Severity.ERROR, subject, str(error))
-        return None
+        return None, None
     _judge_profile(section, role, node)
     _judge_eds(section, role, node)
     section.findings += survey.offer.findings
-    layout = _judge_mapping(section, role, survey)
-    if role.motor is not None:
-        try:
-            samples = run_program(sample_motion(survey, seconds), bus, timeout_s=joint.bus.sdo_timeout_s)
-        except DriveError as error:
-            section.say(Severity.ERROR, subject, str(error))
-            return layout
-        judge_motion(section, survey, samples)
-    return layout
+    return survey, _judge_mapping(section, role, survey)
 
 
 def _judge_profile(section: Section, role: Role, node: FoundNode) -> None:
@@ -252,17 +269,18 @@ def _judge_load(section: Section, layouts: Sequence[NodeLayout], bus: BusSection
 
 
 def _overhear(
-    section: Section, bus: SilentBus, joint: JointFile, base_dir: Path, seconds: float, daemons: Daemons
+    report: Report,
+    section: Section,
+    bus: SilentBus,
+    joint: JointFile,
+    base_dir: Path,
+    seconds: float,
+    daemons: Daemons,
 ) -> None:
     """A bus that may not be touched: only listen."""
     configurator = PassiveConfigurator([joint], [base_dir])
-
-    def take(message: can.Message) -> None:
-        if not (message.is_extended_id or message.is_remote_frame or message.is_error_frame):
-            configurator.feed(message.arbitration_id, bytes(message.data), 0.0)
-            configurator.poll(0.0)
-
-    traffic = listen(bus, seconds, take)
+    tap = SampleTap(joint, configurator)
+    traffic = listen(bus, seconds, tap.take)
     _judge_traffic(section, traffic, joint.bus, daemons)
     for error in configurator.missing.values():
         section.say(Severity.ERROR, joint.bus.channel, str(error))
@@ -284,6 +302,8 @@ def _overhear(
             else:
                 section.ok(f"node {node}", f"0x{tpdo.cob_id:03X} heard {count} times")
     _judge_load(section, list(configurator.layouts.values()), joint.bus)
+    if tap.samples:
+        judge_gathered(report.section("Units and signs"), tap.joint, tap.gathered)
 
 
 def _judge_traffic(section: Section, traffic: Traffic, bus: BusSection, daemons: Daemons) -> None:

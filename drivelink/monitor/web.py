@@ -23,7 +23,7 @@ from drivelink.monitor.statuslines import Shown, shape
 from drivelink.monitor.view import JointView
 from drivelink.monitor.watcher import Watcher
 
-__all__ = ["MAX_CONNECTIONS", "WebView", "snapshot"]
+__all__ = ["MAX_CONNECTIONS", "WebView", "document", "snapshot"]
 
 MAX_CONNECTIONS = 16
 _PATIENCE_S = 5.0  # with a browser that sends or takes nothing
@@ -106,7 +106,7 @@ def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str,
         alive: whether its daemon is there.
         since: times of the newest moment and residual that the page has, by joint; brought forward.
     """
-    history, estimate = view.history, view.history.latest
+    history = view.history
     last = since.get(view.name, -math.inf)
     window = history.window()
     if window and window[-1].time_s < last:  # the daemon was started anew
@@ -117,10 +117,9 @@ def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str,
     touches = [touch for touch in history.touches if last < touch.time_s <= newest]
     if fresh:
         since[view.name] = fresh[-1].time_s
-    told: dict[str, Any] = {
+    return {
+        **_now(view),
         "alive": alive,
-        "live": view.live,
-        "state": view.state,
         "status": _describe(shape(view.status, view.model)),
         "restart": last == -math.inf,
         "moments": [_moment(moment) for moment in fresh],
@@ -129,6 +128,17 @@ def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str,
         "external": _touch(history.touch) if history.touch else None,
         "curves": [[[_finite(v) for v in point] for point in curve.points()] for curve in history.curves],
     }
+
+
+def document(view: JointView) -> dict[str, Any]:
+    """A joint as it is now, for `monitor --json`; what is not finite is null."""
+    return {"joint": view.name, "time": time.time(), **_now(view), "status": view.status}
+
+
+def _now(view: JointView) -> dict[str, Any]:
+    """State and newest estimate."""
+    told: dict[str, Any] = {"live": view.live, "state": view.state}
+    estimate = view.history.latest
     if estimate is not None:
         told["estimate"] = {
             "stiffness": _finite(estimate.stiffness_nm_rad),

@@ -10,6 +10,7 @@ from estimator.diagnosis.result import (
     Refitted,
     Rival,
     Series,
+    StiffnessCurve,
     Verdict,
 )
 from estimator.diagnosis.tracing import diagnose
@@ -23,6 +24,7 @@ __all__ = [
     "Refitted",
     "Rival",
     "Series",
+    "StiffnessCurve",
     "Verdict",
     "calibrate",
     "diagnose",

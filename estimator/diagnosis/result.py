@@ -17,6 +17,7 @@ __all__ = [
     "Refitted",
     "Rival",
     "Series",
+    "StiffnessCurve",
     "Verdict",
 ]
 
@@ -105,6 +106,24 @@ class Refitted(NamedTuple):
     std: dict[str, ParameterValue]
 
 
+class StiffnessCurve(NamedTuple):
+    """Stiffness of one motor's transmission over its deflection, as declared at its best fit, and refitted.
+
+    Attributes:
+        motor: its index.
+        deflection_rad: (n,).
+        before_nm_rad, before_std_nm_rad: (n,) of the declared model, and its standard deviation.
+        after_nm_rad, after_std_nm_rad: (n,) with the effects.
+    """
+
+    motor: int
+    deflection_rad: FloatArray
+    before_nm_rad: FloatArray
+    before_std_nm_rad: FloatArray
+    after_nm_rad: FloatArray
+    after_std_nm_rad: FloatArray
+
+
 class RecordingErrors(NamedTuple):
     """Errors of one recording: where it was fitted, and where it took no part (None: it always did)."""
 
@@ -131,6 +150,7 @@ class Diagnosis:
         advice: which motion would distinguish what could not be distinguished.
         notes: what else is to be said, a line each.
         recordings: errors of each recording.
+        stiffness: of each flexible transmission, before and after.
     """
 
     verdict: Verdict
@@ -147,3 +167,4 @@ class Diagnosis:
     advice: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     recordings: tuple[RecordingErrors, ...] = ()
+    stiffness: tuple[StiffnessCurve, ...] = ()

@@ -22,6 +22,7 @@ from estimator.diagnosis.outcome import (
 )
 from estimator.diagnosis.result import Diagnosis, Errors, Finding, RecordingErrors, Verdict
 from estimator.diagnosis.search import EVEN, Progress, Search
+from estimator.diagnosis.stiffness import stiffness_curves
 from estimator.effects import LIBRARY
 from estimator.errors import EstimatorError
 from estimator.gate import check, refuse
@@ -172,6 +173,7 @@ class _Judge:
             advice=tuple(dict.fromkeys(line for f in effects for line in advice_for(f.name, f.alternatives))),
             notes=tuple(dict.fromkeys(notes)),
             recordings=self._recordings(before, after),
+            stiffness=stiffness_curves(problem, before, after),
         )
 
     def _declared(self, effects: list[Finding]) -> Fitted:

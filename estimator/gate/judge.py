@@ -16,7 +16,7 @@ from estimator.model import JointModel, Motor
 from estimator.sample import FloatArray, Record
 from estimator.transmissions import transmission_model
 
-__all__ = ["Finding", "GateError", "examine", "refuse"]
+__all__ = ["Finding", "GateError", "Judgement", "examine", "judge", "refuse"]
 
 _DECISIVE = 6.0  # nats over "as declared": 400 to 1
 _LEAST_ROWS = 300  # a shorter recording tells nothing to nobody
@@ -96,6 +96,31 @@ def _named(changes: Sequence[Change], motors: int) -> str:
     return " and ".join(parts)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judgement:
+    """What a recording says of units, signs, gears and time.
+
+    Attributes:
+        findings: what is wrong; empty where nothing is, and where nothing can be told.
+        untold: units and signs that this motion does not tell, in words: with them wrong it would look as
+            likely. Empty where something is found.
+        reason: why nothing can be told at all; empty where something can.
+        left: share of the torque that the balance leaves, put right.
+    """
+
+    findings: tuple[Finding, ...] = ()
+    untold: tuple[str, ...] = ()
+    reason: str = ""
+    left: float = math.nan
+
+    @property
+    def remark(self) -> str:
+        """What cannot be told, in words; empty where everything can."""
+        if self.reason:
+            return f"units and signs cannot be checked: {self.reason}"
+        return f"this motion does not tell {' or '.join(self.untold)}" if self.untold else ""
+
+
 class GateError(EstimatorError):
     """Units, signs, gear ratio or time of a recording do not fit the joint as declared.
 
@@ -165,13 +190,14 @@ class _Joint:
         return max(fit.error for _, fit in self.fits(found).values())
 
 
-def examine(record: Record, model: JointModel) -> list[Finding]:
-    """What is wrong with units, signs, gear ratios or time of a recording; nothing, where nothing is.
+def judge(record: Record, model: JointModel) -> Judgement:
+    """What a recording says of units, signs, gear ratios and time.
 
     Every hypothesis is one or two causes. It is weighed by how well the declared motor inertia (within a
     factor), any rising transmission curve, friction that brakes and small delays explain each motor's torque
     (eq 5, `Balance`), and by how usual a joint it makes. What is found beats "as declared" decisively, and
-    explains the torque.
+    explains the torque. Where nothing is found, a cause that is not decisively less likely than "as declared"
+    is one that the motion does not tell: of a link that is held, say, the sign.
 
     Args:
         record: the recording.
@@ -183,10 +209,10 @@ def examine(record: Record, model: JointModel) -> list[Finding]:
     if record.motors != len(model.motors):
         raise EstimatorError(f"recording: expected {len(model.motors)} motor(s), got {record.motors}")
     if len(record) < _LEAST_ROWS:
-        return []
+        return Judgement(reason=f"{len(record)} samples, expected at least {_LEAST_ROWS}")
     joint = _Joint(record, model, _balances(record, model))
     if not joint.balances:
-        return []
+        return Judgement(reason="no motor moves and has a torque")
     ratios = [joint.balances[i].ratio if i in joint.balances else None for i in range(len(model.motors))]
     single = causes(model, record.link_position_rad is not None and model.has_deflection, ratios)
     hypotheses: list[tuple[Cause, ...]] = [(), *((cause,) for cause in single)]
@@ -196,24 +222,46 @@ def examine(record: Record, model: JointModel) -> list[Finding]:
     joint.counts = {i: np.minimum(b.independent, _INDEPENDENT) for i, b in joint.balances.items()}
     weighed = sorted(((joint.evidence(h), h) for h in hypotheses), key=lambda e: -e[0])
     best, found = weighed[0]
-    odds = best - joint.evidence(())
-    after = joint.left(found)
+    declared = joint.evidence(())
+    odds, before, after = best - declared, joint.left(()), joint.left(found)
     if odds < _DECISIVE or after > _LEFT:
-        return []
+        if before > _LEFT:
+            return Judgement(reason=f"the motion explains {1.0 - before:.0%} of the torque", left=before)
+        return Judgement(untold=_untold(joint, single, declared), left=before)
     alike = [h for e, h in weighed[1:] if best - e < _ALIKE and len(h) == len(found)]
-    before, motors = joint.left(()), record.motors
-    return [_finding(found, k, alike, odds, before, after, motors) for k in range(len(found))]
+    motors = record.motors
+    findings = [_finding(found, k, alike, odds, before, after, motors) for k in range(len(found))]
+    return Judgement(findings=tuple(findings), left=after)
 
 
-def refuse(record: Record, model: JointModel) -> None:
+def _untold(joint: _Joint, single: Sequence[Cause], declared: float) -> tuple[str, ...]:
+    """Units and signs that the data alone do not decide, what they cost beforehand aside."""
+    doubtful: dict[str, list[str]] = {}
+    for cause in single:
+        if cause.kind in ("unit", "sign") and declared - joint.evidence((cause,)) - cause.cost < _DECISIVE:
+            kinds = doubtful.setdefault(_named(cause.changes, joint.record.motors), [])
+            kinds += [cause.kind] if cause.kind not in kinds else []
+    return tuple(f"the {' and '.join(sorted(kinds))} of {name}" for name, kinds in doubtful.items())
+
+
+def examine(record: Record, model: JointModel) -> list[Finding]:
+    """What is wrong with units, signs, gear ratios or time of a recording: the findings of `judge`."""
+    return list(judge(record, model).findings)
+
+
+def refuse(record: Record, model: JointModel) -> Judgement:
     """Raise what is wrong with units, signs, gear ratios or time of a recording, if anything is.
 
+    Returns:
+        What the recording does not tell.
+
     Raises:
-        GateError: with the findings of `examine`.
+        GateError: with the findings of `judge`.
     """
-    findings = examine(record, model)
-    if findings:
-        raise GateError(findings, record)
+    judgement = judge(record, model)
+    if judgement.findings:
+        raise GateError(judgement.findings, record)
+    return judgement
 
 
 def _finding(

@@ -1,0 +1,65 @@
+"""Parameters with their intervals and units, of rotary axes and of linear ones."""
+
+from __future__ import annotations
+
+from estimator.model import ParameterValue
+
+__all__ = ["Units"]
+
+_SIGMA_95 = 1.96
+_SUPERSCRIPTS = {3: "³", 5: "⁵", 7: "⁷", 9: "⁹", 11: "¹¹"}
+_UNITS = (  # by the end of a parameter's name; the first that fits
+    ("_nm_s2_rad2", "N·m·s²/rad²"), ("_nm_s_rad", "N·m·s/rad"), ("_nm_rad2", "N·m/rad²"),
+    ("_nm_rad", "N·m/rad"), ("_per_nm2", "1/(N·m)²"), ("_kg_m2", "kg·m²"),
+    ("_rad_s2", "rad/s²"), ("_rad_s", "rad/s"), ("_per_rev", "per rev"), ("_per_rad", "1/rad"),
+    ("_nm", "N·m"), ("_rad", "rad"), ("_hz", "Hz"), ("_s", "s"), ("_error", "relative"),
+    ("_change", "relative"),
+)  # fmt: skip
+_LINEAR = {  # of an axis that moves straight: metres for rad, newtons for N·m
+    "N·m·s/rad": "N·s/m", "N·m/rad": "N/m", "N·m·s²/rad²": "N·s²/m²", "kg·m²": "kg", "rad/s²": "m/s²",
+    "rad/s": "m/s", "per rev": "per 2π m", "N·m/rad²": "N/m²", "1/(N·m)²": "1/N²", "N·m/s": "N/s",
+    "1/rad": "1/m", "N·m": "N", "rad": "m",
+}  # fmt: skip
+
+
+class Units:
+    """The units that a report of an axis shows.
+
+    Args:
+        linear: whether it moves straight.
+    """
+
+    def __init__(self, linear: bool) -> None:
+        self._linear = linear
+
+    def shown(self, unit: str) -> str:
+        """A unit of a rotary axis as it is for this one."""
+        return _LINEAR.get(unit, unit) if self._linear else unit
+
+    def label(self, text: str) -> str:
+        """An axis label "quantity / unit" as it is for this one."""
+        quantity, _, unit = text.rpartition(" / ")
+        bare = unit.strip("()")
+        return f"{quantity} / {unit.replace(bare, self.shown(bare))}"
+
+    def of(self, name: str) -> str:
+        """The unit of a parameter, by the end of its name; empty where it has none."""
+        return self.shown(next((unit for end, unit in _UNITS if f"_{name}".endswith(end)), ""))
+
+    def value(self, name: str, value: ParameterValue, std: ParameterValue | None) -> str:
+        """A parameter with its 95 % interval and unit; of a polynomial each coefficient has its own."""
+        unit = self.of(name)
+        if not isinstance(value, tuple):
+            return f"{_text(value, std if isinstance(std, float) else None)} {unit}".rstrip()
+        deviations = std if isinstance(std, tuple) else (None,) * len(value)
+        length = self.shown("rad")
+        texts = []
+        for k, (x, s) in enumerate(zip(value, deviations, strict=True)):
+            own = unit if not k or not unit.endswith(f"/{length}") else f"{unit}{_SUPERSCRIPTS[2 * k + 1]}"
+            texts.append(f"{_text(x, s)} {own}".rstrip())
+        return ", ".join(texts)
+
+
+def _text(value: float, std: float | None) -> str:
+    """A number with its 95 % interval."""
+    return f"{value:.5g} ± {_SIGMA_95 * std:.2g}" if std is not None and std > 0.0 else f"{value:.5g}"

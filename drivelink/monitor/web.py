@@ -125,7 +125,6 @@ def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str,
         "moments": [_moment(moment) for moment in fresh],
         "residuals": residuals,
         "touches": [_touch(touch) for touch in touches],
-        "external": _touch(history.touch) if history.touch else None,
         "curves": [[[_finite(v) for v in point] for point in curve.points()] for curve in history.curves],
     }
 
@@ -137,7 +136,12 @@ def document(view: JointView) -> dict[str, Any]:
 
 def _now(view: JointView) -> dict[str, Any]:
     """State and newest estimate."""
-    told: dict[str, Any] = {"live": view.live, "state": view.state}
+    touch = view.history.touch
+    told: dict[str, Any] = {
+        "live": view.live,
+        "state": view.state,
+        "external": _touch(touch) if touch else None,
+    }
     estimate = view.history.latest
     if estimate is not None:
         told["estimate"] = {

@@ -38,6 +38,7 @@ _WINDOW_S = 0.02  # differences over less are mostly quantisation
 _LEAST_COUNTS = 50  # that have to pass for a judgement
 _TOLERANCE = 0.15  # relative; velocities are filtered in the drive
 _LINK_TOLERANCE = 0.35  # the transmission bends
+_STALL = 4.0  # turns without an answer after which the motion between is not known
 _PROMPT = 1.5  # times the usual wait for an answer: what came later tells less of when it was read
 _LONGER = "move the joint during the check, by its controller (--seconds 20 gives more time)"
 
@@ -118,7 +119,8 @@ def record_of_motion(
 ) -> Record | None:
     """What the nodes said, as a recording with one period: each value was read at a time of its own.
 
-    An answer that was long in coming is left out: nobody knows when within that time it was made.
+    An answer that was long in coming is left out: nobody knows when within that time it was made. Where the
+    nodes did not answer for several turns, the recording ends: it is the longest stretch without that.
 
     Args:
         surveys: of the nodes.
@@ -147,7 +149,8 @@ def record_of_motion(
     period_s = float(np.median(np.diff(told[wanted[0]][0])))
     if not (end - begin > 2.0 * period_s > 0.0):
         return None
-    grid = begin + period_s * np.arange(int((end - begin) / period_s) + 1)
+    turns = np.asarray(begin + period_s * np.arange(int((end - begin) / period_s) + 1), dtype=np.float64)
+    grid = _longest(turns, [told[key][0] for key in wanted], _STALL * period_s)
 
     def column(signal: Signal, motor: int | None) -> FloatArray:
         return np.asarray(np.interp(grid, *told[signal, motor]))
@@ -159,6 +162,19 @@ def record_of_motion(
         motor_torque_nm=np.stack([column(Signal.MOTOR_TORQUE, i) for i in range(motors)], axis=1),
         link_position_rad=column(Signal.LINK_POSITION, None) if linked else None,
     )
+
+
+def _longest(grid: FloatArray, channels: Sequence[FloatArray], most_s: float) -> FloatArray:
+    """The longest part of the grid in which no channel's readings are further apart than that."""
+    good = np.ones(len(grid), dtype=bool)
+    for times in channels:
+        for k in np.flatnonzero(np.diff(times) > most_s):
+            good &= (grid <= times[k]) | (grid >= times[k + 1])
+    ends = np.flatnonzero(np.diff(np.concatenate(([False], good, [False])).astype(int)))
+    if not len(ends):
+        return grid[:0]
+    longest = int(np.argmax(ends[1::2] - ends[::2]))
+    return grid[ends[2 * longest] : ends[2 * longest + 1]]
 
 
 def judge_record(section: Section, joint: JointFile, record: Record | None) -> None:

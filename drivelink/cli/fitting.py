@@ -118,7 +118,7 @@ def _link(found: Identified) -> dict[str, Any]:
     """[link] as found: its dynamics, and the effects at it and in its encoder."""
     link: dict[str, Any] = {}
     if found.model.link is not None:
-        link["dynamics"] = asdict(found.model.link)
+        link["dynamics"] = {k: x for k, x in asdict(found.model.link).items() if x is not None}
     if found.model.link_effects:
         link["effect"] = [_effect(effect) for effect in found.model.link_effects]
     return link
@@ -148,7 +148,8 @@ def _print(found: Identified) -> None:
     if link is not None or found.model.link_effects:
         table = _table("link")
         for name, x in asdict(link).items() if link is not None else ():
-            table.add_row(name, f"{x:.6g}", "")
+            if x is not None:
+                table.add_row(name, f"{x:.6g}", "")
         _add_effects(table, found.model.link_effects)
         console.print(table)
     if found.doubt:

@@ -32,7 +32,7 @@ from importlib import resources
 from drivelink import jointfile
 from drivelink.canopen.bus import open_bus
 from drivelink.cycle.lockstep import run_lockstep
-from drivelink.simulate import network_from_joint, world_from_joint
+from drivelink.demo.simulate import network_from_joint, world_from_joint
 
 seconds = float(sys.argv[1])
 with resources.as_file(resources.files("drivelink") / "joints" / "vsa-ii.toml") as path:
@@ -71,7 +71,7 @@ def record(log: Path, seconds: float) -> None:
     from drivelink import jointfile
     from drivelink.canopen.bus import open_bus
     from drivelink.cycle.lockstep import run_lockstep
-    from drivelink.simulate import network_from_joint, world_from_joint
+    from drivelink.demo.simulate import network_from_joint, world_from_joint
 
     with resources.as_file(resources.files("drivelink") / "joints" / "vsa-ii.toml") as path:
         joint = jointfile.load(path)

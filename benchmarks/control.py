@@ -20,7 +20,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 
-from drivelink.progress import track
+from drivelink.output.progress import track
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "examples" / "controller"))
 

@@ -29,10 +29,10 @@ from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle import realtime
 from drivelink.cycle.lockstep import run_lockstep
 from drivelink.daemon.service import Daemon, ServedJoint
+from drivelink.demo.simulate import network_from_joint, open_sim_bus
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_session
-from drivelink.simulate import network_from_joint, open_sim_bus
 
 
 class Row:

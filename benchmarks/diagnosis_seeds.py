@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from drivelink.demo.simulate import world_from_joint
 from drivelink.jointfile import JointFile, parse
-from drivelink.progress import track
-from drivelink.simulate import world_from_joint
+from drivelink.output.progress import track
 from estimator.diagnosis import diagnose
 from estimator.effects import LIBRARY
 from estimator.sample import Record

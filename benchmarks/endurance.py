@@ -24,9 +24,9 @@ from drivelink.cycle import pacing, realtime
 from drivelink.cycle.meter import Meter
 from drivelink.cycle.realtime import Alarm
 from drivelink.daemon.service import Daemon, ServedJoint
+from drivelink.demo.simulate import network_from_joint, open_sim_bus
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.session import close_session, open_session
-from drivelink.simulate import network_from_joint, open_sim_bus
 
 BLOCK_S = 5.0
 PERIOD_NS = round(PERIOD_S * 1e9)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drivelink.progress import track
+from drivelink.output.progress import track
 from estimator import EstimatorSettings, Status, make_estimator
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))

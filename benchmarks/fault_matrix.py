@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drivelink.progress import track
+from drivelink.output.progress import track
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 

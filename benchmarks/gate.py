@@ -15,7 +15,7 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-from drivelink.progress import track
+from drivelink.output.progress import track
 from estimator.gate import Finding, examine
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))

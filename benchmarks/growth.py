@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from rig import PERIOD_S, free_endpoint, joint
 
-from drivelink.simulate import world_from_joint
+from drivelink.demo.simulate import world_from_joint
 from estimator import Record, fit, make_estimator
 from estimator.diagnosis import diagnose
 from estimator.model import Effect, JointModel

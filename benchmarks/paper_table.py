@@ -224,7 +224,7 @@ def _list(alpha: Array) -> str:
 
 def plot(motions: dict[str, Motion], folder: Path) -> None:
     """Figures 1 to 9 of the paper."""
-    from drivelink.plots import Curve, new_figure, over_time, save, xy
+    from drivelink.output.plots import Curve, new_figure, over_time, save, xy
 
     folder.mkdir(parents=True, exist_ok=True)
     t = np.arange(N) * T

@@ -18,9 +18,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drivelink import jointfile, recording, report
+from drivelink import jointfile, recording
 from drivelink.jointfile import JointFile
-from drivelink.progress import track
+from drivelink.output import report
+from drivelink.output.progress import track
 from estimator.diagnosis import diagnose
 from estimator.diagnosis.frame import Corrections, Frame, Signals
 from estimator.model import JointModel

@@ -10,8 +10,8 @@ import time
 import can
 from can.interfaces.virtual import VirtualBus
 
+from drivelink.demo.simulate import network_from_joint, open_sim_bus
 from drivelink.jointfile import JointFile, parse
-from drivelink.simulate import network_from_joint, open_sim_bus
 from sim.canopen.node import Node
 
 __all__ = ["PERIOD_S", "AnsweringBus", "Devices", "free_endpoint", "joint", "joint_text", "subscriber"]

@@ -134,7 +134,7 @@ def errors(setting: Setting, states: Array, tau: Array) -> list[float]:
 
 
 def plot(results: dict[str, dict[str, list[float]]], folder: Path) -> Path:
-    from drivelink.plots import bars, new_figure, save
+    from drivelink.output.plots import bars, new_figure, save
 
     folder.mkdir(parents=True, exist_ok=True)
     figure, axes = new_figure("Sensitivity: relative error of the stiffness", rows=len(results), height=2.2)

@@ -31,11 +31,11 @@ from drivelink.cycle import realtime
 from drivelink.cycle.chain import make_chain
 from drivelink.cycle.sources import open_source
 from drivelink.daemon.service import Daemon, ServedJoint
+from drivelink.demo.simulate import network_from_joint, open_sim_bus
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_session
 from drivelink.pubsub.wire import encode_estimate, encode_sample
-from drivelink.simulate import network_from_joint, open_sim_bus
 
 STAGES = ("receive", "decode", "estimate", "encode", "put")
 CASES = ((1, 1), (1, 2), (2, 2), (4, 2), (8, 2), (16, 2))  # joints, motors of each

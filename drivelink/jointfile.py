@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from drivelink.errors import JointFileError
 from drivelink.keyhint import unknown_key
-from drivelink.outfile import write_whole
+from drivelink.output.outfile import write_whole
 from estimator.model import Arrangement, Effect, JointModel, LinkDynamics, Motor, Transmission
 from estimator.settings import EstimatorSettings
 from estimator.transmissions import MODELS, transmission_model

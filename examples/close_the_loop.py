@@ -14,8 +14,8 @@ from drivelink.canopen.bus import open_bus
 from drivelink.cli import main as drivelink
 from drivelink.cycle.lockstep import run_lockstep
 from drivelink.cycle.loop import ObjectSink
+from drivelink.demo.simulate import network_from_joint, world_from_joint
 from drivelink.recording.formats import open_sink
-from drivelink.simulate import network_from_joint, world_from_joint
 from estimator.sample import Estimate, Sample
 
 JOINT = Path(__file__).parent / "vsa-ii.toml"

@@ -19,7 +19,7 @@ from zenohkit import LIMIT_S, free_endpoint, until
 
 from drivelink import jointfile
 from drivelink.cycle import realtime
-from drivelink.simulate import nodes_from_joint, open_sim_bus, world_from_joint
+from drivelink.demo.simulate import nodes_from_joint, open_sim_bus, world_from_joint
 from sim.canopen.statemachine import PowerState
 from sim.effects import parse
 from sim.excitation import build

@@ -11,8 +11,8 @@ import can
 from drivelink._core import Tick
 from drivelink.cycle.loop import ObjectSink
 from drivelink.daemon.service import Daemon, ServedJoint
+from drivelink.demo.simulate import network_from_joint, open_sim_bus
 from drivelink.jointfile import JointFile, parse
-from drivelink.simulate import network_from_joint, open_sim_bus
 from estimator.sample import Estimate, Sample
 from sim.faults import Faults
 from sim.network import Network

@@ -20,8 +20,8 @@ from faultscript import Fault
 
 from drivelink.canopen.layout import MappedObject, Signal
 from drivelink.daemon.service import Daemon
+from drivelink.demo.simulate import network_from_joint, nodes_from_joint, world_from_joint
 from drivelink.jointfile import JointFile
-from drivelink.simulate import network_from_joint, nodes_from_joint, world_from_joint
 from estimator.sample import Sample, Status
 from sim.canopen.node import Node
 from sim.faults import Faults

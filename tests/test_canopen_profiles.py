@@ -8,9 +8,9 @@ from canopenkit import joint_text
 
 from drivelink.canopen import Signal, configure, configure_joints
 from drivelink.canopen.guard import check_frame
+from drivelink.demo.simulate import network_from_joint
 from drivelink.errors import DriveError
 from drivelink.jointfile import parse
-from drivelink.simulate import network_from_joint
 from sim.canopen.profiles import PROFILES
 
 TEXT = joint_text(

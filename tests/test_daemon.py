@@ -19,10 +19,10 @@ from drivelink.cycle.joining import join_bus
 from drivelink.cycle.lockstep import run_lockstep
 from drivelink.daemon import reload
 from drivelink.daemon.service import Daemon, ServedJoint
+from drivelink.demo.simulate import network_from_joint, open_sim_bus
 from drivelink.errors import BusError, DriveError, UsageError, ZenohError
 from drivelink.jointfile import JointFile, load, parse
 from drivelink.pubsub.client import subscribe
-from drivelink.simulate import network_from_joint, open_sim_bus
 from estimator.sample import Estimate, Status
 
 

@@ -19,6 +19,7 @@ from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.canopen.roles import roles
 from drivelink.canopen.scan import listen, scan
 from drivelink.cli import main
+from drivelink.demo.simulate import network_from_joint, world_from_joint
 from drivelink.doctor import Report, Section, examine, examine_eds
 from drivelink.doctor.interface import examine_interface, judge_link
 from drivelink.doctor.machine import examine_machine, percentile
@@ -35,7 +36,6 @@ from drivelink.doctor.sampletap import SampleTap
 from drivelink.doctor.syncs import Daemons, judge_sync
 from drivelink.finding import Finding, Severity
 from drivelink.jointfile import BusSection, parse
-from drivelink.simulate import network_from_joint, world_from_joint
 
 REPOSITORY = Path(__file__).parents[1]
 CHANNELS = itertools.count()

@@ -16,8 +16,8 @@ import pytest
 
 from drivelink import jointfile, recording
 from drivelink.cli import main
-from drivelink.gate import corrections
 from drivelink.jointfile import parse
+from drivelink.recording.gate import corrections
 from estimator import JointModel, Motor, Record, Transmission
 from estimator.batch import fit
 from estimator.diagnosis import diagnose

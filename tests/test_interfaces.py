@@ -19,9 +19,9 @@ from drivelink.canopen.bus import open_bus
 from drivelink.cycle.framesource import BusLostError
 from drivelink.cycle.sources import open_source
 from drivelink.daemon.service import Daemon, ServedJoint
+from drivelink.demo.simulate import network_from_joint, open_sim_bus
 from drivelink.errors import BusError
 from drivelink.jointfile import BusSection, JointFile
-from drivelink.simulate import network_from_joint, open_sim_bus
 from estimator.sample import Status
 from sim.network import Network
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivelink.plots import (
+from drivelink.output.plots import (
     COLORS,
     Curve,
     bars,

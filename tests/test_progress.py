@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import pytest
 from rich.console import Console
 
-from drivelink import progress
-from drivelink.progress import Meter, track
+from drivelink.output import progress
+from drivelink.output.progress import Meter, track
 
 
 class Clock:

@@ -8,9 +8,9 @@ from pathlib import Path
 import can
 import pytest
 
+from drivelink.demo.simulate import bench_from_joints, network_from_joint, nodes_from_joint, world_from_joint
 from drivelink.errors import JointFileError, UsageError
 from drivelink.jointfile import JointFile, parse
-from drivelink.simulate import bench_from_joints, network_from_joint, nodes_from_joint, world_from_joint
 from sim.canopen.drive import Cia402Drive
 from sim.canopen.encoder import Cia406Encoder
 

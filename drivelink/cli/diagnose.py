@@ -10,14 +10,15 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from drivelink import augment, recording, report
+from drivelink import augment, recording
 from drivelink.cli import add_map
 from drivelink.errors import RecordingError, UsageError
-from drivelink.gate import refusal
-from drivelink.outfile import check_target
+from drivelink.output import report
+from drivelink.output.outfile import check_target
+from drivelink.output.progress import Meter
 from drivelink.output.units import Units
-from drivelink.progress import Meter
 from drivelink.recording.columnmap import parse_column_map
+from drivelink.recording.gate import refusal
 from drivelink.recording.mapping import joint_of
 from estimator.diagnosis import Diagnosis, diagnose
 from estimator.errors import EstimatorError

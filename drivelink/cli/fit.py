@@ -9,7 +9,7 @@ from pathlib import Path
 from drivelink import jointfile
 from drivelink.cli import add_map
 from drivelink.errors import RecordingError, UsageError
-from drivelink.outfile import check_target
+from drivelink.output.outfile import check_target
 from drivelink.recording.mapping import joint_of
 
 _EPILOG = """\

@@ -15,13 +15,14 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from drivelink import jointfile, plots, recording
+from drivelink import jointfile, recording
 from drivelink.errors import RecordingError, UsageError
 from drivelink.floor import floor_entry
-from drivelink.gate import refusal
 from drivelink.jointfile import JointFile, JointText
-from drivelink.outfile import check_target, write_whole
+from drivelink.output import plots
+from drivelink.output.outfile import check_target, write_whole
 from drivelink.recording.columnmap import parse_column_map
+from drivelink.recording.gate import refusal
 from drivelink.version import __version__
 from estimator.batch import TransmissionFit
 from estimator.errors import EstimatorError

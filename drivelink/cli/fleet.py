@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drivelink.errors import UsageError
-from drivelink.progress import Meter
+from drivelink.output.progress import Meter
 
 if TYPE_CHECKING:
     from drivelink.fleet.runner import Counts

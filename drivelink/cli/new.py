@@ -18,7 +18,7 @@ from drivelink.canopen.scan import identify, scan
 from drivelink.errors import UsageError
 from drivelink.jointfile import BusSection, parse
 from drivelink.newfile import Answers, answers_from_bus, joint_text
-from drivelink.outfile import check_target, write_whole
+from drivelink.output.outfile import check_target, write_whole
 
 __all__ = ["configure", "run"]
 

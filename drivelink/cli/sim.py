@@ -15,9 +15,7 @@ from pathlib import Path
 
 from drivelink.cli import ALONE, add_bus
 from drivelink.cycle.realtime import PRIORITY, acquire, release
-from drivelink.errors import BusError, UsageError
-from drivelink.jointfile import BusSection, JointFile, load
-from drivelink.simulate import (
+from drivelink.demo.simulate import (
     CASE_NAMES,
     QUIRK_NAMES,
     JoinedBus,
@@ -26,6 +24,8 @@ from drivelink.simulate import (
     open_sim_bus,
     require_free,
 )
+from drivelink.errors import BusError, UsageError
+from drivelink.jointfile import BusSection, JointFile, load
 
 _EPILOG = """\
 examples:

@@ -18,10 +18,10 @@ from typing import NamedTuple, Protocol
 from drivelink import jointfile
 from drivelink._core import Tick
 from drivelink.daemon.service import Daemon, ServedJoint
+from drivelink.demo.simulate import network_from_joint, open_sim_bus, world_from_joint
 from drivelink.errors import DrivelinkError
 from drivelink.monitor.history import TruthLike
 from drivelink.pubsub.publisher import JointPublisher
-from drivelink.simulate import network_from_joint, open_sim_bus, world_from_joint
 
 __all__ = ["Failure", "Summary", "TruePoint", "serve"]
 

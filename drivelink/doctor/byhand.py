@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, NamedTuple, Protocol
 
-from drivelink.gate import corrections
 from drivelink.jointfile import JointFile
+from drivelink.recording.gate import corrections
 from estimator.gate import Change
 
 __all__ = ["ByHand", "Mark", "Person", "Value", "Values", "check_by_hand"]

@@ -17,8 +17,8 @@ from drivelink.canopen.node import NodeSurvey
 from drivelink.canopen.sdo import Program, Read, SdoAbort
 from drivelink.doctor.report import Section
 from drivelink.finding import Severity
-from drivelink.gate import Gathered, corrections
 from drivelink.jointfile import JointFile
+from drivelink.recording.gate import Gathered, corrections
 from estimator.errors import EstimatorError
 from estimator.gate import Judgement, check, judge
 from estimator.sample import FloatArray, Record

@@ -11,8 +11,8 @@ from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.chain import make_assembler
 from drivelink.cycle.syncclock import MEASURED_SYNCS, SyncClock, measure_period
 from drivelink.errors import DriveError
-from drivelink.gate import Gathered
 from drivelink.jointfile import JointFile
+from drivelink.recording.gate import Gathered
 from estimator.sample import Sample
 
 __all__ = ["SampleTap"]

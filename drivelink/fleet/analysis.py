@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drivelink import report
 from drivelink.jointfile import JointFile
+from drivelink.output import report
 from estimator.batch import TransmissionFit
 from estimator.diagnosis import Diagnosis, diagnose
 from estimator.identify import identify

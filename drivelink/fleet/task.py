@@ -21,10 +21,10 @@ from drivelink.fleet.analysis import Analysis, TransmissionRow, analyse
 from drivelink.fleet.joints import Joint, Joints
 from drivelink.fleet.pieces import Piece, pieces
 from drivelink.fleet.storage import Source, fetched
-from drivelink.gate import gate, refusal
+from drivelink.output.report import Title
 from drivelink.recording.canlog import CAN_SUFFIXES, read_frames
+from drivelink.recording.gate import gate, refusal
 from drivelink.recording.mcapfile import read_messages
-from drivelink.report import Title
 from estimator.errors import EstimatorError
 from estimator.gate import GateError
 from estimator.sample import Record

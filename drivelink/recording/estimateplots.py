@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from drivelink import plots
-from drivelink.plots import Curve
+from drivelink.output import plots
+from drivelink.output.plots import Curve
 from estimator.sample import FloatArray
 
 __all__ = ["plot_curves", "plot_over_time"]

@@ -16,7 +16,7 @@ import numpy as np
 
 from drivelink.errors import RecordingError
 from drivelink.jointfile import JointFile
-from drivelink.outfile import check_target, put_in_place, sync
+from drivelink.output.outfile import check_target, put_in_place, sync
 from drivelink.recording.columnmap import ColumnMap, renamed
 from drivelink.recording.columns import KNOWN, record_from_columns, sample_columns, sample_row
 from drivelink.recording.limits import require_samples

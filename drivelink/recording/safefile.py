@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Self
 
 from drivelink.errors import RecordingError
-from drivelink.outfile import NewFile
+from drivelink.output.outfile import NewFile
 
 __all__ = ["SafeFile"]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from drivelink.jointfile import JointFile
-from drivelink.outfile import write_whole
+from drivelink.output.outfile import write_whole
 
 __all__ = ["write_layouts"]
 

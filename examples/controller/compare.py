@@ -15,7 +15,7 @@ from pathlib import Path
 
 from vsacontrol.study import KNOWLEDGE, LAWS, draw, follow, table
 
-from drivelink.progress import track
+from drivelink.output.progress import track
 
 
 def main() -> None:

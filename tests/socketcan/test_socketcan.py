@@ -21,9 +21,9 @@ from drivelink.cycle.framesource import BusLostError
 from drivelink.cycle.socketcan import SocketCanSource
 from drivelink.cycle.sources import open_source
 from drivelink.daemon.service import Daemon, ServedJoint
+from drivelink.demo.simulate import network_from_joint, open_sim_bus
 from drivelink.jointfile import BusSection
 from drivelink.pubsub.client import subscribe
-from drivelink.simulate import network_from_joint, open_sim_bus
 from estimator.sample import Status
 
 CHANNEL = "vcan0"

@@ -11,6 +11,7 @@ import can
 
 from drivelink._core import Tick
 from drivelink.daemon.service import Daemon, ServedJoint
+from drivelink.demo.simulate import nodes_from_joint, open_sim_bus, world_from_joint
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.wire import (
     EstimateMessage,
@@ -19,7 +20,6 @@ from drivelink.pubsub.wire import (
     decode_external,
     decode_sample,
 )
-from drivelink.simulate import nodes_from_joint, open_sim_bus, world_from_joint
 from estimator.sample import Sample
 from sim.faults import Faults
 from sim.network import Network

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from drivelink import jointfile
-from drivelink.plots import Curve, new_figure, over_time, save
+from drivelink.output.plots import Curve, new_figure, over_time, save
 from estimator.sample import FloatArray
 from sim.cases import case
 from sim.excitation import build

@@ -22,7 +22,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from drivelink.outfile import write_whole
+from drivelink.output.outfile import write_whole
 from estimator.sample import FloatArray
 
 __all__ = [

@@ -23,6 +23,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from drivelink import cli, jointfile
+from drivelink.jointfile import schema
 from drivelink.pubsub.wire import ESTIMATE, EXTERNAL, EXTERNAL_BITS, SAMPLE, STATUS_BITS, Field, Layout
 from estimator.effects import LIBRARY
 from estimator.errors import EstimatorError
@@ -38,15 +39,15 @@ BEGIN, END = "<!-- generated: {} -->", "<!-- end -->"
 SECTIONS: list[tuple[str, type]] = [
     ("Top level", jointfile.JointFile),
     ("[[motor]]", jointfile.MotorSection),
-    ("[motor.transmission]", jointfile.Transmission),
-    ("[[motor.effect]], [[link.effect]]", jointfile.Effect),
+    ("[motor.transmission]", schema.Transmission),
+    ("[[motor.effect]], [[link.effect]]", schema.Effect),
     ("[motor.drive]", jointfile.DriveSection),
     ("[[motor.drive.tpdo]], [[link.encoder.tpdo]]", jointfile.TpdoSection),
     ("[link]", jointfile.LinkSection),
     ("[link.encoder]", jointfile.EncoderSection),
-    ("[link.dynamics]", jointfile.LinkDynamics),
+    ("[link.dynamics]", schema.LinkDynamics),
     ("[bus]", jointfile.BusSection),
-    ("[estimator]", jointfile.EstimatorSettings),
+    ("[estimator]", schema.EstimatorSettings),
     ("[zenoh]", jointfile.ZenohSection),
     ("[ros2]", jointfile.Ros2Section),
     ("[sim]", jointfile.SimSection),
@@ -195,7 +196,7 @@ def effects() -> str:
 def joint_file_page() -> str:
     """The whole of docs/reference/joint-file.md."""
     parts = [INTRODUCTION]
-    after = {jointfile.Transmission: models, jointfile.Effect: effects}
+    after = {schema.Transmission: models, schema.Effect: effects}
     for title, section in SECTIONS:
         summary = (inspect.getdoc(section) or "").splitlines()[0]
         heading = f"`{title}`" if title.startswith("[") else title

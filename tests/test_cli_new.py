@@ -6,7 +6,7 @@ from drivelink.canopen.scan import FoundNode
 from drivelink.cli import main
 from drivelink.demo.simulate import network_from_joint
 from drivelink.errors import DriveError
-from drivelink.newfile import Answers, answers_from_bus, joint_text
+from drivelink.jointfile.newfile import Answers, answers_from_bus, joint_text
 
 
 def made(tmp_path, *arguments, name="elbow.toml"):

@@ -12,7 +12,7 @@ import pytest
 
 from drivelink import jointfile
 from drivelink.cli import main
-from drivelink.floor import make_watch
+from drivelink.jointfile.residual_baseline import make_watch
 from estimator.sample import Record
 
 JOINT = f"""\

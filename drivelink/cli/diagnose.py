@@ -10,9 +10,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from drivelink import augment, recording
+from drivelink import recording
 from drivelink.cli import add_map
 from drivelink.errors import RecordingError, UsageError
+from drivelink.jointfile import apply_diagnosis
 from drivelink.output import report
 from drivelink.output.outfile import check_target
 from drivelink.output.progress import Meter
@@ -95,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
     title = report.Title(joint.name, named, validated, joint.axis == "linear")
     made = report.write(outcome, title, args.out)
     if args.write is not None:
-        augment.write(source, args.write, outcome, records[0], named, force=args.force)
+        apply_diagnosis.write(source, args.write, outcome, records[0], named, force=args.force)
         made.append(args.write)
     if args.json:
         print(json.dumps(report.as_json(outcome)))

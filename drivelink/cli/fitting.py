@@ -17,8 +17,8 @@ from rich.table import Table
 
 from drivelink import jointfile, recording
 from drivelink.errors import RecordingError, UsageError
-from drivelink.floor import floor_entry
 from drivelink.jointfile import JointFile, JointText
+from drivelink.jointfile.residual_baseline import floor_entry
 from drivelink.output import plots
 from drivelink.output.outfile import check_target, write_whole
 from drivelink.recording.columnmap import parse_column_map

@@ -17,7 +17,7 @@ from drivelink.canopen.bus import open_bus
 from drivelink.canopen.scan import identify, scan
 from drivelink.errors import UsageError
 from drivelink.jointfile import BusSection, parse
-from drivelink.newfile import Answers, answers_from_bus, joint_text
+from drivelink.jointfile.newfile import Answers, answers_from_bus, joint_text
 from drivelink.output.outfile import check_target, write_whole
 
 __all__ = ["configure", "run"]

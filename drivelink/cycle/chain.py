@@ -10,8 +10,8 @@ from drivelink import _core
 from drivelink._core import Assembler, Chain
 from drivelink.canopen.layout import NodeLayout
 from drivelink.errors import DriveError
-from drivelink.floor import make_watch
 from drivelink.jointfile import JointFile
+from drivelink.jointfile.residual_baseline import make_watch
 from estimator import Estimator, make_estimator
 from estimator.sample import Estimate, Sample
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from drivelink import jointfile
-from drivelink.floor import floor_entry
 from drivelink.jointfile import JointFile, JointText
+from drivelink.jointfile.residual_baseline import floor_entry
 from drivelink.version import __version__
 from estimator.diagnosis import Diagnosis
 from estimator.effects import LIBRARY

@@ -1,4 +1,4 @@
-"""The joint file: one TOML file that says what a joint is, how it is reached and where its estimates go.
+"""Schema of the joint file: one TOML file says what a joint is, how it is reached, where its estimates go.
 
 The schema below is the reference: `docs/` is generated from it. A wrong file is one line: file, key,
 what was expected.
@@ -19,13 +19,14 @@ import tomlkit
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from drivelink.errors import JointFileError
-from drivelink.keyhint import unknown_key
+from drivelink.jointfile.keyhint import unknown_key
 from drivelink.output.outfile import write_whole
 from estimator.model import Arrangement, Effect, JointModel, LinkDynamics, Motor, Transmission
 from estimator.settings import EstimatorSettings
 from estimator.transmissions import MODELS, transmission_model
 
 __all__ = [
+    "MAX_BYTES",
     "BusSection",
     "DriveSection",
     "EncoderSection",

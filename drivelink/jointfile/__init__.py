@@ -1,0 +1,43 @@
+"""The joint file: its schema, what a wrong key meant, a new one, and what fit and diagnose write into it."""
+
+from __future__ import annotations
+
+from drivelink.jointfile.schema import (
+    MAX_BYTES,
+    BusSection,
+    DriveSection,
+    EncoderSection,
+    JointFile,
+    JointText,
+    LinkSection,
+    MotorSection,
+    RecordingSection,
+    Ros2Section,
+    SimSection,
+    TpdoSection,
+    ZenohSection,
+    load,
+    load_text,
+    parse,
+    write_model,
+)
+
+__all__ = [
+    "MAX_BYTES",
+    "BusSection",
+    "DriveSection",
+    "EncoderSection",
+    "JointFile",
+    "JointText",
+    "LinkSection",
+    "MotorSection",
+    "RecordingSection",
+    "Ros2Section",
+    "SimSection",
+    "TpdoSection",
+    "ZenohSection",
+    "load",
+    "load_text",
+    "parse",
+    "write_model",
+]

@@ -8,7 +8,13 @@ from pathlib import Path
 import can
 import pytest
 
-from drivelink.demo.simulate import bench_from_joints, network_from_joint, nodes_from_joint, world_from_joint
+from drivelink.demo.simulate import (
+    assumptions,
+    bench_from_joints,
+    network_from_joint,
+    nodes_from_joint,
+    world_from_joint,
+)
 from drivelink.errors import JointFileError, UsageError
 from drivelink.jointfile import JointFile, parse
 from sim.canopen.drive import Cia402Drive
@@ -116,10 +122,15 @@ def test_what_cannot_be_simulated_is_one_line(extra: str, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_model_without_parameters_asks_for_a_case() -> None:
+def test_a_model_without_parameters_gets_a_spring_and_that_is_said() -> None:
     text = SINGLE.replace("parameters = { coefficients_nm_rad = [150.0, 400.0] }", "")
-    with pytest.raises(JointFileError, match=r"expected sim.case, or parameters in motor\[1\]"):
-        world_from_joint(joint(text))
+    made = joint(text)
+    spring = world_from_joint(made).plant.motors[0].spring.law()
+    inertia = made.motor[0].inertia_kg_m2
+    assert math.sqrt(spring.stiffness(0.0) / inertia) / (2.0 * math.pi) == pytest.approx(5.0)
+    assert spring.stiffness(0.15) == pytest.approx(2.0 * spring.stiffness(0.0))
+    assert any("simulated with" in line and "5 Hz" in line for line in assumptions(made))
+    assert not any("N·m/rad" in line for line in assumptions(joint()))
 
 
 def test_effects_come_from_the_file_the_model_and_the_command_line() -> None:

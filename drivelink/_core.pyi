@@ -293,7 +293,7 @@ class Chain:
         Args:
             sequence: of the cycle.
             flags: service bits of `Status` that hold for it.
-            stamp_ns: UNIX time of its SYNC; None: as the SYNCs fed tell.
+            stamp_ns: UNIX time of its SYNC; None: from the SYNCs fed.
         """
 
     def exchange(self, estimator: Any, watch: Watch | None, unseen: Iterable[Sample] = ()) -> None:

@@ -1,4 +1,4 @@
-"""What was noticed about a machine, a bus or a drive, how bad it is, and the command that fixes it."""
+"""A finding about a machine, a bus or a drive: its severity, and the command that fixes it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The version: below everything else, so that nothing imports the package's root for it."""
+"""The version, in a module without imports, so that nothing imports the package root for it."""
 
 __all__ = ["__version__"]
 

@@ -16,8 +16,8 @@ MAXON, ELMO, COPLEY = VENDORS[0xFB], VENDORS[0x9A], VENDORS[0xAB]
 PLAIN = {(0x608F, 1): 16384, (0x608F, 2): 1, (0x6091, 1): 50, (0x6091, 2): 1, (0x6076, 0): 800}
 
 
-def offered(told, vendor=GENERIC, **sections):
-    return offer(roles(parse(joint_text(**sections)))[0], told, vendor)
+def offered(reported, vendor=GENERIC, **sections):
+    return offer(roles(parse(joint_text(**sections)))[0], reported, vendor)
 
 
 def scale(result, signal):
@@ -60,15 +60,15 @@ def test_direction_turns_position_and_torque_and_can_be_split():
 
 def test_values_a_drive_was_never_given_count_as_not_told():
     # Elmo's DCF: resolution 1/1, rated values 0
-    told = {(0x608F, 1): 1, (0x608F, 2): 1, (0x6076, 0): 0, (0x6075, 0): 0}
-    result = offered(told)
+    reported = {(0x608F, 1): 1, (0x608F, 2): 1, (0x6076, 0): 0, (0x6075, 0): 0}
+    result = offered(reported)
     assert "counts_per_rev" in result.missing[Signal.MOTOR_POSITION]
     assert "rated_torque_nm" in result.missing[Signal.MOTOR_TORQUE]
 
 
 def test_epos4_tells_by_objects_of_its_own_and_in_micro_newton_metres():
     # values of a real EPOS4's DCF: 4.76 A, 107.746 mN·m/A, 0x6076 = 512871 µN·m, gear 26, 3200 counts
-    told = {
+    reported = {
         (0x3000, 5): 3200,
         (0x3001, 1): 4760,
         (0x3001, 5): 107746,
@@ -76,7 +76,7 @@ def test_epos4_tells_by_objects_of_its_own_and_in_micro_newton_metres():
         (0x3003, 2): 1,
         (0x6076, 0): 512871,
     }
-    result = offered(told, MAXON)
+    result = offered(reported, MAXON)
     assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.tau / (3200 * 26))
     assert scale(result, Signal.MOTOR_TORQUE) == pytest.approx(0.512871 / 1000 * 26)
     current = result.candidates[Signal.MOTOR_TORQUE][1]
@@ -87,7 +87,7 @@ def test_epos4_tells_by_objects_of_its_own_and_in_micro_newton_metres():
 @pytest.mark.parametrize(
     ("raw", "drive", "expected"),
     [
-        (512871, "", 0.512871),  # nothing else told: no such motor has 512 N·m
+        (512871, "", 0.512871),  # nothing else reported: no such motor has 512 N·m
         (513, "", 0.513),
         (512, "rated_torque_nm = 0.51", 0.51),  # the joint file says which of the two it is
         (510, "rated_torque_nm = 0.00051", 0.00051),
@@ -99,12 +99,12 @@ def test_the_unit_of_maxons_rated_torque_is_told_from_evidence(raw, drive, expec
 
 
 def test_current_with_the_constant_gives_the_torque_where_0x6076_is_missing():
-    told = {key: value for key, value in PLAIN.items() if key != (0x6076, 0)} | {(0x6075, 0): 4000}
-    result = offered(told, drive="torque_constant_nm_a = 0.1\ntorque_source = 'current'")
+    reported = {key: value for key, value in PLAIN.items() if key != (0x6076, 0)} | {(0x6075, 0): 4000}
+    result = offered(reported, drive="torque_constant_nm_a = 0.1\ntorque_source = 'current'")
     assert result.candidates[Signal.MOTOR_TORQUE][0].address == (0x6078, 0)
     assert scale(result, Signal.MOTOR_TORQUE) == pytest.approx(0.004 * 0.1 * 50)
     # Nanotec: 0x6077 without 0x6076; its unit is the torque of the rated current
-    result = offered(told, drive="torque_constant_nm_a = 0.1")
+    result = offered(reported, drive="torque_constant_nm_a = 0.1")
     assert result.candidates[Signal.MOTOR_TORQUE][0].address == (0x6077, 0)
     assert scale(result, Signal.MOTOR_TORQUE) == pytest.approx(4 * 0.1 / 1000 * 50)
 
@@ -135,8 +135,8 @@ def test_a_stated_current_object_comes_first_in_its_own_unit():
     ],
 )
 def test_velocity_units(unit, expected):
-    told = velocity_unit_rad_s(unit, 16384.0)
-    assert told == (None if expected is None else pytest.approx(expected, rel=1e-12))
+    reported = velocity_unit_rad_s(unit, 16384.0)
+    assert reported == (None if expected is None else pytest.approx(expected, rel=1e-12))
 
 
 def test_velocity_is_scaled_to_the_joint_or_left_out_saying_why():
@@ -154,11 +154,11 @@ def test_velocity_is_scaled_to_the_joint_or_left_out_saying_why():
 
 def test_positions_in_user_units_are_understood():
     # Nanotec's default 0x60A8: tenths of a degree, behind the gear the drive knows
-    told = {(0x60A8, 0): 0xFF410000, (0x608F, 1): 2000, (0x608F, 2): 1, (0x6091, 1): 1, (0x6091, 2): 1}
-    result = offered(told, drive="gear_ratio = 20.0")
+    reported = {(0x60A8, 0): 0xFF410000, (0x608F, 1): 2000, (0x608F, 2): 1, (0x6091, 1): 1, (0x6091, 2): 1}
+    result = offered(reported, drive="gear_ratio = 20.0")
     assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.radians(0.1) / 20)
-    told |= {(0x6091, 1): 20}
-    assert scale(offered(told), Signal.MOTOR_POSITION) == pytest.approx(math.radians(0.1))
+    reported |= {(0x6091, 1): 20}
+    assert scale(offered(reported), Signal.MOTOR_POSITION) == pytest.approx(math.radians(0.1))
 
 
 def test_polarity_of_position_against_velocity_is_a_warning():
@@ -185,7 +185,7 @@ def test_a_wrong_object_is_one_line(text):
 
 
 @pytest.mark.parametrize(
-    ("told", "counts", "modulus"),
+    ("reported", "counts", "modulus"),
     [
         ({(0x6501, 0): 8192}, 8192, 0),  # revolutions unknown: the full length
         ({(0x6501, 0): 8192, (0x6502, 0): 1}, 8192, 8192),  # single turn
@@ -195,9 +195,9 @@ def test_a_wrong_object_is_one_line(text):
         ({(0x6501, 0): 8192, (0x6000, 0): 0, (0x6001, 0): 3600, (0x6502, 0): 1}, 8192, 8192),  # scaling off
     ],
 )
-def test_absolute_encoders_tell_resolution_and_where_they_start_again(told, counts, modulus):
+def test_absolute_encoders_tell_resolution_and_where_they_start_again(reported, counts, modulus):
     text = joint_text(link='[link.encoder]\nsource = "cia406"\nnode_id = 9')
-    (candidate,) = offer(roles(parse(text))[1], told, GENERIC).candidates[Signal.LINK_POSITION]
+    (candidate,) = offer(roles(parse(text))[1], reported, GENERIC).candidates[Signal.LINK_POSITION]
     assert candidate.scale == pytest.approx(math.tau / counts)
     assert candidate.modulus == modulus
 
@@ -217,7 +217,7 @@ def test_epos2_tells_its_current_in_milliamperes_and_its_encoder_in_pulses():
 
 
 def test_epos4_is_not_taken_for_its_predecessor():
-    told = {(0x3000, 5): 4096, (0x2210, 1): 500}
-    result = offered(told, MAXON, drive="torque_constant_nm_a = 0.03\ngear_ratio = 50.0")
+    reported = {(0x3000, 5): 4096, (0x2210, 1): 500}
+    result = offered(reported, MAXON, drive="torque_constant_nm_a = 0.03\ngear_ratio = 50.0")
     assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.tau / (4096 * 50))
     assert result.candidates[Signal.MOTOR_TORQUE][0].address == (0x30D1, 2)

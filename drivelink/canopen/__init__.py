@@ -8,7 +8,7 @@ In the run, beside the loop, which alone reads the bus: `configurator.start(node
 `configurator.feed(cob_id, data, now_s)` for every frame 0x581 to 0x5FF, `configurator.poll(now_s)` now and
 then; it returns the nodes that are done, each with its new layout or its error. With `configure = false`
 the configurator is a `PassiveConfigurator`: same methods, nothing to send with; it also wants the frames
-0x601 to 0x67F, and its `poll` tells when another master has changed a mapping.
+0x601 to 0x67F, and its `poll` reports when another master has changed a mapping.
 """
 
 from drivelink.canopen.bus import interface_is_up, open_bus

@@ -1,4 +1,4 @@
-"""Running a program to its end on a bus that nobody else reads: before the start, and in the doctor."""
+"""Runs an SDO program to completion on a bus that nobody else reads: before the start, and in the doctor."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def sender(bus: FrameBus) -> Callable[[int, bytes], None]:
     """`send(identifier, data)` of a bus.
 
     A frame that finds the transmit queue full is lost, like one on the wire: SDO asks again after its
-    timeout. A queue stays full where nobody acknowledges; then nobody answers, and that is what is told.
+    timeout. A queue stays full where nobody acknowledges: then no answer arrives, which is the error.
     """
 
     def send(cob_id: int, data: bytes) -> None:

@@ -1,4 +1,4 @@
-"""What a node offers: for each signal the objects that can give it, ready to be mapped and decoded."""
+"""What a node offers: for each signal, the objects that carry it, ready to be mapped and decoded."""
 
 from __future__ import annotations
 

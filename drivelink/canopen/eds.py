@@ -1,4 +1,4 @@
-"""EDS and DCF files as they are found (CiA 306-1): everything that can be read is read.
+"""EDS and DCF files as vendors write them (CiA 306-1): everything that can be read is read.
 
 Makers' files have other encodings, keys twice, values left out, other nodes' identifiers, unknown types.
 None of that is a reason to give up; each is a line in `DataSheet.problems`.
@@ -64,7 +64,7 @@ class SheetObject:
 
     @property
     def bits(self) -> int | None:
-        """Length, where the type tells."""
+        """Length, where the type gives it."""
         known = _TYPES.get(self.data_type)
         return known[0] if known else None
 
@@ -81,13 +81,13 @@ class SheetObject:
 
 @dataclass(slots=True, kw_only=True)
 class DataSheet:
-    """What an EDS or DCF file tells.
+    """The content of an EDS or DCF file.
 
     Attributes:
         path: the file.
         vendor_name: as the file has it.
         product_name: as the file has it.
-        vendor_id: VendorNumber, or 0x1018:01; 0 where neither tells.
+        vendor_id: VendorNumber, or 0x1018:01; 0 where neither gives it.
         product_code: ProductNumber, or 0x1018:02.
         revision: RevisionNumber, or 0x1018:03.
         objects: by (index, subindex).

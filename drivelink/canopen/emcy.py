@@ -178,7 +178,7 @@ _STATES = (
 
 
 def drive_state(statusword: int) -> DriveState:
-    """The state that a statusword tells; bits that toggle or belong to modes don't matter."""
+    """The state in a statusword; bits that toggle or belong to modes are ignored."""
     for mask, value, state in _STATES:
         if statusword & mask == value:
             return state

@@ -1,4 +1,4 @@
-"""Nothing leaves this program that could move a drive.
+"""The filter for frames that could move a drive: none of them is sent.
 
 Every frame of the configuration passes through `check_frame`: SYNC, the NMT commands *start* and
 *enter pre-operational*, SDO uploads, and SDO downloads to communication objects (0x1005 to 0x1019,

@@ -1,4 +1,4 @@
-"""What the wire looks like once every node is configured: which frame carries which signal, at what scale.
+"""The configured PDOs: which frame carries which signal, at what scale.
 
 Made by the configuration (active or passive), used by the acquisition; the only thing the two share.
 """
@@ -89,7 +89,7 @@ class NodeLayout:
         tpdos: its frames that carry signals of the joint.
         other_tpdos: enabled frames of this node that nobody here needs, but that load the bus.
         heartbeat_ms: period of the heartbeat the node produces, as read back; 0: none, or not known.
-        identity: (vendor, product code, revision, serial number) of 0x1018; 0 where not told.
+        identity: (vendor, product code, revision, serial number) of 0x1018; 0 where not reported.
         findings: what the configuration had to say about it.
     """
 

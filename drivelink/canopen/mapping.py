@@ -1,4 +1,4 @@
-"""Makes a node send what the joint needs, and reads back what it will really send.
+"""Maps the signals of the joint into a node's TPDOs, and reads back what it will really send.
 
 The order is the one that all drives accept: pre-operational; 0x1800:01 invalid with its bit 30 kept;
 :02 = 1; 0x1A00:00 = 0; entries; count; valid again (CiA 301, 7.5.2.36). A node that is already as it should

@@ -1,4 +1,4 @@
-"""Everything that is asked of one node before it takes part: identity, units, mapping, SYNC, heartbeat."""
+"""Configures one node: identity, units, mapping, SYNC, heartbeat."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ class NodeSurvey:
 
     Attributes:
         role: what it is there for.
-        device_type: 0x1000; 0 where it answers, but does not tell.
+        device_type: 0x1000; 0 where it answers without a value.
         identity: 0x1018.
-        told: unsigned values of the objects that were asked for and exist.
+        reported: unsigned values of the objects that were asked for and exist.
         offer: what it can give.
         refused: the last read that it aborted although the object may exist, or None.
         available: for each signal, the objects that exist, best first, at their real length.
@@ -57,7 +57,7 @@ class NodeSurvey:
     role: Role
     device_type: int
     identity: tuple[int, int, int, int]
-    told: Mapping[tuple[int, int], int]
+    reported: Mapping[tuple[int, int], int]
     offer: Offer
     refused: SdoAbort | None
     available: Mapping[Signal, tuple[Candidate, ...]]
@@ -79,14 +79,14 @@ def survey_node(role: Role, patience: int = 1, *, wake: bool = False) -> Program
     for subindex in (1, 2, 3, 4):
         identity[subindex - 1] = (yield from read_optional(node, 0x1018, subindex)) or 0
     vendor = vendor_of(identity[0])
-    told: dict[tuple[int, int], int] = {}
+    reported: dict[tuple[int, int], int] = {}
     refused = None
     for address in unit_objects(role, vendor):
         try:
-            told[address] = yield from read_number(node, *address)
+            reported[address] = yield from read_number(node, *address)
         except SdoAbort as abort:
             refused = refused if abort.code in ABSENT else abort
-    offered = offer(role, told, vendor)
+    offered = offer(role, reported, vendor)
     available: dict[Signal, tuple[Candidate, ...]] = {}
     for signal, candidates in offered.candidates.items():
         available[signal] = yield from _existing(node, candidates)
@@ -94,7 +94,7 @@ def survey_node(role: Role, patience: int = 1, *, wake: bool = False) -> Program
         role=role,
         device_type=device_type,
         identity=(identity[0], identity[1], identity[2], identity[3]),
-        told=told,
+        reported=reported,
         offer=offered,
         refused=refused,
         available=available,
@@ -123,8 +123,8 @@ def _existing(node: int, candidates: tuple[Candidate, ...]) -> Program[tuple[Can
             if abort.code not in ABSENT:
                 found.append(candidate)
             continue
-        told = len(data) in (1, 2, 3, 4, 8) and not isinstance(data, Unsized)
-        bits = 8 * len(data) if told else candidate.bits
+        sized = len(data) in (1, 2, 3, 4, 8) and not isinstance(data, Unsized)
+        bits = 8 * len(data) if sized else candidate.bits
         found.append(replace(candidate, bits=bits))
     return tuple(found)
 

@@ -42,7 +42,7 @@ class _PassiveNode:
 
     A map is believed when it was written or read back since the node's last start, or when the joint file
     states it: for good with `default = true`, else until the node restarts. What a data sheet says of a map
-    is what the node was born with; who has changed it since nobody can tell, so it is only offered.
+    is the factory setting; it may have been changed since, so it is only offered.
     """
 
     def __init__(self, role: Role) -> None:
@@ -113,7 +113,7 @@ class _PassiveNode:
         )
 
     def offered(self) -> str:
-        """What would state the mapping in the joint file: TOML to be pasted, where a data sheet tells it."""
+        """What would state the mapping in the joint file: TOML to paste, where a data sheet gives it."""
         if self.role.tpdo:
             return f"default = true in {self._keys()}"
         tpdos = self._sheet_tpdos()
@@ -132,19 +132,19 @@ class _PassiveNode:
         values = {**(self._sheet.values() if self._sheet else {}), **self.listener.values}
         if self._sheet is not None and self._sheet.vendor_id:
             values.setdefault((0x1018, 1), self._sheet.vendor_id)
-        told = offer(role, values, vendor_of(values.get((0x1018, 1), 0)))
-        findings = list(told.findings)
+        offered = offer(role, values, vendor_of(values.get((0x1018, 1), 0)))
+        findings = list(offered.findings)
         if self._sheet is not None:
             findings += [
                 Finding(severity=Severity.INFO, subject=str(self._sheet.path.name), text=problem)
                 for problem in self._sheet.problems
             ]
-        for signal, reason in told.missing.items() if tpdos else ():
+        for signal, reason in offered.missing.items() if tpdos else ():
             if signal not in OPTIONAL:
                 raise DriveError(f"{role.subject} ({role.key}): {reason}")
-        layouts = decode(tpdos, told.candidates)
+        layouts = decode(tpdos, offered.candidates)
         given = {mapped.signal for layout in layouts for mapped in layout.objects}
-        lacking = [signal for signal in told.candidates if signal not in given and signal not in OPTIONAL]
+        lacking = [signal for signal in offered.candidates if signal not in given and signal not in OPTIONAL]
         if lacking or not tpdos:
             raise DriveError(self._lacking(lacking, tpdos))
         used = tuple(layout for layout in layouts if any(o.signal != Signal.OTHER for o in layout.objects))

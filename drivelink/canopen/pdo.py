@@ -48,7 +48,7 @@ class Tpdo:
         entries: what is mapped, in order.
         fixed: whether its mapping cannot be changed.
         most: objects that can be mapped into it.
-        known: whether the entries are; a map that the node or the sheet does not tell is not an empty one.
+        known: whether the entries are; an unknown mapping is not an empty one.
     """
 
     number: int
@@ -122,7 +122,7 @@ def read_tpdo(node: int, number: int, *, exactly: bool = False) -> Program[Tpdo 
     Args:
         node: node id.
         number: from 1.
-        exactly: its frames will be decoded by this: what the node has and does not tell must not be guessed.
+        exactly: its frames will be decoded by this: what cannot be read must not be guessed.
 
     Raises:
         SdoAbort: that is the case.

@@ -1,4 +1,4 @@
-"""Which signals go into which TPDO: pure reasoning, nothing is sent from here.
+"""Assigns signals to TPDOs: a computation, nothing is sent from here.
 
 The wish is one frame with position, torque and statusword, so that a sample is atomic; what does not fit
 goes into a second one. Where maps are fixed, those that carry what is needed are taken as they are.

@@ -1,4 +1,4 @@
-"""Who is who on the bus: the nodes of a joint, and what each one is there for."""
+"""The nodes of a joint and their roles: drives and link encoder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who is on the bus, by asking and listening; nothing is written.
+"""Finds the nodes on the bus by asking and listening; nothing is written.
 
 Every node id is asked for its device type (0x1000, mandatory in CiA 301), all at once; whoever answers, or
 is heard by heartbeat or boot-up, is there.
@@ -33,7 +33,7 @@ class FoundNode:
 
     Attributes:
         node_id: 1 to 127.
-        device_type: 0x1000; 0 where it does not tell, None where it does not answer SDO.
+        device_type: 0x1000; 0 where it has no value, None where it does not answer SDO.
         identity: 0x1018.
         name: 0x1008.
     """

@@ -1,7 +1,7 @@
 """Counts become SI at the joint side here, and nowhere else.
 
 What the joint file states is used; what it leaves out is taken from the drive (0x608F, 0x6091, 0x6075,
-0x6076, 0x60A8, 0x60A9 of CiA 402-2, the maker's own objects, 0x6501 of CiA 406). Where both tell and
+0x6076, 0x60A8, 0x60A9 of CiA 402-2, the maker's own objects, 0x6501 of CiA 406). Where both give a value and
 disagree, a finding names both numbers and the one in use.
 """
 
@@ -56,20 +56,20 @@ def unit_objects(role: Role, vendor: Vendor) -> tuple[Address, ...]:
     return wanted
 
 
-def offer(role: Role, told: Mapping[Address, int], vendor: Vendor) -> Offer:
+def offer(role: Role, reported: Mapping[Address, int], vendor: Vendor) -> Offer:
     """What a node can give, and at what scale.
 
     Args:
         role: what the node is there for, with what the joint file states.
-        told: unsigned values of the objects the node has, as far as they are known.
+        reported: unsigned values of the objects the node has, as far as they are known.
         vendor: its maker.
     """
     result = Offer()
-    vendor = vendor.generation(told)
+    vendor = vendor.generation(reported)
     if role.drive is not None:
-        _Drive(role, role.drive, told, vendor, result).offer()
+        _Drive(role, role.drive, reported, vendor, result).offer()
     if role.encoder is not None:
-        _offer_link(role, role.encoder, told, result)
+        _offer_link(role, role.encoder, reported, result)
         if vendor.sensorless == _encoder_address(role.encoder, role.key) and role.encoder.object is None:
             index, subindex = vendor.sensorless
             result.findings.append(
@@ -87,9 +87,15 @@ class _Drive:
     """The reasoning for one drive."""
 
     def __init__(
-        self, role: Role, drive: DriveSection, told: Mapping[Address, int], vendor: Vendor, result: Offer
+        self, role: Role, drive: DriveSection, reported: Mapping[Address, int], vendor: Vendor, result: Offer
     ) -> None:
-        self._role, self._drive, self._told, self._vendor, self._result = role, drive, told, vendor, result
+        self._role, self._drive, self._reported, self._vendor, self._result = (
+            role,
+            drive,
+            reported,
+            vendor,
+            result,
+        )
 
     def offer(self) -> None:
         self._result.candidates[Signal.STATUSWORD] = (
@@ -104,17 +110,18 @@ class _Drive:
         self._polarity()
 
     def _choose(
-        self, what: str, key: str, stated: float | None, told: float | None, source: str
+        self, what: str, key: str, stated: float | None, reported: float | None, source: str
     ) -> float | None:
-        """The stated value, else the told one; a finding where they disagree."""
-        if stated is None or told is None:
-            return told if stated is None else stated
-        if not math.isclose(stated, told, rel_tol=_SAME):
+        """The stated value, else the reported one; a finding where they disagree."""
+        if stated is None or reported is None:
+            return reported if stated is None else stated
+        if not math.isclose(stated, reported, rel_tol=_SAME):
             self._say(
                 Severity.WARNING,
-                f"{what}: the drive says {told:.6g} ({source}), the joint file {stated:.6g}; "
+                f"{what}: the drive says {reported:.6g} ({source}), the joint file {stated:.6g}; "
                 f"{stated:.6g} is used",
-                f"{self._role.key}: {key} = {told:.6g}, or leave it out, or correct {source} in the drive",
+                f"{self._role.key}: {key} = {reported:.6g}, or leave it out, "
+                f"or correct {source} in the drive",
             )
         return stated
 
@@ -124,7 +131,7 @@ class _Drive:
         )
 
     def _ratio(self, numerator: Address, denominator: Address) -> float | None:
-        above, below = self._told.get(numerator, 0), self._told.get(denominator, 1)
+        above, below = self._reported.get(numerator, 0), self._reported.get(denominator, 1)
         return above / below if above > 0 and below > 0 else None
 
     def _drive_gear(self) -> tuple[float | None, str]:
@@ -135,36 +142,36 @@ class _Drive:
 
     def _gear(self) -> float:
         """Motor revolutions per joint revolution."""
-        told, source = self._drive_gear()
+        reported, source = self._drive_gear()
         stated = self._drive.gear_ratio
         if "gear_ratio" not in self._drive.model_fields_set:
-            return stated if told is None else told
-        if told == 1.0 and stated != 1.0:  # the everyday case: the drive was never told of its gear
+            return stated if reported is None else reported
+        if reported == 1.0 and stated != 1.0:  # usual: the drive was never configured with its gear
             self._say(
                 Severity.INFO,
                 f"gear ratio: the drive says 1 ({source}), the joint file {stated:.6g}; {stated:.6g} is used",
             )
             return stated
-        self._choose("gear ratio", "gear_ratio", stated, told, source)
+        self._choose("gear ratio", "gear_ratio", stated, reported, source)
         return stated
 
     def _counts_per_rev(self) -> float | None:
         """Counts of 0x6064 per motor revolution."""
-        told, source = self._told_counts()
+        reported, source = self._reported_counts()
         return self._choose(
-            "counts per motor revolution", "counts_per_rev", self._drive.counts_per_rev, told, source
+            "counts per motor revolution", "counts_per_rev", self._drive.counts_per_rev, reported, source
         )
 
-    def _told_counts(self) -> tuple[float | None, str]:
-        angle = angle_unit_rad(self._told.get((0x60A8, 0), 0))
+    def _reported_counts(self) -> tuple[float | None, str]:
+        angle = angle_unit_rad(self._reported.get((0x60A8, 0), 0))
         if angle is not None:  # user units at the output of the drive's gear
             gear = self._drive_gear()[0] or 1.0
             return math.tau / angle / gear, "0x60A8"
-        told = self._ratio((0x608F, 1), (0x608F, 2))
-        if told is not None and told > 1:  # 1/1 is what a drive says that was never told
-            return told, "0x608F"
+        reported = self._ratio((0x608F, 1), (0x608F, 2))
+        if reported is not None and reported > 1:  # 1/1 is the value of an unconfigured drive
+            return reported, "0x608F"
         if self._vendor.counts_per_rev:
-            counts = self._told.get(self._vendor.counts_per_rev, 0)
+            counts = self._reported.get(self._vendor.counts_per_rev, 0)
             if counts > 1:
                 index, subindex = self._vendor.counts_per_rev
                 return float(counts * self._vendor.counts_factor), f"0x{index:04X}:{subindex:02X}"
@@ -173,7 +180,7 @@ class _Drive:
     def _position(self, counts: float | None, gear: float) -> None:
         if counts is None:
             self._result.missing[Signal.MOTOR_POSITION] = (
-                "counts per motor revolution are unknown: the drive does not tell (0x608F), "
+                "counts per motor revolution are unknown: the drive does not report them (0x608F), "
                 f"set {self._role.key}: counts_per_rev"
             )
             return
@@ -197,10 +204,10 @@ class _Drive:
         )
 
     def _rated_torque(self) -> float | None:
-        raw = self._told.get((0x6076, 0), 0)
-        told = raw * self._rated_torque_unit(raw) if raw else None
+        raw = self._reported.get((0x6076, 0), 0)
+        reported = raw * self._rated_torque_unit(raw) if raw else None
         return self._choose(
-            "rated torque in N·m", "rated_torque_nm", self._drive.rated_torque_nm, told, "0x6076"
+            "rated torque in N·m", "rated_torque_nm", self._drive.rated_torque_nm, reported, "0x6076"
         )
 
     def _rated_torque_unit(self, raw: int) -> float:
@@ -209,26 +216,29 @@ class _Drive:
             return 1e-3
         evidence = self._drive.rated_torque_nm
         constant, current = self._vendor.torque_constant, self._vendor.nominal_current
-        if constant and current and self._told.get(constant) and self._told.get(current):
-            evidence = self._told[constant] * 1e-6 * self._told[current] * 1e-3
+        if constant and current and self._reported.get(constant) and self._reported.get(current):
+            evidence = self._reported[constant] * 1e-6 * self._reported[current] * 1e-3
         if evidence is None:
             return 1e-6 if raw >= _MICRO_FROM else 1e-3
         return min((1e-3, 1e-6), key=lambda unit: abs(math.log(raw * unit / evidence)))
 
     def _rated_current(self) -> float | None:
-        raw = self._told.get((0x6075, 0), 0)
-        told = raw * 1e-3 if raw else None
+        raw = self._reported.get((0x6075, 0), 0)
+        reported = raw * 1e-3 if raw else None
         return self._choose(
-            "rated current in A", "rated_current_a", self._drive.rated_current_a, told, "0x6075"
+            "rated current in A", "rated_current_a", self._drive.rated_current_a, reported, "0x6075"
         )
 
     def _torque_constant(self, rated_torque: float | None, rated_current: float | None) -> float | None:
-        told, source = None, ""
-        if self._vendor.torque_constant and self._told.get(self._vendor.torque_constant):
+        reported, source = None, ""
+        if self._vendor.torque_constant and self._reported.get(self._vendor.torque_constant):
             index, subindex = self._vendor.torque_constant
-            told, source = self._told[self._vendor.torque_constant] * 1e-6, f"0x{index:04X}:{subindex:02X}"
+            reported, source = (
+                self._reported[self._vendor.torque_constant] * 1e-6,
+                f"0x{index:04X}:{subindex:02X}",
+            )
         stated = self._drive.torque_constant_nm_a
-        chosen = self._choose("torque constant in N·m/A", "torque_constant_nm_a", stated, told, source)
+        chosen = self._choose("torque constant in N·m/A", "torque_constant_nm_a", stated, reported, source)
         if chosen is None and rated_torque and rated_current:
             return rated_torque / rated_current
         return chosen
@@ -266,25 +276,25 @@ class _Drive:
             self._result.candidates[Signal.MOTOR_TORQUE] = chosen
         else:
             self._result.missing[Signal.MOTOR_TORQUE] = (
-                "the scale of its torque is unknown: the drive tells neither rated torque (0x6076) nor rated "
-                f"current (0x6075), set {self._role.key}: rated_torque_nm, or torque_constant_nm_a and "
+                "the scale of its torque is unknown: the drive reports neither rated torque (0x6076) nor "
+                f"rated current (0x6075), set {self._role.key}: rated_torque_nm, or torque_constant_nm_a and "
                 "rated_current_a or current_object"
             )
 
     def _velocity(self, counts: float | None, gear: float) -> None:
-        told, source = None, "0x60A9"
-        unit = self._told.get((0x60A9, 0))
+        reported, source = None, "0x60A9"
+        unit = self._reported.get((0x60A9, 0))
         if unit:
-            told = velocity_unit_rad_s(unit, counts)
-        if told is None and self._vendor.velocity_rad_s is not None:
-            told, source = self._vendor.velocity_rad_s, self._vendor.name
-        if told is None and self._vendor.velocity_counts_s is not None and counts is not None:
-            told, source = self._vendor.velocity_counts_s * math.tau / counts, self._vendor.name
+            reported = velocity_unit_rad_s(unit, counts)
+        if reported is None and self._vendor.velocity_rad_s is not None:
+            reported, source = self._vendor.velocity_rad_s, self._vendor.name
+        if reported is None and self._vendor.velocity_counts_s is not None and counts is not None:
+            reported, source = self._vendor.velocity_counts_s * math.tau / counts, self._vendor.name
         stated = self._drive.velocity_rad_s_per_count
-        chosen = self._choose("velocity unit in rad/s", "velocity_rad_s_per_count", stated, told, source)
+        chosen = self._choose("velocity unit in rad/s", "velocity_rad_s_per_count", stated, reported, source)
         if chosen is None:
             self._result.missing[Signal.MOTOR_VELOCITY] = (
-                "the unit of 0x606C is unknown: the drive does not tell (0x60A9), "
+                "the unit of 0x606C is unknown: the drive does not report it (0x60A9), "
                 f"set {self._role.key}: velocity_rad_s_per_count"
             )
             return
@@ -294,7 +304,7 @@ class _Drive:
         )
 
     def _polarity(self) -> None:
-        polarity = self._told.get((0x607E, 0), 0)
+        polarity = self._reported.get((0x607E, 0), 0)
         if polarity & 0x80:
             self._say(
                 Severity.INFO,
@@ -318,21 +328,21 @@ def _encoder_address(encoder: EncoderSection, key: str) -> Address:
     return object_address(encoder.object or default, f"{key}.object")
 
 
-def _offer_link(role: Role, encoder: EncoderSection, told: Mapping[Address, int], result: Offer) -> None:
+def _offer_link(role: Role, encoder: EncoderSection, reported: Mapping[Address, int], result: Offer) -> None:
     """The link position."""
     address = _encoder_address(encoder, "link.encoder")
     if encoder.source == "cia406":
-        scaled = told.get((0x6000, 0), 0) & _SCALING and told.get((0x6001, 0), 0)
+        scaled = reported.get((0x6000, 0), 0) & _SCALING and reported.get((0x6001, 0), 0)
         source = "0x6001" if scaled else "0x6501"
-        counts = float(scaled or told.get((0x6501, 0), 0)) or None
+        counts = float(scaled or reported.get((0x6501, 0), 0)) or None
     else:
-        above, below = told.get((0x60E6, address[1]), 0), told.get((0x60EB, address[1]), 1)
+        above, below = reported.get((0x60E6, address[1]), 0), reported.get((0x60EB, address[1]), 1)
         counts, source = (above / below if above > 1 and below else None), "0x60E6"
     stated = encoder.counts_per_rev
     used = counts if stated is None else stated
     if used is None:
         result.missing[Signal.LINK_POSITION] = (
-            f"counts per joint revolution are unknown: the node does not tell ({source}), "
+            f"counts per joint revolution are unknown: the node does not report them ({source}), "
             "set link.encoder.counts_per_rev"
         )
         return
@@ -355,14 +365,14 @@ def _offer_link(role: Role, encoder: EncoderSection, told: Mapping[Address, int]
             scale=encoder.direction * math.tau / used,
             wraps=True,
             offset=encoder.offset_rad,
-            modulus=_measuring_range(told) if encoder.source == "cia406" else 0,
+            modulus=_measuring_range(reported) if encoder.source == "cia406" else 0,
         ),
     )
 
 
-def _measuring_range(told: Mapping[Address, int]) -> int:
+def _measuring_range(reported: Mapping[Address, int]) -> int:
     """Counts after which an absolute encoder starts again (CiA 406); 0 where that is its full length."""
-    range_ = told.get((0x6002, 0), 0)
-    if range_ in (0, 0xFFFFFFFF):  # not told, or as near to 2^32 as 32 bits can say
-        range_ = told.get((0x6501, 0), 0) * told.get((0x6502, 0), 0)
+    range_ = reported.get((0x6002, 0), 0)
+    if range_ in (0, 0xFFFFFFFF):  # not reported, or as near to 2^32 as 32 bits can say
+        range_ = reported.get((0x6501, 0), 0) * reported.get((0x6502, 0), 0)
     return range_ if 1 < range_ < 1 << 32 else 0

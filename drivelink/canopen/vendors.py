@@ -1,4 +1,4 @@
-"""What makers do in their own way, where the object dictionary does not tell it.
+"""Vendor peculiarities that the object dictionary does not show.
 
 Each line is taken from a maker's manual or data sheet file; what is not known for sure is not here, and
 is said in the joint file instead (`current_object`, `velocity_rad_s_per_count`, …).
@@ -43,8 +43,8 @@ class Vendor:
         nominal_current: object with the nominal current in mA.
         rated_torque_micro: whether 0x6076 may be in µN·m.
         counts_factor: what that one is multiplied by: 4 where it counts the pulses of a quadrature encoder.
-        velocity_rad_s: rad/s per count of 0x606C, where 0x60A9 does not tell.
-        velocity_counts_s: counts per second and count of 0x606C, where 0x60A9 does not tell.
+        velocity_rad_s: rad/s per count of 0x606C, where 0x60A9 does not give it.
+        velocity_counts_s: counts per second and count of 0x606C, where 0x60A9 does not give it.
         sensorless: object of 0x60E4 that is computed and no encoder.
         toggling_statusword_bits: bits of 0x6041 that change by themselves.
         others: (object, its like): the maker's drives that have this object and not `counts_per_rev` are
@@ -71,11 +71,11 @@ class Vendor:
         own = tuple(address for address in single if address) + (self.gear or ())
         return own + tuple(address for _, other in self.others for address in other.objects())
 
-    def generation(self, told: Mapping[Address, int]) -> Vendor:
-        """This maker's way in the drive that has told these objects."""
-        if self.counts_per_rev not in told:
+    def generation(self, reported: Mapping[Address, int]) -> Vendor:
+        """This vendor's variant for a drive that has reported these objects."""
+        if self.counts_per_rev not in reported:
             for marker, other in self.others:
-                if marker in told:
+                if marker in reported:
                     return other
         return self
 

@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 class Rig(NamedTuple):
-    """The other process: what it tells, and how to end it early."""
+    """The other process: its messages, and how to end it early."""
 
     connection: Connection
     stop: Callable[[], None]
@@ -141,7 +141,7 @@ class Watch:
                 if interrupted:
                     raise
                 interrupted = True
-                rig.stop()  # it ends cleanly, and tells how the run went
+                rig.stop()  # it ends cleanly, and reports how the run went
         return interrupted
 
     def _told(self, connection: Connection) -> None:

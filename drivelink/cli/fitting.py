@@ -47,7 +47,7 @@ def fit_recording(args: argparse.Namespace, source: JointText, folder: Path | No
         folder: where plots go; None: no plots.
 
     Raises:
-        RecordingError: the recording cannot be read, or does not tell what is asked.
+        RecordingError: the recording cannot be read, or does not reveal what is asked.
     """
     joint = source.joint
     names = parse_column_map(args.map)
@@ -133,8 +133,8 @@ def _print(found: Identified) -> None:
             for label, x, sigma in _rows(name, value, one.std[name]):
                 table.add_row(label, f"{x:.6g}", f"{_SIGMA_95 * sigma:.2g}")
         for name, key in (("inertia_kg_m2", "inertia"), ("viscous_damping_nm_s_rad", "damping")):
-            told = key in one.nuisance_std
-            shown = f"{_SIGMA_95 * one.nuisance_std[key]:.2g}" if told else ""
+            known = key in one.nuisance_std
+            shown = f"{_SIGMA_95 * one.nuisance_std[key]:.2g}" if known else ""
             table.add_row(name, f"{getattr(motor, name):.6g}", shown)
         _add_effects(table, motor.effects)
         console.print(table)
@@ -182,7 +182,7 @@ def _rows(name: str, value: ParameterValue, std: ParameterValue) -> list[tuple[s
 def _remarks(one: TransmissionFit) -> list[str]:
     remarks = []
     if not one.excited:
-        remarks.append("the motion hardly tells the stiffness: record one with more deflection")
+        remarks.append("the motion hardly reveals the stiffness: record one with more deflection")
     if not one.stiffens:
         remarks.append(
             "the stiffness is not above zero, or its interval is not: no spring is like that. "
@@ -191,7 +191,7 @@ def _remarks(one: TransmissionFit) -> list[str]:
     std = one.nuisance_std
     if abs(one.coulomb_nm) > max(4.0 * std["coulomb"], 0.01 * one.torque_rms_nm):
         remarks.append(
-            f"friction that the model lacks, about {one.coulomb_nm:.3g} N·m: `drivelink diagnose` tells which"
+            f"friction that the model lacks, about {one.coulomb_nm:.3g} N·m: `drivelink diagnose` names it"
         )
     return remarks
 
@@ -224,7 +224,7 @@ def _write(args: argparse.Namespace, source: JointText, found: Identified, recor
     weak = [number for number, one in enumerate(fits, start=1) if one.model != RIGID and not one.excited]
     if weak:
         raise RecordingError(
-            f"{args.recording}: --write: expected a motion that tells the stiffness of motor {weak[0]}"
+            f"{args.recording}: --write: expected a motion that reveals the stiffness of motor {weak[0]}"
         )
     unusable = [number for number, one in enumerate(fits, start=1) if one.model != RIGID and not one.stiffens]
     if unusable:

@@ -28,7 +28,7 @@ _MODELS = ("polynomial", "linear", "exponential", "vsa-ii", "none")
 
 _EPILOG = """\
 examples:
-  drivelink new elbow.toml                            asks what no drive can tell
+  drivelink new elbow.toml                            asks what no drive can report
   drivelink new elbow.toml --rotor-inertia 48 --gear 100 --torque-constant 53
   drivelink new elbow.toml --scan --channel can0      node ids and encoder from what answers on the bus
   drivelink new vsa.toml --case vsa-ii                one of the paper's joints, for `sim` and `run`

@@ -63,7 +63,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve the joints until told to stop."""
+    """Serve the joints until stopped."""
     if args.seconds is not None and not args.seconds > 0:
         raise UsageError(f"--seconds: expected a number > 0, got {args.seconds:g}")
     _set_up_logging(args.log_level)

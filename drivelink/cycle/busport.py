@@ -1,4 +1,4 @@
-"""The one way of sending on the bus of a daemon: directly before the loop runs, through the loop later."""
+"""Sends on a daemon's bus: directly before the loop runs, through the loop afterwards."""
 
 from __future__ import annotations
 

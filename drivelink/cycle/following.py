@@ -1,4 +1,4 @@
-"""Maps that somebody else writes: what the samples of a passive daemon are decoded by, and from when on.
+"""Mappings that another master writes: how the samples of a passive daemon are decoded, and from when on.
 
 The frames go past here after the assemblers have seen them, live or from a log. From the frame on that makes
 a map doubtful, the frames of that node are not used; a map that is known again holds from the next SYNC on,

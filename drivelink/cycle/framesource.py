@@ -86,7 +86,7 @@ class FrameSource(Protocol):
         """Put a frame on the bus; a full transmit queue is counted, not raised."""
 
     def narrow(self, cob_ids: Iterable[int]) -> None:
-        """Receive these identifiers only, where the kernel can tell them apart."""
+        """Receive these identifiers only, where the kernel can filter."""
 
 
 def note_error(errors: dict[str, int], can_id: int, data: bytes) -> None:
@@ -167,7 +167,7 @@ class VirtualSource(BusSource):
     def __init__(self, bus: Any) -> None:
         super().__init__(bus)
         self._queue: queue.Queue[can.Message] = bus.queue
-        # The virtual bus has no other way to tell.
+        # The virtual bus has no other way to know.
         self._is_open: Callable[[], bool] = lambda: bool(bus._open)
         self._channel: list[queue.Queue[can.Message]] = bus.channel  # of all buses on it
         self._channel_id = bus.channel_id

@@ -1,4 +1,4 @@
-"""What has to be done now and then, done in the slack of the cycle: one short task at a time.
+"""Periodic tasks, run in the slack of the cycle: one short task at a time.
 
 A task that is too long for one cycle is a generator: each `yield` leaves the rest to the next slack.
 """
@@ -35,7 +35,7 @@ class Housekeeping:
 
     Attributes:
         urgent: called in every cycle that has slack; for what must go on step by step.
-        on_fault: told of an exception.
+        on_fault: called with an exception.
     """
 
     def __init__(self) -> None:

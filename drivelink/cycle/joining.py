@@ -1,4 +1,4 @@
-"""Joining the bus: configure the nodes or learn how they are configured, and see that it comes to life."""
+"""The start on a bus: configure the nodes or learn their configuration, and wait for their frames."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ def _await(
     """Listen until everything expected has been heard; a mapping that changes meanwhile is learnt.
 
     Returns:
-        Stamps of the SYNCs, enough of them to tell their period where they come often enough.
+        Stamps of the SYNCs, enough to measure their period where they come often enough.
     """
     stamps: list[int] = []
     for cob_id, data, stamp_ns in _frames(port, idle, patience_s):

@@ -1,4 +1,4 @@
-"""Faster than real time: world, devices, bus and the daemon's own cycle in one thread, with no waiting."""
+"""Lockstep: world, devices, bus and the daemon's cycle in one thread, faster than real time."""
 
 from __future__ import annotations
 

@@ -113,8 +113,8 @@ class CycleLoop:
         listeners: by identifier, who else wants a frame: SDO, heartbeat, EMCY.
         after_sync: called at each SYNC, after the joints have taken it.
         clock: what supervision goes by, ns.
-        on_lost: told when the bus is lost.
-        on_fault: told of an exception in what concerns one joint or one node, and whose; that one is left
+        on_lost: called when the bus is lost.
+        on_fault: called with an exception in what concerns one joint or one node, and whose; that one is left
             out, the loop goes on.
         cycles: SYNCs since the start.
         overruns: periods left out because this process was late.

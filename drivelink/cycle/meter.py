@@ -1,4 +1,4 @@
-"""Distributions of durations: counted in a fraction of a microsecond, percentiles drawn in the slack."""
+"""Histograms of durations: counted in a fraction of a microsecond, percentiles computed in the slack."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ class SocketCanSource:
         return frames
 
     def _note_dropped(self, content: bytes) -> None:
-        """How many frames the kernel has dropped since the socket was opened, told with the next one."""
+        """How many frames the kernel has dropped since the socket was opened, reported with the next one."""
         dropped = int.from_bytes(content[:4], sys.byteorder)
         if dropped != self._dropped:
             self.errors[OVERFLOW] = self.errors.get(OVERFLOW, 0) + (dropped - self._dropped) % (1 << 32)

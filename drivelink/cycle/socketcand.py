@@ -1,4 +1,4 @@
-"""python-can's socketcand client, which goes on for ever when its server is gone: here that is a lost bus."""
+"""python-can's socketcand client, which waits forever when its server is gone: here that is a lost bus."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which way of reading a bus is the quickest."""
+"""Selects the fastest way to read a bus."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ FloatArray = NDArray[np.float64]
 
 __all__ = ["LATE", "MEASURED_SYNCS", "MeasuredPeriod", "SyncClock", "measure_period"]
 
-MEASURED_SYNCS = 64  # tell the period to 0.2 % where they jitter by half of it, to 0.01 % where by a fortieth
+MEASURED_SYNCS = 64  # give the period to 0.2 % where they jitter by half of it, to 0.01 % where by a fortieth
 _FEWEST = 8
 _SAME = 0.01  # two periods are the same: the inertia torque is then 2 % off, less than inertias are known to
 _JITTERY = 0.15  # median deviation of the steps, in periods
@@ -27,7 +27,7 @@ class MeasuredPeriod(NamedTuple):
     """The period of a master.
 
     Attributes:
-        period_s: that SYNC really has; the expected one, where the stamps cannot tell the two apart.
+        period_s: that SYNC really has; the expected one, where the stamps cannot separate the two.
         same: whether it is the expected one.
     """
 
@@ -118,7 +118,7 @@ class SyncClock:
 
         Args:
             stamp_ns: when the SYNC was on the bus, by any clock, even one that is set from time to time.
-            monotonic_ns: when it was received, by one that is not; tells a step of the other from a gap.
+            monotonic_ns: when it was received, by one that is not; separates a step of the other from a gap.
         """
         if self._due_ns is None:
             self._due_ns = float(stamp_ns)
@@ -133,7 +133,7 @@ class SyncClock:
         deviation = (stamp_ns - self._due_ns) / self._period_ns
         off = deviation - 1.0
         most_off = min(max(0.5, self._SIGMAS * self._variance**0.5), self._MOST_OFF)
-        if off < -1.5:  # the clock was set back, and nothing tells by how much
+        if off < -1.5:  # the clock was set back by an unknown amount
             self._due_ns = float(stamp_ns)
             return 1
         if off < -most_off:

@@ -1,1 +1,1 @@
-"""The daemon: buses joined, joints served, faults watched, joint files reloaded, status told."""
+"""The daemon: joins buses, serves joints, monitors faults, reloads joint files, reports status."""

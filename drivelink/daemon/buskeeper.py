@@ -1,4 +1,4 @@
-"""Keeps the bus of a daemon open: a lost one is opened again, and given to the loop."""
+"""Keeps the bus of a daemon open: a lost bus is reopened and handed to the loop."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Another model in the running loop, and no cycle lost.
+"""Replaces the model of the running loop without losing a cycle.
 
 When the joint file is rewritten, or on SIGHUP, a new estimator is built beside the cycle, led through the
 last samples so that it starts where the old one is, and put in its place between two cycles. A thread leads
@@ -42,7 +42,7 @@ class Reloader:
         joint: as it is in use.
         chain: whose estimator is exchanged.
         build: makes estimator and watch of a joint file; called in a thread.
-        publish: told the joint file in use after an exchange.
+        publish: called with the joint file in use after an exchange.
         events: where it is said.
     """
 

@@ -1,4 +1,4 @@
-"""What has happened in a run, said once: in the log, and in the documents of the status key."""
+"""Events of a run, reported once: in the log and in the status document."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Watches over the nodes beside the cycle: heartbeats, EMCY, reboots, and the way back after each.
+"""Supervises the nodes beside the cycle: heartbeats, EMCY, reboots, and the recovery from each.
 
 A node that rebooted, fell silent or left the operational state is configured again by the Configurator,
 step by step in the slack. A passive daemon only watches. Every event is said once.
@@ -144,7 +144,7 @@ class Supervisor:
             self._follow(configurator)
 
     def _follow(self, configurator: PassiveConfigurator) -> None:
-        """Somebody else maps the nodes: have every frame that tells of it heard in its turn."""
+        """Another master maps the nodes: process every frame that shows it in its turn."""
         loop, nodes = self._loop, self._nodes
         self._follower = MapFollower(
             configurator,

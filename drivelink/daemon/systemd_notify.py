@@ -9,7 +9,7 @@ __all__ = ["notify", "watchdog_period_s"]
 
 
 def notify(*lines: str) -> bool:
-    """Send lines such as "READY=1"; whether there was anybody to tell."""
+    """Send lines such as "READY=1"; whether systemd listens."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address.startswith(("/", "@")):
         return False

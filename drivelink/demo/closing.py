@@ -1,4 +1,4 @@
-"""How a demo ends: truth beside estimate, and what the daemon needed for it."""
+"""The end of a demo: truth beside estimate, and the daemon's timing."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ class TruthTap:
 
 
 def serve(path: Path, seconds: float | None, connection: Connection) -> None:
-    """Run simulation and daemon, and tell the watcher: batches of `TruePoint`, then a `Summary` or `Failure`.
+    """Run simulation and daemon, and send the watcher batches of `TruePoint`, then a `Summary` or `Failure`.
 
     Args:
         path: joint file with a `[sim]` section, on the virtual bus.

@@ -215,8 +215,8 @@ def _hardware(joint: JointFile, index: int, plant: JointPlant, given: Case | Non
     assumed = given.drives[index] if given else DriveHardware()
     if drive is None:
         return assumed
-    told = given is None or "gear_ratio" in drive.model_fields_set
-    gear = drive.gear_ratio if told else assumed.gear_ratio
+    declared = given is None or "gear_ratio" in drive.model_fields_set
+    gear = drive.gear_ratio if declared else assumed.gear_ratio
     rated_a = drive.rated_current_a or assumed.rated_current_a
     constant = drive.torque_constant_nm_a
     if constant is None and drive.rated_torque_nm is not None:

@@ -1,4 +1,4 @@
-"""What keeps this machine, bus or drive from doing the job, and the fix. Nothing is changed by looking."""
+"""Finds what keeps this machine, bus or drive from doing the job, and the fix. Nothing is changed."""
 
 from __future__ import annotations
 

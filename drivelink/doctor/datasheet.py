@@ -1,4 +1,4 @@
-"""From an EDS or DCF alone: which signals that drive can give, and the mapping that would be used."""
+"""From an EDS or DCF alone: which signals the drive can send, and the mapping that would be used."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ _UNTOLD = {
     Signal.MOTOR_TORQUE: "the file gives no value for rated torque (0x6076) or rated current (0x6075)",
 }
 _STATE = {
-    Signal.MOTOR_POSITION: "motor.drive: counts_per_rev, where the drive itself does not tell",
+    Signal.MOTOR_POSITION: "motor.drive: counts_per_rev, if the drive does not report it",
     Signal.MOTOR_TORQUE: "motor.drive: rated_torque_nm, or torque_constant_nm_a and rated_current_a or "
-    "current_object, where the drive itself does not tell",
+    "current_object, if the drive does not report it",
 }
-_ASSUMED_COUNTS = 4096.0  # only so that units which need it can be told
+_ASSUMED_COUNTS = 4096.0  # a stand-in for units that need it
 
 
 def examine_sheet(section: Section, path: Path) -> None:
@@ -180,7 +180,7 @@ def _more(signal: Signal, sheet: DataSheet, usable: list[tuple[int, int]]) -> st
 
 
 def _units(section: Section, sheet: DataSheet) -> None:
-    """What of the scaling the file tells, and what the joint file will have to state."""
+    """The scaling that the file gives, and what the joint file has to declare."""
     if _is_encoder(sheet):
         counts = sheet.value(0x6501)
         text = (
@@ -190,7 +190,7 @@ def _units(section: Section, sheet: DataSheet) -> None:
         return
     drive = DriveSection(node_id=1)
     bare = Role(node_id=1, motor=0, drive=drive, encoder=None, key="motor.drive", eds=sheet.path, tpdo=())
-    told = offer(bare, sheet.values(), vendor_of(sheet.vendor_id))
+    offered = offer(bare, sheet.values(), vendor_of(sheet.vendor_id))
     for signal, untold in _UNTOLD.items():
-        if signal in told.missing:
+        if signal in offered.missing:
             section.say(Severity.INFO, "units", untold, _STATE[signal])

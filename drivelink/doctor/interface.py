@@ -35,7 +35,7 @@ def examine_interface(section: Section, bus: BusSection) -> None:
         return
     if bus.interface != "socketcan":
         section.say(
-            Severity.INFO, bus.interface, f"{bus.channel}: the system tells nothing of such an interface"
+            Severity.INFO, bus.interface, f"{bus.channel}: the system has no information on such an interface"
         )
         return
     if shutil.which("ip") is None:

@@ -1,4 +1,4 @@
-"""What this machine's kernel and rights allow: scheduling, locked memory, CPU clock, timer."""
+"""Checks kernel and permissions: scheduling, locked memory, CPU clock, timer."""
 
 from __future__ import annotations
 

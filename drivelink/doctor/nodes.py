@@ -1,4 +1,4 @@
-"""What is on the bus: who is there, what each node is, sends, and could send; SYNC and its jitter."""
+"""Checks the bus: which nodes are there, what each is, sends and could send; SYNC and its jitter."""
 
 from __future__ import annotations
 

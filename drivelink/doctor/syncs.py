@@ -1,4 +1,4 @@
-"""SYNC as it is on the bus: who makes it, how often, and how evenly."""
+"""SYNC on the bus: its producer, period and jitter."""
 
 from __future__ import annotations
 

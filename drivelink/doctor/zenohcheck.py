@@ -1,4 +1,4 @@
-"""Whether estimates can get out: the zenoh side, as a subscriber on this machine would see it."""
+"""Checks the zenoh side as a subscriber on this machine would see it."""
 
 from __future__ import annotations
 

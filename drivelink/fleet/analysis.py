@@ -38,7 +38,7 @@ class TransmissionRow(NamedTuple):
         named: (deflection, stiffness, standard deviation) for each of `NAMED`; rad, N·m/rad.
         deflection_rms_rad: excitation.
         torque_rms_nm: excitation.
-        excited: whether the motion tells the stiffness.
+        excited: whether the motion reveals the stiffness.
         inertia_kg_m2: B as refitted.
         viscous_damping_nm_s_rad: D as refitted.
         fit_error_relative: what fit leaves of the torque balance, relative to the flexibility torque.
@@ -84,7 +84,7 @@ def analyse(record: Record, joint: JointFile, validation: Record | None, title: 
         title: of the report.
 
     Raises:
-        EstimatorError: the gate of units and signs refuses it, or it does not tell what is asked.
+        EstimatorError: the gate of units and signs refuses it, or it does not reveal what is asked.
     """
     model = joint.model()
     outcome = diagnose(record, model, validation=validation)  # its gate comes before any fit

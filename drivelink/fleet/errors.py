@@ -1,4 +1,4 @@
-"""What can be wrong with a whole fleet run. What is wrong with one recording is a row of its table."""
+"""Errors of a whole fleet run. An error of one recording is a row of its table."""
 
 from drivelink.errors import DrivelinkError
 

@@ -81,7 +81,7 @@ class Joints:
         `diagnose --write` wrote last, as its `[provenance]` says.
 
         Raises:
-            FleetError: no such folder, no joint file in it, or two of one joint between which nothing tells.
+            FleetError: no such folder, no joint file in it, or two of one joint that cannot be ordered.
             JointFileError: a joint file is wrong.
         """
         paths = [folder] if folder.is_file() else sorted(folder.rglob("*.toml"))

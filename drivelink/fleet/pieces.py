@@ -1,4 +1,4 @@
-"""A recording as records that fit into a worker's memory: whole, or in parts one after the other."""
+"""A recording as records that fit into a worker's memory: whole, or in successive parts."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = ["Piece", "pieces"]
 _EXPANSION = {".csv": 30.0, ".log": 30.0, ".candump": 30.0, ".asc": 30.0, ".trc": 30.0}
 _EXPANSION_OTHER = 100.0
 _BASE_BYTES = 550 << 20  # a worker after many small recordings: interpreter, libraries, Dask, caches
-_LEAST_BYTES = 64 << 20  # planned with in any case: a part is to tell something
+_LEAST_BYTES = 64 << 20  # planned with in any case: a part must hold enough motion
 _USED = 0.7  # share of the limit that is planned with: Dask pauses a worker at 0.8 and ends it at 0.95
 
 

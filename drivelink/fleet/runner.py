@@ -1,4 +1,4 @@
-"""A fleet run: recordings handed to Dask, a few ahead of the workers, and their results into the table."""
+"""A fleet run: submits recordings to Dask, a few ahead of the workers, and stores their results."""
 
 from __future__ import annotations
 
@@ -97,8 +97,8 @@ def run(
         joints: the fleet's joints.
         store: the folder of results.
         settings: how.
-        progress: told after each recording.
-        say: told what the user should know, a line each.
+        progress: called after each recording.
+        say: called with what the user should know, a line each.
 
     Raises:
         FleetError: the scheduler is not reached or lost, or results cannot be written.
@@ -120,7 +120,7 @@ def run(
 
 
 def _wanted(source: Source, joints: Joints, table: Table, settings: Settings, counts: Counts) -> bool:
-    """Whether a recording is to be looked at, as far as its listing tells."""
+    """Whether a recording is to be looked at, as far as its listing shows."""
     latest = named_time(source) or source.modified
     if settings.since and latest and latest < settings.since:
         counts.early += 1

@@ -1,4 +1,4 @@
-"""What the table says of each joint: trend, changes, effects that appear, and how urgent it is."""
+"""Summary of each joint from the table: trend, changes, effects that appear, urgency."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def _series(rows: list[dict[str, Any]]) -> list[_Series]:
 
 
 def _usable(row: dict[str, Any]) -> bool:
-    """Whether a row tells a stiffness."""
+    """Whether a row has a usable stiffness."""
     value, std = row["stiffness_middle_nm_rad"], row["stiffness_std_middle_nm_rad"]
     return bool(
         row["status"] == "done" and row["excited"] and value is not None and value > 0.0 and std is not None
@@ -315,7 +315,7 @@ def _sentence(
         last = [row for row in rows if row["status"] == "done"][-1]
         return f"No significant change, but the last recording says: {last['sentence']}"
     if state == "undecided":
-        return "The motion does not tell the stiffness or what could be missing: record a richer one."
+        return "The motion does not reveal the stiffness or what could be missing: record a richer one."
     return "Steady."
 
 

@@ -1,4 +1,4 @@
-"""Dask preloads this in the workers of a local cluster: a terminal sends Ctrl-C to them too, it is ours."""
+"""Preloaded by Dask in local workers, so that they ignore a terminal's Ctrl-C: the client handles it."""
 
 from __future__ import annotations
 

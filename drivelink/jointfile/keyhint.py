@@ -17,7 +17,7 @@ def unknown_key(root: type, location: tuple[int | str, ...]) -> str:
 
     Args:
         root: the schema of the whole file.
-        location: of the key, as pydantic tells it.
+        location: of the key, as pydantic gives it.
     """
     section: Any = root
     for part in location[:-1]:

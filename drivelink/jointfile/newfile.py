@@ -75,7 +75,7 @@ class Answers:
 
 
 def joint_text(answers: Answers) -> str:
-    """The file; it is valid, or an error tells which answer is not.
+    """The file; it is valid, or an error names the answer that is not.
 
     Raises:
         JointFileError: an answer makes no valid joint file.
@@ -193,7 +193,7 @@ _ZENOH = (
 
 
 def answers_from_bus(answers: Answers, found: list[FoundNode]) -> Answers:
-    """Fill in what the nodes on the bus tell.
+    """Fill in what the nodes on the bus report.
 
     Raises:
         DriveError: there is no drive.

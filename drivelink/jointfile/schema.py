@@ -88,7 +88,7 @@ class TpdoSection(_Section):
 
 
 class DriveSection(_Section):
-    """The drive of one motor, as a CANopen node. What the drive tells by itself may be left out."""
+    """The drive of one motor, as a CANopen node. What the drive reports may be left out."""
 
     node_id: int = Field(ge=1, le=127, description="CANopen node id")
     counts_per_rev: float | None = Field(
@@ -113,7 +113,7 @@ class DriveSection(_Section):
         False, description="also map 0x606C (the robust mode differentiates positions itself)"
     )
     velocity_rad_s_per_count: float | None = Field(
-        None, gt=0, description="unit of 0x606C at the motor shaft, where 0x60A9 does not tell"
+        None, gt=0, description="unit of 0x606C at the motor shaft, where 0x60A9 does not give it"
     )
     direction: Direction = Field(1, description="sign of the motor position against the joint's")
     torque_direction: Direction | None = Field(
@@ -164,12 +164,12 @@ class MotorSection(_Section):
 
     @model_validator(mode="after")
     def _parameters_can_be(self) -> MotorSection:
-        if self.transmission.model in MODELS:  # of one's own models the estimator tells when it is made
+        if self.transmission.model in MODELS:  # registered models are checked when the estimator is made
             transmission_model(self.transmission)
         return self
 
     def motor(self) -> Motor:
-        """What the estimator is told of it."""
+        """Its part of the estimator's model."""
         drive = self.drive
         return Motor(
             inertia_kg_m2=self.inertia_kg_m2,
@@ -323,7 +323,7 @@ class JointFile(_Section):
         return self
 
     def model(self) -> JointModel:
-        """What the estimator is told of this joint."""
+        """The estimator's model of this joint."""
         return JointModel(
             arrangement=self.arrangement,
             motors=tuple(section.motor() for section in self.motor),

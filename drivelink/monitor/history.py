@@ -1,4 +1,4 @@
-"""What a live view remembers: the last seconds, thinned, and stiffness over deflection as it grows.
+"""Data of a live view: the last seconds, decimated, and stiffness over deflection as it grows.
 
 Fed with every estimate (a few microseconds each), read a few times a second.
 """

@@ -1,4 +1,4 @@
-"""Single keys of the terminal, without waiting for Enter; the terminal is as before when it is over."""
+"""Reads single keys of the terminal without Enter; restores the terminal afterwards."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ MODEL_ALARM_ADVICE = (
     "the model is not sufficient: do not control on its numbers; record a minute of motion "
     "(drivelink record), then drivelink diagnose names the effect and writes a better joint file"
 )
-_SHORT_ADVICE = "model alarm: do not control on it; drivelink diagnose tells why"
+_SHORT_ADVICE = "model alarm: do not control on it; drivelink diagnose says why"
 _MOST = 16  # entries of a list that a view shows
 _WORDS = 200  # characters of one entry
 _GAUGE = 10  # characters

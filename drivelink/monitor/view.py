@@ -56,7 +56,7 @@ _HELP = (
     ("residual", "what the model leaves, times its baseline (where it was fitted): half a bar is 1"),
     ("contact", "something touches the link"),
     ("valid", "the numbers may be used; not valid: do not control on them"),
-    ("observable", "the motion tells the stiffness; else it is held, and its interval widens"),
+    ("observable", "the motion reveals the stiffness; else it is held, and its interval widens"),
     ("model alarm", MODEL_ALARM_ADVICE),
 )
 

@@ -1,4 +1,4 @@
-"""What daemons say on zenoh, gathered for the live views: joints come and go, views are kept up to date.
+"""Collects what daemons publish for the live views: joints come and go, views are kept up to date.
 
 A joint's numbers are those of one daemon, chosen as a controller's subscription chooses it, and everything
 passes `drivelink.pubsub.inbound`: nothing that is on the network ends a view or fills its memory.

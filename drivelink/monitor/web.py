@@ -99,7 +99,7 @@ class WebView:
 
 
 def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str, Any]:
-    """What the page is told of one joint; what is not finite is null, and so is what is not valid.
+    """What the page receives of one joint; what is not finite is null, and so is what is not valid.
 
     Args:
         view: of the joint.
@@ -137,21 +137,21 @@ def document(view: JointView) -> dict[str, Any]:
 def _now(view: JointView) -> dict[str, Any]:
     """State and newest estimate."""
     touch = view.history.touch
-    told: dict[str, Any] = {
+    event: dict[str, Any] = {
         "live": view.live,
         "state": view.state,
         "external": _touch(touch) if touch else None,
     }
     estimate = view.history.latest
     if estimate is not None:
-        told["estimate"] = {
+        event["estimate"] = {
             "stiffness": _finite(estimate.stiffness_nm_rad),
             "std": _finite(estimate.stiffness_std_nm_rad),
             "torque": _finite(estimate.flexibility_torque_nm),
             "transmissions": [[_finite(value) for value in one] for one in estimate.transmissions],
             "flags": view.flags,
         }
-    return told
+    return event
 
 
 def _moment(moment: Moment) -> list[float | None]:

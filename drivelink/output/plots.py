@@ -1,4 +1,4 @@
-"""Plots of everything drivelink computes, in one style that a black-and-white print still tells apart.
+"""Plots of everything drivelink computes, in one style that stays distinguishable in black and white.
 
 Figures are made without pyplot: no global state, no window, safe in any thread.
 
@@ -36,8 +36,8 @@ __all__ = [
     "xy",
 ]
 
-# After Okabe and Ito (told apart by all eyes), each with a line style, a marker and a hatch of its own;
-# their lightness differs too, so that a grey print keeps them apart.
+# After Okabe and Ito (distinguishable with any colour vision), each with a line style, a marker and a hatch of its
+# own; their lightness differs too, for a grey print.
 COLORS = ("#005f9e", "#e0701a", "#000000", "#009e73", "#cc79a7", "#56b4e9")
 LINES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 2)))
 MARKERS = ("o", "s", "^", "D", "v", "x")

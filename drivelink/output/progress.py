@@ -23,7 +23,7 @@ _CHECK_EVERY = 256  # items between two looks at the clock
 
 
 class Meter:
-    """Progress of one job, told by its owner.
+    """Progress of one job, reported by its owner.
 
     Use as a context manager; `update` it as often as you like. It ends with what has been reached, also
     after an exception.
@@ -105,7 +105,7 @@ def track(
     Args:
         items: what to go through.
         what: the job in a few words.
-        total: number of items, where the items themselves cannot tell.
+        total: number of items, if the items have no length.
         console: where to show it; stderr if left out.
     """
     if total is None and isinstance(items, Sized):

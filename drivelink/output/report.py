@@ -133,7 +133,7 @@ def sentence(outcome: Diagnosis) -> str:
         )
     if outcome.verdict == "insufficient_excitation":
         said = f" (it might be {names})" if names else ""
-        return f"The motion does not tell what could be missing{said}: record a richer one."
+        return f"The motion does not reveal what could be missing{said}: record a richer one."
     return (
         f"The model is sufficient: what it leaves, {outcome.validation.after_relative:.2%} of the torque, "
         "belongs to no effect."

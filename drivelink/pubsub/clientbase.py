@@ -1,4 +1,4 @@
-"""What the blocking and the asynchronous client share: everything that does not wait.
+"""The common part of the blocking and the asynchronous client: everything that does not wait.
 
 Estimates queue up in zenoh, outside the interpreter, and are taken in when something is asked.
 """
@@ -158,7 +158,7 @@ class Client:
 
     @property
     def observable(self) -> bool:
-        """The latest estimate is fresh, and the motion at hand tells the stiffness."""
+        """The latest estimate is fresh, and the motion reveals the stiffness."""
         return self._fresh(Status.OBSERVABLE)
 
     @property

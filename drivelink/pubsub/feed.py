@@ -1,4 +1,4 @@
-"""What a subscriber knows of one joint: which estimates came, when, from whom, and which are missing.
+"""Bookkeeping of a subscriber: which estimates arrived, when, from whom, and which are missing.
 
 No waiting here: this is the bookkeeping that the blocking and the asynchronous client share. It is fed
 with what zenoh has queued whenever the user asks for something, so that nothing runs, and the interpreter
@@ -22,7 +22,7 @@ WAKE = b"drivelink.wake"  # attachment of a local message that only ends a block
 _DRIFT = 1e-4  # what two clocks may run apart: 100 ppm
 _STALE_PERIODS = 5
 _STALE_AT_LEAST_NS = 20_000_000
-_STALE_UNKNOWN_NS = 500_000_000  # until two estimates have told the period
+_STALE_UNKNOWN_NS = 500_000_000  # until two estimates have shown the period
 _LONGEST_PERIOD_NS = 1_000_000_000  # no drive cycles slower; a stamp that jumps does not make anything fresh
 
 
@@ -39,7 +39,7 @@ class Arrivals:
     """When the latest estimate came in, on the local monotonic clock, without a callback per estimate.
 
     It came after the queue was last seen empty and before it was read: that brackets it whatever the clocks
-    do. Inside the bracket the sender's stamp tells, moved by the smallest difference of the two clocks seen
+    do. Inside the bracket the sender's stamp decides, moved by the smallest difference of the two clocks seen
     so far (which may grow again by their drift).
     """
 

@@ -1,4 +1,4 @@
-"""Whose messages are taken: a joint has one daemon, and everything of it comes from that one's session.
+"""Whose messages are accepted: a joint has one daemon, and everything of it comes from that session.
 
 A daemon names its zenoh session in the liveliness token `<prefix>/<joint>/alive/<zid>`, and every message of
 a joint carries the session that wrote it. `DaemonIdentity` holds the two against each other: it takes the
@@ -30,7 +30,7 @@ def source_of(sample: zenoh.Sample) -> str:
 
 
 class DaemonIdentity:
-    """The daemon of one joint, as far as its subscriber can tell.
+    """The daemon of one joint, as far as its subscriber can see.
 
     Tokens may be entered from zenoh's thread; everything else is the subscriber's.
 

@@ -1,4 +1,4 @@
-"""What comes in from the network, made safe in one place: bounded before it is parsed, checked, stripped.
+"""Validates input from the network in one place: bounded before it is parsed, checked, stripped.
 
 Everything that others have written (a daemon, or whoever says so) passes here before a client hands it out, a
 view shows it or a recorder keeps it. The binary messages are as long as their layout says; a JSON document is

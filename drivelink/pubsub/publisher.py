@@ -1,4 +1,4 @@
-"""What the daemon says on zenoh about one joint.
+"""Publishes one joint on zenoh.
 
 The 1 kHz keys are plain publishers: dropped rather than waited for, the estimate with real-time priority,
 the sample next to it in a queue of its own. `status` and `model` are latched: an advanced subscriber with

@@ -1,4 +1,4 @@
-"""Who listens at the endpoint where everybody meets, when the one who did is gone.
+"""Takes over the common endpoint when the session that listened there is gone.
 
 Zenoh can retry a listener by itself, but a session that still retries takes ten seconds to close (1.10). So
 a daemon that lost a connection looks whether anybody still answers at the endpoint; if not, it opens one

@@ -1,4 +1,4 @@
-"""Opening zenoh: safe by default, whole by configuration file, and never in the way of the process's end.
+"""Opens zenoh sessions: safe defaults, or a whole configuration file; never blocks the end of the process.
 
 Without a configuration file a daemon is a peer on the loopback. The first one of a machine listens at the
 endpoint, `tcp/127.0.0.1:7447`; the others connect to it, so that a plain client there receives all of them.

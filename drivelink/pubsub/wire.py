@@ -171,7 +171,7 @@ SAMPLE = Layout(
 STATUS_BITS: Mapping[str, str] = MappingProxyType(
     {
         "VALID": "the numbers may be used",
-        "OBSERVABLE": "the motion at hand tells the stiffness; otherwise it is held, with a wider interval",
+        "OBSERVABLE": "the motion reveals the stiffness; otherwise it is held, with a wider interval",
         "GAP": "samples were missing before this one and have been bridged",
         "CHANGED": "innovation alarm: the joint changed, the estimate is following",
         "MODEL_ALARM": "the residual is above the model's own baseline: the model is not sufficient",
@@ -213,7 +213,7 @@ class EstimateMessage(NamedTuple):
 
     @property
     def observable(self) -> bool:
-        """Status bit 1: the motion at hand tells the stiffness."""
+        """Status bit 1: the motion reveals the stiffness."""
         return bool(self.status & Status.OBSERVABLE)
 
 
@@ -264,8 +264,8 @@ def decode_estimate(payload: bytes) -> EstimateMessage:
             not finite, a negative stiffness or standard deviation. NaN is taken where PARTIAL says so.
     """
     count = _count(payload, _ESTIMATE_COUNTS, ESTIMATE)
-    *head, told = _ESTIMATE_HEAD.unpack_from(payload)
-    _require_count(told, count, ESTIMATE)
+    *head, stated = _ESTIMATE_HEAD.unpack_from(payload)
+    _require_count(stated, count, ESTIMATE)
     elements = tuple(map(_make_transmission, _TRANSMISSION.iter_unpack(payload[_ESTIMATE_HEAD.size :])))
     message = _make_message((*head, elements))
     if message.status & _VALID and not _usable(message):
@@ -337,6 +337,8 @@ def _count(payload: bytes, counts: Mapping[int, int], layout: Layout) -> int:
     return count
 
 
-def _require_count(told: int, count: int, layout: Layout) -> None:
-    if told != count:
-        raise ZenohError(f"{layout.schema}: expected {count} {layout.elements} by its length, it says {told}")
+def _require_count(stated: int, count: int, layout: Layout) -> None:
+    if stated != count:
+        raise ZenohError(
+            f"{layout.schema}: expected {count} {layout.elements} by its length, it says {stated}"
+        )

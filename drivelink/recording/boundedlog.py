@@ -1,4 +1,4 @@
-"""Files of other tools as python-can's readers are given them: bounded, and in the form that they know.
+"""Prepares files of other tools for python-can's readers: bounded, and in the form they know.
 
 Its readers take lines and containers of any length, take a PCAN trace of an unknown version for one of
 version 1.0, and pass over the difference between relative and absolute stamps of an ASC file.

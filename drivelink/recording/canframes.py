@@ -42,7 +42,7 @@ _LOG = logging.getLogger("drivelink.recording")
 _SDO = range(0x581, 0x680)
 _OF_MAPS = frozenset({0, *_SDO, *range(0x701, 0x780)})  # NMT, SDO, boot-up
 _QUIET_SYNCS = 500  # without a change of the configuration: it is over
-_PEEK = 20_000  # messages that tell whether an MCAP file has samples
+_PEEK = 20_000  # messages that show whether an MCAP file has samples
 
 
 def is_frame_log(path: Path, frames: bool | None = None) -> bool:
@@ -79,7 +79,7 @@ class FrameLog:
         channel: of a recording with several.
 
     Attributes:
-        period_s: the communication cycle, as the SYNCs in it tell.
+        period_s: the communication cycle, from its SYNCs.
         assembler: makes the samples.
 
     Raises:
@@ -231,7 +231,7 @@ class FrameLog:
         """The period that the recorded SYNCs have: the configured one, where they agree."""
         if len(syncs) < 3:
             raise RecordingError(
-                f"{self._path}: expected SYNC frames (0x080), which tell the time of a sample, got "
+                f"{self._path}: expected SYNC frames (0x080), which give the time of a sample, got "
                 f"{len(syncs)}: record the whole bus, no filter set, while its master sends SYNC"
             )
         if syncs[0] == NO_STAMP:

@@ -1,4 +1,4 @@
-"""Raw CAN logs as they are found: candump in its variants, BLF, ASC, PCAN .trc, by python-can's readers.
+"""Raw CAN logs as other tools write them: variants of candump, BLF, ASC, PCAN .trc, by python-can's readers.
 
 Frames come out as plain tuples in the order of the file. Only data frames with 11-bit identifiers are
 CANopen: all others are left out.
@@ -83,7 +83,7 @@ def read_frames(path: Path, channel: str | None = None, configured: str = "") ->
         configured: the joint file's channel, taken if the log has it among several.
 
     Raises:
-        RecordingError: it cannot be read, is not what its name says, or nothing tells the channel.
+        RecordingError: it cannot be read, is not what its name says, or its channel is unknown.
     """
     frames = _text_frames(path) if path.suffix.lower() in (".log", ".candump") else _library_frames(path)
     head = list(islice(frames, _LOOK_AHEAD))
@@ -178,7 +178,7 @@ def _parsed(file: IO[bytes], path: Path) -> Iterator[Frame]:
 
 
 def _require_end(file: IO[bytes], length: int, path: Path) -> None:
-    """What has no end is the last line: it is left out, nothing tells whether its last byte is whole.
+    """What has no end is the last line: it is left out, because its last byte may be incomplete.
 
     Raises:
         RecordingError: it is no last line: more than a line may have, and more follows.

@@ -1,4 +1,4 @@
-"""`--map q_link=link_position_rad:deg`: columns of others under our names and in our units."""
+"""`--map q_link=link_position_rad:deg`: maps foreign columns to our names and units."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def read_csv_columns(
 
     Comma, semicolon or tab between the columns, decimal commas with the latter two, a byte-order mark,
     `#` comments before the header, and a last line that a crash cut off are understood. A last line that
-    does not end is left out: nothing tells whether its last number is whole.
+    does not end is left out: its last number may be incomplete.
 
     Args:
         path: the file.

@@ -1,4 +1,4 @@
-"""The cycles of a recording, as they go into a chain: what raw frames and MCAP files have in common."""
+"""The cycles of a recording as pipeline input: the common part of raw frames and MCAP files."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from estimator.sample import Record, Sample
 __all__ = ["Correction", "Gathered", "corrections", "gate", "record_of", "refusal", "text_of"]
 
 _ON_THE_BUS = (".drive", ".encoder")
-_LONGEST_S = 60.0  # of a run that is looked at: more tells no more about units and signs
+_LONGEST_S = 60.0  # of a run that is examined: more adds nothing about units and signs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,7 +42,7 @@ class Correction:
 
     def __str__(self) -> str:
         if self.value is None:
-            return f"{self.table}.{self.key}: {self.factor:.7g} times what the drive tells"
+            return f"{self.table}.{self.key}: {self.factor:.7g} times what the drive reports"
         return f"{self.table}.{self.key} = {self.value:.7g}"
 
 

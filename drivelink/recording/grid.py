@@ -27,7 +27,7 @@ _JITTER = 0.25
 _MAX_GAP_SHARE = 0.35
 # Stamps may lie this many periods beside their place on the grid (arrival times of a loaded machine).
 _MAX_JITTER_PERIODS = 3.0
-_AHEAD = 65  # stamps that tell a late one from a gap
+_AHEAD = 65  # stamps that separate a late one from a gap
 _MAX_GAPS = 0.1  # of the rows, among stamps that jitter
 
 
@@ -160,7 +160,7 @@ def _number_jittered(time: FloatArray, where: str) -> NDArray[np.int64]:
 def _rounded(time: FloatArray, sequence: NDArray[np.int64], nominal_s: float | None) -> float:
     """The period as slope of time over number, as the round value it was meant to be.
 
-    A round value is taken where the stamps cannot tell it from the slope, by three standard deviations.
+    A round value is taken where the stamps cannot separate it from the slope, by three standard deviations.
     """
     n = sequence - sequence.mean()
     power = float(np.dot(n, n))

@@ -1,4 +1,4 @@
-"""What a recording may ask of this machine's memory, checked before it is taken.
+"""Memory limits of recordings, checked before allocation.
 
 A file says itself how long its parts are, and may say anything. None of these bounds is near what a real
 recording has; docs/reference/recordings.md states them.

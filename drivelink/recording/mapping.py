@@ -1,4 +1,4 @@
-"""What a recording of raw frames knows beside them: how its nodes were mapped, and the joint file.
+"""Metadata of a raw recording: the mapping of its nodes, and the joint file.
 
 An MCAP file carries both. The other formats have no place for them that every tool would pass over, so they
 get a file beside them: `r.log` has `r.log.mapping.json`.
@@ -77,7 +77,7 @@ def recorded_layouts(path: Path, joint: str, *, daemon: bool) -> Sequence[NodeLa
         daemon: only what a daemon said: it is so on the bus, whatever the joint file or an EDS declares.
 
     Raises:
-        RecordingError: what should tell them is damaged.
+        RecordingError: the mapping is damaged.
     """
     try:
         if path.suffix.lower() != ".mcap":

@@ -1,4 +1,4 @@
-"""What the channels of an MCAP recording say, as JSON with a JSON schema each.
+"""The channels of an MCAP recording: JSON with a JSON schema each.
 
 JSON, since Foxglove and PlotJuggler plot it without a plugin; the names are those of the CSV columns. What
 is not finite is null: JSON has no word for it.

@@ -1,4 +1,4 @@
-"""What becomes of the cycles of a replay: estimates.csv, keys on zenoh, plots, a closing line."""
+"""Outputs of a replay: estimates.csv, keys on zenoh, plots, a closing line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A recording played through the chain that live data goes through: frames or samples in, estimates out."""
+"""Plays a recording through the pipeline of live data: frames or samples in, estimates out."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Playback:
     Attributes:
         motors: how many the joint has.
         period_s: of the recording; the estimator works with it.
-        total: number of cycles, where the recording tells without being read.
+        total: number of cycles, where the recording states it.
         chain: what they go through.
     """
 

@@ -1,4 +1,4 @@
-"""Listens to a daemon and to a bus, and writes what it hears; in a process of its own, never in the loop's.
+"""Records a daemon and a bus, in a process of its own, never in the loop's.
 
 Nothing is ever sent: on zenoh it subscribes, on the bus it only receives. What comes faster than it is
 written waits in zenoh's and the kernel's queues; what these drop is counted, not waited for.
@@ -178,7 +178,7 @@ class BusTap:
         sink: where it goes.
         base_dir: folder of the joint file; None: no samples are made.
         gate: decides between its samples and others.
-        layouts: of its nodes, where a daemon told them.
+        layouts: of its nodes, where a daemon reported them.
 
     Attributes:
         frames: received so far.
@@ -218,8 +218,8 @@ class BusTap:
         """Why no samples can be made."""
         if self._listener is None:
             return self._lacking
-        told = [*map(str, self._listener.missing.values()), *self._listener.doubts.values()]
-        return told[0] if told else ""
+        reasons = [*map(str, self._listener.missing.values()), *self._listener.doubts.values()]
+        return reasons[0] if reasons else ""
 
     def poll(self) -> None:
         """Take everything that has come.

@@ -1,4 +1,4 @@
-"""A file that a kill, a full disk or a power loss leaves whole up to the last flush."""
+"""A file that survives a kill, a full disk or a power loss up to its last flush."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class SafeFile(io.BufferedIOBase):
         force: whether it may take the place of another one, which is there until the first `sync`.
 
     Attributes:
-        name: the path, as files tell it.
+        name: the path, as files give it.
 
     Raises:
         RecordingError: it cannot be opened or, later, written.

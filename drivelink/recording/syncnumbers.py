@@ -1,4 +1,4 @@
-"""Numbers for the SYNCs of a recording: a late stamp is told from a lost SYNC by what comes after it.
+"""Numbers for the SYNCs of a recording: the following stamps separate a late stamp from a lost SYNC.
 
 Recorded stamps are often times of arrival, and these come in bursts. A SYNC that was only late is followed
 by ones that catch up; after a lost one all others stay behind. `SyncClock`, which has to decide at once,

@@ -1,4 +1,4 @@
-//! What the bus says about a node besides its PDOs: NMT commands, boot-up, heartbeat, EMCY (CiA 301, 7.2.8).
+//! The state of a node from its other messages: NMT commands, boot-up, heartbeat, EMCY (CiA 301, 7.2.8).
 //!
 //! Made from frames alone, so that a replayed log comes to the same judgement as the live run.
 

@@ -36,8 +36,8 @@ __all__ = [
     "xy",
 ]
 
-# After Okabe and Ito (distinguishable with any colour vision), each with its own line style, marker and hatch;
-# their lightness differs too, for a grey print.
+# After Okabe and Ito (distinguishable with any colour vision), each with its own line style, marker and
+# hatch; their lightness differs too, for a grey print.
 COLORS = ("#005f9e", "#e0701a", "#000000", "#009e73", "#cc79a7", "#56b4e9")
 LINES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 2)))
 MARKERS = ("o", "s", "^", "D", "v", "x")

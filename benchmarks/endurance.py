@@ -21,7 +21,7 @@ from typing import Any
 from rig import PERIOD_S, free_endpoint, joint
 
 from drivelink.cycle import pacing, realtime
-from drivelink.cycle.meter import Meter
+from drivelink.cycle.latency_histogram import LatencyHistogram
 from drivelink.cycle.realtime import Alarm
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simulate import network_from_joint, open_sim_bus
@@ -64,7 +64,7 @@ def total() -> dict[str, Any]:
 def bare_block(row: dict[str, Any], seconds: float) -> None:
     """Nothing but sleeping."""
     obtained = realtime.acquire()
-    alarm, meter = Witness(), Meter()
+    alarm, meter = Witness(), LatencyHistogram()
     deadline = time.monotonic_ns() + PERIOD_NS
     end = deadline + round(seconds * 1e9)
     Witness.own = Witness.others = 0
@@ -112,7 +112,7 @@ def daemon_block(row: dict[str, Any], which: JointFile, seconds: float, own_thre
         close_session(session)
 
 
-def add(row: dict[str, Any], due: int, lateness: Meter, missed: int) -> None:
+def add(row: dict[str, Any], due: int, lateness: LatencyHistogram, missed: int) -> None:
     """Count a block."""
     row["due"] += due
     row["left_out_own"] += Witness.own

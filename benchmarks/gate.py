@@ -16,14 +16,14 @@ from collections import Counter
 from pathlib import Path
 
 from drivelink.output.progress import track
-from estimator.gate import Finding, examine
+from estimator.gate import Discrepancy, examine
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
 import gatekit
 
 
-def outcome(findings: list[Finding], factors: dict[str, float]) -> str:
+def outcome(findings: list[Discrepancy], factors: dict[str, float]) -> str:
     """ "named", "else" (another cause) or "missed"."""
     if not findings:
         return "missed"

@@ -17,7 +17,7 @@ from rig import AnsweringBus, Devices
 from drivelink._core import SYNC_COB_ID
 from drivelink.canopen.layout import NodeLayout, Signal
 from drivelink.cycle.framesource import FrameSource
-from drivelink.cycle.meter import Meter
+from drivelink.cycle.latency_histogram import LatencyHistogram
 from drivelink.cycle.realtime import Alarm
 from drivelink.cycle.sources import open_source
 from drivelink.jointfile import JointFile
@@ -84,7 +84,7 @@ class Textbook:
     def __init__(
         self, joint: JointFile, devices: list[Node], layouts: Mapping[int, NodeLayout], session: zenoh.Session
     ) -> None:
-        self.work = Meter()
+        self.work = LatencyHistogram()
         self.cycles = 0
         self._joint = joint
         self._estimator = NumpyPaper(joint)
@@ -164,7 +164,7 @@ class Floor:
     name = "floor: unpack and put, no estimator"
 
     def __init__(self, joint: JointFile, layouts: Mapping[int, NodeLayout], session: zenoh.Session) -> None:
-        self.work = Meter()
+        self.work = LatencyHistogram()
         self.cycles = 0
         self._joint = joint
         self._formats = {layout.tpdos[0].cob_id: struct.Struct("<ihH") for layout in layouts.values()}

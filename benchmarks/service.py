@@ -22,7 +22,7 @@ import zenoh
 from rig import PERIOD_S, Devices, free_endpoint, joint, joint_text
 
 from drivelink.cycle import realtime
-from drivelink.cycle.meter import Meter
+from drivelink.cycle.latency_histogram import LatencyHistogram
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.session import close_session, open_session
@@ -56,7 +56,7 @@ BARE = f"import time; {LIBRARIES}; print(time.monotonic()); print(open('/proc/se
 def bare_round(seconds: float, real_time: bool) -> dict[str, float]:
     """How late a loop wakes that has nothing to do."""
     obtained = realtime.acquire(privileged=real_time)
-    meter, alarm, clock = Meter(), realtime.Alarm(), time.monotonic_ns
+    meter, alarm, clock = LatencyHistogram(), realtime.Alarm(), time.monotonic_ns
     period = round(PERIOD_S * 1e9)
     deadline = clock() + period
     left_out, end = 0, deadline + round(seconds * 1e9)

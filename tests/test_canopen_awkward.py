@@ -98,7 +98,7 @@ def test_maps_of_two_objects_are_filled_and_the_rest_goes_into_the_next(at_count
     objects = drive_objects(5) | tpdo(1, NO_RTR | 0x185, 255)
     layout = configured(SmallMaps(5, objects, most=2, at_count=at_count))
     assert signals(layout) == [[Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE], [Signal.STATUSWORD]]
-    assert any("TPDO1 takes 2 objects" in finding.text for finding in layout.findings)
+    assert any("TPDO1 takes 2 objects" in finding.text for finding in layout.notices)
 
 
 def test_maps_that_have_fewer_places_than_objects_are_filled():
@@ -117,9 +117,7 @@ def test_a_pdo_that_cannot_be_changed_at_all_is_taken_as_it_is(transmission_type
     layout = configured(Frozen(5, objects))
     (frame,) = layout.tpdos
     assert (frame.cob_id, frame.transmission_type, frame.length) == (0x185, transmission_type, 8)
-    warned = any(
-        f"keeps transmission type {transmission_type}" in finding.text for finding in layout.findings
-    )
+    warned = any(f"keeps transmission type {transmission_type}" in finding.text for finding in layout.notices)
     assert warned == (transmission_type != 1)
 
 
@@ -134,7 +132,7 @@ def test_what_is_never_sent_on_sync_is_asked_for_once_a_period():
     layout = configured(slave, bus="period_s = 0.004")
     assert layout.tpdos[0].transmission_type == 255
     assert slave.objects[0x1800, 5].value == 4
-    assert any("may be older than their SYNC" in finding.text for finding in layout.findings)
+    assert any("may be older than their SYNC" in finding.text for finding in layout.notices)
 
 
 def test_answers_without_a_length_and_aborts_without_an_object_are_understood():

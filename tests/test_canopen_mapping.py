@@ -116,7 +116,7 @@ def test_a_torque_that_cannot_be_mapped_gives_way_to_the_current():
     assert (torque.signal, torque.index) == (Signal.MOTOR_TORQUE, 0x6078)
     # 4 A rated: a count is 4 mA, times 0.1 N·m/A, times gear 50
     assert torque.scale == pytest.approx(0.004 * 0.1 * 50)
-    assert any("0x6077:00 cannot be mapped" in finding.text for finding in layout.findings)
+    assert any("0x6077:00 cannot be mapped" in finding.text for finding in layout.notices)
 
 
 def test_a_refused_mapping_is_one_line_with_code_node_and_object():
@@ -219,7 +219,7 @@ def test_inhibit_time_and_event_timer_are_cleared():
 def test_a_transmission_type_that_is_refused_is_reported_and_kept():
     _, (layout,) = configured(drive(refuse={(0x1800, 2): READ_ONLY}))
     assert layout.tpdos[0].transmission_type == 255
-    assert any("keeps transmission type 255" in finding.text for finding in layout.findings)
+    assert any("keeps transmission type 255" in finding.text for finding in layout.notices)
 
 
 def test_the_sync_counter_is_written_with_the_period_off():
@@ -257,7 +257,7 @@ def test_a_heartbeat_that_cannot_be_set_is_what_it_is():
     slave.objects[0x1017, 0].value = 500
     _, (layout,) = configured(slave)
     assert layout.heartbeat_ms == 500
-    assert any("keeps its heartbeat of 500 ms" in finding.text for finding in layout.findings)
+    assert any("keeps its heartbeat of 500 ms" in finding.text for finding in layout.notices)
 
 
 def test_nobody_at_home_is_one_line(monkeypatch):

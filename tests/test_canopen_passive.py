@@ -4,7 +4,7 @@ import pytest
 from canopenkit import NO_RTR, Slave, Wire, drive_objects, joint_text, tpdo, u32
 
 from drivelink.canopen import PassiveConfigurator, Signal, configure
-from drivelink.canopen.overheard import SdoListener
+from drivelink.canopen.sdo_sniffer import SdoSniffer
 from drivelink.errors import DriveError
 from drivelink.jointfile import parse
 
@@ -147,7 +147,7 @@ def test_a_mapping_that_the_master_changes_in_the_run_is_followed():
 
 
 def test_a_download_counts_only_when_the_node_confirms_it():
-    listener = SdoListener(lambda index, subindex: True)
+    listener = SdoSniffer(lambda index, subindex: True)
     listener.request(bytes.fromhex("2b 17 10 00 64 00 00 00"))
     assert listener.values == {}
     listener.response(bytes.fromhex("80 17 10 00 30 00 09 06"))
@@ -159,7 +159,7 @@ def test_a_download_counts_only_when_the_node_confirms_it():
 
 
 def test_segmented_transfers_are_followed_both_ways():
-    listener = SdoListener(lambda index, subindex: True)
+    listener = SdoSniffer(lambda index, subindex: True)
     listener.request(bytes.fromhex("21 01 1a 01 04 00 00 00"))  # download, 4 bytes in segments
     listener.response(bytes.fromhex("60 01 1a 01 00 00 00 00"))
     listener.request(bytes.fromhex("07 20 00 64 60 00 00 00"))  # last segment, 3 bytes unused

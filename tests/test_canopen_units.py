@@ -9,8 +9,8 @@ from drivelink.canopen.roles import object_address, roles
 from drivelink.canopen.units import offer
 from drivelink.canopen.vendors import GENERIC, VENDORS
 from drivelink.errors import JointFileError
-from drivelink.finding import Severity
 from drivelink.jointfile import parse
+from drivelink.notice import Severity
 
 MAXON, ELMO, COPLEY = VENDORS[0xFB], VENDORS[0x9A], VENDORS[0xAB]
 PLAIN = {(0x608F, 1): 16384, (0x608F, 2): 1, (0x6091, 1): 50, (0x6091, 2): 1, (0x6076, 0): 800}
@@ -29,23 +29,23 @@ def test_everything_is_read_from_a_drive_that_tells():
     assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.tau / (16384 * 50))
     # a count of 0x6077 is a thousandth of 0.8 N·m at the motor, times the gear at the joint
     assert scale(result, Signal.MOTOR_TORQUE) == pytest.approx(0.0008 * 50)
-    assert result.findings == []
+    assert result.notices == []
 
 
 def test_what_the_joint_file_states_is_used_and_a_disagreement_names_both_numbers():
     result = offered(PLAIN, drive="counts_per_rev = 4096\ngear_ratio = 100.0\nrated_torque_nm = 0.5", link="")
     assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.tau / (4096 * 100))
-    texts = [finding.text for finding in result.findings if finding.severity is Severity.WARNING]
+    texts = [finding.text for finding in result.notices if finding.severity is Severity.WARNING]
     assert len(texts) == 3
     assert any("says 16384 (0x608F), the joint file 4096; 4096 is used" in text for text in texts)
     assert any("says 50 (0x6091), the joint file 100; 100 is used" in text for text in texts)
     assert any("says 0.8 (0x6076), the joint file 0.5; 0.5 is used" in text for text in texts)
-    assert all(finding.fix for finding in result.findings)
+    assert all(finding.fix for finding in result.notices)
 
 
 def test_a_drive_that_was_never_told_of_its_gear_is_no_warning():
     result = offered({**PLAIN, (0x6091, 1): 1}, drive="gear_ratio = 100.0")
-    assert [finding.severity for finding in result.findings] == [Severity.INFO]
+    assert [finding.severity for finding in result.notices] == [Severity.INFO]
     assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.tau / (16384 * 100))
 
 
@@ -162,8 +162,8 @@ def test_positions_in_user_units_are_understood():
 
 
 def test_polarity_of_position_against_velocity_is_a_warning():
-    assert offered({**PLAIN, (0x607E, 0): 0xC0}).findings[0].severity is Severity.INFO
-    severities = [finding.severity for finding in offered({**PLAIN, (0x607E, 0): 0x80}).findings]
+    assert offered({**PLAIN, (0x607E, 0): 0xC0}).notices[0].severity is Severity.INFO
+    severities = [finding.severity for finding in offered({**PLAIN, (0x607E, 0): 0x80}).notices]
     assert Severity.WARNING in severities
 
 
@@ -174,8 +174,8 @@ def test_the_second_encoder_takes_its_resolution_from_the_drive_if_it_tells():
     assert "counts_per_rev" in offered(PLAIN, link=link).missing[Signal.LINK_POSITION]
     result = offered({**PLAIN, (0x60E6, 1): 65536}, link=link + "\ncounts_per_rev = 1000")
     assert scale(result, Signal.LINK_POSITION) == pytest.approx(math.tau / 1000)
-    assert "65536" in result.findings[-1].text
-    assert "1000" in result.findings[-1].text
+    assert "65536" in result.notices[-1].text
+    assert "1000" in result.notices[-1].text
 
 
 @pytest.mark.parametrize("text", ["60E4:01:32", "0x60E4:zz", "x", "0x0:1", ""])

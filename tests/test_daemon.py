@@ -15,8 +15,8 @@ from zenohkit import free_endpoint, until
 from drivelink._core import SYNC_COB_ID
 from drivelink.canopen.guard import check_frame
 from drivelink.cycle.chain import make_chain
-from drivelink.cycle.joining import join_bus
 from drivelink.cycle.lockstep import run_lockstep
+from drivelink.cycle.startup import join_bus
 from drivelink.daemon import reload
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simulate import network_from_joint, open_sim_bus

@@ -34,8 +34,8 @@ from drivelink.doctor.motion import (
 )
 from drivelink.doctor.sampletap import SampleTap
 from drivelink.doctor.syncs import Daemons, judge_sync
-from drivelink.finding import Finding, Severity
 from drivelink.jointfile import BusSection, parse
+from drivelink.notice import Notice, Severity
 
 REPOSITORY = Path(__file__).parents[1]
 CHANNELS = itertools.count()
@@ -90,7 +90,7 @@ def texts(report, severity=None):
     return [
         f"{finding.subject}: {finding.text}"
         for section in report.sections
-        for finding in section.findings
+        for finding in section.notices
         if severity is None or finding.severity is severity
     ]
 
@@ -139,13 +139,13 @@ def live(change=lambda text: text, seconds=8.0):
 
 
 def test_a_moving_joint_passes_the_gate_that_recordings_pass():
-    (finding,) = live().findings
+    (finding,) = live().notices
     assert finding.severity is Severity.OK, finding
     assert "positions and torque fit in unit and sign" in finding.text
 
 
 def test_too_short_a_look_is_no_judgement():
-    (finding,) = live(seconds=1.0).findings
+    (finding,) = live(seconds=1.0).notices
     assert finding.severity is Severity.INFO
     assert "too short" in finding.text
 
@@ -174,7 +174,7 @@ def test_too_short_a_look_is_no_judgement():
     ],
 )
 def test_a_fault_of_a_moving_joint_is_named_with_the_line_to_paste(old, new, said, line):
-    (finding,) = live(lambda text: text.replace(old, new, 1)).findings
+    (finding,) = live(lambda text: text.replace(old, new, 1)).notices
     assert finding.severity is Severity.ERROR, finding
     assert said in finding.text
     assert line in finding.fix
@@ -207,7 +207,7 @@ def test_a_bus_that_may_not_be_touched_is_judged_by_its_frames(direction):
     section = Section("Units and signs")
     judge_gathered(section, tap.joint, tap.gathered)
     assert tap.samples > 7000
-    (finding,) = section.findings
+    (finding,) = section.notices
     if direction < 0:
         assert finding.severity is Severity.ERROR
         assert "the link position has the wrong sign" in finding.text
@@ -378,8 +378,8 @@ def test_without_a_joint_the_machine_is_examined(capsys):
 def test_every_warning_of_the_machine_has_a_fix():
     section = Section("Machine")
     examine_machine(section, 0.001, 0.05)
-    assert {"kernel", "real time", "memory", "timer"} <= {finding.subject for finding in section.findings}
-    assert all(finding.fix for finding in section.findings if finding.severity is Severity.WARNING)
+    assert {"kernel", "real time", "memory", "timer"} <= {finding.subject for finding in section.notices}
+    assert all(finding.fix for finding in section.notices if finding.severity is Severity.WARNING)
 
 
 def test_text_of_devices_is_shown_as_it_is():
@@ -415,7 +415,7 @@ LINK = {
 def test_a_sick_interface_is_seen_in_every_way():
     section = Section("CAN")
     judge_link(section, LINK, BusSection(interface="socketcan", channel="can0"))
-    said = "\n".join(str(finding) for finding in section.findings)
+    said = "\n".join(str(finding) for finding in section.notices)
     for expected in (
         "runs at 500 kbit/s, the joint file says 1000",
         "error-passive, error counters: tx 128, rx 3",
@@ -437,7 +437,7 @@ def test_a_healthy_interface_has_no_warning():
     del link["linkinfo"]["info_xstats"]
     section = Section("CAN")
     judge_link(section, link, BusSection(interface="socketcan", channel="can0"))
-    assert {finding.severity for finding in section.findings} == {Severity.OK}
+    assert {finding.severity for finding in section.notices} == {Severity.OK}
 
 
 @pytest.mark.parametrize(
@@ -447,7 +447,7 @@ def test_a_healthy_interface_has_no_warning():
 def test_an_interface_that_cannot_work_is_an_error_with_a_fix(change, expected):
     section = Section("CAN")
     judge_link(section, {**LINK, **change}, BusSection(interface="socketcan", channel="can0"))
-    (finding,) = [f for f in section.findings if f.severity is Severity.ERROR]
+    (finding,) = [f for f in section.notices if f.severity is Severity.ERROR]
     assert expected in finding.text
     assert finding.fix
 
@@ -455,7 +455,7 @@ def test_an_interface_that_cannot_work_is_an_error_with_a_fix(change, expected):
 def test_a_virtual_bus_is_explained():
     section = Section("CAN")
     examine_interface(section, BusSection())
-    assert "one process" in section.findings[0].text
+    assert "one process" in section.notices[0].text
 
 
 def sync(period_s, jitter_s=0.0, count=500):
@@ -476,7 +476,7 @@ def sync(period_s, jitter_s=0.0, count=500):
 def test_sync_is_judged_by_rate_and_role(stamps, bus, severity, expected):
     section = Section("Bus")
     judge_sync(section, stamps, BusSection(**bus))
-    (finding,) = section.findings
+    (finding,) = section.notices
     assert finding.severity is severity
     assert expected in finding.text
 
@@ -484,7 +484,7 @@ def test_sync_is_judged_by_rate_and_role(stamps, bus, severity, expected):
 def test_a_sync_of_our_own_daemon_is_no_reason_to_follow():
     section = Section("Bus")
     judge_sync(section, sync(0.001), BusSection(), Daemons(ours=True, others=()))
-    (finding,) = section.findings
+    (finding,) = section.notices
     assert finding.severity is Severity.OK
     assert "made by the drivelink daemon" in finding.text
     assert not finding.fix
@@ -493,7 +493,7 @@ def test_a_sync_of_our_own_daemon_is_no_reason_to_follow():
 def test_a_sync_of_another_joint_s_daemon_is_named():
     section = Section("Bus")
     judge_sync(section, sync(0.001), BusSection(), Daemons(ours=False, others=("wrist",)))
-    (finding,) = section.findings
+    (finding,) = section.notices
     assert finding.severity is Severity.WARNING
     assert "wrist" in finding.text
     assert "one command" in finding.fix
@@ -553,7 +553,7 @@ def moving(ratio=1.0, link=None, amplitude=0.5):
 def test_signs_and_units_are_checked_against_each_other(samples, severity, expected):
     section = Section("Node 5")
     judge_motion(section, survey()[0], samples)
-    finding = next(finding for finding in section.findings if expected in finding.text)
+    finding = next(finding for finding in section.notices if expected in finding.text)
     assert finding.severity is severity
 
 
@@ -628,7 +628,7 @@ def test_helpers():
     assert slope([1.0, 2.0], [2.0, 4.0]) == pytest.approx(2.0)
     assert slope([0.0], [1.0]) == 0.0
     assert percentile([3.0, 1.0, 2.0], 0.5) == 2.0
-    finding = Finding(severity=Severity.WARNING, subject="a", text="b", fix="c")
+    finding = Notice(severity=Severity.WARNING, subject="a", text="b", fix="c")
     assert str(finding) == "a: b [c]"
 
 

@@ -21,7 +21,7 @@ from drivelink.recording.gate import corrections
 from estimator import JointModel, Motor, Record, Transmission
 from estimator.batch import fit
 from estimator.diagnosis import diagnose
-from estimator.gate import Change, Finding, GateError, examine, judge
+from estimator.gate import Change, Discrepancy, GateError, examine, judge
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("DRIVELINK_DATA", ROOT.parent / "shared" / "data"))
@@ -49,7 +49,7 @@ def same(a: float, b: float) -> bool:
     return abs(a / b - 1.0) < 0.05
 
 
-def named(findings: list[Finding], factors: dict[str, float]) -> bool:
+def named(findings: list[Discrepancy], factors: dict[str, float]) -> bool:
     """Whether the findings, or what they say cannot be told from them, undo these factors."""
     options = [[f.changes for f in findings]]
     for k, finding in enumerate(findings):

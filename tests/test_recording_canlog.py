@@ -11,13 +11,13 @@ import pytest
 
 from drivelink.errors import RecordingError
 from drivelink.jointfile import parse
-from drivelink.recording.canlog import NO_STAMP, Frame, read_frames
+from drivelink.recording.canlog import NO_STAMP, LoggedFrame, read_frames
 from drivelink.recording.formats import open_sink
 from drivelink.recording.syncnumbers import SyncNumbering, numbered_ahead, numbered_at_once
 
 JOINT = parse('name = "j"\n[[motor]]\ninertia_kg_m2 = 0.1\n[bus]\nchannel = "can0"\n')
-FRAME = Frame(1_436_509_052_249_713_000, 0x181, bytes.fromhex("2A366C2BBA"), "can0")
-SYNC = Frame(1_436_509_052_250_713_000, 0x080, b"", "can0")
+FRAME = LoggedFrame(1_436_509_052_249_713_000, 0x181, bytes.fromhex("2A366C2BBA"), "can0")
+SYNC = LoggedFrame(1_436_509_052_250_713_000, 0x080, b"", "can0")
 
 # What each tool writes for FRAME and SYNC.
 VARIANTS = {
@@ -93,11 +93,11 @@ def test_peaks_traces_are_read(text: str, tmp_path: Path) -> None:
     assert frames[1].stamp_ns - frames[0].stamp_ns == pytest.approx(1_000_000, abs=500)
 
 
-def many_frames(n: int = 3000) -> list[Frame]:
+def many_frames(n: int = 3000) -> list[LoggedFrame]:
     rng = random.Random(1)
     ids = (0x080, 0x181, 0x182, 0x18A)
     return [
-        Frame(
+        LoggedFrame(
             1_700_000_000_000_000_000 + 250_000 * k,
             ids[k % 4],
             rng.randbytes(8) if k % 4 else b"",
@@ -196,8 +196,8 @@ def test_python_cans_own_writer_and_this_reader_agree(tmp_path: Path) -> None:
     assert [(f.can_id, f.data) for f in read_frames(path)] == theirs
 
 
-def syncs(stamps_ms: list[float]) -> list[Frame]:
-    return [Frame(round(1e6 * t), 0x080, b"", "can0") for t in stamps_ms]
+def syncs(stamps_ms: list[float]) -> list[LoggedFrame]:
+    return [LoggedFrame(round(1e6 * t), 0x080, b"", "can0") for t in stamps_ms]
 
 
 def jumps(stamps_ms: list[float]) -> list[int]:

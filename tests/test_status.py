@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drivelink.cycle.meter import Meter
+from drivelink.cycle.latency_histogram import LatencyHistogram
 from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor
 from estimator.sample import Estimate, Status
@@ -16,7 +16,7 @@ from estimator.sample import Estimate, Status
 def test_percentiles_are_those_of_the_durations() -> None:
     rng = random.Random(1)
     durations_us = [rng.lognormvariate(4.0, 0.6) for _ in range(20_000)]
-    meter = Meter()
+    meter = LatencyHistogram()
     for us in durations_us:
         meter.add(int(us * 1000))
     for name, q in (("p50_us", 50), ("p90_us", 90), ("p99_us", 99), ("p999_us", 99.9)):
@@ -26,7 +26,7 @@ def test_percentiles_are_those_of_the_durations() -> None:
 
 
 def test_recent_is_since_the_last_look() -> None:
-    meter = Meter()
+    meter = LatencyHistogram()
     for _ in range(100):
         meter.add(10_000)
     assert meter.recent()["p50_us"] == 11.0
@@ -38,7 +38,7 @@ def test_recent_is_since_the_last_look() -> None:
 
 
 def test_durations_beyond_the_range_and_below_zero_are_counted() -> None:
-    meter = Meter()
+    meter = LatencyHistogram()
     meter.add(-5)
     meter.add(10**12)
     assert meter.count == 2

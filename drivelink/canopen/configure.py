@@ -21,8 +21,8 @@ from drivelink.canopen.node import configure_node
 from drivelink.canopen.roles import Role, roles
 from drivelink.canopen.sdo import Program, SdoTimeout, Session
 from drivelink.errors import BusError, DriveError
-from drivelink.finding import log_findings
 from drivelink.jointfile import BusSection, JointFile
+from drivelink.notice import log_notices
 
 __all__ = ["Configurator", "configure", "configure_joints", "refuse_foreign_sync"]
 
@@ -164,7 +164,7 @@ def configure_joints(
     load = configurator.load()
     check_capacity(load, section.period_s)
     for layout in configurator.layouts.values():
-        log_findings(logger, layout.findings)
+        log_notices(logger, layout.notices)
     logger.info("bus load %.0f %% of %d kbit/s", 100 * load.fraction, section.bitrate // 1000)
     send = sender(bus)
     for node in configurator.nodes:

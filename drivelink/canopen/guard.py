@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import can
 
+from drivelink._core import SYNC_COB_ID
 from drivelink.errors import BusError
 
 __all__ = ["ForbiddenFrameError", "SilentBus", "check_frame", "is_writable"]
 
 _NMT_START = 0x01
 _NMT_PRE_OPERATIONAL = 0x80
-_SYNC = 0x080
 _WRITABLE = frozenset({0x1005, 0x1006, 0x1016, 0x1017, 0x1019})
 
 
@@ -35,7 +35,7 @@ def check_frame(cob_id: int, data: bytes) -> None:
     Raises:
         ForbiddenFrameError: the frame is not SYNC, NMT start or pre-operational, or a permitted SDO.
     """
-    if cob_id == _SYNC and len(data) <= 1:
+    if cob_id == SYNC_COB_ID and len(data) <= 1:
         return
     if cob_id == 0 and len(data) == 2 and data[0] in (_NMT_START, _NMT_PRE_OPERATIONAL):
         return

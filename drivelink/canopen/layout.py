@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any
 
-from drivelink.finding import Finding
+from drivelink.notice import Notice
 
 __all__ = ["MappedObject", "NodeLayout", "Signal", "TpdoLayout", "layout_document", "layout_from"]
 
@@ -90,7 +90,7 @@ class NodeLayout:
         other_tpdos: enabled frames of this node that nobody here needs, but that load the bus.
         heartbeat_ms: period of the heartbeat the node produces, as read back; 0: none, or not known.
         identity: (vendor, product code, revision, serial number) of 0x1018; 0 where not reported.
-        findings: what the configuration had to say about it.
+        notices: what the configuration had to say about it.
     """
 
     node_id: int
@@ -99,13 +99,13 @@ class NodeLayout:
     other_tpdos: tuple[TpdoLayout, ...] = ()
     heartbeat_ms: int = 0
     identity: tuple[int, int, int, int] = (0, 0, 0, 0)
-    findings: tuple[Finding, ...] = ()
+    notices: tuple[Notice, ...] = ()
 
 
 def layout_document(layout: NodeLayout) -> dict[str, Any]:
     """A layout as plain values, for the model document; without what its configuration had to say."""
     document = asdict(layout)
-    del document["findings"]
+    del document["notices"]
     return document
 
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from drivelink.canopen.candidates import Candidate
 from drivelink.canopen.layout import Signal, TpdoLayout
+from drivelink.canopen.mappable import MappableObject
 from drivelink.canopen.pdo import (
     EXTENDED,
     INVALID,
@@ -24,11 +24,11 @@ from drivelink.canopen.pdo import (
     read_optional,
     read_tpdo,
 )
-from drivelink.canopen.plan import OPTIONAL, Assignment, assign, choose_cob_id
 from drivelink.canopen.roles import Role
 from drivelink.canopen.sdo import Nmt, Pause, Program, Read, SdoAbort, Write, abort_text
+from drivelink.canopen.tpdo_assignment import OPTIONAL, Assignment, assign, choose_cob_id
 from drivelink.errors import DriveError
-from drivelink.finding import Finding, Severity
+from drivelink.notice import Notice, Severity
 
 __all__ = ["NMT_PRE_OPERATIONAL", "NMT_START", "Mapper", "disable"]
 
@@ -53,7 +53,7 @@ class _MapFixed(Exception):  # noqa: N818
 class _ObjectRefused(Exception):  # noqa: N818
     """A TPDO refuses one object."""
 
-    candidate: Candidate
+    candidate: MappableObject
     code: int
 
 
@@ -67,16 +67,16 @@ class Mapper:
         tpdos: as they are in the node.
         taken: identifiers in use elsewhere on the bus.
         prefer_unused: see `plan.assign`.
-        findings: remarks, added to.
+        notices: remarks, added to.
         period_s: communication cycle, at which a TPDO is asked for that cannot be sent on SYNC.
     """
 
     role: Role
-    available: Mapping[Signal, Sequence[Candidate]]
+    available: Mapping[Signal, Sequence[MappableObject]]
     tpdos: list[Tpdo]
     taken: set[int]
     prefer_unused: bool
-    findings: list[Finding]
+    notices: list[Notice]
     period_s: float = 0.001
     _pre_operational: bool = field(default=False, init=False)
     _chosen: dict[int, int] = field(default_factory=dict, init=False)
@@ -111,9 +111,9 @@ class Mapper:
         return self.role.node_id
 
     def _say(self, severity: Severity, text: str, fix: str = "") -> None:
-        self.findings.append(Finding(severity=severity, subject=self.role.subject, text=text, fix=fix))
+        self.notices.append(Notice(severity=severity, subject=self.role.subject, text=text, fix=fix))
 
-    def _drop(self, available: dict[Signal, list[Candidate]], refused: _ObjectRefused) -> None:
+    def _drop(self, available: dict[Signal, list[MappableObject]], refused: _ObjectRefused) -> None:
         signal = refused.candidate.signal
         index, subindex = refused.candidate.address
         available[signal].remove(refused.candidate)
@@ -147,7 +147,7 @@ class Mapper:
         self._replace(changed)
 
     def _write(
-        self, tpdo: Tpdo, cob_id: int, entries: tuple[Entry, ...], objects: tuple[Candidate, ...] | None
+        self, tpdo: Tpdo, cob_id: int, entries: tuple[Entry, ...], objects: tuple[MappableObject, ...] | None
     ) -> Program[Tpdo]:
         if not self._pre_operational:
             self._pre_operational = True
@@ -191,7 +191,7 @@ class Mapper:
     def _cob(self, tpdo: Tpdo, value: int) -> Program[None]:
         yield from self._put(tpdo.communication, 1, value, 4)
 
-    def _stays_on(self, tpdo: Tpdo, abort: SdoAbort, objects: tuple[Candidate, ...] | None) -> None:
+    def _stays_on(self, tpdo: Tpdo, abort: SdoAbort, objects: tuple[MappableObject, ...] | None) -> None:
         """The TPDO cannot be switched off: then its map is what it is.
 
         Raises:
@@ -242,7 +242,7 @@ class Mapper:
             return False
         return True
 
-    def _entries(self, tpdo: Tpdo, objects: tuple[Candidate, ...]) -> Program[None]:
+    def _entries(self, tpdo: Tpdo, objects: tuple[MappableObject, ...]) -> Program[None]:
         try:
             yield from self._put(tpdo.mapping, 0, 0, 1)
         except SdoAbort as abort:

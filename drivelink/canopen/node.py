@@ -6,11 +6,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from drivelink.canopen.candidates import Candidate, Offer
+from drivelink._core import SYNC_COB_ID
 from drivelink.canopen.layout import NodeLayout, Signal
+from drivelink.canopen.mappable import MappableObject, Offer
 from drivelink.canopen.mapping import NMT_PRE_OPERATIONAL, NMT_START, SETTLE_S, Mapper, disable
 from drivelink.canopen.pdo import ABSENT, Tpdo, decode, read_optional, read_tpdos
-from drivelink.canopen.plan import OPTIONAL
 from drivelink.canopen.roles import Role
 from drivelink.canopen.sdo import (
     Nmt,
@@ -24,15 +24,15 @@ from drivelink.canopen.sdo import (
     abort_text,
     read_number,
 )
+from drivelink.canopen.tpdo_assignment import OPTIONAL
 from drivelink.canopen.units import offer, unit_objects
 from drivelink.canopen.vendors import vendor_of
 from drivelink.errors import DriveError
-from drivelink.finding import Finding, Severity
 from drivelink.jointfile import BusSection
+from drivelink.notice import Notice, Severity
 
 __all__ = ["NodeSurvey", "configure_node", "survey_node"]
 
-_SYNC_COB_ID = 0x80
 _SYNC_PRODUCER = 1 << 30
 _ENCODER_HEARTBEAT_MS = 100
 _VALUE_BYTES = 8  # of the longest object that can be mapped
@@ -60,7 +60,7 @@ class NodeSurvey:
     reported: Mapping[tuple[int, int], int]
     offer: Offer
     refused: SdoAbort | None
-    available: Mapping[Signal, tuple[Candidate, ...]]
+    available: Mapping[Signal, tuple[MappableObject, ...]]
     tpdos: tuple[Tpdo, ...]
 
 
@@ -87,7 +87,7 @@ def survey_node(role: Role, patience: int = 1, *, wake: bool = False) -> Program
         except SdoAbort as abort:
             refused = refused if abort.code in ABSENT else abort
     offered = offer(role, reported, vendor)
-    available: dict[Signal, tuple[Candidate, ...]] = {}
+    available: dict[Signal, tuple[MappableObject, ...]] = {}
     for signal, candidates in offered.candidates.items():
         available[signal] = yield from _existing(node, candidates)
     return NodeSurvey(
@@ -113,7 +113,7 @@ def _first_contact(node: int, patience: int, wake: bool) -> Program[int]:
     return (yield from read_optional(node, 0x1000, 0)) or 0
 
 
-def _existing(node: int, candidates: tuple[Candidate, ...]) -> Program[tuple[Candidate, ...]]:
+def _existing(node: int, candidates: tuple[MappableObject, ...]) -> Program[tuple[MappableObject, ...]]:
     """Those that the node has, with the length it answers with; some have no value before they run."""
     found = []
     for candidate in candidates:
@@ -156,23 +156,23 @@ def configure_node(
         yield Pause(SETTLE_S)
     attempt_s = bus.sdo_timeout_s * (1 + bus.sdo_retries)
     survey = yield from survey_node(role, max(2, math.ceil(BOOT_S / attempt_s)), wake=True)
-    findings = list(survey.offer.findings)
-    available = _wanted(survey, findings)
+    notices = list(survey.offer.notices)
+    available = _wanted(survey, notices)
     mapper = Mapper(
         role=role,
         available=available,
         tpdos=list(survey.tpdos),
         taken=taken,
         prefer_unused=bus.sync == "follow",
-        findings=findings,
+        notices=notices,
         period_s=bus.period_s,
     )
     layouts = yield from mapper.program()
     used = {layout.number for layout in layouts}
     others = tuple(tpdo for tpdo in mapper.tpdos if tpdo.enabled and tpdo.number not in used)
-    others = yield from _others(role, others, {layout.cob_id for layout in layouts}, drop_others, findings)
-    yield from _sync(role, bus, findings)
-    heartbeat_ms = yield from _heartbeat(role, findings)
+    others = yield from _others(role, others, {layout.cob_id for layout in layouts}, drop_others, notices)
+    yield from _sync(role, bus, notices)
+    heartbeat_ms = yield from _heartbeat(role, notices)
     if start:
         yield Nmt(role.node_id, NMT_START)
     return NodeLayout(
@@ -182,11 +182,11 @@ def configure_node(
         other_tpdos=decode(others, {}),
         heartbeat_ms=heartbeat_ms,
         identity=survey.identity,
-        findings=tuple(findings),
+        notices=tuple(notices),
     )
 
 
-def _wanted(survey: NodeSurvey, findings: list[Finding]) -> dict[Signal, tuple[Candidate, ...]]:
+def _wanted(survey: NodeSurvey, notices: list[Notice]) -> dict[Signal, tuple[MappableObject, ...]]:
     """Signals to map, each with the objects that can give it.
 
     Raises:
@@ -197,7 +197,7 @@ def _wanted(survey: NodeSurvey, findings: list[Finding]) -> dict[Signal, tuple[C
         if signal not in OPTIONAL:
             why = f"; {survey.refused}" if survey.refused is not None else ""
             raise DriveError(f"{subject} ({survey.role.key}): {reason}{why}")
-        findings.append(Finding(severity=Severity.WARNING, subject=subject, text=f"no {signal}: {reason}"))
+        notices.append(Notice(severity=Severity.WARNING, subject=subject, text=f"no {signal}: {reason}"))
     wanted = {}
     for signal, candidates in survey.available.items():
         if candidates:
@@ -206,14 +206,14 @@ def _wanted(survey: NodeSurvey, findings: list[Finding]) -> dict[Signal, tuple[C
         tried = ", ".join(f"0x{c.address[0]:04X}:{c.address[1]:02X}" for c in survey.offer.candidates[signal])
         if signal not in OPTIONAL:
             raise DriveError(f"{subject} ({survey.role.key}) gives no {signal}: it has no {tried}")
-        findings.append(
-            Finding(severity=Severity.WARNING, subject=subject, text=f"gives no {signal}: it has no {tried}")
+        notices.append(
+            Notice(severity=Severity.WARNING, subject=subject, text=f"gives no {signal}: it has no {tried}")
         )
     return wanted
 
 
 def _others(
-    role: Role, others: tuple[Tpdo, ...], used: set[int], drop: bool, findings: list[Finding]
+    role: Role, others: tuple[Tpdo, ...], used: set[int], drop: bool, notices: list[Notice]
 ) -> Program[tuple[Tpdo, ...]]:
     """Switch off what shares an identifier with us, and, if asked to, what nobody here needs."""
     left = []
@@ -230,17 +230,17 @@ def _others(
             left.append(tpdo)
             why += f", but it stays on: SDO abort {abort_text(abort.code)}"
         text = f"TPDO{tpdo.number} (0x{tpdo.cob_id:03X}), which nobody here needs, is switched off: {why}"
-        findings.append(Finding(severity=Severity.INFO, subject=role.subject, text=text))
+        notices.append(Notice(severity=Severity.INFO, subject=role.subject, text=text))
     return tuple(left)
 
 
-def _sync(role: Role, bus: BusSection, findings: list[Finding]) -> Program[None]:
+def _sync(role: Role, bus: BusSection, notices: list[Notice]) -> Program[None]:
     """SYNC identifier, one producer only, and the same counter on both sides."""
     node = role.node_id
     cob = yield from read_optional(node, 0x1005, 0)
-    if cob is not None and (cob & 0x7FF != _SYNC_COB_ID or cob & _SYNC_PRODUCER):
+    if cob is not None and (cob & 0x7FF != SYNC_COB_ID or cob & _SYNC_PRODUCER):
         try:
-            yield Write(node, 0x1005, 0, _SYNC_COB_ID, 4)
+            yield Write(node, 0x1005, 0, SYNC_COB_ID, 4)
         except SdoAbort as abort:
             what = "makes SYNC itself" if cob & _SYNC_PRODUCER else f"waits for SYNC 0x{cob & 0x7FF:03X}"
             raise DriveError(
@@ -252,8 +252,8 @@ def _sync(role: Role, bus: BusSection, findings: list[Finding]) -> Program[None]
     if overflow == wanted or (overflow is None and not wanted):
         return
     if overflow is None:
-        findings.append(
-            Finding(
+        notices.append(
+            Notice(
                 severity=Severity.WARNING,
                 subject=role.subject,
                 text="has no SYNC counter (0x1019) and may reject a SYNC with one",
@@ -274,7 +274,7 @@ def _sync_counter(node: int, overflow: int) -> Program[None]:
         yield Write(node, 0x1006, 0, period, 4)
 
 
-def _heartbeat(role: Role, findings: list[Finding]) -> Program[int]:
+def _heartbeat(role: Role, notices: list[Notice]) -> Program[int]:
     """Ask for a heartbeat; what reads back is what will be watched."""
     node = role.node_id
     wanted = role.drive.heartbeat_ms if role.drive is not None else _ENCODER_HEARTBEAT_MS
@@ -285,6 +285,6 @@ def _heartbeat(role: Role, findings: list[Finding]) -> Program[int]:
         yield Write(node, 0x1017, 0, wanted, 2)
     except SdoAbort as abort:
         text = f"keeps its heartbeat of {has} ms instead of {wanted} ms: SDO abort {abort_text(abort.code)}"
-        findings.append(Finding(severity=Severity.WARNING, subject=role.subject, text=text))
+        notices.append(Notice(severity=Severity.WARNING, subject=role.subject, text=text))
         return has
     return (yield from read_optional(node, 0x1017, 0)) or 0

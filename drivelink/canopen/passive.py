@@ -13,15 +13,15 @@ from pathlib import Path
 from drivelink.canopen.busload import BusLoad, bus_load
 from drivelink.canopen.eds import load_eds
 from drivelink.canopen.layout import NodeLayout, Signal
-from drivelink.canopen.overheard import SdoListener
 from drivelink.canopen.pdo import Tpdo, decode, describe, tpdos_of
-from drivelink.canopen.plan import OPTIONAL
 from drivelink.canopen.roles import Role, roles
+from drivelink.canopen.sdo_sniffer import SdoSniffer
+from drivelink.canopen.tpdo_assignment import OPTIONAL
 from drivelink.canopen.units import offer, unit_objects
 from drivelink.canopen.vendors import VENDORS, vendor_of
 from drivelink.errors import BusError, DriveError
-from drivelink.finding import Finding, Severity, log_findings
 from drivelink.jointfile import BusSection, JointFile, TpdoSection
+from drivelink.notice import Notice, Severity, log_notices
 
 __all__ = ["PassiveConfigurator"]
 
@@ -51,7 +51,7 @@ class _PassiveNode:
         self._units = {
             address for vendor in VENDORS.values() for address in unit_objects(role, vendor)
         } | _COMMUNICATION
-        self.listener = SdoListener(self._interesting)
+        self.listener = SdoSniffer(self._interesting)
         self.seen_changes = -1
         self.adopted: NodeLayout | None = None
         self.restarted = False
@@ -133,10 +133,10 @@ class _PassiveNode:
         if self._sheet is not None and self._sheet.vendor_id:
             values.setdefault((0x1018, 1), self._sheet.vendor_id)
         offered = offer(role, values, vendor_of(values.get((0x1018, 1), 0)))
-        findings = list(offered.findings)
+        notices = list(offered.notices)
         if self._sheet is not None:
-            findings += [
-                Finding(severity=Severity.INFO, subject=str(self._sheet.path.name), text=problem)
+            notices += [
+                Notice(severity=Severity.INFO, subject=str(self._sheet.path.name), text=problem)
                 for problem in self._sheet.problems
             ]
         for signal, reason in offered.missing.items() if tpdos else ():
@@ -156,7 +156,7 @@ class _PassiveNode:
             other_tpdos=tuple(layout for layout in layouts if layout not in used),
             heartbeat_ms=self.listener.values.get((0x1017, 0), 0),
             identity=(identity[0], identity[1], identity[2], identity[3]),
-            findings=tuple(findings),
+            notices=tuple(notices),
         )
 
     def _believed_tpdos(self) -> tuple[Tpdo, ...]:
@@ -364,7 +364,7 @@ class PassiveConfigurator:
                 self.doubts[node_id] = doubt
             if self.layouts.get(node_id) != layout:
                 self.layouts[node_id] = layout
-                log_findings(logger, layout.findings)
+                log_notices(logger, layout.notices)
                 ended.append((node_id, layout))
         return ended
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from drivelink.canopen.candidates import Candidate
 from drivelink.canopen.layout import MappedObject, Signal, TpdoLayout
+from drivelink.canopen.mappable import MappableObject
 from drivelink.canopen.sdo import Program, SdoAbort, read_number
 
 __all__ = [
@@ -205,7 +205,9 @@ def _entries(values: Mapping[Address, int], mapping: int) -> tuple[Entry, ...] |
     return tuple(entries)
 
 
-def decode(tpdos: Sequence[Tpdo], candidates: Mapping[Signal, Sequence[Candidate]]) -> tuple[TpdoLayout, ...]:
+def decode(
+    tpdos: Sequence[Tpdo], candidates: Mapping[Signal, Sequence[MappableObject]]
+) -> tuple[TpdoLayout, ...]:
     """The layout of TPDOs' frames: what is mapped decides, not what was wished.
 
     Where several objects for one signal are mapped, the best one counts; where one is mapped twice, its
@@ -216,7 +218,7 @@ def decode(tpdos: Sequence[Tpdo], candidates: Mapping[Signal, Sequence[Candidate
         candidates: for each signal the objects that can give it, best first.
     """
     mapped = {(index, subindex) for tpdo in tpdos for index, subindex, _ in tpdo.entries}
-    chosen: dict[Address, Candidate] = {}
+    chosen: dict[Address, MappableObject] = {}
     for objects in candidates.values():
         best = next((candidate for candidate in objects if candidate.address in mapped), None)
         if best is not None:
@@ -226,7 +228,7 @@ def decode(tpdos: Sequence[Tpdo], candidates: Mapping[Signal, Sequence[Candidate
     return tuple(layouts[k] for k in range(len(tpdos)))
 
 
-def _layout(tpdo: Tpdo, chosen: dict[Address, Candidate]) -> TpdoLayout:
+def _layout(tpdo: Tpdo, chosen: dict[Address, MappableObject]) -> TpdoLayout:
     """One frame; what it carries is taken out of `chosen`."""
     objects = []
     for index, subindex, bits in tpdo.entries:

@@ -35,7 +35,7 @@ class Role:
 
     @property
     def subject(self) -> str:
-        """For findings and messages."""
+        """For notices and messages."""
         return f"node {self.node_id}"
 
 

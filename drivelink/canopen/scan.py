@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import can
 
+from drivelink._core import SYNC_COB_ID
 from drivelink.canopen.blocking import FrameBus, receive, run_program, sender
 from drivelink.canopen.guard import check_frame
 from drivelink.canopen.pdo import read_optional
@@ -85,7 +86,7 @@ class Traffic:
         cob_id, data = message.arbitration_id, bytes(message.data)
         self.counts[cob_id] = self.counts.get(cob_id, 0) + 1
         self.last[cob_id] = data
-        if cob_id == 0x80 and len(self.sync_s) < _MOST_STAMPS:
+        if cob_id == SYNC_COB_ID and len(self.sync_s) < _MOST_STAMPS:
             self.sync_s.append(message.timestamp)
         elif 0x701 <= cob_id <= 0x77F and len(data) == 1:
             state = data[0] & 0x7F

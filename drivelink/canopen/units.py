@@ -10,13 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from drivelink.canopen.candidates import Candidate, Offer
 from drivelink.canopen.cia303 import angle_unit_rad, velocity_unit_rad_s
 from drivelink.canopen.layout import Signal
+from drivelink.canopen.mappable import MappableObject, Offer
 from drivelink.canopen.roles import Role, object_address
 from drivelink.canopen.vendors import Vendor
-from drivelink.finding import Finding, Severity
 from drivelink.jointfile import DriveSection, EncoderSection
+from drivelink.notice import Notice, Severity
 
 __all__ = ["offer", "unit_objects"]
 
@@ -72,8 +72,8 @@ def offer(role: Role, reported: Mapping[Address, int], vendor: Vendor) -> Offer:
         _offer_link(role, role.encoder, reported, result)
         if vendor.sensorless == _encoder_address(role.encoder, role.key) and role.encoder.object is None:
             index, subindex = vendor.sensorless
-            result.findings.append(
-                Finding(
+            result.notices.append(
+                Notice(
                     severity=Severity.WARNING,
                     subject=role.subject,
                     text=f"0x{index:04X}:{subindex:02X} is {vendor.name}'s sensorless position, no encoder",
@@ -99,7 +99,7 @@ class _Drive:
 
     def offer(self) -> None:
         self._result.candidates[Signal.STATUSWORD] = (
-            Candidate(signal=Signal.STATUSWORD, address=(0x6041, 0), bits=16, signed=False, scale=1.0),
+            MappableObject(signal=Signal.STATUSWORD, address=(0x6041, 0), bits=16, signed=False, scale=1.0),
         )
         gear = self._gear()
         counts = self._counts_per_rev()
@@ -126,9 +126,7 @@ class _Drive:
         return stated
 
     def _say(self, severity: Severity, text: str, fix: str = "") -> None:
-        self._result.findings.append(
-            Finding(severity=severity, subject=self._role.subject, text=text, fix=fix)
-        )
+        self._result.notices.append(Notice(severity=severity, subject=self._role.subject, text=text, fix=fix))
 
     def _ratio(self, numerator: Address, denominator: Address) -> float | None:
         above, below = self._reported.get(numerator, 0), self._reported.get(denominator, 1)
@@ -193,7 +191,7 @@ class _Drive:
                 f"encoder and gear {counts * gear:.6g}; {counts * gear:.6g} is used",
             )
         self._result.candidates[Signal.MOTOR_POSITION] = (
-            Candidate(
+            MappableObject(
                 signal=Signal.MOTOR_POSITION,
                 address=(0x6064, 0),
                 bits=32,
@@ -252,8 +250,8 @@ class _Drive:
             rated_torque = constant * rated_current  # Nanotec: no 0x6076, the torque of the rated current
         own = self._vendor.current
         own_unit = own is not None and own.address == (0x6078, 0)  # and then no rated values either
-        by_torque: list[Candidate] = []
-        by_current: list[Candidate] = []
+        by_torque: list[MappableObject] = []
+        by_current: list[MappableObject] = []
         if rated_torque is not None:
             by_torque.append(_torque_candidate((0x6077, 0), 16, direction * gear * rated_torque / 1000))
         if constant is not None:
@@ -300,7 +298,9 @@ class _Drive:
             return
         scale = self._drive.direction * chosen / gear
         self._result.candidates[Signal.MOTOR_VELOCITY] = (
-            Candidate(signal=Signal.MOTOR_VELOCITY, address=(0x606C, 0), bits=32, signed=True, scale=scale),
+            MappableObject(
+                signal=Signal.MOTOR_VELOCITY, address=(0x606C, 0), bits=32, signed=True, scale=scale
+            ),
         )
 
     def _polarity(self) -> None:
@@ -319,8 +319,8 @@ class _Drive:
             )
 
 
-def _torque_candidate(address: Address, bits: int, scale: float) -> Candidate:
-    return Candidate(signal=Signal.MOTOR_TORQUE, address=address, bits=bits, signed=True, scale=scale)
+def _torque_candidate(address: Address, bits: int, scale: float) -> MappableObject:
+    return MappableObject(signal=Signal.MOTOR_TORQUE, address=address, bits=bits, signed=True, scale=scale)
 
 
 def _encoder_address(encoder: EncoderSection, key: str) -> Address:
@@ -348,8 +348,8 @@ def _offer_link(role: Role, encoder: EncoderSection, reported: Mapping[Address, 
         return
     if stated is not None and counts is not None and not math.isclose(stated, counts, rel_tol=_SAME):
         text = f"link encoder, counts per revolution: the node says {counts:.6g} ({source}), "
-        result.findings.append(
-            Finding(
+        result.notices.append(
+            Notice(
                 severity=Severity.WARNING,
                 subject=role.subject,
                 text=text + f"the joint file {stated:.6g}; {stated:.6g} is used",
@@ -357,7 +357,7 @@ def _offer_link(role: Role, encoder: EncoderSection, reported: Mapping[Address, 
             )
         )
     result.candidates[Signal.LINK_POSITION] = (
-        Candidate(
+        MappableObject(
             signal=Signal.LINK_POSITION,
             address=address,
             bits=32,

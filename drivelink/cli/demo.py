@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
     return 130 if interrupted else 0
 
 
-class Rig(NamedTuple):
+class RigProcess(NamedTuple):
     """The other process: its messages, and how to end it early."""
 
     connection: Connection
@@ -78,7 +78,7 @@ class Rig(NamedTuple):
 
 
 @contextmanager
-def _rig(path: Path, seconds: float) -> Iterator[Rig]:
+def _rig(path: Path, seconds: float) -> Iterator[RigProcess]:
     """Simulation and daemon in a process of their own, which is gone afterwards."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
@@ -86,7 +86,7 @@ def _rig(path: Path, seconds: float) -> Iterator[Rig]:
     process.start()
     theirs.close()
     try:
-        yield Rig(ours, process.terminate)
+        yield RigProcess(ours, process.terminate)
     finally:
         if process.is_alive():
             process.terminate()
@@ -117,7 +117,7 @@ class Watch:
         self._period_s = joint.bus.period_s
         self._next_line_s = 0.0
 
-    def follow(self, rig: Rig, subscription: Subscription) -> bool:
+    def follow(self, rig: RigProcess, subscription: Subscription) -> bool:
         """Until the rig has ended; returns whether Ctrl-C ended it early.
 
         Raises:
@@ -128,7 +128,7 @@ class Watch:
         with Live(self._view, console=self._console, refresh_per_second=8, screen=False, transient=True):
             return self._to_the_end(rig, subscription)
 
-    def _to_the_end(self, rig: Rig, subscription: Subscription) -> bool:
+    def _to_the_end(self, rig: RigProcess, subscription: Subscription) -> bool:
         interrupted = False
         while self.summary is None:
             try:

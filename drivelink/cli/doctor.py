@@ -17,8 +17,8 @@ from drivelink.doctor import examine, examine_eds
 from drivelink.doctor.byhand import check_by_hand
 from drivelink.doctor.livevalues import live_values
 from drivelink.errors import UsageError
-from drivelink.finding import Severity
 from drivelink.jointfile import JointFile, load
+from drivelink.notice import Severity
 
 __all__ = ["configure", "run"]
 

@@ -28,7 +28,7 @@ from drivelink.pubsub.inbound import DECODERS
 from drivelink.pubsub.session import close_session, open_client
 from drivelink.recording.formats import open_sink
 from drivelink.recording.mapping import layouts_from, mapping_document
-from drivelink.recording.recorder import BusTap, Gate, Recorder, ZenohTap
+from drivelink.recording.recorder import BusTap, FirstSource, Recorder, ZenohTap
 from drivelink.recording.sinks import Sink
 from drivelink.recording.viewlayouts import write_layouts
 
@@ -111,7 +111,7 @@ def _add_taps(recorder: Recorder, source: str, text: JointText, stack: ExitStack
         UsageError: raw frames of a bus that lives inside another process.
     """
     sink, joint, folder = recorder.sink, text.joint, text.folder
-    gate = Gate(sink)
+    gate = FirstSource(sink)
     needed = source == "daemon" or (source == "auto" and sink.wants != {"frame"})
     session = _session(joint, folder, needed)
     if session is not None:

@@ -10,8 +10,8 @@ from drivelink.canopen.bus import open_bus
 from drivelink.cycle.busport import BusPort
 from drivelink.cycle.chain import make_chain
 from drivelink.cycle.framesource import PumpedSource
-from drivelink.cycle.joining import join_bus
 from drivelink.cycle.loop import CycleLoop, Lane, Sink
+from drivelink.cycle.startup import join_bus
 from drivelink.jointfile import JointFile
 
 __all__ = ["Devices", "run_lockstep"]

@@ -17,7 +17,7 @@ from typing import Protocol
 from drivelink._core import SYNC_COB_ID, Chain, Tick
 from drivelink.cycle.framesource import BusLostError, Frame, FrameSource, LostSource
 from drivelink.cycle.housekeeping import Housekeeping
-from drivelink.cycle.meter import Meter
+from drivelink.cycle.latency_histogram import LatencyHistogram
 from drivelink.cycle.syncclock import LATE, MEASURED_SYNCS, SyncClock
 from estimator.sample import Estimate, Sample
 
@@ -81,8 +81,8 @@ class Lane:
         self.broken: object = None  # the estimator that it ended with
         self.estimates = 0
         self.stale = 0
-        self.work = Meter()
-        self.response = Meter()
+        self.work = LatencyHistogram()
+        self.response = LatencyHistogram()
 
 
 def _log_fault(where: str, error: Exception) -> None:
@@ -155,7 +155,7 @@ class CycleLoop:
         self.sync_stamps: deque[int] = deque(maxlen=MEASURED_SYNCS)
         self.clock_step_ns = self.clock_steps = 0
         self.silent = False
-        self.lateness = Meter()
+        self.lateness = LatencyHistogram()
         self.produce = produce
         self.period_ns = round(period_s * 1e9)
         self._sync_clock = SyncClock(period_s)

@@ -25,9 +25,9 @@ from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle import pacing, realtime
 from drivelink.cycle.busport import BusPort
 from drivelink.cycle.chain import build, make_chain, rehearse
-from drivelink.cycle.joining import join_bus
 from drivelink.cycle.loop import CycleLoop, Lane
 from drivelink.cycle.sources import open_source
+from drivelink.cycle.startup import join_bus
 from drivelink.daemon.buskeeper import BusKeeper
 from drivelink.daemon.jointstatus import JointStatus
 from drivelink.daemon.reload import Reloader

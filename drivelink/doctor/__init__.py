@@ -10,8 +10,8 @@ from drivelink.doctor.machine import examine_machine
 from drivelink.doctor.nodes import examine_bus
 from drivelink.doctor.report import Report, Section
 from drivelink.doctor.zenohcheck import examine_zenoh
-from drivelink.finding import Severity
 from drivelink.jointfile import JointFile
+from drivelink.notice import Severity
 
 __all__ = ["Report", "Section", "examine", "examine_eds"]
 

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drivelink.canopen.candidates import Candidate
 from drivelink.canopen.eds import DataSheet, load_eds
 from drivelink.canopen.layout import Signal
+from drivelink.canopen.mappable import MappableObject
 from drivelink.canopen.pdo import Entry, describe, entry_text
-from drivelink.canopen.plan import Assignment, assign
 from drivelink.canopen.roles import Role
+from drivelink.canopen.tpdo_assignment import Assignment, assign
 from drivelink.canopen.units import offer
 from drivelink.canopen.vendors import vendor_of
 from drivelink.doctor.report import Section
 from drivelink.errors import DriveError
-from drivelink.finding import Severity
 from drivelink.jointfile import DriveSection, EncoderSection
+from drivelink.notice import Severity
 
 __all__ = ["examine_sheet", "planned_entries"]
 
@@ -122,11 +122,11 @@ def _role(sheet: DataSheet) -> Role:
     )
 
 
-def _signals(section: Section, sheet: DataSheet) -> dict[Signal, tuple[Candidate, ...]]:
+def _signals(section: Section, sheet: DataSheet) -> dict[Signal, tuple[MappableObject, ...]]:
     """Which signals the drive can put into a TPDO, with a finding for each."""
     vendor = vendor_of(sheet.vendor_id)
     carried = {(i, s) for tpdo in sheet.tpdos() for i, s, _ in tpdo.entries}
-    found: dict[Signal, tuple[Candidate, ...]] = {}
+    found: dict[Signal, tuple[MappableObject, ...]] = {}
     for signal, addresses in (_CIA406 if _is_encoder(sheet) else _OBJECTS).items():
         if signal is Signal.MOTOR_TORQUE and vendor.current is not None:
             addresses += (vendor.current.address,)
@@ -135,7 +135,7 @@ def _signals(section: Section, sheet: DataSheet) -> dict[Signal, tuple[Candidate
             there = [(0x60E4, 1)]  # subindex 0 is then only the count
         usable = [a for a in there if sheet.objects[a].mappable or a in carried]
         found[signal] = tuple(
-            Candidate(signal=signal, address=a, bits=sheet.objects[a].bits or 32, signed=True, scale=1.0)
+            MappableObject(signal=signal, address=a, bits=sheet.objects[a].bits or 32, signed=True, scale=1.0)
             for a in usable
         )
         _say_signal(section, signal, sheet, there, usable)

@@ -8,8 +8,8 @@ import subprocess
 from typing import Any
 
 from drivelink.doctor.report import Section
-from drivelink.finding import Severity
 from drivelink.jointfile import BusSection
+from drivelink.notice import Severity
 
 __all__ = ["can_interfaces", "examine_interface", "judge_link"]
 

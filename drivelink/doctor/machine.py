@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from drivelink.doctor.report import Section
-from drivelink.finding import Severity
+from drivelink.notice import Severity
 
 __all__ = ["examine_machine", "percentile"]
 

@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivelink.canopen.candidates import Candidate
 from drivelink.canopen.layout import Signal
+from drivelink.canopen.mappable import MappableObject
 from drivelink.canopen.node import NodeSurvey
 from drivelink.canopen.sdo import Program, Read, SdoAbort
 from drivelink.doctor.report import Section
-from drivelink.finding import Severity
 from drivelink.jointfile import JointFile
+from drivelink.notice import Severity
 from drivelink.recording.gate import Gathered, corrections
 from estimator.errors import EstimatorError
 from estimator.gate import Judgement, check, judge
@@ -220,7 +220,7 @@ def _say_judgement(section: Section, joint: JointFile, judgement: Judgement) -> 
 class _Unwrapped:
     """One object's bytes to SI, rolled-over counters straightened."""
 
-    def __init__(self, candidate: Candidate) -> None:
+    def __init__(self, candidate: MappableObject) -> None:
         self._candidate = candidate
         self._last: int | None = None
         self._total = 0

@@ -17,9 +17,9 @@ from drivelink.canopen.layout import NodeLayout, Signal, TpdoLayout
 from drivelink.canopen.node import NodeSurvey, survey_node
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.canopen.pdo import decode, describe, entry_text
-from drivelink.canopen.plan import assign
 from drivelink.canopen.roles import Role, roles
 from drivelink.canopen.scan import FoundNode, Traffic, identify, listen, scan
+from drivelink.canopen.tpdo_assignment import assign
 from drivelink.canopen.vendors import vendor_of
 from drivelink.doctor.datasheet import planned_entries
 from drivelink.doctor.motion import MotionReader, judge_gathered, judge_motion, judge_record, record_of_motion
@@ -27,8 +27,8 @@ from drivelink.doctor.report import Report, Section
 from drivelink.doctor.sampletap import SampleTap
 from drivelink.doctor.syncs import Daemons, judge_sync
 from drivelink.errors import BusError, DriveError, JointFileError
-from drivelink.finding import Finding, Severity
 from drivelink.jointfile import BusSection, JointFile
+from drivelink.notice import Notice, Severity
 
 __all__ = ["examine_bus"]
 
@@ -164,7 +164,7 @@ def _examine_node(
         return None, None
     _judge_profile(section, role, node)
     _judge_eds(section, role, node)
-    section.findings += survey.offer.findings
+    section.notices += survey.offer.notices
     return survey, _judge_mapping(section, role, survey)
 
 
@@ -196,8 +196,8 @@ def _judge_eds(section: Section, role: Role, node: FoundNode) -> None:
         )
     else:
         section.ok(role.subject, f"{role.eds.name} matches its identity")
-    section.findings += [
-        Finding(severity=Severity.INFO, subject=role.eds.name, text=problem) for problem in sheet.problems
+    section.notices += [
+        Notice(severity=Severity.INFO, subject=role.eds.name, text=problem) for problem in sheet.problems
     ]
 
 
@@ -287,7 +287,7 @@ def _overhear(
     for node, doubt in configurator.doubts.items():
         section.say(Severity.WARNING, f"node {node}", doubt)
     for node, layout in configurator.layouts.items():
-        section.findings += layout.findings
+        section.notices += layout.notices
         for tpdo in layout.tpdos:
             count, length = traffic.counts.get(tpdo.cob_id, 0), len(traffic.last.get(tpdo.cob_id, b""))
             if not count:

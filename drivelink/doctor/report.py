@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.padding import Padding
 from rich.table import Table
 
-from drivelink.finding import Finding, Severity
+from drivelink.notice import Notice, Severity
 
 __all__ = ["Report", "Section"]
 
@@ -28,17 +28,17 @@ class Section:
 
     Attributes:
         title: what they are about.
-        findings: in the order in which they were made.
+        notices: in the order in which they were made.
         facts: figures for `--json`.
     """
 
     title: str
-    findings: list[Finding] = field(default_factory=list)
+    notices: list[Notice] = field(default_factory=list)
     facts: dict[str, Any] = field(default_factory=dict)
 
     def say(self, severity: Severity, subject: str, text: str, fix: str = "") -> None:
         """Add a finding."""
-        self.findings.append(Finding(severity=severity, subject=subject, text=text, fix=fix))
+        self.notices.append(Notice(severity=severity, subject=subject, text=text, fix=fix))
 
     def ok(self, subject: str, text: str) -> None:
         """Add what is as it should be."""
@@ -65,7 +65,7 @@ class Report:
     @property
     def worst(self) -> Severity:
         """The worst finding."""
-        severities = [finding.severity for section in self.sections for finding in section.findings]
+        severities = [finding.severity for section in self.sections for finding in section.notices]
         return max(severities, default=Severity.OK)
 
     def as_dict(self) -> dict[str, Any]:
@@ -76,7 +76,7 @@ class Report:
             "findings": [
                 {"section": section.title, **finding.as_dict()}
                 for section in self.sections
-                for finding in section.findings
+                for finding in section.notices
             ],
             "facts": {section.title: section.facts for section in self.sections if section.facts},
         }
@@ -84,7 +84,7 @@ class Report:
     def show(self, console: Console) -> None:
         """Print it."""
         for section in self.sections:
-            if section.findings:
+            if section.notices:
                 console.print(f"[bold]{escape(section.title)}[/bold]", highlight=False)
                 console.print(Padding(_table(section), (0, 0, 1, 1)))
         console.print(self._closing(), highlight=False)
@@ -92,7 +92,7 @@ class Report:
     def _closing(self) -> str:
         counts = dict.fromkeys(Severity, 0)
         for section in self.sections:
-            for finding in section.findings:
+            for finding in section.notices:
                 counts[finding.severity] += 1
         errors, warnings = counts[Severity.ERROR], counts[Severity.WARNING]
         if errors:
@@ -108,7 +108,7 @@ def _table(section: Section) -> Table:
     table.add_column(width=1)
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
-    for finding in section.findings:
+    for finding in section.notices:
         mark, colour = _MARKS[finding.severity]
         text = escape(finding.text)
         if finding.fix:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from drivelink.doctor.machine import percentile
 from drivelink.doctor.report import Section
-from drivelink.finding import Severity
 from drivelink.jointfile import BusSection
+from drivelink.notice import Severity
 
 __all__ = ["Daemons", "judge_sync"]
 

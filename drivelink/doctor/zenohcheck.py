@@ -9,8 +9,8 @@ import zenoh
 
 from drivelink.doctor.report import Section
 from drivelink.errors import ZenohError
-from drivelink.finding import Severity
 from drivelink.jointfile import JointFile
+from drivelink.notice import Severity
 from drivelink.pubsub.rendezvous import answers
 from drivelink.pubsub.session import close_session, open_client
 

@@ -25,7 +25,7 @@ from drivelink.cycle.following import MapFollower
 from drivelink.cycle.syncclock import measure_period
 from drivelink.errors import DriveError, RecordingError
 from drivelink.jointfile import JointFile
-from drivelink.recording.canlog import CAN_SUFFIXES, NO_STAMP, Frame, in_order, read_frames
+from drivelink.recording.canlog import CAN_SUFFIXES, NO_STAMP, LoggedFrame, in_order, read_frames
 from drivelink.recording.columns import sample_columns, sample_row
 from drivelink.recording.cycles import Cycle
 from drivelink.recording.grid import report_gaps
@@ -89,7 +89,7 @@ class FrameLog:
     def __init__(self, path: Path, joint: JointFile, base_dir: Path, channel: str | None = None) -> None:
         self._path = path
 
-        def frames() -> Iterator[Frame]:
+        def frames() -> Iterator[LoggedFrame]:
             mcap = path.suffix.lower() == ".mcap"
             return (
                 in_order(_mcap_frames(path), path) if mcap else read_frames(path, channel, joint.bus.channel)
@@ -99,7 +99,7 @@ class FrameLog:
         self._follow = joint.bus.sync == "follow"
         self._passive = not joint.bus.configure
         self._listener = PassiveConfigurator([joint], [base_dir])
-        self._head: list[Frame] = []  # after the configuration, read already
+        self._head: list[LoggedFrame] = []  # after the configuration, read already
         syncs, overheard = self._learn_configuration()
         declared = not self._listener.busy
         if not overheard and (known := recorded_layouts(path, joint.name, daemon=declared)):
@@ -297,7 +297,7 @@ def read_frame_record(path: Path, joint: JointFile | None, base_dir: Path, chann
     )
 
 
-def _mcap_frames(path: Path) -> Iterator[Frame]:
+def _mcap_frames(path: Path) -> Iterator[LoggedFrame]:
     for message in read_messages(path, frozenset({"can"})):
         try:
             fields = json.loads(message.data)
@@ -307,4 +307,4 @@ def _mcap_frames(path: Path) -> Iterator[Frame]:
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             reason = f"{message.topic[:80]} is no frame of drivelink: {error}"
             raise RecordingError(f"{path}: {reason}") from error
-        yield Frame(message.log_time_ns, can_id, data, "")
+        yield LoggedFrame(message.log_time_ns, can_id, data, "")

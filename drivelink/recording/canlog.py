@@ -21,7 +21,7 @@ from drivelink.errors import RecordingError
 from drivelink.recording.boundedlog import AscText, BlfBytes, TrcText
 from drivelink.recording.limits import MAX_LINE_BYTES
 
-__all__ = ["CAN_SUFFIXES", "NO_STAMP", "Frame", "in_order", "read_frames"]
+__all__ = ["CAN_SUFFIXES", "NO_STAMP", "LoggedFrame", "in_order", "read_frames"]
 
 _LOG = logging.getLogger("drivelink.recording")
 
@@ -40,7 +40,7 @@ _GAP_NS = 1_000_000_000
 _LOOK_AHEAD = 2000  # frames that decide what the stamps mean, and which channels there are
 
 
-class Frame(NamedTuple):
+class LoggedFrame(NamedTuple):
     """One frame of a log.
 
     Attributes:
@@ -74,7 +74,7 @@ _SPACED = re.compile(
 _DATE = re.compile(rb"^[ \t]*\((\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d)\.(\d+)\)")
 
 
-def read_frames(path: Path, channel: str | None = None, configured: str = "") -> Iterator[Frame]:
+def read_frames(path: Path, channel: str | None = None, configured: str = "") -> Iterator[LoggedFrame]:
     """The frames of a log, in its order, all of one channel.
 
     Args:
@@ -88,13 +88,13 @@ def read_frames(path: Path, channel: str | None = None, configured: str = "") ->
     frames = _text_frames(path) if path.suffix.lower() in (".log", ".candump") else _library_frames(path)
     head = list(islice(frames, _LOOK_AHEAD))
     chosen = channel or _channel(head, configured, path)
-    whole: Iterator[Frame] = chain(head, frames)
+    whole: Iterator[LoggedFrame] = chain(head, frames)
     if chosen is not None:
         whole = (frame for frame in whole if _same_channel(frame.channel, chosen))
     return in_order(whole, path)
 
 
-def in_order(frames: Iterable[Frame], path: Path) -> Iterator[Frame]:
+def in_order(frames: Iterable[LoggedFrame], path: Path) -> Iterator[LoggedFrame]:
     """Frames whose stamps go on where they jump back: a clock that was set, or two logs in one file.
 
     How long it took nobody knows: it is a gap, of a second, and said.
@@ -116,7 +116,7 @@ def in_order(frames: Iterable[Frame], path: Path) -> Iterator[Frame]:
         yield frame._replace(stamp_ns=stamp_ns) if offset and frame.stamp_ns != NO_STAMP else frame
 
 
-def _channel(head: list[Frame], configured: str, path: Path) -> str | None:
+def _channel(head: list[LoggedFrame], configured: str, path: Path) -> str | None:
     """Which channel to use, by the first frames of a log; None: there is only one.
 
     Raises:
@@ -137,7 +137,7 @@ def _same_channel(name: str, wanted: str) -> bool:
     return name == wanted or (name.isdigit() and re.fullmatch(rf"\D*{name}", wanted) is not None)
 
 
-def _text_frames(path: Path) -> Iterator[Frame]:
+def _text_frames(path: Path) -> Iterator[LoggedFrame]:
     try:
         with path.open("rb") as file:
             frames = _parsed(file, path)
@@ -147,7 +147,7 @@ def _text_frames(path: Path) -> Iterator[Frame]:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
 
 
-def _parsed(file: IO[bytes], path: Path) -> Iterator[Frame]:
+def _parsed(file: IO[bytes], path: Path) -> Iterator[LoggedFrame]:
     """The lines that are data frames with 11-bit identifiers; what is no frame at all is counted."""
     tolerant = _Lines()
     while block := file.read(_BLOCK):
@@ -188,11 +188,11 @@ def _require_end(file: IO[bytes], length: int, path: Path) -> None:
     _LOG.warning("%s: the last line has no end and is left out: it may be cut off", path)
 
 
-def _plain_frames(lines: list[tuple[str, ...]]) -> Iterator[Frame]:
+def _plain_frames(lines: list[tuple[str, ...]]) -> Iterator[LoggedFrame]:
     """The frames of a block in which every line is as candump -L writes it: much quicker than one by one."""
     seconds, micros, channels, ids, data = zip(*lines, strict=True)
     stamps = [int(s + us) * 1000 for s, us in zip(seconds, micros, strict=True)]
-    frames = map(Frame, stamps, [int(i, 16) for i in ids], map(bytes.fromhex, data), channels)
+    frames = map(LoggedFrame, stamps, [int(i, 16) for i in ids], map(bytes.fromhex, data), channels)
     return (frame for frame in frames if frame.can_id <= _LAST_ID and len(frame.data) <= _LONGEST)
 
 
@@ -208,7 +208,7 @@ class _Lines:
     def __init__(self) -> None:
         self.understood = self.strange = self._number = 0
         self.first_strange = ""
-        self._parse: Callable[[bytes], Frame | None] = _compact
+        self._parse: Callable[[bytes], LoggedFrame | None] = _compact
 
     @property
     def hopeless(self) -> bool:
@@ -220,7 +220,7 @@ class _Lines:
         self._number += lines
         self.understood += lines
 
-    def frames(self, block: bytes) -> Iterator[Frame]:
+    def frames(self, block: bytes) -> Iterator[LoggedFrame]:
         """The data frames with 11-bit identifiers among the lines of a block."""
         for line in BytesIO(block):
             self._number += 1
@@ -239,7 +239,7 @@ class _Lines:
             if frame is not None:
                 yield frame
 
-    def _either(self, line: bytes) -> Frame | None:
+    def _either(self, line: bytes) -> LoggedFrame | None:
         """The frame, in the way of the line before, or in the other."""
         try:
             return self._parse(line)
@@ -248,11 +248,11 @@ class _Lines:
             return self._parse(line)
 
 
-def _no_frame() -> Frame:
+def _no_frame() -> LoggedFrame:
     raise ValueError
 
 
-def _compact(line: bytes) -> Frame | None:
+def _compact(line: bytes) -> LoggedFrame | None:
     match = _COMPACT.match(line) or _COMPACT.match(_undated(line))
     if match is None:
         raise ValueError
@@ -262,10 +262,10 @@ def _compact(line: bytes) -> Frame | None:
     payload = bytes.fromhex(data.replace(b".", b"").decode())
     if len(payload) > _LONGEST:
         return None
-    return Frame(_stamp(seconds, fraction), int(can_id, 16), payload, channel.decode(errors="replace"))
+    return LoggedFrame(_stamp(seconds, fraction), int(can_id, 16), payload, channel.decode(errors="replace"))
 
 
-def _spaced(line: bytes) -> Frame | None:
+def _spaced(line: bytes) -> LoggedFrame | None:
     match = _SPACED.match(line) or _SPACED.match(_undated(line))
     if match is None:
         raise ValueError
@@ -279,7 +279,7 @@ def _spaced(line: bytes) -> Frame | None:
         raise ValueError
     # The characters that -a appends may look like bytes.
     payload = payload[: int(length)]
-    return Frame(_stamp(seconds, fraction), int(can_id, 16), payload, channel.decode(errors="replace"))
+    return LoggedFrame(_stamp(seconds, fraction), int(can_id, 16), payload, channel.decode(errors="replace"))
 
 
 def _stamp(seconds: bytes | None, fraction: bytes) -> int:
@@ -298,7 +298,7 @@ def _undated(line: bytes) -> bytes:
     return b"(%d.%s)" % (int(moment.timestamp()), match[2]) + line[match.end() :]
 
 
-def _dated(first: list[Frame], frames: Iterable[Frame], path: Path) -> Iterator[Frame]:
+def _dated(first: list[LoggedFrame], frames: Iterable[LoggedFrame], path: Path) -> Iterator[LoggedFrame]:
     """Frames with stamps that increase: those of `candump -t d` are differences and are added up."""
     stamps = [frame.stamp_ns for frame in first]
     falls = sum(b < a for a, b in pairwise(stamps))
@@ -308,14 +308,14 @@ def _dated(first: list[Frame], frames: Iterable[Frame], path: Path) -> Iterator[
     return _added_up(frames)
 
 
-def _added_up(frames: Iterable[Frame]) -> Iterator[Frame]:
+def _added_up(frames: Iterable[LoggedFrame]) -> Iterator[LoggedFrame]:
     total = 0
     for frame in frames:
         total += frame.stamp_ns
         yield frame._replace(stamp_ns=total)
 
 
-def _library_frames(path: Path) -> Iterator[Frame]:
+def _library_frames(path: Path) -> Iterator[LoggedFrame]:
     """By python-can's reader of the file's ending; a file that a crash cut off ends where it is whole."""
     kind = _READERS[path.suffix.lower()]
     count = 0
@@ -329,7 +329,7 @@ def _library_frames(path: Path) -> Iterator[Frame]:
                     continue
                 count += 1
                 stamp_ns = round(message.timestamp * 1e9)
-                yield Frame(stamp_ns, message.arbitration_id, bytes(message.data), str(message.channel))
+                yield LoggedFrame(stamp_ns, message.arbitration_id, bytes(message.data), str(message.channel))
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
     except RecordingError:

@@ -14,7 +14,7 @@ from drivelink.jointfile import JointFile
 from drivelink.recording.canframes import is_frame_log
 from drivelink.recording.playback import Played
 from estimator.errors import EstimatorError
-from estimator.gate import Change, Finding, GateError, Judgement, judge, refuse
+from estimator.gate import Change, Discrepancy, GateError, Judgement, judge, refuse
 from estimator.model import JointModel
 from estimator.sample import Record, Sample
 
@@ -46,7 +46,7 @@ class Correction:
         return f"{self.table}.{self.key} = {self.value:.7g}"
 
 
-def refusal(path: Path, joint: JointFile, findings: Sequence[Finding], message: str) -> RecordingError:
+def refusal(path: Path, joint: JointFile, findings: Sequence[Discrepancy], message: str) -> RecordingError:
     """The refusal of a recording in one line, with what to paste into the joint file."""
     return RecordingError(f"{path}: {message}; {text_of(joint, findings, live=is_frame_log(path))}")
 
@@ -124,7 +124,7 @@ def record_of(samples: Sequence[Sample], model: JointModel, period_s: float) -> 
     )
 
 
-def text_of(joint: JointFile, findings: Sequence[Finding], *, live: bool) -> str:
+def text_of(joint: JointFile, findings: Sequence[Discrepancy], *, live: bool) -> str:
     """The correction, ready to be pasted.
 
     Args:

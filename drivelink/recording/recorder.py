@@ -30,12 +30,12 @@ from drivelink.errors import BusError, DriveError, ZenohError
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.identity import DaemonIdentity, source_of
 from drivelink.pubsub.inbound import DECODERS
-from drivelink.recording.canlog import Frame
+from drivelink.recording.canlog import LoggedFrame
 from drivelink.recording.sinks import Sink
 from drivelink.recording.syncnumbers import SyncNumbering
 from estimator.sample import Sample
 
-__all__ = ["BusTap", "Gate", "Recorder", "ZenohTap"]
+__all__ = ["BusTap", "FirstSource", "Recorder", "ZenohTap"]
 
 _QUEUE = 30_000  # messages of a key that may wait: half a minute at 1 kHz
 _FLUSH_S = 1.0
@@ -43,7 +43,7 @@ _POLL_S = 0.005
 _STALE_S = 1.0  # after which another session may take over where no token says who the daemon is
 
 
-class Gate:
+class FirstSource:
     """Lets the samples of one source through, where the daemon and the bus both give them: the first's.
 
     Args:
@@ -77,10 +77,10 @@ class ZenohTap:
     """
 
     def __init__(
-        self, session: zenoh.Session, joint: JointFile, sink: Sink, gate: Gate | None = None
+        self, session: zenoh.Session, joint: JointFile, sink: Sink, gate: FirstSource | None = None
     ) -> None:
         self._sink = sink
-        self._gate = gate or Gate(sink)
+        self._gate = gate or FirstSource(sink)
         self.missed = self._impossible = 0
         self.newest_s = 0.0
         self._sequence = -1
@@ -191,10 +191,10 @@ class BusTap:
         joint: JointFile,
         sink: Sink,
         base_dir: Path | None,
-        gate: Gate | None = None,
+        gate: FirstSource | None = None,
         layouts: Sequence[NodeLayout] = (),
     ) -> None:
-        self._gate = gate or Gate(sink)
+        self._gate = gate or FirstSource(sink)
         self._source = open_source(bus)
         self._sink = sink
         self._joint = joint
@@ -232,7 +232,7 @@ class BusTap:
                 for cob_id, data, stamp_ns in frames:
                     self._sink.frame(stamp_ns, cob_id, data)
                     if self._listener is not None:
-                        for frame, jump in self._numbering.push(Frame(stamp_ns, cob_id, data, "")):
+                        for frame, jump in self._numbering.push(LoggedFrame(stamp_ns, cob_id, data, "")):
                             self._assemble(frame, jump)
                 self.frames += len(frames)
         except BusLostError as error:
@@ -243,7 +243,7 @@ class BusTap:
         for frame, jump in self._numbering.rest():
             self._assemble(frame, jump)
 
-    def _assemble(self, frame: Frame, jump: int) -> None:
+    def _assemble(self, frame: LoggedFrame, jump: int) -> None:
         stamp_ns, cob_id, data, _ = frame
         listener = self._listener
         if listener is None:

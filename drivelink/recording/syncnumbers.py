@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 
 from drivelink._core import SYNC_COB_ID
 from drivelink.cycle.syncclock import SyncClock, measure_period
-from drivelink.recording.canlog import NO_STAMP, Frame
+from drivelink.recording.canlog import NO_STAMP, LoggedFrame
 
 __all__ = ["SyncNumbering", "numbered_ahead", "numbered_at_once"]
 
@@ -24,7 +24,7 @@ _EXTRA = -0.5  # periods before it was due: a SYNC of another master
 _FOLLOW = 0.05  # of the deviation, per SYNC: the two clocks drift
 
 
-def numbered_at_once(frames: Iterable[Frame], period_s: float) -> Iterator[tuple[Frame, int]]:
+def numbered_at_once(frames: Iterable[LoggedFrame], period_s: float) -> Iterator[tuple[LoggedFrame, int]]:
     """Each frame with the jump of its SYNC, decided as the live loop does that follows a SYNC."""
     clock = SyncClock(period_s)
     for frame in frames:
@@ -34,7 +34,7 @@ def numbered_at_once(frames: Iterable[Frame], period_s: float) -> Iterator[tuple
             yield frame, 1
 
 
-def numbered_ahead(frames: Iterable[Frame], period_s: float) -> Iterator[tuple[Frame, int]]:
+def numbered_ahead(frames: Iterable[LoggedFrame], period_s: float) -> Iterator[tuple[LoggedFrame, int]]:
     """Each frame with the jump of its SYNC: whole periods since the one before, 0 for one that is not due."""
     numbering = SyncNumbering(period_s)
     for frame in frames:
@@ -55,10 +55,10 @@ class SyncNumbering:
         self._measure = measure
         self._last: int | None = None
         self._due_ns: float | None = None
-        self._cycles: deque[list[Frame]] = deque()  # each SYNC that waits, and what follows it
+        self._cycles: deque[list[LoggedFrame]] = deque()  # each SYNC that waits, and what follows it
         self._stamps: deque[int] = deque()  # of these SYNCs
 
-    def push(self, frame: Frame) -> list[tuple[Frame, int]]:
+    def push(self, frame: LoggedFrame) -> list[tuple[LoggedFrame, int]]:
         """Take a frame; returns those that are certain now, each with its jump."""
         if frame.can_id == SYNC_COB_ID:
             self._cycles.append([frame])
@@ -69,11 +69,11 @@ class SyncNumbering:
             return []
         return [(frame, 1)]
 
-    def rest(self) -> list[tuple[Frame, int]]:
+    def rest(self) -> list[tuple[LoggedFrame, int]]:
         """The stream has ended: everything that still waits."""
         return [numbered for _ in range(len(self._cycles)) for numbered in self._released()]
 
-    def _released(self) -> list[tuple[Frame, int]]:
+    def _released(self) -> list[tuple[LoggedFrame, int]]:
         """The first cycle that waits."""
         sync, *others = self._cycles.popleft()
         return [(sync, self._jump()), *[(frame, 1) for frame in others]]

@@ -16,7 +16,7 @@ from estimator.model import JointModel, Motor
 from estimator.sample import FloatArray, Record
 from estimator.transmissions import transmission_model
 
-__all__ = ["Finding", "GateError", "Judgement", "examine", "judge", "refuse"]
+__all__ = ["Discrepancy", "GateError", "Judgement", "examine", "judge", "refuse"]
 
 _DECISIVE = 6.0  # nats over "as declared": 400 to 1
 _LEAST_ROWS = 300  # a shorter recording tells nothing to nobody
@@ -39,7 +39,7 @@ _PERIOD = (3e-3, 8.0)  # s, factor: of a sampling period where none is declared
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Finding:
+class Discrepancy:
     """One thing that is wrong with a recording or with what is declared.
 
     Attributes:
@@ -108,7 +108,7 @@ class Judgement:
         left: share of the torque that the balance leaves, put right.
     """
 
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[Discrepancy, ...] = ()
     untold: tuple[str, ...] = ()
     reason: str = ""
     left: float = math.nan
@@ -129,7 +129,7 @@ class GateError(EstimatorError):
         record: with which recording.
     """
 
-    def __init__(self, findings: Sequence[Finding], record: Record) -> None:
+    def __init__(self, findings: Sequence[Discrepancy], record: Record) -> None:
         self.findings = tuple(findings)
         self.record = record
         first = self.findings[0]
@@ -244,7 +244,7 @@ def _untold(joint: _Joint, single: Sequence[Cause], declared: float) -> tuple[st
     return tuple(f"the {' and '.join(sorted(kinds))} of {name}" for name, kinds in doubtful.items())
 
 
-def examine(record: Record, model: JointModel) -> list[Finding]:
+def examine(record: Record, model: JointModel) -> list[Discrepancy]:
     """What is wrong with units, signs, gear ratios or time of a recording: the findings of `judge`."""
     return list(judge(record, model).findings)
 
@@ -272,10 +272,10 @@ def _finding(
     before: float,
     after: float,
     motors: int,
-) -> Finding:
+) -> Discrepancy:
     cause, rest = found[number], set(found) - {found[number]}
     others = [next(iter(set(h) - rest)).changes for h in alike if len(set(h) - rest) == 1]
-    return Finding(
+    return Discrepancy(
         kind=cause.kind,
         what=cause.what,
         changes=cause.changes,

@@ -14,7 +14,7 @@ from sim.canopen.objects import Identity, communication_objects, rpdo_objects, t
 from sim.canopen.quirks import Quirks
 from sim.canopen.statemachine import PowerState, StateMachine
 
-__all__ = ["Cia402Drive", "Rig", "Signals", "drive_objects"]
+__all__ = ["Cia402Drive", "DriveReadings", "MeasuredPlant", "drive_objects"]
 
 _PROFILE_TORQUE, _CYCLIC_TORQUE = 4, 10
 _MODES = (0, _PROFILE_TORQUE, _CYCLIC_TORQUE)
@@ -30,7 +30,7 @@ _RADIAN, _DEGREE, _REVOLUTION, _INCREMENT = 0x10, 0x41, 0xB4, 0xB5
 _SECONDS = {0x03: 1.0, 0x47: 60.0}
 
 
-class Signals(Protocol):
+class DriveReadings(Protocol):
     """What the drive's sensors say, at the motor shaft."""
 
     @property
@@ -50,7 +50,7 @@ class Signals(Protocol):
         """At the motor shaft."""
 
 
-class Rig(Protocol):
+class MeasuredPlant(Protocol):
     """The part of a world that one drive is wired to (`sim.world.World`)."""
 
     @property
@@ -61,7 +61,7 @@ class Rig(Protocol):
     def time_s(self) -> float:
         """The present sampling instant."""
 
-    def drive(self, motor: int) -> Signals:
+    def drive(self, motor: int) -> DriveReadings:
         """What motor `motor` reports now."""
 
     def command(self, motor: int, torque_nm: float | None) -> None:
@@ -101,13 +101,18 @@ class Cia402Drive(Node):
     """
 
     def __init__(
-        self, node_id: int, rig: Rig, motor: int, data: DriveData | None = None, quirks: Quirks | None = None
+        self,
+        node_id: int,
+        rig: MeasuredPlant,
+        motor: int,
+        data: DriveData | None = None,
+        quirks: Quirks | None = None,
     ) -> None:
         self._rig = rig
         self._motor = motor
         self.data = data or DriveData()
         quirks = quirks or Quirks()
-        self._sampled: tuple[Callable[[Signals], None], ...] = ()
+        self._sampled: tuple[Callable[[DriveReadings], None], ...] = ()
         super().__init__(node_id, drive_objects(self.data, quirks), quirks)
         self.machine = StateMachine()
         self._torque_unit_nm = max(1, self.data.rated_torque_mnm) * 1e-6
@@ -137,7 +142,7 @@ class Cia402Drive(Node):
         if (0x60A9, 0) not in self.dictionary:
             self._velocity_unit.value = self.quirks.defaults.get((0x60A9, 0), self.data.velocity_unit)
         self._error_code = live(0x603F)
-        self._sensors: list[tuple[Callable[[Signals], None], frozenset[Entry]]] = [
+        self._sensors: list[tuple[Callable[[DriveReadings], None], frozenset[Entry]]] = [
             (self._read_position, frozenset({self._position, self._internal})),
             (self._read_velocity, frozenset({self._velocity, self._sensor_velocity})),
             (self._read_torque, frozenset({self._torque})),
@@ -253,24 +258,24 @@ class Cia402Drive(Node):
             read(signals)
         self._status.value = self._statusword()
 
-    def _read_position(self, signals: Signals) -> None:
+    def _read_position(self, signals: DriveReadings) -> None:
         counts = signals.position_counts
         self._internal.value = (counts + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
         counts *= self._position_sign
         self._position.value = (counts + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
 
-    def _read_velocity(self, signals: Signals) -> None:
+    def _read_velocity(self, signals: DriveReadings) -> None:
         velocity = _limited(signals.velocity_rad_s * self._velocity_scale, 0x7FFF_FFFF)
         self._velocity.value = self._sensor_velocity.value = velocity
 
-    def _read_torque(self, signals: Signals) -> None:
+    def _read_torque(self, signals: DriveReadings) -> None:
         self._torque.value = _limited(signals.torque_nm / self._torque_unit_nm, 0x7FFF)
 
-    def _read_current(self, signals: Signals) -> None:
+    def _read_current(self, signals: DriveReadings) -> None:
         self._current.value = _limited(signals.current_a / self._current_unit_a, 0x7FFF)
         self._milliampere.value = round(signals.current_a * 1e3)
 
-    def _read_link(self, _signals: Signals) -> None:
+    def _read_link(self, _signals: DriveReadings) -> None:
         counts, time_s = self._rig.link_counts(), self._rig.time_s
         self._link.value = (counts + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
         elapsed_s = time_s - self._link_time_s

@@ -6,7 +6,7 @@ import logging
 from dataclasses import asdict, dataclass
 from enum import IntEnum
 
-__all__ = ["Finding", "Severity", "log_findings"]
+__all__ = ["Notice", "Severity", "log_notices"]
 
 
 class Severity(IntEnum):
@@ -27,7 +27,7 @@ _LEVELS = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Finding:
+class Notice:
     """One thing that was noticed.
 
     Attributes:
@@ -50,7 +50,7 @@ class Finding:
         return {**asdict(self), "severity": self.severity.name.lower()}
 
 
-def log_findings(logger: logging.Logger, findings: tuple[Finding, ...] | list[Finding]) -> None:
+def log_notices(logger: logging.Logger, findings: tuple[Notice, ...] | list[Notice]) -> None:
     """One log line for each, at the level of its severity."""
     for finding in findings:
         logger.log(_LEVELS[finding.severity], "%s", finding)

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from drivelink.canopen.candidates import Candidate
 from drivelink.canopen.layout import Signal
+from drivelink.canopen.mappable import MappableObject
 from drivelink.canopen.pdo import Tpdo, describe
 from drivelink.canopen.roles import Role
 from drivelink.errors import DriveError
@@ -29,7 +29,7 @@ _ORDER = (
 )
 OPTIONAL = (Signal.MOTOR_VELOCITY, Signal.STATUSWORD)
 
-Available = Mapping[Signal, Sequence[Candidate]]
+Available = Mapping[Signal, Sequence[MappableObject]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,12 +42,12 @@ class Assignment:
     """
 
     tpdo: Tpdo
-    objects: tuple[Candidate, ...] | None
+    objects: tuple[MappableObject, ...] | None
 
 
-def pack(objects: Iterable[Candidate], most: int = FRAME_BITS) -> list[tuple[Candidate, ...]]:
+def pack(objects: Iterable[MappableObject], most: int = FRAME_BITS) -> list[tuple[MappableObject, ...]]:
     """Frames of at most eight bytes and `most` objects, first fit, in the order of importance."""
-    frames: list[list[Candidate]] = []
+    frames: list[list[MappableObject]] = []
     for candidate in sorted(objects, key=lambda candidate: _ORDER.index(candidate.signal)):
         for frame in frames:
             if len(frame) < most and sum(other.bits for other in frame) + candidate.bits <= FRAME_BITS:
@@ -97,7 +97,7 @@ def assign(
 
 
 def _free(
-    wanted: Sequence[tuple[Signal, Sequence[Candidate]]], tpdos: Sequence[Tpdo], prefer_unused: bool
+    wanted: Sequence[tuple[Signal, Sequence[MappableObject]]], tpdos: Sequence[Tpdo], prefer_unused: bool
 ) -> tuple[Assignment, ...] | None:
     """Everything in TPDOs that carry it already or can be mapped, or None where there are too few."""
     left = list(tpdos)
@@ -124,7 +124,7 @@ def _free(
     return tuple(result)
 
 
-def _carried(tpdo: Tpdo, wanted: Mapping[Signal, Sequence[Candidate]]) -> list[Signal]:
+def _carried(tpdo: Tpdo, wanted: Mapping[Signal, Sequence[MappableObject]]) -> list[Signal]:
     mapped = {(index, subindex) for index, subindex, _ in tpdo.entries}
     return [
         signal for signal, objects in wanted.items() if any(object_.address in mapped for object_ in objects)

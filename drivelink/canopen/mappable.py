@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from drivelink.canopen.layout import MappedObject, Signal
-from drivelink.finding import Finding
+from drivelink.notice import Notice
 
-__all__ = ["Candidate", "Offer"]
+__all__ = ["MappableObject", "Offer"]
 
 Address = tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Candidate:
+class MappableObject:
     """An object that can give a signal, with all that is needed to decode it."""
 
     signal: Signal
@@ -47,9 +47,9 @@ class Offer:
     Attributes:
         candidates: for each signal the objects that can give it, best first.
         missing: for a signal with no candidate, why.
-        findings: disagreements and remarks.
+        notices: disagreements and remarks.
     """
 
-    candidates: dict[Signal, tuple[Candidate, ...]] = field(default_factory=dict)
+    candidates: dict[Signal, tuple[MappableObject, ...]] = field(default_factory=dict)
     missing: dict[Signal, str] = field(default_factory=dict)
-    findings: list[Finding] = field(default_factory=list)
+    notices: list[Notice] = field(default_factory=list)

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-__all__ = ["SdoListener"]
+__all__ = ["SdoSniffer"]
 
 Address = tuple[int, int]
 
 _MAX_BYTES = 8  # no object of interest is longer
 
 
-class SdoListener:
+class SdoSniffer:
     """Follows the SDO channel of one node.
 
     Args:

@@ -12,7 +12,7 @@ import pytest
 from canopenkit import joint_text
 
 from drivelink.cycle.busport import BusPort
-from drivelink.cycle.joining import join_bus
+from drivelink.cycle.startup import join_bus
 from drivelink.jointfile import parse
 
 DRIVE = """counts_per_rev = 16384

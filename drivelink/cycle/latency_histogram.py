@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Meter"]
+__all__ = ["LatencyHistogram"]
 
 _RANGE_US = 5_000  # anything longer is counted as this long; the maximum is kept exactly
 
 
-class Meter:
+class LatencyHistogram:
     """A distribution of durations, in microseconds: counts per microsecond, and the maximum.
 
     Attributes:

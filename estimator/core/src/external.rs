@@ -28,6 +28,8 @@ const SETTLED: f64 = 4.5; // delays of the filter after which a wrong start is f
 const UNCORRELATED: f64 = 0.697; // w t from which on the noise of s² w³/(s + w)³ is not positively correlated
 const OVERSHOOT: f64 = 1.166; // of a sum over its threshold, standard deviations (Siegmund 1985, chapter X)
 const CAP: f64 = 2.0; // thresholds that a sum may reach: a long contact ends as soon as a short one
+const FRICTION_S: f64 = 20.0; // memory of what opposes the link's motion, as that of the regression
+const FRICTION_SPEEDS: f64 = 0.02; // of the largest velocity: over which dry friction changes its sign
 const CONSISTENCY_S: f64 = 10.0; // over which the two flexibility torques are compared
 const TINY: f64 = 1e-12;
 
@@ -83,7 +85,7 @@ impl External {
 pub struct Carried {
     /// τ_e,t, with what else the transmissions transmit, N·m.
     pub torque: f64,
-    /// Its variance, (N·m)², as the curve is uncertain.
+    /// Its variance, (N·m)², as the curve is uncertain; a skew between the encoders is not in it.
     pub variance: f64,
     /// σ_t, N·m/rad.
     pub stiffness: f64,
@@ -207,8 +209,7 @@ impl Judge {
     /// The torque without its bias, and whether something touches the link.
     fn see(&mut self, sum: f64, carried: f64, uncertain: f64, noise: f64, valid: bool) -> (f64, bool) {
         if !valid {
-            self.test.reset();
-            return (sum - self.bias, false);
+            return (sum - self.bias, false); // a contact that lasts is one still when it is valid again
         }
         self.bias += self.follow * (sum - self.bias);
         let least = self.least.unwrap_or(SHARE * self.largest);
@@ -247,6 +248,63 @@ fn gravity(link: &Link, q: f64) -> f64 {
     link.gravity * (q + link.gravity_phase).sin()
 }
 
+/// What opposes the link's motion and nobody declared, learned from the link's own balance where that is as
+/// expected: a torque in proportion to the velocity, and a dry friction.
+///
+/// Damping is the one, and so is a skew between the encoders: d of it makes σ d q′ of torque. From the motor's
+/// side a skew and the motor's friction look alike; here only the link's damping does, and nothing is to be
+/// told apart.
+#[derive(Clone, Copy, Debug, Default)]
+struct Friction {
+    values: [f64; 2],
+    covariance: Option<[[f64; 2]; 2]>,
+    fastest: f64,
+}
+
+impl Friction {
+    /// What the two are proportional to at this velocity.
+    fn row(&mut self, velocity: f64) -> [f64; 2] {
+        self.fastest = self.fastest.max(velocity.abs());
+        [velocity, (velocity / (FRICTION_SPEEDS * self.fastest).max(TINY)).tanh()]
+    }
+
+    /// One period; `prior`: the variances before anything is learned, which are never exceeded.
+    fn forget(&mut self, prior: [f64; 2], period_s: f64) {
+        let Some(p) = &mut self.covariance else {
+            self.covariance = Some([[prior[0], 0.0], [0.0, prior[1]]]);
+            return;
+        };
+        for i in 0..2 {
+            p[i][i] = (p[i][i] + prior[i] * period_s / FRICTION_S).min(prior[i]);
+        }
+        let most = (p[0][0] * p[1][1]).sqrt();
+        p[0][1] = p[0][1].clamp(-most, most);
+        p[1][0] = p[0][1];
+    }
+
+    /// The torque and its variance.
+    fn at(&self, row: [f64; 2]) -> (f64, f64) {
+        let p = self.covariance.unwrap_or_default();
+        let variance =
+            p[0][0] * row[0] * row[0] + 2.0 * p[0][1] * row[0] * row[1] + p[1][1] * row[1] * row[1];
+        (self.values[0] * row[0] + self.values[1] * row[1], variance.max(0.0))
+    }
+
+    /// What is left of one balance; `noise`: its variance, of errors that last as long as the filter does.
+    fn learn(&mut self, row: [f64; 2], left: f64, noise: f64) {
+        let (_, variance) = self.at(row);
+        let Some(p) = &mut self.covariance else { return };
+        let seen = [p[0][0] * row[0] + p[0][1] * row[1], p[1][0] * row[0] + p[1][1] * row[1]];
+        let scale = 1.0 / (variance + noise).max(TINY * TINY);
+        for i in 0..2 {
+            self.values[i] += scale * seen[i] * left;
+            for j in 0..2 {
+                p[i][j] -= scale * seen[i] * seen[j];
+            }
+        }
+    }
+}
+
 // -- robust mode -----------------------------------------------------------------------------------
 
 /// The link's momentum of robust mode: everything through F(s) = w³/(s + w)³.
@@ -265,6 +323,9 @@ pub struct LinkMomentum {
     carried: [f64; 3],
     measured: [f64; 3],
     last: [f64; 4], // q, g, τ_e, τ_k
+    skew: f64,      // between the encoders, before any data, s
+    dry: f64,       // undeclared dry friction, as a share of the torque carried
+    friction: Friction,
     judge: Judge,
     consistency: Consistency,
     now: External,
@@ -273,7 +334,7 @@ pub struct LinkMomentum {
 impl LinkMomentum {
     /// Of a model whose link dynamics are declared; `None` without them.
     #[must_use]
-    pub fn new(model: &Model, settings: &Settings, period_s: f64) -> Option<LinkMomentum> {
+    pub fn new(model: &Model, settings: &Settings, priors: &Priors, period_s: f64) -> Option<LinkMomentum> {
         let link = model.link?;
         let bandwidth = settings.external_bandwidth.min(0.25 / period_s);
         let filter = StateVariableFilter::<3>::new(bandwidth, period_s);
@@ -300,6 +361,9 @@ impl LinkMomentum {
             last: [0.0; 4],
             judge: Judge::new(settings, filter.bandwidth, period_s),
             filter,
+            skew: priors.encoder_delay * period_s,
+            dry: priors.coulomb_friction,
+            friction: Friction::default(),
             consistency: Consistency::default(),
             now: External::nothing(0),
         })
@@ -308,6 +372,7 @@ impl LinkMomentum {
     /// Forget everything.
     pub fn reset(&mut self) {
         self.judge.reset();
+        self.friction = Friction::default();
         self.consistency = Consistency::default();
         self.now = External::nothing(0);
         self.unsettled = self.settle;
@@ -316,6 +381,7 @@ impl LinkMomentum {
     /// The filters hold something wrong.
     pub fn distrust(&mut self) {
         self.unsettled = self.settle;
+        self.judge.test.reset();
     }
 
     /// At rest here.
@@ -349,7 +415,6 @@ impl LinkMomentum {
     /// `valid`: whether the estimate is; `noise`: variance of q's noise, rad².
     pub fn conclude(&mut self, sequence: u64, carried: &Carried, noise: f64, valid: bool) -> External {
         if !self.known {
-            self.judge.test.reset();
             self.now = External::nothing(sequence);
             return self.now;
         }
@@ -364,21 +429,31 @@ impl LinkMomentum {
         let own = link.inertia * acceleration + link.damping * velocity + self.gravity[0];
         let own = own + self.effects.iter().map(|element| element.torque(&c)).sum::<f64>();
         let sum = own + self.carried[0];
+        let dry = self.dry * self.judge.largest;
+        let prior = [link.damping_std.powi(2) + (carried.stiffness * self.skew).powi(2), dry * dry];
+        self.friction.forget(prior, self.period);
+        let row = self.friction.row(velocity);
+        let (opposed, unknown) = self.friction.at(row);
         // A reading that is rounded errs alike for as long as it stands: what the spring makes of it is no noise.
         let uncertain = (link.inertia_std * acceleration).powi(2)
-            + (link.damping_std * velocity).powi(2)
             + link.gravity_std.powi(2)
             + carried.variance
             + carried.reading
             + carried.stiffness.powi(2) * noise;
         let white = noise * (link.inertia.powi(2) * self.gains[2] + link.damping.powi(2) * self.gains[1]);
         let valid = valid && self.unsettled <= 0 && (sum + uncertain + white).is_finite();
-        let (torque, contact) = self.judge.see(sum, self.carried[0], uncertain, white, valid);
+        let around = uncertain + unknown;
+        let (torque, contact) = self.judge.see(sum - opposed, self.carried[0], around, white, valid);
+        let usual = torque.abs() <= BAND_SIGMA * (around + white).sqrt();
+        if valid && usual && !contact {
+            let lasting = (uncertain + white) / (self.filter.bandwidth * self.period);
+            self.friction.learn(row, torque - self.measured[0], lasting);
+        }
         self.now = External {
             sequence,
             status: if valid { status::VALID } else { 0 } | if contact { status::CONTACT } else { 0 },
             torque,
-            torque_std: (uncertain + white).sqrt(),
+            torque_std: (around + white).sqrt(),
             link_torque: self.measured[0] - own,
             difference: sum - self.measured[0],
         };
@@ -480,6 +555,7 @@ impl PaperMomentum {
         }
         (self.integrals, self.last) = ([0.0; 2], None);
         self.noise.restart();
+        self.judge.test.reset();
         self.unsettled = self.settle;
     }
 
@@ -583,11 +659,21 @@ mod tests {
         gravity_std: 0.0,
     };
 
+    const PRIORS: Priors = Priors {
+        motor_inertia: 0.05,
+        viscous_damping: 0.2,
+        viscous_damping_floor: 0.05,
+        coulomb_friction: 0.1,
+        torque_offset: 0.3,
+        deflection_offset: 0.003,
+        encoder_delay: 1.0,
+    };
+
     #[test]
     fn a_push_on_a_free_link_rises_as_its_filter_does() {
         // q = ½ (τ/M) t² with τ_e = 0: the residual is w³/(s + w)³ of the push.
         let settings = Settings { contact_torque: Some(0.1), ..Settings::default() };
-        let mut momentum = LinkMomentum::new(&joint(FREE), &settings, T).unwrap();
+        let mut momentum = LinkMomentum::new(&joint(FREE), &settings, &PRIORS, T).unwrap();
         momentum.reset();
         momentum.restart(0.0, 0.0);
         for _ in 0..200 {
@@ -613,7 +699,7 @@ mod tests {
     #[test]
     fn an_external_torque_that_is_measured_leaves_no_difference() {
         let settings = Settings::default();
-        let mut momentum = LinkMomentum::new(&joint(FREE), &settings, T).unwrap();
+        let mut momentum = LinkMomentum::new(&joint(FREE), &settings, &PRIORS, T).unwrap();
         momentum.reset();
         momentum.restart(0.0, 0.0);
         for k in 1..400 {
@@ -631,16 +717,7 @@ mod tests {
         // A link held at rest by its transmission against gravity: −r is g through K/(s + K).
         let link = Link { gravity: 6.0, ..FREE };
         let settings = Settings::default();
-        let priors = Priors {
-            motor_inertia: 0.05,
-            viscous_damping: 0.2,
-            viscous_damping_floor: 0.05,
-            coulomb_friction: 0.1,
-            torque_offset: 0.3,
-            deflection_offset: 0.003,
-            encoder_delay: 1.0,
-        };
-        let mut momentum = PaperMomentum::new(&joint(link), &settings, &priors, T).unwrap();
+        let mut momentum = PaperMomentum::new(&joint(link), &settings, &PRIORS, T).unwrap();
         let q: f64 = 0.7;
         let nothing = f64::NAN;
         for k in 0..60u64 {

@@ -627,13 +627,12 @@ impl OnlineIdentification {
         (self.variance_of(row) + slope * slope * phi_variance).sqrt()
     }
 
-    /// Variance of f at a φ that is known, likewise.
+    /// Variance of f at a φ that is known but for its offset, from the covariance of α and of that.
     #[must_use]
-    pub fn torque_variance(&self, phi: f64, link_rate: f64) -> f64 {
+    pub fn torque_variance(&self, phi: f64) -> f64 {
         let (n, mut row) = (self.law.size, [0.0; SIZE]);
         self.law.law.jacobian(phi, &self.values[..n], &mut row[..n]);
-        let stiffness = self.law.law.at(phi, &self.values[..n]).1;
-        (row[n + DELAY], row[n + DEFLECTION_OFFSET]) = (stiffness * link_rate, stiffness);
+        row[n + DEFLECTION_OFFSET] = self.law.law.at(phi, &self.values[..n]).1;
         self.variance_of(row)
     }
 

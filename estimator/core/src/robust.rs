@@ -101,7 +101,7 @@ impl Robust {
             lead,
             transmissions,
             link: Channel::rest(0.0),
-            momentum: LinkMomentum::new(model, settings, period_s),
+            momentum: LinkMomentum::new(model, settings, priors, period_s),
             external: None,
             noise: [NoiseMeter::default(); MOTORS + 1],
             zeros: Inputs::default(),

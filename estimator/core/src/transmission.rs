@@ -374,7 +374,7 @@ impl TransmissionEstimator {
         let link_rate = self.deflection.link_rate();
         let phi = self.deflection.at(0.0) + learned.deflection_offset() + learned.late() * link_rate;
         self.std = learned.stiffness_std(phi, link_rate, self.deflection.variance());
-        self.torque_variance = learned.torque_variance(phi, link_rate);
+        self.torque_variance = learned.torque_variance(phi);
         self.reach = BEYOND * learned.largest_deflection();
         if !learned.law().is_polynomial() {
             self.reach = self.reach.min(EDGE * learned.law().law.reach(&learned.alpha()[1..]));

@@ -97,7 +97,7 @@ class EffectType:
         location: the part of the joint it belongs to.
         channel: what it acts on: the torque balance of its location; the motor torque's measurement; the
             deflection (the zero between the encoders); the link encoder's reading.
-        coordinate: the coordinate that reveals it, a field of `Coordinates`.
+        coordinates: the fields of `Coordinates` that it depends on; first the one that reveals it.
         parameters: its parameters.
         remembers: whether it depends on the path that led here.
         description: for reports, in a few words.
@@ -106,7 +106,7 @@ class EffectType:
     name: str
     location: Location
     channel: Channel
-    coordinate: str
+    coordinates: tuple[str, ...]
     parameters: tuple[Parameter, ...]
     remembers: bool
     description: str
@@ -139,7 +139,8 @@ class EffectType:
         Returns:
             (k, n), one row a linear parameter.
         """
-        fields = [np.ascontiguousarray(field, dtype=np.float64).reshape(-1) for field in c]
+        named = (getattr(c, name) for name in self.coordinates)
+        fields = [np.ascontiguousarray(field, dtype=np.float64).reshape(-1) for field in named]
         listed = [1.0 if p.linear else values[p.name] for p in self.parameters]
         out = np.empty((len(self.linear), max(map(len, fields))))
         _core.effect_terms(self.name, listed, fields, out.reshape(-1))
@@ -151,12 +152,12 @@ LIBRARY: dict[str, EffectType] = {
         name,
         cast(Location, location),
         cast(Channel, channel),
-        coordinate,
+        tuple(coordinates),
         tuple(Parameter(*p) for p in parameters),
         remembers,
         description,
     )
-    for name, location, channel, coordinate, parameters, remembers, description in _core.effect_kinds()
+    for name, location, channel, coordinates, parameters, remembers, description in _core.effect_kinds()
 }
 
 

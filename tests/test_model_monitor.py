@@ -8,6 +8,7 @@ from dataclasses import replace
 import diagnosiskit as kit
 import pytest
 
+from estimator import transmissions
 from estimator.diagnosis import calibrate
 from estimator.model import JointModel
 from estimator.model_monitor import ModelMonitor, ResidualBaseline, can_monitor, measure_baseline
@@ -43,6 +44,18 @@ def _play(monitor: ModelMonitor, record: Record, first: int = 0) -> list[bool]:
         q = float(record.link_position_rad[k])
         alarms.append(monitor.step(Sample(first + k, (theta,), (math.nan,), (tau,), q), NOTHING, 0.0))
     return alarms
+
+
+def first_rows(record: Record, rows: int) -> Record:
+    """Its first rows."""
+    assert record.link_position_rad is not None
+    return replace(
+        record,
+        sequence=record.sequence[:rows],
+        motor_position_rad=record.motor_position_rad[:rows],
+        motor_torque_nm=record.motor_torque_nm[:rows],
+        link_position_rad=record.link_position_rad[:rows],
+    )
 
 
 def test_a_balance_leaves_the_torque_of_the_effect_that_is_missing(
@@ -89,6 +102,23 @@ def test_bad_samples_neither_raise_nor_alarm(
     for value in (math.nan, math.inf, -1e300):
         assert not monitor.step(Sample(0, (value,), (value,), (value,), value), NOTHING, math.nan)
     assert not any(_play(monitor, runs["again"], first=10))
+
+
+def test_a_registered_law_is_monitored_like_one_of_the_library(
+    runs: dict[str, Record], fitted: tuple[JointModel, ResidualBaseline], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(transmissions, "MODELS", dict(transmissions.MODELS))
+    transmissions.register("straight", lambda phi: phi, lambda phi: 1.0 + 0.0 * phi)
+    model, baseline = fitted
+    mine = replace(model.motors[0].transmission, model="straight", order=None)
+    monitors = [
+        ModelMonitor(joint, kit.PERIOD_S, baseline)
+        for joint in (model, replace(model, motors=(replace(model.motors[0], transmission=mine),)))
+    ]
+    some = first_rows(runs["coulomb_nm"], 2600)
+    told = [_play(monitor, some) for monitor in monitors]
+    assert told[0] == told[1] and any(told[0])
+    assert monitors[1].residual_nm == pytest.approx(monitors[0].residual_nm)
 
 
 def test_a_baseline_survives_the_joint_file(fitted: tuple[JointModel, ResidualBaseline]) -> None:

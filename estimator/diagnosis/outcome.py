@@ -187,8 +187,8 @@ def curves_of(problem: Problem, after: Fitted) -> tuple[Curve, ...]:
         made.append(
             Curve(
                 name=kind.name,
-                coordinates=(kind.coordinate,),
-                x=frame.project(getattr(frame.motors[motor or 0], kind.coordinate)),
+                coordinates=kind.coordinates[:1],
+                x=frame.project(getattr(frame.motors[motor or 0], kind.coordinates[0])),
                 residual_nm=sign * (left[pick] + own[pick]),
                 fitted_nm=sign * (own[pick] if kind.channel != "torque" else fitted[pick]),
             )

@@ -34,6 +34,13 @@ macro_rules! coordinates {
                 Coordinates { $($field),* }
             }
 
+            /// One of them, by its place in `NAMES`.
+            pub fn set(&mut self, place: usize, number: f64) {
+                let mut at = 0;
+                $(if at == place { self.$field = number; } at += 1;)*
+                debug_assert!(place < at);
+            }
+
             /// Whether all are numbers that a measurement may give.
             #[must_use]
             pub fn sane(&self) -> bool {
@@ -166,8 +173,8 @@ pub struct Kind {
     pub name: &'static str,
     /// See [`Place`].
     pub place: Place,
-    /// The coordinate that reveals it.
-    pub coordinate: &'static str,
+    /// What it depends on; first the one that reveals it.
+    pub coordinates: &'static [&'static str],
     /// The linear ones first; those of a memory are torque, displacement, exponent, shape.
     pub parameters: &'static [Parameter],
     /// See [`Law`].
@@ -218,7 +225,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "coulomb_friction",
         place: Place::Motor,
-        coordinate: "velocity",
+        coordinates: &["velocity"],
         parameters: &[linear("torque_nm", "friction torque"), SMOOTHING],
         law: Law::Terms(|c, v| one(sign(c.velocity, v[1]))),
         description: "dry friction of the motor",
@@ -226,7 +233,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "stribeck_friction",
         place: Place::Motor,
-        coordinate: "velocity",
+        coordinates: &["velocity"],
         parameters: &[
             linear("torque_nm", "friction torque while sliding"),
             linear("stribeck_nm", "what is added near standstill"),
@@ -242,7 +249,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "asymmetric_friction",
         place: Place::Motor,
-        coordinate: "velocity",
+        coordinates: &["velocity"],
         parameters: &[
             linear("positive_nm", "friction torque in positive motion"),
             linear("negative_nm", "friction torque in negative motion"),
@@ -257,7 +264,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "presliding_friction",
         place: Place::Motor,
-        coordinate: "position",
+        coordinates: &["position", "velocity"],
         parameters: MEMORY,
         law: Law::Memory { path: |c| c.position, rate: |c| c.velocity },
         description: "friction that builds up over a displacement",
@@ -265,7 +272,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "load_dependent_friction",
         place: Place::Motor,
-        coordinate: "velocity",
+        coordinates: &["velocity", "flexibility_torque"],
         parameters: &[linear("coefficient", "friction per flexibility torque"), SMOOTHING],
         law: Law::Terms(|c, v| one(c.flexibility_torque.abs() * sign(c.velocity, v[1]))),
         description: "dry friction that grows with the transmitted torque",
@@ -273,7 +280,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "viscous_damping",
         place: Place::Motor,
-        coordinate: "velocity",
+        coordinates: &["velocity"],
         parameters: &[DAMPING],
         law: Law::Terms(|c, _| one(c.velocity)),
         description: "viscous damping of the motor",
@@ -281,7 +288,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "quadratic_damping",
         place: Place::Motor,
-        coordinate: "velocity",
+        coordinates: &["velocity"],
         parameters: &[linear("damping_nm_s2_rad2", "torque per squared velocity")],
         law: Law::Terms(|c, _| one(c.velocity * c.velocity.abs())),
         description: "damping that grows with the square of velocity",
@@ -289,7 +296,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "cogging",
         place: Place::Motor,
-        coordinate: "position",
+        coordinates: &["position"],
         parameters: &[
             linear("sin_nm", "amplitude of the sine"),
             linear("cos_nm", "amplitude of the cosine"),
@@ -301,7 +308,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "torque_offset",
         place: Place::Motor,
-        coordinate: "time",
+        coordinates: &["time"],
         parameters: &[linear("torque_nm", "torque that is always there")],
         law: Law::Terms(|_, _| one(1.0)),
         description: "offset of the motor torque or current",
@@ -309,7 +316,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "torque_constant",
         place: Place::Torque,
-        coordinate: "torque",
+        coordinates: &["torque"],
         parameters: &[RELATIVE_ERROR],
         law: Law::Terms(|c, _| one(-c.torque)),
         description: "the torque that acts is another multiple of what is reported",
@@ -317,7 +324,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "torque_saturation",
         place: Place::Torque,
-        coordinate: "torque",
+        coordinates: &["torque"],
         parameters: &[linear("coefficient_per_nm2", "what is lost per cubed torque")],
         law: Law::Terms(|c, _| one(c.torque * c.torque * c.torque)),
         description: "large torques fall short of what is reported",
@@ -325,7 +332,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "torque_drift",
         place: Place::Torque,
-        coordinate: "time",
+        coordinates: &["time", "torque"],
         parameters: &[
             linear("relative_change", "change of the torque scale in the long run"),
             scale("time_constant_s", "time constant of the change", None),
@@ -336,7 +343,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "motor_inertia",
         place: Place::Motor,
-        coordinate: "acceleration",
+        coordinates: &["acceleration"],
         parameters: &[INERTIA],
         law: Law::Terms(|c, _| one(c.acceleration)),
         description: "another motor inertia than declared",
@@ -344,7 +351,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "torque_delay",
         place: Place::TorqueDelay,
-        coordinate: "torque_rate",
+        coordinates: &["torque_rate"],
         parameters: &[linear("delay_s", "the torque acts later than reported by")],
         law: Law::Terms(|c, _| one(c.torque_rate)),
         description: "the torque acts later than it is reported",
@@ -352,7 +359,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "torque_lag",
         place: Place::TorqueLag,
-        coordinate: "torque_rate",
+        coordinates: &["torque_rate"],
         parameters: &[linear(
             "time_constant_s",
             "by which the acting torque lags; negative: the reported one does",
@@ -363,7 +370,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "back_driving_loss",
         place: Place::Motor,
-        coordinate: "velocity",
+        coordinates: &["velocity", "flexibility_torque"],
         parameters: &[linear("coefficient", "loss per flexibility torque while the link drives"), SMOOTHING],
         // τ_e acts on the motor as +τ_e: the link drives while it has the velocity's sign.
         law: Law::Terms(|c, v| {
@@ -375,7 +382,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "hysteresis",
         place: Place::Transmission,
-        coordinate: "deflection",
+        coordinates: &["deflection", "deflection_rate"],
         parameters: MEMORY,
         law: Law::Memory { path: |c| c.deflection, rate: |c| c.deflection_rate },
         description: "hysteresis of the transmission",
@@ -383,7 +390,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "backlash",
         place: Place::Transmission,
-        coordinate: "deflection",
+        coordinates: &["deflection"],
         parameters: &[
             linear("stiffness_nm_rad", "stiffness that is missing inside the gap"),
             scale("half_gap_rad", "half of the gap", None),
@@ -397,7 +404,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "asymmetric_stiffness",
         place: Place::Transmission,
-        coordinate: "deflection",
+        coordinates: &["deflection"],
         parameters: &[linear("coefficient_nm_rad2", "torque per squared deflection")],
         law: Law::Spring(|phi, _| (phi * phi, 2.0 * phi)),
         description: "stiffness that differs between the directions",
@@ -405,7 +412,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "higher_order_stiffness",
         place: Place::Transmission,
-        coordinate: "deflection",
+        coordinates: &["deflection"],
         parameters: &[
             linear("coefficient", "torque per power of deflection, N·m/rad^power"),
             scale("power", "odd power of the deflection", Some(5.0)),
@@ -419,7 +426,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "transmission_damping",
         place: Place::Transmission,
-        coordinate: "deflection_rate",
+        coordinates: &["deflection_rate"],
         parameters: &[linear("damping_nm_s_rad", "torque per deflection rate")],
         law: Law::Terms(|c, _| one(c.deflection_rate)),
         description: "viscous damping of the transmission",
@@ -427,7 +434,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "kinematic_error",
         place: Place::Transmission,
-        coordinate: "position",
+        coordinates: &["position", "stiffness"],
         parameters: &[
             linear("sin_rad", "amplitude of the sine, as a deflection"),
             linear("cos_rad", "amplitude of the cosine, as a deflection"),
@@ -439,7 +446,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "deflection_offset",
         place: Place::Deflection,
-        coordinate: "time",
+        coordinates: &["time"],
         parameters: &[linear("offset_rad", "deflection that is read when there is none")],
         law: Law::Terms(|_, _| one(1.0)),
         description: "constant offset between the encoders",
@@ -447,7 +454,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "encoder_eccentricity",
         place: Place::LinkReading,
-        coordinate: "link_position",
+        coordinates: &["link_position"],
         parameters: &[
             linear("sin_rad", "amplitude of the reading's error, sine of q"),
             linear("cos_rad", "amplitude of the reading's error, cosine of q"),
@@ -458,7 +465,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "encoder_delay",
         place: Place::LinkDelay,
-        coordinate: "link_velocity",
+        coordinates: &["link_velocity"],
         parameters: &[linear("delay_s", "the link position is read later than the rest by")],
         law: Law::Terms(|c, _| one(-c.link_velocity)),
         description: "the link encoder lags the other channels",
@@ -466,7 +473,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "encoder_scale",
         place: Place::LinkReading,
-        coordinate: "link_position",
+        coordinates: &["link_position"],
         parameters: &[RELATIVE_ERROR],
         law: Law::Terms(|c, _| one(c.link_position)),
         description: "scale error of the link encoder",
@@ -474,7 +481,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "gravity",
         place: Place::Link,
-        coordinate: "link_position",
+        coordinates: &["link_position"],
         parameters: &[
             linear("sin_nm", "torque times sin q beyond what is declared"),
             linear("cos_nm", "torque times cos q beyond what is declared"),
@@ -485,7 +492,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "link_coulomb_friction",
         place: Place::Link,
-        coordinate: "link_velocity",
+        coordinates: &["link_velocity"],
         parameters: &[linear("torque_nm", "friction torque"), SMOOTHING],
         law: Law::Terms(|c, v| one(sign(c.link_velocity, v[1]))),
         description: "dry friction of the link",
@@ -493,7 +500,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "link_viscous_damping",
         place: Place::Link,
-        coordinate: "link_velocity",
+        coordinates: &["link_velocity"],
         parameters: &[DAMPING],
         law: Law::Terms(|c, _| one(c.link_velocity)),
         description: "viscous damping of the link",
@@ -501,7 +508,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "link_inertia",
         place: Place::Link,
-        coordinate: "link_acceleration",
+        coordinates: &["link_acceleration"],
         parameters: &[INERTIA],
         law: Law::Terms(|c, _| one(c.link_acceleration)),
         description: "another link inertia than declared",
@@ -509,7 +516,7 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "contact",
         place: Place::Link,
-        coordinate: "link_position",
+        coordinates: &["link_position"],
         parameters: &[
             linear("stiffness_nm_rad", "stiffness of what is touched"),
             shape("position_rad", "link position of the first touch", None),
@@ -635,12 +642,30 @@ mod tests {
     fn every_kind_is_whole() {
         for kind in LIBRARY {
             assert!(std::ptr::eq(Kind::named(kind.name).unwrap(), kind), "{}: a name twice", kind.name);
-            assert!(Coordinates::NAMES.contains(&kind.coordinate), "{}", kind.name);
             assert!((1..=2).contains(&kind.terms()) && kind.parameters.len() <= VALUES, "{}", kind.name);
             let linear = |parameter: &Parameter| parameter.role == Role::Linear;
             assert!(kind.parameters[..kind.terms()].iter().all(linear), "{}: linear ones first", kind.name);
             if let Law::Memory { .. } = kind.law {
                 assert!(kind.parameters == MEMORY);
+            }
+        }
+    }
+
+    #[test]
+    fn an_effect_depends_on_what_it_names_alone() {
+        for kind in LIBRARY {
+            // Nothing is saturated here, and every other coordinate is absurd.
+            let element = Element { kind, values: [1.0, 1.5, 2.5, 3.5] };
+            let mut named = Coordinates::default();
+            for name in kind.coordinates {
+                let place = Coordinates::NAMES.iter().position(|known| known == name);
+                named.set(place.unwrap(), 0.7);
+            }
+            let place = |k: usize| kind.coordinates.contains(&Coordinates::NAMES[k]);
+            let others = Coordinates::from_fn(|k| if place(k) { 0.7 } else { f64::NAN });
+            assert_eq!(element.terms(&named), element.terms(&others), "{}", kind.name);
+            if let Law::Memory { path, rate } = kind.law {
+                assert!(path(&others) + rate(&others) == 1.4);
             }
         }
     }

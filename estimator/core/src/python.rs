@@ -575,8 +575,15 @@ mod extension {
     use super::{Estimator, ModelMonitor, OnlineEffects};
 
     type EffectParameter = (&'static str, &'static str, bool, Option<f64>);
-    type EffectKind =
-        (&'static str, &'static str, &'static str, &'static str, Vec<EffectParameter>, bool, &'static str);
+    type EffectKind = (
+        &'static str,
+        &'static str,
+        &'static str,
+        Vec<&'static str>,
+        Vec<EffectParameter>,
+        bool,
+        &'static str,
+    );
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
@@ -704,7 +711,7 @@ mod extension {
         out.copy_from_slice(py, &told)
     }
 
-    /// (name, location, channel, coordinate, parameters, whether it remembers, description) of every effect.
+    /// (name, location, channel, coordinates, parameters, whether it remembers, description) of every effect.
     #[pyfunction]
     fn effect_kinds() -> Vec<EffectKind> {
         let parameter = |p: &Parameter| (p.name, p.meaning, p.role == Role::Linear, p.default);
@@ -713,15 +720,22 @@ mod extension {
                 let (location, channel) = kind.place.names();
                 let parameters = kind.parameters.iter().map(parameter).collect();
                 let remembers = matches!(kind.law, crate::library::Law::Memory { .. });
-                (kind.name, location, channel, kind.coordinate, parameters, remembers, kind.description)
+                (
+                    kind.name,
+                    location,
+                    channel,
+                    kind.coordinates.to_vec(),
+                    parameters,
+                    remembers,
+                    kind.description,
+                )
             })
             .collect()
     }
 
     /// The terms of one element of an effect, unweighted, over consecutive moments.
     ///
-    /// `coordinates`: the fields of `estimator.effects.Coordinates`, each of n numbers or of one; `out`: n
-    /// numbers a term.
+    /// `coordinates`: those that the effect names, each of n numbers or of one; `out`: n numbers a term.
     #[pyfunction]
     fn effect_terms(
         py: Python<'_>,
@@ -731,20 +745,24 @@ mod extension {
         out: PyBuffer<f64>,
     ) -> PyResult<()> {
         let element = Element::new(name, &values)?;
+        let names = element.kind.coordinates;
         let fields: Vec<_> = coordinates.iter().map(|field| slice(py, field)).collect::<PyResult<_>>()?;
         let n = fields.iter().map(Vec::len).max().unwrap_or(0);
         let terms = element.kind.terms();
-        let whole = fields.len() == Coordinates::NAMES.len()
-            && fields.iter().all(|field| field.len() == n || field.len() == 1)
-            && out.item_count() == n * terms;
-        if !whole || n == 0 {
-            return Err(PyValueError::new_err("coordinates: expected arrays of one size"));
+        let alike = fields.iter().all(|field| field.len() == n || field.len() == 1);
+        if !alike || fields.len() != names.len() || n == 0 || out.item_count() != n * terms {
+            return Err(PyValueError::new_err(format!(
+                "coordinates: expected arrays of one size: {names:?}"
+            )));
         }
+        let places: Vec<usize> =
+            names.iter().filter_map(|name| Coordinates::NAMES.iter().position(|one| one == name)).collect();
+        let mut c = Coordinates::default();
         let moments = (0..n).map(|k| {
-            Coordinates::from_fn(|field| {
-                let numbers = &fields[field];
-                numbers[if numbers.len() == 1 { 0 } else { k }]
-            })
+            for (place, field) in places.iter().zip(&fields) {
+                c.set(*place, if field.len() == 1 { field[0] } else { field[k] });
+            }
+            c
         });
         let mut told = vec![0.0; n * terms];
         element.along(moments, &mut told.chunks_exact_mut(n).collect::<Vec<_>>());

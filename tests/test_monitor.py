@@ -210,6 +210,14 @@ def test_without_a_terminal_monitor_prints_plain_lines(
     assert "elbow: stiffness 700.0 ± 5.9 N·m/rad" in out and "\x1b" not in out
 
 
+def test_monitor_prints_json_lines(daemon: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["monitor", "--endpoint", daemon, "--seconds", "2", "--every", "0.5", "--json"]) == 0
+    told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    last = told[-1]
+    assert last["joint"] == "elbow" and last["live"] and last["state"] == "running"
+    assert last["estimate"]["stiffness"] == 700.0 and last["status"]["state"] == "running"
+
+
 def get(url: str, host: str | None = None) -> tuple[int, bytes]:
     request = urllib.request.Request(url, headers={"Host": host} if host else {})
     try:

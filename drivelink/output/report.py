@@ -182,7 +182,7 @@ def page(outcome: Diagnosis, title: Title) -> str:
         ),
         effects=_effects(outcome, units),
         curves=_curves(outcome, units),
-        stiffness="".join(_stiffness_figure(one, units) for one in outcome.stiffness),
+        stiffness=_stiffness(outcome, units),
         rivals=_rivals_figure(outcome),
         series=_series_figure(outcome, units),
         doubts=_doubts(outcome),
@@ -266,6 +266,13 @@ def _is_function(curve: Curve) -> bool:
     return float(np.std(left)) < 0.35 * float(np.std(curve.fitted_nm)) + 1e-300
 
 
+def _stiffness(outcome: Diagnosis, units: Units) -> str:
+    if not outcome.stiffness:
+        return ""
+    figures = "".join(_stiffness_figure(one, units) for one in outcome.stiffness)
+    return f"<h2>Stiffness before and after</h2>{figures}"
+
+
 def _stiffness_figure(curve: StiffnessCurve, units: Units) -> str:
     """Stiffness over deflection, before and after, each with its 95 % band."""
     figure, (axes,) = plots.new_figure(width=_WIDTH, height=3.0)
@@ -275,7 +282,10 @@ def _stiffness_figure(curve: StiffnessCurve, units: Units) -> str:
         "refitted": plots.Curve(phi, curve.after_nm_rad, curve.after_std_nm_rad),
     }
     plots.xy(axes, curves, units.label("deflection / rad"), units.label("stiffness / (N·m/rad)"))
-    caption = f"Stiffness of transmission {curve.motor + 1}, with 95 % bands."
+    caption = (
+        f"Stiffness of transmission {curve.motor + 1}, with 95 % bands. The declared model's band takes its "
+        "other numbers for exact, and for complete."
+    )
     return f"<figure>{plots.svg_text(figure)}<figcaption>{caption}</figcaption></figure>"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -68,8 +69,7 @@ def diagnose(
     for one in everything:
         check(one, model)
     progress("units and signs")
-    for one in everything:
-        refuse(one, model)
+    doubts = [remark for one in everything if (remark := refuse(one, model).remark)]
     progress("bandwidth")
     bandwidth = bandwidth_hz or choose_bandwidth(records[0], model)
     nyquist = 0.4 / max(r.period_s for r in records)
@@ -88,7 +88,9 @@ def diagnose(
     found = _gated(search, held, _chosen(search, held, search.run()))
     outcome = _Judge(search, held, found, validation is not None, progress).diagnosis()
     higher = raised(model, outcome.effects)
-    return outcome if higher is None else diagnose(records, higher, bandwidth, validation, progress)
+    if higher is not None:
+        return diagnose(records, higher, bandwidth, validation, progress)
+    return replace(outcome, notes=tuple(dict.fromkeys((*outcome.notes, *doubts))))
 
 
 def _chosen(search: Search, held: Held, hypotheses: list[Fitted]) -> Fitted:

@@ -81,6 +81,7 @@ class Assembler:
         hold_periods: how long the last value of a TPDO that is not sent on SYNC may be used while nothing
             at all is heard of its node; and how long one that is sent on SYNC may fail before a node that we
             configure is not believed any more, since it may have lost its mapping meanwhile.
+        period_s: communication cycle.
 
     Attributes:
         sequence: number of the current SYNC, from 0; -1 before the first.
@@ -92,6 +93,9 @@ class Assembler:
         faults: nodes that report a fault, with the EMCY error code (0: by statusword only).
         statuswords: of the drives, as last heard, by node id.
         untrusted: nodes that rebooted or were silent for long, and have not been started again.
+        checks: of two readings of one quantity, where both are mapped: motor from 1 on; "velocity",
+            "current", "second_encoder" or "following_error"; "untested", "agrees" or "contradicts"; the scale of the
+            second reading against the first, and its standard deviation.
         has_link: whether any frame carries the link position.
         complete: whether this cycle has given its sample: nothing more is expected before the next SYNC.
 
@@ -106,6 +110,7 @@ class Assembler:
         *,
         active: bool = True,
         hold_periods: int = 250,
+        period_s: float = 0.001,
     ) -> None: ...
     @property
     def sequence(self) -> int: ...
@@ -125,6 +130,8 @@ class Assembler:
     def statuswords(self) -> dict[int, int]: ...
     @property
     def untrusted(self) -> tuple[int, ...]: ...
+    @property
+    def checks(self) -> list[tuple[int, str, str, float, float]]: ...
     @property
     def has_link(self) -> bool: ...
     @property

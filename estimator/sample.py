@@ -71,6 +71,7 @@ class Status(IntFlag):
     PARTIAL = (
         1 << 13
     )  # what is NaN is not given: stiffness of a rigid joint, standard deviation of mode paper
+    CONTRADICTED = 1 << 14  # two readings of one quantity contradict each other; nothing is learned
 
 
 class TransmissionEstimate(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from sim.canopen.drive import Cia402Drive
+from sim.canopen.drive import Cia402Drive, DriveReadings
 from sim.canopen.node import Node
 from sim.canopen.tpdo import Tpdo
 from sim.network import Network
@@ -82,6 +82,10 @@ class Faults:
             node.fault(code, register, vendor)
         else:
             node.emergency.raise_error(code, register, vendor)
+
+    def misread(self, node: Cia402Drive, lie: Callable[[DriveReadings], DriveReadings] | None) -> None:
+        """Its sensors say something else from now on; None: the truth again."""
+        node.misread = lie
 
     def ignore_sdo(self, node: Node, requests: int) -> None:
         """Its SDO server does not answer so many requests."""

@@ -24,6 +24,11 @@ class Signal(StrEnum):
     STATUSWORD = "statusword"
     LINK_POSITION = "link_position"
     LINK_VELOCITY = "link_velocity"
+    VELOCITY_CHECK = "velocity_check"  # the motor's, for a cross-check alone; so are those that follow
+    TORQUE_CHECK = "torque_check"  # current beside torque, or torque beside current
+    SECOND_POSITION = "second_position"  # the motor's, by another encoder
+    FOLLOWING_ERROR = "following_error"
+    POSITION_DEMAND = "position_demand"
     OTHER = "other"  # mapped by the drive, not used by us
 
 

@@ -46,10 +46,18 @@ class Offer:
 
     Attributes:
         candidates: for each signal the objects that can give it, best first.
+        checks: the same for signals that only check others: not mapped, but read where the node maps them.
         missing: for a signal with no candidate, why.
         notices: disagreements and remarks.
     """
 
     candidates: dict[Signal, tuple[MappableObject, ...]] = field(default_factory=dict)
+    checks: dict[Signal, tuple[MappableObject, ...]] = field(default_factory=dict)
     missing: dict[Signal, str] = field(default_factory=dict)
     notices: list[Notice] = field(default_factory=list)
+
+    @property
+    def readable(self) -> dict[Signal, tuple[MappableObject, ...]]:
+        """What frames are decoded by: candidates first."""
+        rest = {signal: objects for signal, objects in self.checks.items() if signal not in self.candidates}
+        return {**self.candidates, **rest}

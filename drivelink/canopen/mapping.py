@@ -69,6 +69,7 @@ class Mapper:
         prefer_unused: see `plan.assign`.
         notices: remarks, added to.
         period_s: communication cycle, at which a TPDO is asked for that cannot be sent on SYNC.
+        readable: signals that are read too, where they are mapped anyway.
     """
 
     role: Role
@@ -78,6 +79,7 @@ class Mapper:
     prefer_unused: bool
     notices: list[Notice]
     period_s: float = 0.001
+    readable: Mapping[Signal, Sequence[MappableObject]] = field(default_factory=dict)
     _pre_operational: bool = field(default=False, init=False)
     _chosen: dict[int, int] = field(default_factory=dict, init=False)
     _patience_s: float = field(default=_STATE_S, init=False)
@@ -308,7 +310,8 @@ class Mapper:
                 raise DriveError(f"{self.role.subject}: TPDO{number} stays disabled after its configuration")
             self._replace(replace(tpdo, fixed=self._is_fixed(tpdo)))
             used.append(tpdo)
-        layouts = decode(used, self.available)
+        rest = {signal: objects for signal, objects in self.readable.items() if signal not in self.available}
+        layouts = decode(used, {**self.available, **rest})
         given = {mapped.signal for layout in layouts for mapped in layout.objects}
         for signal in self.available:
             if signal not in given and signal not in OPTIONAL:

@@ -24,7 +24,7 @@ from drivelink.canopen.sdo import (
     abort_text,
     read_number,
 )
-from drivelink.canopen.tpdo_assignment import OPTIONAL
+from drivelink.canopen.tpdo_assignment import CHECKS, OPTIONAL
 from drivelink.canopen.units import offer, unit_objects
 from drivelink.canopen.vendors import vendor_of
 from drivelink.errors import DriveError
@@ -166,6 +166,7 @@ def configure_node(
         prefer_unused=bus.sync == "follow",
         notices=notices,
         period_s=bus.period_s,
+        readable=survey.offer.checks,
     )
     layouts = yield from mapper.program()
     used = {layout.number for layout in layouts}
@@ -198,8 +199,10 @@ def _wanted(survey: NodeSurvey, notices: list[Notice]) -> dict[Signal, tuple[Map
             why = f"; {survey.refused}" if survey.refused is not None else ""
             raise DriveError(f"{subject} ({survey.role.key}): {reason}{why}")
         notices.append(Notice(severity=Severity.WARNING, subject=subject, text=f"no {signal}: {reason}"))
-    wanted = {}
-    for signal, candidates in survey.available.items():
+    wanted: dict[Signal, tuple[MappableObject, ...]] = {}
+    for signal, objects in survey.available.items():
+        used = [other[0].address for other in wanted.values()] if signal in CHECKS else []
+        candidates = tuple(candidate for candidate in objects if candidate.address not in used)
         if candidates:
             wanted[signal] = candidates
             continue

@@ -142,7 +142,7 @@ class _PassiveNode:
         for signal, reason in offered.missing.items() if tpdos else ():
             if signal not in OPTIONAL:
                 raise DriveError(f"{role.subject} ({role.key}): {reason}")
-        layouts = decode(tpdos, offered.candidates)
+        layouts = decode(tpdos, offered.readable)
         given = {mapped.signal for layout in layouts for mapped in layout.objects}
         lacking = [signal for signal in offered.candidates if signal not in given and signal not in OPTIONAL]
         if lacking or not tpdos:

@@ -211,7 +211,8 @@ def decode(
     """The layout of TPDOs' frames: what is mapped decides, not what was wished.
 
     Where several objects for one signal are mapped, the best one counts; where one is mapped twice, its
-    place in a frame that is sent at every SYNC does, else the first. Everything else is skipped over.
+    place in a frame that is sent at every SYNC does, else the first. An object gives the first signal that it
+    can. Everything else is skipped over.
 
     Args:
         tpdos: as read back, overheard, or declared.
@@ -220,7 +221,8 @@ def decode(
     mapped = {(index, subindex) for tpdo in tpdos for index, subindex, _ in tpdo.entries}
     chosen: dict[Address, MappableObject] = {}
     for objects in candidates.values():
-        best = next((candidate for candidate in objects if candidate.address in mapped), None)
+        left = mapped - chosen.keys()  # what serves one signal does not check it too
+        best = next((candidate for candidate in objects if candidate.address in left), None)
         if best is not None:
             chosen[best.address] = best
     order = sorted(range(len(tpdos)), key=lambda k: (tpdos[k].transmission_type != 1, k))

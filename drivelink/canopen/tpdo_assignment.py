@@ -15,7 +15,7 @@ from drivelink.canopen.pdo import Tpdo, describe
 from drivelink.canopen.roles import Role
 from drivelink.errors import DriveError
 
-__all__ = ["OPTIONAL", "Assignment", "assign", "choose_cob_id", "pack"]
+__all__ = ["CHECKS", "OPTIONAL", "Assignment", "assign", "choose_cob_id", "pack"]
 
 FRAME_BITS = 64
 
@@ -26,8 +26,14 @@ _ORDER = (
     Signal.STATUSWORD,
     Signal.LINK_POSITION,
     Signal.MOTOR_VELOCITY,
+    Signal.TORQUE_CHECK,
+    Signal.VELOCITY_CHECK,
+    Signal.SECOND_POSITION,
+    Signal.FOLLOWING_ERROR,
+    Signal.POSITION_DEMAND,
 )
-OPTIONAL = (Signal.MOTOR_VELOCITY, Signal.STATUSWORD)
+CHECKS = _ORDER[5:]
+OPTIONAL = (Signal.MOTOR_VELOCITY, Signal.STATUSWORD, *CHECKS)
 
 Available = Mapping[Signal, Sequence[MappableObject]]
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 from drivelink.canopen.cia303 import angle_unit_rad, velocity_unit_rad_s
 from drivelink.canopen.layout import Signal
@@ -47,6 +48,9 @@ def unit_objects(role: Role, vendor: Vendor) -> tuple[Address, ...]:
     wanted: tuple[Address, ...] = ()
     if role.drive is not None:
         wanted += _DRIVE_OBJECTS + vendor.objects()
+        if role.drive.second_encoder is not None:
+            subindex = object_address(role.drive.second_encoder, f"{role.key}.second_encoder")[1]
+            wanted += ((0x60E6, subindex), (0x60EB, subindex))
     if role.encoder is not None:
         if role.encoder.source == "cia406":
             wanted += _ENCODER_OBJECTS
@@ -105,8 +109,9 @@ class _Drive:
         counts = self._counts_per_rev()
         self._position(counts, gear)
         self._torque(gear)
-        if self._drive.velocity:
-            self._velocity(counts, gear)
+        self._velocity(counts, gear)
+        self._following_error()
+        self._second_encoder(counts, gear)
         self._polarity()
 
     def _choose(
@@ -278,6 +283,11 @@ class _Drive:
                 f"rated current (0x6075), set {self._role.key}: rated_torque_nm, or torque_constant_nm_a and "
                 "rated_current_a or current_object"
             )
+        if not by_current and rated_torque is not None and not own_unit:
+            # Of unknown unit: a thousandth of rated current is about one of rated torque; the ratio is learned.
+            likely = _torque_candidate((0x6078, 0), 16, direction * gear * rated_torque / 1000)
+            by_current = [likely]
+        self._check("current", Signal.TORQUE_CHECK, (*by_current, *by_torque))
 
     def _velocity(self, counts: float | None, gear: float) -> None:
         reported, source = None, "0x60A9"
@@ -289,19 +299,60 @@ class _Drive:
         if reported is None and self._vendor.velocity_counts_s is not None and counts is not None:
             reported, source = self._vendor.velocity_counts_s * math.tau / counts, self._vendor.name
         stated = self._drive.velocity_rad_s_per_count
-        chosen = self._choose("velocity unit in rad/s", "velocity_rad_s_per_count", stated, reported, source)
-        if chosen is None:
-            self._result.missing[Signal.MOTOR_VELOCITY] = (
+        asked = self._drive.velocity or "velocity" in self._drive.checks
+        if asked:
+            chosen = self._choose(
+                "velocity unit in rad/s", "velocity_rad_s_per_count", stated, reported, source
+            )
+        else:
+            chosen = reported if stated is None else stated
+        signal = Signal.MOTOR_VELOCITY if self._drive.velocity else Signal.VELOCITY_CHECK
+        if chosen is None and asked:
+            self._result.missing[signal] = (
                 "the unit of 0x606C is unknown: the drive does not report it (0x60A9), "
                 f"set {self._role.key}: velocity_rad_s_per_count"
             )
+        if chosen is None:
             return
         scale = self._drive.direction * chosen / gear
-        self._result.candidates[Signal.MOTOR_VELOCITY] = (
-            MappableObject(
-                signal=Signal.MOTOR_VELOCITY, address=(0x606C, 0), bits=32, signed=True, scale=scale
-            ),
-        )
+        objects = (MappableObject(signal=signal, address=(0x606C, 0), bits=32, signed=True, scale=scale),)
+        if self._drive.velocity:
+            self._result.candidates[signal] = objects
+        else:
+            self._check("velocity", signal, objects)
+
+    def _check(self, name: str, signal: Signal, objects: tuple[MappableObject, ...]) -> None:
+        """Objects that only check others: mapped where the joint file asks for it, else read where mapped."""
+        objects = tuple(replace(candidate, signal=signal) for candidate in dict.fromkeys(objects))
+        if objects:
+            asked = name in self._drive.checks or name == "second_encoder"
+            (self._result.candidates if asked else self._result.checks)[signal] = objects
+
+    def _following_error(self) -> None:
+        """0x60F4, and the demand 0x6062 that it is the difference to; both in the unit of the position."""
+        for position in self._result.candidates.get(Signal.MOTOR_POSITION, ()):
+            for signal, index in ((Signal.FOLLOWING_ERROR, 0x60F4), (Signal.POSITION_DEMAND, 0x6062)):
+                wraps = signal is Signal.POSITION_DEMAND
+                self._check("following_error", signal, (replace(position, address=(index, 0), wraps=wraps),))
+
+    def _second_encoder(self, counts: float | None, gear: float) -> None:
+        """Another encoder of the motor; its scale and sign are learned, so a wrong guess does no harm."""
+        text = self._drive.second_encoder
+        if text is None:
+            return
+        address = object_address(text, f"{self._role.key}.second_encoder")
+        reported = self._ratio((0x60E6, address[1]), (0x60EB, address[1]))
+        per_rev = reported if reported is not None and reported > 1 else counts
+        if per_rev is not None:
+            encoder = MappableObject(
+                signal=Signal.SECOND_POSITION,
+                address=address,
+                bits=32,
+                signed=True,
+                scale=self._drive.direction * math.tau / (per_rev * gear),
+                wraps=True,
+            )
+            self._check("second_encoder", Signal.SECOND_POSITION, (encoder,))
 
     def _polarity(self) -> None:
         polarity = self._reported.get((0x607E, 0), 0)

@@ -47,7 +47,13 @@ def make_assembler(joint: JointFile, layouts: Sequence[NodeLayout]) -> Assembler
         DriveError: the layouts lack something that the joint's model needs.
     """
     hold = max(_HOLD_PERIODS, round(_HOLD_S / joint.bus.period_s))
-    assembler = Assembler(layouts, len(joint.motor), active=joint.bus.configure, hold_periods=hold)
+    assembler = Assembler(
+        layouts,
+        len(joint.motor),
+        active=joint.bus.configure,
+        hold_periods=hold,
+        period_s=joint.bus.period_s,
+    )
     if joint.model().has_deflection and not assembler.has_link:
         raise DriveError(
             f"{joint.name}: no frame carries the link position: expected [link.encoder], "

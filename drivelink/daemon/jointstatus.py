@@ -12,6 +12,7 @@ from drivelink.canopen.emcy import emergency_text
 from drivelink.cycle.framesource import LostSource
 from drivelink.cycle.loop import CycleLoop, Lane
 from drivelink.cycle.realtime import RealTime
+from drivelink.daemon.crosschecks import contradiction, cross_checks
 from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor, residual_text
 from drivelink.jointfile import JointFile
@@ -33,6 +34,7 @@ _BITS = (
     ("bus_fault", int(Status.BUS_FAULT)),
     ("stale", int(Status.STALE)),
     ("untimed", int(Status.UNTIMED)),
+    ("contradicted", int(Status.CONTRADICTED)),
 )
 
 
@@ -121,6 +123,8 @@ class JointStatus:
             "residual_nm": lane.chain.estimator.residual_nm,
             "residual_alarm": self._alarm(),
             "external": self._external(),
+            "suspected": contradiction(lane.chain.assembler),
+            "cross_checks": cross_checks(lane.chain.assembler),
             "conditions": sorted(events.active.values()),
             "events": events.recent(),
         }

@@ -23,6 +23,7 @@ from drivelink.cycle.following import MapFollower
 from drivelink.cycle.framesource import OVERFLOW, LostSource
 from drivelink.cycle.loop import CycleLoop, Lane
 from drivelink.cycle.syncclock import MEASURED_SYNCS, measure_period
+from drivelink.daemon.crosschecks import contradiction
 from drivelink.daemon.status import EventLog
 from drivelink.errors import DriveError
 from estimator.sample import Status
@@ -38,6 +39,7 @@ _MANY_SYNCS = 3  # more than there are periods, in a second
 _HEARTBEATS_LOST = 3.5  # of them missing: the node is gone
 _STATES = {0x00: "boot-up", 0x04: "stopped", 0x05: "operational", 0x7F: "pre-operational"}
 _OPERATIONAL = 0x05
+_STATE_BITS, _ENABLED, _LIMIT = 0x6F, 0x27, 0x0800  # of the statusword (CiA 402-2, 8.4.2)
 _BOOT_UP, _STOPPED = 0x00, 0x04
 _COUNTED = (  # counter of a node; by how much it grows at least, and what is said then; and when it rests
     ("missing", 1, "frames are missing", "frames arrive again, {} were missing so far"),
@@ -72,6 +74,7 @@ class _Watched:
         "attempt_ns",
         "bunched_ns",
         "counted",
+        "enabled",
         "heartbeat_ns",
         "lane",
         "layout",
@@ -86,6 +89,7 @@ class _Watched:
         self.layout = layout
         self.lane = lane
         self.started = False  # since its last frame
+        self.enabled = False  # its drive, when last looked at
         self.begin(NodeCounters(), now_ns)
 
     def begin(self, counters: NodeCounters, now_ns: int) -> None:
@@ -178,6 +182,7 @@ class Supervisor:
                 if watched.layout.heartbeat_ms
                 else None,
                 "drive_state": str(drive_state(statuswords[node])) if node in statuswords else None,
+                "internal_limit": node in statuswords and bool(statuswords[node] & _LIMIT),
                 "fault": node in faults,
                 "emergency": f"0x{faults[node]:04X}" if faults.get(node) else None,
                 **counted.as_dict(),
@@ -221,9 +226,11 @@ class Supervisor:
             self._check_frames(node, watched, now)
             self._check_heartbeat(node, watched, now)
             self._check_faults(node, watched)
+            self._check_statusword(node, watched)
         for lane in self._loop.lanes:
             self._check_lane(lane)
             self._check_model(lane)
+            self._check_contradiction(lane)
         if self._follower is not None:
             self._check_maps(self._follower)
         self._check_bus()
@@ -274,6 +281,14 @@ class Supervisor:
         else:
             self._alarmed.discard(lane.name)
             self._events.say(f"{lane.name}: the model alarm is over{residual_text(watch)}")
+
+    def _check_contradiction(self, lane: Lane) -> None:
+        """Say which readings contradict each other, when that begins and when it is over."""
+        key, told = f"contradiction {lane.name}", contradiction(lane.chain.assembler)
+        if told is None:
+            self._events.end(key, f"{lane.name}: no reading contradicts another one any more")
+        else:
+            self._events.begin(key, f"{lane.name}: {told['text']}")
 
     def _say_fault(self, where: str, error: Exception) -> None:
         logger.debug("%s", where, exc_info=error)
@@ -347,6 +362,25 @@ class Supervisor:
             self._events.begin(f"fault {node}", f"node {node} reports a fault")
         else:
             self._events.end(f"fault {node}", f"node {node} reports no fault any more")
+
+    def _check_statusword(self, node: int, watched: _Watched) -> None:
+        """Say when a drive leaves the state in which it drives, and when it limits what it is told."""
+        statusword = watched.lane.chain.assembler.statuswords.get(node)
+        if statusword is None:
+            return
+        enabled = statusword & _STATE_BITS == _ENABLED
+        if enabled:
+            self._events.end(f"enabled {node}", f"node {node}: operation is enabled again")
+        elif watched.enabled:
+            state = drive_state(statusword)
+            self._events.begin(
+                f"enabled {node}", f"node {node} has left operation enabled ({state}): a brake may hold it"
+            )
+        watched.enabled = enabled
+        if statusword & _LIMIT:
+            self._events.begin(f"limit {node}", f"node {node}: internal limit active (statusword bit 11)")
+        else:
+            self._events.end(f"limit {node}", f"node {node}: no internal limit is active any more")
 
     def _check_bus(self) -> None:
         loop = self._loop

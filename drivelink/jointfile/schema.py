@@ -115,6 +115,12 @@ class DriveSection(_Section):
     velocity_rad_s_per_count: float | None = Field(
         None, gt=0, description="unit of 0x606C at the motor shaft, where 0x60A9 does not give it"
     )
+    checks: tuple[Literal["velocity", "current", "following_error"], ...] = Field(
+        (), description="also map these, only to hold them against position and torque (cross-checks)"
+    )
+    second_encoder: str | None = Field(
+        None, description='position of a second encoder of the motor, likewise, e.g. "0x60E4:02"'
+    )
     direction: Direction = Field(1, description="sign of the motor position against the joint's")
     torque_direction: Direction | None = Field(
         None, description="sign of the torque; left out: like direction"

@@ -37,6 +37,7 @@ _FLAGS = (  # bit, what is shown when set, style
     (Status.DRIVE_FAULT, "drive fault", "bold red"),
     (Status.BUS_FAULT, "bus fault", "bold red"),
     (Status.STALE, "stale", "bold red"),
+    (Status.CONTRADICTED, "readings contradict", "bold red"),
     (Status.CHANGED, "joint changed", "yellow"),
     (Status.INPUT_REJECTED, "input rejected", "yellow"),
     (Status.GAP, "gap", "yellow"),

@@ -37,6 +37,7 @@ _USABLE = int(
     | Status.STALE
     | Status.UNTIMED
     | Status.NODE_RESTARTED
+    | Status.CONTRADICTED
 )
 _TOGETHER = 5  # cycles that an estimate and an external torque may be apart, as either may be lost
 _NAME = re.compile(r"[^*$#?\s/]+(/[^*$#?\s/]+)*")

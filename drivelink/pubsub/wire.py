@@ -183,6 +183,7 @@ STATUS_BITS: Mapping[str, str] = MappingProxyType(
         "UNTIMED": "another master made SYNC: values may be of another moment; nothing is learned from them",
         "NODE_RESTARTED": "positions may have started anew: with this sample the estimator begins anew",
         "PARTIAL": "what is NaN is not given: stiffness of a rigid joint, standard deviation in mode paper",
+        "CONTRADICTED": "two readings of one quantity contradict each other; nothing is learned from them",
     }
 )
 

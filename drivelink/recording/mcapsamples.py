@@ -23,7 +23,9 @@ from estimator.sample import Record, Status
 __all__ = ["read_mcap", "recorded_cycles"]
 
 _STALE = int(Status.STALE)
-_SERVICE = int(Status.DRIVE_FAULT | Status.BUS_FAULT | Status.UNTIMED | Status.NODE_RESTARTED)
+_SERVICE = int(
+    Status.DRIVE_FAULT | Status.BUS_FAULT | Status.UNTIMED | Status.NODE_RESTARTED | Status.CONTRADICTED
+)
 _MESSAGE_BYTES = 64 << 10  # of a sample or an estimate: ours have some 500
 _APART = 64  # cycles that a sample and its estimate may be apart in the file
 

@@ -19,8 +19,9 @@ enum {
     DRIVELINK_VALID = 1 << 0,      /* the numbers may be used */
     DRIVELINK_OBSERVABLE = 1 << 1, /* the motion at hand tells the stiffness */
     DRIVELINK_MODEL_ALARM = 1 << 4, /* the model is not sufficient */
-    /* What must be clear beside it: model alarm, restarted, drive fault, stale, untimed, node restarted. */
-    DRIVELINK_AGAINST = 1 << 4 | 1 << 6 | 1 << 8 | 1 << 10 | 1 << 11 | 1 << 12,
+    /* What must be clear beside it: model alarm, restarted, drive fault, stale, untimed, node restarted,
+     * contradicted. */
+    DRIVELINK_AGAINST = 1 << 4 | 1 << 6 | 1 << 8 | 1 << 10 | 1 << 11 | 1 << 12 | 1 << 14,
     DRIVELINK_PARTIAL = 1 << 13,   /* what is NaN is not given: a rigid joint's stiffness, mode paper's std */
     DRIVELINK_MAX_TRANSMISSIONS = 8
 };

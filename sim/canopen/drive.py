@@ -120,6 +120,7 @@ class Cia402Drive(Node):
         self._demand = 0.0  # per mille of rated torque
         self._following = self._limiting = self._reached = False
         self._toggle = 0
+        self.misread: Callable[[DriveReadings], DriveReadings] | None = None  # a fault of its sensors
         self._link_counts = rig.link_counts()
         self._link_time_s = rig.time_s
         self._bind()
@@ -246,17 +247,21 @@ class Cia402Drive(Node):
     def on_sample(self) -> None:
         """Read the rig's sensors into the mapped process data."""
         self._toggle ^= _TOGGLE
-        signals = self._rig.drive(self._motor)
+        signals = self._signals()
         for read in self._sampled:
             read(signals)
         self._status.value = self._statusword()
 
     def _measure(self) -> None:
         """Read the rig's sensors into all process data, for SDO."""
-        signals = self._rig.drive(self._motor)
+        signals = self._signals()
         for read, _ in self._sensors:
             read(signals)
         self._status.value = self._statusword()
+
+    def _signals(self) -> DriveReadings:
+        signals = self._rig.drive(self._motor)
+        return signals if self.misread is None else self.misread(signals)
 
     def _read_position(self, signals: DriveReadings) -> None:
         counts = signals.position_counts

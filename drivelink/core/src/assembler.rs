@@ -10,10 +10,11 @@
 
 use estimator_core::sample::{MOTORS, Sample};
 
-use crate::frames::Slot;
-use crate::layout;
+use crate::cross_check::{CrossCheck, Kind, spoils};
+use crate::frames::{Slot, target};
+use crate::layout::{self, Signal};
 use crate::node::Node;
-use crate::status::{BUS_FAULT, DRIVE_FAULT, NODE_RESTARTED, UNTIMED};
+use crate::status::{BUS_FAULT, CONTRADICTED, DRIVE_FAULT, NODE_RESTARTED, UNTIMED};
 
 /// Identifier of SYNC.
 pub const SYNC_COB_ID: u32 = 0x080;
@@ -27,6 +28,9 @@ const CONFLICT_CYCLES: u32 = 20;
 const MOST_OWED: u32 = 10;
 /// Cycles after a missing frame or a SYNC too many in which what comes may be one period late.
 const DOUBT_CYCLES: u32 = 100;
+
+/// Values of a joint, at most, see [`target`].
+const VALUES: usize = 8 * MOTORS + 2;
 
 /// Who wants the frames of an identifier.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -45,7 +49,10 @@ pub struct Assembler {
     motors: usize,
     active: bool,
     hold_periods: i64,
-    values: [f64; 3 * MOTORS + 2], // m positions, m velocities, m torques, link position, link velocity
+    values: [f64; VALUES],
+    told: [i64; VALUES], // number of the SYNC that each of them answered
+    period: f64,         // s
+    checks: Vec<CrossCheck>,
     nodes: Vec<Node>,
     slots: Vec<Slot>,
     receivers: Vec<Receiver>,
@@ -55,6 +62,7 @@ pub struct Assembler {
     restart: bool,
     unnumbered: bool,
     faulted: u32,
+    contradicted: u32,
     untimed: u32, // cycles for which SYNCs of another master discredit the samples
     awaited: usize,
     /// Number of the current SYNC, from 0; -1 before the first.
@@ -74,6 +82,7 @@ impl Assembler {
     /// else `trust` alone makes it so. `hold_periods`: how long the last value of a TPDO that is not
     /// sent on SYNC may be used while nothing at all is heard of its node; and how long one that is sent on SYNC may
     /// fail before a node that we configure is not believed any more, since it may have lost its mapping meanwhile.
+    /// `period_s`: communication cycle.
     ///
     /// # Errors
     /// Two frames with one identifier, or a motor without position or torque.
@@ -82,6 +91,7 @@ impl Assembler {
         motors: usize,
         active: bool,
         hold_periods: i64,
+        period_s: f64,
     ) -> Result<Assembler, String> {
         if motors > MOTORS {
             return Err(format!("expected at most {MOTORS} motors, got {motors}"));
@@ -90,7 +100,10 @@ impl Assembler {
             motors,
             active,
             hold_periods,
-            values: [f64::NAN; 3 * MOTORS + 2],
+            values: [f64::NAN; VALUES],
+            told: [-1; VALUES],
+            period: period_s,
+            checks: Vec::new(),
             nodes: Vec::new(),
             slots: Vec::new(),
             receivers: Vec::new(),
@@ -100,6 +113,7 @@ impl Assembler {
             restart: false,
             unnumbered: false,
             faulted: 0,
+            contradicted: 0,
             untimed: 0,
             awaited: 0,
             sequence: -1,
@@ -115,6 +129,7 @@ impl Assembler {
         }
         assembler.check()?;
         assembler.arrange();
+        assembler.arrange_checks();
         Ok(assembler)
     }
 
@@ -135,6 +150,12 @@ impl Assembler {
     #[must_use]
     pub fn nodes(&self) -> &[Node] {
         &self.nodes
+    }
+
+    /// The checks that its mapping makes possible.
+    #[must_use]
+    pub fn checks(&self) -> &[CrossCheck] {
+        &self.checks
     }
 
     /// Whether any frame carries the link position.
@@ -210,6 +231,7 @@ impl Assembler {
             }
             return None;
         }
+        self.cross_check();
         let sample = self.close(jump);
         self.untimed = self.untimed.saturating_sub(1);
         self.sequence += jump;
@@ -263,7 +285,7 @@ impl Assembler {
         let all_arrived = self.slots.iter().all(|slot| slot.arrived || !slot.timed());
         if self.note_missing() || self.spoiled || all_arrived {
             self.missed = Some(self.sequence);
-            self.flags = BUS_FAULT | self.faulted;
+            self.flags = BUS_FAULT | self.faulted | self.contradicted;
         }
         None
     }
@@ -375,6 +397,7 @@ impl Assembler {
         let statusword = slot.store(data);
         for field in &mut slot.fields {
             self.values[field.target] = field.take(data);
+            self.told[field.target] = self.sequence;
         }
         let node = &mut self.nodes[slot.node];
         if statusword.is_some() && statusword != node.statusword {
@@ -385,7 +408,7 @@ impl Assembler {
 
     fn sample(&mut self) -> Sample {
         self.open = false;
-        let mut flags = self.faulted;
+        let mut flags = self.faulted | self.contradicted;
         if self.cycle_fault {
             flags |= BUS_FAULT;
         }
@@ -394,6 +417,8 @@ impl Assembler {
         }
         if std::mem::replace(&mut self.restart, false) {
             flags |= NODE_RESTARTED;
+            self.checks.iter_mut().for_each(CrossCheck::reset);
+            self.contradicted = 0;
         }
         self.flags = flags;
         let m = self.motors;
@@ -446,6 +471,7 @@ impl Assembler {
             Err(_) => self.slots = before,
         }
         self.arrange();
+        self.arrange_checks();
         changed
     }
 
@@ -491,6 +517,69 @@ impl Assembler {
             self.receivers[of.cob_id as usize % COB_IDS] = Receiver::Slot(slot);
         }
         self.awaited = self.slots.iter().filter(|slot| slot.timed() && !slot.arrived).count();
+    }
+
+    /// Which readings of one quantity are mapped.
+    fn arrange_checks(&mut self) {
+        let fields: Vec<(usize, f64)> = self
+            .slots
+            .iter()
+            .flat_map(|slot| &slot.fields)
+            .map(|field| (field.target, field.scale))
+            .collect();
+        self.checks.clear();
+        self.contradicted = 0;
+        for motor in 0..self.motors {
+            let step = |signal| {
+                let place = target(signal, Some(motor), self.motors);
+                fields.iter().find(|(target, _)| Some(*target) == place).map(|(_, scale)| *scale)
+            };
+            let (position, torque) = (step(Signal::MotorPosition), step(Signal::MotorTorque));
+            let velocity = step(Signal::MotorVelocity).or(step(Signal::VelocityCheck));
+            let demand = step(Signal::PositionDemand).and(position);
+            for (kind, first, second) in [
+                (Kind::Velocity, position, velocity),
+                (Kind::Current, torque, step(Signal::TorqueCheck)),
+                (Kind::SecondEncoder, position, step(Signal::SecondPosition)),
+                (Kind::FollowingError, demand, step(Signal::FollowingError)),
+            ] {
+                if let (Some(first), Some(second)) = (first, second) {
+                    self.checks.push(CrossCheck::new(kind, motor, (first, second), self.period));
+                }
+            }
+        }
+    }
+
+    /// Hold the readings of the cycle that ends against each other, where all of them are of it.
+    fn cross_check(&mut self) {
+        if self.checks.is_empty() || self.open || self.spoiled || self.untimed > 0 || self.sequence < 0 {
+            return;
+        }
+        let (motors, mut ended) = (self.motors, false);
+        for check in &mut self.checks {
+            let motor = check.motor;
+            let now = |signal| {
+                let place = target(signal, Some(motor), motors)?;
+                (self.told[place] == self.sequence).then_some(self.values[place])
+            };
+            let position = now(Signal::MotorPosition);
+            let (first, second) = match check.kind {
+                Kind::Velocity => (position, now(Signal::MotorVelocity).or(now(Signal::VelocityCheck))),
+                Kind::Current => (now(Signal::MotorTorque), now(Signal::TorqueCheck)),
+                Kind::SecondEncoder => (position, now(Signal::SecondPosition)),
+                Kind::FollowingError => {
+                    let demand = now(Signal::PositionDemand);
+                    (demand.zip(position).map(|(demand, is)| demand - is), now(Signal::FollowingError))
+                }
+            };
+            if let (Some(first), Some(second)) = (first, second) {
+                ended |= check.take(self.sequence, first, second);
+            }
+        }
+        if ended {
+            let spoilt = (0..motors).any(|motor| spoils(&self.checks, motor));
+            self.contradicted = if spoilt { CONTRADICTED } else { 0 };
+        }
     }
 
     fn node_and_slots(&mut self, node: usize) -> (&mut Node, impl Iterator<Item = &mut Slot>) {

@@ -40,7 +40,10 @@ pub struct Field {
     place: Place,
     /// Where in the joint's values it goes, see [`target`].
     pub target: usize,
-    scale: f64,
+    /// Whether it is there to check others alone.
+    checks: bool,
+    /// SI units per count.
+    pub scale: f64,
     offset: f64,
     range: i128,
     longest: i128,
@@ -53,6 +56,7 @@ impl Field {
         Field {
             place: Place { bit, bits: mapped.bits, signed: mapped.signed },
             target,
+            checks: mapped.signal.checks(),
             scale: mapped.scale,
             offset: mapped.offset,
             range: mapped.range,
@@ -86,7 +90,7 @@ impl Field {
 }
 
 /// Where a signal of a node goes among the values of a joint with `motors` motors: m positions, m velocities,
-/// m torques, then the link's position and velocity.
+/// m torques, the link's position and velocity, and for each motor what is there to check others.
 pub fn target(signal: Signal, motor: Option<usize>, motors: usize) -> Option<usize> {
     match signal {
         Signal::MotorPosition => motor,
@@ -94,6 +98,11 @@ pub fn target(signal: Signal, motor: Option<usize>, motors: usize) -> Option<usi
         Signal::MotorTorque => motor.map(|motor| 2 * motors + motor),
         Signal::LinkPosition => Some(3 * motors),
         Signal::LinkVelocity => Some(3 * motors + 1),
+        Signal::VelocityCheck => motor.map(|motor| 3 * motors + 2 + motor),
+        Signal::TorqueCheck => motor.map(|motor| 4 * motors + 2 + motor),
+        Signal::SecondPosition => motor.map(|motor| 5 * motors + 2 + motor),
+        Signal::FollowingError => motor.map(|motor| 6 * motors + 2 + motor),
+        Signal::PositionDemand => motor.map(|motor| 7 * motors + 2 + motor),
         Signal::Statusword | Signal::Other => None,
     }
 }
@@ -105,7 +114,7 @@ pub struct Slot {
     pub node: usize,
     /// Identifier of its frames.
     pub cob_id: u32,
-    /// What goes into the sample.
+    /// What goes into the sample, and what checks it.
     pub fields: Vec<Field>,
     statusword: Option<Place>,
     /// SYNCs from one frame to the next; 0: the drive sends when it pleases, the value is held.
@@ -168,7 +177,7 @@ impl Slot {
 
     /// Whether a sample is incomplete without it.
     pub fn needed(&self) -> bool {
-        !self.fields.is_empty()
+        self.fields.iter().any(|field| !field.checks)
     }
 
     /// Needed, and sent on SYNC.

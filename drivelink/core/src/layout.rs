@@ -15,6 +15,16 @@ pub enum Signal {
     LinkPosition,
     /// q'.
     LinkVelocity,
+    /// θ' of the node's motor, for a cross-check alone.
+    VelocityCheck,
+    /// The current beside the torque, or the torque beside the current, N·m.
+    TorqueCheck,
+    /// θ of the node's motor by another encoder.
+    SecondPosition,
+    /// 0x60F4, as position.
+    FollowingError,
+    /// 0x6062, as position.
+    PositionDemand,
     /// Mapped by the drive, not used by us.
     Other,
 }
@@ -34,6 +44,21 @@ pub struct MappedObject {
     pub offset: f64,
     /// Counts after which it rolls over; 0: never.
     pub range: i128,
+}
+
+impl Signal {
+    /// Whether it is there to check others alone: no sample waits for it.
+    #[must_use]
+    pub fn checks(self) -> bool {
+        matches!(
+            self,
+            Signal::VelocityCheck
+                | Signal::TorqueCheck
+                | Signal::SecondPosition
+                | Signal::FollowingError
+                | Signal::PositionDemand
+        )
+    }
 }
 
 /// One TPDO: its identifier and the objects in it, in order from bit 0.

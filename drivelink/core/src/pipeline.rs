@@ -9,7 +9,7 @@ use estimator_core::sample::status::{MODEL_ALARM, RESTARTED, VALID};
 use estimator_core::sample::{Estimate, Sample};
 
 use crate::assembler::{Assembler, SYNC_COB_ID};
-use crate::status::{NODE_RESTARTED, STALE, UNTIMED};
+use crate::status::{CONTRADICTED, NODE_RESTARTED, STALE, UNTIMED};
 use crate::wire::{Payload, encode_estimate, encode_external, encode_sample};
 
 /// Why an estimator could not step: never the compiled one, perhaps one that somebody registered.
@@ -209,13 +209,16 @@ pub fn estimate(
         estimator.reset()?;
         flags |= RESTARTED;
     }
-    if flags & UNTIMED != 0 {
+    if flags & (UNTIMED | CONTRADICTED) != 0 {
         estimator.distrust()?;
     }
     let mut estimate = estimator.step(sample)?;
     if estimator.alarm(sample, &estimate)? {
         flags |= MODEL_ALARM;
         estimate.status &= !VALID; // a model that is not sufficient makes no number that may be used
+    }
+    if flags & CONTRADICTED != 0 {
+        estimate.status &= !VALID; // one of two readings lies, and nobody can say that it is not the one in use
     }
     estimate.status |= flags;
     let valid = estimate.status & VALID != 0;

@@ -15,6 +15,7 @@ use pyo3::sync::PyOnceLock;
 use pyo3::types::{PyBytes, PyDict, PyTuple};
 
 use crate::assembler::{self, SYNC_COB_ID};
+use crate::cross_check::{CrossCheck, Verdict};
 use crate::layout::{MappedObject, Node, Signal, Tpdo};
 use crate::node::Counters;
 use crate::pipeline::{self, Due, Failure, Pipeline, Step};
@@ -209,6 +210,11 @@ fn mapped_from(py: Python<'_>, object: &Bound<'_, PyAny>) -> PyResult<MappedObje
         "statusword" => Signal::Statusword,
         "link_position" => Signal::LinkPosition,
         "link_velocity" => Signal::LinkVelocity,
+        "velocity_check" => Signal::VelocityCheck,
+        "torque_check" => Signal::TorqueCheck,
+        "second_position" => Signal::SecondPosition,
+        "following_error" => Signal::FollowingError,
+        "position_demand" => Signal::PositionDemand,
         _ => Signal::Other,
     };
     let bits: u32 = object.getattr("bits")?.extract()?;
@@ -318,17 +324,18 @@ struct Assembler {
 #[pymethods]
 impl Assembler {
     #[new]
-    #[pyo3(signature = (layouts, motors, *, active = true, hold_periods = 250))]
+    #[pyo3(signature = (layouts, motors, *, active = true, hold_periods = 250, period_s = 0.001))]
     fn new(
         py: Python<'_>,
         layouts: &Bound<'_, PyAny>,
         motors: usize,
         active: bool,
         hold_periods: i64,
+        period_s: f64,
     ) -> PyResult<Assembler> {
         let layouts =
             layouts.try_iter()?.map(|layout| layout_from(py, &layout?)).collect::<PyResult<Vec<_>>>()?;
-        let core = assembler::Assembler::new(&layouts, motors, active, hold_periods)
+        let core = assembler::Assembler::new(&layouts, motors, active, hold_periods, period_s)
             .map_err(|message| drive_error(py, message))?;
         Ok(Assembler { core: Mutex::new(core) })
     }
@@ -394,6 +401,20 @@ impl Assembler {
         let core = lock(&self.core);
         let nodes: Vec<u32> = core.nodes().iter().filter(|n| !n.trusted).map(|n| n.node_id).collect();
         PyTuple::new(py, nodes)
+    }
+
+    #[getter]
+    fn checks(&self) -> Vec<(usize, &'static str, &'static str, f64, f64)> {
+        let told = |check: &CrossCheck| {
+            let verdict = match check.verdict() {
+                Verdict::Untested => "untested",
+                Verdict::Agrees => "agrees",
+                Verdict::Contradicts => "contradicts",
+            };
+            let (scale, std) = check.scale();
+            (check.motor + 1, check.kind.name(), verdict, scale, std)
+        };
+        lock(&self.core).checks().iter().map(told).collect()
     }
 
     #[getter]

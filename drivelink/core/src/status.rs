@@ -10,3 +10,5 @@ pub const STALE: u32 = 1 << 10;
 pub const UNTIMED: u32 = 1 << 11;
 /// Positions may have started anew: with this sample the estimator begins anew.
 pub const NODE_RESTARTED: u32 = 1 << 12;
+/// Two readings of one quantity that the estimate is made of contradict each other.
+pub const CONTRADICTED: u32 = 1 << 14;

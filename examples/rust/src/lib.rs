@@ -10,8 +10,9 @@ pub const VALID: u32 = 1 << 0;
 /// Status bit 1: the motion at hand tells the stiffness.
 pub const OBSERVABLE: u32 = 1 << 1;
 
-/// What must be clear beside VALID: model alarm, restarted, drive fault, stale, untimed, node restarted.
-pub const AGAINST: u32 = 1 << 4 | 1 << 6 | 1 << 8 | 1 << 10 | 1 << 11 | 1 << 12;
+/// What must be clear beside VALID: model alarm, restarted, drive fault, stale, untimed, node restarted,
+/// contradicted.
+pub const AGAINST: u32 = 1 << 4 | 1 << 6 | 1 << 8 | 1 << 10 | 1 << 11 | 1 << 12 | 1 << 14;
 /// Status bit 13: what is NaN is not given (stiffness of a rigid joint, standard deviation of mode paper).
 pub const PARTIAL: u32 = 1 << 13;
 /// Transmissions in one message; their number is one byte.

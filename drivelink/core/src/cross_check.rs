@@ -1,0 +1,497 @@
+//! Two readings of one quantity, held against each other.
+//!
+//! A drive often tells a quantity twice: its velocity beside its position, its current beside its torque, a second
+//! encoder, its following error. What the second reading tells is a line of the first, y = s x + l ẋ + o: a scale, a
+//! lag and a zero, which are learned while both agree. In blocks of [`BLOCK_PERIODS`] the means of both are compared
+//! (of a velocity: what it integrates to, and how far the position has come). The last [`WINDOW`] blocks with
+//! information in them are tested together: r = y - h x̂ ~ N(0, κ² (I + H P Hᵀ)) in units of what a block is allowed,
+//! so rᵀ(I + H P Hᵀ)⁻¹ r / κ² ~ χ² of [`WINDOW`] degrees of freedom. One test finds a changed scale, a stuck or
+//! drifting reading, noise and slips alike; [`LIMIT`] states how often it errs.
+//!
+//! A block is allowed what the readings' counts cannot resolve, one period between the two, and [`SAME`] of the
+//! change: two readings that agree better are the same. To that comes what is seen beyond it in health: a noise, the
+//! same in every block, and κ >= 1 where that does not do.
+
+/// Communication periods in one block, at least: longer than the filters in drives.
+const BLOCK_PERIODS: i64 = 50;
+/// Periods without a reading that a block may have in one go.
+const MOST_GAP: i64 = 10;
+/// Blocks that are tested together.
+pub const WINDOW: usize = 20;
+/// Blocks that are learned from before the test begins: the noise from a third of them on, κ from two thirds on.
+const FIRST: u32 = 3 * WINDOW as u32;
+/// χ² of 20 degrees of freedom is above it once in 10⁹ windows: at 20 blocks/s of motion, once in 1.6 years.
+pub const LIMIT: f64 = 83.48;
+/// Relative difference between two readings of one quantity that is no fault.
+const SAME: f64 = 0.01;
+/// Blocks that the line is learned over: a minute of motion at 1 kHz.
+const MEMORY: f64 = 1200.0;
+/// A block tells something where a reading moves by so many of its standard deviations of rounding.
+const TELLS: f64 = 5.0;
+/// Standard deviation of a declared scale, relative, before anything is learned; of one that is not declared.
+const DECLARED: f64 = 0.05;
+const UNDECLARED: f64 = 10.0;
+/// Standard deviation of the lag, periods.
+const LAG: f64 = 10.0;
+/// Standard deviation of a zero that may be anywhere, in units of what a block is allowed.
+const ANYWHERE: f64 = 1e6;
+
+type Row = [f64; 3]; // of scale, lag and zero
+type Square = [[f64; 3]; 3];
+
+/// Which two readings.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// Position and velocity (0x606C).
+    Velocity,
+    /// Torque and current: 0x6077 and 0x6078, or the maker's object.
+    Current,
+    /// Position and a second encoder on the motor's side (0x60E4).
+    SecondEncoder,
+    /// Demand (0x6062) less position, and following error (0x60F4).
+    FollowingError,
+}
+
+/// What a check has come to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Verdict {
+    /// Not enough motion so far.
+    Untested,
+    /// Both readings tell the same.
+    Agrees,
+    /// They contradict each other.
+    Contradicts,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Block {
+    row: Row,     // in units of what the block is allowed
+    value: f64,   // likewise
+    allowed: f64, // in the second reading's unit
+}
+
+/// One check of one motor.
+#[derive(Clone, Debug)]
+pub struct CrossCheck {
+    /// Which readings.
+    pub kind: Kind,
+    /// Of which motor, from 0.
+    pub motor: usize,
+    steps: (f64, f64), // SI per count of both readings
+    period: f64,
+    // This block.
+    first: (f64, f64),
+    last: (f64, f64),
+    low: (f64, f64),
+    high: (f64, f64),
+    sums: (f64, f64),
+    readings: f64,
+    begun: i64, // sequence; -1: not begun
+    seen: i64,
+    // The last blocks, and what was learned before them.
+    window: [Block; WINDOW],
+    filled: usize,
+    next: usize,
+    prior: Row,
+    information: Square,
+    vector: Row,
+    learned: u32,
+    weight: f64,
+    squares: f64, // of the units of what is allowed
+    noise_weight: f64,
+    noise_squares: f64,
+    /// χ² of the window, compared with [`LIMIT`].
+    pub statistic: f64,
+    verdict: Verdict,
+}
+
+impl CrossCheck {
+    /// A check that has seen nothing.
+    ///
+    /// `steps`: SI units per count of the first and of the second reading; `period`: s.
+    #[must_use]
+    pub fn new(kind: Kind, motor: usize, steps: (f64, f64), period: f64) -> CrossCheck {
+        let scale = if kind.is_declared() { DECLARED } else { UNDECLARED };
+        let zero = if kind.is_declared() { 1.0 } else { ANYWHERE };
+        let mut check = CrossCheck {
+            kind,
+            motor,
+            steps: (steps.0.abs(), steps.1.abs()),
+            period,
+            first: (0.0, 0.0),
+            last: (0.0, 0.0),
+            low: (0.0, 0.0),
+            high: (0.0, 0.0),
+            sums: (0.0, 0.0),
+            readings: 0.0,
+            begun: -1,
+            seen: -1,
+            window: [Block { row: [0.0; 3], value: 0.0, allowed: 1.0 }; WINDOW],
+            filled: 0,
+            next: 0,
+            prior: [scale.powi(-2), LAG.powi(-2), zero.powi(-2)],
+            information: [[0.0; 3]; 3],
+            vector: [0.0; 3],
+            learned: 0,
+            weight: 0.0,
+            squares: 0.0,
+            noise_weight: 0.0,
+            noise_squares: 0.0,
+            statistic: 0.0,
+            verdict: Verdict::Untested,
+        };
+        check.reset();
+        check
+    }
+
+    /// Forget everything: the readings may begin anew.
+    pub fn reset(&mut self) {
+        (self.begun, self.filled, self.next, self.learned) = (-1, 0, 0, 0);
+        (self.weight, self.squares, self.statistic) = (0.0, 0.0, 0.0);
+        (self.noise_weight, self.noise_squares) = (0.0, 0.0);
+        (self.information, self.vector) = before(&self.prior);
+        self.verdict = Verdict::Untested;
+    }
+
+    /// What it has come to.
+    #[must_use]
+    pub fn verdict(&self) -> Verdict {
+        self.verdict
+    }
+
+    /// The scale of the second reading against the first now, and its standard deviation: of the window while both
+    /// contradict each other, else as learned.
+    #[must_use]
+    pub fn scale(&self) -> (f64, f64) {
+        let (mut information, mut vector) = (self.information, self.vector);
+        if self.verdict == Verdict::Contradicts && self.learned >= FIRST {
+            (information, vector) = before(&[UNDECLARED.powi(-2), self.prior[1], self.prior[2]]);
+            for block in &self.window[..self.filled] {
+                add(&mut information, &mut vector, &block.row, block.value);
+            }
+        }
+        let std = solve(&information, &[1.0, 0.0, 0.0])[0].max(0.0).sqrt();
+        (solve(&information, &vector)[0], self.noise() * std)
+    }
+
+    /// Both readings at the SYNC of this number; whether that ended a block.
+    pub fn take(&mut self, sequence: i64, x: f64, y: f64) -> bool {
+        if !(x.is_finite() && y.is_finite()) {
+            return false;
+        }
+        let gap = sequence - self.seen;
+        if self.begun < 0 || gap <= 0 || gap > MOST_GAP {
+            self.begin(sequence, x, y);
+            return false;
+        }
+        self.seen = sequence;
+        if self.kind == Kind::Velocity {
+            self.sums.1 += 0.5 * (self.last.1 + y) * gap as f64 * self.period;
+        } else {
+            self.sums = (self.sums.0 + x, self.sums.1 + y);
+        }
+        self.readings += 1.0;
+        self.last = (x, y);
+        self.low = (self.low.0.min(x), self.low.1.min(y));
+        self.high = (self.high.0.max(x), self.high.1.max(y));
+        let ended = sequence - self.begun >= BLOCK_PERIODS;
+        if ended {
+            if let Some(block) = self.block() {
+                self.judge(block);
+            }
+            self.begin(sequence, x, y);
+        }
+        ended
+    }
+
+    fn begin(&mut self, sequence: i64, x: f64, y: f64) {
+        (self.begun, self.seen) = (sequence, sequence);
+        (self.first, self.last, self.low, self.high) = ((x, y), (x, y), (x, y), (x, y));
+        (self.sums, self.readings) = ((0.0, 0.0), 0.0);
+    }
+
+    /// The block that ends now, in units of what it is allowed; `None` where it tells nothing.
+    fn block(&self) -> Option<Block> {
+        let periods = (self.seen - self.begun) as f64;
+        let spread = (self.high.0 - self.low.0, self.high.1 - self.low.1);
+        let (x, y, slope, rounding, moved);
+        if self.kind == Kind::Velocity {
+            (x, y) = (self.last.0 - self.first.0, self.sums.1);
+            // A first-order filter of time constant l leaves out l times the change of what it gives: exactly.
+            slope = (self.last.1 - self.first.1) * self.period;
+            // Both ends of the way; a velocity that is rounded always the same way, or cut off.
+            let far = self.steps.1 * periods * self.period;
+            rounding = (2.0 * self.steps.0.powi(2) / 12.0 + far.powi(2) / 3.0).sqrt();
+            moved = x.abs().max(y.abs());
+        } else {
+            (x, y) = (self.sums.0 / self.readings, self.sums.1 / self.readings);
+            slope = (self.last.1 - self.first.1) / periods;
+            rounding = ((self.steps.0.powi(2) + self.steps.1.powi(2)) / 12.0).sqrt();
+            moved = spread.0.max(spread.1);
+        }
+        if rounding <= 0.0 || moved <= TELLS * rounding {
+            return None;
+        }
+        let change = match self.kind {
+            Kind::Velocity => x,
+            Kind::Current => x.abs().max(spread.0),
+            Kind::SecondEncoder | Kind::FollowingError => spread.0,
+        };
+        let noise = if self.noise_weight > 0.0 { self.noise_squares / self.noise_weight } else { 0.0 };
+        let allowed = (rounding.powi(2) + (SAME * change).powi(2) + slope.powi(2) + noise).sqrt();
+        let row = [x / allowed, slope / allowed, rounding / allowed];
+        Some(Block { row, value: y / allowed, allowed })
+    }
+
+    fn judge(&mut self, block: Block) {
+        let leaves = std::mem::replace(&mut self.window[self.next], block);
+        let full = self.filled == WINDOW;
+        self.next = (self.next + 1) % WINDOW;
+        self.filled = (self.filled + 1).min(WINDOW);
+        self.statistic = self.chi_squared();
+        if full && (self.learned < FIRST || self.verdict != Verdict::Contradicts) {
+            self.learn(&leaves);
+        }
+        self.verdict = if self.learned < FIRST {
+            Verdict::Untested
+        } else if self.statistic > LIMIT || self.is_scaled_wrong() {
+            Verdict::Contradicts
+        } else {
+            Verdict::Agrees
+        };
+    }
+
+    /// A scale that is declared on both sides is one.
+    fn is_scaled_wrong(&self) -> bool {
+        if !self.kind.is_declared() {
+            return false;
+        }
+        let scale = solve(&self.information, &self.vector)[0];
+        let std = solve(&self.information, &[1.0, 0.0, 0.0])[0].max(0.0).sqrt();
+        (scale - 1.0).abs() > DECLARED + 5.0 * self.noise() * std
+    }
+
+    fn chi_squared(&self) -> f64 {
+        let line = solve(&self.information, &self.vector);
+        let (mut information, mut vector, mut total) = (self.information, [0.0; 3], 0.0);
+        for block in &self.window[..self.filled] {
+            let left = block.value - dot(&block.row, &line);
+            add(&mut information, &mut vector, &block.row, left);
+            total += left * left;
+        }
+        (total - dot(&vector, &solve(&information, &vector))).max(0.0) / self.noise().powi(2)
+    }
+
+    /// κ.
+    fn noise(&self) -> f64 {
+        ((self.squares + 1.0) / (self.weight + 1.0)).max(1.0).sqrt()
+    }
+
+    fn learn(&mut self, block: &Block) {
+        let line = solve(&self.information, &self.vector);
+        let left = block.value - dot(&block.row, &line);
+        let expected = 1.0 + dot(&block.row, &solve(&self.information, &block.row));
+        let keep = 1.0 - 1.0 / MEMORY;
+        let square = left * left / expected;
+        if self.learned >= FIRST / 3 {
+            // Blocks that are allowed little tell most of the noise: weights of least variance for a mean square.
+            self.noise_weight = keep * self.noise_weight + block.allowed.powi(-4);
+            self.noise_squares = keep * self.noise_squares + square * block.allowed.powi(-2);
+        }
+        if self.learned >= FIRST / 3 * 2 {
+            self.weight = keep * self.weight + 1.0;
+            self.squares = keep * self.squares + square;
+        }
+        for i in 0..3 {
+            for j in 0..3 {
+                self.information[i][j] *= keep;
+            }
+            self.information[i][i] += (1.0 - keep) * self.prior[i]; // never less than before anything was learned
+            self.vector[i] *= keep;
+        }
+        self.vector[0] += (1.0 - keep) * self.prior[0];
+        add(&mut self.information, &mut self.vector, &block.row, block.value);
+        self.learned = self.learned.saturating_add(1);
+    }
+}
+
+impl Kind {
+    /// Whether both readings have one unit by declaration.
+    fn is_declared(self) -> bool {
+        matches!(self, Kind::Velocity | Kind::FollowingError)
+    }
+
+    /// As the service names the second reading.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Kind::Velocity => "velocity",
+            Kind::Current => "current",
+            Kind::SecondEncoder => "second_encoder",
+            Kind::FollowingError => "following_error",
+        }
+    }
+}
+
+/// Whether any of these checks of one motor leaves no doubt that a reading the estimate is made of may lie.
+///
+/// Where one check of the position fails and another one passes, the position is right and the other reading wrong.
+#[must_use]
+pub fn spoils(checks: &[CrossCheck], motor: usize) -> bool {
+    let is = |check: &CrossCheck, verdict| check.motor == motor && check.verdict == verdict;
+    let of_position = |check: &&CrossCheck| check.kind != Kind::Current;
+    let torque = checks.iter().any(|check| check.kind == Kind::Current && is(check, Verdict::Contradicts));
+    let position = checks.iter().filter(of_position).any(|check| is(check, Verdict::Contradicts));
+    let cleared = checks.iter().filter(of_position).any(|check| is(check, Verdict::Agrees));
+    torque || position && !cleared
+}
+
+/// Information and vector of a scale of one, no lag, no zero, before anything is learned.
+fn before(prior: &Row) -> (Square, Row) {
+    let mut information = [[0.0; 3]; 3];
+    for i in 0..3 {
+        information[i][i] = prior[i];
+    }
+    (information, [prior[0], 0.0, 0.0])
+}
+
+fn dot(a: &Row, b: &Row) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+fn add(information: &mut Square, vector: &mut Row, row: &Row, value: f64) {
+    for i in 0..3 {
+        for j in 0..3 {
+            information[i][j] += row[i] * row[j];
+        }
+        vector[i] += row[i] * value;
+    }
+}
+
+/// The solution of a symmetric positive definite system (LDLᵀ).
+fn solve(matrix: &Square, vector: &Row) -> Row {
+    let d0 = matrix[0][0];
+    let (l10, l20) = (matrix[1][0] / d0, matrix[2][0] / d0);
+    let d1 = matrix[1][1] - l10 * l10 * d0;
+    let l21 = (matrix[2][1] - l20 * l10 * d0) / d1;
+    let d2 = matrix[2][2] - l20 * l20 * d0 - l21 * l21 * d1;
+    let y1 = vector[1] - l10 * vector[0];
+    let y2 = vector[2] - l20 * vector[0] - l21 * y1;
+    let z2 = y2 / d2;
+    let z1 = y1 / d1 - l21 * z2;
+    [vector[0] / d0 - l10 * z1 - l20 * z2, z1, z2]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Uniform in [-1, 1] from a small congruential generator.
+    fn random(state: &mut u64) -> f64 {
+        *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (*state >> 11) as f64 / (1u64 << 52) as f64 - 1.0
+    }
+
+    fn run(check: &mut CrossCheck, from: i64, to: i64, reading: impl Fn(f64, f64) -> (f64, f64)) {
+        let mut seed = from as u64 + 1;
+        for k in from..to {
+            let (x, y) = reading(k as f64 * 1e-3, random(&mut seed));
+            check.take(k, x, y);
+        }
+    }
+
+    fn position(t: f64) -> f64 {
+        (5.0 * t).sin() + 0.3 * (17.0 * t).sin()
+    }
+
+    fn velocity(t: f64) -> f64 {
+        5.0 * (5.0 * t).cos() + 5.1 * (17.0 * t).cos()
+    }
+
+    fn counts(value: f64, step: f64) -> f64 {
+        (value / step).round() * step
+    }
+
+    const STEPS: (f64, f64) = (1e-4, 1e-2);
+
+    fn healthy(t: f64, _noise: f64) -> (f64, f64) {
+        (counts(position(t), STEPS.0), counts(velocity(t - 0.004), STEPS.1))
+    }
+
+    #[test]
+    fn a_velocity_that_lags_agrees_and_one_of_another_scale_does_not() {
+        let mut check = CrossCheck::new(Kind::Velocity, 0, STEPS, 1e-3);
+        run(&mut check, 0, 60_000, healthy);
+        assert_eq!(check.verdict(), Verdict::Agrees, "{}", check.statistic);
+        run(&mut check, 60_000, 60_200, |t, n| (healthy(t, n).0, 0.9 * healthy(t, n).1));
+        assert_eq!(check.verdict(), Verdict::Contradicts);
+        assert!((check.scale().0 - 1.0).abs() > 0.01);
+        run(&mut check, 60_200, 62_000, |t, n| (healthy(t, n).0, 0.9 * healthy(t, n).1));
+        assert!((check.scale().0 - 0.9).abs() < 0.01, "{:?}", check.scale());
+        run(&mut check, 62_000, 64_000, healthy);
+        assert_eq!(check.verdict(), Verdict::Agrees);
+    }
+
+    #[test]
+    fn a_declared_scale_that_is_wrong_from_the_start_is_told() {
+        let mut check = CrossCheck::new(Kind::Velocity, 0, STEPS, 1e-3);
+        run(&mut check, 0, 10_000, |t, n| (healthy(t, n).0, 4.0 * healthy(t, n).1));
+        assert_eq!(check.verdict(), Verdict::Contradicts);
+        assert!((check.scale().0 - 4.0).abs() < 0.1, "{:?}", check.scale());
+    }
+
+    #[test]
+    fn the_scale_of_a_current_is_learned_and_a_change_of_it_found_through_noise() {
+        let mut check = CrossCheck::new(Kind::Current, 0, (0.01, 0.01), 1e-3);
+        let ratio = 1.7;
+        let torque =
+            |t: f64, n: f64| (counts(velocity(t), 0.01), counts(ratio * velocity(t) + 0.2 + 0.2 * n, 0.01));
+        run(&mut check, 0, 60_000, torque);
+        assert_eq!(check.verdict(), Verdict::Agrees, "{}", check.statistic);
+        assert!((check.scale().0 - ratio).abs() < 0.02, "{:?}", check.scale());
+        run(&mut check, 60_000, 60_300, |t, n| (1.1 * torque(t, n).0, torque(t, n).1));
+        assert_eq!(check.verdict(), Verdict::Contradicts);
+    }
+
+    #[test]
+    fn a_second_encoder_that_slips_once_stays_wrong() {
+        let mut check = CrossCheck::new(Kind::SecondEncoder, 0, (1e-4, 1e-4), 1e-3);
+        let both = |t: f64, slip: f64| (counts(position(t), 1e-4), counts(3.0 - position(t) + slip, 1e-4));
+        run(&mut check, 0, 10_000, |t, _| both(t, 0.0));
+        assert_eq!(check.verdict(), Verdict::Agrees);
+        run(&mut check, 10_000, 20_000, |t, _| both(t, 0.1));
+        assert_eq!(check.verdict(), Verdict::Contradicts);
+    }
+
+    #[test]
+    fn cycles_that_are_lost_cost_nothing_and_rest_tells_nothing() {
+        let mut check = CrossCheck::new(Kind::Velocity, 0, STEPS, 1e-3);
+        let mut seed = 7;
+        for k in 0..60_000 {
+            if random(&mut seed) > -0.8 {
+                let (x, y) = healthy(k as f64 * 1e-3, 0.0);
+                check.take(k, x, y);
+            }
+        }
+        assert_eq!(check.verdict(), Verdict::Agrees, "{}", check.statistic);
+        let mut check = CrossCheck::new(Kind::Velocity, 0, STEPS, 1e-3);
+        run(&mut check, 0, 10_000, |_, _| (0.5, 0.0));
+        assert_eq!(check.verdict(), Verdict::Untested);
+    }
+
+    #[test]
+    fn the_statistic_errs_no_more_often_than_declared() {
+        // Mean 20 of a chi squared of 20 degrees of freedom, at most: what a block is allowed is not all used.
+        let mut check = CrossCheck::new(Kind::Current, 0, (0.01, 0.01), 1e-3);
+        let (mut sum, mut number, mut worst, mut seed) = (0.0, 0.0, 0.0f64, 3);
+        for k in 0..600_000 {
+            let t = k as f64 * 1e-3;
+            let y = counts(velocity(t) + 0.5 * random(&mut seed), 0.01);
+            if check.take(k, counts(velocity(t) + 0.5 * random(&mut seed), 0.01), y) && k > 10_000 {
+                (sum, number, worst) = (sum + check.statistic, number + 1.0, worst.max(check.statistic));
+            }
+        }
+        assert!(sum / number < 1.2 * WINDOW as f64, "{}", sum / number);
+        assert!(worst < LIMIT, "{worst}");
+    }
+}

@@ -93,9 +93,9 @@ class Assembler:
         faults: nodes that report a fault, with the EMCY error code (0: by statusword only).
         statuswords: of the drives, as last heard, by node id.
         untrusted: nodes that rebooted or were silent for long, and have not been started again.
-        checks: of two readings of one quantity, where both are mapped: motor from 1 on; "velocity",
-            "current", "second_encoder" or "following_error"; "untested", "agrees" or "contradicts"; the scale of the
-            second reading against the first, and its standard deviation.
+        checks: two readings of one quantity, where both are mapped: (motor from 1 on, "velocity", "current",
+            "second_encoder" or "following_error", "untested", "agrees" or "contradicts", scale of the second
+            reading against the first, its standard deviation).
         has_link: whether any frame carries the link position.
         complete: whether this cycle has given its sample: nothing more is expected before the next SYNC.
 

@@ -284,7 +284,7 @@ class _Drive:
                 "rated_current_a or current_object"
             )
         if not by_current and rated_torque is not None and not own_unit:
-            # Of unknown unit: a thousandth of rated current is about one of rated torque; the ratio is learned.
+            # Unit unknown: a thousandth of rated current is about one of rated torque; the ratio is learned.
             likely = _torque_candidate((0x6078, 0), 16, direction * gear * rated_torque / 1000)
             by_current = [likely]
         self._check("current", Signal.TORQUE_CHECK, (*by_current, *by_torque))

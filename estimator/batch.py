@@ -33,7 +33,7 @@ _SHAPE = 1e-7  # relative tolerance of a shape parameter: far below what noise l
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TransmissionFit:
-    """What a recording tells of one transmission and its motor.
+    """One transmission and its motor, fitted to a recording.
 
     Attributes:
         model: transmission model's name.
@@ -53,7 +53,7 @@ class TransmissionFit:
         link_delay_s: by which the link encoder is late.
         torque_skew_s: by which the torque is.
         nuisance_std: standard deviations of the last seven, by name (`NUISANCES`, "link_delay" last).
-        excited: whether the recording tells the stiffness at all.
+        excited: whether the recording reveals the stiffness at all.
     """
 
     model: str

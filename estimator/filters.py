@@ -114,7 +114,7 @@ class StateVariableFilter:
         return math.ceil((14.0 + 3.0 * (self.order - 1)) / (self.bandwidth_rad_s * self.period_s))
 
     def rest(self, value: float) -> FloatArray:
-        """State (n,) in which a constant input has been for ever."""
+        """State (n,) in which a constant input has been forever."""
         state = np.zeros(self.order)
         state[0] = value
         return state

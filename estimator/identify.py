@@ -1,6 +1,6 @@
 """A joint's model from a healthy recording: what `drivelink fit` shows, and what it writes.
 
-`fit` tells each transmission and its motor. `calibrate` adds what that leaves open: the link's dynamics, and
+`fit` gives each transmission and its motor. `calibrate` adds what that leaves open: the link's dynamics, and
 the errors of the readings. With the readings put right, `fit` has the last word on its own numbers, so that
 there is one set of them.
 """
@@ -31,7 +31,7 @@ _READINGS = ("torque_delay", "deflection_offset", "encoder_delay")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Identified:
-    """What a recording tells of a joint.
+    """A joint, fitted to a recording.
 
     Attributes:
         fits: of each motor, in order; every number that `model` has, too, is the same there.

@@ -1,4 +1,4 @@
-"""What the estimator is told about a joint: the known terms of eqs 4-7 and how to estimate the rest.
+"""The declared model of a joint: the known terms of eqs 4-7 and how to estimate the rest.
 
 Plain frozen settings, validated when they are made. They carry no state and know no file format;
 the joint file of the service builds them.

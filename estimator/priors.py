@@ -1,4 +1,4 @@
-"""What is believed about a joint before any data: one table for the on-line estimator, `fit` and `diagnose`.
+"""Priors of a joint: one table for the on-line estimator, `fit` and `diagnose`.
 
 Every number is a standard deviation relative to a scale that the joint file or the recording gives, so the
 table has no unit of its own and holds for a finger as for a crane.
@@ -97,6 +97,6 @@ PRIORS: dict[str, Prior] = {
         0.01, "absolute", "error of an encoder, rad", "mounting, well below a degree"
     ),
     "transmission": Prior(
-        10.0, "torque", "flexibility torque at the deflections seen", "wide: the data tell it"
+        10.0, "torque", "flexibility torque at the deflections seen", "wide: the data decide"
     ),
 }

@@ -57,7 +57,7 @@ class Status(IntFlag):
     """Quality of one estimate. Bits 0-7 are the estimator's, from bit 8 on the service's."""
 
     VALID = 1 << 0  # the numbers may be used
-    OBSERVABLE = 1 << 1  # the motion at hand tells the stiffness; else it is held, with a wider interval
+    OBSERVABLE = 1 << 1  # the motion reveals the stiffness; else it is held, with a wider interval
     GAP = 1 << 2  # samples were missing before this one and have been bridged
     CHANGED = 1 << 3  # innovation alarm: the joint changed, the estimate is following
     MODEL_ALARM = 1 << 4  # the residual is above the model's own baseline: the model is not sufficient
@@ -67,7 +67,7 @@ class Status(IntFlag):
     BUS_FAULT = 1 << 9  # frames of this cycle were late or missing
     STALE = 1 << 10  # the estimate is carried on without fresh measurements
     UNTIMED = 1 << 11  # SYNCs of another master: the values may be of another moment; nothing is learned
-    NODE_RESTARTED = 1 << 12  # positions may have started anew: with this sample the estimator begins anew
+    NODE_RESTARTED = 1 << 12  # positions may have restarted: the estimator restarts with this sample
     PARTIAL = (
         1 << 13
     )  # what is NaN is not given: stiffness of a rigid joint, standard deviation of mode paper

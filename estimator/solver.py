@@ -127,7 +127,7 @@ class Solver:
     def search_delay(self) -> float:
         """Delay of the link encoder in s: a grid of half periods, then a parabola's bracket.
 
-        A delay must earn its place: on a motion that hardly tells it, none is assumed (`_weigh`).
+        A delay must earn its place: on a motion that hardly reveals it, none is assumed (`_weigh`).
         """
         T = self.channels.period_s
         model, self.model = self.model, Polynomial()

@@ -1,4 +1,4 @@
-"""What stands on one bus: worlds, their devices, and a word on them for people."""
+"""The simulated contents of one bus: worlds, their devices, and a description."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ class Case:
         drives: one per motor.
         encoder: at the link.
         excitation: the paper's torque, as a table for `sim.excitation.build`.
-        rich: a torque that tells more: the table of a test stand's run of the same joint.
+        rich: a torque that reveals more: the table of a test stand's run of the same joint.
         assumed: what the paper does not say.
     """
 

@@ -1,4 +1,4 @@
-"""Faults of devices and wires, on command or at a given SYNC: what a master has to survive."""
+"""Injects faults of devices and wires, at once or at a given SYNC."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ Extra = Callable[[float, float, float], float]
 Kinematics = Callable[[float], tuple[float, float]]
 """Error e(theta) of the gear (rad) and its slope de/dtheta: the spring sees phi - e."""
 Commit = Callable[[float, float], None]
-"""Told theta and the deflection that the spring sees at the end of each step."""
+"""Called with theta and the deflection of the spring at the end of each step."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +45,7 @@ class Terms:
         dry: levels of dry friction, N·m.
         extras: of a motor's transmission, added to tau_e on both sides.
         kinematics: of a motor's gear.
-        commits: memories to be told of each step.
+        commits: memories to update at each step.
     """
 
     loads: tuple[Load, ...] = ()

@@ -1,4 +1,4 @@
-"""Drives and encoders at work: from set-points to the torque that acts, from angles to what is reported."""
+"""Simulated drives and encoders: from set-points to acting torque, from angles to reported values."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class LinkScale:
 
     Attributes:
         counts: the reading.
-        history: to be told of every plant step, where the reading lags.
+        history: to receive every plant step, where the reading lags.
     """
 
     def __init__(self, encoder: LinkEncoder, noise: Iterator[float]) -> None:

@@ -1,4 +1,4 @@
-"""What transmissions do in the world: torque, stiffness and potential of a deflection, in closed form.
+"""Transmission laws of the world: torque, stiffness and potential of a deflection, in closed form.
 
 Written for the plant alone; what an estimator believes about the same transmissions is written elsewhere
 on purpose. Every law is odd, has a potential (eq 1) and is made of scalar closures, because the plant

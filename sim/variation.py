@@ -1,4 +1,4 @@
-"""A plant with other values, and a torque that suits it: for worlds that are no named case."""
+"""Plants with changed values, and a suitable torque: for worlds other than the named cases."""
 
 from __future__ import annotations
 

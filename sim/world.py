@@ -257,7 +257,7 @@ def record(world: World, seconds: float) -> dict[str, NDArray[np.float64]]:
     Returns:
         Arrays (n,): `time_s`, `motor1_position_rad`, `motor1_velocity_rad_s`, `motor1_torque_nm`,
         `motor1_current_a`, the same for `motor2_`, `link_position_rad`, `external_torque_nm`; and what no
-        sensor tells: `truth_` followed by `link_position_rad`, `link_velocity_rad_s`,
+        sensor reports: `truth_` followed by `link_position_rad`, `link_velocity_rad_s`,
         `flexibility_torque_nm`, `stiffness_nm_rad` and, per motor, `motor1_` with the fields of
         `MotorTruth`. Motor torques and positions are at the joint; row k's torque acts until row k+1.
     """

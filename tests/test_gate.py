@@ -90,7 +90,7 @@ def test_of_a_link_that_is_held_it_is_said_that_its_sign_cannot_be_told() -> Non
     judgement = judge(drawn.record, drawn.model)
     assert judgement.findings == ()
     assert any("sign" in text and "link" in text for text in judgement.untold), judgement
-    assert "this motion does not tell" in judgement.remark
+    assert "this motion does not reveal" in judgement.remark
     reversed_link = gatekit.faulty(drawn.record, {"link_position": -1.0})
     untold = judge(reversed_link, drawn.model).untold
     assert any("sign" in text and "link" in text for text in untold), untold
@@ -262,7 +262,7 @@ def test_a_real_machine_passes_as_it_is_and_no_fault_of_it_does(path: str, joint
     for name, factors in _faults(record).items():
         if (path, name) in UNTOLD:
             doubt = judge(gatekit.faulty(record, factors), model).remark
-            assert "does not tell" in doubt and "unit of the motor torque" in doubt, (name, doubt)
+            assert "does not reveal" in doubt and "unit of the motor torque" in doubt, (name, doubt)
             continue
         if "InnerLoop" in path and name not in OF_A_HELD_LINK:
             judgement = judge(gatekit.faulty(record, factors), model)

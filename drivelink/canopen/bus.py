@@ -124,7 +124,7 @@ def _check_socketcan(section: BusSection) -> None:
 
 
 def _check_socketcand(section: BusSection) -> None:
-    """Whether a socketcand answers: python-can would try for ten seconds, or wait for ever."""
+    """Whether a socketcand answers: python-can would try for ten seconds, or wait forever."""
     host, port = (
         section.options.get("host", _SOCKETCAND_HOST),
         section.options.get("port", _SOCKETCAND_PORT),
@@ -150,7 +150,7 @@ def _check_socketcand(section: BusSection) -> None:
 
 @contextlib.contextmanager
 def _connecting(section: BusSection) -> Iterator[None]:
-    """A server that falls silent must not hold the start up: python-can waits for ever."""
+    """A server that falls silent must not hold the start up: python-can waits forever."""
     if section.interface != "socketcand":
         yield
         return

@@ -41,7 +41,7 @@ _TIMED_OUT = 0x05040000
 _WRONG_LENGTH, _TOO_LONG, _TOO_SHORT = 0x06070010, 0x06070012, 0x06070013
 _NUMBER_BYTES = 8  # of the longest integer (CiA 301, table 44)
 _TEXT_BYTES = 256  # the longest object that is read here is a device name
-_TRANSFER_TIMEOUTS = 4  # of a whole transfer in answer timeouts: many short answers must not last for ever
+_TRANSFER_TIMEOUTS = 4  # of a whole transfer in answer timeouts: many short answers must not last forever
 
 
 def abort_text(code: int) -> str:

@@ -343,7 +343,7 @@ def open_sim_bus(section: BusSection) -> can.BusABC:
 class JoinedBus(can.BusABC):
     """A socketcand bus that another process serves; when that ends, it says so.
 
-    python-can's own client then returns at once, without a frame, for ever.
+    python-can's own client then returns at once, without a frame, forever.
 
     Args:
         bus: python-can's client.

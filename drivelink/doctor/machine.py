@@ -54,7 +54,7 @@ def _scheduling(section: Section, capabilities: int) -> None:
             "real time",
             f"SCHED_FIFO is not allowed (limit {limit}, 80 is wanted): expect a larger jitter",
             f"echo '{_user()} - rtprio 99' | sudo tee -a /etc/security/limits.d/drivelink.conf, "
-            "then log in anew",
+            "then log in again",
         )
 
 
@@ -68,7 +68,7 @@ def _memory(section: Section, capabilities: int) -> None:
             "memory",
             f"only {limit >> 10} KiB may be locked: a page fault may delay a cycle",
             f"echo '{_user()} - memlock unlimited' | sudo tee -a /etc/security/limits.d/drivelink.conf, "
-            "then log in anew",
+            "then log in again",
         )
 
 

@@ -36,7 +36,7 @@ class Subscription(Client):
         """The next cycle: the newest estimate that was not read yet, waiting for one if there is none.
 
         Args:
-            timeout_s: how long at most; None: for ever.
+            timeout_s: how long at most; None: forever.
 
         Returns:
             The estimate, or None when the time is over or the subscription closed.

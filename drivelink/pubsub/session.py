@@ -44,7 +44,7 @@ _COMMON: dict[str, Any] = {
     "transport/link/tx/queue/size/data": 16,
     "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,  # a stuck subscriber costs no wait
 }
-_CONNECT: dict[str, Any] = {  # for ever, in the background
+_CONNECT: dict[str, Any] = {  # forever, in the background
     "connect/timeout_ms": -1,
     "connect/exit_on_failure": False,
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 2},

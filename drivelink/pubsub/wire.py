@@ -181,8 +181,8 @@ STATUS_BITS: Mapping[str, str] = MappingProxyType(
         "BUS_FAULT": "frames of this cycle were late or missing",
         "STALE": "the estimate is carried on without fresh measurements",
         "UNTIMED": "another master made SYNC: values may be of another moment; nothing is learned from them",
-        "NODE_RESTARTED": "positions may have started anew: with this sample the estimator begins anew",
-        "PARTIAL": "what is NaN is not given: stiffness of a rigid joint, standard deviation in mode paper",
+        "NODE_RESTARTED": "positions may have restarted: the estimator restarts with this sample",
+        "PARTIAL": "not given where NaN: stiffness of a rigid joint, standard deviation in mode paper",
         "CONTRADICTED": "two readings of one quantity contradict each other; nothing is learned from them",
     }
 )

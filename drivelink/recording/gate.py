@@ -96,7 +96,7 @@ class Gathered:
         )
 
     def remarks(self, *, live: bool) -> list[str]:
-        """What is wrong, with what to paste, or what the motion does not tell; a line each."""
+        """What is wrong, with what to paste, or what the motion does not reveal; a line each."""
         try:
             judgement = self.judgement()
         except EstimatorError:

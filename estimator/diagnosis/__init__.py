@@ -1,4 +1,4 @@
-"""Tracing a residual to its effect: locate, select, judge."""
+"""Traces a residual to a physical effect: locate, select, judge."""
 
 from estimator.diagnosis.calibration import calibrate
 from estimator.diagnosis.result import (

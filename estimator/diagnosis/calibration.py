@@ -2,7 +2,7 @@
 
 All declared numbers are fitted together: both balances share the transmission, the motor torque's scale is
 the anchor. So are the small errors that every rig's readings have: channels that are not taken at the same
-instant, encoders with different zeros. What the recording does not tell stays near what was declared.
+instant, encoders with different zeros. What the recording does not reveal stays near its declared value.
 """
 
 from __future__ import annotations

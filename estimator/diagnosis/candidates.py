@@ -138,7 +138,7 @@ def grid(frame: Frame, candidate: Candidate, smoothing_rad_s: float) -> list[dic
     Args:
         frame: the recording.
         candidate: the effect.
-        smoothing_rad_s: velocity below which a sign cannot be told from noise.
+        smoothing_rad_s: velocity below which a sign is lost in noise.
     """
     kind = candidate.kind
     c = frame.motors[candidate.motor or 0]

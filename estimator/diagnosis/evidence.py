@@ -181,7 +181,7 @@ class Regression:
 
 
 def autocorrelation_time(error: FloatArray) -> float:
-    """1 + 2 sum of the squared autocorrelation: rows to one independent error, where its variance is told."""
+    """1 + 2 sum of the squared autocorrelation: rows per independent error."""
     error = error - error.mean()
     n = len(error)
     size = 1 << (2 * n - 1).bit_length()

@@ -1,4 +1,4 @@
-"""Whether the motion tells the effects apart, and which motion would."""
+"""Whether the motion separates the effects, and which motion would."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def poor(frame: Frame) -> bool:
 _HINTS = {
     frozenset({"torque_offset", "deflection_offset"}): (
         "torque_offset or deflection_offset: only the link's dynamics ([link.dynamics]) or a known zero of "
-        "the encoders tells them apart"
+        "the encoders separates them"
     ),
     frozenset({"cogging", "kinematic_error"}): (
         "cogging or kinematic_error: declare [link.dynamics]; a kinematic error shows on both sides"

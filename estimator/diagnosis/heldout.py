@@ -49,7 +49,7 @@ class Held:
         """Of the data that took no part, up to a constant, errors as under another hypothesis."""
         rows = sum(len(left) for left, _, _ in self._left(fitted))
         least = float(np.mean(like.regression.floor**2)) / self._problem.torque_rms**2
-        error = self.squared(fitted) + least  # what laws and rounding leave tells nothing
+        error = self.squared(fitted) + least  # what models and rounding leave means nothing
         return -0.5 * rows / float(np.mean(like.times)) * float(np.log(error))
 
     def errors(self, before: Fitted, after: Fitted) -> Errors:

@@ -185,7 +185,7 @@ class Problem:
         bandwidth_hz: of the filter that all channels share.
         held: share of each recording, in blocks, that takes no part.
         blocks: of time, for cross-validation.
-        calibrating: the recordings are of a healthy joint, and tell what its declared numbers should be.
+        calibrating: the recordings are of a healthy joint, and show what its declared numbers should be.
     """
 
     def __init__(
@@ -510,7 +510,7 @@ class Problem:
         if name in ("torque_delay", "encoder_delay"):
             return (std * frames[0].signals.period_s,)
         if name == "torque_offset":
-            # A healthy joint's constant is the zero between its encoders: both together are not told apart.
+            # A healthy joint's constant is the zero between its encoders: the two cannot be separated.
             return (0.0,) if linked or self.calibrating else (std * self.torque_rms,)
         if name == "deflection_offset":
             phi = frames[0].motors[candidate.motor or 0].deflection
@@ -518,7 +518,7 @@ class Problem:
         if name == "torque_constant" and self.calibrating:
             return (0.0,)  # the anchor
         if linked and not self.calibrating:
-            # Both balances tell a declared number that is off: then it is an effect, and has a name.
+            # Both balances show a declared number that is off: then it is an effect, and has a name.
             std = PRIORS["declared"].std
         if name == "torque_constant":
             return (std,)

@@ -1,4 +1,4 @@
-"""Effects that the model already has: readings corrected, torques taken off the balances."""
+"""Declared effects: corrects the readings and subtracts their torques from the balances."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Polynomials whose order is left to the data: a higher order is the model's affair, not a missing effect."""
+"""Polynomials of open order: a higher order belongs to the model and is not a missing effect."""
 
 from __future__ import annotations
 

@@ -16,8 +16,8 @@ from estimator.sample import FloatArray
 __all__ = ["alignment_of", "curves_of", "findings_of", "rivals_of", "series_of", "transmissions_of"]
 
 _SKEW = 1.05  # periods: more than one sample is a delay, less an everyday skew
-_SURE = 3.0  # standard deviations from zero at which a reading's error is told
-_ALL = 2.0  # times what else is left: a constant torque is then all there is to tell
+_SURE = 3.0  # standard deviations from zero at which a reading's error is reported
+_ALL = 2.0  # times what else is left: a constant torque is then all there is
 _CHANNELS = {"torque_delay": "torque_delay_s", "deflection_offset": "deflection_offset_rad"}
 
 
@@ -106,7 +106,7 @@ def _absolute(problem: Problem, found: Fitted, k: int, name: str, x: float) -> f
 
 def alignment_of(problem: Problem, after: Fitted, effects: list[Finding]) -> dict[str, float]:
     """What was taken out of the readings as everyday, by channel."""
-    told = {(f.name, f.motor) for f in effects}
+    named = {(f.name, f.motor) for f in effects}
     pairs: dict[str, float] = {}
     std = np.sqrt(np.maximum(np.diag(hac_covariance(after)), 0.0))
     for slot, x, sigma in zip(after.slots, after.posterior.x, std, strict=True):
@@ -115,7 +115,7 @@ def alignment_of(problem: Problem, after: Fitted, effects: list[Finding]) -> dic
         if (
             slot.kind not in ("everyday", "term")
             or slot.run not in (None, 0)
-            or (slot.name, slot.motor) in told
+            or (slot.name, slot.motor) in named
         ):
             continue
         if slot.name == "encoder_delay":
@@ -148,7 +148,7 @@ def transmissions_of(problem: Problem, after: Fitted) -> tuple[tuple[Refitted, .
         std = float(np.sqrt(max(slope @ own @ slope, 0.0)))
         if not stiffness - 1.96 * std > 0.0 or any(after.posterior.bound[mine]):
             doubts.append(
-                f"the stiffness of motor {i + 1} is not told: {stiffness:.4g} ± {1.96 * std:.2g} N·m/rad "
+                f"the stiffness of motor {i + 1} is undetermined: {stiffness:.4g} ± {1.96 * std:.2g} N·m/rad "
                 "includes zero"
             )
             made.append(Refitted(model.name, {}, {}))

@@ -99,7 +99,7 @@ class Series:
 
 
 class Refitted(NamedTuple):
-    """One transmission as refitted; empty where it is rigid or the data do not tell its stiffness."""
+    """One transmission as refitted; empty where it is rigid or the data do not reveal its stiffness."""
 
     model: str
     parameters: dict[str, ParameterValue]

@@ -23,7 +23,7 @@ __all__ = ["EVEN", "Progress", "Search"]
 _BEAM = 3  # hypotheses that are grown at once: enough for an imitation beside the true effect
 _TRIED = 8  # effects tried beside each
 _MOST = 5  # effects
-EVEN = 0.05  # posterior odds above which two hypotheses cannot be told apart
+EVEN = 0.05  # posterior odds above which two hypotheses are indistinguishable
 _SMOOTHING = "smoothing_rad_s"
 _SOFTER = 5.0  # a step of its grid
 _ROUGH = 3  # Gauss-Newton steps while hypotheses are compared
@@ -45,7 +45,7 @@ class Search:
 
     Args:
         problem: the recordings and the declared model.
-        progress: told what is being done.
+        progress: called with the current step.
     """
 
     def __init__(self, problem: Problem, progress: Progress = lambda _: None) -> None:

@@ -55,7 +55,7 @@ def diagnose(
         bandwidth_hz: of the filter that all channels share; None: chosen from the data.
         validation: a recording that takes no part in any fit; a term stays only if it lowers its error. None:
             with several recordings each is left out in turn, with one some blocks are held out.
-        progress: told what is being done.
+        progress: called with the current step.
 
     Returns:
         The diagnosis.
@@ -219,7 +219,7 @@ class _Judge:
         return best_curve(self.search, found, ("link", None) if link else ("motor", worst))
 
     def _doubts(self, effects: list[Finding]) -> list[str]:
-        """What cannot be told from these data, in one sentence each."""
+        """What these data cannot decide, in one sentence each."""
         link = self.problem.model.link
         for finding in effects:
             if finding.name not in ("motor_inertia", "link_inertia"):

@@ -1,4 +1,4 @@
-"""The gate before any fit: can a recording tell anything, and do units, signs, gears and time fit."""
+"""The gate before any fit: is a recording usable, and are units, signs, gears and time right."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ def causes(model: JointModel, linked: bool, ratios: Sequence[float | None]) -> l
     Args:
         model: the joint as declared.
         linked: whether there is a link position.
-        ratios: link over motor position as each balance has it; None: it does not tell.
+        ratios: link over motor position as each balance has it; None: it is undetermined.
     """
     names = [f"motor{i + 1}" for i in range(len(model.motors))]
     positions = [f"{name}_position" for name in names]

@@ -19,8 +19,8 @@ from estimator.transmissions import transmission_model
 __all__ = ["Discrepancy", "GateError", "Judgement", "examine", "judge", "refuse"]
 
 _DECISIVE = 6.0  # nats over "as declared": 400 to 1
-_LEAST_ROWS = 300  # a shorter recording tells nothing to nobody
-_ALIKE = 3.0  # nats (20 to 1) between causes that the data do not tell apart
+_LEAST_ROWS = 300  # a shorter recording decides nothing
+_ALIKE = 3.0  # nats (20 to 1) between causes that the data do not separate
 _LEFT = 0.8  # of the torque that a joint put right may leave: what explains less explains nothing
 # Errors of the model are alike in every period of a motion: no band counts for more than so many samples.
 _INDEPENDENT = 30.0
@@ -74,7 +74,7 @@ class Discrepancy:
                 text = text.replace(f" {one} ", f" {many} ", 1)
         others = [_named(changes, self.motors) for changes in self.alternatives]
         if others := [name for name in dict.fromkeys(others) if name != self.subject]:
-            text += f" (or else: {' or '.join(others)}; this motion does not tell)"
+            text += f" (or else: {' or '.join(others)}; this motion does not decide)"
         return text
 
 
@@ -102,7 +102,7 @@ class Judgement:
 
     Attributes:
         findings: what is wrong; empty where nothing is, and where nothing can be told.
-        untold: units and signs that this motion does not tell, in words: with them wrong it would look as
+        untold: units and signs that this motion does not reveal, in words: with them wrong it would look as
             likely. Empty where something is found.
         reason: why nothing can be told at all; empty where something can.
         left: share of the torque that the balance leaves, put right.
@@ -118,7 +118,7 @@ class Judgement:
         """What cannot be told, in words; empty where everything can."""
         if self.reason:
             return f"units and signs cannot be checked: {self.reason}"
-        return f"this motion does not tell {' or '.join(self.untold)}" if self.untold else ""
+        return f"this motion does not reveal {' or '.join(self.untold)}" if self.untold else ""
 
 
 class GateError(EstimatorError):
@@ -197,7 +197,7 @@ def judge(record: Record, model: JointModel) -> Judgement:
     factor), any rising transmission curve, friction that brakes and small delays explain each motor's torque
     (eq 5, `Balance`), and by how usual a joint it makes. What is found beats "as declared" decisively, and
     explains the torque. Where nothing is found, a cause that is not decisively less likely than "as declared"
-    is one that the motion does not tell: of a link that is held, say, the sign.
+    is one that the motion does not reveal: of a link that is held, say, the sign.
 
     Args:
         record: the recording.
@@ -253,7 +253,7 @@ def refuse(record: Record, model: JointModel) -> Judgement:
     """Raise what is wrong with units, signs, gear ratios or time of a recording, if anything is.
 
     Returns:
-        What the recording does not tell.
+        What the recording does not reveal.
 
     Raises:
         GateError: with the findings of `judge`.

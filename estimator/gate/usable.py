@@ -1,4 +1,4 @@
-"""Whether a recording can tell anything: long enough, complete, finite, moving. One line each."""
+"""Whether a recording is usable: long enough, complete, finite, moving. One line each."""
 
 from __future__ import annotations
 

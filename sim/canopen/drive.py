@@ -1,4 +1,4 @@
-"""A CiA 402 drive as a CANopen slave: torque modes, a second encoder, units that its objects tell."""
+"""A CiA 402 drive as a CANopen slave: torque modes, a second encoder, units in its objects."""
 
 from __future__ import annotations
 

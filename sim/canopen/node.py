@@ -89,7 +89,7 @@ class Node:
     # Wiring to the network
 
     def attach(self, put: Callable[[int, bytes], None], rerouted: Callable[[], None]) -> None:
-        """Connect to a network: a way to send, and whom to tell of changed routes."""
+        """Connect to a network: a way to send, and whom to notify of changed routes."""
         self._put = put
         self._rerouted = rerouted
 

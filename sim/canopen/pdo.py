@@ -49,7 +49,7 @@ class Pdo:
         communication: index of the communication parameter record.
         mapping: index of the mapping parameter record.
         quirks: how this device deviates.
-        operational: tells whether the device is in NMT state operational.
+        operational: whether the device is in NMT state operational.
         changed: called after the PDO became valid, invalid or another.
 
     Attributes:

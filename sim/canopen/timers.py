@@ -28,7 +28,7 @@ class Timers:
     """Appointments in order of time.
 
     Attributes:
-        now_s: the present, as last told to `run`.
+        now_s: the present, as last given to `run`.
         next_s: when the first appointment is due; infinity with none. Cheap to compare in every cycle.
     """
 

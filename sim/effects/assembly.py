@@ -1,4 +1,4 @@
-"""A joint in parts, open for effects: what each of them may add, and what comes together in the end."""
+"""Assembles a joint from its parts and the contributions of effects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What several effects need."""
+"""Shared parts of the effects."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Torque that depends on where the joint has been: friction in presliding, hysteresis, creep, delays.
 
 Each memory keeps its state as of the last step. Asked for the torque at another displacement it works out
-where it would be; told to commit, it moves there.
+where it would be; on commit, it moves there.
 """
 
 from __future__ import annotations

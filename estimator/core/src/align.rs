@@ -53,7 +53,7 @@ impl Alignment {
         taken
     }
 
-    /// All channels as of the same (past) time; after a restart as if they had been there for ever.
+    /// All channels as of the same (past) time; after a restart as if they had been there forever.
     pub fn align(&mut self, inputs: &Inputs, restart: bool) -> Inputs {
         let length = self.past.len();
         self.newest = (self.newest + 1) % length;

@@ -52,7 +52,7 @@ pub struct DeflectionFilter {
     pub unsettled: i64,
 }
 
-/// What one update of the estimation tells a deflection filter.
+/// What one update of the estimation gives a deflection filter.
 #[derive(Clone, Copy, Debug)]
 pub struct Tuning {
     /// φ‴ of the regression's filter.
@@ -179,7 +179,7 @@ impl DeflectionFilter {
         self.peak = (self.fade * self.peak).max(self.jerk);
         let noise = told.motor_noise + told.link_noise;
         if !(noise > 0.0 && self.peak > 0.0 && told.unmodelled < f64::INFINITY) {
-            self.modelled = false; // nothing is known of the motor's balance: it tells nothing of its motion
+            self.modelled = false; // the motor's balance is unknown: it cannot predict its motion
             return;
         }
         let density = noise * t;

@@ -1,9 +1,9 @@
-//! How late is the link encoder? The delays that can be, side by side, each with its own balance.
+//! Delay of the link encoder: candidate delays run in parallel, each with its own balance.
 //!
 //! On a stiff joint one period of delay moves q by more than the transmission deflects, so nothing linear
 //! repairs it: φ has to be formed anew for each candidate. Each of them passes the regression's filter with
 //! its cube; of all rows of a while a small least-squares problem is accumulated, and the candidate whose
-//! balance leaves least, to the fraction that a parabola tells, is the delay.
+//! balance leaves least, refined by a parabola, is the delay.
 
 use crate::filters::StateVariableFilter;
 
@@ -134,7 +134,7 @@ impl DelaySearch {
         self.filter.smooth.apply(&mut self.theta, theta, self.motor[LATEST]);
         self.filter.held.apply(&mut self.tau, tau, 0.0);
         for (c, (first, third)) in self.phi.iter_mut().enumerate() {
-            // A link that is late by c/2 − LATEST periods tells now what it was so long ago.
+            // A link that is late by c/2 − LATEST periods reads now what it was so long ago.
             let at = 2 * LATEST - c / 2;
             let q = if c % 2 == 0 { self.link[at] } else { 0.5 * (self.link[at] + self.link[at - 1]) };
             let (old, new) = (self.last[c], q - self.motor[LATEST]);

@@ -1,4 +1,4 @@
-//! What a user can get wrong, said in one line when an estimator is made; a tick has no errors.
+//! Errors of the declared model, one line each, raised when an estimator is made; a tick has no errors.
 
 use std::fmt;
 

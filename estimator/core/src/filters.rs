@@ -92,7 +92,7 @@ impl<const N: usize> StateVariableFilter<N> {
         }
     }
 
-    /// The state in which a constant input has been for ever.
+    /// The state in which a constant input has been forever.
     #[must_use]
     pub fn rest(value: f64) -> [f64; N] {
         let mut state = [0.0; N];

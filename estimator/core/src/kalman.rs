@@ -39,7 +39,7 @@ pub struct Kalman {
     pub ceiling: Vector,
     /// Variance of e.
     pub noise: f64,
-    /// How much larger a variance is than Σ has it, as few independent errors have told it.
+    /// How much larger a variance is than Σ has it, as it was estimated from few independent errors.
     pub caution: f64,
     growth: f64,
     grow: Vector,          // √growth; 1 for what is not forgotten
@@ -146,13 +146,13 @@ impl Kalman {
     }
 
     /// What Σ is multiplied by: noise that is a t variable has a larger variance than its scale squared, and
-    /// few independent errors tell either only roughly.
+    /// few independent errors determine either only roughly.
     #[must_use]
     pub fn variance_over_scale(&self) -> f64 {
         self.caution * TAILS / (TAILS - 2.0)
     }
 
-    /// How much larger a variance is that few independent errors tell: that of a t distribution.
+    /// How much larger a variance estimated from few independent errors is: that of a t distribution.
     fn few(&self) -> f64 {
         let squares: f64 =
             (0..LAGS).map(|lag| (self.r[lag] * taper(lag) / self.noise.max(1e-300)).powi(2)).sum();

@@ -1,4 +1,4 @@
-//! What an estimator is told about a joint: the known terms of eqs 4-7.
+//! The declared model of a joint: the known terms of eqs 4-7.
 
 use crate::effects::Element;
 use crate::error::Error;

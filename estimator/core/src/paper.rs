@@ -132,7 +132,7 @@ impl RecursiveLeastSquares {
         self.rows += 1.0;
     }
 
-    /// Coefficients; 0 where the rows so far do not tell them.
+    /// Coefficients; 0 where the rows so far do not determine them.
     #[must_use]
     pub fn alpha(&self) -> Alpha {
         let mut alpha = [0.0; PARAMETERS];
@@ -146,7 +146,7 @@ impl RecursiveLeastSquares {
         alpha
     }
 
-    /// Standard deviation of slopes · α if the rows' errors were independent; NaN where it is not told.
+    /// Standard deviation of slopes · α if the rows' errors were independent; NaN where it is undetermined.
     #[must_use]
     pub fn std(&self, slopes: &[f64]) -> f64 {
         let n = self.size;
@@ -278,10 +278,10 @@ impl Part {
         };
     }
 
-    /// Whether the torque is a number and the stiffness is told to be positive.
+    /// Whether the torque is finite and the stiffness is known to be positive.
     ///
     /// The paper's stiffness has no standard deviation. Its scatter is the least that it is uncertain by: where
-    /// mean and scatter leave zero inside 95 %, nothing is told, not even the sign.
+    /// mean and scatter leave zero inside 95 %, not even the sign is known.
     fn of_use(&self) -> bool {
         let told = self.stiffness > 0.0 && self.mean > SIGMA_95 * self.scatter.sqrt();
         self.held.flexibility_torque.is_finite() && (self.rigid || told)

@@ -20,7 +20,7 @@ use crate::transmission::{Moment, TransmissionEstimator};
 
 const SAID_S: f64 = 0.5; // how long a restart is reported
 const TRUST_S: f64 = 0.02; // how long an estimate is carried over rejected samples
-const FORESEEN_S: f64 = 0.04; // how far ahead a deflection is told from its last motion
+const FORESEEN_S: f64 = 0.04; // how far ahead a deflection is extrapolated
 const HOME: f64 = 0.01; // of a jump: what is as near to the first zero is that zero again
 const UPDATE_S: f64 = 0.03; // between two equations of a motor, at the usual bandwidth; shorter above it …
 const UPDATE_PHASE: f64 = 1.8; // … so that the bandwidth turns by no more than this, rad
@@ -42,7 +42,7 @@ pub struct Robust {
     corrections: Corrections,
     alignment: Alignment,
     search: DelaySearch,
-    lead: usize, // the motor whose balance tells the link encoder's delay
+    lead: usize, // the motor whose balance determines the link encoder's delay
     transmissions: Vec<TransmissionEstimator>,
     link: Channel,
     momentum: Option<LinkMomentum>,

@@ -28,7 +28,7 @@ pub struct Sample {
 pub mod status {
     /// The numbers may be used.
     pub const VALID: u32 = 1 << 0;
-    /// The motion at hand tells the stiffness; else it is held, with a wider interval.
+    /// The motion reveals the stiffness; else it is held, with a wider interval.
     pub const OBSERVABLE: u32 = 1 << 1;
     /// Samples were missing before this one and have been bridged.
     pub const GAP: u32 = 1 << 2;

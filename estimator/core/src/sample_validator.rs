@@ -1,4 +1,4 @@
-//! What stands between the wire and the mathematics: gaps, values that are no numbers, positions that jump.
+//! Validates samples before the mathematics: gaps, non-finite values, positions that jump.
 
 use crate::model::Model;
 use crate::sample::{MOTORS, Sample, status};

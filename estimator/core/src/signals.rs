@@ -55,7 +55,7 @@ pub struct Channel {
 }
 
 impl Channel {
-    /// As if this input had been there for ever.
+    /// As if this input had been there forever.
     #[must_use]
     pub fn rest(value: f64) -> Channel {
         Channel { light: [value, 0.0, 0.0], main: [value, 0.0, 0.0, 0.0], last: value }
@@ -170,7 +170,7 @@ impl Signals {
         (self.speed, self.effects) = (LEAST_SPEED, Formed::default());
     }
 
-    /// As if the motor had been here for ever; the basis is another matter, see `rest_basis`.
+    /// As if the motor had been here forever; the basis is another matter, see `rest_basis`.
     pub fn restart(&mut self, theta: f64, torque: f64) {
         self.position = Channel::rest(theta);
         self.torque = Channel::rest(torque);
@@ -179,7 +179,7 @@ impl Signals {
         self.filled = 0;
     }
 
-    /// As if the deflection had been this for ever.
+    /// As if the deflection had been this forever.
     pub fn rest_basis(&mut self, law: &Linearisation, phi: f64) {
         let mut columns = [0.0; COLUMNS];
         law.columns(phi, &mut columns);

@@ -23,7 +23,7 @@ class Excitation:
         high_nm: largest pretension.
         swing_hz: of the pretension between the two.
         tones_nm: rms of a sine of this amplitude have all tones together.
-        tones_hz: of motor 1; motor 2 has them a little higher, so that the two can be told apart.
+        tones_hz: of motor 1; motor 2 has them a little higher, so that the two can be separated.
         fade_s: in which everything sets in.
     """
 

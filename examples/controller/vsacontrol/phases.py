@@ -1,4 +1,4 @@
-"""What the controller is told and tells: phases, drives, events, limits and times."""
+"""The controller's inputs and outputs: phases, drives, events, limits and times."""
 
 from __future__ import annotations
 

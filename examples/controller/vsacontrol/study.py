@@ -28,7 +28,7 @@ JOINT = Path(__file__).parent.parent / "joint.toml"
 KNOWLEDGE = ("true", "nominal", "estimated")
 SCENES = ("quiet", "pushed")
 NOMINAL = 0.8  # the nominal model's torque, stiffness and derivatives: 20 % too low
-# Nobody is told of what pushes the link in the second half: 1 mN·m rms, 0.3 % of the gravity torque's peak.
+# Nobody knows what pushes the link in the second half: 1 mN·m rms, 0.3 % of the gravity torque's peak.
 _PUSH = {"kind": "multisine", "amplitude_nm": 0.0014, "low_hz": 0.2, "high_hz": 2.0, "ramp_s": 0.2}
 _BETWEEN = (1.0, 1.0)  # way and rest from the end of the quiet half to the begin of the other, s
 _LEAST = 1e-3  # mrad, mN·m/rad: where logarithmic plots end

@@ -7,7 +7,7 @@ use zenoh_ext::z_deserialize;
 
 /// Status bit 0: the numbers may be used.
 pub const VALID: u32 = 1 << 0;
-/// Status bit 1: the motion at hand tells the stiffness.
+/// Status bit 1: the motion reveals the stiffness.
 pub const OBSERVABLE: u32 = 1 << 1;
 
 /// What must be clear beside VALID: model alarm, restarted, drive fault, stale, untimed, node restarted,

@@ -141,7 +141,7 @@ def test_fit_and_diagnose_refuse_by_the_same_words(degrees: gatekit.Drawn) -> No
 def test_diagnose_says_what_the_motion_does_not_tell() -> None:
     drawn = gatekit.draw("soft", 4, held=True)
     outcome = diagnose(drawn.record, drawn.model)
-    assert any("does not tell" in note and "link position" in note for note in outcome.notes), outcome.notes
+    assert any("does not reveal" in note and "link position" in note for note in outcome.notes), outcome.notes
 
 
 def test_a_recording_too_short_to_tell_is_not_judged(degrees: gatekit.Drawn) -> None:

@@ -19,7 +19,7 @@ def closing_table(
     """The last pair of truth and estimate, the errors of the whole run, and the cycle's figures."""
     errors = comparison.errors()
     table = Table(title=f"{case}: truth beside estimate", title_justify="left")
-    for heading in ("", "truth now", "estimate now", "95 % interval", "rms error"):
+    for heading in ("", "truth", "estimate", "95 %", "rms error"):
         table.add_column(heading, justify="left" if not heading else "right", no_wrap=True)
     if comparison.latest is not None:
         estimate, truth = comparison.latest
@@ -38,8 +38,9 @@ def closing_table(
             _percent(errors.flexibility_torque),
         )
     table.caption = (
-        f"truth and estimate: the last cycle's; rms error: over all {errors.cycles} valid cycles "
-        f"({errors.cycles * period_s:.1f} s), relative to the truth's rms over the same\n"
+        "truth, estimate and its 95 % interval: of the last cycle\n"
+        f"rms error: over all {errors.cycles} valid cycles ({errors.cycles * period_s:.1f} s), "
+        "relative to the truth's rms\n"
         f"{summary.cycles} cycles, {summary.missed_cycles} missed, {received} estimates received over zenoh\n"
         f"a cycle's work p99 {summary.work_p99_us:.0f} µs, "
         f"SYNC late by p99 {summary.lateness_p99_us:.0f} µs\n"

@@ -28,9 +28,11 @@ from estimator.sample import FloatArray
 __all__ = [
     "Curve",
     "bars",
+    "medians",
     "new_figure",
     "over_time",
     "save",
+    "scatter",
     "stiffness_against_deflection",
     "svg_text",
     "xy",
@@ -167,6 +169,22 @@ def svg_text(figure: Figure) -> str:
     for color, themed in _THEMED.items():
         text = text.replace(f": {color}", f": {themed}")
     return text
+
+
+def medians(x: FloatArray, y: FloatArray, bins: int = 80) -> Curve:
+    """What scattered samples come to: the median in each part of all but the outermost x."""
+    low, high = np.quantile(x, [0.002, 0.998])
+    edges = np.linspace(float(low), float(high), bins + 1)
+    place = np.clip(np.searchsorted(edges, x) - 1, 0, bins - 1)
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    filled = [k for k in range(bins) if np.count_nonzero(place == k) > 2]
+    return Curve(middle[filled], np.array([np.median(y[place == k]) for k in filled]))
+
+
+def scatter(axes: Axes, x: FloatArray, y: FloatArray, x_label: str, y_label: str, title: str = "") -> None:
+    """Draw samples as dots, and their medians as a line."""
+    axes.plot(x, y, ".", color="#aaaaaa", markersize=2.0, rasterized=True)
+    xy(axes, {"median": medians(x, y)}, x_label, y_label, title)
 
 
 def _draw(axes: Axes, curve: Curve, name: str, k: int) -> None:

@@ -15,7 +15,6 @@ from drivelink.output.outfile import write_whole
 from drivelink.output.units import Units
 from estimator.diagnosis import Curve, Diagnosis, Errors, Finding, StiffnessCurve
 from estimator.effects import LIBRARY
-from estimator.sample import FloatArray
 
 __all__ = ["Title", "as_json", "sentence", "title_of", "unexplained", "write"]
 
@@ -234,8 +233,8 @@ def _curve_figure(curve: Curve, units: Units) -> str:
     order = np.argsort(curve.x)
     name = curve.name.replace("_", " ")
     if curve.second is None and _is_function(curve):
-        curves = {"left by the model": _medians(curve.x, curve.residual_nm)}
-        curves[name] = _medians(curve.x, curve.fitted_nm)
+        curves = {"left by the model": plots.medians(curve.x, curve.residual_nm)}
+        curves[name] = plots.medians(curve.x, curve.fitted_nm)
         plots.xy(axes, curves, across, torque)
     else:
         axes.plot(curve.x[order], curve.fitted_nm[order], ".", color=plots.COLORS[1], markersize=2.0)
@@ -250,18 +249,9 @@ def _caption(curve: Curve) -> str:
     return f"What the declared model leaves over {over}, and {html.escape(curve.name.replace('_', ' '))}."
 
 
-def _medians(x: FloatArray, y: FloatArray, bins: int = 80) -> plots.Curve:
-    low, high = np.quantile(x, [0.002, 0.998])
-    edges = np.linspace(float(low), float(high), bins + 1)
-    place = np.clip(np.searchsorted(edges, x) - 1, 0, bins - 1)
-    middle = 0.5 * (edges[1:] + edges[:-1])
-    filled = [k for k in range(bins) if np.count_nonzero(place == k) > 2]
-    return plots.Curve(middle[filled], np.array([np.median(y[place == k]) for k in filled]))
-
-
 def _is_function(curve: Curve) -> bool:
     """Whether the fitted torque is nearly one function of the coordinate, in spite of the filter."""
-    line = _medians(curve.x, curve.fitted_nm)
+    line = plots.medians(curve.x, curve.fitted_nm)
     left = curve.fitted_nm - np.interp(curve.x, line.x, line.y)
     return float(np.std(left)) < 0.35 * float(np.std(curve.fitted_nm)) + 1e-300
 

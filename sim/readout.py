@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from sim.effects.assembly import LinkParts, MotorParts, Reading
-from sim.effects.memory import Delayed, History
+from sim.effects.memory import Delayed, History, Lag
 from sim.sensors import DriveHardware, DriveSignals, LinkEncoder
 
 __all__ = ["Amplifier", "LinkScale"]
@@ -38,6 +38,9 @@ class Amplifier:
         self._path, self._readings = tuple(parts.torque_path), tuple(parts.readings)
         delay = parts.torque_delay_s
         self._delay = Delayed(delay, self._period_s, self._substeps) if delay > 0.0 else None
+        lag, step_s = parts.torque_lag_s, self._period_s / self._substeps
+        self._acting = Lag(lag, step_s) if lag > 0.0 else None
+        self._reported = Lag(-lag, self._period_s) if lag < 0.0 else None
 
     def latch(self, current_a: float, time_s: float, theta: float, velocity: float) -> None:
         """Begin a period with this set-point, and sample.
@@ -55,6 +58,10 @@ class Amplifier:
         for acting in self._path:
             torque = acting(torque, time_s, theta)
         self.schedule = [torque] * self._substeps if self._delay is None else self._delay.schedule(torque)
+        if self._acting is not None:
+            self.schedule = [self._acting.passed(each) for each in self.schedule]
+        if self._reported is not None:
+            current_a = self._reported.passed(current_a)
         self._current_a = step * round((current_a + next(self._noise)) / step)
         self._theta, self._velocity = theta, velocity
         if drive.velocity_filter_s > 0.0:

@@ -22,7 +22,8 @@ NOTICEABLE = {
     "coulomb_friction": 1.0, "stribeck_friction": 1.0, "asymmetric_friction": 1.0, "presliding_friction": 1.0,
     "load_dependent_friction": 0.1, "viscous_damping": 1.0, "quadratic_damping": 1.0, "cogging": 0.5,
     "torque_offset": 1.0, "torque_constant": 0.1, "torque_saturation": 0.003, "torque_drift": 0.2,
-    "motor_inertia": 0.05, "torque_delay": 0.002, "hysteresis": 1.0, "backlash": 0.01,
+    "motor_inertia": 0.05, "torque_delay": 0.002, "torque_lag": 0.004, "back_driving_loss": 0.1,
+    "hysteresis": 1.0, "backlash": 0.01,
     "asymmetric_stiffness": 1000.0, "higher_order_stiffness": 1e6, "transmission_damping": 1.0,
     "kinematic_error": 0.005, "deflection_offset": 0.01, "encoder_eccentricity": 0.005,
     "encoder_delay": 0.002, "encoder_scale": 0.02, "gravity": 2.0, "link_coulomb_friction": 1.0,
@@ -85,6 +86,11 @@ MOTOR_LAWS = {
     "load_dependent_friction": lambda r: (
         np.sign(r["truth_motor1_velocity_rad_s"]) * abs(r["truth_motor1_flexibility_torque_nm"])
     ),
+    "back_driving_loss": lambda r: np.where(  # tau_e drives the motor while it has the velocity's sign
+        r["truth_motor1_velocity_rad_s"] * r["truth_motor1_flexibility_torque_nm"] > 0.0,
+        r["truth_motor1_flexibility_torque_nm"],
+        0.0,
+    ),
 }
 
 
@@ -139,6 +145,18 @@ def test_a_delayed_torque_acts_later_by_exactly_that_time() -> None:
     delayed = Delayed(0.0001, 0.001, 2)
     delayed.schedule(10.0)
     assert delayed.schedule(0.0) == pytest.approx([2.0, 0.0])
+
+
+def test_a_lagging_torque_acts_or_is_reported_behind_a_low_pass() -> None:
+    lag, r = NOTICEABLE["torque_lag"], switched_on("torque_lag")
+    acting = r["truth_motor1_torque_nm"]
+    rate = np.gradient(acting, PERIOD_S)
+    # Acting + lag * rate = reported; the mean of a period stands half a period after its beginning.
+    assert slope(r["motor1_torque_nm"] - acting, rate) == pytest.approx(lag + 0.5 * PERIOD_S, rel=0.05)
+    late = measured(sea(HARDENING), parse(f"torque_lag={-lag}"), step_s=0.00025)
+    reported = late["motor1_torque_nm"]
+    rate = np.gradient(reported, PERIOD_S)
+    assert slope(late["truth_motor1_torque_nm"] - reported, rate) == pytest.approx(lag, abs=PERIOD_S)
 
 
 TRANSMISSION_LAWS = {
@@ -377,7 +395,7 @@ def test_the_names_are_those_of_the_contract() -> None:
         "coulomb_friction", "stribeck_friction", "asymmetric_friction", "presliding_friction",
         "load_dependent_friction", "viscous_damping", "quadratic_damping", "cogging", "torque_offset",
         "torque_constant", "torque_saturation", "torque_drift", "motor_inertia", "torque_delay",
-        "hysteresis", "backlash", "asymmetric_stiffness", "higher_order_stiffness", "transmission_damping",
+        "torque_lag", "back_driving_loss", "hysteresis", "backlash", "asymmetric_stiffness", "higher_order_stiffness", "transmission_damping",
         "kinematic_error", "deflection_offset", "encoder_eccentricity", "encoder_delay", "encoder_scale",
         "gravity", "link_coulomb_friction", "link_viscous_damping", "link_inertia", "contact",
     }  # fmt: skip

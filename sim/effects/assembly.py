@@ -31,6 +31,8 @@ class MotorParts:
     commits: list[Commit] = field(default_factory=list)
     torque_path: list[TorquePath] = field(default_factory=list)
     torque_delay_s: float = 0.0
+    torque_lag_s: float = 0.0
+    """Of the acting torque behind the reported one; negative: of the reported one behind the acting one."""
     readings: list[Reading] = field(default_factory=list)
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 from sim.errors import SimError
 
-__all__ = ["Creep", "Delayed", "History", "Slip"]
+__all__ = ["Creep", "Delayed", "History", "Lag", "Slip"]
 
 
 Element = Callable[[float, float], float]
@@ -148,6 +148,21 @@ class Delayed:
             past[last + i] if share == 0.0 else past[last + i] * (1.0 - share) + past[last + i + 1] * share
             for i, share in self._plan
         ]
+
+
+class Lag:
+    """A first-order low-pass of a torque that is held over steps: its mean over each of them."""
+
+    def __init__(self, time_constant_s: float, step_s: float) -> None:
+        self._keep = math.exp(-step_s / time_constant_s)
+        self._mean = -math.expm1(-step_s / time_constant_s) * time_constant_s / step_s
+        self._torque = 0.0
+
+    def passed(self, torque: float) -> float:
+        """Mean over the next step, in which this torque goes in."""
+        ahead = self._torque - torque
+        self._torque = torque + ahead * self._keep
+        return torque + ahead * self._mean
 
 
 class History:

@@ -83,6 +83,19 @@ def _motor_inertia(a: Assembly, m: int, p: Values) -> None:
     a.motors[m].inertia_kg_m2 += p["inertia_kg_m2"]
 
 
+def _back_driving(a: Assembly, m: int, p: Values) -> None:
+    share = not_negative(p, "coefficient")
+
+    def level(position: float, velocity: float, load: float, time: float) -> float:
+        return share * abs(load) if load * velocity >= 0.0 else 0.0
+
+    a.motors[m].dry.append(at_speed(level, p["smoothing_rad_s"]))
+
+
+def _torque_lag(a: Assembly, m: int, p: Values) -> None:
+    a.motors[m].torque_lag_s += p["time_constant_s"]
+
+
 def _torque_delay(a: Assembly, m: int, p: Values) -> None:
     a.motors[m].torque_delay_s += not_negative(p, "delay_s")
 
@@ -201,5 +214,21 @@ DEFINITIONS = (
         meaning="the torque acts later than it is reported",
         parameters=(Parameter("delay_s", "by this time"),),
         apply=_torque_delay,
+    ),
+    Definition(
+        name="torque_lag",
+        location="motor",
+        meaning="the torque acts behind a first-order lag",
+        parameters=(
+            Parameter("time_constant_s", "of the lag; negative: the reported torque lags the acting one"),
+        ),
+        apply=_torque_lag,
+    ),
+    Definition(
+        name="back_driving_loss",
+        location="motor",
+        meaning="the gear loses a share of the torque while the link drives the motor",
+        parameters=(Parameter("coefficient", "loss per transmission torque"), SMOOTHING),
+        apply=_back_driving,
     ),
 )

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +73,8 @@ def sizes(
         "torque_drift": {"relative_change": 1.5 * share, "time_constant_s": 6.0},
         "motor_inertia": {"inertia_kg_m2": 0.4 * share},
         "torque_delay": {"delay_s": 0.0025 + 0.01 * share},
+        "torque_lag": {"time_constant_s": 0.003 + 0.02 * share},
+        "back_driving_loss": {"coefficient": 1.5 * share},
         "hysteresis": {"torque_nm": x, "displacement_rad": 0.01},
         "backlash": {"stiffness_nm_rad": stiffness, "half_gap_rad": angle},
         "asymmetric_stiffness": {"coefficient_nm_rad2": share * stiffness**2 / torque},
@@ -90,9 +93,10 @@ def sizes(
     }
 
 
-def joint_of(name: str, seed: int) -> tuple[JointFile, JointFile]:
-    """The joint as it is declared, and as it is."""
-    rng = np.random.default_rng([seed, sorted(LIBRARY).index(name) if name in LIBRARY else 99])
+def joint_of(names: Sequence[str], seed: int) -> tuple[JointFile, JointFile]:
+    """The joint as it is declared, and as it is, with these effects; the seed stands for them too."""
+    order = sorted(LIBRARY)
+    rng = np.random.default_rng([seed, *(order.index(name) for name in names)] if names else [seed, 99])
     stiffness, share = rng.uniform(80.0, 220.0), np.exp(rng.uniform(np.log(0.03), np.log(0.3)))
     torque = 0.12 * stiffness
     link = rng.uniform(0.2, 0.6)
@@ -107,13 +111,13 @@ def joint_of(name: str, seed: int) -> tuple[JointFile, JointFile]:
         "centring": 3.0 * torque,
         "brake": 0.5 * float(np.sqrt(3.0 * torque * link)),
     }
-    effect = ""
-    if name in LIBRARY:
+    effects = []
+    for name in names:
         parameters = sizes(0.5 * torque, stiffness, float(share), rng)[name]
         inside = ", ".join(f"{key} = {value!r}" for key, value in parameters.items())
-        effect = f'{{ name = "{name}", parameters = {{ {inside} }} }}'
+        effects.append(f'{{ name = "{name}", parameters = {{ {inside} }} }}')
     text = {key: float(v) if key != "seed" else v for key, v in values.items()}
-    return parse(JOINT.format(effect="", **text)), parse(JOINT.format(effect=effect, **text))
+    return parse(JOINT.format(effect="", **text)), parse(JOINT.format(effect=", ".join(effects), **text))
 
 
 def measured(joint: JointFile, seconds: float) -> Record:
@@ -130,11 +134,11 @@ def measured(joint: JointFile, seconds: float) -> Record:
 
 def judged(name: str, seed: int, seconds: float) -> dict[str, Any]:
     """One recording made and diagnosed."""
-    declared, real = joint_of(name, seed)
+    clean = name not in LIBRARY
+    declared, real = joint_of(() if clean else (name,), seed)
     outcome = diagnose(measured(real, seconds), declared.model())
     names = [effect.name for effect in outcome.effects]
     first = outcome.effects[0] if outcome.effects else None
-    clean = name not in LIBRARY
     return {
         "effect": name,
         "seed": seed,
@@ -151,11 +155,12 @@ def judged(name: str, seed: int, seconds: float) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seeds", type=int, default=2, help="recordings of each effect")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first of them")
     parser.add_argument("--seconds", type=float, default=20.0, help="length of a recording")
     parser.add_argument("--effects", nargs="*", default=["clean", *LIBRARY], metavar="NAME")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every outcome there")
     args = parser.parse_args()
-    jobs = [(name, seed) for name in args.effects for seed in range(args.seeds)]
+    jobs = [(name, seed) for name in args.effects for seed in range(args.first, args.first + args.seeds)]
     outcomes = [judged(name, seed, args.seconds) for name, seed in track(jobs, "diagnose")]
     print("| effect | named first | located | else found |\n|---|---|---|---|")
     for name in args.effects:

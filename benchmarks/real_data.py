@@ -17,16 +17,21 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.signal import butter, sosfiltfilt
 
 from drivelink import jointfile, recording
 from drivelink.jointfile import JointFile
+from drivelink.jointfile.apply_diagnosis import augmented
 from drivelink.output import report
 from drivelink.output.progress import track
+from estimator import EstimatorSettings, Sample, make_estimator
 from estimator.diagnosis import diagnose
 from estimator.diagnosis.frame import Corrections, Frame, Signals
 from estimator.model import JointModel
 from estimator.sample import FloatArray, Record
 
+SENSOR_HZ = 40.0  # below it the sensor's torque is compared
+SETTLED_S = 3.0  # of a recording: what the estimator says before is not judged
 ROOT = Path(__file__).resolve().parents[1]
 JOINT = """
 name = "{name}"
@@ -95,11 +100,55 @@ def joint_of(run: Run) -> JointFile:
     return jointfile.load(ROOT / "examples" / f"{run.joint}.toml")
 
 
-def shaft_record(folder: Path, number: str) -> Record:
-    """Both encoders and the motor's torque, which has a clock of its own, on one grid of a millisecond."""
+def _shaft_rows(folder: Path, number: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Encoders and sensors, the motor's file, and a grid of a millisecond that both cover, s."""
     rows = np.genfromtxt(folder / f"Ice_excitation{number}.csv", delimiter=",", skip_header=1)
     motor = np.genfromtxt(folder / f"Ice_excitation{number}_motor.csv", delimiter=",", skip_header=1)
     time = np.arange(max(rows[0, 0], motor[0, 0]), min(rows[-1, 0], motor[-1, 0]), 1e-3)
+    return rows, motor, time
+
+
+def shaft_sensor(folder: Path, number: str) -> FloatArray:
+    """The torque sensor between the encoders on the grid of `shaft_record`, N·m."""
+    rows, _, time = _shaft_rows(folder, number)
+    return np.interp(time, rows[:, 0], rows[:, 6])
+
+
+def against_sensor(model: JointModel, record: Record, sensor_nm: FloatArray) -> dict[str, float]:
+    """rms error below SENSOR_HZ of what the shaft carries, as a share of its variation there.
+
+    "on_line" is what the estimator said at each sample, "twist" the stiffness times the measured twist.
+    """
+    estimator = make_estimator(model, EstimatorSettings(), record.period_s)
+    assert record.link_position_rad is not None
+    said = np.array([
+        estimator.step(Sample(
+            sequence=int(n), motor_position_rad=(float(theta),), motor_velocity_rad_s=(np.nan,),
+            motor_torque_nm=(float(tau),), link_position_rad=float(q),
+        )).flexibility_torque_nm
+        for n, theta, tau, q in zip(
+            record.sequence, record.motor_position_rad[:, 0], record.motor_torque_nm[:, 0],
+            record.link_position_rad, strict=True,
+        )
+    ])  # fmt: skip
+    k = model.motors[0].transmission.parameters.get("k_nm_rad", np.nan)
+    assert isinstance(k, float)
+    twist = k * (record.link_position_rad - record.motor_position_rad[:, 0])
+    slow = butter(4, SENSOR_HZ, output="sos", fs=1.0 / record.period_s)
+    late = slice(int(SETTLED_S / record.period_s), None)
+    true = sosfiltfilt(slow, sensor_nm)[late]
+
+    def error(torque: FloatArray) -> float:
+        x = sosfiltfilt(slow, np.nan_to_num(torque))[late]
+        left = min(float(np.std(sign * x - true)) for sign in (1.0, -1.0))  # the sensor's sign is its own
+        return left / float(np.std(true))
+
+    return {"on_line": error(said), "twist": error(twist)}
+
+
+def shaft_record(folder: Path, number: str) -> Record:
+    """Both encoders and the motor's torque, which has a clock of its own, on one grid of a millisecond."""
+    rows, motor, time = _shaft_rows(folder, number)
     return Record(
         period_s=1e-3,
         sequence=np.arange(len(time)),
@@ -117,11 +166,16 @@ def diagnosed(run: Run, data: Path, out: Path) -> dict[str, Any]:
     else:
         train, validation = (recording.read(data / name, joint) for name in (run.train, run.validation))
     outcome = diagnose(train, joint.model(), run.bandwidth_hz, validation)
+    sensor = None
+    if run.joint == "shaft_line":
+        model, torque = augmented(joint, outcome), shaft_sensor(data, run.validation)
+        sensor = against_sensor(model, validation, torque[: len(validation)])
     folder = out / f"{run.joint}-{Path(run.train).stem}-{Path(run.validation).stem}"
     folder.mkdir(parents=True, exist_ok=True)
     report.write(outcome, report.Title(run.joint, Path(run.train).name, Path(run.validation).name), folder)
     return {
         **run._asdict(),
+        "sensor": sensor,
         "baseline_relative": baseline(train, validation, joint.model(), run.bandwidth_hz),
         **report.as_json(outcome),
     }
@@ -132,6 +186,10 @@ def _stiffness(one: dict[str, Any]) -> str:
     if not parameters:
         return "-"
     return f"{parameters['k_nm_rad']:.3g} ± {1.96 * std['k_nm_rad']:.1g} (95 %) / {one['known_nm_rad']:.3g}"
+
+
+def _sensor(one: dict[str, Any]) -> str:
+    return "-" if one["sensor"] is None else f"{one['sensor']['on_line']:.1%}, {one['sensor']['twist']:.1%}"
 
 
 def main() -> None:
@@ -147,8 +205,11 @@ def main() -> None:
     jobs = [(run, args.data) for run in RUNS]
     jobs += [(run, args.shaft_line) for run in SHAFT_RUNS] if args.shaft_line else []
     outcomes = [diagnosed(run, data, args.out) for run, data in track(jobs, "diagnose")]
-    print("| machine | train → other | baseline | before → after | of baseline | found | stiffness / known |")
-    print("|---|---|---|---|---|---|---|")
+    print(
+        "| machine | train → other | baseline | before → after | of baseline | found | stiffness / known "
+        "| torque against sensor: on line, twist |"
+    )
+    print("|---|---|---|---|---|---|---|---|")
     ratios = []
     for one in outcomes:
         error = one["error"]["validation"]
@@ -158,7 +219,7 @@ def main() -> None:
         fall = f"{error['before_relative']:.1%} → {error['after_relative']:.1%}"
         print(
             f"| {one['joint']}, {one['bandwidth_hz']:g} Hz | {names} | {one['baseline_relative']:.1%} "
-            f"| {fall} | {ratios[-1]:.2f} | {found} | {_stiffness(one)} |"
+            f"| {fall} | {ratios[-1]:.2f} | {found} | {_stiffness(one)} | {_sensor(one)} |"
         )
     mean = np.exp(np.mean(np.log(ratios)))
     print(f"\nerror over the baseline's: geometric mean {mean:.2f}, worst {max(ratios):.2f}")

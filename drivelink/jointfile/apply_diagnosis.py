@@ -16,7 +16,7 @@ from estimator.effects import LIBRARY
 from estimator.model import Effect, JointModel, ParameterValue
 from estimator.sample import Record
 
-__all__ = ["write"]
+__all__ = ["augmented", "write"]
 
 
 def write(
@@ -42,22 +42,19 @@ def write(
         JointFileError: the copy cannot be written.
     """
     joint = source.joint
-    motors = [
-        {"effect": _all_effects(section.effect, outcome, i), **_transmission(joint, outcome, i)}
-        for i, section in enumerate(joint.motor)
-    ]
+    motors, at_link = _entries(joint, outcome)
     changes: dict[str, Any] = {"motor": motors}
-    at_link = _all_effects(joint.link.effect, outcome, None)
     if at_link:
         changes["link"] = {"effect": at_link}
     changes["provenance"] = {
-        **floor_entry(record, _augmented(joint, motors, at_link)),
+        **floor_entry(record, augmented(joint, outcome)),
         "diagnosis": {
             "recording": recording,
             "seconds": float((record.sequence[-1] - record.sequence[0]) * record.period_s),
             "verdict": outcome.verdict,
             "effects": [finding.name for finding in outcome.effects],
             "bandwidth_hz": outcome.bandwidth_hz,
+            "transmission_std": [_plain(one.std) for one in outcome.transmissions],
             "error_before_relative": outcome.validation.before_relative,
             "error_after_relative": outcome.validation.after_relative,
             "written": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -67,8 +64,9 @@ def write(
     return jointfile.write_model(source, target, changes, force=force)
 
 
-def _augmented(joint: JointFile, motors: list[dict[str, Any]], at_link: list[dict[str, Any]]) -> JointModel:
-    """The model as it will be in the copy."""
+def augmented(joint: JointFile, outcome: Diagnosis) -> JointModel:
+    """The model as `write` puts it into the copy."""
+    motors, at_link = _entries(joint, outcome)
     model = joint.model()
     changed = []
     for motor, change in zip(model.motors, motors, strict=True):
@@ -78,6 +76,15 @@ def _augmented(joint: JointFile, motors: list[dict[str, Any]], at_link: list[dic
             transmission = replace(transmission, parameters=parameters)
         changed.append(replace(motor, transmission=transmission, effects=_effects(change["effect"])))
     return replace(model, motors=tuple(changed), link_effects=_effects(at_link))
+
+
+def _entries(joint: JointFile, outcome: Diagnosis) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """What changes of each motor's table, and the effects at the link."""
+    motors = [
+        {"effect": _all_effects(section.effect, outcome, i), **_transmission(joint, outcome, i)}
+        for i, section in enumerate(joint.motor)
+    ]
+    return motors, _all_effects(joint.link.effect, outcome, None)
 
 
 def _effects(entries: list[dict[str, Any]]) -> tuple[Effect, ...]:

@@ -83,6 +83,8 @@ class Motor:
         effects: what the model has been given besides, with motor, transmission or measurement location.
         gear_ratio: motor revolutions per joint revolution, where it is known: everything else is at the joint
             already, and the gate looks for a recording that is not.
+        inertia_std_relative: standard deviation of B as a share of it, where it is known; None: that of
+            `estimator.priors`.
     """
 
     inertia_kg_m2: float
@@ -90,10 +92,13 @@ class Motor:
     transmission: Transmission = field(default_factory=Transmission)
     effects: tuple[Effect, ...] = ()
     gear_ratio: float | None = None
+    inertia_std_relative: float | None = None
 
     def __post_init__(self) -> None:
         require_finite(0.0, strict=True, inertia_kg_m2=self.inertia_kg_m2)
         require_finite(0.0, viscous_damping_nm_s_rad=self.viscous_damping_nm_s_rad)
+        if self.inertia_std_relative is not None:
+            require_finite(0.0, strict=True, inertia_std_relative=self.inertia_std_relative)
 
     @property
     def flexible(self) -> bool:

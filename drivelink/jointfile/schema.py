@@ -161,6 +161,12 @@ class MotorSection(_Section):
     """One motor and its transmission, reflected to the joint side."""
 
     inertia_kg_m2: float = Field(gt=0, description="B of eqs 5, 7, joint side")
+    inertia_std_relative: float | None = Field(
+        None,
+        gt=0,
+        le=1,
+        description="how sure the inertia is: standard deviation as a share of it; default 0.05",
+    )
     viscous_damping_nm_s_rad: float = Field(0.0, ge=0, description="D_theta of eqs 5, 7, joint side")
     transmission: Transmission = Field(
         default_factory=Transmission, description="model of the flexibility torque"
@@ -183,6 +189,7 @@ class MotorSection(_Section):
             transmission=self.transmission,
             effects=self.effect,
             gear_ratio=drive.gear_ratio if drive and "gear_ratio" in drive.model_fields_set else None,
+            inertia_std_relative=self.inertia_std_relative,
         )
 
 

@@ -5,20 +5,13 @@ from __future__ import annotations
 import numpy as np
 from scipy import fft
 
+from estimator.diagnosis.choices import choice
 from estimator.diagnosis.frame import Signals
 from estimator.diagnosis.spectral import lowpass
 from estimator.model import JointModel
 from estimator.sample import FloatArray, Record
 
 __all__ = ["choose_bandwidth", "equation_noise", "torque_rms"]
-
-_CHOICES_HZ = (60.0, 40.0, 30.0, 25.0, 20.0, 16.0, 12.0, 9.0, 6.0, 4.0)
-_CONTENT = 0.98  # share of the torque's power that defines where the motion happens
-_WIDER = 4.0  # bandwidth over that frequency: effects have harmonics
-_LEAST_HZ = 12.0
-_MOST_HZ = 25.0
-_NYQUIST = 0.2  # of the sampling rate, at most
-_NOISE = 0.004  # of the torque's rms, at most
 
 
 def torque_rms(record: Record) -> float:
@@ -32,15 +25,21 @@ def choose_bandwidth(record: Record, model: JointModel) -> float:
     torque = record.motor_torque_nm - record.motor_torque_nm.mean(axis=0)
     power = np.sum(np.abs(fft.rfft(torque, axis=0)) ** 2, axis=1)
     share = np.cumsum(power) / max(float(power.sum()), 1e-300)
-    content = float(np.searchsorted(share, _CONTENT)) * rate / len(torque)
-    wanted = min(max(_WIDER * content, _LEAST_HZ), _MOST_HZ, _NYQUIST * rate)
-    limit = _NOISE * torque_rms(record)
+    content = float(np.searchsorted(share, choice("content"))) * rate / len(torque)
+    wanted = min(
+        max(choice("wider") * content, choice("least_bandwidth")),
+        choice("most_bandwidth"),
+        choice("sampled") * rate,
+    )
+    limit = choice("noise") * torque_rms(record)
     stiffness = rough_stiffness(record, model)
-    for choice in (wanted, *(c for c in _CHOICES_HZ if c < wanted)):
-        signals = Signals(record, choice)
+    bandwidth = wanted
+    while bandwidth > choice("narrowest"):
+        signals = Signals(record, bandwidth)
         if float(np.max(equation_noise(signals, model, stiffness, linked=False))) <= limit:
-            return float(choice)
-    return min(_CHOICES_HZ[-1], wanted)
+            break
+        bandwidth *= choice("narrowing")
+    return float(min(max(bandwidth, choice("narrowest")), wanted))
 
 
 def rough_stiffness(record: Record, model: JointModel) -> list[float]:

@@ -6,14 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from estimator.diagnosis.choices import whole
 from estimator.diagnosis.frame import Frame
 from estimator.model import ParameterValue
 from estimator.sample import FloatArray
 from estimator.transmissions import TransmissionModel, transmission_model
 
 __all__ = ["Base", "start", "with_flexibility"]
-
-_SEARCH = 25  # points of the search over a shape parameter without prior knowledge
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,7 +94,7 @@ def _search(frame: Frame, i: int, model: TransmissionModel, order: int) -> Float
         low, high = model.shape_bounds[0]
         rest = model.shape_start[1:]
         first = 1.02 * low if low > 0.5 else 0.02 / max(most, 1e-9)
-        near = np.geomspace(first, min(high, max(20.0 / max(most, 1e-9), 1.1 * first)), _SEARCH)
+        near = np.geomspace(first, min(high, max(20.0 / max(most, 1e-9), 1.1 * first)), whole("shapes"))
         shapes = [(float(x), *rest) for x in near if model.reach((float(x), *rest)) > most * 1.001]
     best, found = np.inf, np.zeros(0)
     for shape in shapes:

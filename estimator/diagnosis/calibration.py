@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from estimator.diagnosis.bandwidth import choose_bandwidth
+from estimator.diagnosis.choices import choice
 from estimator.diagnosis.covariance import hac_covariance
 from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.gate import check
@@ -20,10 +21,6 @@ from estimator.model import Effect, JointModel
 from estimator.sample import Record
 
 __all__ = ["calibrate"]
-
-_BLOCKS = 10
-_SURE = 4.0  # standard deviations from zero at which an error of the readings is kept
-_SKEW_S = 2e-5  # and how much of it at least: a hundredth of what moves a stiffness by a per mille
 
 
 def calibrate(
@@ -47,7 +44,7 @@ def calibrate(
     for one in records:
         check(one, model)
     bandwidth = bandwidth_hz or choose_bandwidth(records[0], model)
-    problem = Problem(records, model, bandwidth, 0, _BLOCKS, calibrating=True)
+    problem = Problem(records, model, bandwidth, calibrating=True)
     fitted = problem.null()
     return _with_readings(_applied(problem, fitted), problem, fitted)
 
@@ -95,19 +92,19 @@ def _applied(problem: Problem, fitted: Fitted) -> JointModel:
 
 def _with_readings(model: JointModel, problem: Problem, fitted: Fitted) -> JointModel:
     """The model with the errors of its readings as effects; what is not sure stays as declared."""
-    std = np.sqrt(np.maximum(np.diag(hac_covariance(fitted)), 0.0))
+    std = np.sqrt(np.maximum(np.diag(hac_covariance(problem, fitted)), 0.0))
 
     def sure(name: str, motor: int | None, least: float) -> float | None:
         for slot, x, sigma in zip(fitted.slots, fitted.posterior.x, std, strict=True):
             if (slot.kind, slot.name, slot.motor) == ("everyday", name, motor):
                 value = slot.taken + float(x)
-                return value if abs(value) > max(_SURE * float(sigma), least) else None
+                return value if abs(value) > max(choice("sure") * float(sigma), least) else None
         return None
 
     motors = []
     for i, motor in enumerate(model.motors):
         effects = motor.effects
-        if (delay := sure("torque_delay", i, _SKEW_S)) is not None:
+        if (delay := sure("torque_delay", i, choice("least_skew"))) is not None:
             effects = _with_effect(
                 effects, "torque_delay", "delay_s", problem.declared.torque_delay_s[i] + delay
             )
@@ -117,7 +114,7 @@ def _with_readings(model: JointModel, problem: Problem, fitted: Fitted) -> Joint
             )
         motors.append(replace(motor, effects=effects))
     at_link = model.link_effects
-    if (delay := sure("encoder_delay", None, _SKEW_S)) is not None:
+    if (delay := sure("encoder_delay", None, choice("least_skew"))) is not None:
         at_link = _with_effect(at_link, "encoder_delay", "delay_s", problem.declared.encoder_delay_s + delay)
     return replace(model, motors=tuple(motors), link_effects=at_link)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from estimator.diagnosis.choices import choice, whole
 from estimator.diagnosis.frame import Frame
 from estimator.effects import LIBRARY, Coordinates, EffectType
 from estimator.sample import FloatArray
@@ -17,10 +18,6 @@ Values = Mapping[str, float]
 
 # Laws of friction and hysteresis with memory: Dahl, Bouc-Wen, elastic up to the limit.
 LAWS = ((1.0, 1.0), (2.0, 0.5), (50.0, 1.0))
-_LEAST_PERIODS = 2.0  # of a position ripple within the range of motion: fewer are a bend
-_MOST_WAVES = 900
-_QUICKEST = 0.04  # of the recording: a drift that is over sooner is another scale
-_SMOOTHEST = 0.05  # of the largest velocity
 # Without a second equation for the same torque its scale is that of inertia and stiffness together.
 _FREE_ZEROS = ("torque_offset", "deflection_offset")  # fitted anyway where nothing ties them
 _SCALES = ("torque_constant", "torque_saturation", "torque_drift")
@@ -37,6 +34,14 @@ class Candidate:
     def key(self) -> tuple[str, int | None]:
         """What identifies it."""
         return self.kind.name, self.motor
+
+    @property
+    def family(self) -> tuple[str, str, str, int | None]:
+        """What it shares with other laws for the same thing: place, channel and coordinate."""
+        kind = self.kind
+        # Friction with memory is friction: a function of the position's past that changes with the direction.
+        coordinate = "velocity" if kind.remembers and kind.location == "motor" else kind.coordinate
+        return kind.location, kind.channel, coordinate, self.motor
 
 
 def members(frame: Frame) -> list[Candidate]:
@@ -168,7 +173,7 @@ def grid(frame: Frame, candidate: Candidate, smoothing_rad_s: float) -> list[dic
         declared = _declared_power(frame, candidate.motor or 0)
         return _vary(fixed, "power", np.array([p for p in (3.0, 5.0, 7.0) if p > declared][:2]))
     if kind.name == "torque_drift":
-        return _vary(fixed, "time_constant_s", c.time[-1] * np.geomspace(_QUICKEST, 1.0, 6))
+        return _vary(fixed, "time_constant_s", c.time[-1] * np.geomspace(choice("drift"), 1.0, 6))
     if kind.name == "contact":
         places = np.quantile(c.link_position, np.linspace(0.04, 0.96, 12))
         return [{"position_rad": float(x), "side": side} for side in (1.0, -1.0) for x in places]
@@ -188,13 +193,13 @@ def _waves(frame: Frame, c: Coordinates) -> FloatArray:
     slow = float(np.quantile(np.abs(c.velocity), 0.4))
     most = 2.0 * np.pi * frame.signals.bandwidth_hz / max(slow, 1e-12)
     step = np.pi / spread
-    count = int(np.clip((most - least) / step, 0, _MOST_WAVES))
+    count = int(np.clip((most - least) / step, 0, whole("ripples")))
     return np.asarray(least + step * np.arange(count))
 
 
 def least_periods(position: FloatArray) -> float:
     """Fewest periods per revolution that the range of motion lets one call a ripple."""
-    return _LEAST_PERIODS * 2.0 * np.pi / max(_spread(position), 1e-300)
+    return choice("ripple_periods") * 2.0 * np.pi / max(_spread(position), 1e-300)
 
 
 def _declared_power(frame: Frame, motor: int) -> float:
@@ -226,7 +231,7 @@ def bounds_of(frame: Frame, candidate: Candidate, name: str) -> tuple[float, flo
     c = frame.motors[candidate.motor or 0]
     fast = float(np.max(np.abs(c.link_velocity if candidate.motor is None else c.velocity)))
     if name == "smoothing_rad_s":
-        return 0.0, _SMOOTHEST * fast  # smoothed more, a sign is damping
+        return 0.0, choice("smoothing") * fast  # smoothed more, a sign is damping
     if name == "stribeck_velocity_rad_s":
         return 0.0, fast
     if name == "exponent":
@@ -236,7 +241,7 @@ def bounds_of(frame: Frame, candidate: Candidate, name: str) -> tuple[float, flo
     if name == "displacement_rad":
         return 0.0, _spread(c.position if candidate.kind.location == "motor" else c.deflection)
     if name == "time_constant_s":
-        return _QUICKEST * float(c.time[-1]), float(c.time[-1])
+        return choice("drift") * float(c.time[-1]), float(c.time[-1])
     return 0.0, np.inf
 
 

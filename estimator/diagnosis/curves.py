@@ -8,6 +8,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.signal import lfilter
 
+from estimator.diagnosis.choices import choice, whole
 from estimator.diagnosis.frame import Frame
 from estimator.diagnosis.hypothesis import Extra, Fitted
 from estimator.diagnosis.search import Search
@@ -17,14 +18,9 @@ from estimator.sample import FloatArray
 __all__ = ["best_curve"]
 
 _DEGREE = 3
-_KNOTS = 20
-_COARSE = 8
 _LEAST_HARMONICS = 3
-_MOST_HARMONICS = 15
 _FINE = 24  # steps in which a line's frequency is refined
-_SLOW = 10
 _LAGS_S = (0.05, 0.1, 0.2, 0.4, 0.8)
-_SIGN = 0.02  # smoothing of a direction, of the rms velocity
 
 Basis = Callable[[Coordinates], FloatArray]
 
@@ -83,21 +79,28 @@ def _bases(frame: Frame, beside: Fitted, location: str, motor: int) -> list[tupl
         "link": ("link_position", "link_velocity"),
     }[location]
     made: list[tuple[tuple[str, ...], Basis]] = [
-        ((name,), _over(name, _Splines(getattr(c, name), _KNOTS))) for name in (place, rate, *others)
+        ((name,), _over(name, _Splines(getattr(c, name), whole("knots")))) for name in (place, rate, *others)
     ]
     v = getattr(c, rate)
-    slow = _Splines(c.time, _SLOW)
+    slow = _Splines(c.time, whole("coarse_knots"))
     if location == "motor" and frame.linked:
-        made.append((("torque",), _beyond_scale(_Splines(c.torque, _KNOTS))))
-        made.append((("position", "torque"), _scaled("torque", "position", _Splines(c.position, _KNOTS), c)))
-    smoothing = max(_SIGN * float(np.sqrt(np.mean(v * v))), 1e-12)
-    made.append(((place, rate), _both_ways(place, rate, smoothing, _Splines(getattr(c, place), _COARSE))))
+        made.append((("torque",), _beyond_scale(_Splines(c.torque, whole("knots")))))
+        made.append(
+            (("position", "torque"), _scaled("torque", "position", _Splines(c.position, whole("knots")), c))
+        )
+    smoothing = max(choice("smoothing") * float(np.sqrt(np.mean(v * v))), 1e-12)
+    made.append(
+        (
+            (place, rate),
+            _both_ways(place, rate, smoothing, _Splines(getattr(c, place), whole("coarse_knots"))),
+        )
+    )
     if location == "motor":
         made.append((("velocity", "time"), _fading(slow, smoothing, c)))
     if location == "transmission":
         made.append((("deflection", "time"), _scaled("deflection", "time", slow, c)))
         made.append((("deflection", "deflection_rate"), _creeping))
-        path = _Splines(c.link_position, _COARSE)
+        path = _Splines(c.link_position, whole("coarse_knots"))
         made.append((("deflection", "link_position"), _scaled("deflection", "link_position", path, c, True)))
     made.append((("time",), _waves(frame, beside, *_line(frame, beside, location, motor))))
     made.append((("time",), _over("time", slow)))
@@ -164,7 +167,7 @@ def _fading(splines: _Splines, smoothing: float, c: Coordinates) -> Basis:
 def _waves(frame: Frame, beside: Fitted, frequency: float, resolution: float, equation: int) -> Basis:
     """A line and its harmonics, the line refined; both in rad/s."""
     most = 2.0 * np.pi * frame.signals.bandwidth_hz / frequency
-    count = int(np.clip(most, _LEAST_HARMONICS, _MOST_HARMONICS))
+    count = int(np.clip(most, _LEAST_HARMONICS, whole("harmonics")))
 
     def made(time: FloatArray, w: float) -> FloatArray:
         return np.stack([f(k * w * time) for k in range(1, count + 1) for f in (np.sin, np.cos)], axis=1)

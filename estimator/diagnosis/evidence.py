@@ -14,13 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.diagnosis.choices import choice, whole
 from estimator.sample import FloatArray
 
 __all__ = ["Posterior", "Regression", "Scale", "autocorrelation_time"]
-
-_LAGS = 60  # rows, 20 periods of the bandwidth: what repeats with the motion is no correlation of errors
-_LEAST_SCALE = 0.05  # a scale that falls below this has left the range of its linearisation
-_ROUNDS = 8  # of the fixed point between parameters and noise; it converges by a factor in each
 
 
 class Scale(NamedTuple):
@@ -56,6 +53,19 @@ class Posterior(NamedTuple):
     bound: NDArray[np.bool_]
 
 
+class _Gram(NamedTuple):
+    """A balance as normal equations, columns scaled: A'A, A'y, y'y, number of rows."""
+
+    matrix: FloatArray
+    side: FloatArray
+    square: float
+    rows: int
+
+    def left(self, x: FloatArray) -> float:
+        """Squared error at x."""
+        return max(self.square - 2.0 * float(x @ self.side) + float(x @ self.matrix @ x), 0.0)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Regression:
     """Rows of all balances and what is believed of x before.
@@ -64,7 +74,7 @@ class Regression:
         design: (n, k). target: (n,).
         mean, std: (k,) of the prior. low: (k,) bounds from below, -inf where there are none.
         group: (n,) which balance a row belongs to, from 0.
-        block: (n,) block of time of a row; negative: takes no part.
+        used: (n,) whether a row takes part.
         floor: (groups,) smallest standard deviation of each balance, N·m.
         scales: of balances against their measurements.
     """
@@ -75,11 +85,11 @@ class Regression:
     std: FloatArray
     low: FloatArray
     group: NDArray[np.int64]
-    block: NDArray[np.int64]
+    used: NDArray[np.bool_]
     floor: FloatArray
     scales: tuple[Scale, ...]
-    _grams: list[tuple[FloatArray, FloatArray, float, int]]
-    _scale: FloatArray
+    _grams: list[_Gram]
+    _unit: FloatArray
 
     @classmethod
     def make(
@@ -90,84 +100,102 @@ class Regression:
         std: FloatArray,
         low: FloatArray,
         group: NDArray[np.int64],
-        block: NDArray[np.int64],
+        used: NDArray[np.bool_],
         floor: FloatArray,
         scales: tuple[Scale, ...] = (),
     ) -> Regression:
-        """The normal equations of each balance, made once."""
-        scale = np.linalg.norm(design, axis=0)
-        scale[scale == 0.0] = 1.0
-        scaled = design / scale
+        """The normal equations of each balance, made once; every column has norm one in them."""
+        unit = np.linalg.norm(design, axis=0)
+        unit[unit == 0.0] = 1.0
+        scaled = design / unit
         grams = []
         for g in range(int(group.max()) + 1):
-            rows = (group == g) & (block >= 0)
+            rows = (group == g) & used
             a, y = scaled[rows], target[rows]
-            grams.append((a.T @ a, a.T @ y, float(y @ y), int(rows.sum())))
-        return cls(design, target, mean, std, low, group, block, floor, scales, grams, scale)
+            grams.append(_Gram(a.T @ a, a.T @ y, float(y @ y), int(rows.sum())))
+        return cls(design, target, mean, std, low, group, used, floor, scales, grams, unit)
 
     def solve(self, times: FloatArray, start: FloatArray | None = None) -> Posterior:
-        """Parameters, noise and evidence.
+        """Parameters, noise and evidence: a fixed point of parameters and noise, bounds by an active set.
 
         Args:
             times: (groups,) autocorrelation times of the errors, in rows.
             start: (groups,) noise to begin with.
         """
-        mean, std = self.mean * self._scale, self.std * self._scale
-        low = self.low * self._scale
-        counts = np.array([n for *_, n in self._grams], dtype=np.float64)
-        free = np.ones(len(mean), dtype=bool)
+        low = self.low * self._unit
+        counts = np.array([gram.rows for gram in self._grams], dtype=np.float64)
         if start is None:
-            start = np.array([np.sqrt(yy / max(n, 1)) for _, _, yy, n in self._grams])
+            start = np.array([np.sqrt(gram.square / max(gram.rows, 1)) for gram in self._grams])
         sigma = np.maximum(start, self.floor)
         held = np.where(np.isfinite(low), low, 0.0)
-        x = np.where(free, mean, held)
-        independent = counts / times
-        last = _ROUNDS + len(mean) - 1
+        free = np.ones(len(low), dtype=bool)
+        x = self.mean * self._unit
+        last = whole("noise_rounds") + len(x) - 1
         for attempt in range(last + 1):
-            weight = 1.0 / (times * sigma**2)
-            precision = np.diag(1.0 / std**2)
-            side = mean / std**2
-            for w, (gram, product, _, _) in zip(weight, self._grams, strict=True):
-                precision = precision + w * gram
-                side = side + w * product
-            for scale in self.scales:  # Newton's step of -n log s
-                direction = scale.direction / self._scale
-                share = float(independent[list(scale.groups)].sum())
-                size = max(scale.constant + float(direction @ x), _LEAST_SCALE * abs(scale.constant))
-                precision = precision + share / size**2 * np.outer(direction, direction)
-                side = side + share * direction * (1.0 / size + float(direction @ x) / size**2)
+            precision, side = self._normal(times, sigma, x)
             old, x = x, np.where(free, 0.0, held)
             inner = precision[np.ix_(free, free)]
             x[free] = np.linalg.solve(inner, side[free] - precision[np.ix_(free, ~free)] @ x[~free])
-            left = np.array([max(yy - 2.0 * x @ p + x @ g @ x, 0.0) for g, p, yy, _ in self._grams])
+            left = np.array([gram.left(x) for gram in self._grams])
             new = np.maximum(np.sqrt(left / counts), self.floor)
             steady = bool(np.all(np.abs(new - sigma) < 1e-3 * sigma))
             sigma = new
-            wrong = free & (x < low) if attempt < last else np.zeros_like(free)
-            if wrong.any():
+            wrong = free & (x < low)
+            if wrong.any() and attempt < last:
                 free = free & ~wrong
             elif steady and (not self.scales or np.allclose(x, old, rtol=1e-4)):
                 break
         covariance = np.zeros_like(precision)
         covariance[np.ix_(free, free)] = np.linalg.inv(inner)
-        _, logdet = np.linalg.slogdet(inner)
-        strain = (x - mean) / std
-        scaled = 0.0
-        for scale in self.scales:
-            size = scale.constant + float(scale.direction @ (x / self._scale))
-            scaled += float(independent[list(scale.groups)].sum()) * np.log(
-                max(size, _LEAST_SCALE * abs(scale.constant))
-            )
-        evidence = (
-            scaled
-            - float(np.sum(independent * np.log(sigma)))
-            - 0.5 * float(np.sum(left / (times * sigma**2)))
-            - 0.5 * float(strain @ strain)
-            - 0.5 * float(logdet)
-            - float(np.sum(np.log(std[free])))
-        )
+        evidence = self._evidence(x, times, sigma, left, free, inner)
         return Posterior(
-            x / self._scale, covariance / np.outer(self._scale, self._scale), sigma, evidence, ~free
+            x / self._unit, covariance / np.outer(self._unit, self._unit), sigma, evidence, ~free
+        )
+
+    def _normal(self, times: FloatArray, sigma: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Posterior precision and its side, of scaled columns, linearised at x where a torque is scaled."""
+        std = self.std * self._unit
+        precision, side = np.diag(1.0 / std**2), self.mean * self._unit / std**2
+        for w, gram in zip(1.0 / (times * sigma**2), self._grams, strict=True):
+            precision = precision + w * gram.matrix
+            side = side + w * gram.side
+        for scale, size, share in self._sizes(x, times):  # Newton's step of -n log s
+            direction = scale.direction / self._unit
+            precision = precision + share / size**2 * np.outer(direction, direction)
+            side = side + share * direction * (1.0 / size + float(direction @ x) / size**2)
+        return precision, side
+
+    def _sizes(self, x: FloatArray, times: FloatArray) -> list[tuple[Scale, float, float]]:
+        """Each scale with its s at x (scaled columns) and the independent rows that it concerns."""
+        made = []
+        for scale in self.scales:
+            size = scale.constant + float(scale.direction / self._unit @ x)
+            share = sum(self._grams[g].rows / float(times[g]) for g in scale.groups)
+            made.append((scale, max(size, choice("least_scale") * abs(scale.constant)), share))
+        return made
+
+    def _evidence(
+        self,
+        x: FloatArray,
+        times: FloatArray,
+        sigma: FloatArray,
+        left: FloatArray,
+        free: NDArray[np.bool_],
+        inner: FloatArray,
+    ) -> float:
+        """Logarithm of the marginal likelihood by Laplace's approximation, up to a constant of the data."""
+        independent = np.array([gram.rows for gram in self._grams]) / times
+        std = self.std * self._unit
+        strain = (x - self.mean * self._unit) / std
+        _, logdet = np.linalg.slogdet(inner)
+        scaled = sum(share * np.log(size) for _, size, share in self._sizes(x, times))
+        return float(
+            scaled
+            - np.sum(independent * np.log(sigma))
+            - 0.5 * np.sum(left / (times * sigma**2))
+            - 0.5 * strain @ strain
+            - 0.5 * logdet
+            - np.sum(np.log(std[free]))
         )
 
     def residual(self, x: FloatArray) -> FloatArray:
@@ -186,7 +214,7 @@ def autocorrelation_time(error: FloatArray) -> float:
     n = len(error)
     size = 1 << (2 * n - 1).bit_length()
     power = np.abs(np.fft.rfft(error, size)) ** 2
-    correlation = np.fft.irfft(power, size)[: min(n // 4, _LAGS) + 1]
+    correlation = np.fft.irfft(power, size)[: min(n // 4, whole("memory")) + 1]
     if correlation[0] <= 0.0:
         return 1.0
     rho = correlation[1:] / correlation[0]

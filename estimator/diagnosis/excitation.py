@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from scipy import fft
 
+from estimator.diagnosis.choices import choice
 from estimator.diagnosis.frame import Frame
 from estimator.sample import FloatArray
 
 __all__ = ["advice_for", "lines", "poor"]
-
-_FEW = 1.08  # effective number of spectral lines below which everything is proportional to everything
 
 
 def lines(x: FloatArray) -> float:
@@ -24,7 +23,8 @@ def lines(x: FloatArray) -> float:
 def poor(frame: Frame) -> bool:
     """Whether the motion is hardly more than one sine."""
     return all(
-        lines(frame.project(c.velocity)) < _FEW and lines(frame.project(c.torque)) < _FEW
+        lines(frame.project(c.velocity)) < choice("one_sine")
+        and lines(frame.project(c.torque)) < choice("one_sine")
         for c in frame.motors
     )
 

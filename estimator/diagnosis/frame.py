@@ -14,19 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.diagnosis.choices import choice, whole
 from estimator.diagnosis.spectral import Band, Spectrum, lowpass
 from estimator.effects import Coordinates
 from estimator.model import JointModel
 from estimator.sample import FloatArray, Record
 
 __all__ = ["Corrections", "Frame", "Signals"]
-
-_LIGHT = 4.0  # bandwidth of G in units of that of F
-_GRID_RATE = 14.0  # samples of the grid per period of the bandwidth
-_LONG = 90_000  # grid points beyond which the grid gets coarser
-_ROW_RATE = 3.0  # rows per period of the bandwidth
-_EDGE_PERIODS = 1.5  # periods of the bandwidth that are not used at the ends and around gaps
-_TAIL = 0.6  # share of the Nyquist frequency above which the spectrum is taken for noise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,17 +66,17 @@ class Signals:
         self.samples = int(sequence[-1]) + 1
         self.period_s = record.period_s
         self.bandwidth_hz = bandwidth_hz
-        whole = self.samples == len(sequence)
+        unbroken = self.samples == len(sequence)
         grid = np.arange(self.samples)
 
         def bridged(x: FloatArray) -> FloatArray:
-            return x if whole else np.interp(grid, sequence, x)
+            return x if unbroken else np.interp(grid, sequence, x)
 
-        rate = max(_GRID_RATE * bandwidth_hz, 3.0 * _LIGHT * bandwidth_hz)
+        rate = choice("grid") * bandwidth_hz
         step = max(1, int(1.0 / (record.period_s * rate)))
-        if self.samples / step > _LONG:
-            coarse = max(1, int(1.0 / (record.period_s * 2.2 * _LIGHT * bandwidth_hz)))
-            step = min(coarse, max(step, -(-self.samples // _LONG)))
+        if self.samples / step > choice("long"):
+            coarse = max(1, int(1.0 / (record.period_s * 2.2 * choice("light") * bandwidth_hz)))
+            step = min(coarse, max(step, -(-self.samples // whole("long"))))
         margin = 3.0 / bandwidth_hz
         self.light = Band(self.samples, record.period_s, step, margin)
         link = record.link_position_rad
@@ -91,14 +85,14 @@ class Signals:
         self.q = None if link is None else self.light.transform(bridged(link))
         external = record.external_torque_nm
         self.external = None if external is None else self.light.transform(bridged(external))
-        rows_step = max(1, int(1.0 / (self.light.period_s * _ROW_RATE * bandwidth_hz)))
+        rows_step = max(1, int(1.0 / (self.light.period_s * choice("rows") * bandwidth_hz)))
         self.narrow = Band(self.light.kept, self.light.period_s, rows_step, margin)
         self.response = lowpass(self.narrow.frequency_hz, bandwidth_hz)
         self.keep = self._rows(record, sequence)
 
     def _rows(self, record: Record, sequence: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Rows away from the ends and from gaps."""
-        edge = _EDGE_PERIODS / self.bandwidth_hz
+        edge = choice("edge") / self.bandwidth_hz
         time = np.arange(self.narrow.kept) * self.narrow.period_s
         end = (self.samples - 1) * record.period_s
         keep = (time >= edge) & (time <= end - edge)
@@ -115,7 +109,7 @@ class Signals:
             response: of the filter at the frequencies of `light`.
         """
         power = np.abs(spectrum[0]) ** 2
-        white = float(np.median(power[int(_TAIL * len(power)) :]) / np.log(2.0))
+        white = float(np.median(power[int(choice("tail") * len(power)) :]) / np.log(2.0))
         return 2.0 * white * float(np.sum(np.abs(response) ** 2)) / self.light.length**2
 
     def velocity_noise(self, motor: int) -> float:
@@ -133,7 +127,9 @@ def _lag(frequency_hz: FloatArray, time_constant_s: float) -> NDArray[Any]:
 
 def light_response(signals: Signals) -> FloatArray:
     """Response of G."""
-    return lowpass(signals.light.frequency_hz, min(_LIGHT * signals.bandwidth_hz, 0.45 / signals.period_s))
+    return lowpass(
+        signals.light.frequency_hz, min(choice("light") * signals.bandwidth_hz, 0.45 / signals.period_s)
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,15 +8,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.diagnosis.beliefs import OF_RUN
 from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.diagnosis.result import Errors
 from estimator.model import JointModel
 from estimator.sample import FloatArray, Record
 
 __all__ = ["Held", "errors_of", "held_out"]
-
-_RUN = ("torque_offset", "deflection_offset")
-
 
 _Left = tuple[FloatArray, FloatArray, NDArray[np.bool_]]  # error, torque, rows of the motors' balances
 
@@ -74,7 +72,7 @@ class Held:
             return self._memo[id(fitted)][1]
         problem = self._problem
         if not self._others:
-            made = [_balances(problem, fitted, problem.block < 0)]
+            made = [_balances(problem, fitted, ~problem.used)]
         else:
             made = []
             for rest, other in self._others:
@@ -93,15 +91,13 @@ def held_out(
 ) -> Held:
     """The validation recording; or each recording in turn; or blocks of the only one."""
     if validation is not None:
-        return Held(problem, [(problem, Problem([validation], model, bandwidth_hz, 0, 10))])
+        return Held(problem, [(problem, Problem([validation], model, bandwidth_hz))])
     if len(records) == 1:
         return Held(problem, [])
     pairs = []
     for k, record in enumerate(records):
         rest = [r for j, r in enumerate(records) if j != k]
-        pairs.append(
-            (Problem(rest, model, bandwidth_hz, 0, 10), Problem([record], model, bandwidth_hz, 0, 10))
-        )
+        pairs.append((Problem(rest, model, bandwidth_hz), Problem([record], model, bandwidth_hz)))
     return Held(problem, pairs)
 
 
@@ -130,7 +126,7 @@ def on_other(other: Problem, fitted: Fitted) -> _Left:
     run = [
         j
         for j, s in enumerate(there.slots)
-        if s.kind == "everyday" and s.name in _RUN and (s.name, s.motor) not in fitted.pinned
+        if s.kind == "everyday" and s.name in OF_RUN and (s.name, s.motor) not in fitted.pinned
     ]
     x = there.posterior.x
     left = there.regression.residual(x)

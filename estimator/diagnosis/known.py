@@ -6,20 +6,12 @@ import numpy as np
 
 from estimator.diagnosis.candidates import Candidate, columns
 from estimator.diagnosis.frame import Corrections, Frame
+from estimator.diagnosis.readings import READINGS
 from estimator.effects import elements
 from estimator.model import Effect, JointModel
 from estimator.sample import FloatArray
 
 __all__ = ["declared_corrections", "declared_torque"]
-
-_READINGS = (
-    "torque_delay",
-    "torque_lag",
-    "deflection_offset",
-    "encoder_delay",
-    "encoder_scale",
-    "encoder_eccentricity",
-)
 
 
 def declared_corrections(model: JointModel) -> Corrections:
@@ -50,7 +42,7 @@ def declared_torque(frame: Frame) -> FloatArray:
     total = np.zeros(frame.rows * frame.equations)
     owners = [(i, effect) for i, motor in enumerate(frame.model.motors) for effect in motor.effects]
     for motor, effect in [*owners, *((None, effect) for effect in frame.model.link_effects)]:
-        if effect.name in _READINGS:
+        if effect.name in READINGS:
             continue
         kind, each = elements(effect)
         for values in each:

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from estimator.diagnosis.candidates import columns
+from estimator.diagnosis.choices import choice
 from estimator.diagnosis.covariance import hac_covariance
-from estimator.diagnosis.hypothesis import Fitted, Problem, curve_columns
+from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.diagnosis.result import Curve, Finding, Refitted, Rival, Series
 from estimator.diagnosis.search import Search
+from estimator.diagnosis.stack import curve_columns
 from estimator.effects import LIBRARY
 from estimator.model import ParameterValue
 from estimator.sample import FloatArray
 
 __all__ = ["alignment_of", "curves_of", "findings_of", "rivals_of", "series_of", "transmissions_of"]
 
-_SKEW = 1.05  # periods: more than one sample is a delay, less an everyday skew
-_SURE = 3.0  # standard deviations from zero at which a reading's error is reported
-_ALL = 2.0  # times what else is left: a constant torque is then all there is
 _CHANNELS = {"torque_delay": "torque_delay_s", "deflection_offset": "deflection_offset_rad"}
 
 
@@ -25,7 +26,7 @@ def findings_of(
     problem: Problem, found: Fitted, null: Fitted, alternatives: list[tuple[str, ...]]
 ) -> list[Finding]:
     """The effects, the one that explains most first; delays of more than a sample among them."""
-    std = np.sqrt(np.maximum(np.diag(hac_covariance(found)), 0.0))
+    std = np.sqrt(np.maximum(np.diag(hac_covariance(problem, found)), 0.0))
     made = []
     total = float(np.sum(null.posterior.sigma**2))
     for k, term in enumerate(found.terms):
@@ -53,8 +54,10 @@ def findings_of(
             made.append((share, finding))
     for slot, x, sigma in zip(found.slots, found.posterior.x, std, strict=True):
         value = slot.taken + float(x)
-        late = slot.name in ("encoder_delay", "torque_delay") and abs(value) > _SKEW * problem.period_s
-        if slot.kind == "everyday" and late and abs(value) > _SURE * sigma:
+        late = (
+            slot.name in ("encoder_delay", "torque_delay") and abs(value) > choice("skew") * problem.period_s
+        )
+        if slot.kind == "everyday" and late and abs(value) > choice("sure") * sigma:
             kind = LIBRARY[slot.name]
             made.append((0.0, Finding(
                 name=slot.name, location=kind.location, motor=slot.motor, parameters={"delay_s": value},
@@ -78,7 +81,7 @@ def _offsets(problem: Problem, found: Fitted, std: FloatArray) -> list[Finding]:
             found.posterior.x[mine] + np.array([found.slots[j].taken for j in mine])
         )
         left = found.regression.residual(found.posterior.x)
-        if not flexible or float(np.mean(constant**2)) < _ALL**2 * float(np.mean(left**2)):
+        if not flexible or float(np.mean(constant**2)) < choice("constant") ** 2 * float(np.mean(left**2)):
             continue
         size = -float(np.mean(constant[problem.group % problem.equations == i]))
         deviation = float(np.hypot.reduce(std[[j for j in mine if found.slots[j].name == "torque_offset"]]))
@@ -96,7 +99,7 @@ def _everyday(problem: Problem, finding: Finding) -> bool:
     if finding.name not in ("encoder_delay", "torque_delay"):
         return False
     delay = finding.parameters["delay_s"]
-    return isinstance(delay, float) and abs(delay) <= _SKEW * problem.period_s
+    return isinstance(delay, float) and abs(delay) <= choice("skew") * problem.period_s
 
 
 def _absolute(problem: Problem, found: Fitted, k: int, name: str, x: float) -> float:
@@ -108,9 +111,9 @@ def alignment_of(problem: Problem, after: Fitted, effects: list[Finding]) -> dic
     """What was taken out of the readings as everyday, by channel."""
     named = {(f.name, f.motor) for f in effects}
     pairs: dict[str, float] = {}
-    std = np.sqrt(np.maximum(np.diag(hac_covariance(after)), 0.0))
+    std = np.sqrt(np.maximum(np.diag(hac_covariance(problem, after)), 0.0))
     for slot, x, sigma in zip(after.slots, after.posterior.x, std, strict=True):
-        if abs(slot.taken + float(x)) < _SURE * sigma:
+        if abs(slot.taken + float(x)) < choice("sure") * sigma:
             continue
         if (
             slot.kind not in ("everyday", "term")
@@ -125,13 +128,19 @@ def alignment_of(problem: Problem, after: Fitted, effects: list[Finding]) -> dic
     return pairs
 
 
-def transmissions_of(problem: Problem, after: Fitted) -> tuple[tuple[Refitted, ...], list[str]]:
+def transmissions_of(
+    problem: Problem, after: Fitted, accounts: Sequence[tuple[float, Fitted]] = ()
+) -> tuple[tuple[Refitted, ...], list[str]]:
     """Each motor's transmission, and doubts about them.
+
+    Its covariance is that of the fit and that between the accounts of the data (Bayesian model averaging;
+    Hoeting et al., Statistical Science 14, 1999): where another set of effects would do as well, it may ask
+    for another stiffness.
 
     A stiffness that is not above zero, or whose interval includes zero, is no stiffness: its parameters are
     left out, and a doubt says so.
     """
-    covariance = hac_covariance(after)
+    covariance = hac_covariance(problem, after)
     made: list[Refitted] = []
     doubts = []
     for i, model in enumerate(after.base.models(problem.frames[0])):
@@ -140,7 +149,7 @@ def transmissions_of(problem: Problem, after: Fitted) -> tuple[tuple[Refitted, .
             made.append(Refitted("none", {}, {}))
             continue
         alpha = np.array([after.slots[j].taken + after.posterior.x[j] for j in mine])
-        own = covariance[np.ix_(mine, mine)]
+        own = covariance[np.ix_(mine, mine)] + _between(after, accounts, i, alpha)
         phi = problem.frames[0].motors[i].deflection
         middle = float(np.median(np.abs(phi)))
         slope = np.asarray(model.stiffness_jacobian(np.array([middle]), alpha))[0]
@@ -156,6 +165,23 @@ def transmissions_of(problem: Problem, after: Fitted) -> tuple[tuple[Refitted, .
         std_of_alpha = np.sqrt(np.maximum(np.diag(own), 0.0))
         made.append(Refitted(model.name, model.parameters(alpha), model.parameters(std_of_alpha)))
     return tuple(made), doubts
+
+
+def _between(
+    after: Fitted, accounts: Sequence[tuple[float, Fitted]], motor: int, alpha: FloatArray
+) -> FloatArray:
+    """Second moment of a transmission's parameters about those told, over the accounts of the data."""
+    total = np.zeros((len(alpha),) * 2)
+    for chance, other in accounts:
+        there = np.array(
+            [
+                s.taken + x
+                for s, x in zip(other.slots, other.posterior.x, strict=True)
+                if s.kind == "base" and s.motor == motor
+            ]
+        )
+        total += chance * np.outer(there - alpha, there - alpha)
+    return np.asarray(total / (0.5 + sum(chance for chance, _ in accounts)))  # even: a half against a half
 
 
 def rivals_of(search: Search) -> list[Rival]:

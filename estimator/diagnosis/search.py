@@ -10,23 +10,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 
+from estimator.diagnosis.beliefs import effect_std
 from estimator.diagnosis.candidates import Candidate, columns, grid, members
-from estimator.diagnosis.hypothesis import Fitted, Problem, Term, effect_std
+from estimator.diagnosis.choices import choice, whole
+from estimator.diagnosis.hypothesis import Fitted, Problem, Term, stretches
 from estimator.priors import PRIORS
 from estimator.sample import FloatArray
 
-__all__ = ["EVEN", "Progress", "Search"]
+__all__ = ["Progress", "Search"]
 
-_BEAM = 3  # hypotheses that are grown at once: enough for an imitation beside the true effect
-_TRIED = 8  # effects tried beside each
-_MOST = 5  # effects
-EVEN = 0.05  # posterior odds above which two hypotheses are indistinguishable
 _SMOOTHING = "smoothing_rad_s"
-_SOFTER = 5.0  # a step of its grid
-_ROUGH = 3  # Gauss-Newton steps while hypotheses are compared
 
 Progress = Callable[[str], None]
 
@@ -65,20 +62,20 @@ class Search:
         """The hypotheses with the most evidence, best first, pruned; single effects among them."""
         seen = [self.null]
         beam, best = [self.null], self.null
-        for size in range(1, _MOST + 1):
+        for size in range(1, whole("effects") + 1):
             self._progress(f"term {size}")
             grown = [child for parent in beam for child in self.children(parent)]
             self._singles = self._singles or grown
             if not grown:
                 break
-            beam = self._ranked(grown)[:_BEAM]
+            beam = self._ranked(grown)[: whole("beam")]
             seen += beam
             leader = self._ranked(seen)[0]
             if size - len(leader.terms) >= 2 or (size > 1 and leader is best):
                 break
             best = leader
-        finalists = [self._settled(h) for h in self._ranked(seen)[:_BEAM]]
-        best = self._pruned(self._swapped(self._pruned(self._ranked(finalists)[0])))
+        finalists = [self._settled(h) for h in self._ranked(seen)[: whole("beam")]]
+        best = self._pruned(self._swapped(self._merged(self._pruned(self._ranked(finalists)[0]))))
         return [best, *self.leading()]
 
     def singles(self) -> list[Fitted]:
@@ -87,20 +84,20 @@ class Search:
 
     def leading(self) -> list[Fitted]:
         """The single effects with the most evidence."""
-        return self._ranked(self._singles)[:_BEAM] if self._singles else []
+        return self._ranked(self._singles)[: whole("beam")] if self._singles else []
 
-    def children(self, parent: Fitted) -> list[Fitted]:
-        """The most promising hypotheses with one effect more."""
-        grown = (self._grown(parent, term) for term in self.screen(parent))
+    def children(self, parent: Fitted, like: Candidate | None = None) -> list[Fitted]:
+        """The most promising hypotheses with one effect more; `like`: see `screen`."""
+        grown = (self._grown(parent, term) for term in self.screen(parent, like))
         return [child for child in grown if child.real]
 
     def _grown(self, parent: Fitted, term: Term) -> Fitted:
         """One more effect; how sharply a friction changes its sign has several optima, so from two starts."""
-        child = self.problem.added(parent, term, _ROUGH)
+        child = self.problem.added(parent, term, whole("rough_steps"))
         if _SMOOTHING not in term.values:
             return child
-        softer = {**term.values, _SMOOTHING: _SOFTER * term.values[_SMOOTHING]}
-        other = self.problem.added(parent, Term(term.candidate, softer), _ROUGH)
+        softer = {**term.values, _SMOOTHING: choice("softer") * term.values[_SMOOTHING]}
+        other = self.problem.added(parent, Term(term.candidate, softer), whole("rough_steps"))
         return max(child, other, key=lambda h: h.evidence(child))
 
     def score(self, hypothesis: Fitted, like: Fitted) -> float:
@@ -111,6 +108,27 @@ class Search:
         """Log odds of one hypothesis over another; errors as correlated as under the one that leaves less."""
         best = min((one, other), key=_left)
         return self.score(one, best) - self.score(other, best)
+
+    def chance(self, found: Fitted, rival: Fitted) -> float:
+        """Probability that the rival is the better account, had the recording gone on.
+
+        By the odds, and by how they scatter: the log odds of the stretches of time differ among themselves,
+        so their sum has a standard deviation (Vuong, Econometrica 57, 1989). Without it a model that is wrong
+        in detail is as sure as its many rows make it.
+        """
+        gain = self._by_stretch(found) - self._by_stretch(rival)
+        spread = math.sqrt(len(gain)) * float(np.std(gain, ddof=1))
+        odds = self.advantage(found, rival)
+        return max(1.0 / (1.0 + math.exp(min(odds, 700.0))), NormalDist(0.0, spread + 1e-9).cdf(-odds))
+
+    def _by_stretch(self, hypothesis: Fitted) -> FloatArray:
+        """Log likelihood of each stretch of time, errors as independent as all of them are on average."""
+        regression, posterior = hypothesis.regression, hypothesis.posterior
+        sigma, times = posterior.sigma[regression.group], hypothesis.times[regression.group]
+        left = regression.residual(posterior.x)
+        each = -(np.log(sigma) + 0.5 * (left / sigma) ** 2) / times
+        labels = stretches(self.problem)
+        return np.bincount(labels[labels >= 0], each[labels >= 0]).astype(np.float64)
 
     def _ranked(self, hypotheses: list[Fitted]) -> list[Fitted]:
         """Best first, without doublets."""
@@ -131,30 +149,45 @@ class Search:
                 return self._pruned(rest)
         return hypothesis
 
+    def _merged(self, hypothesis: Fitted) -> Fitted:
+        """Two terms replaced by one, where that is nearly as good an account."""
+        for k in range(len(hypothesis.terms)):
+            for j in range(k):
+                rest = self.problem.without(self.problem.without(hypothesis, k), j)
+                grown = self.children(rest)
+                if not grown:
+                    continue
+                one = self._settled(self._ranked(grown)[0])
+                if self.advantage(one, hypothesis) > math.log(choice("even")):
+                    return self._merged(one)
+        return hypothesis
+
     def _swapped(self, hypothesis: Fitted) -> Fitted:
         """Each term in turn replaced by one with more evidence, or by a simpler one that is nearly even."""
         for k in range(len(hypothesis.terms)):
             for other in self.rivals(hypothesis, k):
                 simpler = _parameters(other.terms[-1]) < _parameters(hypothesis.terms[k])
-                if self.advantage(other, hypothesis) > (math.log(EVEN) if simpler else 0.0):
+                if self.advantage(other, hypothesis) > (math.log(choice("even")) if simpler else 0.0):
                     hypothesis = self._settled(other)
                     break
         return hypothesis
 
     def rivals(self, hypothesis: Fitted, k: int) -> list[Fitted]:
         """What could stand in place of a term, most evidence first."""
-        own = hypothesis.terms[k].candidate.key
-        made = [
-            child
-            for child in self.children(self.problem.without(hypothesis, k))
-            if child.terms[-1].candidate.key != own
-        ]
+        own = hypothesis.terms[k].candidate
+        grown = self.children(self.problem.without(hypothesis, k), like=own)
+        made = [child for child in grown if child.terms[-1].candidate.key != own.key]
         return self._ranked(made) if made else []
 
-    def screen(self, parent: Fitted, count: int = _TRIED) -> list[Term]:
-        """The effects that promise most beside a hypothesis, at the best point of their grid."""
+    def screen(self, parent: Fitted, like: Candidate | None = None) -> list[Term]:
+        """The effects that promise most beside a hypothesis, at the best point of their grid.
+
+        Args:
+            parent: the hypothesis.
+            like: an effect whose whole family is wanted, whatever it promises.
+        """
         problem, posterior = self.problem, parent.posterior
-        rows = parent.regression.block >= 0
+        rows = parent.regression.used
         weight = (1.0 / (parent.times * posterior.sigma**2))[problem.group[rows]]
         design = parent.regression.design[rows]
         left = parent.regression.residual(posterior.x)[rows] * weight
@@ -186,7 +219,9 @@ class Search:
                 (gains[best] - math.log(len(gains)), Term(entry.candidate, dict(entry.values[best])))
             )
         found.sort(key=lambda pair: -pair[0])
-        return [term for _, term in found[:count]]
+        tried = whole("tried")
+        more = [t for _, t in found[tried:] if like is not None and t.candidate.family == like.family]
+        return [term for _, term in found[:tried]] + more
 
 
 def _parameters(term: Term) -> int:

@@ -12,17 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from estimator.diagnosis.choices import whole
 from estimator.sample import FloatArray
 
 __all__ = ["Band", "Spectrum", "lowpass"]
 
 Spectrum = tuple[NDArray[np.complex128], float, float]
-_ORDER = 8  # of the low-pass's magnitude
 
 
 def lowpass(frequency_hz: FloatArray, bandwidth_hz: float) -> FloatArray:
     """Magnitude 1/sqrt(1 + (f/fc)^16): -3 dB at fc, no phase."""
-    return np.asarray(1.0 / np.sqrt(1.0 + (frequency_hz / bandwidth_hz) ** (2 * _ORDER)))
+    return np.asarray(1.0 / np.sqrt(1.0 + (frequency_hz / bandwidth_hz) ** (2 * whole("order"))))
 
 
 class Band:

@@ -39,7 +39,7 @@ def _stiffness(
         return nothing, nothing
     mine = [j for j, slot in enumerate(fitted.slots) if slot.kind == "base" and slot.motor == motor]
     alpha = np.array([fitted.slots[j].taken + fitted.posterior.x[j] for j in mine])
-    own = hac_covariance(fitted)[np.ix_(mine, mine)]
+    own = hac_covariance(problem, fitted)[np.ix_(mine, mine)]
     slopes = model.stiffness_jacobian(phi, alpha)
     variance = np.einsum("ij,jk,ik->i", slopes, own, slopes)
     return np.asarray(model.stiffness(phi, alpha)), np.sqrt(np.maximum(variance, 0.0))

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from estimator.diagnosis.bandwidth import choose_bandwidth
+from estimator.diagnosis.choices import choice
 from estimator.diagnosis.curves import best_curve
 from estimator.diagnosis.excitation import advice_for, poor
 from estimator.diagnosis.heldout import Held, errors_of, held_out
@@ -22,7 +23,7 @@ from estimator.diagnosis.outcome import (
     transmissions_of,
 )
 from estimator.diagnosis.result import Diagnosis, Errors, Finding, RecordingErrors, Verdict
-from estimator.diagnosis.search import EVEN, Progress, Search
+from estimator.diagnosis.search import Progress, Search
 from estimator.diagnosis.stiffness import stiffness_curves
 from estimator.effects import LIBRARY
 from estimator.errors import EstimatorError
@@ -32,11 +33,6 @@ from estimator.priors import PRIORS
 from estimator.sample import Record
 
 __all__ = ["diagnose"]
-
-_BLOCKS = 10  # of time, over which errors are compared
-_HELD = 3  # blocks that take no part where there is no other recording
-_FAR = 10.0  # times what a right model leaves: something is missing, whatever it is
-_CURVE = 0.6  # of what named effects leave: a curve without a name must come down to it to be told instead
 
 
 def diagnose(
@@ -76,7 +72,7 @@ def diagnose(
     if not 0.0 < bandwidth <= nyquist:
         raise EstimatorError(f"bandwidth: expected more than 0 and at most {nyquist:g} Hz, got {bandwidth:g}")
     alone = validation is None and len(records) == 1
-    problem = Problem(records, model, bandwidth, held=_HELD if alone else 0, blocks=_BLOCKS)
+    problem = Problem(records, model, bandwidth, held=alone)
     if min(problem.rows) < 60:
         raise EstimatorError(
             f"the recording is too short for a bandwidth of {bandwidth:g} Hz: "
@@ -153,12 +149,14 @@ class _Judge:
             notes.append("the motion is hardly more than one sine: many effects look alike in it")
             if not problem.frames[0].linked or not effects or any(f.alternatives for f in effects):
                 verdict = "insufficient_excitation"
-        train = errors_of(problem, before, after, problem.block >= 0)
+        train = errors_of(problem, before, after, problem.used)
         validation = self.held.errors(before, after)
         if verdict == "effect" and self.held.squared(after) > self.held.squared(before):
             verdict = "insufficient_excitation"
             notes.append("on data that took no part the effects do not lower the error: they are not written")
-        transmissions, unsure = transmissions_of(problem, after)
+        others = [found, null, *(r for each in rivals for r in each)]
+        accounts = [(self.search.chance(after, h), h) for h in others if h is not after]
+        transmissions, unsure = transmissions_of(problem, after, accounts)
         notes += unsure + self._doubts(effects)
         return Diagnosis(
             verdict=verdict,
@@ -190,8 +188,8 @@ class _Judge:
         return self.problem.null(pinned)
 
     def _even(self, found: Fitted, rivals: list[Fitted]) -> tuple[str, ...]:
-        """Effects that could stand in a term's place: posterior probability of one in twenty and more."""
-        close = [r for r in rivals if self.search.advantage(r, found) > np.log(EVEN)]
+        """Effects that could stand in a term's place: what the data do not tell from it."""
+        close = [r for r in rivals if self.search.chance(found, r) > choice("even")]
         names = [r.terms[-1].candidate.kind.name for r in close]
         own = [t.candidate.kind.name for t in found.terms]
         if "motor_inertia" in own and not self.problem.frames[0].linked:
@@ -204,7 +202,7 @@ class _Judge:
             return False
         named = min(self.held.squared(h) for h in (self.found, *self.search.leading()))
         free, before = self.held.squared(curve), self.held.squared(self.search.null)
-        return free < before and free < (_CURVE**2 if self.found.terms else 1.0) * named
+        return free < before and free < (choice("curve") ** 2 if self.found.terms else 1.0) * named
 
     def _remaining(self) -> Fitted | None:
         """A curve at the balance that names leave far from explained, where all its physics is declared."""
@@ -213,7 +211,7 @@ class _Judge:
             return None
         left = found.posterior.sigma / found.regression.floor
         worst = int(np.argmax(left)) % problem.equations
-        if float(np.max(left)) < _FAR:
+        if float(np.max(left)) < choice("far"):
             return None
         link = worst == problem.equations - 1
         return best_curve(self.search, found, ("link", None) if link else ("motor", worst))
@@ -253,7 +251,7 @@ class _Judge:
         problem, equations = self.problem, self.problem.equations
         made: list[RecordingErrors] = []
         for k in range(len(problem.signals)):
-            mine = (problem.group // equations == k) & (problem.block >= 0)
+            mine = (problem.group // equations == k) & problem.used
             train: Errors = errors_of(problem, before, after, mine)
             made.append(RecordingErrors(train, self.held.of(k, before, after)))
         return tuple(made)

@@ -40,6 +40,8 @@ pub enum Transmission {
 pub struct Motor {
     /// B, kg·m².
     pub inertia: f64,
+    /// Standard deviation of B as a share of it, where it is declared.
+    pub inertia_std: Option<f64>,
     /// D_θ, N·m·s/rad.
     pub damping: f64,
     /// See [`Transmission`].

@@ -152,6 +152,7 @@ pub fn model(joint: &Bound<'_, PyAny>) -> PyResult<Model> {
         let motor = motor?;
         motors.push(Motor {
             inertia: motor.getattr("inertia_kg_m2")?.extract()?,
+            inertia_std: motor.getattr("inertia_std_relative")?.extract()?,
             damping: motor.getattr("viscous_damping_nm_s_rad")?.extract()?,
             transmission: transmission(&motor.getattr("transmission")?)?,
             effects: elements(&motor.getattr("effects")?)?,

@@ -10,7 +10,7 @@ use crate::effects::{Corrections, MotorEffects};
 use crate::error::Error;
 use crate::external::{Carried, External, LinkMomentum};
 use crate::laws::Law;
-use crate::model::{Arrangement, Model};
+use crate::model::{Arrangement, Model, Motor};
 use crate::noise::NoiseMeter;
 use crate::sample::{Estimate, MOTORS, Sample, TransmissionEstimate, joint_estimate, status};
 use crate::sample_validator::SampleValidator;
@@ -73,16 +73,20 @@ impl Robust {
             model.motors.iter().map(|motor| MotorEffects::new(&motor.effects)).collect::<Result<_, _>>()?;
         let corrections = Corrections::new(&effects, &model.link_effects, period_s)?;
         let dt = every as f64 * period_s;
+        let own = |motor: &Motor| Priors {
+            motor_inertia: motor.inertia_std.unwrap_or(priors.motor_inertia),
+            ..*priors
+        };
         let transmissions: Vec<TransmissionEstimator> = (model.motors.iter().zip(effects))
             .map(|(motor, effects)| {
-                TransmissionEstimator::new(motor, effects, settings, priors, &filters, period_s, dt)
+                TransmissionEstimator::new(motor, effects, settings, &own(motor), &filters, period_s, dt)
             })
             .collect();
         let lead = model.motors.iter().position(|motor| motor.flexible()).unwrap_or(0);
         let known = Known {
             inertia: model.motors[lead].inertia,
             damping: model.motors[lead].damping,
-            inertia_std: priors.motor_inertia,
+            inertia_std: own(&model.motors[lead]).motor_inertia,
             damping_std: priors.viscous_damping,
             damping_share: priors.viscous_damping_floor,
         };

@@ -1,0 +1,127 @@
+"""What is believed about one joint before any data: the table of priors in the joint's own units."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from estimator.diagnosis.candidates import Candidate
+from estimator.diagnosis.choices import choice
+from estimator.diagnosis.frame import Frame
+from estimator.effects import LIBRARY
+from estimator.model import JointModel
+from estimator.priors import PRIORS
+
+__all__ = ["OF_RUN", "effect_std", "everyday", "everyday_std", "least"]
+
+OF_RUN = ("torque_offset", "deflection_offset")  # belong to a run, all else to the machine
+_AT_MOTOR = ("motor_inertia", "viscous_damping", "torque_offset", "torque_delay", "deflection_offset")
+_AT_LINK = ("encoder_delay", "link_inertia", "link_viscous_damping", "gravity")
+
+# Effects that take energy, never give it.
+_POSITIVE = {
+    "coulomb_friction",
+    "presliding_friction",
+    "load_dependent_friction",
+    "quadratic_damping",
+    "hysteresis",
+    "backlash",
+    "transmission_damping",
+    "link_coulomb_friction",
+    "contact",
+    "back_driving_loss",
+    "torque_saturation",
+    "stribeck_friction",
+    "asymmetric_friction",
+}
+
+
+def everyday(frame: Frame) -> list[Candidate]:
+    """The errors that every rig has: declared numbers that are not quite right, readings that are askew."""
+    made = []
+    for i, flexible in enumerate(frame.flexible):
+        names = [n for n in _AT_MOTOR if flexible or n not in ("deflection_offset", "torque_delay")]
+        made += [Candidate(LIBRARY[name], i) for name in names]
+    if frame.linked:
+        made += [Candidate(LIBRARY["torque_constant"], i) for i in range(len(frame.motors))]
+    for name in _AT_LINK:
+        if (frame.linked or name == "encoder_delay") and any(frame.flexible):
+            made.append(Candidate(LIBRARY[name], None))
+    return made
+
+
+def everyday_std(
+    frames: Sequence[Frame], candidate: Candidate, torque_rms: float, calibrating: bool
+) -> tuple[float, ...]:
+    """Prior standard deviation of each linear parameter of an everyday error; 0: it is none here.
+
+    Args:
+        frames: of all recordings.
+        candidate: the error.
+        torque_rms: of the motor torque without its mean, N·m.
+        calibrating: the recordings are of a healthy joint, and show what its declared numbers should be.
+    """
+    model, linked = frames[0].model, frames[0].linked
+    name, motor, link = candidate.kind.name, model.motors[candidate.motor or 0], model.link
+    std = PRIORS[name].std
+    if name in ("torque_delay", "encoder_delay"):
+        return (std * frames[0].signals.period_s,)
+    if name == "torque_offset":
+        # A healthy joint's constant is the zero between its encoders: the two cannot be separated.
+        return (0.0,) if linked or calibrating else (std * torque_rms,)
+    if name == "deflection_offset":
+        phi = frames[0].motors[candidate.motor or 0].deflection
+        return (0.0,) if linked and not calibrating else (std * float(np.ptp(phi)),)
+    if name == "torque_constant" and calibrating:
+        return (0.0,)  # the anchor
+    if linked and not calibrating:
+        # Both balances show a declared number that is off: then it is an effect, and has a name.
+        std = PRIORS["declared"].std
+    if name == "torque_constant":
+        return (std,)
+    if name == "motor_inertia":
+        return ((motor.inertia_std_relative or std) * motor.inertia_kg_m2,)
+    if name == "viscous_damping":
+        fast = max(float(np.max(np.abs(f.motors[candidate.motor or 0].velocity))) for f in frames)
+        floor = 0.0 if linked else PRIORS["viscous_damping_floor"].std * torque_rms / max(fast, 1e-300)
+        return (float(np.hypot(std * motor.viscous_damping_nm_s_rad, floor)),)
+    assert link is not None
+    if name == "link_inertia":
+        return (std * link.inertia_kg_m2,)
+    if name == "link_viscous_damping":
+        return (std * link.viscous_damping_nm_s_rad,)
+    return (std * abs(link.gravity_nm),) * 2
+
+
+def effect_std(model: JointModel, candidate: Candidate, by_torque: float) -> float:
+    """Prior standard deviation of an effect's linear parameter: by torque, or by what a reading is off."""
+    name = candidate.kind.name
+    if name == "motor_inertia":
+        return PRIORS["anchor"].std * model.motors[candidate.motor or 0].inertia_kg_m2
+    if name == "link_inertia" and model.link is not None:
+        return PRIORS["anchor"].std * model.link.inertia_kg_m2
+    if name in ("torque_constant", "torque_drift"):
+        return PRIORS["torque_scale"].std
+    if name in ("torque_delay", "torque_lag", "encoder_delay"):
+        return min(PRIORS["late"].std, by_torque)
+    return (
+        min(PRIORS[name].std, by_torque) if name in ("encoder_scale", "encoder_eccentricity") else by_torque
+    )
+
+
+def least(model: JointModel, candidate: Candidate) -> float:
+    """The bound that physics sets an effect's linear parameters, beyond what is declared."""
+    name = candidate.kind.name
+    motor, link = model.motors[candidate.motor or 0], model.link
+    if name in _POSITIVE:
+        return 0.0
+    if name == "motor_inertia":
+        return -choice("missing_inertia") * motor.inertia_kg_m2
+    if name == "viscous_damping":
+        return -motor.viscous_damping_nm_s_rad
+    if name == "link_inertia" and link is not None:
+        return -choice("missing_inertia") * link.inertia_kg_m2
+    if name == "link_viscous_damping" and link is not None:
+        return -link.viscous_damping_nm_s_rad
+    return -np.inf

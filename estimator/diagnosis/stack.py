@@ -1,0 +1,246 @@
+"""The columns of one linearised hypothesis: what each stands for, what is believed of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from estimator.diagnosis.base import Base
+from estimator.diagnosis.beliefs import OF_RUN, effect_std, everyday, everyday_std, least
+from estimator.diagnosis.candidates import Candidate, bounds_of, columns, reach_of, spread_of
+from estimator.diagnosis.choices import choice
+from estimator.diagnosis.evidence import Scale
+from estimator.diagnosis.frame import Corrections, Frame
+from estimator.diagnosis.readings import read
+from estimator.effects import STOP_EXPONENT, Coordinates
+from estimator.priors import PRIORS
+from estimator.sample import FloatArray
+
+__all__ = ["Extra", "Pinned", "Slot", "Stack", "Term", "curve_columns", "step_of", "stepped"]
+
+
+# How much more torque acts per unit of what is measured, for one unit of the parameter, on average.
+_TORQUE_SCALES: dict[str, Callable[[Coordinates, dict[str, float]], float]] = {
+    "torque_constant": lambda c, p: 1.0,
+    "torque_saturation": lambda c, p: -3.0 * float(np.mean(c.torque**2)),
+    "torque_drift": lambda c, p: 1.0 - float(np.mean(np.exp(-c.time / p["time_constant_s"]))),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """A missing effect with its nonlinear parameters, and its linear ones as last fitted."""
+
+    candidate: Candidate
+    values: dict[str, float]
+    weights: tuple[float, ...] = ()
+
+    @property
+    def free(self) -> list[str]:
+        """Nonlinear parameters that are fitted."""
+        law = ("exponent", "shape") if self.values.get("exponent", 1.0) >= STOP_EXPONENT else ()
+        return [name for name in self.values if name not in ("side", "power", *law)]
+
+
+class Extra(NamedTuple):
+    """Columns of a free curve beside a hypothesis: basis on coordinates, at a place."""
+
+    location: str
+    motor: int | None
+    coordinates: tuple[str, ...]
+    basis: Callable[..., FloatArray]
+
+
+# Everyday errors held at values, one for each part, by name and motor.
+Pinned = Mapping[tuple[str, int | None], tuple[float, ...]]
+
+
+class Slot(NamedTuple):
+    """What one column of the regression stands for.
+
+    Attributes:
+        kind: "base", "everyday", "term", "shape" (a nonlinear parameter), "curve".
+        name: of effect or parameter. motor: where it is. run: of which recording; None: of all.
+        place: index of the motor's alpha, of the term, or of the parameter of an effect.
+        taken: what has already been corrected, so that taken + x is the quantity.
+    """
+
+    kind: str
+    name: str
+    motor: int | None
+    run: int | None
+    place: int
+    part: int
+    taken: float
+
+
+class Stack:
+    """Collects columns, their slots and priors.
+
+    Args:
+        frames: of all recordings, flexibility torques filled in.
+        corrections: of the readings, one a recording.
+        declared: corrections by the model's own effects.
+        torque_rms: of the motor torque without its mean, N·m.
+        calibrating: the recordings are of a healthy joint.
+    """
+
+    def __init__(
+        self,
+        frames: Sequence[Frame],
+        corrections: Sequence[Corrections],
+        declared: Corrections,
+        torque_rms: float,
+        calibrating: bool,
+    ) -> None:
+        self.slots: list[Slot] = []
+        self.mean: list[float] = []
+        self.std: list[float] = []
+        self.low: list[float] = []
+        self._columns: list[FloatArray] = []
+        self._frames, self._model = frames, frames[0].model
+        self._corrections, self._declared = corrections, declared
+        self._torque_rms, self._calibrating = torque_rms, calibrating
+
+    @property
+    def design(self) -> FloatArray:
+        """(n, k) the columns."""
+        rows = sum(f.rows * f.equations for f in self._frames)
+        return np.stack(self._columns, axis=1) if self._columns else np.zeros((rows, 0))
+
+    def _add(
+        self, column: FloatArray, slot: Slot, width: float, centre: float = 0.0, low: float = -np.inf
+    ) -> None:
+        self._columns.append(column)
+        self.slots.append(slot)
+        self.mean.append(centre - slot.taken)
+        self.std.append(width)
+        self.low.append(low - slot.taken)
+
+    def transmissions(self, base: Base) -> None:
+        """Transmission parameters; the first of each, its stiffness, is not negative."""
+        design = np.concatenate([base.design(f) for f in self._frames])
+        wide = PRIORS["transmission"].std * self._torque_rms
+        j = 0
+        for i, alpha in enumerate(base.alpha):
+            for p, value in enumerate(alpha):
+                slot = Slot("base", "", i, None, p, 0, float(value))
+                low = 0.0 if p == 0 else -np.inf
+                self._add(design[:, j], slot, wide / _rms_of(design[:, j]), low=low)
+                j += 1
+
+    def everyday(self, without: set[tuple[str, int | None]], pinned: Pinned) -> None:
+        """The errors that every rig has, but for those that are terms."""
+        for candidate in everyday(self._frames[0]):
+            widths = everyday_std(self._frames, candidate, self._torque_rms, self._calibrating)
+            if candidate.key in without or not any(widths):
+                continue
+            name, motor = candidate.key
+            held = pinned.get(candidate.key)
+            parts = [columns(f, candidate, {}) for f in self._frames]
+            for run in range(len(self._frames)) if name in OF_RUN else (None,):
+                taken = self._taken(candidate, run or 0)
+                for p, width in enumerate(widths):
+                    slot = Slot("everyday", name, motor, run, p, p, float(taken[p]))
+                    column = _of_run(parts, p, run)
+                    if held is None:
+                        self._add(column, slot, width, low=least(self._model, candidate))
+                    else:
+                        self._add(column, slot, choice("pinned") * width, centre=held[p])
+
+    def term(self, k: int, term: Term) -> None:
+        """An effect, and once it has a size, its nonlinear parameters."""
+        candidate = term.candidate
+        parts = [columns(f, candidate, term.values) for f in self._frames]
+        taken = self._taken(candidate, 0)
+        width = PRIORS["effect"].std * self._torque_rms / np.sqrt(parts[0].shape[1])
+        for p in range(parts[0].shape[1]):
+            column = _of_run(parts, p, None)
+            std = effect_std(self._model, candidate, width / _rms_of(column))
+            slot = Slot("term", candidate.kind.name, candidate.motor, None, k, p, float(taken[p]))
+            self._add(column, slot, std, low=least(self._model, candidate))
+        if term.weights:
+            for name in term.free:
+                slot = Slot("shape", name, candidate.motor, None, k, 0, 0.0)
+                self._add(self._derivative(term, name), slot, 1.0)
+
+    def curve(self, extra: Extra) -> None:
+        """A free curve."""
+        shaped = np.concatenate([curve_columns(f, extra) for f in self._frames])
+        width = choice("curve_width") * PRIORS["effect"].std * self._torque_rms
+        for p, column in enumerate(shaped.T):
+            self._add(column, Slot("curve", "", extra.motor, None, p, 0, 0.0), width)
+
+    def scales(self, terms: Sequence[Term]) -> tuple[Scale, ...]:
+        """The motors' balances against the measured torque."""
+        made = []
+        equations = self._frames[0].equations
+        for i, coordinates in enumerate(self._frames[0].motors):
+            direction = np.zeros(len(self.slots))
+            for j, slot in enumerate(self.slots):
+                if slot.motor == i and slot.name in _TORQUE_SCALES:
+                    values = terms[slot.place].values if slot.kind == "term" else {}
+                    direction[j] = _TORQUE_SCALES[slot.name](coordinates, values)
+            if direction.any():
+                groups = tuple(k * equations + i for k in range(len(self._frames)))
+                made.append(Scale(groups, direction, 1.0))
+        return tuple(made)
+
+    def _taken(self, candidate: Candidate, run: int) -> FloatArray:
+        now, before = read(self._corrections[run], candidate), read(self._declared, candidate)
+        return np.subtract(now, before)
+
+    def _derivative(self, term: Term, name: str) -> FloatArray:
+        """Column of a nonlinear parameter, by a difference."""
+        step, scale = step_of(term, name, self._frames[0])
+        up, down = ({**term.values, name: term.values[name] + sign * step} for sign in (1.0, -1.0))
+        change = [columns(f, term.candidate, up) - columns(f, term.candidate, down) for f in self._frames]
+        return np.asarray(np.concatenate(change) @ np.array(term.weights) * (scale / (2.0 * step)))
+
+
+def curve_columns(frame: Frame, extra: Extra) -> FloatArray:
+    """Stacked columns of a free curve."""
+    made = []
+    for wave in extra.basis(frame.motors[extra.motor or 0]).T:
+        if extra.location == "motor":
+            made.append(frame.column(extra.motor, -wave, None))
+        elif extra.location == "transmission":
+            made.append(frame.column(extra.motor, wave, wave if frame.pulls[extra.motor or 0] else None))
+        else:
+            made.append(frame.column(None, None, wave))
+    return np.stack(made, axis=1)
+
+
+def step_of(term: Term, name: str, frame: Frame) -> tuple[float, float]:
+    """(step of a difference, prior standard deviation) of a nonlinear parameter, in its unit."""
+    value = term.values[name]
+    scale = reach_of(frame, term.candidate, name)
+    if scale is None:
+        return 1e-3 * abs(value), abs(value)
+    return 1e-3 * min(scale, spread_of(frame, term.candidate, name)), scale
+
+
+def stepped(term: Term, name: str, x: float, frame: Frame) -> dict[str, float]:
+    """The nonlinear parameters after a step; what is positive moves by factors, at most by two."""
+    value, scale = term.values[name], reach_of(frame, term.candidate, name)
+    if scale is None:
+        low, high = bounds_of(frame, term.candidate, name)
+        moved = value * float(np.exp(np.clip(x, -0.7, 0.7)))
+        return {**term.values, name: float(np.clip(moved, min(low, value), max(high, value)))}
+    most = spread_of(frame, term.candidate, name)
+    return {**term.values, name: value + float(np.clip(x * scale, -most, most))}
+
+
+def _of_run(parts: list[FloatArray], p: int, run: int | None) -> FloatArray:
+    return np.concatenate(
+        [part[:, p] if run in (None, k) else np.zeros(len(part)) for k, part in enumerate(parts)]
+    )
+
+
+def _rms_of(column: FloatArray) -> float:
+    """rms over the rows that a column enters; one where it enters none."""
+    used = column[np.abs(column) > 1e-100]
+    return float(np.sqrt(np.mean(used**2))) if len(used) else 1.0

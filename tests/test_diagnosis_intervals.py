@@ -1,0 +1,90 @@
+"""Intervals of a diagnosis hold where errors are no noise; how sure the inertia is can be declared."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import diagnosiskit as kit
+import numpy as np
+import pytest
+
+from drivelink import jointfile
+from drivelink.errors import JointFileError
+from estimator.diagnosis.covariance import hac_covariance
+from estimator.diagnosis.hypothesis import Fitted, Problem
+from estimator.model import JointModel
+from estimator.sample import FloatArray, Record
+
+PARTS = 4
+BANDWIDTH_HZ = 20.0
+# Physics that the declared model lacks, in sizes of some per cent of the torque.
+MISSING: list[dict[str, float]] = [
+    {"coulomb_nm": 0.4}, {"cogging_nm": 0.5}, {"hysteresis_nm": 0.6, "hysteresis_rad": 0.01},
+    {"ripple": 0.2}, {"bump_nm": 1.0}, {"fading_nm": 0.8},
+]  # fmt: skip
+
+
+def part(record: Record, rows: slice) -> Record:
+    assert record.link_position_rad is not None
+    return replace(
+        record,
+        sequence=record.sequence[rows],
+        motor_position_rad=record.motor_position_rad[rows],
+        motor_torque_nm=record.motor_torque_nm[rows],
+        link_position_rad=record.link_position_rad[rows],
+    )
+
+
+def parts(record: Record) -> list[Record]:
+    length = len(record) // PARTS
+    return [part(record, slice(k * length, (k + 1) * length)) for k in range(PARTS)]
+
+
+def stiffness(record: Record, model: JointModel) -> tuple[float, float]:
+    """K and its standard deviation under the declared model, nothing searched."""
+    problem = Problem([record], model, BANDWIDTH_HZ)
+    fitted = problem.null()
+    return k_of(fitted), float(np.sqrt(hac_covariance(problem, fitted)[0, 0]))
+
+
+def k_of(fitted: Fitted) -> float:
+    assert fitted.slots[0].kind == "base"
+    return float(fitted.slots[0].taken + fitted.posterior.x[0])
+
+
+def chi_squared(k: FloatArray, std: FloatArray) -> float:
+    mean = np.sum(k / std**2) / np.sum(1.0 / std**2)
+    return float(np.sum(((k - mean) / std) ** 2))
+
+
+def test_parts_of_a_recording_agree_within_what_is_said_though_physics_is_missing() -> None:
+    """Without the link's dynamics, as most machines are; nothing of what is missing is declared."""
+    model = kit.model(linked=False)
+    pairs = [
+        np.array([stiffness(one, model) for one in parts(record)]).T for record in kit.World(MISSING).run()
+    ]
+    freedom = len(MISSING) * (PARTS - 1)
+    ratio = sum(chi_squared(k, std) for k, std in pairs) / freedom
+    # 18 degrees of freedom: chance alone moves the ratio between 0.46 and 1.75 (95 %).
+    assert 0.4 < ratio < 1.75
+
+
+def test_an_inertia_that_is_declared_unsure_gives_way() -> None:
+    """Twenty per cent too much, declared as good as the default and as unsure as it is."""
+    (record,) = kit.World([{}]).run()
+    exact = kit.model(linked=False)
+    heavy = replace(exact.motors[0], inertia_kg_m2=1.2 * kit.INERTIA)
+    usual, unsure = (
+        stiffness(record, replace(exact, motors=(replace(heavy, inertia_std_relative=std),)))
+        for std in (None, 0.5)
+    )
+    assert abs(unsure[0] - kit.STIFFNESS) < 3.0 * unsure[1]
+    assert abs(unsure[0] - kit.STIFFNESS) < abs(usual[0] - kit.STIFFNESS)
+
+
+def test_the_joint_file_says_how_sure_the_inertia_is() -> None:
+    text = 'name = "axis"\n[[motor]]\ninertia_kg_m2 = 0.1\ninertia_std_relative = {}\n'
+    assert jointfile.parse(text.format(0.2)).model().motors[0].inertia_std_relative == 0.2
+    for wrong in ("0.0", "-0.1", '"wide"'):
+        with pytest.raises(JointFileError, match="inertia_std_relative"):
+            jointfile.parse(text.format(wrong))

@@ -33,9 +33,9 @@ from estimator.sample import Record
 
 SIMULATED = ("clean", "coulomb_friction", "presliding_friction", "cogging", "hysteresis", "gravity")
 SEED = 700  # of the simulated joints, and one more each
-SECONDS = 40.0
+SECONDS = 20.0
 SIMULATED_HZ = 20.0
-LEAST_PERIODS = 40  # of the bandwidth in a part: a minute's motion of a slow joint, two seconds of a fast one
+LEAST_S = 4.0  # of a part: a second more than `diagnose` asks for
 MOST_PARTS = 9
 
 
@@ -77,10 +77,9 @@ def _record(run: Run, data: Path, shaft_line: Path | None) -> Record:
     return recording.read(data / run.train, joint_of(run))
 
 
-def parts_of(record: Record, bandwidth_hz: float) -> list[Record]:
+def parts_of(record: Record) -> list[Record]:
     """Disjoint parts of one length, long enough to be diagnosed."""
-    seconds = len(record) * record.period_s
-    count = int(np.clip(seconds * bandwidth_hz / LEAST_PERIODS, 1, MOST_PARTS))
+    count = int(np.clip(len(record) * record.period_s / LEAST_S, 1, MOST_PARTS))
     edges = np.linspace(0, len(record), count + 1).astype(int)
     return [_rows(record, slice(a, b)) for a, b in pairwise(edges)]
 
@@ -140,7 +139,7 @@ def main() -> None:
     print("| recording | parts told | std, median | chi²/dof of the parts | of the machine | against known |")
     print("|---|---|---|---|---|---|")
     for one in track(list(machines(args.data, args.shaft_line, args.machines)), "recordings"):
-        parts = [stiffness_of(part, one) for part in parts_of(one.record, one.bandwidth_hz)]
+        parts = [stiffness_of(part, one) for part in parts_of(one.record)]
         outcomes.append({**one._asdict(), "record": None, "model": None, "parts": parts})
         told = [p for p in parts if p["k"] is not None]
         square, freedom = agreement(parts)

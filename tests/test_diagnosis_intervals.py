@@ -69,17 +69,17 @@ def test_parts_of_a_recording_agree_within_what_is_said_though_physics_is_missin
     assert 0.4 < ratio < 1.75
 
 
-def test_an_inertia_that_is_declared_unsure_gives_way() -> None:
-    """Twenty per cent too much, declared as good as the default and as unsure as it is."""
+def test_an_inertia_moves_as_far_as_it_is_declared_unsure() -> None:
+    """Twenty per cent too much, declared unsure and declared as certain."""
     (record,) = kit.World([{}]).run()
     exact = kit.model(linked=False)
     heavy = replace(exact.motors[0], inertia_kg_m2=1.2 * kit.INERTIA)
-    usual, unsure = (
-        stiffness(record, replace(exact, motors=(replace(heavy, inertia_std_relative=std),)))
-        for std in (None, 0.5)
-    )
-    assert abs(unsure[0] - kit.STIFFNESS) < 3.0 * unsure[1]
-    assert abs(unsure[0] - kit.STIFFNESS) < abs(usual[0] - kit.STIFFNESS)
+    found = {}
+    for std in (0.5, 1e-5):
+        declared = replace(exact, motors=(replace(heavy, inertia_std_relative=std),))
+        (found[std],) = Problem([record], declared, BANDWIDTH_HZ).null().total("everyday", "motor_inertia", 0)
+    assert found[0.5] == pytest.approx(-0.2 * kit.INERTIA, rel=0.02)
+    assert abs(found[1e-5]) < 0.02 * kit.INERTIA
 
 
 def test_the_joint_file_says_how_sure_the_inertia_is() -> None:

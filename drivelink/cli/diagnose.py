@@ -52,7 +52,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--joint", type=Path, metavar="JOINT", help="joint file; left out: the one that the recording carries"
     )
     parser.add_argument(
-        "--validate", type=Path, metavar="RECORDING2", help="data that takes no part in any fit: an effect is kept only if it lowers the error there"
+        "--validate",
+        type=Path,
+        metavar="RECORDING2",
+        help="data that takes no part in any fit: an effect is kept only if it lowers the error there",
     )
     parser.add_argument(
         "--bandwidth-hz", type=float, metavar="F", help="of the filter that all channels share"

@@ -36,6 +36,12 @@ class Candidate:
         return self.kind.name, self.motor
 
     @property
+    def bends(self) -> bool:
+        """Whether it is a function of the deflection alone, as the transmission's model is."""
+        kind = self.kind
+        return kind.location == "transmission" and kind.coordinate == "deflection" and kind.law is None
+
+    @property
     def family(self) -> tuple[str, str, str, int | None]:
         """What it shares with other laws for the same thing: place, channel and coordinate."""
         kind = self.kind

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
+from scipy.stats import t as student
 
 from estimator.diagnosis.choices import whole
 from estimator.diagnosis.hypothesis import Fitted, Problem, stretches
@@ -19,6 +20,8 @@ from estimator.sample import FloatArray
 
 __all__ = ["hac_covariance"]
 
+
+_LEVEL = 0.975  # of a two-sided 95 % interval
 
 Labels = NDArray[np.int64]
 
@@ -57,7 +60,12 @@ def hac_covariance(problem: Problem, fitted: Fitted) -> FloatArray:
 def _jackknife(
     fitted: Fitted, free: NDArray[np.int64], unit: FloatArray, bread: FloatArray, labels: Labels
 ) -> FloatArray:
-    """Covariance of x / unit by leaving out one group of rows after the other, noise as it is."""
+    """Covariance of x / unit by leaving out one group of rows after the other, noise as it is.
+
+    Few groups leave the variance unsure, and a parameter that only some of them tell has fewer still: their
+    effective number is (sum h)^2 / sum h^2, h the part of each in its variance. Standard deviations are those
+    whose 1.96-fold is the 95 % interval of the t distribution that this leaves.
+    """
     regression = fitted.regression
     weight = np.sqrt(1.0 / (fitted.times * fitted.posterior.sigma**2))[regression.group]
     rows = regression.design[:, free] * (weight[:, None] * unit)
@@ -65,14 +73,18 @@ def _jackknife(
     precision = np.linalg.inv(bread)
     total = np.zeros_like(bread)
     groups = np.unique(labels[labels >= 0])
+    parts = []
     for group in groups:
         mine = labels == group
         a = rows[mine]
         change = np.linalg.solve(precision - a.T @ a, a.T @ left[mine])
         total += np.outer(change, change)
+        parts.append(np.sum((a @ bread) ** 2, axis=0))
+    h = np.array(parts)
+    freedom = np.sum(h, axis=0) ** 2 / np.maximum(np.sum(h**2, axis=0), 1e-300) - 1.0
+    wider = student.ppf(_LEVEL, np.maximum(freedom, 1.0)) / student.ppf(_LEVEL, np.inf)
     count = len(groups)
-    # The variance of so few groups is uncertain itself: that of a t distribution.
-    return np.asarray(total * ((count - 1) / count * (count - 1) / max(count - 3, 1)))
+    return np.asarray(total * np.outer(wider, wider) * (count - 1) / count)
 
 
 def _kinds(problem: Problem, fitted: Fitted) -> Labels:

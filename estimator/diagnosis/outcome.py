@@ -129,18 +129,20 @@ def alignment_of(problem: Problem, after: Fitted, effects: list[Finding]) -> dic
 
 
 def transmissions_of(
-    problem: Problem, after: Fitted, accounts: Sequence[tuple[float, Fitted]] = ()
+    search: Search, after: Fitted, accounts: Sequence[tuple[float, Fitted]] = ()
 ) -> tuple[tuple[Refitted, ...], list[str]]:
     """Each motor's transmission, and doubts about them.
 
     Its covariance is that of the fit and that between the accounts of the data (Bayesian model averaging;
     Hoeting et al., Statistical Science 14, 1999): where another set of effects would do as well, it may ask
-    for another stiffness.
+    for another stiffness. And it holds what any one effect that was not needed could make of it.
 
     A stiffness that is not above zero, or whose interval includes zero, is no stiffness: its parameters are
     left out, and a doubt says so.
     """
+    problem = search.problem
     covariance = hac_covariance(problem, after)
+    unseen = search.unseen(after)
     made: list[Refitted] = []
     doubts = []
     for i, model in enumerate(after.base.models(problem.frames[0])):
@@ -153,6 +155,7 @@ def transmissions_of(
         phi = problem.frames[0].motors[i].deflection
         middle = float(np.median(np.abs(phi)))
         slope = np.asarray(model.stiffness_jacobian(np.array([middle]), alpha))[0]
+        own = own + max((x[np.ix_(mine, mine)] for x in unseen), key=lambda x: float(slope @ x @ slope))
         stiffness = float(np.asarray(model.stiffness(np.array([middle]), alpha))[0])
         std = float(np.sqrt(max(slope @ own @ slope, 0.0)))
         if not stiffness - 1.96 * std > 0.0 or any(after.posterior.bound[mine]):

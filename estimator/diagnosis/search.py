@@ -8,9 +8,10 @@ probability of one in their number (Scott and Berger, Annals of Statistics 38, 2
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from statistics import NormalDist
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,6 +36,26 @@ class _Columns:
     candidate: Candidate
     values: list[dict[str, float]]
     stacked: list[FloatArray]
+
+
+class _Tried(NamedTuple):
+    """An effect beside a hypothesis: its nonlinear parameters, gain of evidence, how x moves with it."""
+
+    values: dict[str, float]
+    gain: float
+    shift: FloatArray  # (k, m) of x per prior standard deviation of the effect's parameters
+    precision: FloatArray  # (m, m) of these
+
+    def more(self) -> FloatArray:
+        """(k, k) by which the covariance of x grows."""
+        if not math.isfinite(self.gain):
+            return np.zeros((len(self.shift),) * 2)
+        return np.asarray(self.shift @ np.linalg.solve(self.precision, self.shift.T))
+
+
+class _Beside(NamedTuple):
+    candidate: Candidate
+    tried: list[_Tried]
 
 
 class Search:
@@ -186,42 +207,61 @@ class Search:
             parent: the hypothesis.
             like: an effect whose whole family is wanted, whatever it promises.
         """
-        problem, posterior = self.problem, parent.posterior
-        rows = parent.regression.used
-        weight = (1.0 / (parent.times * posterior.sigma**2))[problem.group[rows]]
-        design = parent.regression.design[rows]
-        left = parent.regression.residual(posterior.x)[rows] * weight
-        taken = {t.candidate.key for t in parent.terms}
-        scale = PRIORS["effect"].std * problem.torque_rms
         found = []
-        for entry in self._library:
-            if entry.candidate.key in taken:
-                continue
-            gains = []
-            for made in entry.stacked:
-                c = made[rows]
-                sizes = np.sqrt(np.mean(c * c, axis=0)) + 1e-100
-                std = np.array(
-                    [
-                        effect_std(problem.model, entry.candidate, scale / np.sqrt(c.shape[1]) / x)
-                        for x in sizes
-                    ]
-                )
-                cross = (design * weight[:, None]).T @ c
-                inner = c.T @ (c * weight[:, None]) - cross.T @ posterior.covariance @ cross
-                side = (c.T @ left) * std
-                scaled = np.eye(len(std)) + inner * np.outer(std, std)
-                sign, logdet = np.linalg.slogdet(scaled)
-                gain = 0.5 * float(side @ np.linalg.solve(scaled, side)) - 0.5 * float(logdet)
-                gains.append(gain if sign > 0.0 and math.isfinite(gain) else -math.inf)
-            best = int(np.argmax(gains))
-            found.append(
-                (gains[best] - math.log(len(gains)), Term(entry.candidate, dict(entry.values[best])))
-            )
+        for beside in self._library_beside(parent):
+            best = max(beside.tried, key=lambda one: one.gain)
+            price = math.log(len(beside.tried))
+            found.append((best.gain - price, Term(beside.candidate, dict(best.values))))
         found.sort(key=lambda pair: -pair[0])
         tried = whole("tried")
         more = [t for _, t in found[tried:] if like is not None and t.candidate.family == like.family]
         return [term for _, term in found[:tried]] + more
+
+    def unseen(self, parent: Fitted) -> list[FloatArray]:
+        """What each effect that is not in a hypothesis adds to its covariance, as large as effects may be.
+
+        An effect that was not needed may be there all the same, where the motion does not tell it from the
+        rest: a gear that loses torque, and is always driven the same way, looks like a softer spring. This is
+        the covariance of the larger model less that of the hypothesis (consider covariance; S. F. Schmidt,
+        Advances in Control Systems 3, 1966).
+
+        Returns:
+            (k, k) for each effect of the library, at the shape that promises most; not of those that bend the
+            transmission's curve, which make another model of it.
+        """
+        return [
+            max(one.tried, key=lambda x: x.gain).more()
+            for one in self._library_beside(parent)
+            if not one.candidate.bends
+        ]
+
+    def _library_beside(self, parent: Fitted) -> Iterator[_Beside]:
+        """Every effect that a hypothesis has not, over its grid, linearised."""
+        problem, posterior = self.problem, parent.posterior
+        rows = parent.regression.used
+        weight = (1.0 / (parent.times * posterior.sigma**2))[problem.group[rows]]
+        design = parent.regression.design[rows] * weight[:, None]
+        left = parent.regression.residual(posterior.x)[rows] * weight
+        taken = {t.candidate.key for t in parent.terms}
+        scale = PRIORS["effect"].std * problem.torque_rms
+        for entry in self._library:
+            if entry.candidate.key in taken:
+                continue
+            tried = []
+            for values, made in zip(entry.values, entry.stacked, strict=True):
+                c = made[rows]
+                sizes = np.sqrt(np.mean(c * c, axis=0)) + 1e-100
+                by_torque = scale / np.sqrt(c.shape[1]) / sizes
+                std = np.array([effect_std(problem.model, entry.candidate, x) for x in by_torque])
+                shift = posterior.covariance @ (design.T @ c) * std
+                inner = (c.T @ (c * weight[:, None])) * np.outer(std, std) - (design.T @ c * std).T @ shift
+                side = (c.T @ left) * std
+                scaled = np.eye(len(std)) + inner
+                sign, logdet = np.linalg.slogdet(scaled)
+                gain = 0.5 * float(side @ np.linalg.solve(scaled, side)) - 0.5 * float(logdet)
+                usable = sign > 0.0 and math.isfinite(gain)
+                tried.append(_Tried(values, gain if usable else -math.inf, shift, scaled))
+            yield _Beside(entry.candidate, tried)
 
 
 def _parameters(term: Term) -> int:

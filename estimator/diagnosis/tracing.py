@@ -149,6 +149,11 @@ class _Judge:
             notes.append("the motion is hardly more than one sine: many effects look alike in it")
             if not problem.frames[0].linked or not effects or any(f.alternatives for f in effects):
                 verdict = "insufficient_excitation"
+        elif verdict == "sufficient" and (left := self._left(found)) > PRIORS["effect"].std:
+            notes.append(
+                f"the model leaves {left:.0%} of the torque, and the recording does not tell what is missing"
+            )
+            verdict = "insufficient_excitation"
         train = errors_of(problem, before, after, problem.used)
         validation = self.held.errors(before, after)
         if verdict == "effect" and self.held.squared(after) > self.held.squared(before):
@@ -156,7 +161,7 @@ class _Judge:
             notes.append("on data that took no part the effects do not lower the error: they are not written")
         others = [found, null, *(r for each in rivals for r in each)]
         accounts = [(self.search.chance(after, h), h) for h in others if h is not after]
-        transmissions, unsure = transmissions_of(problem, after, accounts)
+        transmissions, unsure = transmissions_of(self.search, after, accounts)
         notes += unsure + self._doubts(effects)
         return Diagnosis(
             verdict=verdict,
@@ -238,6 +243,10 @@ class _Judge:
                     "stiffness look alike: check the declared inertia and torque constant first"
                 ]
         return []
+
+    def _left(self, found: Fitted) -> float:
+        """Error of the motors' balances over the torque."""
+        return float(np.sqrt(np.mean(np.square(self._floor(found))))) / self.problem.torque_rms
 
     def _floor(self, after: Fitted) -> list[float]:
         left = after.regression.residual(after.posterior.x)

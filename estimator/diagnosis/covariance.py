@@ -1,10 +1,10 @@
 """How sure a fitted hypothesis is on a machine, where errors are no noise.
 
 What a model lacks leaves errors that last (they are alike at neighbouring times) and that depend on what the
-joint does (they are alike in like states, however far apart in time). Both are told by refitting without
-groups of rows: without each stretch of time, and without each kind of motion (delete-a-group jackknife;
-the heteroscedasticity and autocorrelation consistent covariance CR3 of Bell and McCaffrey, Survey Methodology
-28, 2002, clustered two ways: Cameron, Gelbach and Miller, J. of Business and Economic Statistics 29, 2011).
+joint does (they are alike in like states, however far apart in time). So rows are grouped twice, by stretches
+of time and by kinds of motion, and errors of one group belong together: a heteroscedasticity and
+autocorrelation consistent covariance by clusters (CR2 of Bell and McCaffrey, Survey Methodology 28, 2002),
+clustered two ways (Cameron, Gelbach and Miller, J. of Business and Economic Statistics 29, 2011).
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from estimator.sample import FloatArray
 __all__ = ["hac_covariance"]
 
 
+_FULL = 1e-9  # leverage is below one by the priors; this only keeps a division from rounding
 _LEVEL = 0.975  # of a two-sided 95 % interval
 
 Labels = NDArray[np.int64]
@@ -29,9 +30,8 @@ Labels = NDArray[np.int64]
 def hac_covariance(problem: Problem, fitted: Fitted) -> FloatArray:
     """(k, k) covariance of the posterior's parameters.
 
-    Time and motion each leave out one group of rows after the other; what is in both groupings by chance, the
-    rows that share a stretch and a kind, is counted once. The part of the priors is added. It is never less
-    than the posterior's own covariance.
+    That by stretches of time, and what kinds of motion add to it beyond rows that share both. The part of the
+    priors is added. It is never less than the posterior's own covariance.
 
     Args:
         problem: the recordings.
@@ -48,7 +48,7 @@ def hac_covariance(problem: Problem, fitted: Fitted) -> FloatArray:
     stretch = stretches(problem)
     kind = np.where(stretch < 0, -1, _kinds(problem, fitted))
     both = np.where(stretch < 0, -1, stretch * whole("groups") + kind)
-    by_time, by_kind, by_both = (_jackknife(fitted, free, unit, bread, x) for x in (stretch, kind, both))
+    by_time, by_kind, by_both = (_clustered(fitted, free, unit, bread, x) for x in (stretch, kind, both))
     values, vectors = np.linalg.eigh(by_kind - by_both)
     prior = np.diag((unit / fitted.regression.std[free]) ** 2)
     total = by_time + (vectors * np.maximum(values, 0.0)) @ vectors.T + bread @ prior @ bread
@@ -57,34 +57,36 @@ def hac_covariance(problem: Problem, fitted: Fitted) -> FloatArray:
     return out
 
 
-def _jackknife(
+def _clustered(
     fitted: Fitted, free: NDArray[np.int64], unit: FloatArray, bread: FloatArray, labels: Labels
 ) -> FloatArray:
-    """Covariance of x / unit by leaving out one group of rows after the other, noise as it is.
+    """Covariance of x / unit where errors of one group of rows belong together, noise as it is.
 
-    Few groups leave the variance unsure, and a parameter that only some of them tell has fewer still: their
-    effective number is (sum h)^2 / sum h^2, h the part of each in its variance. Standard deviations are those
-    whose 1.96-fold is the 95 % interval of the t distribution that this leaves.
+    What a fit takes of a group's errors by its leverage H is given back: (1 - H)^(-1/2) e (CR2). Few groups
+    leave the variance unsure, and a parameter that only some of them tell has fewer still: their effective
+    number is (sum h)^2 / sum h^2, h the part of each in its variance. Standard deviations are those whose
+    1.96-fold is the 95 % interval of the t distribution that this leaves.
     """
     regression = fitted.regression
     weight = np.sqrt(1.0 / (fitted.times * fitted.posterior.sigma**2))[regression.group]
     rows = regression.design[:, free] * (weight[:, None] * unit)
     left = regression.residual(fitted.posterior.x) * weight
-    precision = np.linalg.inv(bread)
+    root = np.linalg.cholesky(bread)
     total = np.zeros_like(bread)
-    groups = np.unique(labels[labels >= 0])
     parts = []
+    groups = np.unique(labels[labels >= 0])
     for group in groups:
         mine = labels == group
-        a = rows[mine]
-        change = np.linalg.solve(precision - a.T @ a, a.T @ left[mine])
+        a, e = rows[mine], left[mine]
+        u, s, _ = np.linalg.svd(a @ root, full_matrices=False)  # H = u s² u'
+        e = e + u @ ((1.0 / np.sqrt(np.maximum(1.0 - s**2, _FULL)) - 1.0) * (u.T @ e))
+        change = bread @ (a.T @ e)
         total += np.outer(change, change)
         parts.append(np.sum((a @ bread) ** 2, axis=0))
     h = np.array(parts)
     freedom = np.sum(h, axis=0) ** 2 / np.maximum(np.sum(h**2, axis=0), 1e-300) - 1.0
     wider = student.ppf(_LEVEL, np.maximum(freedom, 1.0)) / student.ppf(_LEVEL, np.inf)
-    count = len(groups)
-    return np.asarray(total * np.outer(wider, wider) * (count - 1) / count)
+    return np.asarray(total * np.outer(wider, wider))
 
 
 def _kinds(problem: Problem, fitted: Fitted) -> Labels:

@@ -39,7 +39,7 @@ class Candidate:
     def bends(self) -> bool:
         """Whether it is a function of the deflection alone, as the transmission's model is."""
         kind = self.kind
-        return kind.location == "transmission" and kind.coordinate == "deflection" and kind.law is None
+        return kind.location == "transmission" and kind.coordinate == "deflection" and not kind.remembers
 
     @property
     def family(self) -> tuple[str, str, str, int | None]:

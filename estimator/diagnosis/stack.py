@@ -22,6 +22,8 @@ from estimator.sample import FloatArray
 __all__ = ["Extra", "Pinned", "Slot", "Stack", "Term", "curve_columns", "step_of", "stepped"]
 
 
+_SIGNED = ("position_rad",)  # nonlinear parameters that may be negative
+
 # How much more torque acts per unit of what is measured, for one unit of the parameter, on average.
 _TORQUE_SCALES: dict[str, Callable[[Coordinates, dict[str, float]], float]] = {
     "torque_constant": lambda c, p: 1.0,
@@ -220,7 +222,8 @@ def step_of(term: Term, name: str, frame: Frame) -> tuple[float, float]:
     scale = reach_of(frame, term.candidate, name)
     if scale is None:
         return 1e-3 * abs(value), abs(value)
-    return 1e-3 * min(scale, spread_of(frame, term.candidate, name)), scale
+    step = 1e-3 * min(scale, spread_of(frame, term.candidate, name))
+    return (step if name in _SIGNED else min(step, 0.5 * value)), scale
 
 
 def stepped(term: Term, name: str, x: float, frame: Frame) -> dict[str, float]:
@@ -231,7 +234,8 @@ def stepped(term: Term, name: str, x: float, frame: Frame) -> dict[str, float]:
         moved = value * float(np.exp(np.clip(x, -0.7, 0.7)))
         return {**term.values, name: float(np.clip(moved, min(low, value), max(high, value)))}
     most = spread_of(frame, term.candidate, name)
-    return {**term.values, name: value + float(np.clip(x * scale, -most, most))}
+    moved = value + float(np.clip(x * scale, -most, most))
+    return {**term.values, name: moved if name in _SIGNED else max(moved, 0.5 * value)}
 
 
 def _of_run(parts: list[FloatArray], p: int, run: int | None) -> FloatArray:

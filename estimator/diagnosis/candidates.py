@@ -39,14 +39,14 @@ class Candidate:
     def bends(self) -> bool:
         """Whether it is a function of the deflection alone, as the transmission's model is."""
         kind = self.kind
-        return kind.location == "transmission" and kind.coordinate == "deflection" and not kind.remembers
+        return kind.location == "transmission" and kind.coordinates == ("deflection",) and not kind.remembers
 
     @property
     def family(self) -> tuple[str, str, str, int | None]:
         """What it shares with other laws for the same thing: place, channel and coordinate."""
         kind = self.kind
         # Friction with memory is friction: a function of the position's past that changes with the direction.
-        coordinate = "velocity" if kind.remembers and kind.location == "motor" else kind.coordinate
+        coordinate = "velocity" if kind.remembers and kind.location == "motor" else kind.coordinates[0]
         return kind.location, kind.channel, coordinate, self.motor
 
 

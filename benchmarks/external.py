@@ -312,7 +312,7 @@ def nominal(rig: Rig, model: JointModel, motion: Motion) -> np.ndarray:
 
 
 def judge(rig: Rig, told: np.ndarray, contact: np.ndarray, motion: Motion, seed: int) -> dict[str, float]:
-    """Error where something is told (else NaN), smallest push, delay."""
+    """Error where a value is valid (else NaN), smallest push, delay."""
     g = rig.plant.link.gravity_nm
     errors, delays = [], []
     found: dict[float, list[bool]] = {size: [] for size in LADDER}

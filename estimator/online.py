@@ -32,7 +32,7 @@ class Estimator(Protocol):
 
     @property
     def consistency(self) -> Consistency | None:
-        """Whether both sides of the joint have told one flexibility torque of late; None: not known."""
+        """Whether both sides of the joint have lately agreed on the flexibility torque; None: not known."""
 
     def step(self, sample: Sample) -> Estimate:
         """The estimate at this sample. Never raises, whatever floats the sample holds.

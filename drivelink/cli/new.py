@@ -139,7 +139,7 @@ def _new_text(args: argparse.Namespace) -> tuple[str, str, list[str]]:
     remarks = [f"motor inertia at the joint: {answers.conversion}"] if answers.conversion else []
     if answers.joint_inertia_kg_m2 is None:
         remarks.append(
-            "motor.inertia_kg_m2 is a placeholder: --rotor-inertia (g·cm²) and --gear, or --inertia, tell it"
+            "motor.inertia_kg_m2 is a placeholder: set --rotor-inertia (g·cm²) and --gear, or --inertia"
         )
     return text, answers.name, remarks
 

@@ -127,7 +127,7 @@ def _executable() -> Path:
 
 
 def _systemctl(*words: str) -> None:
-    """Tell systemd.
+    """Notify systemd.
 
     Raises:
         DrivelinkError: there is none, or it says no.

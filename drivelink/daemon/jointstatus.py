@@ -177,7 +177,7 @@ class JointStatus:
         return {"active": active, **(watch.describe() if watch is not None else {})}
 
     def _external(self) -> dict[str, Any] | None:
-        """What touches the link, and whether both sides of the joint tell one flexibility torque."""
+        """What touches the link, and whether both sides of the joint agree on the flexibility torque."""
         told = self._lane.chain.external
         if told is None:
             return None

@@ -39,7 +39,7 @@ _LEAST_COUNTS = 50  # that have to pass for a judgement
 _TOLERANCE = 0.15  # relative; velocities are filtered in the drive
 _LINK_TOLERANCE = 0.35  # the transmission bends
 _STALL = 4.0  # turns without an answer after which the motion between is not known
-_PROMPT = 1.5  # times the usual wait for an answer: what came later tells less of when it was read
+_PROMPT = 1.5  # times the usual wait for an answer: what came later says less about when it was read
 _LONGER = "move the joint during the check, by its controller (--seconds 20 gives more time)"
 
 

@@ -66,7 +66,7 @@ class SampleTap:
                 self.gathered.add(sample)
 
     def _measure(self, cob_id: int, stamp_ns: int) -> None:
-        """The first SYNCs tell the period."""
+        """The first SYNCs give the period."""
         if cob_id != SYNC_COB_ID:
             return
         self._syncs_ns.append(stamp_ns)

@@ -104,7 +104,7 @@ class Judgement:
         findings: what is wrong; empty where nothing is, and where nothing can be told.
         untold: units and signs that this motion does not reveal, in words: with them wrong it would look as
             likely. Empty where something is found.
-        reason: why nothing can be told at all; empty where something can.
+        reason: why nothing can be decided at all; empty where something can.
         left: share of the torque that the balance leaves, put right.
     """
 
@@ -115,7 +115,7 @@ class Judgement:
 
     @property
     def remark(self) -> str:
-        """What cannot be told, in words; empty where everything can."""
+        """What cannot be decided, in words; empty where everything can."""
         if self.reason:
             return f"units and signs cannot be checked: {self.reason}"
         return f"this motion does not reveal {' or '.join(self.untold)}" if self.untold else ""

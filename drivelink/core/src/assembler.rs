@@ -6,7 +6,7 @@
 //! the first to have been late, and are flagged.
 //!
 //! No clock is read here: the same frames in the same order give the same samples, live or from a log. How many periods
-//! have passed since the last SYNC is told by whoever has its stamp.
+//! have passed since the last SYNC is given by the caller, who has its stamp.
 
 use estimator_core::sample::{MOTORS, Sample};
 
@@ -224,7 +224,7 @@ impl Assembler {
         }
         if jump <= 0 {
             self.extra_syncs += 1;
-            self.spoiled = true; // what comes now answers that SYNC, or ours: nobody can tell
+            self.spoiled = true; // what comes now answers that SYNC or ours: unknowable
             self.untimed = DOUBT_CYCLES;
             for slot in self.slots.iter_mut().filter(|slot| slot.timed()) {
                 slot.suspect = DOUBT_CYCLES; // nor of those that come after ours

@@ -1,7 +1,7 @@
 //! Two readings of one quantity, held against each other.
 //!
-//! A drive often tells a quantity twice: its velocity beside its position, its current beside its torque, a second
-//! encoder, its following error. What the second reading tells is a line of the first, y = s x + l ẋ + o: a scale, a
+//! A drive often reports a quantity twice: its velocity beside its position, its current beside its torque, a second
+//! encoder, its following error. The second reading is a line of the first, y = s x + l ẋ + o: a scale, a
 //! lag and a zero, which are learned while both agree. In blocks of [`BLOCK_PERIODS`] the means of both are compared
 //! (of a velocity: what it integrates to, and how far the position has come). The last [`WINDOW`] blocks with
 //! information in them are tested together: r = y - h x̂ ~ N(0, κ² (I + H P Hᵀ)) in units of what a block is allowed,
@@ -26,7 +26,7 @@ pub const LIMIT: f64 = 83.48;
 const SAME: f64 = 0.01;
 /// Blocks that the line is learned over: a minute of motion at 1 kHz.
 const MEMORY: f64 = 1200.0;
-/// A block tells something where a reading moves by so many of its standard deviations of rounding.
+/// A block is informative where a reading moves by so many of its standard deviations of rounding.
 const TELLS: f64 = 5.0;
 /// Standard deviation of a declared scale, relative, before anything is learned; of one that is not declared.
 const DECLARED: f64 = 0.05;
@@ -57,7 +57,7 @@ pub enum Kind {
 pub enum Verdict {
     /// Not enough motion so far.
     Untested,
-    /// Both readings tell the same.
+    /// Both readings agree.
     Agrees,
     /// They contradict each other.
     Contradicts,
@@ -210,7 +210,7 @@ impl CrossCheck {
         (self.sums, self.readings) = ((0.0, 0.0), 0.0);
     }
 
-    /// The block that ends now, in units of what it is allowed; `None` where it tells nothing.
+    /// The block that ends now, in units of what it is allowed; `None` where it is not informative.
     fn block(&self) -> Option<Block> {
         let periods = (self.seen - self.begun) as f64;
         let spread = (self.high.0 - self.low.0, self.high.1 - self.low.1);

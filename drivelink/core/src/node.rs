@@ -41,9 +41,9 @@ pub struct Node {
     pub node_id: u32,
     /// Whether we configure the nodes. We start each by its own number when it is configured; a start of all nodes is
     /// somebody else's, and says nothing of their mapping. In a log, a start by its own number is taken for ours.
-    /// Where somebody else configures them no start tells anything: see `drivelink.cycle.following`.
+    /// Where somebody else configures them no start proves anything: see `drivelink.cycle.following`.
     active: bool,
-    /// Somebody knows for sure when it is configured, and calls `trust`: no frame tells.
+    /// Somebody knows for sure when it is configured, and calls `trust`: no frame shows it.
     pub supervised: bool,
     /// What became of its frames.
     pub counters: Counters,

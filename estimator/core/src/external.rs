@@ -6,7 +6,7 @@
 //! Every term passes the same filter, so nothing is differentiated: M q′ is the momentum, its derivative
 //! behind the filter is M q″. Robust mode takes τ_e from the transmission's curve at the measured deflection,
 //! which knows nothing of the motor's friction; mode paper takes it from eq 14. Without τ_e the same sum is
-//! eqs 12 and 13, the flexibility torque as the link tells it; the difference of the two is the external
+//! eqs 12 and 13, the flexibility torque from the link side; the difference of the two is the external
 //! torque, less what was measured of it.
 //!
 //! What is not noise does not average out: an inertia 5 % off is 5 % off as long as the link accelerates. So
@@ -52,7 +52,7 @@ pub struct External {
     pub torque: f64,
     /// Its standard deviation, N·m.
     pub torque_std: f64,
-    /// −r of eqs 12, 13: τ_e,t as the link tells it, N·m.
+    /// −r of eqs 12, 13: τ_e,t from the link side, N·m.
     pub link_torque: f64,
     /// τ_e,t of the motor side less that: what the model leaves, or a torque that nobody measured, N·m.
     pub difference: f64,
@@ -222,7 +222,7 @@ impl Judge {
     }
 }
 
-/// Do both sides of the joint tell one flexibility torque? Mean squares of their difference and of the link's.
+/// Do both sides of the joint agree on the flexibility torque? Mean squares of their difference and of the link's.
 #[derive(Clone, Copy, Debug, Default)]
 struct Consistency {
     squares: Option<[f64; 2]>,

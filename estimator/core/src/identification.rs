@@ -7,7 +7,7 @@
 //! F is the filter that all channels share (its delay is common and cancels), B and D are declared, x are
 //! the declared effects, and α, ΔB, ΔD, the Coulomb friction F_c, the offset o, the delay d of the link
 //! encoder and its offset e to the motor's are estimated together. The torque's own scale is the anchor:
-//! nothing on the motor side can tell it. Black-box estimation is the derivative of the same equation, with
+//! nothing on the motor side reveals it. Black-box estimation is the derivative of the same equation, with
 //! a local σ instead of f.
 
 use crate::kalman::{Kalman, Matrix, NUISANCES, SIZE, Vector};
@@ -47,7 +47,7 @@ const LEAST_VARIANCE: f64 = 0.02; // however the noise is coloured, it leaves so
 // Errors that are in no covariance: noise in h, its linearisation, what aligns the channels. Measured as the
 // error over its standard deviation without this, on 86 simulated joints that took no part in anything else.
 const UNSEEN: f64 = 1.3;
-const HANDED_OVER: f64 = 3.0; // by which the covariance of parameters grows that a polynomial has told
+const HANDED_OVER: f64 = 3.0; // by which the covariance of parameters from a polynomial grows
 
 // Places of the nuisances behind α.
 const INERTIA: usize = 0;
@@ -182,7 +182,7 @@ impl OnlineIdentification {
         self.target.as_ref().filter(|_| !self.known.is_empty()).map(|law| (law, &self.known[..]))
     }
 
-    /// The recursive estimation; `None` before the motion has told anything.
+    /// The recursive estimation; `None` before the motion has revealed anything.
     #[must_use]
     pub fn kalman(&self) -> Option<&Kalman> {
         self.kalman.as_ref()
@@ -257,7 +257,7 @@ impl OnlineIdentification {
 
     // -- the equation ------------------------------------------------------------------------------
 
-    /// B θ″ + D θ′ + x − τ, filtered, its k-th derivative: the flexibility torque as the motor tells it (eq 5).
+    /// B θ″ + D θ′ + x − τ, filtered, its k-th derivative: the flexibility torque from the motor side (eq 5).
     ///
     /// A position is taken as straight between samples, which costs it (ωT)²/12 of its amplitude; the torque,
     /// which is held, is given the same loss.
@@ -414,7 +414,7 @@ impl OnlineIdentification {
         let all = n + NUISANCES;
         let mut kalman = Kalman::new(&mean[..all], &std[..all], NOISE_SHARE, 1.0 + self.dt / memory);
         if !self.black_box {
-            // The anchor: what tells another torque or encoder scale from another stiffness.
+            // The anchor: it separates another torque or encoder scale from another stiffness.
             kalman.keep(n + INERTIA);
         }
         self.kalman = Some(kalman);

@@ -118,7 +118,7 @@ impl Linearisation {
     ///
     /// What has been learned is the curve, as far as the tangent at the old parameters goes. It is held: the
     /// new parameters are those of the curve nearest to it, and their covariance is that of the curve.
-    /// Holding the parameters' covariance instead would make sure of what no data have told: the tangent
+    /// Holding the parameters' covariance instead would make certain what no data have shown: the tangent
     /// turns, so along the direction in which parameters compensate each other, old and new seem to cross.
     pub fn relinearise(&mut self, values: &Vector, units: &Vector, deflection: f64) -> Matrix {
         let n = self.size;
@@ -150,7 +150,7 @@ impl Linearisation {
                     }
                 }
             }
-            // What the curve does not tell stays as it is.
+            // What the curve does not determine stays as it is.
             let ridge = RIDGE * (0..n).map(|i| normal[i][i]).sum::<f64>();
             (0..n).for_each(|i| normal[i][i] += ridge);
             let steps = solve(&normal, &down, n);

@@ -5,7 +5,7 @@ use crate::linear_algebra::solve;
 
 const POINTS: usize = 24;
 const MARGIN: f64 = 1.02; // how far beyond the deflections a law has to go on
-const ENOUGH: f64 = 0.1; // relative std of the higher coefficients from which on the shape is told
+const ENOUGH: f64 = 0.1; // relative std of the higher coefficients below which the shape is determined
 const GRID: usize = 30; // of a search over one shape parameter
 const SECTIONS: usize = 60; // of the golden section that refines it
 const ITERATIONS: usize = 60; // of damped Gauss-Newton over several of them

@@ -1,4 +1,4 @@
-//! The signals of one motor's balance behind the filters that all of them share, and what their motion tells.
+//! The signals of one motor's balance behind the filters that all of them share, and what their motion reveals.
 
 use crate::filters::StateVariableFilter;
 use crate::laws::PARAMETERS;
@@ -96,7 +96,7 @@ impl Formed {
     }
 }
 
-/// Does the motion at hand tell the stiffness? From the rate of the deflection, filtered, over its noise.
+/// Does the motion reveal the stiffness? From the rate of the deflection, filtered, over its noise.
 ///
 /// The noise of the filtered rate follows from that of the positions; the largest of late counts, as a
 /// quantised position at rest has none.

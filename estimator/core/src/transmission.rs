@@ -17,7 +17,7 @@ const DRIFT: f64 = 1e-4; // relative growth of the standard deviation per second
 const RESTED_S: f64 = 0.05; // without motion: from then on the interval grows …
 const WIDEST: f64 = 0.02; // … up to this
 const ASTRAY_S: f64 = 1.0; // of updates with parameters that cannot be, after which it starts anew
-const VARIES_S: f64 = 2.0; // over which the balance's variance is taken: a constant torque tells nothing …
+const VARIES_S: f64 = 2.0; // over which the balance's variance is taken: a constant torque is not informative …
 const VARIED_S: f64 = 30.0; // … and how long a lively phase is remembered
 const QUIET: f64 = 0.25; // of the liveliest variance: the least that misses are held against
 const EXPLAINED_S: f64 = 0.3; // over which the curve is held against the balance
@@ -194,7 +194,7 @@ impl TransmissionEstimator {
         self.changes.changed()
     }
 
-    /// Whether the motion at hand tells the stiffness.
+    /// Whether the motion reveals the stiffness.
     #[must_use]
     pub fn excited(&self) -> bool {
         self.excited
@@ -260,7 +260,7 @@ impl TransmissionEstimator {
     ///
     /// Returns whether the estimate has long been where it cannot be and has begun anew.
     pub fn update(&mut self, filters: &Filters, now: &Moment) -> bool {
-        // Does the motion tell the stiffness?
+        // Does the motion reveal the stiffness?
         let motor = self.signals.position.main;
         let resolution = (now.noise[0] + now.noise[1]).sqrt();
         let rate = now.link[1] - motor[1];

@@ -72,7 +72,7 @@ class Settings:
         speed_rad_s: limit of the link's speed.
         motor_mismatch_nm: undeclared torque at a motor from which the model is not believed.
         mismatch_cycles: for which it must last.
-        reaction: to a contact, which the daemon tells.
+        reaction: to a contact, which the daemon reports.
         retract_rad: how far it gives way, in `retract_s`.
         retract_s: see there.
         soft_nm_rad: total stiffness of the softened joint.

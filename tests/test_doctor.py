@@ -106,6 +106,13 @@ def test_a_healthy_bus_is_found_healthy_and_nothing_is_written(rig):
     assert "CiA 402 (drive)" in said
     assert "CiA 406 (encoder)" in said
     assert "the cycle needs" in said
+    offered = {
+        f.fix: f.text for section in report.sections for f in section.notices if f.subject == "cross-check"
+    }
+    assert offered['[motor.drive] checks = ["current"]'].startswith(
+        "current (0x6078:00) can be held against torque"
+    )
+    assert '[motor.drive] checks = ["velocity", "current"]' in offered
     questions = [(cob_id, data) for cob_id, data in sent if cob_id == 0 or 0x601 <= cob_id <= 0x67F]
     assert len(questions) > 127
     for cob_id, data in questions:  # uploads and their segments only
@@ -283,6 +290,14 @@ def test_from_a_sheet_alone_the_mapping_is_told(path):
     assert "0x6041:00:16" in mapped
     assert facts["motor_position"] == ["0x6064:00"]
     assert report.worst < Severity.ERROR
+
+
+def test_a_check_that_was_asked_for_is_planned_and_not_offered(rig):
+    report = examine(parse(joint_on(rig, extra='checks = ["current"]')), Path(), 0.2)
+    said = texts(report)
+    assert any("will be configured to send" in line and "6078:00" in line for line in said)
+    assert not any(line.startswith("cross-check: current") for line in said)
+    assert any(line.startswith("cross-check: velocity") for line in said)
 
 
 def test_a_sheet_without_what_is_needed_says_what_is_missing(tmp_path):

@@ -24,7 +24,7 @@ from drivelink.canopen.sdo import (
     abort_text,
     read_number,
 )
-from drivelink.canopen.tpdo_assignment import CHECKS, OPTIONAL
+from drivelink.canopen.tpdo_assignment import CHECKS, OPTIONAL, unused
 from drivelink.canopen.units import offer, unit_objects
 from drivelink.canopen.vendors import vendor_of
 from drivelink.errors import DriveError
@@ -201,8 +201,7 @@ def _wanted(survey: NodeSurvey, notices: list[Notice]) -> dict[Signal, tuple[Map
         notices.append(Notice(severity=Severity.WARNING, subject=subject, text=f"no {signal}: {reason}"))
     wanted: dict[Signal, tuple[MappableObject, ...]] = {}
     for signal, objects in survey.available.items():
-        used = [other[0].address for other in wanted.values()] if signal in CHECKS else []
-        candidates = tuple(candidate for candidate in objects if candidate.address not in used)
+        candidates = unused(wanted, objects) if signal in CHECKS else objects
         if candidates:
             wanted[signal] = candidates
             continue

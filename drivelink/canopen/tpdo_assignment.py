@@ -15,7 +15,7 @@ from drivelink.canopen.pdo import Tpdo, describe
 from drivelink.canopen.roles import Role
 from drivelink.errors import DriveError
 
-__all__ = ["CHECKS", "OPTIONAL", "Assignment", "assign", "choose_cob_id", "pack"]
+__all__ = ["CHECKS", "OPTIONAL", "Assignment", "assign", "choose_cob_id", "pack", "unused"]
 
 FRAME_BITS = 64
 
@@ -62,6 +62,12 @@ def pack(objects: Iterable[MappableObject], most: int = FRAME_BITS) -> list[tupl
         else:
             frames.append([candidate])
     return [tuple(frame) for frame in frames]
+
+
+def unused(wanted: Available, objects: Sequence[MappableObject]) -> tuple[MappableObject, ...]:
+    """Those of the objects that do not serve a signal already: an object does not check itself."""
+    used = {candidates[0].address for candidates in wanted.values() if candidates}
+    return tuple(candidate for candidate in objects if candidate.address not in used)
 
 
 def assign(

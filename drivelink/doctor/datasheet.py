@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from drivelink.canopen.eds import DataSheet, load_eds
@@ -12,6 +14,7 @@ from drivelink.canopen.roles import Role
 from drivelink.canopen.tpdo_assignment import Assignment, assign
 from drivelink.canopen.units import offer
 from drivelink.canopen.vendors import vendor_of
+from drivelink.doctor.freechecks import say_free_checks
 from drivelink.doctor.report import Section
 from drivelink.errors import DriveError
 from drivelink.jointfile import DriveSection, EncoderSection
@@ -76,6 +79,7 @@ def examine_sheet(section: Section, path: Path) -> None:
         kept = "" if assignment.objects is not None else "its map as it is, "
         text = " + ".join(entry_text(entry) for entry in entries)
         section.ok("configured", f"TPDO{number} = {text}, {kept}at every SYNC")
+    say_free_checks(section, role, mappable, _checks(sheet, available), tpdos)
     section.facts["mapping"] = [
         {"tpdo": number, "objects": [f"0x{i:04X}:{s:02X}:{b}" for i, s, b in entries]}
         for number, entries in map(planned_entries, plan)
@@ -140,6 +144,29 @@ def _signals(section: Section, sheet: DataSheet) -> dict[Signal, tuple[MappableO
         )
         _say_signal(section, signal, sheet, there, usable)
     return found
+
+
+def _checks(
+    sheet: DataSheet, available: Mapping[Signal, tuple[MappableObject, ...]]
+) -> dict[Signal, tuple[MappableObject, ...]]:
+    """Objects that could check others: a second one of torque and current, velocity, following error."""
+
+    def mappable(signal: Signal, index: int) -> tuple[MappableObject, ...]:
+        entry = sheet.objects.get((index, 0))
+        if entry is None or not entry.mappable:
+            return ()
+        bits = entry.bits or 32
+        return (MappableObject(signal=signal, address=(index, 0), bits=bits, signed=True, scale=1.0),)
+
+    as_check = {
+        Signal.VELOCITY_CHECK: available.get(Signal.MOTOR_VELOCITY, ()),
+        Signal.TORQUE_CHECK: available.get(Signal.MOTOR_TORQUE, ()),
+    }
+    return {
+        **{signal: tuple(replace(o, signal=signal) for o in objects) for signal, objects in as_check.items()},
+        Signal.FOLLOWING_ERROR: mappable(Signal.FOLLOWING_ERROR, 0x60F4),
+        Signal.POSITION_DEMAND: mappable(Signal.POSITION_DEMAND, 0x6062),
+    }
 
 
 def _say_signal(

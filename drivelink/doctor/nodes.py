@@ -19,9 +19,10 @@ from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.canopen.pdo import decode, describe, entry_text
 from drivelink.canopen.roles import Role, roles
 from drivelink.canopen.scan import FoundNode, Traffic, identify, listen, scan
-from drivelink.canopen.tpdo_assignment import assign
+from drivelink.canopen.tpdo_assignment import CHECKS, assign, unused
 from drivelink.canopen.vendors import vendor_of
 from drivelink.doctor.datasheet import planned_entries
+from drivelink.doctor.freechecks import asked_signals, say_free_checks
 from drivelink.doctor.motion import MotionReader, judge_gathered, judge_motion, judge_record, record_of_motion
 from drivelink.doctor.report import Report, Section
 from drivelink.doctor.sampletap import SampleTap
@@ -154,7 +155,8 @@ def _examine_node(
     section.ok(subject, f"{_describe_node(node)}, {state}")
     curious = role
     if role.drive is not None:
-        curious = replace(role, drive=role.drive.model_copy(update={"velocity": True}))
+        update = {"velocity": True, "checks": ("current", "following_error")}
+        curious = replace(role, drive=role.drive.model_copy(update=update))
     try:
         survey = run_program(
             survey_node(curious), bus, timeout_s=joint.bus.sdo_timeout_s, retries=joint.bus.sdo_retries
@@ -203,18 +205,23 @@ def _judge_eds(section: Section, role: Role, node: FoundNode) -> None:
 
 def _judge_mapping(section: Section, role: Role, survey: NodeSurvey) -> NodeLayout | None:
     """What it sends now, and what it would be made to send."""
-    wanted = {
-        signal: objects
-        for signal, objects in survey.available.items()
-        if signal is not Signal.MOTOR_VELOCITY or (role.drive is not None and role.drive.velocity)
-    }
+    available = dict(survey.available)
+    velocity = available.pop(Signal.MOTOR_VELOCITY, ())
+    available[Signal.VELOCITY_CHECK] = tuple(replace(o, signal=Signal.VELOCITY_CHECK) for o in velocity)
+    asked = asked_signals(role)
+    wanted = {s: objects for s, objects in available.items() if s not in CHECKS}
+    if role.drive is not None and role.drive.velocity:
+        wanted[Signal.MOTOR_VELOCITY] = velocity
+    wanted |= {s: unused(wanted, objects) for s, objects in available.items() if s in asked}
     enabled = [tpdo for tpdo in survey.tpdos if tpdo.enabled]
     section.say(Severity.INFO, role.subject, f"sends {describe(enabled)}")
     complete = True
     for signal, candidates in wanted.items():
         if not candidates:
-            tried = [f"0x{c.address[0]:04X}:{c.address[1]:02X}" for c in survey.offer.candidates[signal]]
-            severity = Severity.WARNING if signal is Signal.STATUSWORD else Severity.ERROR
+            offered = survey.offer.candidates.get(signal, ())
+            tried = [f"0x{c.address[0]:04X}:{c.address[1]:02X}" for c in offered] or ["object for it"]
+            needed = signal not in (Signal.STATUSWORD, *CHECKS)
+            severity = Severity.ERROR if needed else Severity.WARNING
             section.say(severity, role.subject, f"gives no {signal}: it has no {', '.join(tried)}")
             complete = complete and severity is not Severity.ERROR
     for signal, reason in survey.offer.missing.items():
@@ -241,6 +248,7 @@ def _judge_mapping(section: Section, role: Role, survey: NodeSurvey) -> NodeLayo
             f"will be configured to send {'; '.join(parts)}",
             "drivelink run does it",
         )
+    say_free_checks(section, role, wanted, available, survey.tpdos)
     tpdos = tuple(
         TpdoLayout(cob_id=0x181, objects=tuple(c.mapped() for c in a.objects))
         if a.objects is not None

@@ -13,10 +13,13 @@ import gc
 import json
 import time
 import tracemalloc
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
-from estimator import EstimatorSettings, JointModel, Motor, Record, Transmission, fit, make_estimator
+from estimator import EstimatorSettings, JointModel, Motor, Record, Sample, Transmission, fit, make_estimator
+from estimator.model_monitor import ModelMonitor, measure_baseline
 
 T = 1e-3
 _CASES = {
@@ -61,19 +64,34 @@ def record(n: int, motors: int) -> Record:
 
 def ticks(name: str, settings: EstimatorSettings, n: int) -> dict[str, float]:
     """Percentiles of one tick in microseconds."""
-    estimator = make_estimator(joint(name, 2), settings, T)
-    samples = list(record(n, 2).samples())
+    return percentiles(make_estimator(joint(name, 2), settings, T).step, list(record(n, 2).samples()))
+
+
+def percentiles(step: Callable[[Sample], object], samples: list[Sample]) -> dict[str, float]:
+    """Of a call's time over all samples but the first 3000, in microseconds."""
     clock = time.perf_counter_ns
-    spent = np.empty(n)
+    spent = np.empty(len(samples))
     gc.collect()
     gc.disable()
     for k, sample in enumerate(samples):
         begin = clock()
-        estimator.step(sample)
+        step(sample)
         spent[k] = clock() - begin
     gc.enable()
     late = spent[3000:] / 1e3
     return {f"p{p:g}": float(np.percentile(late, p)) for p in (50, 90, 99, 99.9)}
+
+
+def monitored(n: int) -> dict[str, float]:
+    """Percentiles of one tick of the model's monitor in microseconds."""
+    motor = replace(
+        joint("vsa-ii", 1).motors[0],
+        transmission=Transmission(model="vsa-ii", parameters={"k_nm_rad": 0.5, "c": 1.75}),
+    )
+    model = JointModel(arrangement="antagonistic", motors=(motor, motor))
+    data = record(n, 2)
+    monitor = ModelMonitor(model, T, measure_baseline(data, model))
+    return percentiles(monitor.core.step, list(data.samples()))
 
 
 def batch(name: str) -> float:
@@ -109,7 +127,10 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object only")
     args = parser.parse_args()
     result = {
-        "tick_us": {case: ticks(name, settings, args.ticks) for case, (name, settings) in _CASES.items()},
+        "tick_us": {
+            **{case: ticks(name, settings, args.ticks) for case, (name, settings) in _CASES.items()},
+            "monitor, vsa-ii": monitored(args.ticks),
+        },
         "batch_1e5_s": {name: batch(name) for name in ("polynomial", "vsa-ii")},
         "growth_bytes_per_1e5_ticks": memory(100_000),
     }

@@ -389,7 +389,7 @@ def test_every_view_says_what_to_do_on_a_model_alarm() -> None:
     view = filled()
     view.status = ALARM
     told = snapshot(view, True, {})["status"]
-    assert "do not control on it; drivelink diagnose tells why" in "\n".join(lines(view, 80))
+    assert "do not control on it; drivelink diagnose says why" in "\n".join(lines(view, 80))
     for text in (view.line(), "\n".join(lines(view, 240)), told["advice"]):
         assert "likely at the transmission" in text and "drivelink diagnose" in text
     view.status = STATUS

@@ -261,7 +261,7 @@ class Supervisor:
                 logging.ERROR,
             )
         else:
-            self._events.end(f"joint {lane.name}", f"{lane.name}: estimates begin anew")
+            self._events.end(f"joint {lane.name}", f"{lane.name}: estimates restart")
 
     def _check_model(self, lane: Lane) -> None:
         """Say when the model alarm comes and goes, by how much, and what to do."""
@@ -477,7 +477,7 @@ class Supervisor:
                 f"{', '.join(filter(None, counted))}; drivelink doctor says what keeps it",
             )
         elif now - self._slow_ns > _NS:
-            self._slow = total  # of a bus that was opened anew the count begins anew
+            self._slow = total  # the count restarts with a reopened bus
             text = f"this machine keeps up with the cycle again; {loop.overruns} cycles were left out"
             self._events.end("too slow", text)
 

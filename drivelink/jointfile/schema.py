@@ -73,7 +73,7 @@ class TpdoSection(_Section):
         min_length=1, description='mapped objects in order, "index:subindex:bits", e.g. "0x6064:00:32"'
     )
     transmission_type: int = Field(
-        1, ge=0, le=255, description="1 to 240: every so many SYNCs; 254, 255: when the node pleases"
+        1, ge=0, le=255, description="1 to 240: every so many SYNCs; 254, 255: event-driven"
     )
     default: bool = Field(
         False, description="the node has this map by itself after every start; false: a master gives it"
@@ -128,7 +128,7 @@ class DriveSection(_Section):
     eds: str | None = Field(None, description="EDS or DCF file, relative to the joint file")
     tpdo: tuple[TpdoSection, ...] = Field((), description="the mapping, where it is not read from the drive")
     heartbeat_ms: int = Field(
-        100, ge=0, le=65535, description="heartbeat that is asked of the drive; 0: none"
+        100, ge=0, le=65535, description="heartbeat requested from the drive; 0: none"
     )
 
 
@@ -285,8 +285,8 @@ class SimSection(_Section):
         default_factory=dict, description="true values that differ from the model's"
     )
     effect: tuple[Effect, ...] = Field((), description="effects of the world that the model may not know")
-    excitation: dict[str, Any] = Field(default_factory=dict, description="torque of the rig, see docs")
-    quirks: str | None = Field(None, description="behave like this maker's drives")
+    excitation: dict[str, Any] = Field(default_factory=dict, description="torque of the rig, see reference")
+    quirks: str | None = Field(None, description="behave like this vendor's drives")
     seed: int = Field(0, ge=0, description="of the sensor noise")
 
 

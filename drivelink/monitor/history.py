@@ -158,7 +158,7 @@ class History:
         moments = self.moments
         if moments:
             since = time_s - moments[-1].time_s
-            if since < 0.0:  # the daemon was started anew
+            if since < 0.0:  # the daemon restarted
                 moments.clear()
                 self.residuals.clear()
                 self.touches.clear()
@@ -191,7 +191,7 @@ class History:
             message.contact,
         )
         last = self.touches[-1] if self.touches else None
-        if last is not None and time_s < last.time_s:  # the daemon was started anew
+        if last is not None and time_s < last.time_s:  # the daemon restarted
             self.touches.clear()
         elif last is not None and time_s - last.time_s < 0.999 * self._apart_s:
             begins = self.touch.contact and not last.contact

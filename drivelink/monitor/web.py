@@ -109,7 +109,7 @@ def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str,
     history = view.history
     last = since.get(view.name, -math.inf)
     window = history.window()
-    if window and window[-1].time_s < last:  # the daemon was started anew
+    if window and window[-1].time_s < last:  # the daemon restarted
         last = -math.inf
     fresh = [moment for moment in window if moment.time_s > last]
     residuals = [pair for pair in history.residuals if pair[0] > last]

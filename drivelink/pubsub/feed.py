@@ -131,7 +131,7 @@ class Feed:
         step = message.sequence - before.sequence
         if step == 1 and self._period_ns:
             return
-        if step < 1:  # the daemon started anew
+        if step < 1:  # the daemon restarted
             return
         if overrun:
             self.skipped += step - 1

@@ -176,7 +176,7 @@ STATUS_BITS: Mapping[str, str] = MappingProxyType(
         "CHANGED": "innovation alarm: the joint changed, the estimate is following",
         "MODEL_ALARM": "the residual is above the model's own baseline: the model is not sufficient",
         "INPUT_REJECTED": "this sample was not finite, jumped or froze, and was not used",
-        "RESTARTED": "the estimator started anew at or shortly before this sample",
+        "RESTARTED": "the estimator restarted at or shortly before this sample",
         "DRIVE_FAULT": "a drive reports a fault or is not operational",
         "BUS_FAULT": "frames of this cycle were late or missing",
         "STALE": "the estimate is carried on without fresh measurements",

@@ -62,7 +62,7 @@ def recorded_cycles(path: Path, motors: int, scale: Mapping[str, float] | None =
                 cycle = Cycle(sequence, message.log_time_ns, before.sample if before else None, flags)
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise _strange(path, message.topic, error) from error
-        if cycle.sequence < newest - _APART:  # the daemon was started anew: numbers begin again
+        if cycle.sequence < newest - _APART:  # the daemon restarted: numbers begin again
             yield from _released(waiting, newest + 1)
             newest = -1
         newest = max(newest, cycle.sequence)

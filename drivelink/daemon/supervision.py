@@ -256,8 +256,8 @@ class Supervisor:
         if lane.fault:
             self._events.begin(
                 f"joint {lane.name}",
-                f"{lane.name}: no estimates any more after {lane.fault}; its joint file, written again, or a "
-                "restart begins anew",
+                f"{lane.name}: no estimates any more after {lane.fault}; rewrite its joint file or "
+                "restart the daemon",
                 logging.ERROR,
             )
         else:

@@ -127,9 +127,7 @@ class DriveSection(_Section):
     )
     eds: str | None = Field(None, description="EDS or DCF file, relative to the joint file")
     tpdo: tuple[TpdoSection, ...] = Field((), description="the mapping, where it is not read from the drive")
-    heartbeat_ms: int = Field(
-        100, ge=0, le=65535, description="heartbeat requested from the drive; 0: none"
-    )
+    heartbeat_ms: int = Field(100, ge=0, le=65535, description="heartbeat requested from the drive; 0: none")
 
 
 class EncoderSection(_Section):

@@ -126,7 +126,7 @@ def run_changes(args: argparse.Namespace) -> dict[str, Any]:
     begin = time.monotonic()
     with cluster(folder, 2) as address:
         command = [BIN / "drivelink", "fleet", folder / "recordings", "--joints", folder / "joints"]
-        run = subprocess.Popen([*command, "--out", out, "--scheduler", address])
+        run = subprocess.Popen([*command, "--out", out, "--scheduler", address], stdout=sys.stderr)
         memory = Memory(run.pid, address)
         memory.start()
         killed = 0

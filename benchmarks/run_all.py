@@ -35,6 +35,7 @@ class Section:
 
     Attributes:
         name: its file, without the ending.
+        of: the file, where several sections share one.
         title: over its results.
         full: its arguments.
         quick: its arguments where minutes count.
@@ -48,6 +49,7 @@ class Section:
     quick: tuple[str, ...] = ()
     json_file: bool = True
     markdown: bool = True
+    of: str = ""
 
 
 SECTIONS = (
@@ -106,6 +108,51 @@ SECTIONS = (
     ),
     Section(name="real_data", title="Real data before and after", markdown=False),
     Section(name="control", title="Control with the estimates", markdown=False),
+    Section(
+        name="fleet_throughput",
+        title="A fleet: two workers beside one",
+        of="fleet",
+        full=("throughput", "--nights", "2", "--recordings", "12", "--rounds", "2"),
+        quick=("throughput", "--nights", "2", "--recordings", "4"),
+        json_file=False,
+        markdown=False,
+    ),
+    Section(
+        name="fleet_cpu",
+        title="A fleet: CPU of a recording beside fit and diagnose alone",
+        of="fleet",
+        full=("cpu", "--nights", "2", "--recordings", "8"),
+        quick=("cpu", "--nights", "2", "--recordings", "2"),
+        json_file=False,
+        markdown=False,
+    ),
+    Section(
+        name="fleet_table",
+        title="A fleet: 10 000 rows appended and reported",
+        of="fleet",
+        full=("table",),
+        quick=("table", "--rows", "1000"),
+        json_file=False,
+        markdown=False,
+    ),
+    Section(
+        name="fleet_statistics",
+        title="A fleet: false discoveries and power of the tests",
+        of="fleet",
+        full=("statistics", "--fleets", "120"),
+        quick=("statistics", "--fleets", "10"),
+        json_file=False,
+        markdown=False,
+    ),
+    Section(
+        name="fleet_changes",
+        title="A fleet: 40 joints, 25 nights, one of two workers killed half-way",
+        of="fleet",
+        full=("changes", "--seconds", "5"),
+        quick=("changes", "--seconds", "5", "--joints", "8", "--nights", "8"),
+        json_file=False,
+        markdown=False,
+    ),
 )
 
 
@@ -133,7 +180,7 @@ def machine() -> dict[str, Any]:
 
 def run(section: Section, quick: bool) -> dict[str, Any]:
     """Run a section; what it printed, its numbers, or why there are none."""
-    path = HERE / f"{section.name}.py"
+    path = HERE / f"{section.of or section.name}.py"
     result: dict[str, Any] = {
         "title": section.title,
         "markdown": section.markdown,

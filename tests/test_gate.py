@@ -251,6 +251,32 @@ def _measured(path: str, joint: str) -> tuple[Record, JointModel]:
     return record, replace(declared.model(), period_s=record.period_s)
 
 
+def test_a_jerk_before_a_slow_motion_does_not_make_its_encoder_noise_an_inertia() -> None:
+    """500 Hz, 16 bits, tones below 2.5 Hz: behind the jerk, fast bands of the acceleration are quantisation."""
+    fine, period, B, M, K = 1e-4, 2e-3, 0.14, 0.31, 150.0
+    time = np.arange(0.0, 5.0, fine)
+    tones = ((0.2, 0.3, 0.5), (0.7, 0.1, 2.0), (1.5, 0.03, 4.0), (2.5, 0.012, 1.0))
+    link = sum(a * np.sin(2.0 * math.pi * f * time + p) for f, a, p in tones)
+    link = link + 0.02 * np.sin(90.0 * time) * np.exp(-(((time - 0.3) / 0.08) ** 2))
+
+    def rate(x: np.ndarray) -> np.ndarray:
+        return np.gradient(x, fine)
+
+    motor = link + (M * rate(rate(link)) + 0.1 * rate(link)) / K
+    torque = B * rate(rate(motor)) + 0.7 * rate(motor) - K * (link - motor)
+    rows = slice(20, -20, round(period / fine))
+    count = 2.0 * math.pi / 2**16
+    record = Record(
+        period_s=period,
+        sequence=np.arange(len(time[rows])),
+        motor_position_rad=np.floor(motor[rows] / count)[:, None] * count,
+        motor_torque_nm=torque[rows][:, None],
+        link_position_rad=np.floor(link[rows] / (0.5 * count)) * 0.5 * count,
+    )
+    spring = Motor(inertia_kg_m2=B, transmission=Transmission(model="linear"))
+    assert examine(record, JointModel(arrangement="single", motors=(spring,), period_s=period)) == []
+
+
 @needs_data
 @pytest.mark.parametrize(("path", "joint"), MEASURED)
 def test_a_real_machine_passes_as_it_is_and_no_fault_of_it_does(path: str, joint: str) -> None:

@@ -38,6 +38,7 @@ _MOST = 60_000  # samples that are looked at; a longer recording is thinned to t
 _RATIO = 0.06  # that two encoders' scales may differ by, beside the hypothesis' own factors
 _SEGMENTS = 8  # straight pieces of the transmission's curve
 _FRICTION_SPEED = 0.02  # of the largest velocity: over which Coulomb friction changes its sign
+_RIDGE = 1e-6  # of what a column explains: no two terms of a real joint cancel to a millionth
 _FLOOR = 0.01  # of the torque's rms: no balance of a real joint closes better
 _GAP = 3  # periods that are bridged without a trace
 
@@ -228,19 +229,18 @@ def _bounded(
     size[size == 0.0] = 1.0
     A = A / size
     low, high = (np.array([c[k] for c in columns]) * size for k in (1, 2))
-    joined = np.concatenate((A, target[..., None]), axis=-1)
-    grams = np.matmul(np.swapaxes(joined, 1, 2), joined) / A.shape[1]
-    weights = 1.0 / np.maximum(grams[:, -1, -1], _FLOOR**2)
+    joined = np.concatenate((A, target[..., None]), axis=-1) / math.sqrt(A.shape[1])
+    roots = np.stack(
+        [np.linalg.qr(band, mode="r") for band in joined]
+    )  # not squared: K and B are near to parallel
     k = A.shape[-1]
+    ridge = np.hstack((_RIDGE * np.eye(k), np.zeros((k, 1))))
+    left = np.linalg.norm(roots[:, :, -1], axis=1)
     for _ in range(_ROUNDS):
-        gram = np.einsum("b,bij->ij", weights, grams)
-        values, vectors = np.linalg.eigh(gram[:k, :k])
-        keep = values > 1e-12 * values[-1]
-        root = np.sqrt(values[keep])
-        R = root[:, None] * vectors[:, keep].T
-        x = lsq_linear(R, (vectors[:, keep].T @ gram[:k, k]) / root, (low, high), method="bvls").x
-        full = np.append(-x, 1.0)
-        weights = 1.0 / (np.einsum("i,bij,j->b", full, grams, full) + _FLOOR**2)
+        weighted = (roots / np.hypot(left, _FLOOR)[:, None, None]).reshape(-1, k + 1)
+        R = np.asarray(np.linalg.qr(np.vstack([weighted, ridge]), mode="r"))
+        x = lsq_linear(R[:k, :k], R[:k, k], (low, high), method="bvls").x
+        left = np.linalg.norm(roots @ np.append(-x, 1.0), axis=1)
     return x / size, target - A @ x
 
 
@@ -296,9 +296,9 @@ def _filters(theta: FloatArray) -> list[StateVariableFilter]:
     while w / _OCTAVES > least:
         narrow, other = acceleration(w / _OCTAVES)
         pulse = np.pad(pulse, (0, len(other) - len(pulse)))
-        if noise**2 * float(np.sum((pulse - other) ** 2)) < _NOISE * float(
-            np.var((wide - narrow)[len(other) :])
-        ):
+        # Over the rows that are used at most: a jerk at the start says nothing about them.
+        acceleration_power = float(np.var((wide - narrow)[max(len(other), len(theta) // 4) :]))
+        if noise**2 * float(np.sum((pulse - other) ** 2)) < _NOISE * acceleration_power:
             break
         w, wide, pulse = w / _OCTAVES, narrow, other
     widths = [w / _OCTAVES**k for k in range(_BANDS)]

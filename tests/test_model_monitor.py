@@ -36,13 +36,14 @@ def fitted(runs: dict[str, Record]) -> tuple[JointModel, ResidualBaseline]:
     return model, measure_baseline(runs["healthy"], model)
 
 
-def _play(monitor: ModelMonitor, record: Record, first: int = 0) -> list[bool]:
+def _play(monitor: ModelMonitor, record: Record, first: int = 0, external_nm: float = math.nan) -> list[bool]:
     assert record.link_position_rad is not None
     alarms = []
     for k in range(len(record)):
         theta, tau = record.motor_position_rad[k, 0], record.motor_torque_nm[k, 0]
         q = float(record.link_position_rad[k])
-        alarms.append(monitor.step(Sample(first + k, (theta,), (math.nan,), (tau,), q), NOTHING, 0.0))
+        sample = Sample(first + k, (theta,), (math.nan,), (tau,), q, math.nan, external_nm)
+        alarms.append(monitor.step(sample, NOTHING, 0.0))
     return alarms
 
 
@@ -82,9 +83,19 @@ def test_an_effect_raises_the_alarm_and_its_place_is_named(
     effect: str, runs: dict[str, Record], fitted: tuple[JointModel, ResidualBaseline]
 ) -> None:
     monitor = ModelMonitor(fitted[0], kit.PERIOD_S, fitted[1])
-    alarms = _play(monitor, runs[effect])
+    alarms = _play(monitor, runs[effect], external_nm=0.0)
     assert alarms.index(True) < 4000  # filters that settle for 0.5 s, then whole seconds
     assert monitor.describe()["location"] == PLACES[effect]
+
+
+def test_what_the_link_alone_does_is_no_alarm_where_nobody_measures_what_touches_it(
+    runs: dict[str, Record], fitted: tuple[JointModel, ResidualBaseline]
+) -> None:
+    """It may be a push, and says nothing against the flexibility torque: the external torque tells it."""
+    monitor = ModelMonitor(fitted[0], kit.PERIOD_S, fitted[1])
+    assert not any(_play(monitor, runs["gravity_nm"]))
+    assert monitor.residual_nm[1] > 2.0 * fitted[1].residual_nm[1]
+    assert any(_play(monitor, runs["coulomb_nm"], first=len(runs["gravity_nm"])))
 
 
 def test_the_alarm_ends_when_the_effect_is_gone(

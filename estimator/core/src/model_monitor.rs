@@ -8,6 +8,10 @@
 //! the standard deviation s; one more second is then Student's t with N − 1 degrees of freedom about 0 with
 //! the variance s² (1 + 1/N), and another motion than the recorded one adds its own. The alarm is the quantile
 //! of x at the rate of false alarms that is declared, shared by the balances and by the seconds of an hour.
+//!
+//! Where nobody measures τ_k, what the link's balance leaves may be a push as well as an error of the model, and
+//! neither says anything against the flexibility torque: it is measured, helps to say where an effect sits, and
+//! raises no alarm (see [`crate::external`]).
 
 use crate::effects::{Coordinates, JointEffects, Torques};
 use crate::error::Error;
@@ -113,6 +117,7 @@ pub struct ModelMonitor {
     found: Found,
     seconds: u64,
     alarm: bool,
+    measured: bool, // whether every sample of this second had τ_k
 }
 
 /// How many balances a joint has: of its motors, then of its link where its dynamics are known.
@@ -184,6 +189,7 @@ impl ModelMonitor {
             found: Found::NOTHING,
             seconds: 0,
             alarm: false,
+            measured: true,
         };
         made.reset();
         Ok(made)
@@ -233,6 +239,7 @@ impl ModelMonitor {
         if !goes_on {
             self.effects.reset();
         }
+        self.measured &= sample.external_torque.is_finite();
         let corrected = self.effects.corrections.correct(sample);
         let mut now = self.inputs_of(&corrected);
         self.last = Some(sample.sequence);
@@ -284,6 +291,7 @@ impl ModelMonitor {
     fn begin_second(&mut self) {
         self.squares = [0.0; 2 * BALANCES];
         self.cross = [0.0; MOTORS];
+        self.measured = true;
     }
 
     /// One period: filters, balances, and at the end of a second its judgement.
@@ -391,9 +399,13 @@ impl ModelMonitor {
         let Some(baseline) = &self.baseline else { return };
         let largest = found.torque.iter().fold(0.0f64, |a, b| a.max(*b));
         let (mut worst, mut alarm) = (f64::NEG_INFINITY, false);
+        let judged = if self.measured { balances } else { self.motors.len() };
         for b in 0..balances {
             let growth = (found.torque[b] / baseline.torque[b]).max(1.0);
             found.foreseen[b] = (baseline.residual[b] * growth).powi(2) + (LEAST * largest).powi(2);
+            if b >= judged {
+                continue;
+            }
             let x = (mean[b] / found.foreseen[b]).ln();
             alarm |= x > self.limit[b];
             if x - self.limit[b] > worst {
@@ -517,6 +529,17 @@ mod tests {
             let b = usize::from(place == "link");
             assert!((monitor.found().residual[b] / rms - 1.0).abs() < 0.05);
         }
+    }
+
+    #[test]
+    fn a_push_that_nobody_measures_raises_no_alarm() {
+        let mut monitor = monitor(Vec::new());
+        for k in 0..7000 {
+            let lacks = [0.0, 0.0, if k < 4000 { 0.0 } else { 3.0 }];
+            let pushed = Sample { external_torque: f64::NAN, ..sample(k, lacks) };
+            assert!(!monitor.step(&pushed));
+        }
+        assert!(monitor.found().residual[1] > 1.0 && monitor.found().ratio < 1.0);
     }
 
     #[test]

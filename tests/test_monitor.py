@@ -26,6 +26,7 @@ from drivelink.monitor.view import JointView, joints_table
 from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.web import MAX_CONNECTIONS, WebView, snapshot
 from drivelink.pubsub.session import close_session, open_client
+from drivelink.pubsub.wire import ExternalMessage
 from estimator.sample import Estimate, Status, TransmissionEstimate
 
 STATUS = {
@@ -107,6 +108,20 @@ def test_what_is_not_finite_breaks_nothing() -> None:
         view.update(Estimate(k, 0, nan, nan, nan, (one,)), k * 1e-3)
     assert "not valid" in "\n".join(lines(view)) and "nan" not in view.line()
     assert json.dumps(snapshot(view, True, {}), allow_nan=False)
+
+
+def test_the_view_shows_what_touches_the_link_where_that_is_told() -> None:
+    view = filled()
+    assert not any(line.startswith("│ external") for line in lines(view))
+    for k in range(4000):
+        view.update_external(ExternalMessage(k, k * 1_000_000, 3 if k > 3900 else 1, 0.5, 0.1), k * 1e-3)
+    (row,) = (line for line in lines(view) if line.startswith("│ external"))
+    assert "0.5" in row and "± 0.20 N·m" in row and "contact" in row
+    assert ("contact", "yellow") in view.flags
+    assert "external 0.5" in view.line() and "contact" in view.line()
+    view.update_external(ExternalMessage(4000, 4_000_000_000, 0, math.nan, math.nan), 4.0)
+    assert any("not valid" in line for line in lines(view)) and "external not valid" in view.line()
+    assert len(view.history.touches) <= 605  # thinned; the begin of a contact is kept
 
 
 def test_several_joints_are_one_line_each() -> None:

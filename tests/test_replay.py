@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import logging
+import math
 import signal
 import struct
 import subprocess
@@ -344,6 +345,24 @@ def test_estimates_csv_has_the_columns_of_the_contract_and_a_row_for_each_sample
     assert float(table[-1]["stiffness_nm_rad"]) == pytest.approx(150.0, rel=0.01)
     assert all((plots / name).stat().st_size > 5000 for name in ("stiffness.png", "time.png"))
     assert "1500 cycles" in capsys.readouterr().out
+
+
+def test_estimates_csv_says_what_touches_the_link_where_its_dynamics_are_declared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    joint = tmp_path / "linked.toml"
+    joint.write_text(f"{SINE}\n[link.dynamics]\ninertia_kg_m2 = 0.4\n")
+    recording, out = write_csv(tmp_path / "r.csv", 1500), tmp_path / "e.csv"
+    assert cli.main(["replay", str(recording), "--joint", str(joint), "--out", str(out)]) == 0
+    table = rows(out)
+    assert list(table[0])[-6:] == [
+        "external_torque_nm", "external_torque_std_nm", "external_valid", "contact",
+        "link_flexibility_torque_nm", "flexibility_difference_nm",
+    ]  # fmt: skip
+    assert {row["external_valid"] for row in table} == {"0", "1"}
+    last = {name: float(value) for name, value in table[-1].items()}
+    assert last["external_torque_std_nm"] > 0.0
+    assert all(map(math.isfinite, last.values()))
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,7 @@ class Faults:
     # Devices
 
     def kill(self, node: Node) -> None:
-        """It loses its supply, without a word."""
+        """It loses its supply, silently."""
         self._network.power_off(node)
 
     def revive(self, node: Node) -> None:

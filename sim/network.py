@@ -112,7 +112,7 @@ class Network:
         self._reroute()
 
     def power_off(self, node: Node) -> None:
-        """Switch a device off, without a word."""
+        """Switch a device off, silently."""
         if node in self._alive:
             self._alive.remove(node)
             node.power_off()

@@ -79,7 +79,7 @@ def test_a_sheet_tells_objects_identity_and_tpdos(tmp_path):
         (("ProductNumber=7", "ProductNumber="), "no value for productnumber"),
         (("ProductNumber=7", "ProductNumber=7\nProductNumber=8"), "ProductNumber in [DeviceInfo] twice"),
         (("[6064]", "[1018sub1]\n[6064]"), "[1018sub1] twice"),
-        (("DefaultValue=-5", "DefaultValue=minus five"), "6064:00 has a value that is no number"),
+        (("DefaultValue=-5", "DefaultValue=minus five"), "6064:00 has a value that is not a number"),
         (("DataType=4", "DataType=0x99"), "6064:00 has an unknown data type"),
         (("[DeviceInfo]", "[Device]"), "no [DeviceInfo]"),
         (("[6064]", "this is nothing\n[6064]"), "neither key nor section"),
@@ -124,10 +124,10 @@ def test_an_array_written_once_is_all_its_entries(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "is no EDS"),
-        (b"name = 'elbow'\n", "is no EDS"),
+        (b"", "is not an EDS"),
+        (b"name = 'elbow'\n", "is not an EDS"),
         (b'<?xml version="1.0"?><ISO15745ProfileContainer/>', "is XML"),
-        (bytes(range(256)) * 20, "is no EDS"),
+        (bytes(range(256)) * 20, "is not an EDS"),
     ],
 )
 def test_what_is_no_eds_is_one_line(tmp_path, content, message):

@@ -457,7 +457,7 @@ def test_a_healthy_interface_has_no_warning():
 
 @pytest.mark.parametrize(
     ("change", "expected"),
-    [({"flags": ["NOARP"]}, "is down"), ({"link_type": "ether"}, "is no CAN interface")],
+    [({"flags": ["NOARP"]}, "is down"), ({"link_type": "ether"}, "is not a CAN interface")],
 )
 def test_an_interface_that_cannot_work_is_an_error_with_a_fix(change, expected):
     section = Section("CAN")

@@ -139,7 +139,7 @@ def test_stamps_that_jitter_like_arrival_times_are_put_on_the_grid(
         (lambda t: np.column_stack((t[:, 0] ** 2, t[:, 1:])), "expected uniform sampling"),
         (
             lambda t: np.column_stack((t[:, :2], t[:, 2] * np.nan, t[:, 3])),
-            "motor1_torque_nm holds no number",
+            "motor1_torque_nm holds no numeric value",
         ),
     ],
 )

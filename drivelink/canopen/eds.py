@@ -144,7 +144,7 @@ def load_eds(path: Path, node_id: int | None = None) -> DataSheet:
         raise DriveError(f"{path}: is XML (an XDD?), expected an EDS or DCF file")
     sections = _sections(_text(raw, sheet), sheet)
     if not any(_OBJECT.fullmatch(name) for name in sections):
-        raise DriveError(f"{path}: is no EDS: no section names an object, like [1000]")
+        raise DriveError(f"{path}: is not an EDS: no section names an object, like [1000]")
     made_for = _made_for(sections)
     node = node_id or made_for or 1
     _read_objects(sections, node, sheet)
@@ -245,7 +245,7 @@ def _read_objects(sections: Sections, node: int, sheet: DataSheet) -> None:
         if entry.bits is None and entry.data_type not in _NO_NUMBER:
             unknown.append(f"{index:04X}:{subindex:02X}")
         sheet.objects[index, subindex] = entry
-    for names, what in ((unreadable, "a value that is no number"), (unknown, "an unknown data type")):
+    for names, what in ((unreadable, "a value that is not a number"), (unknown, "an unknown data type")):
         if len(names) > 1:
             sheet.problems.append(f"object {names[0]} and {len(names) - 1} more have {what}")
         elif names:

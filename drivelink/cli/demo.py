@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
             interrupted = watch.follow(rig, subscription)
     summary = watch.summary
     if summary is None:
-        raise DrivelinkError("the simulated drive and the daemon ended without a word")
+        raise DrivelinkError("the simulated drive and the daemon ended unexpectedly")
     if not args.json:
         console.print(closing_table(args.case, watch.comparison, summary, watch.received, joint.bus.period_s))
     else:

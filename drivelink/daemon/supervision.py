@@ -52,7 +52,7 @@ _COUNTED = (  # counter of a node; by how much it grows at least, and what is sa
     (
         "conflicting",
         3,  # a single one may be a frame that was late
-        "different frames in one cycle are not used: has another device its node id, or its identifiers?",
+        "different frames in one cycle are not used: does another device have its node ID or identifiers?",
         "one frame a cycle again, {} cycles had several so far",
     ),
 )

@@ -87,7 +87,7 @@ def judge_link(section: Section, link: dict[str, Any], bus: BusSection) -> None:
         bitrate=data.get("bittiming", {}).get("bitrate"),
     )
     if link.get("link_type") != "can":
-        section.say(Severity.ERROR, name, "is no CAN interface", "correct bus.channel")
+        section.say(Severity.ERROR, name, "is not a CAN interface", "correct bus.channel")
         return
     kind = "" if virtual else f" type can bitrate {bus.bitrate} restart-ms 100"
     if "UP" not in link.get("flags", []):

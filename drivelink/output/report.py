@@ -148,7 +148,7 @@ def unexplained(outcome: Diagnosis, units: Units | None = None) -> str:
         return f"{text} even with the free curve, which has no name in the library."
     if outcome.verdict == "insufficient_excitation":
         return f"{text}; this motion does not reveal whether anything is missing."
-    return f"{text}: noise, or effects too small to be told from it in these data."
+    return f"{text}: noise, or effects too small to be separated from it in these data."
 
 
 def title_of(finding: Finding) -> str:

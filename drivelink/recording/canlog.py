@@ -170,7 +170,7 @@ def _parsed(file: IO[bytes], path: Path) -> Iterator[LoggedFrame]:
         )
     if tolerant.strange:
         _LOG.warning(
-            "%s: %d line(s) are no CAN frame and are left out, first %s",
+            "%s: %d line(s) are not CAN frames and are omitted, first %s",
             path,
             tolerant.strange,
             tolerant.first_strange,

@@ -160,7 +160,7 @@ def _needed(columns: Mapping[str, FloatArray], name: str, where: str, other: str
     _require(columns, name, where, other)
     values = columns[name]
     if not np.any(np.isfinite(values)):
-        raise RecordingError(f"{where}: column {name} holds no number")
+        raise RecordingError(f"{where}: column {name} holds no numeric value")
     return np.where(np.isfinite(values), values, np.nan)
 
 

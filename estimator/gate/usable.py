@@ -54,7 +54,7 @@ def _finite(name: str, x: FloatArray) -> None:
     if bad:
         raise EstimatorError(f"{name}: {bad} values are not finite")
     if np.max(np.abs(x)) > _ABSURD:
-        raise EstimatorError(f"{name}: values up to {np.max(np.abs(x)):.3g} are no measurement")
+        raise EstimatorError(f"{name}: values up to {np.max(np.abs(x)):.3g} are not a measurement")
 
 
 def _channel(name: str, x: FloatArray) -> None:

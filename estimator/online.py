@@ -49,6 +49,15 @@ class Estimator(Protocol):
     def parameters(self) -> list[dict[str, Any]]:
         """Current {"model", "parameters", "std"} of each transmission, names as in the joint file."""
 
+    def suspicion(self) -> dict[str, Any] | None:
+        """The reading that is suspected while what is read cannot be; None: none.
+
+        {"signal": "motor_position" | "motor_torque" | "link_position" | "motor_or_link_position", "motor":
+        from 1 on (0: the link's), "reason": "scale" (relative), "delay" (s), "zero" (rad, N·m), "drift" (rad/s),
+        "impossible", "jumped" or "frozen", "amount" and "std" in the reason's unit (None where it has none), "explains":
+        whether it explains all that is seen, "text": the same in words}.
+        """
+
 
 class _Compiled:
     """`estimator._core.Estimator` with parameters by their names."""
@@ -86,6 +95,24 @@ class _Compiled:
         """See `Estimator`."""
         return [self._named(i, motor) for i, motor in enumerate(self._model.motors)]
 
+    def suspicion(self) -> dict[str, Any] | None:
+        """See `Estimator`."""
+        told = self.core.suspicion()
+        if told is None:
+            return None
+        signal, motor, reason, amount, std, explains = told
+        known = math.isfinite(amount) and math.isfinite(std)
+        return {
+            "signal": signal,
+            "motor": motor,
+            "reason": reason,
+            "amount": amount if known else None,
+            "std": std if known else None,
+            "explains": explains,
+            "text": _in_words(signal, motor if len(self._model.motors) > 1 else 0, reason, amount, std)
+            + ("" if explains else "; it is the likeliest, but does not explain all"),
+        }
+
     def _named(self, i: int, motor: Motor) -> dict[str, Any]:
         told, polynomial, values, std = self.core.alpha(i)
         if not motor.flexible:
@@ -100,6 +127,35 @@ class _Compiled:
             "parameters": model.parameters(np.array(values)),
             "std": model.parameters(np.array(std)),
         }
+
+
+_SIGNALS = {
+    "motor_position": "motor position",
+    "motor_torque": "motor torque",
+    "link_position": "link position",
+    "motor_or_link_position": "zero between motor and link position",
+}
+_REASONS = {
+    "impossible": "it is no number that can be",
+    "jumped": "it jumps by more than it can",
+    "frozen": "it repeats itself while others move",
+}
+
+
+def _in_words(signal: str, motor: int, reason: str, amount: float, std: float) -> str:
+    which = _SIGNALS[signal] if motor == 0 else f"{_SIGNALS[signal]} of motor {motor}"
+    if reason == "scale":
+        why = f"its scale is {1.0 + amount:.3g} ± {std:.1g} times what it was"
+    elif reason == "delay":
+        why = f"it is {1e3 * amount:.2g} ± {1e3 * std:.1g} ms later than it was"
+    elif reason == "drift":
+        why = f"it moves by {amount:.2g} ± {std:.1g} rad/s"
+    elif reason == "zero":
+        unit = "N·m" if signal == "motor_torque" else "rad"
+        why = f"it has moved by {amount:.2g} ± {std:.1g} {unit}"
+    else:
+        why = _REASONS[reason]
+    return f"{which}: {why}"
 
 
 def make_estimator(

@@ -67,6 +67,10 @@ def _offset(x: Values, size: float, rng: np.random.Generator, share: float) -> V
     return x + share * size
 
 
+def _ramp(x: Values, size: float, rng: np.random.Generator, share: float) -> Values:
+    return x + np.linspace(0.0, share * size, len(x))
+
+
 def _gain(x: Values, size: float, rng: np.random.Generator, factor: float) -> Values:
     return factor * x
 
@@ -113,6 +117,8 @@ def faults() -> Iterator[Fault]:
             yield Fault(f"offset {share:.0%}", one, partial(_offset, share=share))
         for factor in (0.75, 0.9, 1.1, 1.25):
             yield Fault(f"gain {factor:g}", one, partial(_gain, factor=factor))
+        if signal == "torque":
+            yield Fault("ramps by 20 %", one, partial(_ramp, share=0.2))
         yield Fault("gain drifts to 1.25", one, partial(_gain_drifts, to=1.25))
         yield Fault("sign", one, partial(_gain, factor=-1.0))
         for periods in (1, 3, 10):
@@ -127,6 +133,9 @@ def faults() -> Iterator[Fault]:
             yield Fault("slips each second", one, partial(_slip, share=0.02, every_s=1.0))
     yield Fault("late by 3", ("motor", "torque"), partial(_late, periods=3))
     yield Fault("gain 0.9", ("motor", "link"), partial(_gain, factor=0.9))
+    yield Fault("gain 1.1", ("torque", "link"), partial(_gain, factor=1.1))
+    yield Fault("offset 10%", ("motor", "torque"), partial(_offset, share=0.1))
+    yield Fault("late by 10", ("torque", "link"), partial(_late, periods=10))
     yield Fault("noise 1 %", SIGNALS, partial(_noise, share=0.01))
 
 

@@ -52,6 +52,9 @@ class Witness:
     def parameters(self) -> list[dict[str, Any]]:
         return []
 
+    def suspicion(self) -> None:
+        return None
+
 
 class ForeignMaster:
     """The same bus for a daemon that may only listen."""

@@ -434,6 +434,9 @@ class Broken:
     def parameters(self) -> list[object]:
         return []
 
+    def suspicion(self) -> None:
+        return None
+
 
 def test_an_exception_in_one_joint_takes_that_one_to_a_fault_and_the_others_go_on() -> None:
     with two_joints() as made:

@@ -98,6 +98,9 @@ class Last:
     def parameters(self) -> list[dict[str, object]]:
         return []
 
+    def suspicion(self) -> None:
+        return None
+
 
 class Stamps(ObjectSink):
     def __init__(self, stop_after: int) -> None:

@@ -123,7 +123,7 @@ class JointStatus:
             "residual_nm": lane.chain.estimator.residual_nm,
             "residual_alarm": self._alarm(),
             "external": self._external(),
-            "suspected": contradiction(lane.chain.assembler),
+            "suspected": contradiction(lane.chain.assembler) or lane.chain.estimator.suspicion(),
             "cross_checks": cross_checks(lane.chain.assembler),
             "conditions": sorted(events.active.values()),
             "events": events.recent(),

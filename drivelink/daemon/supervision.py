@@ -59,6 +59,7 @@ _COUNTED = (  # counter of a node; by how much it grows at least, and what is sa
 
 
 _MODEL_ALARM = int(Status.MODEL_ALARM)
+_BRIEF = ("impossible", "jumped")  # of single samples; their status bit says it
 _BUNCHED = (
     "some frames are missing, others come several in one cycle and are not used: "
     "this machine or the bus is too slow for the cycle, or another device has its node id"
@@ -231,6 +232,7 @@ class Supervisor:
             self._check_lane(lane)
             self._check_model(lane)
             self._check_contradiction(lane)
+            self._check_readings(lane)
         if self._follower is not None:
             self._check_maps(self._follower)
         self._check_bus()
@@ -289,6 +291,15 @@ class Supervisor:
             self._events.end(key, f"{lane.name}: no reading contradicts another one any more")
         else:
             self._events.begin(key, f"{lane.name}: {told['text']}")
+
+    def _check_readings(self, lane: Lane) -> None:
+        """Say which reading is suspected, and of what, when that begins and when it is over."""
+        suspicion = lane.chain.estimator.suspicion() if lane.chain.estimate is not None else None
+        key = f"reading {lane.name}"
+        if suspicion is None:
+            self._events.end(key, f"{lane.name}: no reading is suspected any more")
+        elif suspicion["reason"] not in _BRIEF:
+            self._events.begin(key, f"{lane.name}: no valid estimates; suspected: {suspicion['text']}")
 
     def _say_fault(self, where: str, error: Exception) -> None:
         logger.debug("%s", where, exc_info=error)

@@ -2,12 +2,14 @@
 
 use crate::error::Error;
 use crate::external::External;
+use crate::isolation::Verdict;
 use crate::laws::Law;
 use crate::model::Model;
 use crate::paper::Paper;
 use crate::robust::Robust;
 use crate::sample::{Estimate, Sample};
 use crate::settings::{Mode, Priors, Settings};
+use crate::suspicion::Suspicion;
 
 /// Both modes behind one interface.
 #[derive(Clone, Debug)]
@@ -88,6 +90,24 @@ impl Estimator {
         match self {
             Estimator::Paper(paper) => paper.consistency(),
             Estimator::Robust(robust) => robust.consistency(),
+        }
+    }
+
+    /// The reading that is suspected, while something is.
+    #[must_use]
+    pub fn suspicion(&self) -> Option<Suspicion> {
+        match self {
+            Estimator::Paper(_) => None,
+            Estimator::Robust(robust) => robust.suspicion(),
+        }
+    }
+
+    /// What the window of one motor's balance says of all changes; `None`: nothing.
+    #[must_use]
+    pub fn verdict(&self, motor: usize) -> Option<&Verdict> {
+        match self {
+            Estimator::Paper(_) => None,
+            Estimator::Robust(robust) => robust.verdict(motor),
         }
     }
 

@@ -10,6 +10,8 @@
 //! nothing on the motor side reveals it. Black-box estimation is the derivative of the same equation, with
 //! a local σ instead of f.
 
+use crate::change_detection::{LEAST_IN_WINDOW, UPDATES, WINDOW_TAILS};
+use crate::isolation::{CHANGES, Change, Isolation, Layout, READINGS, Verdict};
 use crate::kalman::{Kalman, Matrix, NUISANCES, SIZE, Vector};
 use crate::laws::{Alpha, Law, PARAMETERS};
 use crate::linear_algebra::{dot, times};
@@ -47,6 +49,11 @@ const LEAST_VARIANCE: f64 = 0.02; // however the noise is coloured, it leaves so
 // Errors that are in no covariance: noise in h, its linearisation, what aligns the channels. Measured as the
 // error over its standard deviation without this, on 86 simulated joints that took no part in anything else.
 const UNSEEN: f64 = 1.3;
+const REFERENCE_S: f64 = 5.0; // of updates, from one reference to the next
+const SETTLED_S: f64 = 2.0; // of updates, until there is a first one
+// Prior standard deviations of the amplitudes of changes, in the units of their columns: stiffness, friction
+// and offsets relative, delays in periods, scales relative, a drift relative a second.
+const CHANGE_STD: [f64; CHANGES] = [0.0, 0.5, 0.1, 0.3, 0.3, 3.0, 0.3, 0.3, 0.3, 3.0, 3.0, 0.3];
 const HANDED_OVER: f64 = 3.0; // by which the covariance of parameters from a polynomial grows
 
 // Places of the nuisances behind α.
@@ -91,6 +98,10 @@ pub struct OnlineIdentification {
     units: Units,
     resolution: f64,
     kalman: Option<Kalman>,
+    reference: Option<Kalman>, // what was learned some time ago, while all was well …
+    candidate: Option<Kalman>, // … and what is to be it next
+    refresh_at: u32,
+    window: Isolation,
     values: Vector, // α, then the nuisances, SI
     updates: u32,
     delay_at: u32,
@@ -138,6 +149,10 @@ impl OnlineIdentification {
             units: NO_UNITS,
             resolution: 0.0,
             kalman: None,
+            reference: None,
+            candidate: None,
+            refresh_at: 0,
+            window: Isolation::default(),
             values: [0.0; SIZE],
             updates: 0,
             delay_at: 0,
@@ -150,6 +165,7 @@ impl OnlineIdentification {
     /// Forget what has been learned.
     pub fn reset(&mut self) {
         self.kalman = None;
+        self.forget_reference();
         let law = match &self.target {
             Some(law) if law.shapes().is_empty() || !self.known.is_empty() => law.clone(),
             _ => Law::Polynomial,
@@ -186,6 +202,12 @@ impl OnlineIdentification {
     #[must_use]
     pub fn kalman(&self) -> Option<&Kalman> {
         self.kalman.as_ref()
+    }
+
+    /// Whether there is something learned in good times to hold the balance against.
+    #[must_use]
+    pub fn has_reference(&self) -> bool {
+        self.reference.is_some()
     }
 
     /// Equations learned from.
@@ -350,18 +372,21 @@ impl OnlineIdentification {
         }
         let new_std = self.nuisance_std();
         let noise = old.torque / self.units.torque;
-        let Some(kalman) = &mut self.kalman else { return };
-        kalman.rescale(&ratio, noise);
-        for i in 0..NUISANCES {
-            kalman.inflate(n + i, (new_std[i].powi(2) - (old_std[i] * ratio[n + i]).powi(2)).max(0.0));
+        for kalman in [&mut self.kalman, &mut self.reference, &mut self.candidate].into_iter().flatten() {
+            kalman.rescale(&ratio, noise);
+            for i in 0..NUISANCES {
+                kalman.inflate(n + i, (new_std[i].powi(2) - (old_std[i] * ratio[n + i]).powi(2)).max(0.0));
+            }
+            // The cut-off's prior, a share of the torque at the deflection reached then, is one of now.
+            let (power, most) = (n - 1, CUT_OFF * CUT_OFF);
+            let variance = kalman.p[power][power];
+            if self.cut_off && variance > most {
+                kalman.ceiling[power] = most;
+                kalman.draw(power, most / variance);
+            }
         }
-        // The cut-off's prior, which was a share of the torque at the deflection reached then, is one of now.
-        let (power, most) = (n - 1, CUT_OFF * CUT_OFF);
-        let variance = kalman.p[power][power];
-        if self.cut_off && variance > most {
-            kalman.ceiling[power] = most;
-            kalman.draw(power, most / variance);
-        }
+        let columns = ratio.map(|ratio| noise / ratio);
+        self.window.rescale(&columns, noise, n + DEFLECTION_OFFSET);
         self.law.remember_tangent(self.units.deflection);
     }
 
@@ -456,6 +481,9 @@ impl OnlineIdentification {
             let ceiling = kalman.ceiling[i];
             if ceiling > 0.0 && kalman.x[i].powi(2) > RELAX * RELAX * ceiling {
                 kalman.inflate(i, 4.0 * ceiling);
+                for reference in [&mut self.reference, &mut self.candidate].into_iter().flatten() {
+                    reference.inflate(i, 4.0 * ceiling);
+                }
             }
         }
     }
@@ -481,18 +509,154 @@ impl OnlineIdentification {
         let Some(kalman) = &mut self.kalman else { return };
         let mut scale = [0.0; SIZE];
         for i in 0..self.law.size {
-            scale[i] = STEP * kalman.x[i];
+            scale[i] = if i < self.law.linear() { STEP * kalman.x[i] } else { 0.0 };
             kalman.inflate(i, (SHAPE_STEP * STEP * kalman.x[i].abs().max(SHAPE_STEP)).powi(2));
         }
         kalman.inflate_along(&scale);
     }
 
+    // -- the reference -----------------------------------------------------------------------------
+
+    /// There is nothing to hold the balance against.
+    pub fn forget_reference(&mut self) {
+        (self.reference, self.candidate) = (None, None);
+        self.refresh_at = self.updates.saturating_add(self.updates_in(SETTLED_S));
+        self.window.clear();
+    }
+
+    /// Hold what has been learned, while all is well: the reference is as old as one to two of its turns.
+    pub fn keep_reference(&mut self) {
+        if self.black_box || self.updates < self.refresh_at {
+            return;
+        }
+        self.refresh_at = self.updates + self.updates_in(REFERENCE_S);
+        let Some(kalman) = &self.kalman else { return };
+        if let (Some(old), Some(new)) = (&self.reference, &self.candidate) {
+            let mut change = [0.0; SIZE];
+            (0..SIZE).for_each(|i| change[i] = new.x[i] - old.x[i]);
+            self.window.rebase(&change);
+        }
+        self.reference = self.candidate.take().or_else(|| Some(kalman.clone()));
+        self.candidate = Some(kalman.clone());
+    }
+
+    /// s² of an equation that the reference foresees.
+    fn reference_noise(reference: &Kalman) -> f64 {
+        reference.noise * reference.tailed() + LEAST_IN_WINDOW * LEAST_IN_WINDOW
+    }
+
+    /// Take an equation into the window; what the reference leaves, and what is left of that where `suspect`
+    /// explains it, squared and over what is foreseen.
+    pub fn observe(
+        &mut self,
+        signals: &Signals,
+        link: &[f64; 4],
+        h: &Vector,
+        y: f64,
+        window: f64,
+        suspect: Option<(Change, f64)>,
+    ) -> Option<[f64; 2]> {
+        let readings = self.readings(signals, link);
+        let reference = self.reference.as_ref()?;
+        let left = reference.innovation(h, y);
+        if !left.is_finite() {
+            return None;
+        }
+        let zero = self.law.size + DEFLECTION_OFFSET;
+        self.window.take(h, &readings, left, window, zero, self.dt);
+        let foreseen = Self::reference_noise(reference)
+            + reference.variance_over_scale() * dot(h, &times(&reference.sigma, h)).max(0.0);
+        let explained = suspect.map_or(0.0, |(change, amplitude)| {
+            Isolation::effect(change, amplitude, h, &readings, reference, &self.layout())
+        });
+        Some([left * left / foreseen, (left - explained).powi(2) / foreseen])
+    }
+
+    /// What the balance of this moment gains with each reading that is not what it was, to first order.
+    fn readings(&self, signals: &Signals, link: &[f64; 4]) -> [f64; READINGS] {
+        let (theta, torque) = (&signals.position.main, &signals.torque.main);
+        let stiffness = self.law.filtered_stiffness(&signals.basis, 0, &self.values);
+        let (b, d, t) = (self.inertia, self.damping, self.period);
+        let si = [
+            b * theta[2] + d * theta[1] + stiffness * theta[0], // θ (1 + c)
+            -stiffness * link[0],                               // q (1 + c)
+            -torque[0],                                         // τ (1 + c)
+            -t * (b * theta[3] + d * theta[2] + stiffness * theta[1]), // θ late by c T
+            t * torque[1],                                      // τ late by c T
+            0.0,                                                // what drifts is nowhere else now
+        ];
+        si.map(|value| value / self.units.torque)
+    }
+
+    fn layout(&self) -> Layout {
+        Layout {
+            law: self.law.size,
+            linear: self.law.linear(),
+            places: [COULOMB, OFFSET, DEFLECTION_OFFSET, DELAY],
+            std: CHANGE_STD,
+        }
+    }
+
+    /// What the window says of every change; `None` without a reference.
+    #[must_use]
+    pub fn judge(&self) -> Option<Verdict> {
+        let reference = self.reference.as_ref()?;
+        let (noise, correlated) =
+            (Self::reference_noise(reference), reference.correlation().max(UPDATES as f64));
+        Some(self.window.judge(reference, &self.layout(), noise, correlated, WINDOW_TAILS))
+    }
+
+    /// What was learned since the reference is void.
+    pub fn restore_reference(&mut self) {
+        self.window.clear();
+        let Some(reference) = &self.reference else { return };
+        self.kalman = Some(reference.clone());
+        self.candidate = Some(reference.clone());
+        self.refresh_at = self.updates.saturating_add(self.updates_in(REFERENCE_S));
+    }
+
+    /// SI units (s for delays) in which a change's amplitude is counted.
+    #[must_use]
+    pub fn unit_of(&self, change: Change) -> f64 {
+        match change {
+            Change::TorqueZero | Change::Friction => self.units.torque,
+            Change::PositionZero | Change::PositionDrift => self.units.deflection,
+            Change::LinkDelay | Change::MotorDelay | Change::TorqueDelay => self.period,
+            _ => 1.0,
+        }
+    }
+
+    /// What has been found changed is changed; the reference is another one from now on.
+    pub fn accept(&mut self, change: Change, verdict: &Verdict) {
+        let place = match change {
+            Change::Friction => COULOMB,
+            Change::TorqueZero => OFFSET,
+            Change::PositionZero => DEFLECTION_OFFSET,
+            Change::LinkDelay => DELAY,
+            _ => return self.renew_reference(), // the stiffness has been followed
+        };
+        self.restore_reference();
+        let (told, index) = (verdict.of(change), self.law.size + place);
+        if let Some(kalman) = &mut self.kalman {
+            kalman.x[index] += told.amplitude;
+            kalman.inflate(index, 4.0 * told.std * told.std);
+        }
+        self.renew_reference();
+    }
+
+    fn renew_reference(&mut self) {
+        (self.reference, self.candidate) = (self.kalman.clone(), self.kalman.clone());
+        self.refresh_at = self.updates.saturating_add(self.updates_in(REFERENCE_S));
+        self.window.clear();
+    }
+
     /// An encoder has moved its zero: the deflection's offset is not what it was to the last digit.
     pub fn reopen_deflection_offset(&mut self) {
         let place = self.law.size + DEFLECTION_OFFSET;
-        if let Some(kalman) = &mut self.kalman {
+        for kalman in [&mut self.kalman, &mut self.reference, &mut self.candidate].into_iter().flatten() {
             kalman.inflate(place, REOPENED * REOPENED);
         }
+        self.window.clear();
     }
 
     /// Whether the parameters are numbers, and those of a spring that reaches as far as this one does.
@@ -516,12 +680,18 @@ impl OnlineIdentification {
             return false;
         }
         let change = self.law.relinearise(&self.values, &self.units.of, self.units.deflection);
-        let mut mean = kalman.x;
+        let (old, mut mean) = (kalman.x, kalman.x);
         for i in 0..self.law.size {
             mean[i] = self.law.alpha0[i] / self.units.of[i];
         }
         let all = self.law.size + NUISANCES;
-        self.kalman = Some(kalman.transformed(&mean[..all], &kalman.ceiling[..all], &change));
+        for kalman in [&mut self.kalman, &mut self.reference, &mut self.candidate].into_iter().flatten() {
+            let (mut own, mut off) = (mean, [0.0; SIZE]);
+            (0..all).for_each(|i| off[i] = kalman.x[i] - old[i]);
+            let off = times(&change, &off);
+            (0..all).for_each(|i| own[i] += off[i]);
+            *kalman = kalman.transformed(&own[..all], &kalman.ceiling[..all], &change);
+        }
         true
     }
 
@@ -539,9 +709,11 @@ impl OnlineIdentification {
         else {
             return false;
         };
-        let old_units = self.units.of;
-        let kalman = kalman.clone();
-        self.law = Linearisation::new(target.clone(), 1 + target.shapes().len(), alpha);
+        let (old_units, kalman) = (self.units.of, kalman.clone());
+        let target = target.clone();
+        self.forget_reference();
+        let size = 1 + target.shapes().len();
+        self.law = Linearisation::new(target, size, alpha);
         self.make_units();
         let (mean, ceiling, change) = self.adopted(&kalman, &alpha, &slopes, &old_units, n_old);
         let n = self.law.size;
@@ -605,9 +777,10 @@ impl OnlineIdentification {
     /// The channels have been aligned by so much more.
     pub fn shift_delay(&mut self, periods: f64) {
         let place = self.law.size + DELAY;
-        if let Some(kalman) = &mut self.kalman {
+        for kalman in [&mut self.kalman, &mut self.reference, &mut self.candidate].into_iter().flatten() {
             kalman.x[place] -= periods;
         }
+        self.window.clear();
         self.values[place] -= periods * self.period;
     }
 

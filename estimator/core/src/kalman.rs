@@ -145,11 +145,24 @@ impl Kalman {
         self.past[0] = self.noisy(innovation, predicted_variance);
     }
 
+    /// Variance of the noise over the square of its scale, as its tails have it.
+    #[must_use]
+    pub fn tailed(&self) -> f64 {
+        TAILS / (TAILS - 2.0)
+    }
+
+    /// How many equations there are to one independent error.
+    #[must_use]
+    pub fn correlation(&self) -> f64 {
+        let sum: f64 = (0..LAGS).map(|lag| self.r[lag] * taper(lag)).sum();
+        (1.0 + 2.0 * sum / self.noise.max(1e-300)).max(1.0)
+    }
+
     /// What Σ is multiplied by: noise that is a t variable has a larger variance than its scale squared, and
     /// few independent errors determine either only roughly.
     #[must_use]
     pub fn variance_over_scale(&self) -> f64 {
-        self.caution * TAILS / (TAILS - 2.0)
+        self.caution * self.tailed()
     }
 
     /// How much larger a variance estimated from few independent errors is: that of a t distribution.

@@ -19,6 +19,7 @@ pub mod estimator;
 pub mod external;
 pub mod filters;
 pub mod identification;
+pub mod isolation;
 pub mod kalman;
 pub mod laws;
 pub mod library;
@@ -36,6 +37,7 @@ pub mod sample_validator;
 pub mod settings;
 pub mod signals;
 pub mod student;
+pub mod suspicion;
 pub mod transmission;
 
 #[cfg(feature = "python")]

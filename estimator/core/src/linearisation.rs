@@ -36,6 +36,12 @@ impl Linearisation {
         self.law.is_polynomial()
     }
 
+    /// How many of α are linear coefficients: with them, by one factor, the curve's scale changes.
+    #[must_use]
+    pub fn linear(&self) -> usize {
+        if self.is_polynomial() { self.size } else { 1 }
+    }
+
     /// What the basis channels take in at a deflection: the slopes of f by α, and that of g by φ (or φ²).
     pub fn columns(&self, phi: f64, out: &mut [f64; COLUMNS]) {
         if self.is_polynomial() {

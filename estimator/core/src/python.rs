@@ -18,6 +18,7 @@ use crate::model::{Arrangement, Link, Model, Motor, Transmission};
 use crate::model_monitor::Baseline;
 use crate::sample::{Estimate, MOTORS, Sample, TransmissionEstimate};
 use crate::settings::{Method, Mode, Priors, Settings};
+use crate::suspicion::{Reason, Signal};
 
 impl From<Error> for PyErr {
     fn from(error: Error) -> PyErr {
@@ -328,6 +329,11 @@ pub fn external<'py>(py: Python<'py>, told: &External) -> PyResult<Bound<'py, Py
     tuples.make.bind(py).call1((&tuples.external, values))
 }
 
+/// Misfit, evidence, amplitude and its standard deviation.
+type Explained = (f64, f64, f64, f64);
+/// Signal, motor from 1 on or 0, reason, amount, its standard deviation, whether it explains all.
+type Suspected = (&'static str, usize, &'static str, f64, f64, bool);
+
 /// The on-line estimator of a joint, in either mode; see `estimator.online.Estimator`.
 #[pyclass]
 pub struct Estimator {
@@ -391,6 +397,34 @@ impl Estimator {
         let law = self.inner.parameters(motor, &mut values, &mut std);
         let polynomial = matches!(law, Some(Law::Polynomial));
         Ok((law.is_some(), polynomial, values, std))
+    }
+
+    /// The reading that is suspected.
+    fn suspicion(&self) -> Option<Suspected> {
+        let told = self.inner.suspicion()?;
+        let (signal, motor) = match told.signal {
+            Signal::MotorPosition(motor) => ("motor_position", motor + 1),
+            Signal::MotorTorque(motor) => ("motor_torque", motor + 1),
+            Signal::LinkPosition => ("link_position", 0),
+            Signal::Positions(motor) => ("motor_or_link_position", motor + 1),
+        };
+        let reason = match told.reason {
+            Reason::Scale => "scale",
+            Reason::Delay => "delay",
+            Reason::Zero => "zero",
+            Reason::Drift => "drift",
+            Reason::Impossible => "impossible",
+            Reason::Jumped => "jumped",
+            Reason::Frozen => "frozen",
+        };
+        Some((signal, motor, reason, told.amount, told.std, told.explains))
+    }
+
+    /// Independent equations of one motor's window, and what it says of every change.
+    fn verdict(&self, motor: usize) -> Option<(f64, Vec<Explained>)> {
+        let verdict = self.inner.verdict(motor)?;
+        let told = verdict.explanations.iter().map(|e| (e.misfit, e.evidence, e.amplitude, e.std));
+        Some((verdict.equations, told.collect()))
     }
 
     /// Seconds that each of so many ticks takes, the samples being taken again and again in turn.

@@ -9,6 +9,7 @@ use crate::delay::{DelaySearch, Known};
 use crate::effects::{Corrections, MotorEffects};
 use crate::error::Error;
 use crate::external::{Carried, External, LinkMomentum};
+use crate::isolation::Verdict;
 use crate::laws::Law;
 use crate::model::{Arrangement, Model, Motor};
 use crate::noise::NoiseMeter;
@@ -16,6 +17,7 @@ use crate::sample::{Estimate, MOTORS, Sample, TransmissionEstimate, joint_estima
 use crate::sample_validator::SampleValidator;
 use crate::settings::{Priors, Settings};
 use crate::signals::{Channel, Filters};
+use crate::suspicion::{Suspicion, suspected};
 use crate::transmission::{Moment, TransmissionEstimator};
 
 const SAID_S: f64 = 0.5; // how long a restart is reported
@@ -56,7 +58,8 @@ pub struct Robust {
     said: i64,
     rejected: i64,
     started: bool,
-    sequence: u64, // of the last sample that was used
+    sequence: u64,                     // of the last sample that was used
+    refused: Option<(Suspicion, i64)>, // what was wrong with a sample of late, and for how long that is said
     estimate: Option<Estimate>,
 }
 
@@ -117,6 +120,7 @@ impl Robust {
             rejected: 0,
             started: false,
             sequence: 0,
+            refused: None,
             estimate: None,
         };
         made.reset();
@@ -135,7 +139,7 @@ impl Robust {
         self.noise = [NoiseMeter::default(); MOTORS + 1];
         (self.zeros, self.last) = (Inputs::default(), Inputs::default());
         (self.tick, self.unsettled, self.said, self.rejected) = (0, self.settle, 0, 0);
-        (self.started, self.sequence, self.estimate) = (false, 0, None);
+        (self.started, self.sequence, self.refused, self.estimate) = (false, 0, None, None);
     }
 
     /// The next sample may not be of its moment: learn nothing until the filters have forgotten it.
@@ -163,6 +167,18 @@ impl Robust {
         self.transmissions.iter().map(|transmission| transmission.misfit().abs()).fold(f64::NAN, f64::max)
     }
 
+    /// The reading that is suspected, while something is.
+    #[must_use]
+    pub fn suspicion(&self) -> Option<Suspicion> {
+        self.refused.map(|(refused, _)| refused).or_else(|| suspected(&self.transmissions))
+    }
+
+    /// What the window of one motor's balance says of all changes; `None` before there is a reference.
+    #[must_use]
+    pub fn verdict(&self, motor: usize) -> Option<&Verdict> {
+        self.transmissions[motor].verdict()
+    }
+
     /// Parameters of one motor's transmission and their standard deviations; the law they belong to.
     pub fn parameters(&self, motor: usize, values: &mut Vec<f64>, std: &mut Vec<f64>) -> Option<&Law> {
         self.transmissions[motor].parameters(values, std)
@@ -172,6 +188,10 @@ impl Robust {
     pub fn step(&mut self, sample: &Sample) -> Estimate {
         // Can it be used, and how far is it from the last one that was?
         let accepted = self.validator.check(sample);
+        self.refused = match (accepted.suspicion, self.refused) {
+            (Some(now), _) => Some((now, (SAID_S / self.period).round() as i64)),
+            (None, before) => before.map(|(was, left)| (was, left - 1)).filter(|(_, left)| *left > 0),
+        };
         if accepted.periods == 0 {
             return self.carry(sample.sequence, accepted.status);
         }
@@ -283,7 +303,7 @@ impl Robust {
 
     /// The link encoder has been found late by so many periods: what was learned is void.
     fn realign(&mut self, late: f64) {
-        if late.abs() < SMALL_DELAY {
+        if late.abs() < SMALL_DELAY || self.transmissions.iter().any(TransmissionEstimator::changed) {
             return;
         }
         self.alignment.shift(late);

@@ -2,6 +2,7 @@
 
 use crate::model::Model;
 use crate::sample::{MOTORS, Sample, status};
+use crate::suspicion::{Reason, Signal, Suspicion};
 
 const PLACES: usize = MOTORS + 1;
 const CHANNELS: usize = 2 * MOTORS + 1;
@@ -37,6 +38,8 @@ pub struct Accepted {
     pub frozen: bool,
     /// With a restart: by how much each position has moved its zero, motors, then the link.
     pub jumps: Option<[f64; PLACES]>,
+    /// What is wrong with it, where something is.
+    pub suspicion: Option<Suspicion>,
 }
 
 /// Decides of each sample whether it can be used, and how far it is from the last one that was.
@@ -62,6 +65,7 @@ pub struct SampleValidator {
     tame: [f64; MOTORS],
     still: u32,
     learning: u32,
+    found: Option<(Signal, Reason)>, // what is wrong with the sample at hand
     memory: Memory,
 }
 
@@ -134,7 +138,17 @@ impl SampleValidator {
             tame,
             still: periods(STILL_S).max(4.0) as u32,
             learning: periods(LEARNING_S) as u32,
+            found: None,
             memory: FRESH,
+        }
+    }
+
+    /// The signal at a place: positions of the motors, the link's where it is watched, torques.
+    fn signal(&self, place: usize) -> Signal {
+        match place {
+            place if place < self.motors => Signal::MotorPosition(place),
+            place if place < self.watched() => Signal::LinkPosition,
+            place => Signal::MotorTorque(place - self.watched()),
         }
     }
 
@@ -155,6 +169,12 @@ impl SampleValidator {
 
     /// Judge one sample.
     pub fn check(&mut self, sample: &Sample) -> Accepted {
+        self.found = None;
+        let accepted = self.judge(sample);
+        Accepted { suspicion: self.found.map(|(signal, why)| Suspicion::of_sample(signal, why)), ..accepted }
+    }
+
+    fn judge(&mut self, sample: &Sample) -> Accepted {
         let rejected = Accepted { status: status::INPUT_REJECTED, ..Accepted::default() };
         let mut places = [0.0; PLACES];
         places[..self.motors].copy_from_slice(&sample.motor_position[..self.motors]);
@@ -163,7 +183,14 @@ impl SampleValidator {
         }
         let size: f64 = places[..self.watched()].iter().map(|x| x.abs()).sum();
         let impossible = size.is_nan() || size >= ABSURD;
-        if impossible || self.is_wild(&sample.motor_torque) {
+        if impossible {
+            let place = (0..self.watched())
+                .find(|i| places[*i].is_nan() || places[*i].abs() >= ABSURD)
+                .unwrap_or(self.motors);
+            self.found = Some((self.signal(place), Reason::Impossible));
+            return rejected;
+        }
+        if self.is_wild(&sample.motor_torque) {
             return rejected;
         }
         let Some(last) = self.memory.sequence else { return self.begin(sample.sequence, places, 0, None) };
@@ -202,7 +229,13 @@ impl SampleValidator {
         m.rejected = 0;
         let gap = if periods > 1 { status::GAP } else { 0 };
         let still = if frozen { status::INPUT_REJECTED } else { 0 };
-        Accepted { periods: periods as u32, restart: false, status: gap | still, frozen, jumps: None }
+        Accepted {
+            periods: periods as u32,
+            restart: false,
+            status: gap | still,
+            frozen,
+            ..Accepted::default()
+        }
     }
 
     fn begin(
@@ -219,7 +252,7 @@ impl SampleValidator {
         m.astray = [false; PLACES];
         (m.values, m.frozen, m.seen, m.rejected) = (None, false, 0, 0);
         self.review();
-        Accepted { periods: 1, restart: true, status, frozen: false, jumps }
+        Accepted { periods: 1, restart: true, status, jumps, ..Accepted::default() }
     }
 
     /// Whether a torque is no finite number, or beyond anything seen and new.
@@ -228,11 +261,13 @@ impl SampleValidator {
         for i in 0..self.motors {
             let size = torques[i].abs();
             if !size.is_finite() {
+                self.found = Some((Signal::MotorTorque(i), Reason::Impossible));
                 return true;
             }
             if size >= self.tame[i].max(WILD * m.largest[i]) {
                 m.wild += 1;
                 if m.wild < self.patience || size > ABSURD * self.tame[i] {
+                    self.found = Some((Signal::MotorTorque(i), Reason::Jumped));
                     return true;
                 }
             }
@@ -268,7 +303,10 @@ impl SampleValidator {
                     jumps[i] = off;
                 }
             }
-            if jumps.iter().any(|jump| *jump != 0.0) {
+            if let Some(place) = jumps.iter().position(|jump| *jump != 0.0) {
+                let signal =
+                    if place < self.motors { Signal::MotorPosition(place) } else { Signal::LinkPosition };
+                self.found = Some((signal, Reason::Jumped));
                 m.rejected += 1;
                 if m.rejected < self.patience {
                     return Accepted { status: status::INPUT_REJECTED | status::GAP, ..Accepted::default() };
@@ -292,7 +330,7 @@ impl SampleValidator {
             m.runs = [0; CHANNELS];
             return false;
         };
-        let (mut moving, mut frozen) = (0.0, false);
+        let (mut moving, mut still) = (0.0, None);
         for i in 0..count {
             if values[i] == old[i] {
                 m.runs[i] += 1;
@@ -306,7 +344,9 @@ impl SampleValidator {
                 // A torque always counts as one that was moving before.
                 let stopped_dead =
                     i >= watched || m.stopped_at[i] * f64::from(self.still) > STOPPED_COUNTS * m.steps[i];
-                frozen |= run > self.still && run > 3 * m.usual[i] && stopped_dead;
+                if run > self.still && run > 3 * m.usual[i] && stopped_dead {
+                    still = Some(i);
+                }
             } else {
                 m.runs[i] = 0;
                 if i < watched {
@@ -315,8 +355,12 @@ impl SampleValidator {
             }
         }
         m.motion += 0.05 * (moving - m.motion);
-        m.frozen = frozen && m.motion > 0.2;
-        m.frozen
+        m.frozen = still.is_some() && m.motion > 0.2;
+        let frozen = m.frozen;
+        if let Some(place) = still.filter(|_| frozen) {
+            self.found = Some((self.signal(place), Reason::Frozen));
+        }
+        frozen
     }
 
     fn jumped(&mut self, places: &[f64; PLACES], periods: f64) -> bool {
@@ -334,6 +378,8 @@ impl SampleValidator {
             if checked && bend > m.limits[i] {
                 m.astray[i] = true;
                 jumped = true;
+                let signal = if i < self.motors { Signal::MotorPosition(i) } else { Signal::LinkPosition };
+                self.found = Some((signal, Reason::Jumped));
             }
             if jumped {
                 continue;

@@ -145,12 +145,14 @@ pub struct Signals {
     past: Vec<f64>, // deflections of the last ticks, a ring; of a nonlinear law
     newest: usize,
     filled: usize,
+    behind: usize, // samples of it that a basis which is being rebuilt has not taken in yet …
+    chunk: usize,  // … and how many it takes in at a tick
 }
 
 impl Signals {
-    /// At rest; `nonlinear`: whether the law has shape parameters.
+    /// At rest; `nonlinear`: whether the law has shape parameters; `every`: ticks between two equations.
     #[must_use]
-    pub fn new(filters: &Filters, period_s: f64, nonlinear: bool) -> Signals {
+    pub fn new(filters: &Filters, period_s: f64, every: usize, nonlinear: bool) -> Signals {
         let past = if nonlinear { (PAST_DELAYS * filters.delay / period_s).ceil() as usize } else { 0 };
         Signals {
             position: Channel::rest(0.0),
@@ -162,6 +164,8 @@ impl Signals {
             past: vec![0.0; past],
             newest: 0,
             filled: 0,
+            behind: 0,
+            chunk: 2 + past / (every / 2).max(1),
         }
     }
 
@@ -181,6 +185,7 @@ impl Signals {
 
     /// As if the deflection had been this forever.
     pub fn rest_basis(&mut self, law: &Linearisation, phi: f64) {
+        self.behind = 0;
         let mut columns = [0.0; COLUMNS];
         law.columns(phi, &mut columns);
         for (channel, value) in self.basis.iter_mut().zip(columns) {
@@ -194,6 +199,10 @@ impl Signals {
             self.newest = (self.newest + 1) % self.past.len();
             self.past[self.newest] = phi;
             self.filled = (self.filled + 1).min(self.past.len());
+        }
+        if self.behind > 0 {
+            self.behind += 1;
+            return self.catch_up(filters, law, self.chunk);
         }
         let mut columns = [0.0; COLUMNS];
         law.columns(phi, &mut columns);
@@ -220,18 +229,28 @@ impl Signals {
     }
 
     /// Give the basis channels the past that they would have had with the law linearised where it is now.
-    pub fn recompute_basis(&mut self, filters: &Filters, law: &Linearisation) {
-        let length = self.past.len();
+    ///
+    /// They are of use again at the next equation: until then a part is done at every tick.
+    pub fn rebuild_basis(&mut self, filters: &Filters, law: &Linearisation) {
+        self.behind = self.past.len();
         let mut columns = [0.0; COLUMNS];
-        for k in 0..length {
-            law.columns(self.past[(self.newest + 1 + k) % length], &mut columns);
+        law.columns(self.past[(self.newest + 1) % self.past.len()], &mut columns);
+        for (channel, value) in self.basis.iter_mut().zip(columns) {
+            *channel = Channel::rest(value);
+        }
+        self.behind -= 1;
+        self.catch_up(filters, law, self.chunk);
+    }
+
+    /// Take in so many of the samples that the basis is behind.
+    pub fn catch_up(&mut self, filters: &Filters, law: &Linearisation, most: usize) {
+        let (length, mut columns) = (self.past.len(), [0.0; COLUMNS]);
+        for _ in 0..most.min(self.behind) {
+            law.columns(self.past[(self.newest + 1 + length - self.behind) % length], &mut columns);
             for i in (0..law.size).chain([PARAMETERS]) {
-                if k == 0 {
-                    self.basis[i] = Channel::rest(columns[i]);
-                } else {
-                    self.basis[i].smooth(filters, columns[i]);
-                }
+                self.basis[i].smooth(filters, columns[i]);
             }
+            self.behind -= 1;
         }
     }
 }

@@ -1,17 +1,24 @@
-//! Student's t distribution: the tails of what is normal but for a variance that is known from few data.
+//! Student's t and Fisher's F distribution: tails of what is normal but for a variance that is known from few data.
 
-/// |t| that a t distribution exceeds with this probability, from its tail integral by bisection.
+/// |t| that a t distribution exceeds with this probability.
 #[must_use]
 pub fn t_quantile(freedom: f64, probability: f64) -> f64 {
-    // ∫ (1 + t²/ν)^(−(ν+1)/2) dt with t = √ν tan u is √ν ∫ cos^(ν−1) u du.
+    f_quantile(1.0, freedom, probability).sqrt()
+}
+
+/// What an F distribution of so many degrees of freedom exceeds with this probability, by bisection.
+#[must_use]
+pub fn f_quantile(above: f64, below: f64, probability: f64) -> f64 {
+    // With x = (below/above) tan² u the density becomes sin^(above−1) u cos^(below−1) u.
     let integral = |from: f64| {
-        const STEPS: usize = 4000;
+        const STEPS: usize = 2000;
         let h = (std::f64::consts::FRAC_PI_2 - from) / STEPS as f64;
-        (0..STEPS).map(|k| (from + (k as f64 + 0.5) * h).cos().powf(freedom - 1.0)).sum::<f64>() * h
+        let density = |u: f64| u.sin().powf(above - 1.0) * u.cos().powf(below - 1.0);
+        (0..STEPS).map(|k| density(from + (k as f64 + 0.5) * h)).sum::<f64>() * h
     };
     let whole = integral(0.0);
     let (mut low, mut high) = (0.0, std::f64::consts::FRAC_PI_2);
-    for _ in 0..60 {
+    for _ in 0..50 {
         let middle = 0.5 * (low + high);
         if integral(middle) > probability.clamp(0.0, 1.0) * whole {
             low = middle;
@@ -19,7 +26,7 @@ pub fn t_quantile(freedom: f64, probability: f64) -> f64 {
             high = middle;
         }
     }
-    freedom.sqrt() * (0.5 * (low + high)).tan()
+    below / above * (0.5 * (low + high)).tan().powi(2)
 }
 
 #[cfg(test)]
@@ -30,5 +37,6 @@ mod tests {
     fn quantiles_are_those_of_tables() {
         assert!((t_quantile(20.0, 0.05) - 2.086).abs() < 1e-3);
         assert!((t_quantile(20.0, 0.001) - 3.850).abs() < 1e-3);
+        assert!((f_quantile(10.0, 8.0, 0.001) - 11.54).abs() < 0.02);
     }
 }

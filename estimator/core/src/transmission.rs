@@ -1,10 +1,11 @@
 //! One motor and its transmission on line: fed every tick, learning at every update, read off at any time.
 
-use crate::change_detection::ChangeDetection;
+use crate::change_detection::{Action, ChangeDetection, Innovation};
 use crate::deflection::{DeflectionFilter, Tuning};
 use crate::effects::{Coordinates, MotorEffects};
 use crate::external::Carried;
 use crate::identification::OnlineIdentification;
+use crate::isolation::{Change, Verdict};
 use crate::laws::Law;
 use crate::model::Motor;
 use crate::sample::TransmissionEstimate;
@@ -122,7 +123,12 @@ impl TransmissionEstimator {
             rigid: !motor.flexible(),
             effects,
             rate_gain: filters.rate_gain(period_s),
-            signals: Signals::new(filters, period_s, identification.is_nonlinear()),
+            signals: Signals::new(
+                filters,
+                period_s,
+                (dt_s / period_s).round() as usize,
+                identification.is_nonlinear(),
+            ),
             effect: 0.0,
             transmitted: 0.0,
             deflection: DeflectionFilter::new(motor.inertia, motor.damping, bandwidth, period_s, dt_s / 2.0),
@@ -192,6 +198,30 @@ impl TransmissionEstimator {
     #[must_use]
     pub fn changed(&self) -> bool {
         self.changes.changed()
+    }
+
+    /// What the window says of all changes; `None` before there is a reference.
+    #[must_use]
+    pub fn verdict(&self) -> Option<&Verdict> {
+        self.changes.verdict()
+    }
+
+    /// The same while a change has not been explained.
+    #[must_use]
+    pub fn doubt(&self) -> Option<&Verdict> {
+        self.changes.doubt()
+    }
+
+    /// Whether a change leaves no more of the window than noise does; true where nothing is said of it.
+    #[must_use]
+    pub fn is_explained_by(&self, change: Change) -> bool {
+        self.changes.is_explained_by(change)
+    }
+
+    /// SI units (s for delays) in which a change's amplitude is counted.
+    #[must_use]
+    pub fn unit_of(&self, change: Change) -> f64 {
+        self.identification.unit_of(change)
     }
 
     /// Whether the motion reveals the stiffness.
@@ -272,6 +302,7 @@ impl TransmissionEstimator {
         if self.identification.kalman().is_none() && now.usable && self.excited {
             self.identification.start();
         }
+        self.signals.catch_up(filters, self.identification.law(), usize::MAX);
         // The balance (eq 5) as one equation: has the joint changed? What does it teach?
         let mut astray = false;
         if self.identification.kalman().is_some() {
@@ -313,17 +344,42 @@ impl TransmissionEstimator {
         if now.usable && updates >= self.identification.updates_in(FIRST_S) {
             self.fit.see(y, innovation, self.dt);
         }
+        // Is it the reference's? If not, is it another stiffness, or a reading that is not what it was?
+        let mut of_reference = None;
+        if now.usable && self.excited && self.changes.may_learn() {
+            let (window, suspect) = (self.changes.window(), self.changes.suspect());
+            of_reference = self.identification.observe(&self.signals, &now.link, &h, y, window, suspect);
+        }
+        let settled = updates >= (1.0 / self.dt) as u32;
         if now.usable {
-            let settled = updates >= (1.0 / self.dt) as u32;
-            if self.changes.watch(innovation, predicted, noise, settled) {
-                self.identification.open_up();
+            let verdict = self.identification.judge();
+            let seen = Innovation { value: innovation, predicted_variance: predicted, noise, of_reference };
+            match self.changes.watch(&seen, verdict, settled) {
+                Action::GoOn => {}
+                Action::OpenUp => {
+                    self.identification.restore_reference();
+                    self.identification.open_up();
+                    return;
+                }
+                Action::Restore => return self.identification.restore_reference(),
+                Action::Accept(change) => {
+                    if let Some(verdict) = verdict {
+                        self.identification.accept(change, &verdict);
+                    }
+                    return;
+                }
+                Action::Relearn => return self.relearn(),
             }
         } else {
             self.changes.pause();
         }
+        // What it teaches.
         if now.usable && self.excited && self.changes.may_learn() {
             self.held_s = 0.0;
             self.identification.learn(&h, innovation, predicted, self.changes.may_learn_noise());
+            if !self.changes.changed() {
+                self.identification.keep_reference();
+            }
         } else {
             self.identification.pass_over(innovation, predicted);
         }
@@ -338,10 +394,21 @@ impl TransmissionEstimator {
     fn is_astray(&mut self) -> bool {
         let long = self.identification.updates_in(ASTRAY_S);
         if !self.identification.kalman().is_some_and(|kalman| kalman.is_finite()) {
+            if self.identification.has_reference() {
+                self.identification.restore_reference();
+                return false;
+            }
             return true;
         }
         self.impossible = if self.identification.is_possible() { 0 } else { self.impossible + 1 };
-        if self.explains() {
+        if self.identification.has_reference() {
+            // Then there is a way back.
+            if self.impossible > long {
+                self.identification.restore_reference();
+                self.impossible = 0;
+            }
+            self.missing = 0;
+        } else if self.explains() {
             self.missing = 0;
         } else if self.excited && self.changes.may_learn_noise() {
             self.missing += 1;
@@ -352,9 +419,10 @@ impl TransmissionEstimator {
     /// The nonlinear law instead of the polynomial, or linearised anew, when it is due.
     fn follow_law(&mut self, filters: &Filters) {
         let updates = self.identification.updates();
-        let due = updates > 0 && updates % self.identification.updates_in(DUE_S) == 0 && self.excited;
-        if due && self.signals.has_past() && self.identification.switch_model() {
-            self.signals.recompute_basis(filters, self.identification.law());
+        let due = updates > 0 && updates % self.identification.updates_in(DUE_S) == 0;
+        let well = self.excited && !self.changes.changed();
+        if due && well && self.signals.has_past() && self.identification.switch_model() {
+            self.signals.rebuild_basis(filters, self.identification.law());
         }
     }
 
@@ -386,7 +454,7 @@ impl TransmissionEstimator {
 
     /// How many periods later than assumed the link is, where that has become clear.
     pub fn take_delay(&mut self) -> Option<f64> {
-        self.identification.take_delay()
+        if self.changes.changed() { None } else { self.identification.take_delay() }
     }
 
     /// The channels have been aligned by so much more.

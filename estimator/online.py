@@ -52,10 +52,12 @@ class Estimator(Protocol):
     def suspicion(self) -> dict[str, Any] | None:
         """The reading that is suspected while what is read cannot be; None: none.
 
-        {"signal": "motor_position" | "motor_torque" | "link_position" | "motor_or_link_position", "motor":
-        from 1 on (0: the link's), "reason": "scale" (relative), "delay" (s), "zero" (rad, N·m), "drift" (rad/s),
-        "impossible", "jumped" or "frozen", "amount" and "std" in the reason's unit (None where it has none), "explains":
-        whether it explains all that is seen, "text": the same in words}.
+        {"signal": "motor_position" | "motor_torque" | "link_position" | "motor_or_link_position",
+        "motor": from 1 on (0: the link's),
+        "reason": "scale" (relative), "delay" (s), "zero" (rad, N·m), "drift" (rad/s), "impossible", "jumped" or
+        "frozen",
+        "amount" and "std": in the reason's unit, None where it has none,
+        "explains": whether it explains all that is seen, "text": the same in words}.
         """
 
 

@@ -54,8 +54,8 @@ class Estimator(Protocol):
 
         {"signal": "motor_position" | "motor_torque" | "link_position" | "motor_or_link_position",
         "motor": from 1 on (0: the link's),
-        "reason": "scale" (relative), "delay" (s), "zero" (rad, N·m), "drift" (rad/s), "impossible", "jumped" or
-        "frozen",
+        "reason": "scale" (relative), "delay" (s), "zero" (rad, N·m), "drift" (rad/s), "impossible", "jumped"
+        or "frozen",
         "amount" and "std": in the reason's unit, None where it has none,
         "explains": whether it explains all that is seen, "text": the same in words}.
         """

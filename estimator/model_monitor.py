@@ -124,10 +124,10 @@ class ModelMonitor:
         false_alarms_per_hour: float = _SETTINGS.false_alarms_per_hour,
         core: type[_core.ModelMonitor] = _core.ModelMonitor,
     ) -> None:
-        told = None
+        arguments = None
         if baseline is not None:
-            told = (baseline.residual_nm, baseline.torque_nm, baseline.log_std, baseline.seconds)
-        self.core = core(model, period_s, told, false_alarms_per_hour)
+            arguments = (baseline.residual_nm, baseline.torque_nm, baseline.log_std, baseline.seconds)
+        self.core = core(model, period_s, arguments, false_alarms_per_hour)
         self.baseline = baseline if self.core.monitoring else None
 
     def step(self, sample: Sample, estimate: Estimate, residual_nm: float) -> bool:

@@ -76,18 +76,18 @@ def _by_hand(joint: JointFile | None, args: argparse.Namespace) -> int:
         raise UsageError("--move: expected a joint file")
     with live_values(joint, args.joint.parent) as values:
         done = check_by_hand(joint, values, _Terminal(sys.stderr if args.json else sys.stdout))
-    told = done.as_dict()
+    outcome = done.as_dict()
     if args.json:
-        print(json.dumps(told, ensure_ascii=False))
-        return 0 if told["good"] else 1
+        print(json.dumps(outcome, ensure_ascii=False))
+        return 0 if outcome["good"] else 1
     if done.paste:
         print(f"Put into {args.joint}:")
     for line in done.paste:
         print(f"  {line}")
-    if told["good"]:
+    if outcome["good"]:
         checked = sum(mark.good is True for mark in done.marks)
         print(f"{checked} checked and right, {len(done.marks) - checked} not checked")
-    return 0 if told["good"] else 1
+    return 0 if outcome["good"] else 1
 
 
 class _Terminal:

@@ -29,7 +29,7 @@ def cross_checks(assembler: Assembler) -> list[dict[str, Any]]:
 
 
 def contradiction(assembler: Assembler) -> dict[str, Any] | None:
-    """The reading that a cross-check suspects, as `Estimator.suspicion` tells its own; None: none.
+    """The reading that a cross-check suspects, as `Estimator.suspicion` gives its own; None: none.
 
     Where a second check clears the position, the other reading is the wrong one; where two contradict it and
     none clears it, the position is; else nobody can say which of the two it is.

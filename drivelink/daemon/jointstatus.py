@@ -178,16 +178,16 @@ class JointStatus:
 
     def _external(self) -> dict[str, Any] | None:
         """What touches the link, and whether both sides of the joint agree on the flexibility torque."""
-        told = self._lane.chain.external
-        if told is None:
+        touch = self._lane.chain.external
+        if touch is None:
             return None
         return {
-            "valid": bool(told.status & ExternalStatus.VALID),
-            "contact": bool(told.status & ExternalStatus.CONTACT),
-            "torque_nm": told.external_torque_nm,
-            "torque_std_nm": told.external_torque_std_nm,
-            "link_flexibility_torque_nm": told.link_flexibility_torque_nm,
-            "difference_nm": told.difference_nm,
+            "valid": bool(touch.status & ExternalStatus.VALID),
+            "contact": bool(touch.status & ExternalStatus.CONTACT),
+            "torque_nm": touch.external_torque_nm,
+            "torque_std_nm": touch.external_torque_std_nm,
+            "link_flexibility_torque_nm": touch.link_flexibility_torque_nm,
+            "difference_nm": touch.difference_nm,
             **self._consistency(),
         }
 

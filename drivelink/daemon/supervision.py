@@ -375,7 +375,7 @@ class Supervisor:
             self._events.end(f"fault {node}", f"node {node} reports no fault any more")
 
     def _check_statusword(self, node: int, watched: _Watched) -> None:
-        """Say when a drive leaves the state in which it drives, and when it limits what it is told."""
+        """Say when a drive leaves the state in which it drives, and when it limits its set-point."""
         statusword = watched.lane.chain.assembler.statuswords.get(node)
         if statusword is None:
             return

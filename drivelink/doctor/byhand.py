@@ -46,7 +46,7 @@ class Person(Protocol):
     """Who moves the joint."""
 
     def say(self, text: str) -> None:
-        """Tell something."""
+        """Show a line."""
 
     def ask(self, text: str, meanwhile: Callable[[], None]) -> str:
         """Ask for an answer; `meanwhile` is called again and again until it comes."""

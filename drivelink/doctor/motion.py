@@ -131,7 +131,7 @@ def record_of_motion(
     Returns:
         The recording; None where a channel is missing or there are less than three turns.
     """
-    told: dict[tuple[Signal, int | None], tuple[FloatArray, FloatArray]] = {}
+    series: dict[tuple[Signal, int | None], tuple[FloatArray, FloatArray]] = {}
     for survey in surveys:
         mine = samples.get(survey.role.node_id, ())
         for signal in mine[0].values if mine else ():
@@ -139,21 +139,21 @@ def record_of_motion(
             prompt = waits <= _PROMPT * np.median(waits)
             times = np.array([sample.times_s[signal] for sample in mine])[prompt]
             values = np.array([sample.values[signal] for sample in mine])[prompt]
-            told[signal, None if signal is Signal.LINK_POSITION else survey.role.motor] = (times, values)
+            series[signal, None if signal is Signal.LINK_POSITION else survey.role.motor] = (times, values)
     needed = [(signal, i) for signal in (Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE) for i in range(motors)]
     wanted: list[tuple[Signal, int | None]] = [*needed, *([(Signal.LINK_POSITION, None)] if linked else [])]
-    if any(key not in told or len(told[key][0]) < 3 for key in wanted):
+    if any(key not in series or len(series[key][0]) < 3 for key in wanted):
         return None
-    begin = max(float(told[key][0][0]) for key in wanted)
-    end = min(float(told[key][0][-1]) for key in wanted)
-    period_s = float(np.median(np.diff(told[wanted[0]][0])))
+    begin = max(float(series[key][0][0]) for key in wanted)
+    end = min(float(series[key][0][-1]) for key in wanted)
+    period_s = float(np.median(np.diff(series[wanted[0]][0])))
     if not (end - begin > 2.0 * period_s > 0.0):
         return None
     turns = np.asarray(begin + period_s * np.arange(int((end - begin) / period_s) + 1), dtype=np.float64)
-    grid = _longest(turns, [told[key][0] for key in wanted], _STALL * period_s)
+    grid = _longest(turns, [series[key][0] for key in wanted], _STALL * period_s)
 
     def column(signal: Signal, motor: int | None) -> FloatArray:
-        return np.asarray(np.interp(grid, *told[signal, motor]))
+        return np.asarray(np.interp(grid, *series[signal, motor]))
 
     return Record(
         period_s=period_s,

@@ -315,14 +315,14 @@ class Ros2Publisher:
 
     def _touch(self, second: int, ns: int, stamp_ns: int) -> tuple[float, ...]:
         """Publish the wrench where it is valid; the values of the external torque's interfaces."""
-        told = self.external
-        if told is None or self._wrench is None:
+        touch = self.external
+        if touch is None or self._wrench is None:
             return (math.nan, math.nan, 0.0, 0.0)
-        valid = bool(told.status & ExternalStatus.VALID)
+        valid = bool(touch.status & ExternalStatus.VALID)
         if valid:
-            self._wrench.put(self._pack_wrench(second, ns, told.external_torque_nm), stamp_ns)
-        contact = bool(told.status & ExternalStatus.CONTACT)
-        return (told.external_torque_nm, told.external_torque_std_nm, float(valid), float(contact))
+            self._wrench.put(self._pack_wrench(second, ns, touch.external_torque_nm), stamp_ns)
+        contact = bool(touch.status & ExternalStatus.CONTACT)
+        return (touch.external_torque_nm, touch.external_torque_std_nm, float(valid), float(contact))
 
     def put_status(self, status: Mapping[str, Any], stamp_ns: int) -> None:
         """Publish diagnostics, once a second however often it is called.

@@ -55,7 +55,7 @@ CHOICES: dict[str, Choice] = {
     "most_bandwidth": Choice(25.0, "Hz", "asked for at most", "above it joints have modes of their own"),
     "sampled": Choice(0.2, "sampling rates", "bandwidth at most", "five samples in a period"),
     "narrowing": Choice(0.75, "", "step by which it is narrowed", "noise halves, with two derivatives"),
-    "narrowest": Choice(4.0, "Hz", "bandwidth at least, whatever the noise", "below it nothing is told"),
+    "narrowest": Choice(4.0, "Hz", "bandwidth at least, whatever the noise", "below it nothing is known"),
     "noise": Choice(
         0.004, "torque rms", "noise of a balance that narrows the bandwidth", "twice the floor"
     ),
@@ -94,13 +94,13 @@ CHOICES: dict[str, Choice] = {
     "effects": Choice(5, "effects", "at most", "a joint with more is declared wrongly"),
     # Verdicts.
     "even": Choice(0.05, "probability", "at which another account is an alternative", "one in twenty"),
-    "sure": Choice(3.0, "standard deviations", "at which a reading's error is told", "one in 400"),
+    "sure": Choice(3.0, "standard deviations", "at which a reading's error is reported", "one in 400"),
     "skew": Choice(1.05, "periods", "an everyday skew at most", "a sample, and what noise makes of it"),
     "least_skew": Choice(
         2e-5, "s", "that is calibrated", "a hundredth of what moves a stiffness by a per mille"
     ),
     "constant": Choice(
-        2.0, "what else is left", "a constant torque that is all there is to tell", "more than the rest"
+        2.0, "what else is left", "a constant torque that is all there is", "more than the rest"
     ),
     "groups": Choice(
         10, "", "stretches of time, and kinds of motion", "more say less each, fewer are unsure"
@@ -110,10 +110,10 @@ CHOICES: dict[str, Choice] = {
         10.0, "floor", "what names leave at which something unnamed is missing", "an order of magnitude"
     ),
     "curve": Choice(
-        0.6, "what names leave", "left by a free curve that is told instead", "else a name says more"
+        0.6, "what names leave", "left by a free curve reported instead", "else a name says more"
     ),
     "one_sine": Choice(
-        1.08, "spectral lines", "of a motion that tells nothing apart", "one, and what its window leaks"
+        1.08, "spectral lines", "of a motion that separates nothing", "one, and what its window leaks"
     ),
     # Free curves.
     "knots": Choice(20, "", "of a spline over one coordinate", "a bump of a twentieth of the range"),

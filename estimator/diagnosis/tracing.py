@@ -151,7 +151,7 @@ class _Judge:
                 verdict = "insufficient_excitation"
         elif verdict == "sufficient" and (left := self._left(found)) > PRIORS["effect"].std:
             notes.append(
-                f"the model leaves {left:.0%} of the torque, and the recording does not tell what is missing"
+                f"the model leaves {left:.0%} of the torque, and the recording hides what is missing"
             )
             verdict = "insufficient_excitation"
         train = errors_of(problem, before, after, problem.used)
@@ -193,7 +193,7 @@ class _Judge:
         return self.problem.null(pinned)
 
     def _even(self, found: Fitted, rivals: list[Fitted]) -> tuple[str, ...]:
-        """Effects that could stand in a term's place: what the data do not tell from it."""
+        """Effects that could stand in a term's place: what the data do not separate from it."""
         close = [r for r in rivals if self.search.chance(found, r) > choice("even")]
         names = [r.terms[-1].candidate.kind.name for r in close]
         own = [t.candidate.kind.name for t in found.terms]

@@ -101,7 +101,7 @@ class Judgement:
     """What a recording says of units, signs, gears and time.
 
     Attributes:
-        findings: what is wrong; empty where nothing is, and where nothing can be told.
+        findings: what is wrong; empty where nothing is, and where nothing can be decided.
         untold: units and signs that this motion does not reveal, in words: with them wrong it would look as
             likely. Empty where something is found.
         reason: why nothing can be decided at all; empty where something can.

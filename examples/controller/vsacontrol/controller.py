@@ -113,7 +113,7 @@ class Controller:
             drives: what the master knows.
             now_s: monotonic time.
             age_s: of the estimate, which may have waited on its way.
-            external: what the world does to the link, by the newest message; None: it is not told.
+            external: what the world does to the link, by the newest message; None: unknown.
         """
         periods = 0 if self._sequence is None else sample.sequence - self._sequence
         self._sequence = sample.sequence

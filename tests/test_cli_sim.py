@@ -138,7 +138,7 @@ def test_a_second_simulation_of_the_same_nodes_is_refused(
         assert main(["sim", str(file), "--seconds", "1"]) == 4
     said = capsys.readouterr().err.splitlines()
     assert "joined" in said[0]
-    assert "node 1, node 2 is on the bus already: another `drivelink sim`" in said[1]
+    assert "node 1, node 2: on the bus already: another `drivelink sim`" in said[1]
 
 
 def test_a_second_simulation_ends_with_the_first_and_burns_nothing(file: Path, tmp_path: Path) -> None:

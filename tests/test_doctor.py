@@ -608,17 +608,19 @@ def test_values_read_one_after_the_other_are_put_on_one_grid():
     assert abs(record.link_position_rad - record.motor_position_rad[:, 0]).max() < 1e-4
 
 
-def test_where_the_nodes_stall_the_recording_ends():
+def test_where_the_nodes_stall_there_is_a_gap_and_after_long_the_recording_ends():
     found, _ = survey(link="[link.encoder]\ncounts_per_rev = 65536")
     signals = (Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE, Signal.LINK_POSITION)
     samples = []
     for k in range(600):
-        t = 0.01 * k + (0.0 if k < 200 else 0.5)
+        t = 0.01 * k + 0.5 * (k >= 200) + 0.1 * (k >= 400)
         values = dict.fromkeys(signals, math.sin(2.0 * t))
         samples.append(MotionSample(t, values, dict.fromkeys(signals, t), dict.fromkeys(signals, 0.001)))
     record = record_of_motion([found], {5: samples}, 1, True)
-    assert len(record) == pytest.approx(400, abs=1)
+    assert len(record) == pytest.approx(400, abs=2)
     assert record.motor_position_rad[0, 0] == pytest.approx(math.sin(2.0 * 2.5), abs=1e-3)
+    steps = [after - before for before, after in itertools.pairwise(record.sequence)]
+    assert sorted(set(steps)) == [1, 11] and steps.count(11) == 1  # 0.1 s more than one period
 
 
 def test_scanning_asks_every_id_and_hears_who_is_there():

@@ -405,7 +405,7 @@ def require_free(bus: can.BusABC, node_ids: Sequence[int], section: BusSection) 
     if taken:
         nodes = ", ".join(f"node {node}" for node in taken)
         raise BusError(
-            f"{section.interface} {section.channel}: {nodes} is on the bus already: another `drivelink sim`, "
+            f"{section.interface} {section.channel}: {nodes}: on the bus already: another `drivelink sim`, "
             "or real drives; end it, or use another --channel"
         )
 

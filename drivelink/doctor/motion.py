@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivelink.canopen.layout import Signal
 from drivelink.canopen.mappable import MappableObject
@@ -38,7 +39,10 @@ _WINDOW_S = 0.02  # differences over less are mostly quantisation
 _LEAST_COUNTS = 50  # that have to pass for a judgement
 _TOLERANCE = 0.15  # relative; velocities are filtered in the drive
 _LINK_TOLERANCE = 0.35  # the transmission bends
-_STALL = 4.0  # turns without an answer after which the motion between is not known
+_STALL = 4.0  # turns without an answer after which the motion between is not known,
+_STALL_S = 0.01  # and so long: at 10 Hz a straight line over it is off by (2 pi f t)²/8 = 5 %
+_LONG_STALL_S = 0.25  # after which the recording ends; a shorter stall is a gap in it
+_LEAST_PERIOD_S = 0.001  # of the recording that is made of the answers: joints move no faster
 _PROMPT = 1.5  # times the usual wait for an answer: what came later says less about when it was read
 _LONGER = "move the joint during the check, by its controller (--seconds 20 gives more time)"
 
@@ -120,7 +124,7 @@ def record_of_motion(
     """What the nodes said, as a recording with one period: each value was read at a time of its own.
 
     An answer that was long in coming is left out: nobody knows when within that time it was made. Where the
-    nodes did not answer for several turns, the recording ends: it is the longest stretch without that.
+    nodes did not answer for several turns there is a gap; where for long, the recording ends.
 
     Args:
         surveys: of the nodes.
@@ -146,35 +150,38 @@ def record_of_motion(
         return None
     begin = max(float(series[key][0][0]) for key in wanted)
     end = min(float(series[key][0][-1]) for key in wanted)
-    period_s = float(np.median(np.diff(series[wanted[0]][0])))
+    period_s = max(float(np.median(np.diff(series[wanted[0]][0]))), _LEAST_PERIOD_S)
     if not (end - begin > 2.0 * period_s > 0.0):
         return None
     turns = np.asarray(begin + period_s * np.arange(int((end - begin) / period_s) + 1), dtype=np.float64)
-    grid = _longest(turns, [series[key][0] for key in wanted], _STALL * period_s)
+    sequence = _known(turns, [series[key][0] for key in wanted], max(_STALL * period_s, _STALL_S))
+    grid = turns[sequence]
 
     def column(signal: Signal, motor: int | None) -> FloatArray:
         return np.asarray(np.interp(grid, *series[signal, motor]))
 
     return Record(
         period_s=period_s,
-        sequence=np.arange(len(grid)),
+        sequence=sequence,
         motor_position_rad=np.stack([column(Signal.MOTOR_POSITION, i) for i in range(motors)], axis=1),
         motor_torque_nm=np.stack([column(Signal.MOTOR_TORQUE, i) for i in range(motors)], axis=1),
         link_position_rad=column(Signal.LINK_POSITION, None) if linked else None,
     )
 
 
-def _longest(grid: FloatArray, channels: Sequence[FloatArray], most_s: float) -> FloatArray:
-    """The longest part of the grid in which no channel's readings are further apart than that."""
+def _known(grid: FloatArray, channels: Sequence[FloatArray], most_s: float) -> NDArray[np.int64]:
+    """Places of the grid where no channel's readings are further apart than that: those of the longest part
+    that no long stall interrupts.
+    """
     good = np.ones(len(grid), dtype=bool)
     for times in channels:
         for k in np.flatnonzero(np.diff(times) > most_s):
             good &= (grid <= times[k]) | (grid >= times[k + 1])
-    ends = np.flatnonzero(np.diff(np.concatenate(([False], good, [False])).astype(int)))
-    if not len(ends):
-        return grid[:0]
-    longest = int(np.argmax(ends[1::2] - ends[::2]))
-    return grid[ends[2 * longest] : ends[2 * longest + 1]]
+    places = np.flatnonzero(good)
+    if not len(places):
+        return places
+    parts = np.split(places, np.flatnonzero(np.diff(grid[places]) > _LONG_STALL_S) + 1)
+    return max(parts, key=len)
 
 
 def judge_record(section: Section, joint: JointFile, record: Record | None) -> None:

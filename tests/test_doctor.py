@@ -620,7 +620,7 @@ def test_where_the_nodes_stall_there_is_a_gap_and_after_long_the_recording_ends(
     assert len(record) == pytest.approx(400, abs=2)
     assert record.motor_position_rad[0, 0] == pytest.approx(math.sin(2.0 * 2.5), abs=1e-3)
     steps = [after - before for before, after in itertools.pairwise(record.sequence)]
-    assert sorted(set(steps)) == [1, 11] and steps.count(11) == 1  # 0.1 s more than one period
+    assert max(steps) in (11, 12) and steps.count(1) == len(steps) - 1  # 0.11 s, by where the grid lies
 
 
 def test_scanning_asks_every_id_and_hears_who_is_there():

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from estimator.diagnosis.candidates import Candidate
+from estimator.diagnosis.candidates import Candidate, reverses
 from estimator.diagnosis.choices import choice
 from estimator.diagnosis.frame import Frame
 from estimator.effects import LIBRARY
@@ -15,8 +15,15 @@ from estimator.priors import PRIORS
 
 __all__ = ["OF_RUN", "effect_std", "everyday", "everyday_std", "least"]
 
-OF_RUN = ("torque_offset", "deflection_offset")  # belong to a run, all else to the machine
-_AT_MOTOR = ("motor_inertia", "viscous_damping", "torque_offset", "torque_delay", "deflection_offset")
+OF_RUN = ("coulomb_friction", "torque_offset", "deflection_offset")  # all else belongs to the machine
+_AT_MOTOR = (
+    "motor_inertia",
+    "viscous_damping",
+    "coulomb_friction",
+    "torque_offset",
+    "torque_delay",
+    "deflection_offset",
+)
 _AT_LINK = ("encoder_delay", "link_inertia", "link_viscous_damping", "gravity")
 
 # Effects that take energy, never give it.
@@ -46,7 +53,8 @@ def everyday(frame: Frame) -> list[Candidate]:
     if frame.linked:
         made += [Candidate(LIBRARY["torque_constant"], i) for i in range(len(frame.motors))]
     for name in _AT_LINK:
-        if (frame.linked or name == "encoder_delay") and any(frame.flexible):
+        reading = name == "encoder_delay"
+        if (reading and any(frame.flexible)) or (not reading and (frame.linked or frame.carried)):
             made.append(Candidate(LIBRARY[name], None))
     return made
 
@@ -67,9 +75,14 @@ def everyday_std(
     std = PRIORS[name].std
     if name in ("torque_delay", "encoder_delay"):
         return (std * frames[0].signals.period_s,)
+    if name == "coulomb_friction":
+        back = any(reverses(f.motors[candidate.motor or 0].velocity) for f in frames)
+        # Friction that nobody declared is a missing effect like any other.
+        return (PRIORS["effect"].std * torque_rms,) if calibrating and back else (0.0,)
     if name == "torque_offset":
         # A healthy joint's constant is the zero between its encoders: the two cannot be separated.
-        return (0.0,) if linked or calibrating else (std * torque_rms,)
+        fixed = frames[0].flexible[candidate.motor or 0] if calibrating else linked
+        return (0.0,) if fixed else (std * torque_rms,)
     if name == "deflection_offset":
         phi = frames[0].motors[candidate.motor or 0].deflection
         return (0.0,) if linked and not calibrating else (std * float(np.ptp(phi)),)
@@ -91,7 +104,8 @@ def everyday_std(
         return (std * link.inertia_kg_m2,)
     if name == "link_viscous_damping":
         return (std * link.viscous_damping_nm_s_rad,)
-    return (std * abs(link.gravity_nm),) * 2
+    unknown = PRIORS["effect"].std * torque_rms if calibrating and frames[0].carried else 0.0
+    return (float(np.hypot(std * link.gravity_nm, unknown)),) * 2
 
 
 def effect_std(model: JointModel, candidate: Candidate, by_torque: float) -> float:

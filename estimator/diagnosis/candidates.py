@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from estimator.diagnosis.choices import choice, whole
 from estimator.diagnosis.frame import Frame
-from estimator.effects import LIBRARY, Coordinates, EffectType
+from estimator.effects import LIBRARY, Coordinates, EffectType, elements
 from estimator.sample import FloatArray
 
-__all__ = ["Candidate", "bounds_of", "columns", "grid", "least_periods", "members", "reach_of", "spread_of"]
+__all__ = [
+    "Candidate",
+    "bounds_of",
+    "columns",
+    "grid",
+    "least_periods",
+    "members",
+    "reach_of",
+    "reverses",
+    "sign_smoothing",
+    "spread_of",
+]
 
 Values = Mapping[str, float]
 
@@ -57,7 +68,7 @@ def members(frame: Frame) -> list[Candidate]:
     for kind in LIBRARY.values():
         if kind.location == "link":
             smooth = "smoothing_rad_s" in kind.nonlinear
-            if external and (not smooth or _reverses(frame.motors[0].link_velocity)):
+            if external and (not smooth or reverses(frame.motors[0].link_velocity)):
                 found.append(Candidate(kind, None))
         elif kind.channel == "link_position":
             if any(frame.flexible):
@@ -69,15 +80,26 @@ def members(frame: Frame) -> list[Candidate]:
                 Candidate(kind, i)
                 for i in range(len(frame.motors))
                 if (frame.flexible[i] or not _needs_deflection(kind))
-                and ("smoothing_rad_s" not in kind.nonlinear or _reverses(frame.motors[i].velocity))
+                and ("smoothing_rad_s" not in kind.nonlinear or reverses(frame.motors[i].velocity))
                 and (frame.linked or kind.name not in (*_SCALES, *_FREE_ZEROS))
             ]
     return found
 
 
-def _reverses(velocity: FloatArray) -> bool:
+def reverses(velocity: FloatArray) -> bool:
     """Whether a motion has both directions: dry friction is a constant torque in only one."""
     return bool(np.quantile(velocity, 0.05) < 0.0 < np.quantile(velocity, 0.95))
+
+
+def sign_smoothing(frames: Sequence[Frame], motor: int) -> float:
+    """Velocity over which everyday dry friction changes its sign, rad/s: as declared, else by the motion."""
+    for effect in frames[0].model.motors[motor].effects:
+        if effect.name == "coulomb_friction":
+            return elements(effect)[1][0]["smoothing_rad_s"]
+    fast = max(float(np.max(np.abs(f.motors[motor].velocity))) for f in frames)
+    noise = max(f.signals.velocity_noise(motor) for f in frames)
+    least, most = choice("sharpest_sign") * fast, choice("softest_sign") * fast
+    return min(max(choice("sign_noise") * noise, least), most)
 
 
 def _needs_deflection(kind: EffectType) -> bool:
@@ -105,7 +127,7 @@ def columns(frame: Frame, candidate: Candidate, values: Values) -> FloatArray:
             made.append(frame.column(motor, force, force if frame.pulls[motor] else None))
         elif kind.location == "transmission":
             made.append(frame.column(motor, term, term if frame.pulls[motor] else None))
-        elif kind.location == "motor":
+        elif kind.location == "motor" or frame.carried:
             made.append(frame.column(motor, -term, None))
         else:
             made.append(frame.column(None, None, term))

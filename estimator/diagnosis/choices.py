@@ -44,6 +44,11 @@ CHOICES: dict[str, Choice] = {
     "edge": Choice(
         1.5, "periods of the bandwidth", "left out at ends and gaps", "the filter's own memory"
     ),
+    "clear": Choice(
+        3.0, "periods of the bandwidth", "the same of healthy joints",
+        "what is beyond the ends comes through the filter with exp(-2 pi sin(pi/16) t): 2.5 % after three",
+    ),
+    "bridged": Choice(3, "periods", "longest gap that a line bridges", "short of the motion's own bends"),
     "order": Choice(8, "", "order of the low-pass's magnitude", "steep; its ringing ends within the edge"),
     "tail": Choice(
         0.6, "Nyquist frequencies", "above it a spectrum is noise", "drives filter below half their rate"
@@ -61,6 +66,9 @@ CHOICES: dict[str, Choice] = {
     ),
     # Models and their errors.
     "floor": Choice(0.002, "torque rms", "error that no model gets below", "filters, sampling and rounding"),
+    "exact": Choice(
+        0.0005, "torque rms", "the same of a healthy joint", "filters and sampling leave 0.03 % of exact data"
+    ),
     "law": Choice(
         0.08, "torque of an effect", "error of any textbook law", "friction, play and slip differ by so much"
     ),
@@ -75,6 +83,21 @@ CHOICES: dict[str, Choice] = {
     "rough_steps": Choice(3, "", "of hypotheses that are compared", "what they still gain decides nothing"),
     "converged": Choice(0.02, "standard deviations", "step that ends the iteration", "far below the told"),
     "pinned": Choice(1e-4, "prior's width", "width of a prior that holds", "any narrow one"),
+    "patient_steps": Choice(
+        20, "", "of a healthy joint's fit", "it starts from springs and readings that nobody knows"
+    ),
+    "present": Choice(
+        0.95, "probability", "of a delay, zero or friction that a healthy joint is given", "as for alternatives"
+    ),
+    "fit_periods": Choice(
+        30, "periods of the bandwidth", "in a recording of a healthy joint, at least", "three rows in each"
+    ),
+    "fit_rows": Choice(60, "rows", "of a healthy joint, at least", "five for each parameter"),
+    "sign_noise": Choice(
+        5.0, "velocity noise", "over which everyday friction changes its sign", "no row sees it sharper"
+    ),
+    "sharpest_sign": Choice(1e-3, "largest velocity", "the same at least", "a division by zero otherwise"),
+    "softest_sign": Choice(0.02, "largest velocity", "the same at most", "softer, it is damping"),
     "missing_inertia": Choice(0.8, "declared inertia", "that may be missing of it", "some of it is there"),
     "shapes": Choice(25, "points", "start of a spring's shape parameter", "an octave in four steps"),
     # Which effects are tried.

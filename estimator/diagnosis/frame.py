@@ -59,9 +59,10 @@ class Signals:
     Args:
         record: the recording; gaps are bridged by lines and not used as rows.
         bandwidth_hz: of F.
+        edge: periods of the bandwidth that are not used at the ends and around gaps; None: as chosen.
     """
 
-    def __init__(self, record: Record, bandwidth_hz: float) -> None:
+    def __init__(self, record: Record, bandwidth_hz: float, edge: float | None = None) -> None:
         sequence = record.sequence - record.sequence[0]
         self.samples = int(sequence[-1]) + 1
         self.period_s = record.period_s
@@ -88,15 +89,14 @@ class Signals:
         rows_step = max(1, int(1.0 / (self.light.period_s * choice("rows") * bandwidth_hz)))
         self.narrow = Band(self.light.kept, self.light.period_s, rows_step, margin)
         self.response = lowpass(self.narrow.frequency_hz, bandwidth_hz)
-        self.keep = self._rows(record, sequence)
+        self.keep = self._rows(record, sequence, (edge or choice("edge")) / bandwidth_hz)
 
-    def _rows(self, record: Record, sequence: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Rows away from the ends and from gaps."""
-        edge = choice("edge") / self.bandwidth_hz
+    def _rows(self, record: Record, sequence: NDArray[np.int64], edge: float) -> NDArray[np.bool_]:
+        """Rows away from the ends and from gaps by so many seconds."""
         time = np.arange(self.narrow.kept) * self.narrow.period_s
         end = (self.samples - 1) * record.period_s
         keep = (time >= edge) & (time <= end - edge)
-        gaps = np.flatnonzero(np.diff(sequence) > 1)
+        gaps = np.flatnonzero(np.diff(sequence) > whole("bridged"))
         for before, after in zip(sequence[gaps], sequence[gaps + 1], strict=True):
             keep &= (time < before * record.period_s - edge) | (time > after * record.period_s + edge)
         return keep
@@ -166,11 +166,11 @@ class Frame:
         light = light_response(signals)
         hold = light * np.sinc(f * period) * np.exp(-1j * np.pi * f * period)
         zero = np.zeros(band.kept)
-        link = _link_path(signals, light, corrections) if signals.q is not None else (zero,) * 3
         flexible = tuple(m.transmission.model != "none" and signals.q is not None for m in model.motors)
+        paths = [tuple(band.apply(x, light, order) for order in range(3)) for x in signals.theta]
+        link = _link_path(signals, light, corrections) if any(flexible) else paths[0]
         motors = []
-        for i, spectrum in enumerate(signals.theta):
-            theta, velocity, acceleration = (band.apply(spectrum, light, order) for order in range(3))
+        for i, (theta, velocity, acceleration) in enumerate(paths):
             delay = corrections.torque_delay_s[i]
             acting = hold * _lag(f, corrections.torque_lag_s[i])
             motors.append(
@@ -198,6 +198,11 @@ class Frame:
     def rows(self) -> int:
         """Number of rows of one equation."""
         return int(np.count_nonzero(self.signals.keep))
+
+    @property
+    def carried(self) -> bool:
+        """Whether the link moves with the first motor, which then has the dynamics of both."""
+        return self.model.link is not None and not self.flexible[0]
 
     @property
     def pulls(self) -> tuple[bool, ...]:
@@ -238,11 +243,8 @@ class Frame:
         """B theta" + D theta' - tau on the grid, which is tau_e by eq 5."""
         motor, c = self.model.motors[i], self.motors[i]
         own = motor.inertia_kg_m2 * c.acceleration + motor.viscous_damping_nm_s_rad * c.velocity
-        link = self.model.link
-        if link is not None and not self.flexible[i] and i == 0:
-            # Rigid: the link moves with the motor.
-            own = own + link.inertia_kg_m2 * c.acceleration + link.viscous_damping_nm_s_rad * c.velocity
-            own = own + link.gravity_nm * np.sin(c.position + link.gravity_phase_rad)
+        if self.carried and i == 0:
+            own = own - self.link_balance()
         return np.asarray(own - c.torque)
 
     def target(self) -> FloatArray:

@@ -107,7 +107,8 @@ class Problem:
     ) -> None:
         self.model = model
         self.calibrating = calibrating
-        self.signals = [Signals(record, bandwidth_hz) for record in records]
+        edge = choice("clear" if calibrating else "edge")
+        self.signals = [Signals(record, bandwidth_hz, edge) for record in records]
         declared = declared_corrections(model)
         self.declared = declared
         self._frames: dict[Corrections, dict[int, Frame]] = {}
@@ -165,8 +166,8 @@ class Problem:
     def null(self, pinned: Pinned | None = None) -> Fitted:
         """The declared model at its best fit, everyday errors within their priors or pinned."""
         corrections = tuple(self.declared for _ in self.signals)
-        base = start(self._frame(0, self.declared))
-        return self.fit((), base, corrections, pinned=pinned)
+        widest = max(self.frames, key=lambda f: max(float(np.ptp(c.deflection)) for c in f.motors))
+        return self.fit((), start(widest), corrections, pinned=pinned)
 
     def numbers(self, like: Fitted | None = None) -> Pinned:
         """The declared numbers, pinned as they are declared or as another hypothesis has them."""
@@ -188,11 +189,14 @@ class Problem:
         extra: Extra | None = None,
         pinned: Pinned | None = None,
     ) -> Fitted:
-        """Gauss-Newton from a given point; the best point on the way."""
+        """Gauss-Newton from a given point; the best point on the way.
+
+        That of a healthy joint goes on until it stands still: a first step from far promises more than it holds.
+        """
         best: Fitted | None = None
-        for _ in range((steps or whole("newton_steps")) + 1):
+        for _ in range((steps or whole("patient_steps" if self.calibrating else "newton_steps")) + 1):
             now = self._linearised(terms, base, corrections, extra, pinned or {})
-            if best is not None and now.posterior.evidence < best.evidence(now):
+            if best is not None and not self.calibrating and now.posterior.evidence < best.evidence(now):
                 break
             best = now
             if not self._curved(now) or _converged(now):
@@ -263,7 +267,7 @@ class Problem:
             np.array(stack.low),
             self.group,
             self.used,
-            np.full(groups, choice("floor") * self.torque_rms),
+            np.full(groups, choice("exact" if self.calibrating else "floor") * self.torque_rms),
             stack.scales(terms),
         )
         times = np.ones(groups)

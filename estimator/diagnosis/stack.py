@@ -10,7 +10,7 @@ import numpy as np
 
 from estimator.diagnosis.base import Base
 from estimator.diagnosis.beliefs import OF_RUN, effect_std, everyday, everyday_std, least
-from estimator.diagnosis.candidates import Candidate, bounds_of, columns, reach_of, spread_of
+from estimator.diagnosis.candidates import Candidate, bounds_of, columns, reach_of, sign_smoothing, spread_of
 from estimator.diagnosis.choices import choice
 from estimator.diagnosis.evidence import Scale
 from estimator.diagnosis.frame import Corrections, Frame
@@ -142,7 +142,10 @@ class Stack:
                 continue
             name, motor = candidate.key
             held = pinned.get(candidate.key)
-            parts = [columns(f, candidate, {}) for f in self._frames]
+            values = {}
+            if candidate.kind.nonlinear:
+                values["smoothing_rad_s"] = sign_smoothing(self._frames, motor or 0)
+            parts = [columns(f, candidate, values) for f in self._frames]
             for run in range(len(self._frames)) if name in OF_RUN else (None,):
                 taken = self._taken(candidate, run or 0)
                 for p, width in enumerate(widths):

@@ -1,64 +1,72 @@
-"""Model-based estimation from a whole recording: what `drivelink fit` does.
+"""Model-based estimation from whole recordings: what `drivelink fit` does.
 
-The same balance as on line (see `regression`), every channel through the same filter, solved at once:
-transmission parameters together with small errors of the motor's own ones, delays between channels
-searched, nonlinear parameters by variable projection, standard deviations from the measured
-autocorrelation of what is left.
+It is the hypothesis without missing effects of `estimator.diagnosis`: the declared joint at its best fit,
+with the errors that every rig has, within the priors of `estimator.priors`. What a healthy joint need not
+have, a delay or a zero of its readings and the friction of a rigid joint, has to earn its place.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from estimator.align import prepare
-from estimator.declared import corrected
+from estimator.diagnosis.bandwidth import choose_bandwidth
+from estimator.diagnosis.covariance import hac_covariance
+from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.errors import EstimatorError
-from estimator.flexibility import Polynomial, TransmissionModel
-from estimator.gate import refuse
-from estimator.leastsquares import search_shape
-from estimator.model import JointModel, Motor, ParameterValue
+from estimator.gate import check, refuse
+from estimator.model import JointModel, ParameterValue, Transmission
 from estimator.sample import FloatArray, Record
-from estimator.solver import NUISANCES, Solver
-from estimator.transmissions import MODELS, RIGID, UNKNOWN, transmission_model
+from estimator.transmissions import MODELS, RIGID, UNKNOWN
 
-__all__ = ["TransmissionFit", "fit"]
+__all__ = ["Key", "Told", "TransmissionFit", "fit", "joint_problem", "tell", "transmission_fits"]
 
 _SIGMA_95 = 1.96
 _LOOKED_AT = 33  # deflections from zero to the largest one
-_SHAPE = 1e-7  # relative tolerance of a shape parameter: far below what noise leaves of it
+_HIGHEST_ORDER = 4
+_BLOCKS = 10  # of time
+_SURE = 3.0  # nats (20 to 1) by which an error that need not be there must be likelier than none
+_LEAST_ROWS = 60  # fewer tell nothing about their own errors
+_PERIODS = 30.0  # of the bandwidth that a recording lasts at least: three rows each, less the ends
+_READINGS = ("encoder_delay", "torque_delay", "deflection_offset")
+_OF_RIGID = ("coulomb_friction", "torque_offset")
+
+Key = tuple[str, int | None]  # an everyday error and its motor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TransmissionFit:
-    """One transmission and its motor, fitted to a recording.
+    """What recordings tell of one motor and its transmission.
 
     Attributes:
         model: transmission model's name.
-        parameters: by their names in the joint file.
+        parameters: by their names in the joint file; empty where it is rigid.
         std: their standard deviations, by the same names.
         alpha: parameters as an array.
         covariance: of alpha.
         deflection_rad: (rows,) filtered deflections, for plots.
         torque_nm: (rows,) flexibility torque that the motor's balance gives there, nuisances removed.
-        error_rms_nm: what is left of the balance.
-        torque_rms_nm: of the flexibility torque.
-        inertia_kg_m2: B, with what the recording says of it.
+        error_rms_nm: what is left of the motor's balance.
+        torque_rms_nm: of the flexibility torque; of the motor torque, where it is rigid.
+        inertia_kg_m2: B, with what the recordings say of it.
         viscous_damping_nm_s_rad: D, likewise.
-        coulomb_nm: friction that the declared model lacks.
-        offset_nm: constant torque.
-        deflection_offset_rad: zero of the deflection against the encoders'.
-        link_delay_s: by which the link encoder is late.
-        torque_skew_s: by which the torque is.
-        nuisance_std: standard deviations of the last seven, by name (`NUISANCES`, "link_delay" last).
-        excited: whether the recording reveals the stiffness at all.
+        coulomb_nm: friction beyond what is declared; mean of the recordings.
+        offset_nm: constant torque of a rigid joint, likewise.
+        deflection_offset_rad: zero of the deflection against the encoders', likewise.
+        link_delay_s: by which the link encoder is late, beyond what is declared.
+        torque_delay_s: by which the torque acts later than reported, likewise.
+        nuisance_std: standard deviations of the last seven: "inertia", "damping", "coulomb", "offset",
+            "shift", "link_delay", "torque_delay".
+        excited: whether the recordings tell the stiffness at all.
     """
 
     model: str
-    parameters: dict[str, ParameterValue]
-    std: dict[str, ParameterValue]
+    parameters: dict[str, ParameterValue] = field(default_factory=dict)
+    std: dict[str, ParameterValue] = field(default_factory=dict)
     alpha: FloatArray
     covariance: FloatArray
     deflection_rad: FloatArray
@@ -71,13 +79,13 @@ class TransmissionFit:
     offset_nm: float
     deflection_offset_rad: float
     link_delay_s: float
-    torque_skew_s: float
+    torque_delay_s: float
     nuisance_std: dict[str, float]
     excited: bool
 
     @property
     def stiffens(self) -> bool:
-        """Whether the stiffness is positive, its 95 % interval too, at every deflection of the recording."""
+        """Whether the stiffness is positive, its 95 % interval too, at every deflection of the recordings."""
         law = MODELS[self.model]
         reach = float(np.max(np.abs(self.deflection_rad)))
         phi = np.linspace(0.0, reach, _LOOKED_AT)
@@ -86,117 +94,264 @@ class TransmissionFit:
         return bool(np.all(law.stiffness(phi, self.alpha) > _SIGMA_95 * std))
 
 
-def fit(record: Record, model: JointModel, bandwidth_rad_s: float | None = None) -> list[TransmissionFit]:
-    """Fit every flexible transmission of a joint to a recording; one entry a motor.
+class Told(NamedTuple):
+    """A joint at its best fit.
+
+    Attributes:
+        records: what was fitted to, rows that are no numbers left out.
+        problem: the recordings, and the joint with its orders chosen.
+        fitted: the hypothesis.
+        covariance: (k, k) of its parameters; whether a reading's error is there is itself uncertain.
+        absent: what has not earned its place.
+    """
+
+    records: Sequence[Record]
+    problem: Problem
+    fitted: Fitted
+    covariance: FloatArray
+    absent: frozenset[Key]
+
+    def places(self, key: Key) -> list[int]:
+        """Columns of an everyday error: its parts, or its values in each recording."""
+        return [
+            j for j, s in enumerate(self.fitted.slots) if s.kind == "everyday" and (s.name, s.motor) == key
+        ]
+
+    def values(self, key: Key) -> FloatArray:
+        """The error itself, beyond what is declared, likewise."""
+        mine = self.places(key)
+        return np.zeros(len(mine)) if key in self.absent else _totals(self.fitted)[mine]
+
+    def mean(self, name: str, motor: int | None) -> tuple[float, float]:
+        """An error and its standard deviation, the mean of the recordings where each has its own."""
+        mine = self.places((name, motor))
+        if not mine:
+            return 0.0, 0.0
+        variance = float(np.sum(self.covariance[np.ix_(mine, mine)])) / len(mine) ** 2
+        return float(np.mean(self.values((name, motor)))), math.sqrt(max(variance, 0.0))
+
+
+def fit(
+    record: Record | Sequence[Record], model: JointModel, bandwidth_rad_s: float | None = None
+) -> list[TransmissionFit]:
+    """Fit every transmission of a joint to recordings; one entry a motor.
 
     A rigid transmission's entry has no parameters; an unknown one is fitted by a polynomial.
 
     Args:
-        record: measured data.
+        record: measured data, of one or several runs.
         model: declared joint; its transmission parameters, if any, are not used, its effects are honoured.
-        bandwidth_rad_s: of the filter that all channels share; left out: chosen for the sampling.
+        bandwidth_rad_s: of the filter that all channels share; left out: chosen from the data.
 
     Raises:
-        EstimatorError: the recording lacks what is needed, is too short, or nothing moves in it.
+        EstimatorError: a recording lacks what is needed, is too short, or nothing moves in it.
         GateError: its units, signs, gear ratio or time do not fit the joint.
     """
-    if record.motors != len(model.motors):
-        raise EstimatorError(f"recording: expected {len(model.motors)} motor(s), got {record.motors}")
-    if model.has_deflection and record.link_position_rad is None:
-        raise EstimatorError("recording: expected link_position_rad, as the transmission is flexible")
-    bandwidth = bandwidth_rad_s or min(60.0, 0.12 / record.period_s)
-    refuse(record, model)
-    record = corrected(record, model)
-    return [_fit_motor(record, i, motor, bandwidth) for i, motor in enumerate(model.motors)]
+    return transmission_fits(tell(record, model, bandwidth_rad_s))
 
 
-def _fit_motor(record: Record, index: int, motor: Motor, bandwidth: float) -> TransmissionFit:
-    if motor.transmission.model == RIGID:
-        return _rigid(motor)
-    channels = prepare(record, index, motor, bandwidth)
-    declared = transmission_model(motor.transmission)
-    transmission: TransmissionModel = declared or Polynomial()
-    solver = Solver(channels, motor, transmission)
-    delay = solver.search_delay()
-    shape: tuple[float, ...] = ()
-    if transmission.shape_names:
-        reach = float(np.max(np.abs(channels.deflection(delay))))
-        shape = search_shape(transmission, reach, lambda s: solver.cost(delay, s, 1), _SHAPE)
-        if delay != 0.0:
-            delay = solver.refine_delay(delay, shape)
-            shape = search_shape(transmission, reach, lambda s: solver.cost(delay, s, 1), _SHAPE)
-    order = solver.choose_order(delay)
-    return _finish(
-        solver, motor, delay, shape, order, UNKNOWN if motor.transmission.model == UNKNOWN else None
-    )
-
-
-def _rigid(motor: Motor) -> TransmissionFit:
-    empty = np.zeros(0)
-    return TransmissionFit(
-        model=RIGID,
-        parameters={},
-        std={},
-        alpha=empty,
-        covariance=np.zeros((0, 0)),
-        deflection_rad=empty,
-        torque_nm=empty,
-        error_rms_nm=math.nan,
-        torque_rms_nm=math.nan,
-        inertia_kg_m2=motor.inertia_kg_m2,
-        viscous_damping_nm_s_rad=motor.viscous_damping_nm_s_rad,
-        coulomb_nm=0.0,
-        offset_nm=0.0,
-        deflection_offset_rad=0.0,
-        link_delay_s=0.0,
-        torque_skew_s=0.0,
-        nuisance_std={},
-        excited=False,
-    )
-
-
-def _finish(
-    solver: Solver, motor: Motor, delay: float, shape: tuple[float, ...], order: int, name: str | None
-) -> TransmissionFit:
-    """Parameters, honest covariance and what is left."""
-    c, model = solver.channels, solver.model
-    A, y, units, prior = solver.system(delay, shape, order)
-    told = solver.solve(A, y, prior)
-    x, noise = told.x, told.noise
-    alpha = np.concatenate([x[:order] * units[:order], shape])
-    if shape:
-        sensitivity = c.sensitivity(model, delay, alpha) / solver.torque_unit
-        full = np.column_stack([A[:, :order], sensitivity, A[:, order:]])
-        units = np.concatenate([units[:order], np.ones(len(shape)), units[order:]])
-        free = np.full(len(shape), 1e6)
-        told = told._replace(prior=np.concatenate([told.prior[:order], free, told.prior[order:]]))
+def tell(record: Record | Sequence[Record], model: JointModel, bandwidth_rad_s: float | None = None) -> Told:
+    """The joint at its best fit; arguments and errors as of `fit`."""
+    records = [record] if isinstance(record, Record) else list(record)
+    usable = []
+    for one in records:
+        usable.append(_whole(one, model))
+        check(usable[-1], model)
+        refuse(one, model)
+    if bandwidth_rad_s is None:
+        shortest = min(len(one) * one.period_s for one in usable)
+        bandwidth_hz = max(min(choose_bandwidth(one, model) for one in usable), _PERIODS / shortest)
     else:
-        full = A
-    covariance = solver.covariance(full, told, delay, alpha)
-    covariance *= np.outer(np.append(units, c.period_s), np.append(units, c.period_s))
-    n = alpha.size
-    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    nuisance = dict(zip(NUISANCES, (x[order:] * units[n:]).tolist(), strict=True))
-    others = A[:, order:] @ x[order:] * solver.torque_unit
-    stated = model if name is None else Polynomial()
-    torque = float(np.std(A[:, :order] @ x[:order])) * solver.torque_unit
-    return TransmissionFit(
-        model=stated.name,
-        parameters=stated.parameters(alpha),
-        std=stated.parameters(std[:n]),
-        alpha=alpha,
-        covariance=covariance[:n, :n],
-        deflection_rad=c.deflection(delay) + nuisance["shift"],
-        torque_nm=c.balance - others,
-        error_rms_nm=noise * solver.torque_unit,
-        torque_rms_nm=torque,
-        inertia_kg_m2=motor.inertia_kg_m2 + nuisance["inertia"],
-        viscous_damping_nm_s_rad=motor.viscous_damping_nm_s_rad + nuisance["damping"],
-        coulomb_nm=nuisance["coulomb"],
-        offset_nm=nuisance["offset"],
-        deflection_offset_rad=nuisance["shift"],
-        link_delay_s=delay,
-        torque_skew_s=nuisance["torque_skew"],
-        nuisance_std=dict(zip((*NUISANCES, "link_delay"), std[n:].tolist(), strict=True)),
-        excited=bool(std[0] < 0.25 * abs(alpha[0])),
+        bandwidth_hz = bandwidth_rad_s / (2.0 * math.pi)
+    nyquist = 0.4 / max(one.period_s for one in usable)
+    if not 0.0 < bandwidth_hz <= nyquist:
+        raise EstimatorError(
+            f"bandwidth: expected more than 0 and at most {nyquist:g} Hz, got {bandwidth_hz:g}"
+        )
+    problem, fitted = _ordered(usable, _bare(model), bandwidth_hz)
+    return _aligned(usable, problem, fitted)
+
+
+def joint_problem(records: Sequence[Record], model: JointModel, bandwidth_hz: float) -> Problem:
+    """The regression of a healthy joint.
+
+    Raises:
+        EstimatorError: too short for the bandwidth, or a deflection that does not change.
+    """
+    problem = Problem(records, model, bandwidth_hz, 0, _BLOCKS, calibrating=True)
+    if min(problem.rows) < _LEAST_ROWS:
+        raise EstimatorError(
+            f"recording: expected at least {_LEAST_ROWS} rows without gaps at a bandwidth of "
+            f"{bandwidth_hz:g} Hz, got {min(problem.rows)}"
+        )
+    for i, motor in enumerate(model.motors):
+        if motor.flexible and not any(np.ptp(f.motors[i].deflection) > 0.0 for f in problem.frames):
+            raise EstimatorError("recording: expected a deflection that changes, it stands still")
+    return problem
+
+
+def _whole(record: Record, model: JointModel) -> Record:
+    """The rows whose readings are numbers; the others are gaps."""
+    good = np.all(np.isfinite(record.motor_position_rad) & np.isfinite(record.motor_torque_nm), axis=1)
+    if model.has_deflection and record.link_position_rad is not None:
+        good &= np.isfinite(record.link_position_rad)
+    if np.all(good):
+        return record
+
+    def kept(x: FloatArray | None) -> FloatArray | None:
+        return None if x is None else x[good]
+
+    return replace(
+        record,
+        sequence=record.sequence[good],
+        motor_position_rad=record.motor_position_rad[good],
+        motor_torque_nm=record.motor_torque_nm[good],
+        motor_velocity_rad_s=kept(record.motor_velocity_rad_s),
+        link_position_rad=kept(record.link_position_rad),
+        link_velocity_rad_s=kept(record.link_velocity_rad_s),
+        external_torque_nm=kept(record.external_torque_nm),
     )
+
+
+def _bare(model: JointModel) -> JointModel:
+    """The joint with its transmissions yet to be found."""
+
+    def open_(own: Transmission) -> Transmission:
+        name = "polynomial" if own.model == UNKNOWN else own.model
+        return replace(own, model=name, parameters={})
+
+    return replace(model, motors=tuple(replace(m, transmission=open_(m.transmission)) for m in model.motors))
+
+
+def _ordered(records: Sequence[Record], model: JointModel, bandwidth_hz: float) -> tuple[Problem, Fitted]:
+    """The best fit, with the order of each polynomial, where none is declared, that has the most evidence."""
+    problem = joint_problem(records, model, bandwidth_hz)
+    fitted = problem.null()
+    for i, motor in enumerate(model.motors):
+        if motor.transmission.model != "polynomial" or motor.transmission.order is not None:
+            continue
+        tried = []
+        for order in range(1, _HIGHEST_ORDER + 1):
+            own = replace(motor, transmission=replace(motor.transmission, order=order))
+            motors = (*problem.model.motors[:i], own, *problem.model.motors[i + 1 :])
+            one = joint_problem(records, replace(problem.model, motors=motors), bandwidth_hz)
+            tried.append((one, one.null()))
+        closest = min((h for _, h in tried), key=lambda h: float(np.sum(np.log(h.posterior.sigma))))
+        problem, fitted = max(tried, key=lambda pair: pair[1].evidence(closest))
+    return problem, fitted
+
+
+def _aligned(records: Sequence[Record], problem: Problem, free: Fitted) -> Told:
+    """The fit without what has not earned its place, the least likely left out first.
+
+    What is left open of that is part of the covariance: it is the one of the mixture of both hypotheses.
+    """
+    everything = _covariance(free)
+    fitted, covariance, absent = free, everything, frozenset[Key]()
+    while True:
+        told = Told(records, problem, fitted, covariance, absent)
+        odds = {key: _odds_of_zero(told, [key]) for key in _optional(told)}
+        doubtful = [key for key in odds if odds[key] > -_SURE]
+        if not doubtful:
+            break
+        absent |= {max(doubtful, key=lambda key: odds[key])}
+        pinned = dict.fromkeys(absent, (0.0,))
+        fitted = problem.fit((), fitted.base, fitted.corrections, pinned=pinned)
+        covariance = _covariance(fitted)
+    if not absent:
+        return told
+    full = Told(records, problem, free, everything, frozenset())
+    weight = 1.0 / (1.0 + math.exp(min(_odds_of_zero(full, sorted(absent, key=str)), 700.0)))
+    apart = _totals(free) - _totals(fitted)
+    mixed = (1.0 - weight) * covariance + weight * (everything + np.outer(apart, apart))
+    return told._replace(covariance=mixed)
+
+
+def _covariance(fitted: Fitted) -> FloatArray:
+    """Covariance of the parameters; what a sign holds at its bound is no surer than before any data."""
+    covariance = hac_covariance(fitted)
+    held = np.flatnonzero(fitted.posterior.bound & [s.kind == "everyday" for s in fitted.slots])
+    covariance[held, held] = fitted.regression.std[held] ** 2
+    return covariance
+
+
+def _optional(told: Told) -> list[Key]:
+    """Errors that may have to be left out: of readings, and friction and offset of a rigid joint."""
+    motors = told.problem.model.motors
+    keys = {(s.name, s.motor) for s in told.fitted.slots if s.kind == "everyday"}
+    rigid = {(name, i) for i, motor in enumerate(motors) if not motor.flexible for name in _OF_RIGID}
+    return sorted((k for k in keys - told.absent if k[0] in _READINGS or k in rigid), key=str)
+
+
+def _odds_of_zero(told: Told, keys: Sequence[Key]) -> float:
+    """Log odds that there are no such errors: the Savage-Dickey density ratio.
+
+    Posterior over prior density at zero (Dickey, Annals of Mathematical Statistics 42, 1971), with the
+    covariance that holds for correlated errors.
+    """
+    mine = [j for key in keys for j in told.places(key)]
+    wide = told.fitted.regression.std[mine]
+    x = _totals(told.fitted)[mine] / wide
+    covariance = told.covariance[np.ix_(mine, mine)] / np.outer(wide, wide)
+    covariance = covariance + 1e-12 * np.eye(len(mine))
+    return float(-0.5 * x @ np.linalg.solve(covariance, x) - 0.5 * np.linalg.slogdet(covariance)[1])
+
+
+def _totals(fitted: Fitted) -> FloatArray:
+    """(k,) each column's quantity, what has been corrected before included."""
+    return np.array([s.taken for s in fitted.slots]) + fitted.posterior.x
+
+
+def transmission_fits(told: Told) -> list[TransmissionFit]:
+    """What a fit says of each motor and its transmission."""
+    problem, fitted = told.problem, told.fitted
+    frames = problem.at(fitted.corrections, fitted.base)
+    left = fitted.regression.residual(fitted.posterior.x)
+    base = fitted.moved_base(problem)
+    spring = np.concatenate([fitted.base.torque(frame) for frame in frames])
+    made = []
+    for i, (motor, law) in enumerate(zip(problem.model.motors, base.models(frames[0]), strict=True)):
+        rows = problem.group % problem.equations == i
+        mine = [j for j, s in enumerate(fitted.slots) if s.kind == "base" and s.motor == i]
+        alpha, covariance = base.alpha[i], told.covariance[np.ix_(mine, mine)]
+        std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        torque = (spring + fitted.regression.design[:, mine] @ fitted.posterior.x[mine])[rows]
+        measured = problem.torque()[rows]
+        inertia, inertia_std = told.mean("motor_inertia", i)
+        damping, damping_std = told.mean("viscous_damping", i)
+        coulomb, coulomb_std = told.mean("coulomb_friction", i)
+        offset, offset_std = told.mean("torque_offset", i)
+        shift, shift_std = told.mean("deflection_offset", i)
+        link_delay, link_delay_std = told.mean("encoder_delay", None)
+        torque_delay, torque_delay_std = told.mean("torque_delay", i)
+        made.append(
+            TransmissionFit(
+                model=RIGID if law is None else law.name,
+                parameters={} if law is None else law.parameters(alpha),
+                std={} if law is None else law.parameters(std),
+                alpha=alpha,
+                covariance=covariance,
+                deflection_rad=np.concatenate([f.project(f.motors[i].deflection) for f in frames]),
+                torque_nm=torque + left[rows],
+                error_rms_nm=float(np.sqrt(np.mean(left[rows] ** 2))),
+                torque_rms_nm=float(np.std(measured if law is None else torque)),
+                inertia_kg_m2=motor.inertia_kg_m2 + inertia,
+                viscous_damping_nm_s_rad=max(motor.viscous_damping_nm_s_rad + damping, 0.0),
+                coulomb_nm=coulomb,
+                offset_nm=offset,
+                deflection_offset_rad=shift,
+                link_delay_s=link_delay if motor.flexible else 0.0,
+                torque_delay_s=torque_delay,
+                nuisance_std={
+                    "inertia": inertia_std,
+                    "damping": damping_std,
+                    "coulomb": coulomb_std,
+                    "offset": offset_std,
+                    "shift": shift_std,
+                    "link_delay": link_delay_std,
+                    "torque_delay": torque_delay_std,
+                },
+                excited=law is not None and bool(std[0] < 0.25 * abs(alpha[0])),
+            )
+        )
+    return made

@@ -1,129 +1,202 @@
-"""A joint's model from a healthy recording: what `drivelink fit` shows, and what it writes.
-
-`fit` gives each transmission and its motor. `calibrate` adds what that leaves open: the link's dynamics, and
-the errors of the readings. With the readings put right, `fit` has the last word on its own numbers, so that
-there is one set of them.
-"""
+"""A joint's model from healthy recordings: what `drivelink fit` shows, and what it writes."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
-from estimator.batch import TransmissionFit, fit
-from estimator.diagnosis import calibrate
+import numpy as np
+from scipy.special import chdtrc
+
+from estimator.batch import Told, TransmissionFit, joint_problem, tell, transmission_fits
+from estimator.diagnosis.candidates import sign_smoothing
+from estimator.diagnosis.heldout import on_other
 from estimator.effects import elements
-from estimator.errors import EstimatorError
-from estimator.model import Effect, JointModel, Motor, Transmission
-from estimator.sample import Record
+from estimator.model import Effect, JointModel, LinkDynamics, Motor, Transmission
+from estimator.sample import FloatArray, Record
 from estimator.transmissions import RIGID
 
-__all__ = ["Identified", "identify"]
+__all__ = ["Identified", "Left", "RecordingFit", "identify"]
 
-_SURE = 4.0  # standard deviations from zero at which a delay is kept: chance makes one of 16 000
-_LEAST_DELAY_S = 2e-5  # and how much of it: less shifts no estimate that anybody could see
-# Readings put right lower the error of the motor's balance; by less than this it rises where they hardly
-# change and are interpolated anew.
-_WORSE = 1.01
-_READINGS = ("torque_delay", "deflection_offset", "encoder_delay")
+_CHANCE = 0.01  # probability below which values of several recordings are not one value
+_PARAMETER = {
+    "encoder_delay": "delay_s",
+    "torque_delay": "delay_s",
+    "deflection_offset": "offset_rad",
+    "coulomb_friction": "torque_nm",
+    "torque_offset": "torque_nm",
+}
+
+
+class Left(NamedTuple):
+    """What is left of the motors' balances: rms in N·m, and relative to the measured torque."""
+
+    rms_nm: float
+    relative: float
+
+
+class RecordingFit(NamedTuple):
+    """What is left of one recording: fitted with the others, and by a fit of the others alone."""
+
+    train: Left
+    validation: Left | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Identified:
-    """A joint, fitted to a recording.
+    """What recordings tell of a joint.
 
     Attributes:
         fits: of each motor, in order; every number that `model` has, too, is the same there.
         model: the joint with what was found: transmissions, inertias, dampings, link, readings.
-        doubt: why link dynamics and readings stay as declared; empty: they do not.
+        link_std: standard deviations of the link's dynamics, by name.
+        recordings: what is left of each recording.
+        notes: what is to be said of the numbers, a line each.
     """
 
     fits: list[TransmissionFit]
     model: JointModel
-    doubt: str = ""
+    link_std: dict[str, float] = field(default_factory=dict)
+    recordings: tuple[RecordingFit, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
-def identify(record: Record, model: JointModel, bandwidth_rad_s: float | None = None) -> Identified:
-    """Fit all numbers of a joint to a healthy recording.
+def identify(
+    record: Record | Sequence[Record], model: JointModel, bandwidth_rad_s: float | None = None
+) -> Identified:
+    """Fit all numbers of a joint to healthy recordings.
+
+    What belongs to the machine is shared: stiffness, inertias, dampings, link, delays. What belongs to a run
+    is not: zeros of the encoders, offset and level of friction.
 
     Args:
-        record: measured data.
+        record: measured data, of one or several runs.
         model: declared joint; its effects are honoured, those of the readings are refined.
-        bandwidth_rad_s: of the filter that all channels of `fit` share; left out: chosen for the sampling.
+        bandwidth_rad_s: of the filter that all channels of `fit` share; left out: chosen from the data.
 
     Raises:
-        EstimatorError: the recording lacks what is needed, is too short, or nothing moves in it.
+        EstimatorError: a recording lacks what is needed, is too short, or nothing moves in it.
         GateError: its units, signs, gear ratio or time do not fit the joint.
     """
-    fits = fit(record, model, bandwidth_rad_s)
-    aligned = _aligned(model, fits)
-    try:
-        calibrated = calibrate(record, _fitted(aligned, fits, usable_only=True))
-    except EstimatorError as error:
-        return Identified(fits=fits, model=_fitted(aligned, fits), doubt=str(error))
-    motors = (
-        replace(mine, effects=found.effects) if mine.flexible else found
-        for mine, found in zip(model.motors, calibrated.motors, strict=True)
+    told = tell(record, model, bandwidth_rad_s)
+    fits = transmission_fits(told)
+    notes: list[str] = []
+    motors = tuple(
+        replace(_fitted(motor, one), effects=_effects(told, motor.effects, i, notes))
+        for i, (motor, one) in enumerate(zip(model.motors, fits, strict=True))
     )
-    found = replace(model, motors=tuple(motors), link=calibrated.link, link_effects=calibrated.link_effects)
-    if _readings(found) != _readings(model):
-        again = fit(record, found, bandwidth_rad_s)
-        if any(b.error_rms_nm > _WORSE * a.error_rms_nm for a, b in zip(fits, again, strict=True)):
-            doubt = "the zeros and delays that suit them best spoil the motor's balance" if model.link else ""
-            return Identified(fits=fits, model=_fitted(aligned, fits), doubt=doubt)
-        fits = again
-    return Identified(fits=fits, model=_fitted(_aligned(found, fits), fits))
-
-
-def _aligned(model: JointModel, fits: Sequence[TransmissionFit]) -> JointModel:
-    """The model with the delays that `fit` is sure of as effects of the readings."""
-    motors = []
-    for motor, one in zip(model.motors, fits, strict=True):
-        std = one.nuisance_std.get("torque_skew", math.inf)
-        if _sure(one.torque_skew_s, std):  # late readings are of a torque that acted earlier
-            motor = replace(motor, effects=_later(motor.effects, "torque_delay", -one.torque_skew_s))
-        motors.append(motor)
-    told = [(one.link_delay_s, one.nuisance_std["link_delay"]) for one in fits if one.model != RIGID]
-    weights = [1.0 / max(std, 1e-12) ** 2 for _, std in told]
-    link_effects = model.link_effects
-    if told:
-        delay = sum(w * d for w, (d, _) in zip(weights, told, strict=True)) / sum(weights)
-        if _sure(delay, 1.0 / math.sqrt(sum(weights))):
-            link_effects = _later(link_effects, "encoder_delay", delay)
-    return replace(model, motors=tuple(motors), link_effects=link_effects)
-
-
-def _sure(delay_s: float, std_s: float) -> bool:
-    return abs(delay_s) > max(_SURE * std_s, _LEAST_DELAY_S)
-
-
-def _later(effects: tuple[Effect, ...], name: str, delay_s: float) -> tuple[Effect, ...]:
-    """The effects with so much more of a delay."""
-    declared = sum(v["delay_s"] for e in effects if e.name == name for v in elements(e)[1])
-    others = tuple(e for e in effects if e.name != name)
-    return (*others, Effect(name=name, parameters={"delay_s": declared + delay_s}))
-
-
-def _readings(model: JointModel) -> list[list[Effect]]:
-    owners = [motor.effects for motor in model.motors]
-    return [[e for e in effects if e.name in _READINGS] for effects in (*owners, model.link_effects)]
-
-
-def _fitted(model: JointModel, fits: Sequence[TransmissionFit], *, usable_only: bool = False) -> JointModel:
-    """The model with the numbers of the fits; of the usable ones only, where others stand in the way."""
-    motors = (
-        motor if one.model == RIGID or (usable_only and not one.stiffens) else _told(motor, one)
-        for motor, one in zip(model.motors, fits, strict=True)
+    link, link_std = _link(told)
+    link_effects = _effects(told, model.link_effects, None, notes)
+    found = replace(model, motors=motors, link=link, link_effects=link_effects)
+    return Identified(
+        fits=fits, model=found, link_std=link_std, recordings=_recordings(told), notes=tuple(notes)
     )
-    return replace(model, motors=tuple(motors))
 
 
-def _told(motor: Motor, one: TransmissionFit) -> Motor:
-    order = int(one.alpha.size) if one.model == "polynomial" else motor.transmission.order
+def _fitted(motor: Motor, one: TransmissionFit) -> Motor:
+    transmission = motor.transmission
+    if one.model != RIGID:
+        order = int(one.alpha.size) if one.model == "polynomial" else transmission.order
+        transmission = Transmission(model=one.model, order=order, parameters=one.parameters)
     return replace(
         motor,
         inertia_kg_m2=one.inertia_kg_m2,
-        viscous_damping_nm_s_rad=max(one.viscous_damping_nm_s_rad, 0.0),
-        transmission=Transmission(model=one.model, order=order, parameters=one.parameters),
+        viscous_damping_nm_s_rad=one.viscous_damping_nm_s_rad,
+        transmission=transmission,
     )
+
+
+def _effects(
+    told: Told, declared: tuple[Effect, ...], motor: int | None, notes: list[str]
+) -> tuple[Effect, ...]:
+    """Effects with the readings' errors, and a rigid joint's friction, as found."""
+    flexible = motor is None or told.problem.model.motors[motor].flexible
+    for name, parameter in _PARAMETER.items():
+        mine = told.places((name, motor))
+        if not mine or (name, motor) in told.absent or (flexible and name == "coulomb_friction"):
+            continue
+        more = _shared(told, mine)
+        if more is None:
+            each = ", ".join(f"{x:.3g}" for x in told.values((name, motor)))
+            notes.append(f"{name} differs between the recordings ({parameter} {each}) and stays as declared")
+            continue
+        before = sum(v[parameter] for e in declared if e.name == name for v in elements(e)[1])
+        values_of = {parameter: before + more}
+        if name == "coulomb_friction":
+            values_of["smoothing_rad_s"] = sign_smoothing(told.problem.frames, motor or 0)
+        declared = (*(e for e in declared if e.name != name), Effect(name=name, parameters=values_of))
+    return declared
+
+
+def _shared(told: Told, mine: list[int]) -> float | None:
+    """The one value of all recordings; None where they contradict each other."""
+    values = np.array([told.fitted.slots[j].taken + told.fitted.posterior.x[j] for j in mine])
+    precision = np.linalg.pinv(told.covariance[np.ix_(mine, mine)], hermitian=True)
+    mean = float(np.sum(precision @ values) / np.sum(precision))
+    apart = values - mean
+    freedom = len(mine) - 1
+    if freedom and chdtrc(freedom, float(apart @ precision @ apart)) < _CHANCE:
+        return None
+    return mean
+
+
+def _link(told: Told) -> tuple[LinkDynamics | None, dict[str, float]]:
+    """The link's dynamics as found, and their standard deviations."""
+    link = told.problem.model.link
+    gravity = told.places(("gravity", None))
+    if link is None or not told.places(("link_inertia", None)):
+        return link, {}
+    inertia, inertia_std = told.mean("link_inertia", None)
+    damping, damping_std = told.mean("link_viscous_damping", None)
+    std = {"inertia_kg_m2": inertia_std, "viscous_damping_nm_s_rad": damping_std}
+    link = replace(
+        link,
+        inertia_kg_m2=link.inertia_kg_m2 + inertia,
+        viscous_damping_nm_s_rad=max(link.viscous_damping_nm_s_rad + damping, 0.0),
+    )
+    if gravity:
+        parts = told.values(("gravity", None))
+        a = link.gravity_nm * math.cos(link.gravity_phase_rad) + float(parts[0])
+        b = link.gravity_nm * math.sin(link.gravity_phase_rad) + float(parts[1])
+        sign = -1.0 if link.gravity_nm < 0.0 else 1.0
+        size = max(math.hypot(a, b), 1e-300)
+        both = told.covariance[np.ix_(gravity, gravity)]
+        along, across = np.array([a, b]) / size, np.array([-b, a]) / size**2
+        std["gravity_nm"] = math.sqrt(max(float(along @ both @ along), 0.0))
+        std["gravity_phase_rad"] = math.sqrt(max(float(across @ both @ across), 0.0))
+        link = replace(link, gravity_nm=sign * size, gravity_phase_rad=math.atan2(sign * b, sign * a))
+    return link, std
+
+
+def _recordings(told: Told) -> tuple[RecordingFit, ...]:
+    """What is left of each recording, and of each one where it took no part."""
+    problem, fitted = told.problem, told.fitted
+    residual, torque = fitted.regression.residual(fitted.posterior.x), problem.torque()
+    motors = problem.group % problem.equations < len(problem.model.motors)
+    made = []
+    for k in range(len(problem.signals)):
+        mine = motors & (problem.group // problem.equations == k)
+        made.append(RecordingFit(_left(residual[mine], torque[mine]), _left_out(told, k)))
+    return tuple(made)
+
+
+def _left_out(told: Told, k: int) -> Left | None:
+    """What the k-th recording leaves under a fit of the others; what belongs to a run is fitted there."""
+    problem, fitted = told.problem, told.fitted
+    records = told.records
+    if len(records) < 2:
+        return None
+    rest = [j for j in range(len(records)) if j != k]
+    bandwidth = problem.signals[0].bandwidth_hz
+    others = joint_problem([records[j] for j in rest], problem.model, bandwidth)
+    corrections = tuple(fitted.corrections[j] for j in rest)
+    there = others.fit((), fitted.base, corrections, pinned=fitted.pinned)
+    left, torque, motors = on_other(joint_problem([records[k]], problem.model, bandwidth), there)
+    return _left(left[motors], torque[motors])
+
+
+def _left(residual: FloatArray, torque: FloatArray) -> Left:
+    rms = float(np.sqrt(np.mean(residual**2)))
+    return Left(rms, rms / max(float(np.sqrt(np.mean(torque**2))), 1e-300))

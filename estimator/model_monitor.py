@@ -73,22 +73,23 @@ def can_monitor(model: JointModel) -> bool:
     return all(m.transmission.model == "none" or m.transmission.parameters for m in model.motors)
 
 
-def measure_baseline(record: Record, model: JointModel) -> ResidualBaseline:
-    """The baseline of a model on a recording that it is sufficient for (at most its first two minutes).
+def measure_baseline(record: Record | Sequence[Record], model: JointModel) -> ResidualBaseline:
+    """The baseline of a model on recordings that it is sufficient for (at most the first two minutes of each).
 
     Raises:
-        EstimatorError: the recording has less than two whole seconds after the filters have settled.
+        EstimatorError: they have less than two whole seconds after the filters have settled.
     """
-    monitor = ModelMonitor(model, record.period_s, None)
-    residuals, torques, seconds = [], [], 0
-    for sample in record.samples():
-        if sample.sequence - record.sequence[0] > _LONGEST_S / record.period_s:
-            break
-        monitor.core.step(sample)
-        if monitor.core.seconds > seconds:
-            seconds = monitor.core.seconds
-            residuals.append(monitor.residual_nm)
-            torques.append(monitor.torque_nm)
+    residuals, torques = [], []
+    for one in [record] if isinstance(record, Record) else record:
+        monitor, seconds = ModelMonitor(model, one.period_s, None), 0
+        for sample in one.samples():
+            if sample.sequence - one.sequence[0] > _LONGEST_S / one.period_s:
+                break
+            monitor.core.step(sample)
+            if monitor.core.seconds > seconds:
+                seconds = monitor.core.seconds
+                residuals.append(monitor.residual_nm)
+                torques.append(monitor.torque_nm)
     require(len(residuals) >= _LEAST_SECONDS, "baseline: expected a recording of more than 3 s")
     residual, torque = np.maximum(residuals, _NOTHING), np.maximum(torques, _NOTHING)
     usual = np.sqrt(np.mean(torque**2, axis=0))

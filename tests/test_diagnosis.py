@@ -8,8 +8,9 @@ import diagnosiskit as kit
 import numpy as np
 import pytest
 
-from estimator.diagnosis import calibrate, diagnose
+from estimator.diagnosis import diagnose
 from estimator.errors import EstimatorError
+from estimator.identify import identify
 from estimator.model import Effect
 from estimator.sample import Record
 
@@ -133,7 +134,7 @@ def test_declared_numbers_off_by_a_percent_are_everyday_and_calibrated_on_a_heal
 ) -> None:
     off = kit.model(error=0.01)
     assert diagnose(records["clean"], off).verdict == "sufficient"
-    calibrated = calibrate(records["clean"], off)
+    calibrated = identify(records["clean"], off).model
     assert diagnose(records["clean2"], calibrated).verdict == "sufficient"
     assert [e.name for e in diagnose(records["coulomb"], calibrated).effects] == ["coulomb_friction"]
     # The torque is the anchor and exact but for its noise, so the number itself comes back.
@@ -146,7 +147,7 @@ def test_what_a_healthy_rig_reads_skewed_and_shifted_is_calibrated_too(records: 
     (healthy,) = kit.World([rig], seed=3).run()
     clean, rubbing = kit.World([rig, {**rig, "coulomb_nm": 0.4}], seed=4).run()
     healthy, clean, rubbing = (with_late_torque(r, 0.00025) for r in (healthy, clean, rubbing))
-    calibrated = calibrate(healthy, kit.model(error=0.01))
+    calibrated = identify(healthy, kit.model(error=0.01)).model
     (motor,) = calibrated.motors
     readings = {e.name: e.parameters for e in (*motor.effects, *calibrated.link_effects)}
     assert readings["encoder_delay"]["delay_s"] == pytest.approx(0.0003, abs=3e-5)

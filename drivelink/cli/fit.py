@@ -1,4 +1,4 @@
-"""`drivelink fit RECORDING --joint JOINT`: model-based estimation from a recording."""
+"""`drivelink fit RECORDING… --joint JOINT`: model-based estimation from recordings."""
 
 from __future__ import annotations
 
@@ -15,11 +15,15 @@ from drivelink.recording.mapping import joint_of
 _EPILOG = """\
 examples:
   drivelink fit healthy.csv --joint elbow.toml --out fit/ --plots --write elbow-fitted.toml
+  drivelink fit monday.csv tuesday.csv --joint elbow.toml      runs of one joint, each validated by the others
   drivelink fit healthy.mcap --json                   a recording of drivelink carries its joint file
 
+Of several recordings stiffness, inertias, dampings, link dynamics and delays are shared; zeros of encoders,
+offsets and the level of friction belong to each.
+
 What is printed, and what fit.json says, is what --write puts into a copy of the joint file: parameters of
-the transmission, inertia and damping of the motor, link dynamics where they are declared, and delays and
-zeros of the readings, as effects. `run`, `replay` and `diagnose` start from there.
+the transmission, inertia and damping of the motor, link dynamics where they are declared, delays and zeros of
+the readings and friction of a rigid joint, as effects. `run`, `replay` and `diagnose` start from there.
 """
 
 
@@ -27,7 +31,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _EPILOG
-    parser.add_argument("recording", type=Path, metavar="RECORDING", help="measured data: CSV, MCAP, CAN log")
+    parser.add_argument(
+        "recording",
+        type=Path,
+        nargs="+",
+        metavar="RECORDING",
+        help="measured data of one joint: CSV, MCAP, CAN log; of several each is validated by the others",
+    )
     parser.add_argument(
         "--joint", type=Path, metavar="JOINT", help="joint file; left out: the one that the recording carries"
     )
@@ -51,11 +61,12 @@ def run(args: argparse.Namespace) -> int:
     folder = _plots_folder(args)
     if args.joint is not None:
         jointfile.load(args.joint)  # it is named first when both are wrong
-    if not args.recording.exists():
-        raise RecordingError(f"{args.recording}: no such file")
+    for path in args.recording:
+        if not path.exists():
+            raise RecordingError(f"{path}: no such file")
     if args.write is not None:  # the joint file itself may be brought up to date
-        check_target(args.write, [args.recording], force=args.force)
-    source = joint_of(args.recording, args.joint)
+        check_target(args.write, args.recording, force=args.force)
+    source = joint_of(args.recording[0], args.joint)
     from drivelink.cli.fitting import fit_recording  # a second; what can be wrong before is said before
 
     fit_recording(args, source, folder)

@@ -1,11 +1,11 @@
-"""From a recording to transmission parameters: what `drivelink fit` computes, prints and writes."""
+"""From recordings to transmission parameters: what `drivelink fit` computes, prints and writes."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -43,23 +43,24 @@ def fit_recording(args: argparse.Namespace, source: JointText, folder: Path | No
 
     Args:
         args: of `drivelink fit`.
-        source: the joint file that they name, or that the recording carries.
+        source: the joint file that they name, or that the first recording carries.
         folder: where plots go; None: no plots.
 
     Raises:
-        RecordingError: the recording cannot be read, or does not reveal what is asked.
+        RecordingError: a recording cannot be read, or does not reveal what is asked.
     """
     joint = source.joint
     names = parse_column_map(args.map)
-    record = recording.read(args.recording, joint, base_dir=source.folder, names=names)
+    records = [recording.read(path, joint, base_dir=source.folder, names=names) for path in args.recording]
     bandwidth = None if args.bandwidth_hz is None else 2.0 * math.pi * args.bandwidth_hz
     try:
-        found = identify(record, joint.model(), bandwidth)
+        found = identify(records, joint.model(), bandwidth)
     except GateError as error:
-        raise refusal(args.recording, joint, error.findings, str(error)) from error
+        path = next(p for p, one in zip(args.recording, records, strict=True) if one is error.record)
+        raise refusal(path, joint, error.findings, str(error)) from error
     except EstimatorError as error:
-        raise RecordingError(f"{args.recording}: {error}") from error
-    document, made = _as_json(found), []
+        raise RecordingError(f"{_named(args)}: {error}") from error
+    document, made = _as_json(found, args.recording), []
     if args.out is not None:
         made.append(args.out / "fit.json")
         _folder(args.out)
@@ -69,12 +70,12 @@ def fit_recording(args: argparse.Namespace, source: JointText, folder: Path | No
         _folder(folder)
         made.append(_plot(found.fits, joint, folder))
     if args.write is not None:
-        _write(args, source, found, record)
+        _write(args, source, found, records)
         made.append(args.write)
     if args.json:
         print(json.dumps(document))
         return
-    _print(found)
+    _print(found, args.recording)
     for path in made:
         print(f"wrote {path}")
 
@@ -83,16 +84,33 @@ def _folder(path: Path) -> None:
     path.mkdir(parents=True, exist_ok=True)
 
 
+def _named(args: argparse.Namespace) -> str:
+    return ", ".join(str(path) for path in args.recording)
+
+
 def _inputs(args: argparse.Namespace) -> list[Path]:
-    return [args.recording, *([args.joint] if args.joint else [])]
+    return [*args.recording, *([args.joint] if args.joint else [])]
 
 
-def _as_json(found: Identified) -> dict[str, Any]:
+def _as_json(found: Identified, paths: Sequence[Path]) -> dict[str, Any]:
     pairs = zip(found.fits, found.model.motors, strict=True)
     document: dict[str, Any] = {"transmissions": [_entry(one, motor) for one, motor in pairs]}
     link = _link(found)
     if link:
         document["link"] = link
+    if found.link_std:
+        document["link_std"] = found.link_std
+    if len(paths) > 1:
+        document["recordings"] = [
+            {
+                "recording": path.name,
+                "train": one.train._asdict(),
+                "validation": one.validation and one.validation._asdict(),
+            }
+            for path, one in zip(paths, found.recordings, strict=True)
+        ]
+    if found.notes:
+        document["notes"] = list(found.notes)
     return document
 
 
@@ -104,14 +122,13 @@ def _entry(one: TransmissionFit, motor: Motor) -> dict[str, Any]:
     }
     if motor.effects:
         entry["effects"] = [_effect(effect) for effect in motor.effects]
-    if one.model == RIGID:
-        return entry
     std = one.nuisance_std
     entry["motor"] |= {"inertia_std_kg_m2": std["inertia"], "viscous_damping_std_nm_s_rad": std["damping"]}
-    entry["unmodelled"] = {"coulomb_nm": one.coulomb_nm, "offset_nm": one.offset_nm}
     entry["error_rms_nm"] = one.error_rms_nm
     entry["error_relative"] = one.error_rms_nm / one.torque_rms_nm
-    entry["excited"] = one.excited
+    if one.model != RIGID:
+        entry["unmodelled"] = {"coulomb_nm": one.coulomb_nm, "offset_nm": one.offset_nm}
+        entry["excited"] = one.excited
     return entry
 
 
@@ -125,7 +142,7 @@ def _link(found: Identified) -> dict[str, Any]:
     return link
 
 
-def _print(found: Identified) -> None:
+def _print(found: Identified, paths: Sequence[Path]) -> None:
     console = Console()
     for number, (one, motor) in enumerate(zip(found.fits, found.model.motors, strict=True), start=1):
         table = _table(f"motor {number}: {'rigid' if one.model == RIGID else one.model}")
@@ -133,28 +150,37 @@ def _print(found: Identified) -> None:
             for label, x, sigma in _rows(name, value, one.std[name]):
                 table.add_row(label, f"{x:.6g}", f"{_SIGMA_95 * sigma:.2g}")
         for name, key in (("inertia_kg_m2", "inertia"), ("viscous_damping_nm_s_rad", "damping")):
-            known = key in one.nuisance_std
-            shown = f"{_SIGMA_95 * one.nuisance_std[key]:.2g}" if known else ""
-            table.add_row(name, f"{getattr(motor, name):.6g}", shown)
+            table.add_row(name, f"{getattr(motor, name):.6g}", f"{_SIGMA_95 * one.nuisance_std[key]:.2g}")
         _add_effects(table, motor.effects)
         console.print(table)
-        if one.model == RIGID:
-            continue
         share = one.error_rms_nm / one.torque_rms_nm
-        left = f"{one.error_rms_nm:.3g} N·m rms left, {100 * share:.2f} % of the flexibility torque"
-        print(f"  torque balance: {left}")
+        whole = "motor torque" if one.model == RIGID else "flexibility torque"
+        print(f"  torque balance: {one.error_rms_nm:.3g} N·m rms left, {100 * share:.2f} % of the {whole}")
         for line in _remarks(one):
             print(f"  {line}")
     link = found.model.link
     if link is not None or found.model.link_effects:
         table = _table("link")
         for name, x in asdict(link).items() if link is not None else ():
-            if x is not None:
-                table.add_row(name, f"{x:.6g}", "")
+            std = found.link_std.get(name)
+            table.add_row(name, f"{x:.6g}", "" if std is None else f"{_SIGMA_95 * std:.2g}")
         _add_effects(table, found.model.link_effects)
         console.print(table)
-    if found.doubt:
-        print(f"  link dynamics and readings stay as declared: {found.doubt}")
+    for line in found.notes:
+        print(f"  {line}")
+    if len(paths) > 1:
+        console.print(_left(found, paths))
+
+
+def _left(found: Identified, paths: Sequence[Path]) -> Table:
+    """What is left of each recording, relative to its motor torque."""
+    table = Table(title="error of the torque balance", title_justify="left")
+    for column in ("recording", "fitted", "left out"):
+        table.add_column(column, justify="left" if column == "recording" else "right")
+    for path, one in zip(paths, found.recordings, strict=True):
+        cells = [f"{left.rms_nm:.3g} N·m  {left.relative:.2%}" if left else "" for left in one]
+        table.add_row(path.name, *cells)
+    return table
 
 
 def _table(title: str) -> Table:
@@ -180,7 +206,9 @@ def _rows(name: str, value: ParameterValue, std: ParameterValue) -> list[tuple[s
 
 
 def _remarks(one: TransmissionFit) -> list[str]:
-    remarks = []
+    remarks: list[str] = []
+    if one.model == RIGID:
+        return remarks
     if not one.excited:
         remarks.append("the motion hardly reveals the stiffness: record one with more deflection")
     if not one.stiffens:
@@ -219,21 +247,19 @@ def _plot(fits: list[TransmissionFit], joint: JointFile, folder: Path) -> Path:
     return plots.save(figure, folder / "fit.png")
 
 
-def _write(args: argparse.Namespace, source: JointText, found: Identified, record: Record) -> None:
+def _write(args: argparse.Namespace, source: JointText, found: Identified, records: Sequence[Record]) -> None:
     fits = found.fits
     weak = [number for number, one in enumerate(fits, start=1) if one.model != RIGID and not one.excited]
     if weak:
         raise RecordingError(
-            f"{args.recording}: --write: expected a motion that reveals the stiffness of motor {weak[0]}"
+            f"{_named(args)}: --write: expected a motion that tells the stiffness of motor {weak[0]}"
         )
     unusable = [number for number, one in enumerate(fits, start=1) if one.model != RIGID and not one.stiffens]
     if unusable:
         raise RecordingError(
-            f"{args.recording}: --write: expected a stiffness above zero, interval included, over all "
+            f"{_named(args)}: --write: expected a stiffness above zero, interval included, over all "
             f"deflections of the recording; that of motor {unusable[0]} is not"
         )
-    if found.doubt:
-        raise RecordingError(f"{args.recording}: --write: {found.doubt}")
     model = found.model
     motors: list[dict[str, Any]] = []
     for motor in model.motors:
@@ -255,10 +281,10 @@ def _write(args: argparse.Namespace, source: JointText, found: Identified, recor
     if link:
         changes["link"] = link
     provenance = {
-        **floor_entry(record, model),
+        **floor_entry(records, model),
         "fit": {
-            "recording": args.recording.name,
-            "seconds": float((record.sequence[-1] - record.sequence[0]) * record.period_s),
+            "recording": ", ".join(path.name for path in args.recording),
+            "seconds": sum(float((one.sequence[-1] - one.sequence[0]) * one.period_s) for one in records),
             "written": datetime.now(UTC).isoformat(timespec="seconds"),
             "version": __version__,
         },

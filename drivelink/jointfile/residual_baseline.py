@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from drivelink import _core
@@ -16,7 +17,7 @@ __all__ = ["floor_entry", "make_watch"]
 _KEY = "floor"
 
 
-def floor_entry(record: Record, model: JointModel) -> dict[str, Any]:
+def floor_entry(record: Record | Sequence[Record], model: JointModel) -> dict[str, Any]:
     """What [provenance] keeps of a model's baseline; nothing where it cannot be measured."""
     if not can_monitor(model):
         return {}

@@ -1,6 +1,5 @@
 """Traces a residual to a physical effect: locate, select, judge."""
 
-from estimator.diagnosis.calibration import calibrate
 from estimator.diagnosis.result import (
     Curve,
     Diagnosis,
@@ -26,6 +25,5 @@ __all__ = [
     "Series",
     "StiffnessCurve",
     "Verdict",
-    "calibrate",
     "diagnose",
 ]

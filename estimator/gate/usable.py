@@ -10,7 +10,7 @@ from estimator.sample import FloatArray, Record
 
 __all__ = ["check"]
 
-_LEAST_S = 3.0
+_LEAST_S = 1.0
 _LEAST_ROWS = 300
 _MOST_GAPS = 0.2  # of the samples
 _ABSURD = 1e12
@@ -31,7 +31,8 @@ def check(record: Record, model: JointModel) -> None:
         )
     if record.motors != len(model.motors):
         raise EstimatorError(
-            f"the recording has {record.motors} motor(s): expected {len(model.motors)}, as in the joint file"
+            f"the recording has {record.motors} motor(s): expected {len(model.motors)} motor(s), "
+            "as in the joint file"
         )
     if model.has_deflection and record.link_position_rad is None:
         raise EstimatorError(
@@ -60,7 +61,9 @@ def _finite(name: str, x: FloatArray) -> None:
 def _channel(name: str, x: FloatArray) -> None:
     _finite(name, x)
     if np.ptp(x) == 0.0:
-        raise EstimatorError(f"{name} is constant ({x[0]:g}): the joint must move and its sensors report it")
+        raise EstimatorError(
+            f"{name} is constant ({x[0]:g}): the joint stands still, or its sensor is silent"
+        )
     still = np.count_nonzero(np.diff(x) == 0.0) / (len(x) - 1)
     if still > 0.995 and len(np.unique(x)) < 4:
         raise EstimatorError(f"{name} hardly changes: only {len(np.unique(x))} different values")

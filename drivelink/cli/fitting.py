@@ -136,7 +136,7 @@ def _link(found: Identified) -> dict[str, Any]:
     """[link] as found: its dynamics, and the effects at it and in its encoder."""
     link: dict[str, Any] = {}
     if found.model.link is not None:
-        link["dynamics"] = {k: x for k, x in asdict(found.model.link).items() if x is not None}
+        link["dynamics"] = {name: x for name, x in asdict(found.model.link).items() if x is not None}
     if found.model.link_effects:
         link["effect"] = [_effect(effect) for effect in found.model.link_effects]
     return link
@@ -161,7 +161,7 @@ def _print(found: Identified, paths: Sequence[Path]) -> None:
     link = found.model.link
     if link is not None or found.model.link_effects:
         table = _table("link")
-        for name, x in asdict(link).items() if link is not None else ():
+        for name, x in _link(found).get("dynamics", {}).items():
             std = found.link_std.get(name)
             table.add_row(name, f"{x:.6g}", "" if std is None else f"{_SIGMA_95 * std:.2g}")
         _add_effects(table, found.model.link_effects)

@@ -23,14 +23,14 @@ from estimator.model import JointModel, ParameterValue, Transmission
 from estimator.sample import FloatArray, Record
 from estimator.transmissions import MODELS, RIGID, UNKNOWN
 
-__all__ = ["Key", "Told", "TransmissionFit", "fit", "joint_problem", "tell", "transmission_fits"]
+__all__ = ["JointFit", "Key", "TransmissionFit", "fit", "fit_joint", "joint_problem", "transmission_fits"]
 
 _SIGMA_95 = 1.96
 _LOOKED_AT = 33  # deflections from zero to the largest one
 _HIGHEST_ORDER = 4
 _BLOCKS = 10  # of time
 _SURE = 3.0  # nats (20 to 1) by which an error that need not be there must be likelier than none
-_LEAST_ROWS = 60  # fewer tell nothing about their own errors
+_LEAST_ROWS = 60  # fewer reveal nothing about their own errors
 _PERIODS = 30.0  # of the bandwidth that a recording lasts at least: three rows each, less the ends
 _READINGS = ("encoder_delay", "torque_delay", "deflection_offset")
 _OF_RIGID = ("coulomb_friction", "torque_offset")
@@ -40,7 +40,7 @@ Key = tuple[str, int | None]  # an everyday error and its motor
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TransmissionFit:
-    """What recordings tell of one motor and its transmission.
+    """One motor and its transmission, fitted to recordings.
 
     Attributes:
         model: transmission model's name.
@@ -52,7 +52,7 @@ class TransmissionFit:
         torque_nm: (rows,) flexibility torque that the motor's balance gives there, nuisances removed.
         error_rms_nm: what is left of the motor's balance.
         torque_rms_nm: of the flexibility torque; of the motor torque, where it is rigid.
-        inertia_kg_m2: B, with what the recordings say of it.
+        inertia_kg_m2: B, as fitted.
         viscous_damping_nm_s_rad: D, likewise.
         coulomb_nm: friction beyond what is declared; mean of the recordings.
         offset_nm: constant torque of a rigid joint, likewise.
@@ -61,7 +61,7 @@ class TransmissionFit:
         torque_delay_s: by which the torque acts later than reported, likewise.
         nuisance_std: standard deviations of the last seven: "inertia", "damping", "coulomb", "offset",
             "shift", "link_delay", "torque_delay".
-        excited: whether the recordings tell the stiffness at all.
+        excited: whether the recordings reveal the stiffness at all.
     """
 
     model: str
@@ -94,7 +94,7 @@ class TransmissionFit:
         return bool(np.all(law.stiffness(phi, self.alpha) > _SIGMA_95 * std))
 
 
-class Told(NamedTuple):
+class JointFit(NamedTuple):
     """A joint at its best fit.
 
     Attributes:
@@ -147,10 +147,12 @@ def fit(
         EstimatorError: a recording lacks what is needed, is too short, or nothing moves in it.
         GateError: its units, signs, gear ratio or time do not fit the joint.
     """
-    return transmission_fits(tell(record, model, bandwidth_rad_s))
+    return transmission_fits(fit_joint(record, model, bandwidth_rad_s))
 
 
-def tell(record: Record | Sequence[Record], model: JointModel, bandwidth_rad_s: float | None = None) -> Told:
+def fit_joint(
+    record: Record | Sequence[Record], model: JointModel, bandwidth_rad_s: float | None = None
+) -> JointFit:
     """The joint at its best fit; arguments and errors as of `fit`."""
     records = [record] if isinstance(record, Record) else list(record)
     usable = []
@@ -241,7 +243,7 @@ def _ordered(records: Sequence[Record], model: JointModel, bandwidth_hz: float) 
     return problem, fitted
 
 
-def _aligned(records: Sequence[Record], problem: Problem, free: Fitted) -> Told:
+def _aligned(records: Sequence[Record], problem: Problem, free: Fitted) -> JointFit:
     """The fit without what has not earned its place, the least likely left out first.
 
     What is left open of that is part of the covariance: it is the one of the mixture of both hypotheses.
@@ -249,8 +251,8 @@ def _aligned(records: Sequence[Record], problem: Problem, free: Fitted) -> Told:
     everything = _covariance(free)
     fitted, covariance, absent = free, everything, frozenset[Key]()
     while True:
-        told = Told(records, problem, fitted, covariance, absent)
-        odds = {key: _odds_of_zero(told, [key]) for key in _optional(told)}
+        joint = JointFit(records, problem, fitted, covariance, absent)
+        odds = {key: _odds_of_zero(joint, [key]) for key in _optional(joint)}
         doubtful = [key for key in odds if odds[key] > -_SURE]
         if not doubtful:
             break
@@ -259,40 +261,40 @@ def _aligned(records: Sequence[Record], problem: Problem, free: Fitted) -> Told:
         fitted = problem.fit((), fitted.base, fitted.corrections, pinned=pinned)
         covariance = _covariance(fitted)
     if not absent:
-        return told
-    full = Told(records, problem, free, everything, frozenset())
+        return joint
+    full = JointFit(records, problem, free, everything, frozenset())
     weight = 1.0 / (1.0 + math.exp(min(_odds_of_zero(full, sorted(absent, key=str)), 700.0)))
     apart = _totals(free) - _totals(fitted)
     mixed = (1.0 - weight) * covariance + weight * (everything + np.outer(apart, apart))
-    return told._replace(covariance=mixed)
+    return joint._replace(covariance=mixed)
 
 
 def _covariance(fitted: Fitted) -> FloatArray:
-    """Covariance of the parameters; what a sign holds at its bound is no surer than before any data."""
+    """Covariance of the parameters; what a sign holds at its bound is as uncertain as before any data."""
     covariance = hac_covariance(fitted)
     held = np.flatnonzero(fitted.posterior.bound & [s.kind == "everyday" for s in fitted.slots])
     covariance[held, held] = fitted.regression.std[held] ** 2
     return covariance
 
 
-def _optional(told: Told) -> list[Key]:
+def _optional(joint: JointFit) -> list[Key]:
     """Errors that may have to be left out: of readings, and friction and offset of a rigid joint."""
-    motors = told.problem.model.motors
-    keys = {(s.name, s.motor) for s in told.fitted.slots if s.kind == "everyday"}
+    motors = joint.problem.model.motors
+    keys = {(s.name, s.motor) for s in joint.fitted.slots if s.kind == "everyday"}
     rigid = {(name, i) for i, motor in enumerate(motors) if not motor.flexible for name in _OF_RIGID}
-    return sorted((k for k in keys - told.absent if k[0] in _READINGS or k in rigid), key=str)
+    return sorted((k for k in keys - joint.absent if k[0] in _READINGS or k in rigid), key=str)
 
 
-def _odds_of_zero(told: Told, keys: Sequence[Key]) -> float:
+def _odds_of_zero(joint: JointFit, keys: Sequence[Key]) -> float:
     """Log odds that there are no such errors: the Savage-Dickey density ratio.
 
     Posterior over prior density at zero (Dickey, Annals of Mathematical Statistics 42, 1971), with the
     covariance that holds for correlated errors.
     """
-    mine = [j for key in keys for j in told.places(key)]
-    wide = told.fitted.regression.std[mine]
-    x = _totals(told.fitted)[mine] / wide
-    covariance = told.covariance[np.ix_(mine, mine)] / np.outer(wide, wide)
+    mine = [j for key in keys for j in joint.places(key)]
+    wide = joint.fitted.regression.std[mine]
+    x = _totals(joint.fitted)[mine] / wide
+    covariance = joint.covariance[np.ix_(mine, mine)] / np.outer(wide, wide)
     covariance = covariance + 1e-12 * np.eye(len(mine))
     return float(-0.5 * x @ np.linalg.solve(covariance, x) - 0.5 * np.linalg.slogdet(covariance)[1])
 
@@ -302,9 +304,9 @@ def _totals(fitted: Fitted) -> FloatArray:
     return np.array([s.taken for s in fitted.slots]) + fitted.posterior.x
 
 
-def transmission_fits(told: Told) -> list[TransmissionFit]:
+def transmission_fits(joint: JointFit) -> list[TransmissionFit]:
     """What a fit says of each motor and its transmission."""
-    problem, fitted = told.problem, told.fitted
+    problem, fitted = joint.problem, joint.fitted
     frames = problem.at(fitted.corrections, fitted.base)
     left = fitted.regression.residual(fitted.posterior.x)
     base = fitted.moved_base(problem)
@@ -313,17 +315,17 @@ def transmission_fits(told: Told) -> list[TransmissionFit]:
     for i, (motor, law) in enumerate(zip(problem.model.motors, base.models(frames[0]), strict=True)):
         rows = problem.group % problem.equations == i
         mine = [j for j, s in enumerate(fitted.slots) if s.kind == "base" and s.motor == i]
-        alpha, covariance = base.alpha[i], told.covariance[np.ix_(mine, mine)]
+        alpha, covariance = base.alpha[i], joint.covariance[np.ix_(mine, mine)]
         std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         torque = (spring + fitted.regression.design[:, mine] @ fitted.posterior.x[mine])[rows]
         measured = problem.torque()[rows]
-        inertia, inertia_std = told.mean("motor_inertia", i)
-        damping, damping_std = told.mean("viscous_damping", i)
-        coulomb, coulomb_std = told.mean("coulomb_friction", i)
-        offset, offset_std = told.mean("torque_offset", i)
-        shift, shift_std = told.mean("deflection_offset", i)
-        link_delay, link_delay_std = told.mean("encoder_delay", None)
-        torque_delay, torque_delay_std = told.mean("torque_delay", i)
+        inertia, inertia_std = joint.mean("motor_inertia", i)
+        damping, damping_std = joint.mean("viscous_damping", i)
+        coulomb, coulomb_std = joint.mean("coulomb_friction", i)
+        offset, offset_std = joint.mean("torque_offset", i)
+        shift, shift_std = joint.mean("deflection_offset", i)
+        link_delay, link_delay_std = joint.mean("encoder_delay", None)
+        torque_delay, torque_delay_std = joint.mean("torque_delay", i)
         made.append(
             TransmissionFit(
                 model=RIGID if law is None else law.name,

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtrc
 
-from estimator.batch import Told, TransmissionFit, joint_problem, tell, transmission_fits
+from estimator.batch import JointFit, TransmissionFit, fit_joint, joint_problem, transmission_fits
 from estimator.diagnosis.candidates import sign_smoothing
 from estimator.diagnosis.heldout import on_other
 from estimator.effects import elements
@@ -46,7 +46,7 @@ class RecordingFit(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Identified:
-    """What recordings tell of a joint.
+    """A joint, fitted to recordings.
 
     Attributes:
         fits: of each motor, in order; every number that `model` has, too, is the same there.
@@ -80,18 +80,18 @@ def identify(
         EstimatorError: a recording lacks what is needed, is too short, or nothing moves in it.
         GateError: its units, signs, gear ratio or time do not fit the joint.
     """
-    told = tell(record, model, bandwidth_rad_s)
-    fits = transmission_fits(told)
+    joint = fit_joint(record, model, bandwidth_rad_s)
+    fits = transmission_fits(joint)
     notes: list[str] = []
     motors = tuple(
-        replace(_fitted(motor, one), effects=_effects(told, motor.effects, i, notes))
+        replace(_fitted(motor, one), effects=_effects(joint, motor.effects, i, notes))
         for i, (motor, one) in enumerate(zip(model.motors, fits, strict=True))
     )
-    link, link_std = _link(told)
-    link_effects = _effects(told, model.link_effects, None, notes)
+    link, link_std = _link(joint)
+    link_effects = _effects(joint, model.link_effects, None, notes)
     found = replace(model, motors=motors, link=link, link_effects=link_effects)
     return Identified(
-        fits=fits, model=found, link_std=link_std, recordings=_recordings(told), notes=tuple(notes)
+        fits=fits, model=found, link_std=link_std, recordings=_recordings(joint), notes=tuple(notes)
     )
 
 
@@ -109,31 +109,31 @@ def _fitted(motor: Motor, one: TransmissionFit) -> Motor:
 
 
 def _effects(
-    told: Told, declared: tuple[Effect, ...], motor: int | None, notes: list[str]
+    joint: JointFit, declared: tuple[Effect, ...], motor: int | None, notes: list[str]
 ) -> tuple[Effect, ...]:
     """Effects with the readings' errors, and a rigid joint's friction, as found."""
-    flexible = motor is None or told.problem.model.motors[motor].flexible
+    flexible = motor is None or joint.problem.model.motors[motor].flexible
     for name, parameter in _PARAMETER.items():
-        mine = told.places((name, motor))
-        if not mine or (name, motor) in told.absent or (flexible and name == "coulomb_friction"):
+        mine = joint.places((name, motor))
+        if not mine or (name, motor) in joint.absent or (flexible and name == "coulomb_friction"):
             continue
-        more = _shared(told, mine)
+        more = _shared(joint, mine)
         if more is None:
-            each = ", ".join(f"{x:.3g}" for x in told.values((name, motor)))
+            each = ", ".join(f"{x:.3g}" for x in joint.values((name, motor)))
             notes.append(f"{name} differs between the recordings ({parameter} {each}) and stays as declared")
             continue
         before = sum(v[parameter] for e in declared if e.name == name for v in elements(e)[1])
         values_of = {parameter: before + more}
         if name == "coulomb_friction":
-            values_of["smoothing_rad_s"] = sign_smoothing(told.problem.frames, motor or 0)
+            values_of["smoothing_rad_s"] = sign_smoothing(joint.problem.frames, motor or 0)
         declared = (*(e for e in declared if e.name != name), Effect(name=name, parameters=values_of))
     return declared
 
 
-def _shared(told: Told, mine: list[int]) -> float | None:
+def _shared(joint: JointFit, mine: list[int]) -> float | None:
     """The one value of all recordings; None where they contradict each other."""
-    values = np.array([told.fitted.slots[j].taken + told.fitted.posterior.x[j] for j in mine])
-    precision = np.linalg.pinv(told.covariance[np.ix_(mine, mine)], hermitian=True)
+    values = np.array([joint.fitted.slots[j].taken + joint.fitted.posterior.x[j] for j in mine])
+    precision = np.linalg.pinv(joint.covariance[np.ix_(mine, mine)], hermitian=True)
     mean = float(np.sum(precision @ values) / np.sum(precision))
     apart = values - mean
     freedom = len(mine) - 1
@@ -142,14 +142,14 @@ def _shared(told: Told, mine: list[int]) -> float | None:
     return mean
 
 
-def _link(told: Told) -> tuple[LinkDynamics | None, dict[str, float]]:
+def _link(joint: JointFit) -> tuple[LinkDynamics | None, dict[str, float]]:
     """The link's dynamics as found, and their standard deviations."""
-    link = told.problem.model.link
-    gravity = told.places(("gravity", None))
-    if link is None or not told.places(("link_inertia", None)):
+    link = joint.problem.model.link
+    gravity = joint.places(("gravity", None))
+    if link is None or not joint.places(("link_inertia", None)):
         return link, {}
-    inertia, inertia_std = told.mean("link_inertia", None)
-    damping, damping_std = told.mean("link_viscous_damping", None)
+    inertia, inertia_std = joint.mean("link_inertia", None)
+    damping, damping_std = joint.mean("link_viscous_damping", None)
     std = {"inertia_kg_m2": inertia_std, "viscous_damping_nm_s_rad": damping_std}
     link = replace(
         link,
@@ -157,12 +157,12 @@ def _link(told: Told) -> tuple[LinkDynamics | None, dict[str, float]]:
         viscous_damping_nm_s_rad=max(link.viscous_damping_nm_s_rad + damping, 0.0),
     )
     if gravity:
-        parts = told.values(("gravity", None))
+        parts = joint.values(("gravity", None))
         a = link.gravity_nm * math.cos(link.gravity_phase_rad) + float(parts[0])
         b = link.gravity_nm * math.sin(link.gravity_phase_rad) + float(parts[1])
         sign = -1.0 if link.gravity_nm < 0.0 else 1.0
         size = max(math.hypot(a, b), 1e-300)
-        both = told.covariance[np.ix_(gravity, gravity)]
+        both = joint.covariance[np.ix_(gravity, gravity)]
         along, across = np.array([a, b]) / size, np.array([-b, a]) / size**2
         std["gravity_nm"] = math.sqrt(max(float(along @ both @ along), 0.0))
         std["gravity_phase_rad"] = math.sqrt(max(float(across @ both @ across), 0.0))
@@ -170,22 +170,22 @@ def _link(told: Told) -> tuple[LinkDynamics | None, dict[str, float]]:
     return link, std
 
 
-def _recordings(told: Told) -> tuple[RecordingFit, ...]:
+def _recordings(joint: JointFit) -> tuple[RecordingFit, ...]:
     """What is left of each recording, and of each one where it took no part."""
-    problem, fitted = told.problem, told.fitted
+    problem, fitted = joint.problem, joint.fitted
     residual, torque = fitted.regression.residual(fitted.posterior.x), problem.torque()
     motors = problem.group % problem.equations < len(problem.model.motors)
     made = []
     for k in range(len(problem.signals)):
         mine = motors & (problem.group // problem.equations == k)
-        made.append(RecordingFit(_left(residual[mine], torque[mine]), _left_out(told, k)))
+        made.append(RecordingFit(_left(residual[mine], torque[mine]), _left_out(joint, k)))
     return tuple(made)
 
 
-def _left_out(told: Told, k: int) -> Left | None:
+def _left_out(joint: JointFit, k: int) -> Left | None:
     """What the k-th recording leaves under a fit of the others; what belongs to a run is fitted there."""
-    problem, fitted = told.problem, told.fitted
-    records = told.records
+    problem, fitted = joint.problem, joint.fitted
+    records = joint.records
     if len(records) < 2:
         return None
     rest = [j for j in range(len(records)) if j != k]

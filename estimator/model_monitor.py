@@ -6,7 +6,7 @@ The arithmetic is `estimator/core/src/model_monitor.rs`, which says what is test
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -74,7 +74,7 @@ def can_monitor(model: JointModel) -> bool:
 
 
 def measure_baseline(record: Record | Sequence[Record], model: JointModel) -> ResidualBaseline:
-    """The baseline of a model on recordings that it is sufficient for (at most the first two minutes of each).
+    """The baseline of a model on recordings that it is sufficient for (at most two minutes of each).
 
     Raises:
         EstimatorError: they have less than two whole seconds after the filters have settled.

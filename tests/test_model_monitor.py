@@ -9,7 +9,7 @@ import diagnosiskit as kit
 import pytest
 
 from estimator import transmissions
-from estimator.diagnosis import calibrate
+from estimator.identify import identify
 from estimator.model import JointModel
 from estimator.model_monitor import ModelMonitor, ResidualBaseline, can_monitor, measure_baseline
 from estimator.sample import Estimate, Record, Sample
@@ -32,7 +32,7 @@ def runs() -> dict[str, Record]:
 
 @pytest.fixture(scope="module")
 def fitted(runs: dict[str, Record]) -> tuple[JointModel, ResidualBaseline]:
-    model = calibrate(runs["healthy"], kit.model())
+    model = identify(runs["healthy"], kit.model()).model
     return model, measure_baseline(runs["healthy"], model)
 
 

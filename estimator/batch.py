@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimator.diagnosis.bandwidth import choose_bandwidth
+from estimator.diagnosis.choices import choice, whole
 from estimator.diagnosis.covariance import hac_covariance
 from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.errors import EstimatorError
@@ -28,10 +29,6 @@ __all__ = ["JointFit", "Key", "TransmissionFit", "fit", "fit_joint", "joint_prob
 _SIGMA_95 = 1.96
 _LOOKED_AT = 33  # deflections from zero to the largest one
 _HIGHEST_ORDER = 4
-_BLOCKS = 10  # of time
-_SURE = 3.0  # nats (20 to 1) by which an error that need not be there must be likelier than none
-_LEAST_ROWS = 60  # fewer reveal nothing about their own errors
-_PERIODS = 30.0  # of the bandwidth that a recording lasts at least: three rows each, less the ends
 _READINGS = ("encoder_delay", "torque_delay", "deflection_offset")
 _OF_RIGID = ("coulomb_friction", "torque_offset")
 
@@ -162,7 +159,9 @@ def fit_joint(
         refuse(one, model)
     if bandwidth_rad_s is None:
         shortest = min(len(one) * one.period_s for one in usable)
-        bandwidth_hz = max(min(choose_bandwidth(one, model) for one in usable), _PERIODS / shortest)
+        bandwidth_hz = max(
+            min(choose_bandwidth(one, model) for one in usable), choice("fit_periods") / shortest
+        )
     else:
         bandwidth_hz = bandwidth_rad_s / (2.0 * math.pi)
     nyquist = 0.4 / max(one.period_s for one in usable)
@@ -180,10 +179,10 @@ def joint_problem(records: Sequence[Record], model: JointModel, bandwidth_hz: fl
     Raises:
         EstimatorError: too short for the bandwidth, or a deflection that does not change.
     """
-    problem = Problem(records, model, bandwidth_hz, 0, _BLOCKS, calibrating=True)
-    if min(problem.rows) < _LEAST_ROWS:
+    problem = Problem(records, model, bandwidth_hz, calibrating=True)
+    if min(problem.rows) < whole("fit_rows"):
         raise EstimatorError(
-            f"recording: expected at least {_LEAST_ROWS} rows without gaps at a bandwidth of "
+            f"recording: expected at least {whole('fit_rows')} rows without gaps at a bandwidth of "
             f"{bandwidth_hz:g} Hz, got {min(problem.rows)}"
         )
     for i, motor in enumerate(model.motors):
@@ -248,18 +247,18 @@ def _aligned(records: Sequence[Record], problem: Problem, free: Fitted) -> Joint
 
     What is left open of that is part of the covariance: it is the one of the mixture of both hypotheses.
     """
-    everything = _covariance(free)
+    everything = _covariance(problem, free)
     fitted, covariance, absent = free, everything, frozenset[Key]()
     while True:
         joint = JointFit(records, problem, fitted, covariance, absent)
         odds = {key: _odds_of_zero(joint, [key]) for key in _optional(joint)}
-        doubtful = [key for key in odds if odds[key] > -_SURE]
+        doubtful = [key for key in odds if odds[key] > math.log(1.0 / choice("present") - 1.0)]
         if not doubtful:
             break
         absent |= {max(doubtful, key=lambda key: odds[key])}
         pinned = dict.fromkeys(absent, (0.0,))
         fitted = problem.fit((), fitted.base, fitted.corrections, pinned=pinned)
-        covariance = _covariance(fitted)
+        covariance = _covariance(problem, fitted)
     if not absent:
         return joint
     full = JointFit(records, problem, free, everything, frozenset())
@@ -269,9 +268,9 @@ def _aligned(records: Sequence[Record], problem: Problem, free: Fitted) -> Joint
     return joint._replace(covariance=mixed)
 
 
-def _covariance(fitted: Fitted) -> FloatArray:
+def _covariance(problem: Problem, fitted: Fitted) -> FloatArray:
     """Covariance of the parameters; what a sign holds at its bound is as uncertain as before any data."""
-    covariance = hac_covariance(fitted)
+    covariance = hac_covariance(problem, fitted)
     held = np.flatnonzero(fitted.posterior.bound & [s.kind == "everyday" for s in fitted.slots])
     covariance[held, held] = fitted.regression.std[held] ** 2
     return covariance

@@ -87,7 +87,7 @@ CHOICES: dict[str, Choice] = {
         20, "", "of a healthy joint's fit", "it starts from springs and readings that nobody knows"
     ),
     "present": Choice(
-        0.95, "probability", "of a delay, zero or friction that a healthy joint is given", "as for alternatives"
+        0.95, "probability", "of a delay, zero or friction of a healthy joint", "as alternatives"
     ),
     "fit_periods": Choice(
         30, "periods of the bandwidth", "in a recording of a healthy joint, at least", "three rows in each"
@@ -119,9 +119,6 @@ CHOICES: dict[str, Choice] = {
     "even": Choice(0.05, "probability", "at which another account is an alternative", "one in twenty"),
     "sure": Choice(3.0, "standard deviations", "at which a reading's error is reported", "one in 400"),
     "skew": Choice(1.05, "periods", "an everyday skew at most", "a sample, and what noise makes of it"),
-    "least_skew": Choice(
-        2e-5, "s", "that is calibrated", "a hundredth of what moves a stiffness by a per mille"
-    ),
     "constant": Choice(
         2.0, "what else is left", "a constant torque that is all there is", "more than the rest"
     ),

@@ -191,7 +191,7 @@ class Problem:
     ) -> Fitted:
         """Gauss-Newton from a given point; the best point on the way.
 
-        That of a healthy joint goes on until it stands still: a first step from far promises more than it holds.
+        That of a healthy joint goes on until it stands still: a step from far promises more than it holds.
         """
         best: Fitted | None = None
         for _ in range((steps or whole("patient_steps" if self.calibrating else "newton_steps")) + 1):

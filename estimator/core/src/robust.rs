@@ -296,8 +296,7 @@ impl Robust {
         if let Some(late) = transmission.take_delay() {
             let taken = self.alignment.shift(late);
             transmission.shift_delay(taken);
-            self.unsettled = self.settle;
-            self.search.begin();
+            self.distrust(); // which of the channels waits for which has changed
         }
     }
 
@@ -308,6 +307,7 @@ impl Robust {
         }
         self.alignment.shift(late);
         self.unsettled = self.settle;
+        self.momentum.iter_mut().for_each(LinkMomentum::distrust);
         for (i, transmission) in self.transmissions.iter_mut().enumerate() {
             transmission.relearn();
             transmission.deflection.restart(self.last.motor[i], self.last.link - self.last.motor[i]);

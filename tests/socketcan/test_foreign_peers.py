@@ -1,17 +1,22 @@
 """Foreign peers on a real SocketCAN, at rates that an emulated kernel carries."""
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import can
 import canopen
 import pytest
 
-from drivelink._core import SYNC_COB_ID
+from drivelink._core import SYNC_COB_ID, Assembler
+from drivelink.canopen import Signal, configure
 from drivelink.canopen.bus import interface_is_up, open_bus
+from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.framesource import OVERFLOW
 from drivelink.cycle.socketcan import SocketCanSource
 from drivelink.cycle.syncclock import SyncClock, measure_period
-from drivelink.jointfile import BusSection
+from drivelink.jointfile import BusSection, parse
 
 CHANNEL = "vcan0"
 pytestmark = [
@@ -19,6 +24,24 @@ pytestmark = [
     pytest.mark.skipif(not interface_is_up(CHANNEL), reason="no SocketCAN interface vcan0 here"),
 ]
 SECTION = BusSection(interface="socketcan", channel=CHANNEL)
+SHEET = Path(__file__).parents[2] / "sim/eds/cia402-drive.eds"
+SYNCS = 200  # at 100 Hz
+JOINT = """
+name = "wrist"
+[[motor]]
+inertia_kg_m2 = 0.05
+[motor.transmission]
+model = "none"
+[motor.drive]
+node_id = 5
+counts_per_rev = 4096
+rated_torque_nm = 1.0
+[bus]
+interface = "socketcan"
+channel = "vcan0"
+period_s = 0.01
+sdo_timeout_s = 0.5
+"""
 
 
 @pytest.mark.parametrize("period_s", [0.01, 0.004])
@@ -66,3 +89,97 @@ def test_frames_that_the_kernel_dropped_because_nobody_read_them_are_counted() -
         assert source.errors[OVERFLOW] == 201 - read
     finally:
         bus.shutdown()
+
+
+@contextmanager
+def slave() -> Iterator[tuple[canopen.Network, canopen.LocalNode]]:
+    """A slave of another make: python-canopen's `LocalNode` with a drive's sheet, in its own thread."""
+    network = canopen.Network(bus=can.Bus(interface="socketcan", channel=CHANNEL))
+    network.connect()
+    try:
+        yield network, network.create_node(5, str(SHEET))
+    finally:
+        network.disconnect()
+
+
+def answer_syncs(network: canopen.Network, node: canopen.LocalNode) -> None:
+    """Send every enabled TPDO at each SYNC: position 1000 + k, torque -k at the kth, packed by python-canopen."""
+    node.tpdo.read()
+    count = [0]
+
+    def answer(_cob_id: int, _data: bytearray, _stamp: float) -> None:
+        for tpdo in (tpdo for tpdo in node.tpdo.values() if tpdo.enabled and tpdo.trans_type == 1):
+            for variable in tpdo.map:
+                if variable.index == 0x6064:
+                    variable.raw = 1000 + count[0]
+                elif variable.index == 0x6077:
+                    variable.raw = -count[0]
+            tpdo.transmit()
+        count[0] += 1
+
+    network.subscribe(SYNC_COB_ID, answer)
+
+
+def test_another_makers_slave_is_configured_and_what_it_sends_is_decoded() -> None:
+    with slave() as (network, node):
+        bus = open_bus(SECTION)
+        try:
+            (layout,) = configure(bus, parse(JOINT))
+            answer_syncs(network, node)
+            assembler, samples = Assembler((layout,), 1), []
+            source = SocketCanSource(bus)
+            for _ in range(SYNCS):
+                source.send(SYNC_COB_ID, b"")
+                assembler.feed(SYNC_COB_ID, b"")
+                end_s = time.monotonic() + 0.01
+                while (left_s := end_s - time.monotonic()) > 0:
+                    source.wait(left_s)
+                    frames = [frame for frame in source.take() if frame.cob_id != SYNC_COB_ID]
+                    samples += [assembler.feed(frame.cob_id, frame.data) for frame in frames]
+        finally:
+            bus.shutdown()
+    objects = {o.signal: o for tpdo in layout.tpdos for o in tpdo.objects}
+    position, torque = objects[Signal.MOTOR_POSITION].scale, objects[Signal.MOTOR_TORQUE].scale
+    decoded = [sample for sample in samples if sample is not None]
+    assert len(decoded) >= 0.9 * SYNCS  # an emulated machine may stall for a cycle
+    for sample in decoded:
+        k = round(sample.motor_position_rad[0] / position) - 1000
+        assert sample.motor_torque_nm[0] == pytest.approx(-k * torque)
+        assert k == sample.sequence
+
+
+def test_a_map_that_a_foreign_master_writes_is_overheard() -> None:
+    text = JOINT.replace("[bus]", '[bus]\nconfigure = false\nsync = "follow"')
+    with slave() as (_, node):
+        bus = open_bus(SECTION)
+        source = SocketCanSource(bus)
+        passive = PassiveConfigurator([parse(text)], [Path()])
+        master = canopen.Network(bus=can.Bus(interface="socketcan", channel=CHANNEL))
+        master.connect()
+        try:
+            remote = master.add_node(5, str(SHEET))
+            remote.nmt.state = "PRE-OPERATIONAL"
+            remote.tpdo.read()
+            for tpdo in remote.tpdo.values():
+                tpdo.enabled = False
+            mapped = remote.tpdo[2]
+            mapped.clear()
+            for index in (0x6064, 0x6077, 0x6041):
+                mapped.add_variable(index)
+            mapped.trans_type, mapped.enabled = 1, True
+            remote.tpdo.save()
+            for index in (0x6075, 0x6076, 0x608F):
+                remote.sdo.upload(index, 1 if index == 0x608F else 0)
+            remote.nmt.state = "OPERATIONAL"
+            end_s = time.monotonic() + 2.0
+            while not passive.layouts and time.monotonic() < end_s:
+                source.wait(0.05)
+                for frame in source.take():
+                    passive.feed(frame.cob_id, frame.data, 0.0)
+                passive.poll(0.0)
+        finally:
+            master.disconnect()
+            bus.shutdown()
+    layout = passive.layouts[5]
+    assert [(o.index, o.bits) for o in layout.tpdos[0].objects] == [(0x6064, 32), (0x6077, 16), (0x6041, 16)]
+    assert node.nmt.state == "OPERATIONAL"

@@ -3,8 +3,8 @@
     python benchmarks/queries.py [--seconds S] [--rounds N] [--rate R] [--json FILE]
 
 Another process asks for model, status and schema of the joint, so many times a second, and never waits. The
-baseline is the same daemon beside the same flood at somebody else, a bare zenoh session with as many
-queryables that answers nothing: the processors are as busy, and only the daemon's share differs. Rounds alternate. The
+baseline is the same daemon beside the same flood at somebody else: a bare zenoh session with such queryables
+that answers nothing. The processors are as busy, and only the daemon's share differs. Rounds alternate. The
 cycle's thread is measured by its own CPU time, so another load of the machine is not in it.
 """
 

@@ -27,7 +27,7 @@ const SAME: f64 = 0.01;
 /// Blocks that the line is learned over: a minute of motion at 1 kHz.
 const MEMORY: f64 = 1200.0;
 /// A block is informative where a reading moves by so many of its standard deviations of rounding.
-const TELLS: f64 = 5.0;
+const TELLS: f64 = 20.0;
 /// Standard deviation of a declared scale, relative, before anything is learned; of one that is not declared.
 const DECLARED: f64 = 0.05;
 const UNDECLARED: f64 = 10.0;
@@ -294,9 +294,9 @@ impl CrossCheck {
         let keep = 1.0 - 1.0 / MEMORY;
         let square = left * left / expected;
         if self.learned >= FIRST / 3 {
-            // Blocks that are allowed little tell most of the noise: weights of least variance for a mean square.
-            self.noise_weight = keep * self.noise_weight + block.allowed.powi(-4);
-            self.noise_squares = keep * self.noise_squares + square * block.allowed.powi(-2);
+            // Of all blocks alike: too much where motion scatters more, but never a few that happen to agree.
+            self.noise_weight = keep * self.noise_weight + 1.0;
+            self.noise_squares = keep * self.noise_squares + square * block.allowed.powi(2);
         }
         if self.learned >= FIRST / 3 * 2 {
             self.weight = keep * self.weight + 1.0;

@@ -105,6 +105,13 @@ class _Law(TransmissionModel):
 
     law: TransmissionLaw
 
+    def __init_subclass__(cls) -> None:
+        """Bounds and start of the shape parameters are the law's."""
+        super().__init_subclass__()
+        shapes = cls.law.shapes if "law" in vars(cls) else []
+        cls.shape_bounds = tuple((low, high) for low, high, _ in shapes)
+        cls.shape_start = tuple(start for *_, start in shapes)
+
     def torque(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
         """Flexibility torque (eq 17)."""
         return self.both(phi, alpha)[0]
@@ -208,8 +215,6 @@ class VsaII(_Shaped, _Law):
 
     name = "vsa-ii"
     shape_names = ("c",)
-    shape_bounds = ((1.0, 20.0),)
-    shape_start = (1.1,)
     law = TransmissionLaw("vsa-ii")
 
 
@@ -218,8 +223,6 @@ class Exponential(_Shaped, _Law):
 
     name = "exponential"
     shape_names = ("b_per_rad",)
-    shape_bounds = ((1e-6, 1e6),)
-    shape_start = (1.0,)
     law = TransmissionLaw("exponential")
 
 

@@ -639,8 +639,13 @@ mod tests {
     const T: f64 = 1e-3;
 
     fn joint(link: Link) -> Model {
-        let motor =
-            Motor { inertia: 0.1, damping: 0.2, transmission: Transmission::Unknown, effects: Vec::new() };
+        let motor = Motor {
+            inertia: 0.1,
+            inertia_std: None,
+            damping: 0.2,
+            transmission: Transmission::Unknown,
+            effects: Vec::new(),
+        };
         Model {
             arrangement: Arrangement::Single,
             motors: vec![motor],

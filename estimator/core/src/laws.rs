@@ -63,6 +63,18 @@ const VSA_II: [Shape; 1] = [Shape { low: 1.0, high: 20.0, start: 1.1 }];
 const EXPONENTIAL: [Shape; 1] = [Shape { low: 1e-6, high: 1e6, start: 1.0 }];
 
 impl Law {
+    /// By its name in joint files; `None`: one of somebody else's making.
+    #[must_use]
+    pub fn named(name: &str) -> Option<Law> {
+        Some(match name {
+            "linear" => Law::Linear,
+            "polynomial" => Law::Polynomial,
+            "vsa-ii" => Law::VsaII,
+            "exponential" => Law::Exponential,
+            _ => return None,
+        })
+    }
+
     /// Its shape parameters, which enter nonlinearly.
     #[must_use]
     pub fn shapes(&self) -> &[Shape] {

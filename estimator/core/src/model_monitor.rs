@@ -453,6 +453,7 @@ mod tests {
             arrangement: Arrangement::Single,
             motors: vec![Motor {
                 inertia: 0.1,
+                inertia_std: None,
                 damping: 0.5,
                 transmission: Transmission::Elastic {
                     law: Law::Linear,

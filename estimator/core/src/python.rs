@@ -84,16 +84,13 @@ fn tabulated(deflection: &[f64], torque: &[f64]) -> Result<Law, Error> {
 /// It is of no kind that is known here.
 pub fn law(model: &Bound<'_, PyAny>) -> PyResult<Law> {
     let name: String = model.getattr("name")?.extract()?;
-    Ok(match name.as_str() {
-        "linear" => Law::Linear,
-        "polynomial" => Law::Polynomial,
-        "vsa-ii" => Law::VsaII,
-        "exponential" => Law::Exponential,
-        _ if model.hasattr("points")? => {
+    Ok(match Law::named(&name) {
+        Some(law) => law,
+        None if model.hasattr("points")? => {
             let (deflection, torque): (Vec<f64>, Vec<f64>) = model.getattr("points")?.extract()?;
             tabulated(&deflection, &torque)?
         }
-        _ => {
+        None => {
             let bounds: Vec<(f64, f64)> = model.getattr("shape_bounds")?.extract()?;
             let starts: Vec<f64> = model.getattr("shape_start")?.extract()?;
             let shapes: Vec<Shape> = (bounds.iter().zip(starts))
@@ -647,20 +644,20 @@ mod extension {
         /// By its name: linear, polynomial, vsa-ii, exponential.
         #[new]
         fn new(name: &str) -> PyResult<TransmissionLaw> {
-            let law = match name {
-                "linear" => Law::Linear,
-                "polynomial" => Law::Polynomial,
-                "vsa-ii" => Law::VsaII,
-                "exponential" => Law::Exponential,
-                _ => return Err(PyValueError::new_err(format!("law: expected a known name, got {name}"))),
-            };
-            Ok(TransmissionLaw { law })
+            let unknown = || PyValueError::new_err(format!("law: expected a known name, got {name}"));
+            Ok(TransmissionLaw { law: Law::named(name).ok_or_else(unknown)? })
         }
 
         /// An odd curve through points, see `estimator.flexibility.Table`.
         #[staticmethod]
         fn table(deflection: Vec<f64>, torque: Vec<f64>) -> PyResult<TransmissionLaw> {
             Ok(TransmissionLaw { law: super::tabulated(&deflection, &torque)? })
+        }
+
+        /// (least, largest, usual value) of each of its shape parameters.
+        #[getter]
+        fn shapes(&self) -> Vec<(f64, f64, f64)> {
+            self.law.shapes().iter().map(|shape| (shape.low, shape.high, shape.start)).collect()
         }
 
         /// Torque and stiffness at each φ into arrays of its size.

@@ -56,6 +56,7 @@ fn elements(on_link: bool) -> Vec<Element> {
 fn model(law: Law, parameters: Vec<f64>, effects: bool) -> Model {
     let motor = Motor {
         inertia: 0.02,
+        inertia_std: None,
         damping: 0.02,
         transmission: Transmission::Elastic { law, order: None, parameters },
         effects: if effects { elements(false) } else { Vec::new() },

@@ -24,7 +24,7 @@ from drivelink.jointfile import JointFile
 from drivelink.jointfile.apply_diagnosis import augmented
 from drivelink.output import report
 from drivelink.output.progress import track
-from estimator import EstimatorSettings, Sample, make_estimator
+from estimator import EstimatorSettings, Sample, Status, make_estimator
 from estimator.diagnosis import diagnose
 from estimator.diagnosis.frame import Corrections, Frame, Signals
 from estimator.model import JointModel
@@ -117,20 +117,21 @@ def shaft_sensor(folder: Path, number: str) -> FloatArray:
 def against_sensor(model: JointModel, record: Record, sensor_nm: FloatArray) -> dict[str, float]:
     """rms error below SENSOR_HZ of what the shaft carries, as a share of its variation there.
 
-    "on_line" is what the estimator said at each sample, "twist" the stiffness times the measured twist.
+    "on_line" is what the estimator said at each sample, "valid" how often it vouched for it, "twist" the stiffness
+    times the measured twist.
     """
     estimator = make_estimator(model, EstimatorSettings(), record.period_s)
     assert record.link_position_rad is not None
-    said = np.array([
+    said = [
         estimator.step(Sample(
             sequence=int(n), motor_position_rad=(float(theta),), motor_velocity_rad_s=(np.nan,),
             motor_torque_nm=(float(tau),), link_position_rad=float(q),
-        )).flexibility_torque_nm
+        ))
         for n, theta, tau, q in zip(
             record.sequence, record.motor_position_rad[:, 0], record.motor_torque_nm[:, 0],
             record.link_position_rad, strict=True,
         )
-    ])  # fmt: skip
+    ]  # fmt: skip
     k = model.motors[0].transmission.parameters.get("k_nm_rad", np.nan)
     assert isinstance(k, float)
     twist = k * (record.link_position_rad - record.motor_position_rad[:, 0])
@@ -143,7 +144,11 @@ def against_sensor(model: JointModel, record: Record, sensor_nm: FloatArray) -> 
         left = min(float(np.std(sign * x - true)) for sign in (1.0, -1.0))  # the sensor's sign is its own
         return left / float(np.std(true))
 
-    return {"on_line": error(said), "twist": error(twist)}
+    return {
+        "on_line": error(np.array([one.flexibility_torque_nm for one in said])),
+        "valid": float(np.mean([one.status & Status.VALID for one in said[late]])),
+        "twist": error(twist),
+    }
 
 
 def shaft_record(folder: Path, number: str) -> Record:
@@ -189,7 +194,9 @@ def _stiffness(one: dict[str, Any]) -> str:
 
 
 def _sensor(one: dict[str, Any]) -> str:
-    return "-" if one["sensor"] is None else f"{one['sensor']['on_line']:.1%}, {one['sensor']['twist']:.1%}"
+    if one["sensor"] is None:
+        return "-"
+    return "{on_line:.1%} ({valid:.0%}), {twist:.1%}".format(**one["sensor"])
 
 
 def main() -> None:
@@ -207,7 +214,7 @@ def main() -> None:
     outcomes = [diagnosed(run, data, args.out) for run, data in track(jobs, "diagnose")]
     print(
         "| machine | train → other | baseline | before → after | of baseline | found | stiffness / known "
-        "| torque against sensor: on line, twist |"
+        "| torque against sensor: on line (valid), twist |"
     )
     print("|---|---|---|---|---|---|---|---|")
     ratios = []

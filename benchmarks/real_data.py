@@ -117,8 +117,8 @@ def shaft_sensor(folder: Path, number: str) -> FloatArray:
 def against_sensor(model: JointModel, record: Record, sensor_nm: FloatArray) -> dict[str, float]:
     """rms error below SENSOR_HZ of what the shaft carries, as a share of its variation there.
 
-    "on_line" is what the estimator said at each sample, "valid" how often it vouched for it, "twist" the stiffness
-    times the measured twist.
+    "on_line" is what the estimator said at each sample, "valid" how often it vouched for it, "twist" the
+    stiffness times the measured twist.
     """
     estimator = make_estimator(model, EstimatorSettings(), record.period_s)
     assert record.link_position_rad is not None

@@ -2,7 +2,7 @@
 
 It is the hypothesis without missing effects of `estimator.diagnosis`: the declared joint at its best fit,
 with the errors that every rig has, within the priors of `estimator.priors`. What a healthy joint need not
-have, a delay or a zero of its readings and the friction of a rigid joint, has to earn its place.
+have, a delay of its readings and the friction of a rigid joint, has to earn its place.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ __all__ = ["JointFit", "Key", "TransmissionFit", "fit", "fit_joint", "joint_prob
 _SIGMA_95 = 1.96
 _LOOKED_AT = 33  # deflections from zero to the largest one
 _HIGHEST_ORDER = 4
-_READINGS = ("encoder_delay", "torque_delay", "deflection_offset")
+_DELAYS = ("encoder_delay", "torque_delay")  # a zero of the encoders is always there
 _OF_RIGID = ("coulomb_friction", "torque_offset")
 
 Key = tuple[str, int | None]  # an everyday error and its motor
@@ -277,11 +277,11 @@ def _covariance(problem: Problem, fitted: Fitted) -> FloatArray:
 
 
 def _optional(joint: JointFit) -> list[Key]:
-    """Errors that may have to be left out: of readings, and friction and offset of a rigid joint."""
+    """Errors that may have to be left out: delays, and friction and offset of a rigid joint."""
     motors = joint.problem.model.motors
     keys = {(s.name, s.motor) for s in joint.fitted.slots if s.kind == "everyday"}
     rigid = {(name, i) for i, motor in enumerate(motors) if not motor.flexible for name in _OF_RIGID}
-    return sorted((k for k in keys - joint.absent if k[0] in _READINGS or k in rigid), key=str)
+    return sorted((k for k in keys - joint.absent if k[0] in _DELAYS or k in rigid), key=str)
 
 
 def _odds_of_zero(joint: JointFit, keys: Sequence[Key]) -> float:

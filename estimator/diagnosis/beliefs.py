@@ -85,7 +85,9 @@ def everyday_std(
         return (0.0,) if fixed else (std * torque_rms,)
     if name == "deflection_offset":
         phi = frames[0].motors[candidate.motor or 0].deflection
-        return (0.0,) if linked and not calibrating else (std * float(np.ptp(phi)),)
+        if calibrating:  # a healthy joint's encoders may start anywhere
+            return (std * float(np.ptp(phi) + abs(np.mean(phi))),)
+        return (0.0,) if linked else (std * float(np.ptp(phi)),)
     if name == "torque_constant" and calibrating:
         return (0.0,)  # the anchor
     if linked and not calibrating:

@@ -42,10 +42,7 @@ CHOICES: dict[str, Choice] = {
         90_000, "points", "grid beyond which it gets coarser", "memory: ten minutes at full rate"
     ),
     "edge": Choice(
-        1.5, "periods of the bandwidth", "left out at ends and gaps", "the filter's own memory"
-    ),
-    "clear": Choice(
-        3.0, "periods of the bandwidth", "the same of healthy joints",
+        3.0, "periods of the bandwidth", "left out at ends and gaps",
         "what is beyond the ends comes through the filter with exp(-2 pi sin(pi/16) t): 2.5 % after three",
     ),
     "bridged": Choice(3, "periods", "longest gap that a line bridges", "short of the motion's own bends"),

@@ -59,10 +59,9 @@ class Signals:
     Args:
         record: the recording; gaps are bridged by lines and not used as rows.
         bandwidth_hz: of F.
-        edge: periods of the bandwidth that are not used at the ends and around gaps; None: as chosen.
     """
 
-    def __init__(self, record: Record, bandwidth_hz: float, edge: float | None = None) -> None:
+    def __init__(self, record: Record, bandwidth_hz: float) -> None:
         sequence = record.sequence - record.sequence[0]
         self.samples = int(sequence[-1]) + 1
         self.period_s = record.period_s
@@ -89,7 +88,7 @@ class Signals:
         rows_step = max(1, int(1.0 / (self.light.period_s * choice("rows") * bandwidth_hz)))
         self.narrow = Band(self.light.kept, self.light.period_s, rows_step, margin)
         self.response = lowpass(self.narrow.frequency_hz, bandwidth_hz)
-        self.keep = self._rows(record, sequence, (edge or choice("edge")) / bandwidth_hz)
+        self.keep = self._rows(record, sequence, choice("edge") / bandwidth_hz)
 
     def _rows(self, record: Record, sequence: NDArray[np.int64], edge: float) -> NDArray[np.bool_]:
         """Rows away from the ends and from gaps by so many seconds."""

@@ -107,8 +107,7 @@ class Problem:
     ) -> None:
         self.model = model
         self.calibrating = calibrating
-        edge = choice("clear" if calibrating else "edge")
-        self.signals = [Signals(record, bandwidth_hz, edge) for record in records]
+        self.signals = [Signals(record, bandwidth_hz) for record in records]
         declared = declared_corrections(model)
         self.declared = declared
         self._frames: dict[Corrections, dict[int, Frame]] = {}

@@ -8,6 +8,8 @@ stays what it is; in the end every innovation is "lost", and the 33 samples unti
 not valid. Now the innovations' own mean square is held against the covariance, and the larger of the two counts.
 """
 
+import math
+
 import numpy as np
 import onlinekit as kit
 import pytest
@@ -45,3 +47,22 @@ def test_coarse_encoders_are_never_wrong_and_valid(name, bits, noise):
     """A large inertia behind 12 bits tells no stiffness; then nothing is valid rather than something wrong."""
     _, wrong = told_of(name, bits, noise)
     assert not np.any(wrong)
+
+
+def test_a_joint_that_turns_all_the_time_is_valid():
+    """A position that never turns back has no small change; its resolution shows in the changes' changes."""
+    motion = kit.motion("constant", SECONDS, bits=16)
+    declared = kit.declared("constant")
+    a_sample = 400 * 2.0 * math.pi / 2**16  # 38 rad/s, in whole counts; the spring sees nothing of it
+    damping = declared.motors[0].viscous_damping_nm_s_rad * a_sample / kit.PERIOD_S
+    turning = [
+        sample._replace(
+            motor_position_rad=(sample.motor_position_rad[0] + a_sample * sample.sequence,),
+            link_position_rad=sample.link_position_rad + a_sample * sample.sequence,
+            motor_torque_nm=(sample.motor_torque_nm[0] + damping,),
+        )
+        for sample in motion.samples
+    ]
+    found, _ = kit.play(declared, turning)
+    assert not np.any(kit.wrong(found, motion.stiffness_nm_rad))
+    assert np.mean(found.valid[SETTLED:]) > 0.95

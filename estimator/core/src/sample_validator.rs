@@ -4,6 +4,7 @@ use crate::model::Model;
 use crate::sample::{MOTORS, Sample, status};
 use crate::suspicion::{Reason, Signal, Suspicion};
 
+const ROUNDING: f64 = 1e-12; // of a position: what arithmetic may leave of counts that cancel
 const PLACES: usize = MOTORS + 1;
 const CHANNELS: usize = 2 * MOTORS + 1;
 
@@ -74,11 +75,12 @@ struct Memory {
     sequence: Option<u64>,
     places: [f64; PLACES],
     slopes: [f64; PLACES],
+    span: f64, // periods that the slopes are over
     peaks: [f64; PLACES],
-    steps: [f64; PLACES],   // smallest change seen of each position: its resolution
-    limits: [f64; PLACES],  // bends that are jumps
+    steps: [f64; PLACES], // smallest change seen of each position, or of its changes: its resolution
+    limits: [f64; PLACES], // bends that are jumps
     fastest: [f64; PLACES], // changes in a period
-    rates: [f64; PLACES],   // mean change in a period, of late
+    rates: [f64; PLACES], // mean change in a period, of late
     stopped_at: [f64; PLACES],
     astray: [bool; PLACES],
     values: Option<[f64; CHANNELS]>,
@@ -98,6 +100,7 @@ const FRESH: Memory = Memory {
     sequence: None,
     places: [0.0; PLACES],
     slopes: [0.0; PLACES],
+    span: 0.0,
     peaks: [0.0; PLACES],
     steps: [f64::INFINITY; PLACES],
     limits: [f64::INFINITY; PLACES],
@@ -157,7 +160,7 @@ impl SampleValidator {
         self.memory = FRESH;
     }
 
-    /// Smallest change seen of each position (motors, then the link): its resolution, rad; ∞ before any.
+    /// Smallest change of each position (motors, then the link) or of its changes: its resolution, rad; ∞ before any.
     #[must_use]
     pub fn resolution(&self) -> &[f64; PLACES] {
         &self.memory.steps
@@ -386,8 +389,12 @@ impl SampleValidator {
             }
             let size = change.abs();
             m.rates[i] += 0.1 * (size - m.rates[i]);
-            if size > 0.0 && size < m.steps[i] {
-                m.steps[i] = size;
+            // Of a joint that turns steadily no change is small; a change of the change is whole counts as well.
+            let second = if m.seen > 0 && periods == m.span { bend * periods } else { 0.0 };
+            for count in [size, second] {
+                if count > ROUNDING * places[i].abs() && count < m.steps[i] {
+                    m.steps[i] = count;
+                }
             }
             m.fastest[i] = m.fastest[i].max(size / periods);
             if bend > m.peaks[i] && m.seen > 0 {
@@ -397,7 +404,7 @@ impl SampleValidator {
             }
         }
         if !jumped {
-            m.slopes = slopes;
+            (m.slopes, m.span) = (slopes, periods);
         }
         jumped
     }

@@ -408,7 +408,7 @@ class Supervisor:
             self._events.say(
                 f"the system's clock was set by {loop.clock_step_ns / _NS:+.3f} s: stamps follow it, "
                 "the cycle does not",
-                key="clock set",
+                key="clock set forward" if loop.clock_step_ns > 0 else "clock set back",
             )
         if loop.silent:
             self._events.begin("no sync", "no SYNC on the bus: the estimates are stale", logging.ERROR)

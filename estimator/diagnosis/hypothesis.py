@@ -190,12 +190,14 @@ class Problem:
     ) -> Fitted:
         """Gauss-Newton from a given point; the best point on the way.
 
-        That of a healthy joint goes on until it stands still: a step from far promises more than it holds.
+        A step from far promises more than it holds, so the first promise is not believed, and the fit of a
+        healthy joint goes on until it stands still.
         """
         best: Fitted | None = None
-        for _ in range((steps or whole("patient_steps" if self.calibrating else "newton_steps")) + 1):
+        for k in range((steps or whole("patient_steps" if self.calibrating else "newton_steps")) + 1):
             now = self._linearised(terms, base, corrections, extra, pinned or {})
-            if best is not None and not self.calibrating and now.posterior.evidence < best.evidence(now):
+            believed = k > 1 and not self.calibrating
+            if believed and best is not None and now.posterior.evidence < best.evidence(now):
                 break
             best = now
             if not self._curved(now) or _converged(now):

@@ -122,6 +122,20 @@ class _Judge:
         self.search, self.held, self.found, self.validated = search, held, found, validated
         self.problem, self.progress = search.problem, progress
 
+    def _sides(self, before: Fitted, after: Fitted) -> list[str]:
+        """What either side of the transmission leaves, before and after; both have a balance."""
+        problem = self.problem
+        if not problem.frames[0].linked:
+            return []
+        equation = problem.group % problem.equations
+        sides = [equation < problem.equations - 1, equation == problem.equations - 1]
+        residuals = [h.regression.residual(h.posterior.x) for h in (before, after)]
+        left = np.array(
+            [[np.sqrt(np.mean(r[side & problem.used] ** 2)) for side in sides] for r in residuals]
+        )
+        motor, link = (f"from {a:.3g} to {b:.3g} N·m" for a, b in left.T)
+        return [f"the balance of the motor (eq 5) falls {motor}, that of the link (eq 4) {link}"]
+
     def diagnosis(self) -> Diagnosis:
         """Verdict, findings, errors."""
         problem, found, null = self.problem, self.found, self.search.null
@@ -163,6 +177,8 @@ class _Judge:
         accounts = [(self.search.chance(after, h), h) for h in others if h is not after]
         transmissions, unsure = transmissions_of(self.search, after, accounts)
         notes += unsure + self._doubts(effects)
+        if verdict in ("effect", "unexplained"):
+            notes += self._sides(before, after)
         return Diagnosis(
             verdict=verdict,
             bandwidth_hz=problem.signals[0].bandwidth_hz,

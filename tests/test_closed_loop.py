@@ -170,7 +170,7 @@ def test_a_healthy_joint_raises_no_alarm(floor: Live) -> None:
         drawn("coulomb_friction", 0.4, 1.2),
         drawn("cogging", 0.3, 0.8, ",periods_per_rev=12"),
         drawn("hysteresis", 0.5, 1.2),
-        drawn("link_viscous_damping", 0.3, 0.8),
+        # None at the link: what acts there is an external torque, and no alarm, unless it is measured.
     ],
 )
 def test_an_undeclared_effect_is_noticed_named_and_taken_out_of_the_live_residual(

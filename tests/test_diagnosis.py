@@ -52,7 +52,7 @@ def test_an_injected_effect_is_named_located_and_measured(case: str, records: di
     assert (first.name, first.location) == (name, location)
     assert first.parameters[parameter] == pytest.approx(value, abs=tolerance)
     assert found.validation.after_rms_nm <= found.validation.before_rms_nm
-    assert any("that of the link (eq 4)" in note for note in found.notes)
+    assert any("the link's (eq 4)" in note for note in found.notes)
 
 
 @pytest.mark.parametrize("case", ["clean", "clean2", "skew"])

@@ -179,7 +179,7 @@ class Search:
                 if not grown:
                     continue
                 one = self._settled(self._ranked(grown)[0])
-                if self.advantage(one, hypothesis) > math.log(choice("even")):
+                if self.chance(hypothesis, one) > choice("even"):
                     return self._merged(one)
         return hypothesis
 

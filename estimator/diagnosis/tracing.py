@@ -133,8 +133,10 @@ class _Judge:
         left = np.array(
             [[np.sqrt(np.mean(r[side & problem.used] ** 2)) for side in sides] for r in residuals]
         )
-        motor, link = (f"from {a:.3g} to {b:.3g} N·m" for a, b in left.T)
-        return [f"the balance of the motor (eq 5) falls {motor}, that of the link (eq 4) {link}"]
+        motor, link = left[1] / np.maximum(left[0], 1e-300)
+        return [
+            f"what the motor's balance (eq 5) leaves falls to {motor:.1%}, the link's (eq 4) to {link:.1%}"
+        ]
 
     def diagnosis(self) -> Diagnosis:
         """Verdict, findings, errors."""

@@ -13,6 +13,7 @@ import argparse
 import json
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,14 +25,16 @@ from drivelink.jointfile import JointFile
 from drivelink.jointfile.apply_diagnosis import augmented
 from drivelink.output import report
 from drivelink.output.progress import track
-from estimator import EstimatorSettings, Sample, Status, make_estimator
+from estimator import EstimatorSettings, ExternalStatus, LinkDynamics, Sample, Status, make_estimator
 from estimator.diagnosis import diagnose
 from estimator.diagnosis.frame import Corrections, Frame, Signals
+from estimator.filters import StateVariableFilter
 from estimator.model import JointModel
 from estimator.sample import FloatArray, Record
 
 SENSOR_HZ = 40.0  # below it the sensor's torque is compared
 SETTLED_S = 3.0  # of a recording: what the estimator says before is not judged
+BEHIND_KG_M2 = 6.0e-5  # of the shaft line between its second encoder and its torque sensor
 ROOT = Path(__file__).resolve().parents[1]
 JOINT = """
 name = "{name}"
@@ -114,24 +117,29 @@ def shaft_sensor(folder: Path, number: str) -> FloatArray:
     return np.interp(time, rows[:, 0], rows[:, 6])
 
 
-def against_sensor(model: JointModel, record: Record, sensor_nm: FloatArray) -> dict[str, float]:
+def against_sensor(model: JointModel, record: Record, sensor_nm: FloatArray) -> dict[str, Any]:
     """rms error below SENSOR_HZ of what the shaft carries, as a share of its variation there.
 
     "on_line" is what the estimator said at each sample, "valid" how often it vouched for it, "twist" the
-    stiffness times the measured twist.
+    stiffness times the measured twist. "external" is the external torque on what turns between the second
+    encoder and the sensor, where it is valid, against the sensor behind the same filter; "external_mean" is
+    its mean beside the sensor's, N·m.
     """
-    estimator = make_estimator(model, EstimatorSettings(), record.period_s)
+    behind = replace(model, link=LinkDynamics(inertia_kg_m2=BEHIND_KG_M2))
+    estimator = make_estimator(behind, EstimatorSettings(), record.period_s)
     assert record.link_position_rad is not None
-    said = [
-        estimator.step(Sample(
+    said, external = [], []
+    for n, theta, tau, q in zip(
+        record.sequence, record.motor_position_rad[:, 0], record.motor_torque_nm[:, 0],
+        record.link_position_rad, strict=True,
+    ):  # fmt: skip
+        sample = Sample(
             sequence=int(n), motor_position_rad=(float(theta),), motor_velocity_rad_s=(np.nan,),
             motor_torque_nm=(float(tau),), link_position_rad=float(q),
-        ))
-        for n, theta, tau, q in zip(
-            record.sequence, record.motor_position_rad[:, 0], record.motor_torque_nm[:, 0],
-            record.link_position_rad, strict=True,
-        )
-    ]  # fmt: skip
+        )  # fmt: skip
+        said.append(estimator.step(sample))
+        told = estimator.external
+        external.append(told.external_torque_nm if told.status & ExternalStatus.VALID else np.nan)
     k = model.motors[0].transmission.parameters.get("k_nm_rad", np.nan)
     assert isinstance(k, float)
     twist = k * (record.link_position_rad - record.motor_position_rad[:, 0])
@@ -144,7 +152,16 @@ def against_sensor(model: JointModel, record: Record, sensor_nm: FloatArray) -> 
         left = min(float(np.std(sign * x - true)) for sign in (1.0, -1.0))  # the sensor's sign is its own
         return left / float(np.std(true))
 
+    push = np.array(external)
+    good = np.isfinite(push)
+    bridged = np.interp(np.arange(len(push)), np.flatnonzero(good), push[good])
+    same = StateVariableFilter(3, EstimatorSettings().external_bandwidth_rad_s, record.period_s)
+    behind_filter = -sosfiltfilt(slow, same.apply(sensor_nm)[0])[late][good[late]]
+    pushed = sosfiltfilt(slow, bridged)[late][good[late]]
     return {
+        "external": float(np.std(pushed - behind_filter) / np.std(behind_filter)),
+        "external_valid": float(np.mean(good[late])),
+        "external_mean": (float(np.mean(pushed)), float(np.mean(behind_filter))),
         "on_line": error(np.array([one.flexibility_torque_nm for one in said])),
         "valid": float(np.mean([one.status & Status.VALID for one in said[late]])),
         "twist": error(twist),
@@ -196,7 +213,9 @@ def _stiffness(one: dict[str, Any]) -> str:
 def _sensor(one: dict[str, Any]) -> str:
     if one["sensor"] is None:
         return "-"
-    return "{on_line:.1%} ({valid:.0%}), {twist:.1%}".format(**one["sensor"])
+    return "{on_line:.1%} ({valid:.0%}), {twist:.1%}, {external:.1%} ({external_valid:.0%})".format(
+        **one["sensor"]
+    )
 
 
 def main() -> None:
@@ -214,7 +233,7 @@ def main() -> None:
     outcomes = [diagnosed(run, data, args.out) for run, data in track(jobs, "diagnose")]
     print(
         "| machine | train → other | baseline | before → after | of baseline | found | stiffness / known "
-        "| torque against sensor: on line (valid), twist |"
+        "| torque against sensor: on line (valid), twist, external torque (valid) |"
     )
     print("|---|---|---|---|---|---|---|---|")
     ratios = []

@@ -30,6 +30,7 @@ const OVERSHOOT: f64 = 1.166; // of a sum over its threshold, standard deviation
 const CAP: f64 = 2.0; // thresholds that a sum may reach: a long contact ends as soon as a short one
 const FRICTION_S: f64 = 20.0; // memory of what opposes the link's motion, as that of the regression
 const FRICTION_SPEEDS: f64 = 0.02; // of the largest velocity: over which dry friction changes its sign
+const ONE_WAY: f64 = 0.9; // mean direction beyond which less than a twentieth of the motion goes the other way
 const CONSISTENCY_S: f64 = 10.0; // over which the two flexibility torques are compared
 const TINY: f64 = 1e-12;
 
@@ -253,12 +254,13 @@ fn gravity(link: &Link, q: f64) -> f64 {
 ///
 /// Damping is the one, and so is a skew between the encoders: d of it makes σ d q′ of torque. From the motor's
 /// side a skew and the motor's friction look alike; here only the link's damping does, and nothing is to be
-/// told apart.
+/// told apart. Of a link that turns one way only, a load and friction are the same: nothing is learned there.
 #[derive(Clone, Copy, Debug, Default)]
 struct Friction {
     values: [f64; 2],
     covariance: Option<[[f64; 2]; 2]>,
     fastest: f64,
+    direction: Option<f64>, // its mean over the memory: ±1 one way only, 0 to and fro
 }
 
 impl Friction {
@@ -290,8 +292,17 @@ impl Friction {
         (self.values[0] * row[0] + self.values[1] * row[1], variance.max(0.0))
     }
 
+    /// One period of motion.
+    fn turn(&mut self, direction: f64, period_s: f64) {
+        let before = self.direction.unwrap_or(direction.signum());
+        self.direction = Some(before + (direction - before) * period_s / FRICTION_S);
+    }
+
     /// What is left of one balance; `noise`: its variance, of errors that last as long as the filter does.
     fn learn(&mut self, row: [f64; 2], left: f64, noise: f64) {
+        if self.direction.map_or(true, |mean| mean.abs() > ONE_WAY) {
+            return;
+        }
         let (_, variance) = self.at(row);
         let Some(p) = &mut self.covariance else { return };
         let seen = [p[0][0] * row[0] + p[0][1] * row[1], p[1][0] * row[0] + p[1][1] * row[1]];
@@ -433,6 +444,7 @@ impl LinkMomentum {
         let prior = [link.damping_std.powi(2) + (carried.stiffness * self.skew).powi(2), dry * dry];
         self.friction.forget(prior, self.period);
         let row = self.friction.row(velocity);
+        self.friction.turn(row[1], self.period);
         let (opposed, unknown) = self.friction.at(row);
         // A reading that is rounded errs alike for as long as it stands: what the spring makes of it is no noise.
         let uncertain = (link.inertia_std * acceleration).powi(2)
@@ -673,6 +685,24 @@ mod tests {
         deflection_offset: 0.003,
         encoder_delay: 1.0,
     };
+
+    #[test]
+    fn a_load_on_a_link_that_turns_one_way_is_not_taken_for_its_friction() {
+        let mut momentum = LinkMomentum::new(&joint(FREE), &Settings::default(), &PRIORS, T).unwrap();
+        momentum.reset();
+        momentum.restart(0.0, 0.0);
+        let (load, speed) = (-1.9, 40.0);
+        let carried = Carried { torque: load, stiffness: 35.0, ..Carried::default() };
+        let mut told = External::nothing(0);
+        for k in 1..20_000_u64 {
+            momentum.feed(speed * k as f64 * T, Some(load), f64::NAN);
+            told = momentum.conclude(k, &carried, 1e-10, true);
+        }
+        assert!(told.status & status::VALID != 0);
+        assert!((told.torque - load).abs() < 0.01 * load.abs(), "{}", told.torque);
+        // A skew of one period between the encoders would make as much: that is said.
+        assert!(told.torque_std > 0.5 * carried.stiffness * T * speed, "{}", told.torque_std);
+    }
 
     #[test]
     fn a_push_on_a_free_link_rises_as_its_filter_does() {

@@ -300,7 +300,7 @@ impl Friction {
 
     /// What is left of one balance; `noise`: its variance, of errors that last as long as the filter does.
     fn learn(&mut self, row: [f64; 2], left: f64, noise: f64) {
-        if self.direction.map_or(true, |mean| mean.abs() > ONE_WAY) {
+        if self.direction.is_none_or(|mean| mean.abs() > ONE_WAY) {
             return;
         }
         let (_, variance) = self.at(row);

@@ -1,5 +1,6 @@
 """The main job: simulated drive, bus, daemon, zenoh, subscriber; truth beside estimate."""
 
+import io
 import json
 import math
 import os
@@ -9,9 +10,11 @@ import sys
 import time
 
 import pytest
+from rich.console import Console
 
+from drivelink.demo.closing import as_json, closing_table
 from drivelink.demo.comparison import Comparison
-from drivelink.demo.rig import TruePoint
+from drivelink.demo.rig import Summary, TruePoint
 from drivelink.pubsub.wire import EstimateMessage
 from estimator.sample import Status, TransmissionEstimate
 
@@ -56,6 +59,40 @@ def test_an_interval_that_misses_the_truth_is_not_covered() -> None:
     assert comparison.errors().covered == 0.0
 
 
+SUMMARY = Summary(1200, 1150, 3, 180.0, 40.0, "")
+
+
+def closing(comparison: Comparison) -> str:
+    console = Console(width=100, record=True, file=io.StringIO())
+    console.print(closing_table("vsa-ii", comparison, SUMMARY, 1150, 1e-3))
+    return console.export_text()
+
+
+def test_the_end_says_over_what_the_errors_are() -> None:
+    comparison = Comparison()
+    for sequence in range(1000):
+        comparison.known(TruePoint(sequence, 2.0, 100.0))
+        comparison.received(message(sequence, 2.02, 101.0))
+    said = closing(comparison)
+    assert "over all 1000 valid cycles (1.0 s), relative to the truth's rms" in said
+    assert "held the truth in 100 % of 1000 valid cycles" in said
+    assert "not valid" not in said and "–" not in said
+
+
+def test_an_end_before_the_first_valid_cycle_gives_no_error() -> None:
+    comparison = Comparison()
+    nothing = closing(comparison)
+    comparison.known(TruePoint(1, 2.0, 100.0))
+    comparison.received(message(1, 9.0, 900.0, status=Status(0)))
+    said = closing(comparison)
+    assert "of the last cycle, which is not valid" in said and "of the last cycle" not in nothing
+    for text in (nothing, said):
+        assert "no valid cycle, so no error" in text and "1200 cycles, 3 missed" in text
+        assert "relative to" not in text and "held the truth" not in text
+    document = as_json("vsa-ii", comparison, SUMMARY, 1150)
+    assert document["valid_cycles"] == 0 and document["stiffness_error_relative"] is None
+
+
 @pytest.mark.parametrize("case", ["constant", "quadratic", "vsa-ii"])
 def test_the_demo_finds_the_stiffness_it_was_not_told(case: str) -> None:
     # Twelve seconds of motion; 3 % leaves room for a loaded machine that loses cycles, and is far below
@@ -85,14 +122,14 @@ def test_ctrl_c_ends_the_demo_with_its_results_and_leaves_nothing_running() -> N
         start_new_session=True,
     )
     assert process.stderr is not None
-    for line in process.stderr:
-        if "stiffness" in line:
+    for line in process.stderr:  # one a second, of a pair of truth and estimate
+        if "rad, valid" in line:
             break
     os.killpg(process.pid, signal.SIGINT)
     out, err = process.communicate(timeout=90)
     assert process.returncode == 130
     assert "truth beside estimate" in out
-    assert "valid cycles" in out and "relative to the truth's rms" in out and "…" not in out
+    assert "relative to the truth's rms" in out and "held the truth in" in out and "…" not in out
     assert "Traceback" not in err
     deadline = time.monotonic() + 10
     while time.monotonic() < deadline:

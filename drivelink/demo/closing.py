@@ -5,17 +5,20 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from rich.console import Group, RenderableType
 from rich.table import Table
+from rich.text import Text
 
 from drivelink.demo.comparison import Comparison
 from drivelink.demo.rig import Summary
+from estimator.sample import Status
 
 __all__ = ["as_json", "closing_table"]
 
 
 def closing_table(
     case: str, comparison: Comparison, summary: Summary, received: int, period_s: float
-) -> Table:
+) -> RenderableType:
     """The last pair of truth and estimate, the errors of the whole run, and the cycle's figures."""
     errors = comparison.errors()
     table = Table(title=f"{case}: truth beside estimate", title_justify="left")
@@ -37,17 +40,22 @@ def closing_table(
             "",
             _percent(errors.flexibility_torque),
         )
-    table.caption = (
-        "truth, estimate and its 95 % interval: of the last cycle\n"
-        f"rms error: over all {errors.cycles} valid cycles ({errors.cycles * period_s:.1f} s), "
-        "relative to the truth's rms\n"
-        f"{summary.cycles} cycles, {summary.missed_cycles} missed, {received} estimates received over zenoh\n"
-        f"a cycle's work p99 {summary.work_p99_us:.0f} µs, "
-        f"SYNC late by p99 {summary.lateness_p99_us:.0f} µs\n"
-        f"the 95 % interval held the truth in {_percent(errors.covered)} of {errors.cycles} valid cycles"
-    )
-    table.caption_justify = "left"
-    return table
+    lines = [
+        f"{summary.cycles} cycles, {summary.missed_cycles} missed, {received} estimates received over zenoh",
+        f"a cycle's work p99 {summary.work_p99_us:.0f} µs, SYNC late by p99 {summary.lateness_p99_us:.0f} µs",
+    ]
+    if errors.cycles:
+        over = f"rms error: over all {errors.cycles} valid cycles ({errors.cycles * period_s:.1f} s), "
+        lines.insert(0, f"{over}relative to the truth's rms")
+        held = f"the 95 % interval held the truth in {_percent(errors.covered)}"
+        lines.append(f"{held} of {errors.cycles} valid cycles")
+    else:
+        lines.insert(0, "no valid cycle, so no error: an estimate is valid after some seconds of motion")
+    if comparison.latest is not None:
+        valid = comparison.latest[0].status & Status.VALID
+        doubt = "" if valid else ", which is not valid"
+        lines.insert(0, f"truth, estimate and its 95 % interval: of the last cycle{doubt}")
+    return Group(table, *map(Text, lines))
 
 
 def as_json(case: str, comparison: Comparison, summary: Summary, received: int) -> dict[str, Any]:

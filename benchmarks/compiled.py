@@ -32,7 +32,10 @@ from importlib import resources
 from drivelink import jointfile
 from drivelink.canopen.bus import open_bus
 from drivelink.cycle.lockstep import run_lockstep
-from drivelink.demo.simulate import network_from_joint, world_from_joint
+try:
+    from drivelink.demo.simulate import network_from_joint, world_from_joint
+except ModuleNotFoundError:  # the interpreted commit
+    from drivelink.simulate import network_from_joint, world_from_joint
 
 seconds = float(sys.argv[1])
 with resources.as_file(resources.files("drivelink") / "joints" / "vsa-ii.toml") as path:
@@ -129,7 +132,7 @@ def measure(seconds: float, rounds: int, interpreted: str) -> dict[str, Any]:
                 for row, pair in (
                     ("replay", [(replay(tree, log),) for tree in (old, root)]),
                     ("lockstep", [run(tree, "-c", LOCKSTEP, str(seconds)).split() for tree in (old, root)]),
-                    ("tick", [run(tree, "-c", TICK, str(HERE)).split() for tree in (old, root)]),
+                    ("tick", [run(tree, "-c", TICK, str(tree / "benchmarks")).split() for tree in (old, root)]),
                 ):
                     names = {
                         "replay": ["replay of raw CAN, times real time"],

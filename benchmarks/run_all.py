@@ -26,7 +26,7 @@ import can
 import numpy as np
 
 HERE = Path(__file__).parent
-TIMEOUT_S = 1800
+TIMEOUT_S = 7200  # of a section: the longest takes a quarter of an hour on two quiet cores
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,14 +100,78 @@ SECTIONS = (
     Section(name="paper_table", title="The paper's table", json_file=False, markdown=False),
     Section(name="sensitivity", title="Sensitivity", json_file=False, markdown=False),
     Section(
+        name="ensembles",
+        title="The estimator on random joints",
+        quick=("--joints", "1"),
+        json_file=False,
+    ),
+    Section(
+        name="intervals",
+        title="The 95 % intervals over a minute",
+        quick=("--seconds", "20"),
+        json_file=False,
+        markdown=False,
+    ),
+    Section(
         name="diagnosis_seeds",
         title="Diagnosis on published seeds",
         full=("--seeds", "1"),
         quick=("--seeds", "1", "--effects", "clean", "coulomb_friction", "backlash"),
         markdown=False,
     ),
+    Section(
+        name="effect_pairs",
+        title="Two effects at once",
+        quick=("--seconds", "10"),
+        json_file=False,
+    ),
     Section(name="real_data", title="Real data before and after", markdown=False),
     Section(name="control", title="Control with the estimates", markdown=False),
+    Section(
+        name="parts",
+        title="Disjoint parts of one recording",
+        quick=("--machines", "emps"),
+        json_file=False,
+    ),
+    Section(
+        name="gate",
+        title="Units, signs, gears and time",
+        full=("--seeds", "2"),
+        quick=("--seeds", "1", "--kinds", "serial"),
+        json_file=False,
+    ),
+    Section(
+        name="external",
+        title="What touches the link",
+        quick=("--minutes", "2", "--errors", "2", "--joints", "sea"),
+        json_file=False,
+    ),
+    Section(
+        name="fault_matrix",
+        title="One signal lies plausibly",
+        quick=("--joints", "constant", "--seconds", "8"),
+        json_file=False,
+    ),
+    Section(
+        name="queries",
+        title="A flood of queries",
+        quick=("--seconds", "2", "--rounds", "1"),
+        json_file=False,
+    ),
+    Section(
+        name="kill_recorder",
+        title="Recorders killed at random",
+        quick=("--kills", "5"),
+        json_file=False,
+        markdown=False,
+    ),
+    Section(
+        name="soak",
+        title="Ten minutes of random faults in real time",
+        quick=("--seconds", "60"),
+        json_file=False,
+        markdown=False,
+    ),
     Section(
         name="fleet_throughput",
         title="A fleet: two workers beside one",
@@ -153,11 +217,17 @@ SECTIONS = (
         json_file=False,
         markdown=False,
     ),
+    Section(
+        name="fleet_storage",
+        title="A fleet: local files, SFTP and S3",
+        json_file=False,
+        markdown=False,
+    ),
 )
 
 
 def machine() -> dict[str, Any]:
-    """What the numbers were taken on."""
+    """What numbers are taken on."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
@@ -184,6 +254,7 @@ def run(section: Section, quick: bool) -> dict[str, Any]:
     result: dict[str, Any] = {
         "title": section.title,
         "markdown": section.markdown,
+        "machine": machine(),
         "at": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
         "load": os.getloadavg()[0],
     }
@@ -225,11 +296,10 @@ def execute(command: list[str], folder: str) -> subprocess.CompletedProcess[str]
 
 def document(results: dict[str, Any]) -> str:
     """The results in Markdown."""
-    told = ", ".join(f"{name} {value}" for name, value in results["machine"].items())
     lines = [
         "# Results",
         "",
-        f"Written by `python benchmarks/run_all.py`; [README.md](README.md) says what each measures. {told}.",
+        "Written by `python benchmarks/run_all.py`; [README.md](README.md) says what each measures.",
     ]
     for name, result in results["sections"].items():
         lines += ["", f"## {result['title']}", ""]
@@ -240,6 +310,8 @@ def document(results: dict[str, Any]) -> str:
             f"`{result['command']}`, {result['at']}, {result['took_s']:.0f} s, "
             f"load of the machine before: {result['load']:.1f}."
         )
+        if "machine" in result:
+            lines += ["", ", ".join(f"{name} {value}" for name, value in result["machine"].items()) + "."]
         text = result["text"]
         lines += ["", text if result["markdown"] else f"```\n{text}\n```"]
     return "\n".join(lines) + "\n"
@@ -265,13 +337,8 @@ def main() -> None:
             print(f"  {sections[section.name].get('skipped', 'done')}", flush=True)
         elif section.name in before:
             sections[section.name] = before[section.name]
-        results = {
-            "machine": machine(),
-            "sections": sections | {k: v for k, v in before.items() if k not in sections},
-        }
-        results["sections"] = {
-            name: results["sections"][name] for name in names if name in results["sections"]
-        }
+        together = before | sections
+        results = {"sections": {name: together[name] for name in names if name in together}}
         path.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
         (args.out / "results.md").write_text(document(results), encoding="utf-8")
     print(f"{args.out / 'results.md'}, {path}")

@@ -132,7 +132,10 @@ def measure(seconds: float, rounds: int, interpreted: str) -> dict[str, Any]:
                 for row, pair in (
                     ("replay", [(replay(tree, log),) for tree in (old, root)]),
                     ("lockstep", [run(tree, "-c", LOCKSTEP, str(seconds)).split() for tree in (old, root)]),
-                    ("tick", [run(tree, "-c", TICK, str(tree / "benchmarks")).split() for tree in (old, root)]),
+                    (
+                        "tick",
+                        [run(tree, "-c", TICK, str(tree / "benchmarks")).split() for tree in (old, root)],
+                    ),
                 ):
                     names = {
                         "replay": ["replay of raw CAN, times real time"],

@@ -374,6 +374,8 @@ def test_the_command_prints_one_json_object(capsys):
         (["nowhere.toml"], 2),
         (["--seconds", "0"], 2),
         (["x.toml", "--eds", "y.eds"], 2),
+        (["--eds", str(OURS[0]), "--channel", "can0"], 2),
+        (["--interface", "socketcan"], 2),
     ],
 )
 def test_bad_arguments_are_one_line(arguments, status, capsys):

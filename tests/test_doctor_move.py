@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable, Mapping
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 
+import can
 import pytest
 
+from drivelink.cli import main
+from drivelink.demo.simulate import network_from_joint
 from drivelink.doctor.byhand import ByHand, Value, check_by_hand
-from drivelink.jointfile import JointFile, parse
+from drivelink.jointfile import JointFile, load, parse
 
 JOINT = """
 name = "elbow"
@@ -33,9 +40,9 @@ counts_per_rev = 4096.0
 """
 
 
-def joint(arrangement: str = "single", gear: float = 1.0) -> JointFile:
+def joint(arrangement: str = "single", gear: float = 1.0, axis: str = "rotary") -> JointFile:
     more = "" if arrangement == "single" else SECOND
-    return parse(JOINT.format(arrangement=arrangement, gear=gear, more=more))
+    return parse(f'axis = "{axis}"\n' + JOINT.format(arrangement=arrangement, gear=gear, more=more))
 
 
 class Rig:
@@ -46,23 +53,29 @@ class Rig:
         self.true = {f"motor{i}_{what}": 0.0 for i in (1, 2) for what in ("position", "torque")}
         self.true["link_position"] = 0.0
         self.said: list[str] = []
+        self.unread: set[str] = set()
+        self.push = 1.5
 
     def read(self, seconds: float) -> Mapping[str, Value]:
-        return {name: Value(self.wrong.get(name, 1.0) * x, 1e-4) for name, x in self.true.items()}
+        read = (name for name in self.true if name not in self.unread)
+        return {name: Value(self.wrong.get(name, 1.0) * self.true[name], 1e-4) for name in read}
 
     def say(self, text: str) -> None:
         self.said.append(text)
 
-    def ask(self, text: str, meanwhile: Callable[[], None]) -> str:
+    def ask(self, text: str, meanwhile: Callable[[], object]) -> str:
         meanwhile()
-        if text.startswith("Turn the joint"):
+        if text.startswith("Move the joint"):
+            for name in ("motor1_position", "motor2_position", "link_position"):
+                self.true[name] += 0.051
+        elif text.startswith("Turn the joint"):
             for name in ("motor1_position", "motor2_position", "link_position"):
                 self.true[name] += math.radians(88.0)  # by eye
         elif text.startswith("Turn motor 2"):
             self.true["motor2_position"] += math.radians(92.0)
         elif text.startswith("Push"):  # the drives hold against it: eqs 4, 5
             for i in (1, 2):
-                self.true[f"motor{i}_torque"] -= 1.5
+                self.true[f"motor{i}_torque"] -= self.push
         return next((reply for start, reply in self.replies.items() if text.startswith(start)), "")
 
 
@@ -128,6 +141,7 @@ def test_a_torque_is_measured_against_a_known_push() -> None:
 def test_what_was_not_seen_is_not_ticked() -> None:
     done = checked({}, **{"Turn": "s", "Let": "s"})
     assert done.marks and all(mark.good is None for mark in done.marks)
+    assert done.as_dict()["good"] is None
     done = checked({"motor1_position": 0.0, "motor1_torque": 0.0})
     seen = {mark.channel: mark for mark in done.marks}
     assert seen["motor1_position"].good is None and "did not follow" in seen["motor1_position"].text
@@ -139,7 +153,7 @@ def test_an_amount_has_units_and_nonsense_is_asked_again() -> None:
     replies = iter(["lots", "1.536 rad"])
 
     class Person(Rig):
-        def ask(self, text: str, meanwhile: Callable[[], None]) -> str:
+        def ask(self, text: str, meanwhile: Callable[[], object]) -> str:
             if text.startswith("Turn the joint"):
                 reply = next(replies)
                 if reply == "lots":
@@ -150,4 +164,123 @@ def test_an_amount_has_units_and_nonsense_is_asked_again() -> None:
 
     rig = Person({})
     done = check_by_hand(joint(), rig, rig)
-    assert done.paste == [] and "expected an amount like 45, 0.8 rad or 50 mm, got lots" in rig.said
+    assert done.paste == [] and "expected an amount like 45 or 0.8 rad, got lots" in rig.said
+
+
+def test_a_linear_axis_is_moved_in_millimetres_and_pushed_in_newtons() -> None:
+    rig = Rig({})
+    done = check_by_hand(joint(axis="linear"), rig, rig)
+    assert done.good and done.paste == []
+    assert any("+51 mm (+0.051) for +50 mm (+0.05)" in line for line in rig.said)
+    assert any("-1.5 N against the push" in line for line in rig.said)
+    rig = Rig({"link_position": 1e3}, {"Move": "0.051 m"})  # counts taken for millimetres
+    done = check_by_hand(joint(axis="linear"), rig, rig)
+    assert done.paste == ["link.encoder.counts_per_rev = 6.5536e+07"]
+    rig = Rig({}, {"Move": "90 deg"})
+    rig.ask = once(rig.ask, "Move", "51")  # type: ignore[method-assign]
+    assert check_by_hand(joint(axis="linear"), rig, rig).good
+    assert "expected an amount like 50 or 0.2 m, got 90 deg" in rig.said
+
+
+def once(ask: Callable[..., str], start: str, then: str) -> Callable[..., str]:
+    """`ask`, which answers otherwise when it is asked a second time."""
+    asked = []
+
+    def answer(text: str, meanwhile: Callable[[], object]) -> str:
+        asked.append(text)
+        again = text.startswith(start) and asked.count(text) > 1
+        return then if again else ask(text, meanwhile)
+
+    return answer
+
+
+def test_a_push_in_the_negative_direction_is_typed_with_its_sign() -> None:
+    rig = Rig({}, {"Push": "-1.4"})
+    rig.push = -1.5
+    assert check_by_hand(joint(), rig, rig).good
+    rig = Rig({"motor1_torque": -1.0}, {"Push": "-1.4"})
+    rig.push = -1.5
+    assert check_by_hand(joint(), rig, rig).paste == ["motor[1].drive.torque_direction = -1"]
+
+
+def test_of_two_motors_each_torque_has_its_own_gear_and_what_is_not_read_is_not_judged() -> None:
+    # The second motor's gear of 100 is not declared: its position reads 100 times as far, its torque a hundredth.
+    wrong = {"motor2_position": 100.0, "motor2_torque": 0.01}
+    rig = Rig(wrong, {"Push": "3.0"})
+    done = check_by_hand(joint("antagonistic"), rig, rig)
+    assert [line.partition(" = ")[0] for line in done.paste] == ["motor[2].drive.gear_ratio"]
+    scales = {mark.channel: mark.good for mark in done.marks if mark.what == "scale"}
+    assert scales["motor1_torque"] is scales["motor2_torque"] is True
+
+    rig = Rig({}, {"Push": "3.0"})
+    rig.unread.add("motor2_torque")
+    done = check_by_hand(joint("antagonistic"), rig, rig)
+    torques = {(mark.channel, mark.what): mark.good for mark in done.marks if "torque" in mark.channel}
+    assert torques == {
+        ("motor1_torque", "sign"): True, ("motor2_torque", "sign"): None, ("motor1_torque", "scale"): None,
+    }  # fmt: skip
+
+    rig = Rig({"motor1_torque": 30.0}, {"Push": "3.0"})  # one of two is wrong, and nobody knows which
+    done = check_by_hand(joint("antagonistic"), rig, rig)
+    assert not done.good and done.paste == []
+    assert any("in one of them or in both" in mark.text for mark in done.marks)
+
+
+# The command
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Path]:
+    """The joint file of a simulated drive and encoder, served by a thread on a virtual bus."""
+    text = JOINT.format(arrangement="single", gear=1.0, more="")
+    text = text.replace("[link.encoder]", '[link.encoder]\nsource = "cia406"\nnode_id = 9')
+    channel = f"move-{tmp_path.name}"
+    path = tmp_path / "elbow.toml"
+    path.write_text(
+        f'{text}\n[link.dynamics]\ninertia_kg_m2 = 0.2\n[sim.excitation]\nkind = "none"\n[bus]\nchannel = "{channel}"\n'
+    )
+    with can.Bus(interface="virtual", channel=channel) as bus:
+        network = network_from_joint(load(path), bus)
+        network.start()
+        yield path
+        network.stop()
+
+
+@contextmanager
+def typed(*lines: str) -> Iterator[None]:
+    """Somebody at the terminal types these lines, then goes."""
+    read, write = os.pipe()
+    os.write(write, "".join(f"{line}\n" for line in lines).encode())
+    os.close(write)
+    with os.fdopen(read) as stdin, pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.stdin", stdin)
+        yield
+
+
+def test_the_command_leads_through_the_steps_and_says_what_was_not_checked(
+    bench: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with typed("", "", "", "1.5"):  # nobody moves the simulated joint
+        assert main(["doctor", str(bench), "--move", "--seconds", "0.05"]) == 1
+    said = capsys.readouterr().out
+    assert (
+        "> Hold the joint still" in said and "> Turn the joint by 90°" in said and "> Push the joint" in said
+    )
+    assert "· motor 1 position, sign: did not follow" in said
+    assert "0 checked and right" in said
+
+
+def test_the_command_s_json_is_alone_on_stdout(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with typed("", "s", "s"):
+        assert main(["doctor", str(bench), "--move", "--json", "--seconds", "0.05"]) == 1
+    said = capsys.readouterr()
+    document = json.loads(said.out)
+    assert document["schema"] == "drivelink.doctor.move/1"
+    assert document["good"] is None and document["paste"] == []
+    assert "> Hold the joint still" in said.err
+
+
+def test_nobody_at_the_terminal_is_one_line(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with typed():
+        assert main(["doctor", str(bench), "--move"]) == 2
+    assert capsys.readouterr().err == "drivelink doctor: --move: nobody answers: run it in a terminal\n"

@@ -22,6 +22,9 @@ from drivelink.notice import Severity
 
 __all__ = ["configure", "run"]
 
+_EXAMINED_S = 3.0
+_AT_REST_S = 0.3  # a person waits for each of these
+
 _EPILOG = """\
 examples:
   drivelink doctor                     this machine: real time, memory, CAN, zenoh
@@ -41,7 +44,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--eds", type=Path, metavar="FILE", help="what the drive of this EDS or DCF can give")
     parser.add_argument(
-        "--seconds", type=float, default=3.0, metavar="S", help="for each measurement (default: %(default)s)"
+        "--seconds",
+        type=float,
+        metavar="S",
+        help=f"for each measurement (default: {_EXAMINED_S:g}, with --move {_AT_REST_S:g})",
     )
     parser.add_argument(
         "--move", action="store_true", help="what to do by hand, and what each sign and scale turns out to be"
@@ -52,8 +58,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Examine, print, and return 1 where something prevents the job."""
-    if not 0 < args.seconds <= 3600:
-        raise UsageError(f"--seconds: expected more than 0 and at most 3600, got {args.seconds:g}")
+    seconds = args.seconds if args.seconds is not None else _AT_REST_S if args.move else _EXAMINED_S
+    if not 0 < seconds <= 3600:
+        raise UsageError(f"--seconds: expected more than 0 and at most 3600, got {seconds:g}")
+    if args.joint is None and (args.interface or args.channel):
+        raise UsageError("--interface and --channel: expected a joint file, whose bus they replace")
     if args.eds is not None:
         if args.joint is not None or args.move:
             raise UsageError("expected either JOINT or --eds FILE")
@@ -61,8 +70,8 @@ def run(args: argparse.Namespace) -> int:
     else:
         joint = moved(load(args.joint), args) if args.joint is not None else None
         if args.move:
-            return _by_hand(joint, args)
-        report = examine(joint, args.joint.parent if args.joint else Path(), args.seconds)
+            return _by_hand(joint, args, seconds)
+        report = examine(joint, args.joint.parent if args.joint else Path(), seconds)
     if args.json:
         print(json.dumps(report.as_dict(), ensure_ascii=False))
     else:
@@ -70,24 +79,23 @@ def run(args: argparse.Namespace) -> int:
     return 1 if report.worst is Severity.ERROR else 0
 
 
-def _by_hand(joint: JointFile | None, args: argparse.Namespace) -> int:
-    """Lead through the checks; 1 where a sign or scale is wrong."""
+def _by_hand(joint: JointFile | None, args: argparse.Namespace, seconds: float) -> int:
+    """Lead through the checks; 1 where a sign or scale is wrong, and where nothing was checked."""
     if joint is None:
         raise UsageError("--move: expected a joint file")
     with live_values(joint, args.joint.parent) as values:
-        done = check_by_hand(joint, values, _Terminal(sys.stderr if args.json else sys.stdout))
-    outcome = done.as_dict()
+        done = check_by_hand(joint, values, _Terminal(sys.stderr if args.json else sys.stdout), seconds)
     if args.json:
-        print(json.dumps(outcome, ensure_ascii=False))
-        return 0 if outcome["good"] else 1
+        print(json.dumps(done.as_dict(), ensure_ascii=False))
+        return 0 if done.good else 1
     if done.paste:
         print(f"Put into {args.joint}:")
     for line in done.paste:
         print(f"  {line}")
-    if outcome["good"]:
+    if done.good is not False:
         checked = sum(mark.good is True for mark in done.marks)
         print(f"{checked} checked and right, {len(done.marks) - checked} not checked")
-    return 0 if outcome["good"] else 1
+    return 0 if done.good else 1
 
 
 class _Terminal:
@@ -100,7 +108,7 @@ class _Terminal:
         """Print a line."""
         print(text, file=self._out, flush=True)
 
-    def ask(self, text: str, meanwhile: Callable[[], None]) -> str:
+    def ask(self, text: str, meanwhile: Callable[[], object]) -> str:
         """Print a question, and read a line without waiting for it.
 
         Raises:

@@ -18,14 +18,63 @@ from estimator.gate import Change
 
 __all__ = ["ByHand", "Mark", "Person", "Value", "Values", "check_by_hand"]
 
-_TURN_RAD = math.pi / 2.0
 _STILL = 0.1  # of the motion that was asked for: what moves less has not taken part
 _BY_EYE = 0.15  # relative: how well an angle is turned by eye
 _FRICTION = 2.0  # factor: what friction in a gear and a push by hand leave uncertain of a torque
 _GEARED = 3.0  # ratios nearer to one than this are a scale, not a gear
 _SIGMAS = 5.0  # standard deviations of the torque's noise that a push has to exceed
-_AMOUNT = re.compile(r"([+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*(°|deg|rad|mm|m|)", re.ASCII)
-_UNITS = {"": math.pi / 180.0, "°": math.pi / 180.0, "deg": math.pi / 180.0, "rad": 1.0, "mm": 1e-3, "m": 1.0}
+_AMOUNT = re.compile(r"([+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*(\D*)", re.ASCII)  # number, unit
+
+
+class _Axis(NamedTuple):
+    """How people speak of the motion of an axis.
+
+    Attributes:
+        verb: what is done with it.
+        asked: rad or m, unless the person says another amount.
+        unit: the everyday one, by which a scale may be off, as it stands behind a number.
+        everyday: rad or m of it.
+        units: rad or m of every unit that an amount may have.
+        example: amounts.
+        force: unit of what a motor exerts.
+        known: how a push is computed.
+    """
+
+    verb: str
+    asked: float
+    unit: str
+    everyday: float
+    units: Mapping[str, float]
+    example: str
+    force: str
+    known: str
+
+    def shown(self, value: float) -> str:
+        """An amount in people's unit, and in SI."""
+        return f"{value / self.everyday:+.4g}{self.unit} ({value:+.3g})"
+
+
+_DEGREE = math.pi / 180.0
+_ROTARY = _Axis(
+    verb="Turn",
+    asked=math.pi / 2.0,
+    unit="°",
+    everyday=_DEGREE,
+    units={"": _DEGREE, "°": _DEGREE, "deg": _DEGREE, "rad": 1.0},
+    example="45 or 0.8 rad",
+    force="N·m",
+    known="mass × 9.81 × lever",
+)
+_LINEAR = _Axis(
+    verb="Move",
+    asked=0.05,
+    unit=" mm",
+    everyday=1e-3,
+    units={"": 1e-3, "mm": 1e-3, "m": 1.0},
+    example="50 or 0.2 m",
+    force="N",
+    known="mass × 9.81",
+)
 
 
 class Value(NamedTuple):
@@ -48,7 +97,7 @@ class Person(Protocol):
     def say(self, text: str) -> None:
         """Show a line."""
 
-    def ask(self, text: str, meanwhile: Callable[[], None]) -> str:
+    def ask(self, text: str, meanwhile: Callable[[], object]) -> str:
         """Ask for an answer; `meanwhile` is called again and again until it comes."""
 
 
@@ -87,209 +136,219 @@ class ByHand:
     needed: dict[str, float] = field(default_factory=dict)
     paste: list[str] = field(default_factory=list)
 
+    @property
+    def good(self) -> bool | None:
+        """Whether everything that was checked is right; None: nothing was."""
+        checked = [mark.good for mark in self.marks if mark.good is not None]
+        return all(checked) if checked else None
+
     def as_dict(self) -> dict[str, Any]:
         """For `--json`."""
-        good = all(mark.good is not False for mark in self.marks)
         return {
             "schema": "drivelink.doctor.move/1",
-            "good": good,
+            "good": self.good,
             "marks": [asdict(mark) for mark in self.marks],
             "paste": self.paste,
         }
 
 
-def check_by_hand(joint: JointFile, values: Values, person: Person) -> ByHand:
+def check_by_hand(joint: JointFile, values: Values, person: Person, seconds: float = 0.3) -> ByHand:
     """Lead a person through the checks.
 
     Args:
         joint: as it is.
         values: of its channels.
         person: who moves it.
+        seconds: over which a channel at rest is averaged.
 
     Raises:
         UsageError: the person has gone.
     """
-    done = ByHand()
+    steps = _Steps(joint, values, person, seconds)
     person.say("drivelink moves nothing: you do, by hand or with whatever controls the drive.")
     serial = joint.arrangement == "serial"
     together = [f"motor{i + 1}_position" for i in range(1 if serial else len(joint.motor))]
+    motors = [name.replace("position", "torque") for name in together]
     if joint.link.encoder is not None:
         together.append("link_position")
-    _positions(done, values, person, together, "the joint", joint)
+    steps.positions(together, "the joint")
     if serial:
-        _positions(done, values, person, ["motor2_position"], "motor 2 alone (it sets the stiffness)", joint)
-    _torques(done, values, person, joint, together)
-    changes = [Change(channel, factor) for channel, factor in done.needed.items()]
-    done.paste = [str(one) for one in corrections(joint, changes, live=True)]
-    return done
+        steps.positions(["motor2_position"], "motor 2 alone (it sets the stiffness)")
+    steps.torques(motors)
+    changes = [Change(channel, factor) for channel, factor in steps.done.needed.items()]
+    steps.done.paste = [str(one) for one in corrections(joint, changes, live=True)]
+    return steps.done
 
 
-def _positions(
-    done: ByHand, values: Values, person: Person, channels: Sequence[str], what: str, joint: JointFile
-) -> None:
-    watch = _Watch(values)
-    person.ask(f"Hold {what} still, then press Enter.", watch.pass_time)
-    before = watch.now()
-    text = (
-        f"Turn {what} by 90° in the positive direction and hold it there, then press Enter; "
-        "or type by how much it was turned (45, 0.8 rad, 50 mm), or s to skip."
-    )
-    asked = _amount(person, text, watch)
-    if asked is None:
+class _Steps:
+    """The checks, one after the other.
+
+    Attributes:
+        done: how they went so far.
+    """
+
+    def __init__(self, joint: JointFile, values: Values, person: Person, seconds: float) -> None:
+        self._joint, self._values, self._person, self._seconds = joint, values, person, seconds
+        self._axis = _LINEAR if joint.axis == "linear" else _ROTARY
+        self.done = ByHand()
+
+    def positions(self, channels: Sequence[str], what: str) -> None:
+        """What the channels read when something is turned by an amount that the person knows."""
+        axis = self._axis
+        self._ask(f"Hold {what} still, then press Enter.")
+        before = self._now()
+        amount = f"{axis.asked / axis.everyday:g}{axis.unit}"
+        asked = self._amount(
+            f"{axis.verb} {what} by {amount} in the positive direction and hold it there, then press Enter; "
+            f"or type by how much it was moved ({axis.example}), or s to skip."
+        )
+        if asked is None:
+            for channel in channels:
+                self._mark(channel, "sign", None, "skipped")
+            return
+        after = self._now()
         for channel in channels:
-            _mark(done, person, channel, "sign", None, "skipped")
-        return
-    after = watch.now()
-    for channel in channels:
-        if channel not in before or channel not in after:
-            _mark(done, person, channel, "sign", None, "not read")
-            continue
-        _position(done, person, channel, after[channel].mean - before[channel].mean, asked, joint)
+            if channel in before and channel in after:
+                self._position(channel, after[channel].mean - before[channel].mean, asked)
+            else:
+                self._mark(channel, "sign", None, "not read")
 
+    def _position(self, channel: str, moved: float, asked: float) -> None:
+        shown = self._axis.shown
+        seen, ratio = f"{shown(moved)} for {shown(asked)}", abs(moved / asked)
+        geared = channel != "link_position" and (self._is_gear(ratio) or self._gear_twice(ratio, channel))
+        if ratio < _STILL and not geared:
+            self._mark(channel, "sign", None, f"did not follow ({seen}): jog it, or check its cable")
+            return
+        positive = moved * asked > 0.0
+        text = "positive" if positive else "negative: it counts backwards"
+        self._mark(channel, "sign", positive, text)
+        good = abs(ratio - 1.0) <= _BY_EYE
+        self._mark(channel, "scale", good, seen if good else f"{seen}: {ratio:.4g} times as far")
+        factor = (1.0 if positive else -1.0) / (1.0 if good else ratio)
+        if factor != 1.0:
+            self.done.needed[channel] = factor
+        if not good and geared:  # a gear is in the torque as well
+            self.done.needed[channel.replace("position", "torque")] = ratio
 
-def _position(
-    done: ByHand, person: Person, channel: str, moved: float, asked: float, joint: JointFile
-) -> None:
-    seen, ratio = f"{_angle(moved)} for {_angle(asked)}", abs(moved / asked)
-    geared = channel != "link_position" and (_is_gear(ratio) or _gear_twice(ratio, channel, joint))
-    if ratio < _STILL and not geared:
-        _mark(done, person, channel, "sign", None, f"did not follow ({seen}): jog it, or check its cable")
-        return
-    positive = moved * asked > 0.0
-    _mark(
-        done, person, channel, "sign", positive, "positive" if positive else "negative: it counts backwards"
-    )
-    good = abs(ratio - 1.0) <= _BY_EYE
-    _mark(done, person, channel, "scale", good, seen if good else f"{seen}: {ratio:.4g} times as far")
-    factor = (1.0 if positive else -1.0) / (1.0 if good else ratio)
-    if factor != 1.0:
-        done.needed[channel] = factor
-    if not good and geared:  # a gear is in the torque as well
-        done.needed[channel.replace("position", "torque")] = ratio
+    def _is_gear(self, ratio: float) -> bool:
+        """Whether a scale is off by a gear that is not declared: by so much, and not by the unit."""
+        return ratio > _GEARED and abs(math.log(ratio * self._axis.everyday)) > _BY_EYE
 
+    def _gear_twice(self, ratio: float, channel: str) -> bool:
+        """Whether a motor moves less by the gear that is declared for it."""
+        drive = self._joint.motor[int(channel[5]) - 1].drive
+        gear = 1.0 if drive is None else drive.gear_ratio
+        return gear > _GEARED and abs(ratio * gear - 1.0) < _BY_EYE
 
-def _is_gear(ratio: float) -> bool:
-    """Whether a scale is off by a gear that is not declared: by so much, and not by degrees."""
-    return ratio > _GEARED and abs(math.log(math.radians(ratio))) > _BY_EYE
-
-
-def _gear_twice(ratio: float, channel: str, joint: JointFile) -> bool:
-    """Whether a motor moves less by the gear that is declared for it."""
-    drive = joint.motor[int(channel[5]) - 1].drive
-    return drive is not None and drive.gear_ratio > _GEARED and abs(ratio * drive.gear_ratio - 1.0) < _BY_EYE
-
-
-def _torques(done: ByHand, values: Values, person: Person, joint: JointFile, together: Sequence[str]) -> None:
-    channels = [name.replace("position", "torque") for name in together if name.startswith("motor")]
-    watch = _Watch(values)
-    text = (
-        "Let the drives hold their position, by whatever controls them; drivelink enables none. "
-        "Press Enter when they hold, or type s to skip the torques."
-    )
-    if person.ask(text, watch.pass_time).strip().lower() == "s":
-        for channel in channels:
-            _mark(done, person, channel, "sign", None, "skipped")
-        return
-    before = watch.now()
-    text = (
-        "Push the joint in its positive direction and keep pushing, then press Enter; "
-        "or type the torque if you know it (N·m: mass × 9.81 × lever)."
-    )
-    pushed = _torque(person, text, watch)
-    after = watch.now()
-    reaction = 0.0
-    for channel in channels:
-        if channel not in before or channel not in after:
-            _mark(done, person, channel, "sign", None, "not read")
-            continue
-        change = after[channel].mean - before[channel].mean
-        if abs(change) < max(_SIGMAS * before[channel].std, 1e-12):
-            _mark(
-                done, person, channel, "sign", None, f"no reaction ({change:+.3g} N·m): does the drive hold?"
-            )
-            continue
-        # The push turns the link ahead of the motor: +tau_e on the motor (eq 5), which the drive balances.
-        good = change < 0.0
-        _mark(done, person, channel, "sign", good, f"{change:+.3g} N·m against the push" if good
-              else f"{change:+.3g} N·m with the push: it has the wrong sign")  # fmt: skip
-        reaction += abs(change)
-        if not good:
-            done.needed[channel] = -done.needed.get(channel, 1.0)
-    if pushed is not None and reaction > 0.0:
-        _torque_scale(done, person, channels, reaction, pushed)
-
-
-def _torque_scale(
-    done: ByHand, person: Person, channels: Sequence[str], reaction: float, pushed: float
-) -> None:
-    """The motors' torques together against a torque that is known."""
-    known = abs(done.needed.get(channels[0], 1.0))  # what a gear that was found changes of it
-    ratio = reaction * known / abs(pushed)
-    good = 1.0 / _FRICTION <= ratio <= _FRICTION
-    for channel in channels:
-        text = f"{reaction * known:.3g} N·m for {abs(pushed):.3g} N·m"
-        _mark(done, person, channel, "scale", good, text if good else f"{text}: {ratio:.4g} times as much")
-        if not good:
-            done.needed[channel] = done.needed.get(channel, 1.0) / ratio
-
-
-class _Watch:
-    """Reads on while a person moves, so that counters that roll over are followed."""
-
-    def __init__(self, values: Values) -> None:
-        self._values = values
-
-    def pass_time(self) -> None:
-        """A short while."""
-        self._values.read(0.05)
-
-    def now(self) -> Mapping[str, Value]:
-        """The channels at rest."""
-        return self._values.read(0.3)
-
-
-def _mark(done: ByHand, person: Person, channel: str, what: str, good: bool | None, text: str) -> None:
-    mark = Mark(channel=channel, what=what, good=good, text=text)
-    done.marks.append(mark)
-    person.say(f"  {mark}")
-
-
-def _amount(person: Person, text: str, watch: _Watch) -> float | None:
-    """By how much something was turned, rad or m; None: skipped."""
-    while True:
-        reply = person.ask(text, watch.pass_time).strip()
-        if not reply:
-            return _TURN_RAD
+    def torques(self, channels: Sequence[str]) -> None:
+        """What the torques read when drives hold their position against a push."""
+        reply = self._ask(
+            "Let the drives hold their position, by whatever controls them; drivelink enables none. "
+            "Press Enter when they hold, or type s to skip the torques."
+        )
         if reply.lower() == "s":
-            return None
-        match = _AMOUNT.fullmatch(reply)
-        try:
-            amount = float(match[1]) * _UNITS[match[2]] if match else 0.0
-        except ValueError:
-            amount = 0.0
-        if amount and math.isfinite(amount):
-            return amount
-        person.say(f"expected an amount like 45, 0.8 rad or 50 mm, got {reply}")
+            for channel in channels:
+                self._mark(channel, "sign", None, "skipped")
+            return
+        unit = self._axis.force
+        before = self._now()
+        pushed = self._torque(
+            "Push the joint in its positive direction and keep pushing, then press Enter; or type what you "
+            f"push with if you know it ({unit}: {self._axis.known}; negative: in the other direction)."
+        )
+        after = self._now()
+        direction = -1.0 if pushed is not None and pushed < 0.0 else 1.0
+        held: dict[str, float] = {}  # against the push, by the scales that were found so far
+        unread = False
+        for channel in channels:
+            if channel not in before or channel not in after:
+                self._mark(channel, "sign", None, "not read")
+                unread = True
+                continue
+            change = after[channel].mean - before[channel].mean
+            if abs(change) < max(_SIGMAS * before[channel].std, 1e-12):
+                text = f"no reaction ({change:+.3g} {unit}): does the drive hold?"
+                self._mark(channel, "sign", None, text)
+                continue
+            # The push turns the link ahead of the motor: +tau_e on the motor (eq 5), balanced by the drive.
+            good = change * direction < 0.0
+            text = "against the push" if good else "with the push: it has the wrong sign"
+            self._mark(channel, "sign", good, f"{change:+.3g} {unit} {text}")
+            held[channel] = abs(change * self.done.needed.get(channel, 1.0))
+            if not good:
+                self.done.needed[channel] = -self.done.needed.get(channel, 1.0)
+        if pushed is not None and held:
+            self._torque_scale(held, abs(pushed), unread)
+
+    def _torque_scale(self, held: Mapping[str, float], pushed: float, unread: bool) -> None:
+        """The motors' torques together against a torque that is known."""
+        total = sum(held.values())
+        ratio = total / pushed
+        text = f"{total:.3g} {self._axis.force} for {pushed:.3g} {self._axis.force}"
+        good = 1.0 / _FRICTION <= ratio <= _FRICTION
+        if unread:
+            good_or_not, text = None, f"{text}, without the motor that was not read"
+        elif good:
+            good_or_not = True
+        elif len(held) == 1:
+            good_or_not, text = False, f"{text}: {ratio:.4g} times as much"
+        else:
+            good_or_not, text = (
+                False,
+                f"{text} together: {ratio:.4g} times as much, in one of them or in both",
+            )
+        for channel in held:
+            self._mark(channel, "scale", good_or_not, text)
+            if good_or_not is False and len(held) == 1:
+                self.done.needed[channel] = self.done.needed.get(channel, 1.0) / ratio
+
+    def _ask(self, text: str) -> str:
+        """The reply; channels are read meanwhile, so that counters that roll over are followed."""
+        return self._person.ask(text, lambda: self._values.read(0.05)).strip()
+
+    def _now(self) -> Mapping[str, Value]:
+        """The channels at rest."""
+        return self._values.read(self._seconds)
+
+    def _mark(self, channel: str, what: str, good: bool | None, text: str) -> None:
+        mark = Mark(channel=channel, what=what, good=good, text=text)
+        self.done.marks.append(mark)
+        self._person.say(f"  {mark}")
+
+    def _amount(self, text: str) -> float | None:
+        """By how much something was moved, rad or m; None: skipped."""
+        axis = self._axis
+        while True:
+            reply = self._ask(text)
+            if not reply:
+                return axis.asked
+            if reply.lower() == "s":
+                return None
+            match = _AMOUNT.fullmatch(reply)
+            amount = _number(match[1]) * axis.units.get(match[2], math.nan) if match else math.nan
+            if math.isfinite(amount) and amount != 0.0:
+                return amount
+            self._person.say(f"expected an amount like {axis.example}, got {reply}")
+
+    def _torque(self, text: str) -> float | None:
+        """What the joint is pushed with, N·m or N; None where it is not known."""
+        while True:
+            reply = self._ask(text)
+            if not reply:
+                return None
+            torque = _number(reply)
+            if math.isfinite(torque) and torque != 0.0:
+                return torque
+            self._person.say(f"expected a number of {self._axis.force}, got {reply}")
 
 
-def _torque(person: Person, text: str, watch: _Watch) -> float | None:
-    """A torque in N·m; None where it is not known."""
-    while True:
-        reply = person.ask(text, watch.pass_time).strip()
-        if not reply:
-            return None
-        try:
-            torque = float(reply)
-        except ValueError:
-            torque = math.nan
-        if math.isfinite(torque) and torque != 0.0:
-            return torque
-        person.say(f"expected a torque in N·m, got {reply}")
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def _words(channel: str) -> str:
     return channel.replace("_", " ").replace("motor", "motor ")
-
-
-def _angle(value: float) -> str:
-    return f"{math.degrees(value):+.4g}° ({value:+.3g})"

@@ -116,9 +116,7 @@ def live_values(joint: JointFile, base_dir: Path) -> Iterator[Values]:
             tap = SampleTap(joint, configurator)
             listen(silent, _PATIENCE_S, tap.take)
             if tap.latest is None:
-                missing = [*map(str, configurator.missing.values()), tap.missing]
-                reason = next((text for text in missing if text), "no SYNC, or not all of its frames")
-                raise DriveError(f"{joint.name}: no sample in {_PATIENCE_S:g} s: {reason}")
+                raise DriveError(f"{joint.name}: no sample in {_PATIENCE_S:g} s: {tap.missing}")
             yield HeardValues(silent, tap)
     finally:
         bus.shutdown()

@@ -117,7 +117,12 @@ def _watch_motion(
     nodes = list(surveys.values())
     together = report.section("Units and signs")
     try:
-        samples = run_program(MotionReader(nodes).program(seconds), bus, timeout_s=joint.bus.sdo_timeout_s)
+        samples = run_program(
+            MotionReader(nodes).program(seconds),
+            bus,
+            timeout_s=joint.bus.sdo_timeout_s,
+            retries=joint.bus.sdo_retries,
+        )
     except DriveError as error:
         together.say(Severity.ERROR, joint.name, str(error))
         return
@@ -312,6 +317,9 @@ def _overhear(
     _judge_load(section, list(configurator.layouts.values()), joint.bus)
     if tap.samples:
         judge_gathered(report.section("Units and signs"), tap.joint, tap.gathered)
+    elif not configurator.missing:  # which has been said
+        text = f"units and signs cannot be checked: no sample in {seconds:g} s: {tap.missing}"
+        section.say(Severity.INFO, joint.name, text)
 
 
 def _judge_traffic(section: Section, traffic: Traffic, bus: BusSection, daemons: Daemons) -> None:

@@ -30,7 +30,6 @@ class SampleTap:
         gathered: the samples of the first minute.
         samples: how many there have been.
         latest: the last of them; None before.
-        missing: why none can be made; empty while that is not known.
     """
 
     def __init__(self, joint: JointFile, configurator: PassiveConfigurator) -> None:
@@ -38,11 +37,17 @@ class SampleTap:
         self.gathered = Gathered(joint, joint.bus.period_s)
         self.samples = 0
         self.latest: Sample | None = None
-        self.missing = ""
+        self._missing = ""
         self._configurator = configurator
         self._syncs_ns: list[int] = []
         self._clock: SyncClock | None = None
         self._assembler: Assembler | None = None
+
+    @property
+    def missing(self) -> str:
+        """Why there are no samples, as far as the frames so far say."""
+        reasons = [*map(str, self._configurator.missing.values()), self._missing]
+        return next((text for text in reasons if text), "no SYNC, or not all of its frames")
 
     def take(self, message: can.Message) -> None:
         """One more frame."""
@@ -88,4 +93,4 @@ class SampleTap:
         try:
             self._assembler = make_assembler(self.joint, tuple(self._configurator.layouts.values()))
         except DriveError as error:
-            self.missing = str(error)
+            self._missing = str(error)

@@ -12,7 +12,9 @@ import pytest
 
 from drivelink import jointfile
 from drivelink.cli import main
-from drivelink.jointfile.residual_baseline import make_watch
+from drivelink.jointfile.residual_baseline import floor_entry, make_watch
+from drivelink.output.units import Units
+from estimator.model import JointModel, Motor, Transmission
 from estimator.sample import Record
 
 JOINT = f"""\
@@ -155,3 +157,20 @@ def test_what_cannot_be_diagnosed_is_one_line(folder: Path, capsys: pytest.Captu
     error = capsys.readouterr().err
     assert "too short" in error
     assert error.count("\n") == 1
+
+
+def test_every_coefficient_of_a_polynomial_has_its_unit() -> None:
+    text = Units(linear=False).value("coefficients_nm_rad", tuple(float(k) for k in range(1, 9)), None)
+    units = ["rad", "rad³", "rad⁵", "rad⁷", "rad⁹", "rad¹¹", "rad¹³", "rad¹⁵"]
+    assert text == ", ".join(f"{k} N·m/{unit}" for k, unit in enumerate(units, start=1))
+
+
+def test_a_baseline_that_cannot_be_measured_is_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    k, zeros = np.arange(50), np.zeros((50, 1))
+    record = Record(
+        period_s=1e-3, sequence=k, motor_position_rad=zeros, motor_torque_nm=zeros, link_position_rad=1e-3 * k
+    )
+    known = Transmission(model="linear", parameters={"k_nm_rad": 100.0})
+    model = JointModel(arrangement="single", motors=(Motor(inertia_kg_m2=0.1, transmission=known),))
+    assert floor_entry(record, model) == {}
+    assert "the daemon cannot raise the model alarm: " in caplog.text

@@ -23,18 +23,20 @@ __all__ = ["JointStatus"]
 
 _TIMING_EVERY = 4  # documents; percentiles cost more than all the rest
 
-_BITS = (
-    ("observable", int(Status.OBSERVABLE)),
-    ("gap", int(Status.GAP)),
-    ("changed", int(Status.CHANGED)),
-    ("model_alarm", int(Status.MODEL_ALARM)),
-    ("input_rejected", int(Status.INPUT_REJECTED)),
-    ("restarted", int(Status.RESTARTED)),
-    ("drive_fault", int(Status.DRIVE_FAULT)),
-    ("bus_fault", int(Status.BUS_FAULT)),
-    ("stale", int(Status.STALE)),
-    ("untimed", int(Status.UNTIMED)),
-    ("contradicted", int(Status.CONTRADICTED)),
+# In the order of the status document; those of one cycle alone are events or nothing.
+_QUALITY = (
+    Status.VALID,
+    Status.OBSERVABLE,
+    Status.GAP,
+    Status.CHANGED,
+    Status.MODEL_ALARM,
+    Status.INPUT_REJECTED,
+    Status.RESTARTED,
+    Status.DRIVE_FAULT,
+    Status.BUS_FAULT,
+    Status.STALE,
+    Status.UNTIMED,
+    Status.CONTRADICTED,
 )
 
 
@@ -168,7 +170,7 @@ class JointStatus:
     def _quality(self) -> dict[str, bool]:
         estimate = self._lane.chain.estimate
         status = int(estimate.status) if estimate is not None else 0
-        return {"valid": bool(status & 1), **{name: bool(status & bit) for name, bit in _BITS}}
+        return {str(bit.name).lower(): bool(status & bit) for bit in _QUALITY}
 
     def _alarm(self) -> dict[str, Any]:
         watch = self._lane.chain.watch
@@ -181,6 +183,7 @@ class JointStatus:
         touch = self._lane.chain.external
         if touch is None:
             return None
+        consistency = self._lane.chain.estimator.consistency
         return {
             "valid": bool(touch.status & ExternalStatus.VALID),
             "contact": bool(touch.status & ExternalStatus.CONTACT),
@@ -188,12 +191,8 @@ class JointStatus:
             "torque_std_nm": touch.external_torque_std_nm,
             "link_flexibility_torque_nm": touch.link_flexibility_torque_nm,
             "difference_nm": touch.difference_nm,
-            **self._consistency(),
+            **(consistency._asdict() if consistency is not None else {}),
         }
-
-    def _consistency(self) -> dict[str, float]:
-        consistency = getattr(self._lane.chain.estimator, "consistency", None)
-        return {} if consistency is None else consistency._asdict()
 
     def _real_time(self) -> dict[str, bool]:
         obtained = self.real_time

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,15 +16,17 @@ from estimator.sample import Record
 __all__ = ["floor_entry", "make_watch"]
 
 _KEY = "floor"
+_LOG = logging.getLogger(__name__)
 
 
 def floor_entry(record: Record | Sequence[Record], model: JointModel) -> dict[str, Any]:
-    """What [provenance] keeps of a model's baseline; nothing where it cannot be measured."""
+    """What [provenance] keeps of a model's baseline; nothing where it cannot be measured, which is logged."""
     if not can_monitor(model):
         return {}
     try:
         return {_KEY: measure_baseline(record, model).as_dict()}
-    except EstimatorError:
+    except EstimatorError as error:
+        _LOG.warning("no residual baseline is written, so the daemon cannot raise the model alarm: %s", error)
         return {}
 
 

@@ -7,7 +7,7 @@ from estimator.model import ParameterValue
 __all__ = ["Units"]
 
 _SIGMA_95 = 1.96
-_SUPERSCRIPTS = {3: "³", 5: "⁵", 7: "⁷", 9: "⁹", 11: "¹¹"}
+_RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 _UNITS = (  # by the end of a parameter's name; the first that fits
     ("_nm_s2_rad2", "N·m·s²/rad²"), ("_nm_s_rad", "N·m·s/rad"), ("_nm_rad2", "N·m/rad²"),
     ("_nm_rad", "N·m/rad"), ("_per_nm2", "1/(N·m)²"), ("_kg_m2", "kg·m²"),
@@ -55,8 +55,8 @@ class Units:
         length = self.shown("rad")
         texts = []
         for k, (x, s) in enumerate(zip(value, deviations, strict=True)):
-            own = unit if not k or not unit.endswith(f"/{length}") else f"{unit}{_SUPERSCRIPTS[2 * k + 1]}"
-            texts.append(f"{_text(x, s)} {own}".rstrip())
+            power = str(2 * k + 1).translate(_RAISED) if k and unit.endswith(f"/{length}") else ""
+            texts.append(f"{_text(x, s)} {unit}{power}".rstrip())
         return ", ".join(texts)
 
 

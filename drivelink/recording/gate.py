@@ -99,8 +99,8 @@ class Gathered:
         """What is wrong, with what to paste, or what the motion does not reveal; a line each."""
         try:
             judgement = self.judgement()
-        except EstimatorError:
-            return []
+        except EstimatorError as error:
+            return [f"units and signs cannot be checked: {error}"]
         if judgement.findings:
             fix = text_of(self._joint, judgement.findings, live=live)
             return [f"{', and '.join(map(str, judgement.findings))}; {fix}"]

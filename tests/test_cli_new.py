@@ -73,6 +73,7 @@ def test_an_existing_file_is_kept_unless_forced(tmp_path, capsys):
         (["--encoder", "128"], "--encoder"),
         (["--scan", "--passive"], "--passive forbids"),
         (["--inertia", "1", "--rotor-inertia", "1"], "--rotor-inertia"),
+        (["--rotor-inertia", "48.2"], "--rotor-inertia: expected --gear"),
     ],
 )
 def test_a_wrong_answer_is_one_line_and_no_file(tmp_path, arguments, expected, capsys, monkeypatch):

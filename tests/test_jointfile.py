@@ -136,6 +136,47 @@ def test_a_rewritten_model_keeps_everything_else_and_its_comments(tmp_path: Path
     assert "# part of the key expression" in target.read_text(encoding="utf-8")
 
 
+DOTTED = """\
+name = "elbow"
+link.dynamics.inertia_kg_m2 = 0.2  # weighed
+link.encoder.source = "drive"
+[[motor]]
+inertia_kg_m2 = 0.1
+transmission.model = "linear"  # a soft one
+transmission.parameters.k_nm_rad = 100.0
+drive.node_id = 3
+"""
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        DOTTED,
+        DOTTED.replace("parameters.k_nm_rad = 100.0", "parameters = { k_nm_rad = 100.0 }"),
+        'name = "elbow"\nlink = { dynamics = { inertia_kg_m2 = 0.2 } }\n'
+        "motor = [{ inertia_kg_m2 = 0.1, transmission = { model = 'linear' } }]\n",
+    ],
+)
+def test_tables_without_a_header_are_rewritten_as_well(tmp_path: Path, text: str) -> None:
+    source, target = tmp_path / "elbow.toml", tmp_path / "elbow2.toml"
+    source.write_text(text, encoding="utf-8")
+    effect = {"name": "torque_offset", "parameters": {"torque_nm": 0.2}}
+    transmission = {"model": "linear", "parameters": {"k_nm_rad": 120.0}}
+    changes = {
+        "motor": [{"transmission": transmission, "effect": [effect]}],
+        "link": {"dynamics": {"inertia_kg_m2": 0.3, "gravity_nm": 1.0}, "effect": [effect, effect]},
+        "provenance": {"fit": {"seconds": 3.0}},
+    }
+    joint = jointfile.write_model(jointfile.load_text(source), target, changes)
+    assert joint == jointfile.load(target)
+    assert joint.motor[0].transmission.parameters == {"k_nm_rad": 120.0}
+    assert joint.link.dynamics is not None
+    assert (joint.link.dynamics.inertia_kg_m2, joint.link.dynamics.gravity_nm) == (0.3, 1.0)
+    assert (len(joint.motor[0].effect), len(joint.link.effect)) == (1, 2)
+    assert joint.motor[0].drive == jointfile.load(source).motor[0].drive
+    assert ("# weighed" in text) == ("# weighed" in target.read_text(encoding="utf-8"))
+
+
 @pytest.fixture
 def written(tmp_path: Path) -> Path:
     """A joint file as `fit --write` leaves it."""

@@ -23,7 +23,8 @@ class Answers:
         name: of the joint.
         arrangement: single, antagonistic or serial.
         inertia_kg_m2: of each motor, joint side; None: not known, a placeholder is written.
-        rotor_inertia_gcm2: of each motor, as its data sheet has it; reflected through the gear.
+        rotor_inertia_gcm2: of each motor, as its data sheet has it; reflected through the gear ratio,
+            without which it says nothing of the joint side.
         torque_constant_mnm_a: likewise; None: the drive reports a torque.
         viscous_damping_nm_s_rad: of each motor, joint side; 0 where it is not known.
         model: of the transmission.
@@ -61,17 +62,17 @@ class Answers:
     @property
     def joint_inertia_kg_m2(self) -> float | None:
         """Of each motor at the joint side, as given or by the data sheet."""
-        if self.inertia_kg_m2 is not None or self.rotor_inertia_gcm2 is None:
+        if self.inertia_kg_m2 is not None or self.rotor_inertia_gcm2 is None or self.gear_ratio is None:
             return self.inertia_kg_m2
-        return self.rotor_inertia_gcm2 * GCM2 * (self.gear_ratio or 1.0) ** 2
+        return self.rotor_inertia_gcm2 * GCM2 * self.gear_ratio**2
 
     @property
     def conversion(self) -> str:
         """How the inertia came about, in words; empty where it was given at the joint side."""
-        if self.rotor_inertia_gcm2 is None or self.inertia_kg_m2 is not None:
+        inertia = self.joint_inertia_kg_m2
+        if inertia is None or self.inertia_kg_m2 is not None:
             return ""
-        gear = f" × {self.gear_ratio:g}²" if self.gear_ratio else ""
-        return f"{self.rotor_inertia_gcm2:g} g·cm²{gear} = {self.joint_inertia_kg_m2:.6g} kg·m²"
+        return f"{self.rotor_inertia_gcm2:g} g·cm² × {self.gear_ratio:g}² = {inertia:.6g} kg·m²"
 
 
 def joint_text(answers: Answers) -> str:

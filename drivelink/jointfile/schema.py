@@ -17,6 +17,7 @@ from typing import Any, Literal, Self
 
 import tomlkit
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from tomlkit.container import Container
 
 from drivelink.errors import JointFileError
 from drivelink.jointfile.keyhint import unknown_key
@@ -473,15 +474,37 @@ def _require_whole(text: str, where: str) -> None:
         _LOG.warning("%s: edited since drivelink wrote it: read as it is now", where)
 
 
-def _merge(table: Any, changes: dict[str, Any]) -> None:
+def _merge(table: Any, changes: dict[str, Any], *, dotted: bool = False) -> None:
+    """Put changes into a table; `dotted`: it has no header of its own, and takes what is new in one line."""
     for key, value in changes.items():
         if isinstance(value, dict) and key in table and key != "parameters":
-            _merge(table[key], value)
+            _merge(table[key], value, dotted=dotted or _is_dotted(table, key))
         elif key == "motor":
             for element, change in zip(table[key], value, strict=True):
                 _merge(element, change)
         else:
-            table[key] = value
+            table[key] = _inline(value) if dotted else value
+
+
+def _is_dotted(table: Any, key: str) -> bool:
+    """Whether a table stands as `key.name = …` and not below a header."""
+    container = table if isinstance(table, Container) else getattr(table, "value", None)
+    body = container.body if isinstance(container, Container) else ()
+    return any(k is not None and k.key == key and k.is_dotted() for k, _ in body)
+
+
+def _inline(value: Any) -> Any:
+    """A value that needs no header."""
+    if isinstance(value, dict):
+        made = tomlkit.inline_table()
+        for key, one in value.items():
+            made[key] = _inline(one)
+        return made
+    if isinstance(value, list):
+        array = tomlkit.array()
+        array.extend([_inline(one) for one in value])
+        return array
+    return value
 
 
 def _one_line(error: ValidationError) -> str:

@@ -100,6 +100,7 @@ class JointFit(NamedTuple):
         fitted: the hypothesis.
         covariance: (k, k) of its parameters; whether a reading's error is there is itself uncertain.
         absent: what has not earned its place.
+        doubts: what the recordings do not reveal of units and signs, a line each.
     """
 
     records: Sequence[Record]
@@ -107,6 +108,7 @@ class JointFit(NamedTuple):
     fitted: Fitted
     covariance: FloatArray
     absent: frozenset[Key]
+    doubts: tuple[str, ...] = ()
 
     def places(self, key: Key) -> list[int]:
         """Columns of an everyday error: its parts, or its values in each recording."""
@@ -152,11 +154,11 @@ def fit_joint(
 ) -> JointFit:
     """The joint at its best fit; arguments and errors as of `fit`."""
     records = [record] if isinstance(record, Record) else list(record)
-    usable = []
+    usable, untold = [], []
     for one in records:
         usable.append(_whole(one, model))
         check(usable[-1], model)
-        refuse(one, model)
+        untold.append(refuse(one, model).remark)
     if bandwidth_rad_s is None:
         shortest = min(len(one) * one.period_s for one in usable)
         bandwidth_hz = max(
@@ -170,7 +172,8 @@ def fit_joint(
             f"bandwidth: expected more than 0 and at most {nyquist:g} Hz, got {bandwidth_hz:g}"
         )
     problem, fitted = _ordered(usable, _bare(model), bandwidth_hz)
-    return _aligned(usable, problem, fitted)
+    doubts = tuple(dict.fromkeys(remark for remark in untold if remark))
+    return _aligned(usable, problem, fitted)._replace(doubts=doubts)
 
 
 def joint_problem(records: Sequence[Record], model: JointModel, bandwidth_hz: float) -> Problem:

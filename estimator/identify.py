@@ -82,7 +82,7 @@ def identify(
     """
     joint = fit_joint(record, model, bandwidth_rad_s)
     fits = transmission_fits(joint)
-    notes: list[str] = []
+    notes = list(joint.doubts)
     motors = tuple(
         replace(_fitted(motor, one), effects=_effects(joint, motor.effects, i, notes))
         for i, (motor, one) in enumerate(zip(model.motors, fits, strict=True))

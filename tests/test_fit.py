@@ -2,12 +2,14 @@
 
 import json
 
+import diagnosiskit as kit
 import joints
 import numpy as np
 import pytest
 
 from drivelink.cli import main
 from estimator import EstimatorError, EstimatorSettings, Record, Status, fit, make_estimator
+from estimator.identify import identify
 from estimator.transmissions import MODELS
 
 T = 1e-3
@@ -218,3 +220,11 @@ def test_no_delay_is_made_of_noise_and_one_that_is_there_has_an_honest_interval(
         assert found.link_delay_s == 0.0 or late
         z.append((found.inertia_kg_m2 - plants.B[j, 0]) / found.nuisance_std["inertia"])
     assert np.sqrt(np.mean(np.square(z))) < 2.0
+
+
+def test_what_the_motion_does_not_reveal_of_units_and_signs_is_a_note(monkeypatch):
+    monkeypatch.setattr(kit, "SECONDS", 6.0)
+    (gentle,), (rich,) = kit.World([{}], slow=True).run(), kit.World([{}]).run()
+    unrevealed = "this motion does not reveal the unit of the positions"
+    assert any(note.startswith(unrevealed) for note in identify(gentle, kit.model()).notes)
+    assert not any("does not reveal" in note for note in identify(rich, kit.model()).notes)

@@ -21,7 +21,7 @@ from can.interfaces import VALID_INTERFACES
 from drivelink.errors import BusError
 from drivelink.jointfile import BusSection
 
-__all__ = ["interface_is_up", "listening_s", "open_bus", "receive_buffer_frames"]
+__all__ = ["interface_is_up", "listening_s", "open_bus", "receive_buffer_frames", "server_has_gone"]
 
 logger = logging.getLogger(__name__)
 
@@ -72,7 +72,7 @@ def open_bus(section: BusSection) -> can.BusABC:
     except (TypeError, ValueError, KeyError, ImportError) as error:
         raise BusError(f"{where} cannot be opened, check bus.channel and bus.options: {error}") from error
     if section.interface == "socketcand":
-        bus._SocketCanDaemonBus__socket.settimeout(None)  # type: ignore[attr-defined]
+        _socketcand_socket(bus).settimeout(None)
     if section.interface == "socketcan":
         _size_receive_buffer(bus, section)
     return bus
@@ -160,6 +160,22 @@ def _connecting(section: BusSection) -> Iterator[None]:
         yield
     finally:
         socket.setdefaulttimeout(before)
+
+
+def _socketcand_socket(bus: can.BusABC) -> socket.socket:
+    """The connection of python-can's client, which has no public name."""
+    found: socket.socket = bus._SocketCanDaemonBus__socket  # type: ignore[attr-defined]
+    return found
+
+
+def server_has_gone(bus: can.BusABC) -> bool:
+    """Whether a socketcand server has closed the connection, which python-can's client does not notice."""
+    try:
+        return _socketcand_socket(bus).recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b""
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
 
 
 def listening_s(section: BusSection) -> float:

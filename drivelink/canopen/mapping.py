@@ -66,7 +66,7 @@ class Mapper:
         available: for each signal, the objects that the node has for it, best first.
         tpdos: as they are in the node.
         taken: identifiers in use elsewhere on the bus.
-        prefer_unused: see `plan.assign`.
+        prefer_unused: see `tpdo_assignment.assign`.
         notices: remarks, added to.
         period_s: communication cycle, at which a TPDO is asked for that cannot be sent on SYNC.
         readable: signals that are read too, where they are mapped anyway.

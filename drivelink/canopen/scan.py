@@ -7,7 +7,7 @@ is heard by heartbeat or boot-up, is there.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 import can
@@ -106,8 +106,12 @@ def listen(bus: FrameBus, seconds: float, on_frame: Callable[[can.Message], None
     return traffic
 
 
-def scan(bus: FrameBus) -> tuple[list[int], Traffic]:
-    """Ask every node id for its device type.
+def scan(bus: FrameBus, node_ids: Iterable[int] = range(1, 128)) -> tuple[list[int], Traffic]:
+    """Ask node ids for their device type.
+
+    Args:
+        bus: where.
+        node_ids: who is asked; every id, unless fewer will do.
 
     Returns:
         Ids of the nodes that answered or were heard, and what else was heard meanwhile.
@@ -116,7 +120,7 @@ def scan(bus: FrameBus) -> tuple[list[int], Traffic]:
     traffic = Traffic()
     started_s = time.monotonic()
     question = bytes([0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0])
-    for node in range(1, 128):
+    for node in node_ids:
         check_frame(0x600 + node, question)
         send(0x600 + node, question)
         _drain(bus, traffic, _GAP_S)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import errno
 import math
 import re
-import socket
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
@@ -19,9 +18,8 @@ from typing import Any
 
 import can
 
-from drivelink.canopen.blocking import sender
-from drivelink.canopen.bus import open_bus
-from drivelink.canopen.scan import listen
+from drivelink.canopen.bus import open_bus, server_has_gone
+from drivelink.canopen.scan import scan
 from drivelink.errors import BusError, JointFileError, UsageError
 from drivelink.jointfile import BusSection, JointFile, MotorSection, SimSection
 from estimator.model import LinkDynamics
@@ -62,7 +60,6 @@ CASE_NAMES = tuple(CASES)
 QUIRK_NAMES = tuple(PROFILES)
 
 _LOCAL = ("127.0.0.1", "localhost", "::1")
-_ANSWER_S = 0.3  # for the slowest node, as in `drivelink.canopen.scan`
 
 # Springs of a joint file that declares none, by stiffness at rest and order: `new` makes such files.
 _NATURAL_HZ = 5.0  # sqrt(K/B)/(2 pi): a soft joint, which shows what drivelink estimates
@@ -356,7 +353,6 @@ class JoinedBus(can.BusABC):
     def __init__(self, bus: can.BusABC) -> None:
         self._is_shutdown = False
         self._bus = bus
-        self._socket: socket.socket = bus._SocketCanDaemonBus__socket  # type: ignore[attr-defined]
         self.lost = False
         self.on_lost: Callable[[], object] = lambda: None
         self.channel_info = bus.channel_info
@@ -368,19 +364,11 @@ class JoinedBus(can.BusABC):
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         found = self._bus._recv_internal(timeout)
-        if found[0] is None and self._closed():
+        if found[0] is None and server_has_gone(self._bus):
             self.lost = True
             self.on_lost()
             raise can.CanOperationError("the server has closed the connection")
         return found
-
-    def _closed(self) -> bool:
-        try:
-            return self._socket.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b""
-        except BlockingIOError:
-            return False
-        except OSError:
-            return True
 
     def shutdown(self) -> None:
         """Close the connection."""
@@ -396,12 +384,8 @@ def require_free(bus: can.BusABC, node_ids: Sequence[int], section: BusSection) 
     """
     if section.interface == "virtual" or isinstance(bus, SocketcandServer):
         return  # nobody else can be there
-    question = bytes([0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0])  # upload 0x1000, mandatory in CiA 301
-    send = sender(bus)
-    for node in node_ids:
-        send(0x600 + node, question)
-    answered = {cob_id - 0x580 for cob_id in listen(bus, _ANSWER_S).counts if 0x581 <= cob_id <= 0x5FF}
-    taken = sorted(answered.intersection(node_ids))
+    there, _ = scan(bus, node_ids)
+    taken = sorted(set(node_ids).intersection(there))
     if taken:
         nodes = ", ".join(f"node {node}" for node in taken)
         raise BusError(

@@ -19,6 +19,7 @@ import zenoh
 from drivelink.errors import ZenohError
 from drivelink.jointfile import JointFile, Ros2Section
 from drivelink.pubsub.session import one_line
+from drivelink.pubsub.wire import EXTERNAL_COLUMNS
 from estimator.sample import Estimate, External, ExternalStatus, Sample, Status
 
 __all__ = [
@@ -61,7 +62,6 @@ _FLAGS = (
     ("observable", int(Status.OBSERVABLE)),
     ("model_alarm", int(Status.MODEL_ALARM)),
 )
-_LINK = ("external_torque_nm", "external_torque_std_nm", "external_valid", "contact")
 _OK, _WARN, _ERROR, _STALE = range(4)  # levels of diagnostic_msgs/DiagnosticStatus
 
 
@@ -156,7 +156,7 @@ def interfaces(transmissions: int, linked: bool = False) -> tuple[str, ...]:
     """
     numbers = ("flexibility_torque_nm", "stiffness_nm_rad", "stiffness_std_nm_rad")
     own = (f"transmission{i + 1}_{number}" for i in range(transmissions) for number in numbers)
-    return (*numbers, *(name for name, _ in _FLAGS), *own, *(_LINK if linked else ()))
+    return (*numbers, *(name for name, _ in _FLAGS), *own, *(EXTERNAL_COLUMNS if linked else ()))
 
 
 def wrench(frame_id: str) -> Any:

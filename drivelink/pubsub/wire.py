@@ -26,6 +26,7 @@ __all__ = [
     "ESTIMATE",
     "EXTERNAL",
     "EXTERNAL_BITS",
+    "EXTERNAL_COLUMNS",
     "MAX_ELEMENTS",
     "SAMPLE",
     "STATUS_BITS",
@@ -236,6 +237,10 @@ class ExternalMessage(NamedTuple):
     def contact(self) -> bool:
         """Status bit 1: something touches the link."""
         return bool(self.status & ExternalStatus.CONTACT)
+
+
+EXTERNAL_COLUMNS = (*ExternalMessage._fields[3:], "external_valid", "contact")
+"""Names of what an `ExternalMessage` says, where they stand among others."""
 
 
 class SampleMessage(NamedTuple):

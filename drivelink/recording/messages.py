@@ -11,9 +11,9 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
+from drivelink.pubsub.wire import EXTERNAL_COLUMNS, EstimateMessage, ExternalMessage
 from drivelink.recording.columns import sample_columns, sample_row
-from estimator.sample import External, Sample, Status, TransmissionEstimate
+from estimator.sample import External, ExternalStatus, Sample, Status, TransmissionEstimate
 
 __all__ = [
     "TOPICS",
@@ -32,7 +32,7 @@ TOPICS = ("sample", "estimate", "external", "status", "model", "joint", "mapping
 
 _PER_MOTOR = ("flexibility_torque_nm", "stiffness_nm_rad", "stiffness_std_nm_rad", "deflection_rad")
 _VALID, _OBSERVABLE = int(Status.VALID), int(Status.OBSERVABLE)
-_EXTERNAL = ("external_torque_nm", "external_torque_std_nm")
+_EXTERNAL_NAMES = ("time_s", *EXTERNAL_COLUMNS[:2], "valid", "contact")
 _SIGMA_95 = 1.96
 
 
@@ -61,13 +61,7 @@ def estimate_row(
 
 def external_columns() -> tuple[str, ...]:
     """Names of what an estimate of a joint with declared link dynamics says besides, see `external_row`."""
-    return (
-        *_EXTERNAL,
-        "external_valid",
-        "contact",
-        "link_flexibility_torque_nm",
-        "flexibility_difference_nm",
-    )
+    return (*EXTERNAL_COLUMNS, "link_flexibility_torque_nm", "flexibility_difference_nm")
 
 
 def external_row(external: External | None) -> tuple[float, ...]:
@@ -75,7 +69,8 @@ def external_row(external: External | None) -> tuple[float, ...]:
     if external is None:
         return (math.nan, math.nan, 0, 0, math.nan, math.nan)
     _, status, torque, std, link_torque, difference = external
-    return (torque, std, status & 1, status >> 1 & 1, link_torque, difference)
+    valid, contact = status & ExternalStatus.VALID, status & ExternalStatus.CONTACT
+    return (torque, std, int(bool(valid)), int(bool(contact)), link_torque, difference)
 
 
 def _band_columns(motors: int) -> tuple[str, ...]:
@@ -116,7 +111,7 @@ def estimate_encoder(motors: int, period_s: float) -> Callable[[EstimateMessage]
 
 def external_encoder(period_s: float) -> Callable[[ExternalMessage], bytes]:
     """The function that makes an external torque's message."""
-    fill = _template(("sequence", "status"), _external_names())
+    fill = _template(("sequence", "status"), _EXTERNAL_NAMES)
 
     def encode(message: ExternalMessage) -> bytes:
         torque, std = message.external_torque_nm, message.external_torque_std_nm
@@ -124,10 +119,6 @@ def external_encoder(period_s: float) -> Callable[[ExternalMessage], bytes]:
         return fill((message.sequence, message.status, *row))
 
     return encode
-
-
-def _external_names() -> tuple[str, ...]:
-    return ("time_s", *_EXTERNAL, "valid", "contact")
 
 
 def read_sample(message: Mapping[str, Any], motors: int) -> Sample:
@@ -162,7 +153,7 @@ def message_schema(topic: str, motors: int) -> bytes:
             **_numbers((*estimate_columns(motors), *_band_columns(motors))),
         }
     elif topic == "external":
-        properties = {"sequence": integer, "status": integer, **_numbers(_external_names())}
+        properties = {"sequence": integer, "status": integer, **_numbers(_EXTERNAL_NAMES)}
     elif topic == "can":
         properties = {"id": integer, "data": text | {"description": "bytes, two hex digits each"}}
     elif topic == "mapping":

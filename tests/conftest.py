@@ -1,10 +1,42 @@
-"""What holds for every test."""
+"""What holds for every test, and how they are shared out where several processes run them (`-n 2`)."""
 
 import os
 import signal
+from pathlib import Path
+
+import pytest
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does
 
 # A shell starts what runs in the background with SIGINT ignored, and processes hand that on to the ones they
 # start; the tests press Ctrl-C on theirs.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Real processes, sockets and clocks. One worker runs them all, one after the other: they load a second core
+# by themselves, and what they wait for comes late enough beside one worker that only calculates.
+REAL_TIME = {
+    "test_cli_run", "test_cli_sim", "test_client", "test_client_examples", "test_controller",
+    "test_controller_processes", "test_daemon", "test_daemon_faults", "test_demo", "test_fault_script",
+    "test_foreign_peers", "test_interfaces", "test_monitor", "test_network_attacks", "test_never_moves",
+    "test_publisher", "test_realtime", "test_recording_recorder", "test_ros2", "test_session",
+    "test_session_security", "test_sim_canopen_network", "test_socketcan",
+}  # fmt: skip
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.path.stem in REAL_TIME:
+            item.add_marker(pytest.mark.real_time)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """By file, so that what a module prepares is prepared once; all in real time as if they were one file."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByFile(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = nodeid.partition("::")[0]
+            return "real time" if Path(file).stem in REAL_TIME else file
+
+    return ByFile(config, log)

@@ -62,6 +62,7 @@ def test_an_undeclared_effect_in_the_middle_of_a_motion_and_its_end(effect):
         assert kit.recovers(rig, 30.0)[-2:] == [Phase.APPROACH, Phase.RUN]
 
 
+@pytest.mark.slow
 def test_an_effect_that_stays_keeps_it_from_going_on():
     with kit.running() as rig:
         rig.world.alter(effects=[parse("coulomb_friction=0.05")])

@@ -93,6 +93,7 @@ def test_a_lie_is_found_named_and_nothing_valid_said_until_it_is_over(learned, n
         assert any(e.status & Status.VALID for e in after[-1000:])
 
 
+@pytest.mark.slow
 def test_healthy_motion_contradicts_nothing() -> None:
     """Two motors with two checks each: 3200 blocks, where one in 10⁹ windows is declared."""
     with rig(joint()) as made:

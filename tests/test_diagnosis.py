@@ -43,7 +43,12 @@ def records() -> dict[str, Record]:
     return dict(zip(effects, kit.World(list(effects.values())).run(), strict=True))
 
 
-@pytest.mark.parametrize("case", CASES)
+SLOW_CASES = ("cogging", "offset", "constant", "inertia", "zero", "link")
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=pytest.mark.slow) if case in SLOW_CASES else case for case in CASES]
+)
 def test_an_injected_effect_is_named_located_and_measured(case: str, records: dict[str, Record]) -> None:
     _, name, location, parameter, value, tolerance = CASES[case]
     found = diagnose(records[case], kit.model())
@@ -55,7 +60,7 @@ def test_an_injected_effect_is_named_located_and_measured(case: str, records: di
     assert any("the link's (eq 4)" in note for note in found.notes)
 
 
-@pytest.mark.parametrize("case", ["clean", "clean2", "skew"])
+@pytest.mark.parametrize("case", ["clean", pytest.param("clean2", marks=pytest.mark.slow), "skew"])
 def test_clean_and_everyday_recordings_are_sufficient(case: str, records: dict[str, Record]) -> None:
     found = diagnose(records[case], kit.model())
     assert found.verdict == "sufficient"
@@ -64,6 +69,7 @@ def test_clean_and_everyday_recordings_are_sufficient(case: str, records: dict[s
     assert found.validation.after_relative < 0.01
 
 
+@pytest.mark.slow
 def test_an_inertia_that_is_hardly_to_be_believed_is_doubted(records: dict[str, Record]) -> None:
     declared = kit.model()
     light = replace(declared.motors[0], inertia_kg_m2=kit.INERTIA / 2)
@@ -97,8 +103,8 @@ def test_what_is_in_no_library_is_located_and_described_by_a_curve(records: dict
     ("case", "location", "coordinates"),
     [
         ("push", "link", ("time",)),
-        ("fading", "motor", ("velocity", "time")),
-        ("ripple", "motor", ("position", "torque")),
+        pytest.param("fading", "motor", ("velocity", "time"), marks=pytest.mark.slow),
+        pytest.param("ripple", "motor", ("position", "torque"), marks=pytest.mark.slow),
     ],
 )
 def test_what_no_function_of_one_coordinate_explains_is_never_sufficient(
@@ -118,6 +124,7 @@ def test_without_link_dynamics_friction_is_still_found(records: dict[str, Record
     assert {effect.location for effect in found.effects} == {"motor"}
 
 
+@pytest.mark.slow
 def test_an_offset_of_the_motor_side_alone_names_its_twin(records: dict[str, Record]) -> None:
     found = diagnose(records["offset"], kit.model(linked=False))
     assert {found.effects[0].name, *found.effects[0].alternatives} >= {"torque_offset", "deflection_offset"}
@@ -130,6 +137,7 @@ def test_a_model_that_knows_the_effect_is_sufficient(records: dict[str, Record])
     assert diagnose(records["late"], known).verdict == "sufficient"
 
 
+@pytest.mark.slow
 def test_declared_numbers_off_by_a_percent_are_everyday_and_calibrated_on_a_healthy_run(
     records: dict[str, Record],
 ) -> None:
@@ -142,6 +150,7 @@ def test_declared_numbers_off_by_a_percent_are_everyday_and_calibrated_on_a_heal
     assert calibrated.motors[0].inertia_kg_m2 == pytest.approx(kit.INERTIA, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_what_a_healthy_rig_reads_skewed_and_shifted_is_calibrated_too(records: dict[str, Record]) -> None:
     """An encoder 0.3 ms late, with another zero, and a torque 0.25 ms late: no findings of a suspect run."""
     rig = {"late_s": 0.0003, "zero_rad": 0.004}
@@ -166,12 +175,14 @@ def with_late_torque(record: Record, late_s: float) -> Record:
     return replace(record, motor_torque_nm=torque[:, None])
 
 
+@pytest.mark.slow
 def test_a_slow_sine_does_not_tell() -> None:
     (record,) = kit.World([{"constant": 0.05}], slow=True).run()
     found = diagnose(record, kit.model(linked=False))
     assert found.verdict == "insufficient_excitation"
 
 
+@pytest.mark.slow
 def test_a_validation_recording_takes_no_part(records: dict[str, Record]) -> None:
     (other,) = kit.World([{"coulomb_nm": 0.4}], seed=9).run()
     found = diagnose(records["coulomb"], kit.model(), validation=other)

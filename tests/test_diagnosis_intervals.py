@@ -57,6 +57,7 @@ def chi_squared(k: FloatArray, std: FloatArray) -> float:
     return float(np.sum(((k - mean) / std) ** 2))
 
 
+@pytest.mark.slow
 def test_parts_of_a_recording_agree_within_what_is_said_though_physics_is_missing() -> None:
     """Without the link's dynamics, as most machines are; nothing of what is missing is declared."""
     model = kit.model(linked=False)

@@ -24,7 +24,7 @@ KINDS = (
 )
 
 
-@pytest.mark.parametrize("joint", ["constant", "vsa-ii"])
+@pytest.mark.parametrize("joint", ["constant", pytest.param("vsa-ii", marks=pytest.mark.slow)])
 def test_little_of_what_is_valid_is_wrong(joint):
     chosen = [fault for fault in matrix.FAULTS if fault.name in KINDS]
     rows = np.array([matrix.outcome(joint, fault, HEALTH_S, FAULT_S) for fault in chosen])

@@ -54,6 +54,7 @@ def test_machine_is_shared_and_runs_keep_their_own(runs: list[Record]) -> None:
     assert any("deflection_offset differs between the recordings" in note for note in both.notes)
 
 
+@pytest.mark.slow
 def test_a_zero_that_all_recordings_share_is_written() -> None:
     rig = {"zero_rad": ZEROS_RAD[0]}
     runs = [kit.World([rig], seed=seed).run()[0] for seed in (7, 8)]
@@ -63,6 +64,7 @@ def test_a_zero_that_all_recordings_share_is_written() -> None:
     assert effect.parameters["offset_rad"] == pytest.approx(ZEROS_RAD[0], abs=kit.MOTOR_LSB + kit.LINK_LSB)
 
 
+@pytest.mark.slow
 def test_each_recording_is_validated_by_the_others(runs: list[Record]) -> None:
     model = kit.model(error=0.01, linked=False)
     found = identify([*runs, kit.World([{"late_s": LATE_S}], seed=9).run()[0]], model)

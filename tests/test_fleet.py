@@ -60,6 +60,7 @@ def done(path: Path, joints: Joints, **more: Any) -> task.Outcome:
 # One recording
 
 
+@pytest.mark.slow
 def test_a_row_says_what_fit_and_diagnose_say(fleet: Path, joints: Joints, tmp_path: Path) -> None:
     path, joint = fleet / "recordings" / "wrist-2026-01-06.csv", str(fleet / "joints" / "wrist.toml")
     outcome = done(path, joints)
@@ -124,6 +125,7 @@ def test_units_and_signs_are_checked_before_anything_else(
     assert (outcome.kind, outcome.rows[0]["validated_on"]) == ("done", task.HELD_OUT)
 
 
+@pytest.mark.slow
 def test_a_recording_larger_than_the_memory_is_cut_into_parts(
     joints: Joints, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -140,6 +142,7 @@ def test_a_recording_larger_than_the_memory_is_cut_into_parts(
     assert any("cut into 2 parts" in note for note in outcome.notes)
 
 
+@pytest.mark.slow
 def test_the_recording_before_validates(fleet: Path, joints: Joints) -> None:
     before = source(fleet / "recordings" / "wrist-2026-01-05.csv")
     (row,) = done(fleet / "recordings" / "wrist-2026-01-06.csv", joints, previous=before).rows
@@ -356,6 +359,7 @@ def test_from_recordings_to_a_page(fleet: Path, tmp_path: Path, capsys: pytest.C
     assert ids(out) == before
 
 
+@pytest.mark.slow
 def test_a_killed_worker_loses_nothing_and_doubles_nothing(fleet: Path, tmp_path: Path) -> None:
     from distributed import Client, LocalCluster
 
@@ -436,6 +440,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(
     assert "--scheduler tcp://127.0.0.1:1: cannot be reached" in capsys.readouterr().err.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_earlier_recordings_are_left_out(
     fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

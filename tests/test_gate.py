@@ -31,9 +31,10 @@ UW = JointModel(
     motors=(Motor(inertia_kg_m2=5.878e-4, transmission=Transmission(model="linear")),),
     period_s=0.005,
 )
-MEASURED = (
+MEASURED = (  # the first in the default run
+    ("emps/train.csv", "emps"),
+    ("emps/pulses.csv", "emps"),
     *((f"kuka_kr300/axis{axis}_{run}.csv", f"kuka_axis{axis}") for axis in (2, 3) for run in "AB"),
-    *((f"emps/{run}.csv", "emps") for run in ("train", "pulses")),
     *((f"uw_sea/uw_{run}.csv", "") for run in ("InnerLoop", "DoubleLoopReference", "DoubleLoopDisturbance")),
 )
 # What these recordings do not tell. The inertia takes 2 % of axis 3's torque, whose balance leaves 12 %.
@@ -60,16 +61,20 @@ def named(findings: list[Discrepancy], factors: dict[str, float]) -> bool:
     )
 
 
-@pytest.mark.parametrize("first", [100, 106, 112])
+@pytest.mark.parametrize(
+    "seeds", [range(100, 101), pytest.param(range(101, 118), marks=pytest.mark.slow)], ids=["one", "more"]
+)
 @pytest.mark.parametrize("kind", gatekit.KINDS)
-def test_a_healthy_joint_passes(kind: str, first: int) -> None:
+def test_a_healthy_joint_passes(kind: str, seeds: range) -> None:
     """Eighteen random joints of each kind: undeclared effects, late channels, inertia up to a fifth off."""
-    for seed in range(first, first + 6):
+    for seed in seeds:
         drawn = gatekit.draw(kind, seed, seconds=6.0)
         assert examine(drawn.record, drawn.model) == [], (kind, seed)
 
 
-@pytest.mark.parametrize("kind", gatekit.KINDS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=pytest.mark.slow) if kind != "none" else kind for kind in gatekit.KINDS]
+)
 def test_each_fault_is_named(kind: str) -> None:
     drawn = gatekit.draw(kind, 0, effects=False)
     for name, factors in gatekit.faults(drawn).items():
@@ -278,7 +283,9 @@ def test_a_jerk_before_a_slow_motion_does_not_make_its_encoder_noise_an_inertia(
 
 
 @needs_data
-@pytest.mark.parametrize(("path", "joint"), MEASURED)
+@pytest.mark.parametrize(
+    ("path", "joint"), [MEASURED[0], *(pytest.param(*each, marks=pytest.mark.slow) for each in MEASURED[1:])]
+)
 def test_a_real_machine_passes_as_it_is_and_no_fault_of_it_does(path: str, joint: str) -> None:
     record, model = _measured(path, joint)
     healthy = judge(record, model)

@@ -58,7 +58,7 @@ def valid(out):
     return out[:, 1].astype(int) & int(Status.VALID) > 0
 
 
-@pytest.mark.parametrize("factor", [0.8, 0.9, 1.25])
+@pytest.mark.parametrize("factor", [0.9, *(pytest.param(f, marks=pytest.mark.slow) for f in (0.8, 1.25))])
 def test_a_step_of_the_stiffness_is_announced_and_followed_and_not_valid_meanwhile(factor):
     at = 7000
     told, truth = run(9.0, scale_at=(at * T, factor))
@@ -73,6 +73,7 @@ def test_a_step_of_the_stiffness_is_announced_and_followed_and_not_valid_meanwhi
         assert not np.any(beyond[found:])
 
 
+@pytest.mark.slow
 def test_friction_that_nobody_declared_is_no_change_but_widens_the_interval():
     """0.3 N·m is 3 to 5 % of the torque: it comes in bursts, at reversals."""
     widths = []

@@ -18,8 +18,10 @@ from sim.cases import case
 
 SECONDS = 12.0
 SETTLED = 5000
-FINE = (17, 18, 19, 20, 22, 24, 26)
-COARSE = (12, 14, 16)
+SLOW = pytest.mark.slow
+FINE = (17, *(pytest.param(bits, marks=SLOW) for bits in (18, 19, 20, 22, 24)), 26)
+COARSE = (12, *(pytest.param(bits, marks=SLOW) for bits in (14, 16)))
+QUIET = pytest.mark.parametrize("noise", [pytest.param(False, marks=SLOW), True], ids=["quiet", "noisy"])
 
 
 def told_of(name, bits, noise, excitation=None):
@@ -28,10 +30,10 @@ def told_of(name, bits, noise, excitation=None):
     return told, kit.wrong(told, motion.stiffness_nm_rad)
 
 
-@pytest.mark.parametrize("noise", [False, True], ids=["quiet", "noisy"])
+@QUIET
 @pytest.mark.parametrize("bits", FINE)
 @pytest.mark.parametrize("name", ["constant", "vsa-ii"])
-@pytest.mark.parametrize("pace", ["fast", "slow"])
+@pytest.mark.parametrize("pace", ["fast", pytest.param("slow", marks=SLOW)])
 def test_fine_encoders_cost_no_valid(name, pace, bits, noise):
     excitation = case(name).excitation if pace == "slow" else None  # slow: one sine of 0.05 Hz a motor
     told, wrong = told_of(name, bits, noise, excitation)
@@ -40,7 +42,7 @@ def test_fine_encoders_cost_no_valid(name, pace, bits, noise):
     assert np.mean(told.valid[SETTLED:]) > (0.95 if (name, bits) == ("constant", 17) else 0.99)
 
 
-@pytest.mark.parametrize("noise", [False, True], ids=["quiet", "noisy"])
+@QUIET
 @pytest.mark.parametrize("bits", COARSE)
 @pytest.mark.parametrize("name", ["constant", "vsa-ii"])
 def test_coarse_encoders_are_never_wrong_and_valid(name, bits, noise):

@@ -28,6 +28,7 @@ def _diagnose(joint: str, train: str, validation: str, bandwidth_hz: float) -> D
     return diagnose(data[0], declared.model(), bandwidth_hz, data[1])
 
 
+@pytest.mark.slow
 def test_emps_friction_is_found_and_the_published_errors_are_beaten() -> None:
     found = _diagnose("emps", "emps/train.csv", "emps/pulses.csv", 40.0)
     assert found.effects[0].name in ("presliding_friction", "asymmetric_friction", "coulomb_friction")
@@ -35,7 +36,7 @@ def test_emps_friction_is_found_and_the_published_errors_are_beaten() -> None:
     assert found.validation.after_relative < 0.0598  # published: 5.98 %
 
 
-@pytest.mark.parametrize(("axis", "limit"), [(3, 0.24), (2, 0.36)])
+@pytest.mark.parametrize(("axis", "limit"), [(3, 0.24), pytest.param(2, 0.36, marks=pytest.mark.slow)])
 def test_kuka_axes_have_friction_and_get_better_on_the_other_recording(axis: int, limit: float) -> None:
     recordings = [f"kuka_kr300/axis{axis}_{name}.csv" for name in "AB"]
     found = _diagnose(f"kuka_axis{axis}", recordings[0], recordings[1], 15.0)
@@ -44,6 +45,7 @@ def test_kuka_axes_have_friction_and_get_better_on_the_other_recording(axis: int
     assert any("friction" in effect.name for effect in found.effects)
 
 
+@pytest.mark.slow
 def test_two_recordings_of_a_machine_find_what_belongs_to_it() -> None:
     """The authors regress 2.6 to 2.9 ms of skew between the encoders; the parts agree with the whole."""
     declared = jointfile.load(ROOT / "examples" / "kuka_axis3.toml")

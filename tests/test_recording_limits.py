@@ -225,15 +225,16 @@ def taken(path: Path) -> None:
             assert "\n" not in str(error) and len(str(error)) < 700, str(error)[:900]
 
 
+@pytest.mark.parametrize(("seed", "times"), [(18, 12), pytest.param(19, 110, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("suffix", [".mcap", ".csv", ".log", ".blf", ".asc", ".trc"])
 def test_damaged_recordings_are_read_or_refused_in_one_line(
-    suffix: str, whole: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    suffix: str, seed: int, times: int, whole: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Bytes flipped, cut, doubled, filled with others: never anything but a line."""
     caplog.set_level(logging.CRITICAL)
-    good, rng = (whole / f"r{suffix}").read_bytes(), random.Random(18)
+    good, rng = (whole / f"r{suffix}").read_bytes(), random.Random(seed)
     path = tmp_path / f"r{suffix}"
-    for _ in range(120):
+    for _ in range(times):
         data = bytearray(good)
         for _ in range(rng.randrange(1, 4)):
             at = rng.randrange(len(data))

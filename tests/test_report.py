@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from functools import cache
 from pathlib import Path
 
 import diagnosiskit as kit
@@ -52,6 +53,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@cache  # what was diagnosed once is looked at by several tests
 def _diagnose(folder: Path, name: str, joint: str = "joint.toml", *more: str) -> dict:  # type: ignore[type-arg]
     out = folder / f"{name}-{joint}"
     arguments = ["diagnose", str(folder / f"{name}.csv"), "--joint", str(folder / joint), "--out", str(out)]

@@ -280,6 +280,7 @@ def test_vsa_ii_is_found_from_nothing_on_both_sides():
     assert out[late, 3] == pytest.approx(truth.sigma[late, 0].sum(1), rel=0.02)
 
 
+@pytest.mark.slow
 def test_what_a_nonlinear_model_is_declared_with_does_not_matter_after_some_seconds():
     """Right, or k 20 % too small and c too large: the same curve is found, and its interval holds."""
     rng = np.random.default_rng(5)

@@ -110,10 +110,10 @@ def replay(tree: Path, log: Path) -> float:
     """How many times real time."""
     joint = tree / "drivelink" / "joints" / "vsa-ii.toml"
     arguments = ("replay", str(log), "--joint", str(joint))
-    told = run(tree, "-c", "import sys; from drivelink.cli import main; sys.exit(main())", *arguments)
-    found = re.search(r"([\d.e+]+) × real time", told)
+    printed = run(tree, "-c", "import sys; from drivelink.cli import main; sys.exit(main())", *arguments)
+    found = re.search(r"([\d.e+]+) × real time", printed)
     if found is None:
-        raise SystemExit(told)
+        raise SystemExit(printed)
     return float(found[1])
 
 

@@ -77,9 +77,9 @@ def daemon_round(
     """The daemon as `drivelink run` runs it, supervision, status key and housekeeping included."""
     with Daemon([ServedJoint(joint=which)], session=session, devices=devices.poll) as daemon:
         row.measure(devices, lambda: daemon.run(seconds))
-        (lane,) = daemon.loop.lanes
-        row.complete += lane.estimates
-        row.work.append(lane.work.total())
+        (loop_joint,) = daemon.loop.loop_joints
+        row.complete += loop_joint.estimates
+        row.work.append(loop_joint.work.total())
         return dict(daemon.layouts)
 
 
@@ -128,7 +128,7 @@ def lockstep(mode: str, seconds: float) -> dict[str, Any]:
     network = network_from_joint(which, bus)
     publisher = JointPublisher(session, which)
     start, cpu_s = time.perf_counter(), time.process_time()
-    lane = run_lockstep(which, network, publisher, round(seconds / PERIOD_S))
+    loop_joint = run_lockstep(which, network, publisher, round(seconds / PERIOD_S))
     elapsed, cpu_s = time.perf_counter() - start, time.process_time() - cpu_s
     publisher.close()
     bus.shutdown()
@@ -139,7 +139,7 @@ def lockstep(mode: str, seconds: float) -> dict[str, Any]:
         "took_s": elapsed,
         "cpu_s": cpu_s,
         "faster_than_real_time": seconds / elapsed,
-        **{f"work_{key}": value for key, value in lane.work.total().items()},
+        **{f"work_{key}": value for key, value in loop_joint.work.total().items()},
     }
 
 

@@ -3,7 +3,7 @@
     python benchmarks/effect_pairs.py [--seeds N] [--first SEED] [--seconds S] [--json FILE]
 
 Nine pairs over all places of a joint, the joints and sizes of diagnosis_seeds.py. An effect counts as named
-where a finding has its name, and as told where it is among a finding's alternatives.
+where a finding has its name, and as listed where it is among a finding's alternatives.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ def judged(pair: tuple[str, str], seed: int, seconds: float) -> dict[str, Any]:
     declared, real = joint_of(pair, seed)
     outcome = diagnose(measured(real, seconds), declared.model())
     names = [effect.name for effect in outcome.effects]
-    told = {*names, *(other for effect in outcome.effects for other in effect.alternatives)}
+    listed = {*names, *(other for effect in outcome.effects for other in effect.alternatives)}
     return {
         "pair": pair,
         "seed": seed,
         "verdict": outcome.verdict,
         "found": names,
         "named": sum(name in names for name in pair),
-        "told": sum(name in told for name in pair),
+        "listed": sum(name in listed for name in pair),
         "surplus": sum(name not in pair for name in names),
         "after_over_before": outcome.validation.after_rms_nm / outcome.validation.before_rms_nm,
     }
@@ -58,16 +58,16 @@ def main() -> None:
     args = parser.parse_args()
     jobs = [(pair, seed) for pair in PAIRS for seed in range(args.first, args.first + args.seeds)]
     outcomes = [judged(pair, seed, args.seconds) for pair, seed in track(jobs, "diagnose")]
-    print("| pair | both named | both told | surplus | found |\n|---|---|---|---|---|")
+    print("| pair | both named | both listed | surplus | found |\n|---|---|---|---|---|")
     for pair in PAIRS:
         mine = [o for o in outcomes if o["pair"] == pair]
         found = "; ".join(", ".join(o["found"]) or o["verdict"] for o in mine)
-        both, told = (sum(o[key] == 2 for o in mine) for key in ("named", "told"))
+        both, listed = (sum(o[key] == 2 for o in mine) for key in ("named", "listed"))
         surplus = sum(o["surplus"] for o in mine)
-        print(f"| {' + '.join(pair)} | {both} of {len(mine)} | {told} | {surplus} | {found} |")
-    both, told = (sum(o[key] == 2 for o in outcomes) for key in ("named", "told"))
+        print(f"| {' + '.join(pair)} | {both} of {len(mine)} | {listed} | {surplus} | {found} |")
+    both, listed = (sum(o[key] == 2 for o in outcomes) for key in ("named", "listed"))
     print(
-        f"\nboth named {both} of {len(outcomes)}, both told {told}, one named at least "
+        f"\nboth named {both} of {len(outcomes)}, both listed {listed}, one named at least "
         f"{sum(o['named'] > 0 for o in outcomes)}, surplus {sum(o['surplus'] for o in outcomes)}"
     )
     if args.json:

@@ -102,8 +102,8 @@ def daemon_block(row: dict[str, Any], which: JointFile, seconds: float, own_thre
             Witness.own = Witness.others = 0
             daemon.run(seconds)
             loop = daemon.loop
-            (lane,) = loop.lanes
-            add(row, loop.cycles + loop.overruns, loop.lateness, lane.chain.missed)
+            (loop_joint,) = loop.loop_joints
+            add(row, loop.cycles + loop.overruns, loop.lateness, loop_joint.pipeline.missed)
     finally:
         stop.set()
         if thread:

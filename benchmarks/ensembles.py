@@ -93,8 +93,8 @@ def measure(case, n_joints, seconds, seed):
         if off is not None:
             (k_name, k), (shape_name, shape), low = declared[j]
             parameters = {k_name: off[0] * k, shape_name: low + off[1] * (shape - low)}
-        told = joints.joint_model(B[j, 0], D[j, 0], model=model, order=order, parameters=parameters)
-        estimator = make_estimator(told, EstimatorSettings(), T)
+        joint_declared = joints.joint_model(B[j, 0], D[j, 0], model=model, order=order, parameters=parameters)
+        estimator = make_estimator(joint_declared, EstimatorSettings(), T)
         out = np.array([estimator.step(sample)[:5] for sample in record.samples()])
         status, sigma = out[:, 1].astype(int), truth.sigma[:, j, 0]
         usable = (status & USABLE == USABLE) & (np.arange(n) * T >= 5.0)

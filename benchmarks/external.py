@@ -4,7 +4,7 @@
 
 Each joint moves freely for so long; then its link is pushed by steps of 0.25 s, weak and strong ones in turn.
 The declared link inertia and gravity are off by so many per cent, and the declaration says so
-(`inertia_std_kg_m2`, `gravity_std_nm`). Nobody is told the springs. drivelink's joint file has the motor's
+(`inertia_std_kg_m2`, `gravity_std_nm`). No method knows the springs. drivelink's joint file has the motor's
 friction as `diagnose` would have left it, 10 % too low.
 
 - rigid: the momentum observer on motor position and current, motor and link being one body.
@@ -18,8 +18,8 @@ motion: no false alarm in that time.
 
 error: rms of the torque from 60 ms after a push began, over the push; of pushes of a fifth of gravity and
 more. smallest: the push from which on nine in ten are found within 20 ms, of those that begin while something
-is told. delay: median over pushes of half of gravity and more. alarms: contacts in the free motion. valid:
-share of the free motion in which something is told.
+is valid. delay: median over pushes of half of gravity and more. alarms: contacts in the free motion. valid:
+share of the free motion in which the torque is valid.
 """
 
 from __future__ import annotations
@@ -265,9 +265,9 @@ def ours(model: JointModel, motion: Motion) -> tuple[np.ndarray, np.ndarray, np.
     )
     for k, (theta, tau, q) in enumerate(rows):
         estimator.step(Sample(k, theta, nothing, tau, q))
-        told = estimator.external
-        assert told is not None
-        torque[k], status[k] = told.external_torque_nm, told.status
+        estimated = estimator.external
+        assert estimated is not None
+        torque[k], status[k] = estimated.external_torque_nm, estimated.status
     valid = status & int(ExternalStatus.VALID) > 0
     return torque, valid, status & int(ExternalStatus.CONTACT) > 0
 
@@ -311,7 +311,9 @@ def nominal(rig: Rig, model: JointModel, motion: Motion) -> np.ndarray:
     return total
 
 
-def judge(rig: Rig, told: np.ndarray, contact: np.ndarray, motion: Motion, seed: int) -> dict[str, float]:
+def judge(
+    rig: Rig, estimated: np.ndarray, contact: np.ndarray, motion: Motion, seed: int
+) -> dict[str, float]:
     """Error where a value is valid (else NaN), smallest push, delay."""
     g = rig.plant.link.gravity_nm
     errors, delays = [], []
@@ -319,14 +321,14 @@ def judge(rig: Rig, told: np.ndarray, contact: np.ndarray, motion: Motion, seed:
     for begin, size in zip(*pushes(g, seed), strict=True):
         at, share = round(begin / T), abs(size) / g
         rung = min(LADDER, key=lambda x: abs(x - share))
-        if not np.isfinite(told[at]):
+        if not np.isfinite(estimated[at]):
             continue
         seen = np.flatnonzero(contact[at : at + round(PUSH_S / T)])
         late = seen[0] * T if len(seen) and not contact[at] else math.inf
         found[rung].append(late <= WITHIN_S)
         if share >= LARGE:
             window = slice(at + round(SETTLED_S / T), at + round(PUSH_S / T))
-            off = (told[window] - size)[np.isfinite(told[window])] / size
+            off = (estimated[window] - size)[np.isfinite(estimated[window])] / size
             errors += (off**2).tolist()
         if share >= TYPICAL:
             delays.append(late)
@@ -368,9 +370,9 @@ def measure(name: str, minutes: float, errors: list[float], seed: int = 1) -> li
         methods: dict[str, dict[str, Any]] = {
             "drivelink": own | judge(rig, np.where(sound, pushed, np.nan), touched, motion, seed + 1)
         }
-        for method, (quiet, told) in both.items():
+        for method, (quiet, estimated) in both.items():
             threshold = float(np.nanmax(np.abs(quiet[after])))
-            methods[method] = judge(rig, told, np.abs(told) > threshold, motion, seed + 1)
+            methods[method] = judge(rig, estimated, np.abs(estimated) > threshold, motion, seed + 1)
         rows += [
             {"joint": rig.title, "error_percent": error, "method": method, "minutes": minutes, **values}
             for method, values in methods.items()

@@ -36,7 +36,7 @@ def main() -> None:
         began_s = time.perf_counter()
         run = FuzzRun(seed, hostile=options.hostile, passive=options.passive, real=options.estimator)
         run.run(min(left, PORTION))
-        print(f"{run.told()} in {time.perf_counter() - began_s:.1f} s", flush=True)
+        print(f"{run.summary()} in {time.perf_counter() - began_s:.1f} s", flush=True)
         left -= PORTION
         seed += 1
 

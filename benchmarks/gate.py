@@ -4,7 +4,7 @@
 
 Joints of every kind (`tests/gatekit.py`) with undeclared effects, late channels and an inertia up to a fifth
 off: as they are, and with each fault of a first installation. A fault counts as named where the correction,
-or one that the finding says cannot be told from it, undoes it to 5 %.
+or one that the finding says cannot be separated from it, undoes it to 5 %.
 """
 
 from __future__ import annotations

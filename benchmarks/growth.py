@@ -76,8 +76,8 @@ def measure(fit_s: list[float], diagnose_s: list[float]) -> dict[str, list[dict[
     (motor,) = model.motors
     ticks = []
     for count in range(len(EFFECTS) + 1):
-        told = replace(model, motors=(replace(motor, effects=EFFECTS[:count]),))
-        ticks.append({"what": f"effects: {count}", "cost": tick_us(told, data[TICKS * PERIOD_S])})
+        declared = replace(model, motors=(replace(motor, effects=EFFECTS[:count]),))
+        ticks.append({"what": f"effects: {count}", "cost": tick_us(declared, data[TICKS * PERIOD_S])})
     return {
         "fit, CPU s": [{"what": f"{s:g} s", "cost": cpu_s(lambda s=s: fit(data[s], model))} for s in fit_s],
         "diagnose, CPU s": [

@@ -46,19 +46,19 @@ def measure(case, seconds):
     network = network_from_joint(joint, bus, world=world)
     served, rows = [ServedJoint(joint=joint)], []
     with bus, Daemon(served, publish=False, devices=network.poll, real_time=False) as daemon:
-        (lane,) = daemon.loop.lanes
+        (loop_joint,) = daemon.loop.loop_joints
         for begin in range(0, seconds, WINDOW_S):
-            lane.sink = sink = Beside(world)
+            loop_joint.sink = sink = Beside(world)
             daemon.run_lockstep(round(WINDOW_S / joint.bus.period_s))
-            valid, told, std, truth = np.array(sink.rows).T
-            told, std, truth = (values[valid > 0] for values in (told, std, truth))
+            valid, estimated, std, truth = np.array(sink.rows).T
+            estimated, std, truth = (values[valid > 0] for values in (estimated, std, truth))
             rows.append(
                 {
                     "from_s": begin,
                     "valid": float(np.mean(valid)),
-                    "coverage": float(np.mean(np.abs(told - truth) < 1.96 * std)),
-                    "rmse_relative": float(np.sqrt(np.mean((told / truth - 1.0) ** 2))),
-                    "std_relative": float(np.median(std / told)),
+                    "coverage": float(np.mean(np.abs(estimated - truth) < 1.96 * std)),
+                    "rmse_relative": float(np.sqrt(np.mean((estimated / truth - 1.0) ** 2))),
+                    "std_relative": float(np.median(std / estimated)),
                 }
             )
     return rows

@@ -101,7 +101,7 @@ def _rows(record: Record, rows: slice) -> Record:
 
 
 def stiffness_of(part: Record, one: Machine) -> dict[str, Any]:
-    """What a diagnosis says of one part: stiffness and standard deviation, where it tells them."""
+    """What a diagnosis says of one part: stiffness and standard deviation, where it reports them."""
     try:
         outcome = diagnose(part, one.model, one.bandwidth_hz)
     except EstimatorError as error:
@@ -116,13 +116,13 @@ def stiffness_of(part: Record, one: Machine) -> dict[str, Any]:
 
 
 def agreement(parts: list[dict[str, Any]]) -> tuple[float, int]:
-    """(chi-squared about the weighted mean, degrees of freedom) of the parts whose stiffness is told."""
-    told = [(p["k"], p["std"]) for p in parts if p["k"] is not None]
-    if len(told) < 2:
+    """(chi-squared about the weighted mean, degrees of freedom) of the parts whose stiffness is reported."""
+    reported = [(p["k"], p["std"]) for p in parts if p["k"] is not None]
+    if len(reported) < 2:
         return 0.0, 0
-    k, std = np.array(told).T
+    k, std = np.array(reported).T
     mean = np.sum(k / std**2) / np.sum(1.0 / std**2)
-    return float(np.sum(((k - mean) / std) ** 2)), len(told) - 1
+    return float(np.sum(((k - mean) / std) ** 2)), len(reported) - 1
 
 
 def main() -> None:
@@ -136,19 +136,20 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every part there")
     args = parser.parse_args()
     outcomes: list[dict[str, Any]] = []
-    print("| recording | parts told | std, median | chi²/dof of the parts | of the machine | against known |")
+    print("| recording | parts reported | std, median | chi²/dof, parts | of the machine | against known |")
     print("|---|---|---|---|---|---|")
     for one in track(list(machines(args.data, args.shaft_line, args.machines)), "recordings"):
         parts = [stiffness_of(part, one) for part in parts_of(one.record)]
         outcomes.append({**one._asdict(), "record": None, "model": None, "parts": parts})
-        told = [p for p in parts if p["k"] is not None]
+        reported = [p for p in parts if p["k"] is not None]
         square, freedom = agreement(parts)
         alike = [p for o in outcomes if o["machine"] == one.machine for p in o["parts"]]
         total, degrees = agreement(alike) if one.machine != "simulated" else (square, freedom)
-        far = [((p["k"] - one.known_nm_rad) / p["std"]) ** 2 for p in told]
+        far = [((p["k"] - one.known_nm_rad) / p["std"]) ** 2 for p in reported]
         print(
-            f"| {one.machine} {one.name} | {len(told)} of {len(parts)} "
-            f"| {np.median([p['std'] / p['k'] for p in told] or [np.nan]):.1%} | {_ratio(square, freedom)} "
+            f"| {one.machine} {one.name} | {len(reported)} of {len(parts)} "
+            f"| {np.median([p['std'] / p['k'] for p in reported] or [np.nan]):.1%} "
+            f"| {_ratio(square, freedom)} "
             f"| {_ratio(total, degrees)} | {np.mean(far or [np.nan]):.2f} |",
             flush=True,
         )

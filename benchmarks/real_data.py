@@ -138,8 +138,8 @@ def against_sensor(model: JointModel, record: Record, sensor_nm: FloatArray) -> 
             motor_torque_nm=(float(tau),), link_position_rad=float(q),
         )  # fmt: skip
         said.append(estimator.step(sample))
-        told = estimator.external
-        external.append(told.external_torque_nm if told.status & ExternalStatus.VALID else np.nan)
+        reported = estimator.external
+        external.append(reported.external_torque_nm if reported.status & ExternalStatus.VALID else np.nan)
     k = model.motors[0].transmission.parameters.get("k_nm_rad", np.nan)
     assert isinstance(k, float)
     twist = k * (record.link_position_rad - record.motor_position_rad[:, 0])

@@ -40,7 +40,7 @@ which = joint("robust", sys.argv[1])
 devices = Devices(which)
 with Daemon([ServedJoint(joint=which)], devices=devices.poll) as daemon:
     ready = time.monotonic()
-    while daemon.loop.lanes[0].estimates == 0:
+    while daemon.loop.loop_joints[0].estimates == 0:
         daemon.run_lockstep(1)
     first = time.monotonic()
     memory = [mb()]
@@ -86,10 +86,10 @@ def daemon_round(
             daemon.run(seconds)
             cpu_s = time.process_time() - cpu_s - devices.cpu_s
             loop = daemon.loop
-            (lane,) = loop.lanes
+            (loop_joint,) = loop.loop_joints
             return {
                 **{f"late_{name}": value for name, value in loop.lateness.total().items()},
-                **{f"work_{name}": value for name, value in lane.work.total().items()},
+                **{f"work_{name}": value for name, value in loop_joint.work.total().items()},
                 "cpu_us_per_cycle": 1e6 * cpu_s / loop.cycles,
                 "left_out": loop.overruns,
                 "cycles": loop.cycles,

@@ -61,14 +61,14 @@ def rss_kb() -> int:
 
 def measured(stage: RealStage) -> tuple[int, int, int]:
     """Memory, threads and objects, without the samples that are kept for the check while this is measured."""
-    sink, stage.lane.sink = stage.lane.sink, None
+    sink, stage.loop_joint.sink = stage.loop_joint.sink, None
     stage.forget()
     try:
         gc.collect()
         objects = len(gc.get_objects())  # at once: every cycle of the daemon makes some
         return rss_kb(), threading.active_count(), objects
     finally:
-        stage.lane.sink = sink
+        stage.loop_joint.sink = sink
 
 
 def faults() -> list[Fault]:

@@ -28,7 +28,7 @@ from rivals import Floor
 from drivelink._core import SYNC_COB_ID
 from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle import realtime
-from drivelink.cycle.chain import make_chain
+from drivelink.cycle.pipeline import make_pipeline
 from drivelink.cycle.sources import open_source
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simulate import network_from_joint, open_sim_bus
@@ -72,22 +72,22 @@ class Clocked:
         which = joint("robust", free_endpoint(), motors=motors)
         self.bus = can.Bus(interface="virtual", channel=f"stage-{index}")
         self._source = open_source(self.bus)
-        self._chain = make_chain(which, tuple(layouts.values()))
+        self._pipeline = make_pipeline(which, tuple(layouts.values()))
         named = joint("robust", free_endpoint(), index=index, motors=motors)
         self.publisher = JointPublisher(session, named)
 
     def work(self, spent: list[int]) -> None:
         """One cycle; adds the CPU time of each stage, ns."""
-        clock, chain = time.thread_time_ns, self._chain
+        clock, pipeline = time.thread_time_ns, self._pipeline
         begin = clock()
         frames = self._source.take()
         received = clock()
-        chain.assembler.feed(SYNC_COB_ID, b"")
-        samples = [chain.assembler.feed(cob_id, data) for cob_id, data, _ in frames]
+        pipeline.assembler.feed(SYNC_COB_ID, b"")
+        samples = [pipeline.assembler.feed(cob_id, data) for cob_id, data, _ in frames]
         sample = samples[-1]
         assert sample is not None
         decoded = clock()
-        estimate = chain.estimator.step(sample)
+        estimate = pipeline.estimator.step(sample)
         estimated = clock()
         encode_estimate(estimate, 0)
         encode_sample(sample, 0)
@@ -184,14 +184,14 @@ def memory(ticks: int) -> dict[str, int]:
     which = joint("robust", free_endpoint(), motors=2)
     recorded, layouts = frames_of(which, 5000)
     cycles = [[(frame.arbitration_id, bytes(frame.data)) for frame in frames] for frames in recorded]
-    chain = make_chain(which, tuple(layouts.values()))
+    pipeline = make_pipeline(which, tuple(layouts.values()))
     start = 0
     for k in range(ticks):
         if k == ticks // 10:
             start = resident_bytes()
-        chain.feed(SYNC_COB_ID, b"")
+        pipeline.feed(SYNC_COB_ID, b"")
         for cob_id, data in cycles[k % len(cycles)]:
-            tick = chain.feed(cob_id, data)
+            tick = pipeline.feed(cob_id, data)
         assert tick is not None and tick.estimate_payload
     return {"ticks": ticks, "growth_bytes": resident_bytes() - start}
 

@@ -2,7 +2,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from drivelink.canopen.layout import NodeLayout
-from drivelink.cycle.chain import Watch
+from drivelink.cycle.pipeline import Watch
 from estimator._core import Estimator as _Core
 from estimator._core import ModelMonitor as _ModelMonitor
 from estimator.online import Estimator as _Estimator
@@ -226,7 +226,7 @@ class History:
     def behind(self, sequence: int) -> int:
         """How many came after one of that number."""
 
-class Chain:
+class JointPipeline:
     """One joint from frames to the bytes for zenoh: assembler, estimator, watch. No clock, no bus, no key.
 
     What the service knows of the estimate's quality is added to its status: drive faults, missing frames, and

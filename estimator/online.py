@@ -90,8 +90,8 @@ class _Compiled:
     @property
     def consistency(self) -> Consistency | None:
         """See `Estimator`."""
-        told = self.core.consistency
-        return None if told is None else Consistency(*told)
+        result = self.core.consistency
+        return None if result is None else Consistency(*result)
 
     def parameters(self) -> list[dict[str, Any]]:
         """See `Estimator`."""
@@ -99,10 +99,10 @@ class _Compiled:
 
     def suspicion(self) -> dict[str, Any] | None:
         """See `Estimator`."""
-        told = self.core.suspicion()
-        if told is None:
+        suspicion = self.core.suspicion()
+        if suspicion is None:
             return None
-        signal, motor, reason, amount, std, explains = told
+        signal, motor, reason, amount, std, explains = suspicion
         known = math.isfinite(amount) and math.isfinite(std)
         return {
             "signal": signal,
@@ -116,10 +116,10 @@ class _Compiled:
         }
 
     def _named(self, i: int, motor: Motor) -> dict[str, Any]:
-        told, polynomial, values, std = self.core.alpha(i)
+        known, polynomial, values, std = self.core.alpha(i)
         if not motor.flexible:
             return {"model": RIGID, "parameters": {}, "std": {}}
-        if not told:
+        if not known:
             black_box = {"stiffness_nm_rad": values[0]} if values and math.isfinite(values[0]) else {}
             return {"model": UNKNOWN, "parameters": black_box, "std": {}}
         declared = transmission_model(motor.transmission)

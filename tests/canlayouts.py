@@ -75,5 +75,5 @@ def link(position: int) -> bytes:
 
 
 def vsa_cycle(count: int) -> list[tuple[int, bytes]]:
-    """The frames that answer one SYNC; every value tells the cycle."""
+    """The frames that answer one SYNC; every value identifies the cycle."""
     return [(0x181, pdo(count, count)), (0x182, pdo(-count, -count)), (0x183, link(count))]

@@ -103,7 +103,7 @@ class Observed:
         return getattr(self._bus, name)
 
     def ended_s(self, since_s: float) -> float:
-        """When, after that time, the last drive was first told to give no torque."""
+        """When, after that time, the last drive was first commanded to give no torque."""
         first: dict[int, float] = {}
         for time_s, cob_id, per_mille in list(self.torques):
             if time_s >= since_s and per_mille == 0:
@@ -210,7 +210,7 @@ class Plant:
 
 def go_through_faults(plant: Plant) -> list[dict]:
     """Each fault on the running joint, and back to moving; the events of safe torque, in order."""
-    told = []
+    outcomes = []
 
     def safe(why: str) -> None:
         before = len(plant.events)
@@ -222,7 +222,7 @@ def go_through_faults(plant: Plant) -> list[dict]:
         if why in ENDS_ESTIMATES:
             begin_s = event["time_s"] - event["age_s"]
         ended_s = plant.observed.ended_s(begin_s)
-        told.append({"fault": why, "torque_ended_s": ended_s - begin_s, **event})
+        outcomes.append({"fault": why, "torque_ended_s": ended_s - begin_s, **event})
         acts[why][1]()
         # A machine that is busy with something else may stop it again on the way: that is what it is for.
         plant.reaches("run", before)
@@ -239,7 +239,7 @@ def go_through_faults(plant: Plant) -> list[dict]:
     plant.reaches("run")
     for why in acts:
         safe(why)
-    return told
+    return outcomes
 
 
 WALL = "contact=3.0,position_rad={:.4f},side={:d}"
@@ -247,7 +247,7 @@ WALL = "contact=3.0,position_rad={:.4f},side={:d}"
 
 def go_through_contacts(plant: Plant) -> list[dict]:
     """A wall, a push and a clamp on the running joint, and back to moving; the events of its reactions."""
-    world, told = plant.world, []
+    world, outcomes = plant.world, []
 
     def wall(*sides: int) -> None:
         q = world.truth().link_position_rad
@@ -266,7 +266,7 @@ def go_through_contacts(plant: Plant) -> list[dict]:
         before, begin_s = len(plant.events), time.monotonic()
         begin()
         event = plant.reaches("react", before)
-        told.append({"touch": what, "took_s": event["time_s"] - begin_s, **event})
+        outcomes.append({"touch": what, "took_s": event["time_s"] - begin_s, **event})
         end()
         plant.reaches("run", len(plant.events))
-    return told
+    return outcomes

@@ -107,8 +107,8 @@ class Rig:
             devices=self.network.poll,
         )
         self.collector = Collector()
-        (self.lane,) = self.daemon.loop.lanes
-        self.lane.sink = self.collector
+        (self.loop_joint,) = self.daemon.loop.loop_joints
+        self.loop_joint.sink = self.collector
 
     @property
     def status(self) -> dict:

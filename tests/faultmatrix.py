@@ -202,14 +202,14 @@ def stepped(
     name = joint.removesuffix(" fitted")
     motion = kit.motion(name, health_s + after_s, seed=seed, step=(health_s, factor))
     begin = round(health_s / T)
-    told = _told(joint, motion.samples)
+    estimates = _estimates(joint, motion.samples)
     end = slice(-round(2.0 / T), None)
-    off = np.abs(told.stiffness_nm_rad[end] / motion.stiffness_nm_rad[end] - 1.0)
-    followed = float(np.mean(told.valid[end] & (off < 0.05)))
-    return _count(joint, motion.samples, motion.stiffness_nm_rad, begin, told), followed
+    off = np.abs(estimates.stiffness_nm_rad[end] / motion.stiffness_nm_rad[end] - 1.0)
+    followed = float(np.mean(estimates.valid[end] & (off < 0.05)))
+    return _count(joint, motion.samples, motion.stiffness_nm_rad, begin, estimates), followed
 
 
-def _told(joint: str, samples: list[Sample]) -> kit.Told:
+def _estimates(joint: str, samples: list[Sample]) -> kit.Estimates:
     name = joint.removesuffix(" fitted")
     if joint == name:
         return kit.play(kit.declared(name), samples)[0]
@@ -218,9 +218,9 @@ def _told(joint: str, samples: list[Sample]) -> kit.Told:
 
 
 def _count(
-    joint: str, samples: list[Sample], truth: np.ndarray, begin: int, told: kit.Told | None = None
+    joint: str, samples: list[Sample], truth: np.ndarray, begin: int, estimates: kit.Estimates | None = None
 ) -> Outcome:
-    told = told or _told(joint, samples)
-    wrong = kit.wrong(told, truth)[begin:]
-    silent = wrong & (told.status[begin:] & FLAGS == 0)
-    return Outcome(len(wrong), int(told.valid[begin:].sum()), int(wrong.sum()), int(silent.sum()))
+    estimates = estimates or _estimates(joint, samples)
+    wrong = kit.wrong(estimates, truth)[begin:]
+    silent = wrong & (estimates.status[begin:] & FLAGS == 0)
+    return Outcome(len(wrong), int(estimates.valid[begin:].sum()), int(wrong.sum()), int(silent.sum()))

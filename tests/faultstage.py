@@ -106,7 +106,7 @@ class Sink(Collector):
 
     def put_sample(self, sample: Sample, stamp_ns: int) -> None:
         super().put_sample(sample, stamp_ns)
-        current = sample.sequence == self._stage.lane.chain.assembler.sequence
+        current = sample.sequence == self._stage.loop_joint.pipeline.assembler.sequence
         self.due.append(self._stage.truth.syncs - (1 if current else 2))
 
 
@@ -164,9 +164,9 @@ class Stage:
         self._level = logger.level
         logger.setLevel(logging.INFO)
         logger.addHandler(self.said)
-        (self.lane,) = self.daemon.loop.lanes
+        (self.loop_joint,) = self.daemon.loop.loop_joints
         self.truth = Truth(self)
-        self.lane.sink = self.collector = Sink(self)
+        self.loop_joint.sink = self.collector = Sink(self)
         inner = self.network.sync_filter
         assert inner is not None
 
@@ -213,11 +213,11 @@ class Stage:
 
     @property
     def valid(self) -> bool:
-        estimate = self.lane.chain.estimate
+        estimate = self.loop_joint.pipeline.estimate
         return (
             estimate is not None
             and bool(estimate.status & Status.VALID)
-            and self.lane.chain.sample is not None
+            and self.loop_joint.pipeline.sample is not None
         )
 
     @property
@@ -225,7 +225,8 @@ class Stage:
         """Whether everything is as if nothing had ever been."""
         return (
             self.valid
-            and not self.lane.chain.estimate.status & (Status.BUS_FAULT | Status.STALE | Status.DRIVE_FAULT)
+            and not self.loop_joint.pipeline.estimate.status
+            & (Status.BUS_FAULT | Status.STALE | Status.DRIVE_FAULT)
             and not self.daemon.events.active.keys() - self.of_the_machine
             and self.document()["state"] == "running"
         )
@@ -290,7 +291,7 @@ class Stage:
         return states
 
     def _counters(self) -> dict[int, dict[str, int]]:
-        counters = self.lane.chain.assembler.counters
+        counters = self.loop_joint.pipeline.assembler.counters
         return {node: count.as_dict() for node, count in counters.items()}
 
     def _check_flags(self, fault: Fault) -> None:
@@ -341,9 +342,9 @@ class Stage:
             )
         once = len(self.said.lines) == len(set(self.said.lines))
         assert once or not self.exact, f"{fault.name}: {self.said.lines}"  # in real time it may come again
-        told = [event["text"] for event in self.document()["events"]]
+        reported = [event["text"] for event in self.document()["events"]]
         for line in self.said.lines[-8:]:
-            assert line in told, f"{fault.name}: {line!r} is in the log and not in the status"
+            assert line in reported, f"{fault.name}: {line!r} is in the log and not in the status"
 
     # Actions
 

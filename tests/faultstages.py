@@ -143,13 +143,13 @@ class RealStage(Stage):
     def well(self) -> bool:
         if self._together:
             return super().well
-        chain = self.lane.chain
-        estimate = chain.estimate
+        pipeline = self.loop_joint.pipeline
+        estimate = pipeline.estimate
         bad = Status.STALE | Status.DRIVE_FAULT
         late = ("missing ", "conflicting ")
         return (
             estimate is not None
-            and chain.sample is not None
+            and pipeline.sample is not None
             and not estimate.status & bad
             and all(key.startswith(late) for key in self.daemon.events.active)
             and self.document()["state"] == "running"

@@ -1,11 +1,11 @@
 """A bus that lies: three strict slaves, one of them a trap, and everything between them and the daemon.
 
-No clock, no thread, no plant: each slave's values tell the SYNC they were sampled at, so that every published
+No clock, no thread, no plant: each slave's values identify the SYNC they were sampled at, so that every published
 sample can be held against it. What the fuzzer does to the frames comes in two strengths:
 
 *Faulty*: what wires, queues, gateways, other masters and confused nodes do. Frames are lost, late, doubled,
 cut, in another order; nodes are reset, stopped, started by others; frames of any identifier and content come in
-between. Then no estimate may be VALID and wrong. One thing cannot be told by anybody: a forged frame that is
+between. Then no estimate may be VALID and wrong. One thing nobody can detect: a forged frame that is
 right in identifier and length and comes first in its cycle. Those are counted, not judged.
 
 *Hostile*: answers of the SDO server are forged too, so that even the configuration may be wrong. Then there
@@ -218,7 +218,7 @@ class FuzzBus:
         draw = self._random
         command = draw.choice((0x40, 0x43, 0x4B, 0x4F, 0x60, 0x80, 0x00, 0x10, 0x20, 0x41, 0xC0))
         if not self._hostile:
-            # An object that the configuration never asks for: nobody could tell a forged answer that fits.
+            # An object that the configuration never asks for: a forged answer that fits cannot be detected.
             index = draw.choice((0x2000, 0x6502, 0x1003))
             return (bytes([command]) + struct.pack("<HB", index, draw.randrange(4)) + draw.randbytes(4))[
                 : draw.choice((8, 8, 8, 7, 3))

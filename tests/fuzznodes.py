@@ -1,4 +1,4 @@
-"""The slaves on the bus that lies: each value tells the SYNC it was sampled at, and one of them is a trap."""
+"""The slaves on the bus that lies: each value identifies the SYNC it was sampled at, and one of them is a trap."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class FuzzNode:
         self.slave.state = 5 if self._starts_itself else 0x7F
 
     def values(self, tick: int) -> dict[int, int]:
-        """What it measures at a SYNC: everything tells the tick, the position alone tells it fully."""
+        """What it measures at a SYNC: every value identifies the tick, the position alone uniquely."""
         return {
             0x6064: 3 * tick + 1000 * self.node,
             0x606C: 0x7000_0000 - tick,

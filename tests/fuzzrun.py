@@ -12,12 +12,12 @@ import can
 from daemonkit import vsa_text
 from fuzzbus import MIXES, FuzzBus
 
-from drivelink._core import Assembler, Chain
+from drivelink._core import Assembler, JointPipeline
 from drivelink.canopen.configure import configure_joints
 from drivelink.canopen.layout import NodeLayout, Signal
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cycle.chain import build
-from drivelink.cycle.loop import CycleLoop, Lane, ObjectSink
+from drivelink.cycle.loop import CycleLoop, LoopJoint, ObjectSink
+from drivelink.cycle.pipeline import build
 from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor
 from drivelink.jointfile import JointFile, parse
@@ -92,7 +92,7 @@ class _Judge(ObjectSink):
 
     def put_sample(self, sample: Sample, stamp_ns: int) -> None:
         self.samples += 1
-        estimate = self._run.chain.estimate
+        estimate = self._run.pipeline.estimate
         assert estimate is not None
         if not estimate.status & Status.VALID:
             return
@@ -104,17 +104,17 @@ class _Judge(ObjectSink):
 
     def _judge(self, sample: Sample, status: Status) -> None:
         run = self._run
-        before, due = run.due[-2:] if sample.sequence == run.chain.assembler.sequence else run.due[-3:-1]
+        before, due = run.due[-2:] if sample.sequence == run.pipeline.assembler.sequence else run.due[-3:-1]
         # BUS_FAULT says that frames were late: then they are of the cycle before, whose SYNC it may be.
         allowed = range(before, due + 1) if Status.BUS_FAULT in status else range(due, due + 1)
-        told = run.ticks_of(sample)
-        wrong = [name for name, tick in told.items() if tick not in allowed]
+        ticks = run.ticks_of(sample)
+        wrong = [name for name, tick in ticks.items() if tick not in allowed]
         if not wrong:
             return
         if all(run.forged(name) for name in wrong):
             self.unknowable += 1
             return
-        raise WrongValidError(f"{run.where}: sample of SYNC {due} tells {told}, {status!r}")
+        raise WrongValidError(f"{run.where}: sample of SYNC {due} has values of {ticks}, {status!r}")
 
 
 class FuzzRun:
@@ -145,13 +145,13 @@ class FuzzRun:
         self.configurator, (layouts,) = configure_joints(port, [parse(vsa_text())])
         self._scales = _scales(layouts)
         estimator = build(self.joint)[0] if real else Witness()
-        self.chain = Chain(Assembler(layouts, 2, active=not passive), estimator)
+        self.pipeline = JointPipeline(Assembler(layouts, 2, active=not passive), estimator)
         self.judge = _Judge(self)
-        lane = Lane("fuzzed", self.chain, self.judge)
+        loop_joint = LoopJoint("fuzzed", self.pipeline, self.judge)
         source: Any = ForeignMaster(self.bus) if passive else self.bus
         self.loop = CycleLoop(
             source,
-            [lane],
+            [loop_joint],
             period_s=PERIOD_S,
             produce=not passive,
             world_steps=True,
@@ -160,7 +160,7 @@ class FuzzRun:
         self.bus.loop = self.loop
         self.events = EventLog(_Silent(), clock=lambda: self.loop.clock() * 1e-9)  # type: ignore[arg-type]
         watching = PassiveConfigurator([self.joint]) if passive else self.configurator
-        self.supervisor = Supervisor(self.loop, {lane: layouts}, self.events, watching)
+        self.supervisor = Supervisor(self.loop, {loop_joint: layouts}, self.events, watching)
         self.loop.on_fault = _reraise  # whatever the daemon would survive is a failure here
         self.loop.housekeeping.urgent.append(self.supervisor.step)
         self.loop.housekeeping.every(0.05, self.supervisor.check)
@@ -173,16 +173,16 @@ class FuzzRun:
         """For the one who has to reproduce it."""
         return f"seed {self.seed}, cycle {self.loop.cycles}"
 
-    def told(self) -> str:
+    def summary(self) -> str:
         """The run in one line."""
         kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(self.bus.kinds.items()))
         return (
             f"seed {self.seed}: {self.bus.frames} frames in {self.loop.cycles} cycles ({kinds}); "
-            f"{self.judge.valid} VALID, of these {self.judge.unknowable} with a forged frame nobody could tell"
+            f"{self.judge.valid} VALID, of these {self.judge.unknowable} with a forged frame nobody could detect"
         )
 
     def ticks_of(self, sample: Sample) -> dict[str, float]:
-        """The SYNC that each value of a sample tells."""
+        """The SYNC that each value of a sample was taken at."""
         first, second = self._scales["motor1"], self._scales["motor2"]
         return {
             "motor1": (round(sample.motor_position_rad[0] / first) - 1000) / 3,

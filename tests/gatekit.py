@@ -43,7 +43,7 @@ class Drawn:
 
 
 def draw(kind: str, seed: int, *, effects: bool = True, seconds: float = 8.0, held: bool = False) -> Drawn:
-    """The joint of that kind and seed, recorded in a rich motion; with its link held, if told so."""
+    """The joint of that kind and seed, recorded in a rich motion; with its link held, if asked for."""
     rng = np.random.default_rng((KINDS.index(kind), seed))
 
     def between(low: float, high: float) -> float:

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drivelink._core import Assembler, Chain
-from drivelink.cycle.chain import Watch
+from drivelink._core import Assembler, JointPipeline
+from drivelink.cycle.pipeline import Watch
 from estimator import (
     Estimator,
     EstimatorSettings,
@@ -42,7 +42,7 @@ class Motion(NamedTuple):
     torque_nm: np.ndarray
 
 
-class Told(NamedTuple):
+class Estimates(NamedTuple):
     """What an estimator said of a motion, one entry a sample that it was given."""
 
     status: np.ndarray
@@ -146,23 +146,23 @@ def declared(name: str, **transmission: Any) -> JointModel:
 
 def play(
     model: JointModel, samples: Iterable[Sample], *, watch: Watch | None = None, **settings: Any
-) -> tuple[Told, Estimator]:
+) -> tuple[Estimates, Estimator]:
     """An estimator's word on these samples, with a watch's as the service adds it, and the estimator."""
     estimator = make_estimator(model, EstimatorSettings(**settings), PERIOD_S)
-    chain = Chain(Assembler((), 0), estimator, watch)  # what it is given are samples already
+    pipeline = JointPipeline(Assembler((), 0), estimator, watch)  # what it is given are samples already
     rows = []
     for sample in samples:
-        e = chain.take(sample).estimate
+        e = pipeline.take(sample).estimate
         rows.append((e.status, e.flexibility_torque_nm, e.stiffness_nm_rad, e.stiffness_std_nm_rad))
     status, torque, stiffness, std = np.array(rows).T
-    return Told(status.astype(int), torque, stiffness, std), estimator
+    return Estimates(status.astype(int), torque, stiffness, std), estimator
 
 
-def wrong(told: Told, truth: np.ndarray) -> np.ndarray:
+def wrong(estimates: Estimates, truth: np.ndarray) -> np.ndarray:
     """Which samples are valid and wrong: off by more than 10 % and by more than five standard deviations."""
-    off = np.abs(told.stiffness_nm_rad - truth)
-    beyond = ~(off <= np.maximum(WRONG_RELATIVE * np.abs(truth), WRONG_STD * told.std_nm_rad))
-    return np.asarray(told.valid & beyond)
+    off = np.abs(estimates.stiffness_nm_rad - truth)
+    beyond = ~(off <= np.maximum(WRONG_RELATIVE * np.abs(truth), WRONG_STD * estimates.std_nm_rad))
+    return np.asarray(estimates.valid & beyond)
 
 
 def without(samples: Sequence[Sample], share: float, seed: int) -> tuple[list[Sample], np.ndarray]:

@@ -474,6 +474,6 @@ class TestMeasuredPeriod:
             ]
             assert measure_period(sorted(stamps)[:64], 0.001) == (0.001, True)
 
-    def test_too_few_stamps_tell_nothing(self) -> None:
+    def test_too_few_stamps_decide_nothing(self) -> None:
         assert measure_period([k * MS for k in range(7)], 0.001) is None
         assert measure_period([5] * 100, 0.001) is None

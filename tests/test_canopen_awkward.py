@@ -35,7 +35,7 @@ def signals(layout):
 
 @dataclass
 class SlowState(Slave):
-    """Refuses to be changed for the first so many writes after it was told to be pre-operational."""
+    """Refuses to be changed for the first so many writes after it was sent to pre-operational."""
 
     refusals: int = 3
 

@@ -150,7 +150,7 @@ def test_a_passive_serial_adapter_is_opened_listen_only():
     assert "L" in adapter.commands
 
 
-def test_what_the_system_says_is_told_apart(monkeypatch):
+def test_errors_of_the_system_are_distinguished(monkeypatch):
     for number, expected in ((errno.EPERM, "may not use"), (errno.ENETDOWN, "is down"), (errno.EIO, "Input")):
 
         def refuse(number=number, **_):

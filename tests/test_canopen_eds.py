@@ -61,7 +61,7 @@ def sheet(tmp_path, text, node=None, name="x.eds"):
     return load_eds(path, node)
 
 
-def test_a_sheet_tells_objects_identity_and_tpdos(tmp_path):
+def test_an_eds_file_gives_objects_identity_and_tpdos(tmp_path):
     found = sheet(tmp_path, MINIMAL, 5)
     assert (found.vendor_name, found.vendor_id, found.product_code) == ("Somebody", 0x1F, 7)
     (frame,) = found.tpdos()
@@ -220,7 +220,7 @@ def test_roboteqs_name_for_the_node_id_is_understood(tmp_path):
     assert not any("no number" in problem for problem in sheet.problems)
 
 
-def test_a_map_that_the_sheet_does_not_tell_is_unknown_and_not_empty(tmp_path):
+def test_a_map_that_the_eds_file_lacks_is_unknown_and_not_empty(tmp_path):
     path = tmp_path / "untold.eds"
     maps = {0x1A00: ("", ""), 0x1A01: ("DefaultValue=0", ""), 0x1A02: ("DefaultValue=2", "")}
     text = ""

@@ -183,7 +183,7 @@ def test_an_identifier_left_over_from_another_node_is_corrected():
     assert layout.tpdos[0].cob_id == 0x185
 
 
-def test_two_tpdos_with_one_identifier_are_told_apart():
+def test_two_tpdos_with_one_identifier_are_distinguished():
     slave = fixed(drive(), (STATUS,), (), (STATUS, POSITION), (), ())
     slave.objects.update(tpdo(5, NO_RTR | INVALID | 0x385, 1, STATUS, TORQUE))
     for subindex in range(9):

@@ -109,7 +109,7 @@ def test_a_drive_without_a_second_encoder_says_so(rig):
         configure(bus, joint, idle=network.poll)
 
 
-def test_a_drive_that_does_not_tell_its_resolution_says_what_to_state(rig):
+def test_a_drive_that_does_not_report_its_resolution_says_what_to_declare(rig):
     bus, _, network = rig("epos4")
     joint = parse(TEXT.replace("counts_per_rev = 8192\n", ""))
     with pytest.raises(DriveError, match="counts_per_rev"):

@@ -41,7 +41,7 @@ def test_expedited_upload_as_on_the_wire():
 
 
 @pytest.mark.parametrize(("size", "command"), [(1, "2f"), (2, "2b"), (4, "23")])
-def test_expedited_download_tells_its_length(size, command):
+def test_expedited_download_states_its_length(size, command):
     sent = []
     running = session(write(5, 0x1017, 0, 100, size), sent)
     assert not running.poll(0.0)

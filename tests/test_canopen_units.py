@@ -24,7 +24,7 @@ def scale(result, signal):
     return result.candidates[signal][0].scale
 
 
-def test_everything_is_read_from_a_drive_that_tells():
+def test_everything_is_read_from_a_drive_that_reports_it():
     result = offered(PLAIN)
     assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.tau / (16384 * 50))
     # a count of 0x6077 is a thousandth of 0.8 N·m at the motor, times the gear at the joint
@@ -43,7 +43,7 @@ def test_what_the_joint_file_states_is_used_and_a_disagreement_names_both_number
     assert all(finding.fix for finding in result.notices)
 
 
-def test_a_drive_that_was_never_told_of_its_gear_is_no_warning():
+def test_a_drive_whose_gear_was_never_configured_is_no_warning():
     result = offered({**PLAIN, (0x6091, 1): 1}, drive="gear_ratio = 100.0")
     assert [finding.severity for finding in result.notices] == [Severity.INFO]
     assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.tau / (16384 * 100))
@@ -58,7 +58,7 @@ def test_direction_turns_position_and_torque_and_can_be_split():
     assert scale(result, Signal.MOTOR_TORQUE) > 0
 
 
-def test_values_a_drive_was_never_given_count_as_not_told():
+def test_values_that_were_never_configured_count_as_missing():
     # Elmo's DCF: resolution 1/1, rated values 0
     reported = {(0x608F, 1): 1, (0x608F, 2): 1, (0x6076, 0): 0, (0x6075, 0): 0}
     result = offered(reported)
@@ -66,7 +66,7 @@ def test_values_a_drive_was_never_given_count_as_not_told():
     assert "rated_torque_nm" in result.missing[Signal.MOTOR_TORQUE]
 
 
-def test_epos4_tells_by_objects_of_its_own_and_in_micro_newton_metres():
+def test_epos4_reports_by_objects_of_its_own_and_in_micro_newton_metres():
     # values of a real EPOS4's DCF: 4.76 A, 107.746 mN·m/A, 0x6076 = 512871 µN·m, gear 26, 3200 counts
     reported = {
         (0x3000, 5): 3200,
@@ -93,7 +93,7 @@ def test_epos4_tells_by_objects_of_its_own_and_in_micro_newton_metres():
         (510, "rated_torque_nm = 0.00051", 0.00051),
     ],
 )
-def test_the_unit_of_maxons_rated_torque_is_told_from_evidence(raw, drive, expected):
+def test_the_unit_of_maxons_rated_torque_follows_from_evidence(raw, drive, expected):
     result = offered({**PLAIN, (0x6076, 0): raw}, MAXON, drive=f"{drive}\ngear_ratio = 50.0")
     assert scale(result, Signal.MOTOR_TORQUE) == pytest.approx(expected / 1000 * 50, rel=2e-3)
 
@@ -167,7 +167,7 @@ def test_polarity_of_position_against_velocity_is_a_warning():
     assert Severity.WARNING in severities
 
 
-def test_the_second_encoder_takes_its_resolution_from_the_drive_if_it_tells():
+def test_the_second_encoder_takes_its_resolution_from_the_drive_if_it_reports_it():
     link = "[link.encoder]"
     result = offered({**PLAIN, (0x60E6, 1): 65536, (0x60EB, 1): 1}, link=link)
     assert scale(result, Signal.LINK_POSITION) == pytest.approx(math.tau / 65536)
@@ -195,7 +195,7 @@ def test_a_wrong_object_is_one_line(text):
         ({(0x6501, 0): 8192, (0x6000, 0): 0, (0x6001, 0): 3600, (0x6502, 0): 1}, 8192, 8192),  # scaling off
     ],
 )
-def test_absolute_encoders_tell_resolution_and_where_they_start_again(reported, counts, modulus):
+def test_absolute_encoders_report_resolution_and_where_they_start_again(reported, counts, modulus):
     text = joint_text(link='[link.encoder]\nsource = "cia406"\nnode_id = 9')
     (candidate,) = offer(roles(parse(text))[1], reported, GENERIC).candidates[Signal.LINK_POSITION]
     assert candidate.scale == pytest.approx(math.tau / counts)
@@ -205,7 +205,7 @@ def test_absolute_encoders_tell_resolution_and_where_they_start_again(reported, 
 EPOS2 = {(0x2210, 1): 500, (0x6410, 1): 2000}  # pulses a turn; no 0x6075, 0x6076, 0x608F, 0x3000
 
 
-def test_epos2_tells_its_current_in_milliamperes_and_its_encoder_in_pulses():
+def test_epos2_reports_its_current_in_milliamperes_and_its_encoder_in_pulses():
     drive = "torque_constant_nm_a = 0.03\nrated_current_a = 2.0\ngear_ratio = 50.0\nvelocity = true"
     result = offered(EPOS2, MAXON, drive=drive)
     assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.tau / (4 * 500 * 50))

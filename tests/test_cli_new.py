@@ -118,7 +118,7 @@ def test_the_inertia_of_a_data_sheet_goes_through_the_gear(tmp_path, capsys):
     assert "48.2 g·cm² × 100²" in (tmp_path / "elbow.toml").read_text()
 
 
-def test_an_inertia_that_nobody_told_is_marked_as_a_placeholder(tmp_path, capsys):
+def test_an_inertia_that_nobody_gave_is_marked_as_a_placeholder(tmp_path, capsys):
     made(tmp_path)
     assert "placeholder" in capsys.readouterr().out
     assert "PLACEHOLDER" in (tmp_path / "elbow.toml").read_text()

@@ -77,15 +77,15 @@ def endpoint_of(path: Path) -> str:
 
 
 def test_simulated_drives_daemon_and_subscriber_are_three_processes(joint: Path, tmp_path: Path) -> None:
-    told = str(tmp_path / "notify")
+    address = str(tmp_path / "notify")
     with (
         socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager,
         process("sim", str(joint)) as drives,
     ):
-        manager.bind(told)
+        manager.bind(address)
         manager.settimeout(30.0)
         assert "ready" in drives.stdout.readline()
-        with process("run", str(joint), "--no-realtime", NOTIFY_SOCKET=told) as daemon:
+        with process("run", str(joint), "--no-realtime", NOTIFY_SOCKET=address) as daemon:
             line = daemon.stdout.readline()
             assert line.startswith("drivelink run: elbow on socketcand can0, 200 Hz, ready"), (
                 daemon.stderr.read()

@@ -119,7 +119,7 @@ def test_the_external_torque_comes_with_its_estimate(publisher, joint):
     assert not joint.contact
 
 
-def test_an_external_torque_of_other_cycles_is_not_told(publisher, joint):
+def test_an_external_torque_of_other_cycles_is_not_returned(publisher, joint):
     publish(publisher, 1)
     publisher.put_external(make_external(1, status=3), time.time_ns())
     until(lambda: joint.contact)
@@ -162,7 +162,7 @@ def test_iteration_gives_every_cycle_in_order(publisher, joint):
     assert seen == list(range(1, 21))
 
 
-def test_iteration_can_tell_that_nothing_came(publisher, joint):
+def test_iteration_can_report_that_nothing_came(publisher, joint):
     publish(publisher, 1)
     cycles = joint.cycles(timeout_s=0.05)
     assert next(cycles).sequence == 1

@@ -69,8 +69,8 @@ def cpp(tmp_path_factory):
 
 
 def test_the_cpp_decoder_reads_the_golden_vectors(cpp):
-    told = run(cpp / "golden", ROOT / "tests" / "golden")
-    assert "12 vectors, 39 to be refused, 0 wrong" in told
+    printed = run(cpp / "golden", ROOT / "tests" / "golden")
+    assert "12 vectors, 39 to be refused, 0 wrong" in printed
 
 
 def test_the_cpp_example_reads_the_daemon(cpp, endpoint):

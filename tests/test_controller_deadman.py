@@ -67,15 +67,15 @@ class Daemon:
 
 
 class Drives:
-    """A master whose drives are enabled, and what they have been told."""
+    """A master whose drives are enabled, and what torques they were commanded."""
 
     enabled, faulted, status_ids = True, False, ()
 
     def __init__(self) -> None:
-        self.told: list[tuple[float, tuple[float, float]]] = []
+        self.commanded: list[tuple[float, tuple[float, float]]] = []
 
     def command(self, torques: tuple[float, float], now_s: float) -> None:
-        self.told.append((now_s, torques))
+        self.commanded.append((now_s, torques))
 
     def poll(self, *_: object, **__: object) -> None:
         pass
@@ -107,7 +107,7 @@ def running(monkeypatch):
         while daemon.now_s < begin_s + 1.0:
             process._once()
         assert controller.phase is Phase.IDENTIFY
-        assert drives.told[-1][1] != SAFE
+        assert drives.commanded[-1][1] != SAFE
         yield process, daemon, drives, controller
 
 
@@ -115,9 +115,9 @@ def test_no_torque_a_deadline_and_a_look_after_the_last_estimate_and_never_befor
     process, daemon, drives, controller = running
     daemon.silent_from_s = daemon.now_s
     last_s = daemon.last_s
-    before = len(drives.told)
+    before = len(drives.commanded)
     process.run(lambda: daemon.now_s > last_s + 0.1)
-    ended = drives.told[before:]
+    ended = drives.commanded[before:]
     assert all(torques == SAFE for _, torques in ended)
     assert DEADLINE_S < ended[0][0] - last_s <= DEADLINE_S + LOOK_S + 1e-9
     assert len(ended) > 0.1 / DEADLINE_S - 2  # and said again: the frame may have been lost
@@ -129,7 +129,7 @@ def test_an_estimate_that_comes_in_time_keeps_it_moving(running):
     process, daemon, drives, _ = running
     daemon.sleep(DEADLINE_S - 2 * PERIOD_S)  # a stall shorter than the deadline
     process._once()
-    assert drives.told[-1][1] != SAFE
+    assert drives.commanded[-1][1] != SAFE
 
 
 def test_what_waited_while_the_process_was_stopped_moves_nothing(running, monkeypatch):
@@ -138,6 +138,6 @@ def test_what_waited_while_the_process_was_stopped_moves_nothing(running, monkey
     daemon.sleep(0.03)
     monkeypatch.setattr(daemon, "wait", lambda _: old)
     process._once()
-    assert drives.told[-1][1] == SAFE
+    assert drives.commanded[-1][1] == SAFE
     assert controller.events[-1].reason == "estimates are stale"
     assert controller.events[-1].age_s == pytest.approx(0.03)

@@ -2,7 +2,7 @@
 
 What is asserted is that each fault ends in safe torque and that the controller comes back. How fast is asserted
 in bus time by the tests in lockstep and of the process's own clock by `test_controller_deadman.py`, and here only
-told: the machine may be doing something else.
+reported: the machine may be doing something else.
 """
 
 import socket
@@ -28,14 +28,14 @@ def start(folder, *options):
 def test_it_reacts_to_a_wall_a_push_and_a_clamp_in_three_processes(tmp_path, capsys, reaction):
     plant = start(tmp_path, "--reaction", reaction)
     try:
-        told = go_through_contacts(plant)
+        outcomes = go_through_contacts(plant)
         assert plant.end_controller() == 0
         until(lambda: not plant.enabled())
     finally:
         plant.close()
-    assert [event["reason"] for event in told] == [f"contact: {reaction}"] * 3
+    assert [event["reason"] for event in outcomes] == [f"contact: {reaction}"] * 3
     with capsys.disabled():
-        for event in told:
+        for event in outcomes:
             print(f"\n{event['touch']}: {event['reason']} after {1e3 * event['took_s']:.0f} ms", end="")
 
 
@@ -44,15 +44,15 @@ def test_it_reacts_to_a_wall_a_push_and_a_clamp_in_three_processes(tmp_path, cap
 def test_each_fault_and_the_way_back_in_three_processes(tmp_path, capsys):
     plant = start(tmp_path)
     try:
-        told = go_through_faults(plant)
+        outcomes = go_through_faults(plant)
         assert plant.end_controller() == 0
         until(lambda: not plant.enabled())
     finally:
         plant.close()
     with capsys.disabled():
-        for event in told:
+        for event in outcomes:
             print(
-                f"\n{event['fault']}: {event['reason']}; told {1e3 * event['age_s']:.1f} ms after the last "
+                f"\n{event['fault']}: {event['reason']}; {1e3 * event['age_s']:.1f} ms after the last "
                 f"estimate, no torque at the drives after {1e3 * event['torque_ended_s']:.1f} ms",
                 end="",
             )

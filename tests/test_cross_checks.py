@@ -1,4 +1,4 @@
-"""Readings of one quantity that a drive tells twice: what a lie of one of them leads to, and that health tells none."""
+"""Readings of one quantity that a drive reports twice: what a fault of one leads to, and no alarm in health."""
 
 import math
 import struct
@@ -18,7 +18,7 @@ from sim.canopen.drive import Cia402Drive
 from sim.sensors import DriveSignals
 
 SYNC = 0x080
-LEARNING = 12_000  # cycles: the test begins after three seconds of blocks that tell something
+LEARNING = 12_000  # cycles: the test begins after three seconds of blocks with motion
 
 
 def joint(**changes: object) -> JointFile:
@@ -117,9 +117,9 @@ def test_a_check_that_does_not_come_costs_no_sample() -> None:
         layout = made.daemon.layouts[1]
         (number,) = [t.number for t in layout.tpdos if Signal.VELOCITY_CHECK in {o.signal for o in t.objects}]
         made.faults.mute(made.node(1), number, 1000)
-        missed = made.lane.chain.missed
+        missed = made.loop_joint.pipeline.missed
         made.run(1000)
-        assert made.lane.chain.missed == missed
+        assert made.loop_joint.pipeline.missed == missed
 
 
 # --- frames alone: what the simulated drives do not have ---------------------------------------------------------------
@@ -161,7 +161,7 @@ def motion(t: float) -> float:
     return 8000 * math.sin(5 * t) + 1500 * math.sin(17 * t)
 
 
-def test_a_second_encoder_tells_which_of_position_and_velocity_is_wrong() -> None:
+def test_a_second_encoder_decides_which_of_position_and_velocity_is_wrong() -> None:
     """Velocity and second encoder both check the position: the velocity alone is wrong, and the estimate stays."""
 
     def truth(t: float, velocity: float = 1.0, position: float = 1.0) -> tuple[float, tuple[int, ...]]:
@@ -186,7 +186,7 @@ def test_a_second_encoder_tells_which_of_position_and_velocity_is_wrong() -> Non
     assert {check[2] for check in assembler.checks} == {"contradicts"}
 
 
-def test_a_following_error_that_is_not_demand_less_position_is_told() -> None:
+def test_a_following_error_that_is_not_demand_less_position_is_found() -> None:
     def truth(t: float, factor: float = 1.0) -> tuple[float, tuple[int, ...]]:
         error = 800 * math.sin(11 * t)
         return motion(t), (round(motion(t) + error), round(factor * error))
@@ -199,7 +199,7 @@ def test_a_following_error_that_is_not_demand_less_position_is_told() -> None:
     assert feed(assembler, 20_000, 1000, lambda t: truth(t, 0.0))[-1] & Status.CONTRADICTED
 
 
-def test_a_velocity_of_another_unit_is_told_from_the_start() -> None:
+def test_a_velocity_of_another_unit_is_found_from_the_start() -> None:
     """A counts_per_rev that is four times too small, say: velocity is in rpm, whatever the encoder is."""
 
     def readings(t: float) -> tuple[float, tuple[int, ...]]:

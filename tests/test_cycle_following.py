@@ -29,9 +29,9 @@ class Master:
         self.run.judge.put_sample = self._keep  # type: ignore[method-assign]
 
     def _keep(self, sample, _stamp_ns: int) -> None:
-        estimate = self.run.chain.estimate
+        estimate = self.run.pipeline.estimate
         assert estimate is not None and estimate.status & Status.VALID
-        later = self.run.chain.assembler.sequence - sample.sequence  # given at the end of its cycle
+        later = self.run.pipeline.assembler.sequence - sample.sequence  # given at the end of its cycle
         self.valid.append((self.run.bus.tick - later, self.run.ticks_of(sample)))
 
     def syncs(self, count: int) -> None:
@@ -74,7 +74,7 @@ class Master:
 
     @property
     def wrong(self) -> list[tuple[int, dict[str, float]]]:
-        return [(tick, told) for tick, told in self.valid if set(told.values()) != {float(tick)}]
+        return [(tick, ticks) for tick, ticks in self.valid if set(ticks.values()) != {float(tick)}]
 
     @property
     def conditions(self) -> str:
@@ -228,7 +228,7 @@ def test_a_log_gives_the_samples_of_the_live_run(tmp_path: Path) -> None:
     )
     log = FrameLog(path, master.run.joint, tmp_path)
     replayed = [master.run.ticks_of(cycle.sample) for cycle in log.cycles() if cycle.sample is not None]
-    assert replayed == [told for _, told in master.valid[begun:]]
+    assert replayed == [ticks for _, ticks in master.valid[begun:]]
     assert len(replayed) > 700
 
 
@@ -245,13 +245,13 @@ def test_a_node_without_heartbeat_after_its_reset_is_operational_when_it_sends(
     for node in run.bus.nodes:
         answer = node.answer
         monkeypatch.setattr(node, "answer", lambda tick, a=answer: [f for f in a(tick) if f[0] < 0x700])
-    assert run.supervisor.node_status(run.loop.lanes[0])["2"]["state"] == "boot-up"
+    assert run.supervisor.node_status(run.loop.loop_joints[0])["2"]["state"] == "boot-up"
     master.syncs(100)
     master.map(2, 1, POSITION, TORQUE, STATUSWORD)
     master.nmt(START, 2)
     for _ in range(20):
         master.syncs(100)
-    status = run.supervisor.node_status(run.loop.lanes[0])["2"]
+    status = run.supervisor.node_status(run.loop.loop_joints[0])["2"]
     assert (status["state"], status["heartbeat_age_s"]) == ("operational", None)
     assert "node 2: heartbeat lost" not in master.conditions
 
@@ -283,5 +283,5 @@ def test_a_log_that_begins_after_the_configuration_says_what_would_settle_its_ma
         list(log.cycles())
     line = str(error.value).partition("in [motor.drive] ")[2]
     assert line.startswith('tpdo = [{ cob_id = 0x185, objects = ["0x6064:00:32", "0x6077:00:16"]')
-    told = FrameLog(path, parse(text.replace("eds =", f"{line}\neds =")), tmp_path)
-    assert len([cycle for cycle in told.cycles() if cycle.sample is not None]) >= 599
+    declared = FrameLog(path, parse(text.replace("eds =", f"{line}\neds =")), tmp_path)
+    assert len([cycle for cycle in declared.cycles() if cycle.sample is not None]) >= 599

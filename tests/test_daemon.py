@@ -14,8 +14,8 @@ from zenohkit import free_endpoint, until
 
 from drivelink._core import SYNC_COB_ID
 from drivelink.canopen.guard import check_frame
-from drivelink.cycle.chain import make_chain
 from drivelink.cycle.lockstep import run_lockstep
+from drivelink.cycle.pipeline import make_pipeline
 from drivelink.cycle.startup import join_bus
 from drivelink.daemon import reload
 from drivelink.daemon.service import Daemon, ServedJoint
@@ -182,7 +182,7 @@ def test_a_passive_daemon_follows_a_foreign_master_and_never_sends_a_frame() -> 
         follower = made[0]
         follower._port.bus.send = lambda *_: pytest.fail("a passive daemon has sent a frame")
         with running(follower):
-            until(lambda: follower.loop.lanes[0].estimates > 300)
+            until(lambda: follower.loop.loop_joints[0].estimates > 300)
             assert follower.documents()[0]["bus"]["sync"] == "follow"
     network.stop()
     bus.shutdown()
@@ -212,15 +212,15 @@ def test_when_sync_stops_the_estimates_are_stale_and_come_back_with_it() -> None
         maker = threading.Thread(target=master)
         maker.start()
         follower = daemon(follow, publish=False)
-        chain = follower.chains[0]
+        pipeline = follower.pipelines[0]
         with running(follower):
-            until(lambda: chain.estimate and not chain.estimate.status & Status.STALE)
+            until(lambda: pipeline.estimate and not pipeline.estimate.status & Status.STALE)
             going.clear()
             until(lambda: follower.documents()[0]["state"] == "no SYNC")
-            assert chain.estimate.status & Status.STALE
-            assert not chain.estimate.status & Status.VALID
+            assert pipeline.estimate.status & Status.STALE
+            assert not pipeline.estimate.status & Status.VALID
             going.set()
-            until(lambda: not chain.estimate.status & Status.STALE)
+            until(lambda: not pipeline.estimate.status & Status.STALE)
         stop.set()
         maker.join()
         listener.close()
@@ -231,13 +231,13 @@ def test_a_lost_bus_is_opened_again_by_itself() -> None:
     joint = vsa(bus=SLOWLY)
     with served(joint):
         made = daemon(joint, publish=False)
-        chain = made.chains[0]
+        pipeline = made.pipelines[0]
         with running(made):
-            until(lambda: fresh(chain.estimate))
+            until(lambda: fresh(pipeline.estimate))
             made._port.bus.shutdown()  # as if the interface were gone
-            until(lambda: chain.estimate.status & Status.STALE)
+            until(lambda: pipeline.estimate.status & Status.STALE)
             assert made.documents()[0]["state"] in ("bus lost", "stale")
-            until(lambda: not chain.estimate.status & Status.STALE)
+            until(lambda: not pipeline.estimate.status & Status.STALE)
             texts = [event["text"] for event in made.events.recent()]
             assert sum("the bus is lost" in text for text in texts) == 1
             assert sum("the bus is back" in text for text in texts) == 1
@@ -253,15 +253,15 @@ def test_a_rewritten_joint_file_changes_the_model_without_losing_a_cycle(tmp_pat
     made = reloadable(tmp_path)
     path = tmp_path / "elbow.toml"
     made.run(3000)  # until the model in use has shown itself valid
-    old = made.lane.chain.estimator
+    old = made.loop_joint.pipeline.estimator
     text = path.read_text(encoding="utf-8").replace("k_nm_rad = 0.5", "k_nm_rad = 0.51")
     path.write_text(text, encoding="utf-8")
     estimates = []
     limit = time.monotonic() + 60.0
-    while made.lane.chain.estimator is old and time.monotonic() < limit:
+    while made.loop_joint.pipeline.estimator is old and time.monotonic() < limit:
         estimates += made.run(1)
         time.sleep(0.001)  # the slack of a cycle, in which the new estimator catches up
-    assert made.lane.chain.estimator is not old
+    assert made.loop_joint.pipeline.estimator is not old
     estimates += made.run(50)
     sequences = [estimate.sequence for estimate in estimates]
     assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
@@ -279,14 +279,14 @@ def test_the_new_model_comes_into_use_even_where_its_thread_gets_no_time(
     made = reloadable(tmp_path)
     path = tmp_path / "elbow.toml"
     made.run(1000)
-    old = made.lane.chain.estimator
+    old = made.loop_joint.pipeline.estimator
     path.write_text(path.read_text(encoding="utf-8").replace("= 0.5,", "= 0.51,"), encoding="utf-8")
     (reloader,) = made.daemon._reloaders
     reloader.check()
     until(lambda: reloader._ready is not None)
-    behind = len(made.lane.chain.history)
+    behind = len(made.loop_joint.pipeline.history)
     estimates = made.run(2 * 50 + behind)  # while it waits 50 more samples come; then two steps for each
-    assert made.lane.chain.estimator is not old
+    assert made.loop_joint.pipeline.estimator is not old
     assert not any(estimate.status & Status.STALE for estimate in estimates)
     assert "elbow.toml: the model in it is now in use" in made.events
     made.close()
@@ -295,7 +295,7 @@ def test_the_new_model_comes_into_use_even_where_its_thread_gets_no_time(
 def test_a_joint_file_with_an_error_leaves_the_model_as_it_is(tmp_path: Path) -> None:
     made = reloadable(tmp_path)
     made.run(100)
-    old = made.lane.chain.estimator
+    old = made.loop_joint.pipeline.estimator
     (tmp_path / "elbow.toml").write_text("name = 3", encoding="utf-8")
     made.daemon.reload()
 
@@ -304,7 +304,7 @@ def test_a_joint_file_with_an_error_leaves_the_model_as_it_is(tmp_path: Path) ->
         return any("the model stays as it is" in text for text in made.events)
 
     until(said)
-    assert made.lane.chain.estimator is old
+    assert made.loop_joint.pipeline.estimator is old
     made.close()
 
 
@@ -344,11 +344,11 @@ def test_the_raw_frames_of_a_run_give_the_published_bytes_back_bit_for_bit() -> 
             made.faults.at(at, lambda: made.faults.mute(made.node(2), made.tpdo(2)[0]))
         made.faults.at(1200, lambda: made.faults.reboot(made.node(1)))
         made.run(3000)
-        chain = make_chain(joint, layouts)
+        pipeline = make_pipeline(joint, layouts)
         again, stamp_ns = [], made.collector.estimates[0][1] - MS
         for cob_id, data in listener.frames():
             stamp_ns += MS * (cob_id == SYNC_COB_ID)
-            tick = chain.feed(cob_id, data, 1, stamp_ns)
+            tick = pipeline.feed(cob_id, data, 1, stamp_ns)
             if tick is not None:
                 again.append((tick.estimate_payload, tick.sample_payload))
         assert len(again) == 3000
@@ -361,8 +361,8 @@ def test_lockstep_is_the_same_cycle_without_the_daemon_around_it() -> None:
     bus = open_sim_bus(joint.bus)
     network = network_from_joint(joint, bus)
     truth = []
-    lane = run_lockstep(joint, network, None, 400, each=lambda: truth.append(network.syncs))
-    assert (lane.estimates, lane.chain.missed) == (400, 0)
+    loop_joint = run_lockstep(joint, network, None, 400, each=lambda: truth.append(network.syncs))
+    assert (loop_joint.estimates, loop_joint.pipeline.missed) == (400, 0)
     assert truth == list(range(1, 401))
     bus.shutdown()
 
@@ -418,8 +418,8 @@ def test_two_joints_share_a_bus_and_its_sync() -> None:
         assert (first["joint"], second["joint"]) == ("elbow", "wrist")
         assert first["estimates"] == second["estimates"] == 600
         assert set(second["nodes"]) == {"11"}
-        assert {chain.estimate.sequence for chain in made.chains} == {599}
-        assert [len(chain.estimate.transmissions) for chain in made.chains] == [2, 1]
+        assert {pipeline.estimate.sequence for pipeline in made.pipelines} == {599}
+        assert [len(pipeline.estimate.transmissions) for pipeline in made.pipelines] == [2, 1]
         assert first["bus"]["load"] == second["bus"]["load"] > 0.3
 
 
@@ -441,19 +441,19 @@ class Broken:
 def test_an_exception_in_one_joint_takes_that_one_to_a_fault_and_the_others_go_on() -> None:
     with two_joints() as made:
         made.run_lockstep(100)
-        elbow, wrist = made.loop.lanes
-        sound = wrist.chain.estimator
-        wrist.chain.exchange(Broken(), None)
+        elbow, wrist = made.loop.loop_joints
+        sound = wrist.pipeline.estimator
+        wrist.pipeline.exchange(Broken(), None)
         collector = wrist.sink = Collector()
         made.run_lockstep(200)
         first, second = made.documents()
         assert (first["state"], first["estimates"]) == ("running", 300)
         assert (second["state"], second["estimates"]) == ("fault", 100)
-        assert any("wrist: no estimates any more after ZeroDivisionError" in c for c in second["conditions"])
+        assert any("wrist: no estimates since ZeroDivisionError" in c for c in second["conditions"])
         assert len(collector.estimates) == 199  # one for each cycle after that of the exception
         assert [e.sequence for e, _ in collector.estimates] == list(range(100, 299))
         assert all(e.status & Status.STALE and not e.status & Status.VALID for e, _ in collector.estimates)
-        wrist.chain.exchange(sound, None)  # as a joint file written again does it
+        wrist.pipeline.exchange(sound, None)  # as a joint file written again does it
         made.run_lockstep(100)
         assert made.documents()[1]["state"] == "running"
         assert elbow.estimates == 400
@@ -468,7 +468,7 @@ def test_an_exception_in_publishing_or_beside_the_cycle_is_said_and_the_loop_goe
         raise ValueError("a task's own")
 
     with two_joints() as made:
-        elbow, _wrist = made.loop.lanes
+        elbow, _wrist = made.loop.loop_joints
         elbow.sink = Full()
         made.loop.housekeeping.every(0.01, task)
         made.loop.listeners[0x181] = lambda *_: {}["nothing"]

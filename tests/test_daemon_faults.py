@@ -204,7 +204,7 @@ def test_a_second_reboot_in_the_middle_of_the_configuration_begins_it_anew() -> 
         made.faults.reboot(made.node(2))
         for _ in range(3):
             made.run(8)
-            assert made.daemon.chains[0].assembler.untrusted == (2,)
+            assert made.daemon.pipelines[0].assembler.untrusted == (2,)
             made.faults.reboot(made.node(2))
         assert valid(made.run(ENOUGH))[-1]
         assert made.status["nodes"]["2"]["reboots"] == 4
@@ -275,7 +275,7 @@ def test_whatever_goes_wrong_in_the_configuration_of_a_node_is_that_nodes_own(
         monkeypatch.setattr("drivelink.canopen.node.offer", broken)
         made.faults.reboot(made.node(1))
         estimates = made.run(1500)
-        assert len(estimates) >= 1499  # a cycle that lacks a frame is told with the next SYNC
+        assert len(estimates) >= 1499  # a cycle that lacks a frame is concluded with the next SYNC
         assert "node 1 cannot be configured: node 1: OverflowError in its configuration: int too large" in (
             " ".join(made.events)
         )

@@ -21,7 +21,7 @@ TURN = 30_000  # torques have 16 bits
     [(0.001, 20_000), (0.004, 2_000)],
 )
 def test_a_sample_that_is_not_of_its_cycle_is_always_flagged(share: float, certain: int) -> None:
-    """Frames get lost, late, doubled, cut and reordered, amid noise; every value tells its cycle."""
+    """Frames get lost, late, doubled, cut and reordered, amid noise; every value identifies its cycle."""
     rng = random.Random(17)
     assembler = Assembler(VSA, 2)
     noise = [0x000, 0x181 + 0x200, 0x585, 0x605, 0x7E5, 0x710, 0x0FF, 0x7FF]
@@ -67,7 +67,7 @@ def test_a_sample_that_is_not_of_its_cycle_is_always_flagged(share: float, certa
 
 
 def cycle_frames(k: int) -> list[tuple[int, bytes]]:
-    """Frames whose values tell the cycle: the torques modulo TURN, the link position for good."""
+    """Frames whose values identify the cycle: the torques modulo TURN, the link position for good."""
     first, second, _ = vsa_cycle(k % TURN)
     return [first, second, (0x183, link(k))]
 

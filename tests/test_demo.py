@@ -96,7 +96,7 @@ def test_an_end_before_the_first_valid_cycle_gives_no_error() -> None:
 @pytest.mark.parametrize(
     "case", [*(pytest.param(case, marks=pytest.mark.slow) for case in ("constant", "quadratic")), "vsa-ii"]
 )
-def test_the_demo_finds_the_stiffness_it_was_not_told(case: str) -> None:
+def test_the_demo_finds_the_stiffness_it_does_not_know(case: str) -> None:
     # Six seconds of motion; 3 % leaves room for a loaded machine that loses cycles, and is far below
     # the error of a chain with any sign, unit or time shift wrong.
     run = subprocess.run(

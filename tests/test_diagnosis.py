@@ -176,7 +176,7 @@ def with_late_torque(record: Record, late_s: float) -> Record:
 
 
 @pytest.mark.slow
-def test_a_slow_sine_does_not_tell() -> None:
+def test_a_slow_sine_decides_nothing() -> None:
     (record,) = kit.World([{"constant": 0.05}], slow=True).run()
     found = diagnose(record, kit.model(linked=False))
     assert found.verdict == "insufficient_excitation"

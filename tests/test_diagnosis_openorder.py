@@ -1,4 +1,4 @@
-"""An open polynomial order is raised by what the diagnosis finds; one that was told is not."""
+"""An open polynomial order is raised by what the diagnosis finds; a declared one is not."""
 
 import pytest
 

@@ -279,7 +279,7 @@ def test_an_eds_that_does_not_match_the_node_is_a_warning(rig, tmp_path):
 
 
 @pytest.mark.parametrize("path", OURS, ids=lambda path: path.name)
-def test_from_a_sheet_alone_the_mapping_is_told(path):
+def test_from_an_eds_file_alone_the_mapping_is_shown(path):
     report = examine_eds(path)
     facts = report.sections[0].facts
     if "encoder" in path.name:
@@ -341,7 +341,7 @@ def sheet_of(*addresses, tmp_path):
     return examine_eds(path)
 
 
-def test_a_sheet_tells_of_every_link_encoder_and_which_is_none(tmp_path):
+def test_an_eds_file_names_every_link_encoder_and_which_is_none(tmp_path):
     report = sheet_of("6064", "6077", "606C", "60E4sub1", "60E4sub2", tmp_path=tmp_path)
     said = texts(report)
     (line,) = [line for line in said if line.startswith("link position")]
@@ -361,10 +361,10 @@ def test_a_sheet_s_mapping_is_the_one_that_run_would_use(tmp_path):
 
 def test_the_command_prints_one_json_object(capsys):
     assert main(["doctor", "--eds", str(OURS[0]), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["schema"] == "drivelink.doctor/1"
-    assert told["verdict"] in ("ok", "info", "warning")
-    assert {"section", "severity", "subject", "text", "fix"} == set(told["findings"][0])
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["schema"] == "drivelink.doctor/1"
+    assert printed["verdict"] in ("ok", "info", "warning")
+    assert {"section", "severity", "subject", "text", "fix"} == set(printed["findings"][0])
 
 
 @pytest.mark.parametrize(
@@ -575,7 +575,7 @@ def test_signs_and_units_are_checked_against_each_other(samples, severity, expec
 
 
 def test_positions_are_sampled_over_the_roll_over():
-    told, slave = survey(link="[link.encoder]\ncounts_per_rev = 65536")
+    node, slave = survey(link="[link.encoder]\ncounts_per_rev = 65536")
     slave.objects[0x6064, 0].value = 0x7FFFFFFF
     ticks = iter(range(10_000))
 
@@ -584,7 +584,7 @@ def test_positions_are_sampled_over_the_roll_over():
         slave.objects[0x6064, 0].value = (0x7FFFFFF0 + k) & 0xFFFFFFFF
         return 0.01 * k
 
-    samples = run_program(MotionReader([told], clock).program(1.0), Wire([slave]))[5]
+    samples = run_program(MotionReader([node], clock).program(1.0), Wire([slave]))[5]
     positions = [sample.values[Signal.MOTOR_POSITION] for sample in samples]
     assert all(0 < after - before < 1e-4 for before, after in itertools.pairwise(positions))
 

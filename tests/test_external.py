@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivelink._core import Assembler, Chain
+from drivelink._core import Assembler, JointPipeline
 from estimator import (
     EstimatorError,
     EstimatorSettings,
@@ -88,20 +88,20 @@ def samples(rows, measured=False):
         yield Sample(k, (theta,), (math.nan,), (tau,), q, math.nan, external if measured else math.nan)
 
 
-class Told:
+class Estimates:
     """What an estimator said of every sample."""
 
     def __init__(self, joint, rows, *, measured=False, **settings):
         self.estimator = make_estimator(joint, EstimatorSettings(**settings), T)
-        estimates, told = [], []
+        estimates, external = [], []
         for sample in samples(rows, measured):
             estimates.append(self.estimator.step(sample)[:3])
-            told.append(self.estimator.external)
+            external.append(self.estimator.external)
         self.estimate_valid = np.array([int(e[1]) & int(Status.VALID) > 0 for e in estimates])
         self.flexibility = np.array([e[2] for e in estimates])
-        self.status = np.array([e.status for e in told])
+        self.status = np.array([e.status for e in external])
         self.valid, self.contact = self.status & VALID > 0, self.status & CONTACT > 0
-        self.torque, self.std, self.link_torque, self.difference = np.array([e[2:] for e in told]).T
+        self.torque, self.std, self.link_torque, self.difference = np.array([e[2:] for e in external]).T
 
 
 @pytest.fixture(scope="module")
@@ -115,8 +115,8 @@ def free():
 
 
 @pytest.fixture(scope="module")
-def told(pushed):
-    return Told(model(), pushed, contact_torque_nm=0.2)
+def estimated(pushed):
+    return Estimates(model(), pushed, contact_torque_nm=0.2)
 
 
 def filtered(x):
@@ -124,33 +124,33 @@ def filtered(x):
     return StateVariableFilter(3, W, T).apply(x)[0]
 
 
-def test_the_torque_of_a_push_is_found_within_three_per_cent_of_it(pushed, told):
+def test_the_torque_of_a_push_is_found_within_three_per_cent_of_it(pushed, estimated):
     for begin, size in PUSHES:
         # 60 ms are four delays of the filter: what it still lacks of a step then is 0.05 %
         window = slice(round((begin + 0.06) / T), round((begin + PUSH_S) / T))
-        assert told.valid[window].all()
-        off = told.torque[window] - size
+        assert estimated.valid[window].all()
+        off = estimated.torque[window] - size
         assert abs(np.mean(off)) < 0.03 * abs(size), (begin, size, np.mean(off))
         # What is left around that is the noise that the link encoder's steps make of 0.4 kg·m²: 0.045 N·m.
         assert np.sqrt(np.mean(off**2)) < 0.03 * abs(size) + 0.05
 
 
-def test_the_standard_deviation_is_that_of_the_error(pushed, told):
+def test_the_standard_deviation_is_that_of_the_error(pushed, estimated):
     """It holds its error, and is not much larger either: a controller's threshold is made of it."""
-    use = told.valid & (np.arange(len(told.torque)) > LEARNED)
-    off = (told.torque - filtered(pushed["external_torque_nm"]))[use] / told.std[use]
+    use = estimated.valid & (np.arange(len(estimated.torque)) > LEARNED)
+    off = (estimated.torque - filtered(pushed["external_torque_nm"]))[use] / estimated.std[use]
     assert np.mean(np.abs(off) < 1.96) > 0.90
     assert np.sqrt(np.mean(off**2)) > 0.2
 
 
-def test_a_contact_is_raised_by_pushes_and_by_nothing_else(told):
+def test_a_contact_is_raised_by_pushes_and_by_nothing_else(estimated):
     for begin, _ in PUSHES:
         at = round(begin / T)
-        assert not told.contact[at - 200 : at].any()
-        first = int(np.argmax(told.contact[at : at + 400]))
-        assert told.contact[at + first] and first <= 20, (begin, first)  # 20 ms
-        assert not told.contact[at + round((PUSH_S + 0.1) / T)]
-    assert not told.contact[:8000].any()
+        assert not estimated.contact[at - 200 : at].any()
+        first = int(np.argmax(estimated.contact[at : at + 400]))
+        assert estimated.contact[at + first] and first <= 20, (begin, first)  # 20 ms
+        assert not estimated.contact[at + round((PUSH_S + 0.1) / T)]
+    assert not estimated.contact[:8000].any()
 
 
 @pytest.mark.parametrize("error", [0.02, -0.05, 0.10])
@@ -162,26 +162,26 @@ def test_a_link_that_is_off_by_what_is_declared_raises_no_contact(free, error):
         inertia_std_kg_m2=abs(error) * 0.4,
         gravity_std_nm=abs(error) * GRAVITY_NM,
     )
-    told = Told(model(link), free, contact_torque_nm=0.0)
-    assert np.mean(told.valid[LEARNED:]) > 0.9
-    assert not told.contact.any()
+    estimated = Estimates(model(link), free, contact_torque_nm=0.0)
+    assert np.mean(estimated.valid[LEARNED:]) > 0.9
+    assert not estimated.contact.any()
     # It is wrong by what it says: errors that do not average out are in the standard deviation.
-    off = np.abs(told.torque / told.std)[told.valid]
+    off = np.abs(estimated.torque / estimated.std)[estimated.valid]
     assert 0.1 < np.sqrt(np.mean(off**2)) < 1.5
 
 
 def test_friction_at_the_link_below_the_least_torque_is_no_contact():
     rows = record(world(seed=3, effects=("link_coulomb_friction=0.3",)), 14.0)
-    assert not Told(model(), rows, contact_torque_nm=0.7).contact.any()
-    assert Told(model(), rows, contact_torque_nm=0.0).contact.any()  # it is there to be found
+    assert not Estimates(model(), rows, contact_torque_nm=0.7).contact.any()
+    assert Estimates(model(), rows, contact_torque_nm=0.0).contact.any()  # it is there to be found
 
 
 def test_a_bias_takes_a_payload_in_and_lets_a_lasting_push_fade():
     """A constant torque fades as exp(-t/bias_s): here to 13.5 % in 4 s at most, which is what it costs."""
     begin, size = 9.0, 2.0
     rows = record(world(seed=4, external=lambda t: size * (t >= begin)), 14.0)
-    with_bias = Told(model(), rows, contact_torque_nm=0.5, external_bias_s=2.0)
-    without = Told(model(), rows, contact_torque_nm=0.5)
+    with_bias = Estimates(model(), rows, contact_torque_nm=0.5, external_bias_s=2.0)
+    without = Estimates(model(), rows, contact_torque_nm=0.5)
     at = round((begin + 4.0) / T)
     assert without.torque[at] == pytest.approx(size, rel=0.05)
     # while it fades, what is left of it comes and goes with what is learned of the link's friction
@@ -192,37 +192,37 @@ def test_a_bias_takes_a_payload_in_and_lets_a_lasting_push_fade():
 
 def test_the_flexibility_torque_from_the_link_side_is_the_true_one(pushed):
     """Eqs 12, 13 in robust mode: with tau_k measured, -r is tau_e behind the filter and the difference is nothing."""
-    told = Told(model(), pushed, measured=True)
+    estimated = Estimates(model(), pushed, measured=True)
     use = slice(LEARNED, None)
     truth = filtered(pushed["truth_flexibility_torque_nm"])[use]
     # tau_k is held over a period, where the filter takes it as straight: half a period, at a push's edges only
-    off = told.link_torque[use] - truth
+    off = estimated.link_torque[use] - truth
     # 0.04 N·m of encoder noise are 1.6 % of it.
     assert np.sqrt(np.mean(off**2)) < 0.02 * np.sqrt(np.mean(truth**2))
-    assert np.sqrt(np.mean(told.difference[use] ** 2)) < 0.02 * np.sqrt(np.mean(truth**2))
-    consistency = told.estimator.consistency
+    assert np.sqrt(np.mean(estimated.difference[use] ** 2)) < 0.02 * np.sqrt(np.mean(truth**2))
+    consistency = estimated.estimator.consistency
     # its ten seconds begin while the spring is still being learned
     assert consistency.difference_rms_nm < 0.05 * consistency.link_flexibility_torque_rms_nm
 
 
 def test_mode_paper_has_equation_13_and_the_same_external_torque(pushed):
     """-r of eq 12 is tau_e,t through K/(s + K); noise of the differenced position is averaged away over 50 ms."""
-    told = Told(model(), pushed, measured=True, mode="paper", k_tau_rad_s=100.0)
+    estimated = Estimates(model(), pushed, measured=True, mode="paper", k_tau_rad_s=100.0)
     a = first_order_pole(100.0, T)
     truth = linear_filter([1.0 - a], [1.0, -a], pushed["truth_flexibility_torque_nm"])
     smooth = np.ones(50) / 50
-    off = np.convolve(told.link_torque - truth, smooth, "same")[1000:-1000]
+    off = np.convolve(estimated.link_torque - truth, smooth, "same")[1000:-1000]
     assert np.sqrt(np.mean(off**2)) < 0.02 * np.sqrt(np.mean(truth**2))
     # The motor's dry friction is in tau_e of eq 14, and so in the external torque: no better than that.
-    push_found = np.mean(told.torque[round(11.1 / T) : round(11.4 / T)])
+    push_found = np.mean(estimated.torque[round(11.1 / T) : round(11.4 / T)])
     assert push_found == pytest.approx(-3.0, abs=0.75 + 0.3)
 
 
-def test_it_is_valid_only_where_the_estimate_is_and_the_filter_has_settled(told):
-    assert not (told.valid & ~told.estimate_valid).any()
-    assert not (told.contact & ~told.valid).any()
-    assert not told.valid[:100].any()
-    assert np.all(np.isfinite(told.torque[told.valid]) & (told.std[told.valid] > 0.0))
+def test_it_is_valid_only_where_the_estimate_is_and_the_filter_has_settled(estimated):
+    assert not (estimated.valid & ~estimated.estimate_valid).any()
+    assert not (estimated.contact & ~estimated.valid).any()
+    assert not estimated.valid[:100].any()
+    assert np.all(np.isfinite(estimated.torque[estimated.valid]) & (estimated.std[estimated.valid] > 0.0))
 
 
 def test_nothing_is_said_where_nothing_is_declared(free):
@@ -232,7 +232,7 @@ def test_nothing_is_said_where_nothing_is_declared(free):
         assert estimator.external is None and estimator.consistency is None
 
 
-def test_a_rigid_transmission_tells_nothing_of_the_link(free):
+def test_a_rigid_transmission_reveals_nothing_of_the_link(free):
     estimator = make_estimator(model(model="none", order=None), EstimatorSettings(), T)
     for sample in samples({name: column[:500] for name, column in free.items()}):
         estimator.step(sample)
@@ -253,12 +253,12 @@ def test_after_a_restart_it_settles_anew(free):
 
 
 def test_a_cycle_without_a_sample_says_so(free):
-    chain = Chain(Assembler((), 0), make_estimator(model(), EstimatorSettings(), T))
+    pipeline = JointPipeline(Assembler((), 0), make_estimator(model(), EstimatorSettings(), T))
     tick = None
     for sample in samples({name: column[:8000] for name, column in free.items()}):
-        tick = chain.take(sample)
+        tick = pipeline.take(sample)
     assert tick.external.status & VALID and tick.external_payload is not None
-    carried = chain.carry_on(8000)
+    carried = pipeline.carry_on(8000)
     assert (carried.external.sequence, carried.external.status) == (8000, 0)
     assert carried.external.external_torque_nm == tick.external.external_torque_nm
 
@@ -271,9 +271,9 @@ def test_a_service_bit_that_takes_the_estimates_validity_takes_this_one_too(free
         def describe(self):
             return {}
 
-    chain = Chain(Assembler((), 0), make_estimator(model(), EstimatorSettings(), T), Alarm())
+    pipeline = JointPipeline(Assembler((), 0), make_estimator(model(), EstimatorSettings(), T), Alarm())
     for sample in samples({name: column[:8000] for name, column in free.items()}):
-        assert chain.take(sample).external.status == 0
+        assert pipeline.take(sample).external.status == 0
 
 
 @pytest.mark.parametrize("sample", [{"q": math.nan}, {"q": 1e300}, {"tau": math.inf}])

@@ -25,7 +25,7 @@ class Follower:
         self.run.judge.put_sample = self._keep  # type: ignore[method-assign]
 
     def _keep(self, sample, _stamp_ns: int) -> None:
-        status = self.run.chain.estimate.status
+        status = self.run.pipeline.estimate.status
         self.found.append((sample.sequence, status, set(self.run.ticks_of(sample).values())))
 
     def syncs(self, count: int) -> None:
@@ -53,10 +53,10 @@ class Follower:
         return [event["text"] for event in self.run.events.recent()]
 
     def steps(self) -> set[tuple[int, float]]:
-        """From one sample to the next: by how much the sequence grows, and the SYNC that the values tell."""
+        """From one sample to the next: by how much the sequence grows, and the SYNC that the values belong to."""
         assert all(len(ticks) == 1 for _, _, ticks in self.found)  # never two SYNCs in one sample
-        told = [(sequence, next(iter(ticks))) for sequence, _, ticks in self.found]
-        return {(b[0] - a[0], b[1] - a[1]) for a, b in itertools.pairwise(told)}
+        answered = [(sequence, next(iter(ticks))) for sequence, _, ticks in self.found]
+        return {(b[0] - a[0], b[1] - a[1]) for a, b in itertools.pairwise(answered)}
 
 
 def test_every_sync_is_a_sample_of_its_own() -> None:

@@ -45,13 +45,13 @@ def test_the_paper_modes_residual_is_that_over_arrays():
     model = JointModel(arrangement="single", motors=(motor,))
     paper = make_estimator(model, EstimatorSettings(mode="paper", k_tau_rad_s=300.0), T)
     rows = zip(theta.tolist(), omega.tolist(), tau.tolist(), strict=True)
-    told = [paper.step(Sample(k, (x,), (v,), (u,)))[2] for k, (x, v, u) in enumerate(rows)]
+    estimated = [paper.step(Sample(k, (x,), (v,), (u,)))[2] for k, (x, v, u) in enumerate(rows)]
     y = motor_balance(inertia, damping, theta, omega, tau, T)
-    assert np.array(told) == pytest.approx(first_order(y, 300.0, T), abs=1e-9)
+    assert np.array(estimated) == pytest.approx(first_order(y, 300.0, T), abs=1e-9)
 
 
 @pytest.mark.parametrize("held", [False, True])
-def test_the_answer_to_a_pulse_tells_the_whole_filter(held):
+def test_the_impulse_response_determines_the_filter(held):
     filter_ = StateVariableFilter(4, 60.0, T)
     signal = np.cumsum(np.random.default_rng(3).normal(size=1500))
     response = filter_.impulse(filter_.settling_periods, held=held)

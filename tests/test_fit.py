@@ -120,7 +120,7 @@ def test_gaps_and_missing_values_are_bridged_or_left_out(elbow):
     assert _error(found, alpha, truth, 0) < 2e-3
 
 
-def test_what_cannot_be_fitted_is_told(elbow):
+def test_what_cannot_be_fitted_is_reported(elbow):
     plants, _, truth = elbow
     model = joints.joint_model(plants.B[0, 0], plants.D[0, 0])
     record = _record(truth, 0)

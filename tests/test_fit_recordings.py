@@ -70,7 +70,7 @@ def test_each_recording_is_validated_by_the_others(runs: list[Record]) -> None:
     found = identify([*runs, kit.World([{"late_s": LATE_S}], seed=9).run()[0]], model)
     for one in found.recordings:
         assert one.validation is not None
-        # The others tell the machine as well as all do: nothing is fitted to noise.
+        # The others determine the machine as well as all do: nothing is fitted to noise.
         assert one.train.relative <= one.validation.relative < 1.1 * one.train.relative
     stranger = kit.World([{"late_s": LATE_S, "inertia_kg_m2": 0.5 * kit.INERTIA}], seed=9).run()[0]
     *_, last = identify([*runs, stranger], model).recordings
@@ -99,12 +99,12 @@ def test_the_command_takes_several_and_says_how_each_does(
     asked = ["fit", *map(str, paths), "--joint", str(joint), "--out", str(tmp_path), "--write", str(target)]
     assert main(asked) == 0
     said = capsys.readouterr().out
-    told = json.loads((tmp_path / "fit.json").read_text())
-    assert [one["recording"] for one in told["recordings"]] == ["monday.csv", "tuesday.csv"]
-    for one in told["recordings"]:
+    document = json.loads((tmp_path / "fit.json").read_text())
+    assert [one["recording"] for one in document["recordings"]] == ["monday.csv", "tuesday.csv"]
+    for one in document["recordings"]:
         assert f"{one['validation']['rms_nm']:.3g} N·m  {one['validation']['relative']:.2%}" in said
     written = tomllib.loads(target.read_text())
-    assert written["motor"][0]["transmission"]["parameters"] == told["transmissions"][0]["parameters"]
+    assert written["motor"][0]["transmission"]["parameters"] == document["transmissions"][0]["parameters"]
     assert written["provenance"]["fit"]["recording"] == "monday.csv, tuesday.csv"
     assert len(written["provenance"]["floor"]["residual_nm"]) == 1
 
@@ -176,7 +176,7 @@ def test_gravity_and_friction_of_a_joint_with_one_encoder(arm: Record, gravity_n
     found = identify(arm, JointModel(arrangement="single", motors=(motor,), link=link))
     link, (motor,) = found.model.link or link, found.model.motors
     for name, truth in (("gravity_nm", ARM.gravity_nm), ("gravity_phase_rad", ARM.gravity_phase_rad)):
-        # Amplitude and phase share with a constant torque what the arc does not tell: the interval says so.
+        # Amplitude and phase share with a constant torque what the arc does not separate: the interval shows it.
         assert abs(getattr(link, name) - truth) < 3.0 * found.link_std[name]
         assert found.link_std[name] < 0.1 * truth
     effects = {e.name: e.parameters["torque_nm"] for e in motor.effects}

@@ -133,17 +133,17 @@ def test_what_is_printed_is_what_is_written(
     model: str, link: str, run: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (folder / "joint.toml").write_text(ONE.format(model=model) + link)
-    written, told, tables = _fit(folder, run, "joint.toml", capsys)
+    written, document, tables = _fit(folder, run, "joint.toml", capsys)
     (motor,) = written["motor"]
     _same(tables[0], _of_motor(motor))
-    (entry,) = told["transmissions"]
+    (entry,) = document["transmissions"]
     assert entry["parameters"] == motor["transmission"].get("parameters", {})
     assert {k: entry["motor"][k] for k in ("inertia_kg_m2", "viscous_damping_nm_s_rad")} == dict(
         _numbers(motor)
     )
     assert entry.get("effects", []) == motor.get("effect", [])
     owner = written.get("link", {})
-    assert told.get("link", {}) == owner
+    assert document.get("link", {}) == owner
     if owner:
         _same(tables[1], dict(_numbers(owner.get("dynamics", {}))) | _of_effects(owner))
     else:
@@ -153,18 +153,18 @@ def test_what_is_printed_is_what_is_written(
 def test_both_motors_of_a_pair_are_written_as_printed(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    written, told, tables = _fit(folder, "pair", "pair.toml", capsys)
-    for table, motor, entry in zip(tables, written["motor"], told["transmissions"], strict=False):
+    written, document, tables = _fit(folder, "pair", "pair.toml", capsys)
+    for table, motor, entry in zip(tables, written["motor"], document["transmissions"], strict=False):
         _same(table, _of_motor(motor))
         assert entry["parameters"] == motor["transmission"]["parameters"]
         assert entry.get("effects", []) == motor.get("effect", [])
 
 
 def test_a_rigid_joint_is_written_as_printed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    written, told, (table,) = _fit(folder, "rigid", "rigid.toml", capsys)
+    written, document, (table,) = _fit(folder, "rigid", "rigid.toml", capsys)
     (motor,) = written["motor"]
     _same(table, _of_motor(motor))
-    (entry,) = told["transmissions"]
+    (entry,) = document["transmissions"]
     assert {k: entry["motor"][k] for k in ("inertia_kg_m2", "viscous_damping_nm_s_rad")} == dict(
         _numbers(motor)
     )

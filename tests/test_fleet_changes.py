@@ -77,7 +77,7 @@ def test_nights_that_resemble_each_other_are_not_taken_for_a_trend() -> None:
     assert np.mean(np.array(p) < 0.05) < 0.08  # binomial, 500 draws: three sigma above 5 %
 
 
-def test_too_few_recordings_tell_nothing() -> None:
+def test_too_few_recordings_decide_nothing() -> None:
     few = LEAST - 1
     assert series_test(TIME_S[:few], np.linspace(1.0, 2.0, few), STATED[:few]).p_value == 1.0
     assert changes(TIME_S[:few], np.linspace(1.0, 2.0, few), STATED[:few], 0.05) == []

@@ -21,7 +21,7 @@ def quiet() -> Iterator[None]:
 def test_whatever_wires_and_confused_nodes_do_what_is_valid_is_of_its_sync(seed: int) -> None:
     run = FuzzRun(seed)
     run.run(200_000)
-    print(run.told())
+    print(run.summary())
     # The fuzz must leave enough to be judged, and forged frames that fit must stay the exception they are.
     assert run.judge.valid > 0.15 * run.loop.cycles
     assert run.judge.unknowable < 0.01 * run.judge.valid
@@ -31,26 +31,26 @@ def test_whatever_wires_and_confused_nodes_do_what_is_valid_is_of_its_sync(seed:
 def test_forged_answers_to_the_configuration_raise_nothing(seed: int) -> None:
     run = FuzzRun(seed, hostile=True)
     run.run(100_000)
-    print(run.told())
+    print(run.summary())
     assert run.judge.samples
 
 
 def test_a_passive_daemon_fuzzed_raises_nothing_and_sends_nothing() -> None:
     run = FuzzRun(301, passive=True)
     run.run(100_000)
-    print(run.told())
+    print(run.summary())
     assert run.judge.samples
 
 
 def test_the_real_estimator_comes_out_of_it_with_finite_values() -> None:
     run = FuzzRun(401, real=True)
     run.run(40_000)
-    print(run.told())
+    print(run.summary())
     assert run.judge.samples
     run.bus.rate = 0.0
     for _ in range(4000):
         run.cycle()
-    estimate = run.chain.estimate
+    estimate = run.pipeline.estimate
     assert estimate is not None
     assert not estimate.status & Status.STALE
     assert math.isfinite(estimate.flexibility_torque_nm + estimate.stiffness_nm_rad)
@@ -68,4 +68,4 @@ def test_after_all_that_a_calm_bus_gives_valid_estimates_again() -> None:
     for _ in range(1000):
         run.cycle()
     assert run.judge.valid - before == 1000
-    assert run.supervisor.node_status(run.loop.lanes[0])["2"]["state"] == "operational"
+    assert run.supervisor.node_status(run.loop.loop_joints[0])["2"]["state"] == "operational"

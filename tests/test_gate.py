@@ -37,7 +37,7 @@ MEASURED = (  # the first in the default run
     *((f"kuka_kr300/axis{axis}_{run}.csv", f"kuka_axis{axis}") for axis in (2, 3) for run in "AB"),
     *((f"uw_sea/uw_{run}.csv", "") for run in ("InnerLoop", "DoubleLoopReference", "DoubleLoopDisturbance")),
 )
-# What these recordings do not tell. The inertia takes 2 % of axis 3's torque, whose balance leaves 12 %.
+# What these recordings do not decide. The inertia takes 2 % of axis 3's torque, whose balance leaves 12 %.
 UNTOLD = {(f"kuka_kr300/axis3_{run}.csv", "torque in N·mm") for run in "AB"}
 # InnerLoop was recorded with the link held: a deflection is a motor position there.
 OF_A_HELD_LINK = {"torque in N·mm", "time in ms"}
@@ -51,7 +51,7 @@ def same(a: float, b: float) -> bool:
 
 
 def named(findings: list[Discrepancy], factors: dict[str, float]) -> bool:
-    """Whether the findings, or what they say cannot be told from them, undo these factors."""
+    """Whether the findings, or what they say cannot be separated from them, undo these factors."""
     options = [[f.changes for f in findings]]
     for k, finding in enumerate(findings):
         options += [[*options[0][:k], other, *options[0][k + 1 :]] for other in finding.alternatives]
@@ -83,14 +83,16 @@ def test_each_fault_is_named(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", gatekit.KINDS)
-def test_a_rich_motion_tells_every_sign_and_the_unit_of_the_link(kind: str) -> None:
-    told = [judge(d.record, d.model) for d in (gatekit.draw(kind, seed, seconds=6.0) for seed in (7, 8))]
-    for judgement in told:
+def test_a_rich_motion_decides_every_sign_and_the_unit_of_the_link(kind: str) -> None:
+    judgements = [
+        judge(d.record, d.model) for d in (gatekit.draw(kind, seed, seconds=6.0) for seed in (7, 8))
+    ]
+    for judgement in judgements:
         assert judgement.reason == "" and judgement.left < 0.3
         assert not any("sign" in text and "link" in text for text in judgement.untold), judgement.untold
 
 
-def test_of_a_link_that_is_held_it_is_said_that_its_sign_cannot_be_told() -> None:
+def test_the_sign_of_a_link_that_is_held_is_reported_as_undecided() -> None:
     drawn = gatekit.draw("soft", 4, held=True)
     judgement = judge(drawn.record, drawn.model)
     assert judgement.findings == ()
@@ -101,7 +103,7 @@ def test_of_a_link_that_is_held_it_is_said_that_its_sign_cannot_be_told() -> Non
     assert any("sign" in text and "link" in text for text in untold), untold
 
 
-def test_a_torque_that_is_only_noise_tells_nothing() -> None:
+def test_a_torque_that_is_only_noise_decides_nothing() -> None:
     drawn = gatekit.draw("soft", 5)
     noise = np.random.default_rng(1).normal(0.0, 1e-3, drawn.record.motor_torque_nm.shape)
     judgement = judge(replace(drawn.record, motor_torque_nm=noise), drawn.model)
@@ -143,13 +145,13 @@ def test_fit_and_diagnose_refuse_by_the_same_words(degrees: gatekit.Drawn) -> No
     assert said[0] == said[1]
 
 
-def test_diagnose_says_what_the_motion_does_not_tell() -> None:
+def test_diagnose_reports_what_the_motion_does_not_decide() -> None:
     drawn = gatekit.draw("soft", 4, held=True)
     outcome = diagnose(drawn.record, drawn.model)
     assert any("does not reveal" in note and "link position" in note for note in outcome.notes), outcome.notes
 
 
-def test_a_recording_too_short_to_tell_is_not_judged(degrees: gatekit.Drawn) -> None:
+def test_a_recording_that_is_too_short_is_not_judged(degrees: gatekit.Drawn) -> None:
     r = degrees.record
     assert r.link_position_rad is not None
     short = Record(
@@ -303,7 +305,7 @@ def test_a_real_machine_passes_as_it_is_and_no_fault_of_it_does(path: str, joint
             continue
         findings = examine(gatekit.faulty(record, factors), model)
         assert findings, name
-        if record.link_position_rad is not None:  # with one encoder, only scales of inertia can be told
+        if record.link_position_rad is not None:  # with one encoder, only scales of inertia can be found
             assert named(findings, factors), (name, findings)
 
 

@@ -14,7 +14,7 @@ import pytest
 from daemonkit import running, vsa
 from zenohkit import until
 
-from drivelink._core import Chain
+from drivelink._core import JointPipeline
 from drivelink.canopen.bus import open_bus
 from drivelink.cycle.framesource import BusLostError
 from drivelink.cycle.sources import open_source
@@ -108,8 +108,8 @@ def devices(joint: JointFile) -> Iterator[Network]:
         bus.shutdown()
 
 
-def is_valid(chain: Chain) -> bool:
-    return chain.estimate is not None and bool(chain.estimate.status & Status.VALID)
+def is_valid(pipeline: JointPipeline) -> bool:
+    return pipeline.estimate is not None and bool(pipeline.estimate.status & Status.VALID)
 
 
 def lost(daemon: Daemon) -> bool:
@@ -123,14 +123,14 @@ def test_a_joint_behind_a_serial_adapter_that_is_pulled_out_and_put_in(tmp_path:
     try:
         with devices(behind):
             daemon = Daemon([ServedJoint(joint=joint)], publish=False, real_time=False)
-            chain = daemon.chains[0]
+            pipeline = daemon.pipelines[0]
             with running(daemon):
-                until(lambda: is_valid(chain))
+                until(lambda: is_valid(pipeline))
                 adapter.pull_out()
                 until(lambda: lost(daemon))
-                until(lambda: not is_valid(chain))
+                until(lambda: not is_valid(pipeline))
                 adapter.put_in()
-                until(lambda: is_valid(chain))
+                until(lambda: is_valid(pipeline))
                 assert not lost(daemon)
             assert {"S8", "O"} <= set(adapter.commands)
     finally:
@@ -146,15 +146,15 @@ def test_a_socketcand_server_that_goes_and_comes_back() -> None:
     joint = joint_on("socketcand", "can0", f'host = "127.0.0.1", port = {free_port()}')
     with devices(joint):
         daemon = Daemon([ServedJoint(joint=joint)], publish=False, real_time=False)
-        chain = daemon.chains[0]
+        pipeline = daemon.pipelines[0]
         thread = running(daemon)
         thread.__enter__()
-        until(lambda: is_valid(chain))
+        until(lambda: is_valid(pipeline))
     try:
         until(lambda: lost(daemon))
-        until(lambda: not is_valid(chain))
+        until(lambda: not is_valid(pipeline))
         with devices(joint):
-            until(lambda: is_valid(chain))
+            until(lambda: is_valid(pipeline))
             assert not lost(daemon)
     finally:
         thread.__exit__(None, None, None)
@@ -197,12 +197,12 @@ def test_a_second_daemon_under_another_name_is_refused_on_socketcand() -> None:
     with devices(joint):
         daemon = Daemon([ServedJoint(joint=joint)], publish=False, real_time=False)
         with running(daemon):
-            until(lambda: is_valid(daemon.chains[0]))
+            until(lambda: is_valid(daemon.pipelines[0]))
             other = joint.model_copy(update={"name": "other"})
-            reboots = [c.reboots for c in daemon.chains[0].assembler.counters.values()]
+            reboots = [c.reboots for c in daemon.pipelines[0].assembler.counters.values()]
             with pytest.raises(BusError, match="another master already makes SYNC"):
                 Daemon([ServedJoint(joint=other)], publish=False, real_time=False)
-            assert [c.reboots for c in daemon.chains[0].assembler.counters.values()] == reboots
+            assert [c.reboots for c in daemon.pipelines[0].assembler.counters.values()] == reboots
             assert not any("configured again" in e["text"] for e in daemon.events.recent())
 
 

@@ -222,8 +222,8 @@ def test_a_copy_of_a_written_file_has_one_check_line(written: Path) -> None:
 
 def test_the_daemon_does_not_take_a_part_of_a_joint_file_over(written: Path) -> None:
     events = EventLog(logging.getLogger("drivelink.test"))
-    chain: Any = SimpleNamespace(history=None)  # never reached
-    reloader = Reloader(written, jointfile.load(written), chain, chain, chain, events)
+    pipeline: Any = SimpleNamespace(history=None)  # never reached
+    reloader = Reloader(written, jointfile.load(written), pipeline, pipeline, pipeline, events)
     written.write_bytes(written.read_bytes()[:-40])
     reloader._prepare()
     (said,) = [event["text"] for event in events.recent()]

@@ -91,7 +91,7 @@ def test_an_effect_raises_the_alarm_and_its_place_is_named(
 def test_what_the_link_alone_does_is_no_alarm_where_nobody_measures_what_touches_it(
     runs: dict[str, Record], fitted: tuple[JointModel, ResidualBaseline]
 ) -> None:
-    """It may be a push, and says nothing against the flexibility torque: the external torque tells it."""
+    """It may be a push, and says nothing against the flexibility torque: the external torque shows it."""
     monitor = ModelMonitor(fitted[0], kit.PERIOD_S, fitted[1])
     assert not any(_play(monitor, runs["gravity_nm"]))
     assert monitor.residual_nm[1] > 2.0 * fitted[1].residual_nm[1]
@@ -127,8 +127,8 @@ def test_a_registered_law_is_monitored_like_one_of_the_library(
         for joint in (model, replace(model, motors=(replace(model.motors[0], transmission=mine),)))
     ]
     some = first_rows(runs["coulomb_nm"], 2600)
-    told = [_play(monitor, some) for monitor in monitors]
-    assert told[0] == told[1] and any(told[0])
+    raised = [_play(monitor, some) for monitor in monitors]
+    assert raised[0] == raised[1] and any(raised[0])
     assert monitors[1].residual_nm == pytest.approx(monitors[0].residual_nm)
 
 

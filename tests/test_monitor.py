@@ -1,4 +1,4 @@
-"""The live views: what fits where, what is told apart, and the page in a real browser."""
+"""The live views: what fits where, what is distinguished, and the page in a real browser."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_what_is_not_finite_breaks_nothing() -> None:
     assert json.dumps(snapshot(view, True, {}), allow_nan=False)
 
 
-def test_the_view_shows_what_touches_the_link_where_that_is_told() -> None:
+def test_the_view_shows_what_touches_the_link_where_that_is_known() -> None:
     view = filled()
     assert not any(line.startswith("│ external") for line in lines(view))
     for k in range(4000):
@@ -227,8 +227,8 @@ def test_without_a_terminal_monitor_prints_plain_lines(
 
 def test_monitor_prints_json_lines(daemon: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["monitor", "--endpoint", daemon, "--seconds", "2", "--every", "0.5", "--json"]) == 0
-    told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    last = told[-1]
+    displayed = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    last = displayed[-1]
     assert last["joint"] == "elbow" and last["live"] and last["state"] == "running"
     assert last["estimate"]["stiffness"] == 700.0 and last["status"]["state"] == "running"
 
@@ -344,8 +344,8 @@ def test_a_daemon_that_is_gone_leaves_no_green_and_no_live_numbers() -> None:
     text = "\n".join(lines(view))
     assert "daemon gone, last estimate 12 s ago" in text
     assert "operational" not in text and "● valid" not in text
-    told = snapshot(view, False, {})
-    assert not told["live"] and told["estimate"]["flags"] == [(view.state, "bold red")]
+    displayed = snapshot(view, False, {})
+    assert not displayed["live"] and displayed["estimate"]["flags"] == [(view.state, "bold red")]
     assert "daemon gone" in view.line() and "observable" not in view.line()
 
 
@@ -395,17 +395,17 @@ def test_the_residual_is_a_gauge_against_its_baseline_before_and_after() -> None
     view = filled()
     view.status, view.model = ALARM, IMPROVED
     assert view.history.residuals[-1][1] == pytest.approx(3.0)
-    told = snapshot(view, True, {})
-    assert told["status"]["balances"][0][3] == pytest.approx(3.0) and told["residuals"]
+    displayed = snapshot(view, True, {})
+    assert displayed["status"]["balances"][0][3] == pytest.approx(3.0) and displayed["residuals"]
     assert "residual 3.0" in view.line() and "8.1 % before its effects, 1.2 % after" in view.line()
 
 
 def test_every_view_says_what_to_do_on_a_model_alarm() -> None:
     view = filled()
     view.status = ALARM
-    told = snapshot(view, True, {})["status"]
+    displayed = snapshot(view, True, {})["status"]
     assert "do not control on it; drivelink diagnose says why" in "\n".join(lines(view, 80))
-    for text in (view.line(), "\n".join(lines(view, 240)), told["advice"]):
+    for text in (view.line(), "\n".join(lines(view, 240)), displayed["advice"]):
         assert "likely at the transmission" in text and "drivelink diagnose" in text
     view.status = STATUS
     assert "diagnose" not in view.line() and not snapshot(view, True, {})["status"]["alarm"]

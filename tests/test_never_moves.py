@@ -111,16 +111,16 @@ def test_a_passive_daemon_puts_no_frame_on_the_bus_whatever_happens(monkeypatch:
             starting.join(20.0)
             (follower,) = made
             with running(follower):
-                lane = follower.loop.lanes[0]
-                until(lambda: lane.estimates > 100)
+                loop_joint = follower.loop.loop_joints[0]
+                until(lambda: loop_joint.estimates > 100)
                 network.nodes[0].reset_node()
-                before = lane.chain.assembler.counters[1].received
-                until(lambda: lane.chain.assembler.counters[1].received > before + 100)
+                before = loop_joint.pipeline.assembler.counters[1].received
+                until(lambda: loop_joint.pipeline.assembler.counters[1].received > before + 100)
                 network.power_off(network.nodes[1])
                 time.sleep(0.7)
                 network.power_on(network.nodes[1])
-                before = lane.chain.assembler.counters[2].received
-                until(lambda: lane.chain.assembler.counters[2].received > before + 100)
+                before = loop_joint.pipeline.assembler.counters[2].received
+                until(lambda: loop_joint.pipeline.assembler.counters[2].received > before + 100)
                 assert follower.documents()[0]["bus"]["lost_sends"] == 0
             assert master.is_alive()
     mine = [cob_id for sender, cob_id in senders if sender is follower._port.bus]

@@ -34,7 +34,7 @@ def run(seconds, *, scale_at=(np.inf, 1.0), coulomb=0.0, seed=11):
         *joints.polynomial(alpha), B, D, M, Dq, gravity, coulomb=coulomb, scale_at=scale_at
     )
     truth = joints.simulate(plants, joints.sweep(rng, n, N, 1, T, np.full((1, N, 1), 7.0), 3.0), T)
-    told = []
+    estimates = []
     for j in range(N):
         record = joints.record(
             truth,
@@ -46,8 +46,8 @@ def run(seconds, *, scale_at=(np.inf, 1.0), coulomb=0.0, seed=11):
             torque_noise=rng.normal(0, 0.04, (n, 1)),
         )
         estimator = make_estimator(joints.joint_model(B[j, 0], D[j, 0]), EstimatorSettings(), T)
-        told.append(np.array([estimator.step(sample)[:5] for sample in record.samples()]))
-    return told, truth
+        estimates.append(np.array([estimator.step(sample)[:5] for sample in record.samples()]))
+    return estimates, truth
 
 
 def changed(out):
@@ -61,8 +61,8 @@ def valid(out):
 @pytest.mark.parametrize("factor", [0.9, *(pytest.param(f, marks=pytest.mark.slow) for f in (0.8, 1.25))])
 def test_a_step_of_the_stiffness_is_announced_and_followed_and_not_valid_meanwhile(factor):
     at = 7000
-    told, truth = run(9.0, scale_at=(at * T, factor))
-    for j, out in enumerate(told):
+    estimates, truth = run(9.0, scale_at=(at * T, factor))
+    for j, out in enumerate(estimates):
         assert not np.any(changed(out)[:at])
         found = at + int(np.argmax(changed(out)[at:]))
         assert changed(out)[found] and found < at + 250
@@ -78,14 +78,14 @@ def test_friction_that_nobody_declared_is_no_change_but_widens_the_interval():
     """0.3 N·m is 3 to 5 % of the torque: it comes in bursts, at reversals."""
     widths = []
     for coulomb in (0.0, 0.3):
-        told, truth = run(14.0, coulomb=coulomb)
+        estimates, truth = run(14.0, coulomb=coulomb)
         late = slice(5000, None)
-        for j, out in enumerate(told):
+        for j, out in enumerate(estimates):
             assert not np.any(changed(out))
             assert np.mean(valid(out)[late]) > 0.95
             off = np.abs(out[late, 3] - truth.sigma[late, j, 0])
             assert np.mean(off < 3.0 * out[late, 4]) > 0.9
-        widths.append(np.median([np.median(out[late, 4] / out[late, 3]) for out in told]))
+        widths.append(np.median([np.median(out[late, 4] / out[late, 3]) for out in estimates]))
     assert widths[1] > 1.2 * widths[0]
 
 
@@ -101,9 +101,9 @@ def test_a_fitted_spring_is_not_left_for_a_wrong_one():
     found = fit(record, kit.declared("constant", parameters={}))
     for seed in (1, 2):
         motion = kit.motion("constant", 8.0, seed=seed)
-        told, _ = kit.play(kit.declared("constant", parameters=found[0].parameters), motion.samples)
-        assert not np.any(kit.wrong(told, motion.stiffness_nm_rad))
-        assert np.mean(told.valid[4000:]) > 0.99
+        estimates, _ = kit.play(kit.declared("constant", parameters=found[0].parameters), motion.samples)
+        assert not np.any(kit.wrong(estimates, motion.stiffness_nm_rad))
+        assert np.mean(estimates.valid[4000:]) > 0.99
 
 
 def test_a_measured_curve_is_a_model_too():

@@ -6,7 +6,7 @@ in the interval. `linear` is the polynomial that has one power for good: there t
 0.3 % of the largest torque, and with `order = 1` and no parameters K was held at nothing at all.
 
 "Within its interval" is three standard deviations, or what nobody can notice: 0.2 % of the stiffness, as seconds in
-which an error hardly changes are one draw. For the VSA-II it is 0.5 %: where the motion hardly tells its shape (here
+which an error hardly changes are one draw. For the VSA-II it is 0.5 %: where the motion hardly reveals its shape (here
 |phi| < 0.07 rad of 1.26), k and c run along the line on which they make up for each other, and each new tangent on
 the way leaves them surer than what was measured. That falls short; it was 0.36 % at most.
 """
@@ -94,8 +94,8 @@ def sensed(truth, noisy):
 def ends(model, order, parameters, noisy):
     """Share of the last two seconds that is valid, and what of it is outside three standard deviations."""
     truth = moved(model)
-    told = joints.joint_model(B, D, model=model, order=order, parameters=parameters)
-    estimator = make_estimator(told, EstimatorSettings(), T)
+    joint_declared = joints.joint_model(B, D, model=model, order=order, parameters=parameters)
+    estimator = make_estimator(joint_declared, EstimatorSettings(), T)
     out = np.array([estimator.step(sample)[:5] for sample in sensed(truth, noisy).samples()])[LAST]
     valid = out[:, 1].astype(int) & 1 > 0
     sigma = truth.sigma[LAST, 0, 0]

@@ -1,4 +1,4 @@
-"""Encoders from 12 to 26 bits, quiet or noisy, slow or fast: valid where the stiffness is told, never wrong.
+"""Encoders from 12 to 26 bits, quiet or noisy, slow or fast: valid where the motion determines the stiffness, never wrong.
 
 Fine, quiet encoders used to cost `valid`: 2^22 counts a revolution left one sample in 35, although the
 stiffness was right. The deflection filter starts anew where its innovation is twelve standard deviations, and
@@ -24,10 +24,10 @@ COARSE = (12, *(pytest.param(bits, marks=SLOW) for bits in (14, 16)))
 QUIET = pytest.mark.parametrize("noise", [pytest.param(False, marks=SLOW), True], ids=["quiet", "noisy"])
 
 
-def told_of(name, bits, noise, excitation=None):
+def estimates_of(name, bits, noise, excitation=None):
     motion = kit.motion(name, SECONDS, bits=bits, noise=noise, excitation=excitation)
-    told, _ = kit.play(kit.declared(name), motion.samples)
-    return told, kit.wrong(told, motion.stiffness_nm_rad)
+    estimates, _ = kit.play(kit.declared(name), motion.samples)
+    return estimates, kit.wrong(estimates, motion.stiffness_nm_rad)
 
 
 @QUIET
@@ -36,18 +36,18 @@ def told_of(name, bits, noise, excitation=None):
 @pytest.mark.parametrize("pace", ["fast", pytest.param("slow", marks=SLOW)])
 def test_fine_encoders_cost_no_valid(name, pace, bits, noise):
     excitation = case(name).excitation if pace == "slow" else None  # slow: one sine of 0.05 Hz a motor
-    told, wrong = told_of(name, bits, noise, excitation)
+    estimates, wrong = estimates_of(name, bits, noise, excitation)
     assert not np.any(wrong)
     # At 17 bits the constant case has one false alarm in these 7 s; the 0.27 s after it are not valid.
-    assert np.mean(told.valid[SETTLED:]) > (0.95 if (name, bits) == ("constant", 17) else 0.99)
+    assert np.mean(estimates.valid[SETTLED:]) > (0.95 if (name, bits) == ("constant", 17) else 0.99)
 
 
 @QUIET
 @pytest.mark.parametrize("bits", COARSE)
 @pytest.mark.parametrize("name", ["constant", "vsa-ii"])
 def test_coarse_encoders_are_never_wrong_and_valid(name, bits, noise):
-    """A large inertia behind 12 bits tells no stiffness; then nothing is valid rather than something wrong."""
-    _, wrong = told_of(name, bits, noise)
+    """A large inertia behind 12 bits reveals no stiffness; then nothing is valid rather than something wrong."""
+    _, wrong = estimates_of(name, bits, noise)
     assert not np.any(wrong)
 
 

@@ -20,11 +20,11 @@ def test_cycles_lost_at_random_cost_little_and_make_nothing_wrong(name, share, l
     motion = kit.motion(name, SECONDS)
     for seed in range(2):
         samples, kept = kit.without(motion.samples, share, seed)
-        told, _ = kit.play(kit.declared(name), samples)
-        assert not np.any(kit.wrong(told, motion.stiffness_nm_rad[kept]))
+        estimates, _ = kit.play(kit.declared(name), samples)
+        assert not np.any(kit.wrong(estimates, motion.stiffness_nm_rad[kept]))
         late = kept > SETTLED
-        assert np.mean(told.valid[late]) >= least
-        learning = told.status[late] & kit.OBSERVABLE > 0
+        assert np.mean(estimates.valid[late]) >= least
+        learning = estimates.status[late] & kit.OBSERVABLE > 0
         assert np.mean(learning) > 0.8
 
 
@@ -36,7 +36,7 @@ def test_a_late_link_encoder_is_found_while_cycles_are_lost():
         for k, sample in enumerate(motion.samples)
     ]
     left, kept = kit.without(samples, 0.05, 1)
-    told, _ = kit.play(kit.declared("vsa-ii"), left)
+    estimates, _ = kit.play(kit.declared("vsa-ii"), left)
     end = kept > SETTLED + 5000
-    assert np.mean(told.valid[end]) > 0.95
-    assert not np.any(kit.wrong(told, motion.stiffness_nm_rad[kept])[end])
+    assert np.mean(estimates.valid[end]) > 0.95
+    assert not np.any(kit.wrong(estimates, motion.stiffness_nm_rad[kept])[end])

@@ -29,10 +29,10 @@ measured = pytest.mark.skipif(
 )
 
 
-def unusable(told):
+def unusable(estimates):
     """Valid although the stiffness, or the end of its interval, is not above zero; no interval counts as none."""
-    std = np.where(np.isnan(told.std_nm_rad), 0.0, told.std_nm_rad)
-    return told.valid & ~(told.stiffness_nm_rad - 1.96 * std > 0.0)
+    std = np.where(np.isnan(estimates.std_nm_rad), 0.0, estimates.std_nm_rad)
+    return estimates.valid & ~(estimates.stiffness_nm_rad - 1.96 * std > 0.0)
 
 
 @pytest.mark.parametrize("method", ["mbe", "bbe"])
@@ -40,23 +40,23 @@ def unusable(told):
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_valid_is_above_zero(name, mode, method):
     motion = kit.motion(name, 6.0)
-    told, _ = kit.play(kit.declared(name, parameters={}), motion.samples, mode=mode, method=method)
-    assert not np.any(unusable(told))
+    estimates, _ = kit.play(kit.declared(name, parameters={}), motion.samples, mode=mode, method=method)
+    assert not np.any(unusable(estimates))
 
 
 def test_a_paper_stiffness_that_changes_its_sign_is_hardly_ever_valid():
     motion = kit.motion("vsa-ii", 8.0)
-    told, _ = kit.play(kit.declared("vsa-ii"), motion.samples, mode="paper")
-    assert np.mean(told.stiffness_nm_rad <= 0.0) > 0.2
-    assert np.mean(told.valid) < 0.01
+    estimates, _ = kit.play(kit.declared("vsa-ii"), motion.samples, mode="paper")
+    assert np.mean(estimates.stiffness_nm_rad <= 0.0) > 0.2
+    assert np.mean(estimates.valid) < 0.01
 
 
 def test_a_paper_stiffness_that_holds_still_is_valid():
     motion = kit.motion("constant", 10.0)
-    told, _ = kit.play(kit.declared("constant"), motion.samples, mode="paper", method="mbe")
+    estimates, _ = kit.play(kit.declared("constant"), motion.samples, mode="paper", method="mbe")
     late = slice(6000, None)
-    assert np.mean(told.valid[late]) > 0.95
-    assert told.stiffness_nm_rad[late] == pytest.approx(motion.stiffness_nm_rad[late], rel=0.01)
+    assert np.mean(estimates.valid[late]) > 0.95
+    assert estimates.stiffness_nm_rad[late] == pytest.approx(motion.stiffness_nm_rad[late], rel=0.01)
 
 
 @measured
@@ -68,8 +68,8 @@ def test_on_a_measured_axis_too(axis, mode):
     estimator = make_estimator(joint.model(), EstimatorSettings(mode=mode), record.period_s)
     rows = [estimator.step(sample)[:5] for sample in record.samples()]
     _, status, torque, stiffness, std = np.array(rows).T
-    told = kit.Told(status.astype(int), torque, stiffness, std)
-    assert not np.any(unusable(told))
+    estimates = kit.Estimates(status.astype(int), torque, stiffness, std)
+    assert not np.any(unusable(estimates))
 
 
 @pytest.mark.parametrize("coefficients", [(-5.0,), (-1.0, 200.0), (0.0, 0.0)])

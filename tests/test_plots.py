@@ -1,4 +1,4 @@
-"""Plots: one style, told apart without colour, the same file for the same data."""
+"""Plots: one style, legible without colour, the same file for the same data."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_neighbouring_colours_differ_in_lightness() -> None:
     assert min(abs(a - b) for i, a in enumerate(values) for b in values[:i]) > 20
 
 
-def test_bars_carry_hatches_so_that_a_grey_print_tells_them_apart() -> None:
+def test_bars_carry_hatches_so_that_a_grey_print_distinguishes_them() -> None:
     _, (axes,) = new_figure()
     bars(axes, {"paper": {"A": 1.0, "B": 2.0}, "robust": {"A": 0.5}, "floor": {"B": 0.1}}, "error / %")
     assert len({patch.get_hatch() for patch in axes.patches}) == 3

@@ -13,7 +13,7 @@ from drivelink.output.progress import Meter, track
 
 
 class Clock:
-    """Seconds that pass as told."""
+    """Seconds that pass when asked to."""
 
     def __init__(self) -> None:
         self.now_s = 100.0
@@ -87,7 +87,7 @@ def test_work_that_breaks_off_leaves_the_terminal_as_it_was(clock: Clock) -> Non
     assert "\x1b[?25h" in text(shown)  # the cursor is back
 
 
-def test_the_total_is_taken_from_the_items_where_they_tell(clock: Clock) -> None:
+def test_the_total_is_taken_from_the_items_where_they_have_a_length(clock: Clock) -> None:
     shown = console(terminal=False)
     for _ in track([0] * 20, "fit", console=shown):
         clock.now_s += 1.0

@@ -133,9 +133,9 @@ def test_a_flood_of_queries_waits_for_the_slack_and_most_of_it_is_dropped(publis
     time.sleep(0.3)  # for all of them to have come
     for _ in range(20):
         publisher.answer()
-    told = [reply for answer in answers for reply in answer if reply.ok]
-    assert 1 <= len(told) <= 20
-    assert json.loads(told[-1].ok.payload.to_bytes())["joint"] == "elbow"
+    answered = [reply for answer in answers for reply in answer if reply.ok]
+    assert 1 <= len(answered) <= 20
+    assert json.loads(answered[-1].ok.payload.to_bytes())["joint"] == "elbow"
 
 
 def test_model_status_and_schema_answer_queries_with_json(publisher, client, joint, answering):
@@ -161,11 +161,13 @@ def test_the_model_says_its_effects_and_where_it_comes_from(endpoint):
     json.loads(to_json(model))
 
 
-def test_the_schema_tells_how_to_read_the_bytes():
-    told = schema()
-    assert [field["name"] for field in told["estimate"]["fields"]] == list(wire.EstimateMessage._fields[:6])
-    assert {bit["name"]: bit["bit"] for bit in told["status_bits"]}["observable"] == 1
-    assert [1 << bit["bit"] for bit in told["status_bits"]] == [int(bit) for bit in Status]
+def test_the_schema_describes_the_bytes():
+    document = schema()
+    assert [field["name"] for field in document["estimate"]["fields"]] == list(
+        wire.EstimateMessage._fields[:6]
+    )
+    assert {bit["name"]: bit["bit"] for bit in document["status_bits"]}["observable"] == 1
+    assert [1 << bit["bit"] for bit in document["status_bits"]] == [int(bit) for bit in Status]
 
 
 def test_numbers_that_are_not_finite_become_null():
@@ -196,8 +198,8 @@ def test_nothing_that_others_write_changes_what_the_daemon_says(publisher, clien
         client.delete(f"drivelink/elbow/{name}")
     client.put("@/**/config/mode", b"client")
     assert {name: ask(client, f"drivelink/elbow/{name}") for name in before} == before
-    told = [str(reply.ok.key_expr) for reply in client.get("@/**", timeout=0.5) if reply.ok]
-    assert not [key for key in told if key.split("/")[1] != str(client.zid())]  # no admin space either
+    answered = [str(reply.ok.key_expr) for reply in client.get("@/**", timeout=0.5) if reply.ok]
+    assert not [key for key in answered if key.split("/")[1] != str(client.zid())]  # no admin space either
 
 
 def test_a_subscriber_that_stopped_does_not_stop_the_publisher(publisher, endpoint):

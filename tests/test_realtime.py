@@ -1,4 +1,4 @@
-"""What is asked of the operating system is given back; deadlines are whole periods; systemd is told."""
+"""What is asked of the operating system is given back; deadlines are whole periods; systemd is notified."""
 
 import gc
 import os
@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 from canlayouts import VSA, vsa_cycle
 
-from drivelink._core import Assembler, Chain
+from drivelink._core import Assembler, JointPipeline
 from drivelink.cycle import pacing, realtime
 from drivelink.cycle.framesource import Frame
 from drivelink.cycle.housekeeping import Housekeeping
-from drivelink.cycle.loop import CycleLoop, Lane, ObjectSink
+from drivelink.cycle.loop import CycleLoop, LoopJoint, ObjectSink
 from drivelink.daemon.systemd_notify import notify, watchdog_period_s
 from estimator.sample import Estimate, Sample
 
@@ -120,8 +120,8 @@ class Stamps(ObjectSink):
 def test_deadlines_move_by_whole_periods_and_late_cycles_are_left_out_as_gaps() -> None:
     source, sink = Echo(), Stamps(100)
     source.delay = {20: 0.005, 50: 0.0101}
-    lane = Lane("x", Chain(Assembler(VSA, 2), Last()), sink)
-    loop = sink.loop = CycleLoop(source, [lane], period_s=0.001)
+    loop_joint = LoopJoint("x", JointPipeline(Assembler(VSA, 2), Last()), sink)
+    loop = sink.loop = CycleLoop(source, [loop_joint], period_s=0.001)
     pacing.run(loop)
     assert loop.overruns >= 4 + 9
     for (before, stamp_before), (after, stamp) in pairwise(sink.seen):
@@ -171,7 +171,9 @@ def test_a_task_that_never_finds_slack_is_done_all_the_same_after_a_while() -> N
     assert 1 <= len(done) <= 4
 
 
-def test_systemd_is_told_and_its_absence_is_no_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_systemd_is_notified_and_its_absence_is_no_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     assert not notify("READY=1")
     address = str(tmp_path / "notify")

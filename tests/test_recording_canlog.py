@@ -223,7 +223,7 @@ def test_lost_syncs_are_a_gap() -> None:
     assert jumps(stamps) == expected
 
 
-def test_syncs_that_are_not_due_are_told() -> None:
+def test_syncs_that_are_not_due_are_reported() -> None:
     stamps = [float(k) for k in range(200)]
     stamps[150:150] = [149.2]  # a second master
     assert jumps(stamps) == [1] * 150 + [0] + [1] * 50

@@ -233,7 +233,7 @@ def test_a_clock_that_is_set_makes_a_gap_and_loses_nothing(
     expected = jump_s * 1e3 + 1 if jump_s > 0 else 1000
     assert np.count_nonzero(steps != 1) == 1 and steps.max() == pytest.approx(
         expected, rel=1e-4, abs=2
-    )  # 200 SYNCs with stamps in microseconds tell the period to 1e-4 of it
+    )  # 200 SYNCs with stamps in microseconds give the period to 1e-4 of it
     if jump_s < 0:
         assert "the stamps jump back by" in caplog.text
 

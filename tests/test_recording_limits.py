@@ -62,10 +62,10 @@ def one_line(caught: pytest.ExceptionInfo[RecordingError]) -> str:
     return text
 
 
-def zstd_bomb(size: int, told: bool) -> bytes:
+def zstd_bomb(size: int, sized: bool) -> bytes:
     out = io.BytesIO()
     packer = zstandard.ZstdCompressor()
-    with packer.stream_writer(out, size=size if told else -1, closefd=False) as writer:
+    with packer.stream_writer(out, size=size if sized else -1, closefd=False) as writer:
         for _ in range(size >> 24):
             writer.write(bytes(1 << 24))
     return out.getvalue()
@@ -88,8 +88,8 @@ def chunk(compression: bytes, packed: bytes, size: int) -> bytes:
 @pytest.mark.parametrize(
     ("compression", "packed"),
     [
-        (b"zstd", lambda: zstd_bomb(GIB, told=True)),
-        (b"zstd", lambda: zstd_bomb(GIB, told=False)),
+        (b"zstd", lambda: zstd_bomb(GIB, sized=True)),
+        (b"zstd", lambda: zstd_bomb(GIB, sized=False)),
         (b"lz4", lambda: lz4_bomb(GIB)),
     ],
 )

@@ -17,7 +17,7 @@ import zenohkit
 
 from drivelink import cli, jointfile
 from drivelink.canopen.bus import open_bus
-from drivelink.cli.record import _Teller
+from drivelink.cli.record import _Summary
 from drivelink.cycle.framesource import Frame, FrameSource
 from drivelink.recording import read
 from drivelink.recording.canlog import read_frames
@@ -167,7 +167,7 @@ def test_a_bus_is_recorded_by_listening_only(suffix: str, tmp_path: Path) -> Non
     assert len(record) >= 148  # the first cycle's SYNC may come before the mapping is at rest
 
 
-def test_a_bus_is_recorded_by_the_mapping_that_the_daemon_tells(tmp_path: Path) -> None:
+def test_a_bus_is_recorded_by_the_mapping_that_the_daemon_publishes(tmp_path: Path) -> None:
     """The recorder begins when the drives are configured: nothing of the mapping is on the bus any more."""
     joint = daemonkit.vsa()
     path = tmp_path / "r.csv"
@@ -190,19 +190,17 @@ def test_a_bus_is_recorded_by_the_mapping_that_the_daemon_tells(tmp_path: Path) 
 
 def test_a_mapping_without_the_link_makes_no_samples_and_says_so(tmp_path: Path) -> None:
     joint = daemonkit.vsa()
-    nobody_told_of_the_link = joint.model_copy(
-        update={"link": joint.link.model_copy(update={"encoder": None})}
-    )
+    without_encoder = joint.model_copy(update={"link": joint.link.model_copy(update={"encoder": None})})
     bus = open_bus(joint.bus)
     sink = open_sink(tmp_path / "r.mcap", joint)
-    tap = BusTap(bus, nobody_told_of_the_link, sink, tmp_path)
+    tap = BusTap(bus, without_encoder, sink, tmp_path)
     tap._source = InRealTime(tap._source)
     with daemonkit.rig(joint) as rig, Recorder(sink, [tap]) as recorder:
         for _ in range(150):
             rig.run(1)
             tap.poll()
-        told = _Teller(tmp_path / "r.mcap", recorder).text()
+        printed = _Summary(tmp_path / "r.mcap", recorder).text()
         recorder.run(lambda: True)
     bus.shutdown()
-    assert "no samples: " in told and "no frame carries the link position" in told
+    assert "no samples: " in printed and "no frame carries the link position" in printed
     assert not tap.assembling and sink.counts["frame"] >= 150 * 4 and not sink.counts.get("sample")

@@ -1,4 +1,4 @@
-"""Replay: the same chain, bit for bit, from every format; and what the command leaves behind."""
+"""Replay: the same pipeline, bit for bit, from every format; and what the command leaves behind."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def test_raw_frames_and_samples_make_the_same_record(recorded: Recorded) -> None
         assert first.period_s == other.period_s
 
 
-def test_a_log_without_its_configuration_says_what_the_joint_file_must_tell(
+def test_a_log_without_its_configuration_says_what_the_joint_file_must_declare(
     recorded: Recorded, tmp_path: Path
 ) -> None:
     lines = (recorded.folder / "r.log").read_text().splitlines(keepends=True)
@@ -201,7 +201,7 @@ def test_frames_recorded_from_a_running_daemon_are_decoded_by_its_model_document
 def asked_over_zenoh(
     joint: JointFile, layouts: list[NodeLayout], endpoint: str, folder: Path
 ) -> Sequence[NodeLayout]:
-    """What `record` is told of the mapping by a daemon, beside a stranger who tells another one."""
+    """The mapping that `record` takes from a daemon, beside a stranger who publishes another one."""
     serving, asking, stranger = (
         open_session(joint.zenoh, folder),
         open_client(endpoint),

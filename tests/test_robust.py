@@ -78,7 +78,7 @@ def test_stiffness_is_right_along_the_motion_declared_parameters_exact_or_not(ri
     # Asked for: 0.1 % median, 0.3 % worst after convergence; here the first seconds count, too.
     assert np.median(errors) < 1.5e-3
     assert max(errors) < 4e-3
-    # Six joints are six draws, each slow to change: 95 % of them on average is told by many more (docs).
+    # Six joints are six draws, each slow to change: 95 % of them on average needs many more draws (benchmarks/ensembles.py).
     assert np.mean(inside) > 0.85
 
 
@@ -110,11 +110,11 @@ def test_deflection_is_that_of_this_moment_however_late_the_link_encoder(rig, la
     for j in range(2):
         estimator = make_estimator(joints.joint_model(rig.B[j, 0], rig.D[j, 0]), EstimatorSettings(), T)
         samples = rig.record(j, link_delay=late).samples()
-        told = np.array([estimator.step(sample).transmissions[0].deflection_rad for sample in samples])
+        deflection = np.array([estimator.step(sample).transmissions[0].deflection_rad for sample in samples])
         phi = rig.truth.q[:, j] - rig.truth.theta[:, j, 0]
         settled = slice(4000, None)
         rate = np.gradient(phi, T)[settled]
-        error = told[settled] - phi[settled]
+        error = deflection[settled] - phi[settled]
         assert abs(rate @ (error - error.mean()) / (rate @ rate)) < 0.1 * T
 
 
@@ -130,7 +130,7 @@ def test_a_stiffness_step_is_announced_and_followed_within_half_a_second(changin
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_first_reversal_of_a_motion_is_no_change(seed):
-    """Coulomb friction is not told before it, so one large innovation is foreseen there; three are not."""
+    """Coulomb friction is unknown before it, so one large innovation is foreseen there; three are not."""
     rng = np.random.default_rng(seed)
     N, n, reversal = 4, 4000, 3000
     K = rng.uniform(80, 220, (N, 1))
@@ -156,9 +156,9 @@ def test_standstill_moves_nothing_and_is_not_called_observable(changing):
         assert np.ptp(out[rest, 3]) < np.min(out[rest, 4])
         assert not np.any(out[rest, 1].astype(int) & Status.OBSERVABLE)
         assert np.all(out[rest, 1].astype(int) & Status.VALID)
-        (told,) = estimator.parameters()
+        (reported,) = estimator.parameters()
         expected = 0.8 * changing.alpha[j, 0]
-        assert told["parameters"]["coefficients_nm_rad"][0] == pytest.approx(expected[0], rel=1e-2)
+        assert reported["parameters"]["coefficients_nm_rad"][0] == pytest.approx(expected[0], rel=1e-2)
 
 
 def test_replay_gives_the_same_bits_as_live(rig):
@@ -272,10 +272,10 @@ def test_vsa_ii_is_found_from_nothing_on_both_sides():
         joints.joint_model(0.02, 0.02, model="vsa-ii", order=None, m=2), EstimatorSettings(), T
     )
     out = np.array([estimator.step(sample)[:5] for sample in record.samples()])
-    for told in estimator.parameters():
-        assert told["model"] == "vsa-ii"
-        assert told["parameters"]["k_nm_rad"] == pytest.approx(0.5, rel=5e-3)
-        assert told["parameters"]["c"] == pytest.approx(1.75, rel=5e-3)
+    for reported in estimator.parameters():
+        assert reported["model"] == "vsa-ii"
+        assert reported["parameters"]["k_nm_rad"] == pytest.approx(0.5, rel=5e-3)
+        assert reported["parameters"]["c"] == pytest.approx(1.75, rel=5e-3)
     late = slice(6000, None)
     assert out[late, 3] == pytest.approx(truth.sigma[late, 0].sum(1), rel=0.02)
 

@@ -139,9 +139,13 @@ def test_a_stiffness_says_of_which_moment_it_is_and_whether_it_is_valid(ros2, st
     )
     assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == STAMP_NS
     (values,) = message.interface_values
-    told = dict(zip(values.interface_names, values.values.tolist(), strict=True))
-    assert (told["stiffness_nm_rad"], told["stiffness_std_nm_rad"], told["valid"]) == (61.0, 1.75, valid)
-    assert told["transmission2_stiffness_nm_rad"] == 31.0
+    received = dict(zip(values.interface_names, values.values.tolist(), strict=True))
+    assert (received["stiffness_nm_rad"], received["stiffness_std_nm_rad"], received["valid"]) == (
+        61.0,
+        1.75,
+        valid,
+    )
+    assert received["transmission2_stiffness_nm_rad"] == 31.0
 
 
 def test_a_cycle_arrives_where_a_ros_node_listens(ros2):
@@ -183,9 +187,9 @@ def test_the_external_torque_is_a_stamped_wrench_about_z_where_it_is_valid(ros2)
     dynamic = client.declare_subscriber(
         f"0/dynamic_joint_states/{DYNAMIC}/{TYPE_HASHES[DYNAMIC]}", zenoh.handlers.RingChannel(64)
     )
-    told = until(lambda: put() and dynamic.try_recv())
+    received = until(lambda: put() and dynamic.try_recv())
     (values,) = STORE.deserialize_cdr(
-        told.payload.to_bytes(), "control_msgs/msg/DynamicJointState"
+        received.payload.to_bytes(), "control_msgs/msg/DynamicJointState"
     ).interface_values
     named = dict(zip(values.interface_names, values.values.tolist(), strict=True))
     assert (named["external_torque_nm"], named["external_torque_std_nm"]) == (0.05, 0.25)
@@ -272,11 +276,11 @@ def test_diagnostics_come_once_a_second_with_a_level_that_fits_the_status(ros2):
         message = STORE.deserialize_cdr(
             until(subscriber.try_recv).payload.to_bytes(), "diagnostic_msgs/msg/DiagnosticArray"
         )
-        (told,) = message.status
-        assert told.level == level
-        assert told.message.startswith(words)
-        assert (told.name, told.hardware_id) == ("drivelink: elbow", "elbow")
-        assert {pair.key: pair.value for pair in told.values} == {
+        (received,) = message.status
+        assert received.level == level
+        assert received.message.startswith(words)
+        assert (received.name, received.hardware_id) == ("drivelink: elbow", "elbow")
+        assert {pair.key: pair.value for pair in received.values} == {
             "state": "running",
             "latency.p99_us": "80.5",
         }

@@ -139,12 +139,12 @@ def test_systemd_finds_the_unit_right_and_little_exposed(
         ["systemd-analyze", "verify", unit], capture_output=True, text=True, check=False
     )
     assert verified.returncode == 0, verified.stderr
-    told = subprocess.run(
+    done = subprocess.run(
         ["systemd-analyze", "security", "--offline=true", "--threshold=20", unit],
         capture_output=True,
         text=True,
         check=False,
     )
-    assert told.returncode == 0, told.stdout
-    level = re.search(r"exposure level .*: ([\d.]+)", told.stdout)
+    assert done.returncode == 0, done.stdout
+    level = re.search(r"exposure level .*: ([\d.]+)", done.stdout)
     assert level is not None and float(level[1]) <= 2.0

@@ -232,10 +232,10 @@ def test_an_emergency_reaches_the_master_and_its_history() -> None:
     with mastered(device, rig=rig) as master:
         peer = remote(master, 1, "cia402-drive.eds")
         peer.sdo[0x1000].raw  # noqa: B018 - the drive is up
-        told = threading.Event()
-        peer.emcy.add_callback(lambda _emergency: told.set())
+        arrived = threading.Event()
+        peer.emcy.add_callback(lambda _emergency: arrived.set())
         device.fault(0x2310, 0x02, b"\x01\x02")
-        assert told.wait(PATIENCE_S)
+        assert arrived.wait(PATIENCE_S)
         emergency = peer.emcy.log[-1]
         assert (emergency.code, emergency.register, emergency.data[:2]) == (0x2310, 0x03, b"\x01\x02")
         assert peer.sdo[0x1003][1].raw == 0x0201_2310

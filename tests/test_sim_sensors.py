@@ -61,7 +61,7 @@ def test_current_is_noisy_and_comes_in_per_mille_of_the_rated_current() -> None:
     assert permille == pytest.approx(np.round(permille), abs=1e-6)
     error = r["motor1_torque_nm"] - r["truth_motor1_torque_nm"]
     per_ampere = 0.05 * 50.0
-    # Noise of 10 mA and a step of 4 mA add as squares; 3000 draws tell it to 1.3 %.
+    # Noise of 10 mA and a step of 4 mA add as squares; 3000 draws give it to 1.3 %.
     assert np.std(error) == pytest.approx(per_ampere * math.hypot(0.01, 0.004 / math.sqrt(12.0)), rel=0.05)
     assert r["motor1_torque_nm"] == pytest.approx(r["motor1_current_a"] * per_ampere)
 

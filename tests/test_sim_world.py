@@ -75,7 +75,7 @@ def test_many_periods_at_once_are_the_same_as_one_by_one() -> None:
 
 
 @pytest.mark.parametrize("effect", ["coulomb_friction=0.5", "hysteresis=1", "encoder_delay=0.0023"])
-def test_a_world_is_told_by_its_seed(effect: str) -> None:
+def test_a_world_follows_from_its_seed(effect: str) -> None:
     first, again, other = (record(world(seed, effects=[parse(effect)]), 0.5) for seed in (3, 3, 4))
     for name, column in first.items():
         assert np.array_equal(column, again[name], equal_nan=True)
@@ -109,7 +109,7 @@ def test_the_lever_of_a_serial_joint_is_a_parameter() -> None:
         with_parameters(sea(motors=2), {"lever_per_rad": 0.8})
 
 
-def test_a_rigid_joint_has_no_stiffness_to_tell() -> None:
+def test_a_rigid_joint_reports_no_stiffness() -> None:
     w = World(sea(RIGID), (PERFECT,), PERFECT_ENCODER)
     w.command(0, 0.1)
     w.advance(100)

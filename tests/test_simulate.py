@@ -145,7 +145,7 @@ def test_effects_come_from_the_file_the_model_and_the_command_line() -> None:
         world_from_joint(joint(), effects=["magic=1"])
 
 
-def test_the_devices_tell_what_the_joint_file_says() -> None:
+def test_the_devices_report_what_the_joint_file_says() -> None:
     drive, encoder = nodes_from_joint(joint(), world_from_joint(joint()))
     assert isinstance(drive, Cia402Drive)
     assert isinstance(encoder, Cia406Encoder)

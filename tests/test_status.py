@@ -100,8 +100,8 @@ def test_the_log_says_when_the_model_alarm_comes_and_goes_and_what_to_do(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.INFO)
-    told = {"residual_nm": [0.09, 0.01], "floor_nm": [0.03, 0.02], "location": "transmission"}
-    watch = SimpleNamespace(describe=lambda: told)
+    described = {"residual_nm": [0.09, 0.01], "floor_nm": [0.03, 0.02], "location": "transmission"}
+    watch = SimpleNamespace(describe=lambda: described)
     supervisor = Supervisor.__new__(Supervisor)
     supervisor._events, supervisor._alarmed = EventLog(logging.getLogger("drivelink")), set()
     for status in (
@@ -111,10 +111,10 @@ def test_the_log_says_when_the_model_alarm_comes_and_goes_and_what_to_do(
         Status.VALID,
         Status.VALID,
     ):
-        chain = SimpleNamespace(estimate=Estimate(1, int(status), 1.0, 1.0, 1.0, ()), watch=watch)
-        supervisor._check_model(SimpleNamespace(name="elbow", chain=chain))  # type: ignore[arg-type]
+        pipeline = SimpleNamespace(estimate=Estimate(1, int(status), 1.0, 1.0, 1.0, ()), watch=watch)
+        supervisor._check_model(SimpleNamespace(name="elbow", pipeline=pipeline))  # type: ignore[arg-type]
         if status == Status.MODEL_ALARM:
-            told |= {"residual_nm": [0.02, 0.01], "location": ""}
+            described |= {"residual_nm": [0.02, 0.01], "location": ""}
     begun, over = [record.getMessage() for record in caplog.records]
     assert begun.startswith(
         "elbow: model alarm: the residual is 3 times its baseline, likely at the transmission"

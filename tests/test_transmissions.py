@@ -146,6 +146,6 @@ def test_a_registered_model_with_two_shape_parameters_is_estimated_on_line(quint
         ("linear", {"k_nm_rad": (1.0, 2.0)}),
     ],
 )
-def test_wrong_names_and_values_are_told(model, parameters):
+def test_wrong_names_and_values_are_reported(model, parameters):
     with pytest.raises(EstimatorError):
         transmission_model(Transmission(model=model, parameters=parameters))

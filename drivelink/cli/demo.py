@@ -133,7 +133,7 @@ class Watch:
         while self.summary is None:
             try:
                 if rig.connection.poll(0.02):
-                    self._told(rig.connection)
+                    self._receive(rig.connection)
                 self._take(subscription)
             except EOFError:
                 break
@@ -144,7 +144,7 @@ class Watch:
                 rig.stop()  # it ends cleanly, and reports how the run went
         return interrupted
 
-    def _told(self, connection: Connection) -> None:
+    def _receive(self, connection: Connection) -> None:
         message: list[TruePoint] | Summary | Failure = connection.recv()
         if isinstance(message, Summary):
             self.summary = message

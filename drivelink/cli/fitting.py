@@ -252,7 +252,7 @@ def _write(args: argparse.Namespace, source: JointText, found: Identified, recor
     weak = [number for number, one in enumerate(fits, start=1) if one.model != RIGID and not one.excited]
     if weak:
         raise RecordingError(
-            f"{_named(args)}: --write: expected a motion that tells the stiffness of motor {weak[0]}"
+            f"{_named(args)}: --write: expected a motion that determines the stiffness of motor {weak[0]}"
         )
     unusable = [number for number, one in enumerate(fits, start=1) if one.model != RIGID and not one.stiffens]
     if unusable:

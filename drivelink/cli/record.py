@@ -97,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
         recorder = stack.enter_context(Recorder(sink, []))
         _add_taps(recorder, args.source, source, stack)
         end = time.monotonic() + args.seconds if args.seconds else float("inf")
-        say = _Teller(args.out, recorder)
+        say = _Summary(args.out, recorder)
         recorder.run(lambda: stopped.is_set() or time.monotonic() >= end, say.tick)
     print(json.dumps(say.document()) if args.json else f"{args.out}: {say.text()}")
     return 0
@@ -212,7 +212,7 @@ def _declared_layouts(joint: JointFile, folder: Path) -> Sequence[NodeLayout]:
     return ()
 
 
-class _Teller:
+class _Summary:
     """Says how the recording goes."""
 
     def __init__(self, path: Path, recorder: Recorder) -> None:

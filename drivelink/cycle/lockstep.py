@@ -8,9 +8,9 @@ from typing import Protocol
 
 from drivelink.canopen.bus import open_bus
 from drivelink.cycle.busport import BusPort
-from drivelink.cycle.chain import make_chain
 from drivelink.cycle.framesource import PumpedSource
-from drivelink.cycle.loop import CycleLoop, Lane, Sink
+from drivelink.cycle.loop import CycleLoop, LoopJoint, Sink
+from drivelink.cycle.pipeline import make_pipeline
 from drivelink.cycle.startup import join_bus
 from drivelink.jointfile import JointFile
 
@@ -33,20 +33,20 @@ def run_lockstep(
     folder: Path = Path(),
     start_ns: int = 0,
     each: Callable[[], object] | None = None,
-) -> Lane:
+) -> LoopJoint:
     """Configure the devices, then run so many cycles of the very loop that the daemon runs.
 
     Args:
         joint: its bus is a virtual one that the devices are on.
         devices: polled in this thread; SYNC moves their world on by one period.
-        sink: gets estimates and samples, e.g. a `JointPublisher`; None: only the lane counts them.
+        sink: gets estimates and samples, e.g. a `JointPublisher`; None: only the loop_joint counts them.
         cycles: how many.
         folder: of the joint file.
         start_ns: UNIX time that the first SYNC is stamped with.
         each: called after every cycle, e.g. to look at the truth.
 
     Returns:
-        The lane, with its chain and what was counted.
+        The loop_joint, with its pipeline and what was counted.
 
     Raises:
         DriveError, BusError: as the daemon's start does.
@@ -55,10 +55,10 @@ def run_lockstep(
     try:
         port = BusPort(bus)
         _, layouts = join_bus(port, [joint], [folder], idle=devices.poll)
-        lane = Lane(joint.name, make_chain(joint, layouts[0]), sink)
+        loop_joint = LoopJoint(joint.name, make_pipeline(joint, layouts[0]), sink)
         loop = CycleLoop(
             PumpedSource(bus, devices.poll),
-            [lane],
+            [loop_joint],
             period_s=joint.bus.period_s,
             counter_overflow=joint.bus.sync_counter_overflow,
             world_steps=True,
@@ -69,6 +69,6 @@ def run_lockstep(
             for stamp_ns in loop.stamps(cycles, start_ns):
                 loop.run_lockstep(1, stamp_ns)
                 each()
-        return lane
+        return loop_joint
     finally:
         bus.shutdown()

@@ -14,14 +14,14 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Protocol
 
-from drivelink._core import SYNC_COB_ID, Chain, Tick
+from drivelink._core import SYNC_COB_ID, JointPipeline, Tick
 from drivelink.cycle.framesource import BusLostError, Frame, FrameSource, LostSource
 from drivelink.cycle.housekeeping import Housekeeping
 from drivelink.cycle.latency_histogram import LatencyHistogram
 from drivelink.cycle.syncclock import LATE, MEASURED_SYNCS, SyncClock
 from estimator.sample import Estimate, Sample
 
-__all__ = ["CycleLoop", "Lane", "ObjectSink", "Sink"]
+__all__ = ["CycleLoop", "LoopJoint", "ObjectSink", "Sink"]
 
 logger = logging.getLogger(__name__)
 
@@ -57,25 +57,25 @@ class ObjectSink(ABC):
         """Take what it was made from."""
 
 
-class Lane:
+class LoopJoint:
     """One joint in the loop.
 
     Attributes:
         name: of the joint.
-        chain: from its frames to its estimates.
+        pipeline: from its frames to its estimates.
         sink: where they go; None: nowhere.
-        fault: what has ended its estimates; empty: nothing. A new estimator in the chain mends it.
+        fault: what has ended its estimates; empty: nothing. A new estimator in the pipeline mends it.
         estimates: published from fresh samples.
         stale: cycles without a sample.
         work: from the last frame in hand to the estimate published.
         response: from SYNC to the last frame in hand.
     """
 
-    __slots__ = ("broken", "chain", "estimates", "fault", "name", "response", "sink", "stale", "work")
+    __slots__ = ("broken", "estimates", "fault", "name", "pipeline", "response", "sink", "stale", "work")
 
-    def __init__(self, name: str, chain: Chain, sink: Sink | None) -> None:
+    def __init__(self, name: str, pipeline: JointPipeline, sink: Sink | None) -> None:
         self.name = name
-        self.chain = chain
+        self.pipeline = pipeline
         self.sink = sink
         self.fault = ""
         self.broken: object = None  # the estimator that it ended with
@@ -94,7 +94,7 @@ class CycleLoop:
 
     Args:
         source: the bus.
-        lanes: the joints.
+        loop_joints: the joints.
         period_s: communication cycle.
         produce: make SYNC; else follow it.
         counter_overflow: 0x1019; 0: SYNC carries no counter.
@@ -133,7 +133,7 @@ class CycleLoop:
     def __init__(
         self,
         source: FrameSource,
-        lanes: Sequence[Lane],
+        loop_joints: Sequence[LoopJoint],
         *,
         period_s: float,
         produce: bool = True,
@@ -142,7 +142,7 @@ class CycleLoop:
     ) -> None:
         self.world_steps = world_steps
         self.source = source
-        self.lanes = tuple(lanes)
+        self.loop_joints = tuple(loop_joints)
         self.housekeeping = Housekeeping()
         self.listeners: dict[int, Listener] = {}
         self.after_sync: list[Callable[[], None]] = []
@@ -161,7 +161,7 @@ class CycleLoop:
         self._sync_clock = SyncClock(period_s)
         self._overflow = counter_overflow
         self._counter = 0
-        self._lanes_of: dict[int, list[Lane]] = {}
+        self._loop_joints_of: dict[int, list[LoopJoint]] = {}
         self.reroute()
         self.unix_ns = time.time_ns() - time.monotonic_ns()
         self.sync_ns = self.received_ns = time.monotonic_ns()
@@ -170,20 +170,20 @@ class CycleLoop:
     @property
     def complete(self) -> bool:
         """Whether every joint has its sample of this cycle."""
-        return all([chain.assembler.complete for chain in self._chains])  # noqa: C419 - twice as fast
+        return all([pipeline.assembler.complete for pipeline in self._pipelines])  # noqa: C419 - twice as fast
 
     def reroute(self) -> None:
         """Learn again which joint wants which frame."""
-        self._lanes_of.clear()
-        sound = [lane for lane in self.lanes if not lane.fault]
-        self._chains = [lane.chain for lane in sound]
-        for lane in sound:
-            for cob_id in lane.chain.assembler.cob_ids:
-                self._lanes_of.setdefault(cob_id, []).append(lane)
+        self._loop_joints_of.clear()
+        sound = [loop_joint for loop_joint in self.loop_joints if not loop_joint.fault]
+        self._pipelines = [loop_joint.pipeline for loop_joint in sound]
+        for loop_joint in sound:
+            for cob_id in loop_joint.pipeline.assembler.cob_ids:
+                self._loop_joints_of.setdefault(cob_id, []).append(loop_joint)
 
     def receive_ids(self) -> set[int]:
         """Identifiers that anybody here wants."""
-        return {SYNC_COB_ID, *self._lanes_of, *self.listeners}
+        return {SYNC_COB_ID, *self._loop_joints_of, *self.listeners}
 
     def send(self, cob_id: int, data: bytes) -> None:
         """Put a frame on the bus that is not SYNC; the joints see it, as they would in a log."""
@@ -191,8 +191,8 @@ class CycleLoop:
             self.source.send(cob_id, data)
         except BusLostError as error:
             self._lose(error)
-        for lane in list(self._lanes_of.get(cob_id, ())):
-            self._feed(lane, cob_id, data)
+        for loop_joint in list(self._loop_joints_of.get(cob_id, ())):
+            self._feed(loop_joint, cob_id, data)
 
     def stop(self) -> None:
         """Have the pacing end after the present cycle; from any thread or signal handler."""
@@ -260,16 +260,16 @@ class CycleLoop:
         return bytes((self._counter,))
 
     def _dispatch(self, frames: list[Frame], now_ns: int) -> None:
-        lanes_of, listeners = self._lanes_of, self.listeners
+        interested, listeners = self._loop_joints_of, self.listeners
         for cob_id, data, stamp_ns in frames:
             if cob_id == SYNC_COB_ID:
                 self._foreign_sync(data, stamp_ns, now_ns)
                 continue
-            for lane in lanes_of.get(cob_id, ()):
-                tick = self._feed(lane, cob_id, data)
+            for loop_joint in interested.get(cob_id, ()):
+                tick = self._feed(loop_joint, cob_id, data)
                 if tick is not None:
-                    self._publish(lane, tick, now_ns)
-                    lane.response.add(now_ns - self.sync_ns)
+                    self._publish(loop_joint, tick, now_ns)
+                    loop_joint.response.add(now_ns - self.sync_ns)
             if cob_id in listeners:
                 try:
                     listeners[cob_id](cob_id, data)
@@ -303,49 +303,51 @@ class CycleLoop:
         if jump > 0:
             self.cycles += 1
             self.silent = False
-        for lane in self.lanes:
-            if lane.fault:
-                tick = self._carry_on_faulted(lane, jump, stamp_ns)
+        for loop_joint in self.loop_joints:
+            if loop_joint.fault:
+                tick = self._carry_on_faulted(loop_joint, jump, stamp_ns)
             else:
-                tick = self._feed(lane, SYNC_COB_ID, data, jump, stamp_ns)
+                tick = self._feed(loop_joint, SYNC_COB_ID, data, jump, stamp_ns)
             if tick is not None:
-                self._publish(lane, tick, now_ns)
+                self._publish(loop_joint, tick, now_ns)
         for follow in self.after_sync:
             follow()
 
-    def _feed(self, lane: Lane, cob_id: int, data: bytes, jump: int = 1, stamp_ns: int = 0) -> Tick | None:
+    def _feed(
+        self, loop_joint: LoopJoint, cob_id: int, data: bytes, jump: int = 1, stamp_ns: int = 0
+    ) -> Tick | None:
         """A frame for one joint; an exception ends its estimates, and nobody else's."""
         try:
-            return lane.chain.feed(cob_id, data, jump, stamp_ns)
+            return loop_joint.pipeline.feed(cob_id, data, jump, stamp_ns)
         except Exception as error:  # noqa: BLE001 - see above
-            lane.fault = f"{type(error).__name__}: {error}"
-            lane.broken = lane.chain.estimator
+            loop_joint.fault = f"{type(error).__name__}: {error}"
+            loop_joint.broken = loop_joint.pipeline.estimator
             self.reroute()
-            self.on_fault(lane.name, error)
+            self.on_fault(loop_joint.name, error)
             return None
 
-    def _carry_on_faulted(self, lane: Lane, jump: int, stamp_ns: int) -> Tick | None:
+    def _carry_on_faulted(self, loop_joint: LoopJoint, jump: int, stamp_ns: int) -> Tick | None:
         """What a joint in fault has to say at a SYNC: that its last estimate is not fresh."""
-        chain = lane.chain
-        if chain.estimator is not lane.broken:  # the joint file was mended
-            lane.fault, lane.broken = "", None
+        pipeline = loop_joint.pipeline
+        if pipeline.estimator is not loop_joint.broken:  # the joint file was mended
+            loop_joint.fault, loop_joint.broken = "", None
             self.reroute()
-        if chain.estimate is None or jump <= 0:
+        if pipeline.estimate is None or jump <= 0:
             return None
-        return chain.carry_on(chain.estimate.sequence + jump, stamp_ns=stamp_ns)
+        return pipeline.carry_on(pipeline.estimate.sequence + jump, stamp_ns=stamp_ns)
 
-    def _publish(self, lane: Lane, tick: Tick, since_ns: int) -> None:
-        if lane.sink is not None:
+    def _publish(self, loop_joint: LoopJoint, tick: Tick, since_ns: int) -> None:
+        if loop_joint.sink is not None:
             try:
-                lane.sink.put(tick)
+                loop_joint.sink.put(tick)
             except Exception as error:  # noqa: BLE001 - the other joints' go out all the same
-                self.on_fault(lane.name, error)
+                self.on_fault(loop_joint.name, error)
         if tick.current:
-            lane.work.add(time.monotonic_ns() - since_ns)
+            loop_joint.work.add(time.monotonic_ns() - since_ns)
         if tick.fresh:
-            lane.estimates += 1
+            loop_joint.estimates += 1
         else:
-            lane.stale += 1
+            loop_joint.stale += 1
 
     def wait(self, timeout_s: float) -> None:
         """Wait for frames and receive them; a bus that is lost ends the wait."""
@@ -362,7 +364,7 @@ class CycleLoop:
     def carry_on(self) -> None:
         """No SYNC for a while: say that what was last published is not fresh."""
         self.silent = True
-        for lane in self.lanes:
-            tick = lane.chain.carry_on(lane.chain.assembler.sequence)
+        for loop_joint in self.loop_joints:
+            tick = loop_joint.pipeline.carry_on(loop_joint.pipeline.assembler.sequence)
             if tick is not None:
-                self._publish(lane, tick, time.monotonic_ns())
+                self._publish(loop_joint, tick, time.monotonic_ns())

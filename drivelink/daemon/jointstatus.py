@@ -10,7 +10,7 @@ from typing import Any
 
 from drivelink.canopen.emcy import emergency_text
 from drivelink.cycle.framesource import LostSource
-from drivelink.cycle.loop import CycleLoop, Lane
+from drivelink.cycle.loop import CycleLoop, LoopJoint
 from drivelink.cycle.realtime import RealTime
 from drivelink.daemon.crosschecks import contradiction, cross_checks
 from drivelink.daemon.status import EventLog
@@ -46,7 +46,7 @@ class JointStatus:
     Args:
         joint: its joint file.
         loop: the cycle it runs in.
-        lane: its place in it.
+        loop_joint: its place in it.
         supervisor: knows its nodes.
         events: what has happened.
         bus_load: fraction of the bit rate that the configured frames take.
@@ -56,14 +56,14 @@ class JointStatus:
         self,
         joint: JointFile,
         loop: CycleLoop,
-        lane: Lane,
+        loop_joint: LoopJoint,
         supervisor: Supervisor,
         events: EventLog,
         bus_load: float,
     ) -> None:
         self._joint = joint
         self._loop = loop
-        self._lane = lane
+        self._loop_joint = loop_joint
         self._supervisor = supervisor
         self._events = events
         self._bus_load = bus_load
@@ -78,8 +78,8 @@ class JointStatus:
         self._asked += 1
         if self._asked % _TIMING_EVERY == 1:
             for name, meter in (
-                ("latency", self._lane.work),
-                ("response", self._lane.response),
+                ("latency", self._loop_joint.work),
+                ("response", self._loop_joint.response),
                 ("jitter", self._loop.lateness),
             ):
                 self._timing[name] = meter.recent()
@@ -95,48 +95,49 @@ class JointStatus:
         Args:
             state: "starting" or "stopped"; left out: as it is found.
         """
-        loop, lane, events = self._loop, self._lane, self._events
+        loop, loop_joint, events = self._loop, self._loop_joint, self._events
         now, unix_s = time.monotonic(), time.time()
         before_s, before_estimates, before_cpu_s = self._before
         cpu_s, elapsed_s = time.process_time(), max(now - before_s, 1e-9)
-        self._before = (now, lane.estimates, cpu_s)
+        self._before = (now, loop_joint.estimates, cpu_s)
         return {
             "schema": "drivelink.status/1",
-            "joint": lane.name,
+            "joint": loop_joint.name,
             "state": state or self._state(),
             "time": unix_s,
             "uptime_s": round(unix_s - self._started_s, 3),
             "version": __version__,
             "pid": os.getpid(),
             "period_s": self._joint.bus.period_s,
-            "rate_hz": round((lane.estimates - before_estimates) / elapsed_s, 1),
+            "rate_hz": round((loop_joint.estimates - before_estimates) / elapsed_s, 1),
             "cycles": loop.cycles,
-            "estimates": lane.estimates,
-            "missed_cycles": lane.chain.missed + loop.overruns,
+            "estimates": loop_joint.estimates,
+            "missed_cycles": loop_joint.pipeline.missed + loop.overruns,
             "overruns": loop.overruns,
             "cpu_fraction": round((cpu_s - before_cpu_s) / elapsed_s, 4),
             **self._timing,
             "real_time": self._real_time(),
             "bus": self._bus(),
-            "nodes": self._supervisor.node_status(lane),
+            "nodes": self._supervisor.node_status(loop_joint),
             "drive_faults": self._faults(),
             "quality": self._quality(),
-            "transmissions": lane.chain.estimator.parameters(),
-            "residual_nm": lane.chain.estimator.residual_nm,
+            "transmissions": loop_joint.pipeline.estimator.parameters(),
+            "residual_nm": loop_joint.pipeline.estimator.residual_nm,
             "residual_alarm": self._alarm(),
             "external": self._external(),
-            "suspected": contradiction(lane.chain.assembler) or lane.chain.estimator.suspicion(),
-            "cross_checks": cross_checks(lane.chain.assembler),
+            "suspected": contradiction(loop_joint.pipeline.assembler)
+            or loop_joint.pipeline.estimator.suspicion(),
+            "cross_checks": cross_checks(loop_joint.pipeline.assembler),
             "conditions": sorted(events.active.values()),
             "events": events.recent(),
         }
 
     def _state(self) -> str:
-        loop, lane = self._loop, self._lane
-        estimate = lane.chain.estimate
+        loop, loop_joint = self._loop, self._loop_joint
+        estimate = loop_joint.pipeline.estimate
         if isinstance(loop.source, LostSource):
             return "bus lost"
-        if lane.fault:
+        if loop_joint.fault:
             return "fault"
         if loop.silent:
             return "no SYNC"
@@ -164,26 +165,26 @@ class JointStatus:
     def _faults(self) -> list[str]:
         return [
             f"node {node}: EMCY 0x{code:04X} ({emergency_text(code)})" if code else f"node {node}: fault"
-            for node, code in self._lane.chain.assembler.faults.items()
+            for node, code in self._loop_joint.pipeline.assembler.faults.items()
         ]
 
     def _quality(self) -> dict[str, bool]:
-        estimate = self._lane.chain.estimate
+        estimate = self._loop_joint.pipeline.estimate
         status = int(estimate.status) if estimate is not None else 0
         return {str(bit.name).lower(): bool(status & bit) for bit in _QUALITY}
 
     def _alarm(self) -> dict[str, Any]:
-        watch = self._lane.chain.watch
-        estimate = self._lane.chain.estimate
+        watch = self._loop_joint.pipeline.watch
+        estimate = self._loop_joint.pipeline.estimate
         active = estimate is not None and bool(estimate.status & Status.MODEL_ALARM)
         return {"active": active, **(watch.describe() if watch is not None else {})}
 
     def _external(self) -> dict[str, Any] | None:
         """What touches the link, and whether both sides of the joint agree on the flexibility torque."""
-        touch = self._lane.chain.external
+        touch = self._loop_joint.pipeline.external
         if touch is None:
             return None
-        consistency = self._lane.chain.estimator.consistency
+        consistency = self._loop_joint.pipeline.estimator.consistency
         return {
             "valid": bool(touch.status & ExternalStatus.VALID),
             "contact": bool(touch.status & ExternalStatus.CONTACT),
@@ -203,15 +204,15 @@ class JointStatus:
 
     def summary(self) -> str:
         """The run in one line."""
-        lane, loop = self._lane, self._loop
-        work, jitter = lane.work.total(), loop.lateness.total()
-        text = f"{lane.name}: {loop.cycles} cycles, {lane.estimates} estimates, "
-        text += f"{lane.chain.missed + loop.overruns} missed"
+        loop_joint, loop = self._loop_joint, self._loop
+        work, jitter = loop_joint.work.total(), loop.lateness.total()
+        text = f"{loop_joint.name}: {loop.cycles} cycles, {loop_joint.estimates} estimates, "
+        text += f"{loop_joint.pipeline.missed + loop.overruns} missed"
         if work and jitter:
             text += (
                 f"; a cycle's work p99 {work['p99_us']:.0f} µs, SYNC late by p99 {jitter['p99_us']:.0f} µs"
             )
-        residual = lane.chain.estimator.residual_nm
+        residual = loop_joint.pipeline.estimator.residual_nm
         if math.isfinite(residual):
-            text += f"; residual {residual:.3g} N·m" + residual_text(lane.chain.watch)
+            text += f"; residual {residual:.3g} N·m" + residual_text(loop_joint.pipeline.watch)
         return text

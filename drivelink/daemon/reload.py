@@ -15,8 +15,8 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from drivelink._core import Chain
-from drivelink.cycle.chain import Built
+from drivelink._core import JointPipeline
+from drivelink.cycle.pipeline import Built
 from drivelink.daemon.status import EventLog
 from drivelink.errors import DrivelinkError
 from drivelink.jointfile import JointFile, load
@@ -35,12 +35,12 @@ _FIXED = ("name", "arrangement", "bus", "zenoh")  # what a running daemon does n
 
 
 class Reloader:
-    """Watches one joint file, and exchanges the estimator of its chain.
+    """Watches one joint file, and exchanges the estimator of its pipeline.
 
     Args:
         path: the joint file.
         joint: as it is in use.
-        chain: whose estimator is exchanged.
+        pipeline: whose estimator is exchanged.
         build: makes estimator and watch of a joint file; called in a thread.
         publish: called with the joint file in use after an exchange.
         events: where it is said.
@@ -50,14 +50,14 @@ class Reloader:
         self,
         path: Path,
         joint: JointFile,
-        chain: Chain,
+        pipeline: JointPipeline,
         build: Callable[[JointFile], Built],
         publish: Callable[[JointFile], None],
         events: EventLog,
     ) -> None:
         self._path = path
         self._joint = joint
-        self._chain, self._history = chain, chain.history
+        self._pipeline, self._history = pipeline, pipeline.history
         self._build = build
         self._publish = publish
         self._events = events
@@ -97,7 +97,7 @@ class Reloader:
                     self._lead(joint, (estimator, watch), self._history.after(sequence, _AID))
                 return
             self._ready = self._thread = None
-            self._chain.exchange(estimator, watch, self._history.after(sequence))
+            self._pipeline.exchange(estimator, watch, self._history.after(sequence))
         finally:
             self._turn.release()
         self._joint = joint

@@ -19,13 +19,13 @@ from typing import Any
 
 import zenoh
 
-from drivelink._core import Chain
+from drivelink._core import JointPipeline
 from drivelink.canopen.bus import open_bus
 from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle import pacing, realtime
 from drivelink.cycle.busport import BusPort
-from drivelink.cycle.chain import build, make_chain, rehearse
-from drivelink.cycle.loop import CycleLoop, Lane
+from drivelink.cycle.loop import CycleLoop, LoopJoint
+from drivelink.cycle.pipeline import build, make_pipeline, rehearse
 from drivelink.cycle.sources import open_source
 from drivelink.cycle.startup import join_bus
 from drivelink.daemon.buskeeper import BusKeeper
@@ -116,18 +116,22 @@ class Daemon:
             )
             self._section = self._configurator.bus  # with the period that another master's SYNC really has
             keep = round(_HISTORY_S / self._section.period_s)
-            self._lanes = [
-                Lane(served.joint.name, make_chain(self._timed(served.joint), mine, keep=keep), publisher)
+            self._loop_joints = [
+                LoopJoint(
+                    served.joint.name, make_pipeline(self._timed(served.joint), mine, keep=keep), publisher
+                )
                 for served, mine, publisher in zip(joints, layouts, self._publishers, strict=True)
             ]
             self.loop = self._make_loop()
             self._supervisor = Supervisor(
-                self.loop, dict(zip(self._lanes, layouts, strict=True)), self.events, self._configurator
+                self.loop, dict(zip(self._loop_joints, layouts, strict=True)), self.events, self._configurator
             )
             load = self._configurator.load().fraction
             self._status = [
-                JointStatus(self._timed(served.joint), self.loop, lane, self._supervisor, self.events, load)
-                for served, lane in zip(joints, self._lanes, strict=True)
+                JointStatus(
+                    self._timed(served.joint), self.loop, loop_joint, self._supervisor, self.events, load
+                )
+                for served, loop_joint in zip(joints, self._loop_joints, strict=True)
             ]
             for served, mine, publisher in zip(joints, layouts, self._publishers, strict=True):
                 self._republish(publisher, mine)(served.joint)
@@ -146,9 +150,9 @@ class Daemon:
         self.close()
 
     @property
-    def chains(self) -> tuple[Chain, ...]:
+    def pipelines(self) -> tuple[JointPipeline, ...]:
         """Of the joints, in their order."""
-        return tuple(lane.chain for lane in self._lanes)
+        return tuple(loop_joint.pipeline for loop_joint in self._loop_joints)
 
     @property
     def layouts(self) -> Mapping[int, NodeLayout]:
@@ -222,7 +226,7 @@ class Daemon:
         section = self._section
         loop = CycleLoop(
             open_source(self._port.bus, self._devices),
-            self._lanes,
+            self._loop_joints,
             period_s=section.period_s,
             produce=section.sync == "produce",
             counter_overflow=section.sync_counter_overflow,
@@ -237,13 +241,13 @@ class Daemon:
             Reloader(
                 served.path,
                 served.joint,
-                lane.chain,
+                loop_joint.pipeline,
                 lambda joint: build(self._timed(joint)),
                 self._republish(publisher, mine),
                 self.events,
             )
-            for served, lane, publisher, mine in zip(
-                self._joints, self._lanes, self._publishers, layouts, strict=True
+            for served, loop_joint, publisher, mine in zip(
+                self._joints, self._loop_joints, self._publishers, layouts, strict=True
             )
             if served.path is not None
         ]

@@ -18,10 +18,10 @@ from drivelink.canopen.configure import Configurator
 from drivelink.canopen.emcy import drive_state, parse_emergency
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cycle.chain import Watch
 from drivelink.cycle.following import MapFollower
 from drivelink.cycle.framesource import OVERFLOW, LostSource
-from drivelink.cycle.loop import CycleLoop, Lane
+from drivelink.cycle.loop import CycleLoop, LoopJoint
+from drivelink.cycle.pipeline import Watch
 from drivelink.cycle.syncclock import MEASURED_SYNCS, measure_period
 from drivelink.daemon.crosschecks import contradiction
 from drivelink.daemon.status import EventLog
@@ -77,8 +77,8 @@ class _Watched:
         "counted",
         "enabled",
         "heartbeat_ns",
-        "lane",
         "layout",
+        "loop_joint",
         "received",
         "seen_ns",
         "sent",
@@ -86,9 +86,9 @@ class _Watched:
         "state",
     )
 
-    def __init__(self, layout: NodeLayout, lane: Lane, now_ns: int) -> None:
+    def __init__(self, layout: NodeLayout, loop_joint: LoopJoint, now_ns: int) -> None:
         self.layout = layout
-        self.lane = lane
+        self.loop_joint = loop_joint
         self.started = False  # since its last frame
         self.enabled = False  # its drive, when last looked at
         self.begin(NodeCounters(), now_ns)
@@ -110,7 +110,7 @@ class Supervisor:
 
     Args:
         loop: its listeners are set here.
-        layouts: of each lane's nodes.
+        layouts: of each loop_joint's nodes.
         events: where it is said.
         configurator: configures nodes again, or, passive, learns that somebody else has.
 
@@ -121,7 +121,7 @@ class Supervisor:
     def __init__(
         self,
         loop: CycleLoop,
-        layouts: Mapping[Lane, tuple[NodeLayout, ...]],
+        layouts: Mapping[LoopJoint, tuple[NodeLayout, ...]],
         events: EventLog,
         configurator: Configurator | PassiveConfigurator,
     ) -> None:
@@ -138,10 +138,10 @@ class Supervisor:
         self.sync_period_s: float | None = None
         loop.on_fault = self._say_fault
         self._nodes: dict[int, _Watched] = {}
-        for lane, mine in layouts.items():
-            lane.chain.assembler.supervise()
+        for loop_joint, mine in layouts.items():
+            loop_joint.pipeline.assembler.supervise()
             for layout in mine:
-                self._nodes[layout.node_id] = _Watched(layout, lane, loop.clock())
+                self._nodes[layout.node_id] = _Watched(layout, loop_joint, loop.clock())
                 loop.listeners[0x700 + layout.node_id] = self._heartbeat
                 loop.listeners[0x080 + layout.node_id] = self._emergency
                 loop.listeners[0x580 + layout.node_id] = self._answer
@@ -153,7 +153,7 @@ class Supervisor:
         loop, nodes = self._loop, self._nodes
         self._follower = MapFollower(
             configurator,
-            {node: watched.lane.chain.assembler for node, watched in nodes.items()},
+            {node: watched.loop_joint.pipeline.assembler for node, watched in nodes.items()},
             {node: watched.layout for node, watched in nodes.items()},
             self._listen_anew,
         )
@@ -167,14 +167,14 @@ class Supervisor:
         """Identifiers of the frames it listens to."""
         return tuple(self._loop.listeners)
 
-    def node_status(self, lane: Lane) -> dict[str, Any]:
+    def node_status(self, loop_joint: LoopJoint) -> dict[str, Any]:
         """Of the nodes of one joint, for the status key."""
         now = self._loop.clock()
-        counters = lane.chain.assembler.counters
-        faults, statuswords = lane.chain.assembler.faults, lane.chain.assembler.statuswords
+        counters = loop_joint.pipeline.assembler.counters
+        faults, statuswords = loop_joint.pipeline.assembler.faults, loop_joint.pipeline.assembler.statuswords
         status: dict[str, Any] = {}
         for node, watched in self._nodes.items():
-            if watched.lane is not lane:
+            if watched.loop_joint is not loop_joint:
                 continue
             counted = counters[node]
             status[str(node)] = {
@@ -205,7 +205,7 @@ class Supervisor:
                 continue
             if result.tpdos != watched.layout.tpdos:
                 try:
-                    watched.lane.chain.assembler.relayout(result)
+                    watched.loop_joint.pipeline.assembler.relayout(result)
                 except DriveError as error:  # what it has answered cannot be
                     self._events.begin(f"configure {node}", f"node {node} cannot be configured: {error}")
                     continue
@@ -213,7 +213,7 @@ class Supervisor:
                 self._events.say(f"node {node} has another mapping now: {_maps(result)}")
             watched.layout = result
             self._events.end(f"configure {node}")
-            watched.lane.chain.assembler.trust(node)
+            watched.loop_joint.pipeline.assembler.trust(node)
             if not watched.started:
                 self._events.say(f"node {node} is configured again and started")
             watched.started = True
@@ -228,11 +228,11 @@ class Supervisor:
             self._check_heartbeat(node, watched, now)
             self._check_faults(node, watched)
             self._check_statusword(node, watched)
-        for lane in self._loop.lanes:
-            self._check_lane(lane)
-            self._check_model(lane)
-            self._check_contradiction(lane)
-            self._check_readings(lane)
+        for loop_joint in self._loop.loop_joints:
+            self._check_joint(loop_joint)
+            self._check_model(loop_joint)
+            self._check_contradiction(loop_joint)
+            self._check_readings(loop_joint)
         if self._follower is not None:
             self._check_maps(self._follower)
         self._check_bus()
@@ -254,52 +254,54 @@ class Supervisor:
             else:
                 self._events.end(f"mapping {node}", f"node {node}: its mapping is known, its frames are used")
 
-    def _check_lane(self, lane: Lane) -> None:
-        if lane.fault:
+    def _check_joint(self, loop_joint: LoopJoint) -> None:
+        if loop_joint.fault:
             self._events.begin(
-                f"joint {lane.name}",
-                f"{lane.name}: no estimates any more after {lane.fault}; rewrite its joint file or "
+                f"joint {loop_joint.name}",
+                f"{loop_joint.name}: no estimates since {loop_joint.fault}; rewrite its joint file or "
                 "restart the daemon",
                 logging.ERROR,
             )
         else:
-            self._events.end(f"joint {lane.name}", f"{lane.name}: estimates restart")
+            self._events.end(f"joint {loop_joint.name}", f"{loop_joint.name}: estimates restart")
 
-    def _check_model(self, lane: Lane) -> None:
+    def _check_model(self, loop_joint: LoopJoint) -> None:
         """Say when the model alarm comes and goes, by how much, and what to do."""
-        estimate, watch = lane.chain.estimate, lane.chain.watch
+        estimate, watch = loop_joint.pipeline.estimate, loop_joint.pipeline.watch
         if estimate is None:
             return
         alarm = bool(estimate.status & _MODEL_ALARM)
-        if alarm == (lane.name in self._alarmed):
+        if alarm == (loop_joint.name in self._alarmed):
             return
         if alarm:
-            self._alarmed.add(lane.name)
+            self._alarmed.add(loop_joint.name)
             self._events.say(
-                f"{lane.name}: model alarm{residual_text(watch)}: do not control on its numbers; "
+                f"{loop_joint.name}: model alarm{residual_text(watch)}: do not control on its numbers; "
                 "record a minute of motion, then drivelink diagnose names the effect",
                 logging.WARNING,
             )
         else:
-            self._alarmed.discard(lane.name)
-            self._events.say(f"{lane.name}: the model alarm is over{residual_text(watch)}")
+            self._alarmed.discard(loop_joint.name)
+            self._events.say(f"{loop_joint.name}: the model alarm is over{residual_text(watch)}")
 
-    def _check_contradiction(self, lane: Lane) -> None:
+    def _check_contradiction(self, loop_joint: LoopJoint) -> None:
         """Say which readings contradict each other, when that begins and when it is over."""
-        key, told = f"contradiction {lane.name}", contradiction(lane.chain.assembler)
-        if told is None:
-            self._events.end(key, f"{lane.name}: no reading contradicts another one any more")
+        key, found = f"contradiction {loop_joint.name}", contradiction(loop_joint.pipeline.assembler)
+        if found is None:
+            self._events.end(key, f"{loop_joint.name}: no reading contradicts another")
         else:
-            self._events.begin(key, f"{lane.name}: {told['text']}")
+            self._events.begin(key, f"{loop_joint.name}: {found['text']}")
 
-    def _check_readings(self, lane: Lane) -> None:
+    def _check_readings(self, loop_joint: LoopJoint) -> None:
         """Say which reading is suspected, and of what, when that begins and when it is over."""
-        suspicion = lane.chain.estimator.suspicion() if lane.chain.estimate is not None else None
-        key = f"reading {lane.name}"
+        suspicion = (
+            loop_joint.pipeline.estimator.suspicion() if loop_joint.pipeline.estimate is not None else None
+        )
+        key = f"reading {loop_joint.name}"
         if suspicion is None:
-            self._events.end(key, f"{lane.name}: no reading is suspected any more")
+            self._events.end(key, f"{loop_joint.name}: no reading is suspected")
         elif suspicion["reason"] not in _BRIEF:
-            self._events.begin(key, f"{lane.name}: no valid estimates; suspected: {suspicion['text']}")
+            self._events.begin(key, f"{loop_joint.name}: no valid estimates; suspected: {suspicion['text']}")
 
     def _say_fault(self, where: str, error: Exception) -> None:
         logger.debug("%s", where, exc_info=error)
@@ -308,7 +310,7 @@ class Supervisor:
     def reconfigure_all(self) -> None:
         """The bus was away: nobody knows what the nodes have lived through."""
         for node, watched in self._nodes.items():
-            assembler = watched.lane.chain.assembler
+            assembler = watched.loop_joint.pipeline.assembler
             if isinstance(self._configurator, Configurator):
                 assembler.distrust(node)
             watched.begin(assembler.counters[node], self._loop.clock())
@@ -317,7 +319,7 @@ class Supervisor:
             self._follower.lose_sight()
 
     def _check_frames(self, node: int, watched: _Watched, now: int) -> None:
-        assembler = watched.lane.chain.assembler
+        assembler = watched.loop_joint.pipeline.assembler
         counters = assembler.counters[node]
         for name, least, grows, stopped in _COUNTED:
             count, (before, since_ns) = getattr(counters, name), watched.counted[name]
@@ -352,7 +354,7 @@ class Supervisor:
 
     def _say_unstarted(self, node: int, watched: _Watched) -> None:
         state = _STATES.get(watched.state, f"0x{watched.state:02X}")
-        code = watched.lane.chain.assembler.faults.get(node)
+        code = watched.loop_joint.pipeline.assembler.faults.get(node)
         why = f" and EMCY 0x{code:04X}: its error may want a reset or its supply off and on" if code else ""
         self._events.begin(
             f"start {node}",
@@ -368,15 +370,15 @@ class Supervisor:
             self._events.end(f"heartbeat {node}", f"node {node}: heartbeat is back")
 
     def _check_faults(self, node: int, watched: _Watched) -> None:
-        faulted = node in watched.lane.chain.assembler.faults
+        faulted = node in watched.loop_joint.pipeline.assembler.faults
         if faulted:
             self._events.begin(f"fault {node}", f"node {node} reports a fault")
         else:
-            self._events.end(f"fault {node}", f"node {node} reports no fault any more")
+            self._events.end(f"fault {node}", f"node {node} reports no fault")
 
     def _check_statusword(self, node: int, watched: _Watched) -> None:
         """Say when a drive leaves the state in which it drives, and when it limits its set-point."""
-        statusword = watched.lane.chain.assembler.statuswords.get(node)
+        statusword = watched.loop_joint.pipeline.assembler.statuswords.get(node)
         if statusword is None:
             return
         enabled = statusword & _STATE_BITS == _ENABLED
@@ -391,7 +393,7 @@ class Supervisor:
         if statusword & _LIMIT:
             self._events.begin(f"limit {node}", f"node {node}: internal limit active (statusword bit 11)")
         else:
-            self._events.end(f"limit {node}", f"node {node}: no internal limit is active any more")
+            self._events.end(f"limit {node}", f"node {node}: no internal limit is active")
 
     def _check_bus(self) -> None:
         loop = self._loop
@@ -444,7 +446,7 @@ class Supervisor:
         elif (loop.foreign_syncs - foreign) - (loop.skipped_periods - skipped) >= _MANY_SYNCS:
             what = "a second master makes SYNC too: its cycles are not used; stop one of the two"
         else:
-            self._events.end("foreign sync", "the other master makes no SYNC any more")
+            self._events.end("foreign sync", "the other master stopped producing SYNC")
             return
         self._events.begin("foreign sync", what, logging.ERROR)
 

@@ -113,18 +113,18 @@ def _run(path: Path, seconds: float | None, connection: Connection) -> Summary:
     try:
         with Daemon([ServedJoint(joint=joint, path=path)], devices=network.poll) as daemon:
             signal.signal(signal.SIGTERM, lambda *_: daemon.stop())
-            (lane,) = daemon.loop.lanes
-            assert isinstance(lane.sink, JointPublisher)
-            tap = TruthTap(lane.sink, world, connection)
-            lane.sink = tap
+            (loop_joint,) = daemon.loop.loop_joints
+            assert isinstance(loop_joint.sink, JointPublisher)
+            tap = TruthTap(loop_joint.sink, world, connection)
+            loop_joint.sink = tap
             daemon.run(seconds)
             tap.flush()
             loop = daemon.loop
             return Summary(
                 cycles=loop.cycles,
-                estimates=lane.estimates,
-                missed_cycles=lane.chain.missed + loop.overruns,
-                work_p99_us=lane.work.total().get("p99_us", 0.0),
+                estimates=loop_joint.estimates,
+                missed_cycles=loop_joint.pipeline.missed + loop.overruns,
+                work_p99_us=loop_joint.work.total().get("p99_us", 0.0),
                 lateness_p99_us=loop.lateness.total().get("p99_us", 0.0),
                 text=daemon.summary(),
             )

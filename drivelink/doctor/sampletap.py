@@ -8,7 +8,7 @@ import can
 
 from drivelink._core import SYNC_COB_ID, Assembler
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cycle.chain import make_assembler
+from drivelink.cycle.pipeline import make_assembler
 from drivelink.cycle.syncclock import MEASURED_SYNCS, SyncClock, measure_period
 from drivelink.errors import DriveError
 from drivelink.jointfile import JointFile

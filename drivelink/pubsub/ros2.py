@@ -279,7 +279,7 @@ class Ros2Publisher:
         self._pack_wrench = wrench(joint.name)
         self._velocity_rad_s = 0.0
         self._before: tuple[int, float] | None = None
-        self._told_ns: int | None = None
+        self._reported_ns: int | None = None
         self.latest: Estimate | None = None
         self.external: External | None = None
 
@@ -331,9 +331,9 @@ class Ros2Publisher:
             status: as on the status key.
             stamp_ns: UNIX time, ns.
         """
-        if self._told_ns is not None and 0 <= stamp_ns - self._told_ns < _NS:
+        if self._reported_ns is not None and 0 <= stamp_ns - self._reported_ns < _NS:
             return
-        self._told_ns = stamp_ns
+        self._reported_ns = stamp_ns
         level, message = _judge(self.latest.status if self.latest else 0)
         values = dict(_flat(status))
         name = f"drivelink: {self._joint}"

@@ -17,11 +17,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from drivelink._core import SYNC_COB_ID, Assembler, Chain, Tick
+from drivelink._core import SYNC_COB_ID, Assembler, JointPipeline, Tick
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cycle.chain import make_assembler
 from drivelink.cycle.following import MapFollower
+from drivelink.cycle.pipeline import make_assembler
 from drivelink.cycle.syncclock import measure_period
 from drivelink.errors import DriveError, RecordingError
 from drivelink.jointfile import JointFile
@@ -138,16 +138,16 @@ class FrameLog:
 
         return self._fed(feed)
 
-    def ticks(self, joint_chain: Chain) -> Iterator[Tick]:
+    def ticks(self, pipeline: JointPipeline) -> Iterator[Tick]:
         """What is published of the cycles; once.
 
         Args:
-            joint_chain: made with `assembler`.
+            pipeline: made with `assembler`.
 
         Raises:
             RecordingError: as for `cycles`.
         """
-        return self._fed(joint_chain.feed)
+        return self._fed(pipeline.feed)
 
     def _fed(self, feed: Callable[[int, bytes, int, int], _Fed | None]) -> Iterator[_Fed]:
         """What becomes of the frames."""

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from itertools import islice
 from typing import NamedTuple
 
-from drivelink._core import Chain, Tick
+from drivelink._core import JointPipeline, Tick
 from drivelink.errors import DrivelinkError
 from estimator.sample import Sample
 
@@ -31,8 +31,8 @@ class Cycle(NamedTuple):
     flags: int
 
 
-def estimated(cycles: Iterable[Cycle], chain: Chain) -> Iterator[Tick]:
-    """What the chain makes of the cycles, as the live loop would have published it.
+def estimated(cycles: Iterable[Cycle], pipeline: JointPipeline) -> Iterator[Tick]:
+    """What the pipeline makes of the cycles, as the live loop would have published it.
 
     Reading and estimating take turns of many cycles: a processor that does one thing for a while is quicker
     than one that changes between them every cycle.
@@ -41,8 +41,8 @@ def estimated(cycles: Iterable[Cycle], chain: Chain) -> Iterator[Tick]:
         for cycle in batch:
             sequence, stamp_ns, sample, flags = cycle
             if sample is not None:
-                yield chain.take(sample, flags, stamp_ns)
-            elif (tick := chain.carry_on(sequence, flags, stamp_ns)) is not None:
+                yield pipeline.take(sample, flags, stamp_ns)
+            elif (tick := pipeline.carry_on(sequence, flags, stamp_ns)) is not None:
                 yield tick
 
 

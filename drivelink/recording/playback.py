@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from drivelink._core import Assembler, Chain, Tick
-from drivelink.cycle.chain import build
+from drivelink._core import Assembler, JointPipeline, Tick
+from drivelink.cycle.pipeline import build
 from drivelink.jointfile import JointFile
 from drivelink.recording import read
 from drivelink.recording.canframes import FrameLog, is_frame_log
@@ -41,7 +41,7 @@ class Playback:
         motors: how many the joint has.
         period_s: of the recording; the estimator works with it.
         total: number of cycles, where the recording states it.
-        chain: what they go through.
+        pipeline: what they go through.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Playback:
         joint: JointFile,
         period_s: float,
         total: int | None,
-        cycles: Callable[[Chain], Iterator[Played]],
+        cycles: Callable[[JointPipeline], Iterator[Played]],
         assembler: Assembler | None = None,
     ) -> None:
         self.motors = len(joint.motor)
@@ -57,12 +57,12 @@ class Playback:
         self.total = total
         timed = joint.model_copy(update={"bus": joint.bus.model_copy(update={"period_s": period_s})})
         # Without an assembler what it is given are samples already.
-        self.chain = Chain(assembler or Assembler((), 0), *build(timed))
+        self.pipeline = JointPipeline(assembler or Assembler((), 0), *build(timed))
         self._cycles = cycles
 
     def __iter__(self) -> Iterator[Played]:
         with _calm_collector():
-            yield from self._cycles(self.chain)
+            yield from self._cycles(self.pipeline)
 
 
 @contextmanager
@@ -103,24 +103,26 @@ def open_playback(
         log = FrameLog(path, joint, base_dir, channel)
         period_s = log.period_s
         return Playback(
-            joint, period_s, None, lambda chain: _played(log.ticks(chain), period_s), log.assembler
+            joint, period_s, None, lambda pipeline: _played(log.ticks(pipeline), period_s), log.assembler
         )
     if path.suffix.lower() == ".mcap":
         period_s = joint.bus.period_s
         recorded = recorded_cycles(path, len(joint.motor), joint.recording.scale)
-        return Playback(joint, period_s, None, lambda chain: _played(estimated(recorded, chain), period_s))
+        return Playback(
+            joint, period_s, None, lambda pipeline: _played(estimated(recorded, pipeline), period_s)
+        )
     record = read(path, joint, keep_nan=True, names=names)
     times = record.time_s.tolist()
     return Playback(
         joint,
         record.period_s,
         len(record),
-        lambda chain: _from_samples(record.samples(), times, chain),
+        lambda pipeline: _from_samples(record.samples(), times, pipeline),
     )
 
 
-def _from_samples(samples: Iterable[Sample], times: list[float], chain: Chain) -> Iterator[Played]:
-    take = chain.take
+def _from_samples(samples: Iterable[Sample], times: list[float], pipeline: JointPipeline) -> Iterator[Played]:
+    take = pipeline.take
     for time_s, sample in zip(times, samples, strict=True):
         yield Played(time_s, take(sample, 0, round(time_s * 1e9)))
 

@@ -22,9 +22,9 @@ import zenoh.ext
 from drivelink._core import SYNC_COB_ID, Assembler
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cycle.chain import make_assembler
 from drivelink.cycle.following import MapFollower
 from drivelink.cycle.framesource import BusLostError
+from drivelink.cycle.pipeline import make_assembler
 from drivelink.cycle.sources import open_source
 from drivelink.errors import BusError, DriveError, ZenohError
 from drivelink.jointfile import JointFile

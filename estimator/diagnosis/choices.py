@@ -78,7 +78,7 @@ CHOICES: dict[str, Choice] = {
     "noise_rounds": Choice(8, "", "fixed point of parameters and noise", "it converges by a factor in each"),
     "newton_steps": Choice(6, "", "of a hypothesis that is kept", "three are usual"),
     "rough_steps": Choice(3, "", "of hypotheses that are compared", "what they still gain decides nothing"),
-    "converged": Choice(0.02, "standard deviations", "step that ends the iteration", "far below the told"),
+    "converged": Choice(0.02, "standard deviations", "step that ends the iteration", "small beside one"),
     "pinned": Choice(1e-4, "prior's width", "width of a prior that holds", "any narrow one"),
     "patient_steps": Choice(
         20, "", "of a healthy joint's fit", "it starts from springs and readings that nobody knows"

@@ -63,9 +63,9 @@ def _clustered(
     """Covariance of x / unit where errors of one group of rows belong together, noise as it is.
 
     What a fit takes of a group's errors by its leverage H is given back: (1 - H)^(-1/2) e (CR2). Few groups
-    leave the variance unsure, and a parameter that only some of them tell has fewer still: their effective
-    number is (sum h)^2 / sum h^2, h the part of each in its variance. Standard deviations are those whose
-    1.96-fold is the 95 % interval of the t distribution that this leaves.
+    leave the variance unsure, and a parameter that only some of them determine has fewer still: their
+    effective number is (sum h)^2 / sum h^2, h the part of each in its variance. Standard deviations are
+    those whose 1.96-fold is the 95 % interval of the t distribution that this leaves.
     """
     regression = fitted.regression
     weight = np.sqrt(1.0 / (fitted.times * fitted.posterior.sigma**2))[regression.group]

@@ -173,7 +173,7 @@ def transmissions_of(
 def _between(
     after: Fitted, accounts: Sequence[tuple[float, Fitted]], motor: int, alpha: FloatArray
 ) -> FloatArray:
-    """Second moment of a transmission's parameters about those told, over the accounts of the data."""
+    """Second moment of a transmission's parameters about those reported, over the accounts of the data."""
     total = np.zeros((len(alpha),) * 2)
     for chance, other in accounts:
         there = np.array(

@@ -220,10 +220,10 @@ class Search:
     def unseen(self, parent: Fitted) -> list[FloatArray]:
         """What each effect that is not in a hypothesis adds to its covariance, as large as effects may be.
 
-        An effect that was not needed may be there all the same, where the motion does not tell it from the
-        rest: a gear that loses torque, and is always driven the same way, looks like a softer spring. This is
-        the covariance of the larger model less that of the hypothesis (consider covariance; S. F. Schmidt,
-        Advances in Control Systems 3, 1966).
+        An effect that was not needed may be there all the same, where the motion does not separate it from
+        the rest: a gear that loses torque, and is always driven the same way, looks like a softer spring.
+        This is the covariance of the larger model less that of the hypothesis (consider covariance;
+        S. F. Schmidt, Advances in Control Systems 3, 1966).
 
         Returns:
             (k, k) for each effect of the library, at the shape that promises most; not of those that bend the

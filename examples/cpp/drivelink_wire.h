@@ -17,7 +17,7 @@ extern "C" {
 
 enum {
     DRIVELINK_VALID = 1 << 0,      /* the numbers may be used */
-    DRIVELINK_OBSERVABLE = 1 << 1, /* the motion at hand tells the stiffness */
+    DRIVELINK_OBSERVABLE = 1 << 1, /* the motion reveals the stiffness */
     DRIVELINK_MODEL_ALARM = 1 << 4, /* the model is not sufficient */
     /* What must be clear beside it: model alarm, restarted, drive fault, stale, untimed, node restarted,
      * contradicted. */

@@ -82,7 +82,7 @@ def test_frames_that_the_kernel_dropped_because_nobody_read_them_are_counted() -
                     can.Message(arbitration_id=0x181, data=k.to_bytes(8, "little"), is_extended_id=False)
                 )
             read = len(source.take())
-            other.send(can.Message(arbitration_id=0x181, is_extended_id=False))  # tells with itself
+            other.send(can.Message(arbitration_id=0x181, is_extended_id=False))  # collides with itself
             source.wait(1.0)
             read += len(source.take())
         assert 0 < read < 201

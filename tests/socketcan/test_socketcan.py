@@ -132,15 +132,15 @@ def test_the_daemon_survives_an_interface_that_goes_and_comes_back(removed: bool
     network = network_from_joint(joint, bus)
     network.start()
     daemon = Daemon([ServedJoint(joint=joint)], publish=False, real_time=False)
-    chain = daemon.chains[0]
+    pipeline = daemon.pipelines[0]
     try:
         with running(daemon):
-            until(lambda: chain.estimate and chain.estimate.status & Status.VALID)
+            until(lambda: pipeline.estimate and pipeline.estimate.status & Status.VALID)
             ip("set", "vcan1", "down")
             if removed:
                 ip("del", "vcan1")
-            until(lambda: chain.estimate.status & Status.STALE)
-            assert not chain.estimate.status & Status.VALID
+            until(lambda: pipeline.estimate.status & Status.STALE)
+            assert not pipeline.estimate.status & Status.VALID
             until(lambda: any("the bus is lost" in text for text in daemon.events.active.values()))
             network.stop()
             bus.shutdown()
@@ -150,7 +150,7 @@ def test_the_daemon_survives_an_interface_that_goes_and_comes_back(removed: bool
             bus = open_sim_bus(joint.bus)
             network = network_from_joint(joint, bus)
             network.start()
-            until(lambda: chain.estimate.status & Status.VALID)
+            until(lambda: pipeline.estimate.status & Status.VALID)
             assert "bus" not in daemon.events.active
     finally:
         network.stop()

@@ -11,7 +11,7 @@
 use estimator_core::sample::{MOTORS, Sample};
 
 use crate::cross_check::{CrossCheck, Kind, spoils};
-use crate::frames::{Slot, target};
+use crate::frames::{TpdoDecoder, target};
 use crate::layout::{self, Signal};
 use crate::node::Node;
 use crate::status::{BUS_FAULT, CONTRADICTED, DRIVE_FAULT, NODE_RESTARTED, UNTIMED};
@@ -36,7 +36,7 @@ const VALUES: usize = 8 * MOTORS + 2;
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Receiver {
     Nobody,
-    Slot(usize),
+    TpdoDecoder(usize),
     Sync,
     Command,
     Heartbeat(usize),
@@ -50,11 +50,11 @@ pub struct Assembler {
     active: bool,
     hold_periods: i64,
     values: [f64; VALUES],
-    told: [i64; VALUES], // number of the SYNC that each of them answered
-    period: f64,         // s
+    answered: [i64; VALUES], // number of the SYNC that each value answered
+    period: f64,             // s
     checks: Vec<CrossCheck>,
     nodes: Vec<Node>,
-    slots: Vec<Slot>,
+    decoders: Vec<TpdoDecoder>,
     receivers: Vec<Receiver>,
     open: bool,
     spoiled: bool,
@@ -101,11 +101,11 @@ impl Assembler {
             active,
             hold_periods,
             values: [f64::NAN; VALUES],
-            told: [-1; VALUES],
+            answered: [-1; VALUES],
             period: period_s,
             checks: Vec::new(),
             nodes: Vec::new(),
-            slots: Vec::new(),
+            decoders: Vec::new(),
             receivers: Vec::new(),
             open: false,
             spoiled: false,
@@ -172,10 +172,10 @@ impl Assembler {
 
     /// Nodes that the current cycle still waits for, some of them twice.
     pub fn missing_nodes(&self) -> impl Iterator<Item = u32> + '_ {
-        self.slots
+        self.decoders
             .iter()
-            .filter(|slot| slot.timed() && !slot.arrived)
-            .map(|slot| self.nodes[slot.node].node_id)
+            .filter(|decoder| decoder.timed() && !decoder.arrived)
+            .map(|decoder| self.nodes[decoder.node].node_id)
     }
 
     /// Take one frame in the order of the bus, SYNC included; the sample that it completes, if it does.
@@ -185,14 +185,14 @@ impl Assembler {
     pub fn feed(&mut self, cob_id: u32, data: &[u8], jump: i64) -> Option<Sample> {
         match self.receivers.get(cob_id as usize)? {
             Receiver::Nobody => None,
-            Receiver::Slot(slot) => self.pdo(*slot, data),
+            Receiver::TpdoDecoder(decoder) => self.pdo(*decoder, data),
             Receiver::Sync => self.sync(jump),
             Receiver::Command => {
                 if let [command, addressed] = *data {
                     for node in 0..self.nodes.len() {
                         if addressed == 0 || u32::from(addressed) == self.nodes[node].node_id {
-                            let (node, slots) = self.node_and_slots(node);
-                            node.command(command, addressed, slots);
+                            let (node, decoders) = self.node_and_decoders(node);
+                            node.command(command, addressed, decoders);
                         }
                     }
                 }
@@ -201,8 +201,8 @@ impl Assembler {
             }
             Receiver::Heartbeat(node) => {
                 if let [state] = *data {
-                    let (node, slots) = self.node_and_slots(*node);
-                    node.heartbeat(state, slots);
+                    let (node, decoders) = self.node_and_decoders(*node);
+                    node.heartbeat(state, decoders);
                 }
                 self.note_news();
                 None
@@ -226,8 +226,8 @@ impl Assembler {
             self.extra_syncs += 1;
             self.spoiled = true; // what comes now answers that SYNC or ours: unknowable
             self.untimed = DOUBT_CYCLES;
-            for slot in self.slots.iter_mut().filter(|slot| slot.timed()) {
-                slot.suspect = DOUBT_CYCLES; // nor of those that come after ours
+            for decoder in self.decoders.iter_mut().filter(|decoder| decoder.timed()) {
+                decoder.suspect = DOUBT_CYCLES; // nor of those that come after ours
             }
             return None;
         }
@@ -252,9 +252,9 @@ impl Assembler {
 
     fn await_all(&mut self) {
         self.awaited = 0;
-        for slot in &mut self.slots {
-            slot.arrived = false;
-            self.awaited += usize::from(slot.timed());
+        for decoder in &mut self.decoders {
+            decoder.arrived = false;
+            self.awaited += usize::from(decoder.timed());
         }
     }
 
@@ -262,10 +262,10 @@ impl Assembler {
         let was_open = std::mem::replace(&mut self.open, false);
         let unnumbered = std::mem::replace(&mut self.unnumbered, false);
         self.missed = None;
-        for slot in self.slots.iter_mut().filter(|slot| slot.needed() && !slot.arrived) {
-            slot.silent += jump;
-            if self.active && slot.every > 0 && slot.silent > self.hold_periods {
-                self.nodes[slot.node].trusted = false; // nobody knows what it has lived through
+        for decoder in self.decoders.iter_mut().filter(|decoder| decoder.needed() && !decoder.arrived) {
+            decoder.silent += jump;
+            if self.active && decoder.every > 0 && decoder.silent > self.hold_periods {
+                self.nodes[decoder.node].trusted = false; // nobody knows what it has lived through
             }
         }
         if !was_open {
@@ -275,14 +275,14 @@ impl Assembler {
             return None;
         }
         if self.usable() {
-            for slot in self.slots.iter_mut().filter(|slot| slot.timed() && slot.suspect > 0) {
-                slot.suspect -= 1;
-                slot.owed = if slot.suspect > 0 { slot.owed } else { 0 };
+            for decoder in self.decoders.iter_mut().filter(|decoder| decoder.timed() && decoder.suspect > 0) {
+                decoder.suspect -= 1;
+                decoder.owed = if decoder.suspect > 0 { decoder.owed } else { 0 };
                 self.cycle_fault = true;
             }
             return Some(self.sample());
         }
-        let all_arrived = self.slots.iter().all(|slot| slot.arrived || !slot.timed());
+        let all_arrived = self.decoders.iter().all(|decoder| decoder.arrived || !decoder.timed());
         if self.note_missing() || self.spoiled || all_arrived {
             self.missed = Some(self.sequence);
             self.flags = BUS_FAULT | self.faulted | self.contradicted;
@@ -293,14 +293,14 @@ impl Assembler {
     /// Count what has not come though it was due; whether there is any.
     fn note_missing(&mut self) -> bool {
         let mut missing = false;
-        for slot in self.slots.iter_mut().filter(|slot| slot.timed()) {
-            if !slot.arrived && slot.silent >= slot.every {
-                self.nodes[slot.node].counters.missing += 1;
-                slot.suspect = DOUBT_CYCLES;
-                slot.owed = (slot.owed + 1).min(MOST_OWED);
+        for decoder in self.decoders.iter_mut().filter(|decoder| decoder.timed()) {
+            if !decoder.arrived && decoder.silent >= decoder.every {
+                self.nodes[decoder.node].counters.missing += 1;
+                decoder.suspect = DOUBT_CYCLES;
+                decoder.owed = (decoder.owed + 1).min(MOST_OWED);
                 missing = true;
             } else if self.spoiled {
-                slot.suspect = DOUBT_CYCLES;
+                decoder.suspect = DOUBT_CYCLES;
             }
         }
         missing
@@ -309,26 +309,28 @@ impl Assembler {
     /// Whether everything a sample needs is there, and nothing speaks against it.
     fn usable(&self) -> bool {
         !self.spoiled
-            && self.slots.iter().all(|slot| {
-                if slot.timed() {
-                    slot.arrived && slot.conflict == 0
+            && self.decoders.iter().all(|decoder| {
+                if decoder.timed() {
+                    decoder.arrived && decoder.conflict == 0
                 } else {
-                    !slot.held()
-                        || slot.heard && slot.silent <= self.hold_periods && self.nodes[slot.node].trusted
+                    !decoder.held()
+                        || decoder.heard
+                            && decoder.silent <= self.hold_periods
+                            && self.nodes[decoder.node].trusted
                 }
             })
     }
 
     /// Whether no frame of this cycle can be that of an earlier one.
     fn certain(&self) -> bool {
-        !self.slots.iter().any(|slot| slot.timed() && slot.suspect > 0)
+        !self.decoders.iter().any(|decoder| decoder.timed() && decoder.suspect > 0)
     }
 
     fn pdo(&mut self, index: usize, data: &[u8]) -> Option<Sample> {
-        let slot = &self.slots[index];
-        let (every, needed) = (slot.every, slot.needed());
-        let node = &mut self.nodes[slot.node];
-        if !slot.fits(data.len()) {
+        let decoder = &self.decoders[index];
+        let (every, needed) = (decoder.every, decoder.needed());
+        let node = &mut self.nodes[decoder.node];
+        if !decoder.fits(data.len()) {
             node.counters.wrong_length += 1;
             self.cycle_fault = true;
             return None;
@@ -340,44 +342,44 @@ impl Assembler {
         if self.sequence < 0 {
             return None;
         }
-        if slot.arrived && every > 0 {
+        if decoder.arrived && every > 0 {
             if !self.repeated(index, data) {
                 return None;
             }
         } else {
-            let slot = &mut self.slots[index];
-            slot.conflict = slot.conflict.saturating_sub(1);
+            let decoder = &mut self.decoders[index];
+            decoder.conflict = decoder.conflict.saturating_sub(1);
         }
         self.decode(index, data);
-        let slot = &mut self.slots[index];
-        if !slot.arrived && every > 0 && needed {
+        let decoder = &mut self.decoders[index];
+        if !decoder.arrived && every > 0 && needed {
             self.awaited = self.awaited.saturating_sub(1);
         }
-        slot.arrived = true;
-        slot.heard = true;
-        slot.silent = 0;
-        self.nodes[slot.node].counters.received += 1;
+        decoder.arrived = true;
+        decoder.heard = true;
+        decoder.silent = 0;
+        self.nodes[decoder.node].counters.received += 1;
         if self.awaited > 0 || !self.open || !needed {
             return None;
         }
-        let any_timed = self.slots.iter().any(Slot::timed);
+        let any_timed = self.decoders.iter().any(TpdoDecoder::timed);
         (any_timed && self.usable() && self.certain()).then(|| self.sample())
     }
 
     /// Whether a further frame in one cycle is the one that belongs to it.
     fn repeated(&mut self, index: usize, data: &[u8]) -> bool {
-        let slot = &mut self.slots[index];
-        let counters = &mut self.nodes[slot.node].counters;
-        let same = slot.repeats(data);
-        if slot.suspect > 0 && same {
+        let decoder = &mut self.decoders[index];
+        let counters = &mut self.nodes[decoder.node].counters;
+        let same = decoder.repeats(data);
+        if decoder.suspect > 0 && same {
             counters.duplicate += 1; // the same once more settles nothing
             return false;
         }
-        if slot.suspect > 0 && slot.conflict == 0 {
+        if decoder.suspect > 0 && decoder.conflict == 0 {
             // The first was a late one of a cycle before.
-            slot.owed = slot.owed.saturating_sub(1);
-            if slot.owed == 0 {
-                slot.suspect = 0;
+            decoder.owed = decoder.owed.saturating_sub(1);
+            if decoder.owed == 0 {
+                decoder.suspect = 0;
             }
             counters.late += 1;
             self.cycle_fault = true;
@@ -385,7 +387,7 @@ impl Assembler {
         }
         counters.duplicate += 1;
         if !same && !self.spoiled {
-            slot.conflict = CONFLICT_CYCLES; // two nodes answer, or somebody babbles: believe neither
+            decoder.conflict = CONFLICT_CYCLES; // two nodes answer, or somebody babbles: believe neither
             self.spoiled = true;
             counters.conflicting += 1;
         }
@@ -393,13 +395,13 @@ impl Assembler {
     }
 
     fn decode(&mut self, index: usize, data: &[u8]) {
-        let slot = &mut self.slots[index];
-        let statusword = slot.store(data);
-        for field in &mut slot.fields {
+        let decoder = &mut self.decoders[index];
+        let statusword = decoder.store(data);
+        for field in &mut decoder.fields {
             self.values[field.target] = field.take(data);
-            self.told[field.target] = self.sequence;
+            self.answered[field.target] = self.sequence;
         }
-        let node = &mut self.nodes[slot.node];
+        let node = &mut self.nodes[decoder.node];
         if statusword.is_some() && statusword != node.statusword {
             node.take_statusword(statusword.unwrap_or_default());
             self.note_news();
@@ -453,8 +455,8 @@ impl Assembler {
     /// A node has been configured and started.
     pub fn trust(&mut self, node_id: u32) {
         if let Some(node) = self.nodes.iter().position(|node| node.node_id == node_id) {
-            let (node, slots) = self.node_and_slots(node);
-            node.trust(slots);
+            let (node, decoders) = self.node_and_decoders(node);
+            node.trust(decoders);
         }
     }
 
@@ -463,12 +465,12 @@ impl Assembler {
     /// # Errors
     /// As for `new`; then everything is as it was.
     pub fn relayout(&mut self, layout: &layout::Node) -> Result<(), String> {
-        let before = self.slots.clone();
-        self.slots.retain(|slot| self.nodes[slot.node].node_id != layout.node_id);
+        let before = self.decoders.clone();
+        self.decoders.retain(|decoder| self.nodes[decoder.node].node_id != layout.node_id);
         let changed = self.add(layout).and_then(|()| self.check());
         match changed {
             Ok(()) => self.restart = true, // what is decoded anew may jump
-            Err(_) => self.slots = before,
+            Err(_) => self.decoders = before,
         }
         self.arrange();
         self.arrange_checks();
@@ -481,10 +483,10 @@ impl Assembler {
             return Err(format!("node {node_id}: expected a node of this joint"));
         };
         for tpdo in &layout.tpdos {
-            if self.slots.iter().any(|slot| slot.cob_id == tpdo.cob_id) {
+            if self.decoders.iter().any(|decoder| decoder.cob_id == tpdo.cob_id) {
                 return Err(format!("node {node_id}: COB-ID 0x{:03X} is used by two TPDOs", tpdo.cob_id));
             }
-            self.slots.push(Slot::new(tpdo, node, layout.motor, self.motors));
+            self.decoders.push(TpdoDecoder::new(tpdo, node, layout.motor, self.motors));
         }
         Ok(())
     }
@@ -501,7 +503,7 @@ impl Assembler {
     }
 
     fn carries(&self, target: usize) -> bool {
-        self.slots.iter().flat_map(|slot| &slot.fields).any(|field| field.target == target)
+        self.decoders.iter().flat_map(|decoder| &decoder.fields).any(|field| field.target == target)
     }
 
     fn arrange(&mut self) {
@@ -513,18 +515,18 @@ impl Assembler {
             self.receivers[(0x080 + of.node_id as usize) % COB_IDS] = Receiver::Error(node);
         }
         self.receivers[SYNC_COB_ID as usize] = Receiver::Sync;
-        for (slot, of) in self.slots.iter().enumerate() {
-            self.receivers[of.cob_id as usize % COB_IDS] = Receiver::Slot(slot);
+        for (decoder, of) in self.decoders.iter().enumerate() {
+            self.receivers[of.cob_id as usize % COB_IDS] = Receiver::TpdoDecoder(decoder);
         }
-        self.awaited = self.slots.iter().filter(|slot| slot.timed() && !slot.arrived).count();
+        self.awaited = self.decoders.iter().filter(|decoder| decoder.timed() && !decoder.arrived).count();
     }
 
     /// Which readings of one quantity are mapped.
     fn arrange_checks(&mut self) {
         let fields: Vec<(usize, f64)> = self
-            .slots
+            .decoders
             .iter()
-            .flat_map(|slot| &slot.fields)
+            .flat_map(|decoder| &decoder.fields)
             .map(|field| (field.target, field.scale))
             .collect();
         self.checks.clear();
@@ -560,7 +562,7 @@ impl Assembler {
             let motor = check.motor;
             let now = |signal| {
                 let place = target(signal, Some(motor), motors)?;
-                (self.told[place] == self.sequence).then_some(self.values[place])
+                (self.answered[place] == self.sequence).then_some(self.values[place])
             };
             let position = now(Signal::MotorPosition);
             let (first, second) = match check.kind {
@@ -582,8 +584,8 @@ impl Assembler {
         }
     }
 
-    fn node_and_slots(&mut self, node: usize) -> (&mut Node, impl Iterator<Item = &mut Slot>) {
-        (&mut self.nodes[node], self.slots.iter_mut().filter(move |slot| slot.node == node))
+    fn node_and_decoders(&mut self, node: usize) -> (&mut Node, impl Iterator<Item = &mut TpdoDecoder>) {
+        (&mut self.nodes[node], self.decoders.iter_mut().filter(move |decoder| decoder.node == node))
     }
 
     fn note_news(&mut self) {

@@ -433,7 +433,7 @@ mod tests {
     }
 
     #[test]
-    fn a_declared_scale_that_is_wrong_from_the_start_is_told() {
+    fn a_declared_scale_that_is_wrong_from_the_start_is_found() {
         let mut check = CrossCheck::new(Kind::Velocity, 0, STEPS, 1e-3);
         run(&mut check, 0, 10_000, |t, n| (healthy(t, n).0, 4.0 * healthy(t, n).1));
         assert_eq!(check.verdict(), Verdict::Contradicts);
@@ -464,7 +464,7 @@ mod tests {
     }
 
     #[test]
-    fn cycles_that_are_lost_cost_nothing_and_rest_tells_nothing() {
+    fn cycles_that_are_lost_cost_nothing_and_nothing_is_tested_at_rest() {
         let mut check = CrossCheck::new(Kind::Velocity, 0, STEPS, 1e-3);
         let mut seed = 7;
         for k in 0..60_000 {

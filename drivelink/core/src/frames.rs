@@ -109,7 +109,7 @@ pub fn target(signal: Signal, motor: Option<usize>, motors: usize) -> Option<usi
 
 /// One TPDO of one node, with what has become of it in this cycle.
 #[derive(Clone, Debug)]
-pub struct Slot {
+pub struct TpdoDecoder {
     /// Which of the joint's nodes sends it.
     pub node: usize,
     /// Identifier of its frames.
@@ -136,9 +136,9 @@ pub struct Slot {
     last: ([u8; MOST_BYTES], usize),
 }
 
-impl Slot {
-    /// The slot of a TPDO of node number `node`, which drives `motor`.
-    pub fn new(tpdo: &Tpdo, node: usize, motor: Option<usize>, motors: usize) -> Slot {
+impl TpdoDecoder {
+    /// The decoder of a TPDO of node number `node`, which drives `motor`.
+    pub fn new(tpdo: &Tpdo, node: usize, motor: Option<usize>, motors: usize) -> TpdoDecoder {
         let mut fields = Vec::new();
         let mut statusword = None;
         let mut bit = 0;
@@ -153,7 +153,7 @@ impl Slot {
         let length = (bit as usize).div_ceil(8);
         // More than eight bytes travel in the next CAN FD length, padded.
         let padded = FD_LENGTHS.into_iter().find(|padded| *padded >= length);
-        Slot {
+        TpdoDecoder {
             node,
             cob_id: tpdo.cob_id,
             fields,

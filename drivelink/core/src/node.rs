@@ -2,7 +2,7 @@
 //!
 //! Made from frames alone, so that a replayed log comes to the same judgement as the live run.
 
-use crate::frames::Slot;
+use crate::frames::TpdoDecoder;
 
 const START: u8 = 0x01;
 const RESETS: [u8; 2] = [0x81, 0x82]; // node, communication
@@ -75,19 +75,24 @@ impl Node {
         }
     }
 
-    /// From now on its frames mean what its layout says; `slots` are its own.
-    pub fn trust<'a>(&mut self, slots: impl Iterator<Item = &'a mut Slot>) {
+    /// From now on its frames mean what its layout says; `decoders` are its own.
+    pub fn trust<'a>(&mut self, decoders: impl Iterator<Item = &'a mut TpdoDecoder>) {
         self.trusted = true;
-        for slot in slots {
-            slot.silent = 0;
-            slot.owed = 0;
+        for decoder in decoders {
+            decoder.silent = 0;
+            decoder.owed = 0;
         }
     }
 
     /// An NMT command that is addressed to this node, or to all.
-    pub fn command<'a>(&mut self, command: u8, addressed: u8, slots: impl Iterator<Item = &'a mut Slot>) {
+    pub fn command<'a>(
+        &mut self,
+        command: u8,
+        addressed: u8,
+        decoders: impl Iterator<Item = &'a mut TpdoDecoder>,
+    ) {
         if command == START && self.active && !self.supervised && addressed != 0 {
-            self.trust(slots);
+            self.trust(decoders);
         } else if RESETS.contains(&command) {
             self.trusted = false;
             self.restarted = true; // it will; its boot-up message may get lost
@@ -95,7 +100,7 @@ impl Node {
     }
 
     /// Boot-up (state 0) or heartbeat.
-    pub fn heartbeat<'a>(&mut self, state: u8, slots: impl Iterator<Item = &'a mut Slot>) {
+    pub fn heartbeat<'a>(&mut self, state: u8, decoders: impl Iterator<Item = &'a mut TpdoDecoder>) {
         let state = state & 0x7F;
         if state == 0 {
             self.counters.reboots += 1;
@@ -104,11 +109,11 @@ impl Node {
             self.emergency = 0;
             self.statusword = None;
             self.restarted = true;
-            slots.for_each(Slot::forget);
+            decoders.for_each(TpdoDecoder::forget);
             return;
         }
-        for slot in slots.filter(|slot| slot.every == 0) {
-            slot.silent = 0;
+        for decoder in decoders.filter(|decoder| decoder.every == 0) {
+            decoder.silent = 0;
         }
     }
 

@@ -159,10 +159,10 @@ impl Pipeline {
         &mut self,
         sample: &Sample,
         motors: usize,
-        told: (Estimate, Option<External>),
+        results: (Estimate, Option<External>),
         stamp_ns: Option<i64>,
     ) -> Tick {
-        self.publish(told, Some(*sample), motors, stamp_ns)
+        self.publish(results, Some(*sample), motors, stamp_ns)
     }
 
     /// The last estimate under a new number: stale, not valid; `None` where there never was one.
@@ -222,6 +222,7 @@ pub fn estimate(
     }
     estimate.status |= flags;
     let valid = estimate.status & VALID != 0;
-    let external = estimator.external()?.map(|told| if valid { told } else { told.void(told.sequence) });
+    let external =
+        estimator.external()?.map(|external| if valid { external } else { external.void(external.sequence) });
     Ok((estimate, external))
 }

@@ -1,4 +1,4 @@
-//! The Python module `drivelink._core`: `Assembler`, `Chain` and what they give.
+//! The Python module `drivelink._core`: `Assembler`, `JointPipeline` and what they give.
 //!
 //! No lock is held while Python code runs.
 
@@ -405,7 +405,7 @@ impl Assembler {
 
     #[getter]
     fn checks(&self) -> Vec<(usize, &'static str, &'static str, f64, f64)> {
-        let told = |check: &CrossCheck| {
+        let fields = |check: &CrossCheck| {
             let verdict = match check.verdict() {
                 Verdict::Untested => "untested",
                 Verdict::Agrees => "agrees",
@@ -414,7 +414,7 @@ impl Assembler {
             let (scale, std) = check.scale();
             (check.motor + 1, check.kind.name(), verdict, scale, std)
         };
-        lock(&self.core).checks().iter().map(told).collect()
+        lock(&self.core).checks().iter().map(fields).collect()
     }
 
     #[getter]
@@ -589,7 +589,7 @@ impl History {
     }
 }
 
-/// The estimator of a chain, and the monitor of its model: compiled ones are called without Python in between.
+/// The estimator of a pipeline, and the monitor of its model: compiled ones are called without Python in between.
 struct Driver {
     estimator: Py<PyAny>,
     compiled: Option<Py<Estimator>>,
@@ -651,8 +651,8 @@ impl Step for Driver {
                 return Ok(compiled.try_borrow(py).map_err(PyErr::from)?.inner.external());
             }
             // An estimator that somebody registered may have none.
-            let Ok(told) = self.estimator.getattr(py, "external") else { return Ok(None) };
-            Ok(told.extract::<Option<ExternalFields>>(py)?.map(external_of))
+            let Ok(external) = self.estimator.getattr(py, "external") else { return Ok(None) };
+            Ok(external.extract::<Option<ExternalFields>>(py)?.map(external_of))
         })
         .map_err(Failure::from)
     }
@@ -660,7 +660,7 @@ impl Step for Driver {
 
 /// Frames of one joint in, estimates and their bytes out.
 #[pyclass(frozen, module = "drivelink._core")]
-struct Chain {
+struct JointPipeline {
     assembler: Py<Assembler>,
     history: Py<History>,
     state: Mutex<Pipeline>,
@@ -668,7 +668,7 @@ struct Chain {
     objects: Mutex<(Py<PyAny>, Option<Py<PyAny>>)>, // estimator and watch, for whoever asks
 }
 
-impl Chain {
+impl JointPipeline {
     /// Estimate a sample for which these service bits hold.
     fn run(
         &self,
@@ -677,7 +677,7 @@ impl Chain {
         flags: u32,
         stamp_ns: Option<i64>,
     ) -> PyResult<pipeline::Tick> {
-        let told = {
+        let results = {
             let Ok(mut driver) = self.driver.try_lock() else {
                 return Err(PyRuntimeError::new_err("two threads feed one joint"));
             };
@@ -685,12 +685,12 @@ impl Chain {
             pipeline::estimate(&mut *driver, sample, flags).map_err(to_python)?
         };
         self.history.get().push(*sample, motors);
-        Ok(lock(&self.state).take(sample, motors, told, stamp_ns))
+        Ok(lock(&self.state).take(sample, motors, results, stamp_ns))
     }
 }
 
 #[pymethods]
-impl Chain {
+impl JointPipeline {
     #[new]
     #[pyo3(signature = (assembler, estimator, watch = None, *, keep = 0))]
     fn new(
@@ -699,9 +699,9 @@ impl Chain {
         estimator: Py<PyAny>,
         watch: Option<Py<PyAny>>,
         keep: usize,
-    ) -> PyResult<Chain> {
+    ) -> PyResult<JointPipeline> {
         let objects = (estimator.clone_ref(py), watch.as_ref().map(|watch| watch.clone_ref(py)));
-        Ok(Chain {
+        Ok(JointPipeline {
             assembler,
             history: Py::new(py, History { keep, kept: Mutex::new(VecDeque::with_capacity(keep)) })?,
             state: Mutex::default(),
@@ -744,7 +744,7 @@ impl Chain {
     #[getter]
     fn external<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
         let last = lock(&self.state).last().copied();
-        last.and_then(|tick| tick.external).map(|told| external_object(py, &told)).transpose()
+        last.and_then(|tick| tick.external).map(|external| external_object(py, &external)).transpose()
     }
 
     #[getter]
@@ -817,7 +817,7 @@ mod extension {
 
     #[pymodule_export]
     use super::{
-        Assembler, Chain, Estimator, History, ModelMonitor, NodeCounters, Tick, encode_estimate,
+        Assembler, Estimator, History, JointPipeline, ModelMonitor, NodeCounters, Tick, encode_estimate,
         encode_external, encode_sample,
     };
 

@@ -172,22 +172,22 @@ impl DeflectionFilter {
     }
 
     /// One step towards the steady-state gains.
-    pub fn tune(&mut self, told: &Tuning) {
+    pub fn tune(&mut self, tuning: &Tuning) {
         let (t, w) = (self.period, self.w);
-        (self.inertia, self.damping) = (told.inertia, told.damping);
-        self.jerk += self.average * (LIVELY * told.jerk * told.jerk - self.jerk);
+        (self.inertia, self.damping) = (tuning.inertia, tuning.damping);
+        self.jerk += self.average * (LIVELY * tuning.jerk * tuning.jerk - self.jerk);
         self.peak = (self.fade * self.peak).max(self.jerk);
-        let noise = told.motor_noise + told.link_noise;
-        if !(noise > 0.0 && self.peak > 0.0 && told.unmodelled < f64::INFINITY) {
+        let noise = tuning.motor_noise + tuning.link_noise;
+        if !(noise > 0.0 && self.peak > 0.0 && tuning.unmodelled < f64::INFINITY) {
             self.modelled = false; // the motor's balance is unknown: it cannot predict its motion
             return;
         }
         let density = noise * t;
         let natural = (self.jerk.max(0.1 * self.peak) * CORRELATION_S / density).powf(1.0 / 6.0);
         let natural = natural.clamp(SLOWEST * w, FASTEST * w);
-        self.count_steps(told, natural);
-        let mut c = told.stiffness.max(0.0) / self.inertia;
-        let mut drift = (told.unmodelled / self.inertia).powi(2) * CORRELATION_S;
+        self.count_steps(tuning, natural);
+        let mut c = tuning.stiffness.max(0.0) / self.inertia;
+        let mut drift = (tuning.unmodelled / self.inertia).powi(2) * CORRELATION_S;
         if !(c * t * t < STIFF && drift < noise * w.powi(4) * 1e6) {
             (c, drift) = (0.0, noise * w.powi(4));
         }
@@ -201,7 +201,7 @@ impl DeflectionFilter {
         let moved = self.moved(&before, c, drift * t, density * natural.powi(6) * t);
         // Kalman gains for measured θ and φ = q − θ, whose noises share θ's.
         let (s00, s01, s11) =
-            (moved[0][0] + told.motor_noise, moved[0][2] - told.motor_noise, moved[2][2] + noise);
+            (moved[0][0] + tuning.motor_noise, moved[0][2] - tuning.motor_noise, moved[2][2] + noise);
         let determinant = s00 * s11 - s01 * s01;
         if !(determinant > 0.0 && determinant < f64::INFINITY) {
             self.p = None;
@@ -249,10 +249,10 @@ impl DeflectionFilter {
     }
 
     /// The variance of φ that quantisation leaves, were all noise quantisation.
-    fn count_steps(&mut self, told: &Tuning, memory_rad_s: f64) {
+    fn count_steps(&mut self, tuning: &Tuning, memory_rad_s: f64) {
         let rates = [self.x[1], self.x[1] + self.x[3]];
         self.counted = 0.0;
-        for (i, noise) in [told.motor_noise, told.link_noise].into_iter().enumerate() {
+        for (i, noise) in [tuning.motor_noise, tuning.link_noise].into_iter().enumerate() {
             self.squares[i] += self.average * (rates[i] * rates[i] - self.squares[i]);
             if noise > 0.0 {
                 let counts = (self.squares[i] / (12.0 * noise)).sqrt() / memory_rad_s;

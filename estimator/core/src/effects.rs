@@ -176,12 +176,12 @@ impl JointEffects {
     /// The torques at one period's coordinates, of each motor and of the link; corrected positions are taken
     /// back to what was read.
     pub fn torques(&mut self, motors: &[Coordinates], link: &Coordinates) -> Torques {
-        let mut told = Torques { link: self.link.torque(link, self.period), ..Torques::default() };
+        let mut torques = Torques { link: self.link.torque(link, self.period), ..Torques::default() };
         for (i, (effects, c)) in self.motors.iter_mut().zip(motors).enumerate() {
             let c = Coordinates { position: c.position - effects.offset, ..*c };
-            told.motor[i] = effects.motor.torque(&c, self.period);
-            told.transmission[i] = effects.transmission.torque(&c, self.period);
+            torques.motor[i] = effects.motor.torque(&c, self.period);
+            torques.transmission[i] = effects.transmission.torque(&c, self.period);
         }
-        told
+        torques
     }
 }

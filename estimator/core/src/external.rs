@@ -230,11 +230,11 @@ struct Consistency {
 }
 
 impl Consistency {
-    fn see(&mut self, told: &External, period_s: f64) {
-        if told.status & status::VALID == 0 {
+    fn see(&mut self, external: &External, period_s: f64) {
+        if external.status & status::VALID == 0 {
             return;
         }
-        let now = [told.difference * told.difference, told.link_torque * told.link_torque];
+        let now = [external.difference * external.difference, external.link_torque * external.link_torque];
         let squares = self.squares.get_or_insert(now);
         let gain = (period_s / CONSISTENCY_S).min(1.0);
         (0..2).for_each(|i| squares[i] += gain * (now[i] - squares[i]));
@@ -254,7 +254,7 @@ fn gravity(link: &Link, q: f64) -> f64 {
 ///
 /// Damping is the one, and so is a skew between the encoders: d of it makes σ d q′ of torque. From the motor's
 /// side a skew and the motor's friction look alike; here only the link's damping does, and nothing is to be
-/// told apart. Of a link that turns one way only, a load and friction are the same: nothing is learned there.
+/// separated. Of a link that turns one way only, a load and friction are the same: nothing is learned there.
 #[derive(Clone, Copy, Debug, Default)]
 struct Friction {
     values: [f64; 2],
@@ -693,15 +693,15 @@ mod tests {
         momentum.restart(0.0, 0.0);
         let (load, speed) = (-1.9, 40.0);
         let carried = Carried { torque: load, stiffness: 35.0, ..Carried::default() };
-        let mut told = External::nothing(0);
+        let mut external = External::nothing(0);
         for k in 1..20_000_u64 {
             momentum.feed(speed * k as f64 * T, Some(load), f64::NAN);
-            told = momentum.conclude(k, &carried, 1e-10, true);
+            external = momentum.conclude(k, &carried, 1e-10, true);
         }
-        assert!(told.status & status::VALID != 0);
-        assert!((told.torque - load).abs() < 0.01 * load.abs(), "{}", told.torque);
+        assert!(external.status & status::VALID != 0);
+        assert!((external.torque - load).abs() < 0.01 * load.abs(), "{}", external.torque);
         // A skew of one period between the encoders would make as much: that is said.
-        assert!(told.torque_std > 0.5 * carried.stiffness * T * speed, "{}", told.torque_std);
+        assert!(external.torque_std > 0.5 * carried.stiffness * T * speed, "{}", external.torque_std);
     }
 
     #[test]
@@ -719,12 +719,12 @@ mod tests {
         for k in 1..60 {
             let t = f64::from(k) * T;
             momentum.feed(0.5 * push / FREE.inertia * t * t, Some(0.0), f64::NAN);
-            let told = momentum.conclude(k as u64, &Carried::default(), 1e-14, true);
+            let external = momentum.conclude(k as u64, &Carried::default(), 1e-14, true);
             let x = w * t;
             let expected = push * (1.0 - (-x).exp() * (1.0 + x + 0.5 * x * x));
-            assert!((told.torque - expected).abs() < 0.01 * push, "{k}: {} {expected}", told.torque);
-            assert!(told.difference == told.torque && told.link_torque == -told.torque);
-            if found.is_none() && told.status & status::CONTACT != 0 {
+            assert!((external.torque - expected).abs() < 0.01 * push, "{k}: {} {expected}", external.torque);
+            assert!(external.difference == external.torque && external.link_torque == -external.torque);
+            if found.is_none() && external.status & status::CONTACT != 0 {
                 found = Some(k);
             }
         }
@@ -742,8 +742,8 @@ mod tests {
             let push = 3.0 * (20.0 * t).sin();
             let q = 3.0 / FREE.inertia * (t / 20.0 - (20.0 * t).sin() / 400.0);
             momentum.feed(q, Some(0.0), push);
-            let told = momentum.conclude(k as u64, &Carried::default(), 1e-14, true);
-            assert!(told.difference.abs() < 2e-3, "{k}: {}", told.difference);
+            let external = momentum.conclude(k as u64, &Carried::default(), 1e-14, true);
+            assert!(external.difference.abs() < 2e-3, "{k}: {}", external.difference);
         }
     }
 
@@ -765,10 +765,10 @@ mod tests {
                 link_velocity: 0.0,
                 external_torque: nothing,
             };
-            let told = momentum.update(&sample, 1, 0.0, 0.0, true);
+            let external = momentum.update(&sample, 1, 0.0, 0.0, true);
             if k > 0 {
                 let expected = -6.0 * q.sin() * (1.0 - (-settings.k_tau * T * k as f64).exp());
-                assert!((told.link_torque - expected).abs() < 1e-9, "{k}");
+                assert!((external.link_torque - expected).abs() < 1e-9, "{k}");
             }
         }
     }

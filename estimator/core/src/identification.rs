@@ -636,10 +636,10 @@ impl OnlineIdentification {
             _ => return self.renew_reference(), // the stiffness has been followed
         };
         self.restore_reference();
-        let (told, index) = (verdict.of(change), self.law.size + place);
+        let (explanation, index) = (verdict.of(change), self.law.size + place);
         if let Some(kalman) = &mut self.kalman {
-            kalman.x[index] += told.amplitude;
-            kalman.inflate(index, 4.0 * told.std * told.std);
+            kalman.x[index] += explanation.amplitude;
+            kalman.inflate(index, 4.0 * explanation.std * explanation.std);
         }
         self.renew_reference();
     }

@@ -323,12 +323,12 @@ impl Isolation {
             known.copy_from_slice(&column[..SIZE]);
             let row = whitened(&known).map(|x| std * x);
             let corner = (1.0 + q * std * std * power - row.iter().map(|x| x * x).sum::<f64>()).max(1e-12);
-            let told = std * q * along - row.iter().zip(&u).map(|(a, b)| a * b).sum::<f64>();
-            (row, corner, told, column)
+            let projection = std * q * along - row.iter().zip(&u).map(|(a, b)| a * b).sum::<f64>();
+            (row, corner, projection, column)
         };
         for change in &Change::ALL[1..] {
             let (std, own) = (layout.std[*change as usize], direction(*change, reference, layout));
-            let (row, mut corner, mut told, _) = add(&own, std);
+            let (row, mut corner, mut projection, _) = add(&own, std);
             let (mut square, mut log) = (healthy, log_healthy);
             if *change == Change::PositionDrift {
                 // What drifts is elsewhere by now.
@@ -340,13 +340,13 @@ impl Isolation {
                     q * std * zero_std * along - row.iter().zip(&first).map(|(a, b)| a * b).sum::<f64>();
                 square -= moved * moved / power;
                 log += power.ln();
-                told -= cross * moved / power;
+                projection -= cross * moved / power;
                 corner = (corner - cross * cross / power).max(1e-12);
             }
             explanations[*change as usize] = explain(
-                square - told * told / corner,
+                square - projection * projection / corner,
                 log + corner.ln(),
-                std * told / corner,
+                std * projection / corner,
                 std / corner.sqrt(),
             );
         }
@@ -399,7 +399,7 @@ mod tests {
         std: [0.0, 0.5, 0.1, 0.3, 0.3, 3.0, 0.3, 0.3, 0.3, 3.0, 3.0, 0.3],
     };
 
-    /// A spring of 1 with the six other parameters at nothing, told to a thousandth, under noise of a hundredth.
+    /// A spring of 1 with the six other parameters at nothing, known to a thousandth, under noise of a hundredth.
     fn reference() -> Kalman {
         let std = [1e-3; 7];
         Kalman::new(&[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], &std, 0.01, 1.0)
@@ -441,9 +441,9 @@ mod tests {
                 _ => 0.2 * readings[i - 6],
             });
             assert_eq!(verdict.best(|_| true), Some(change));
-            let told = verdict.of(change);
-            assert!((told.amplitude - 0.2).abs() < 4.0 * told.std + 1e-3, "{change:?} {told:?}");
-            assert!(told.misfit < 1.5 && verdict.of(Change::Nothing).misfit > 20.0);
+            let found = verdict.of(change);
+            assert!((found.amplitude - 0.2).abs() < 4.0 * found.std + 1e-3, "{change:?} {found:?}");
+            assert!(found.misfit < 1.5 && verdict.of(Change::Nothing).misfit > 20.0);
         }
     }
 

@@ -708,9 +708,9 @@ mod tests {
             ("contact", vec![1.0, 1.0, 1.0], vec![c.link_position - 1.0]),
             ("contact", vec![1.0, 1.0, -1.0], vec![0.0]),
         ] {
-            let told = element(name, &values).terms(&c);
-            for (told, expected) in told.iter().zip(expected) {
-                assert!((told - expected).abs() < 1e-12, "{name}: {told} is not {expected}");
+            let found = element(name, &values).terms(&c);
+            for (found, expected) in found.iter().zip(expected) {
+                assert!((found - expected).abs() < 1e-12, "{name}: {found} is not {expected}");
             }
         }
         // While the motor drives the link, there is no back-driving loss.

@@ -22,12 +22,12 @@ pub fn polynomial_to_law(
     reach: f64,
 ) -> Option<(Alpha, [Alpha; PARAMETERS])> {
     let n = 1 + law.shapes().len();
-    let told = std.iter().zip(coefficients).enumerate().all(|(i, (std, coefficient))| match i {
+    let determined = std.iter().zip(coefficients).enumerate().all(|(i, (std, coefficient))| match i {
         0 => *coefficient > 0.0 && *std <= 0.5 * ENOUGH * coefficient,
         i if i < n => *std <= ENOUGH * coefficient.abs(),
         _ => true,
     });
-    if !told {
+    if !determined {
         return None;
     }
     let mut phi = [0.0; POINTS];

@@ -283,8 +283,8 @@ impl Part {
     /// The paper's stiffness has no standard deviation. Its scatter is the least that it is uncertain by: where
     /// mean and scatter leave zero inside 95 %, not even the sign is known.
     fn of_use(&self) -> bool {
-        let told = self.stiffness > 0.0 && self.mean > SIGMA_95 * self.scatter.sqrt();
-        self.held.flexibility_torque.is_finite() && (self.rigid || told)
+        let significant = self.stiffness > 0.0 && self.mean > SIGMA_95 * self.scatter.sqrt();
+        self.held.flexibility_torque.is_finite() && (self.rigid || significant)
     }
 
     fn observable(&self) -> bool {

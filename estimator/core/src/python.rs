@@ -64,8 +64,8 @@ fn call(py: Python<'_>, function: &Py<PyAny>, phi: &[f64], shape: &[f64], out: &
     for value in shape {
         arguments.push(value.into_pyobject(py)?.into_any());
     }
-    let told = function.bind(py).call1(PyTuple::new(py, arguments)?)?;
-    let wide = numpy.call_method1("broadcast_to", (told, (phi.len(),)))?;
+    let result = function.bind(py).call1(PyTuple::new(py, arguments)?)?;
+    let wide = numpy.call_method1("broadcast_to", (result, (phi.len(),)))?;
     let values: Vec<f64> = wide.call_method1("astype", ("float64",))?.call_method0("tolist")?.extract()?;
     out.copy_from_slice(&values);
     Ok(())
@@ -297,32 +297,32 @@ fn tuples(py: Python<'_>) -> PyResult<&'static Tuples> {
 ///
 /// # Errors
 /// Python's classes cannot be had.
-pub fn estimate<'py>(py: Python<'py>, told: &Estimate) -> PyResult<Bound<'py, PyAny>> {
+pub fn estimate<'py>(py: Python<'py>, result: &Estimate) -> PyResult<Bound<'py, PyAny>> {
     let tuples = tuples(py)?;
     let make = tuples.make.bind(py);
     let part = |i: usize| -> PyResult<Bound<'py, PyAny>> {
-        let t = &told.transmissions[i];
+        let t = &result.transmissions[i];
         let values = (t.flexibility_torque, t.stiffness, t.stiffness_std, t.deflection);
         make.call1((&tuples.transmission, values))
     };
-    let parts = if told.motors == 1 {
+    let parts = if result.motors == 1 {
         PyTuple::new(py, [part(0)?])?
     } else {
         PyTuple::new(py, [part(0)?, part(1)?])?
     };
-    let sequence = told.sequence as i64;
-    let totals = (told.flexibility_torque, told.stiffness, told.stiffness_std);
-    make.call1((&tuples.estimate, (sequence, told.status, totals.0, totals.1, totals.2, parts)))
+    let sequence = result.sequence as i64;
+    let totals = (result.flexibility_torque, result.stiffness, result.stiffness_std);
+    make.call1((&tuples.estimate, (sequence, result.status, totals.0, totals.1, totals.2, parts)))
 }
 
 /// An `estimator.sample.External`.
 ///
 /// # Errors
 /// Python's classes cannot be had.
-pub fn external<'py>(py: Python<'py>, told: &External) -> PyResult<Bound<'py, PyAny>> {
+pub fn external<'py>(py: Python<'py>, result: &External) -> PyResult<Bound<'py, PyAny>> {
     let tuples = tuples(py)?;
-    let torques = (told.torque, told.torque_std, told.link_torque, told.difference);
-    let values = (told.sequence as i64, told.status, torques.0, torques.1, torques.2, torques.3);
+    let torques = (result.torque, result.torque_std, result.link_torque, result.difference);
+    let values = (result.sequence as i64, result.status, torques.0, torques.1, torques.2, torques.3);
     tuples.make.bind(py).call1((&tuples.external, values))
 }
 
@@ -353,8 +353,8 @@ impl Estimator {
         if motors != self.motors {
             taken.motor_position[0] = f64::NAN; // no sample of this joint: rejected
         }
-        let told = self.inner.step(&taken);
-        estimate(sample.py(), &told)
+        let result = self.inner.step(&taken);
+        estimate(sample.py(), &result)
     }
 
     /// Forget everything that was learned.
@@ -376,7 +376,7 @@ impl Estimator {
     /// What the world does to the link, by the last sample.
     #[getter]
     fn external<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
-        self.inner.external().map(|told| external(py, &told)).transpose()
+        self.inner.external().map(|result| external(py, &result)).transpose()
     }
 
     /// (rms of what the two sides' flexibility torques differ by, of the link's) over some seconds.
@@ -398,14 +398,14 @@ impl Estimator {
 
     /// The reading that is suspected.
     fn suspicion(&self) -> Option<Suspected> {
-        let told = self.inner.suspicion()?;
-        let (signal, motor) = match told.signal {
+        let result = self.inner.suspicion()?;
+        let (signal, motor) = match result.signal {
             Signal::MotorPosition(motor) => ("motor_position", motor + 1),
             Signal::MotorTorque(motor) => ("motor_torque", motor + 1),
             Signal::LinkPosition => ("link_position", 0),
             Signal::Positions(motor) => ("motor_or_link_position", motor + 1),
         };
-        let reason = match told.reason {
+        let reason = match result.reason {
             Reason::Scale => "scale",
             Reason::Delay => "delay",
             Reason::Zero => "zero",
@@ -414,14 +414,14 @@ impl Estimator {
             Reason::Jumped => "jumped",
             Reason::Frozen => "frozen",
         };
-        Some((signal, motor, reason, told.amount, told.std, told.explains))
+        Some((signal, motor, reason, result.amount, result.std, result.explains))
     }
 
     /// Independent equations of one motor's window, and what it says of every change.
     fn verdict(&self, motor: usize) -> Option<(f64, Vec<Explained>)> {
         let verdict = self.inner.verdict(motor)?;
-        let told = verdict.explanations.iter().map(|e| (e.misfit, e.evidence, e.amplitude, e.std));
-        Some((verdict.equations, told.collect()))
+        let explanations = verdict.explanations.iter().map(|e| (e.misfit, e.evidence, e.amplitude, e.std));
+        Some((verdict.equations, explanations.collect()))
     }
 
     /// Seconds that each of so many ticks takes, the samples being taken again and again in turn.
@@ -530,7 +530,7 @@ impl ModelMonitor {
         let model = self::model(model)?;
         let balances = crate::model_monitor::balances(&model);
         let baseline =
-            baseline.filter(|told| told.0.len() == balances).map(|(residual, torque, log_std, seconds)| {
+            baseline.filter(|known| known.0.len() == balances).map(|(residual, torque, log_std, seconds)| {
                 let padded =
                     |values: Vec<f64>| std::array::from_fn(|b| values.get(b).copied().unwrap_or(1.0));
                 Baseline {
@@ -734,13 +734,13 @@ mod extension {
     ) -> PyResult<()> {
         let (residual, rate) = (slice(py, &residual)?, slice(py, &rate)?);
         let mut stiffness = start;
-        let told: Vec<f64> = (residual.iter().zip(&rate))
+        let result: Vec<f64> = (residual.iter().zip(&rate))
             .map(|(residual, rate)| {
                 stiffness = crate::paper::regressor_step(stiffness, *residual, *rate, k_r, k_max);
                 stiffness
             })
             .collect();
-        out.copy_from_slice(py, &told)
+        out.copy_from_slice(py, &result)
     }
 
     /// (name, location, channel, coordinates, parameters, whether it remembers, description) of every effect.
@@ -796,8 +796,8 @@ mod extension {
             }
             c
         });
-        let mut told = vec![0.0; n * terms];
-        element.along(moments, &mut told.chunks_exact_mut(n).collect::<Vec<_>>());
-        out.copy_from_slice(py, &told)
+        let mut result = vec![0.0; n * terms];
+        element.along(moments, &mut result.chunks_exact_mut(n).collect::<Vec<_>>());
+        out.copy_from_slice(py, &result)
     }
 }

@@ -104,11 +104,17 @@ pub fn suspected(transmissions: &[TransmissionEstimator]) -> Option<Suspicion> {
         Change::PositionDrift => (Signal::Positions(motor), Reason::Drift),
         Change::Nothing | Change::Stiffness | Change::Friction => return None, // of the joint, not of a reading
     };
-    let told = verdicts[motor]?.of(change);
+    let explanation = verdicts[motor]?.of(change);
     let unit = transmissions[motor].unit_of(change);
     let explains = transmissions.iter().enumerate().all(|(i, one)| {
         let own = common || i == motor;
         one.is_explained_by(if own { change } else { Change::Nothing })
     });
-    Some(Suspicion { signal, reason, amount: unit * told.amplitude, std: unit * told.std, explains })
+    Some(Suspicion {
+        signal,
+        reason,
+        amount: unit * explanation.amplitude,
+        std: unit * explanation.std,
+        explains,
+    })
 }

@@ -87,7 +87,7 @@ pub struct TransmissionEstimator {
     missing: u32,
     misfit: f64,
     // What is published.
-    told: bool,
+    concluded: bool,
     std: f64,
     torque_variance: f64,
     reach: f64,
@@ -140,7 +140,7 @@ impl TransmissionEstimator {
             impossible: 0,
             missing: 0,
             misfit: f64::NAN,
-            told: false,
+            concluded: false,
             std: f64::NAN,
             torque_variance: f64::NAN,
             reach: 0.0,
@@ -174,7 +174,8 @@ impl TransmissionEstimator {
         self.identification.reset();
         self.changes.reset();
         (self.impossible, self.missing, self.fit) = (0, 0, Fit::default());
-        (self.told, self.std, self.reach, self.held_s, self.trusted) = (false, f64::NAN, 0.0, 0.0, false);
+        (self.concluded, self.std, self.reach, self.held_s, self.trusted) =
+            (false, f64::NAN, 0.0, 0.0, false);
         (self.acting, self.stiffness, self.unmodelled) = (0.0, 0.0, f64::INFINITY);
         (self.inertia_now, self.damping_now) = (self.inertia, self.damping);
     }
@@ -278,7 +279,7 @@ impl TransmissionEstimator {
     /// (τ_e, σ) at a deflection as it is measured; zeros before anything is known.
     fn curve(&self, phi: f64) -> (f64, f64) {
         let learned = &self.identification;
-        if self.told {
+        if self.concluded {
             return learned.law().law.at(phi + learned.deflection_offset(), learned.alpha());
         }
         learned.declared().map_or((0.0, 0.0), |(law, known)| law.at(phi, known))
@@ -432,7 +433,7 @@ impl TransmissionEstimator {
     fn publish(&mut self) {
         let learned = &mut self.identification;
         learned.conclude();
-        self.told = true;
+        self.concluded = true;
         let motor = learned.motor();
         if let Some((inertia, damping)) = motor {
             (self.inertia_now, self.damping_now) = (inertia, damping);
@@ -482,7 +483,7 @@ impl TransmissionEstimator {
             return (TransmissionEstimate { flexibility_torque: torque, ..nothing }, torque.is_finite());
         }
         let (now, learned) = (self.deflection.at(ahead_s), &self.identification);
-        if !self.told {
+        if !self.concluded {
             let (mut torque, mut stiffness) = (self.lead, f64::NAN);
             if let Some((law, known)) = learned.declared() {
                 let more = self.effects.spring(now);
@@ -548,6 +549,6 @@ impl TransmissionEstimator {
 
     /// The law's parameters with their standard deviations; `None` before any, or without a law.
     pub fn parameters(&self, values: &mut Vec<f64>, std: &mut Vec<f64>) -> Option<&Law> {
-        if self.told { self.identification.parameters(values, std) } else { None }
+        if self.concluded { self.identification.parameters(values, std) } else { None }
     }
 }

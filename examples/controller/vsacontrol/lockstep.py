@@ -121,7 +121,7 @@ class Rig:
         self.daemon = Daemon(
             [ServedJoint(joint=self.joint)], publish=False, real_time=False, devices=self.network.poll
         )
-        self.daemon.loop.lanes[0].sink = self
+        self.daemon.loop.loop_joints[0].sink = self
 
     def kill_daemon(self) -> None:
         """No SYNC and no estimate from now on, and nobody says goodbye."""

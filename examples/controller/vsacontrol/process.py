@@ -105,7 +105,7 @@ class Process:
             torques = self._controller.cycle(estimate, sample, drives, now_s, age_s, external)
         self._command(torques, now_s)
         self._master.poll(now_s, may_configure=self._estimates.age_s < _LIVE_S)
-        self._tell()
+        self._print_events()
 
     def _command(self, torques: tuple[float, float] | None, now_s: float) -> None:
         """Torques at once; no torque at once too, and then now and again."""
@@ -158,7 +158,7 @@ class Process:
         with suppress(can.CanError, OSError):
             self._bus.send(can.Message(arbitration_id=cob_id, data=data, is_extended_id=False))
 
-    def _tell(self) -> None:
+    def _print_events(self) -> None:
         for event in self._controller.events[self._reported :]:
             self._reported += 1
             line = {

@@ -1,4 +1,4 @@
-"""The chain of a joint: `drivelink._core.Chain` made from its joint file, for live, lockstep and replay."""
+"""Makes a joint's pipeline (`drivelink._core.JointPipeline`) from its joint file: live, lockstep, replay."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 from drivelink import _core
-from drivelink._core import Assembler, Chain
+from drivelink._core import Assembler, JointPipeline
 from drivelink.canopen.layout import NodeLayout
 from drivelink.errors import DriveError
 from drivelink.jointfile import JointFile
@@ -15,7 +15,7 @@ from drivelink.jointfile.residual_baseline import make_watch
 from estimator import Estimator, make_estimator
 from estimator.sample import Estimate, Sample
 
-__all__ = ["Built", "Watch", "build", "make_assembler", "make_chain", "rehearse"]
+__all__ = ["Built", "Watch", "build", "make_assembler", "make_pipeline", "rehearse"]
 
 _REHEARSED = 500  # samples: half a second, in which an estimator has begun to learn
 _HOLD_S, _HOLD_PERIODS = 0.25, 10  # of silence, and at least so many, see `Assembler`
@@ -62,13 +62,13 @@ def make_assembler(joint: JointFile, layouts: Sequence[NodeLayout]) -> Assembler
     return assembler
 
 
-def make_chain(joint: JointFile, layouts: Sequence[NodeLayout], *, keep: int = 0) -> Chain:
-    """The chain of a joint file whose nodes send by these layouts; arguments as for `Chain`.
+def make_pipeline(joint: JointFile, layouts: Sequence[NodeLayout], *, keep: int = 0) -> JointPipeline:
+    """The pipeline of a joint file whose nodes send by these layouts; arguments as for `JointPipeline`.
 
     Raises:
         DriveError: the layouts lack something that the joint's model needs.
     """
-    return Chain(make_assembler(joint, layouts), *build(joint), keep=keep)
+    return JointPipeline(make_assembler(joint, layouts), *build(joint), keep=keep)
 
 
 def rehearse(joint: JointFile) -> None:
@@ -76,12 +76,12 @@ def rehearse(joint: JointFile) -> None:
 
     What is loaded, allocated or started with the first use (a library's threads, say) is there afterwards.
     """
-    chain = Chain(Assembler((), 0), *build(joint))
+    pipeline = JointPipeline(Assembler((), 0), *build(joint))
     motors = len(joint.motor)
     for k in range(_REHEARSED):
         theta, nothing = tuple(0.01 * math.sin(0.05 * k + i) for i in range(motors)), (math.nan,) * motors
-        tick = chain.take(Sample(k, theta, nothing, theta, 0.0))
+        tick = pipeline.take(Sample(k, theta, nothing, theta, 0.0))
         assert tick.estimate_payload and tick.sample_payload and tick.estimate and tick.sample  # made once
         assert (tick.external_payload is None) == (tick.external is None)
-    chain.carry_on(_REHEARSED)
-    chain.estimator.parameters()
+    pipeline.carry_on(_REHEARSED)
+    pipeline.estimator.parameters()

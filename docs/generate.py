@@ -69,9 +69,9 @@ An error is one line: file, key, what was expected. `drivelink new` writes a com
 | `run`, `record`, `doctor` | also `[motor.drive]`, `[link.encoder]`, `[bus]` |
 | `sim` | also `[sim]` if the world differs from the model |
 
-"Left out" says what applies without the key. Objects in brackets, such as 0x608F, are where the value is then
-read from the drive. A file written by `fit --write` or `diagnose --write` ends with a check line: a truncated
-file is refused, also on reload; an edited one is accepted with a message. A joint file has at most 256 KiB.
+"Left out" says what applies without the key; an object in brackets, such as 0x608F, is then read from the
+drive. A file written by `fit --write` or `diagnose --write` ends with a check line: a truncated file is
+refused, also on reload; an edited one is accepted with a message. A joint file has at most 256 KiB.
 """
 
 MODELS_HEAD = """\
@@ -82,11 +82,12 @@ Models (`none`: rigid transmission, no link encoder, no stiffness):
 """
 
 LIBRARY_HEAD = """\
-Effects that `diagnose` finds, or that you declare. `=` gives a default:
+Effects that `diagnose` finds, or that you declare. `=` gives a default.
 
 | name | of | what it is | parameters |
 |---|---|---|---|
 """
+SHARED = 2  # effects: a parameter that so many have is explained once, below the table
 
 
 def type_name(annotation: object) -> str:
@@ -163,6 +164,13 @@ def rows(section: type) -> list[tuple[str, str, str, str]]:
     ]
 
 
+def value(kind: str, default: str) -> str:
+    """Type and default of a key in one cell."""
+    if default == "required":
+        return f"{kind}, **required**"
+    return f"{kind}, default {default}" if default else kind
+
+
 def models() -> str:
     """The transmissions' models, as a table."""
     lines = [MODELS_HEAD]
@@ -184,13 +192,23 @@ def parameter_names(model: TransmissionModel) -> list[str]:
 def effects() -> str:
     """The library of effects, as a table."""
     lines = [LIBRARY_HEAD]
+    explained = [
+        f"`{p.name}`{'' if p.default is None else f' = {p.default:g}'} ({p.meaning})"
+        for effect in LIBRARY.values()
+        for p in effect.parameters
+    ]
+    names = [text.split(" ")[0] for text in explained]
+    shared = [
+        text
+        for text in dict.fromkeys(explained)
+        if SHARED <= explained.count(text) == names.count(text.split(" ")[0])
+    ]
+    rest = iter(explained)
     for effect in LIBRARY.values():
-        parameters = "; ".join(
-            f"`{p.name}`{'' if p.default is None else f' = {p.default:g}'} {p.meaning}"
-            for p in effect.parameters
-        )
+        texts = [next(rest) for _ in effect.parameters]
+        parameters = "; ".join(text.split(" ")[0] if text in shared else text for text in texts)
         lines.append(f"| `{effect.name}` | {effect.location} | {effect.description} | {parameters} |\n")
-    return "".join(lines)
+    return "".join(lines) + "\nParameters of several effects:\n\n" + "".join(f"- {text}\n" for text in shared)
 
 
 def joint_file_page() -> str:
@@ -200,11 +218,10 @@ def joint_file_page() -> str:
     for title, section in SECTIONS:
         summary = (inspect.getdoc(section) or "").splitlines()[0]
         heading = f"`{title}`" if title.startswith("[") else title
-        parts.append(
-            f"\n## {heading}\n\n{summary}\n\n| key | type | default | meaning |\n|---|---|---|---|\n"
-        )
+        parts.append(f"\n## {heading}\n\n{summary}\n\n| key | value | meaning |\n|---|---|---|\n")
         parts += [
-            f"| `{key}` | {kind} | {default} | {meaning} |\n" for key, kind, default, meaning in rows(section)
+            f"| `{key}` | {value(kind, default)} | {meaning} |\n"
+            for key, kind, default, meaning in rows(section)
         ]
         if section in after:
             parts.append("\n" + after[section]())
@@ -254,20 +271,30 @@ def bits_table(flags: type[IntFlag], meanings: Mapping[str, str]) -> str:
     return "\n".join(rows)
 
 
-def simulated_effects_table(definitions: Iterable[Definition]) -> str:
-    """One row an effect of the simulated world."""
-    rows = ["| effect | where | what | parameters (default) |", "|---|---|---|---|"]
+def defaults_table(definitions: Iterable[Definition]) -> str:
+    """One row an effect whose parameters have defaults in the simulated world."""
+    rows = ["| effect | defaults |", "|---|---|"]
     for effect in definitions:
-        names = ", ".join(f"`{p.name}`" + default_of(p.default) for p in effect.parameters)
+        names = ", ".join(f"`{p.name}` {default_of(p.default)}" for p in effect.parameters if p.default)
+        if names:
+            rows.append(f"| `{effect.name}` | {names} |")
+    return "\n".join(rows)
+
+
+def unlisted_effects_table(definitions: Iterable[Definition]) -> str:
+    """One row an effect that only the simulated world has."""
+    rows = ["| effect | of | what it is | parameters and defaults |", "|---|---|---|---|"]
+    for effect in definitions:
+        names = ", ".join(f"`{p.name}` {default_of(p.default)}".rstrip() for p in effect.parameters)
         rows.append(f"| `{effect.name}` | {effect.location} | {effect.meaning} | {names} |")
     return "\n".join(rows)
 
 
 def default_of(default: float | Callable[[float], float] | None) -> str:
-    """A default in brackets; a function of the first parameter is shown at 1."""
+    """A default; a function of the first parameter is shown at 1."""
     if default is None:
         return ""
-    return f" ({default(1.0):g} × the first)" if callable(default) else f" ({default:g})"
+    return f"{default(1.0):g} × the first" if callable(default) else f"{default:g}"
 
 
 def filled(page: str, parts: dict[str, str]) -> str:
@@ -299,8 +326,8 @@ def simulation_page() -> str:
     return filled(
         "simulation.md",
         {
-            "effects": simulated_effects_table(LISTED.values()),
-            "unlisted effects": simulated_effects_table(UNLISTED.values()),
+            "effects": defaults_table(LISTED.values()),
+            "unlisted effects": unlisted_effects_table(UNLISTED.values()),
         },
     )
 

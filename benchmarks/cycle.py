@@ -5,8 +5,9 @@
 All variants make SYNC at 1 kHz for the same simulated devices, which answer in the thread that sends and
 whose CPU time is not counted, and publish in the same zenoh session to a subscriber in another process.
 Rounds alternate between them, so that all see the same machine. CPU is that of the whole process without
-the devices, over the SYNCs that were made: SYNC, reception, estimation, publication, zenoh's own threads,
-and the threads that each variant brings with it. Work is wall-clock time from the last PDO in hand to the
+the devices, over the SYNCs that were made, from the first one of each round on (locking memory and the
+collector's last look are of a start): SYNC, reception, estimation, publication, zenoh's own threads, and the
+threads that each variant brings with it. Work is wall-clock time from the last PDO in hand to the
 put returned.
 """
 
@@ -46,12 +47,13 @@ class Row:
 
     def measure(self, devices: Devices, run: Callable[[], None]) -> None:
         """CPU of the process without that of the devices, over the SYNCs that were made."""
-        syncs, cpu_s = devices.syncs, time.process_time() - devices.cpu_s
+        devices.begin()
         start = time.monotonic()
         run()
         self.wall_s += time.monotonic() - start
-        self.cpu_s += time.process_time() - devices.cpu_s - cpu_s
-        self.syncs += devices.syncs - syncs
+        syncs, cpu_s = devices.counted()
+        self.cpu_s += cpu_s
+        self.syncs += syncs
 
     def result(self) -> dict[str, Any]:
         """Totals; of the percentiles the median over the rounds."""

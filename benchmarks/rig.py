@@ -111,6 +111,7 @@ class Devices:
             network_from_joint(which, bus) for which, bus in zip(joints, self._buses, strict=True)
         ]
         self.cpu_s = 0.0
+        self._begin: tuple[int, float] | None = None
 
     @property
     def nodes(self) -> list[Node]:
@@ -127,7 +128,20 @@ class Devices:
         start = time.thread_time()
         for network in self.networks:
             network.poll()
+        if self._begin is None and self.syncs:
+            self._begin = (self.syncs, time.process_time() - self.cpu_s)
         self.cpu_s += time.thread_time() - start
+
+    def begin(self) -> None:
+        """What is counted begins with the next SYNC: a start is none of the cycle's business."""
+        self._begin = None
+
+    def counted(self) -> tuple[int, float]:
+        """SYNCs, and CPU time of the process without that of the devices, s, since then."""
+        if self._begin is None:
+            return 0, 0.0
+        syncs, cpu_s = self._begin
+        return self.syncs - syncs, time.process_time() - self.cpu_s - cpu_s
 
     def close(self) -> None:
         """Take them off the bus."""

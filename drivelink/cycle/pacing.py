@@ -78,26 +78,30 @@ def _produce(loop: CycleLoop) -> None:
 def _gather(loop: CycleLoop, deadline_ns: int, expectation: _Expectation) -> None:
     """Receive until the cycle is complete; housekeeping then, or from the middle of the period on."""
     clock = time.monotonic_ns
-    if not loop.complete:
+    complete = loop.complete
+    if not complete:
         left = loop.sync_ns + int(expectation.after_ns) - clock()
         if left > 0:
             time.sleep(left * 1e-9)
         loop.receive()
         at_once = loop.complete
-        _receive_until(loop, deadline_ns - loop.period_ns // 2)
-        if loop.complete:
+        complete = at_once or _receive_until(loop, deadline_ns - loop.period_ns // 2)
+        if complete:
             expectation.learn(loop.received_ns - loop.sync_ns, at_once)
     now = clock()
     loop.housekeeping.run(now, deadline_ns - now)
-    _receive_until(loop, deadline_ns - _MARGIN_NS)
+    if not complete:
+        _receive_until(loop, deadline_ns - _MARGIN_NS)
 
 
-def _receive_until(loop: CycleLoop, time_ns: int) -> None:
+def _receive_until(loop: CycleLoop, time_ns: int) -> bool:
+    """Whether the cycle is complete by then."""
     while not loop.complete:
         left = time_ns - time.monotonic_ns()
         if left <= 0:
-            return
+            return False
         loop.wait(left * 1e-9)
+    return True
 
 
 def _follow(loop: CycleLoop) -> None:

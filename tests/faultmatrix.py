@@ -8,6 +8,7 @@ joint with two motors it is the first one's.
 from __future__ import annotations
 
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import lru_cache, partial
 from typing import NamedTuple
@@ -15,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import onlinekit as kit
 
-from estimator import JointModel, Record
+from estimator import Estimator, JointModel, Record
 from estimator.identify import identify
 from estimator.model_monitor import ModelMonitor, ResidualBaseline, measure_baseline
 from estimator.sample import Sample, Status
@@ -23,6 +24,12 @@ from estimator.sample import Sample, Status
 __all__ = ["FAULTS", "JOINTS", "SIGNALS", "STEPS", "Fault", "Outcome", "faults", "outcome", "stepped"]
 
 SIGNALS = ("motor", "torque", "link")
+SUSPECTS = {  # what `suspected` may call each of them
+    "motor": ("motor_position", "motor_or_link_position"),
+    "torque": ("motor_torque",),
+    "link": ("link_position", "motor_or_link_position"),
+}
+LOOKED_EVERY = 50  # periods
 JOINTS = ("constant", "vsa-ii", "vsa-ii fitted")
 STEPS = (0.5, 0.7, 1.4, 2.0, 3.0)  # true changes of the stiffness
 FLAGS = int(Status.CHANGED | Status.MODEL_ALARM | Status.INPUT_REJECTED | Status.RESTARTED | Status.GAP)
@@ -43,12 +50,20 @@ class Fault(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Samples from the begin of a fault on: valid ones, wrong ones of these, those without any flag at all."""
+    """Samples from the begin of a fault on: valid ones, wrong ones of these, those without any flag at all.
+
+    And the signal that was suspected most often; empty: none was.
+    """
 
     samples: int
     valid: int
     wrong: int
     silent: int
+    suspected: str = ""
+
+    def names(self, fault: Fault) -> bool:
+        """Whether the suspected signal is one that the fault hits."""
+        return any(self.suspected in SUSPECTS[signal] for signal in fault.signals)
 
 
 def _frozen_noisy(x: Values, size: float, rng: np.random.Generator, share: float) -> Values:
@@ -192,7 +207,7 @@ def outcome(joint: str, fault: Fault | None, health_s: float, fault_s: float, se
     motion = _healthy(name, health_s + fault_s, seed)
     begin = round(health_s / T)
     samples = motion.samples if fault is None else _spoilt(motion.samples, begin, fault, seed)
-    return _count(joint, samples, motion.stiffness_nm_rad, begin)
+    return _count(*_estimates(joint, samples, begin), motion.stiffness_nm_rad, begin)
 
 
 def stepped(
@@ -202,25 +217,32 @@ def stepped(
     name = joint.removesuffix(" fitted")
     motion = kit.motion(name, health_s + after_s, seed=seed, step=(health_s, factor))
     begin = round(health_s / T)
-    estimates = _estimates(joint, motion.samples)
+    estimates, suspected = _estimates(joint, motion.samples, begin)
     end = slice(-round(2.0 / T), None)
     off = np.abs(estimates.stiffness_nm_rad[end] / motion.stiffness_nm_rad[end] - 1.0)
     followed = float(np.mean(estimates.valid[end] & (off < 0.05)))
-    return _count(joint, motion.samples, motion.stiffness_nm_rad, begin, estimates), followed
+    return _count(estimates, suspected, motion.stiffness_nm_rad, begin), followed
 
 
-def _estimates(joint: str, samples: list[Sample]) -> kit.Estimates:
+def _estimates(joint: str, samples: list[Sample], begin: int) -> tuple[kit.Estimates, str]:
+    """The estimates from the samples, and whom the estimator suspected most often from `begin` on."""
+    suspects: Counter[str] = Counter()
+
+    def look(k: int, estimator: Estimator) -> None:
+        if k >= begin and k % LOOKED_EVERY == 0 and (suspicion := estimator.suspicion()) is not None:
+            suspects[suspicion["signal"]] += 1
+
     name = joint.removesuffix(" fitted")
     if joint == name:
-        return kit.play(kit.declared(name), samples)[0]
-    model, baseline = _fitted(name)
-    return kit.play(model, samples, watch=ModelMonitor(model, T, baseline))[0]
+        estimates, _ = kit.play(kit.declared(name), samples, look=look)
+    else:
+        model, baseline = _fitted(name)
+        estimates, _ = kit.play(model, samples, watch=ModelMonitor(model, T, baseline), look=look)
+    return estimates, suspects.most_common(1)[0][0] if suspects else ""
 
 
-def _count(
-    joint: str, samples: list[Sample], truth: np.ndarray, begin: int, estimates: kit.Estimates | None = None
-) -> Outcome:
-    estimates = estimates or _estimates(joint, samples)
+def _count(estimates: kit.Estimates, suspected: str, truth: np.ndarray, begin: int) -> Outcome:
     wrong = kit.wrong(estimates, truth)[begin:]
     silent = wrong & (estimates.status[begin:] & FLAGS == 0)
-    return Outcome(len(wrong), int(estimates.valid[begin:].sum()), int(wrong.sum()), int(silent.sum()))
+    valid = int(estimates.valid[begin:].sum())
+    return Outcome(len(wrong), valid, int(wrong.sum()), int(silent.sum()), suspected)

@@ -5,7 +5,7 @@ Everything goes through the public interface, `make_estimator(...).step`, so it 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -145,14 +145,23 @@ def declared(name: str, **transmission: Any) -> JointModel:
 
 
 def play(
-    model: JointModel, samples: Iterable[Sample], *, watch: Watch | None = None, **settings: Any
+    model: JointModel,
+    samples: Iterable[Sample],
+    *,
+    watch: Watch | None = None,
+    look: Callable[[int, Estimator], object] = lambda _k, _estimator: None,
+    **settings: Any,
 ) -> tuple[Estimates, Estimator]:
-    """An estimator's word on these samples, with a watch's as the service adds it, and the estimator."""
+    """An estimator's word on these samples, with a watch's as the service adds it, and the estimator.
+
+    `look` is called after each sample, with its place.
+    """
     estimator = make_estimator(model, EstimatorSettings(**settings), PERIOD_S)
     pipeline = JointPipeline(Assembler((), 0), estimator, watch)  # what it is given are samples already
     rows = []
-    for sample in samples:
+    for k, sample in enumerate(samples):
         e = pipeline.take(sample).estimate
+        look(k, estimator)
         rows.append((e.status, e.flexibility_torque_nm, e.stiffness_nm_rad, e.stiffness_std_nm_rad))
     status, torque, stiffness, std = np.array(rows).T
     return Estimates(status.astype(int), torque, stiffness, std), estimator

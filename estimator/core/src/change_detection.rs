@@ -31,7 +31,8 @@ const WINDOW_S: f64 = 2.0; // of the window while all is well …
 const LONG_WINDOW_S: f64 = 6.0; // … and while a change is being explained
 const LEAST_UPDATES: f64 = 15.0; // in a window that is judged …
 const FOLLOWED_S: f64 = 1.0; // … and in one that ends a doubt: less shows no difference
-const SURE: f64 = 6.9; // logarithm of the odds, a thousand to one, at which a change is preferred
+/// Logarithm of the odds, a thousand to one, at which a change is preferred.
+pub const SURE: f64 = 6.9;
 const QUANTILES: usize = 8; // at 1, 2, 4 … degrees of freedom
 
 /// What is to be done with what has been learned.

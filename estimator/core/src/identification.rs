@@ -53,7 +53,7 @@ const REFERENCE_S: f64 = 5.0; // of updates, from one reference to the next
 const SETTLED_S: f64 = 2.0; // of updates, until there is a first one
 // Prior standard deviations of the amplitudes of changes, in the units of their columns: stiffness, friction
 // and offsets relative, delays in periods, scales relative, a drift relative a second.
-const CHANGE_STD: [f64; CHANGES] = [0.0, 0.5, 0.1, 0.3, 0.3, 3.0, 0.3, 0.3, 0.3, 3.0, 3.0, 0.3];
+const CHANGE_STD: [f64; CHANGES] = [0.0, 0.5, 0.1, 0.3, 0.3, 3.0, 0.3, 0.3, 0.3, 3.0, 3.0, 0.3, 0.3];
 const HANDED_OVER: f64 = 3.0; // by which the covariance of parameters from a polynomial grows
 
 // Places of the nuisances behind α.
@@ -556,13 +556,24 @@ impl OnlineIdentification {
         window: f64,
         suspect: Option<(Change, f64)>,
     ) -> Option<[f64; 2]> {
-        let readings = self.readings(signals, link);
         let reference = self.reference.as_ref()?;
+        // What a change does follows from the curve that is held against the window, not from the one that
+        // is being looked for in the meantime.
+        let mut known = [0.0; SIZE];
+        (0..reference.size()).for_each(|i| known[i] = reference.x[i] * self.units.of[i]);
+        bound(&self.law.law, &mut known);
+        let (n, mut row) = (self.law.size, *h);
+        let stiffness = self.law.filtered_stiffness(&signals.basis, 0, &known);
+        let late = self.law.law.at(link[0] - signals.position.main[0], &known[..n]).1 * link[1];
+        row[n + DELAY] = late * self.units.of[n + DELAY] / self.units.torque;
+        row[n + DEFLECTION_OFFSET] = stiffness * self.units.of[n + DEFLECTION_OFFSET] / self.units.torque;
+        let h = &row;
+        let readings = self.readings(signals, link, stiffness);
         let left = reference.innovation(h, y);
         if !left.is_finite() {
             return None;
         }
-        let zero = self.law.size + DEFLECTION_OFFSET;
+        let zero = n + DEFLECTION_OFFSET;
         self.window.take(h, &readings, left, window, zero, self.dt);
         let foreseen = Self::reference_noise(reference)
             + reference.variance_over_scale() * dot(h, &times(&reference.sigma, h)).max(0.0);
@@ -573,9 +584,8 @@ impl OnlineIdentification {
     }
 
     /// What the balance of this moment gains with each reading that is not what it was, to first order.
-    fn readings(&self, signals: &Signals, link: &[f64; 4]) -> [f64; READINGS] {
+    fn readings(&self, signals: &Signals, link: &[f64; 4], stiffness: f64) -> [f64; READINGS] {
         let (theta, torque) = (&signals.position.main, &signals.torque.main);
-        let stiffness = self.law.filtered_stiffness(&signals.basis, 0, &self.values);
         let (b, d, t) = (self.inertia, self.damping, self.period);
         let si = [
             b * theta[2] + d * theta[1] + stiffness * theta[0], // θ (1 + c)
@@ -583,7 +593,8 @@ impl OnlineIdentification {
             -torque[0],                                         // τ (1 + c)
             -t * (b * theta[3] + d * theta[2] + stiffness * theta[1]), // θ late by c T
             t * torque[1],                                      // τ late by c T
-            0.0,                                                // what drifts is nowhere else now
+            0.0,                                                // q − c t: nowhere else now
+            d * self.units.deflection,                          // θ + c t
         ];
         si.map(|value| value / self.units.torque)
     }
@@ -620,7 +631,7 @@ impl OnlineIdentification {
     pub fn unit_of(&self, change: Change) -> f64 {
         match change {
             Change::TorqueZero | Change::Friction => self.units.torque,
-            Change::PositionZero | Change::PositionDrift => self.units.deflection,
+            Change::PositionZero | Change::LinkDrift | Change::MotorDrift => self.units.deflection,
             Change::LinkDelay | Change::MotorDelay | Change::TorqueDelay => self.period,
             _ => 1.0,
         }

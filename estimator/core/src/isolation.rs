@@ -12,9 +12,9 @@
 use crate::kalman::{Kalman, SIZE, Vector};
 
 /// Columns of readings that are not what they were, beside those of the equation.
-pub const READINGS: usize = 6;
+pub const READINGS: usize = 7;
 const COLUMNS: usize = SIZE + READINGS;
-const DRIFT: usize = SIZE + READINGS - 1; // the last one: made of the zero's column here
+const DRIFTS: [usize; 2] = [COLUMNS - 2, COLUMNS - 1]; // the last ones: the zero's column times time is added here
 const LEFT: usize = COLUMNS; // r, behind the columns
 const WIDTH: usize = COLUMNS + 1;
 
@@ -43,12 +43,14 @@ pub enum Change {
     MotorDelay,
     /// The delay of the motor's torque.
     TorqueDelay,
-    /// The zero between the encoders, which moves on.
-    PositionDrift,
+    /// The zero of the link's position, which moves on.
+    LinkDrift,
+    /// The zero of the motor's position, which moves on: to the motor that is a velocity, which is damped.
+    MotorDrift,
 }
 
 /// How many there are.
-pub const CHANGES: usize = 12;
+pub const CHANGES: usize = 13;
 
 impl Change {
     /// All of them; the first five after `Nothing` are parameters of the equation, which can be followed.
@@ -64,13 +66,20 @@ impl Change {
         Change::TorqueScale,
         Change::MotorDelay,
         Change::TorqueDelay,
-        Change::PositionDrift,
+        Change::LinkDrift,
+        Change::MotorDrift,
     ];
 
     /// Whether the equation has a parameter for it.
     #[must_use]
     pub fn is_parameter(self) -> bool {
         self != Change::Nothing && !self.is_reading()
+    }
+
+    /// Whether it goes on: by now it is elsewhere.
+    #[must_use]
+    pub fn is_drift(self) -> bool {
+        matches!(self, Change::LinkDrift | Change::MotorDrift)
     }
 
     /// Whether it is of a reading that the equation has no parameter for.
@@ -189,19 +198,21 @@ impl Isolation {
         self.equations = keep * self.equations + 1.0;
     }
 
-    /// What drifts is h t with t = 0 now: all that is in the window is older by so much.
+    /// What drifts is h t + d with t = 0 now: all that is in the window is older by so much.
     fn age(&mut self, zero: usize, dt_s: f64) {
-        for i in (0..WIDTH).filter(|i| *i != DRIFT) {
-            let moved = self.at(DRIFT, i) - dt_s * self.at(zero, i);
-            if i < DRIFT {
-                self.gram[DRIFT][i] = moved;
-            } else {
-                self.gram[i][DRIFT] = moved;
+        for drift in DRIFTS {
+            // The corner last, with the cross terms moved already: (d − z dt)² = d² − dt (2 z (d − z dt) + dt z²).
+            for i in (0..WIDTH).filter(|i| *i != drift) {
+                let moved = self.at(drift, i) - dt_s * self.at(zero, i);
+                *self.at_mut(drift, i) = moved;
             }
+            let (now, square) = (self.at(drift, zero), self.at(zero, zero));
+            self.gram[drift][drift] -= dt_s * (2.0 * now + dt_s * square);
         }
-        // With the cross terms moved already: (d − z dt)² = d² − dt (d z + z d).
-        let (now, square) = (self.at(DRIFT, zero), self.at(zero, zero));
-        self.gram[DRIFT][DRIFT] -= dt_s * (2.0 * now + dt_s * square);
+    }
+
+    fn at_mut(&mut self, i: usize, j: usize) -> &mut f64 {
+        if i >= j { &mut self.gram[i][j] } else { &mut self.gram[j][i] }
     }
 
     fn at(&self, i: usize, j: usize) -> f64 {
@@ -213,7 +224,7 @@ impl Isolation {
     pub fn rescale(&mut self, columns: &Vector, scale: f64, zero: usize) {
         let mut factors = [scale; WIDTH];
         factors[..SIZE].copy_from_slice(columns);
-        factors[DRIFT] = columns[zero];
+        DRIFTS.iter().for_each(|drift| factors[*drift] = columns[zero]);
         for i in 0..WIDTH {
             for j in 0..=i {
                 self.gram[i][j] *= factors[i] * factors[j];
@@ -330,7 +341,7 @@ impl Isolation {
             let (std, own) = (layout.std[*change as usize], direction(*change, reference, layout));
             let (row, mut corner, mut projection, _) = add(&own, std);
             let (mut square, mut log) = (healthy, log_healthy);
-            if *change == Change::PositionDrift {
+            if change.is_drift() {
                 // What drifts is elsewhere by now.
                 let zero_std = layout.std[Change::PositionZero as usize];
                 let (first, power, moved, column) =
@@ -396,8 +407,10 @@ mod tests {
         law: 1,
         linear: 1,
         places: [2, 3, 5, 4],
-        std: [0.0, 0.5, 0.1, 0.3, 0.3, 3.0, 0.3, 0.3, 0.3, 3.0, 3.0, 0.3],
+        std: [0.0, 0.5, 0.1, 0.3, 0.3, 3.0, 0.3, 0.3, 0.3, 3.0, 3.0, 0.3, 0.3],
     };
+
+    const DAMPING: f64 = 0.8; // what a drift of the motor does by itself
 
     /// A spring of 1 with the six other parameters at nothing, known to a thousandth, under noise of a hundredth.
     fn reference() -> Kalman {
@@ -412,7 +425,8 @@ mod tests {
             let t = f64::from(k);
             let (mut h, mut readings) = ([0.0; SIZE], [0.0; READINGS]);
             (0..7).for_each(|i| h[i] = ((0.11 + 0.07 * i as f64) * t).sin());
-            (0..READINGS - 1).for_each(|i| readings[i] = ((0.13 + 0.09 * i as f64) * t).cos());
+            (0..READINGS - 2).for_each(|i| readings[i] = ((0.13 + 0.09 * i as f64) * t).cos());
+            readings[READINGS - 1] = DAMPING;
             let noise = 0.01 * if (k * 7919) % 13 < 6 { 1.0 } else { -1.0 };
             window.take(&h, &readings, fault(&h, &readings) + noise, 200.0, 6, 0.03);
         }
@@ -436,7 +450,8 @@ mod tests {
                 0.2 * age * h[6]
             };
             let verdict = judged(|h, readings| match change {
-                Change::PositionDrift => drift(h),
+                Change::LinkDrift => drift(h),
+                Change::MotorDrift => drift(h) + 0.2 * DAMPING,
                 _ if i < 6 => 0.2 * h[place],
                 _ => 0.2 * readings[i - 6],
             });

@@ -1,5 +1,6 @@
 //! Which reading is suspected, and of what: said of a joint while what it reads cannot be.
 
+use crate::change_detection::SURE;
 use crate::isolation::{Change, Verdict};
 use crate::sample::MOTORS;
 use crate::transmission::TransmissionEstimator;
@@ -84,15 +85,19 @@ pub fn suspected(transmissions: &[TransmissionEstimator]) -> Option<Suspicion> {
             continue;
         }
         for change in &Change::ALL[1..] {
-            let common = matches!(change, Change::LinkScale | Change::LinkDelay);
+            let common = matches!(change, Change::LinkScale | Change::LinkDelay | Change::LinkDrift);
             let now = evidence((!common).then_some(motor), *change);
             if best.is_none_or(|(most, ..)| now > most) {
                 best = Some((now, motor, *change, common));
             }
         }
     }
-    let (_, motor, change, common) = best?;
+    let (most, motor, change, common) = best?;
+    // Whose zero drifts shows by the motor's damping alone.
+    let other = evidence(None, Change::LinkDrift).min(evidence(Some(motor), Change::MotorDrift));
+    let either = change.is_drift() && other > most - SURE;
     let (signal, reason) = match change {
+        _ if either => (Signal::Positions(motor), Reason::Drift),
         Change::MotorScale => (Signal::MotorPosition(motor), Reason::Scale),
         Change::MotorDelay => (Signal::MotorPosition(motor), Reason::Delay),
         Change::TorqueScale => (Signal::MotorTorque(motor), Reason::Scale),
@@ -101,11 +106,14 @@ pub fn suspected(transmissions: &[TransmissionEstimator]) -> Option<Suspicion> {
         Change::LinkScale => (Signal::LinkPosition, Reason::Scale),
         Change::LinkDelay => (Signal::LinkPosition, Reason::Delay),
         Change::PositionZero => (Signal::Positions(motor), Reason::Zero),
-        Change::PositionDrift => (Signal::Positions(motor), Reason::Drift),
+        Change::LinkDrift => (Signal::LinkPosition, Reason::Drift),
+        Change::MotorDrift => (Signal::MotorPosition(motor), Reason::Drift),
         Change::Nothing | Change::Stiffness | Change::Friction => return None, // of the joint, not of a reading
     };
     let explanation = verdicts[motor]?.of(change);
     let unit = transmissions[motor].unit_of(change);
+    // The deflection's drift is counted.
+    let unit = if signal == Signal::LinkPosition && change.is_drift() { -unit } else { unit };
     let explains = transmissions.iter().enumerate().all(|(i, one)| {
         let own = common || i == motor;
         one.is_explained_by(if own { change } else { Change::Nothing })
@@ -114,7 +122,7 @@ pub fn suspected(transmissions: &[TransmissionEstimator]) -> Option<Suspicion> {
         signal,
         reason,
         amount: unit * explanation.amplitude,
-        std: unit * explanation.std,
+        std: unit.abs() * explanation.std,
         explains,
     })
 }

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import ast
+import importlib
 import importlib.util
 import re
+import shlex
+import tomllib
 from pathlib import Path
 from types import ModuleType
 
@@ -16,6 +20,8 @@ ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 REFERENCE = DOCS / "reference"
 PAGES = sorted(DOCS.rglob("*.md"))
+DOCUMENTS = [ROOT / "README.md", ROOT / "benchmarks" / "README.md", ROOT / "examples" / "README.md", *PAGES]
+OWN = {"drivelink", "estimator", "sim"}
 
 
 def generator() -> ModuleType:
@@ -37,15 +43,19 @@ def test_the_generated_reference_is_current(name: str) -> None:
     assert page == generator().PAGES[name](), "run python docs/generate.py"
 
 
-@pytest.mark.parametrize("package", ["drivelink", "estimator", "sim"])
-def test_the_architecture_names_every_part_of_a_package_in_its_place(package: str) -> None:
+@pytest.mark.parametrize("package", ["drivelink", "estimator", "sim", "drivelink/core", "estimator/core"])
+def test_the_architecture_names_exactly_the_parts_of_a_package(package: str) -> None:
     page = (DOCS / "architecture.md").read_text(encoding="utf-8")
-    section = page.partition(f"## Inside `{package}/`")[2].partition("\n## ")[0]
-    named = set(re.findall(r"`(\w+(?:/|\.py))`", section))
-    parts = {f"{path.parent.name}/" for path in (ROOT / package).glob("*/__init__.py")}
-    assert parts <= named
-    missing = [name for name in named if not (ROOT / package / name).exists()]
-    assert not missing, f"not in {package}/"
+    section = page.partition(f"\n## Inside `{package}/`")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| (`.*?) \|", section, re.MULTILINE)
+    named = re.findall(r"`([\w/.]+)`", " ".join(rows))
+    folder = ROOT / package
+    if package.endswith("/core"):
+        parts = {path.name for path in (folder / "src").glob("*.rs")} - {"lib.rs", "python.rs"}
+    else:
+        parts = {path.name for path in folder.glob("*.py")} - {"__init__.py", "__main__.py"}
+        parts |= {f"{path.name}/" for path in folder.iterdir() if path.is_dir() and path.name[0] != "_"}
+    assert sorted(named) == sorted(parts)
 
 
 def test_every_verb_explains_each_of_its_arguments() -> None:
@@ -66,22 +76,46 @@ def test_files_that_a_page_names_exist(page: Path) -> None:
     assert not missing
 
 
-@pytest.mark.parametrize("page", [ROOT / "README.md", *PAGES], ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: str(page.relative_to(ROOT)))
 def test_pages_and_pictures_that_a_page_links_to_exist(page: Path) -> None:
     links = re.findall(r"\]\(([\w./-]+)(?:#[\w-]*)?\)", page.read_text(encoding="utf-8"))
     assert not [link for link in links if not (page.parent / link).exists()]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(DOCS)))
+@pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: str(page.relative_to(ROOT)))
 def test_commands_that_a_page_shows_can_be_parsed(page: Path) -> None:
     parser = cli.make_parser(list(cli.VERBS))
-    for line in re.findall(
-        r"^ {0,4}\$? ?drivelink ([a-z].*)$", page.read_text(encoding="utf-8"), re.MULTILINE
-    ):
-        command = re.split(r"\s{2,}|\s[#|&]|`", line)[0].split()
-        if command[0] not in cli.VERBS or set(line) & set("…["):
-            continue
-        assert parser.parse_args(command).verb == command[0]
+    text = page.read_text(encoding="utf-8")
+    for line in re.findall(r"^ {0,4}(?:sudo |\.venv/bin/)?drivelink ([a-z].*)$", text, re.MULTILINE):
+        command = shlex.split(re.split(r"\s{2,}|\s[#|&]|`", line)[0])
+        if command[0] in cli.VERBS and not set(line) & set("…["):
+            assert parser.parse_args(command).verb == command[0]
+    verbs = subparsers()
+    for fragment in re.findall(r"`drivelink ([a-z][^`]* --[^`]*)`", text):
+        known = verbs[fragment.split()[0]]._option_string_actions
+        assert set(re.findall(r"--[\w-]+", fragment)) <= set(known), fragment
+
+
+@pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: str(page.relative_to(ROOT)))
+def test_programs_and_code_that_a_page_shows_are_there_and_parse(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    programs = re.findall(r"\bpython ((?:benchmarks|examples|docs)/[\w/.-]+\.py)", text)
+    assert not [program for program in programs if not (ROOT / program).is_file()]
+    for language, code in re.findall(r"^```(\w+)\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
+        if language == "python":
+            for node in ast.walk(ast.parse(code)):
+                if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in OWN:
+                    module = importlib.import_module(node.module or "")
+                    assert all(hasattr(module, name.name) for name in node.names)
+        elif language == "toml":
+            tomllib.loads(code)
+
+
+def test_the_benchmarks_page_lists_every_program() -> None:
+    folder = ROOT / "benchmarks"
+    text = (folder / "README.md").read_text(encoding="utf-8")
+    programs = {path.stem for path in folder.glob("*.py") if "argparse" in path.read_text(encoding="utf-8")}
+    assert programs - {"fleet", "fleet_world"} <= set(re.findall(r"`(\w+)(?:\.py)?`", text)) | {"run_all"}
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.toml")), ids=lambda path: path.name)

@@ -1,5 +1,6 @@
 """`drivelink run` as a process: ready, published, ended; and every bad start in one line."""
 
+import json
 import os
 import re
 import signal
@@ -92,22 +93,25 @@ def test_simulated_drives_daemon_and_subscriber_are_three_processes(joint: Path,
             )
             assert manager.recv(100).startswith(b"READY=1")
             with subscribe("elbow", endpoint=endpoint_of(joint)) as client:
-                until(lambda: (e := client.wait(timeout_s=1.0)) and e.status & Status.VALID)
+                until(lambda: (e := client.wait(timeout_s=1.0)) and not e.status & Status.STALE)
                 daemon.send_signal(signal.SIGHUP)  # reloads, and does not end it
                 last = client.wait(timeout_s=5.0)
                 assert until(lambda: client.wait(timeout_s=1.0)).sequence > last.sequence
                 daemon.send_signal(signal.SIGTERM)
-                out, err = daemon.communicate(timeout=20.0)
+                out, err = daemon.communicate(timeout=60)
             assert daemon.returncode == 0, err
             assert re.match(r"elbow: \d+ cycles, \d+ estimates, \d+ missed", out.splitlines()[-1])
             assert "Traceback" not in err
         with process("run", str(joint), "--no-realtime") as again:  # the drives were left as they were
             assert "ready" in again.stdout.readline()
             again.kill()
-        with process("run", str(joint), "--no-realtime", "--seconds", "0.5") as after_kill:
+        with process("run", str(joint), "--no-realtime", "--seconds", "0.5", "--json") as after_kill:
             out, err = after_kill.communicate(timeout=60.0)
             assert after_kill.returncode == 0, err
-            assert "ready" in out
+            ready, end = map(json.loads, out.splitlines())  # two objects and nothing else
+            assert (ready["event"], ready["joints"], ready["rate_hz"]) == ("ready", ["elbow"], 200.0)
+            (status,) = end["joints"]
+            assert (end["event"], status["joint"]) == ("end", "elbow") and status["estimates"] > 0
 
 
 def test_a_bus_without_drives_is_one_line(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from drivelink.cli import main
 
-PATIENCE_S = 20.0  # only ever waited for when something is broken
+PATIENCE_S = 60.0  # only ever waited for when something is broken
 
 JOINT = """
 name = "wrist"

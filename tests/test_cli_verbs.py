@@ -1,32 +1,104 @@
-"""What every verb has in common: pure JSON where it is asked for, its own usage, the bus by option."""
+"""What every verb has in common: pure JSON where it is asked for, errors in a line, its own usage, the bus by option."""
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 
+import diagnosiskit as kit
+import fleetkit
 import pytest
 
 from drivelink import cli
 from drivelink.cli import main
 
-BUS_VERBS = ("run", "sim", "record", "doctor", "new")
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return fleetkit.make_fleet(tmp_path_factory.mktemp("verbs"), nights=1)
 
 
-def parsers() -> dict[str, argparse.ArgumentParser]:
-    parser = cli.make_parser(list(cli.VERBS))
-    return {verb: cli._verb_parser(parser, verb) for verb in cli.VERBS}
+# `demo`, `run`, `monitor`, `record`, `fleet` and `doctor` need processes or a table: see the tests of each.
+@pytest.mark.parametrize("verb", ["fit", "replay", "diagnose"])
+def test_with_json_a_verb_prints_one_object_and_nothing_else(
+    verb: str,
+    fleet: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run, joint = fleet / "recordings" / "elbow-2026-01-05.csv", fleet / "joints" / "elbow.toml"
+    assert main([verb, str(run), "--joint", str(joint), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    if verb == "fit":
+        (found,) = document["transmissions"]
+        assert found["parameters"]["k_nm_rad"] == pytest.approx(kit.STIFFNESS, rel=0.01)
+    elif verb == "replay":
+        assert document["cycles"] == 1000 * fleetkit.SECONDS
+    else:
+        assert document["verdict"] == "sufficient"
 
 
-@pytest.mark.parametrize("verb", cli.VERBS)
-def test_every_verb_prints_json(verb: str) -> None:
-    assert "--json" in parsers()[verb]._option_string_actions
+@pytest.mark.parametrize(
+    ("verb", "arguments"),
+    [
+        ("run", ["{joint}"]),
+        ("sim", ["{joint}"]),
+        ("record", ["{joint}", "--out", "a.log", "--source", "bus"]),
+        ("new", ["other.toml", "--scan"]),
+    ],
+)
+def test_every_verb_that_uses_a_bus_takes_it_by_option(
+    verb: str,
+    arguments: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", "elbow.toml", "--interface", "virtual"]) == 0
+    capsys.readouterr()
+    given = [text.format(joint="elbow.toml") for text in arguments]
+    assert main([verb, *given, "--interface", "carrierpigeon", "--channel", "roof"]) == 4
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith(f'drivelink {verb}: bus.interface: python-can has no "carrierpigeon", expected ')
 
 
-@pytest.mark.parametrize("verb", BUS_VERBS)
-def test_every_verb_that_uses_a_bus_takes_it_by_option(verb: str) -> None:
-    assert {"--interface", "--channel"} <= parsers()[verb]._option_string_actions.keys()
+@pytest.mark.parametrize(
+    ("arguments", "status", "line"),
+    [
+        (["demo", "--seconds", "0"], 2, "argument --seconds: expected a number of seconds > 0, got 0"),
+        (["run", "none.toml"], 2, "none.toml: cannot be read"),
+        (["sim", "none.toml"], 2, "none.toml: cannot be read"),
+        (["monitor", "--web", "--json"], 2, "expected either --web or --json"),
+        (["record", "none.toml", "--out", "a.csv"], 2, "none.toml: cannot be read"),
+        (["replay", "none.csv"], 3, "none.csv"),
+        (["fit", "none.csv"], 3, "none.csv"),
+        (["diagnose", "none.csv"], 3, "none.csv"),
+        (["fleet", "none/*.csv", "--joints", "none"], 2, "there is no none"),
+        (["doctor", "none.toml"], 2, "none.toml: cannot be read"),
+        (["service", "install", "none.toml", "--root", "stage"], 2, "none.toml: cannot be read"),
+        (["new", "there.toml"], 2, "there.toml"),
+        (["completion", "sh"], 2, "invalid choice: 'sh'"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_what_a_verb_cannot_do_is_one_line(
+    arguments: list[str], status: int, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there.toml").write_text("# mine\n")
+    try:
+        ended = main(arguments)
+    except SystemExit as exit_:  # argparse's own: its usage comes first
+        ended = int(exit_.code or 0)
+    said = capsys.readouterr()
+    lines = [text for text in said.err.splitlines() if not text.startswith(("usage: ", " "))]
+    assert (ended, said.out) == (status, "")
+    assert len(lines) == 1 and lines[0].startswith(f"drivelink {arguments[0]}: ") and line in lines[0]
+    assert (tmp_path / "there.toml").read_text() == "# mine\n"
 
 
 @pytest.mark.parametrize("verb", cli.VERBS)
@@ -64,7 +136,7 @@ def test_new_completion_and_service_print_one_object(
     assert set(json.loads(capsys.readouterr().out)["removed"]) == set(installed["written"])
 
 
-def test_run_and_sim_say_ready_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_sim_says_ready_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     joint = tmp_path / "elbow.toml"
     assert main(["new", str(joint), "--interface", "virtual"]) == 0
     capsys.readouterr()

@@ -1,9 +1,11 @@
 """The daemon's life: what it publishes, how it starts and ends, another model in the running loop."""
 
+import math
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -74,6 +76,38 @@ def test_the_status_says_what_the_contract_promises() -> None:
         assert status["residual_alarm"]["active"] is False
         assert status["nodes"]["1"]["drive_state"] == "switch on disabled"  # and we leave it so
         assert 0.1 < status["bus"]["load"] < 0.9
+
+
+LINK = """
+[link.dynamics]
+inertia_kg_m2 = 0.003
+viscous_damping_nm_s_rad = 0.001
+gravity_nm = 0.2943
+"""
+
+
+def test_the_status_says_what_touches_the_link_where_its_dynamics_are_declared() -> None:
+    with rig() as made:
+        made.run(10)
+        assert made.status["external"] is None
+    with rig(parse(vsa_text() + LINK)) as made:
+        made.run(10)
+        begin = made.status["external"]
+        assert (begin["valid"], begin["contact"]) == (False, False) and math.isnan(begin["torque_nm"])
+        (estimate, *_) = made.run(3000)[-1:]
+        free = made.status["external"]
+        assert (free["valid"], free["contact"]) == (True, False)
+        assert abs(free["torque_nm"]) < 3.0 * free["torque_std_nm"] < 0.1
+        # Both sides of the joint tell the torque of its transmission.
+        told = free["link_flexibility_torque_nm"]
+        assert told == pytest.approx(estimate.flexibility_torque_nm, abs=3.0 * free["torque_std_nm"])
+        assert abs(free["difference_nm"]) < 3.0 * free["torque_std_nm"]
+        (world,) = made.network._worlds
+        world.excitation = replace(world.excitation, external=lambda _: 0.3)
+        made.run(200)  # of a thousandth of a second: many time constants of the observer
+        touched = made.status["external"]
+        assert (touched["valid"], touched["contact"]) == (True, True)
+        assert touched["torque_nm"] == pytest.approx(0.3, abs=3.0 * touched["torque_std_nm"])
 
 
 @pytest.mark.usefixtures("no_thread_left")

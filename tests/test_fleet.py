@@ -357,6 +357,8 @@ def test_from_recordings_to_a_page(fleet: Path, tmp_path: Path, capsys: pytest.C
     assert run_fleet(fleet, out, recordings=recordings) == 0
     assert "0 done, 6 there already" in capsys.readouterr().out
     assert ids(out) == before
+    assert main(["fleet", "report", str(out), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == json.loads((out / "fleet.json").read_text())
 
 
 @pytest.mark.slow

@@ -68,7 +68,7 @@ def test_a_daemon_is_recorded_until_sigterm_and_replays(
         zenohkit.ready(daemon)
         zenohkit.until(lambda: samples_in(out) > 150)  # on the disk while it still records
         process.send_signal(signal.SIGTERM)
-        text, errors = process.communicate(timeout=20)
+        text, errors = process.communicate(timeout=60)
     assert process.returncode == 0 and not errors, errors
     assert "samples" in text and "estimates" in text
     record = read(out, jointfile.load(path))
@@ -86,15 +86,16 @@ def test_a_daemon_is_recorded_until_sigterm_and_replays(
 def test_a_daemon_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> None:
     endpoint = zenohkit.free_endpoint()
     path, out = joint_file(tmp_path, endpoint), tmp_path / "r.csv"
-    with start(str(path), "--out", str(out)) as process:
+    with start(str(path), "--out", str(out), "--json") as process:
         assert process.stderr is not None
         assert "no daemon serves elbow yet: waiting" in process.stderr.readline()
         with zenohkit.script("elbow", endpoint) as daemon:
             zenohkit.ready(daemon)
             zenohkit.until(lambda: out.exists() and out.read_text().count("\n") > 20)
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=20)
+        document = json.loads(process.communicate(timeout=60)[0])  # one object and nothing else
         assert process.returncode == 0
+        assert document["file"] == str(out) and document["recorded"]["sample"] > 15
     assert len(read(out, jointfile.load(path).model_copy(update={"link": jointfile.LinkSection()}))) > 15
 
 

@@ -59,7 +59,7 @@ from sim.springs import Spring
 from sim.world import World
 
 T = 0.001
-LEARN_S = 40.0  # free motion before the pushes, in which drivelink learns the springs
+LEARN_S = 40.0  # free motion before the pushes, in which drivelink estimates the springs
 PUSH_S, EVERY_S = 0.25, 1.0
 LADDER = [0.004 * 1.35**k for k in range(19)]  # of gravity
 EACH = 10

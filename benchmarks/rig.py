@@ -100,7 +100,7 @@ def subscriber(endpoint: str) -> subprocess.Popen[bytes]:
 
 
 class Devices:
-    """Simulated devices that answer in the thread of whoever sends, with their CPU time on an account apart.
+    """Simulated devices that answer in the sender's thread; their CPU time is counted apart.
 
     A thread of their own would fight for Python's lock with what is measured, which no real drive does.
     """

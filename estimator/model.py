@@ -19,7 +19,7 @@ __all__ = ["Arrangement", "Effect", "JointModel", "LinkDynamics", "Motor", "Para
 Arrangement = Literal["single", "antagonistic", "serial"]
 ParameterValue = float | tuple[float, ...]
 
-# Read by whoever validates these classes from a file: no key may be unknown, no text stands for a number.
+# Read by validators of these classes from a file: no key may be unknown, no text stands for a number.
 _STRICT: dict[str, Any] = {"extra": "forbid", "strict": True}
 
 

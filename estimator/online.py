@@ -41,10 +41,10 @@ class Estimator(Protocol):
         """
 
     def distrust(self) -> None:
-        """The next sample may not be of its moment: use it, but learn nothing from it."""
+        """The next sample may not be of its moment: use it, but update no parameter from it."""
 
     def reset(self) -> None:
-        """Forget everything that was learned."""
+        """Reset: forget every estimate."""
 
     def parameters(self) -> list[dict[str, Any]]:
         """Current {"model", "parameters", "std"} of each transmission, names as in the joint file."""
@@ -138,7 +138,7 @@ _SIGNALS = {
     "motor_or_link_position": "zero between motor and link position",
 }
 _REASONS = {
-    "impossible": "it is no number that can be",
+    "impossible": "the value is impossible",
     "jumped": "it jumps by more than it can",
     "frozen": "it repeats itself while others move",
 }

@@ -47,11 +47,9 @@ PRIORS: dict[str, Prior] = {
         0.2, "declared", "viscous damping D beside its floor", "damping changes so much between cold and warm"
     ),
     "viscous_damping_floor": Prior(
-        0.05, "torque over speed", "viscous damping that nobody declared", "what seals and grease take"
+        0.05, "torque over speed", "undeclared viscous damping", "what seals and grease take"
     ),
-    "coulomb_friction": Prior(
-        0.1, "torque", "dry friction that nobody declared", "usual loss of bearings and a gear"
-    ),
+    "coulomb_friction": Prior(0.1, "torque", "undeclared dry friction", "usual loss of bearings and a gear"),
     "torque_offset": Prior(
         0.3, "torque", "constant torque", "current offsets, and a load that does not move"
     ),

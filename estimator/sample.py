@@ -66,12 +66,12 @@ class Status(IntFlag):
     DRIVE_FAULT = 1 << 8  # a drive reports a fault or is not in operation-capable state
     BUS_FAULT = 1 << 9  # frames of this cycle were late or missing
     STALE = 1 << 10  # the estimate is carried on without fresh measurements
-    UNTIMED = 1 << 11  # SYNCs of another master: the values may be of another moment; nothing is learned
+    UNTIMED = 1 << 11  # SYNCs of another master: the values may be of another moment; no parameter is updated
     NODE_RESTARTED = 1 << 12  # positions may have restarted: the estimator restarts with this sample
     PARTIAL = (
         1 << 13
     )  # what is NaN is not given: stiffness of a rigid joint, standard deviation of mode paper
-    CONTRADICTED = 1 << 14  # two readings of one quantity contradict each other; nothing is learned
+    CONTRADICTED = 1 << 14  # two readings of one quantity contradict each other; no parameter is updated
 
 
 class TransmissionEstimate(NamedTuple):

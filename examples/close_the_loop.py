@@ -1,4 +1,4 @@
-"""The whole loop without hardware: healthy run, fit, a run with friction that nobody declared, diagnosis.
+"""The whole loop without hardware: healthy run, fit, a run with undeclared friction, diagnosis.
 
 python examples/close_the_loop.py [FOLDER]
 

@@ -1,4 +1,4 @@
-"""A second of estimates as numpy arrays, for whoever analyses rather than controls.
+"""A second of estimates as numpy arrays, for analysis rather than control.
 
 python examples/subscribe_numpy.py [JOINT [ENDPOINT [SECONDS]]]
 """

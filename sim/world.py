@@ -69,7 +69,7 @@ class Truth(NamedTuple):
 
 
 class World:
-    """A joint in motion, in lockstep with whoever advances it."""
+    """A joint in motion, in lockstep with its caller."""
 
     def __init__(
         self,

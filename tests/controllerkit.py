@@ -1,4 +1,4 @@
-"""What the controller's tests share: the example's package, and rigs in lockstep that have learned the springs."""
+"""What the controller's tests share: the example's package, and rigs in lockstep that have identified the springs."""
 
 import math
 import sys

@@ -1,6 +1,6 @@
 """Where the fault script is played: a daemon, its devices, a third party on the bus, and the truth.
 
-Besides what the script expects, every VALID sample is held against `Truth`: all its values are those of one
+Besides what the script expects, every VALID sample is compared with `Truth`: all its values are those of one
 and the same SYNC, and that is the latest.
 """
 
@@ -152,7 +152,7 @@ class Stage:
         self.network = network_from_joint(joint, self.bus, world=self.world)
         self.faults = Faults(self.network)
         self.said = _Said()
-        self.checked = 0  # VALID samples that were held against the truth
+        self.checked = 0  # VALID samples that were compared with the truth
         self._impostor: Node | None = None
         self._injector: can.BusABC | None = None
         self._due: dict[int, list[Callable[[], None]]] = {}

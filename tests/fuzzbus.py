@@ -1,7 +1,7 @@
 """A bus that lies: three strict slaves, one of them a trap, and everything between them and the daemon.
 
 No clock, no thread, no plant: each slave's values identify the SYNC they were sampled at, so that every published
-sample can be held against it. What the fuzzer does to the frames comes in two strengths:
+sample can be compared with it. What the fuzzer does to the frames comes in two strengths:
 
 *Faulty*: what wires, queues, gateways, other masters and confused nodes do. Frames are lost, late, doubled,
 cut, in another order; nodes are reset, stopped, started by others; frames of any identifier and content come in

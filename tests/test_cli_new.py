@@ -41,7 +41,7 @@ def test_flags_are_what_the_file_says(tmp_path):
 
 
 def test_every_line_that_is_commented_out_is_valid_too(tmp_path):
-    """Whoever removes a `#` gets a joint file, not an error."""
+    """Removing a `#` gives a joint file, not an error."""
     text = joint_text(Answers(nodes=[3]))
     for line in text.splitlines():
         if line.startswith("# ") and " = " in line and "config" not in line and "eds" not in line:

@@ -76,7 +76,7 @@ def test_it_reacts_to_what_touches_it_and_goes_on_when_it_is_gone(reaction, obst
         pushed = math.copysign(1.0, reacts(rig, torque_nm))
         assert rig.controller.events[-1].reason == f"contact: {reaction}"
         at = rig.world.truth().link_position_rad
-        rows = [rig.step() for _ in range(450)]  # before it goes on where nothing touches it any more
+        rows = [rig.step() for _ in range(450)]  # before it goes on once nothing touches it
         gave_way = pushed * (rows[-1].q - at)
         if reaction is Reaction.RETRACT and obstacle != "clamp":
             # As far as it is asked to; a push that lasts takes it further, a wall lets go of it on the way.

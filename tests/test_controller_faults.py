@@ -31,7 +31,7 @@ def test_zenoh_cut_while_the_bus_goes_on_and_back():
         rig.cut = True
         assert kit.goes_safe(rig, rig.last_estimate_s) == "estimates are stale"
         rig.cut = False
-        # nothing is wrong with the joint: no need to learn anything again
+        # nothing is wrong with the joint: no need to identify anything again
         assert kit.recovers(rig, 4.0) == [Phase.APPROACH, Phase.RUN]
 
 
@@ -57,8 +57,8 @@ def test_a_drive_that_reboots_is_configured_by_both_masters_and_taken_up_again()
 def test_an_undeclared_effect_in_the_middle_of_a_motion_and_its_end(effect):
     with kit.running() as rig:
         rig.world.alter(effects=[parse(effect)])
-        assert kit.goes_safe(rig, rig.now_s) == "a torque acts that nobody declared"
-        rig.world.alter(effects=[])  # what was learned with it is forgotten over the estimator's 20 s
+        assert kit.goes_safe(rig, rig.now_s) == "an undeclared torque acts"
+        rig.world.alter(effects=[])  # what was estimated with it is forgotten over the estimator's 20 s
         assert kit.recovers(rig, 30.0)[-2:] == [Phase.APPROACH, Phase.RUN]
 
 
@@ -74,7 +74,7 @@ def test_an_effect_that_stays_keeps_it_from_going_on():
 def test_a_dead_controller_leaves_drives_without_torque():
     """The drives watch the master's heartbeat (0x1016) and switch off by themselves (0x6007)."""
     with kit.running() as rig:
-        rig.daemon.run_lockstep(150)  # the controller does nothing any more
+        rig.daemon.run_lockstep(150)  # the controller has stopped
         assert not any(node.machine.state == PowerState.OPERATION_ENABLED for node in rig.network.nodes[:2])
         assert all(abs(motor.torque_nm) < 2e-3 for motor in rig.world.truth().motors)
         assert all(node.state == 0x05 for node in rig.network.nodes)  # and go on measuring for the daemon

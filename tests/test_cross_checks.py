@@ -42,7 +42,7 @@ def lie(made: Rig, spoil: Callable[[DriveSignals], DriveSignals]) -> None:
 
 
 @pytest.fixture(scope="module")
-def learned():
+def calibrated():
     """Drives of which every check agrees, for the faults to come upon one after the other."""
     with rig(joint()) as made:
         made.run(LEARNING)
@@ -72,23 +72,23 @@ UNUSED = ("the velocity is stuck", "the current is stuck")  # by the estimate
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_lie_is_found_named_and_nothing_valid_said_until_it_is_over(learned, name) -> None:
+def test_a_lie_is_found_named_and_nothing_valid_said_until_it_is_over(calibrated, name) -> None:
     spoil, signal = FAULTS[name]
-    before = learned.run(200)
+    before = calibrated.run(200)
     assert not any(e.status & Status.CONTRADICTED for e in before)
-    lie(learned, spoil)
-    found = learned.run(1500)
+    lie(calibrated, spoil)
+    found = calibrated.run(1500)
     first = next((k for k, e in enumerate(found) if e.status & Status.CONTRADICTED), None)
     assert first is not None
     assert first <= 500, f"found after {first} cycles"
     assert not any(e.status & Status.VALID for e in found[first:])
-    suspected = learned.status["suspected"]
+    suspected = calibrated.status["suspected"]
     assert (suspected["signal"], suspected["motor"], suspected["reason"]) == (signal, 1, "contradicted")
-    assert suspected["text"] in " ".join(learned.status["conditions"])
-    lie(learned, lambda s: s)
-    after = learned.run(3000)
+    assert suspected["text"] in " ".join(calibrated.status["conditions"])
+    lie(calibrated, lambda s: s)
+    after = calibrated.run(3000)
     assert not after[-1].status & Status.CONTRADICTED
-    assert "contradicts" not in checks(learned).values()
+    assert "contradicts" not in checks(calibrated).values()
     if name in UNUSED:  # else the estimator has its own way back
         assert any(e.status & Status.VALID for e in after[-1000:])
 

@@ -87,7 +87,7 @@ class Master:
 
 
 def read_scales(master: Master) -> None:
-    """What a master reads of the drives, and a passive listener learns the scales from."""
+    """What a master reads of the drives, and a passive listener takes the scales from."""
     for node in (1, 2):
         for index, subindex in ((0x608F, 1), (0x608F, 2), (0x6075, 0), (0x6076, 0), (0x60A9, 0)):
             master.read(node, index, subindex)

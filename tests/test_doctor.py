@@ -110,7 +110,7 @@ def test_a_healthy_bus_is_found_healthy_and_nothing_is_written(rig):
         f.fix: f.text for section in report.sections for f in section.notices if f.subject == "cross-check"
     }
     assert offered['[motor.drive] checks = ["current"]'].startswith(
-        "current (0x6078:00) can be held against torque"
+        "current (0x6078:00) can be compared with torque"
     )
     assert '[motor.drive] checks = ["velocity", "current"]' in offered
     questions = [(cob_id, data) for cob_id, data in sent if cob_id == 0 or 0x601 <= cob_id <= 0x67F]

@@ -184,7 +184,7 @@ def test_a_bias_takes_a_payload_in_and_lets_a_lasting_push_fade():
     without = Estimates(model(), rows, contact_torque_nm=0.5)
     at = round((begin + 4.0) / T)
     assert without.torque[at] == pytest.approx(size, rel=0.05)
-    # while it fades, what is left of it comes and goes with what is learned of the link's friction
+    # while it fades, what is left of it comes and goes with the estimate of the link's friction
     assert abs(np.mean(with_bias.torque[at : at + 1000])) < size * (math.exp(-2.0) + 0.1)
     assert with_bias.contact[round(begin / T) + 30]
     assert without.contact[at]
@@ -201,7 +201,7 @@ def test_the_flexibility_torque_from_the_link_side_is_the_true_one(pushed):
     assert np.sqrt(np.mean(off**2)) < 0.02 * np.sqrt(np.mean(truth**2))
     assert np.sqrt(np.mean(estimated.difference[use] ** 2)) < 0.02 * np.sqrt(np.mean(truth**2))
     consistency = estimated.estimator.consistency
-    # its ten seconds begin while the spring is still being learned
+    # its ten seconds begin while the spring is not yet known
     assert consistency.difference_rms_nm < 0.05 * consistency.link_flexibility_torque_rms_nm
 
 

@@ -120,8 +120,8 @@ def test_one_master_that_jitters_by_up_to_half_a_period_is_one_master(
     follower.jittering(5000, lambda: draw.uniform(-most, most))
     assert follower.run.loop.foreign_syncs <= 1
     assert not any("master" in text for text in follower.events)
-    taught = [status for _, status, _ in follower.found if not status & Status.UNTIMED]
-    assert len(taught) > 0.97 * 5100
+    timely = [status for _, status, _ in follower.found if not status & Status.UNTIMED]
+    assert len(timely) > 0.97 * 5100
     numbered = [b[0] - a[0] for a, b in itertools.pairwise(follower.found)]
     assert sum(step != 1 for step in numbered) <= 0.01 * len(numbered)
     assert follower.found[-1][0] == pytest.approx(5099, abs=1)  # the numbers keep to time

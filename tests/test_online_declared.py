@@ -1,9 +1,8 @@
 """What a joint file declares of its springs is where the estimate begins, and never where it is held.
 
-A declared `linear` stiffness used to be frozen on line. A polynomial whose order (or coefficients) are declared
-gets one power more than declared, with a narrow prior around zero, so that what is cut off of a real spring is
-in the interval. `linear` is the polynomial that has one power for good: there the narrow prior fell on K itself,
-0.3 % of the largest torque, and with `order = 1` and no parameters K was held at nothing at all.
+A polynomial whose order (or coefficients) are declared gets one power more than declared, with a narrow prior
+around zero, so that what is cut off of a real spring is in the interval. `linear` has one power only: that prior
+must not fall on K itself.
 
 "Within its interval" is three standard deviations, or what nobody can notice: 0.2 % of the stiffness, as seconds in
 which an error hardly changes are one draw. For the VSA-II it is 0.5 %: where the motion hardly reveals its shape (here

@@ -1,11 +1,8 @@
 """Encoders from 12 to 26 bits, quiet or noisy, slow or fast: valid where the motion determines the stiffness, never wrong.
 
-Fine, quiet encoders used to cost `valid`: 2^22 counts a revolution left one sample in 35, although the
-stiffness was right. The deflection filter starts anew where its innovation is twelve standard deviations, and
-takes the deviation from its own covariance: that of white noise and of a white third derivative, at a bandwidth
-with an upper limit. The finer the encoder, the smaller that covariance, while what the filter cannot follow
-stays what it is; in the end every innovation is "lost", and the 33 samples until the new start has settled are
-not valid. Now the innovations' own mean square is held against the covariance, and the larger of the two counts.
+The deflection filter restarts where its innovation exceeds twelve standard deviations. The finer the encoder, the
+smaller its own covariance, while what the filter cannot follow stays what it is; so the innovations' mean square is
+taken where it is larger than the covariance. Otherwise fine, quiet encoders would restart it all the time.
 """
 
 import math

@@ -1,8 +1,7 @@
-"""Whole cycles lost at random: what is made up of single periods is no reason to learn nothing.
+"""Whole cycles lost at random cost no validity.
 
-A gap of more than one cycle used to empty the filters: nothing was learned for half a second. With every tenth cycle
-lost there is such a gap each tenth of a second, so nothing was ever learned, and the search for a late encoder, which
-began anew at each gap, never ended. What a gap costs follows from the straight line across it: (w n T)²/12 of the
+With every tenth cycle lost there is a gap of more than one cycle each tenth of a second: filters and the search for a
+late encoder must not restart at each of them. What a gap costs follows from the straight line across it: (w n T)²/12 of the
 amplitude, for n periods T in a filter of bandwidth w.
 """
 
@@ -24,8 +23,8 @@ def test_cycles_lost_at_random_cost_little_and_make_nothing_wrong(name, share, l
         assert not np.any(kit.wrong(estimates, motion.stiffness_nm_rad[kept]))
         late = kept > SETTLED
         assert np.mean(estimates.valid[late]) >= least
-        learning = estimates.status[late] & kit.OBSERVABLE > 0
-        assert np.mean(learning) > 0.8
+        observable = estimates.status[late] & kit.OBSERVABLE > 0
+        assert np.mean(observable) > 0.8
 
 
 def test_a_late_link_encoder_is_found_while_cycles_are_lost():

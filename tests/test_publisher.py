@@ -1,4 +1,4 @@
-"""The keys of one joint: latched documents, queries, bytes and quality of service, and nobody else's say in it."""
+"""The keys of one joint: latched documents, queries, bytes and quality of service, and no influence from others."""
 
 import json
 import math
@@ -190,7 +190,7 @@ def test_the_liveliness_token_comes_and_goes_with_the_publisher(publisher, clien
 
 
 def test_nothing_that_others_write_changes_what_the_daemon_says(publisher, client, answering):
-    """No key is read: whoever writes into them changes neither the answers nor the daemon's own stream."""
+    """No key is read: writing into them changes neither the answers nor the daemon's own stream."""
     publisher.put_status({"state": "running"})
     before = {name: ask(client, f"drivelink/elbow/{name}") for name in ("status", "model", "schema")}
     for name in ("estimate", "sample", "status", "model", "schema", "alive", "config", "command"):

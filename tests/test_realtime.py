@@ -158,7 +158,7 @@ def test_a_long_task_is_done_in_parts_and_finished_before_the_next_begins() -> N
     assert done == ["1"]
     housekeeping.run(2 * MS, MS)
     assert done == ["1", "2"]
-    housekeeping.run(1500 * MS, 0)  # the other has waited for so long that it does not ask for slack any more
+    housekeeping.run(1500 * MS, 0)  # the other has waited for so long that it no longer asks for slack
     assert done == ["1", "2", "3", "other"]
 
 

@@ -169,7 +169,7 @@ def test_a_bus_is_recorded_by_listening_only(suffix: str, tmp_path: Path) -> Non
 
 
 def test_a_bus_is_recorded_by_the_mapping_that_the_daemon_publishes(tmp_path: Path) -> None:
-    """The recorder begins when the drives are configured: nothing of the mapping is on the bus any more."""
+    """The recorder begins when the drives are configured: the mapping is no longer on the bus."""
     joint = daemonkit.vsa()
     path = tmp_path / "r.csv"
     with daemonkit.rig(joint) as rig:

@@ -212,7 +212,7 @@ def test_one_thread_sends_while_another_one_serves(monkeypatch: pytest.MonkeyPat
     with SocketcandServer("vcan0", port=0) as server:
         first, second = clients(server, 2)
         server.send(sync())
-        assert exchange(server, second) is not None  # nothing is held back after the greeting any more
+        assert exchange(server, second) is not None  # nothing is held back after the greeting
         ended, failures = threading.Event(), []
 
         def serve() -> None:

@@ -68,7 +68,7 @@ class _PassiveNode:
         self.listener.forget(lambda address: _is_mapping(address) or address in _VOLATILE)
 
     def lose_sight(self) -> None:
-        """The bus was away: nobody knows what the node has lived through."""
+        """The bus was away: the state of the node is unknown."""
         self.adopted = None
         self.listener.forget(_is_mapping)
 
@@ -311,7 +311,7 @@ class PassiveConfigurator:
                 self.doubts.pop(layout.node_id, None)
 
     def start(self, node: int, *, stopped: bool = False) -> None:
-        """Nothing: whoever configures this node will do it again."""
+        """Nothing: the master of this node configures it again."""
 
     def lose_sight(self) -> None:
         """The bus was away: what was overheard may hold no more."""

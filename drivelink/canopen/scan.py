@@ -1,6 +1,6 @@
 """Finds the nodes on the bus by asking and listening; nothing is written.
 
-Every node id is asked for its device type (0x1000, mandatory in CiA 301), all at once; whoever answers, or
+Every node id is asked for its device type (0x1000, mandatory in CiA 301), all at once; what answers, or
 is heard by heartbeat or boot-up, is there.
 """
 

@@ -1,4 +1,4 @@
-"""What another master writes to a node by SDO, learned by listening (CiA 301, 7.2.4.3).
+"""What another master writes to a node by SDO, taken from the traffic (CiA 301, 7.2.4.3).
 
 A download counts when the node has confirmed it. Expedited and segmented transfers are followed; block
 transfers are not used for objects of a few bytes.

@@ -284,7 +284,7 @@ class _Drive:
                 "rated_current_a or current_object"
             )
         if not by_current and rated_torque is not None and not own_unit:
-            # Unit unknown: a thousandth of rated current is about one of rated torque; the ratio is learned.
+            # Unit unknown: a thousandth of rated current is about one of rated torque; the ratio follows.
             likely = _torque_candidate((0x6078, 0), 16, direction * gear * rated_torque / 1000)
             by_current = [likely]
         self._check("current", Signal.TORQUE_CHECK, (*by_current, *by_torque))
@@ -336,7 +336,7 @@ class _Drive:
                 self._check("following_error", signal, (replace(position, address=(index, 0), wraps=wraps),))
 
     def _second_encoder(self, counts: float | None, gear: float) -> None:
-        """Another encoder of the motor; its scale and sign are learned, so a wrong guess does no harm."""
+        """Another encoder of the motor; its scale and sign are estimated, so a wrong guess does no harm."""
         text = self._drive.second_encoder
         if text is None:
             return

@@ -40,7 +40,7 @@ VERBS = {
 }
 
 ALONE = (
-    'bus.interface = "virtual" lives inside this process, nobody else is on it; '
+    'bus.interface = "virtual" exists inside this process only; '
     "with --interface socketcand, `drivelink sim` and `drivelink run` meet over TCP"
 )
 _INTERRUPTED = 130

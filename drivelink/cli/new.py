@@ -226,7 +226,7 @@ def _ask(answers: Answers, known: set[str]) -> None:
         for key, question, check in _QUESTIONS:
             if key in known or (key == "rotor_inertia_gcm2" and "inertia_kg_m2" in known):
                 continue
-            needed = key in ("gear_ratio", "rotor_inertia_gcm2")  # nobody else knows them
+            needed = key in ("gear_ratio", "rotor_inertia_gcm2")  # no drive reports them
             setattr(answers, key, _asked(question, getattr(answers, key), check, needed=needed))
             if key == "rotor_inertia_gcm2":
                 print(f"  at the joint: {answers.conversion}")

@@ -150,7 +150,7 @@ def _bus_wanted(sink: Sink, source: str, alive: bool, joint: JointFile) -> bool:
     if joint.bus.interface == "virtual":
         if needed:
             raise UsageError(
-                'bus.interface = "virtual" lives inside one process, where nobody else can listen'
+                'bus.interface = "virtual" exists inside one process only: nothing else can listen'
                 ": record samples (.mcap, .csv) from the daemon"
             )
         return False
@@ -205,7 +205,7 @@ def _daemon_layouts(session: zenoh.Session, joint: JointFile) -> Sequence[NodeLa
 
 def _declared_layouts(joint: JointFile, folder: Path) -> Sequence[NodeLayout]:
     """How the joint file, or a data sheet, says they are mapped; () if they do not."""
-    with suppress(DrivelinkError):  # no drives, no EDS: then nobody knows it
+    with suppress(DrivelinkError):  # no drives, no EDS: then it is unknown
         listener = PassiveConfigurator([joint], [folder])
         if not listener.busy:
             return tuple(listener.layouts.values())

@@ -13,7 +13,7 @@ __all__ = ["BusPort"]
 
 
 class BusPort:
-    """The bus for whoever sends python-can messages: directly before the loop runs, by the loop afterwards.
+    """The bus for senders of python-can messages: directly before the loop runs, by the loop afterwards.
 
     Attributes:
         bus: as it is open now.

@@ -21,7 +21,7 @@ class MapFollower:
     """Keeps the assemblers of passive joints to maps that are believed.
 
     Args:
-        configurator: learns the maps by listening. Nodes that it knows nothing of are taken to send by the
+        configurator: takes the mappings from the traffic. Unknown nodes are taken to send by the
             layouts given here.
         assemblers: of each node's joint.
         layouts: by which they decode now.

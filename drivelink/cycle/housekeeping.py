@@ -88,6 +88,6 @@ class Housekeeping:
             self.on_fault(error)
 
     def _finish(self) -> None:
-        """Where there was no slack for so long that another task cannot wait any more."""
+        """Where there was no slack for so long that another task can no longer wait."""
         while self._parts is not None:
             self._go_on(self._parts)

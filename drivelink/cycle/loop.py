@@ -173,7 +173,7 @@ class CycleLoop:
         return all([pipeline.assembler.complete for pipeline in self._pipelines])  # noqa: C419 - twice as fast
 
     def reroute(self) -> None:
-        """Learn again which joint wants which frame."""
+        """Look up again which joint wants which frame."""
         self._loop_joints_of.clear()
         sound = [loop_joint for loop_joint in self.loop_joints if not loop_joint.fault]
         self._pipelines = [loop_joint.pipeline for loop_joint in sound]

@@ -14,7 +14,7 @@ from drivelink.cycle.realtime import Alarm
 __all__ = ["run"]
 
 _LATEST = 0.4  # of a period: a SYNC later than this is left out, for it would be nearer to the next one
-_MARGIN_NS = 120_000  # before the deadline, from where on frames are not waited for any more
+_MARGIN_NS = 120_000  # before the deadline, from where on no frame is waited for
 _SILENCE_PERIODS = 5  # without SYNC, when following, until the estimates are called stale
 _SILENCE_NS = 20_000_000  # and at least
 _LONGEST_WAIT_NS = 20_000_000
@@ -31,7 +31,7 @@ def run(loop: CycleLoop) -> None:
 class _Expectation:
     """When, after SYNC, the cycle's last frame is usually there: until then it is enough to sleep.
 
-    Waking for every single frame costs more than all the rest of the cycle. What is learned errs on the
+    Waking for every single frame costs more than all the rest of the cycle. The estimate errs on the
     early side; a frame that comes before its time waits in the bus for a few tens of microseconds.
     """
 
@@ -43,7 +43,7 @@ class _Expectation:
         self._most_ns = int(self._MOST * period_ns)
         self.after_ns = 0.0
 
-    def learn(self, complete_ns: int, at_once: bool) -> None:
+    def update(self, complete_ns: int, at_once: bool) -> None:
         """The cycle was complete so long after SYNC, at the first look or after waiting for more."""
         if at_once:
             self.after_ns *= 1.0 - self._EARLIER
@@ -87,7 +87,7 @@ def _gather(loop: CycleLoop, deadline_ns: int, expectation: _Expectation) -> Non
         at_once = loop.complete
         complete = at_once or _receive_until(loop, deadline_ns - loop.period_ns // 2)
         if complete:
-            expectation.learn(loop.received_ns - loop.sync_ns, at_once)
+            expectation.update(loop.received_ns - loop.sync_ns, at_once)
     now = clock()
     loop.housekeeping.run(now, deadline_ns - now)
     if not complete:

@@ -17,7 +17,7 @@ from estimator.sample import Estimate, Sample
 
 __all__ = ["Built", "Watch", "build", "make_assembler", "make_pipeline", "rehearse"]
 
-_REHEARSED = 500  # samples: half a second, in which an estimator has begun to learn
+_REHEARSED = 500  # samples: half a second, in which an estimator has begun to estimate
 _HOLD_S, _HOLD_PERIODS = 0.25, 10  # of silence, and at least so many, see `Assembler`
 
 

@@ -103,7 +103,7 @@ def _lock_memory(libc: ctypes.CDLL) -> None:
 class Alarm:
     """Sleeps until a deadline of the monotonic clock.
 
-    The kernel wakes late, by an amount that is steady but for its scatter. The steady part is learned and
+    The kernel wakes late, by an amount that is steady but for its scatter. The steady part is estimated and
     asked for in advance; what is then early is polled away. Being early is held rare, so that polling costs
     a microsecond or two a cycle.
     """

@@ -1,4 +1,4 @@
-"""The start on a bus: configure the nodes or learn their configuration, and wait for their frames."""
+"""The start on a bus: configure the nodes, or listen how they are configured; wait for their frames."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def join_bus(
     passive = PassiveConfigurator(joints, folders)
     if section.sync == "produce":
         refuse_foreign_sync(port, section, idle)
-    _learn(port, passive, idle, patience_s)
+    _listen(port, passive, idle, patience_s)
     if section.sync == "follow":
         expected = _Expected(section.channel, passive.layouts.values())
         passive.bus = _timed(section, _await(port, expected, idle, patience_s, passive))
@@ -110,7 +110,7 @@ def _frames(port: BusPort, idle: Idle | None, seconds: float) -> Iterator[tuple[
             yield message.arbitration_id, bytes(message.data), int(message.timestamp * 1e9)
 
 
-def _learn(port: BusPort, passive: PassiveConfigurator, idle: Idle | None, patience_s: float) -> None:
+def _listen(port: BusPort, passive: PassiveConfigurator, idle: Idle | None, patience_s: float) -> None:
     """Listen until the mapping of every node is known."""
     if not passive.busy:
         return

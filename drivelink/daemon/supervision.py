@@ -69,7 +69,7 @@ _BUNCHES_NS = _NS  # for which that goes on, until it is said
 
 
 class _Watched:
-    """What is known of one node."""
+    """The state of one node."""
 
     __slots__ = (
         "attempt_ns",
@@ -112,7 +112,7 @@ class Supervisor:
         loop: its listeners are set here.
         layouts: of each loop_joint's nodes.
         events: where it is said.
-        configurator: configures nodes again, or, passive, learns that somebody else has.
+        configurator: configures nodes again, or, passive, notices that another master has.
 
     Attributes:
         sync_period_s: of the master that is followed, as last measured; None: not yet, or SYNC is ours.
@@ -308,7 +308,7 @@ class Supervisor:
         self._events.say(f"{where}: {type(error).__name__}: {error}", logging.ERROR)
 
     def reconfigure_all(self) -> None:
-        """The bus was away: nobody knows what the nodes have lived through."""
+        """The bus was away: the state of the nodes is unknown."""
         for node, watched in self._nodes.items():
             assembler = watched.loop_joint.pipeline.assembler
             if isinstance(self._configurator, Configurator):

@@ -1,7 +1,7 @@
 """The demo's other process: the simulated joint and the daemon that serves it, on one virtual bus.
 
 python-can's virtual bus lives inside one process, so both are in this one, and in one thread: two would wait
-for each other's hold on the interpreter, which no real drive does. For the same reason whoever watches is in
+for each other's hold on the interpreter, which no real drive does. For the same reason the subscriber is in
 another process. Truth goes to the watcher by a pipe, under the
 sequence numbers of the published estimates.
 """

@@ -56,7 +56,7 @@ def say_free_checks(
             found[name] = objects
     for name, objects in found.items():
         what = " + ".join(f"0x{o[0].address[0]:04X}:{o[0].address[1]:02X}" for o in objects.values())
-        text = f"{name} ({what}) can be held against {_AGAINST[name]}"
+        text = f"{name} ({what}) can be compared with {_AGAINST[name]}"
         _say(section, role, [name], text, _cost(role, wanted, objects, tpdos))
     if len(found) > 1:
         everything = {signal: each for objects in found.values() for signal, each in objects.items()}

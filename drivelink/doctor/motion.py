@@ -1,6 +1,6 @@
 """Units and signs, checked against each other: positions, velocity and torque of the nodes, as they answer.
 
-The drives are only read; whoever wants to know more moves the joint meanwhile, by hand or by its controller.
+The drives are only read; to find out more, move the joint meanwhile, by hand or by its controller.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def record_of_motion(
 ) -> Record | None:
     """What the nodes said, as a recording with one period: each value was read at a time of its own.
 
-    An answer that was long in coming is left out: nobody knows when within that time it was made. Where the
+    An answer that took long is left out: its moment within that time is unknown. Where the
     nodes did not answer for several turns there is a gap; where for long, the recording ends.
 
     Args:

@@ -23,7 +23,7 @@ class SampleTap:
 
     Args:
         joint: the joint.
-        configurator: knows how its nodes are mapped, or learns it from the frames.
+        configurator: knows how its nodes are mapped, or takes it from the frames.
 
     Attributes:
         joint: the joint, with the period that SYNC has.

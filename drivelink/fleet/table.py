@@ -200,7 +200,7 @@ class Table:
         self._cost = self._flushed - begin
 
     def _open(self) -> None:
-        """Learn what is in the parts; continue the last one if it is small and nobody else does."""
+        """Read what is in the parts; continue the last one if it is small and nobody else does."""
         newest: dict[str, tuple[datetime, str]] = {}
         parts = self._store.names(FOLDER, ".parquet")
         for part in parts:

@@ -117,7 +117,7 @@ class DriveSection(_Section):
         None, gt=0, description="unit of 0x606C at the motor shaft, where 0x60A9 does not give it"
     )
     checks: tuple[Literal["velocity", "current", "following_error"], ...] = Field(
-        (), description="also map these, only to hold them against position and torque (cross-checks)"
+        (), description="also map these, only to compare them with position and torque (cross-checks)"
     )
     second_encoder: str | None = Field(
         None, description='position of a second encoder of the motor, likewise, e.g. "0x60E4:02"'

@@ -75,7 +75,7 @@ class JointView:
         history: everything the view remembers.
         status: the joint's status message; empty until there is one.
         model: the model message, likewise.
-        gone: the daemon was there and is not any more.
+        gone: the daemon has ended or died.
         silent_s: time since the last estimate.
         help: show what the lines mean in place of the plots.
         footer: a line at the lower edge, e.g. how to leave.

@@ -273,7 +273,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self.wfile.write(b"data: " + self.web.event(since) + b"\n\n")
                 self.wfile.flush()
                 self.web.wait(max(0.0, _EVENT_S - (time.monotonic() - begin)))
-        except OSError:  # the browser has left, or takes nothing any more
+        except OSError:  # the browser has left, or no longer reads
             return
 
 

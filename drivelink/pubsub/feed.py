@@ -32,7 +32,7 @@ class State(StrEnum):
     WAITING = "waiting"  # nothing has been seen of it yet
     LIVE = "live"  # fresh estimates come in
     STALE = "stale"  # it is there, but nothing fresh came
-    GONE = "gone"  # it was there, and is not any more; it may come back
+    GONE = "gone"  # it has ended or died; it may come back
 
 
 class Arrivals:

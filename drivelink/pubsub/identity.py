@@ -3,8 +3,8 @@
 A daemon names its zenoh session in the liveliness token `<prefix>/<joint>/alive/<zid>`, and every message of
 a joint carries the session that wrote it. `DaemonIdentity` holds the two against each other: it takes the
 messages of one session whose token vouches for it, and stays with that session until its token is gone.
-Where no token is (a plain publisher, or access control that lets none through), it takes whoever writes
-first, until that is stale.
+Where no token is (a plain publisher, or access control that lets none through), it takes the session
+that writes first, until that is stale.
 
 A session can forge its identity. What stops that is TLS and access control: docs/how-to/secure-zenoh.md.
 """

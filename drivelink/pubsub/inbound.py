@@ -1,6 +1,6 @@
 """Validates input from the network in one place: bounded before it is parsed, checked, stripped.
 
-Everything that others have written (a daemon, or whoever says so) passes here before a client hands it out, a
+Everything from the network passes here before a client hands it out, a
 view shows it or a recorder keeps it. The binary messages are as long as their layout says; a JSON document is
 bounded in bytes, depth, elements and text, its numbers are finite, and its texts hold nothing that moves a
 terminal's cursor, turns the direction of writing, or is half a character.

@@ -40,7 +40,7 @@ def _address(endpoint: str) -> tuple[str, int] | None:
 
 
 class Rendezvous:
-    """Follows in the place of whoever listened at the endpoint, if it is on this machine.
+    """Takes over from the daemon that listened at the endpoint, if it is on this machine.
 
     Args:
         endpoint: where everybody meets.

@@ -87,7 +87,7 @@ class _Text(io.TextIOBase):
         """The next line, as the reader knows it; "" at the end.
 
         Raises:
-            RecordingError: it is longer than a line may be, or of a version that nobody knows.
+            RecordingError: it is longer than a line may be, or of an unknown version.
         """
         line = self._file.readline(MAX_LINE_BYTES + 1)
         self._number += 1

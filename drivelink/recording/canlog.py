@@ -97,7 +97,7 @@ def read_frames(path: Path, channel: str | None = None, configured: str = "") ->
 def in_order(frames: Iterable[LoggedFrame], path: Path) -> Iterator[LoggedFrame]:
     """Frames whose stamps go on where they jump back: a clock that was set, or two logs in one file.
 
-    How long it took nobody knows: it is a gap, of a second, and said.
+    The time between them is unknown: it counts as a gap of a second and is reported.
     """
     offset = last = 0
     for frame in frames:

@@ -57,7 +57,7 @@ def read_csv_columns(
         names: columns that have other names or units in the file.
 
     Raises:
-        RecordingError: no header, a cell that is no number, a line with another number of columns, or more
+        RecordingError: no header, a cell that is not a number, a line with another number of columns, or more
             lines or columns than there may be.
     """
     try:

@@ -17,7 +17,7 @@ __all__ = [
 ]
 
 MAX_SAMPLES = 10_000_000  # periods from first to last where a recording is read as a whole: 2.7 h at 1 kHz
-MAX_COLUMNS = 4096  # of a CSV file; those that nobody knows are never held in memory
+MAX_COLUMNS = 4096  # of a CSV file; unknown ones are never held in memory
 MAX_LINE_BYTES = 1 << 20  # of a line of text
 MAX_BLOCK_BYTES = 64 << 20  # an MCAP chunk or a BLF container, unpacked; tools write up to 8 MiB
 

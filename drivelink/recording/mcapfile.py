@@ -130,7 +130,7 @@ def _decompressed(body: bytes, path: Path) -> bytes:
 def _messages(
     data: bytes, channels: dict[int, str | None], topics: frozenset[str] | None
 ) -> Iterator[McapMessage]:
-    """The messages among some records; `channels` learns those that are declared on the way."""
+    """The messages among some records; `channels` takes up those that are declared on the way."""
     at, end = 0, len(data)
     unpack_head, unpack_message, head_size = _HEAD.unpack_from, _MESSAGE.unpack_from, _HEAD.size
     while at < end:

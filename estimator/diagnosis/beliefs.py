@@ -77,7 +77,7 @@ def everyday_std(
         return (std * frames[0].signals.period_s,)
     if name == "coulomb_friction":
         back = any(reverses(f.motors[candidate.motor or 0].velocity) for f in frames)
-        # Friction that nobody declared is a missing effect like any other.
+        # Undeclared friction is a missing effect like any other.
         return (PRIORS["effect"].std * torque_rms,) if calibrating and back else (0.0,)
     if name == "torque_offset":
         # A healthy joint's constant is the zero between its encoders: the two cannot be separated.

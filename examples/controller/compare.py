@@ -3,7 +3,7 @@
     python examples/controller/compare.py [--out FOLDER] [--seed N] [--law regulation|decoupling]
 
 Everything runs in lockstep, the daemon's own code included: some minutes in all. Each law follows its
-reference twice: in peace, and while something that nobody declared pushes the link.
+reference twice: undisturbed, and while an undeclared torque pushes the link.
 """
 
 from __future__ import annotations

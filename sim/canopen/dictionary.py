@@ -1,7 +1,7 @@
 """The object dictionary of a simulated device: typed entries with access rights, limits and hooks.
 
 A dictionary is made of `Item` descriptions (data: what an EDS file says of an object) and holds the live
-`Entry` of each sub-index. Process data are plain attribute reads of `Entry.value`: whoever packs a PDO
+`Entry` of each sub-index. Process data are plain attribute reads of `Entry.value`: what packs a PDO
 touches no dictionary.
 """
 

@@ -27,7 +27,7 @@ def test_each_fault_ends_in_safe_torque_within_20_ms_and_the_controller_comes_ba
 
         rig.run(0.2)
         rig.world.alter(effects=[parse("contact=2.0,position_rad=-0.5")])
-        assert kit.goes_safe(rig, rig.now_s) == "a torque acts that nobody declared"
+        assert kit.goes_safe(rig, rig.now_s) == "an undeclared torque acts"
         rig.world.alter(effects=[])
         kit.recovers(rig, 8.0)
 

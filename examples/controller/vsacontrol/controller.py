@@ -92,8 +92,8 @@ class Controller:
         """Whether the reference has been followed to its end."""
         return self.phase is Phase.RUN and self.reference_s >= self.reference.length_s
 
-    def learn(self, transmissions: Sequence[Mapping[str, Any]]) -> None:
-        """Take the transmissions that the daemon has identified, as its status says them."""
+    def set_springs(self, transmissions: Sequence[Mapping[str, Any]]) -> None:
+        """Take the identified transmissions from the daemon's status document."""
         self._estimated = springs_of(transmissions) or self._estimated
 
     def cycle(
@@ -177,13 +177,13 @@ class Controller:
             return ""
         if now_s - self._valid_s > self._settings.deadline_s:
             return "estimates are not valid"
-        self._doubtful = True  # unless none of what follows applies, the springs are to be learned again
+        self._doubtful = True  # unless none of what follows applies, the springs are identified again
         if status & Status.CHANGED:
             return "the joint has changed"
         if status & Status.MODEL_ALARM:
             return "the daemon's model is not sufficient"
         if mismatch:
-            return "a torque acts that nobody declared"
+            return "an undeclared torque acts"
         self._doubtful = False
         return ""
 

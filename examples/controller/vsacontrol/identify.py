@@ -1,4 +1,4 @@
-"""The motion from which the daemon learns the springs: small at first, then with the motors pulled apart."""
+"""The motion that identifies the springs: small at first, then with the motors pulled apart."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["Excitation"]
 class Excitation:
     """Open-loop torques: a pretension that both motors pull against, and a sum of tones on top.
 
-    A curve that is not known yet is learned near the middle first, as a polynomial, and handed over to the
+    An unknown curve is identified near the middle first, as a polynomial, and handed over to the
     transmission's own model; so the pretension stays at `small_nm` for `small_s` and swings between `low_nm`
     and `high_nm` afterwards.
 

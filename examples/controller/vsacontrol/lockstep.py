@@ -188,7 +188,7 @@ class Rig:
             return self.controller.watch(drives, self.now_s)
         self.last_estimate_s = self.now_s
         if self._cycles % _STATUS_PERIODS == 0 and self.daemon is not None:
-            self.controller.learn(self._status()["transmissions"])
+            self.controller.set_springs(self._status()["transmissions"])
         self._cycles += 1
         fresh = [s for s in samples if s.sequence == estimates[-1].sequence]
         if not fresh:

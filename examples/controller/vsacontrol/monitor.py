@@ -2,7 +2,7 @@
 
 The paper's residual (eq 14) is a first-order image of the flexibility torque. What the daemon's model says of
 the same torque, sent through the same filter, must agree with it; where it does not, some torque acts at the
-motor that nobody declared. The daemon reports what touches the link.
+motor that is undeclared. The daemon reports what touches the link.
 """
 
 from __future__ import annotations

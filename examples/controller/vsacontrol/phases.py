@@ -15,7 +15,7 @@ class Phase(StrEnum):
     """What the controller does."""
 
     WAITING = "waiting"  # for estimates and enabled drives
-    IDENTIFY = "identify"  # moves open loop so that the daemon learns the springs
+    IDENTIFY = "identify"  # moves open loop so that the daemon identifies the springs
     APPROACH = "approach"  # goes to where the reference is
     RUN = "run"  # follows the reference
     REACT = "react"  # something touches the link

@@ -99,7 +99,7 @@ class Process:
         if estimate is None or sample is None:
             torques = self._controller.watch(drives, now_s)
         else:
-            self._learn()
+            self._take_springs()
             age_s = self._estimates.age_s
             external = self._estimates.external
             torques = self._controller.cycle(estimate, sample, drives, now_s, age_s, external)
@@ -119,11 +119,11 @@ class Process:
             self._safe_s = now_s
         self._master.command(torques, now_s)
 
-    def _learn(self) -> None:
+    def _take_springs(self) -> None:
         status = self._estimates.status
         if status is not None and status is not self._status:
             self._status = status
-            self._controller.learn(status.get("transmissions", ()))
+            self._controller.set_springs(status.get("transmissions", ()))
 
     def _sample_of(self, estimate: EstimateMessage) -> Sample | None:
         """The sample of the same cycle, which comes a little after the estimate."""

@@ -22,7 +22,7 @@ class Waypoint(NamedTuple):
     sigma_nm_rad: float
 
 
-# The link moves up to 0.45 rad out of the vertical while the stiffness goes its own way.
+# The link moves up to 0.45 rad out of the vertical while the stiffness changes independently.
 _TRACKING = (
     Waypoint(0.0, 0.0, 0.0, 0.6),
     Waypoint(1.0, 0.0, 0.4, 0.75),

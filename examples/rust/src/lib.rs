@@ -109,7 +109,7 @@ type Wire = (u64, u64, u32, f64, f64, f64, Vec<(f64, f64, f64, f64)>);
 impl Estimate {
     /// Read a payload; an error for anything that is no estimate, or is called valid and cannot be.
     ///
-    /// The number of transmissions is held against the payload's length before anything is allocated for it.
+    /// The number of transmissions is checked against the payload's length before anything is allocated for it.
     pub fn decode(payload: &ZBytes) -> Result<Self, Refused> {
         let bytes = payload.to_bytes();
         let count = usize::from(*bytes.get(HEAD).ok_or(Refused::NoEstimate)?);

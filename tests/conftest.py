@@ -4,6 +4,7 @@ import os
 import signal
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does
@@ -11,6 +12,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does
 # A shell starts what runs in the background with SIGINT ignored, and processes hand that on to the ones they
 # start; the tests press Ctrl-C on theirs.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# How long an example takes says something of the machine only.
+hypothesis.settings.register_profile(
+    "drivelink", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
+hypothesis.settings.load_profile("drivelink")
 
 # Real processes, sockets and clocks. One worker runs them all, one after the other: they load a second core
 # by themselves, and what they wait for comes late enough beside one worker that only calculates.

@@ -40,8 +40,13 @@ def run(*command, **options):
 )
 def test_the_python_examples_run(endpoint, name, seconds, expected):
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    out = run(sys.executable, EXAMPLES / name, "elbow", endpoint, seconds, env=environment)
-    assert expected in out
+    for longer in (1, 4, 10):  # on a loaded machine the first seconds may pass before anything has come
+        out = run(
+            sys.executable, EXAMPLES / name, "elbow", endpoint, float(seconds) * longer, env=environment
+        )
+        if expected in out:
+            return
+    pytest.fail(out)
 
 
 @pytest.mark.rust

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from daemonkit import Collector, Listener, Rig, rig, running, served, vsa, vsa_text
+from daemonkit import Collector, Listener, Rig, listens, patient, rig, running, served, vsa, vsa_text
 from zenohkit import free_endpoint, until
 
 from drivelink._core import SYNC_COB_ID
@@ -136,7 +136,8 @@ def test_a_given_time_is_kept() -> None:
 
 def test_a_second_daemon_of_the_same_name_is_refused_and_leaves_the_drives_alone() -> None:
     joint = vsa(endpoint=free_endpoint())
-    with served(joint), running(daemon(joint)):
+    # The first one has its name from the start on; it need not run, and so asks no drive anything.
+    with served(joint), daemon(joint):
         listener = Listener(joint)
         with pytest.raises(ZenohError, match="another daemon already serves a joint named elbow"):
             daemon(vsa(endpoint=joint.zenoh.endpoint))
@@ -202,7 +203,10 @@ def passive(active: JointFile) -> JointFile:
     return vsa(name="guest", channel=active.bus.channel, bus=PASSIVE)
 
 
-def test_a_passive_daemon_follows_a_foreign_master_and_never_sends_a_frame() -> None:
+def test_a_passive_daemon_follows_a_foreign_master_and_never_sends_a_frame(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    patient(monkeypatch)
     joint = vsa()
     bus = open_sim_bus(joint.bus)
     network = network_from_joint(joint, bus)
@@ -210,9 +214,9 @@ def test_a_passive_daemon_follows_a_foreign_master_and_never_sends_a_frame() -> 
     made: list[Daemon] = []
     guest = threading.Thread(target=lambda: made.append(daemon(passive(joint), publish=False)))
     guest.start()  # it must be there before the master configures, to overhear the mapping
-    time.sleep(0.3)
+    listens(joint, devices=1)
     with running(daemon(joint, publish=False)):
-        guest.join(20.0)
+        guest.join(60.0)
         follower = made[0]
         follower._port.bus.send = lambda *_: pytest.fail("a passive daemon has sent a frame")
         with running(follower):

@@ -187,7 +187,7 @@ def test_a_fault_of_a_moving_joint_is_named_with_the_line_to_paste(old, new, sai
     assert line in finding.fix
 
 
-@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("direction", [-1, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_bus_that_may_not_be_touched_is_judged_by_its_frames(direction):
     text = daemonkit.vsa_text() + '[sim.excitation]\nkind = "rich"\n'
     frames = []

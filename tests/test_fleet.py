@@ -336,7 +336,7 @@ def test_from_recordings_to_a_page(fleet: Path, tmp_path: Path, capsys: pytest.C
     shutil.copy(recordings / "elbow-2026-01-05.csv", recordings / "elbow-2026-01-05-copy.csv")
     (recordings / "elbow-2026-01-07.csv").write_text("nothing")
     out = tmp_path / "out"
-    assert run_fleet(fleet, out, "--workers", "2", "--validate", "previous", recordings=recordings) == 0
+    assert run_fleet(fleet, out, "--workers", "1", "--validate", "previous", recordings=recordings) == 0
     said = capsys.readouterr()
     assert "6 recordings: 4 done, 1 there already, 1 broken" in said.out
     assert "elbow-2026-01-07.csv" in said.err

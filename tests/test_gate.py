@@ -82,7 +82,10 @@ def test_each_fault_is_named(kind: str) -> None:
         assert named(findings, factors), (kind, name, findings)
 
 
-@pytest.mark.parametrize("kind", gatekit.KINDS)
+@pytest.mark.parametrize(
+    "kind",
+    [k if k in ("soft", "antagonistic") else pytest.param(k, marks=pytest.mark.slow) for k in gatekit.KINDS],
+)
 def test_a_rich_motion_decides_every_sign_and_the_unit_of_the_link(kind: str) -> None:
     judgements = [
         judge(d.record, d.model) for d in (gatekit.draw(kind, seed, seconds=6.0) for seed in (7, 8))
@@ -145,6 +148,7 @@ def test_fit_and_diagnose_refuse_by_the_same_words(degrees: gatekit.Drawn) -> No
     assert said[0] == said[1]
 
 
+@pytest.mark.slow
 def test_diagnose_reports_what_the_motion_does_not_decide() -> None:
     drawn = gatekit.draw("soft", 4, held=True)
     outcome = diagnose(drawn.record, drawn.model)

@@ -9,7 +9,7 @@ import time
 import can
 import pytest
 from can.interfaces.virtual import VirtualBus
-from daemonkit import Listener, Rig, rig, running, served, vsa, vsa_text
+from daemonkit import Listener, Rig, listens, patient, rig, running, served, vsa, vsa_text
 from zenohkit import until
 
 from drivelink.cycle.framesource import VirtualSource
@@ -86,6 +86,7 @@ def test_through_boot_run_reboot_and_configuration_no_frame_could_move_a_drive(p
 
 
 def test_a_passive_daemon_puts_no_frame_on_the_bus_whatever_happens(monkeypatch: pytest.MonkeyPatch) -> None:
+    patient(monkeypatch)
     senders: list[tuple[object, int]] = []
     by_bus, by_source = VirtualBus.send, VirtualSource.send
 
@@ -106,9 +107,9 @@ def test_a_passive_daemon_puts_no_frame_on_the_bus_whatever_happens(monkeypatch:
         made: list[Daemon] = []
         starting = threading.Thread(target=lambda: made.append(quiet_daemon(guest)))
         starting.start()  # before the master configures, so that it overhears the mapping
-        time.sleep(0.3)
+        listens(joint, devices=1)
         with running(quiet_daemon(joint)) as master:
-            starting.join(20.0)
+            starting.join(60.0)
             (follower,) = made
             with running(follower):
                 loop_joint = follower.loop.loop_joints[0]

@@ -11,7 +11,6 @@ import struct
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -397,8 +396,9 @@ def test_ctrl_c_leaves_the_estimates_so_far(tmp_path: Path, joint_path: Path) ->
     process = subprocess.Popen(
         [*command, "--out", str(out), "--realtime"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
-    zenohkit.until(lambda: list(tmp_path.glob(f".{out.name}.*")))
-    time.sleep(0.5)
+    zenohkit.until(
+        lambda: any(path.stat().st_size for path in tmp_path.glob(f".{out.name}.*"))
+    )  # some estimates
     process.send_signal(signal.SIGINT)
     text, errors = process.communicate(timeout=90)
     assert process.returncode == 130 and not errors, errors

@@ -138,7 +138,7 @@ def test_a_bus_that_fails_is_tried_again() -> None:
 
 
 def test_without_a_sync_the_world_follows_the_wall_clock() -> None:
-    rig = StubRig()
+    rig, before = StubRig(), set(threading.enumerate())
     with can.Bus(interface="virtual", channel="net-3") as device_end:
         network = Network(device_end, [Cia402Drive(1, rig, 0)], rig)
         network.start()
@@ -147,7 +147,7 @@ def test_without_a_sync_the_world_follows_the_wall_clock() -> None:
             time.sleep(0.01)
         network.stop()
         assert rig.tick >= 20
-        assert not [t for t in threading.enumerate() if t.name == "sim-network"]
+        assert set(threading.enumerate()) <= before
 
 
 def clients(server: SocketcandServer, count: int) -> list[can.BusABC]:

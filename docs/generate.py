@@ -47,6 +47,7 @@ SECTIONS: list[tuple[str, type]] = [
     ("[link.encoder]", jointfile.EncoderSection),
     ("[link.dynamics]", schema.LinkDynamics),
     ("[bus]", jointfile.BusSection),
+    ("[recording]", schema.RecordingSection),
     ("[estimator]", schema.EstimatorSettings),
     ("[zenoh]", jointfile.ZenohSection),
     ("[ros2]", jointfile.Ros2Section),

@@ -237,7 +237,7 @@ class BusSection(_Section):
 
 
 class RecordingSection(_Section):
-    """What recordings of this joint need before they are in SI at the joint side."""
+    """What turns recordings of this joint into SI at the joint side."""
 
     scale: dict[str, float] = Field(
         default_factory=dict,

@@ -97,13 +97,13 @@ def type_name(annotation: object) -> str:
     if origin is typing.Annotated:
         return type_name(arguments[0])
     if origin is typing.Literal:
-        return " \\| ".join(f'`"{item}"`' if isinstance(item, str) else f"`{item}`" for item in arguments)
+        return ", ".join(f'`"{item}"`' if isinstance(item, str) else f"`{item}`" for item in arguments)
     if origin in (types.UnionType, typing.Union):
         return " \\| ".join(dict.fromkeys(type_name(item) for item in arguments if item is not type(None)))
     if origin is tuple:
         return f"array of {type_name(arguments[0])}"
     if inspect.isclass(annotation):
-        names = {bool: "true \\| false", int: "integer", float: "number", str: "text"}
+        names = {bool: "true or false", int: "integer", float: "number", str: "text"}
         if annotation in names:
             return names[annotation]
         if dataclasses.is_dataclass(annotation) or issubclass(annotation, BaseModel):
@@ -130,7 +130,7 @@ def limits(info: FieldInfo) -> str:
     """Bounds on a number, where there are some."""
     signs = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
     found = [
-        f"{sign} {getattr(item, name)}"
+        f"{sign}{getattr(item, name)}"
         for item in info.metadata
         for name, sign in signs.items()
         if getattr(item, name, None) is not None
@@ -215,6 +215,7 @@ def effects() -> str:
 def joint_file_page() -> str:
     """The whole of docs/reference/joint-file.md."""
     parts = [INTRODUCTION]
+    described = {key for title, _ in SECTIONS for key in re.findall(r"(\w+)\]", title)}
     after = {schema.Transmission: models, schema.Effect: effects}
     for title, section in SECTIONS:
         summary = (inspect.getdoc(section) or "").splitlines()[0]
@@ -223,6 +224,7 @@ def joint_file_page() -> str:
         parts += [
             f"| `{key}` | {value(kind, default)} | {meaning} |\n"
             for key, kind, default, meaning in rows(section)
+            if not (kind == "table" and key in described)
         ]
         if section in after:
             parts.append("\n" + after[section]())

@@ -105,7 +105,7 @@ def test_a_daemon_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> None:
         (["--out", "{folder}/r.xyz"], "expected a name that ends in .mcap"),
         (["--out", "{folder}/none/r.csv"], "cannot be written"),
         (["--out", "{folder}/elbow.toml"], "is read here and must not be replaced"),
-        (["--out", "{folder}/r.log"], 'bus.interface = "virtual" lives inside one process'),
+        (["--out", "{folder}/r.log"], 'bus.interface = "virtual" exists inside one process'),
         (["--out", "{folder}/r.csv", "--seconds", "0"], "--seconds: expected a number above 0"),
     ],
 )

@@ -72,7 +72,7 @@ BANDWIDTH = EstimatorSettings().external_bandwidth_rad_s
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Rig:
+class JointUnderTest:
     """A joint as it is."""
 
     title: str
@@ -127,9 +127,9 @@ def _friction(name: str, shape: dict[str, float] | None = None, **torques: float
     return Effect(name=name, parameters=values | {"smoothing_rad_s": 0.01} | (shape or {}))
 
 
-def _vsa() -> Rig:
+def _vsa() -> JointUnderTest:
     vsa = case("vsa-ii")
-    return Rig(
+    return JointUnderTest(
         title="VSA-II (the paper's), no friction",
         plant=vsa.plant,
         drives=vsa.drives,
@@ -140,10 +140,10 @@ def _vsa() -> Rig:
     )
 
 
-def _sea() -> Rig:
+def _sea() -> JointUnderTest:
     """The SEA of docs: 150 N·m/rad, gear 50 with dry friction of 5 % of the rated torque."""
     spring = Spring(model="polynomial", parameters={"coefficients_nm_rad": (150.0, 1500.0)})
-    return Rig(
+    return JointUnderTest(
         title="SEA, 150 N·m/rad, gear 50",
         plant=JointPlant(
             arrangement="single",
@@ -174,10 +174,10 @@ def _sea() -> Rig:
     )
 
 
-def _hd() -> Rig:
+def _hd() -> JointUnderTest:
     """A harmonic drive: stiff, gear 100, Stribeck and load-dependent friction."""
     spring = Spring(model="polynomial", parameters={"coefficients_nm_rad": (8000.0, 1.0e8)})
-    return Rig(
+    return JointUnderTest(
         title="harmonic drive, 8000 N·m/rad, gear 100",
         plant=JointPlant(
             arrangement="single",
@@ -232,7 +232,7 @@ def pushes(scale: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return np.round(begins / T) * T, sizes
 
 
-def simulate(rig: Rig, seconds: float, seed: int, pushed: bool) -> Motion:
+def simulate(rig: JointUnderTest, seconds: float, seed: int, pushed: bool) -> Motion:
     """Run the world."""
     external, n = None, round(seconds / T)
     profile = np.zeros(n)
@@ -299,7 +299,7 @@ def rigid(model: JointModel, motion: Motion, compensated: bool) -> np.ndarray:
     return total
 
 
-def nominal(rig: Rig, model: JointModel, motion: Motion) -> np.ndarray:
+def nominal(rig: JointUnderTest, model: JointModel, motion: Motion) -> np.ndarray:
     """The link's momentum and a data sheet's springs."""
     F = StateVariableFilter(3, BANDWIDTH, T)
     total = link_side(model, motion.q)
@@ -312,7 +312,7 @@ def nominal(rig: Rig, model: JointModel, motion: Motion) -> np.ndarray:
 
 
 def judge(
-    rig: Rig, estimated: np.ndarray, contact: np.ndarray, motion: Motion, seed: int
+    rig: JointUnderTest, estimated: np.ndarray, contact: np.ndarray, motion: Motion, seed: int
 ) -> dict[str, float]:
     """Error where a value is valid (else NaN), smallest push, delay."""
     g = rig.plant.link.gravity_nm

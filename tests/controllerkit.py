@@ -12,7 +12,7 @@ if str(EXAMPLE) not in sys.path:
 from vsacontrol.controller import Controller  # noqa: E402
 from vsacontrol.identify import Excitation  # noqa: E402
 from vsacontrol.laws import Decoupler  # noqa: E402
-from vsacontrol.lockstep import Rig  # noqa: E402
+from vsacontrol.lockstep import LockstepRig  # noqa: E402
 from vsacontrol.phases import Phase, Settings  # noqa: E402
 from vsacontrol.plant import Joint, joint_of  # noqa: E402
 from vsacontrol.references import WAYPOINTS, Reference  # noqa: E402
@@ -58,7 +58,7 @@ def running(seconds: float = 0.5, channel: str | None = None, settings: Settings
         settings=settings,
         excitation=GENTLE,
     )
-    rig = Rig(joint, controller, channel=channel)
+    rig = LockstepRig(joint, controller, channel=channel)
     try:
         assert rig.run(12.0, until=lambda: controller.phase is Phase.RUN), controller.events
         rig.run(seconds)

@@ -97,7 +97,7 @@ class Collector(ObjectSink):
         self.samples.append((sample, stamp_ns))
 
 
-class Rig:
+class DaemonRig:
     """Simulated devices and a daemon in one thread; nothing is published."""
 
     def __init__(self, joint: JointFile, path: Path | None = None) -> None:
@@ -143,8 +143,8 @@ class Rig:
 
 
 @contextmanager
-def rig(joint: JointFile | None = None, path: Path | None = None) -> Iterator[Rig]:
-    made = Rig(joint or vsa(), path)
+def rig(joint: JointFile | None = None, path: Path | None = None) -> Iterator[DaemonRig]:
+    made = DaemonRig(joint or vsa(), path)
     try:
         yield made
     finally:

@@ -23,7 +23,7 @@ import can
 from canopenkit import drive_objects
 from fuzznodes import FuzzNode, encoder_objects, trap_objects
 
-from drivelink.cycle.framesource import Frame
+from drivelink.cycle.framesource import CanFrame
 from drivelink.cycle.loop import CycleLoop
 
 __all__ = ["MIXES", "FuzzBus"]
@@ -88,10 +88,10 @@ class FuzzBus:
     def narrow(self, cob_ids: Iterable[int]) -> None:
         pass
 
-    def take(self) -> list[Frame]:
+    def take(self) -> list[CanFrame]:
         if not self._queue:
             return []
-        taken = [Frame(cob_id, data, self._stamp_ns) for cob_id, data in self._queue]
+        taken = [CanFrame(cob_id, data, self._stamp_ns) for cob_id, data in self._queue]
         self._queue.clear()
         self.frames += len(taken)
         return taken

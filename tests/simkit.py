@@ -17,7 +17,7 @@ TRANSCRIPTS = Path(__file__).parent / "transcripts"
 _channels = itertools.count()
 
 
-class Signals(NamedTuple):
+class Readings(NamedTuple):
     position_counts: int
     velocity_rad_s: float
     current_a: float
@@ -40,8 +40,8 @@ class StubRig:
     def advance(self, periods: int = 1) -> None:
         self.tick += periods
 
-    def drive(self, motor: int) -> Signals:
-        return Signals(100 * self.tick, 3.14159265358979, 0.5, 0.05)
+    def drive(self, motor: int) -> Readings:
+        return Readings(100 * self.tick, 3.14159265358979, 0.5, 0.05)
 
     def command(self, motor: int, torque_nm: float | None) -> None:
         self.commands.append(torque_nm)

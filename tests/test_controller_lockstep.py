@@ -6,7 +6,7 @@ import json
 import can
 import controllerkit as kit
 import pytest
-from vsacontrol.lockstep import Rig
+from vsacontrol.lockstep import LockstepRig
 from vsacontrol.springs import spring, springs_of
 
 from drivelink.cycle.framesource import PumpedBus
@@ -72,7 +72,7 @@ def transmissions(joint: JointFile, seconds: float) -> list:
     """The status's entry after so much bus time, over the wire's own JSON."""
     law = kit.Decoupler(joint=kit.VSA)
     controller = kit.Controller(kit.VSA, law, kit.Reference(kit.WAYPOINTS["decoupling"]), 1e-3)
-    rig = Rig(joint, controller)
+    rig = LockstepRig(joint, controller)
     try:
         rig.run(seconds)
         return json.loads(json.dumps(rig.daemon.documents()[0]))["transmissions"]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from canlayouts import COUNT_RAD, drive
-from daemonkit import Rig, rig, vsa
+from daemonkit import DaemonRig, rig, vsa
 from scipy.signal import lfilter
 
 from drivelink._core import Assembler
@@ -31,11 +31,11 @@ def joint(**changes: object) -> JointFile:
     return plain.model_copy(update={"motor": motors})
 
 
-def checks(made: Rig) -> dict[tuple[int, str], str]:
+def checks(made: DaemonRig) -> dict[tuple[int, str], str]:
     return {(c["motor"], c["check"]): c["verdict"] for c in made.status["cross_checks"]}
 
 
-def lie(made: Rig, spoil: Callable[[DriveSignals], DriveSignals]) -> None:
+def lie(made: DaemonRig, spoil: Callable[[DriveSignals], DriveSignals]) -> None:
     node = made.node(1)
     assert isinstance(node, Cia402Drive)
     made.faults.misread(node, spoil)

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from daemonkit import Collector, Listener, Rig, listens, patient, rig, running, served, vsa, vsa_text
+from daemonkit import Collector, DaemonRig, Listener, listens, patient, rig, running, served, vsa, vsa_text
 from zenohkit import free_endpoint, until
 
 from drivelink._core import SYNC_COB_ID
@@ -281,10 +281,10 @@ def test_a_lost_bus_is_opened_again_by_itself() -> None:
             assert sum("the bus is back" in text for text in texts) == 1
 
 
-def reloadable(tmp_path: Path) -> Rig:
+def reloadable(tmp_path: Path) -> DaemonRig:
     path = tmp_path / "elbow.toml"
     path.write_text(vsa_text(), encoding="utf-8")
-    return Rig(load(path), path)
+    return DaemonRig(load(path), path)
 
 
 def test_a_rewritten_joint_file_changes_the_model_without_losing_a_cycle(tmp_path: Path) -> None:

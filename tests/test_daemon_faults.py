@@ -3,7 +3,7 @@
 from itertools import pairwise
 
 import pytest
-from daemonkit import Listener, Rig, rig, vsa
+from daemonkit import DaemonRig, Listener, rig, vsa
 
 from estimator.sample import Estimate, Status
 
@@ -14,7 +14,7 @@ def valid(estimates: list[Estimate]) -> list[bool]:
     return [bool(estimate.status & Status.VALID) for estimate in estimates]
 
 
-def settle(made: Rig) -> None:
+def settle(made: DaemonRig) -> None:
     """Past the estimator's start."""
     assert valid(made.run(2000))[-1]
     assert made.status["state"] == "running"
@@ -210,7 +210,7 @@ def test_a_second_reboot_in_the_middle_of_the_configuration_begins_it_anew() -> 
         assert made.status["nodes"]["2"]["reboots"] == 4
 
 
-def bunches(made: Rig, listener: Listener, count: int) -> list[str]:
+def bunches(made: DaemonRig, listener: Listener, count: int) -> list[str]:
     """One frame of node 2 is missing, and two more than one come afterwards; what is said of that."""
     number, cob_id = made.tpdo(2)
     for k in range(count):

@@ -7,7 +7,7 @@ from canlayouts import LINK_RAD, TORQUE_NM, VSA, link, vsa_cycle
 from daemonkit import rig
 
 from drivelink._core import Assembler
-from drivelink.cycle.framesource import Frame
+from drivelink.cycle.framesource import CanFrame
 from estimator.sample import Status
 
 SYNC = 0x080
@@ -78,14 +78,14 @@ class Fuzzed:
     def __init__(self, inner, seed: int) -> None:
         self.inner = inner
         self.rng = random.Random(seed)
-        self.real: list[Frame] = []
+        self.real: list[CanFrame] = []
         self.frames = 0
         self.quiet = False
 
     def __getattr__(self, name: str):
         return getattr(self.inner, name)
 
-    def take(self) -> list[Frame]:
+    def take(self) -> list[CanFrame]:
         frames = self.inner.take()
         if self.quiet:
             return frames
@@ -97,19 +97,19 @@ class Fuzzed:
         self.frames += len(found)
         return found
 
-    def bad(self) -> Frame:
+    def bad(self) -> CanFrame:
         """Anything, or something real with some bits changed."""
         rng = self.rng
         if rng.random() < 0.5 or not self.real:
             node = rng.choice((0, 1, 2, 3, 4, 127))
             function = rng.choice((0x000, 0x080, 0x180, 0x280, 0x380, 0x580, 0x600, 0x700, 0x100))
-            return Frame(function + node, rng.randbytes(rng.choice((0, 1, 2, 4, 6, 8, 8, 8))), 0)
+            return CanFrame(function + node, rng.randbytes(rng.choice((0, 1, 2, 4, 6, 8, 8, 8))), 0)
         frame = rng.choice(self.real)
         data = bytearray(frame.data)
         for _ in range(rng.randint(0, 3)):
             if data:
                 data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
-        return Frame(frame.cob_id, bytes(data[: rng.randint(0, 8)]), 0)
+        return CanFrame(frame.cob_id, bytes(data[: rng.randint(0, 8)]), 0)
 
 
 def test_a_daemon_amid_random_and_mutated_frames_goes_on_and_recovers() -> None:

@@ -45,7 +45,7 @@ def joint(arrangement: str = "single", gear: float = 1.0, axis: str = "rotary") 
     return parse(f'axis = "{axis}"\n' + JOINT.format(arrangement=arrangement, gear=gear, more=more))
 
 
-class Rig:
+class HandMovedJoint:
     """A joint whose channels read so many times what is true, and a person who does what is said."""
 
     def __init__(self, wrong: Mapping[str, float], replies: Mapping[str, str] | None = None) -> None:
@@ -82,7 +82,7 @@ class Rig:
 def checked(
     wrong: Mapping[str, float], arrangement: str = "single", gear: float = 1.0, **replies: str
 ) -> ByHand:
-    rig = Rig(wrong, replies)
+    rig = HandMovedJoint(wrong, replies)
     return check_by_hand(joint(arrangement, gear), rig, rig)
 
 
@@ -152,7 +152,7 @@ def test_what_was_not_seen_is_not_ticked() -> None:
 def test_an_amount_has_units_and_nonsense_is_asked_again() -> None:
     replies = iter(["lots", "1.536 rad"])
 
-    class Person(Rig):
+    class Person(HandMovedJoint):
         def ask(self, text: str, meanwhile: Callable[[], object]) -> str:
             if text.startswith("Turn the joint"):
                 reply = next(replies)
@@ -168,15 +168,15 @@ def test_an_amount_has_units_and_nonsense_is_asked_again() -> None:
 
 
 def test_a_linear_axis_is_moved_in_millimetres_and_pushed_in_newtons() -> None:
-    rig = Rig({})
+    rig = HandMovedJoint({})
     done = check_by_hand(joint(axis="linear"), rig, rig)
     assert done.good and done.paste == []
     assert any("+51 mm (+0.051) for +50 mm (+0.05)" in line for line in rig.said)
     assert any("-1.5 N against the push" in line for line in rig.said)
-    rig = Rig({"link_position": 1e3}, {"Move": "0.051 m"})  # counts taken for millimetres
+    rig = HandMovedJoint({"link_position": 1e3}, {"Move": "0.051 m"})  # counts taken for millimetres
     done = check_by_hand(joint(axis="linear"), rig, rig)
     assert done.paste == ["link.encoder.counts_per_rev = 6.5536e+07"]
-    rig = Rig({}, {"Move": "90 deg"})
+    rig = HandMovedJoint({}, {"Move": "90 deg"})
     rig.ask = once(rig.ask, "Move", "51")  # type: ignore[method-assign]
     assert check_by_hand(joint(axis="linear"), rig, rig).good
     assert "expected an amount like 50 or 0.2 m, got 90 deg" in rig.said
@@ -195,10 +195,10 @@ def once(ask: Callable[..., str], start: str, then: str) -> Callable[..., str]:
 
 
 def test_a_push_in_the_negative_direction_is_typed_with_its_sign() -> None:
-    rig = Rig({}, {"Push": "-1.4"})
+    rig = HandMovedJoint({}, {"Push": "-1.4"})
     rig.push = -1.5
     assert check_by_hand(joint(), rig, rig).good
-    rig = Rig({"motor1_torque": -1.0}, {"Push": "-1.4"})
+    rig = HandMovedJoint({"motor1_torque": -1.0}, {"Push": "-1.4"})
     rig.push = -1.5
     assert check_by_hand(joint(), rig, rig).paste == ["motor[1].drive.torque_direction = -1"]
 
@@ -206,13 +206,13 @@ def test_a_push_in_the_negative_direction_is_typed_with_its_sign() -> None:
 def test_of_two_motors_each_torque_has_its_own_gear_and_what_is_not_read_is_not_judged() -> None:
     # The second motor's gear of 100 is not declared: its position reads 100 times as far, its torque a hundredth.
     wrong = {"motor2_position": 100.0, "motor2_torque": 0.01}
-    rig = Rig(wrong, {"Push": "3.0"})
+    rig = HandMovedJoint(wrong, {"Push": "3.0"})
     done = check_by_hand(joint("antagonistic"), rig, rig)
     assert [line.partition(" = ")[0] for line in done.paste] == ["motor[2].drive.gear_ratio"]
     scales = {mark.channel: mark.good for mark in done.marks if mark.what == "scale"}
     assert scales["motor1_torque"] is scales["motor2_torque"] is True
 
-    rig = Rig({}, {"Push": "3.0"})
+    rig = HandMovedJoint({}, {"Push": "3.0"})
     rig.unread.add("motor2_torque")
     done = check_by_hand(joint("antagonistic"), rig, rig)
     torques = {(mark.channel, mark.what): mark.good for mark in done.marks if "torque" in mark.channel}
@@ -220,7 +220,9 @@ def test_of_two_motors_each_torque_has_its_own_gear_and_what_is_not_read_is_not_
         ("motor1_torque", "sign"): True, ("motor2_torque", "sign"): None, ("motor1_torque", "scale"): None,
     }  # fmt: skip
 
-    rig = Rig({"motor1_torque": 30.0}, {"Push": "3.0"})  # one of two is wrong, and nobody knows which
+    rig = HandMovedJoint(
+        {"motor1_torque": 30.0}, {"Push": "3.0"}
+    )  # one of two is wrong, and nobody knows which
     done = check_by_hand(joint("antagonistic"), rig, rig)
     assert not done.good and done.paste == []
     assert any("in one of them or in both" in mark.text for mark in done.marks)

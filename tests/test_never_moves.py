@@ -9,7 +9,7 @@ import time
 import can
 import pytest
 from can.interfaces.virtual import VirtualBus
-from daemonkit import Listener, Rig, listens, patient, rig, running, served, vsa, vsa_text
+from daemonkit import DaemonRig, Listener, listens, patient, rig, running, served, vsa, vsa_text
 from zenohkit import until
 
 from drivelink.cycle.framesource import VirtualSource
@@ -45,7 +45,7 @@ def of_the_daemon(frames: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
     return [frame for frame in frames if frame[0] in own | rpdos]
 
 
-def lives(made: Rig) -> None:
+def lives(made: DaemonRig) -> None:
     """Boot, run, reboots, faults, refusals, a stop by somebody else, and the way back each time."""
     made.run(500)
     first, second, encoder = (made.node(node) for node in NODES)

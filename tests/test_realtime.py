@@ -14,7 +14,7 @@ from canlayouts import VSA, vsa_cycle
 
 from drivelink._core import Assembler, JointPipeline
 from drivelink.cycle import pacing, realtime
-from drivelink.cycle.framesource import Frame
+from drivelink.cycle.framesource import CanFrame
 from drivelink.cycle.housekeeping import Housekeeping
 from drivelink.cycle.loop import CycleLoop, LoopJoint, ObjectSink
 from drivelink.daemon.systemd_notify import notify, watchdog_period_s
@@ -64,20 +64,20 @@ class Echo:
     def __init__(self) -> None:
         self.lost_sends = 0
         self.errors: dict[str, int] = {}
-        self.pending: list[Frame] = []
+        self.pending: list[CanFrame] = []
         self.syncs = 0
         self.delay: dict[int, float] = {}
 
     def wait(self, timeout_s: float) -> bool:
         return bool(self.pending)
 
-    def take(self) -> list[Frame]:
+    def take(self) -> list[CanFrame]:
         frames, self.pending = self.pending, []
         return frames
 
     def send(self, cob_id: int, data: bytes) -> None:
         self.syncs += 1
-        self.pending = [Frame(*frame, 0) for frame in vsa_cycle(self.syncs)]
+        self.pending = [CanFrame(*frame, 0) for frame in vsa_cycle(self.syncs)]
         threading.Event().wait(self.delay.pop(self.syncs, 0.0))
 
     def narrow(self, cob_ids: object) -> None:

@@ -18,7 +18,7 @@ import zenohkit
 from drivelink import cli, jointfile
 from drivelink.canopen.bus import open_bus
 from drivelink.cli.record import _Summary
-from drivelink.cycle.framesource import Frame, FrameSource
+from drivelink.cycle.framesource import CanFrame, FrameSource
 from drivelink.recording import read
 from drivelink.recording.canlog import read_frames
 from drivelink.recording.formats import open_sink
@@ -130,11 +130,11 @@ class InRealTime:
         self._source = source
         self._syncs = 0
 
-    def take(self) -> list[Frame]:
+    def take(self) -> list[CanFrame]:
         frames = []
         for cob_id, data, _ in self._source.take():
             self._syncs += cob_id == 0x080
-            frames.append(Frame(cob_id, data, 1_700_000_000_000_000_000 + self._syncs * 1_000_000))
+            frames.append(CanFrame(cob_id, data, 1_700_000_000_000_000_000 + self._syncs * 1_000_000))
         return frames
 
 

@@ -48,7 +48,9 @@ def bits(estimate: Estimate) -> bytes:
 class Recorded:
     """A daemon in lockstep with its devices, all its frames and estimates recorded in every format."""
 
-    def __init__(self, folder: Path, text: str, disturb: Callable[[daemonkit.Rig], None] | None) -> None:
+    def __init__(
+        self, folder: Path, text: str, disturb: Callable[[daemonkit.DaemonRig], None] | None
+    ) -> None:
         self.folder = folder
         self.joint = parse(text)
         self.tap = can.Bus(interface="virtual", channel=self.joint.bus.channel)
@@ -106,7 +108,7 @@ def test_every_format_gives_the_published_estimates_bit_for_bit(
     assert [bits(e) for e in recorded.replayed(suffix, frames)] == [bits(e) for e in recorded.live]
 
 
-def disturb(rig: daemonkit.Rig) -> None:
+def disturb(rig: daemonkit.DaemonRig) -> None:
     at, syncs = rig.faults.at, rig.network.syncs
     node = rig.node
     at(syncs + 60, lambda: rig.faults.mute(node(2), rig.tpdo(2)[0]))
@@ -124,7 +126,7 @@ def test_a_disturbed_bus_is_judged_as_it_was_live(suffix: str, tmp_path: Path) -
     assert [bits(e) for e in recorded.replayed(suffix)] == [bits(e) for e in recorded.live]
 
 
-def upset(rig: daemonkit.Rig) -> None:
+def upset(rig: daemonkit.DaemonRig) -> None:
     at, syncs, tap = rig.faults.at, rig.network.syncs, daemonkit.Listener(rig.joint)
     at(syncs + 60, lambda: rig.faults.reboot(rig.node(2)))
     at(syncs + 320, lambda: tap.send(0x080))

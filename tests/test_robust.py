@@ -14,7 +14,7 @@ T = 1e-3
 USABLE = int(Status.VALID | Status.OBSERVABLE)
 
 
-class Rig:
+class RecordedJoint:
     """Six soft joints on one motion; from 9 s on their stiffness is 20 % less, from 12 s on they rest."""
 
     def __init__(self, step_at: float = math.inf, rest_at: float = math.inf, seconds: float = 9.0) -> None:
@@ -53,12 +53,12 @@ class Rig:
 
 @pytest.fixture(scope="module")
 def rig():
-    return Rig()
+    return RecordedJoint()
 
 
 @pytest.fixture(scope="module")
 def changing():
-    return Rig(step_at=7.0, rest_at=9.0, seconds=14.0)
+    return RecordedJoint(step_at=7.0, rest_at=9.0, seconds=14.0)
 
 
 def _usable(out):

@@ -93,7 +93,7 @@ class ScriptedBus(can.BusABC):
 
 
 def served_ticks(stamps_s: list[float]) -> list[int]:
-    """Rig ticks after each SYNC that arrives at these times (relative to now)."""
+    """Ticks of the world after each SYNC that arrives at these times (relative to now)."""
     rig = StubRig()
     stop = threading.Event()
     ticks: list[int] = []

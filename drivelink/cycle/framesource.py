@@ -20,7 +20,7 @@ __all__ = [
     "OVERFLOW",
     "BusLostError",
     "BusSource",
-    "Frame",
+    "CanFrame",
     "FrameSource",
     "LostSource",
     "PumpedBus",
@@ -46,7 +46,7 @@ _ERROR_KINDS = {  # linux/can/error.h, which python-can keeps to
 }
 
 
-class Frame(NamedTuple):
+class CanFrame(NamedTuple):
     """One frame: identifier, bytes, UNIX time in ns."""
 
     cob_id: int
@@ -79,7 +79,7 @@ class FrameSource(Protocol):
     def wait(self, timeout_s: float) -> bool:
         """Wait for a frame; whether there is one."""
 
-    def take(self) -> list[Frame]:
+    def take(self) -> list[CanFrame]:
         """What has been received, in order; data frames with 11-bit identifiers only."""
 
     def send(self, cob_id: int, data: bytes) -> None:
@@ -117,7 +117,7 @@ class BusSource:
         self._waiting.append(message)
         return True
 
-    def take(self) -> list[Frame]:
+    def take(self) -> list[CanFrame]:
         """See FrameSource."""
         messages, self._waiting = self._waiting, []
         while len(messages) < MOST_FRAMES and (message := self._receive(0.0)) is not None:
@@ -140,14 +140,14 @@ class BusSource:
     def narrow(self, cob_ids: Iterable[int]) -> None:
         """Nothing to gain: python-can filters after it has received."""
 
-    def _frames(self, messages: list[can.Message]) -> list[Frame]:
+    def _frames(self, messages: list[can.Message]) -> list[CanFrame]:
         frames = []
         for message in messages:
             if message.is_error_frame:
                 note_error(self.errors, message.arbitration_id, bytes(message.data))
             elif not (message.is_extended_id or message.is_remote_frame):
                 stamp_ns = int(message.timestamp * 1e9) or time.time_ns()
-                frames.append(Frame(message.arbitration_id, bytes(message.data), stamp_ns))
+                frames.append(CanFrame(message.arbitration_id, bytes(message.data), stamp_ns))
         return frames
 
     def _receive(self, timeout_s: float) -> can.Message | None:
@@ -186,7 +186,7 @@ class VirtualSource(BusSource):
             return False
         return True
 
-    def take(self) -> list[Frame]:
+    def take(self) -> list[CanFrame]:
         """See FrameSource."""
         if not (self._pending or self._waiting):
             self._check()
@@ -229,7 +229,7 @@ class PumpedSource(VirtualSource):
         super().__init__(bus)
         self._devices = devices
 
-    def take(self) -> list[Frame]:
+    def take(self) -> list[CanFrame]:
         """See FrameSource."""
         if not self._pending:
             self._devices()
@@ -253,7 +253,7 @@ class PumpedBus(BusSource):
         super().__init__(bus)
         self._devices = devices
 
-    def take(self) -> list[Frame]:
+    def take(self) -> list[CanFrame]:
         """See FrameSource."""
         self._devices()
         return super().take()
@@ -276,7 +276,7 @@ class LostSource:
         time.sleep(max(timeout_s, 0.0))
         return False
 
-    def take(self) -> list[Frame]:
+    def take(self) -> list[CanFrame]:
         """See FrameSource."""
         return []
 

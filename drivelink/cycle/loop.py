@@ -15,7 +15,7 @@ from functools import partial
 from typing import Protocol
 
 from drivelink._core import SYNC_COB_ID, JointPipeline, Tick
-from drivelink.cycle.framesource import BusLostError, Frame, FrameSource, LostSource
+from drivelink.cycle.framesource import BusLostError, CanFrame, FrameSource, LostSource
 from drivelink.cycle.housekeeping import Housekeeping
 from drivelink.cycle.latency_histogram import LatencyHistogram
 from drivelink.cycle.syncclock import LATE, MEASURED_SYNCS, SyncClock
@@ -259,7 +259,7 @@ class CycleLoop:
         self._counter = self._counter % self._overflow + 1
         return bytes((self._counter,))
 
-    def _dispatch(self, frames: list[Frame], now_ns: int) -> None:
+    def _dispatch(self, frames: list[CanFrame], now_ns: int) -> None:
         interested, listeners = self._loop_joints_of, self.listeners
         for cob_id, data, stamp_ns in frames:
             if cob_id == SYNC_COB_ID:

@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterable
 from typing import Any
 
-from drivelink.cycle.framesource import MOST_FRAMES, OVERFLOW, BusLostError, Frame, note_error
+from drivelink.cycle.framesource import MOST_FRAMES, OVERFLOW, BusLostError, CanFrame, note_error
 
 __all__ = ["SocketCanSource"]
 
@@ -45,9 +45,9 @@ class SocketCanSource:
         except (OSError, ValueError) as error:
             raise BusLostError(_reason(error)) from error
 
-    def take(self) -> list[Frame]:
+    def take(self) -> list[CanFrame]:
         """See FrameSource."""
-        frames: list[Frame] = []
+        frames: list[CanFrame] = []
         receive, buffer = self._socket.recvmsg_into, self._buffer
         try:
             while len(frames) < MOST_FRAMES:
@@ -65,7 +65,7 @@ class SocketCanSource:
                     elif len(content) >= self._TIME.size:
                         seconds, nanoseconds = self._TIME.unpack_from(content)
                 stamp = seconds * 1_000_000_000 + nanoseconds or time.time_ns()
-                frames.append(Frame(can_id, data[:length], stamp))
+                frames.append(CanFrame(can_id, data[:length], stamp))
         except BlockingIOError:
             pass
         except (OSError, ValueError) as error:

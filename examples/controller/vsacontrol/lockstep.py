@@ -28,7 +28,7 @@ from vsacontrol.drive import wiring_of
 from vsacontrol.master import Master
 from vsacontrol.phases import Drives
 
-__all__ = ["Rig", "Row"]
+__all__ = ["LockstepRig", "Row"]
 
 _channels = itertools.count()
 _STATUS_PERIODS = 250  # as often as the daemon publishes its status
@@ -60,7 +60,7 @@ class Row(NamedTuple):
     deflections: tuple[float, float]
 
 
-class Rig:
+class LockstepRig:
     """Everything in one thread.
 
     Args:

@@ -16,7 +16,7 @@ from sim.cases import case
 from sim.excitation import build
 from vsacontrol.controller import Controller
 from vsacontrol.laws import ControlLaw, Decoupler, Regulator
-from vsacontrol.lockstep import Rig, Row
+from vsacontrol.lockstep import LockstepRig, Row
 from vsacontrol.phases import Phase
 from vsacontrol.plant import joint_of
 from vsacontrol.references import WAYPOINTS, Reference, Waypoint
@@ -128,7 +128,7 @@ def follow(law: str, knowledge: str, *, seed: int = 0) -> list[Outcome]:
     joint = joint_of(file)
     acting: ControlLaw = Decoupler(joint=joint) if law == "decoupling" else Regulator(joint=joint)
     controller = Controller(joint, acting, reference, file.bus.period_s, springs=_springs(knowledge))
-    rig = Rig(file, controller, seed=seed)
+    rig = LockstepRig(file, controller, seed=seed)
     rows: list[Row] = []
 
     def note(row: Row) -> None:

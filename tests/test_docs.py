@@ -15,6 +15,10 @@ from types import ModuleType
 import pytest
 
 from drivelink import cli, jointfile
+from drivelink.recording.columnmap import UNITS
+from sim.canopen.profiles import PROFILES
+from sim.excitation import KINDS
+from sim.faults import Faults
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -109,6 +113,21 @@ def test_programs_and_code_that_a_page_shows_are_there_and_parse(page: Path) -> 
                     assert all(hasattr(module, name.name) for name in node.names)
         elif language == "toml":
             tomllib.loads(code)
+
+
+@pytest.mark.parametrize(
+    ("name", "heading", "known"),
+    [
+        ("simulated-drives.md", "Vendor profiles", set(PROFILES)),
+        ("simulated-drives.md", "Faults", {name for name in vars(Faults) if name[0] != "_"}),
+        ("recordings.md", "Units", {unit for units in UNITS.values() for unit in units}),
+        ("simulation.md", "Excitation", set(KINDS)),
+    ],
+)
+def test_a_reference_page_lists_what_the_code_knows(name: str, heading: str, known: set[str]) -> None:
+    page = (REFERENCE / name).read_text(encoding="utf-8")
+    section = re.split(r"\n##+ ", page.partition(f"# {heading}")[2])[0]
+    assert known <= set(re.findall(r"`([\w/-]+)`", section))
 
 
 def test_the_benchmarks_page_lists_every_program() -> None:

@@ -275,7 +275,7 @@ def test_what_a_daemon_said_counts_more_than_a_file_beside_the_recording(tmp_pat
     assert len(recorded_layouts(tmp_path / "r.mcap", joint.name, daemon=False)) == 1
     assert len(recorded_layouts(tmp_path / "r.mcap", joint.name, daemon=True)) == len(layouts)
     (tmp_path / "r.log.mapping.json").write_text('{"joint": "elbow", "nodes": 7}')
-    with pytest.raises(RecordingError, match="what it knows of the mapping cannot be read"):
+    with pytest.raises(RecordingError, match="its mapping cannot be read"):
         recorded_layouts(tmp_path / "r.log", joint.name, daemon=False)
 
 

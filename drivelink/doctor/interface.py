@@ -28,7 +28,7 @@ def examine_interface(section: Section, bus: BusSection) -> None:
         section.say(
             Severity.INFO,
             "virtual",
-            "lives inside one process: nothing that runs elsewhere can be on it",
+            "exists inside one process only: no other program can join it",
             "for two processes: sudo modprobe vcan && sudo ip link add vcan0 type vcan && "
             'sudo ip link set vcan0 up; or interface = "socketcand", which drivelink sim serves',
         )

@@ -275,7 +275,7 @@ def decode_estimate(payload: bytes) -> EstimateMessage:
     elements = tuple(map(_make_transmission, _TRANSMISSION.iter_unpack(payload[_ESTIMATE_HEAD.size :])))
     message = _make_message((*head, elements))
     if message.status & _VALID and not _usable(message):
-        raise ZenohError(f"{ESTIMATE.schema}: called valid, but not every number in it is one")
+        raise ZenohError(f"{ESTIMATE.schema}: valid, but a value is impossible (not finite, negative)")
     return message
 
 
@@ -314,7 +314,7 @@ def decode_external(payload: bytes) -> ExternalMessage:
     if message.valid:
         torque, std = message.external_torque_nm, message.external_torque_std_nm
         if not (math.isfinite(torque) and 0.0 <= std < math.inf):
-            raise ZenohError(f"{EXTERNAL.schema}: called valid, but not every number in it is one")
+            raise ZenohError(f"{EXTERNAL.schema}: valid, but a value is impossible (not finite, negative)")
     elif message.contact:
         raise ZenohError(f"{EXTERNAL.schema}: says contact, but is not valid")
     return message

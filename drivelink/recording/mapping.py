@@ -87,7 +87,7 @@ def recorded_layouts(path: Path, joint: str, *, daemon: bool) -> Sequence[NodeLa
             if layouts := layouts_from(message.data, joint, daemon=daemon):
                 return layouts
     except ValueError as error:
-        raise RecordingError(f"{path}: what it knows of the mapping cannot be read: {error}") from error
+        raise RecordingError(f"{path}: its mapping cannot be read: {error}") from error
     return ()
 
 

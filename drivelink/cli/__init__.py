@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 __all__ = ["ALONE", "VERBS", "add_bus", "add_map", "main", "make_parser", "moved"]
 
 VERBS = {
-    "demo": "simulated drive on the virtual bus, daemon, subscriber, live view: the whole chain",
+    "demo": "everything without hardware: simulated drives, daemon, subscriber, live view",
     "run": "the daemon: one or several joints on one bus",
     "sim": "the simulated drives alone, on the bus of the joint file",
     "monitor": "live view of any daemon",
     "record": "record a running daemon or a bus",
-    "replay": "send a recording through the same chain",
+    "replay": "run a recording through the same code as live data",
     "fit": "fit the transmission to a recording (model-based estimation)",
-    "diagnose": "trace what the model leaves unexplained to a physical effect, and add it",
-    "fleet": "fit and diagnose many recordings of many joints, here or on a cluster; a table, trends, a page",
-    "doctor": "what keeps this machine, bus or drive from doing the job, and the fix",
+    "diagnose": "find the physical effect that the model lacks, and add it",
+    "fleet": "fit and diagnose many recordings of many joints, here or on a cluster: table, trends, report",
+    "doctor": "check machine, bus and drives, and name the fix for each problem",
     "service": "run the daemon of a joint as a systemd service, from boot on",
     "new": "write a commented joint file, from a few questions or from what is on the bus",
-    "completion": "what a shell needs to complete verbs, options and files",
+    "completion": "print the script that completes verbs, options and files in a shell",
 }
 
 ALONE = (

@@ -1,4 +1,4 @@
-"""`drivelink demo`: the whole chain without hardware, watched from a process of its own."""
+"""`drivelink demo`: everything without hardware, watched from a process of its own."""
 
 from __future__ import annotations
 

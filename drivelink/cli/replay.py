@@ -1,4 +1,4 @@
-"""`drivelink replay FILE --joint JOINT`: a recording through the same chain as live data."""
+"""`drivelink replay FILE --joint JOINT`: a recording through the same code as live data."""
 
 from __future__ import annotations
 

@@ -12,6 +12,7 @@ import tomllib
 from pathlib import Path
 from types import ModuleType
 
+import daemonkit
 import pytest
 
 from drivelink import cli, jointfile
@@ -128,6 +129,14 @@ def test_a_reference_page_lists_what_the_code_knows(name: str, heading: str, kno
     page = (REFERENCE / name).read_text(encoding="utf-8")
     section = re.split(r"\n##+ ", page.partition(f"# {heading}")[2])[0]
     assert known <= set(re.findall(r"`([\w/-]+)`", section))
+
+
+def test_the_reference_describes_every_key_of_the_status_document() -> None:
+    page = (REFERENCE / "wire.md").read_text(encoding="utf-8")
+    section = page.partition("## Status document")[2].partition("\n## ")[0]
+    first_cells = " ".join(re.findall(r"^\| (`.*?) \|", section, re.MULTILINE))
+    with daemonkit.rig() as rig:
+        assert set(rig.status) == set(re.findall(r"`(\w+)`", first_cells))
 
 
 def test_the_benchmarks_page_lists_every_program() -> None:

@@ -155,6 +155,8 @@ def _link(joint: JointFit) -> tuple[LinkDynamics | None, dict[str, float]]:
         link,
         inertia_kg_m2=link.inertia_kg_m2 + inertia,
         viscous_damping_nm_s_rad=max(link.viscous_damping_nm_s_rad + damping, 0.0),
+        inertia_std_kg_m2=inertia_std,
+        viscous_damping_std_nm_s_rad=damping_std,
     )
     if gravity:
         parts = joint.values(("gravity", None))
@@ -166,7 +168,12 @@ def _link(joint: JointFit) -> tuple[LinkDynamics | None, dict[str, float]]:
         along, across = np.array([a, b]) / size, np.array([-b, a]) / size**2
         std["gravity_nm"] = math.sqrt(max(float(along @ both @ along), 0.0))
         std["gravity_phase_rad"] = math.sqrt(max(float(across @ both @ across), 0.0))
-        link = replace(link, gravity_nm=sign * size, gravity_phase_rad=math.atan2(sign * b, sign * a))
+        link = replace(
+            link,
+            gravity_nm=sign * size,
+            gravity_phase_rad=math.atan2(sign * b, sign * a),
+            gravity_std_nm=max(std["gravity_nm"], size * std["gravity_phase_rad"]),
+        )
     return link, std
 
 

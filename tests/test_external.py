@@ -14,12 +14,14 @@ from estimator import (
     JointModel,
     LinkDynamics,
     Motor,
+    Record,
     Sample,
     Status,
     Transmission,
     make_estimator,
 )
 from estimator.filters import StateVariableFilter, first_order_pole, linear_filter
+from estimator.identify import identify
 from sim.effects import parse
 from sim.excitation import build
 from sim.plant import JointPlant, LinkPlant, MotorPlant
@@ -44,8 +46,8 @@ LINK = LinkDynamics(
 )
 
 
-def world(seed=1, external=None, effects=()):
-    """A series elastic joint behind a gear with dry friction, in rich motion."""
+def world(seed=1, external=None, effects=(), payload=(0.0, 0.0)):
+    """A series elastic joint behind a gear with dry friction, in rich motion; payload: kg·m², N·m."""
     spring = Spring(model="polynomial", parameters={"coefficients_nm_rad": (150.0, 1500.0)})
     table = {"kind": "rich", "amplitude_nm": 8.0, "low_hz": 0.15, "high_hz": 4.0}
     excitation = build(table | {"centring_nm_rad": 10.0, "centring_nm_s_rad": 1.0}, 1)
@@ -53,7 +55,11 @@ def world(seed=1, external=None, effects=()):
         JointPlant(
             arrangement="single",
             motors=(MotorPlant(inertia_kg_m2=0.125, viscous_damping_nm_s_rad=0.8, spring=spring),),
-            link=LinkPlant(inertia_kg_m2=0.4, viscous_damping_nm_s_rad=0.1, gravity_nm=GRAVITY_NM),
+            link=LinkPlant(
+                inertia_kg_m2=0.4 + payload[0],
+                viscous_damping_nm_s_rad=0.1,
+                gravity_nm=GRAVITY_NM + payload[1],
+            ),
         ),
         (
             DriveHardware(
@@ -188,6 +194,34 @@ def test_a_bias_takes_a_payload_in_and_lets_a_lasting_push_fade():
     assert abs(np.mean(with_bias.torque[at : at + 1000])) < size * (math.exp(-2.0) + 0.1)
     assert with_bias.contact[round(begin / T) + 30]
     assert without.contact[at]
+
+
+def test_fit_finds_the_link_with_its_payload_in_a_free_motion():
+    """1 kg at 0.3 m, declared by nobody: fitted to one motion, it is no contact in another, and a push is right."""
+    payload = (1.0 * 0.3**2, 1.0 * 0.3 * 9.81)
+    rows = record(world(seed=7, payload=payload), 20.0)
+    declared = LinkDynamics(inertia_kg_m2=0.4, viscous_damping_nm_s_rad=0.1, gravity_nm=GRAVITY_NM)
+    free = Record(
+        period_s=T,
+        sequence=np.arange(len(rows["time_s"])),
+        motor_position_rad=rows["motor1_position_rad"][:, None],
+        motor_torque_nm=rows["motor1_torque_nm"][:, None],
+        link_position_rad=rows["link_position_rad"],
+    )
+    found = identify(free, model(declared))
+    link = found.model.link
+    truth = {"inertia_kg_m2": 0.4 + payload[0], "gravity_nm": GRAVITY_NM + payload[1]}
+    for name, value in truth.items():
+        off = abs(getattr(link, name) - value)
+        assert off < 0.02 * value and off < 3.0 * found.link_std[name], (name, off)
+    again = record(world(seed=8, external=push, payload=payload), 12.0)
+    without, told = (Told(m, again, contact_torque_nm=0.2) for m in (model(declared), found.model))
+    use = slice(LEARNED, 8000)  # a free motion
+    assert np.sqrt(np.mean(told.torque[use] ** 2)) < 0.1 * np.sqrt(np.mean(without.torque[use] ** 2))
+    assert not told.contact[:8000].any()
+    for begin, size in PUSHES:
+        window = slice(round((begin + 0.06) / T), round((begin + PUSH_S) / T))
+        assert abs(np.mean(told.torque[window]) - size) < 0.03 * abs(size) + 0.02 * payload[1]
 
 
 def test_the_flexibility_torque_from_the_link_side_is_the_true_one(pushed):

@@ -28,9 +28,10 @@ const SETTLED: f64 = 4.5; // delays of the filter after which a wrong start is f
 const UNCORRELATED: f64 = 0.697; // w t from which on the noise of s² w³/(s + w)³ is not positively correlated
 const OVERSHOOT: f64 = 1.166; // of a sum over its threshold, standard deviations (Siegmund 1985, chapter X)
 const CAP: f64 = 2.0; // thresholds that a sum may reach: a long contact ends as soon as a short one
-const FRICTION_S: f64 = 20.0; // memory of what opposes the link's motion, as that of the regression
+const MEMORY_S: f64 = 20.0; // of how far the declared link is off, as that of the regression
 const FRICTION_SPEEDS: f64 = 0.02; // of the largest velocity: over which dry friction changes its sign
-const ONE_WAY: f64 = 0.9; // mean direction beyond which less than a twentieth of the motion goes the other way
+const PARAMETERS: usize = 6; // of `LinkErrors`
+const CONSTANT: usize = 5; // the last of them
 const CONSISTENCY_S: f64 = 10.0; // over which the two flexibility torques are compared
 const TINY: f64 = 1e-12;
 
@@ -249,68 +250,77 @@ fn gravity(link: &Link, q: f64) -> f64 {
     link.gravity * (q + link.gravity_phase).sin()
 }
 
-/// What opposes the link's motion and nobody declared, learned from the link's own balance where that is as
-/// expected: a torque in proportion to the velocity, and a dry friction.
+/// How far the declared link is off: identified from the link's own balance, where that is as expected.
 ///
-/// Damping is the one, and so is a skew between the encoders: d of it makes σ d q′ of torque. From the motor's
-/// side a skew and the motor's friction look alike; here only the link's damping does, and nothing is to be
-/// separated. Of a link that turns one way only, a load and friction are the same: nothing is learned there.
+/// Parameters: inertia, viscous damping, dry friction, gravity's sine and cosine, and a constant torque. The
+/// declared uncertainties are the priors. Recursive least squares with exponential forgetting in information
+/// form: Λ = Λ₀ + Σ e^(−t/20 s) x xᵀ/r.
+///
+/// The constant may be a push: it is identified with a flat prior so that the others have to explain what varies
+/// with the motion, and it is not taken off. A load on a link that turns one way is no friction, and one on a
+/// link at rest is no gravity. A skew between the encoders makes σ d q′, which looks like damping; from the
+/// motor's side it looks like the motor's friction.
 #[derive(Clone, Copy, Debug, Default)]
-struct Friction {
-    values: [f64; 2],
-    covariance: Option<[[f64; 2]; 2]>,
+struct LinkErrors {
+    information: [[f64; PARAMETERS]; PARAMETERS], // of the data alone; the lower triangle
+    vector: [f64; PARAMETERS],
     fastest: f64,
-    direction: Option<f64>, // its mean over the memory: ±1 one way only, 0 to and fro
 }
 
-impl Friction {
-    /// What the two are proportional to at this velocity.
-    fn row(&mut self, velocity: f64) -> [f64; 2] {
+type Row = [f64; PARAMETERS];
+
+impl LinkErrors {
+    /// What the parameters multiply: with the link here, and of these variances before any data.
+    fn row(&mut self, link: &Link, [q, velocity, acceleration]: [f64; 3], prior: &Row) -> Row {
         self.fastest = self.fastest.max(velocity.abs());
-        [velocity, (velocity / (FRICTION_SPEEDS * self.fastest).max(TINY)).tanh()]
+        let dry = (velocity / (FRICTION_SPEEDS * self.fastest).max(TINY)).tanh();
+        let (sine, cosine) = (q + link.gravity_phase).sin_cos();
+        let row = [acceleration, velocity, dry, sine, cosine, 1.0];
+        std::array::from_fn(|i| if prior[i] > 0.0 { row[i] } else { 0.0 }) // known exactly
     }
 
-    /// One period; `prior`: the variances before anything is learned, which are never exceeded.
-    fn forget(&mut self, prior: [f64; 2], period_s: f64) {
-        let Some(p) = &mut self.covariance else {
-            self.covariance = Some([[prior[0], 0.0], [0.0, prior[1]]]);
-            return;
-        };
-        for i in 0..2 {
-            p[i][i] = (p[i][i] + prior[i] * period_s / FRICTION_S).min(prior[i]);
+    /// The torque that these errors make, and its variance.
+    fn at(&self, row: &Row, prior: &Row) -> (f64, f64) {
+        let mut factor = self.information;
+        for i in 0..PARAMETERS {
+            factor[i][i] += if prior[i] > 0.0 { 1.0 / prior[i] } else { 1.0 };
         }
-        let most = (p[0][0] * p[1][1]).sqrt();
-        p[0][1] = p[0][1].clamp(-most, most);
-        p[1][0] = p[0][1];
-    }
-
-    /// The torque and its variance.
-    fn at(&self, row: [f64; 2]) -> (f64, f64) {
-        let p = self.covariance.unwrap_or_default();
-        let variance =
-            p[0][0] * row[0] * row[0] + 2.0 * p[0][1] * row[0] * row[1] + p[1][1] * row[1] * row[1];
-        (self.values[0] * row[0] + self.values[1] * row[1], variance.max(0.0))
-    }
-
-    /// One period of motion.
-    fn turn(&mut self, direction: f64, period_s: f64) {
-        let before = self.direction.unwrap_or(direction.signum());
-        self.direction = Some(before + (direction - before) * period_s / FRICTION_S);
-    }
-
-    /// What is left of one balance; `noise`: its variance, of errors that last as long as the filter does.
-    fn learn(&mut self, row: [f64; 2], left: f64, noise: f64) {
-        if self.direction.is_none_or(|mean| mean.abs() > ONE_WAY) {
-            return;
+        // Cholesky, and L⁻¹ of both sides on the way.
+        let mut own = *row;
+        own[CONSTANT] = 0.0;
+        let mut vector = self.vector;
+        let (mut torque, mut variance) = (0.0, 0.0);
+        for i in 0..PARAMETERS {
+            for j in 0..=i {
+                let sum: f64 = (0..j).map(|k| factor[i][k] * factor[j][k]).sum();
+                let left = factor[i][j] - sum;
+                factor[i][j] = if i == j { left.max(TINY * TINY).sqrt() } else { left / factor[j][j] };
+            }
+            for k in 0..i {
+                own[i] -= factor[i][k] * own[k];
+                vector[i] -= factor[i][k] * vector[k];
+            }
+            own[i] /= factor[i][i];
+            vector[i] /= factor[i][i];
+            torque += own[i] * vector[i];
+            variance += own[i] * own[i];
         }
-        let (_, variance) = self.at(row);
-        let Some(p) = &mut self.covariance else { return };
-        let seen = [p[0][0] * row[0] + p[0][1] * row[1], p[1][0] * row[0] + p[1][1] * row[1]];
-        let scale = 1.0 / (variance + noise).max(TINY * TINY);
-        for i in 0..2 {
-            self.values[i] += scale * seen[i] * left;
-            for j in 0..2 {
-                p[i][j] -= scale * seen[i] * seen[j];
+        (torque, variance)
+    }
+
+    /// One period passes.
+    fn forget(&mut self, period_s: f64) {
+        let kept = 1.0 - period_s / MEMORY_S;
+        self.information.iter_mut().flatten().chain(&mut self.vector).for_each(|x| *x *= kept);
+    }
+
+    /// What the declared link leaves of one balance; `noise`: its variance, as if errors were independent.
+    fn identify(&mut self, row: &Row, left: f64, noise: f64) {
+        let weight = 1.0 / noise.max(TINY * TINY);
+        for i in 0..PARAMETERS {
+            self.vector[i] += weight * row[i] * left;
+            for j in 0..=i {
+                self.information[i][j] += weight * row[i] * row[j];
             }
         }
     }
@@ -336,7 +346,7 @@ pub struct LinkMomentum {
     last: [f64; 4], // q, g, τ_e, τ_k
     skew: f64,      // between the encoders, before any data, s
     dry: f64,       // undeclared dry friction, as a share of the torque carried
-    friction: Friction,
+    errors: LinkErrors,
     judge: Judge,
     consistency: Consistency,
     now: External,
@@ -374,7 +384,7 @@ impl LinkMomentum {
             filter,
             skew: priors.encoder_delay * period_s,
             dry: priors.coulomb_friction,
-            friction: Friction::default(),
+            errors: LinkErrors::default(),
             consistency: Consistency::default(),
             now: External::nothing(0),
         })
@@ -383,7 +393,7 @@ impl LinkMomentum {
     /// Forget everything.
     pub fn reset(&mut self) {
         self.judge.reset();
-        self.friction = Friction::default();
+        self.errors = LinkErrors::default();
         self.consistency = Consistency::default();
         self.now = External::nothing(0);
         self.unsettled = self.settle;
@@ -440,26 +450,23 @@ impl LinkMomentum {
         let own = link.inertia * acceleration + link.damping * velocity + self.gravity[0];
         let own = own + self.effects.iter().map(|element| element.torque(&c)).sum::<f64>();
         let sum = own + self.carried[0];
-        let dry = self.dry * self.judge.largest;
-        let prior = [link.damping_std.powi(2) + (carried.stiffness * self.skew).powi(2), dry * dry];
-        self.friction.forget(prior, self.period);
-        let row = self.friction.row(velocity);
-        self.friction.turn(row[1], self.period);
-        let (opposed, unknown) = self.friction.at(row);
+        let damping = link.damping_std.powi(2) + (carried.stiffness * self.skew).powi(2);
+        let (dry, gravity) = (self.dry * self.judge.largest, link.gravity_std.powi(2));
+        let prior = [link.inertia_std.powi(2), damping, dry * dry, gravity, gravity, f64::INFINITY];
+        self.errors.forget(self.period);
+        let row = self.errors.row(link, self.position, &prior);
+        let (off, unknown) = self.errors.at(&row, &prior);
         // A reading that is rounded errs alike for as long as it stands: what the spring makes of it is no noise.
-        let uncertain = (link.inertia_std * acceleration).powi(2)
-            + link.gravity_std.powi(2)
-            + carried.variance
-            + carried.reading
-            + carried.stiffness.powi(2) * noise;
+        let read = carried.reading + carried.stiffness.powi(2) * noise;
         let white = noise * (link.inertia.powi(2) * self.gains[2] + link.damping.powi(2) * self.gains[1]);
-        let valid = valid && self.unsettled <= 0 && (sum + uncertain + white).is_finite();
-        let around = uncertain + unknown;
-        let (torque, contact) = self.judge.see(sum - opposed, self.carried[0], around, white, valid);
+        let around = carried.variance + read + unknown;
+        let valid = valid && self.unsettled <= 0 && (sum + around + white).is_finite();
+        let (torque, contact) = self.judge.see(sum - off, self.carried[0], around, white, valid);
         let usual = torque.abs() <= BAND_SIGMA * (around + white).sqrt();
         if valid && usual && !contact {
-            let lasting = (uncertain + white) / (self.filter.bandwidth * self.period);
-            self.friction.learn(row, torque - self.measured[0], lasting);
+            // Errors of readings last as long as the filter does; that of the curve does not average out at all.
+            let lasting = (read + white) / self.filter.bandwidth + carried.variance * MEMORY_S;
+            self.errors.identify(&row, sum - self.measured[0], lasting / self.period);
         }
         self.now = External {
             sequence,
@@ -690,13 +697,13 @@ mod tests {
     fn a_load_on_a_link_that_turns_one_way_is_not_taken_for_its_friction() {
         let mut momentum = LinkMomentum::new(&joint(FREE), &Settings::default(), &PRIORS, T).unwrap();
         momentum.reset();
-        momentum.restart(0.0, 0.0);
         let (load, speed) = (-1.9, 40.0);
+        momentum.restart(0.0, load);
         let carried = Carried { torque: load, stiffness: 35.0, ..Carried::default() };
         let mut external = External::nothing(0);
         for k in 1..20_000_u64 {
             momentum.feed(speed * k as f64 * T, Some(load), f64::NAN);
-            external = momentum.conclude(k, &carried, 1e-10, true);
+            told = momentum.conclude(k, &carried, 1e-10, k > 200); // after the jump to this speed
         }
         assert!(external.status & status::VALID != 0);
         assert!((external.torque - load).abs() < 0.01 * load.abs(), "{}", external.torque);

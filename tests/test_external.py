@@ -215,13 +215,13 @@ def test_fit_finds_the_link_with_its_payload_in_a_free_motion():
         off = abs(getattr(link, name) - value)
         assert off < 0.02 * value and off < 3.0 * found.link_std[name], (name, off)
     again = record(world(seed=8, external=push, payload=payload), 12.0)
-    without, told = (Told(m, again, contact_torque_nm=0.2) for m in (model(declared), found.model))
+    without, loaded = (Estimates(m, again, contact_torque_nm=0.2) for m in (model(declared), found.model))
     use = slice(LEARNED, 8000)  # a free motion
-    assert np.sqrt(np.mean(told.torque[use] ** 2)) < 0.1 * np.sqrt(np.mean(without.torque[use] ** 2))
-    assert not told.contact[:8000].any()
+    assert np.sqrt(np.mean(loaded.torque[use] ** 2)) < 0.1 * np.sqrt(np.mean(without.torque[use] ** 2))
+    assert not loaded.contact[:8000].any()
     for begin, size in PUSHES:
         window = slice(round((begin + 0.06) / T), round((begin + PUSH_S) / T))
-        assert abs(np.mean(told.torque[window]) - size) < 0.03 * abs(size) + 0.02 * payload[1]
+        assert abs(np.mean(loaded.torque[window]) - size) < 0.03 * abs(size) + 0.02 * payload[1]
 
 
 def test_the_flexibility_torque_from_the_link_side_is_the_true_one(pushed):

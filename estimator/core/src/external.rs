@@ -703,7 +703,7 @@ mod tests {
         let mut external = External::nothing(0);
         for k in 1..20_000_u64 {
             momentum.feed(speed * k as f64 * T, Some(load), f64::NAN);
-            told = momentum.conclude(k, &carried, 1e-10, k > 200); // after the jump to this speed
+            external = momentum.conclude(k, &carried, 1e-10, k > 200); // after the jump to this speed
         }
         assert!(external.status & status::VALID != 0);
         assert!((external.torque - load).abs() < 0.01 * load.abs(), "{}", external.torque);

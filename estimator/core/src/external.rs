@@ -30,8 +30,11 @@ const OVERSHOOT: f64 = 1.166; // of a sum over its threshold, standard deviation
 const CAP: f64 = 2.0; // thresholds that a sum may reach: a long contact ends as soon as a short one
 const MEMORY_S: f64 = 20.0; // of how far the declared link is off, as that of the regression
 const FRICTION_SPEEDS: f64 = 0.02; // of the largest velocity: over which dry friction changes its sign
+const ONE_WAY: f64 = 0.9; // mean direction beyond which less than a twentieth of the motion goes the other way
 const PARAMETERS: usize = 6; // of `LinkErrors`
-const CONSTANT: usize = 5; // the last of them
+const DAMPING: usize = 1;
+const DRY: usize = 2;
+const CONSTANT: usize = 5;
 const CONSISTENCY_S: f64 = 10.0; // over which the two flexibility torques are compared
 const TINY: f64 = 1e-12;
 
@@ -257,26 +260,30 @@ fn gravity(link: &Link, q: f64) -> f64 {
 /// form: Λ = Λ₀ + Σ e^(−t/20 s) x xᵀ/r.
 ///
 /// The constant may be a push: it is identified with a flat prior so that the others have to explain what varies
-/// with the motion, and it is not taken off. A load on a link that turns one way is no friction, and one on a
-/// link at rest is no gravity. A skew between the encoders makes σ d q′, which looks like damping; from the
-/// motor's side it looks like the motor's friction.
+/// with the motion, and it is not taken off: a load on a link at rest is no gravity. Of a link that turns one way
+/// only, a load and friction are the same even so, since the load changes the speed: no friction is identified
+/// there. A skew between the encoders makes σ d q′, which looks like damping; from the motor's side it looks like
+/// the motor's friction.
 #[derive(Clone, Copy, Debug, Default)]
 struct LinkErrors {
     information: [[f64; PARAMETERS]; PARAMETERS], // of the data alone; the lower triangle
     vector: [f64; PARAMETERS],
     fastest: f64,
+    direction: Option<f64>, // its mean over the memory: ±1 one way only, 0 to and fro
 }
 
 type Row = [f64; PARAMETERS];
 
 impl LinkErrors {
-    /// What the parameters multiply: with the link here, and of these variances before any data.
-    fn row(&mut self, link: &Link, [q, velocity, acceleration]: [f64; 3], prior: &Row) -> Row {
+    /// What the parameters multiply, and one more period of motion.
+    fn row(&mut self, link: &Link, [q, velocity, acceleration]: [f64; 3], period_s: f64) -> Row {
         self.fastest = self.fastest.max(velocity.abs());
         let dry = (velocity / (FRICTION_SPEEDS * self.fastest).max(TINY)).tanh();
         let (sine, cosine) = (q + link.gravity_phase).sin_cos();
-        let row = [acceleration, velocity, dry, sine, cosine, 1.0];
-        std::array::from_fn(|i| if prior[i] > 0.0 { row[i] } else { 0.0 }) // known exactly
+        let kept = 1.0 - period_s / MEMORY_S;
+        self.direction = Some(dry + kept * (self.direction.unwrap_or(dry.signum()) - dry));
+        self.information.iter_mut().flatten().chain(&mut self.vector).for_each(|x| *x *= kept);
+        [acceleration, velocity, dry, sine, cosine, 1.0]
     }
 
     /// The torque that these errors make, and its variance.
@@ -308,15 +315,13 @@ impl LinkErrors {
         (torque, variance)
     }
 
-    /// One period passes.
-    fn forget(&mut self, period_s: f64) {
-        let kept = 1.0 - period_s / MEMORY_S;
-        self.information.iter_mut().flatten().chain(&mut self.vector).for_each(|x| *x *= kept);
-    }
-
     /// What the declared link leaves of one balance; `noise`: its variance, as if errors were independent.
     fn identify(&mut self, row: &Row, left: f64, noise: f64) {
         let weight = 1.0 / noise.max(TINY * TINY);
+        let mut row = *row;
+        if self.direction.is_none_or(|mean| mean.abs() > ONE_WAY) {
+            (row[DAMPING], row[DRY]) = (0.0, 0.0);
+        }
         for i in 0..PARAMETERS {
             self.vector[i] += weight * row[i] * left;
             for j in 0..=i {
@@ -453,8 +458,8 @@ impl LinkMomentum {
         let damping = link.damping_std.powi(2) + (carried.stiffness * self.skew).powi(2);
         let (dry, gravity) = (self.dry * self.judge.largest, link.gravity_std.powi(2));
         let prior = [link.inertia_std.powi(2), damping, dry * dry, gravity, gravity, f64::INFINITY];
-        self.errors.forget(self.period);
-        let row = self.errors.row(link, self.position, &prior);
+        let row = self.errors.row(link, self.position, self.period);
+        let row = std::array::from_fn(|i| if prior[i] > 0.0 { row[i] } else { 0.0 }); // 0: known exactly
         let (off, unknown) = self.errors.at(&row, &prior);
         // A reading that is rounded errs alike for as long as it stands: what the spring makes of it is no noise.
         let read = carried.reading + carried.stiffness.powi(2) * noise;

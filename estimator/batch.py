@@ -46,7 +46,11 @@ class TransmissionFit:
         alpha: parameters as an array.
         covariance: of alpha.
         deflection_rad: (rows,) filtered deflections, for plots.
+        deflection_rate_rad_s: (rows,) their derivatives.
+        velocity_rad_s: (rows,) filtered motor velocities.
         torque_nm: (rows,) flexibility torque that the motor's balance gives there, nuisances removed.
+        unexplained_nm: (rows,) what is left of the motor's balance there, with the friction that is not
+            declared.
         error_rms_nm: what is left of the motor's balance.
         torque_rms_nm: of the flexibility torque; of the motor torque, where it is rigid.
         inertia_kg_m2: B, as fitted.
@@ -67,7 +71,10 @@ class TransmissionFit:
     alpha: FloatArray
     covariance: FloatArray
     deflection_rad: FloatArray
+    deflection_rate_rad_s: FloatArray
+    velocity_rad_s: FloatArray
     torque_nm: FloatArray
+    unexplained_nm: FloatArray
     error_rms_nm: float
     torque_rms_nm: float
     inertia_kg_m2: float
@@ -306,6 +313,13 @@ def _totals(fitted: Fitted) -> FloatArray:
     return np.array([s.taken for s in fitted.slots]) + fitted.posterior.x
 
 
+def _friction(joint: JointFit, motor: int) -> FloatArray:
+    """(rows,) torque of the friction that is not declared, as fitted."""
+    mine = joint.places(("coulomb_friction", motor))
+    design, x = joint.fitted.regression.design, joint.fitted.posterior.x
+    return np.asarray(design[:, mine] @ x[mine], dtype=np.float64)
+
+
 def transmission_fits(joint: JointFit) -> list[TransmissionFit]:
     """What a fit says of each motor and its transmission."""
     problem, fitted = joint.problem, joint.fitted
@@ -336,7 +350,12 @@ def transmission_fits(joint: JointFit) -> list[TransmissionFit]:
                 alpha=alpha,
                 covariance=covariance,
                 deflection_rad=np.concatenate([f.project(f.motors[i].deflection) for f in frames]),
+                deflection_rate_rad_s=np.concatenate(
+                    [f.project(f.motors[i].deflection_rate) for f in frames]
+                ),
+                velocity_rad_s=np.concatenate([f.project(f.motors[i].velocity) for f in frames]),
                 torque_nm=torque + left[rows],
+                unexplained_nm=(left + _friction(joint, i))[rows],
                 error_rms_nm=float(np.sqrt(np.mean(left[rows] ** 2))),
                 torque_rms_nm=float(np.std(measured if law is None else torque)),
                 inertia_kg_m2=motor.inertia_kg_m2 + inertia,

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import functools
+import math
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import diagnosiskit as kit
 import numpy as np
 
-from estimator.sample import Record
+from drivelink.jointfile import parse
+from drivelink.recording.formats import open_sink
+from estimator.sample import Record, Sample
 
 JOINT = f"""\
 name = "{{name}}"
@@ -52,3 +60,32 @@ def make_fleet(folder: Path, nights: int = 2) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(JOINT.format(name=name), encoding="utf-8")
     return folder
+
+
+def write_mcap(record: Record, name: str, path: Path, begin_s: int) -> Path:
+    """The record as `drivelink record` writes it: with its joint file in it."""
+    text, nothing = JOINT.format(name=name), math.nan
+    sink = open_sink(path, parse(text), text, str(path.parent))
+    assert record.link_position_rad is not None
+    columns = (record.motor_position_rad, record.motor_torque_nm, record.link_position_rad)
+    for sequence, (theta, torque, link) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
+        sample = Sample(sequence, tuple(theta), (nothing,), tuple(torque), link, nothing, nothing)
+        sink.sample(sample, begin_s * 10**9 + sequence * 10**6)
+    sink.close()
+    return path
+
+
+class _Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """The folder by http on loopback; its address."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(_Quiet, directory=str(folder))) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+        thread.join()

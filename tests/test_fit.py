@@ -3,11 +3,14 @@
 import json
 
 import diagnosiskit as kit
+import fleetkit
 import joints
 import numpy as np
 import pytest
 
+from drivelink import jointfile
 from drivelink.cli import main
+from drivelink.output.fitplot import fit_plot
 from estimator import EstimatorError, EstimatorSettings, Record, Status, fit, make_estimator
 from estimator.identify import identify
 from estimator.transmissions import MODELS
@@ -228,3 +231,16 @@ def test_what_the_motion_does_not_reveal_of_units_and_signs_is_a_note(monkeypatc
     unrevealed = "this motion does not reveal the unit of the positions"
     assert any(note.startswith(unrevealed) for note in identify(gentle, kit.model()).notes)
     assert not any("does not reveal" in note for note in identify(rich, kit.model()).notes)
+
+
+def test_what_is_left_shows_friction_as_a_step_and_hysteresis_as_a_loop(monkeypatch, tmp_path):
+    monkeypatch.setattr(kit, "SECONDS", 8.0)
+    effects = [{"coulomb_nm": 0.5}, {"hysteresis_nm": 1.0, "hysteresis_rad": 0.01}]
+    (stuck,), (looping,) = (fit(record, kit.model()) for record in kit.World(effects).run())
+    step = [np.median(stuck.unexplained_nm[side * stuck.velocity_rad_s > 0.3]) for side in (1, -1)]
+    assert step == pytest.approx([-0.5, 0.5], abs=0.05)
+    directions = (looping.deflection_rate_rad_s > 0.0, looping.deflection_rate_rad_s < 0.0)
+    up, down = (np.median(looping.unexplained_nm[rows]) for rows in directions)
+    assert 1.0 < up - down < 2.0  # the loop is 2 N·m wide where the motion is longer than its 0.01 rad
+    joint = jointfile.parse(fleetkit.JOINT.format(name="elbow"))
+    assert fit_plot([looping], joint, tmp_path / "fit.png").stat().st_size > 20_000

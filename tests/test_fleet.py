@@ -185,6 +185,34 @@ def test_a_remote_storage_holds_recordings_and_results(fleet: Path, joints: Join
     assert [r["id"] for r in read_rows(Store("memory://plant/out"))] == [row["id"]]
 
 
+def test_recordings_come_over_http_and_an_mcap_brings_its_joint(
+    fleet: Path, joints: Joints, tmp_path: Path
+) -> None:
+    record = recording.read(fleet / "recordings" / "elbow-2026-01-05.csv")
+    (tmp_path / "night").mkdir()
+    begin = datetime(2026, 1, 7, 3, tzinfo=UTC)
+    fleetkit.write_mcap(record, "elbow", tmp_path / "night" / "one.mcap", int(begin.timestamp()))
+    (tmp_path / "night" / "knee.csv").write_text("time_s\n")
+    with fleetkit.served(tmp_path) as address:
+        for pattern in (f"{address}/night/", f"{address}/night/*"):
+            found, _ = storage.find([pattern])
+            assert sorted(one.name for one in found) == ["knee.csv", "one.mcap"]
+        made = [task.process(task.Task(source=one, version=__version__), joints) for one in found]
+        gone, _ = storage.find([f"{address}/night/one.mcap"])
+    (row,), (broken,) = sorted((outcome.rows for outcome in made), key=lambda rows: rows[0]["status"])
+    assert (row["status"], row["joint"], row["time"]) == ("done", "elbow", begin)
+    assert row["accepted_model"] == joints.by_name["elbow"].digest  # the fleet's, not the one that is carried
+    assert broken["error"].startswith("expected the name of a joint")
+    (here,) = done(fleet / "recordings" / "elbow-2026-01-05.csv", joints).rows
+    (k,), (there,) = json.loads(row["parameters"]).values(), json.loads(here["parameters"]).values()
+    assert k == pytest.approx(there, rel=1e-6)  # the CSV has nine digits
+    (lost,) = task.process(
+        task.Task(source=gone[0], version=__version__), joints
+    ).rows  # the server has ended
+    assert (lost["status"], "\n" in lost["error"]) == ("error", False)
+    assert "127.0.0.1" in lost["error"]
+
+
 def test_a_frame_log_brings_the_file_beside_it_along(tmp_path: Path) -> None:
     import fsspec
 

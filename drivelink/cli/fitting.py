@@ -11,15 +11,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from drivelink import jointfile, recording
-from drivelink.errors import RecordingError, UsageError
-from drivelink.jointfile import JointFile, JointText
+from drivelink.errors import RecordingError
+from drivelink.jointfile import JointText
 from drivelink.jointfile.residual_baseline import floor_entry
-from drivelink.output import plots
+from drivelink.output.fitplot import fit_plot
 from drivelink.output.outfile import check_target, write_whole
 from drivelink.recording.columnmap import parse_column_map
 from drivelink.recording.gate import refusal
@@ -30,12 +29,11 @@ from estimator.gate import GateError
 from estimator.identify import Identified, identify
 from estimator.model import Effect, Motor, ParameterValue
 from estimator.sample import Record
-from estimator.transmissions import MODELS, RIGID
+from estimator.transmissions import RIGID
 
 __all__ = ["fit_recording"]
 
 _SIGMA_95 = 1.96
-_CURVE_POINTS = 200
 
 
 def fit_recording(args: argparse.Namespace, source: JointText, folder: Path | None) -> None:
@@ -68,7 +66,7 @@ def fit_recording(args: argparse.Namespace, source: JointText, folder: Path | No
         write_whole(made[0], json.dumps(document, indent=2) + "\n", force=True)
     if folder is not None:
         _folder(folder)
-        made.append(_plot(found.fits, joint, folder))
+        made.append(fit_plot(found.fits, joint, folder / "fit.png"))
     if args.write is not None:
         _write(args, source, found, records)
         made.append(args.write)
@@ -222,29 +220,6 @@ def _remarks(one: TransmissionFit) -> list[str]:
             f"friction that the model lacks, about {one.coulomb_nm:.3g} N·m: `drivelink diagnose` names it"
         )
     return remarks
-
-
-def _plot(fits: list[TransmissionFit], joint: JointFile, folder: Path) -> Path:
-    flexible = [(number, one) for number, one in enumerate(fits, start=1) if one.model != RIGID]
-    if not flexible:
-        raise UsageError("--plots: expected a flexible transmission, every one is rigid")
-    figure, axes = plots.new_figure(f"{joint.name}: fitted transmissions", rows=2 * len(flexible))
-    for row, (number, one) in enumerate(flexible):
-        model = MODELS[one.model]
-        reach = float(np.max(np.abs(one.deflection_rad)))
-        phi = np.linspace(-reach, reach, _CURVE_POINTS)
-        gradient = model.stiffness_jacobian(phi, one.alpha)
-        std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", gradient, one.covariance, gradient), 0.0))
-        stiffness = plots.Curve(phi, model.stiffness(phi, one.alpha), std)
-        title = f"motor {number}: stiffness"
-        plots.xy(axes[2 * row], {"fitted": stiffness}, "deflection / rad", "stiffness / (N·m/rad)", title)
-        order = np.argsort(one.deflection_rad)
-        curves = {
-            "from the motor's balance": plots.Curve(one.deflection_rad[order], one.torque_nm[order]),
-            "fitted": plots.Curve(phi, model.torque(phi, one.alpha)),
-        }
-        plots.xy(axes[2 * row + 1], curves, "deflection / rad", "flexibility torque / N·m")
-    return plots.save(figure, folder / "fit.png")
 
 
 def _write(args: argparse.Namespace, source: JointText, found: Identified, records: Sequence[Record]) -> None:

@@ -104,7 +104,8 @@ def process(task: Task, joints: Joints) -> Outcome:
                     return Outcome("early", [], [], [])
                 rows, reports = _results(task, joint, path, row)
         except (DrivelinkError, EstimatorError, OSError) as error:
-            return _broken(row, str(error).replace(f"{where}: ", ""), notes, begin)
+            line = str(error).replace(f"{where}: ", "").replace(f"{task.source.url}: ", "")
+            return _broken(row, line, notes, begin)
         except MemoryError:
             return _broken(row, "does not fit into the memory of a worker", notes, begin)
         except Exception as error:  # noqa: BLE001 - one recording never ends the run

@@ -28,11 +28,11 @@ from estimator.sample import FloatArray
 __all__ = [
     "Curve",
     "bars",
+    "dots",
     "medians",
     "new_figure",
     "over_time",
     "save",
-    "scatter",
     "stiffness_against_deflection",
     "svg_text",
     "xy",
@@ -181,10 +181,9 @@ def medians(x: FloatArray, y: FloatArray, bins: int = 80) -> Curve:
     return Curve(middle[filled], np.array([np.median(y[place == k]) for k in filled]))
 
 
-def scatter(axes: Axes, x: FloatArray, y: FloatArray, x_label: str, y_label: str, title: str = "") -> None:
-    """Draw samples as dots, and their medians as a line."""
-    axes.plot(x, y, ".", color="#aaaaaa", markersize=2.0, rasterized=True)
-    xy(axes, {"median": medians(x, y)}, x_label, y_label, title)
+def dots(axes: Axes, x: FloatArray, y: FloatArray, name: str | None = None) -> None:
+    """Draw samples as dots, before the curves that go through them."""
+    axes.plot(x, y, ".", color="#aaaaaa", markersize=2.5, rasterized=True, label=name)
 
 
 def _draw(axes: Axes, curve: Curve, name: str, k: int) -> None:

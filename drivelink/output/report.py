@@ -229,7 +229,7 @@ def _curves(outcome: Diagnosis, units: Units) -> str:
 def _curve_figure(curve: Curve, units: Units) -> str:
     figure, (axes,) = plots.new_figure(width=_WIDTH, height=3.2)
     across, torque = units.label(_AXES[curve.coordinates[0]]), units.label("torque / N·m")
-    axes.plot(curve.x, curve.residual_nm, ".", color="#aaaaaa", markersize=2.5, rasterized=True)
+    plots.dots(axes, curve.x, curve.residual_nm)
     order = np.argsort(curve.x)
     name = curve.name.replace("_", " ")
     if curve.second is None and _is_function(curve):

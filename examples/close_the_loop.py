@@ -35,9 +35,12 @@ class Recorder(ObjectSink):
         pass
 
 
-def record(path: Path, seconds: float, *effects: str) -> None:
-    """Record a joint in which these effects are switched on."""
+def record(path: Path, seconds: float, *effects: str, run: int = 0) -> None:
+    """Record a joint in which these effects are switched on; each run has a motion and noise of its own."""
     joint = jointfile.load(JOINT)
+    excitation = {**joint.sim.excitation, "seed": run}
+    sim = joint.sim.model_copy(update={"seed": run, "excitation": excitation})
+    joint = joint.model_copy(update={"sim": sim})
     world = world_from_joint(joint, effects=effects)
     path.unlink(missing_ok=True)
     recorder = Recorder(path)

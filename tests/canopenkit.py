@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import can
+from canopen.objectdictionary import datatypes
 
 from drivelink.canopen.eds import DataSheet
 
@@ -110,10 +111,9 @@ def sheet_objects(sheet: DataSheet, node: int) -> Objects:
     """The dictionary that an EDS describes."""
     objects: Objects = {}
     for (index, subindex), entry in sheet.objects.items():
-        if entry.bits in (8, 16, 24, 32, 64):
-            size = entry.bits // 8
-            value = (sheet.value(index, subindex) or 0) & ((1 << entry.bits) - 1)
-            objects[index, subindex] = Item(value, size, entry.writable, entry.mappable)
+        if entry.data_type in datatypes.INTEGER_TYPES:
+            value = sheet.value(index, subindex) or 0
+            objects[index, subindex] = Item(value, len(entry) // 8, entry.writable, entry.pdo_mappable)
     objects.setdefault((0x1000, 0), u32(0x00020192))
     return objects
 

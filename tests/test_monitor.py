@@ -258,6 +258,12 @@ def test_monitor_prints_json_lines(daemon: str, capsys: pytest.CaptureFixture[st
     assert last["estimate"]["stiffness"] == 700.0 and last["status"]["state"] == "running"
 
 
+def test_a_joint_that_nobody_serves_is_not_live(daemon: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["monitor", "knee", "--endpoint", daemon, "--seconds", "1.2", "--json"]) == 0
+    displayed = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert displayed["joint"] == "knee" and not displayed["live"] and "estimate" not in displayed
+
+
 def get(url: str, host: str | None = None) -> tuple[int, bytes]:
     request = urllib.request.Request(url, headers={"Host": host} if host else {})
     try:

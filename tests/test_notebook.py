@@ -20,6 +20,8 @@ def runner() -> ModuleType:
     return module
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_the_notebook_finds_the_effect_and_its_outputs_are_stored(tmp_path: Path) -> None:
     made = runner()
     stored = json.loads(made.NOTEBOOK.read_text(encoding="utf-8"))

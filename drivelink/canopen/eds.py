@@ -1,82 +1,35 @@
 """EDS and DCF files as vendors write them (CiA 306-1): everything that can be read is read.
 
 Makers' files have other encodings, keys twice, values left out, other nodes' identifiers, unknown types.
-None of that is a reason to give up; each is a line in `DataSheet.problems`.
+None of that is a reason to give up; each is a line in `DataSheet.problems`. What is left, with compact arrays
+laid out, is handed to canopen, whose object dictionary holds it.
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field, replace
+from io import StringIO
+from itertools import groupby
 from pathlib import Path
+
+from canopen.objectdictionary import ODVariable, datatypes
+from canopen.objectdictionary.eds import RECORD, import_eds
 
 from drivelink.canopen.pdo import Tpdo, tpdos_of
 from drivelink.errors import DriveError
 
-__all__ = ["DataSheet", "SheetObject", "load_eds"]
+__all__ = ["DataSheet", "load_eds"]
 
 Sections = dict[str, dict[str, str]]
+Address = tuple[int, int]
 
-# CiA 301, table 44: length in bits, signed.
-_TYPES = {
-    0x01: (1, False),
-    0x02: (8, True),
-    0x03: (16, True),
-    0x04: (32, True),
-    0x05: (8, False),
-    0x06: (16, False),
-    0x07: (32, False),
-    0x08: (32, True),
-    0x10: (24, True),
-    0x11: (64, True),
-    0x12: (40, True),
-    0x13: (48, True),
-    0x14: (56, True),
-    0x15: (64, True),
-    0x16: (24, False),
-    0x18: (40, False),
-    0x19: (48, False),
-    0x1A: (56, False),
-    0x1B: (64, False),
-}
-_NO_NUMBER = frozenset({0x08, 0x09, 0x0A, 0x0B, 0x0C, 0x0D, 0x0F, 0x11})  # floats, strings, times, domain
+_NUMBERS = frozenset({datatypes.BOOLEAN, *datatypes.INTEGER_TYPES})
+_TIMES = (datatypes.TIME_OF_DAY, datatypes.TIME_DIFFERENCE)
+_NO_NUMBERS = frozenset({*datatypes.FLOAT_TYPES, *datatypes.DATA_TYPES, *_TIMES})
+_STAND_IN = datatypes.UNSIGNED32  # for a type that nobody knows
 _OBJECT = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?")
 _NODE = re.compile(r"\$(my_)?node_?id", re.IGNORECASE)  # $NODEID, and Roboteq's $MY_NODE_ID
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SheetObject:
-    """One entry of the object dictionary.
-
-    Attributes:
-        name: ParameterName.
-        data_type: of CiA 301; 0 where the file does not say.
-        access: ro, rw, wo, const, …, in lower case.
-        mappable: PDOMapping.
-        value: ParameterValue, else DefaultValue, as a number; None where there is none.
-    """
-
-    name: str
-    data_type: int
-    access: str
-    mappable: bool
-    value: int | None
-
-    @property
-    def bits(self) -> int | None:
-        """Length, where the type gives it."""
-        known = _TYPES.get(self.data_type)
-        return known[0] if known else None
-
-    @property
-    def signed(self) -> bool:
-        """Whether the type is a signed one."""
-        return _TYPES.get(self.data_type, (0, False))[1]
-
-    @property
-    def writable(self) -> bool:
-        """Whether it can be written."""
-        return self.access not in ("ro", "const")
 
 
 @dataclass(slots=True, kw_only=True)
@@ -100,15 +53,16 @@ class DataSheet:
     vendor_id: int = 0
     product_code: int = 0
     revision: int = 0
-    objects: dict[tuple[int, int], SheetObject] = field(default_factory=dict)
+    objects: dict[Address, ODVariable] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
 
     def value(self, index: int, subindex: int = 0) -> int | None:
         """Value of an object as an unsigned number of its length; None where the file has none."""
         entry = self.objects.get((index, subindex))
-        if entry is None or entry.value is None:
+        if entry is None:
             return None
-        return entry.value & ((1 << (entry.bits or 64)) - 1)
+        value = entry.default if entry.value is None else entry.value
+        return None if value is None else value & ((1 << len(entry)) - 1)
 
     def values(self) -> dict[tuple[int, int], int]:
         """All values, as `value` gives them."""
@@ -147,7 +101,10 @@ def load_eds(path: Path, node_id: int | None = None) -> DataSheet:
         raise DriveError(f"{path}: is not an EDS: no section names an object, like [1000]")
     made_for = _made_for(sections)
     node = node_id or made_for or 1
-    _read_objects(sections, node, sheet)
+    od = import_eds(StringIO(_cleaned(sections, node, sheet)), node)  # type: ignore[no-untyped-call]
+    for one in od.values():
+        members = [one] if isinstance(one, ODVariable) else one.values()
+        sheet.objects |= {(member.index, member.subindex): member for member in members}
     _device(sections, sheet)
     _move_to_node(sheet, made_for, node)
     return sheet
@@ -227,64 +184,67 @@ def _made_for(sections: Sections) -> int | None:
     return None
 
 
-def _read_objects(sections: Sections, node: int, sheet: DataSheet) -> None:
+def _cleaned(sections: Sections, node: int, sheet: DataSheet) -> str:
+    """The objects as canopen takes them: each complete, below its index, with numbers that are numbers."""
+    found: dict[Address, dict[str, str]] = {}
+    for name, keys in sections.items():
+        if match := _OBJECT.fullmatch(name):
+            index, subindex = int(match[1], 16), int(match[2] or "0", 16)
+            if match[2] is None and "datatype" not in keys:
+                found |= _compact(index, keys, sections.get(f"{index:04x}value", {}))
+            else:
+                found[index, subindex] = keys
+    lines = ["[DeviceInfo]"]  # canopen misses it else; see `_device`
     unreadable: list[str] = []
     unknown: list[str] = []
-    for name, keys in sections.items():
-        match = _OBJECT.fullmatch(name)
-        if match is None:
-            continue
-        index, subindex = int(match[1], 16), int(match[2] or "0", 16)
-        if match[2] is None and "datatype" not in keys:
-            _compact(index, keys, sections, node, sheet)
-            continue
-        entry = _object(keys, node, sections)
-        text = keys.get("parametervalue") or keys.get("defaultvalue")
-        if entry.value is None and text and entry.data_type not in _NO_NUMBER:
-            unreadable.append(f"{index:04X}:{subindex:02X}")
-        if entry.bits is None and entry.data_type not in _NO_NUMBER:
-            unknown.append(f"{index:04X}:{subindex:02X}")
-        sheet.objects[index, subindex] = entry
-    for names, what in ((unreadable, "a value that is not a number"), (unknown, "an unknown data type")):
-        if len(names) > 1:
-            sheet.problems.append(f"object {names[0]} and {len(names) - 1} more have {what}")
-        elif names:
-            sheet.problems.append(f"object {names[0]} has {what}")
+    for index, members in groupby(sorted(found.items(), key=lambda item: item[0]), lambda item: item[0][0]):
+        addresses = dict(members)
+        single = list(addresses) == [(index, 0)]
+        if not single:
+            lines += [f"[{index:04X}]", "ParameterName=", f"ObjectType={RECORD}"]
+        for (_, subindex), keys in addresses.items():
+            lines.append(f"[{index:04X}]" if single else f"[{index:04X}sub{subindex:X}]")
+            data_type = _data_type(keys, sections)
+            if data_type not in _NUMBERS | _NO_NUMBERS:
+                unknown.append(f"{index:04X}:{subindex:02X}")
+                data_type = _STAND_IN
+            values = {}
+            if data_type in _NUMBERS:
+                values = {key: _number(keys.get(key, ""), node) for key in ("parametervalue", "defaultvalue")}
+                if any(map(keys.get, values)) and all(value is None for value in values.values()):
+                    unreadable.append(f"{index:04X}:{subindex:02X}")
+            lines += [
+                f"ParameterName={keys.get('parametername', '')}",
+                f"DataType={data_type}",
+                f"AccessType={keys.get('accesstype', 'rw')}",
+                f"PDOMapping={int(bool(_number(keys.get('pdomapping', ''))))}",
+            ]
+            names = {"parametervalue": "ParameterValue", "defaultvalue": "DefaultValue"}
+            lines += [f"{names[key]}={value}" for key, value in values.items() if value is not None]
+    for places, what in ((unreadable, "a value that is not a number"), (unknown, "an unknown data type")):
+        if len(places) > 1:
+            sheet.problems.append(f"object {places[0]} and {len(places) - 1} more have {what}")
+        elif places:
+            sheet.problems.append(f"object {places[0]} has {what}")
+    return "\n".join(lines)
 
 
-def _object(keys: dict[str, str], node: int, sections: Sections) -> SheetObject:
+def _data_type(keys: dict[str, str], sections: Sections) -> int:
+    """As the file says; of CANFestival's editor, which makes a section of its own for it, the base type."""
     data_type = _number(keys.get("datatype", "")) or 0
-    if data_type > 0x1B:  # CANFestival's editor: a section of its own gives the base type
-        data_type = _number(sections.get(f"{data_type:x}sub1", {}).get("defaultvalue", "")) or data_type
-    value = None
-    if data_type not in _NO_NUMBER:
-        for key in ("parametervalue", "defaultvalue"):
-            value = _number(keys.get(key, ""), node)
-            if value is not None:
-                break
-    return SheetObject(
-        name=keys.get("parametername", ""),
-        data_type=data_type,
-        access=keys.get("accesstype", "rw").lower(),
-        mappable=bool(_number(keys.get("pdomapping", "")) or 0),
-        value=value,
-    )
+    base = sections.get(f"{data_type:x}sub1", {}).get("defaultvalue", "") if data_type > 0x1B else ""
+    return _number(base) or data_type
 
 
-def _compact(index: int, keys: dict[str, str], sections: Sections, node: int, sheet: DataSheet) -> None:
+def _compact(index: int, keys: dict[str, str], values: dict[str, str]) -> dict[Address, dict[str, str]]:
     """An array written once for all its subindices (CompactSubObj, [XXXXValue])."""
-    count = _number(keys.get("compactsubobj", "")) or 0
+    count = min(_number(keys.get("compactsubobj", "")) or 0, 254)
     if not count:
-        return
-    values = sections.get(f"{index:04x}value", {})
-    for subindex in range(1, min(count, 254) + 1):
-        stated = values.get(str(subindex))
-        sheet.objects[index, subindex] = _object(
-            {**keys, **({"parametervalue": stated} if stated else {})}, node, sections
-        )
-    sheet.objects[index, 0] = SheetObject(
-        name="Number of entries", data_type=0x05, access="ro", mappable=False, value=count
-    )
+        return {}
+    stated = ({"parametervalue": values[str(k)]} if str(k) in values else {} for k in range(1, count + 1))
+    members = {(index, k): keys | one for k, one in enumerate(stated, start=1)}
+    length = {"parametername": "Number of entries", "accesstype": "ro", "defaultvalue": str(count)}
+    return {(index, 0): length | {"datatype": str(datatypes.UNSIGNED8)}} | members
 
 
 def _device(sections: Sections, sheet: DataSheet) -> None:
@@ -307,17 +267,12 @@ def _move_to_node(sheet: DataSheet, made_for: int | None, node: int) -> None:
     if made_for is None or made_for == node:
         return
     moved = 0
-    for (index, subindex), entry in list(sheet.objects.items()):
-        if subindex != 1 or not 0x1400 <= index <= 0x19FF or entry.value is None:
+    for (index, subindex), entry in sheet.objects.items():
+        value = sheet.value(index, subindex)
+        if subindex != 1 or not 0x1400 <= index <= 0x19FF or value is None:
             continue
-        if entry.value & 0x7F == made_for and entry.value & 0x780:
-            sheet.objects[index, subindex] = SheetObject(
-                name=entry.name,
-                data_type=entry.data_type,
-                access=entry.access,
-                mappable=entry.mappable,
-                value=entry.value - made_for + node,
-            )
+        if value & 0x7F == made_for and value & 0x780:
+            entry.value = value - made_for + node
             moved += 1
     if moved:
         sheet.problems.append(

@@ -1,4 +1,7 @@
-"""TPDOs as they are in a node: communication parameter 0x1800+n, mapping 0x1A00+n (CiA 301, 7.5.2)."""
+"""TPDOs as they are in a node: communication parameter 0x1800+n, mapping 0x1A00+n (CiA 301, 7.5.2).
+
+They are read by programs of `drivelink.canopen.sdo`: canopen's own PDO code blocks until each answer comes.
+"""
 
 from __future__ import annotations
 

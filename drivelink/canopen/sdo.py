@@ -3,7 +3,8 @@
 A *program* is a generator that yields requests (`Read`, `Write`, `Nmt`, `Pause`) and gets their answers;
 `Session` runs one program over a bus that somebody else reads: frames come in by `feed`, time by `poll`.
 The same program thus serves the blocking configuration before the start and the reconfiguration of a
-drive that rebooted in the middle of a run, with no second thread and no second reader of the bus.
+drive that rebooted in the middle of a run, with no second thread and no second reader of the bus; canopen's
+own client blocks its caller until the answer comes.
 """
 
 from __future__ import annotations

@@ -137,9 +137,9 @@ def _signals(section: Section, sheet: DataSheet) -> dict[Signal, tuple[MappableO
         there = [address for address in addresses if address in sheet.objects]
         if (0x60E4, 1) in there:
             there = [(0x60E4, 1)]  # subindex 0 is then only the count
-        usable = [a for a in there if sheet.objects[a].mappable or a in carried]
+        usable = [a for a in there if sheet.objects[a].pdo_mappable or a in carried]
         found[signal] = tuple(
-            MappableObject(signal=signal, address=a, bits=sheet.objects[a].bits or 32, signed=True, scale=1.0)
+            MappableObject(signal=signal, address=a, bits=len(sheet.objects[a]), signed=True, scale=1.0)
             for a in usable
         )
         _say_signal(section, signal, sheet, there, usable)
@@ -153,10 +153,9 @@ def _checks(
 
     def mappable(signal: Signal, index: int) -> tuple[MappableObject, ...]:
         entry = sheet.objects.get((index, 0))
-        if entry is None or not entry.mappable:
+        if entry is None or not entry.pdo_mappable:
             return ()
-        bits = entry.bits or 32
-        return (MappableObject(signal=signal, address=(index, 0), bits=bits, signed=True, scale=1.0),)
+        return (MappableObject(signal=signal, address=(index, 0), bits=len(entry), signed=True, scale=1.0),)
 
     as_check = {
         Signal.VELOCITY_CHECK: available.get(Signal.MOTOR_VELOCITY, ()),
@@ -179,7 +178,7 @@ def _say_signal(
     name = signal.replace("_", " ")
     section.facts[str(signal)] = [f"0x{index:04X}:{subindex:02X}" for index, subindex in usable]
     if usable:
-        parts = [f"0x{i:04X}:{s:02X} {sheet.objects[i, s].name or ''}".rstrip() for i, s in usable]
+        parts = [f"0x{i:04X}:{s:02X} {sheet.objects[i, s].name}".rstrip() for i, s in usable]
         text = " or ".join(parts) + _more(signal, sheet, usable)
         section.ok(name, text)
     elif there:
@@ -198,7 +197,9 @@ def _more(signal: Signal, sheet: DataSheet, usable: list[tuple[int, int]]) -> st
     index, subindex = usable[0]
     if signal is not Signal.LINK_POSITION or index != 0x60E4 or not subindex:
         return ""
-    others = [s for (i, s), entry in sorted(sheet.objects.items()) if i == index and s > 1 and entry.mappable]
+    others = [
+        s for i, s in sorted(sheet.objects) if i == index and s > 1 and sheet.objects[i, s].pdo_mappable
+    ]
     names = [f"0x{index:04X}:{s:02X} {sheet.objects[index, s].name}".rstrip() for s in others]
     sensorless = vendor_of(sheet.vendor_id).sensorless == (index, subindex)
     return (", the sensorless one" if sensorless else "") + (

@@ -138,7 +138,7 @@ def _now(view: JointView) -> dict[str, Any]:
     """State and newest estimate."""
     touch = view.history.touch
     event: dict[str, Any] = {
-        "live": view.live,
+        "live": view.live and view.history.latest is not None,
         "state": view.state,
         "external": _touch(touch) if touch else None,
     }

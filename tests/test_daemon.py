@@ -98,9 +98,9 @@ def test_the_status_says_what_touches_the_link_where_its_dynamics_are_declared()
         free = made.status["external"]
         assert (free["valid"], free["contact"]) == (True, False)
         assert abs(free["torque_nm"]) < 3.0 * free["torque_std_nm"] < 0.1
-        # Both sides of the joint tell the torque of its transmission.
-        told = free["link_flexibility_torque_nm"]
-        assert told == pytest.approx(estimate.flexibility_torque_nm, abs=3.0 * free["torque_std_nm"])
+        # Both sides of the joint give the torque of its transmission.
+        linked_nm = free["link_flexibility_torque_nm"]
+        assert linked_nm == pytest.approx(estimate.flexibility_torque_nm, abs=3.0 * free["torque_std_nm"])
         assert abs(free["difference_nm"]) < 3.0 * free["torque_std_nm"]
         (world,) = made.network._worlds
         world.excitation = replace(world.excitation, external=lambda _: 0.3)

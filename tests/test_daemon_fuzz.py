@@ -125,7 +125,7 @@ def test_a_daemon_amid_random_and_mutated_frames_goes_on_and_recovers() -> None:
         for estimate in estimates:
             assert not (estimate.status & Status.STALE and estimate.status & Status.VALID)
         fuzzed.quiet = True
-        # Among the frames were forged answers to the configuration; nobody can tell them from the node's own. What
+        # Among the frames were forged answers to the configuration; they cannot be distinguished from the node's own. What
         # they said of its units and mapping stays until it is configured again.
         for node in list(made.network.nodes):
             made.faults.reboot(node)

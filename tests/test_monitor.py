@@ -132,15 +132,18 @@ def test_the_page_gets_each_external_torque_once_and_a_gap_where_it_is_not_valid
         status = 0 if k < 2500 else 1 if k < 3000 else 3
         torque, std = (math.nan, math.nan) if status == 0 else (0.5, 0.1)
         view.update_external(ExternalMessage(k, k * 1_000_000, status, torque, std), k * 1e-3)
-    told = snapshot(view, True, since)
-    times = [touch[0] for touch in told["touches"]]
+    displayed = snapshot(view, True, since)
+    times = [touch[0] for touch in displayed["touches"]]
     assert len(times) > 90 and times == sorted(set(times)) and times[0] == 2.0
-    assert {(v, s, c) for t, v, s, c in told["touches"] if t < 2.5} == {(None, None, False)}
-    assert {(v, s, c) for t, v, s, c in told["touches"] if 2.5 <= t < 3.0} == {(0.5, 0.1, False)}
-    assert {(v, s, c) for t, v, s, c in told["touches"] if t >= 3.0} == {(0.5, 0.1, True)}
+    assert {(v, s, c) for t, v, s, c in displayed["touches"] if t < 2.5} == {(None, None, False)}
+    assert {(v, s, c) for t, v, s, c in displayed["touches"] if 2.5 <= t < 3.0} == {(0.5, 0.1, False)}
+    assert {(v, s, c) for t, v, s, c in displayed["touches"] if t >= 3.0} == {(0.5, 0.1, True)}
     assert 3.0 in times  # the begin of a contact is not thinned out
-    assert told["external"] == [3.999, 0.5, 0.1, True] and ("contact", "yellow") in told["estimate"]["flags"]
-    assert json.dumps(told, allow_nan=False)
+    assert (
+        displayed["external"] == [3.999, 0.5, 0.1, True]
+        and ("contact", "yellow") in displayed["estimate"]["flags"]
+    )
+    assert json.dumps(displayed, allow_nan=False)
     assert snapshot(view, True, since)["touches"] == []  # they have been given
     for k in range(10):  # a daemon that starts anew
         view.update(estimate(k), k * 1e-3)

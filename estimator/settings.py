@@ -16,23 +16,22 @@ class EstimatorSettings:
 
     Attributes:
         mode: "robust", or "paper" (eqs 14, 28, 32, 33 as printed, correctly discretised).
-        method: where the stiffness comes from: "mbe" (the transmission's model), "bbe" (black box), or
-            "auto": in robust mode "mbe" wherever the transmission has a model, in paper mode "bbe".
+        method: where the stiffness comes from: "mbe" (the transmission's model), "bbe" (black box); "auto":
+            "mbe" in robust mode with a model, else "bbe".
         bandwidth_rad_s: of the filter that every channel shares in robust mode.
         k_tau_rad_s: K_tau_e of eq 14.
         k_sigma_1_rad2_s2: K_sigma,1 of eq 28.
         k_sigma_2_rad_s: K_sigma,2 of eq 28.
         k_r_s2_rad2: K_R of eq 32.
         k_max: K_max < 2 of eq 33.
-        false_alarms_per_hour: of the robust mode's `changed`, and of the model alarm; more of them find
-            smaller changes.
-        external_bandwidth_rad_s: of the filter behind which robust mode has the external torque; in mode
-            "paper" that is K_tau_e.
-        external_bias_s: time constant of a bias that follows the external torque and is taken off it, as a
-            payload or a wrong gravity would be; what pushes for so long fades with it. None: no bias.
-        contact_torque_nm: least external torque that is called a contact; None: 5 % of the largest torque
-            that the joint has carried.
-        contact_false_alarms_per_hour: of the contact bit; more of them find smaller contacts.
+        false_alarms_per_hour: of `changed` in robust mode and of the model alarm; a higher rate finds smaller
+            changes.
+        external_bandwidth_rad_s: of the external torque's filter in robust mode; in mode "paper" K_tau_e.
+        external_bias_s: time constant of a bias (payload, wrong gravity) that is subtracted from the external
+            torque; a push that lasts as long fades with it. None: no bias.
+        contact_torque_nm: least external torque that counts as a contact; None: 5 % of the largest torque
+            carried.
+        contact_false_alarms_per_hour: of the contact bit; a higher rate finds smaller contacts.
     """
 
     __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "strict": True}

@@ -77,7 +77,7 @@ class TpdoSection(_Section):
         1, ge=0, le=255, description="1 to 240: every so many SYNCs; 254, 255: event-driven"
     )
     default: bool = Field(
-        False, description="the node has this map by itself after every start; false: a master gives it"
+        False, description="the node has this mapping after every start; false: a master writes it"
     )
 
     @model_validator(mode="after")
@@ -295,7 +295,7 @@ class JointFile(_Section):
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", description="part of the key expression")
     arrangement: Arrangement = Field("single", description="how the transmissions act on the link")
     axis: Literal["rotary", "linear"] = Field(
-        "rotary", description="linear: every rad in a name is a metre, every N·m a newton; reports say so"
+        "rotary", description="linear: every rad in a name is a metre, every N·m a newton"
     )
     motor: tuple[MotorSection, ...] = Field(min_length=1, max_length=2, description="one, or two for a VSA")
     link: LinkSection = Field(LinkSection(), description="the link side")

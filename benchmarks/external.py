@@ -1,4 +1,4 @@
-"""What touches the link, without a sensor: drivelink beside what people use instead, on simulated joints.
+"""External torque without a sensor, beside the usual methods, on simulated joints.
 
     python benchmarks/external.py [--minutes 60] [--errors 0,1,2,5,10] [--joints vsa,sea,hd] [--json FILE]
 
@@ -13,7 +13,7 @@ friction as `diagnose` would have left it, 10 % too low.
 - drivelink, threshold: its torque judged as the others' are.
 - drivelink: its contact bit, with one false alarm an hour.
 
-All have the same filter. The threshold of all but the last is the largest that they have said in the free
+All have the same filter. The threshold of all but the last is their largest value in the free
 motion: no false alarm in that time.
 
 error: rms of the torque from 60 ms after a push began, over the push; of pushes of a fifth of gravity and

@@ -1,4 +1,4 @@
-"""Plausible lies of one signal: how much of what is called valid is wrong, and how much of that has no flag?
+"""Plausible sensor faults: how many samples called valid are wrong, and how many of those carry no flag?
 
     python benchmarks/fault_matrix.py [--joints constant,vsa-ii,"vsa-ii fitted"] [--health 15] [--seconds 15]
 

@@ -64,10 +64,10 @@ SECTIONS = (
         title="Jitter, recorder, start, memory",
         quick=("--seconds", "2", "--rounds", "1"),
     ),
-    Section(name="endurance", title="Missed cycles, and whose they are", quick=("--seconds", "10")),
+    Section(name="endurance", title="Missed cycles by cause", quick=("--seconds", "10")),
     Section(
         name="growth",
-        title="How cost grows",
+        title="Cost against size",
         quick=("--seconds", "5,10", "--diagnose-seconds", "10"),
     ),
     Section(
@@ -135,20 +135,20 @@ SECTIONS = (
     ),
     Section(
         name="gate",
-        title="Units, signs, gears and time",
+        title="Wrong units, signs, gears and time",
         full=("--seeds", "2"),
         quick=("--seeds", "1", "--kinds", "serial"),
         json_file=False,
     ),
     Section(
         name="external",
-        title="What touches the link",
+        title="External torque and contact",
         quick=("--minutes", "2", "--errors", "2", "--joints", "sea"),
         json_file=False,
     ),
     Section(
         name="fault_matrix",
-        title="One signal lies plausibly",
+        title="Sensor faults: wrong samples called valid",
         quick=("--joints", "constant", "--seconds", "8"),
         json_file=False,
     ),
@@ -321,7 +321,7 @@ def main() -> None:
     """Run what is asked for, and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     names = [section.name for section in SECTIONS]
-    parser.add_argument("--quick", action="store_true", help="a few minutes instead of half an hour")
+    parser.add_argument("--quick", action="store_true", help="small sizes: minutes instead of hours")
     parser.add_argument(
         "--only", nargs="+", choices=names, default=names, metavar="NAME", help=", ".join(names)
     )

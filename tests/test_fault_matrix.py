@@ -1,4 +1,4 @@
-"""Plausible lies and true changes, a bounded part of `benchmarks/fault_matrix.py`.
+"""Plausible sensor faults and true changes, a bounded part of `benchmarks/fault_matrix.py`.
 
 What is called valid is right while the balance is explained by the reference parameters, or by a change of the
 joint that explains it better than a reading that is not what it was (`estimator/core/src/isolation.rs`). Wrong without

@@ -62,11 +62,11 @@ def named(findings: list[Discrepancy], factors: dict[str, float]) -> bool:
 
 
 @pytest.mark.parametrize(
-    "seeds", [range(100, 101), pytest.param(range(101, 118), marks=pytest.mark.slow)], ids=["one", "more"]
+    "seeds", [range(100, 101), pytest.param(range(101, 109), marks=pytest.mark.slow)], ids=["one", "more"]
 )
 @pytest.mark.parametrize("kind", gatekit.KINDS)
 def test_a_healthy_joint_passes(kind: str, seeds: range) -> None:
-    """Eighteen random joints of each kind: undeclared effects, late channels, inertia up to a fifth off."""
+    """Nine random joints of each kind: undeclared effects, late channels, inertia up to a fifth off."""
     for seed in seeds:
         drawn = gatekit.draw(kind, seed, seconds=6.0)
         assert examine(drawn.record, drawn.model) == [], (kind, seed)

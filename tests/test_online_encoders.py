@@ -16,7 +16,7 @@ from sim.cases import case
 SECONDS = 12.0
 SETTLED = 5000
 SLOW = pytest.mark.slow
-FINE = (17, *(pytest.param(bits, marks=SLOW) for bits in (18, 19, 20, 22, 24)), 26)
+FINE = (17, *(pytest.param(bits, marks=SLOW) for bits in (19, 22)), 26)
 COARSE = (12, *(pytest.param(bits, marks=SLOW) for bits in (14, 16)))
 QUIET = pytest.mark.parametrize("noise", [pytest.param(False, marks=SLOW), True], ids=["quiet", "noisy"])
 

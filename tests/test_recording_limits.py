@@ -225,9 +225,7 @@ def taken(path: Path) -> None:
             assert "\n" not in str(error) and len(str(error)) < 700, str(error)[:900]
 
 
-@pytest.mark.parametrize(
-    ("seed", "times"), [(18, 12), pytest.parampytest.param(19, 50, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("seed", "times"), [(18, 12), pytest.param(19, 50, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("suffix", [".mcap", ".csv", ".log", ".blf", ".asc", ".trc"])
 def test_damaged_recordings_are_read_or_refused_in_one_line(
     suffix: str, seed: int, times: int, whole: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture

@@ -22,7 +22,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from drivelink import jointfile, recording
 from drivelink.jointfile import JointFile
-from drivelink.jointfile.apply_diagnosis import augmented
+from drivelink.jointfile.apply_diagnosis import diagnosed_model
 from drivelink.output import report
 from drivelink.output.progress import track
 from estimator import EstimatorSettings, ExternalStatus, LinkDynamics, Sample, Status, make_estimator
@@ -190,7 +190,7 @@ def diagnosed(run: Run, data: Path, out: Path) -> dict[str, Any]:
     outcome = diagnose(train, joint.model(), run.bandwidth_hz, validation)
     sensor = None
     if run.joint == "shaft_line":
-        model, torque = augmented(joint, outcome), shaft_sensor(data, run.validation)
+        model, torque = diagnosed_model(joint, outcome), shaft_sensor(data, run.validation)
         sensor = against_sensor(model, validation, torque[: len(validation)])
     folder = out / f"{run.joint}-{Path(run.train).stem}-{Path(run.validation).stem}"
     folder.mkdir(parents=True, exist_ok=True)

@@ -2,7 +2,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from drivelink.canopen.layout import NodeLayout
-from drivelink.cycle.pipeline import Watch
+from drivelink.cycle.pipeline import ResidualMonitor
 from estimator._core import Estimator as _Core
 from estimator._core import ModelMonitor as _ModelMonitor
 from estimator.online import Estimator as _Estimator
@@ -250,14 +250,19 @@ class JointPipeline:
     """
 
     def __init__(
-        self, assembler: Assembler, estimator: _Estimator, watch: Watch | None = None, *, keep: int = 0
+        self,
+        assembler: Assembler,
+        estimator: _Estimator,
+        watch: ResidualMonitor | None = None,
+        *,
+        keep: int = 0,
     ) -> None: ...
     @property
     def assembler(self) -> Assembler: ...
     @property
     def estimator(self) -> _Estimator: ...
     @property
-    def watch(self) -> Watch | None: ...
+    def watch(self) -> ResidualMonitor | None: ...
     @property
     def history(self) -> History: ...
     @property
@@ -303,5 +308,5 @@ class JointPipeline:
             stamp_ns: UNIX time of its SYNC; None: from the SYNCs fed.
         """
 
-    def exchange(self, estimator: Any, watch: Watch | None, unseen: Iterable[Sample] = ()) -> None:
+    def exchange(self, estimator: Any, watch: ResidualMonitor | None, unseen: Iterable[Sample] = ()) -> None:
         """Put another estimator in place between two cycles, after it has seen the last samples too."""

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drivelink._core import Assembler, JointPipeline
-from drivelink.cycle.pipeline import Watch
+from drivelink.cycle.pipeline import ResidualMonitor
 from estimator import (
     Estimator,
     EstimatorSettings,
@@ -148,7 +148,7 @@ def play(
     model: JointModel,
     samples: Iterable[Sample],
     *,
-    watch: Watch | None = None,
+    watch: ResidualMonitor | None = None,
     look: Callable[[int, Estimator], object] = lambda _k, _estimator: None,
     **settings: Any,
 ) -> tuple[Estimates, Estimator]:

@@ -99,7 +99,7 @@ def test_a_data_sheet_gives_mapping_identifier_and_scale(tmp_path):
     assert layout.identity[0] == 0x1F
 
 
-def overheard(active, joint):
+def exchanged(active, joint):
     """A foreign master's configuration, as a passive listener on the same bus sees it."""
     wire = Wire([active])
     configure(wire, joint)
@@ -112,7 +112,7 @@ def overheard(active, joint):
 
 def test_a_foreign_masters_configuration_is_learnt_by_listening():
     active = Slave(5, drive_objects(5))
-    frames = overheard(active, parse(joint_text()))
+    frames = exchanged(active, parse(joint_text()))
     joint = parse(joint_text(drive="", bus=PASSIVE))
     configurator = PassiveConfigurator([joint])
     assert configurator.busy
@@ -121,7 +121,7 @@ def test_a_foreign_masters_configuration_is_learnt_by_listening():
     ((node, layout),) = configurator.poll(0.0)
     assert node == 5
     assert not configurator.busy
-    # nothing is stated in this joint file: mapping, scale, heartbeat and identity are all overheard
+    # nothing is stated in this joint file: mapping, scale, heartbeat and identity are all in the traffic
     wire = Wire([Slave(5, drive_objects(5))])
     (known,) = configure(wire, parse(joint_text()))
     assert layout.tpdos == known.tpdos
@@ -133,12 +133,12 @@ def test_a_mapping_that_the_master_changes_in_the_run_is_followed():
     slave = Slave(5, drive_objects(5))
     joint = parse(joint_text(bus=PASSIVE))
     configurator = PassiveConfigurator([joint])
-    for cob_id, data in overheard(slave, parse(joint_text())):
+    for cob_id, data in exchanged(slave, parse(joint_text())):
         configurator.feed(cob_id, data, 0.0)
     configurator.poll(0.0)
     wider = parse(joint_text(link="[link.encoder]\ncounts_per_rev = 1000"))
     ended = []
-    for cob_id, data in overheard(slave, wider):
+    for cob_id, data in exchanged(slave, wider):
         configurator.feed(cob_id, data, 0.0)
         ended += configurator.poll(0.0)
     assert configurator.layouts[5].tpdos  # never lost meanwhile

@@ -199,7 +199,7 @@ configure = false
 
 
 def passive(active: JointFile) -> JointFile:
-    """A second daemon's joint file for the bus of another master; the mapping is overheard."""
+    """A second daemon's joint file for the bus of another master; the mapping is taken from the traffic."""
     return vsa(name="guest", channel=active.bus.channel, bus=PASSIVE)
 
 

@@ -160,7 +160,7 @@ def test_a_bus_is_recorded_by_listening_only(suffix: str, tmp_path: Path) -> Non
     if suffix == ".log":
         assert sum(frame.can_id == 0x080 for frame in read_frames(path)) == 150
         return
-    # Samples of the bus alone, by the mapping that was overheard: those of the daemon.
+    # Samples of the bus alone, by the mapping in the traffic: those of the daemon.
     record = read(path, joint)
     assert [tuple(row) for row in record.motor_position_rad.tolist()] == [
         s.motor_position_rad for s in samples

@@ -13,7 +13,7 @@ import pytest
 
 from drivelink import jointfile
 from drivelink.cli import main
-from drivelink.jointfile.residual_baseline import floor_entry, make_watch
+from drivelink.jointfile.residual_baseline import floor_entry, make_model_monitor
 from drivelink.output.units import Units
 from estimator.model import JointModel, Motor, Transmission
 from estimator.sample import Record
@@ -80,7 +80,7 @@ def test_the_written_joint_file_knows_the_effect_and_its_floor(folder: Path) -> 
         joint = jointfile.load(folder / better)
         effects = joint.motor[0].effect if place == "motor" else joint.link.effect
         assert [e.name for e in effects] == [{"coulomb": "coulomb_friction", "late": "encoder_delay"}[name]]
-        assert make_watch(joint) is not None
+        assert make_model_monitor(joint) is not None
         assert _diagnose(folder, name, better)["verdict"] == "sufficient"
 
 
@@ -147,7 +147,7 @@ def test_a_fitted_joint_file_is_calibrated_and_watched(folder: Path) -> None:
     assert joint.link.dynamics is not None
     # The declared numbers are exact; noise moves them by less than a percent.
     assert joint.link.dynamics.inertia_kg_m2 == pytest.approx(kit.LINK_INERTIA, rel=0.01)
-    assert make_watch(joint) is not None
+    assert make_model_monitor(joint) is not None
     assert _diagnose(folder, "clean", "healthy.toml")["verdict"] == "sufficient"
 
 

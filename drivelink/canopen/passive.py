@@ -1,7 +1,7 @@
 """Layouts of nodes that somebody else configures: from the joint file, a data sheet, or by listening.
 
-Nothing is ever sent from here; there is nothing here to send with. What is overheard comes before what the
-joint file states, and only these two are believed; see `_PassiveNode`.
+Nothing is ever sent from here; there is nothing here to send with. What the traffic shows comes before what
+the joint file states, and only these two are believed; see `_PassiveNode`.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ class _PassiveNode:
         )
 
     def _believed_tpdos(self) -> tuple[Tpdo, ...]:
-        """What the joint file states, as far as the node still has it, and what was overheard."""
+        """What the joint file states, as far as the node still has it, and what the traffic showed."""
         seen = {address: value for address, value in self.listener.values.items() if _is_mapping(address)}
         touched = {(index & 0x1FF) + 1 for index, _ in seen}
         stated, values = [], dict(seen)
@@ -302,7 +302,7 @@ class PassiveConfigurator:
         )
 
     def adopt(self, layouts: Iterable[NodeLayout]) -> None:
-        """Take layouts that are known from elsewhere; what is overheard later counts more."""
+        """Take layouts that are known from elsewhere; what the traffic shows later counts more."""
         for layout in layouts:
             node = self._nodes.get(layout.node_id)
             if node is not None:
@@ -314,7 +314,7 @@ class PassiveConfigurator:
         """Nothing: the master of this node configures it again."""
 
     def lose_sight(self) -> None:
-        """The bus was away: what was overheard may hold no more."""
+        """The bus was away: what the traffic showed may be out of date."""
         for node in self._nodes.values():
             node.lose_sight()
 

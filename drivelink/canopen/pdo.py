@@ -174,7 +174,7 @@ def tpdos_of(values: Mapping[Address, int]) -> tuple[Tpdo, ...]:
     """The TPDOs that the values of 0x1800 to 0x1BFF describe; one whose map is not complete is not `known`.
 
     Args:
-        values: unsigned values by (index, subindex), from a data sheet or overheard.
+        values: unsigned values by (index, subindex), from a data sheet or the traffic.
     """
     found = []
     for communication in sorted({index for index, _ in values if 0x1800 <= index <= 0x19FF}):
@@ -218,7 +218,7 @@ def decode(
     can. Everything else is skipped over.
 
     Args:
-        tpdos: as read back, overheard, or declared.
+        tpdos: as read back, taken from the traffic, or declared.
         candidates: for each signal the objects that can give it, best first.
     """
     mapped = {(index, subindex) for tpdo in tpdos for index, subindex, _ in tpdo.entries}

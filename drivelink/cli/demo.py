@@ -57,16 +57,16 @@ def run(args: argparse.Namespace) -> int:
     live = console.is_terminal and not args.headless and not args.json
     with resources.as_file(resources.files("drivelink") / "joints" / f"{args.case}.toml") as path:
         joint = jointfile.load(path)
-        watch = Watch(joint, console, live=live)
+        shown = DemoRun(joint, console, live=live)
         with _rig(path, args.seconds) as rig, subscribe(joint.name) as subscription:
-            interrupted = watch.follow(rig, subscription)
-    summary = watch.summary
+            interrupted = shown.follow(rig, subscription)
+    summary = shown.summary
     if summary is None:
         raise DrivelinkError("the simulated drive and the daemon ended unexpectedly")
     if not args.json:
-        console.print(closing_table(args.case, watch.comparison, summary, watch.received, joint.bus.period_s))
+        console.print(closing_table(args.case, shown.comparison, summary, shown.received, joint.bus.period_s))
     else:
-        print(json.dumps(as_json(args.case, watch.comparison, summary, watch.received)))
+        print(json.dumps(as_json(args.case, shown.comparison, summary, shown.received)))
     return 130 if interrupted else 0
 
 
@@ -97,7 +97,7 @@ def _rig(path: Path, seconds: float) -> Iterator[RigProcess]:
         ours.close()
 
 
-class Watch:
+class DemoRun:
     """Follows a run to its end, on a terminal or in plain lines.
 
     Attributes:

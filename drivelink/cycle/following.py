@@ -29,7 +29,7 @@ class MapFollower:
 
     Attributes:
         changed: by node, the layouts that have come into use since somebody last cleared this.
-        refused: by node, why a map that was overheard cannot be used.
+        refused: by node, why a mapping taken from the traffic cannot be used.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class MapFollower:
         self._due.clear()
 
     def lose_sight(self) -> None:
-        """The bus was away: what was overheard may hold no more."""
+        """The bus was away: what the traffic showed may be out of date."""
         self._configurator.lose_sight()
         self._configurator.poll(0.0)
         self._judge()

@@ -11,33 +11,33 @@ from drivelink._core import Assembler, JointPipeline
 from drivelink.canopen.layout import NodeLayout
 from drivelink.errors import DriveError
 from drivelink.jointfile import JointFile
-from drivelink.jointfile.residual_baseline import make_watch
+from drivelink.jointfile.residual_baseline import make_model_monitor
 from estimator import Estimator, make_estimator
 from estimator.sample import Estimate, Sample
 
-__all__ = ["Built", "Watch", "build", "make_assembler", "make_pipeline", "rehearse"]
+__all__ = ["Built", "ResidualMonitor", "build", "make_assembler", "make_pipeline", "rehearse"]
 
 _REHEARSED = 500  # samples: half a second, in which an estimator has begun to estimate
 _HOLD_S, _HOLD_PERIODS = 0.25, 10  # of silence, and at least so many, see `Assembler`
 
 
-class Watch(Protocol):
+class ResidualMonitor(Protocol):
     """Judges on line whether the model is still sufficient."""
 
     def step(self, sample: Sample, estimate: Estimate, residual_nm: float) -> bool:
         """Whether the alarm is on after this tick."""
 
     def describe(self) -> dict[str, Any]:
-        """What it found, for the status key: residual against floor, likely location."""
+        """What it found, for the status key: residual against its baseline, likely location."""
 
 
-Built = tuple[Estimator, Watch | None]
+Built = tuple[Estimator, ResidualMonitor | None]
 
 
 def build(joint: JointFile) -> Built:
-    """Estimator and watch of a joint."""
+    """Estimator and residual monitor of a joint."""
     estimator = make_estimator(joint.model(), joint.estimator, joint.bus.period_s, core=_core.Estimator)
-    return estimator, make_watch(joint)
+    return estimator, make_model_monitor(joint)
 
 
 def make_assembler(joint: JointFile, layouts: Sequence[NodeLayout]) -> Assembler:

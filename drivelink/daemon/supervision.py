@@ -21,7 +21,7 @@ from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.following import MapFollower
 from drivelink.cycle.framesource import OVERFLOW, LostSource
 from drivelink.cycle.loop import CycleLoop, LoopJoint
-from drivelink.cycle.pipeline import Watch
+from drivelink.cycle.pipeline import ResidualMonitor
 from drivelink.cycle.syncclock import MEASURED_SYNCS, measure_period
 from drivelink.daemon.crosschecks import contradiction
 from drivelink.daemon.status import EventLog
@@ -544,7 +544,7 @@ def _maps(layout: NodeLayout) -> str:
     )
 
 
-def residual_text(watch: Watch | None) -> str:
+def residual_text(watch: ResidualMonitor | None) -> str:
     """What the model leaves unexplained against its baseline, in words, as far as it is known."""
     described = watch.describe() if watch is not None else {}
     residuals, baselines = described.get("residual_nm") or (), described.get("floor_nm") or ()

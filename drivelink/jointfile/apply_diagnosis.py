@@ -16,7 +16,7 @@ from estimator.effects import LIBRARY
 from estimator.model import Effect, JointModel, ParameterValue
 from estimator.sample import Record
 
-__all__ = ["augmented", "write"]
+__all__ = ["diagnosed_model", "write"]
 
 
 def write(
@@ -47,7 +47,7 @@ def write(
     if at_link:
         changes["link"] = {"effect": at_link}
     changes["provenance"] = {
-        **floor_entry(record, augmented(joint, outcome)),
+        **floor_entry(record, diagnosed_model(joint, outcome)),
         "diagnosis": {
             "recording": recording,
             "seconds": float((record.sequence[-1] - record.sequence[0]) * record.period_s),
@@ -64,7 +64,7 @@ def write(
     return jointfile.write_model(source, target, changes, force=force)
 
 
-def augmented(joint: JointFile, outcome: Diagnosis) -> JointModel:
+def diagnosed_model(joint: JointFile, outcome: Diagnosis) -> JointModel:
     """The model as `write` puts it into the copy."""
     motors, at_link = _entries(joint, outcome)
     model = joint.model()

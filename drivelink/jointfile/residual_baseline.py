@@ -13,7 +13,7 @@ from estimator.model import JointModel
 from estimator.model_monitor import ModelMonitor, ResidualBaseline, can_monitor, measure_baseline
 from estimator.sample import Record
 
-__all__ = ["floor_entry", "make_watch"]
+__all__ = ["floor_entry", "make_model_monitor"]
 
 _KEY = "floor"
 _LOG = logging.getLogger(__name__)
@@ -30,7 +30,7 @@ def floor_entry(record: Record | Sequence[Record], model: JointModel) -> dict[st
         return {}
 
 
-def make_watch(joint: JointFile) -> ModelMonitor | None:
+def make_model_monitor(joint: JointFile) -> ModelMonitor | None:
     """The monitor of a joint's model, where that is complete and its baseline is known."""
     entry = joint.provenance.get(_KEY)
     baseline = ResidualBaseline.from_dict(entry) if isinstance(entry, dict) else None

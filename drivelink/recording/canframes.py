@@ -100,9 +100,9 @@ class FrameLog:
         self._passive = not joint.bus.configure
         self._listener = PassiveConfigurator([joint], [base_dir])
         self._head: list[LoggedFrame] = []  # after the configuration, read already
-        syncs, overheard = self._learn_configuration()
+        syncs, heard = self._learn_configuration()
         declared = not self._listener.busy
-        if not overheard and (known := recorded_layouts(path, joint.name, daemon=declared)):
+        if not heard and (known := recorded_layouts(path, joint.name, daemon=declared)):
             self._listener = PassiveConfigurator([joint], [base_dir])
             self._listener.adopt(known)  # the recording began when the nodes were configured already
             self._head, self._frames = [], frames()
@@ -197,11 +197,11 @@ class FrameLog:
         follows is heard in its turn.
 
         Returns:
-            Stamps of the SYNCs till then, and whether a node's mapping was overheard.
+            Stamps of the SYNCs till then, and whether a node's mapping was in the traffic.
         """
         listener, head = self._listener, self._head
         syncs: list[int] = []
-        quiet, overheard = 0, False
+        quiet, heard = 0, False
         for frame in self._frames:
             stamp_ns, can_id, data, _ = frame
             if not listener.busy:
@@ -215,8 +215,8 @@ class FrameLog:
                 listener.feed(can_id, data, 0.0)
                 if listener.poll(0.0):
                     head.clear()
-                    quiet, overheard = 0, True
-        return syncs[-2 * _QUIET_SYNCS :], overheard and not listener.busy
+                    quiet, heard = 0, True
+        return syncs[-2 * _QUIET_SYNCS :], heard and not listener.busy
 
     def _check_complete(self) -> None:
         """Raise where the mapping of a node is not known."""

@@ -1,6 +1,7 @@
 """The joint file: what is right is read, what is wrong is one line."""
 
 import logging
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -81,7 +82,7 @@ def test_the_contract_s_example_is_read_as_written() -> None:
             "motor[1].drive.node_id: input should be less than or equal to 127, got 128",
         ),
         ('name = "elbow"', "", "name: expected this key, it is missing"),
-        ('name = "elbow"', 'name = "el/bow"', "name: string should match pattern"),
+        ('name = "elbow"', 'name = "el/bow"', "name: expected letters, digits"),
         ('"robust"', '"rob"', "estimator.mode: input should be 'robust' or 'paper', got 'rob'"),
         ("gravity_nm", "grav", "link.dynamics.grav: unknown key, expected one of inertia_kg_m2"),
         ('"single"', '"serial"', 'motor: expected 2 [[motor]] with arrangement = "serial", got 1'),
@@ -134,6 +135,18 @@ def test_a_rewritten_model_keeps_everything_else_and_its_comments(tmp_path: Path
     assert [effect.name for effect in joint.motor[0].effect] == ["cogging"]
     assert joint.motor[0].drive == jointfile.load(source).motor[0].drive
     assert "# part of the key expression" in target.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ('name = "left arm"', "name: expected letters, digits, '.', '-' and '_'"),
+        ('name = "a"\nzenoh.prefix = "a b"', "zenoh.prefix: expected parts of a zenoh key"),
+    ],
+)
+def test_what_a_name_may_be_is_said_in_words(text: str, line: str) -> None:
+    with pytest.raises(JointFileError, match=re.escape(line)):
+        jointfile.parse(f"{text}\nmotor = [{{ inertia_kg_m2 = 0.1 }}]\n")
 
 
 DOTTED = """\

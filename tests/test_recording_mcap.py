@@ -308,3 +308,15 @@ def test_the_layouts_for_foxglove_and_plotjuggler_plot_what_is_recorded(motors: 
         placed.append(rest["first"])
         rest = rest["second"]
     assert [*placed, rest] == list(layout["configById"])
+
+
+def test_a_file_that_is_cut_off_is_one_warning_however_often_it_is_read(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "cut.mcap"
+    record(path, close=False)
+    for _ in range(3):
+        list(read_messages(path))
+    assert [entry.getMessage() for entry in caplog.records].count(
+        f"{path}: cut off or damaged: read up to where it is whole"
+    ) == 1

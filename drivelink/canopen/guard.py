@@ -13,7 +13,7 @@ import can
 from drivelink._core import SYNC_COB_ID
 from drivelink.errors import BusError
 
-__all__ = ["ForbiddenFrameError", "SilentBus", "check_frame", "is_writable"]
+__all__ = ["ForbiddenFrameError", "SilentBus", "check_frame"]
 
 _NMT_START = 0x01
 _NMT_PRE_OPERATIONAL = 0x80
@@ -24,7 +24,7 @@ class ForbiddenFrameError(Exception):
     """A frame that this program must never send: a mistake in it, not of its user."""
 
 
-def is_writable(index: int) -> bool:
+def _is_writable(index: int) -> bool:
     """Whether an object of a drive may be written: SYNC, heartbeat, TPDO communication and mapping."""
     return index in _WRITABLE or 0x1800 <= index <= 0x1BFF
 
@@ -44,7 +44,7 @@ def check_frame(cob_id: int, data: bytes) -> None:
         if command in (2, 3, 4):  # upload, upload segment, abort
             return
         index = data[1] | data[2] << 8
-        if command == 1 and data[0] & 0x02 and is_writable(index):  # expedited download
+        if command == 1 and data[0] & 0x02 and _is_writable(index):  # expedited download
             return
     raise ForbiddenFrameError(f"frame 0x{cob_id:03X} [{data.hex(' ')}] may not be sent to a drive")
 

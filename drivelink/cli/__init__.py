@@ -10,8 +10,10 @@ from __future__ import annotations
 import argparse
 import importlib
 import logging
+import math
 import os
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from drivelink.errors import DrivelinkError, UsageError
@@ -21,7 +23,7 @@ from estimator.errors import EstimatorError
 if TYPE_CHECKING:
     from drivelink.jointfile import JointFile
 
-__all__ = ["ALONE", "VERBS", "add_bus", "add_map", "main", "make_parser", "moved"]
+__all__ = ["ALONE", "VERBS", "add_bus", "add_map", "add_recordings", "main", "make_parser", "moved"]
 
 VERBS = {
     "demo": "everything without hardware: simulated drives, daemon, subscriber, live view",
@@ -138,6 +140,38 @@ def add_map(parser: argparse.ArgumentParser) -> None:
         help="take a column of a CSV or MF4 file for one of ours, e.g. q_link=link_position_rad:deg; "
         "a factor may stand for UNIT, e.g. tau=motor1_torque_nm:-0.05; may be repeated",
     )
+
+
+def add_recordings(parser: argparse.ArgumentParser) -> None:
+    """Add RECORDING, `--joint`, `--bandwidth-hz` and `--map`, for the verbs that fit."""
+    parser.add_argument(
+        "recording",
+        type=Path,
+        nargs="+",
+        metavar="RECORDING",
+        help="measured data of one joint: CSV, MCAP, CAN log; of several each is validated by the others",
+    )
+    parser.add_argument(
+        "--joint", type=Path, metavar="JOINT", help="joint file; left out: the one that the recording carries"
+    )
+    parser.add_argument(
+        "--bandwidth-hz",
+        type=_bandwidth,
+        metavar="F",
+        help="of the filter that all channels share; left out: chosen from the data",
+    )
+    add_map(parser)
+
+
+def _bandwidth(text: str) -> float:
+    """A number above 0, as `--bandwidth-hz` wants it."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise UsageError(f"--bandwidth-hz: expected a number above 0, got {text}")
+    return value
 
 
 def add_bus(parser: argparse.ArgumentParser) -> None:

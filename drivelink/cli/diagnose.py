@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
 from drivelink import recording
-from drivelink.cli import add_map
-from drivelink.errors import RecordingError, UsageError
+from drivelink.cli import add_recordings
+from drivelink.errors import RecordingError
 from drivelink.jointfile import apply_diagnosis
 from drivelink.output import report
 from drivelink.output.outfile import check_target
@@ -41,38 +40,23 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _EPILOG
-    parser.add_argument(
-        "recording",
-        type=Path,
-        nargs="+",
-        metavar="RECORDING",
-        help="measured data of one joint: CSV, MCAP, CAN log; of several each is validated by the others",
-    )
-    parser.add_argument(
-        "--joint", type=Path, metavar="JOINT", help="joint file; left out: the one that the recording carries"
-    )
+    add_recordings(parser)
     parser.add_argument(
         "--validate",
         type=Path,
         metavar="RECORDING2",
         help="data that takes no part in any fit: an effect is kept only if it lowers the error there",
     )
-    parser.add_argument(
-        "--bandwidth-hz", type=float, metavar="F", help="of the filter that all channels share"
-    )
     parser.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="where the reports go")
     parser.add_argument(
         "--write", type=Path, metavar="JOINT2", help="write a joint file with the effects found"
     )
     parser.add_argument("--force", action="store_true", help="replace the file of --write if it exists")
-    add_map(parser)
     parser.add_argument("--json", action="store_true", help="print what report.json says, and nothing else")
 
 
 def run(args: argparse.Namespace) -> int:
     """Do the job; return the exit status."""
-    if args.bandwidth_hz is not None and not 0.0 < args.bandwidth_hz < math.inf:
-        raise UsageError(f"--bandwidth-hz: expected a number above 0, got {args.bandwidth_hz:g}")
     source = joint_of(args.recording[0], args.joint)
     joint, base, names = source.joint, source.folder, parse_column_map(args.map)
     inputs = [path for path in (*args.recording, args.validate, args.joint) if path is not None]

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import math
 from pathlib import Path
 
 from drivelink import jointfile
-from drivelink.cli import add_map
+from drivelink.cli import add_recordings
 from drivelink.errors import RecordingError, UsageError
 from drivelink.output.outfile import check_target
 from drivelink.recording.mapping import joint_of
@@ -31,33 +30,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _EPILOG
-    parser.add_argument(
-        "recording",
-        type=Path,
-        nargs="+",
-        metavar="RECORDING",
-        help="measured data of one joint: CSV, MCAP, CAN log; of several each is validated by the others",
-    )
-    parser.add_argument(
-        "--joint", type=Path, metavar="JOINT", help="joint file; left out: the one that the recording carries"
-    )
+    add_recordings(parser)
     parser.add_argument("--out", type=Path, metavar="DIR", help="write fit.json there")
     parser.add_argument("--write", type=Path, metavar="JOINT2", help="write a copy of the joint file")
     parser.add_argument("--force", action="store_true", help="replace the file of --write if it exists")
     parser.add_argument(
         "--plots", nargs="?", type=Path, const=Path(), metavar="DIR", help="write plots there, or into --out"
     )
-    parser.add_argument(
-        "--bandwidth-hz", type=float, metavar="F", help="of the filter that all channels share"
-    )
-    add_map(parser)
     parser.add_argument("--json", action="store_true", help="print what fit.json says, and nothing else")
 
 
 def run(args: argparse.Namespace) -> int:
     """Do the job; return the exit status."""
-    if args.bandwidth_hz is not None and not 0.0 < args.bandwidth_hz < math.inf:
-        raise UsageError(f"--bandwidth-hz: expected a number above 0, got {args.bandwidth_hz:g}")
     folder = _plots_folder(args)
     if args.joint is not None:
         jointfile.load(args.joint)  # it is named first when both are wrong

@@ -39,7 +39,7 @@ from drivelink.jointfile import JointFile
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_session
 
-__all__ = ["Daemon", "ServedJoint", "check_agreement"]
+__all__ = ["Daemon", "ServedJoint"]
 
 logger = logging.getLogger("drivelink")
 
@@ -97,7 +97,7 @@ class Daemon:
         real_time: bool = True,
         devices: Callable[[], object] | None = None,
     ) -> None:
-        check_agreement(joints)
+        _check_agreement(joints)
         self._joints = tuple(joints)
         self._section = joints[0].joint.bus
         self._real_time = real_time
@@ -314,7 +314,7 @@ def _put_status(publisher: JointPublisher, status: JointStatus) -> Generator[Non
     publisher.put_status(document)
 
 
-def check_agreement(joints: Sequence[ServedJoint]) -> None:
+def _check_agreement(joints: Sequence[ServedJoint]) -> None:
     """Several joints in one daemon share one bus and one zenoh session.
 
     Raises:

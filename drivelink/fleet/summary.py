@@ -16,10 +16,10 @@ from drivelink.fleet.changes import Appearance, Change, SeriesTest, appearance, 
 from estimator.sample import FloatArray
 from estimator.transmissions import MODELS
 
-__all__ = ["COLUMNS", "METHOD", "SCHEMA", "summarise"]
+__all__ = ["COLUMNS", "SCHEMA", "summarise"]
 
 SCHEMA = "drivelink.fleet/1"
-METHOD = (
+_METHOD = (
     "sup-F test against steps and ramps with Bonferroni's bound, robust to any one recording left out; "
     "Fisher's exact test for effects; Benjamini-Hochberg over all series of the fleet"
 )
@@ -90,7 +90,7 @@ def summarise(rows: list[dict[str, Any]], false_discovery_rate: float) -> dict[s
         "version": __version__,
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
         "false_discovery_rate": false_discovery_rate,
-        "method": METHOD,
+        "method": _METHOD,
         "tests": len(p),
         "level": level,
         "recordings": len({row["recording"] for row in rows}),

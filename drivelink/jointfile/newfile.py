@@ -9,9 +9,9 @@ from drivelink.canopen.vendors import vendor_of
 from drivelink.errors import DriveError
 from drivelink.jointfile import JointFile, parse
 
-__all__ = ["GCM2", "Answers", "answers_from_bus", "joint_text"]
+__all__ = ["Answers", "answers_from_bus", "joint_text"]
 
-GCM2 = 1e-7  # kg·m² a g·cm²
+_GCM2 = 1e-7  # kg·m² a g·cm²
 _PLACEHOLDER = 0.1  # kg·m², where the inertia is not known
 
 
@@ -64,7 +64,7 @@ class Answers:
         """Of each motor at the joint side, as given or by the data sheet."""
         if self.inertia_kg_m2 is not None or self.rotor_inertia_gcm2 is None or self.gear_ratio is None:
             return self.inertia_kg_m2
-        return self.rotor_inertia_gcm2 * GCM2 * self.gear_ratio**2
+        return self.rotor_inertia_gcm2 * _GCM2 * self.gear_ratio**2
 
     @property
     def conversion(self) -> str:

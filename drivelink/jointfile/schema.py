@@ -55,6 +55,11 @@ _NESTED = "expected a joint file, got tables nested without end"
 _MARK = "# drivelink wrote this file, and ends it with a check line: a part of it is refused."
 _CHECK = re.compile(r"^# drivelink check: sha256 ([0-9a-f]{16})$\n?", re.MULTILINE)
 
+_PATTERNS = {  # in words, by key
+    "name": "letters, digits, '.', '-' and '_', a letter or digit first",
+    "prefix": "parts of a zenoh key with '/' between, without spaces and without any of *$#?",
+}
+
 Direction = Literal[1, -1]
 _COLUMN = (
     "time_s|motor[12]_(position_rad|velocity_rad_s|torque_nm|current_a)"
@@ -518,6 +523,8 @@ def _one_line(error: ValidationError) -> str:
         message = unknown_key(JointFile, first["loc"])
     elif first["type"] == "missing":
         message = "expected this key, it is missing"
+    elif first["type"] == "string_pattern_mismatch" and first["loc"][-1] in _PATTERNS:
+        message = f"expected {_PATTERNS[str(first['loc'][-1])]}, got {_shown(first['input'])}"
     elif first["type"] != "value_error":
         message = f"{message[0].lower()}{message[1:]}, got {_shown(first['input'])}"
     rest = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""

@@ -25,7 +25,6 @@ from estimator.sample import Estimate, External, ExternalStatus, Sample, Status
 __all__ = [
     "TYPE_HASHES",
     "Ros2Publisher",
-    "diagnostic_array",
     "dynamic_joint_state",
     "interfaces",
     "joint_state",
@@ -173,7 +172,7 @@ def wrench(frame_id: str) -> Any:
     return message
 
 
-def diagnostic_array(
+def _diagnostic_array(
     stamp_ns: int, level: int, name: str, message: str, hardware: str, values: Mapping[str, str]
 ) -> bytes:
     """diagnostic_msgs/DiagnosticArray with one status."""
@@ -337,7 +336,7 @@ class Ros2Publisher:
         level, message = _judge(self.latest.status if self.latest else 0)
         values = dict(_flat(status))
         name = f"drivelink: {self._joint}"
-        payload = diagnostic_array(stamp_ns, level, name, message, self._joint, values)
+        payload = _diagnostic_array(stamp_ns, level, name, message, self._joint, values)
         self._diagnostics.put(payload, stamp_ns)
 
     def close(self) -> None:

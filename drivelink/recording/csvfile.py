@@ -23,7 +23,7 @@ from drivelink.recording.columns import KNOWN, record_from_columns
 from drivelink.recording.limits import MAX_COLUMNS, MAX_LINE_BYTES, require_samples
 from estimator.sample import FloatArray, Record
 
-__all__ = ["read_csv", "read_csv_columns"]
+__all__ = ["read_csv"]
 
 _LOG = logging.getLogger("drivelink.recording")
 
@@ -39,11 +39,11 @@ def read_csv(
     Raises:
         RecordingError: it cannot be read, or lacks what is needed.
     """
-    columns, ignored = read_csv_columns(path, names)
+    columns, ignored = _read_csv_columns(path, names)
     return record_from_columns(columns, str(path), joint, keep_nan, ignored)
 
 
-def read_csv_columns(
+def _read_csv_columns(
     path: Path, names: ColumnMap | None = None
 ) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
     """(rows,) values of each known column by its name, and the names of the others; an empty cell is NaN.

@@ -18,7 +18,7 @@ from estimator.gate import Change, Discrepancy, GateError, Judgement, judge, ref
 from estimator.model import JointModel
 from estimator.sample import Record, Sample
 
-__all__ = ["Correction", "Gathered", "corrections", "gate", "record_of", "refusal", "text_of"]
+__all__ = ["Correction", "Gathered", "corrections", "gate", "refusal"]
 
 _ON_THE_BUS = (".drive", ".encoder")
 _LONGEST_S = 60.0  # of a run that is examined: more adds nothing about units and signs
@@ -48,7 +48,7 @@ class Correction:
 
 def refusal(path: Path, joint: JointFile, findings: Sequence[Discrepancy], message: str) -> RecordingError:
     """The refusal of a recording in one line, with what to paste into the joint file."""
-    return RecordingError(f"{path}: {message}; {text_of(joint, findings, live=is_frame_log(path))}")
+    return RecordingError(f"{path}: {message}; {_text_of(joint, findings, live=is_frame_log(path))}")
 
 
 def gate(path: Path, joint: JointFile, record: Record) -> None:
@@ -90,7 +90,7 @@ class Gathered:
     def judgement(self) -> Judgement:
         """What the samples say of units and signs."""
         model = self._joint.model()
-        record = record_of(self._samples, model, self._period_s)
+        record = _record_of(self._samples, model, self._period_s)
         return (
             Judgement(reason="no samples in one run of numbers") if record is None else judge(record, model)
         )
@@ -102,12 +102,12 @@ class Gathered:
         except EstimatorError as error:
             return [f"units and signs cannot be checked: {error}"]
         if judgement.findings:
-            fix = text_of(self._joint, judgement.findings, live=live)
+            fix = _text_of(self._joint, judgement.findings, live=live)
             return [f"{', and '.join(map(str, judgement.findings))}; {fix}"]
         return [judgement.remark] if judgement.untold else []
 
 
-def record_of(samples: Sequence[Sample], model: JointModel, period_s: float) -> Record | None:
+def _record_of(samples: Sequence[Sample], model: JointModel, period_s: float) -> Record | None:
     """The samples as a recording, without those that are not complete; None where they are not one run."""
     rows = [s for s in samples if np.all(np.isfinite((*s.motor_position_rad, *s.motor_torque_nm)))]
     linked = model.has_deflection
@@ -124,7 +124,7 @@ def record_of(samples: Sequence[Sample], model: JointModel, period_s: float) -> 
     )
 
 
-def text_of(joint: JointFile, findings: Sequence[Discrepancy], *, live: bool) -> str:
+def _text_of(joint: JointFile, findings: Sequence[Discrepancy], *, live: bool) -> str:
     """The correction, ready to be pasted.
 
     Args:

@@ -12,11 +12,10 @@ __all__ = [
     "MAX_BLOCK_BYTES",
     "MAX_COLUMNS",
     "MAX_LINE_BYTES",
-    "MAX_SAMPLES",
     "require_samples",
 ]
 
-MAX_SAMPLES = 10_000_000  # periods from first to last where a recording is read as a whole: 2.7 h at 1 kHz
+_MAX_SAMPLES = 10_000_000  # periods from first to last where a recording is read as a whole: 2.7 h at 1 kHz
 MAX_COLUMNS = 4096  # of a CSV file; unknown ones are never held in memory
 MAX_LINE_BYTES = 1 << 20  # of a line of text
 MAX_BLOCK_BYTES = 64 << 20  # an MCAP chunk or a BLF container, unpacked; tools write up to 8 MiB
@@ -28,8 +27,8 @@ def require_samples(count: int, where: str) -> None:
     Raises:
         RecordingError: there are more.
     """
-    if count > MAX_SAMPLES:
+    if count > _MAX_SAMPLES:
         raise RecordingError(
-            f"{where}: expected at most {MAX_SAMPLES} periods from the first sample to the last, "
+            f"{where}: expected at most {_MAX_SAMPLES} periods from the first sample to the last, "
             f"got {count}: split it, at a gap if there is one"
         )

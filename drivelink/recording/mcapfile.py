@@ -11,6 +11,7 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ import zstandard
 from drivelink.errors import RecordingError
 from drivelink.recording.limits import MAX_BLOCK_BYTES
 
-__all__ = ["McapMessage", "is_mcap", "read_messages"]
+__all__ = ["McapMessage", "read_messages"]
 
 _LOG = logging.getLogger("drivelink.recording")
 
@@ -40,12 +41,6 @@ class McapMessage(NamedTuple):
     topic: str
     log_time_ns: int
     data: bytes
-
-
-def is_mcap(path: Path) -> bool:
-    """Whether the file begins as MCAP files do."""
-    with path.open("rb") as file:
-        return file.read(len(_MAGIC)) == _MAGIC
 
 
 def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[McapMessage]:
@@ -82,6 +77,12 @@ def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
     except _BrokenError:
         pass
+    _warn_once(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=16)
+def _warn_once(path: Path, _mtime_ns: int) -> None:
+    """A file is looked at several times: for its joint, its mapping, its samples."""
     _LOG.warning("%s: cut off or damaged: read up to where it is whole", path)
 
 

@@ -7,6 +7,9 @@ In lockstep on the project's simulated joints, seeded (--seed): seconds of healt
 standard deviations. Named is a fault whose signal `suspected` names most often, of those in which it names
 any. Then true changes of the stiffness, which are to be followed: the share of the last two seconds that is
 valid and within 5 %.
+
+With --sizes instead: for each kind of fault the largest size up to which nothing is said of it in eight
+seconds (every sample valid, no flag), and by how much the stiffness is off then.
 """
 
 from __future__ import annotations
@@ -52,6 +55,23 @@ def measure(joint, health, seconds, seed):
     }
 
 
+def sizes(joints, seed):
+    """The table of what is not noticed."""
+    print(
+        "| fault | "
+        + " | ".join(f"{joint}: unnoticed up to | error of the stiffness" for joint in joints)
+        + " |"
+    )
+    print("|---|" + "---|---|" * len(joints))
+    for kind, (text, _, signals, _) in matrix.LADDERS.items():
+        for signal in signals:
+            cells = []
+            for joint in joints:
+                size, error = matrix.unnoticed(joint, kind, signal, health_s=8.0, fault_s=8.0, seed=seed)
+                cells += [text.format(size) if size else "always noticed", f"{error:.1%}" if size else ""]
+            print(f"| {signal}: {kind} | " + " | ".join(cells) + " |", flush=True)
+
+
 def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -60,8 +80,12 @@ def main():
     parser.add_argument("--health", type=float, default=15.0, metavar="SECONDS")
     parser.add_argument("--seconds", type=float, default=15.0, help="of each fault")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--sizes", action="store_true", help="what is not noticed, and up to which size")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
+    if args.sizes:
+        sizes(args.joints.split(","), args.seed)
+        return
     found = [measure(joint, args.health, args.seconds, args.seed) for joint in args.joints.split(",")]
     if args.json:
         print(json.dumps(found))

@@ -21,7 +21,20 @@ from estimator.identify import identify
 from estimator.model_monitor import ModelMonitor, ResidualBaseline, measure_baseline
 from estimator.sample import Sample, Status
 
-__all__ = ["FAULTS", "JOINTS", "SIGNALS", "STEPS", "Fault", "Outcome", "faults", "outcome", "stepped"]
+__all__ = [
+    "FAULTS",
+    "JOINTS",
+    "LADDERS",
+    "SIGNALS",
+    "STEPS",
+    "Fault",
+    "Outcome",
+    "faults",
+    "garbled",
+    "outcome",
+    "stepped",
+    "unnoticed",
+]
 
 SIGNALS = ("motor", "torque", "link")
 SUSPECTS = {  # what `suspected` may call each of them
@@ -155,6 +168,35 @@ def faults() -> Iterator[Fault]:
 
 
 FAULTS = tuple(faults())
+LADDERS: dict[str, tuple[str, tuple[float, ...], tuple[str, ...], Callable[[float], Spoil]]] = {
+    # kind: (its size, sizes from small to large, signals, what a size does)
+    "scale": ("{:.1%}", (0.01, 0.02, 0.05, 0.1, 0.25), SIGNALS, lambda s: partial(_gain, factor=1.0 + s)),
+    "scale drifts, in 8 s": (
+        "{:.1%}",
+        (0.01, 0.02, 0.05, 0.1, 0.25),
+        SIGNALS,
+        lambda s: partial(_gain_drifts, to=1.0 + s),
+    ),
+    "offset, of the largest value": (
+        "{:.1%}",
+        (0.001, 0.003, 0.01, 0.03, 0.1),
+        SIGNALS,
+        lambda s: partial(_offset, share=s),
+    ),
+    "drift": (
+        "{:g} rad/s",
+        (1e-4, 3e-4, 1e-3, 3e-3, 1e-2),
+        ("motor", "link"),
+        lambda s: partial(_drift, per_s=s),
+    ),
+    "late": ("{:g} periods", (1, 2, 3, 5, 10), SIGNALS, lambda s: partial(_late, periods=int(s))),
+    "noise, of the largest value": (
+        "{:.2%}",
+        (1e-4, 3e-4, 1e-3, 3e-3, 1e-2),
+        SIGNALS,
+        lambda s: partial(_noise, share=s),
+    ),
+}
 
 
 @lru_cache(maxsize=8)
@@ -246,3 +288,72 @@ def _count(estimates: kit.Estimates, suspected: str, truth: np.ndarray, begin: i
     silent = wrong & (estimates.status[begin:] & FLAGS == 0)
     valid = int(estimates.valid[begin:].sum())
     return Outcome(len(wrong), valid, int(wrong.sum()), int(silent.sum()), suspected)
+
+
+def unnoticed(
+    joint: str, kind: str, signal: str, *, health_s: float, fault_s: float, seed: int = 0
+) -> tuple[float, float]:
+    """The largest size of a fault up to which nothing is said of it, and the stiffness's relative error then.
+
+    Nothing is said where every sample is valid and without a flag. 0, 0: even the smallest size is noticed.
+    """
+    _, sizes, _, spoil = LADDERS[kind]
+    motion, begin = _healthy(joint, health_s + fault_s, seed), round(health_s / T)
+    truth, last = motion.stiffness_nm_rad[begin:], (0.0, 0.0)
+    for size in sizes:
+        samples = _spoilt(motion.samples, begin, Fault(kind, (signal,), spoil(size)), seed)
+        estimates, _ = _estimates(joint, samples, len(samples))
+        if not np.all(estimates.valid[begin:] & (estimates.status[begin:] & FLAGS == 0)):
+            break
+        last = size, float(np.max(np.abs(estimates.stiffness_nm_rad[begin:] / truth - 1.0)))
+    return last
+
+
+def garbled(
+    joint: str,
+    share: float,
+    positions: bool,
+    *,
+    health_s: float,
+    garbage_s: float,
+    after_s: float,
+    seed: int = 0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Valid and wrong samples, from the end of a time on in which readings had some of their bits turned.
+
+    Args:
+        joint: which.
+        share: of the samples that are hit, each signal of it with a probability of a half.
+        positions: whether those are hit too, or the torques alone.
+        health_s: before.
+        garbage_s: meanwhile.
+        after_s: that is judged.
+        seed: of all.
+    """
+    motion = _healthy(joint, health_s + garbage_s + after_s, seed)
+    rng = np.random.default_rng(seed)
+    begin, end = round(health_s / T), round((health_s + garbage_s) / T)
+    most = max(abs(torque) for sample in motion.samples for torque in sample.motor_torque_nm)
+
+    def turned(value: float, count: float) -> float:
+        if rng.random() < 0.5:
+            return value
+        bits = np.bitwise_or.reduce(1 << rng.integers(0, 16, 3))
+        return float(np.int16(np.uint16((round(value / count) & 0xFFFF) ^ int(bits)))) * count
+
+    samples = list(motion.samples)
+    for k in range(begin, end):
+        if rng.random() < share:
+            sample = samples[k]
+            sample = sample._replace(
+                motor_torque_nm=tuple(turned(value, 1e-3 * most) for value in sample.motor_torque_nm)
+            )
+            if positions:
+                count = 2.0 * np.pi / 2**16
+                sample = sample._replace(
+                    motor_position_rad=tuple(turned(value, count) for value in sample.motor_position_rad),
+                    link_position_rad=turned(sample.link_position_rad, count),
+                )
+            samples[k] = sample
+    estimates, _ = _estimates(joint, samples, len(samples))
+    return estimates.valid[end:], kit.wrong(estimates, motion.stiffness_nm_rad)[begin:]

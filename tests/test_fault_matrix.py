@@ -55,3 +55,14 @@ def test_a_fitted_file_gives_no_wrong_valid_on_another_healthy_run():
         healthy = matrix.outcome("constant fitted", None, 0.0, 6.0, seed)
         assert healthy.wrong == 0
         assert healthy.valid > 0.8 * healthy.samples
+
+
+@pytest.mark.parametrize("positions", [True, False])
+@pytest.mark.parametrize("share", [0.1, 0.5])
+@pytest.mark.parametrize("joint", ["constant", "vsa-ii"])
+def test_after_garbage_of_five_seconds_the_way_back_takes_less_than_five(joint, share, positions):
+    """What was learned before holds again; how large and how noisy the garbage was is no measure of the joint."""
+    valid, wrong = matrix.garbled(joint, share, positions, health_s=6.0, garbage_s=5.0, after_s=6.0)
+    assert valid[-1000:].all()
+    assert np.flatnonzero(~valid)[-1] < 5000
+    assert wrong.sum() < 30  # until the next equation of a motor

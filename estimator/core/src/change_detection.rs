@@ -10,7 +10,7 @@
 //! interval and can be followed, is followed; where a reading explains it better, or nothing does, it is
 //! suspected, and nothing is valid until the reference holds again.
 
-use crate::isolation::{Change, Verdict};
+use crate::isolation::{Change, Explanation, Verdict};
 use crate::student::f_quantile;
 
 const TAILS: f64 = 4.0; // degrees of freedom of the level over the filters' correlation time …
@@ -46,6 +46,8 @@ pub enum Action {
     Restore,
     /// This change explains all, and is a parameter's.
     Accept(Change),
+    /// No one change explains the window: what has been seen is of the past.
+    LookAgain,
     /// Nothing explains it: begin anew.
     Relearn,
 }
@@ -230,9 +232,13 @@ impl ChangeDetection {
                 return self.end(Action::Accept(change));
             }
         }
+        let seen_s = verdict.updates * self.dt;
         self.explained_by = explained_by;
         if since_s > LONGEST_S && explained_by.is_none() {
             return self.end(Action::Relearn);
+        }
+        if explained_by.is_none() && seen_s > WINDOW_S {
+            return Action::LookAgain;
         }
         Action::GoOn
     }
@@ -249,12 +255,12 @@ impl ChangeDetection {
         self.seen_again == AGAIN && held <= AS_FORESEEN * AGAIN as f64 && disproven
     }
 
-    /// What explains the window best so far, and how large it is.
+    /// What explains the window best so far, and how.
     #[must_use]
-    pub fn suspect(&self) -> Option<(Change, f64)> {
+    pub fn suspect(&self) -> Option<(Change, Explanation)> {
         let verdict = self.doubt()?;
         let change = verdict.best(|change| change != Change::Nothing)?;
-        Some((change, verdict.of(change).amplitude))
+        Some((change, *verdict.of(change)))
     }
 
     fn end(&mut self, action: Action) -> Action {

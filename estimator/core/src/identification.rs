@@ -11,7 +11,7 @@
 //! a local σ instead of f.
 
 use crate::change_detection::{LEAST_IN_WINDOW, UPDATES, WINDOW_TAILS};
-use crate::isolation::{CHANGES, Change, Isolation, Layout, READINGS, Verdict};
+use crate::isolation::{CHANGES, Change, Explanation, Isolation, Layout, READINGS, Verdict};
 use crate::kalman::{Kalman, Matrix, NUISANCES, SIZE, Vector};
 use crate::laws::{Alpha, Law, PARAMETERS};
 use crate::linear_algebra::{dot, times};
@@ -49,6 +49,7 @@ const LEAST_VARIANCE: f64 = 0.02; // however the noise is coloured, it leaves so
 // Errors that are in no covariance: noise in h, its linearisation, what aligns the channels. Measured as the
 // error over its standard deviation without this, on 86 simulated joints that took no part in anything else.
 const UNSEEN: f64 = 1.3;
+const FAR: f64 = 1e3; // times what an equation is measured in: it says nothing of what has changed
 const REFERENCE_S: f64 = 5.0; // of updates, from one reference to the next
 const SETTLED_S: f64 = 2.0; // of updates, until there is a first one
 // Prior standard deviations of the amplitudes of changes, in the units of their columns: stiffness, friction
@@ -458,7 +459,7 @@ impl OnlineIdentification {
         kalman.remember(innovation, predicted_variance);
         self.updates = self.updates.saturating_add(1);
         if self.updates % self.updates_in(OFTEN_S) == 0 {
-            self.relax();
+            self.keep_regular(noisy);
         }
         if self.choose_order && self.updates >= self.order_at {
             self.order_at = self.updates + self.updates_in(ORDER_S);
@@ -473,10 +474,14 @@ impl OnlineIdentification {
         }
     }
 
-    /// Where a nuisance strains against its prior, the prior was too narrow: widen it.
-    fn relax(&mut self) {
+    /// What rounding has done is mended; where a nuisance strains against its prior in usual times, the
+    /// prior was too narrow: widen it.
+    fn keep_regular(&mut self, usual: bool) {
         let Some(kalman) = &mut self.kalman else { return };
         kalman.keep_regular();
+        if !usual {
+            return; // what is not explained strains at everything
+        }
         for i in self.law.size..self.law.size + NUISANCES {
             let ceiling = kalman.ceiling[i];
             if ceiling > 0.0 && kalman.x[i].powi(2) > RELAX * RELAX * ceiling {
@@ -554,7 +559,7 @@ impl OnlineIdentification {
         h: &Vector,
         y: f64,
         window: f64,
-        suspect: Option<(Change, f64)>,
+        suspect: Option<(Change, Explanation)>,
     ) -> Option<[f64; 2]> {
         let reference = self.reference.as_ref()?;
         // What a change does follows from the curve that is held against the window, not from the one that
@@ -570,15 +575,16 @@ impl OnlineIdentification {
         let h = &row;
         let readings = self.readings(signals, link, stiffness);
         let left = reference.innovation(h, y);
-        if !left.is_finite() {
+        // No motion of this joint, and no number that others may be added to.
+        if !h.iter().chain(&readings).chain([&left]).all(|value| value.abs() < FAR) {
             return None;
         }
         let zero = n + DEFLECTION_OFFSET;
         self.window.take(h, &readings, left, window, zero, self.dt);
         let foreseen = Self::reference_noise(reference)
             + reference.variance_over_scale() * dot(h, &times(&reference.sigma, h)).max(0.0);
-        let explained = suspect.map_or(0.0, |(change, amplitude)| {
-            Isolation::effect(change, amplitude, h, &readings, reference, &self.layout())
+        let explained = suspect.map_or(0.0, |(change, explanation)| {
+            Isolation::effect(change, &explanation, h, &readings, reference, &self.layout())
         });
         Some([left * left / foreseen, (left - explained).powi(2) / foreseen])
     }
@@ -661,11 +667,18 @@ impl OnlineIdentification {
         self.window.clear();
     }
 
-    /// An encoder has moved its zero: the deflection's offset is not what it was to the last digit.
-    pub fn reopen_deflection_offset(&mut self) {
+    /// The window begins anew.
+    pub fn look_again(&mut self) {
+        self.window.clear();
+    }
+
+    /// An encoder has moved its zero: the deflection's offset is not what it was to the last digit (`known`),
+    /// or anywhere within the largest deflection.
+    pub fn reopen_deflection_offset(&mut self, known: bool) {
         let place = self.law.size + DEFLECTION_OFFSET;
+        let std = if known { REOPENED } else { 1.0 };
         for kalman in [&mut self.kalman, &mut self.reference, &mut self.candidate].into_iter().flatten() {
-            kalman.inflate(place, REOPENED * REOPENED);
+            kalman.inflate(place, std * std);
         }
         self.window.clear();
     }

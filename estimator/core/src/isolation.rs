@@ -100,6 +100,8 @@ pub struct Explanation {
     pub amplitude: f64,
     /// Standard deviation of that.
     pub std: f64,
+    /// Where what drifts is by now, in the unit of the zero between the encoders.
+    pub place: f64,
 }
 
 /// All changes held against one window.
@@ -250,18 +252,22 @@ impl Isolation {
         self.gram[LEFT][LEFT] = (self.gram[LEFT][LEFT] + square).max(0.0);
     }
 
-    /// What a change of this amplitude adds to an equation.
+    /// What a change that has been explained so adds to an equation.
     #[must_use]
     pub fn effect(
         change: Change,
-        amplitude: f64,
+        explanation: &Explanation,
         h: &Vector,
         readings: &[f64; READINGS],
         reference: &Kalman,
         layout: &Layout,
     ) -> f64 {
-        let direction = direction(change, reference, layout);
-        amplitude * direction.iter().zip(h.iter().chain(readings)).map(|(a, b)| a * b).sum::<f64>()
+        let along = |change: Change| -> f64 {
+            let direction = direction(change, reference, layout);
+            direction.iter().zip(h.iter().chain(readings)).map(|(a, b)| a * b).sum()
+        };
+        let drifted = if change.is_drift() { explanation.place * along(Change::PositionZero) } else { 0.0 };
+        explanation.amplitude * along(change) + drifted
     }
 
     /// Hold every change against the window.
@@ -316,6 +322,7 @@ impl Isolation {
             evidence: -0.5 * (independent + tails) * (square.max(independent) / tails).ln_1p() - 0.5 * log,
             amplitude,
             std,
+            place: 0.0,
         };
         let mut explanations = [Explanation::default(); CHANGES];
         explanations[0] = explain(healthy, log_healthy, 0.0, 0.0);
@@ -341,6 +348,7 @@ impl Isolation {
             let (std, own) = (layout.std[*change as usize], direction(*change, reference, layout));
             let (row, mut corner, mut projection, _) = add(&own, std);
             let (mut square, mut log) = (healthy, log_healthy);
+            let mut place = [0.0; 2]; // without a drift, and what its amplitude takes from it
             if change.is_drift() {
                 // What drifts is elsewhere by now.
                 let zero_std = layout.std[Change::PositionZero as usize];
@@ -353,6 +361,7 @@ impl Isolation {
                 log += power.ln();
                 projection -= cross * moved / power;
                 corner = (corner - cross * cross / power).max(1e-12);
+                place = [zero_std * moved / power, zero_std * cross / power];
             }
             explanations[*change as usize] = explain(
                 square - projection * projection / corner,
@@ -360,6 +369,7 @@ impl Isolation {
                 std * projection / corner,
                 std / corner.sqrt(),
             );
+            explanations[*change as usize].place = place[0] - place[1] * projection / corner;
         }
         Verdict { explanations, equations: independent, updates: self.equations }
     }

@@ -15,9 +15,15 @@ pub struct NoiseMeter {
 }
 
 impl NoiseMeter {
-    /// The signal goes on elsewhere.
+    /// The signal goes on elsewhere, as noisy as it was.
     pub fn restart(&mut self) {
-        (self.known, self.seen) = (0, 0.0);
+        self.known = 0;
+    }
+
+    /// Whether there is a measurement.
+    #[must_use]
+    pub fn is_known(&self) -> bool {
+        self.measured > 0.0
     }
 
     /// One sample.

@@ -238,13 +238,22 @@ impl Robust {
         let usable = self.unsettled <= 0;
         self.tick += 1;
         self.link.smooth(&self.filters, now.link);
-        self.noise[self.motors].see(now.link, self.period);
+        // Noise is that of usual times: what lies is not measured by it.
+        let doubtful = !usable || self.transmissions.iter().any(TransmissionEstimator::changed);
+        let mut see = |place: usize, value: f64| {
+            if doubtful && self.noise[place].is_known() {
+                self.noise[place].restart();
+            } else {
+                self.noise[place].see(value, self.period);
+            }
+        };
+        see(self.motors, now.link);
         let time = self.tick as f64 * self.period;
         for (i, transmission) in self.transmissions.iter_mut().enumerate() {
             let (theta, torque, before) = (now.motor[i], now.torque[i], self.last.torque[i]);
             transmission.feed(&self.filters, theta, now.link - theta, torque, before, usable);
             transmission.feed_effects(&self.filters, &self.link, time);
-            self.noise[i].see(theta, self.period);
+            see(i, theta);
         }
         if self.momentum.is_some() {
             let carried = self.carried(now).map(|carried| carried.torque);
@@ -360,7 +369,14 @@ impl Robust {
         if self.flexible {
             self.zeros.link = moved(self.zeros.link, jumps[m]);
         }
-        self.transmissions.iter_mut().for_each(TransmissionEstimator::reopen_deflection_offset);
+        let link_now = inputs.link - self.zeros.link;
+        for (i, transmission) in self.transmissions.iter_mut().enumerate() {
+            let known = !transmission.is_beyond(link_now - (inputs.motor[i] - self.zeros.motor[i]));
+            if !known {
+                self.zeros.motor[i] = inputs.motor[i] - link_now; // in the middle of where it can be
+            }
+            transmission.reopen_deflection_offset(known);
+        }
     }
 
     /// What is said of a sample that was used.

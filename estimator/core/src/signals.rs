@@ -105,6 +105,7 @@ pub struct Excitation {
     noise: f64,
     square: f64,
     peak: f64,
+    before: [f64; 2], // rms and noise at the last update
 }
 
 impl Excitation {
@@ -114,17 +115,25 @@ impl Excitation {
     const PEAK_S: f64 = 60.0; // how long the largest rate is remembered
 
     /// Whether a filtered rate of φ is above the noise that it has, over the last moments.
-    pub fn update(&mut self, rate: f64, noise: f64, usable: bool, dt: f64) -> bool {
+    ///
+    /// `usual`: whether the balance was explained at the last update; what was read otherwise is no measure.
+    pub fn update(&mut self, rate: f64, noise: f64, usable: bool, usual: bool, dt: f64) -> bool {
         if !usable {
             self.square = 0.0;
             return false;
         }
         let fade = (-dt / Self::PEAK_S).exp();
+        let [rms_before, noise_before] = std::mem::take(&mut self.before);
+        if usual {
+            self.peak = (fade * self.peak).max(rms_before);
+            self.noise = (fade * self.noise).max(noise_before);
+        } else {
+            self.square = self.square.min(self.peak * self.peak);
+        }
         self.square += (dt / Self::WINDOW_S).min(1.0) * (rate * rate - self.square);
         let rms = self.square.sqrt();
-        self.peak = (fade * self.peak).max(rms);
-        self.noise = (fade * self.noise).max(noise);
-        rms > Self::NOISE_MARGIN * self.noise && rms > Self::SHARE * self.peak && rms > 0.0
+        self.before = [rms, noise];
+        rms > Self::NOISE_MARGIN * self.noise.max(noise) && rms > Self::SHARE * self.peak && rms > 0.0
     }
 }
 

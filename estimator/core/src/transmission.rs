@@ -295,9 +295,15 @@ impl TransmissionEstimator {
         let motor = self.signals.position.main;
         let resolution = (now.noise[0] + now.noise[1]).sqrt();
         let rate = now.link[1] - motor[1];
-        self.excited = self.excitation.update(rate, self.rate_gain * resolution, now.usable, self.dt);
+        self.excited = self.excitation.update(
+            rate,
+            self.rate_gain * resolution,
+            now.usable,
+            !self.changes.changed(),
+            self.dt,
+        );
         self.identification.observe_noise(resolution);
-        if now.usable {
+        if now.usable && self.identification.kalman().is_none() {
             self.identification.observe_scale(&self.signals, &now.link);
         }
         if self.identification.kalman().is_none() && now.usable && self.excited {
@@ -369,6 +375,7 @@ impl TransmissionEstimator {
                     }
                     return;
                 }
+                Action::LookAgain => self.identification.look_again(),
                 Action::Relearn => return self.relearn(),
             }
         } else {
@@ -383,6 +390,10 @@ impl TransmissionEstimator {
             }
         } else {
             self.identification.pass_over(innovation, predicted);
+        }
+        // How large motion is: what is not explained does not tell.
+        if now.usable && !self.changes.changed() {
+            self.identification.observe_scale(&self.signals, &now.link);
         }
     }
 
@@ -463,9 +474,16 @@ impl TransmissionEstimator {
         self.identification.shift_delay(periods);
     }
 
-    /// An encoder has moved its zero.
-    pub fn reopen_deflection_offset(&mut self) {
-        self.identification.reopen_deflection_offset();
+    /// An encoder has moved its zero, `known`: by so much, or somewhere.
+    pub fn reopen_deflection_offset(&mut self, known: bool) {
+        self.identification.reopen_deflection_offset(known);
+    }
+
+    /// Whether a deflection is larger than any that the joint can have.
+    #[must_use]
+    pub fn is_beyond(&self, phi: f64) -> bool {
+        let largest = self.identification.largest_deflection();
+        largest > 0.0 && phi.abs() > BEYOND * largest
     }
 
     /// The estimate at a deflection a little ahead of the last sample, and whether it is of use.

@@ -13,11 +13,12 @@ import argparse
 import json
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from drivelink.output.progress import track
-from estimator import EstimatorSettings, Status, make_estimator
+from estimator import EstimatorSettings, JointModel, Record, Status, make_estimator
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
@@ -62,8 +63,18 @@ def springs(kind, K, rng):
     return *joints.polynomial(np.stack([K, K * cubic], axis=-1)), [None] * len(K)
 
 
-def measure(case, n_joints, seconds, seed):
-    """One row."""
+class Drawn(NamedTuple):
+    """One joint of an ensemble: as it is declared, what its drive read, and the truth."""
+
+    model: JointModel
+    record: Record
+    stiffness_nm_rad: np.ndarray
+    torque_noise_nm: float
+    jerk_rad_s3: float  # rms, of the link
+
+
+def draw_joints(case, n_joints, seconds, seed):
+    """The joints of a case."""
     kind, model, order, off, stiff, late, friction = CASES[case]
     rng, n = np.random.default_rng(seed), round(seconds / T)
 
@@ -76,28 +87,38 @@ def measure(case, n_joints, seconds, seed):
     plants = joints.Plants(torque, stiffness, B, D, M[:, 0], Dq[:, 0], gravity[:, 0], coulomb=friction)
     size = draw((5, 10), (15, 40))[None]
     truth = joints.simulate(plants, joints.sweep(rng, n, n_joints, 1, T, size, 4.0 if stiff else 3.0), T)
-    rows = []
     for j in range(n_joints):
         rated = 1.2 * np.abs(truth.tau[:, j]).max()
+        counts = rng.choice([4096, 8192, 16384]) * (100 if stiff else 1)
+        bits = rng.choice([17, 18] if stiff else [16, 17, 18])
+        noise = rng.uniform(0.001, 0.005) * rated
         record = joints.record(
             truth,
             j,
             T,
-            motor_counts=rng.choice([4096, 8192, 16384]) * (100 if stiff else 1),
-            link_bits=rng.choice([17, 18] if stiff else [16, 17, 18]),
+            motor_counts=counts,
+            link_bits=bits,
             velocity_rad_s=None,
-            torque_noise=rng.normal(0, rng.uniform(0.001, 0.005) * rated, (n, 1)),
+            torque_noise=rng.normal(0, noise, (n, 1)),
             link_delay=late,
         )
         parameters = {}
         if off is not None:
             (k_name, k), (shape_name, shape), low = declared[j]
             parameters = {k_name: off[0] * k, shape_name: low + off[1] * (shape - low)}
-        joint_declared = joints.joint_model(B[j, 0], D[j, 0], model=model, order=order, parameters=parameters)
-        estimator = make_estimator(joint_declared, EstimatorSettings(), T)
-        out = np.array([estimator.step(sample)[:5] for sample in record.samples()])
-        status, sigma = out[:, 1].astype(int), truth.sigma[:, j, 0]
-        usable = (status & USABLE == USABLE) & (np.arange(n) * T >= 5.0)
+        known = joints.joint_model(B[j, 0], D[j, 0], model=model, order=order, parameters=parameters)
+        jerk = np.diff(truth.q[:, j].reshape(n), 3) / T**3
+        yield Drawn(known, record, truth.sigma[:, j, 0], noise, float(np.sqrt(np.mean(jerk**2))))
+
+
+def measure(case, n_joints, seconds, seed):
+    """One row."""
+    rows = []
+    for joint in draw_joints(case, n_joints, seconds, seed):
+        estimator = make_estimator(joint.model, EstimatorSettings(), T)
+        out = np.array([estimator.step(sample)[:5] for sample in joint.record.samples()])
+        status, sigma = out[:, 1].astype(int), joint.stiffness_nm_rad
+        usable = (status & USABLE == USABLE) & (np.arange(len(out)) * T >= 5.0)
         error = out[usable, 3] - sigma[usable]
         changed = (status & int(Status.CHANGED)) > 0
         rows.append(

@@ -22,6 +22,7 @@ from drivelink.errors import RecordingError
 from drivelink.jointfile import parse
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from drivelink.recording import read
+from drivelink.recording.columns import record_from_columns
 from drivelink.recording.formats import open_sink
 from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import read_messages
@@ -320,3 +321,21 @@ def test_a_file_that_is_cut_off_is_one_warning_however_often_it_is_read(
     assert [entry.getMessage() for entry in caplog.records].count(
         f"{path}: cut off or damaged: read up to where it is whole"
     ) == 1
+
+
+def test_a_recording_of_more_motors_than_the_joint_has_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "two.mcap"
+    record(path)
+    motors = len(JOINT.motor)
+    with pytest.raises(RecordingError, match="has more motors than the joint file"):
+        list(recorded_cycles(path, motors - 1))
+    assert len(list(recorded_cycles(path, motors))) == 500
+
+
+def test_of_a_second_motor_that_the_joint_has_not_a_warning_speaks(caplog: pytest.LogCaptureFixture) -> None:
+    k = np.arange(200, dtype=float)
+    names = ("motor1_position_rad", "motor1_torque_nm", "motor2_position_rad", "link_position_rad")
+    columns = {"time_s": 1e-3 * k, **{name: np.sin(0.1 * k) for name in names}}
+    alone = parse('name = "elbow"\nmotor = [{ inertia_kg_m2 = 0.1 }]\n')
+    record_from_columns(columns, "two.csv", alone)
+    assert "two.csv: has a second motor" in caplog.text

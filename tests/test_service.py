@@ -55,6 +55,30 @@ def test_install_writes_the_unit_and_the_interface_and_uninstall_leaves_nothing(
     assert [path for path in root.rglob("*") if path.is_file()] == []
 
 
+def test_the_bus_of_the_command_line_is_the_service_s(joint: Path, tmp_path: Path) -> None:
+    root, moved = tmp_path / "root", ("--channel", "can1")
+    assert service("install", joint, "--root", root, *moved) == 0
+    unit = (root / UNIT).read_text()
+    assert f" run {joint} --channel can1\n" in unit
+    assert "sys-subsystem-net-devices-can1.device" in unit
+    assert "Name=can1" in (root / "etc/systemd/network/80-drivelink-can1.network").read_text()
+    assert service("uninstall", joint, "--root", root, *moved) == 0
+    assert [path for path in root.rglob("*") if path.is_file()] == []
+    assert service("install", joint, "--root", root, "--channel", "can 1") == 2
+
+
+def test_without_systemd_nothing_is_written(
+    joint: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("os.geteuid", lambda: 0)
+    monkeypatch.setattr(
+        "subprocess.run", lambda *_, **__: subprocess.CompletedProcess((), 1, "", "no systemd")
+    )
+    monkeypatch.setattr(Path, "write_text", lambda *_, **__: pytest.fail("something was written"))
+    assert service("install", joint) == 1
+    assert capsys.readouterr().err == "drivelink service: systemctl daemon-reload: no systemd\n"
+
+
 def test_what_somebody_has_changed_is_replaced_only_when_asked(
     joint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 from drivelink import jointfile
+from drivelink.cli import add_bus, moved
 from drivelink.errors import DrivelinkError, UsageError
 from drivelink.systemd.unit import UNITS, installation, network_files, unit_name
 
@@ -23,6 +24,7 @@ examples:
   sudo drivelink service install elbow.toml                    start now and at every boot
   drivelink service install elbow.toml --root stage            write the files below a folder, start nothing
   sudo drivelink service install elbow.toml --allow 10.0.0.0/24 --credential daemon.key=/etc/keys/daemon.key
+  sudo drivelink service install elbow.toml --channel can1     on another interface than the joint file's
   sudo drivelink service uninstall elbow.toml
 """
 
@@ -46,6 +48,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--credential", action="append", default=[], metavar="NAME=FILE", help="a key that zenoh.config names"
     )
+    add_bus(parser)
     parser.add_argument("--force", action="store_true", help="replace files that are there and differ")
     parser.add_argument("--json", action="store_true", help="print what was done as one JSON object")
 
@@ -60,12 +63,16 @@ def run(args: argparse.Namespace) -> int:
 
 def _install(args: argparse.Namespace, root: Path) -> int:
     path = Path(args.joint)
-    joint = jointfile.load(path)
-    made = installation(joint, path, _executable(), allow=args.allow, credentials=args.credential)
+    joint = moved(jointfile.load(path), args)
+    asked = {"--interface": args.interface, "--channel": args.channel}
+    bus = [word for option, value in asked.items() if value for word in (option, value)]
+    made = installation(joint, path, _executable(), bus=bus, allow=args.allow, credentials=args.credential)
     for place, text in made.files.items():
         there = root / place
         if there.exists() and there.read_text(encoding="utf-8") != text and not args.force:
             raise UsageError(f"{there}: exists already and differs; --force replaces it")
+    if args.root is None:
+        _systemctl("daemon-reload")  # where there is no systemd, nothing is written
     for place, text in made.files.items():
         (root / place).parent.mkdir(parents=True, exist_ok=True)
         (root / place).write_text(text, encoding="utf-8")
@@ -92,7 +99,7 @@ def _print_json(unit: str, what: str, files: list[Path], running: bool) -> None:
 def _uninstall(args: argparse.Namespace, root: Path) -> int:
     name, channel = args.joint, ""
     if name.endswith(".toml"):
-        joint = jointfile.load(Path(name))
+        joint = moved(jointfile.load(Path(name)), args)
         name, channel = joint.name, joint.bus.channel
     unit = unit_name(name)
     there = root / UNITS / unit

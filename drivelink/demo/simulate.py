@@ -191,7 +191,7 @@ def _asked(effects: Sequence[str]) -> list[PlantEffect]:
     try:
         return [parse(text) for text in effects]
     except SimError as error:
-        raise UsageError(f"--effect: {error}") from error
+        raise UsageError(f"--effect: {str(error).removeprefix('effect: ')}") from error
 
 
 def _excitation(section: SimSection, plant: JointPlant, given: Case | None) -> Mapping[str, Any]:

@@ -52,6 +52,8 @@ def recorded_cycles(path: Path, motors: int, scale: Mapping[str, float] | None =
                 for name, factor in (scale or {}).items():
                     if isinstance(fields.get(name), float):
                         fields[name] *= factor
+                if not found and f"motor{motors + 1}_position_rad" in fields:
+                    raise RecordingError(f"{path}: has more motors than the joint file, which has {motors}")
                 sample = read_sample(fields, motors)
                 found = True
                 before = waiting.get(sample.sequence)

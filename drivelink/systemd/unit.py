@@ -53,6 +53,7 @@ def installation(
     path: Path,
     executable: Path,
     *,
+    bus: Sequence[str] = (),
     allow: Sequence[str] = (),
     credentials: Sequence[str] = (),
 ) -> Installation:
@@ -62,6 +63,7 @@ def installation(
         joint: the joint file's content.
         path: where it is.
         executable: the installed `drivelink`.
+        bus: options of `drivelink run` that name the bus, where it is another than the joint file's.
         allow: addresses beside this machine that may connect, e.g. "10.0.0.0/24".
         credentials: "NAME=FILE": keys that the unit hands to the daemon as
             `/run/credentials/drivelink@JOINT.service/NAME`.
@@ -84,7 +86,7 @@ def installation(
         "name": joint.name,
         "device": f"sys-subsystem-net-devices-{_escape(channel)}.device" if can else "",
         "executable": _plain(executable),
-        "joint": _plain(path),
+        "joint": " ".join((_plain(path), *map(_word, bus))),
         "folder": _plain(path.parent),
         "paths": "\n".join(f"BindReadOnlyPaths={_plain(place)}" for place in seen),
         "devices": "DeviceAllow=char-ttyACM rw\nDeviceAllow=char-ttyUSB rw\nSupplementaryGroups=dialout"
@@ -140,6 +142,13 @@ def _plain(path: Path) -> str:
     if not _BARE.fullmatch(str(path)):
         raise UsageError(f"{path}: expected a path without spaces and special characters for a unit")
     return str(path)
+
+
+def _word(text: str) -> str:
+    """An option as it stands in a unit."""
+    if not _BARE.fullmatch(text):
+        raise UsageError(f"{text}: expected no spaces and special characters for a unit")
+    return text
 
 
 def _escape(channel: str) -> str:

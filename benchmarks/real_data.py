@@ -154,13 +154,15 @@ def against_sensor(model: JointModel, record: Record, sensor_nm: FloatArray) -> 
 
     push = np.array(external)
     good = np.isfinite(push)
+    if not any(good[late]):
+        push, good = np.full_like(push, np.nan), np.ones_like(good)
     bridged = np.interp(np.arange(len(push)), np.flatnonzero(good), push[good])
     same = StateVariableFilter(3, EstimatorSettings().external_bandwidth_rad_s, record.period_s)
     behind_filter = -sosfiltfilt(slow, same.apply(sensor_nm)[0])[late][good[late]]
     pushed = sosfiltfilt(slow, bridged)[late][good[late]]
     return {
         "external": float(np.std(pushed - behind_filter) / np.std(behind_filter)),
-        "external_valid": float(np.mean(good[late])),
+        "external_valid": float(np.mean(np.isfinite(push[late]))),
         "external_mean": (float(np.mean(pushed)), float(np.mean(behind_filter))),
         "on_line": error(np.array([one.flexibility_torque_nm for one in said])),
         "valid": float(np.mean([one.status & Status.VALID for one in said[late]])),

@@ -16,8 +16,10 @@ import numpy as np
 
 from estimator.diagnosis.bandwidth import choose_bandwidth
 from estimator.diagnosis.choices import choice, whole
-from estimator.diagnosis.covariance import hac_covariance
+from estimator.diagnosis.covariance import design_effects, hac_covariance
 from estimator.diagnosis.hypothesis import Fitted, Problem
+from estimator.diagnosis.search import Search
+from estimator.diagnosis.stiffness import middle
 from estimator.errors import EstimatorError
 from estimator.gate import check, refuse
 from estimator.model import JointModel, ParameterValue, Transmission
@@ -41,7 +43,7 @@ class TransmissionFit:
 
     Attributes:
         model: transmission model's name.
-        parameters: by their names in the joint file; empty where it is rigid.
+        parameters: by their names in the joint file; empty where it is rigid, or not determined.
         std: their standard deviations, by the same names.
         alpha: parameters as an array.
         covariance: of alpha.
@@ -52,7 +54,7 @@ class TransmissionFit:
         unexplained_nm: (rows,) what is left of the motor's balance there, with the friction that is not
             declared.
         error_rms_nm: what is left of the motor's balance.
-        torque_rms_nm: of the flexibility torque; of the motor torque, where it is rigid.
+        torque_rms_nm: of the flexibility torque; of the motor torque, where that is not determined.
         inertia_kg_m2: B, as fitted.
         viscous_damping_nm_s_rad: D, likewise.
         coulomb_nm: friction beyond what is declared; mean of the recordings.
@@ -62,7 +64,7 @@ class TransmissionFit:
         torque_delay_s: by which the torque acts later than reported, likewise.
         nuisance_std: standard deviations of the last seven: "inertia", "damping", "coulomb", "offset",
             "shift", "link_delay", "torque_delay".
-        excited: whether the recordings reveal the stiffness at all.
+        excited: whether the recordings determine the stiffness (`estimator.diagnosis.stiffness.Middle`).
     """
 
     model: str
@@ -281,7 +283,7 @@ def _aligned(records: Sequence[Record], problem: Problem, free: Fitted) -> Joint
 def _covariance(problem: Problem, fitted: Fitted) -> FloatArray:
     """Covariance of the parameters; what a sign holds at its bound is as uncertain as before any data."""
     covariance = hac_covariance(problem, fitted)
-    held = np.flatnonzero(fitted.posterior.bound & [s.kind == "everyday" for s in fitted.slots])
+    held = np.flatnonzero(fitted.posterior.bound & [s.kind in ("everyday", "base") for s in fitted.slots])
     covariance[held, held] = fitted.regression.std[held] ** 2
     return covariance
 
@@ -327,11 +329,18 @@ def transmission_fits(joint: JointFit) -> list[TransmissionFit]:
     left = fitted.regression.residual(fitted.posterior.x)
     base = fitted.moved_base(problem)
     spring = np.concatenate([fitted.base.torque(frame) for frame in frames])
+    search, effects = Search(problem, null=fitted), design_effects(problem, fitted)
     made = []
     for i, (motor, law) in enumerate(zip(problem.model.motors, base.models(frames[0]), strict=True)):
         rows = problem.group % problem.equations == i
         mine = [j for j, s in enumerate(fitted.slots) if s.kind == "base" and s.motor == i]
         alpha, covariance = base.alpha[i], joint.covariance[np.ix_(mine, mine)]
+        excited = False
+        if law is not None:
+            unseen = search.unseen(fitted, mine[0], float(effects[mine[0]]))
+            covariance = covariance + unseen[np.ix_(mine, mine)]
+            phi = np.concatenate([f.motors[i].deflection for f in frames])
+            excited = middle(law, alpha, covariance, phi).determined and not any(fitted.posterior.bound[mine])
         std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         torque = (spring + fitted.regression.design[:, mine] @ fitted.posterior.x[mine])[rows]
         measured = problem.torque()[rows]
@@ -345,8 +354,8 @@ def transmission_fits(joint: JointFit) -> list[TransmissionFit]:
         made.append(
             TransmissionFit(
                 model=RIGID if law is None else law.name,
-                parameters={} if law is None else law.parameters(alpha),
-                std={} if law is None else law.parameters(std),
+                parameters=law.parameters(alpha) if law is not None and excited else {},
+                std=law.parameters(std) if law is not None and excited else {},
                 alpha=alpha,
                 covariance=covariance,
                 deflection_rad=np.concatenate([f.project(f.motors[i].deflection) for f in frames]),
@@ -357,7 +366,7 @@ def transmission_fits(joint: JointFit) -> list[TransmissionFit]:
                 torque_nm=torque + left[rows],
                 unexplained_nm=(left + _friction(joint, i))[rows],
                 error_rms_nm=float(np.sqrt(np.mean(left[rows] ** 2))),
-                torque_rms_nm=float(np.std(measured if law is None else torque)),
+                torque_rms_nm=float(np.std(torque if excited else measured)),
                 inertia_kg_m2=motor.inertia_kg_m2 + inertia,
                 viscous_damping_nm_s_rad=max(motor.viscous_damping_nm_s_rad + damping, 0.0),
                 coulomb_nm=coulomb,
@@ -374,7 +383,7 @@ def transmission_fits(joint: JointFit) -> list[TransmissionFit]:
                     "link_delay": link_delay_std,
                     "torque_delay": torque_delay_std,
                 },
-                excited=law is not None and bool(std[0] < 0.25 * abs(alpha[0])),
+                excited=excited,
             )
         )
     return made

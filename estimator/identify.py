@@ -84,7 +84,9 @@ def identify(
     fits = transmission_fits(joint)
     notes = list(joint.doubts)
     motors = tuple(
-        replace(_fitted(motor, one), effects=_effects(joint, motor.effects, i, notes))
+        replace(_fitted(motor, one), effects=motor.effects)
+        if motor.flexible and not one.excited  # the readings' errors show through the spring
+        else replace(_fitted(motor, one), effects=_effects(joint, motor.effects, i, notes))
         for i, (motor, one) in enumerate(zip(model.motors, fits, strict=True))
     )
     link, link_std = _link(joint)

@@ -78,6 +78,12 @@ PRIORS: dict[str, Prior] = {
     "effect": Prior(
         0.3, "torque", "torque of a missing effect", "larger ones are the joint's main physics, and declared"
     ),
+    "load_dependent_friction": Prior(
+        0.25, "absolute", "torque that a gear loses, as a share", "1 - e of gears with e from 0.6 to 0.95"
+    ),
+    "back_driving_loss": Prior(
+        0.36, "absolute", "the same of one that the link drives", "1/e - 1 of the same gears"
+    ),
     "declared": Prior(
         0.01, "declared", "a declared number, link dynamics declared too", "a rig that has been calibrated"
     ),

@@ -79,9 +79,9 @@ def test_intervals_cover_about_as_often_as_they_say(elbow):
         (found,) = fit(_record(truth, j), joints.joint_model(plants.B[j, 0], plants.D[j, 0]))
         z += ((found.alpha - alpha[j]) / np.sqrt(np.diag(found.covariance))).tolist()
     # 24 numbers of unit variance: their rms is 1 within 0.15 (one sigma); naive intervals give 3 to 5.
-    # A standard deviation is the 95 % interval of few groups of rows over 1.96, up to 1.4 times the usual one
-    # (`hac_covariance`), so the lower bound of 0.5 is one of 0.35.
-    assert 0.35 < np.sqrt(np.mean(np.square(z))) < 1.6
+    # These joints lack nothing, but an interval also holds what an effect that the motion does not tell from
+    # the spring could make of it (`Search.unseen`): half as much again, so the lower bound is not 0.5.
+    assert 0.3 < np.sqrt(np.mean(np.square(z))) < 1.6
 
 
 @pytest.mark.parametrize("b", [2.0, 8.0, 40.0])

@@ -152,7 +152,7 @@ def _print(found: Identified, paths: Sequence[Path]) -> None:
         _add_effects(table, motor.effects)
         console.print(table)
         share = one.error_rms_nm / one.torque_rms_nm
-        whole = "motor torque" if one.model == RIGID else "flexibility torque"
+        whole = "flexibility torque" if one.excited else "motor torque"
         print(f"  torque balance: {one.error_rms_nm:.3g} N·m rms left, {100 * share:.2f} % of the {whole}")
         for line in _remarks(one):
             print(f"  {line}")
@@ -208,8 +208,11 @@ def _remarks(one: TransmissionFit) -> list[str]:
     if one.model == RIGID:
         return remarks
     if not one.excited:
-        remarks.append("the motion hardly reveals the stiffness: record one with more deflection")
-    if not one.stiffens:
+        remarks.append(
+            "the motion does not determine the stiffness to half of itself, so none is reported: "
+            "record one with more deflection, driven both ways and by either side"
+        )
+    elif not one.stiffens:
         remarks.append(
             "the stiffness is not above zero, or its interval is not: no spring is like that. "
             "Check the signs of position and torque, and the inertia"

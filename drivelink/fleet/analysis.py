@@ -124,7 +124,7 @@ def _row(number: int, one: TransmissionFit) -> TransmissionRow:
         parameters=json.dumps(_plain(one.parameters)),
         parameters_std=json.dumps(_plain(one.std)),
         covariance=one.covariance.ravel().tolist(),
-        named={} if rigid else {name: _named(one, deflection, share) for name, share in NAMED.items()},
+        named={name: _named(one, deflection, share) for name, share in NAMED.items()} if one.excited else {},
         deflection_rms_rad=math.nan if rigid else float(np.sqrt(np.mean(deflection**2))),
         torque_rms_nm=one.torque_rms_nm,
         excited=one.excited,

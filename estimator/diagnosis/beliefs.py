@@ -119,6 +119,8 @@ def effect_std(model: JointModel, candidate: Candidate, by_torque: float) -> flo
         return PRIORS["anchor"].std * model.link.inertia_kg_m2
     if name in ("torque_constant", "torque_drift"):
         return PRIORS["torque_scale"].std
+    if name in ("load_dependent_friction", "back_driving_loss"):
+        return PRIORS[name].std
     if name in ("torque_delay", "torque_lag", "encoder_delay"):
         return min(PRIORS["late"].std, by_torque)
     return (

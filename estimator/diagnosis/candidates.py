@@ -191,12 +191,13 @@ def grid(frame: Frame, candidate: Candidate, smoothing_rad_s: float) -> list[dic
         return _vary(fixed, "smoothing_rad_s", smooth)
     if kind.remembers:
         path = c.position if kind.location == "motor" else c.deflection
-        scales = _spread(path) * np.geomspace(0.0002, 0.5, 11)
+        scales = _spread(path) * np.geomspace(0.0002, 0.5, 11 if _spread(path) > 0.0 else 0)
         return [{"displacement_rad": float(d), "exponent": n, "shape": b} for n, b in LAWS for d in scales]
     if kind.name in ("cogging", "kinematic_error"):
         return _vary(fixed, "periods_per_rev", _waves(frame, c))
     if kind.name == "backlash":
-        return _vary(fixed, "half_gap_rad", np.quantile(np.abs(c.deflection), np.linspace(0.05, 0.9, 9)))
+        gaps = np.quantile(np.abs(c.deflection), np.linspace(0.05, 0.9, 9))
+        return _vary(fixed, "half_gap_rad", gaps[gaps > 0.0])
     if kind.name == "higher_order_stiffness":
         declared = _declared_power(frame, candidate.motor or 0)
         return _vary(fixed, "power", np.array([p for p in (3.0, 5.0, 7.0) if p > declared][:2]))

@@ -122,6 +122,10 @@ CHOICES: dict[str, Choice] = {
     "groups": Choice(
         10, "", "stretches of time, and kinds of motion", "more say less each, fewer are unsure"
     ),
+    "moderation": Choice(
+        4.0, "groups", "that the variance of rows as independent as they look counts for",
+        "it is right within a factor of three: chi-squared of four degrees of freedom",
+    ),
     "held": Choice(3, "in ten groups", "held out of a single recording", "a quarter"),
     "far": Choice(
         10.0, "floor", "what names leave at which something unnamed is missing", "an order of magnitude"

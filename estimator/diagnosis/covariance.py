@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.stats import t as student
 
-from estimator.diagnosis.choices import whole
+from estimator.diagnosis.choices import choice, whole
 from estimator.diagnosis.hypothesis import Fitted, Problem, stretches
 from estimator.sample import FloatArray
 
-__all__ = ["hac_covariance"]
+__all__ = ["design_effects", "hac_covariance"]
 
 
 _FULL = 1e-9  # leverage is below one by the priors; this only keeps a division from rounding
@@ -28,44 +28,74 @@ Labels = NDArray[np.int64]
 
 
 def hac_covariance(problem: Problem, fitted: Fitted) -> FloatArray:
-    """(k, k) covariance of the posterior's parameters.
+    """(k, k) covariance of the posterior's parameters, never less than the posterior's own.
 
-    That by stretches of time, and what kinds of motion add to it beyond rows that share both. The part of the
-    priors is added. It is never less than the posterior's own covariance.
+    Standard deviations are those whose 1.96-fold is the 95 % interval of a t distribution: few groups of rows
+    leave a variance unsure, and a parameter that only some of them determine has fewer still.
 
     Args:
         problem: the recordings.
         fitted: to all of them.
     """
+    free, moderated, freedom = _moderated(problem, fitted)
+    out = np.zeros((len(fitted.posterior.x),) * 2)
+    wider = student.ppf(_LEVEL, freedom) / student.ppf(_LEVEL, np.inf)
+    least = np.sqrt(np.maximum(1.0 / np.maximum(np.diag(moderated), 1e-300), 1.0))
+    unit = _unit(fitted, free) * wider * least
+    out[np.ix_(free, free)] = moderated * np.outer(unit, unit)
+    return out
+
+
+def design_effects(problem: Problem, fitted: Fitted) -> FloatArray:
+    """(k,) variance of each parameter over what it had if rows were as independent as they look, at least 1.
+
+    So many rows say no more than one (Kish, Survey Sampling, 1965).
+    """
+    free, moderated, _ = _moderated(problem, fitted)
+    out = np.ones(len(fitted.posterior.x))
+    out[free] = np.maximum(np.diag(moderated), 1.0)
+    return out
+
+
+def _unit(fitted: Fitted, free: NDArray[np.int64]) -> FloatArray:
+    """(f,) standard deviations of the free parameters by the posterior."""
+    return np.sqrt(np.maximum(np.diag(fitted.posterior.covariance)[free], 1e-300))
+
+
+def _moderated(problem: Problem, fitted: Fitted) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
+    """(free parameters, their covariance over the posterior's deviations, degrees of freedom of each).
+
+    The clustered covariance is that by stretches of time, and what kinds of motion add to it beyond rows that
+    share both; the part of the priors is added. Of few groups it is itself a guess, so it is moderated by the
+    posterior's own, which counts as so many groups (Smyth, Statistical Applications in Genetics and Molecular
+    Biology 3, 2004).
+    """
     posterior = fitted.posterior
     free = np.flatnonzero(~posterior.bound)
-    out = np.zeros((len(posterior.x),) * 2)
     if not len(free):
-        return out
-    own = posterior.covariance[np.ix_(free, free)]
-    unit = np.sqrt(np.maximum(np.diag(own), 1e-300))
-    bread = own / np.outer(unit, unit)
+        return free, np.zeros((0, 0)), np.zeros(0)
+    unit = _unit(fitted, free)
+    bread = posterior.covariance[np.ix_(free, free)] / np.outer(unit, unit)
     stretch = stretches(problem)
     kind = np.where(stretch < 0, -1, _kinds(problem, fitted))
     both = np.where(stretch < 0, -1, stretch * whole("groups") + kind)
-    by_time, by_kind, by_both = (_clustered(fitted, free, unit, bread, x) for x in (stretch, kind, both))
+    by_time, freedom = _clustered(fitted, free, unit, bread, stretch)
+    by_kind, by_both = (_clustered(fitted, free, unit, bread, x)[0] for x in (kind, both))
     values, vectors = np.linalg.eigh(by_kind - by_both)
     prior = np.diag((unit / fitted.regression.std[free]) ** 2)
-    total = by_time + (vectors * np.maximum(values, 0.0)) @ vectors.T + bread @ prior @ bread
-    scale = unit * np.sqrt(np.maximum(1.0 / np.diag(total), 1.0))
-    out[np.ix_(free, free)] = total * np.outer(scale, scale)
-    return out
+    clustered = by_time + (vectors * np.maximum(values, 0.0)) @ vectors.T + bread @ prior @ bread
+    total = freedom + choice("moderation")
+    own, theirs = np.sqrt(choice("moderation") / total), np.sqrt(freedom / total)
+    return free, bread * np.outer(own, own) + clustered * np.outer(theirs, theirs), total
 
 
 def _clustered(
     fitted: Fitted, free: NDArray[np.int64], unit: FloatArray, bread: FloatArray, labels: Labels
-) -> FloatArray:
-    """Covariance of x / unit where errors of one group of rows belong together, noise as it is.
+) -> tuple[FloatArray, FloatArray]:
+    """(covariance of x / unit where errors of one group of rows belong together, degrees of freedom).
 
-    What a fit takes of a group's errors by its leverage H is given back: (1 - H)^(-1/2) e (CR2). Few groups
-    leave the variance unsure, and a parameter that only some of them determine has fewer still: their
-    effective number is (sum h)^2 / sum h^2, h the part of each in its variance. Standard deviations are
-    those whose 1.96-fold is the 95 % interval of the t distribution that this leaves.
+    What a fit takes of a group's errors by its leverage H is given back: (1 - H)^(-1/2) e (CR2). The
+    effective number of groups is (sum h)^2 / sum h^2, h the part of each in a parameter's variance.
     """
     regression = fitted.regression
     weight = np.sqrt(1.0 / (fitted.times * fitted.posterior.sigma**2))[regression.group]
@@ -85,8 +115,7 @@ def _clustered(
         parts.append(np.sum((a @ bread) ** 2, axis=0))
     h = np.array(parts)
     freedom = np.sum(h, axis=0) ** 2 / np.maximum(np.sum(h**2, axis=0), 1e-300) - 1.0
-    wider = student.ppf(_LEVEL, np.maximum(freedom, 1.0)) / student.ppf(_LEVEL, np.inf)
-    return np.asarray(total * np.outer(wider, wider))
+    return total, np.maximum(freedom, 0.0)
 
 
 def _kinds(problem: Problem, fitted: Fitted) -> Labels:

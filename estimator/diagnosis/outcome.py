@@ -8,11 +8,12 @@ import numpy as np
 
 from estimator.diagnosis.candidates import columns
 from estimator.diagnosis.choices import choice
-from estimator.diagnosis.covariance import hac_covariance
+from estimator.diagnosis.covariance import design_effects, hac_covariance
 from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.diagnosis.result import Curve, Finding, Refitted, Rival, Series
 from estimator.diagnosis.search import Search
 from estimator.diagnosis.stack import curve_columns
+from estimator.diagnosis.stiffness import middle
 from estimator.effects import LIBRARY
 from estimator.model import ParameterValue
 from estimator.sample import FloatArray
@@ -135,14 +136,12 @@ def transmissions_of(
 
     Its covariance is that of the fit and that between the accounts of the data (Bayesian model averaging;
     Hoeting et al., Statistical Science 14, 1999): where another set of effects would do as well, it may ask
-    for another stiffness. And it holds what any one effect that was not needed could make of it.
+    for another stiffness. And it holds what the effects that were not needed could make of it.
 
-    A stiffness that is not above zero, or whose interval includes zero, is no stiffness: its parameters are
-    left out, and a doubt says so.
+    A stiffness that these data do not determine has no parameters, and a doubt says so.
     """
     problem = search.problem
-    covariance = hac_covariance(problem, after)
-    unseen = search.unseen(after)
+    covariance, effects = hac_covariance(problem, after), design_effects(problem, after)
     made: list[Refitted] = []
     doubts = []
     for i, model in enumerate(after.base.models(problem.frames[0])):
@@ -151,17 +150,13 @@ def transmissions_of(
             made.append(Refitted("none", {}, {}))
             continue
         alpha = np.array([after.slots[j].taken + after.posterior.x[j] for j in mine])
-        own = covariance[np.ix_(mine, mine)] + _between(after, accounts, i, alpha)
-        phi = problem.frames[0].motors[i].deflection
-        middle = float(np.median(np.abs(phi)))
-        slope = np.asarray(model.stiffness_jacobian(np.array([middle]), alpha))[0]
-        own = own + max((x[np.ix_(mine, mine)] for x in unseen), key=lambda x: float(slope @ x @ slope))
-        stiffness = float(np.asarray(model.stiffness(np.array([middle]), alpha))[0])
-        std = float(np.sqrt(max(slope @ own @ slope, 0.0)))
-        if not stiffness - 1.96 * std > 0.0 or any(after.posterior.bound[mine]):
+        own = (covariance + search.unseen(after, mine[0], float(effects[mine[0]])))[np.ix_(mine, mine)]
+        own = own + _between(after, accounts, i, alpha)
+        found = middle(model, alpha, own, problem.frames[0].motors[i].deflection)
+        if not found.determined or any(after.posterior.bound[mine]):
             doubts.append(
-                f"the stiffness of motor {i + 1} is undetermined: {stiffness:.4g} ± {1.96 * std:.2g} N·m/rad "
-                "includes zero"
+                f"these data do not determine the stiffness of motor {i + 1}: {found.stiffness_nm_rad:.4g} "
+                f"± {1.96 * found.std_nm_rad:.2g} N·m/rad (95 %)"
             )
             made.append(Refitted(model.name, {}, {}))
             continue

@@ -46,11 +46,12 @@ class _Tried(NamedTuple):
     shift: FloatArray  # (k, m) of x per prior standard deviation of the effect's parameters
     precision: FloatArray  # (m, m) of these
 
-    def more(self) -> FloatArray:
-        """(k, k) by which the covariance of x grows."""
+    def more(self, effect: float) -> FloatArray:
+        """(k, k) by which the covariance of x grows; so many rows say of the effect what one does."""
         if not math.isfinite(self.gain):
             return np.zeros((len(self.shift),) * 2)
-        return np.asarray(self.shift @ np.linalg.solve(self.precision, self.shift.T))
+        eye = np.eye(len(self.precision))
+        return np.asarray(self.shift @ np.linalg.solve(eye + (self.precision - eye) / effect, self.shift.T))
 
 
 class _Beside(NamedTuple):
@@ -64,11 +65,14 @@ class Search:
     Args:
         problem: the recordings and the declared model.
         progress: called with the current step.
+        null: the declared model at its best fit, where that is known.
     """
 
-    def __init__(self, problem: Problem, progress: Progress = lambda _: None) -> None:
+    def __init__(
+        self, problem: Problem, progress: Progress = lambda _: None, null: Fitted | None = None
+    ) -> None:
         self.problem, self._progress = problem, progress
-        self.null = problem.null()
+        self.null = null or problem.null()
         self._singles: list[Fitted] = []
         frames = problem.at(self.null.corrections, self.null.base)
         self._library = []
@@ -217,23 +221,35 @@ class Search:
         more = [t for _, t in found[tried:] if like is not None and t.candidate.family == like.family]
         return [term for _, term in found[:tried]] + more
 
-    def unseen(self, parent: Fitted) -> list[FloatArray]:
-        """What each effect that is not in a hypothesis adds to its covariance, as large as effects may be.
+    def unseen(self, parent: Fitted, place: int, effect: float) -> FloatArray:
+        """What the effects that are not in a hypothesis add to its covariance, as large as effects may be.
 
-        An effect that was not needed may be there all the same, where the motion does not separate it from
-        the rest: a gear that loses torque, and is always driven the same way, looks like a softer spring.
-        This is the covariance of the larger model less that of the hypothesis (consider covariance;
-        S. F. Schmidt, Advances in Control Systems 3, 1966).
+        An effect that was not needed may be there all the same, where the motion does not tell it from the
+        rest: a gear that loses torque, and is always driven the same way, looks like a softer spring. It adds
+        the covariance of the larger model less that of the hypothesis (consider covariance; S. F. Schmidt,
+        Advances in Control Systems 3, 1966). Families of effects are independent contributions (JCGM 100,
+        5.1.2); laws of one family are the same thing, and the one that adds most stands for it.
+
+        Args:
+            parent: the hypothesis.
+            place: of the parameter in question.
+            effect: so many rows say what one independent row does (`design_effects`).
 
         Returns:
-            (k, k) for each effect of the library, at the shape that promises most; not of those that bend the
-            transmission's curve, which make another model of it.
+            (k, k), each effect at the shape that promises most. Those that bend the transmission's curve make
+            another model of it and have no part, nor has the scale of the torque in a fit: it is the anchor.
         """
-        return [
-            max(one.tried, key=lambda x: x.gain).more()
-            for one in self._library_beside(parent)
-            if not one.candidate.bends
-        ]
+        families: dict[tuple[object, ...], FloatArray] = {}
+        nothing = np.zeros_like(parent.posterior.covariance)
+        for one in self._library_beside(parent):
+            candidate = one.candidate
+            if candidate.bends or (self.problem.calibrating and candidate.kind.channel == "motor_torque"):
+                continue
+            more = max(one.tried, key=lambda x: x.gain).more(effect)
+            _, *family = candidate.family  # either side of the motor's balance is the same to it
+            before = families.get(tuple(family), nothing)
+            families[tuple(family)] = max(more, before, key=lambda x: float(x[place, place]))
+        return np.asarray(sum(families.values(), nothing))
 
     def _library_beside(self, parent: Fitted) -> Iterator[_Beside]:
         """Every effect that a hypothesis has not, over its grid, linearised."""

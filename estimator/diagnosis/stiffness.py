@@ -1,6 +1,8 @@
-"""Stiffness over deflection before and after a diagnosis, with the uncertainty of both."""
+"""Stiffness over deflection with its uncertainty, and whether it may be said at all."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -8,11 +10,48 @@ from estimator.diagnosis.covariance import hac_covariance
 from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.diagnosis.result import StiffnessCurve
 from estimator.sample import FloatArray
+from estimator.transmissions import TransmissionModel
 
-__all__ = ["stiffness_curves"]
+__all__ = ["Middle", "middle", "stiffness_curves"]
 
 _POINTS = 121
+_SIGMA_95 = 1.96
 _OUTERMOST = 0.99  # quantile of the deflections: what is beyond is a few samples
+
+
+class Middle(NamedTuple):
+    """A transmission's stiffness at the middle of the deflections seen.
+
+    Attributes:
+        stiffness_nm_rad: N·m/rad. std_nm_rad: its standard deviation.
+        slope: (n,) of the stiffness over the transmission's parameters.
+    """
+
+    stiffness_nm_rad: float
+    std_nm_rad: float
+    slope: FloatArray
+
+    @property
+    def determined(self) -> bool:
+        """Whether it is known to half of itself (95 %).
+
+        A control loop has a gain margin of two as a rule: with a stiffness that is further off it has none.
+        """
+        return _SIGMA_95 * self.std_nm_rad < 0.5 * self.stiffness_nm_rad
+
+
+def middle(model: TransmissionModel, alpha: FloatArray, covariance: FloatArray, phi: FloatArray) -> Middle:
+    """The stiffness at the median of the deflections' sizes.
+
+    Args:
+        model: the transmission.
+        alpha: (n,) its parameters. covariance: (n, n) of them.
+        phi: deflections seen, rad.
+    """
+    at = np.array([float(np.median(np.abs(phi)))])
+    slope = np.asarray(model.stiffness_jacobian(at, alpha))[0]
+    variance = float(slope @ covariance @ slope)
+    return Middle(float(np.asarray(model.stiffness(at, alpha))[0]), float(np.sqrt(max(variance, 0.0))), slope)
 
 
 def stiffness_curves(problem: Problem, before: Fitted, after: Fitted) -> tuple[StiffnessCurve, ...]:

@@ -152,3 +152,9 @@ def test_record_takes_another_bus(tmp_path: Path, capsys: pytest.CaptureFixture[
     out = str(tmp_path / "elbow.log")
     assert main(["record", str(joint), "--out", out, "--source", "bus", "--channel", "can77"]) == 4
     assert "can77" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["fit", "a.csv", "./a.csv"], ["diagnose", "a.csv", "--validate", "a.csv"]])
+def test_no_recording_validates_itself(words, capsys):
+    assert main(words) == 2
+    assert "given twice: expected another recording" in capsys.readouterr().err

@@ -13,6 +13,7 @@ import logging
 import math
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -23,7 +24,17 @@ from estimator.errors import EstimatorError
 if TYPE_CHECKING:
     from drivelink.jointfile import JointFile
 
-__all__ = ["ALONE", "VERBS", "add_bus", "add_map", "add_recordings", "main", "make_parser", "moved"]
+__all__ = [
+    "ALONE",
+    "VERBS",
+    "add_bus",
+    "add_map",
+    "add_recordings",
+    "main",
+    "make_parser",
+    "moved",
+    "require_distinct",
+]
 
 VERBS = {
     "demo": "everything without hardware: simulated drives, daemon, subscriber, live view",
@@ -161,6 +172,21 @@ def add_recordings(parser: argparse.ArgumentParser) -> None:
         help="of the filter that all channels share; left out: chosen from the data",
     )
     add_map(parser)
+
+
+def require_distinct(paths: Sequence[Path]) -> None:
+    """Raise unless every recording is another one: none may validate a fit that it took part in.
+
+    Raises:
+        UsageError: one is given twice.
+    """
+    seen: set[Path] = set()
+    for path in paths:
+        if path.resolve() in seen:
+            raise UsageError(
+                f"{path}: given twice: expected another recording, which takes no part in the fit"
+            )
+        seen.add(path.resolve())
 
 
 def _bandwidth(text: str) -> float:

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from drivelink import recording
-from drivelink.cli import add_recordings
+from drivelink.cli import add_recordings, require_distinct
 from drivelink.errors import RecordingError
 from drivelink.jointfile import apply_diagnosis
 from drivelink.output import report
@@ -57,6 +57,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Do the job; return the exit status."""
+    require_distinct([*args.recording, *([args.validate] if args.validate else [])])
     source = joint_of(args.recording[0], args.joint)
     joint, base, names = source.joint, source.folder, parse_column_map(args.map)
     inputs = [path for path in (*args.recording, args.validate, args.joint) if path is not None]

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from drivelink import jointfile
-from drivelink.cli import add_recordings
+from drivelink.cli import add_recordings, require_distinct
 from drivelink.errors import RecordingError, UsageError
 from drivelink.output.outfile import check_target
 from drivelink.recording.mapping import joint_of
@@ -43,6 +43,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Do the job; return the exit status."""
     folder = _plots_folder(args)
+    require_distinct(args.recording)
     if args.joint is not None:
         jointfile.load(args.joint)  # it is named first when both are wrong
     for path in args.recording:

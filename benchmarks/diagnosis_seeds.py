@@ -4,7 +4,8 @@
 
 Every joint, motion and effect is drawn from its seed: soft joints of 80 to 220 N·m/rad with encoders and
 torque noise as drives have them, effects of 3 to 30 % of the torque. The world is `sim`, which shares no code
-with the estimator.
+with the estimator. Told: named first, or an alternative with a probability of 0.1 or more. Wrong and certain:
+a name that the joint does not carry, with a probability above 0.9.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import numpy as np
 from drivelink.demo.simulate import world_from_joint
 from drivelink.jointfile import JointFile, parse
 from drivelink.output.progress import track
-from estimator.diagnosis import diagnose
+from estimator.diagnosis import Finding, diagnose
 from estimator.effects import LIBRARY
 from estimator.sample import Record
 from sim.world import record
@@ -132,6 +133,24 @@ def measured(joint: JointFile, seconds: float) -> Record:
     )
 
 
+LIKELY, CERTAIN = 0.1, 0.9
+
+
+def told(effects: Sequence[Finding]) -> set[str]:
+    """The names in a diagnosis, and the alternatives that are likely enough."""
+    names = {effect.name for effect in effects}
+    for effect in effects:
+        pairs = zip(effect.alternatives, effect.alternative_probabilities, strict=True)
+        names |= {name for name, probability in pairs if probability >= LIKELY}
+    return names
+
+
+def wrong_and_certain(effects: Sequence[Finding], real: Sequence[str]) -> list[str]:
+    """The names in a diagnosis that are stated as certain and are not real."""
+    listed = [e for e in effects if e.name != "unlisted" and e.name not in real]
+    return [e.name for e in listed if e.probability > CERTAIN]
+
+
 def judged(name: str, seed: int, seconds: float) -> dict[str, Any]:
     """One recording made and diagnosed."""
     clean = name not in LIBRARY
@@ -146,7 +165,8 @@ def judged(name: str, seed: int, seconds: float) -> dict[str, Any]:
         "found": names,
         "named_first": outcome.verdict == "sufficient" if clean else names[:1] == [name],
         "located": clean or (first is not None and first.location == LIBRARY[name].location),
-        "among_alternatives": first is not None and name in first.alternatives,
+        "told": name in told(outcome.effects[:1]) or (clean and not names),
+        "wrong_and_certain": wrong_and_certain(outcome.effects, () if clean else (name,)),
         "surplus": max(0, len(names) - (0 if clean else 1)),
         "after_over_before": outcome.validation.after_rms_nm / outcome.validation.before_rms_nm,
     }
@@ -162,21 +182,28 @@ def main() -> None:
     args = parser.parse_args()
     jobs = [(name, seed) for name in args.effects for seed in range(args.first, args.first + args.seeds)]
     outcomes = [judged(name, seed, args.seconds) for name, seed in track(jobs, "diagnose")]
-    print("| effect | named first | located | else found |\n|---|---|---|---|")
+    print(
+        "| effect | named first | told | located | else found | wrong and certain |" + "\n" + "|---" * 6 + "|"
+    )
     for name in args.effects:
         mine = [o for o in outcomes if o["effect"] == name]
         wrong = Counter(
             str(f) for o in mine if not o["named_first"] for f in o["found"][:1] or [o["verdict"]]
         )
-        named, located = (sum(o[key] for o in mine) for key in ("named_first", "located"))
-        print(f"| {name} | {named}/{len(mine)} | {located}/{len(mine)} | {', '.join(wrong) or '-'} |")
+        counts = " | ".join(
+            f"{sum(o[key] for o in mine)}/{len(mine)}" for key in ("named_first", "told", "located")
+        )
+        certain = sorted({each for o in mine for each in o["wrong_and_certain"]})
+        print(f"| {name} | {counts} | {', '.join(wrong) or '-'} | {', '.join(certain) or '-'} |")
     real = [o for o in outcomes if o["effect"] in LIBRARY]
     if real:
         ratios = [o["after_over_before"] for o in real]
         print(
             f"\nnamed first {sum(o['named_first'] for o in real)}/{len(real)}, "
+            f"told {sum(o['told'] for o in real)}/{len(real)}, "
             f"located {sum(o['located'] for o in real)}/{len(real)}, "
             f"surplus terms {sum(o['surplus'] for o in real)}, "
+            f"wrong and certain {sum(len(o['wrong_and_certain']) for o in outcomes)}, "
             f"held-out error after/before: median {np.median(ratios):.3f}"
         )
     if args.json:

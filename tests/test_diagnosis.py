@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from estimator.diagnosis import diagnose
+from estimator.diagnosis.choices import choice
 from estimator.errors import EstimatorError
 from estimator.identify import identify
 from estimator.model import Effect
@@ -56,7 +57,10 @@ def test_an_injected_effect_is_named_located_and_measured(case: str, records: di
     first = found.effects[0]
     assert (first.name, first.location) == (name, location)
     assert first.parameters[parameter] == pytest.approx(value, abs=tolerance)
-    assert found.validation.after_rms_nm <= found.validation.before_rms_nm
+    # An effect at the link does not show in the motor's balance, which then stays at its noise.
+    at_noise = found.validation.after_relative < choice("floor")
+    assert found.validation.after_rms_nm <= found.validation.before_rms_nm or at_noise
+    assert first.probability > 0.9
     assert any("the link's (eq 4)" in note for note in found.notes)
 
 
@@ -127,7 +131,9 @@ def test_without_link_dynamics_friction_is_still_found(records: dict[str, Record
 @pytest.mark.slow
 def test_an_offset_of_the_motor_side_alone_names_its_twin(records: dict[str, Record]) -> None:
     found = diagnose(records["offset"], kit.model(linked=False))
-    assert {found.effects[0].name, *found.effects[0].alternatives} >= {"torque_offset", "deflection_offset"}
+    (offset,) = found.effects
+    assert (offset.name, offset.alternatives) == ("torque_offset", ("deflection_offset",))
+    assert (offset.probability, offset.alternative_probabilities) == (0.5, (0.5,))
 
 
 def test_a_model_that_knows_the_effect_is_sufficient(records: dict[str, Record]) -> None:

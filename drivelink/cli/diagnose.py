@@ -111,8 +111,9 @@ def _print(outcome: Diagnosis, units: Units) -> None:
         print(f"  {report.title_of(finding)}")
         for name, value in finding.parameters.items():
             print(f"    {name} = {units.value(name, value, finding.std.get(name))}")
+        print(f"    probability = {finding.probability:.2f}")
         if finding.alternatives:
-            print(f"    could also be: {', '.join(finding.alternatives)}")
+            print(f"    could also be: {report.others_of(finding)}")
     for number, refitted in enumerate(outcome.transmissions, start=1):
         for name, value in refitted.parameters.items():
             text = units.value(name, value, refitted.std[name])

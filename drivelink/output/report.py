@@ -91,7 +91,9 @@ def _effect(finding: Finding, unlisted: Curve | None) -> dict[str, Any]:
         "location": finding.location,
         "parameters": dict(finding.parameters),
         "std": dict(finding.std),
+        "probability": finding.probability,
         "alternatives": list(finding.alternatives),
+        "alternative_probabilities": list(finding.alternative_probabilities),
         "share": finding.share,
     }
     if finding.motor is not None:
@@ -156,6 +158,12 @@ def title_of(finding: Finding) -> str:
     if finding.name == "unlisted":
         return f"an unlisted effect at the {_place(finding)}"
     return f"{finding.name.replace('_', ' ')} ({_place(finding)})"
+
+
+def others_of(finding: Finding) -> str:
+    """What else an effect may be, each with its probability."""
+    pairs = zip(finding.alternatives, finding.alternative_probabilities, strict=True)
+    return ", ".join(f"{name.replace('_', ' ')} ({p:.2f})" for name, p in pairs)
 
 
 def _place(finding: Finding) -> str:
@@ -320,7 +328,7 @@ def _series_figure(outcome: Diagnosis, units: Units) -> str:
 
 def _doubts(outcome: Diagnosis) -> str:
     lines = [
-        f"{title_of(f)} could also be: {', '.join(a.replace('_', ' ') for a in f.alternatives)}."
+        f"{title_of(f)}, probability {f.probability:.2f}, could also be: {others_of(f)}."
         for f in outcome.effects
         if f.alternatives
     ]

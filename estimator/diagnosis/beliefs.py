@@ -81,13 +81,15 @@ def everyday_std(
         return (PRIORS["effect"].std * torque_rms,) if calibrating and back else (0.0,)
     if name == "torque_offset":
         # A healthy joint's constant is the zero between its encoders: the two cannot be separated.
-        fixed = frames[0].flexible[candidate.motor or 0] if calibrating else linked
-        return (0.0,) if fixed else (std * torque_rms,)
+        if calibrating and frames[0].flexible[candidate.motor or 0]:
+            return (0.0,)
+        return ((choice("floor") if linked and not calibrating else std) * torque_rms,)
     if name == "deflection_offset":
         phi = frames[0].motors[candidate.motor or 0].deflection
         if calibrating:  # a healthy joint's encoders may start anywhere
             return (std * float(np.ptp(phi) + abs(np.mean(phi))),)
-        return (0.0,) if linked else (std * float(np.ptp(phi)),)
+        # What is left of a zero that has been set is no effect: half a count of an encoder is as much.
+        return ((PRIORS["declared_zero"].std if linked else std) * float(np.ptp(phi)),)
     if name == "torque_constant" and calibrating:
         return (0.0,)  # the anchor
     if linked and not calibrating:

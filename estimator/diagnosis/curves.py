@@ -173,7 +173,7 @@ def _waves(frame: Frame, beside: Fitted, frequency: float, resolution: float, eq
         return np.stack([f(k * w * time) for k in range(1, count + 1) for f in (np.sin, np.cos)], axis=1)
 
     residual = _residual(frame, beside, equation)
-    time = frame.motors[0].time[:: _step_of(frame)][: len(frame.signals.keep)][frame.signals.keep]
+    time = frame.motors[0].time[:: frame.rows_step][: len(frame.signals.keep)][frame.signals.keep]
 
     def left(w: float) -> float:
         columns = np.column_stack((made(time, w), np.ones(len(time))))
@@ -183,10 +183,6 @@ def _waves(frame: Frame, beside: Fitted, frequency: float, resolution: float, eq
     near = frequency + resolution * np.linspace(-1.0, 1.0, 2 * _FINE + 1)
     best = float(min(near, key=left))
     return lambda c: made(c.time, best)
-
-
-def _step_of(frame: Frame) -> int:
-    return round(frame.signals.narrow.period_s / frame.signals.light.period_s)
 
 
 def _residual(frame: Frame, beside: Fitted, equation: int) -> FloatArray:

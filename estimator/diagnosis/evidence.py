@@ -21,18 +21,29 @@ __all__ = ["Posterior", "Regression", "Scale", "autocorrelation_time"]
 
 
 class Scale(NamedTuple):
-    """How a balance is scaled against its measurement: r changes by s = constant + direction x per unit.
+    """How a balance is scaled against its measurement: r_t changes by s_t = 1 + slopes_t x per N·m.
 
-    The likelihood is that of the measurements, so each independent row has the factor s; without it the
-    errors could be made small by making everything small.
+    Errors of the torque are those of r / s, errors of the model those of r. Taken for the former, they become
+    small where s is large; taken for the latter, where it is small. Nobody knows which they are, so x is what
+    lies between (geometric mean regression), and the evidence is the lower of the two: no scale pays that
+    makes errors small in one reading only.
 
     Attributes:
-        groups: the balances. direction: (k,). constant: at x = 0.
+        groups: the balances. columns: (j,) the entries of x that scale them.
+        slopes: (m, j) at the moments of the rows; one moment, where it is the same at all of them.
     """
 
     groups: tuple[int, ...]
-    direction: FloatArray
-    constant: float
+    columns: NDArray[np.int64]
+    slopes: FloatArray
+
+    def sizes(self, x: FloatArray) -> FloatArray:
+        """(m,) s at each moment."""
+        return np.maximum(1.0 + self.slopes @ x[self.columns], choice("least_scale"))
+
+    def size(self, x: FloatArray) -> float:
+        """What r is divided by in the reading that makes it larger: geometric mean of s, one at most."""
+        return min(float(np.exp(np.mean(np.log(self.sizes(x))))), 1.0)
 
 
 class Posterior(NamedTuple):
@@ -137,7 +148,7 @@ class Regression:
             inner = precision[np.ix_(free, free)]
             x[free] = np.linalg.solve(inner, side[free] - precision[np.ix_(free, ~free)] @ x[~free])
             left = np.array([gram.left(x) for gram in self._grams])
-            new = np.maximum(np.sqrt(left / counts), self.floor)
+            new = np.maximum(np.sqrt(left / counts), self.floor * self._sizes(x / self._unit))
             steady = bool(np.all(np.abs(new - sigma) < 1e-3 * sigma))
             sigma = new
             wrong = free & (x < low)
@@ -159,20 +170,20 @@ class Regression:
         for w, gram in zip(1.0 / (times * sigma**2), self._grams, strict=True):
             precision = precision + w * gram.matrix
             side = side + w * gram.side
-        for scale, size, share in self._sizes(x, times):  # Newton's step of -n log s
-            direction = scale.direction / self._unit
-            precision = precision + share / size**2 * np.outer(direction, direction)
-            side = side + share * direction * (1.0 / size + float(direction @ x) / size**2)
+        for scale in self.scales:  # Newton's step of -sum log s / 2
+            rows = 0.5 * sum(self._grams[g].rows / float(times[g]) for g in scale.groups)
+            steep = scale.slopes / self._unit[scale.columns] / scale.sizes(x / self._unit)[:, None]
+            curvature = rows * (steep.T @ steep) / len(steep)
+            precision[np.ix_(scale.columns, scale.columns)] += curvature
+            side[scale.columns] += rows * steep.mean(axis=0) + curvature @ x[scale.columns]
         return precision, side
 
-    def _sizes(self, x: FloatArray, times: FloatArray) -> list[tuple[Scale, float, float]]:
-        """Each scale with its s at x (scaled columns) and the independent rows that it concerns."""
-        made = []
+    def _sizes(self, x: FloatArray) -> FloatArray:
+        """(groups,) by how much each balance is smaller than as measured."""
+        sizes = np.ones(len(self._grams))
         for scale in self.scales:
-            size = scale.constant + float(scale.direction / self._unit @ x)
-            share = sum(self._grams[g].rows / float(times[g]) for g in scale.groups)
-            made.append((scale, max(size, choice("least_scale") * abs(scale.constant)), share))
-        return made
+            sizes[list(scale.groups)] = scale.size(x)
+        return sizes
 
     def _evidence(
         self,
@@ -188,10 +199,8 @@ class Regression:
         std = self.std * self._unit
         strain = (x - self.mean * self._unit) / std
         _, logdet = np.linalg.slogdet(inner)
-        scaled = sum(share * np.log(size) for _, size, share in self._sizes(x, times))
         return float(
-            scaled
-            - np.sum(independent * np.log(sigma))
+            np.sum(independent * np.log(self._sizes(x / self._unit) / sigma))
             - 0.5 * np.sum(left / (times * sigma**2))
             - 0.5 * strain @ strain
             - 0.5 * logdet

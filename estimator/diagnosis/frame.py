@@ -199,6 +199,11 @@ class Frame:
         return int(np.count_nonzero(self.signals.keep))
 
     @property
+    def rows_step(self) -> int:
+        """Points of the grid in one row."""
+        return round(self.signals.narrow.period_s / self.signals.light.period_s)
+
+    @property
     def carried(self) -> bool:
         """Whether the link moves with the first motor, which then has the dynamics of both."""
         return self.model.link is not None and not self.flexible[0]

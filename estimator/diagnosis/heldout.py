@@ -155,9 +155,8 @@ def _scaled(problem: Problem, fitted: Fitted, left: FloatArray) -> FloatArray:
     """Errors as those of the declared torque, where the torque's own scale has been fitted."""
     left = left.copy()
     for scale in fitted.regression.scales:
-        size = scale.constant + float(scale.direction @ fitted.posterior.x)
         motor = scale.groups[0] % problem.equations
-        left[problem.group % problem.equations == motor] /= size
+        left[problem.group % problem.equations == motor] /= scale.size(fitted.posterior.x)
     return left
 
 

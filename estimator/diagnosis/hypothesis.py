@@ -25,7 +25,10 @@ from estimator.effects import LIBRARY
 from estimator.model import JointModel
 from estimator.sample import FloatArray, Record
 
-__all__ = ["Extra", "Fitted", "Problem", "Slot", "Term", "stretches"]
+__all__ = ["Extra", "Fitted", "Keys", "Problem", "Slot", "Term", "stretches"]
+
+
+Keys = frozenset[tuple[str, int | None]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,6 +63,12 @@ class Fitted:
             return self.posterior.evidence
         regression = replace(self.regression, floor=like.regression.floor)
         return regression.solve(like.times, self.posterior.sigma).evidence
+
+    @property
+    def keys(self) -> Keys:
+        """Its effects and the motors they are at, whatever their order; a free curve is an unlisted one."""
+        own = frozenset(t.candidate.key for t in self.terms)
+        return own if self.extra is None else own | {("unlisted", self.extra.motor)}
 
     @property
     def real(self) -> bool:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from statistics import NormalDist
 
 import numpy as np
 
 from estimator.diagnosis.candidates import columns
+from estimator.diagnosis.certainty import Standing
 from estimator.diagnosis.choices import choice
 from estimator.diagnosis.covariance import design_effects, hac_covariance
 from estimator.diagnosis.hypothesis import Fitted, Problem
@@ -24,7 +26,7 @@ _CHANNELS = {"torque_delay": "torque_delay_s", "deflection_offset": "deflection_
 
 
 def findings_of(
-    problem: Problem, found: Fitted, null: Fitted, alternatives: list[tuple[str, ...]]
+    problem: Problem, found: Fitted, null: Fitted, standings: Sequence[Standing]
 ) -> list[Finding]:
     """The effects, the one that explains most first; delays of more than a sample among them."""
     std = np.sqrt(np.maximum(np.diag(hac_covariance(problem, found)), 0.0))
@@ -40,7 +42,8 @@ def findings_of(
             zip(kind.linear, (float(std[j]) for j in mine), strict=True)
         )
         deviation.update({name: _absolute(problem, found, k, name, x) for name, x in shapes.items()})
-        torque = found.regression.design[:, mine] @ found.posterior.x[mine]
+        whole = found.posterior.x[mine] + np.array([found.slots[j].taken for j in mine])
+        torque = found.regression.design[:, mine] @ whole
         share = float(np.mean(torque**2)) / max(total, 1e-300)
         finding = Finding(
             name=kind.name,
@@ -48,7 +51,9 @@ def findings_of(
             motor=term.candidate.motor,
             parameters={**dict(zip(kind.linear, term.weights, strict=True)), **term.values},
             std=deviation,
-            alternatives=alternatives[k],
+            probability=standings[k].probability,
+            alternatives=tuple(name for name, _ in standings[k].alternatives),
+            alternative_probabilities=tuple(p for _, p in standings[k].alternatives),
             share=min(share, 1.0),
         )
         if not _everyday(problem, finding):
@@ -62,7 +67,8 @@ def findings_of(
             kind = LIBRARY[slot.name]
             made.append((0.0, Finding(
                 name=slot.name, location=kind.location, motor=slot.motor, parameters={"delay_s": value},
-                std={"delay_s": float(sigma)}, alternatives=(), share=0.0,
+                std={"delay_s": float(sigma)},
+                probability=NormalDist().cdf((abs(value) - choice("skew") * problem.period_s) / sigma),
             )))  # fmt: skip
     made += [(0.0, f) for f in _offsets(problem, found, std)] if not made else []
     made.sort(key=lambda pair: -pair[0])
@@ -89,7 +95,8 @@ def _offsets(problem: Problem, found: Fitted, std: FloatArray) -> list[Finding]:
         return [
             Finding(
                 name="torque_offset", location="motor", motor=i, parameters={"torque_nm": size},
-                std={"torque_nm": deviation}, alternatives=("deflection_offset",), share=0.0,
+                std={"torque_nm": deviation}, probability=0.5,
+                alternatives=("deflection_offset",), alternative_probabilities=(0.5,),
             )
         ]  # fmt: skip
     return []

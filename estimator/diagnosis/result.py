@@ -43,7 +43,9 @@ class Finding:
         motor: index of the motor; None at the link.
         parameters: by their names in the joint file.
         std: their standard deviations, where they are known.
-        alternatives: effects that explain the data as well.
+        probability: that it is this effect and not another one.
+        alternatives: effects that may stand in its place, the likeliest first.
+        alternative_probabilities: of each of them.
         share: of the squared error of the declared model that it explains beside the others.
         coordinates: of an unlisted effect, what its curve depends on.
     """
@@ -53,7 +55,9 @@ class Finding:
     motor: int | None
     parameters: dict[str, ParameterValue]
     std: dict[str, ParameterValue]
+    probability: float = 1.0
     alternatives: tuple[str, ...] = ()
+    alternative_probabilities: tuple[float, ...] = ()
     share: float = 0.0
     coordinates: tuple[str, ...] = ()
 

@@ -18,7 +18,7 @@ import numpy as np
 from estimator.diagnosis.beliefs import effect_std
 from estimator.diagnosis.candidates import Candidate, columns, grid, members
 from estimator.diagnosis.choices import choice, whole
-from estimator.diagnosis.hypothesis import Fitted, Problem, Term, stretches
+from estimator.diagnosis.hypothesis import Fitted, Keys, Problem, Term, stretches
 from estimator.priors import PRIORS
 from estimator.sample import FloatArray
 
@@ -74,6 +74,7 @@ class Search:
         self.problem, self._progress = problem, progress
         self.null = null or problem.null()
         self._singles: list[Fitted] = []
+        self.seen: list[Fitted] = [self.null]
         frames = problem.at(self.null.corrections, self.null.base)
         self._library = []
         for candidate in members(frames[0]):
@@ -85,7 +86,7 @@ class Search:
 
     def run(self) -> list[Fitted]:
         """The hypotheses with the most evidence, best first, pruned; single effects among them."""
-        seen = [self.null]
+        seen = self.seen
         beam, best = [self.null], self.null
         for size in range(1, whole("effects") + 1):
             self._progress(f"term {size}")
@@ -159,9 +160,9 @@ class Search:
         """Best first, without doublets."""
         best = min(hypotheses, key=_left)
         order = sorted(hypotheses, key=lambda h: -self.score(h, best))
-        unique: dict[frozenset[tuple[str, int | None]], Fitted] = {}
+        unique: dict[Keys, Fitted] = {}
         for h in order:
-            unique.setdefault(frozenset(t.candidate.key for t in h.terms), h)
+            unique.setdefault(h.keys, h)
         return list(unique.values())
 
     def _settled(self, hypothesis: Fitted) -> Fitted:

@@ -24,11 +24,11 @@ __all__ = ["Extra", "Pinned", "Slot", "Stack", "Term", "curve_columns", "step_of
 
 _SIGNED = ("position_rad",)  # nonlinear parameters that may be negative
 
-# How much more torque acts per unit of what is measured, for one unit of the parameter, on average.
-_TORQUE_SCALES: dict[str, Callable[[Coordinates, dict[str, float]], float]] = {
-    "torque_constant": lambda c, p: 1.0,
-    "torque_saturation": lambda c, p: -3.0 * float(np.mean(c.torque**2)),
-    "torque_drift": lambda c, p: 1.0 - float(np.mean(np.exp(-c.time / p["time_constant_s"]))),
+# How much more torque acts per unit of what is measured, for one unit of the parameter.
+_TORQUE_SCALES: dict[str, Callable[[Coordinates, dict[str, float]], FloatArray]] = {
+    "torque_constant": lambda c, p: np.ones_like(c.torque),
+    "torque_saturation": lambda c, p: -3.0 * c.torque**2,
+    "torque_drift": lambda c, p: 1.0 - np.exp(-c.time / p["time_constant_s"]),
 }
 
 
@@ -183,16 +183,23 @@ class Stack:
         """The motors' balances against the measured torque."""
         made = []
         equations = self._frames[0].equations
-        for i, coordinates in enumerate(self._frames[0].motors):
-            direction = np.zeros(len(self.slots))
-            for j, slot in enumerate(self.slots):
-                if slot.motor == i and slot.name in _TORQUE_SCALES:
-                    values = terms[slot.place].values if slot.kind == "term" else {}
-                    direction[j] = _TORQUE_SCALES[slot.name](coordinates, values)
-            if direction.any():
-                groups = tuple(k * equations + i for k in range(len(self._frames)))
-                made.append(Scale(groups, direction, 1.0))
+        for i in range(len(self._frames[0].motors)):
+            mine = [j for j, s in enumerate(self.slots) if s.motor == i and s.name in _TORQUE_SCALES]
+            if not mine:
+                continue
+            slopes = np.stack([self._torque_scale(self.slots[j], terms) for j in mine], axis=1)
+            same = bool(np.all(slopes == slopes[0]))
+            groups = tuple(k * equations + i for k in range(len(self._frames)))
+            made.append(Scale(groups, np.array(mine), slopes[:1] if same else slopes))
         return tuple(made)
+
+    def _torque_scale(self, slot: Slot, terms: Sequence[Term]) -> FloatArray:
+        """(m,) how much more torque acts per unit of what is measured, by one unit of a slot."""
+        values = terms[slot.place].values if slot.kind == "term" else {}
+        slope = _TORQUE_SCALES[slot.name]
+        return np.concatenate(
+            [slope(f.motors[slot.motor or 0], values)[:: f.rows_step] for f in self._frames]
+        )
 
     def _taken(self, candidate: Candidate, run: int) -> FloatArray:
         now, before = read(self._corrections[run], candidate), read(self._declared, candidate)

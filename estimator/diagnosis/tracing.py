@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from estimator.diagnosis.bandwidth import choose_bandwidth
+from estimator.diagnosis.certainty import accounts, standing
 from estimator.diagnosis.choices import choice
 from estimator.diagnosis.curves import best_curve
 from estimator.diagnosis.excitation import advice_for, poor
@@ -135,19 +136,23 @@ class _Judge:
         )
         motor, link = left[1] / np.maximum(left[0], 1e-300)
         return [
-            f"what the motor's balance (eq 5) leaves falls to {motor:.1%}, the link's (eq 4) to {link:.1%}"
+            f"the motor's balance (eq 5) leaves {motor:.1%} of what it did, the link's (eq 4) {link:.1%}"
         ]
 
     def diagnosis(self) -> Diagnosis:
         """Verdict, findings, errors."""
         problem, found, null = self.problem, self.found, self.search.null
         rivals = [self.search.rivals(found, k) for k in range(len(found.terms))]
-        effects = findings_of(problem, found, null, [self._even(found, r) for r in rivals])
+        self.progress("free curves")
+        curve = best_curve(self.search, null)
+        others = [null, *(r for each in rivals for r in each)]
+        free = [] if curve is None else [curve]
+        beside = accounts(self.search, found, [*others, *self.search.seen, *free])
+        standings = [standing(self.search, found, k, beside) for k in range(len(found.terms))]
+        effects = findings_of(problem, found, null, standings)
         verdict: Verdict = "effect" if effects else "sufficient"
         after, notes = found, []
         before = self._declared(effects)
-        self.progress("free curves")
-        curve = best_curve(self.search, null)
         if curve is None or not self._unlisted(curve):
             curve = self._remaining()
         if curve is not None:
@@ -175,9 +180,8 @@ class _Judge:
         if verdict == "effect" and self.held.squared(after) > self.held.squared(before):
             verdict = "insufficient_excitation"
             notes.append("on data that took no part the effects do not lower the error: they are not written")
-        others = [found, null, *(r for each in rivals for r in each)]
-        accounts = [(self.search.chance(after, h), h) for h in others if h is not after]
-        transmissions, unsure = transmissions_of(self.search, after, accounts)
+        chances = [(self.search.chance(after, h), h) for h in (found, *others) if h is not after]
+        transmissions, unsure = transmissions_of(self.search, after, chances)
         notes += unsure + self._doubts(effects)
         if verdict in ("effect", "unexplained"):
             notes += self._sides(before, after)
@@ -209,15 +213,6 @@ class _Judge:
         if "torque_offset" in {f.name for f in effects}:
             pinned |= {("deflection_offset", i): (0.0,) for i in range(len(self.problem.model.motors))}
         return self.problem.null(pinned)
-
-    def _even(self, found: Fitted, rivals: list[Fitted]) -> tuple[str, ...]:
-        """Effects that could stand in a term's place: what the data do not separate from it."""
-        close = [r for r in rivals if self.search.chance(found, r) > choice("even")]
-        names = [r.terms[-1].candidate.kind.name for r in close]
-        own = [t.candidate.kind.name for t in found.terms]
-        if "motor_inertia" in own and not self.problem.frames[0].linked:
-            names.append("torque_constant")
-        return tuple(dict.fromkeys(n for n in names if n not in own))
 
     def _unlisted(self, curve: Fitted) -> bool:
         """Whether a free curve is a better account than all that has a name, here and on held-out data."""

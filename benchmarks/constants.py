@@ -2,10 +2,11 @@
 
     python benchmarks/constants.py [--list] [--only NAME ...] [--seeds N] [--state FILE] [--data DIR]
 
-A constant is a number at the top of a module, or an entry of a table of choices or priors. For each one the
-figures of diagnosis seeds and of real data are formed with half and with twice its value, in a process of its
-own, and appended to --state (JSON lines): a run that was interrupted goes on where it ended. A figure that
-gets worse by more than a fifth names a mechanism to replace, not a number.
+A constant is a number written at the top of a module, or an entry of a table of choices or priors; numbers
+that are computed there are not. For each one the figures are formed with half and with twice its value, on a
+few short recordings that are made once, in a forked process, and appended to --state (JSON lines): a run that
+was interrupted goes on where it ended. A figure that gets worse by more than a fifth names a mechanism to
+replace, not a number. The constants of `estimator/core` are compiled: they are counted, not varied.
 """
 
 from __future__ import annotations
@@ -15,19 +16,28 @@ import ast
 import importlib
 import json
 import os
-import subprocess
+import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from estimator.model import JointModel
+from estimator.sample import Record
 
 ROOT = Path(__file__).resolve().parents[1]
 FACTORS = (0.5, 2.0)
 FIFTH = 1.2
 SEED = 300  # of the simulated recordings: none that a constant was chosen on
 SECONDS = 10.0
-EFFECTS = ("clean", "coulomb_friction", "cogging", "hysteresis", "encoder_delay", "gravity")
+EFFECTS: tuple[tuple[str, ...], ...] = (
+    (),
+    ("coulomb_friction", "gravity"),
+    ("hysteresis", "encoder_delay"),
+    ("cogging", "motor_inertia"),
+)
 
 
 class Constant(NamedTuple):
@@ -72,12 +82,15 @@ def constants() -> list[Constant]:
             if not isinstance(node, ast.Assign | ast.AnnAssign) or not isinstance(target, ast.Name):
                 continue
             value = getattr(importlib.import_module(module), target.id, None)
+            written = node.value is not None and not any(
+                isinstance(part, ast.Name | ast.Call | ast.BinOp) for part in ast.walk(node.value)
+            )
             if target.id in ("PRIORS", "CHOICES") and isinstance(value, dict):
                 found += [
                     Constant(module, target.id, key, entry.std if hasattr(entry, "std") else entry.value)
                     for key, entry in value.items()
                 ]
-            elif _number(value):
+            elif written and _number(value):
                 found.append(Constant(module, target.id, None, value))
     return found
 
@@ -88,48 +101,100 @@ def _number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def figures(data: Path, seeds: int) -> dict[str, float]:
-    """What is judged; all of it is better the smaller it is."""
-    from diagnosis_seeds import judged
-    from real_data import RUNS, baseline, joint_of
+class Case(NamedTuple):
+    """A recording, the joint as declared, its effects; real ones: bandwidth, baseline; stiffness."""
+
+    record: Record
+    model: JointModel
+    effects: tuple[str, ...]
+    bandwidth_hz: float | None = None
+    baseline: float | None = None
+    stiffness_nm_rad: float | None = None
+
+
+def cases(data: Path, seeds: int) -> list[Case]:
+    """The recordings: simulated ones, and the quickest of the real ones where it has been fetched."""
+    from diagnosis_seeds import joint_of, measured
+    from real_data import RUNS, baseline
+    from real_data import joint_of as real_joint
 
     from drivelink import recording
+
+    made = []
+    for names in EFFECTS:
+        for seed in range(SEED, SEED + seeds):
+            declared, real = joint_of(names, seed)
+            (k,) = real.model().motors[0].transmission.parameters.values()
+            known = k if isinstance(k, float) else None
+            made.append(Case(measured(real, SECONDS), declared.model(), names, stiffness_nm_rad=known))
+    run = RUNS[0]
+    if (data / run.train).exists():
+        joint = real_joint(run)
+        train, other = (recording.read(data / name, joint) for name in (run.train, run.validation))
+        floor = baseline(train, other, joint.model(), run.bandwidth_hz)
+        made.append(Case(train, joint.model(), (), run.bandwidth_hz, floor, run.known_nm_rad))
+    return made
+
+
+def figures(recordings: Sequence[Case]) -> dict[str, float]:
+    """What is judged; all of it is better the smaller it is."""
+    from diagnosis_seeds import wrong_and_certain
+
     from estimator.diagnosis import diagnose
 
-    outcomes = [judged(name, SEED + k, SECONDS) for name in EFFECTS for k in range(seeds)]
-    ratios, off = [], []
-    for run in RUNS[::2] if (data / RUNS[0].train).exists() else ():
-        joint = joint_of(run)
-        train, other = (recording.read(data / name, joint) for name in (run.train, run.validation))
-        outcome = diagnose(train, joint.model(), run.bandwidth_hz, other)
-        floor = baseline(train, other, joint.model(), run.bandwidth_hz)
-        ratios.append(outcome.validation.after_relative / floor)
+    missed, surplus, certain, left, real, off = [], [], [], [], [], []
+    for case in recordings:
+        outcome = diagnose(case.record, case.model, case.bandwidth_hz)
         k = outcome.transmissions[0].parameters.get("k_nm_rad")
-        if run.known_nm_rad and isinstance(k, float):
-            off.append(abs(np.log(k / run.known_nm_rad)))
+        if case.stiffness_nm_rad:
+            off.append(abs(np.log(k / case.stiffness_nm_rad)) if isinstance(k, float) else 1.0)
+        if case.baseline is not None:
+            real.append(outcome.validation.after_relative / case.baseline)
+            continue
+        names = [effect.name for effect in outcome.effects]
+        missed.append(sum(name not in names for name in case.effects))
+        surplus.append(sum(name not in case.effects for name in names))
+        certain.append(len(wrong_and_certain(outcome.effects, case.effects)))
+        left.append(outcome.validation.after_relative)
     return {
-        "seeds not named first, share": float(np.mean([not o["named_first"] for o in outcomes])),
-        "seeds surplus, mean": float(np.mean([o["surplus"] for o in outcomes])),
-        "seeds error after over before": float(
-            np.exp(np.mean(np.log([o["after_over_before"] for o in outcomes])))
-        ),
-        "real error over baseline": float(np.exp(np.mean(np.log(ratios)))) if ratios else 0.0,
-        "real stiffness off, log": float(np.mean(off)) if off else 0.0,
+        "effects missed": float(sum(missed)),
+        "surplus": float(sum(surplus)),
+        "wrong and certain": float(sum(certain)),
+        "error left": float(np.exp(np.mean(np.log(left)))),
+        "real error over baseline": float(np.mean(real)) if real else 0.0,
+        "stiffness off, log": float(np.mean(off)),
     }
 
 
-def _child(args: argparse.Namespace, label: str, factor: float) -> dict[str, float] | str:
-    command = [sys.executable, __file__, "--child", label, str(factor), "--seeds", str(args.seeds)]
-    done = subprocess.run(
-        [*command, "--data", str(args.data)],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
-    if done.returncode:
-        return (done.stderr.strip().splitlines() or ["it failed"])[-1]
-    made: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+def _forked(recordings: Sequence[Case], constant: Constant | None, factor: float) -> dict[str, float] | str:
+    """The figures with one constant changed, in a process that ends with it."""
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            if constant is not None:
+                constant.set(factor)
+            outcome: object = figures(recordings)
+        except Exception as error:  # noqa: BLE001 - whatever a wild constant breaks is the answer
+            outcome = f"{type(error).__name__}: {error}"
+        with os.fdopen(writer, "w", encoding="utf-8") as pipe:
+            json.dump(outcome, pipe)
+        os._exit(0)
+    os.close(writer)
+    with os.fdopen(reader, encoding="utf-8") as pipe:
+        text = pipe.read()
+    os.waitpid(child, 0)
+    made: dict[str, float] | str = json.loads(text) if text else "it died"
     return made
+
+
+def compiled() -> int:
+    """Numbers written at the top of the modules of `estimator/core`."""
+    pattern = re.compile(
+        r"^(?:pub(?:\([a-z]+\))? )?const [A-Z0-9_]+: (?:f64|usize|u\d+|i\d+) = [-\d]", re.MULTILINE
+    )
+    paths = (ROOT / "estimator" / "core" / "src").glob("*.rs")
+    return sum(len(pattern.findall(path.read_text(encoding="utf-8"))) for path in paths)
 
 
 def main() -> None:
@@ -137,34 +202,32 @@ def main() -> None:
     default = Path(os.environ.get("DRIVELINK_DATA", ROOT.parent / "shared" / "data"))
     parser.add_argument("--list", action="store_true", help="only list the constants")
     parser.add_argument("--only", nargs="*", metavar="NAME", help="beginnings of names as --list gives them")
-    parser.add_argument("--seeds", type=int, default=2, help="simulated recordings of each effect")
+    parser.add_argument("--seeds", type=int, default=1, help="simulated joints of each kind")
     parser.add_argument("--state", type=Path, default=Path("constants.jsonl"), metavar="FILE")
     parser.add_argument("--data", type=Path, default=default, metavar="DIR")
-    parser.add_argument("--child", nargs=2, metavar=("NAME", "FACTOR"), help=argparse.SUPPRESS)
     args = parser.parse_args()
     everything = constants()
-    if args.child:
-        for constant in everything:
-            if constant.label == args.child[0]:
-                constant.set(float(args.child[1]))
-        print(json.dumps(figures(args.data, args.seeds)))
-        return
     chosen = [c for c in everything if not args.only or any(c.label.startswith(name) for name in args.only)]
     if args.list:
         for constant in chosen:
             print(f"{constant.label} = {constant.value}")
-        print(f"{len(chosen)} constants")
+        print(
+            f"{len(chosen)} constants; {compiled()} more in estimator/core, which are compiled and not varied"
+        )
         return
     done: dict[tuple[str, float], Any] = {}
     if args.state.exists():
         for line in args.state.read_text(encoding="utf-8").splitlines():
             entry = json.loads(line)
             done[entry["constant"], entry["factor"]] = entry["figures"]
-    jobs = [("as it is", 1.0), *((c.label, factor) for c in chosen for factor in FACTORS)]
+    recordings: list[Case] = []
+    by_label = {c.label: c for c in chosen}
+    jobs = [("as it is", 1.0), *((label, factor) for label in by_label for factor in FACTORS)]
     for label, factor in jobs:
         if (label, factor) in done:
             continue
-        done[label, factor] = _child(args, label, factor)
+        recordings = recordings or cases(args.data, args.seeds)
+        done[label, factor] = _forked(recordings, by_label.get(label), factor)
         with args.state.open("a", encoding="utf-8") as state:
             state.write(
                 json.dumps({"constant": label, "factor": factor, "figures": done[label, factor]}) + "\n"

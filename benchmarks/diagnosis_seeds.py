@@ -4,8 +4,8 @@
 
 Every joint, motion and effect is drawn from its seed: soft joints of 80 to 220 N·m/rad with encoders and
 torque noise as drives have them, effects of 3 to 30 % of the torque. The world is `sim`, which shares no code
-with the estimator. Told: named first, or an alternative with a probability of 0.1 or more. Wrong and certain:
-a name that the joint does not carry, with a probability above 0.9.
+with the estimator. Listed: named first, or an alternative with a probability of 0.1 or more. Wrong and
+certain: a name that the joint does not carry, with a probability above 0.9.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ def measured(joint: JointFile, seconds: float) -> Record:
 LIKELY, CERTAIN = 0.1, 0.9
 
 
-def told(effects: Sequence[Finding]) -> set[str]:
+def listed(effects: Sequence[Finding]) -> set[str]:
     """The names in a diagnosis, and the alternatives that are likely enough."""
     names = {effect.name for effect in effects}
     for effect in effects:
@@ -165,7 +165,7 @@ def judged(name: str, seed: int, seconds: float) -> dict[str, Any]:
         "found": names,
         "named_first": outcome.verdict == "sufficient" if clean else names[:1] == [name],
         "located": clean or (first is not None and first.location == LIBRARY[name].location),
-        "told": name in told(outcome.effects[:1]) or (clean and not names),
+        "listed": name in listed(outcome.effects[:1]) or (clean and not names),
         "wrong_and_certain": wrong_and_certain(outcome.effects, () if clean else (name,)),
         "surplus": max(0, len(names) - (0 if clean else 1)),
         "after_over_before": outcome.validation.after_rms_nm / outcome.validation.before_rms_nm,
@@ -183,7 +183,10 @@ def main() -> None:
     jobs = [(name, seed) for name in args.effects for seed in range(args.first, args.first + args.seeds)]
     outcomes = [judged(name, seed, args.seconds) for name, seed in track(jobs, "diagnose")]
     print(
-        "| effect | named first | told | located | else found | wrong and certain |" + "\n" + "|---" * 6 + "|"
+        "| effect | named first | listed | located | else found | wrong and certain |"
+        + "\n"
+        + "|---" * 6
+        + "|"
     )
     for name in args.effects:
         mine = [o for o in outcomes if o["effect"] == name]
@@ -191,7 +194,7 @@ def main() -> None:
             str(f) for o in mine if not o["named_first"] for f in o["found"][:1] or [o["verdict"]]
         )
         counts = " | ".join(
-            f"{sum(o[key] for o in mine)}/{len(mine)}" for key in ("named_first", "told", "located")
+            f"{sum(o[key] for o in mine)}/{len(mine)}" for key in ("named_first", "listed", "located")
         )
         certain = sorted({each for o in mine for each in o["wrong_and_certain"]})
         print(f"| {name} | {counts} | {', '.join(wrong) or '-'} | {', '.join(certain) or '-'} |")
@@ -200,7 +203,7 @@ def main() -> None:
         ratios = [o["after_over_before"] for o in real]
         print(
             f"\nnamed first {sum(o['named_first'] for o in real)}/{len(real)}, "
-            f"told {sum(o['told'] for o in real)}/{len(real)}, "
+            f"listed {sum(o['listed'] for o in real)}/{len(real)}, "
             f"located {sum(o['located'] for o in real)}/{len(real)}, "
             f"surplus terms {sum(o['surplus'] for o in real)}, "
             f"wrong and certain {sum(len(o['wrong_and_certain']) for o in outcomes)}, "

@@ -3,7 +3,7 @@
     python benchmarks/effect_pairs.py [--seeds N] [--first SEED] [--seconds S] [--json FILE]
 
 Nine pairs over all places of a joint, the joints and sizes of diagnosis_seeds.py. An effect counts as named
-where a finding has its name, and as told where it is a likely alternative of one.
+where a finding has its name, and as listed where it is a likely alternative of one.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from diagnosis_seeds import joint_of, measured, told, wrong_and_certain
+from diagnosis_seeds import joint_of, listed, measured, wrong_and_certain
 
 from drivelink.output.progress import track
 from estimator.diagnosis import diagnose
@@ -36,14 +36,14 @@ def judged(pair: tuple[str, str], seed: int, seconds: float) -> dict[str, Any]:
     declared, real = joint_of(pair, seed)
     outcome = diagnose(measured(real, seconds), declared.model())
     names = [effect.name for effect in outcome.effects]
-    likely = told(outcome.effects)
+    likely = listed(outcome.effects)
     return {
         "pair": pair,
         "seed": seed,
         "verdict": outcome.verdict,
         "found": names,
         "named": sum(name in names for name in pair),
-        "told": sum(name in likely for name in pair),
+        "listed": sum(name in likely for name in pair),
         "surplus": sum(name not in pair for name in names),
         "wrong_and_certain": wrong_and_certain(outcome.effects, pair),
         "after_over_before": outcome.validation.after_rms_nm / outcome.validation.before_rms_nm,
@@ -60,18 +60,18 @@ def main() -> None:
     jobs = [(pair, seed) for pair in PAIRS for seed in range(args.first, args.first + args.seeds)]
     outcomes = [judged(pair, seed, args.seconds) for pair, seed in track(jobs, "diagnose")]
     print(
-        "| pair | both named | both told | surplus | wrong and certain | found |\n|---|---|---|---|---|---|"
+        "| pair | both named | both listed | surplus | wrong and certain | found |\n|---|---|---|---|---|---|"
     )
     for pair in PAIRS:
         mine = [o for o in outcomes if o["pair"] == pair]
         found = "; ".join(", ".join(o["found"]) or o["verdict"] for o in mine)
-        both, likely = (sum(o[key] == 2 for o in mine) for key in ("named", "told"))
+        both, likely = (sum(o[key] == 2 for o in mine) for key in ("named", "listed"))
         surplus, certain = sum(o["surplus"] for o in mine), sum(len(o["wrong_and_certain"]) for o in mine)
         counts = f"{both}/{len(mine)} | {likely}/{len(mine)} | {surplus} | {certain}"
         print(f"| {' + '.join(pair)} | {counts} | {found} |")
-    both, likely = (sum(o[key] == 2 for o in outcomes) for key in ("named", "told"))
+    both, likely = (sum(o[key] == 2 for o in outcomes) for key in ("named", "listed"))
     print(
-        f"\nboth named {both}/{len(outcomes)}, both told {likely}/{len(outcomes)}, one named at least "
+        f"\nboth named {both}/{len(outcomes)}, both listed {likely}/{len(outcomes)}, one named at least "
         f"{sum(o['named'] > 0 for o in outcomes)}, surplus {sum(o['surplus'] for o in outcomes)}, "
         f"wrong and certain {sum(len(o['wrong_and_certain']) for o in outcomes)}"
     )

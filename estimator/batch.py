@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -28,7 +29,7 @@ from estimator.transmissions import MODELS, RIGID, UNKNOWN
 
 __all__ = ["JointFit", "Key", "TransmissionFit", "fit", "fit_joint", "joint_problem", "transmission_fits"]
 
-_SIGMA_95 = 1.96
+_SIGMA_95 = NormalDist().inv_cdf(0.975)
 _LOOKED_AT = 33  # deflections from zero to the largest one
 _HIGHEST_ORDER = 4
 _DELAYS = ("encoder_delay", "torque_delay")  # a zero of the encoders is always there
@@ -192,7 +193,7 @@ def joint_problem(records: Sequence[Record], model: JointModel, bandwidth_hz: fl
         EstimatorError: too short for the bandwidth, or a deflection that does not change.
     """
     problem = Problem(records, model, bandwidth_hz, calibrating=True)
-    if min(problem.rows) < whole("fit_rows"):
+    if min(problem.rows) < 2 * whole("fit_periods"):
         raise EstimatorError(
             f"recording: expected at least {whole('fit_rows')} rows without gaps at a bandwidth of "
             f"{bandwidth_hz:g} Hz, got {min(problem.rows)}"
@@ -264,7 +265,7 @@ def _aligned(records: Sequence[Record], problem: Problem, free: Fitted) -> Joint
     while True:
         joint = JointFit(records, problem, fitted, covariance, absent)
         odds = {key: _odds_of_zero(joint, [key]) for key in _optional(joint)}
-        doubtful = [key for key in odds if odds[key] > math.log(1.0 / choice("present") - 1.0)]
+        doubtful = [key for key in odds if odds[key] > math.log(choice("even") / (1.0 - choice("even")))]
         if not doubtful:
             break
         absent |= {max(doubtful, key=lambda key: odds[key])}

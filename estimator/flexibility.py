@@ -21,7 +21,7 @@ from estimator.sample import FloatArray
 
 __all__ = ["Exponential", "Function", "Linear", "Polynomial", "Table", "TransmissionModel", "VsaII"]
 
-_STEP = 6.0e-6  # relative step of central differences, about eps**(1/3)
+_STEP = np.finfo(float).eps ** (1.0 / 3.0)  # relative step of central differences
 
 
 class TransmissionModel(ABC):

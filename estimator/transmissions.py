@@ -25,7 +25,7 @@ __all__ = [
 RIGID = "none"  # no deflection: the torque is what the motor's balance leaves
 UNKNOWN = "unknown"  # flexible, but no model of it: black-box estimation
 
-_STEP = 6.0e-6  # relative step of central differences, about eps**(1/3)
+_STEP = np.finfo(float).eps ** (1.0 / 3.0)  # relative step of central differences
 
 MODELS: dict[str, TransmissionModel] = {
     model.name: model for model in (Linear(), Polynomial(), VsaII(), Exponential())

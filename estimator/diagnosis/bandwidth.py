@@ -31,7 +31,7 @@ def choose_bandwidth(record: Record, model: JointModel) -> float:
         choice("most_bandwidth"),
         choice("sampled") * rate,
     )
-    limit = choice("noise") * torque_rms(record)
+    limit = 2.0 * choice("floor") * torque_rms(record)
     stiffness = rough_stiffness(record, model)
     bandwidth = wanted
     while bandwidth > choice("narrowest"):

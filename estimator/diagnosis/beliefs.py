@@ -137,11 +137,11 @@ def least(model: JointModel, candidate: Candidate) -> float:
     if name in _POSITIVE:
         return 0.0
     if name == "motor_inertia":
-        return -choice("missing_inertia") * motor.inertia_kg_m2
+        return -motor.inertia_kg_m2
     if name == "viscous_damping":
         return -motor.viscous_damping_nm_s_rad
     if name == "link_inertia" and link is not None:
-        return -choice("missing_inertia") * link.inertia_kg_m2
+        return -link.inertia_kg_m2
     if name == "link_viscous_damping" and link is not None:
         return -link.viscous_damping_nm_s_rad
     return -np.inf

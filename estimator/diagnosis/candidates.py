@@ -98,7 +98,7 @@ def sign_smoothing(frames: Sequence[Frame], motor: int) -> float:
             return elements(effect)[1][0]["smoothing_rad_s"]
     fast = max(float(np.max(np.abs(f.motors[motor].velocity))) for f in frames)
     noise = max(f.signals.velocity_noise(motor) for f in frames)
-    least, most = choice("sharpest_sign") * fast, choice("softest_sign") * fast
+    least, most = choice("floor") * fast, choice("smoothing") * fast
     return min(max(choice("sign_noise") * noise, least), most)
 
 
@@ -178,7 +178,7 @@ def grid(frame: Frame, candidate: Candidate, smoothing_rad_s: float) -> list[dic
     fixed = {p.name: float(p.default) for p in kind.parameters if not p.linear and p.default is not None}
     if "smoothing_rad_s" in kind.nonlinear:
         _, most = bounds_of(frame, candidate, "smoothing_rad_s")
-        smooth = smoothing_rad_s * np.array([1.0, 5.0, 25.0])
+        smooth = smoothing_rad_s * choice("softer") ** np.arange(3)
         smooth = smooth[smooth <= max(most, smoothing_rad_s)]
         if kind.name == "stribeck_friction":
             fast = _rms(c.velocity) * np.geomspace(0.04, 0.8, 7)
@@ -202,11 +202,16 @@ def grid(frame: Frame, candidate: Candidate, smoothing_rad_s: float) -> list[dic
         declared = _declared_power(frame, candidate.motor or 0)
         return _vary(fixed, "power", np.array([p for p in (3.0, 5.0, 7.0) if p > declared][:2]))
     if kind.name == "torque_drift":
-        return _vary(fixed, "time_constant_s", c.time[-1] * np.geomspace(choice("drift"), 1.0, 6))
+        return _vary(fixed, "time_constant_s", c.time[-1] * np.geomspace(_shortest_drift(), 1.0, 6))
     if kind.name == "contact":
         places = np.quantile(c.link_position, np.linspace(0.04, 0.96, 12))
         return [{"position_rad": float(x), "side": side} for side in (1.0, -1.0) for x in places]
     return [fixed]
+
+
+def _shortest_drift() -> float:
+    """Time constant of a drift, in recordings, at least: half a stretch; one over sooner is a start."""
+    return 0.5 / whole("groups")
 
 
 def _vary(fixed: Values, name: str, values: Iterable[float]) -> list[dict[str, float]]:
@@ -270,7 +275,7 @@ def bounds_of(frame: Frame, candidate: Candidate, name: str) -> tuple[float, flo
     if name == "displacement_rad":
         return 0.0, _spread(c.position if candidate.kind.location == "motor" else c.deflection)
     if name == "time_constant_s":
-        return choice("drift") * float(c.time[-1]), float(c.time[-1])
+        return _shortest_drift() * float(c.time[-1]), float(c.time[-1])
     return 0.0, np.inf
 
 

@@ -58,9 +58,6 @@ CHOICES: dict[str, Choice] = {
     "sampled": Choice(0.2, "sampling rates", "bandwidth at most", "five samples in a period"),
     "narrowing": Choice(0.75, "", "step by which it is narrowed", "noise halves, with two derivatives"),
     "narrowest": Choice(4.0, "Hz", "bandwidth at least, whatever the noise", "below it nothing is known"),
-    "noise": Choice(
-        0.004, "torque rms", "noise of a balance that narrows the bandwidth", "twice the floor"
-    ),
     # Models and their errors.
     "floor": Choice(0.002, "torque rms", "error that no model gets below", "filters, sampling and rounding"),
     "exact": Choice(
@@ -75,52 +72,36 @@ CHOICES: dict[str, Choice] = {
     "least_scale": Choice(
         0.05, "", "torque scale that ends its linearisation", "twenty times off is no scale error"
     ),
-    "noise_rounds": Choice(8, "", "fixed point of parameters and noise", "it converges by a factor in each"),
     "newton_steps": Choice(6, "", "of a hypothesis that is kept", "three are usual"),
     "rough_steps": Choice(3, "", "of hypotheses that are compared", "what they still gain decides nothing"),
     "converged": Choice(0.02, "standard deviations", "step that ends the iteration", "small beside one"),
-    "pinned": Choice(1e-4, "prior's width", "width of a prior that holds", "any narrow one"),
     "patient_steps": Choice(
         20, "", "of a healthy joint's fit", "it starts from springs and readings that nobody knows"
     ),
-    "present": Choice(
-        0.95, "probability", "of a delay, zero or friction of a healthy joint", "as alternatives"
-    ),
     "fit_periods": Choice(
-        30, "periods of the bandwidth", "in a recording of a healthy joint, at least", "three rows in each"
+        30, "periods of the bandwidth", "in a recording, at least", "five rows for each parameter"
     ),
-    "fit_rows": Choice(60, "rows", "of a healthy joint, at least", "five for each parameter"),
     "sign_noise": Choice(
         5.0, "velocity noise", "over which everyday friction changes its sign", "no row sees it sharper"
     ),
-    "sharpest_sign": Choice(1e-3, "largest velocity", "the same at least", "a division by zero otherwise"),
-    "softest_sign": Choice(0.02, "largest velocity", "the same at most", "softer, it is damping"),
-    "missing_inertia": Choice(0.8, "declared inertia", "that may be missing of it", "some of it is there"),
     "shapes": Choice(25, "points", "start of a spring's shape parameter", "an octave in four steps"),
     # Which effects are tried.
     "ripple_periods": Choice(
         2.0, "periods", "of a ripple in the range of motion, at least", "fewer are a bend"
     ),
     "ripples": Choice(900, "", "frequencies of a ripple at most", "time; a gear has fewer"),
-    "drift": Choice(
-        0.04, "recordings", "time constant of a drift, at least", "one that is over sooner is a start"
-    ),
     "smoothing": Choice(
-        0.05, "largest velocity", "over which a sign may change", "smoother, a sign is damping"
+        0.05, "largest velocity", "over which a sign may change, at most", "smoother, it is damping"
     ),
-    "softer": Choice(5.0, "", "second start of a smoothing", "a step of its grid"),
+    "softer": Choice(5.0, "", "step of the grid of smoothings", "a sign changes as sharply or not"),
     "beam": Choice(3, "hypotheses", "grown at once", "enough for an imitation beside the true effect"),
     "tried": Choice(8, "effects", "tried beside each", "the families of friction and ripple have six"),
     "effects": Choice(5, "effects", "at most", "a joint with more is declared wrongly"),
     # Verdicts.
     "even": Choice(0.05, "probability", "at which another account is an alternative", "one in twenty"),
     "sure": Choice(3.0, "standard deviations", "at which a reading's error is reported", "one in 400"),
-    "skew": Choice(1.05, "periods", "an everyday skew at most", "a sample, and what noise makes of it"),
-    "constant": Choice(
-        2.0, "what else is left", "a constant torque that is all there is", "more than the rest"
-    ),
     "groups": Choice(
-        10, "", "stretches of time, and kinds of motion", "more say less each, fewer are unsure"
+        10, "", "stretches of time, kinds of motion, knots over time", "more say less each, fewer are unsure"
     ),
     "moderation": Choice(
         4.0, "groups", "that the variance of rows as independent as they look counts for",
@@ -138,7 +119,6 @@ CHOICES: dict[str, Choice] = {
     ),
     # Free curves.
     "knots": Choice(20, "", "of a spline over one coordinate", "a bump of a twentieth of the range"),
-    "coarse_knots": Choice(8, "", "of a spline beside another coordinate", "twice as many columns"),
     "harmonics": Choice(15, "", "of a line in time at most", "a push that is short in its period"),
     "curve_width": Choice(3.0, "effect's prior", "prior of a curve's coefficients", "they share the torque"),
 }  # fmt: skip

@@ -82,7 +82,7 @@ def _bases(frame: Frame, beside: Fitted, location: str, motor: int) -> list[tupl
         ((name,), _over(name, _Splines(getattr(c, name), whole("knots")))) for name in (place, rate, *others)
     ]
     v = getattr(c, rate)
-    slow = _Splines(c.time, whole("coarse_knots"))
+    slow = _Splines(c.time, whole("groups"))
     if location == "motor" and frame.linked:
         made.append((("torque",), _beyond_scale(_Splines(c.torque, whole("knots")))))
         made.append(
@@ -92,7 +92,7 @@ def _bases(frame: Frame, beside: Fitted, location: str, motor: int) -> list[tupl
     made.append(
         (
             (place, rate),
-            _both_ways(place, rate, smoothing, _Splines(getattr(c, place), whole("coarse_knots"))),
+            _both_ways(place, rate, smoothing, _Splines(getattr(c, place), whole("groups"))),
         )
     )
     if location == "motor":
@@ -100,7 +100,7 @@ def _bases(frame: Frame, beside: Fitted, location: str, motor: int) -> list[tupl
     if location == "transmission":
         made.append((("deflection", "time"), _scaled("deflection", "time", slow, c)))
         made.append((("deflection", "deflection_rate"), _creeping))
-        path = _Splines(c.link_position, whole("coarse_knots"))
+        path = _Splines(c.link_position, whole("groups"))
         made.append((("deflection", "link_position"), _scaled("deflection", "link_position", path, c, True)))
     made.append((("time",), _waves(frame, beside, *_line(frame, beside, location, motor))))
     made.append((("time",), _over("time", slow)))

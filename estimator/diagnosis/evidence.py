@@ -141,7 +141,7 @@ class Regression:
         held = np.where(np.isfinite(low), low, 0.0)
         free = np.ones(len(low), dtype=bool)
         x = self.mean * self._unit
-        last = whole("noise_rounds") + len(x) - 1
+        last = whole("newton_steps") + len(x) - 1
         for attempt in range(last + 1):
             precision, side = self._normal(times, sigma, x)
             old, x = x, np.where(free, 0.0, held)

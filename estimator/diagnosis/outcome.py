@@ -60,15 +60,13 @@ def findings_of(
             made.append((share, finding))
     for slot, x, sigma in zip(found.slots, found.posterior.x, std, strict=True):
         value = slot.taken + float(x)
-        late = (
-            slot.name in ("encoder_delay", "torque_delay") and abs(value) > choice("skew") * problem.period_s
-        )
-        if slot.kind == "everyday" and late and abs(value) > choice("sure") * sigma:
+        late = abs(value) > problem.period_s + choice("sure") * sigma
+        if slot.kind == "everyday" and slot.name in ("encoder_delay", "torque_delay") and late:
             kind = LIBRARY[slot.name]
             made.append((0.0, Finding(
                 name=slot.name, location=kind.location, motor=slot.motor, parameters={"delay_s": value},
                 std={"delay_s": float(sigma)},
-                probability=NormalDist().cdf((abs(value) - choice("skew") * problem.period_s) / sigma),
+                probability=NormalDist().cdf((abs(value) - problem.period_s) / sigma),
             )))  # fmt: skip
     made += [(0.0, f) for f in _offsets(problem, found, std)] if not made else []
     made.sort(key=lambda pair: -pair[0])
@@ -88,7 +86,7 @@ def _offsets(problem: Problem, found: Fitted, std: FloatArray) -> list[Finding]:
             found.posterior.x[mine] + np.array([found.slots[j].taken for j in mine])
         )
         left = found.regression.residual(found.posterior.x)
-        if not flexible or float(np.mean(constant**2)) < choice("constant") ** 2 * float(np.mean(left**2)):
+        if not flexible or float(np.mean(constant**2)) < choice("sure") ** 2 * float(np.mean(left**2)):
             continue
         size = -float(np.mean(constant[problem.group % problem.equations == i]))
         deviation = float(np.hypot.reduce(std[[j for j in mine if found.slots[j].name == "torque_offset"]]))
@@ -106,8 +104,9 @@ def _everyday(problem: Problem, finding: Finding) -> bool:
     """Whether a delay is a skew of up to a sample: it is aligned and reported, not diagnosed."""
     if finding.name not in ("encoder_delay", "torque_delay"):
         return False
-    delay = finding.parameters["delay_s"]
-    return isinstance(delay, float) and abs(delay) <= choice("skew") * problem.period_s
+    delay, std = finding.parameters["delay_s"], finding.std["delay_s"]
+    assert isinstance(delay, float) and isinstance(std, float)
+    return abs(delay) <= problem.period_s + choice("sure") * std
 
 
 def _absolute(problem: Problem, found: Fitted, k: int, name: str, x: float) -> float:

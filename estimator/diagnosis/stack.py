@@ -154,7 +154,7 @@ class Stack:
                     if held is None:
                         self._add(column, slot, width, low=least(self._model, candidate))
                     else:
-                        self._add(column, slot, choice("pinned") * width, centre=held[p])
+                        self._add(column, slot, choice("exact") * width, centre=held[p])
 
     def term(self, k: int, term: Term) -> None:
         """An effect, and once it has a size, its nonlinear parameters."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -15,8 +16,7 @@ from estimator.transmissions import TransmissionModel
 __all__ = ["Middle", "middle", "stiffness_curves"]
 
 _POINTS = 121
-_SIGMA_95 = 1.96
-_OUTERMOST = 0.99  # quantile of the deflections: what is beyond is a few samples
+_SIGMA_95 = NormalDist().inv_cdf(0.975)
 
 
 class Middle(NamedTuple):
@@ -60,7 +60,7 @@ def stiffness_curves(problem: Problem, before: Fitted, after: Fitted) -> tuple[S
     for i, motor in enumerate(problem.model.motors):
         if not motor.flexible:
             continue
-        reach = float(np.quantile(np.abs(frame.motors[i].deflection), _OUTERMOST))
+        reach = float(np.max(np.abs(frame.motors[i].deflection)))
         phi = np.linspace(-reach, reach, _POINTS)
         made.append(
             StiffnessCurve(i, phi, *_stiffness(problem, before, i, phi), *_stiffness(problem, after, i, phi))

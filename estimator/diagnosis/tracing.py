@@ -9,7 +9,7 @@ import numpy as np
 
 from estimator.diagnosis.bandwidth import choose_bandwidth
 from estimator.diagnosis.certainty import accounts, standing
-from estimator.diagnosis.choices import choice
+from estimator.diagnosis.choices import choice, whole
 from estimator.diagnosis.curves import best_curve
 from estimator.diagnosis.excitation import advice_for, poor
 from estimator.diagnosis.heldout import Held, errors_of, held_out
@@ -74,7 +74,7 @@ def diagnose(
         raise EstimatorError(f"bandwidth: expected more than 0 and at most {nyquist:g} Hz, got {bandwidth:g}")
     alone = validation is None and len(records) == 1
     problem = Problem(records, model, bandwidth, held=alone)
-    if min(problem.rows) < 60:
+    if min(problem.rows) < 2 * whole("fit_periods"):
         raise EstimatorError(
             f"the recording is too short for a bandwidth of {bandwidth:g} Hz: "
             f"{min(problem.rows)} independent rows"

@@ -89,7 +89,7 @@ def everyday_std(
         if calibrating:  # a healthy joint's encoders may start anywhere
             return (std * float(np.ptp(phi) + abs(np.mean(phi))),)
         # What is left of a zero that has been set is no effect: half a count of an encoder is as much.
-        return ((PRIORS["declared_zero"].std if linked else std) * float(np.ptp(phi)),)
+        return ((choice("floor") * float(np.std(phi)) if linked else std * float(np.ptp(phi))),)
     if name == "torque_constant" and calibrating:
         return (0.0,)  # the anchor
     if linked and not calibrating:

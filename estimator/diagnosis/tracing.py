@@ -135,9 +135,7 @@ class _Judge:
             [[np.sqrt(np.mean(r[side & problem.used] ** 2)) for side in sides] for r in residuals]
         )
         motor, link = left[1] / np.maximum(left[0], 1e-300)
-        return [
-            f"the motor's balance (eq 5) leaves {motor:.1%} of what it did, the link's (eq 4) {link:.1%}"
-        ]
+        return [f"the motor's balance (eq 5) leaves {motor:.1%} of what it did, the link's (eq 4) {link:.1%}"]
 
     def diagnosis(self) -> Diagnosis:
         """Verdict, findings, errors."""
@@ -210,8 +208,11 @@ class _Judge:
             kind = LIBRARY[finding.name]
             if kind.channel != "torque" or kind.name == "torque_offset":
                 pinned[kind.name, finding.motor] = (0.0,) * len(kind.linear)
-        if "torque_offset" in {f.name for f in effects}:
-            pinned |= {("deflection_offset", i): (0.0,) for i in range(len(self.problem.model.motors))}
+        zeros = ("torque_offset", "deflection_offset")
+        if self.problem.frames[0].linked or "torque_offset" in {f.name for f in effects}:
+            motors = range(len(self.problem.model.motors))
+            pinned |= {(name, i): (0.0,) for name in zeros for i in motors}
+        return self.problem.null(pinned)
         return self.problem.null(pinned)
 
     def _unlisted(self, curve: Fitted) -> bool:

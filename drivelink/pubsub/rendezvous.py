@@ -19,6 +19,7 @@ import zenoh
 __all__ = ["Rendezvous", "answers"]
 
 _ATTEMPT_S = 0.2
+_LOOKS = 3  # in a row that must be answered: a killed process loses its connections before its listener
 _CONNECT_S = 0.5
 
 
@@ -87,10 +88,15 @@ class Rendezvous:
                 self._thread.start()
 
     def _follow(self) -> None:
-        while not self._closed.is_set() and not answers(self._endpoint):
-            if self._listen():
+        answered = 0
+        while answered < _LOOKS and not self._closed.wait(_ATTEMPT_S if answered else 0.0):
+            if answers(self._endpoint):
+                answered += 1
+            elif self._listen():
                 return
-            self._closed.wait(_ATTEMPT_S)
+            else:  # another daemon was quicker, or the port is not free yet
+                answered = 0
+                self._closed.wait(_ATTEMPT_S)
 
     def _listen(self) -> bool:
         config = zenoh.Config()
@@ -105,7 +111,7 @@ class Rendezvous:
             config.insert_json5(key, json.dumps(value))
         try:
             session = zenoh.open(config)
-        except zenoh.ZError:  # another daemon was quicker, or the port is not free yet
+        except zenoh.ZError:
             return False
         with self._lock:
             if not self._closed.is_set():

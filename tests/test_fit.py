@@ -192,6 +192,11 @@ def test_command_writes_json_plots_and_a_joint_file_that_loads(elbow, tmp_path, 
     assert "from the drawing" in (tmp_path / "fitted.toml").read_text()
     assert written.provenance["fit"]["recording"] == "run.csv"
     capsys.readouterr()
+    # A result is printed before any file is written: what cannot be written takes nothing else with it.
+    (tmp_path / "taken").write_text("a file")
+    assert main([*args[:5], str(tmp_path / "taken")]) != 0
+    said = capsys.readouterr()
+    assert "torque balance" in said.out and "taken" in said.err and said.err.count("\n") == 1
 
 
 @pytest.fixture(scope="module")

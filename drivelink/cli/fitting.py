@@ -58,7 +58,12 @@ def fit_recording(args: argparse.Namespace, source: JointText, folder: Path | No
         raise refusal(path, joint, error.findings, str(error)) from error
     except EstimatorError as error:
         raise RecordingError(f"{_named(args)}: {error}") from error
-    document, made = _as_json(found, args.recording), []
+    document = _as_json(found, args.recording)
+    if args.json:
+        print(json.dumps(document))
+    else:
+        _print(found, args.recording)  # before any file: a full disk takes no result
+    made = []
     if args.out is not None:
         made.append(args.out / "fit.json")
         _folder(args.out)
@@ -70,11 +75,7 @@ def fit_recording(args: argparse.Namespace, source: JointText, folder: Path | No
     if args.write is not None:
         _write(args, source, found, records)
         made.append(args.write)
-    if args.json:
-        print(json.dumps(document))
-        return
-    _print(found, args.recording)
-    for path in made:
+    for path in [] if args.json else made:
         print(f"wrote {path}")
 
 

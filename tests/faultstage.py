@@ -102,7 +102,7 @@ class Sink(Collector):
 
     def forget(self) -> None:
         """Start anew."""
-        self.estimates, self.samples, self.due = [], [], []
+        self.estimates, self.samples, self.payloads, self.due = [], [], [], []
 
     def put_sample(self, sample: Sample, stamp_ns: int) -> None:
         super().put_sample(sample, stamp_ns)

@@ -103,8 +103,8 @@ def test_it_ends_by_itself_and_leaves_the_data_sheets(
     ("arguments", "status", "message"),
     [
         (("--quirks", "acme"), 2, "--quirks: expected one of strict, epos4"),
-        (("--effect", "magic=1"), 2, "--effect: effect: expected one of"),
-        (("--effect", "cogging"), 2, "--effect: effect: expected NAME=VALUE"),
+        (("--effect", "magic=1"), 2, "--effect: expected one of"),
+        (("--effect", "cogging"), 2, "--effect: expected NAME=VALUE"),
         (("--seconds", "-1"), 2, "--seconds: expected a number > 0"),
         (("--interface", "socketcan", "--channel", "can77"), 4, "socketcan can77"),
         (("--interface", "carrierpigeon"), 4, "carrierpigeon"),

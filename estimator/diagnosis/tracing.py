@@ -82,7 +82,7 @@ def diagnose(
     search = Search(problem, progress)
     progress("held-out data")
     held = held_out(records, model, bandwidth, validation, problem)
-    found = _gated(search, held, _chosen(search, held, search.run()))
+    found = _chosen(search, held, [_gated(search, held, one) for one in search.run()])
     outcome = _Judge(search, held, found, validation is not None, progress).diagnosis()
     higher = raised(model, outcome.effects)
     if higher is not None:
@@ -91,7 +91,7 @@ def diagnose(
 
 
 def _chosen(search: Search, held: Held, hypotheses: list[Fitted]) -> Fitted:
-    """The hypothesis with the best odds on the data that were fitted and on those that took no part."""
+    """Of hypotheses past the gate, the best by its odds on the data that were fitted and on those held out."""
     best = hypotheses[0]
 
     def odds(one: Fitted) -> float:

@@ -32,9 +32,10 @@ const MEMORY_S: f64 = 20.0; // of how far the declared link is off, as that of t
 const FRICTION_SPEEDS: f64 = 0.02; // of the largest velocity: over which dry friction changes its sign
 const ONE_WAY: f64 = 0.9; // mean direction beyond which less than a twentieth of the motion goes the other way
 const PARAMETERS: usize = 6; // of `LinkErrors`
-const DAMPING: usize = 1;
-const DRY: usize = 2;
-const CONSTANT: usize = 5;
+const CONSTANT: usize = 0;
+const DAMPING: usize = 2;
+const DRY: usize = 3;
+const FLOOR: f64 = 1e-3; // of the torque carried: no curve is known better
 const CONSISTENCY_S: f64 = 10.0; // over which the two flexibility torques are compared
 const TINY: f64 = 1e-12;
 
@@ -255,7 +256,7 @@ fn gravity(link: &Link, q: f64) -> f64 {
 
 /// How far the declared link is off: identified from the link's own balance, where that is as expected.
 ///
-/// Parameters: inertia, viscous damping, dry friction, gravity's sine and cosine, and a constant torque. The
+/// Parameters: a constant torque, inertia, viscous damping, dry friction, gravity's sine and cosine. The
 /// declared uncertainties are the priors. Recursive least squares with exponential forgetting in information
 /// form: Λ = Λ₀ + Σ e^(−t/20 s) x xᵀ/r.
 ///
@@ -283,16 +284,17 @@ impl LinkErrors {
         let kept = 1.0 - period_s / MEMORY_S;
         self.direction = Some(dry + kept * (self.direction.unwrap_or(dry.signum()) - dry));
         self.information.iter_mut().flatten().chain(&mut self.vector).for_each(|x| *x *= kept);
-        [acceleration, velocity, dry, sine, cosine, 1.0]
+        [1.0, acceleration, velocity, dry, sine, cosine]
     }
 
     /// The torque that these errors make, and its variance.
     fn at(&self, row: &Row, prior: &Row) -> (f64, f64) {
         let mut factor = self.information;
+        let least = prior.map(|variance| if variance > 0.0 { 1.0 / variance } else { 1.0 });
         for i in 0..PARAMETERS {
-            factor[i][i] += if prior[i] > 0.0 { 1.0 / prior[i] } else { 1.0 };
+            factor[i][i] += least[i];
         }
-        // Cholesky, and L⁻¹ of both sides on the way.
+        // Cholesky, and L⁻¹ of both sides on the way. No pivot is less than what was known before any data.
         let mut own = *row;
         own[CONSTANT] = 0.0;
         let mut vector = self.vector;
@@ -301,7 +303,8 @@ impl LinkErrors {
             for j in 0..=i {
                 let sum: f64 = (0..j).map(|k| factor[i][k] * factor[j][k]).sum();
                 let left = factor[i][j] - sum;
-                factor[i][j] = if i == j { left.max(TINY * TINY).sqrt() } else { left / factor[j][j] };
+                factor[i][j] =
+                    if i == j { left.max(least[i]).max(TINY * TINY).sqrt() } else { left / factor[j][j] };
             }
             for k in 0..i {
                 own[i] -= factor[i][k] * own[k];
@@ -457,7 +460,7 @@ impl LinkMomentum {
         let sum = own + self.carried[0];
         let damping = link.damping_std.powi(2) + (carried.stiffness * self.skew).powi(2);
         let (dry, gravity) = (self.dry * self.judge.largest, link.gravity_std.powi(2));
-        let prior = [link.inertia_std.powi(2), damping, dry * dry, gravity, gravity, f64::INFINITY];
+        let prior = [f64::INFINITY, link.inertia_std.powi(2), damping, dry * dry, gravity, gravity];
         let row = self.errors.row(link, self.position, self.period);
         let row = std::array::from_fn(|i| if prior[i] > 0.0 { row[i] } else { 0.0 }); // 0: known exactly
         let (off, unknown) = self.errors.at(&row, &prior);
@@ -470,7 +473,8 @@ impl LinkMomentum {
         let usual = torque.abs() <= BAND_SIGMA * (around + white).sqrt();
         if valid && usual && !contact {
             // Errors of readings last as long as the filter does; that of the curve does not average out at all.
-            let lasting = (read + white) / self.filter.bandwidth + carried.variance * MEMORY_S;
+            let curve = carried.variance + (FLOOR * self.judge.largest).powi(2);
+            let lasting = (read + white) / self.filter.bandwidth + curve * MEMORY_S;
             self.errors.identify(&row, sum - self.measured[0], lasting / self.period);
         }
         self.now = External {

@@ -233,6 +233,7 @@ def test_a_short_recording_is_refused(records: dict[str, Record]) -> None:
         diagnose(short, kit.model())
 
 
+@pytest.mark.slow
 def test_gaps_are_left_out(records: dict[str, Record]) -> None:
     whole = records["coulomb"]
     keep = np.ones(len(whole), dtype=bool)

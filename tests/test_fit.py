@@ -72,6 +72,7 @@ def test_the_order_is_found_where_it_is_not_declared(elbow):
     assert sorted(orders)[3] == 2
 
 
+@pytest.mark.slow
 def test_intervals_cover_about_as_often_as_they_say(elbow):
     plants, alpha, truth = elbow
     z = []

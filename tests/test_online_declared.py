@@ -104,7 +104,11 @@ def ends(model, order, parameters, noisy):
 
 
 @pytest.mark.parametrize("noisy", [pytest.param(False, marks=pytest.mark.slow), True], ids=["clean", "noisy"])
-@pytest.mark.parametrize("off", [1.0, 0.6, 1.4], ids=["right", "40 % low", "40 % high"])
+@pytest.mark.parametrize(
+    "off",
+    [pytest.param(1.0, marks=pytest.mark.slow), 0.6, pytest.param(1.4, marks=pytest.mark.slow)],
+    ids=["right", "40 % low", "40 % high"],
+)
 @pytest.mark.parametrize("model", SPRINGS)
 def test_an_estimate_ends_at_the_truth_however_its_spring_was_declared(model, off, noisy):
     for order in ORDERS.get(model, (None,)):

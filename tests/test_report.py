@@ -110,6 +110,7 @@ def test_the_report_has_units_bands_the_winner_and_what_is_left(folder: Path) ->
     assert "prefers-color-scheme: dark" in page and "currentColor" in page and "#ffffff" not in page
 
 
+@pytest.mark.slow
 def test_of_a_linear_axis_the_report_speaks_of_newtons_and_metres(folder: Path) -> None:
     (folder / "slide.toml").write_text(JOINT.replace("[[motor]]", 'axis = "linear"\n[[motor]]', 1))
     _diagnose(folder, "coulomb", "slide.toml")

@@ -91,7 +91,7 @@ def diagnose(
 
 
 def _chosen(search: Search, held: Held, hypotheses: list[Fitted]) -> Fitted:
-    """Of hypotheses past the gate, the best by its odds on the data that were fitted and on those held out."""
+    """Of hypotheses past the gate, the best by its odds on all data."""
     best = hypotheses[0]
 
     def odds(one: Fitted) -> float:

@@ -119,6 +119,10 @@ def _rss() -> float:
     return psutil.Process().memory_info().rss / 2**20
 
 
+def size_of(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
 def run_changes(args: argparse.Namespace) -> dict[str, Any]:
     folder = prepared(args)
     out = folder / f"out-{os.getpid()}"
@@ -153,6 +157,8 @@ def run_changes(args: argparse.Namespace) -> dict[str, Any]:
         "second_run": again.stdout.splitlines()[0] if again.stdout else again.stderr,
         "seconds": round(seconds, 1),
         "cpu_s_a_recording": round(statistics.mean(row["cpu_s"] for row in rows), 3),
+        "bytes_a_recording": size_of(folder / "recordings") // total,
+        "report_bytes_a_recording": size_of(out / "diagnoses") // total,
         **used,
         **judged(folder, json.loads((out / "fleet.json").read_text())),
         "out": str(out),

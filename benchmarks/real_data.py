@@ -3,8 +3,9 @@
     python benchmarks/real_data.py [--data DIR] [--shaft-line DIR] [--out DIR] [--json FILE]
 
 The recordings are not part of the project: DIR (or $DRIVELINK_DATA, or ../shared/data) holds emps/,
-kuka_kr300/ and uw_sea/. --shaft-line names a folder with Ice_excitation1.csv … and their motor files of
-github.com/aksel-ilveskero/Shaftline-Torque-Estimation, if it has been fetched; it has a torque sensor.
+kuka_kr300/ and uw_sea/. --shaft-line (or $DRIVELINK_SHAFT_LINE) names a folder with Ice_excitation1.csv … and
+their motor files of github.com/aksel-ilveskero/Shaftline-Torque-Estimation, if it has been fetched; it has a
+torque sensor.
 """
 
 from __future__ import annotations
@@ -224,7 +225,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     default = Path(os.environ.get("DRIVELINK_DATA", ROOT.parent / "shared" / "data"))
     parser.add_argument("--data", type=Path, default=default, metavar="DIR")
-    parser.add_argument("--shaft-line", type=Path, metavar="DIR", help="recordings of the shaft line")
+    shaft = os.environ.get("DRIVELINK_SHAFT_LINE")
+    parser.add_argument("--shaft-line", type=Path, default=shaft and Path(shaft), metavar="DIR")
     parser.add_argument("--out", type=Path, default=Path("real_data"), metavar="DIR", help="reports go there")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all outcomes there")
     args = parser.parse_args()

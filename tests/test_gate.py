@@ -76,7 +76,7 @@ def test_a_healthy_joint_passes(kind: str, seeds: range) -> None:
     "kind", [pytest.param(kind, marks=pytest.mark.slow) if kind != "none" else kind for kind in gatekit.KINDS]
 )
 def test_each_fault_is_named(kind: str) -> None:
-    drawn = gatekit.draw(kind, 0, effects=False)
+    drawn = gatekit.draw(kind, 0, effects=False, seconds=6.0)
     for name, factors in gatekit.faults(drawn).items():
         findings = examine(gatekit.faulty(drawn.record, factors), drawn.model)
         assert named(findings, factors), (kind, name, findings)

@@ -47,14 +47,16 @@ def test_kuka_axes_have_friction_and_get_better_on_the_other_recording(axis: int
 
 @pytest.mark.slow
 def test_two_recordings_of_a_machine_find_what_belongs_to_it() -> None:
-    """The authors regress 2.6 to 2.9 ms of skew between the encoders; the parts agree with the whole."""
+    """The authors regress 2.6 to 2.9 ms of skew between the encoders; what each tells alone agrees with that."""
     declared = jointfile.load(ROOT / "examples" / "kuka_axis3.toml")
     a, b = (recording.read(DATA / f"kuka_kr300/axis3_{name}.csv", declared) for name in "AB")
     both = diagnose([a, b], declared.model(), 15.0)
     assert both.alignment["link_position_delay_s"] == pytest.approx(2.6e-3, abs=3e-4)
     (together,) = both.transmissions
-    for alone in (diagnose(one, declared.model(), 15.0) for one in (a, b)):
-        (transmission,) = alone.transmissions
+    each = [diagnose(one, declared.model(), 15.0).transmissions[0] for one in (a, b)]
+    determined = [transmission for transmission in each if transmission.parameters]
+    assert determined  # one alone may not determine its stiffness
+    for transmission in determined:
         difference = _number(transmission.parameters) - _number(together.parameters)
         deviation = float(np.hypot(_number(transmission.std), _number(together.std)))
         assert abs(difference) < 3.0 * deviation

@@ -8,15 +8,20 @@ import signal
 import subprocess
 import sys
 import time
+from importlib import resources
 
 import pytest
 from rich.console import Console
 
+from drivelink import jointfile
+from drivelink.cycle.loop import ObjectSink
+from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.closing import as_json, closing_table
 from drivelink.demo.comparison import Comparison
 from drivelink.demo.rig import Summary, TruePoint
+from drivelink.demo.simulate import network_from_joint, open_sim_bus, world_from_joint
 from drivelink.pubsub.wire import EstimateMessage
-from estimator.sample import Status, TransmissionEstimate
+from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
 
 DEMO = [sys.executable, "-m", "drivelink", "demo"]
 
@@ -24,6 +29,33 @@ DEMO = [sys.executable, "-m", "drivelink", "demo"]
 def message(sequence: int, torque: float, stiffness: float, *, status: int = Status.VALID) -> EstimateMessage:
     each = TransmissionEstimate(torque, stiffness, 1.0, 0.1)
     return EstimateMessage(sequence, 0, int(status), torque, stiffness, 1.0, (each,))
+
+
+class Statuses(ObjectSink):
+    """A sink that keeps each status."""
+
+    def __init__(self) -> None:
+        self.seen: list[int] = []
+
+    def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
+        self.seen.append(estimate.status)
+
+    def put_sample(self, sample: Sample, stamp_ns: int) -> None:
+        pass
+
+
+@pytest.mark.parametrize("case", ["constant", "quadratic", "vsa-ii"])
+def test_in_a_healthy_demo_nothing_changes(case: str) -> None:
+    with resources.as_file(resources.files("drivelink") / "joints" / f"{case}.toml") as path:
+        joint = jointfile.load(path)
+    world, bus = world_from_joint(joint), open_sim_bus(joint.bus)
+    network, served = network_from_joint(joint, bus, world=world), [ServedJoint(joint=joint)]
+    with bus, Daemon(served, publish=False, devices=network.poll, real_time=False) as daemon:
+        (loop_joint,) = daemon.loop.loop_joints
+        loop_joint.sink = sink = Statuses()
+        daemon.run_lockstep(round(10.0 / joint.bus.period_s))
+    assert not any(status & Status.CHANGED for status in sink.seen)
+    assert sink.seen[-1] & Status.VALID
 
 
 def test_truth_and_estimate_are_paired_whichever_comes_first() -> None:

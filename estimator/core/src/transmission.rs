@@ -303,7 +303,8 @@ impl TransmissionEstimator {
             self.dt,
         );
         self.identification.observe_noise(resolution);
-        if now.usable && self.identification.kalman().is_none() {
+        // How large motion is: what is not explained does not tell.
+        if now.usable && !self.changes.changed() {
             self.identification.observe_scale(&self.signals, &now.link);
         }
         if self.identification.kalman().is_none() && now.usable && self.excited {
@@ -390,10 +391,6 @@ impl TransmissionEstimator {
             }
         } else {
             self.identification.pass_over(innovation, predicted);
-        }
-        // How large motion is: what is not explained does not tell.
-        if now.usable && !self.changes.changed() {
-            self.identification.observe_scale(&self.signals, &now.link);
         }
     }
 

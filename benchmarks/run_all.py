@@ -47,7 +47,7 @@ class Section:
     title: str
     full: tuple[str, ...] = ()
     quick: tuple[str, ...] = ()
-    json_file: bool = True
+    json_file: bool = False
     markdown: bool = True
     of: str = ""
 
@@ -57,24 +57,28 @@ SECTIONS = (
         name="cycle",
         title="One cycle beside the textbook way and the floor",
         quick=("--seconds", "2", "--rounds", "2"),
+        json_file=True,
     ),
-    Section(name="stages", title="Stages, and joints on one core", quick=("--cycles", "2000")),
+    Section(
+        name="stages", title="Stages, and joints on one core", quick=("--cycles", "2000"), json_file=True
+    ),
     Section(
         name="service",
         title="Jitter, recorder, start, memory",
         quick=("--seconds", "2", "--rounds", "1"),
+        json_file=True,
     ),
-    Section(name="endurance", title="Missed cycles by cause", quick=("--seconds", "10")),
+    Section(name="endurance", title="Missed cycles by cause", quick=("--seconds", "10"), json_file=True),
     Section(
         name="growth",
         title="Cost against size",
         quick=("--seconds", "5,10", "--diagnose-seconds", "10"),
+        json_file=True,
     ),
     Section(
         name="latency",
         title="Publisher to subscriber, beside bare zenoh",
         quick=("--cycles", "4000"),
-        json_file=False,
         markdown=False,
     ),
     Section(
@@ -82,34 +86,31 @@ SECTIONS = (
         title="Many joints through one router",
         full=("--joints", "1,6,12,24"),
         quick=("--joints", "1,6", "--seconds", "3"),
-        json_file=False,
         markdown=False,
     ),
     Section(
         name="estimator_tick",
         title="The estimator alone",
         quick=("--ticks", "8000"),
-        json_file=False,
         markdown=False,
     ),
     Section(
         name="compiled",
         title="The compiled core beside the last interpreted commit",
         quick=("--seconds", "5", "--rounds", "1"),
+        json_file=True,
     ),
-    Section(name="paper_table", title="The paper's table", json_file=False, markdown=False),
-    Section(name="sensitivity", title="Sensitivity", json_file=False, markdown=False),
+    Section(name="paper_table", title="The paper's table", markdown=False),
+    Section(name="sensitivity", title="Sensitivity", markdown=False),
     Section(
         name="ensembles",
         title="The estimator on random joints",
         quick=("--joints", "1"),
-        json_file=False,
     ),
     Section(
         name="intervals",
         title="The 95 % intervals over a minute",
         quick=("--seconds", "20"),
-        json_file=False,
         markdown=False,
     ),
     Section(
@@ -118,58 +119,51 @@ SECTIONS = (
         full=("--seeds", "1"),
         quick=("--seeds", "1", "--effects", "clean", "coulomb_friction", "backlash"),
         markdown=False,
+        json_file=True,
     ),
     Section(
         name="effect_pairs",
         title="Two effects at once",
         quick=("--seconds", "10"),
-        json_file=False,
     ),
-    Section(name="real_data", title="Real data before and after", markdown=False),
-    Section(name="control", title="Control with the estimates", markdown=False),
+    Section(name="real_data", title="Real data before and after", markdown=False, json_file=True),
+    Section(name="control", title="Control with the estimates", markdown=False, json_file=True),
     Section(
         name="parts",
         title="Disjoint parts of one recording",
         quick=("--machines", "emps"),
-        json_file=False,
     ),
     Section(
         name="gate",
         title="Wrong units, signs, gears and time",
         full=("--seeds", "2"),
         quick=("--seeds", "1", "--kinds", "serial"),
-        json_file=False,
     ),
     Section(
         name="external",
         title="External torque and contact",
         quick=("--minutes", "2", "--errors", "2", "--joints", "sea"),
-        json_file=False,
     ),
     Section(
         name="fault_matrix",
         title="Sensor faults: wrong samples called valid",
         quick=("--joints", "constant", "--seconds", "8"),
-        json_file=False,
     ),
     Section(
         name="queries",
         title="A flood of queries",
         quick=("--seconds", "2", "--rounds", "1"),
-        json_file=False,
     ),
     Section(
         name="kill_recorder",
         title="Recorders killed at random",
         quick=("--kills", "5"),
-        json_file=False,
         markdown=False,
     ),
     Section(
         name="soak",
         title="Ten minutes of random faults in real time",
         quick=("--seconds", "60"),
-        json_file=False,
         markdown=False,
     ),
     Section(
@@ -178,7 +172,6 @@ SECTIONS = (
         of="fleet",
         full=("throughput", "--nights", "2", "--recordings", "12", "--rounds", "2"),
         quick=("throughput", "--nights", "2", "--recordings", "4"),
-        json_file=False,
         markdown=False,
     ),
     Section(
@@ -187,7 +180,6 @@ SECTIONS = (
         of="fleet",
         full=("cpu", "--nights", "2", "--recordings", "8"),
         quick=("cpu", "--nights", "2", "--recordings", "2"),
-        json_file=False,
         markdown=False,
     ),
     Section(
@@ -196,7 +188,6 @@ SECTIONS = (
         of="fleet",
         full=("table",),
         quick=("table", "--rows", "1000"),
-        json_file=False,
         markdown=False,
     ),
     Section(
@@ -205,7 +196,6 @@ SECTIONS = (
         of="fleet",
         full=("statistics", "--fleets", "120"),
         quick=("statistics", "--fleets", "10"),
-        json_file=False,
         markdown=False,
     ),
     Section(
@@ -214,13 +204,11 @@ SECTIONS = (
         of="fleet",
         full=("changes", "--seconds", "5"),
         quick=("changes", "--seconds", "5", "--joints", "8", "--nights", "8"),
-        json_file=False,
         markdown=False,
     ),
     Section(
         name="fleet_storage",
         title="A fleet: local files, SFTP and S3",
-        json_file=False,
         markdown=False,
     ),
 )

@@ -10,17 +10,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
 
 from estimator.diagnosis.bandwidth import choose_bandwidth
-from estimator.diagnosis.choices import choice, whole
+from estimator.diagnosis.choices import choice, least_rows
 from estimator.diagnosis.covariance import design_effects, hac_covariance
 from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.diagnosis.search import Search
-from estimator.diagnosis.stiffness import middle
+from estimator.diagnosis.stiffness import SIGMA_95, middle
 from estimator.errors import EstimatorError
 from estimator.gate import check, refuse
 from estimator.model import JointModel, ParameterValue, Transmission
@@ -29,7 +28,6 @@ from estimator.transmissions import MODELS, RIGID, UNKNOWN
 
 __all__ = ["JointFit", "Key", "TransmissionFit", "fit", "fit_joint", "joint_problem", "transmission_fits"]
 
-_SIGMA_95 = NormalDist().inv_cdf(0.975)
 _LOOKED_AT = 33  # deflections from zero to the largest one
 _HIGHEST_ORDER = 4
 _DELAYS = ("encoder_delay", "torque_delay")  # a zero of the encoders is always there
@@ -98,7 +96,7 @@ class TransmissionFit:
         phi = np.linspace(0.0, reach, _LOOKED_AT)
         slopes = law.stiffness_jacobian(phi, self.alpha)
         std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", slopes, self.covariance, slopes), 0.0))
-        return bool(np.all(law.stiffness(phi, self.alpha) > _SIGMA_95 * std))
+        return bool(np.all(law.stiffness(phi, self.alpha) > SIGMA_95 * std))
 
 
 class JointFit(NamedTuple):
@@ -164,11 +162,11 @@ def fit_joint(
 ) -> JointFit:
     """The joint at its best fit; arguments and errors as of `fit`."""
     records = [record] if isinstance(record, Record) else list(record)
-    usable, untold = [], []
+    usable, remarks = [], []
     for one in records:
         usable.append(_whole(one, model))
         check(usable[-1], model)
-        untold.append(refuse(one, model).remark)
+        remarks.append(refuse(one, model).remark)
     if bandwidth_rad_s is None:
         shortest = min(len(one) * one.period_s for one in usable)
         bandwidth_hz = max(
@@ -182,7 +180,7 @@ def fit_joint(
             f"bandwidth: expected more than 0 and at most {nyquist:g} Hz, got {bandwidth_hz:g}"
         )
     problem, fitted = _ordered(usable, _bare(model), bandwidth_hz)
-    doubts = tuple(dict.fromkeys(remark for remark in untold if remark))
+    doubts = tuple(dict.fromkeys(remark for remark in remarks if remark))
     return _aligned(usable, problem, fitted)._replace(doubts=doubts)
 
 
@@ -192,12 +190,7 @@ def joint_problem(records: Sequence[Record], model: JointModel, bandwidth_hz: fl
     Raises:
         EstimatorError: too short for the bandwidth, or a deflection that does not change.
     """
-    problem = Problem(records, model, bandwidth_hz, calibrating=True)
-    if min(problem.rows) < 2 * whole("fit_periods"):
-        raise EstimatorError(
-            f"recording: expected at least {whole('fit_rows')} rows without gaps at a bandwidth of "
-            f"{bandwidth_hz:g} Hz, got {min(problem.rows)}"
-        )
+    problem = Problem(records, model, bandwidth_hz, calibrating=True, least=least_rows())
     for i, motor in enumerate(model.motors):
         if motor.flexible and not any(np.ptp(f.motors[i].deflection) > 0.0 for f in problem.frames):
             raise EstimatorError("recording: expected a deflection that changes, it stands still")

@@ -19,9 +19,18 @@ from estimator.errors import EstimatorError
 from estimator.model import ParameterValue
 from estimator.sample import FloatArray
 
-__all__ = ["Exponential", "Function", "Linear", "Polynomial", "Table", "TransmissionModel", "VsaII"]
+__all__ = [
+    "RELATIVE_STEP",
+    "Exponential",
+    "Function",
+    "Linear",
+    "Polynomial",
+    "Table",
+    "TransmissionModel",
+    "VsaII",
+]
 
-_STEP = np.finfo(float).eps ** (1.0 / 3.0)  # relative step of central differences
+RELATIVE_STEP = np.finfo(float).eps ** (1.0 / 3.0)  # of central differences
 
 
 class TransmissionModel(ABC):
@@ -64,7 +73,7 @@ class TransmissionModel(ABC):
     def stiffness_jacobian(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
         """dsigma/dalpha, (..., n); it carries the covariance of alpha over to sigma."""
         phi = np.asarray(phi, dtype=np.float64)
-        step = _STEP * np.maximum(np.abs(phi), 1e-3)[..., None]
+        step = RELATIVE_STEP * np.maximum(np.abs(phi), 1e-3)[..., None]
         after = self.jacobian(phi + step[..., 0], alpha)
         before = self.jacobian(phi - step[..., 0], alpha)
         return np.asarray((after - before) / (2.0 * step))
@@ -271,7 +280,7 @@ class Function(_Shaped):
         columns = [self.torque(phi, (1.0, *alpha[1:]))]
         for i in range(1, alpha.size):
             step = np.zeros_like(alpha)
-            step[i] = _STEP * max(abs(alpha[i]), 1e-3)
+            step[i] = RELATIVE_STEP * max(abs(alpha[i]), 1e-3)
             columns.append((self.torque(phi, alpha + step) - self.torque(phi, alpha - step)) / (2 * step[i]))
         return np.stack(columns, axis=-1)
 

@@ -9,7 +9,16 @@ from typing import Any
 import numpy as np
 
 from estimator.errors import EstimatorError
-from estimator.flexibility import Exponential, Function, Linear, Polynomial, Table, TransmissionModel, VsaII
+from estimator.flexibility import (
+    RELATIVE_STEP,
+    Exponential,
+    Function,
+    Linear,
+    Polynomial,
+    Table,
+    TransmissionModel,
+    VsaII,
+)
 from estimator.model import Transmission
 
 __all__ = [
@@ -24,8 +33,6 @@ __all__ = [
 
 RIGID = "none"  # no deflection: the torque is what the motor's balance leaves
 UNKNOWN = "unknown"  # flexible, but no model of it: black-box estimation
-
-_STEP = np.finfo(float).eps ** (1.0 / 3.0)  # relative step of central differences
 
 MODELS: dict[str, TransmissionModel] = {
     model.name: model for model in (Linear(), Polynomial(), VsaII(), Exponential())
@@ -73,7 +80,7 @@ def register(
     phi = np.linspace(-phi_max_rad, phi_max_rad, 41)
     alpha = np.array([1.0, *model.shape_start])
     value, slope = model.torque(phi, alpha), model.stiffness(phi, alpha)
-    step = _STEP * phi_max_rad
+    step = RELATIVE_STEP * phi_max_rad
     difference = (model.torque(phi + step, alpha) - model.torque(phi - step, alpha)) / (2 * step)
     if not np.allclose(value, -value[::-1], rtol=1e-9, atol=1e-12 * float(np.max(np.abs(value)))):
         raise EstimatorError(f'transmission "{name}": torque: expected an odd function of phi (eq 2)')

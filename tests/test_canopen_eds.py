@@ -221,7 +221,7 @@ def test_roboteqs_name_for_the_node_id_is_understood(tmp_path):
 
 
 def test_a_map_that_the_eds_file_lacks_is_unknown_and_not_empty(tmp_path):
-    path = tmp_path / "untold.eds"
+    path = tmp_path / "silent.eds"
     maps = {0x1A00: ("", ""), 0x1A01: ("DefaultValue=0", ""), 0x1A02: ("DefaultValue=2", "")}
     text = ""
     for index, (count, first) in maps.items():

@@ -148,6 +148,15 @@ def test_what_cannot_be_fitted_is_reported(elbow):
             ),
             model,
         )
+    short = Record(
+        period_s=T,
+        sequence=np.arange(1500),
+        motor_position_rad=record.motor_position_rad[:1500],
+        motor_torque_nm=record.motor_torque_nm[:1500],
+        link_position_rad=record.link_position_rad[:1500],
+    )
+    with pytest.raises(EstimatorError, match="too short for a bandwidth of 4 Hz: expected at least 60"):
+        fit(short, model, 2.0 * np.pi * 4.0)
     with pytest.raises(EstimatorError, match="2 motor"):
         fit(record, joints.joint_model(1.0, 1.0, m=2))
 

@@ -92,18 +92,18 @@ def test_a_rich_motion_decides_every_sign_and_the_unit_of_the_link(kind: str) ->
     ]
     for judgement in judgements:
         assert judgement.reason == "" and judgement.left < 0.3
-        assert not any("sign" in text and "link" in text for text in judgement.untold), judgement.untold
+        assert not any("sign" in text and "link" in text for text in judgement.undecided), judgement.undecided
 
 
 def test_the_sign_of_a_link_that_is_held_is_reported_as_undecided() -> None:
     drawn = gatekit.draw("soft", 4, held=True)
     judgement = judge(drawn.record, drawn.model)
     assert judgement.findings == ()
-    assert any("sign" in text and "link" in text for text in judgement.untold), judgement
+    assert any("sign" in text and "link" in text for text in judgement.undecided), judgement
     assert "this motion does not reveal" in judgement.remark
     reversed_link = gatekit.faulty(drawn.record, {"link_position": -1.0})
-    untold = judge(reversed_link, drawn.model).untold
-    assert any("sign" in text and "link" in text for text in untold), untold
+    undecided = judge(reversed_link, drawn.model).undecided
+    assert any("sign" in text and "link" in text for text in undecided), undecided
 
 
 def test_a_torque_that_is_only_noise_decides_nothing() -> None:
@@ -297,7 +297,7 @@ def test_a_real_machine_passes_as_it_is_and_no_fault_of_it_does(path: str, joint
     healthy = judge(record, model)
     assert healthy.findings == ()
     if "InnerLoop" in path:
-        assert any("link" in text for text in healthy.untold), healthy
+        assert any("link" in text for text in healthy.undecided), healthy
     for name, factors in _faults(record).items():
         if (path, name) in UNTOLD:
             doubt = judge(gatekit.faulty(record, factors), model).remark
@@ -305,7 +305,7 @@ def test_a_real_machine_passes_as_it_is_and_no_fault_of_it_does(path: str, joint
             continue
         if "InnerLoop" in path and name not in OF_A_HELD_LINK:
             judgement = judge(gatekit.faulty(record, factors), model)
-            assert judgement.findings or judgement.untold, name  # it is not passed in silence
+            assert judgement.findings or judgement.undecided, name  # it is not passed in silence
             continue
         findings = examine(gatekit.faulty(record, factors), model)
         assert findings, name

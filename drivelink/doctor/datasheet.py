@@ -33,7 +33,7 @@ _OBJECTS: dict[Signal, tuple[tuple[int, int], ...]] = {
 _CIA406: dict[Signal, tuple[tuple[int, int], ...]] = {Signal.LINK_POSITION: ((0x6004, 0),)}
 _NEEDED = {Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE}  # of a drive
 _NEEDED_OF_ENCODER = {Signal.LINK_POSITION}
-_UNTOLD = {
+_UNDECLARED = {
     Signal.MOTOR_POSITION: "the file gives no counts per motor revolution (0x608F)",
     Signal.MOTOR_TORQUE: "the file gives no value for rated torque (0x6076) or rated current (0x6075)",
 }
@@ -219,6 +219,6 @@ def _units(section: Section, sheet: DataSheet) -> None:
     drive = DriveSection(node_id=1)
     bare = Role(node_id=1, motor=0, drive=drive, encoder=None, key="motor.drive", eds=sheet.path, tpdo=())
     offered = offer(bare, sheet.values(), vendor_of(sheet.vendor_id))
-    for signal, untold in _UNTOLD.items():
+    for signal, missing in _UNDECLARED.items():
         if signal in offered.missing:
-            section.say(Severity.INFO, "units", untold, _STATE[signal])
+            section.say(Severity.INFO, "units", missing, _STATE[signal])

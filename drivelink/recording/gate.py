@@ -104,7 +104,7 @@ class Gathered:
         if judgement.findings:
             fix = _text_of(self._joint, judgement.findings, live=live)
             return [f"{', and '.join(map(str, judgement.findings))}; {fix}"]
-        return [judgement.remark] if judgement.untold else []
+        return [judgement.remark] if judgement.undecided else []
 
 
 def _record_of(samples: Sequence[Sample], model: JointModel, period_s: float) -> Record | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-__all__ = ["CHOICES", "Choice", "choice", "whole"]
+__all__ = ["CHOICES", "Choice", "choice", "least_rows", "whole"]
 
 
 class Choice(NamedTuple):
@@ -132,3 +132,8 @@ def choice(name: str) -> float:
 def whole(name: str) -> int:
     """That number, where it counts something."""
     return max(1, round(CHOICES[name].value))
+
+
+def least_rows() -> int:
+    """Rows that a recording needs: two in each period of the bandwidth."""
+    return 2 * whole("fit_periods")

@@ -22,6 +22,7 @@ from estimator.diagnosis.known import declared_corrections, declared_torque
 from estimator.diagnosis.readings import READINGS, corrected, restored
 from estimator.diagnosis.stack import Extra, Pinned, Slot, Stack, Term, step_of, stepped
 from estimator.effects import LIBRARY
+from estimator.errors import EstimatorError
 from estimator.model import JointModel
 from estimator.sample import FloatArray, Record
 
@@ -104,6 +105,10 @@ class Problem:
         bandwidth_hz: of the filter that all channels share.
         held: some blocks of each recording take no part.
         calibrating: the recordings are of a healthy joint, and show what its declared numbers should be.
+        least: independent rows that each recording needs.
+
+    Raises:
+        EstimatorError: a recording has fewer.
     """
 
     def __init__(
@@ -113,6 +118,7 @@ class Problem:
         bandwidth_hz: float,
         held: bool = False,
         calibrating: bool = False,
+        least: int = 1,
     ) -> None:
         self.model = model
         self.calibrating = calibrating
@@ -123,6 +129,11 @@ class Problem:
         frames = [self._frame(k, declared) for k in range(len(records))]
         self.frames = frames
         self.rows = [frame.rows for frame in frames]
+        if min(self.rows) < least:
+            raise EstimatorError(
+                f"the recording is too short for a bandwidth of {bandwidth_hz:g} Hz: "
+                f"expected at least {least} independent rows, got {min(self.rows)}"
+            )
         group, used = [], []
         equations = frames[0].equations
         for k, frame in enumerate(frames):

@@ -15,7 +15,7 @@ from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.diagnosis.result import Curve, Finding, Refitted, Rival, Series
 from estimator.diagnosis.search import Search
 from estimator.diagnosis.stack import curve_columns
-from estimator.diagnosis.stiffness import middle
+from estimator.diagnosis.stiffness import SIGMA_95, middle
 from estimator.effects import LIBRARY
 from estimator.model import ParameterValue
 from estimator.sample import FloatArray
@@ -162,7 +162,7 @@ def transmissions_of(
         if not found.determined or any(after.posterior.bound[mine]):
             doubts.append(
                 f"these data do not determine the stiffness of motor {i + 1}: {found.stiffness_nm_rad:.4g} "
-                f"± {1.96 * found.std_nm_rad:.2g} N·m/rad (95 %)"
+                f"± {SIGMA_95 * found.std_nm_rad:.2g} N·m/rad (95 %)"
             )
             made.append(Refitted(model.name, {}, {}))
             continue

@@ -13,10 +13,10 @@ from estimator.diagnosis.result import StiffnessCurve
 from estimator.sample import FloatArray
 from estimator.transmissions import TransmissionModel
 
-__all__ = ["Middle", "middle", "stiffness_curves"]
+__all__ = ["SIGMA_95", "Middle", "middle", "stiffness_curves"]
 
 _POINTS = 121
-_SIGMA_95 = NormalDist().inv_cdf(0.975)
+SIGMA_95 = NormalDist().inv_cdf(0.975)
 
 
 class Middle(NamedTuple):
@@ -37,7 +37,7 @@ class Middle(NamedTuple):
 
         A control loop has a gain margin of two as a rule: with a stiffness that is further off it has none.
         """
-        return _SIGMA_95 * self.std_nm_rad < 0.5 * self.stiffness_nm_rad
+        return SIGMA_95 * self.std_nm_rad < 0.5 * self.stiffness_nm_rad
 
 
 def middle(model: TransmissionModel, alpha: FloatArray, covariance: FloatArray, phi: FloatArray) -> Middle:

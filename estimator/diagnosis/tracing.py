@@ -9,7 +9,7 @@ import numpy as np
 
 from estimator.diagnosis.bandwidth import choose_bandwidth
 from estimator.diagnosis.certainty import accounts, standing
-from estimator.diagnosis.choices import choice, whole
+from estimator.diagnosis.choices import choice, least_rows
 from estimator.diagnosis.curves import best_curve
 from estimator.diagnosis.excitation import advice_for, poor
 from estimator.diagnosis.heldout import Held, errors_of, held_out
@@ -73,12 +73,7 @@ def diagnose(
     if not 0.0 < bandwidth <= nyquist:
         raise EstimatorError(f"bandwidth: expected more than 0 and at most {nyquist:g} Hz, got {bandwidth:g}")
     alone = validation is None and len(records) == 1
-    problem = Problem(records, model, bandwidth, held=alone)
-    if min(problem.rows) < 2 * whole("fit_periods"):
-        raise EstimatorError(
-            f"the recording is too short for a bandwidth of {bandwidth:g} Hz: "
-            f"{min(problem.rows)} independent rows"
-        )
+    problem = Problem(records, model, bandwidth, held=alone, least=least_rows())
     search = Search(problem, progress)
     progress("held-out data")
     held = held_out(records, model, bandwidth, validation, problem)
@@ -212,7 +207,6 @@ class _Judge:
         if self.problem.frames[0].linked or "torque_offset" in {f.name for f in effects}:
             motors = range(len(self.problem.model.motors))
             pinned |= {(name, i): (0.0,) for name in zeros for i in motors}
-        return self.problem.null(pinned)
         return self.problem.null(pinned)
 
     def _unlisted(self, curve: Fitted) -> bool:

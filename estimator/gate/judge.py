@@ -102,14 +102,14 @@ class Judgement:
 
     Attributes:
         findings: what is wrong; empty where nothing is, and where nothing can be decided.
-        untold: units and signs that this motion does not reveal, in words: with them wrong it would look as
-            likely. Empty where something is found.
+        undecided: units and signs that this motion does not reveal, in words: with them wrong it would look
+            as likely. Empty where something is found.
         reason: why nothing can be decided at all; empty where something can.
         left: share of the torque that the balance leaves, put right.
     """
 
     findings: tuple[Discrepancy, ...] = ()
-    untold: tuple[str, ...] = ()
+    undecided: tuple[str, ...] = ()
     reason: str = ""
     left: float = math.nan
 
@@ -118,7 +118,7 @@ class Judgement:
         """What cannot be decided, in words; empty where everything can."""
         if self.reason:
             return f"units and signs cannot be checked: {self.reason}"
-        return f"this motion does not reveal {' or '.join(self.untold)}" if self.untold else ""
+        return f"this motion does not reveal {' or '.join(self.undecided)}" if self.undecided else ""
 
 
 class GateError(EstimatorError):
@@ -227,14 +227,14 @@ def judge(record: Record, model: JointModel) -> Judgement:
     if odds < _DECISIVE or after > _LEFT:
         if before > _LEFT:
             return Judgement(reason=f"the motion explains {1.0 - before:.0%} of the torque", left=before)
-        return Judgement(untold=_untold(joint, single, declared), left=before)
+        return Judgement(undecided=_undecided(joint, single, declared), left=before)
     alike = [h for e, h in weighed[1:] if best - e < _ALIKE and len(h) == len(found)]
     motors = record.motors
     findings = [_finding(found, k, alike, odds, before, after, motors) for k in range(len(found))]
     return Judgement(findings=tuple(findings), left=after)
 
 
-def _untold(joint: _Joint, single: Sequence[Cause], declared: float) -> tuple[str, ...]:
+def _undecided(joint: _Joint, single: Sequence[Cause], declared: float) -> tuple[str, ...]:
     """Units and signs that the data alone do not decide, what they cost beforehand aside."""
     doubtful: dict[str, list[str]] = {}
     for cause in single:

@@ -276,15 +276,20 @@ struct LinkErrors {
 type Row = [f64; PARAMETERS];
 
 impl LinkErrors {
-    /// What the parameters multiply, and one more period of motion.
-    fn row(&mut self, link: &Link, [q, velocity, acceleration]: [f64; 3], period_s: f64) -> Row {
+    /// What the parameters multiply.
+    fn row(&mut self, link: &Link, [q, velocity, acceleration]: [f64; 3]) -> Row {
         self.fastest = self.fastest.max(velocity.abs());
         let dry = (velocity / (FRICTION_SPEEDS * self.fastest).max(TINY)).tanh();
         let (sine, cosine) = (q + link.gravity_phase).sin_cos();
-        let kept = 1.0 - period_s / MEMORY_S;
-        self.direction = Some(dry + kept * (self.direction.unwrap_or(dry.signum()) - dry));
-        self.information.iter_mut().flatten().chain(&mut self.vector).for_each(|x| *x *= kept);
         [1.0, acceleration, velocity, dry, sine, cosine]
+    }
+
+    /// One period of motion in this direction (−1 to 1) passes.
+    fn forget(&mut self, direction: f64, period_s: f64) {
+        let kept = 1.0 - period_s / MEMORY_S;
+        let mean = self.direction.unwrap_or(direction.signum());
+        self.direction = Some(direction + kept * (mean - direction));
+        self.information.iter_mut().flatten().chain(&mut self.vector).for_each(|x| *x *= kept);
     }
 
     /// The torque that these errors make, and its variance.
@@ -461,7 +466,8 @@ impl LinkMomentum {
         let damping = link.damping_std.powi(2) + (carried.stiffness * self.skew).powi(2);
         let (dry, gravity) = (self.dry * self.judge.largest, link.gravity_std.powi(2));
         let prior = [f64::INFINITY, link.inertia_std.powi(2), damping, dry * dry, gravity, gravity];
-        let row = self.errors.row(link, self.position, self.period);
+        let row = self.errors.row(link, self.position);
+        self.errors.forget(row[DRY], self.period);
         let row = std::array::from_fn(|i| if prior[i] > 0.0 { row[i] } else { 0.0 }); // 0: known exactly
         let (off, unknown) = self.errors.at(&row, &prior);
         // A reading that is rounded errs alike for as long as it stands: what the spring makes of it is no noise.

@@ -150,6 +150,13 @@ SECTIONS = (
         quick=("--joints", "constant", "--seconds", "8"),
     ),
     Section(
+        name="fault_sizes",
+        of="fault_matrix",
+        title="Sensor faults: sizes up to which nothing is noticed",
+        full=("--sizes", "--joints", "constant,vsa-ii"),
+        quick=("--sizes", "--joints", "constant"),
+    ),
+    Section(
         name="queries",
         title="A flood of queries",
         quick=("--seconds", "2", "--rounds", "1"),

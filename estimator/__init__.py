@@ -1,4 +1,4 @@
-"""Flexibility torque and stiffness from motor signals: the mathematics, and nothing else.
+"""Estimates flexibility torque and stiffness from motor signals: pure mathematics.
 
 Arrays and numbers in, results out. No clock, file or socket. Equation numbers are those of
 "Residual-based Stiffness Estimation in Robots with Flexible Transmissions".
@@ -71,7 +71,7 @@ _LAZY = {name: f"estimator.{module}" for module, names in _PLACES.items() for na
 
 
 def __getattr__(name: str) -> Any:
-    """Public names are imported when asked for: a subscriber that wants a type does not pay for scipy."""
+    """Import public names on first use: a subscriber that needs a type does not load scipy."""
     if name in _LAZY:
         return getattr(import_module(_LAZY[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,8 +1,8 @@
 """Model-based estimation from whole recordings: what `drivelink fit` does.
 
 It is the hypothesis without missing effects of `estimator.diagnosis`: the declared joint at its best fit,
-with the errors that every rig has, within the priors of `estimator.priors`. What a healthy joint need not
-have, a delay of its readings and the friction of a rigid joint, has to earn its place.
+with the errors that every rig has, within the priors of `estimator.priors`. Optional errors (delays of the
+readings, friction of a rigid joint) are kept only if the data support them.
 """
 
 from __future__ import annotations
@@ -49,10 +49,9 @@ class TransmissionFit:
         deflection_rad: (rows,) filtered deflections, for plots.
         deflection_rate_rad_s: (rows,) their derivatives.
         velocity_rad_s: (rows,) filtered motor velocities.
-        torque_nm: (rows,) flexibility torque that the motor's balance gives there, nuisances removed.
-        unexplained_nm: (rows,) what is left of the motor's balance there, with the friction that is not
-            declared.
-        error_rms_nm: what is left of the motor's balance.
+        torque_nm: (rows,) flexibility torque by the motor's balance there, nuisances removed.
+        unexplained_nm: (rows,) residual of the motor's balance there, undeclared friction included.
+        error_rms_nm: rms residual of the motor's balance.
         torque_rms_nm: of the flexibility torque; of the motor torque, where that is not determined.
         inertia_kg_m2: B, as fitted.
         viscous_damping_nm_s_rad: D, likewise.
@@ -100,15 +99,15 @@ class TransmissionFit:
 
 
 class JointFit(NamedTuple):
-    """A joint at its best fit.
+    """A fitted joint.
 
     Attributes:
-        records: what was fitted to, rows that are no numbers left out.
+        records: the recordings without rows that contain NaN.
         problem: the recordings, and the joint with its orders chosen.
         fitted: the hypothesis.
-        covariance: (k, k) of its parameters; whether a reading's error is there is itself uncertain.
-        absent: what has not earned its place.
-        doubts: what the recordings do not reveal of units and signs, a line each.
+        covariance: (k, k) of its parameters; includes the uncertainty whether a reading has an error at all.
+        absent: optional errors that the data do not support.
+        doubts: units and signs that the recordings do not reveal, one line each.
     """
 
     records: Sequence[Record]
@@ -125,7 +124,7 @@ class JointFit(NamedTuple):
         ]
 
     def values(self, key: Key) -> FloatArray:
-        """The error itself, beyond what is declared, likewise."""
+        """The estimated error beyond the declared value, in the same order."""
         mine = self.places(key)
         return np.zeros(len(mine)) if key in self.absent else _totals(self.fitted)[mine]
 
@@ -141,7 +140,7 @@ class JointFit(NamedTuple):
 def fit(
     record: Record | Sequence[Record], model: JointModel, bandwidth_rad_s: float | None = None
 ) -> list[TransmissionFit]:
-    """Fit every transmission of a joint to recordings; one entry a motor.
+    """Fit every transmission of a joint to recordings; one entry per motor.
 
     A rigid transmission's entry has no parameters; an unknown one is fitted by a polynomial.
 
@@ -160,7 +159,7 @@ def fit(
 def fit_joint(
     record: Record | Sequence[Record], model: JointModel, bandwidth_rad_s: float | None = None
 ) -> JointFit:
-    """The joint at its best fit; arguments and errors as of `fit`."""
+    """Fit the whole joint; arguments and errors as in `fit`."""
     records = [record] if isinstance(record, Record) else list(record)
     usable, remarks = [], []
     for one in records:
@@ -198,7 +197,7 @@ def joint_problem(records: Sequence[Record], model: JointModel, bandwidth_hz: fl
 
 
 def _whole(record: Record, model: JointModel) -> Record:
-    """The rows whose readings are numbers; the others are gaps."""
+    """The recording without rows that contain NaN; they become gaps."""
     good = np.all(np.isfinite(record.motor_position_rad) & np.isfinite(record.motor_torque_nm), axis=1)
     if model.has_deflection and record.link_position_rad is not None:
         good &= np.isfinite(record.link_position_rad)
@@ -221,7 +220,7 @@ def _whole(record: Record, model: JointModel) -> Record:
 
 
 def _bare(model: JointModel) -> JointModel:
-    """The joint with its transmissions yet to be found."""
+    """The joint without transmission parameters."""
 
     def open_(own: Transmission) -> Transmission:
         name = "polynomial" if own.model == UNKNOWN else own.model
@@ -231,7 +230,7 @@ def _bare(model: JointModel) -> JointModel:
 
 
 def _ordered(records: Sequence[Record], model: JointModel, bandwidth_hz: float) -> tuple[Problem, Fitted]:
-    """The best fit, with the order of each polynomial, where none is declared, that has the most evidence."""
+    """The best fit; each undeclared polynomial order is the one with the most evidence."""
     problem = joint_problem(records, model, bandwidth_hz)
     fitted = problem.null()
     for i, motor in enumerate(model.motors):
@@ -249,9 +248,9 @@ def _ordered(records: Sequence[Record], model: JointModel, bandwidth_hz: float) 
 
 
 def _aligned(records: Sequence[Record], problem: Problem, free: Fitted) -> JointFit:
-    """The fit without what has not earned its place, the least likely left out first.
+    """The fit without unsupported optional errors, removed one at a time, the least probable first.
 
-    What is left open of that is part of the covariance: it is the one of the mixture of both hypotheses.
+    The covariance is that of the mixture of both hypotheses, weighted by their odds.
     """
     everything = _covariance(problem, free)
     fitted, covariance, absent = free, everything, frozenset[Key]()
@@ -275,7 +274,7 @@ def _aligned(records: Sequence[Record], problem: Problem, free: Fitted) -> Joint
 
 
 def _covariance(problem: Problem, fitted: Fitted) -> FloatArray:
-    """Covariance of the parameters; what a sign holds at its bound is as uncertain as before any data."""
+    """Covariance of the parameters; one held at its bound by a sign constraint keeps its prior variance."""
     covariance = hac_covariance(problem, fitted)
     held = np.flatnonzero(fitted.posterior.bound & [s.kind in ("everyday", "base") for s in fitted.slots])
     covariance[held, held] = fitted.regression.std[held] ** 2
@@ -283,7 +282,7 @@ def _covariance(problem: Problem, fitted: Fitted) -> FloatArray:
 
 
 def _optional(joint: JointFit) -> list[Key]:
-    """Errors that may have to be left out: delays, and friction and offset of a rigid joint."""
+    """Optional errors: delays, and friction and offset of a rigid joint."""
     motors = joint.problem.model.motors
     keys = {(s.name, s.motor) for s in joint.fitted.slots if s.kind == "everyday"}
     rigid = {(name, i) for i, motor in enumerate(motors) if not motor.flexible for name in _OF_RIGID}
@@ -294,7 +293,7 @@ def _odds_of_zero(joint: JointFit, keys: Sequence[Key]) -> float:
     """Log odds that there are no such errors: the Savage-Dickey density ratio.
 
     Posterior over prior density at zero (Dickey, Annals of Mathematical Statistics 42, 1971), with the
-    covariance that holds for correlated errors.
+    covariance for correlated errors.
     """
     mine = [j for key in keys for j in joint.places(key)]
     wide = joint.fitted.regression.std[mine]
@@ -305,19 +304,19 @@ def _odds_of_zero(joint: JointFit, keys: Sequence[Key]) -> float:
 
 
 def _totals(fitted: Fitted) -> FloatArray:
-    """(k,) each column's quantity, what has been corrected before included."""
+    """(k,) the quantity of each column, including corrections already applied."""
     return np.array([s.taken for s in fitted.slots]) + fitted.posterior.x
 
 
 def _friction(joint: JointFit, motor: int) -> FloatArray:
-    """(rows,) torque of the friction that is not declared, as fitted."""
+    """(rows,) torque of the fitted, undeclared friction."""
     mine = joint.places(("coulomb_friction", motor))
     design, x = joint.fitted.regression.design, joint.fitted.posterior.x
     return np.asarray(design[:, mine] @ x[mine], dtype=np.float64)
 
 
 def transmission_fits(joint: JointFit) -> list[TransmissionFit]:
-    """What a fit says of each motor and its transmission."""
+    """The result of a fit for each motor and its transmission."""
     problem, fitted = joint.problem, joint.fitted
     frames = problem.at(fitted.corrections, fitted.base)
     left = fitted.regression.residual(fitted.posterior.x)

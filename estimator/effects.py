@@ -4,8 +4,8 @@ Names, places, parameters and laws are those of `estimator/core/src/library.rs`,
 
 Signs: with x in N·m, B theta" + D theta' + x_motor - tau_e(phi) - x_transmission = tau and
 M q" + D_q q' + g(q) + tau_e + x_transmission + x_link = tau_k. x is the sum over an effect's terms, each
-times its linear parameter. A measured torque has x too much: the torque that acts is tau - x. A reading
-has its error too much: the true position is the reading less the error.
+times its linear parameter. A measured torque is the acting torque plus x; a reading is the true position plus
+its error.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Channel = Literal["torque", "motor_torque", "deflection", "link_position"]
 
 
 class Coordinates(NamedTuple):
-    """What a term may depend on: numbers of one tick, or arrays over a recording, all filtered alike.
+    """Coordinates that a term may depend on: numbers of one tick, or equally filtered arrays of a recording.
 
     Attributes:
         position: theta, rad.
@@ -79,7 +79,7 @@ class Parameter(NamedTuple):
         name: with its unit, as it stands in a joint file.
         meaning: in words.
         linear: whether the effect is proportional to it; the k-th linear parameter weighs the k-th term.
-        default: its value where a joint file leaves it out; None: it must be given.
+        default: value used if the joint file omits it; None: required.
     """
 
     name: str
@@ -99,7 +99,7 @@ class EffectType:
             deflection (the zero between the encoders); the link encoder's reading.
         coordinates: the fields of `Coordinates` that it depends on; first the one that reveals it.
         parameters: its parameters.
-        remembers: whether it depends on the path that led here.
+        remembers: whether it has memory (hysteresis).
         description: for reports, in a few words.
     """
 
@@ -123,21 +123,21 @@ class EffectType:
 
     @property
     def on_link(self) -> bool:
-        """Whether a joint file holds it under [[link.effect]] and not under [[motor.effect]]."""
+        """Whether it belongs into [[link.effect]] of a joint file rather than [[motor.effect]]."""
         return self.location == "link" or self.channel == "link_position"
 
     def terms(self, c: Coordinates, values: Mapping[str, float]) -> FloatArray:
         """Its terms over consecutive moments, unweighted.
 
-        Channel "torque": torques; "motor_torque": what the measured torque has too much; "deflection" and
-        "link_position": what the reading has too much, rad. What remembers starts from nothing.
+        Channel "torque": torques; "motor_torque": error of the measured torque, N·m; "deflection" and
+        "link_position": error of the reading, rad. Effects with memory start unloaded.
 
         Args:
             c: arrays (n,), or numbers where they do not change.
             values: of the nonlinear parameters.
 
         Returns:
-            (k, n), one row a linear parameter.
+            (k, n), one row per linear parameter.
         """
         named = (getattr(c, name) for name in self.coordinates)
         fields = [np.ascontiguousarray(field, dtype=np.float64).reshape(-1) for field in named]

@@ -1,8 +1,8 @@
-"""Discretisations that keep the physics: exact where a torque is held, exact ratios of derivatives elsewhere.
+"""Discretised filters: exact for a held torque, with exact ratios between derivatives for a position.
 
-A torque command is held over a period (zero-order hold); a position is smooth, and is taken as straight
-between samples (first-order hold). Filters built on these two assumptions give a signal and its
-derivatives without ever differentiating a sample.
+A torque command is held over a period (zero-order hold); a position is interpolated linearly between samples
+(first-order hold). Filters built on these assumptions give a signal and its derivatives without
+differentiating samples.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def linear_filter(
 ) -> FloatArray:
     """B(z) / A(z) over a whole recording, from rest, along axis 0: `scipy.signal.lfilter`.
 
-    Imported here, as scipy.signal is half the start of a daemon that never filters a whole recording.
+    Imported here because scipy.signal would double the start-up time of a daemon, which does not need it.
     """
     from scipy.signal import lfilter
 
@@ -114,13 +114,13 @@ class StateVariableFilter:
         return math.ceil((14.0 + 3.0 * (self.order - 1)) / (self.bandwidth_rad_s * self.period_s))
 
     def rest(self, value: float) -> FloatArray:
-        """State (n,) in which a constant input has been forever."""
+        """Steady state (n,) for a constant input."""
         state = np.zeros(self.order)
         state[0] = value
         return state
 
     def impulse(self, periods: int, *, held: bool = False) -> FloatArray:
-        """Answers of all states to a unit pulse, (periods, n), newest first: outputs as sums over inputs."""
+        """Impulse responses of all states, (periods, n), newest first."""
         step = self.held if held else self.smooth
         out = np.empty((periods, self.order))
         state = step.new.copy()

@@ -38,7 +38,7 @@ class TransmissionModel(ABC):
 
     Attributes:
         name: as in the joint file.
-        linear: how many leading entries of alpha enter linearly; None: all, and as many as there are.
+        linear: number of leading entries of alpha that enter linearly; None: all.
         shape_names: names of the remaining entries ("shape"), which enter nonlinearly.
         shape_bounds: (low, high) of each shape parameter.
         shape_start: where a search without prior knowledge starts.
@@ -71,7 +71,7 @@ class TransmissionModel(ABC):
         """df/dalpha, (..., n) (eq 25)."""
 
     def stiffness_jacobian(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """dsigma/dalpha, (..., n); it carries the covariance of alpha over to sigma."""
+        """dsigma/dalpha, (..., n), which maps the covariance of alpha to sigma."""
         phi = np.asarray(phi, dtype=np.float64)
         step = RELATIVE_STEP * np.maximum(np.abs(phi), 1e-3)[..., None]
         after = self.jacobian(phi + step[..., 0], alpha)
@@ -79,7 +79,7 @@ class TransmissionModel(ABC):
         return np.asarray((after - before) / (2.0 * step))
 
     def at(self, phi: float, alpha: Sequence[float]) -> tuple[float, float]:
-        """(torque, stiffness) at one deflection: what a tick needs, without arrays where that is faster."""
+        """(torque, stiffness) at one deflection, for a tick."""
         return float(self.torque(phi, alpha)), float(self.stiffness(phi, alpha))
 
     def reach(self, shape: Sequence[float] = ()) -> float:
@@ -87,9 +87,8 @@ class TransmissionModel(ABC):
         return math.inf
 
     def shapes(self, reach_rad: float, points: int) -> FloatArray:
-        """Values of a single shape parameter that a search begins with, at most so many; each reaches |phi|.
-
-        Geometrically from the lower bound: from a thousandth of what the usual start is above it.
+        """Start values for a search over a single shape parameter, at most so many, all defined at |phi|.
+        Spaced geometrically, from a thousandth of the distance between lower bound and usual start.
         """
         (low, high), (start,) = self.shape_bounds[0], self.shape_start
         least = 1e-3 * (start - low if start > low else high - low)
@@ -155,7 +154,7 @@ class _Law(TransmissionModel):
         return self.law.at(phi, alpha)
 
     def reach(self, shape: Sequence[float] = ()) -> float:
-        """Where the arcsine of a VSA-II, an exponential spring or a table ends."""
+        """Largest |phi| of the law: of the arcsine, the exponential or the table."""
         return self.law.reach(shape) if shape or not self.shape_names else math.inf
 
 

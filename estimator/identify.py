@@ -1,4 +1,4 @@
-"""A joint's model from healthy recordings: what `drivelink fit` shows, and what it writes."""
+"""Identifies a joint's model from healthy recordings, for `drivelink fit`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from estimator.transmissions import RIGID
 
 __all__ = ["Identified", "Left", "RecordingFit", "identify"]
 
-_CHANCE = 0.01  # probability below which values of several recordings are not one value
+_CHANCE = 0.01  # significance level at which recordings disagree on a value
 _PARAMETER = {
     "encoder_delay": "delay_s",
     "torque_delay": "delay_s",
@@ -31,14 +31,14 @@ _PARAMETER = {
 
 
 class Left(NamedTuple):
-    """What is left of the motors' balances: rms in N·m, and relative to the measured torque."""
+    """Residual of the motors' balances: rms in N·m, and relative to the measured torque."""
 
     rms_nm: float
     relative: float
 
 
 class RecordingFit(NamedTuple):
-    """What is left of one recording: fitted with the others, and by a fit of the others alone."""
+    """Residual of one recording: fitted with the others, and under a fit of the others alone."""
 
     train: Left
     validation: Left | None
@@ -49,11 +49,11 @@ class Identified:
     """A joint, fitted to recordings.
 
     Attributes:
-        fits: of each motor, in order; every number that `model` has, too, is the same there.
-        model: the joint with what was found: transmissions, inertias, dampings, link, readings.
+        fits: of each motor; its numbers agree with those in `model`.
+        model: the joint with fitted transmissions, inertias, dampings, link and readings.
         link_std: standard deviations of the link's dynamics, by name.
-        recordings: what is left of each recording.
-        notes: what is to be said of the numbers, a line each.
+        recordings: residual of each recording.
+        notes: remarks on the numbers, one line each.
     """
 
     fits: list[TransmissionFit]
@@ -68,12 +68,12 @@ def identify(
 ) -> Identified:
     """Fit all numbers of a joint to healthy recordings.
 
-    What belongs to the machine is shared: stiffness, inertias, dampings, link, delays. What belongs to a run
-    is not: zeros of the encoders, offset and level of friction.
+    Recordings share the machine's parameters (stiffness, inertias, dampings, link, delays). Each recording
+    has its own encoder zeros, offset and level of friction.
 
     Args:
         record: measured data, of one or several runs.
-        model: declared joint; its effects are honoured, those of the readings are refined.
+        model: declared joint; its effects are kept, those of the readings are refitted.
         bandwidth_rad_s: of the filter that all channels of `fit` share; left out: chosen from the data.
 
     Raises:
@@ -133,7 +133,7 @@ def _effects(
 
 
 def _shared(joint: JointFit, mine: list[int]) -> float | None:
-    """The one value of all recordings; None where they contradict each other."""
+    """The common value of all recordings; None if they contradict each other."""
     values = np.array([joint.fitted.slots[j].taken + joint.fitted.posterior.x[j] for j in mine])
     precision = np.linalg.pinv(joint.covariance[np.ix_(mine, mine)], hermitian=True)
     mean = float(np.sum(precision @ values) / np.sum(precision))
@@ -180,7 +180,7 @@ def _link(joint: JointFit) -> tuple[LinkDynamics | None, dict[str, float]]:
 
 
 def _recordings(joint: JointFit) -> tuple[RecordingFit, ...]:
-    """What is left of each recording, and of each one where it took no part."""
+    """Residual of each recording, fitted and left out."""
     problem, fitted = joint.problem, joint.fitted
     residual, torque = fitted.regression.residual(fitted.posterior.x), problem.torque()
     motors = problem.group % problem.equations < len(problem.model.motors)
@@ -192,7 +192,7 @@ def _recordings(joint: JointFit) -> tuple[RecordingFit, ...]:
 
 
 def _left_out(joint: JointFit, k: int) -> Left | None:
-    """What the k-th recording leaves under a fit of the others; what belongs to a run is fitted there."""
+    """Residual of the k-th recording under a fit of the others; only its own zeros and offsets are fitted."""
     problem, fitted = joint.problem, joint.fitted
     records = joint.records
     if len(records) < 2:

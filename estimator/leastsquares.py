@@ -61,15 +61,15 @@ def fit_polynomial(
     rule: Literal["paper", "bic", "cross-validation"] = "bic",
     gamma: float = 1e-2,
 ) -> ArrayFit:
-    """Odd polynomials of growing order p (eq 24) until the rule says that p is enough.
+    """Fit odd polynomials of increasing order p (eq 24) until the rule stops.
 
     Args:
         columns: f_h(phi), h = 1 … p_max, (s, p_max), filtered like the target where lags are to cancel.
         target: r_tau_e, (s,).
         rule: "paper": stop when the sum of squared errors changes by less than gamma (in N²·m², so it
             depends on units and number of samples); "bic": smallest s ln(e/s) + p ln s;
-            "cross-validation": smallest error on blocks left out, and by more than 1 %. The last two have
-            no scale, and stop in any case where the error is 1e-4 of the torque.
+            "cross-validation": smallest error on blocks left out, and by more than 1 %. The last two are
+            scale-free, and also stop at an error of 1e-4 of the torque.
         gamma: threshold of the paper's rule.
     """
     highest = min(columns.shape[1], _HIGHEST_ORDER)
@@ -125,7 +125,7 @@ def fit_alpha(
     """Iterative least squares for a nonlinearly parametrised model (eqs 25, 26).
 
     Damped (Levenberg-Marquardt) unless asked otherwise: the printed undamped step diverges from the
-    paper's start. The step is measured relative to alpha (the paper's delta = 1 mixes k and C).
+    paper's start. The step is relative to alpha (the paper's delta = 1 mixes k and C).
 
     Args:
         model: f and its Jacobian.

@@ -1,7 +1,6 @@
-"""The declared model of a joint: the known terms of eqs 4-7 and how to estimate the rest.
+"""The declared model of a joint: the known terms of eqs 4-7.
 
-Plain frozen settings, validated when they are made. They carry no state and know no file format;
-the joint file of the service builds them.
+Frozen dataclasses, validated at construction; they know no file format.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ class Transmission:
     Attributes:
         model: its name in `estimator.transmissions.MODELS`, or "none" for a rigid transmission.
         order: p of eq 24 for polynomials; None: chosen from the data.
-        parameters: alpha where it is known or has been fitted; empty: estimated from nothing.
+        parameters: alpha, if known or fitted; empty: estimated without prior.
     """
 
     __pydantic_config__: ClassVar[dict[str, Any]] = _STRICT
@@ -80,11 +79,10 @@ class Motor:
         inertia_kg_m2: B > 0.
         viscous_damping_nm_s_rad: D_theta >= 0.
         transmission: the model of tau_e(phi).
-        effects: what the model has been given besides, with motor, transmission or measurement location.
-        gear_ratio: motor revolutions per joint revolution, where it is known: everything else is at the joint
-            already, and the gate looks for a recording that is not.
-        inertia_std_relative: standard deviation of B as a share of it, where it is known; None: that of
-            `estimator.priors`.
+        effects: declared effects of the motor, the transmission or the measurement.
+        gear_ratio: motor revolutions per joint revolution, if known: everything else is at the joint side;
+            the gate tests for recordings that are not.
+        inertia_std_relative: relative standard deviation of B; None: that of `estimator.priors`.
     """
 
     inertia_kg_m2: float
@@ -158,9 +156,9 @@ class JointModel:
     Attributes:
         arrangement: how the transmissions act on the link (eqs 9, 11 for "antagonistic").
         motors: one motor, or two for a variable-stiffness joint.
-        link: the link dynamics where they are known; they make the external residual (eq 12) available.
+        link: the link dynamics, if known; needed for the external residual (eq 12).
         link_effects: effects located at the link or in its encoder.
-        period_s: sampling period as declared, where it is: a recording's may be another, but not by much.
+        period_s: declared sampling period, if any; the gate compares recordings with it.
     """
 
     arrangement: Arrangement

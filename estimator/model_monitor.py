@@ -1,6 +1,6 @@
-"""On line: is the model still sufficient? Its residual beside what it left when it was fitted.
+"""Tests on line whether the model is still sufficient: its residual against the baseline of its fit.
 
-The arithmetic is `estimator/core/src/model_monitor.rs`, which says what is tested, and how.
+Test and arithmetic are in `estimator/core/src/model_monitor.rs`.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ __all__ = ["ModelMonitor", "ResidualBaseline", "can_monitor", "measure_baseline"
 _SETTINGS = EstimatorSettings()
 _LONGEST_S = 120.0  # of a recording that a baseline is measured on
 _LEAST_SECONDS = 2  # that a standard deviation takes
-_NOTHING = 1e-12  # N·m: a second without residual or torque has a logarithm too
+_NOTHING = 1e-12  # N·m: keeps the logarithm of a second without residual or torque finite
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResidualBaseline:
-    """What a sufficient model leaves of each balance, from the seconds of a healthy recording.
+    """Residual of a sufficient model in each balance, from the seconds of a healthy recording.
 
     Attributes:
         residual_nm: (motors, then the link where its dynamics are known) usual rms of a second.
-        torque_nm: rms of each balance's torque at which that was; more torque lets the residual rise with it.
+        torque_nm: rms of each balance's torque in these seconds; the limit rises with the torque.
         log_std: standard deviation of the logarithm of a second's mean square.
-        seconds: how many there were.
+        seconds: number of seconds.
     """
 
     residual_nm: tuple[float, ...]
@@ -51,12 +51,12 @@ class ResidualBaseline:
             require_finite(0.0, log_std=std)
 
     def as_dict(self) -> dict[str, Any]:
-        """For the joint file."""
+        """The baseline as plain values for the joint file."""
         return {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(self).items()}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> ResidualBaseline | None:
-        """From the joint file; None where it holds none that makes sense."""
+        """Read the baseline from a joint file; None if it is absent or not usable."""
         try:
             return cls(
                 residual_nm=tuple(float(x) for x in values["residual_nm"]),
@@ -74,7 +74,7 @@ def can_monitor(model: JointModel) -> bool:
 
 
 def measure_baseline(record: Record | Sequence[Record], model: JointModel) -> ResidualBaseline:
-    """The baseline of a model on recordings that it is sufficient for (at most two minutes of each).
+    """Measure the baseline of a model on recordings that it explains (at most two minutes of each).
 
     Raises:
         EstimatorError: they have less than two whole seconds after the filters have settled.
@@ -103,15 +103,14 @@ def measure_baseline(record: Record | Sequence[Record], model: JointModel) -> Re
 
 
 class ModelMonitor:
-    """Raises the model alarm, and says where the missing effect is likely to sit.
+    """Raises the model alarm and locates the missing effect.
 
     Args:
         model: as declared, transmission parameters included.
         period_s: of the samples.
-        baseline: what the model left when it was fitted; None: only measure.
+        baseline: residual of the model at its fit; None: only measure.
         false_alarms_per_hour: that a sufficient model may raise.
-        core: the compiled class. Every extension module has one of its own, which it calls without Python in
-            between.
+        core: the compiled class to use; each extension module calls its own without going through Python.
 
     Raises:
         EstimatorError: the model contradicts itself.
@@ -132,7 +131,7 @@ class ModelMonitor:
         self.baseline = baseline if self.core.monitoring else None
 
     def step(self, sample: Sample, estimate: Estimate, residual_nm: float) -> bool:
-        """Take one sample as it was measured; the monitor does not trust what adapts.
+        """Take one measured sample; the monitor uses the declared model, not the adapted one.
 
         Returns:
             Whether the alarm is on.
@@ -150,20 +149,20 @@ class ModelMonitor:
 
     @property
     def torque_nm(self) -> tuple[float, ...]:
-        """Rms of the torque that it is to be compared with."""
+        """Rms of each balance's torque over the same second."""
         return self.core.torque_nm
 
     @property
     def settled(self) -> bool:
-        """Whether they mean something."""
+        """Whether the filters have settled."""
         return not math.isnan(self.residual_nm[0])
 
     def location(self) -> str:
-        """Where the effect that the model lacks is likely to sit."""
+        """Likely location of the effect that the model lacks."""
         return self.core.location()
 
     def describe(self) -> dict[str, Any]:
-        """What it found: residual and baseline per balance, their ratio against its limit, the location."""
+        """Residual and baseline per balance, their ratio and its limit, the location."""
         found: dict[str, Any] = {"watching": self.baseline is not None}
         if self.settled:
             found["residual_nm"] = list(self.residual_nm)

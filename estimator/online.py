@@ -1,4 +1,4 @@
-"""The one way to get an estimator that runs tick by tick: a protocol before `estimator._core`."""
+"""Makes estimators that run tick by tick, and the protocol that they implement."""
 
 from __future__ import annotations
 
@@ -17,31 +17,30 @@ __all__ = ["Estimator", "make_estimator"]
 
 
 class Estimator(Protocol):
-    """What both modes offer."""
+    """Interface of both modes."""
 
     @property
     def residual_nm(self) -> float:
-        """What the model left unexplained of the torque balance at the last sample; nan: unknown."""
+        """Residual of the torque balance at the last sample, N·m; NaN: unknown."""
 
     @property
     def external(self) -> External | None:
-        """What the world does to the link, by the last sample.
-
-        None: no link dynamics are declared, or there was no sample yet. Never valid where nothing deflects.
+        """External torque on the link at the last sample. None: no link dynamics declared, or no sample yet.
+        Never valid if no transmission deflects.
         """
 
     @property
     def consistency(self) -> Consistency | None:
-        """Whether both sides of the joint have lately agreed on the flexibility torque; None: not known."""
+        """Recent agreement of both sides of the joint on the flexibility torque; None: not known."""
 
     def step(self, sample: Sample) -> Estimate:
-        """The estimate at this sample. Never raises, whatever floats the sample holds.
+        """Estimate at this sample. Never raises, whatever values the sample has.
 
         `sample.sequence` counts periods: a jump by more than one is a gap of whole periods.
         """
 
     def distrust(self) -> None:
-        """The next sample may not be of its moment: use it, but update no parameter from it."""
+        """Use the next sample without updating parameters: its timing is in doubt."""
 
     def reset(self) -> None:
         """Reset: forget every estimate."""
@@ -50,14 +49,14 @@ class Estimator(Protocol):
         """Current {"model", "parameters", "std"} of each transmission, names as in the joint file."""
 
     def suspicion(self) -> dict[str, Any] | None:
-        """The reading that is suspected while what is read cannot be; None: none.
+        """The reading that is suspected while readings contradict the model; None: none.
 
         {"signal": "motor_position" | "motor_torque" | "link_position" | "motor_or_link_position",
         "motor": from 1 on (0: the link's),
         "reason": "scale" (relative), "delay" (s), "zero" (rad, N·m), "drift" (rad/s), "impossible", "jumped"
         or "frozen",
-        "amount" and "std": in the reason's unit, None where it has none,
-        "explains": whether it explains all that is seen, "text": the same in words}.
+        "amount" and "std": in the reason's unit, or None, "explains": whether it explains the whole residual,
+        "text": the same in words}.
         """
 
 
@@ -166,14 +165,13 @@ def make_estimator(
     period_s: float,
     core: type[_core.Estimator] = _core.Estimator,
 ) -> Estimator:
-    """The estimator that the settings ask for.
+    """Make the estimator that the settings select.
 
     Args:
         model: of the joint.
-        settings: which estimator, and how it is to work.
+        settings: mode, gains and bandwidths.
         period_s: of the samples.
-        core: the compiled class. Every extension module has one of its own, which it calls without Python in
-            between.
+        core: the compiled class to use; each extension module calls its own without going through Python.
 
     Raises:
         EstimatorError: the model names a transmission that does not exist, or contradicts itself.

@@ -1,7 +1,7 @@
 """Priors of a joint: one table for the on-line estimator, `fit` and `diagnose`.
 
-Every number is a standard deviation relative to a scale that the joint file or the recording gives, so the
-table has no unit of its own and holds for a finger as for a crane.
+Every number is a standard deviation relative to a scale given by the joint file or the recording, so the
+table applies to joints of any size.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Prior(NamedTuple):
     """A Gaussian prior about what is declared (zero where nothing is declared).
 
     Attributes:
-        std: standard deviation, as a share of the scale.
+        std: standard deviation, as a fraction of the scale.
         scale: what it is a share of.
         meaning: the quantity.
         reason: why this wide.

@@ -1,7 +1,7 @@
-"""The residuals of the paper: the flexibility torque from momenta, without differentiating or sensing it.
+"""The paper's residuals: the flexibility torque from momenta, without differentiation or torque sensor.
 
 `motor_balance` integrates the known part of a balance exactly for a held torque; `first_order` and
-`second_order` turn it into eqs 14-16 and 28-30 over arrays. Tick by tick they are in the paper mode, as are
+`second_order` turn it into eqs 14-16 and 28-30 over arrays. The paper mode computes them tick by tick, with
 eqs 12 and 13.
 """
 
@@ -57,7 +57,7 @@ def first_order(balance: FloatArray, k_tau_rad_s: float, period_s: float) -> Flo
 
 
 def match_first_order(signal: FloatArray, k_tau_rad_s: float, period_s: float) -> FloatArray:
-    """A regressor through the residual's own filter K/(s + K), so that their lags cancel.
+    """Filter a regressor by the residual's filter K/(s + K), so that their lags cancel.
 
     The residual sees the mean of tau_e over each period; the regressor's is that of its two ends.
     """

@@ -1,4 +1,4 @@
-"""What goes into the estimator and what comes out: one tick as tuples, one recording as arrays.
+"""Inputs and outputs of the estimator: one tick as tuples, one recording as arrays.
 
 SI units, joint side, the paper's signs: phi = q - theta, and tau_e = f(phi) acts on the motor as +tau_e.
 """
@@ -32,7 +32,7 @@ FloatArray = NDArray[np.float64]
 
 
 class Sample(NamedTuple):
-    """What was measured at one SYNC; NaN stands for what is not there.
+    """Measured values at one SYNC; NaN: not available.
 
     Attributes:
         sequence: number of the SYNC; a jump by more than one is a gap of whole periods.
@@ -62,7 +62,7 @@ class Status(IntFlag):
     CHANGED = 1 << 3  # innovation alarm: the joint changed, the estimate is following
     MODEL_ALARM = 1 << 4  # the residual is above the model's own baseline: the model is not sufficient
     INPUT_REJECTED = 1 << 5  # this sample was not finite, jumped or froze, and was not used
-    RESTARTED = 1 << 6  # the estimator started anew at or shortly before this sample
+    RESTARTED = 1 << 6  # the estimator restarted at or shortly before this sample
     DRIVE_FAULT = 1 << 8  # a drive reports a fault or is not in operation-capable state
     BUS_FAULT = 1 << 9  # frames of this cycle were late or missing
     STALE = 1 << 10  # the estimate is carried on without fresh measurements
@@ -70,7 +70,7 @@ class Status(IntFlag):
     NODE_RESTARTED = 1 << 12  # positions may have restarted: the estimator restarts with this sample
     PARTIAL = (
         1 << 13
-    )  # what is NaN is not given: stiffness of a rigid joint, standard deviation of mode paper
+    )  # NaN values are not available: stiffness of a rigid joint, standard deviation in mode paper
     CONTRADICTED = 1 << 14  # two readings of one quantity contradict each other; no parameter is updated
 
 
@@ -84,7 +84,7 @@ class TransmissionEstimate(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """The joint at one SYNC: totals (eqs 9, 11) and each transmission's own."""
+    """The joint at one SYNC: totals (eqs 9, 11) and each transmission."""
 
     sequence: int
     status: int
@@ -102,7 +102,7 @@ class ExternalStatus(IntFlag):
 
 
 class External(NamedTuple):
-    """What the world does to the link at one SYNC; NaN where nothing is known.
+    """External torque on the link at one SYNC; NaN: unknown.
 
     Attributes:
         sequence: as in `Sample`.
@@ -110,8 +110,8 @@ class External(NamedTuple):
         external_torque_nm: +tau_k of eqs 4, 6, from the motor side's flexibility torque.
         external_torque_std_nm: its standard deviation.
         link_flexibility_torque_nm: tau_e,t from the link side, -r of eqs 12, 13.
-        difference_nm: tau_e,t of the motor side less that, filtered alike: what the model leaves, or a torque
-            on the link that nobody measured.
+        difference_nm: tau_e,t of the motor side minus that of the link side, filtered alike: a model error,
+            or an unmeasured torque on the link.
     """
 
     sequence: int
@@ -126,8 +126,8 @@ class Consistency(NamedTuple):
     """Flexibility torque from the motor side and from the link's, over the last ten seconds or so.
 
     Attributes:
-        difference_rms_nm: of the one less the other; small against the second where the model is right, and
-            nothing touched the link that was not measured.
+        difference_rms_nm: rms of their difference; small against the second if the model is right and no
+            unmeasured torque acts on the link.
         link_flexibility_torque_rms_nm: of the link side's.
     """
 

@@ -1,4 +1,4 @@
-"""How the estimator is to work: the mode, its gains and bandwidths."""
+"""Settings of the estimator: mode, gains, bandwidths."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class EstimatorSettings:
 
     Attributes:
         mode: "robust", or "paper" (eqs 14, 28, 32, 33 as printed, correctly discretised).
-        method: where the stiffness comes from: "mbe" (the transmission's model), "bbe" (black box); "auto":
-            "mbe" in robust mode with a model, else "bbe".
+        method: source of the stiffness: "mbe" (the transmission's model), "bbe" (black box), or "auto": "mbe"
+            in robust mode with a model, else "bbe".
         bandwidth_rad_s: of the filter that every channel shares in robust mode.
         k_tau_rad_s: K_tau_e of eq 14.
         k_sigma_1_rad2_s2: K_sigma,1 of eq 28.
@@ -28,7 +28,7 @@ class EstimatorSettings:
             changes.
         external_bandwidth_rad_s: of the external torque's filter in robust mode; in mode "paper" K_tau_e.
         external_bias_s: time constant of a bias (payload, wrong gravity) that is subtracted from the external
-            torque; a push that lasts as long fades with it. None: no bias.
+            torque; a lasting push fades with it. None: no bias.
         contact_torque_nm: least external torque that counts as a contact; None: 5 % of the largest torque
             carried.
         contact_false_alarms_per_hour: of the contact bit; a higher rate finds smaller contacts.

@@ -1,4 +1,4 @@
-"""The transmission models by their names in the joint file, and how to add one more."""
+"""Registry of transmission models by their names in the joint file."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ __all__ = [
     "transmission_model",
 ]
 
-RIGID = "none"  # no deflection: the torque is what the motor's balance leaves
+RIGID = "none"  # no deflection: the torque is the residual of the motor's balance
 UNKNOWN = "unknown"  # flexible, but no model of it: black-box estimation
 
 MODELS: dict[str, TransmissionModel] = {
@@ -54,7 +54,7 @@ def register(
         torque: g(phi, *shape), odd in phi, on arrays.
         stiffness: dg/dphi, its analytic derivative, on arrays.
         shape: start, low and high of each nonlinear parameter, by name, in the order of the arguments.
-        phi_max_rad: up to where oddness and derivative are checked.
+        phi_max_rad: range in which oddness and derivative are checked.
 
     Raises:
         EstimatorError: the name is taken, the functions do not take these arguments, a start is out of
@@ -97,7 +97,7 @@ def register_table(
 
     Args:
         name: its name.
-        deflection_rad: growing, the first above 0; the curve is odd and goes through 0.
+        deflection_rad: increasing, all above 0; the curve is odd and passes through 0.
         torque_nm: the torque at each of them.
 
     Raises:
@@ -110,7 +110,7 @@ def register_table(
 
 
 def transmission_model(transmission: Transmission) -> TransmissionModel | None:
-    """The model a transmission names; None where it is rigid or unknown.
+    """The model of a transmission; None if it is rigid or unknown.
 
     Raises:
         EstimatorError: no model has that name, or its parameters do not fit it.

@@ -59,7 +59,7 @@ class Bench:
         return found
 
     def describe(self) -> str:
-        """Joints and node ids in a few words."""
+        """Joints and node ids, for messages."""
         parts = []
         for name, group in self._groups:
             kinds = (f"{'drive' if isinstance(n, Cia402Drive) else 'encoder'} {n.node_id}" for n in group)

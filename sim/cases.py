@@ -12,8 +12,8 @@ are 1e-3 of theirs, so that all numbers go over by the same factor.
 | g(q) | 0.025 sin q N·m | 0.2943 sin q N·m, assumed |
 | torque | 0.01 sin 0.1πt N·m | 0.1 sin 0.1πt, 0.1 sin 0.2πt N·m, assumed |
 
-What was assumed, and why, is in each case's `assumed`. The drives, gears and encoders are assumed in every
-case, because the paper has none.
+Each case's `assumed` lists assumptions and reasons. Drives, gears and encoders are assumed in every case: the
+paper states none.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class Case:
         drives: one per motor.
         encoder: at the link.
         excitation: the paper's torque, as a table for `sim.excitation.build`.
-        rich: a torque that reveals more: the table of a test stand's run of the same joint.
-        assumed: what the paper does not say.
+        rich: a richer torque for the same joint.
+        assumed: values that the paper does not state.
     """
 
     name: str
@@ -82,8 +82,8 @@ class Case:
         """The case at rest.
 
         Args:
-            excitation: another table than the paper's.
-            effects: physics that is switched on besides.
+            excitation: a table in place of the paper's.
+            effects: effects to switch on.
             period_s: control period.
             plant_step_s: integration step; None: chosen.
             seed: of the sensor noise.

@@ -39,7 +39,7 @@ Coupling = Callable[[float, float, float, float], tuple[float, float]]
 
 
 def spring_deflection(motor: MotorPlant) -> Load:
-    """(q, theta) -> what the spring sees: phi less the gear's errors, rad."""
+    """(q, theta) -> deflection of the spring: phi minus the gear's errors, rad."""
     kinematics = motor.terms.kinematics
     return lambda q, theta: q - theta - sum(error(theta)[0] for error in kinematics)
 
@@ -61,7 +61,7 @@ def _coupling(motor: MotorPlant) -> Coupling:
 
 
 def transmission_torques(plant: JointPlant) -> Callable[[State], tuple[float, ...]]:
-    """State -> tau_e,i as each motor feels it (N·m); zero at a rigid coupling, which has no law."""
+    """State -> tau_e,i on each motor (N·m); zero at a rigid coupling, which has no law."""
     if plant.rigid:
         return lambda state: (0.0,)
     if plant.arrangement == "serial":
@@ -84,7 +84,7 @@ def elasticity(plant: JointPlant) -> Callable[[State], tuple[tuple[float, float]
     """State -> (tau_e,i, sigma_i) of each transmission, N·m and N·m/rad: its elastic part alone.
 
     A rigid coupling has no law: the torque is unknown (NaN), the stiffness infinite. Motor 2 of the serial
-    arrangement has the torque that it works against, and no stiffness of its own.
+    arrangement has a torque but no stiffness.
     """
     if plant.rigid:
         return lambda state: ((math.nan, math.inf),)
@@ -136,7 +136,7 @@ def _link_load(link: LinkPlant) -> Load:
 
 
 def equations(plant: JointPlant) -> Pair | Triple:
-    """Accelerations of the joint as one closure; a joint without further terms gets a shorter one."""
+    """Accelerations of the joint as one closure, shorter if no effects add terms."""
     if plant.rigid:
         return _rigid(plant)
     if plant.arrangement == "serial":

@@ -1,8 +1,8 @@
-"""Torque profiles of the rig: what makes the joint move while nobody commands its drives.
+"""Torque profiles of the rig, which move the joint while no master commands its drives.
 
-All torques are at the joint. A profile is a function of time; on top of it a rig may hold its motors near a
-place with a soft spring (`centring_nm_rad`, `centring_nm_s_rad`), as a test stand does so that an open-loop
-torque does not carry the joint away. Both are sampled once a control period and held.
+All torques are at the joint. A profile is a function of time; a soft spring (`centring_nm_rad`,
+`centring_nm_s_rad`) can keep the motors near a position, so that an open-loop torque does not carry the joint
+away. Both are sampled once per control period and held.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ Profile = Callable[[float], float]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Excitation:
-    """What the rig applies.
+    """Torques that the rig applies.
 
     Attributes:
         profiles: torque (N·m, joint side) over time (s), one per motor.
         external: tau_k of eq 4 over time.
-        centre_rad: where each motor is held.
+        centre_rad: centre of the spring for each motor.
         centring_nm_rad: stiffness of that hold.
         centring_nm_s_rad: damping of that hold.
     """
@@ -45,7 +45,7 @@ class Excitation:
 
 
 class _Keys:
-    """The keys of one table: each is taken once, what is left over is an error."""
+    """The keys of one table: each is taken once; remaining keys are an error."""
 
     def __init__(self, table: Mapping[str, Any], where: str) -> None:
         self._left = dict(table)
@@ -182,7 +182,7 @@ def _band(keys: _Keys, low_hz: float, high_hz: float) -> tuple[float, float]:
 def _random_tones(
     motors: int, count: int, low: float, high: float, seed: int
 ) -> list[list[tuple[float, float, float]]]:
-    """Tones spread geometrically over the band, each motor's between the other's; together a sine's rms."""
+    """Tones spaced geometrically over the band, interleaved between motors, with the rms of one sine."""
     draw = random.Random(seed)
     amplitude = 1.0 / math.sqrt(count)
     ratio = high / low
@@ -241,7 +241,7 @@ def _steps(keys: _Keys, motors: int) -> list[Profile]:
 
 
 def _rich(keys: _Keys, motors: int) -> list[Profile]:
-    """Twelve tones over the band, and a slow sine a motor that carries them over the whole range."""
+    """Twelve tones over the band, and a slow sine per motor that covers the whole range."""
     low, high = _band(keys, 0.15, 8.0)
     count, seed = keys.whole("tones", 12, 1), keys.whole("seed", 0, 0)
     shapes = []

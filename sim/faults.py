@@ -44,7 +44,7 @@ class _Tap:
 
 
 class Faults:
-    """Brings faults upon a network.
+    """Injects faults into a network.
 
     Args:
         network: its devices.
@@ -65,83 +65,83 @@ class Faults:
     # Devices
 
     def kill(self, node: Node) -> None:
-        """It loses its supply, silently."""
+        """Switch a device off without notice."""
         self._network.power_off(node)
 
     def revive(self, node: Node) -> None:
-        """Its supply comes back: boot-up message, power-on values."""
+        """Switch it on again: boot-up message, power-on values."""
         self._network.power_on(node)
 
     def reboot(self, node: Node) -> None:
-        """It resets itself: boot-up message out of nothing."""
+        """Let it reset itself: an unexpected boot-up message."""
         node.reset_node()
 
     def emergency(self, node: Node, code: int, register: int = 0, vendor: bytes = b"") -> None:
-        """A fault: EMCY, and of a drive the state fault."""
+        """Raise a fault: EMCY, and the state fault of a drive."""
         if isinstance(node, Cia402Drive):
             node.fault(code, register, vendor)
         else:
             node.emergency.raise_error(code, register, vendor)
 
     def misread(self, node: Cia402Drive, lie: Callable[[DriveReadings], DriveReadings] | None) -> None:
-        """Its sensors say something else from now on; None: the truth again."""
+        """Falsify its sensors from now on; None: correct readings again."""
         node.misread = lie
 
     def ignore_sdo(self, node: Node, requests: int) -> None:
-        """Its SDO server does not answer so many requests."""
+        """Let its SDO server ignore so many requests."""
         node.sdo.ignored = requests
 
     def refuse_sdo(self, node: Node, code: int, requests: int) -> None:
-        """Its SDO server aborts so many requests."""
+        """Let its SDO server abort so many requests."""
         node.sdo.refusal, node.sdo.refused = code, requests
 
     def endless_sdo(self, node: Node, segment_bytes: int) -> None:
-        """Its SDO server answers every upload without end, so many bytes (0 to 7) at a time; -1: no more."""
+        """Let its SDO server answer uploads without end, so many bytes (0 to 7) at a time; -1: stop."""
         node.sdo.endless = segment_bytes
 
     def impostor(self, node: Node) -> None:
-        """One more device; with a node id that is taken, if you like."""
+        """Add a device, also with a node id in use."""
         self._network.add(node)
 
     # Wires
 
     def unplug(self) -> None:
-        """The cable comes out: the devices go on, and neither hear nor are heard."""
+        """Unplug the cable: the devices go on, disconnected."""
         self._network.plugged = False
 
     def plug(self) -> None:
-        """The cable is back."""
+        """Plug the cable in again."""
         self._network.plugged = True
 
     # Frames
 
     def mute(self, node: Node, tpdo: int, cycles: int = 1) -> None:
-        """So many transmissions of a TPDO get lost."""
+        """Lose so many transmissions of a TPDO."""
         self._tap(node, tpdo).mute = cycles
 
     def delay(self, node: Node, tpdo: int, cycles: int = 1) -> None:
-        """So many transmissions of a TPDO come late: after the next SYNC, before that cycle's own."""
+        """Delay so many transmissions of a TPDO until after the next SYNC, before that cycle's own."""
         self._tap(node, tpdo).late = cycles
 
     def resize(self, node: Node, tpdo: int, length: int, cycles: int = 1) -> None:
-        """So many transmissions of a TPDO have `length` bytes (0 to 8)."""
+        """Give so many transmissions of a TPDO a length of `length` bytes (0 to 8)."""
         tap = self._tap(node, tpdo)
         tap.length, tap.cut = length, cycles
 
     def repeat(self, node: Node, tpdo: int, cycles: int = 1) -> None:
-        """So many transmissions of a TPDO come twice."""
+        """Send so many transmissions of a TPDO twice."""
         self._tap(node, tpdo).twice = cycles
 
     def reverse(self) -> None:
-        """The devices answer SYNC in the opposite order from now on."""
+        """Reverse the order in which the devices answer SYNC."""
         self._network.reverse()
 
     def babble(self, can_id: int, data: bytes = b"", per_cycle: int = 10) -> None:
-        """A node sends so many frames with every SYNC; `per_cycle` 0 silences it."""
+        """Let a node send additional frames with every SYNC; `per_cycle` 0 stops it."""
         self._babble = (can_id, data, per_cycle) if per_cycle else None
 
     def drop_sync(self, count: int = 1) -> None:
-        """No device sees the next `count` SYNC messages."""
+        """Hide the next `count` SYNC messages from all devices."""
         self._dropped = count
 
     # Underneath

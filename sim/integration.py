@@ -1,9 +1,9 @@
-"""Moving a joint by one fixed step: Runge-Kutta of order four, dry friction, memories.
+"""Integrates a joint over one fixed step: Runge-Kutta of order four, dry friction, memories.
 
-Smooth torques act inside the stages. Dry friction is no function of the velocity where it matters, so it
-acts as Coulomb stated it, at the end of each step: it takes from the momentum at most what stops the body,
-and the body sticks by itself (the impulse form of J. J. Moreau's time stepping). Terms with a memory
-(hysteresis, presliding) are functions of the displacement since the last step: stages ask, commits remember.
+Smooth torques act inside the stages. Dry friction is not a function of the velocity at standstill, so it acts
+as an impulse at the end of each step: it removes at most the momentum of the body, which then sticks (J. J.
+Moreau's time stepping). Terms with memory (hysteresis, presliding) are evaluated in the stages and updated
+once per step.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ __all__ = ["Settle", "Step", "integrator", "settling", "whole_fraction"]
 Step = Callable[[State, float, float, float], None]
 """(state, tau_1, tau_2, tau_k): moves the state by one step, in place."""
 Settle = Callable[[State, float], None]
-"""(state, time): what happens between two steps."""
+"""(state, time): update between two steps."""
 
 
 def integrator(plant: JointPlant, step_s: float) -> Step:
@@ -94,7 +94,7 @@ def whole_fraction(period_s: float, step_s: float | None, plant: JointPlant, fin
         step_s: the step; None: at most a tenth of a radian of the fastest oscillation that the springs
             allow at twice their stiffness at rest, 1 ms, and 0.5 ms with dry friction or memories.
         plant: the joint.
-        fine: whether dry friction or memories act in it.
+        fine: whether it has dry friction or memories.
 
     Raises:
         SimError: the step is no whole fraction of the period.
@@ -127,7 +127,7 @@ def _fastest(plant: JointPlant) -> float:
 
 
 def settling(plant: JointPlant, step_s: float) -> Settle | None:
-    """Dry friction and memories between two steps; None where the joint has neither."""
+    """Dry friction and memories between two steps; None if the joint has neither."""
     bodies = _dry_bodies(plant, step_s)
     commits = [
         (2 + 2 * i, spring_deflection(motor), commit)

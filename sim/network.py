@@ -1,8 +1,8 @@
-"""Simulated devices on a CAN bus, and the world they measure, moved on by SYNC.
+"""Simulated devices on a CAN bus, and the world they measure, advanced by SYNC.
 
-Two ways to run it. In lockstep the caller's thread calls `poll` after it has sent; every SYNC moves the
-world by exactly one period, so results don't depend on the machine. Served by a thread (`start`), the world
-follows the wall clock in whole periods locked to the SYNC, as a drive's control loop does.
+In lockstep the caller's thread calls `poll` after it has sent; every SYNC advances the world by exactly one
+period, so results do not depend on the machine. Served by a thread (`start`), the world follows the wall
+clock in whole periods locked to the SYNC, as a drive's control loop does.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = ["Network"]
 
 _log = logging.getLogger(__name__)
 
-_WITHOUT_SYNC_S = 0.05  # after so long without a SYNC the wall clock moves the world
+_WITHOUT_SYNC_S = 0.05  # without a SYNC for so long, the wall clock advances the world
 _LONGEST_CATCH_UP_S = 0.2
 _PHASE_GAIN = 0.05  # of the lock of control periods to the SYNC
 _TICK_S = 0.005
@@ -30,14 +30,14 @@ _RETRY_S = 0.1
 
 
 class Moving(Protocol):
-    """What a SYNC moves on (`sim.world.World`)."""
+    """What a SYNC advances (`sim.world.World`)."""
 
     @property
     def period_s(self) -> float:
         """Control period."""
 
     def advance(self, periods: int = 1) -> None:
-        """Move on by whole periods."""
+        """Advance by whole periods."""
 
 
 class Network:
@@ -46,7 +46,7 @@ class Network:
     Args:
         bus: any python-can bus; the network does not shut it down.
         nodes: the devices, switched on in this order with the first poll.
-        worlds: what they measure; each is moved on by the same SYNC.
+        worlds: what they measure; the same SYNC advances all.
         clock: monotonic seconds, for the devices' timers.
 
     Attributes:
@@ -54,7 +54,7 @@ class Network:
         syncs: SYNC messages seen, dropped ones included.
         send_failures: frames that the bus did not take.
         send: puts any frame (identifier, data) on the bus, for tests.
-        plugged: whether the bus reaches the devices at all; the cable, for tests.
+        plugged: for tests: whether the cable is plugged in.
         sync_filter: called with each SYNC's data; False drops it for all devices. For tests.
     """
 
@@ -121,7 +121,7 @@ class Network:
     # Lockstep
 
     def poll(self) -> int:
-        """Handle every frame that is waiting, and every timer that is due.
+        """Handle all waiting frames and due timers.
 
         Returns:
             How many frames were handled.
@@ -140,7 +140,7 @@ class Network:
     # Served
 
     def start(self) -> None:
-        """Serve the bus from a thread of its own until `stop`."""
+        """Serve the bus in a thread until `stop`."""
         if self._thread is None:
             self._stop.clear()
             self._thread = threading.Thread(
@@ -156,7 +156,7 @@ class Network:
             self._thread = None
 
     def serve(self, stop: threading.Event) -> None:
-        """Serve the bus in this thread until `stop` is set; a bus that fails is tried again."""
+        """Serve the bus in this thread until `stop` is set; retry after a bus error."""
         self._lockstep = False
         self._anchor_s = time.time()
         self.power_on()
@@ -226,7 +226,7 @@ class Network:
             self._deliver_own()
 
     def _deliver_own(self) -> None:
-        """What one device sends is heard by the others."""
+        """Deliver a device's frames to the other devices."""
         while self._own:
             can_id, data = self._own.popleft()
             for handler in self._routes.get(can_id, ()):
@@ -253,10 +253,10 @@ class Network:
             node.transmit()
 
     def _periods(self, stamp_s: float) -> int:
-        """Whole control periods since the last SYNC, with the phase of the periods locked to the SYNC."""
+        """Whole control periods since the last SYNC, phase-locked to it."""
         late_s = stamp_s - self._anchor_s
         if not -_LONGEST_CATCH_UP_S < late_s < _LONGEST_CATCH_UP_S:
-            self._anchor_s = stamp_s  # the clock has jumped, or nobody made SYNC for long
+            self._anchor_s = stamp_s  # the clock has jumped, or there was no SYNC for long
             return 1
         periods = max(1, round(late_s / self._period_s))
         self._anchor_s += periods * self._period_s
@@ -273,7 +273,7 @@ class Network:
             self._run_timers()
 
     def _pass_time(self) -> None:
-        """Let the devices' clocks follow: the SYNC in lockstep while there is one, else the wall clock."""
+        """Advance the devices' clocks: by SYNC in lockstep, else by the wall clock."""
         wall_s = self._clock()
         elapsed_s, self._wall_s = wall_s - self._wall_s, wall_s
         silent = wall_s - self._sync_wall_s > _WITHOUT_SYNC_S
@@ -284,7 +284,7 @@ class Network:
             self._drift()
 
     def _drift(self) -> None:
-        """Nobody makes SYNC: the world follows the wall clock."""
+        """Without SYNC, advance the world by the wall clock."""
         stamp_s = time.time()
         late_s = stamp_s - self._anchor_s
         if not 0.0 <= late_s < _LONGEST_CATCH_UP_S:

@@ -1,4 +1,4 @@
-"""A joint as its parts: bodies, springs, and the further physics that effects add to them."""
+"""Parts of a joint: bodies, springs, and the terms that effects add."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ Commit = Callable[[float, float], None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Terms:
-    """Further physics of one body: what effects add to it.
+    """Terms that effects add to one body.
 
     Attributes:
         loads: x(position, velocity), N·m.
@@ -66,7 +66,7 @@ class MotorPlant:
         inertia_kg_m2: B > 0.
         viscous_damping_nm_s_rad: D_theta >= 0.
         spring: tau_e(phi); rigid: motor and link are one body.
-        reshape: what effects make of the spring's law, applied in order.
+        reshape: changes of the spring's law by effects, applied in order.
         terms: further physics.
     """
 
@@ -80,7 +80,7 @@ class MotorPlant:
         _check("motor", self.inertia_kg_m2, self.viscous_damping_nm_s_rad)
 
     def law(self) -> Law:
-        """The elastic law as it acts, effects included."""
+        """The elastic law including effects."""
         law = self.spring.law()
         for reshape in self.reshape:
             law = reshape(law)
@@ -111,7 +111,7 @@ class LinkPlant:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JointPlant:
-    """A joint: how its motors act on the link.
+    """A joint: motors, transmissions and link.
 
     Attributes:
         arrangement: "single", "antagonistic" (eq 9) or "serial" (motor 2 sets the lever of motor 1's spring).

@@ -14,7 +14,7 @@ __all__ = ["Amplifier", "LinkScale"]
 class Amplifier:
     """A drive's current loop and its sampled signals.
 
-    The current that it reports is what it believes to drive; what effects make of it acts.
+    It reports the commanded current; effects change the acting torque.
     """
 
     def __init__(self, drive: DriveHardware, period_s: float, substeps: int, noise: Iterator[float]) -> None:
@@ -34,7 +34,7 @@ class Amplifier:
         self.fit(MotorParts())
 
     def fit(self, parts: MotorParts) -> None:
-        """What effects add to it, from the next period on."""
+        """Add effects, from the next period on."""
         self._path, self._readings = tuple(parts.torque_path), tuple(parts.readings)
         delay = parts.torque_delay_s
         self._delay = Delayed(delay, self._period_s, self._substeps) if delay > 0.0 else None
@@ -43,10 +43,10 @@ class Amplifier:
         self._reported = Lag(-lag, self._period_s) if lag < 0.0 else None
 
     def latch(self, current_a: float, time_s: float, theta: float, velocity: float) -> None:
-        """Begin a period with this set-point, and sample.
+        """Start a period with this set-point, and sample.
 
         Args:
-            current_a: set-point; limited to what the drive lets through.
+            current_a: set-point, limited by the drive.
             time_s: now.
             theta: motor position at the joint, rad.
             velocity: motor velocity at the joint, rad/s.
@@ -70,7 +70,7 @@ class Amplifier:
             self._filtered = self._velocity = before + share * (velocity - before)
 
     def signals(self) -> DriveSignals:
-        """What was sampled."""
+        """The sampled signals."""
         drive, theta = self.drive, self._theta
         for read in self._readings:
             theta = read(theta)
@@ -89,7 +89,7 @@ class LinkScale:
 
     Attributes:
         counts: the reading.
-        history: to receive every plant step, where the reading lags.
+        history: receives every plant step if the reading lags; else None.
     """
 
     def __init__(self, encoder: LinkEncoder, noise: Iterator[float]) -> None:
@@ -105,7 +105,7 @@ class LinkScale:
         self._readings: tuple[Reading, ...] = ()
 
     def fit(self, parts: LinkParts, step_s: float, position: float) -> None:
-        """What effects add to it, with an integration step of step_s and the link at this position (rad)."""
+        """Add effects, with an integration step of step_s and the link at this position (rad)."""
         delay = parts.reading_delay_s
         self._readings = tuple(parts.readings)
         self.history = History(delay, step_s, position) if delay > 0.0 else None

@@ -1,4 +1,4 @@
-"""What drives and encoders report of the joint: counts, per milles and their noise.
+"""Signals that drives and encoders report: counts, quantised values, noise.
 
 A drive works at the motor shaft: joint position times gear ratio, joint torque divided by it. Its torque is
 its current times its torque constant, so a reported torque is never better than the reported current.
@@ -23,7 +23,7 @@ _BLOCK = 4096
 
 
 class DriveSignals(NamedTuple):
-    """What a drive knows at one sampling instant, at the motor shaft and in its own directions.
+    """Signals of a drive at one sampling instant, at the motor shaft, with the drive's signs.
 
     Attributes:
         position_counts: encoder counts since the joint's zero, unbounded (a bus object wraps it).
@@ -87,7 +87,7 @@ class DriveHardware:
 
     @property
     def limit_a(self) -> float:
-        """Largest current the drive lets through."""
+        """Current limit of the drive."""
         return 3.0 * self.rated_current_a if self.max_current_a is None else self.max_current_a
 
     @property
@@ -103,7 +103,7 @@ class DriveHardware:
 
     @property
     def joint_torque_per_ampere(self) -> float:
-        """Signed torque at the joint per ampere, as the drive believes it."""
+        """Signed torque at the joint per ampere, by the drive's torque constant."""
         sign = self.direction if self.torque_direction is None else self.torque_direction
         return sign * self.torque_constant_nm_a * self.gear_ratio
 
@@ -143,7 +143,7 @@ def _require(name: str, value: float, *, positive: bool) -> None:
 
 
 def noise(seed: tuple[int, ...], std: float) -> Iterator[float]:
-    """White Gaussian noise without end, the same for the same seed; zeros for std 0."""
+    """An endless stream of white Gaussian noise from a seed; zeros for std 0."""
     if std == 0.0:
         while True:
             yield 0.0

@@ -1,8 +1,8 @@
-"""A CAN bus between processes without a kernel's help: the socketcand protocol, served over TCP.
+"""A CAN bus between processes: the socketcand protocol, served over TCP.
 
-Every client of the protocol (python-can's `socketcand` interface, for one) is a node on this bus, and so is
-the process that serves it: `SocketcandServer` is itself a python-can bus. Raw mode only, no CAN FD.
-See https://github.com/linux-can/socketcand/blob/master/doc/protocol.md.
+Every client (such as python-can's `socketcand` interface) is a node on this bus, and so is the serving
+process: `SocketcandServer` is itself a python-can bus. Raw mode only, no CAN FD. See
+https://github.com/linux-can/socketcand/blob/master/doc/protocol.md.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ __all__ = ["DEFAULT_PORT", "SocketcandServer"]
 
 DEFAULT_PORT = 29536
 
-_LARGEST_BACKLOG = 1 << 20  # bytes a client may leave unread before it is dropped
+_LARGEST_BACKLOG = 1 << 20  # unread bytes at which a client is dropped
 _LONGEST_COMMAND = 1 << 12
 _SETTLE_S = 0.05  # python-can's client takes its greeting for one whole read: no frame may follow at once
 _CHUNK = 1 << 16
 
 
 class _Client:
-    """One connection: its state in the protocol and what it has not read yet."""
+    """One connection: protocol state and unsent bytes."""
 
     __slots__ = ("hold_until_s", "open", "pending", "raw", "received", "socket", "unsent")
 
@@ -44,15 +44,15 @@ class SocketcandServer(can.BusABC):
     """Serves one CAN channel to any number of clients; frames pass between all of them and this process.
 
     Args:
-        channel: name that clients have to open; "any" name is accepted if empty.
+        channel: name that clients have to open; empty: any name.
         host: address to listen on.
         port: TCP port; 0 takes a free one.
 
     Attributes:
-        port: the port that is listened on.
+        port: the port in use.
 
     Raises:
-        OSError: the address cannot be listened on.
+        OSError: the address cannot be used.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class SocketcandServer(can.BusABC):
         return min(timeout, _SETTLE_S) if held and timeout is not None else timeout
 
     def _release(self) -> None:
-        """Send what was held back after a greeting."""
+        """Send the frames held back after a greeting."""
         now_s = time.monotonic()
         for client in list(self._clients):
             if client.pending and now_s >= client.hold_until_s:

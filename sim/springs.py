@@ -1,8 +1,7 @@
 """Transmission laws of the world: torque, stiffness and potential of a deflection, in closed form.
 
-Written for the plant alone; what an estimator believes about the same transmissions is written elsewhere
-on purpose. Every law is odd, has a potential (eq 1) and is made of scalar closures, because the plant
-calls it four times a step.
+Independent of the estimator's laws on purpose. Every law is odd, has a potential (eq 1) and is made of scalar
+closures, because the plant calls it four times per step.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ class Spring:
 
     Attributes:
         model: "linear", "polynomial", "vsa-ii", "exponential", or "none" for a rigid coupling.
-        parameters: what the law needs, by names that carry their unit (see `MODELS`).
+        parameters: by names that carry their unit (see `MODELS`).
     """
 
     model: str
@@ -121,8 +120,8 @@ def _polynomial(parameters: Parameters) -> Law:
 def _vsa_ii(parameters: Parameters) -> Law:
     """tau_e = 2 k beta beta', beta = asin(C sin(phi/2)) - phi/2 (eqs 19, 20), so U_e = k beta².
 
-    The four-bar linkage stretches out at C sin(phi/2) = 1. A little before that (99.5 % of the angle) the
-    law goes on as a straight line, so that a hard blow has a finite answer.
+    The four-bar linkage is fully stretched at C sin(phi/2) = 1. From 99.5 % of that angle on the law
+    continues as a straight line, so that torques stay finite.
     """
     k = _positive(parameters, "k_nm_rad")
     c = _positive(parameters, "c")

@@ -1,4 +1,4 @@
-"""Plants with changed values, and a suitable torque: for worlds other than the named cases."""
+"""Plants with changed parameters, and a suitable excitation for them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def with_parameters(plant: JointPlant, parameters: Mapping[str, float]) -> Joint
     """Replace values of a plant.
 
     Args:
-        plant: where the other values come from.
+        plant: the plant to change.
         parameters: `link_inertia_kg_m2`, `link_gravity_nm`, `motor1_viscous_damping_nm_s_rad`,
             `motor2_k_nm_rad`, `motor1_coefficient2_nm_rad` (the second of `coefficients_nm_rad`), …;
             `lever_per_rad` of a serial joint.
@@ -72,7 +72,7 @@ def _motor(motor: MotorPlant, key: str, name: str, value: float) -> MotorPlant:
 
 
 def typical_torque_nm(plant: JointPlant) -> float:
-    """Torque at the joint that moves it well: 0.15 rad in a soft spring, less in a stiff one."""
+    """A torque with a suitable motion: 0.15 rad in a soft spring, less in a stiff one."""
     springs = [motor.spring for motor in plant.motors if not motor.spring.rigid]
     if not springs:
         return max(abs(plant.link.gravity_nm), 5.0 * plant.link.inertia_kg_m2)
@@ -82,7 +82,7 @@ def typical_torque_nm(plant: JointPlant) -> float:
 
 
 def suitable(plant: JointPlant) -> dict[str, Any]:
-    """Excitation table for `sim.excitation.build`: rich, and held softly so that nothing drifts away."""
+    """Excitation table for `sim.excitation.build`: rich, with soft centring against drift."""
     torque = typical_torque_nm(plant)
     inertia = plant.link.inertia_kg_m2 + sum(motor.inertia_kg_m2 for motor in plant.motors)
     hold = 3.0 * torque

@@ -1,8 +1,8 @@
 """One joint with its drives, encoders and rig, advanced by whole control periods.
 
-The convention of rows: at t_k everything is sampled, and the torque that a drive reports at t_k acts from
-t_k to t_{k+1}. That is what a drive does whose current loop is updated at the SYNC: the set-point that came
-before SYNC k is latched by it, is the current that the drive reports with SYNC k, and holds until SYNC k+1.
+At t_k everything is sampled; the torque that a drive reports at t_k acts from t_k to t_{k+1}. So does a drive
+whose current loop is updated at the SYNC: it latches the last set-point at SYNC k, reports it with SYNC k,
+and holds it until SYNC k+1.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ __all__ = ["MotorTruth", "Truth", "World", "record"]
 
 
 class MotorTruth(NamedTuple):
-    """One motor and its transmission as they are, joint side.
+    """True state of one motor and its transmission, joint side.
 
     Attributes:
         position_rad: theta.
         velocity_rad_s: theta'.
-        torque_nm: what acts now, which is not always what the drive reports.
+        torque_nm: the acting torque, which may differ from the reported one.
         deflection_rad: phi = q - theta.
         flexibility_torque_nm: tau_e(phi), the elastic part of the transmission's torque.
         stiffness_nm_rad: sigma = d tau_e / d phi.
@@ -47,7 +47,7 @@ class MotorTruth(NamedTuple):
 
 
 class Truth(NamedTuple):
-    """The joint as it is at one sampling instant.
+    """True state of the joint at one sampling instant.
 
     Attributes:
         time_s: t_k.
@@ -90,8 +90,8 @@ class World:
             plant: its physics as declared.
             drives: one per motor.
             encoder: the link encoder; None: a fine one.
-            excitation: the rig's torque where nobody commands; None: no torque.
-            effects: physics that is switched on besides.
+            excitation: the rig's torque while no master commands; None: no torque.
+            effects: effects to switch on.
             period_s: control period.
             plant_step_s: integration step, a whole fraction of the period; None: chosen from the plant.
             seed: of the sensor noise.
@@ -129,16 +129,16 @@ class World:
         return self._tick * self.period_s
 
     def alter(self, *, plant: JointPlant | None = None, effects: Sequence[PlantEffect] | None = None) -> None:
-        """Other physics from now on: a spring that breaks, friction that comes.
+        """Change the physics from now on: a spring that breaks, friction that appears.
 
-        Position and velocity go on as they are; memories begin anew. The plant step stays.
+        Position and velocity are kept, memories are reset. The plant step stays.
 
         Args:
-            plant: another joint of the same kind; None: as it was.
-            effects: all that is switched on from now; None: as it was.
+            plant: another joint of the same kind; None: unchanged.
+            effects: all effects from now on; None: unchanged.
 
         Raises:
-            SimError: a joint of another kind, or values that cannot be.
+            SimError: a joint of another kind, or impossible values.
         """
         if plant is not None:
             if (plant.arrangement, plant.rigid) != (self._declared.arrangement, self._declared.rigid):
@@ -173,7 +173,7 @@ class World:
         self._commands[motor] = torque_nm
 
     def advance(self, periods: int = 1) -> None:
-        """Move on by whole control periods."""
+        """Advance by whole control periods."""
         step, settle, state, history = self._step, self._settle, self._state, self._scale.history
         first, last = self._amplifiers[0], self._amplifiers[-1]
         for _ in range(periods):
@@ -189,7 +189,7 @@ class World:
             self._latch()
 
     def _latch(self) -> None:
-        """Begin a period: set-points become currents, and everything is sampled."""
+        """Start a period: apply set-points and sample everything."""
         t, state, excitation = self._tick * self.period_s, self._state, self.excitation
         for motor, amplifier in enumerate(self._amplifiers):
             theta, w = state[2 + 2 * motor], state[3 + 2 * motor]
@@ -205,15 +205,15 @@ class World:
         self._scale.sample(state[0])
 
     def drive(self, motor: int) -> DriveSignals:
-        """What this drive has sampled at the present instant."""
+        """Signals of this drive at the present instant."""
         return self._amplifiers[motor].signals()
 
     def link_counts(self) -> int:
-        """What the link encoder has sampled at the present instant."""
+        """Reading of the link encoder at the present instant."""
         return self._scale.counts
 
     def truth(self) -> Truth:
-        """The joint as it is now."""
+        """True state of the joint now."""
         state = self._state
         elastic = self._elastic(state)
         motors = tuple(
@@ -248,18 +248,18 @@ def _start(initial_rad: Sequence[float], motors: int, rigid: bool) -> list[float
 
 
 def record(world: World, seconds: float) -> dict[str, NDArray[np.float64]]:
-    """Advance a world and keep what its sensors say, in the columns of a recording, and the truth.
+    """Advance a world and record its sensors and the truth as columns.
 
     Args:
-        world: where it starts is row 0.
+        world: its present state is row 0.
         seconds: length; round(seconds / period) rows.
 
     Returns:
         Arrays (n,): `time_s`, `motor1_position_rad`, `motor1_velocity_rad_s`, `motor1_torque_nm`,
-        `motor1_current_a`, the same for `motor2_`, `link_position_rad`, `external_torque_nm`; and what no
-        sensor reports: `truth_` followed by `link_position_rad`, `link_velocity_rad_s`,
-        `flexibility_torque_nm`, `stiffness_nm_rad` and, per motor, `motor1_` with the fields of
-        `MotorTruth`. Motor torques and positions are at the joint; row k's torque acts until row k+1.
+        `motor1_current_a`, the same for `motor2_`, `link_position_rad`, `external_torque_nm`; and the truth:
+        `truth_` followed by `link_position_rad`, `link_velocity_rad_s`, `flexibility_torque_nm`,
+        `stiffness_nm_rad` and, per motor, `motor1_` with the fields of `MotorTruth`. Motor torques and
+        positions are at the joint; row k's torque acts until row k+1.
     """
     rows = []
     for k in range(round(seconds / world.period_s)):

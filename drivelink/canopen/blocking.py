@@ -1,4 +1,4 @@
-"""Runs an SDO program to completion on a bus that nobody else reads: before the start, and in the doctor."""
+"""Runs an SDO program to completion on a bus without another reader: before the start, and in the doctor."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 
 
 class FrameBus(Protocol):
-    """What is needed of a bus: python-can's, or `bus.Bus`."""
+    """Required interface of a bus: python-can's `Bus`, or `BusPort`."""
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Put a frame on the bus."""
@@ -37,8 +37,8 @@ class FrameBus(Protocol):
 def sender(bus: FrameBus) -> Callable[[int, bytes], None]:
     """`send(identifier, data)` of a bus.
 
-    A frame that finds the transmit queue full is lost, like one on the wire: SDO asks again after its
-    timeout. A queue stays full where nobody acknowledges: then no answer arrives, which is the error.
+    A frame is lost if the transmit queue is full; SDO retries after its timeout. If no node acknowledges, the
+    queue stays full and the missing answer is the error.
     """
 
     def send(cob_id: int, data: bytes) -> None:
@@ -61,7 +61,7 @@ def run_program(
     retries: int = 1,
     idle: Idle | None = None,
 ) -> T:
-    """Run a program to its end on a bus that nobody else reads.
+    """Run a program to its end on a bus without another reader.
 
     Args:
         program: what to do.

@@ -1,7 +1,7 @@
-"""Opens the bus of a joint file, on anything python-can opens, and says in one line why it cannot.
+"""Opens the bus of a joint file with any python-can interface; a failure is one line.
 
-SocketCAN comes first: a receive buffer sized for the bus, kernel time stamps, error frames, CAN FD frames
-accepted, state of the interface.
+SocketCAN gets a receive buffer sized for the bus, kernel time stamps, error frames, CAN FD frames, and a
+check of the interface's state.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _SOCKETCAND_PORT = 29536
 _SOCKETCAND_HOST = "127.0.0.1"  # where `drivelink sim` serves one, by default
 _CONNECT_S = 3.0  # for the connection, and for each answer of the greeting
 _DELIVERY_S = {"virtual": 0.05, "socketcan": 0.05}  # a frame is there as soon as it is sent
-_SLOWEST_DELIVERY_S = 0.5  # servers and adapters hold frames back for a while after they are opened
+_SLOWEST_DELIVERY_S = 0.5  # servers and adapters delay frames after they are opened
 _SYS_NET = Path("/sys/class/net")
 _IFF_UP = 1
 _WITHOUT_BITRATE = frozenset({"virtual", "socketcan", "socketcand", "udp_multicast"})
@@ -102,7 +102,7 @@ def _check_interface(section: BusSection) -> None:
 
 
 def _check_socketcan(section: BusSection) -> None:
-    """What would go wrong, said before python-can has half a socket open."""
+    """Check the interface before python-can opens a socket."""
     name = section.channel
     try:
         socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
@@ -124,7 +124,7 @@ def _check_socketcan(section: BusSection) -> None:
 
 
 def _check_socketcand(section: BusSection) -> None:
-    """Whether a socketcand answers: python-can would try for ten seconds, or wait forever."""
+    """Check that a socketcand answers: python-can would try for ten seconds, or wait forever."""
     host, port = (
         section.options.get("host", _SOCKETCAND_HOST),
         section.options.get("port", _SOCKETCAND_PORT),
@@ -150,7 +150,7 @@ def _check_socketcand(section: BusSection) -> None:
 
 @contextlib.contextmanager
 def _connecting(section: BusSection) -> Iterator[None]:
-    """A server that falls silent must not hold the start up: python-can waits forever."""
+    """Limit the time to connect: python-can waits forever for a silent server."""
     if section.interface != "socketcand":
         yield
         return
@@ -179,12 +179,12 @@ def server_has_gone(bus: can.BusABC) -> bool:
 
 
 def listening_s(section: BusSection) -> float:
-    """How long to listen for frames that come every period, until silence on this bus is certain."""
+    """How long to listen for periodic frames before the bus counts as silent, s."""
     return max(_DELIVERY_S.get(section.interface, _SLOWEST_DELIVERY_S), 3 * section.period_s)
 
 
 def interface_is_up(name: str) -> bool:
-    """Whether a network interface exists and is up; cheap enough to ask now and then in a run."""
+    """Whether a network interface exists and is up; cheap enough for repeated use in a run."""
     try:
         flags = (_SYS_NET / name / "flags").read_text(encoding="ascii")
         return bool(int(flags, 16) & _IFF_UP)
@@ -193,7 +193,7 @@ def interface_is_up(name: str) -> bool:
 
 
 def _size_receive_buffer(bus: can.BusABC, section: BusSection) -> None:
-    """Room for everything a full bus brings during the longest stall."""
+    """Size the receive buffer for a full bus during the longest stall."""
     frames = int(_BUFFER_S * section.bitrate / _SHORTEST_FRAME_BITS)
     wanted = frames * _BYTES_PER_FRAME
     sock: socket.socket = bus.socket  # type: ignore[attr-defined]
@@ -213,14 +213,14 @@ def _size_receive_buffer(bus: can.BusABC, section: BusSection) -> None:
 
 
 def receive_buffer_frames(bus: can.BusABC) -> int:
-    """How many frames the kernel keeps for a SocketCAN bus that is not read."""
+    """Frames that the kernel buffers for a SocketCAN bus."""
     sock: socket.socket = bus.socket  # type: ignore[attr-defined]
     return sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // _BYTES_PER_FRAME
 
 
 def _reason(error: BaseException) -> str:
     cause: BaseException | None = error
-    while cause is not None:  # python-can wraps what the system said
+    while cause is not None:  # python-can wraps the system's error
         number = getattr(cause, "errno", None) or getattr(cause, "error_code", None)
         if number in _REASONS:
             return _REASONS[number]

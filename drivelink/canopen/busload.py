@@ -1,4 +1,4 @@
-"""How much of the bus the cycle needs, before it is started.
+"""Computes the bus load of a cycle before the start.
 
 A standard frame with n data bytes takes at most 47 + 8 n + ⌊(33 + 8 n) / 4⌋ bits, interframe space and
 worst-case stuffing included: 55 for a SYNC, 135 for eight bytes.
@@ -25,7 +25,7 @@ def frame_bits(data_bytes: int) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BusLoad:
-    """What the cycle puts on the bus.
+    """Load of the cycle on the bus.
 
     Attributes:
         bits_per_s: worst case.
@@ -51,7 +51,7 @@ def _tpdo_rate_hz(tpdo: TpdoLayout, sync_hz: float) -> float:
 
 
 def bus_load(layouts: Iterable[NodeLayout], *, period_s: float, bitrate: int, sync_bytes: int = 0) -> BusLoad:
-    """Load of SYNC, TPDOs (also those nobody here needs) and heartbeats.
+    """Load of SYNC, all enabled TPDOs and heartbeats.
 
     Args:
         layouts: all nodes.
@@ -76,7 +76,7 @@ def bus_load(layouts: Iterable[NodeLayout], *, period_s: float, bitrate: int, sy
 
 
 def check_capacity(load: BusLoad, period_s: float) -> None:
-    """Refuse what the bus cannot carry.
+    """Check that the bus can carry the load.
 
     Raises:
         BusError: more bits per second than the bit rate.

@@ -1,8 +1,8 @@
-"""From a joint file and a bus to `NodeLayout`s: before the start (blocking), and beside the loop.
+"""Configures the nodes of a joint file: before the start (blocking), and beside the loop.
 
-`configure` does it all before the start. In a run, a node that rebooted is configured again by
-`Configurator.start(node)`: the loop hands every SDO response to `feed`, lets time pass with `poll`, and
-takes the new layout when it is there. Nothing here waits, and nothing here reads the bus a second time.
+`configure` runs before the start. In a run, `Configurator.start(node)` configures a rebooted node again: the
+loop passes every SDO response to `feed`, calls `poll` regularly, and takes the new layout from it. Nothing
+here waits or reads the bus.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _DEVICE_TYPE = 0x1000  # what a node is asked for first
 
 
 class Configurator:
-    """Configures the nodes of one or several joints, again and again if need be.
+    """Configures the nodes of one or several joints, repeatedly if necessary.
 
     Args:
         send: puts a frame (identifier, data) on the bus.
@@ -58,7 +58,7 @@ class Configurator:
         self.layouts: dict[int, NodeLayout] = {}
         self.drop_others = False
         self._sessions: dict[int, Session[NodeLayout]] = {}
-        self._broken: dict[int, DriveError] = {}  # nodes whose configuration ended with a mistake of ours
+        self._broken: dict[int, DriveError] = {}  # nodes whose configuration ended with an internal error
 
     @property
     def nodes(self) -> tuple[int, ...]:
@@ -66,7 +66,7 @@ class Configurator:
         return tuple(self._roles)
 
     def program(self, node: int, *, start: bool, stopped: bool = False) -> Program[NodeLayout]:
-        """What configures one node; one that is known to be stopped is woken first."""
+        """The SDO program that configures a node; a stopped node is woken first."""
         taken = {
             tpdo.cob_id
             for other, layout in self.layouts.items()
@@ -78,7 +78,7 @@ class Configurator:
         )
 
     def start(self, node: int, *, stopped: bool = False) -> None:
-        """Begin to configure a node beside the loop, anew if that is already under way."""
+        """Start to configure a node beside the loop; restart if it is already being configured."""
         self._sessions[node] = Session(
             self.program(node, start=True, stopped=stopped),
             self._send,
@@ -103,7 +103,7 @@ class Configurator:
             self._break_off(node, error)
 
     def poll(self, now_s: float) -> list[tuple[int, NodeLayout | DriveError]]:
-        """Let time pass; what has come to an end: the node with its new layout, or with the error."""
+        """Advance the configurations; return finished nodes with their new layout or error."""
         ended: list[tuple[int, NodeLayout | DriveError]] = []
         for node, session in list(self._sessions.items()):
             try:
@@ -126,7 +126,7 @@ class Configurator:
         self._broken[node] = DriveError(f"node {node}: {type(error).__name__} in its configuration: {error}")
 
     def load(self) -> BusLoad:
-        """Bus load of all that is configured."""
+        """Bus load of all configured nodes."""
         return bus_load(
             self.layouts.values(),
             period_s=self.bus.period_s,
@@ -142,10 +142,10 @@ def configure_joints(
     *,
     idle: Idle | None = None,
 ) -> tuple[Configurator, tuple[tuple[NodeLayout, ...], ...]]:
-    """Configure all nodes of all joints on one bus, check the bus load, and start them.
+    """Configure and start all nodes of all joints on one bus, and check the bus load.
 
     Args:
-        bus: open, and read by nobody else meanwhile.
+        bus: open, without another reader.
         joints: joint files with `configure = true`; the first one's bus section counts.
         base_dirs: their folders, for EDS files.
         idle: called between receptions, e.g. the simulated devices' `poll` in lockstep.
@@ -220,10 +220,10 @@ def _configure_one(configurator: Configurator, node: int, bus: FrameBus, idle: I
 
 
 def refuse_foreign_sync(bus: FrameBus, section: BusSection, idle: Idle | None) -> None:
-    """Two masters must not both make SYNC.
+    """Check that no other master produces SYNC.
 
     Raises:
-        BusError: somebody else does.
+        BusError: another master does.
     """
     heard = _listen(bus, listening_s(section), idle)
     syncs = sum(1 for cob_id in heard if cob_id == 0x80)

@@ -1,8 +1,8 @@
-"""EDS and DCF files as vendors write them (CiA 306-1): everything that can be read is read.
+"""Reads EDS and DCF files as vendors write them (CiA 306-1).
 
-Makers' files have other encodings, keys twice, values left out, other nodes' identifiers, unknown types.
-None of that is a reason to give up; each is a line in `DataSheet.problems`. What is left, with compact arrays
-laid out, is handed to canopen, whose object dictionary holds it.
+Makers' files have unexpected encodings, duplicate keys, missing values, other nodes' identifiers, unknown
+types. Each is a line in `DataSheet.problems`, not an error. The cleaned file, with compact arrays expanded,
+is passed to canopen, whose object dictionary holds it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Address = tuple[int, int]
 _NUMBERS = frozenset({datatypes.BOOLEAN, *datatypes.INTEGER_TYPES})
 _TIMES = (datatypes.TIME_OF_DAY, datatypes.TIME_DIFFERENCE)
 _NO_NUMBERS = frozenset({*datatypes.FLOAT_TYPES, *datatypes.DATA_TYPES, *_TIMES})
-_STAND_IN = datatypes.UNSIGNED32  # for a type that nobody knows
+_STAND_IN = datatypes.UNSIGNED32  # for an unknown type
 _OBJECT = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?")
 _NODE = re.compile(r"\$(my_)?node_?id", re.IGNORECASE)  # $NODEID, and Roboteq's $MY_NODE_ID
 
@@ -44,7 +44,7 @@ class DataSheet:
         product_code: ProductNumber, or 0x1018:02.
         revision: RevisionNumber, or 0x1018:03.
         objects: by (index, subindex).
-        problems: what is wrong with the file, a line each.
+        problems: problems of the file, one line each.
     """
 
     path: Path
@@ -57,7 +57,7 @@ class DataSheet:
     problems: list[str] = field(default_factory=list)
 
     def value(self, index: int, subindex: int = 0) -> int | None:
-        """Value of an object as an unsigned number of its length; None where the file has none."""
+        """Value of an object as an unsigned number of its length; None if the file has none."""
         entry = self.objects.get((index, subindex))
         if entry is None:
             return None
@@ -70,7 +70,7 @@ class DataSheet:
         return {address: value for address, value in pairs if value is not None}
 
     def tpdos(self) -> tuple[Tpdo, ...]:
-        """The TPDOs as the file has them; fixed where it says that they cannot be written."""
+        """The TPDOs in the file; `fixed` if it declares them read-only."""
         return tuple(replace(tpdo, fixed=self._fixed(tpdo)) for tpdo in tpdos_of(self.values()))
 
     def _fixed(self, tpdo: Tpdo) -> bool:
@@ -87,7 +87,7 @@ def load_eds(path: Path, node_id: int | None = None) -> DataSheet:
             for, or 1.
 
     Raises:
-        DriveError: it cannot be read at all, or is no EDS.
+        DriveError: it cannot be read, or is not an EDS.
     """
     try:
         raw = path.read_bytes()
@@ -124,7 +124,7 @@ def _text(raw: bytes, sheet: DataSheet) -> str:
 
 
 def _sections(text: str, sheet: DataSheet) -> Sections:
-    """Sections and keys, in lower case; the first of two equal keys counts."""
+    """Sections and keys in lower case; the first of duplicate keys counts."""
     sections: Sections = {}
     current: dict[str, str] | None = None
     section = ""
@@ -157,7 +157,7 @@ def _sections(text: str, sheet: DataSheet) -> Sections:
 
 
 def _number(text: str, node: int = 0) -> int | None:
-    """A number in any of the ways the files have it, `$NODEID` included."""
+    """A number in any notation of the files, `$NODEID` included."""
     relative = bool(_NODE.search(text))
     text = _NODE.sub("", text).replace(" ", "").strip("+")
     if not text:
@@ -171,7 +171,7 @@ def _number(text: str, node: int = 0) -> int | None:
 
 
 def _made_for(sections: Sections) -> int | None:
-    """The node a DCF was made for: stated, or seen from its first TPDO's identifier."""
+    """The node a DCF was made for: declared, or from its first TPDO's identifier."""
     for name in ("devicecomissioning", "devicecommissioning"):
         stated = _number(sections.get(name, {}).get("nodeid", ""))
         if stated is not None and 1 <= stated <= 127:
@@ -185,7 +185,7 @@ def _made_for(sections: Sections) -> int | None:
 
 
 def _cleaned(sections: Sections, node: int, sheet: DataSheet) -> str:
-    """The objects as canopen takes them: each complete, below its index, with numbers that are numbers."""
+    """The objects as canopen expects them: complete, nested below their index, with valid numbers."""
     found: dict[Address, dict[str, str]] = {}
     for name, keys in sections.items():
         if match := _OBJECT.fullmatch(name):
@@ -230,14 +230,14 @@ def _cleaned(sections: Sections, node: int, sheet: DataSheet) -> str:
 
 
 def _data_type(keys: dict[str, str], sections: Sections) -> int:
-    """As the file says; of CANFestival's editor, which makes a section of its own for it, the base type."""
+    """The declared type; the base type for CANFestival's editor, which writes a section for each type."""
     data_type = _number(keys.get("datatype", "")) or 0
     base = sections.get(f"{data_type:x}sub1", {}).get("defaultvalue", "") if data_type > 0x1B else ""
     return _number(base) or data_type
 
 
 def _compact(index: int, keys: dict[str, str], values: dict[str, str]) -> dict[Address, dict[str, str]]:
-    """An array written once for all its subindices (CompactSubObj, [XXXXValue])."""
+    """Expand a compact array (CompactSubObj, [XXXXValue])."""
     count = min(_number(keys.get("compactsubobj", "")) or 0, 254)
     if not count:
         return {}
@@ -263,7 +263,7 @@ def _device(sections: Sections, sheet: DataSheet) -> None:
 
 
 def _move_to_node(sheet: DataSheet, made_for: int | None, node: int) -> None:
-    """Identifiers that a DCF has for the node it was made for become those of the node asked for."""
+    """Change the identifiers of a DCF to those of the requested node."""
     if made_for is None or made_for == node:
         return
     moved = 0

@@ -1,9 +1,8 @@
-"""The filter for frames that could move a drive: none of them is sent.
+"""Filters every outgoing frame: nothing that could move a drive is sent.
 
-Every frame of the configuration passes through `check_frame`: SYNC, the NMT commands *start* and
-*enter pre-operational*, SDO uploads, and SDO downloads to communication objects (0x1005 to 0x1019,
-0x1800 to 0x1BFF of CiA 301). Controlword, modes of operation, targets, and everything else of the
-manufacturer or the profile is refused here, whatever the caller wants.
+`check_frame` permits SYNC, the NMT commands *start* and *enter pre-operational*, SDO uploads, and SDO
+downloads to communication objects (0x1005 to 0x1019, 0x1800 to 0x1BFF of CiA 301). It refuses everything
+else, such as controlword, modes of operation and targets.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ _WRITABLE = frozenset({0x1005, 0x1006, 0x1016, 0x1017, 0x1019})
 
 
 class ForbiddenFrameError(Exception):
-    """A frame that this program must never send: a mistake in it, not of its user."""
+    """A frame that this program must never send: an internal error."""
 
 
 def _is_writable(index: int) -> bool:
@@ -30,7 +29,7 @@ def _is_writable(index: int) -> bool:
 
 
 def check_frame(cob_id: int, data: bytes) -> None:
-    """Refuse what may not be sent.
+    """Refuse frames that may not be sent.
 
     Raises:
         ForbiddenFrameError: the frame is not SYNC, NMT start or pre-operational, or a permitted SDO.
@@ -58,7 +57,7 @@ class SilentBus:
         self.shutdown = bus.shutdown
 
     def send(self, message: can.Message, timeout: float | None = None) -> None:
-        """Refused, always.
+        """Refuse every frame.
 
         Raises:
             BusError: always.

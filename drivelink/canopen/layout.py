@@ -1,6 +1,6 @@
 """The configured PDOs: which frame carries which signal, at what scale.
 
-Made by the configuration (active or passive), used by the acquisition; the only thing the two share.
+The only interface between configuration (active or passive) and acquisition.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ __all__ = ["MappedObject", "NodeLayout", "Signal", "TpdoLayout", "layout_documen
 
 
 class Signal(StrEnum):
-    """What a mapped object means to the joint."""
+    """Meaning of a mapped object for the joint."""
 
     MOTOR_POSITION = "motor_position"
     MOTOR_VELOCITY = "motor_velocity"
@@ -24,7 +24,7 @@ class Signal(StrEnum):
     STATUSWORD = "statusword"
     LINK_POSITION = "link_position"
     LINK_VELOCITY = "link_velocity"
-    VELOCITY_CHECK = "velocity_check"  # the motor's, for a cross-check alone; so are those that follow
+    VELOCITY_CHECK = "velocity_check"  # the motor's, for cross-checks only; so are the following
     TORQUE_CHECK = "torque_check"  # current beside torque, or torque beside current
     SECOND_POSITION = "second_position"  # the motor's, by another encoder
     FOLLOWING_ERROR = "following_error"
@@ -67,8 +67,8 @@ class TpdoLayout:
     Attributes:
         cob_id: identifier of the frame.
         objects: what is in it.
-        transmission_type: 1 to 240 every so many SYNCs; 254, 255 when the drive pleases.
-        number: 1 for 0x1800/0x1A00 and so on; 0 where it is not known (passive).
+        transmission_type: 1 to 240: every so many SYNCs; 254, 255: event-driven.
+        number: 1 for 0x1800/0x1A00 and so on; 0: unknown (passive).
         inhibit_s: shortest time between two frames with types 254 and 255; 0: none, or not known.
     """
 
@@ -92,10 +92,10 @@ class NodeLayout:
         node_id: 1 to 127.
         motor: index of the motor this drive belongs to, or None for a node that is only an encoder.
         tpdos: its frames that carry signals of the joint.
-        other_tpdos: enabled frames of this node that nobody here needs, but that load the bus.
+        other_tpdos: enabled frames of this node that are not used but load the bus.
         heartbeat_ms: period of the heartbeat the node produces, as read back; 0: none, or not known.
         identity: (vendor, product code, revision, serial number) of 0x1018; 0 where not reported.
-        notices: what the configuration had to say about it.
+        notices: findings of its configuration.
     """
 
     node_id: int
@@ -108,7 +108,7 @@ class NodeLayout:
 
 
 def layout_document(layout: NodeLayout) -> dict[str, Any]:
-    """A layout as plain values, for the model document; without what its configuration had to say."""
+    """A layout as plain values, for the model document; without notices."""
     document = asdict(layout)
     del document["notices"]
     return document

@@ -1,4 +1,4 @@
-"""What a node offers: for each signal, the objects that carry it, ready to be mapped and decoded."""
+"""Objects of a node that carry each signal, with all data to map and decode them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Address = tuple[int, int]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MappableObject:
-    """An object that can give a signal, with all that is needed to decode it."""
+    """An object that carries a signal, with all data to decode it."""
 
     signal: Signal
     address: Address
@@ -26,7 +26,7 @@ class MappableObject:
     modulus: int = 0
 
     def mapped(self, bits: int | None = None) -> MappedObject:
-        """It as an object of a TPDO."""
+        """The object as part of a TPDO."""
         return MappedObject(
             signal=self.signal,
             index=self.address[0],
@@ -46,7 +46,7 @@ class Offer:
 
     Attributes:
         candidates: for each signal the objects that can give it, best first.
-        checks: the same for signals that only check others: not mapped, but read where the node maps them.
+        checks: the same for cross-checks: not mapped, but read if the node maps them.
         missing: for a signal with no candidate, why.
         notices: disagreements and remarks.
     """
@@ -58,6 +58,6 @@ class Offer:
 
     @property
     def readable(self) -> dict[Signal, tuple[MappableObject, ...]]:
-        """What frames are decoded by: candidates first."""
+        """All objects for decoding, candidates first."""
         rest = {signal: objects for signal, objects in self.checks.items() if signal not in self.candidates}
         return {**self.candidates, **rest}

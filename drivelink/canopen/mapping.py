@@ -1,8 +1,8 @@
-"""Maps the signals of the joint into a node's TPDOs, and reads back what it will really send.
+"""Maps the signals of the joint into a node's TPDOs, and reads the result back.
 
-The order is the one that all drives accept: pre-operational; 0x1800:01 invalid with its bit 30 kept;
-:02 = 1; 0x1A00:00 = 0; entries; count; valid again (CiA 301, 7.5.2.36). A node that is already as it should
-be is not written to, and not taken out of operational: after a restart of the daemon nothing changes.
+The order is the one that all drives accept: pre-operational; 0x1800:01 invalid with its bit 30 kept; :02 = 1;
+0x1A00:00 = 0; entries; count; valid again (CiA 301, 7.5.2.36). A node that is already configured is not
+written to and stays operational, also after a restart of the daemon.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ __all__ = ["NMT_PRE_OPERATIONAL", "NMT_START", "Mapper", "disable"]
 NMT_START = 0x01
 NMT_PRE_OPERATIONAL = 0x80
 _TIMING_NAMES = {2: "transmission type", 3: "inhibit time", 5: "event timer", 6: "SYNC start value"}
-SETTLE_S = 0.02  # for a node to change its NMT state: there is no answer to wait for
+SETTLE_S = 0.02  # for a change of the NMT state, which is not acknowledged
 
 _NOT_NOW = frozenset({0x08000020, 0x08000021, 0x08000022})  # local control, present state of the device
 _READ_ONLY = frozenset({0x06010000, 0x06010002})
 _TOO_MANY = 0x06040042
 _NO_SUBINDEX = 0x06090011
-_STATE_S = 1.5  # that a node may take to be pre-operational, and to take what it refuses before
+_STATE_S = 1.5  # until a node is pre-operational and accepts what it refused before
 _STATE_POLL_S = 0.05
 
 
 class _MapFixed(Exception):  # noqa: N818
-    """A TPDO refuses another map, or one of so many objects: what is known of it has changed."""
+    """A TPDO refuses another mapping, or one of this length."""
 
 
 @dataclass(slots=True)
@@ -69,7 +69,7 @@ class Mapper:
         prefer_unused: see `tpdo_assignment.assign`.
         notices: remarks, added to.
         period_s: communication cycle, at which a TPDO is asked for that cannot be sent on SYNC.
-        readable: signals that are read too, where they are mapped anyway.
+        readable: further signals that are read if they are mapped anyway.
     """
 
     role: Role
@@ -86,10 +86,10 @@ class Mapper:
     _refusal: str = field(default="", init=False)
 
     def program(self) -> Program[tuple[TpdoLayout, ...]]:
-        """Map, read back, decode.
+        """The program: map, read back, decode.
 
         Raises:
-            DriveError: the node cannot give what is needed, or does not keep what was written.
+            DriveError: the node lacks a needed signal, or does not keep the mapping.
         """
         available = {signal: list(candidates) for signal, candidates in self.available.items()}
         while True:
@@ -130,7 +130,7 @@ class Mapper:
         self.tpdos[[other.number for other in self.tpdos].index(tpdo.number)] = tpdo
 
     def _apply(self, assignment: Assignment) -> Program[None]:
-        """Make one TPDO what it should be, if it is not."""
+        """Configure one TPDO, if necessary."""
         tpdo = assignment.tpdo
         entries = tpdo.entries
         if assignment.objects is not None:
@@ -171,14 +171,14 @@ class Mapper:
                 raise
         try:
             yield from self._cob(tpdo, cob_id | no_rtr)
-        except SdoAbort:  # an identifier that cannot be changed: the node's own, if nobody else has it
+        except SdoAbort:  # an identifier that cannot be changed is used, if it is unique
             if tpdo.cob_id in self.taken:
                 raise
             yield from self._cob(tpdo, tpdo.cob & ~INVALID)
         return replace(tpdo, cob=cob_id | no_rtr, transmission_type=1, entries=entries)
 
     def _put(self, index: int, subindex: int, value: int, size: int) -> Program[None]:
-        """Write, with patience for a node that takes its time to be pre-operational."""
+        """Write, with retries for a node that is slow to enter pre-operational."""
         while True:
             try:
                 yield Write(self.node, index, subindex, value, size)
@@ -194,7 +194,7 @@ class Mapper:
         yield from self._put(tpdo.communication, 1, value, 4)
 
     def _stays_on(self, tpdo: Tpdo, abort: SdoAbort, objects: tuple[MappableObject, ...] | None) -> None:
-        """The TPDO cannot be switched off: then its map is what it is.
+        """The TPDO cannot be disabled: its mapping is fixed.
 
         Raises:
             _MapFixed: another map was wanted.
@@ -213,9 +213,8 @@ class Mapper:
         self._refusal = self._refusal or f"; writing {answer}"
 
     def _timing(self, tpdo: Tpdo) -> Program[None]:
-        """Every SYNC, and nothing that holds frames back or adds some.
-
-        Where it is never sent on SYNC its event timer has it sent once a period.
+        """Set transmission at every SYNC, without inhibit time or event timer. A TPDO that cannot be
+        synchronous gets an event timer of one period.
         """
         start = yield from read_optional(self.node, tpdo.communication, 6)
         on_sync = yield from self._ask(tpdo, 2, tpdo.transmission_type, 1)
@@ -227,14 +226,14 @@ class Mapper:
         yield from self._ask(tpdo, 6, start or 0, 0)
 
     def _ask(self, tpdo: Tpdo, subindex: int, has: int, wanted: int) -> Program[bool]:
-        """Write a communication parameter, if it is another one; whether it is as wanted."""
+        """Write a communication parameter if it differs; return whether it has the wanted value."""
         if has == wanted:
             return True
         try:
             yield from self._put(tpdo.communication, subindex, wanted, 2 if subindex in (3, 5) else 1)
         except SdoAbort as abort:
             if subindex == 2 and abort.code in _NOT_NOW:
-                raise  # a later attempt will do; what is not sent at SYNC is worth much less
+                raise  # not essential, unlike transmission at SYNC
             old = ": its values may be older than their SYNC" if subindex == 2 else ""
             self._say(
                 Severity.WARNING if subindex == 2 else Severity.INFO,
@@ -268,7 +267,7 @@ class Mapper:
             self._mark_fixed(tpdo, abort)
 
     def _is_full(self, tpdo: Tpdo, position: int, abort: SdoAbort) -> Program[bool]:
-        """Whether it is the map that has no such entry, and not the node that has no such object."""
+        """Whether the mapping is full, rather than the object unknown to the node."""
         if abort.code != _NO_SUBINDEX:
             return abort.code == _TOO_MANY
         try:
@@ -288,7 +287,7 @@ class Mapper:
         raise _MapFixed from abort
 
     def _restore(self, tpdo: Tpdo) -> Program[None]:
-        """After a refusal: the map and the identifier that were there."""
+        """Restore mapping and identifier after a refusal."""
         try:
             if tpdo.known and not self._is_fixed(tpdo):
                 yield Write(self.node, tpdo.mapping, 0, 0, 1)
@@ -325,5 +324,5 @@ class Mapper:
 
 
 def disable(node: int, tpdo: Tpdo) -> Program[None]:
-    """Switch off a TPDO that nobody here needs."""
+    """Disable an unused TPDO."""
     yield Write(node, tpdo.communication, 1, tpdo.cob & ~EXTENDED | INVALID, 4)

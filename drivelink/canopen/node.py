@@ -36,22 +36,22 @@ __all__ = ["NodeSurvey", "configure_node", "survey_node"]
 _SYNC_PRODUCER = 1 << 30
 _ENCODER_HEARTBEAT_MS = 100
 _VALUE_BYTES = 8  # of the longest object that can be mapped
-BOOT_S = 3.0  # that a node may take to answer after power-on; the slowest take two seconds
+BOOT_S = 3.0  # until a node answers after power-on; the slowest take two seconds
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodeSurvey:
-    """What a node says of itself, nothing of it written.
+    """Data read from a node.
 
     Attributes:
         role: what it is there for.
-        device_type: 0x1000; 0 where it answers without a value.
+        device_type: 0x1000; 0 if it has no value.
         identity: 0x1018.
-        reported: unsigned values of the objects that were asked for and exist.
-        offer: what it can give.
-        refused: the last read that it aborted although the object may exist, or None.
+        reported: unsigned values of the requested objects that exist.
+        offer: signals it can send.
+        refused: the last aborted read of an object that may exist, or None.
         available: for each signal, the objects that exist, best first, at their real length.
-        tpdos: as they are.
+        tpdos: present TPDOs.
     """
 
     role: Role
@@ -65,13 +65,12 @@ class NodeSurvey:
 
 
 def survey_node(role: Role, patience: int = 1, *, wake: bool = False) -> Program[NodeSurvey]:
-    """Read what a node is, what it can give, and what it sends now; writes nothing.
+    """Read identity, possible signals and present TPDOs of a node; write nothing.
 
     Args:
         role: what it is there for.
-        patience: how often it is tried, SDO timeout and retries each time, before it counts as absent.
-        wake: send one that does not answer to pre-operational: a node that somebody stopped has no SDO
-            (CiA 301, 7.3.2.2.4).
+        patience: attempts, each with SDO timeout and retries, before the node counts as absent.
+        wake: send a silent node to pre-operational: a stopped node has no SDO (CiA 301, 7.3.2.2.4).
     """
     node = role.node_id
     device_type = yield from _first_contact(node, patience, wake)
@@ -103,7 +102,7 @@ def survey_node(role: Role, patience: int = 1, *, wake: bool = False) -> Program
 
 
 def _first_contact(node: int, patience: int, wake: bool) -> Program[int]:
-    """The device type, with patience for a node that is still booting."""
+    """Read the device type, with retries for a node that is booting."""
     for _ in range(patience - 1):
         try:
             return (yield from read_optional(node, 0x1000, 0)) or 0
@@ -114,7 +113,7 @@ def _first_contact(node: int, patience: int, wake: bool) -> Program[int]:
 
 
 def _existing(node: int, candidates: tuple[MappableObject, ...]) -> Program[tuple[MappableObject, ...]]:
-    """Those that the node has, with the length it answers with; some have no value before they run."""
+    """The objects that exist, with their actual length; some have no value before the drive runs."""
     found = []
     for candidate in candidates:
         try:
@@ -144,9 +143,9 @@ def configure_node(
         role: what the node is there for.
         bus: the bus section of the joint file.
         taken: identifiers of other nodes' TPDOs.
-        drop_others: switch off TPDOs of this node that nobody here needs.
+        drop_others: disable unused TPDOs of this node.
         start: send NMT start at the end.
-        stopped: it has said that it is stopped, and will not answer before it is woken.
+        stopped: the node is stopped and does not answer SDO until it is woken.
 
     Raises:
         DriveError: the node is absent, refuses, or cannot give what is needed.
@@ -188,10 +187,10 @@ def configure_node(
 
 
 def _wanted(survey: NodeSurvey, notices: list[Notice]) -> dict[Signal, tuple[MappableObject, ...]]:
-    """Signals to map, each with the objects that can give it.
+    """Signals to map, each with the objects that carry it.
 
     Raises:
-        DriveError: something needed cannot be had.
+        DriveError: a needed signal is not available.
     """
     subject = survey.role.subject
     for signal, reason in survey.offer.missing.items():
@@ -217,7 +216,7 @@ def _wanted(survey: NodeSurvey, notices: list[Notice]) -> dict[Signal, tuple[Map
 def _others(
     role: Role, others: tuple[Tpdo, ...], used: set[int], drop: bool, notices: list[Notice]
 ) -> Program[tuple[Tpdo, ...]]:
-    """Switch off what shares an identifier with us, and, if asked to, what nobody here needs."""
+    """Disable TPDOs that share an identifier with ours and, on request, unused ones."""
     left = []
     for tpdo in others:
         if not drop and tpdo.cob_id not in used:
@@ -237,7 +236,7 @@ def _others(
 
 
 def _sync(role: Role, bus: BusSection, notices: list[Notice]) -> Program[None]:
-    """SYNC identifier, one producer only, and the same counter on both sides."""
+    """Configure SYNC: identifier, one producer, the same counter on both sides."""
     node = role.node_id
     cob = yield from read_optional(node, 0x1005, 0)
     if cob is not None and (cob & 0x7FF != SYNC_COB_ID or cob & _SYNC_PRODUCER):
@@ -277,7 +276,7 @@ def _sync_counter(node: int, overflow: int) -> Program[None]:
 
 
 def _heartbeat(role: Role, notices: list[Notice]) -> Program[int]:
-    """Ask for a heartbeat; what reads back is what will be watched."""
+    """Request a heartbeat; the value read back is monitored."""
     node = role.node_id
     wanted = role.drive.heartbeat_ms if role.drive is not None else _ENCODER_HEARTBEAT_MS
     has = yield from read_optional(node, 0x1017, 0)

@@ -1,7 +1,6 @@
-"""Layouts of nodes that somebody else configures: from the joint file, a data sheet, or by listening.
+"""Layouts of nodes that another master configures: from the joint file, a data sheet, or by listening.
 
-Nothing is ever sent from here; there is nothing here to send with. What the traffic shows comes before what
-the joint file states, and only these two are believed; see `_PassiveNode`.
+This module cannot send. Only traffic and joint file are trusted, the traffic first; see `_PassiveNode`.
 """
 
 from __future__ import annotations
@@ -33,16 +32,16 @@ _COMMUNICATION = frozenset(
     {(0x1005, 0), (0x1006, 0), (0x1017, 0), (0x1018, 1), (0x1018, 2), (0x1018, 3), (0x1018, 4), (0x1019, 0)}
 )
 _NMT_RESETS = (0x81, 0x82)  # of the node, of its communication
-_VOLATILE = frozenset({(0x1005, 0), (0x1006, 0), (0x1017, 0), (0x1019, 0)})  # as after power-on again
+_VOLATILE = frozenset({(0x1005, 0), (0x1006, 0), (0x1017, 0), (0x1019, 0)})  # as after power-on
 _MOST_ENTRIES = 8  # of a map whose objects are whole bytes
 
 
 class _PassiveNode:
-    """What is known of one node, and how far that is believed.
+    """Mapping of one node, and whether it is trusted.
 
-    A map is believed when it was written or read back since the node's last start, or when the joint file
-    states it: for good with `default = true`, else until the node restarts. What a data sheet says of a map
-    is the factory setting; it may have been changed since, so it is only offered.
+    A mapping is trusted if it was written or read back since the node's last start, or if the joint file
+    declares it: permanently with `default = true`, else until the node restarts. A data sheet contains the
+    factory setting, which may have changed, so it is only suggested.
     """
 
     def __init__(self, role: Role) -> None:
@@ -63,26 +62,26 @@ class _PassiveNode:
         return (index, subindex) in self._units
 
     def restart(self) -> None:
-        """It boots: maps and whatever was written are as the node has them by itself."""
+        """Handle a boot-up: mapping and parameters are the node's defaults again."""
         self.restarted, self.adopted = True, None
         self.listener.forget(lambda address: _is_mapping(address) or address in _VOLATILE)
 
     def lose_sight(self) -> None:
-        """The bus was away: the state of the node is unknown."""
+        """Handle a loss of the bus: the state of the node is unknown."""
         self.adopted = None
         self.listener.forget(_is_mapping)
 
     @property
     def being_mapped(self) -> bool:
-        """Whether the master is writing to its maps just now."""
+        """Whether the master is changing its mapping now."""
         pending = self.listener.pending
         return pending is not None and _is_mapping(pending)
 
     def layout(self) -> tuple[NodeLayout, str]:
-        """The layout from all that is known, and why it is not believed; empty: it is.
+        """The best known layout, and why it is not trusted (empty: it is).
 
         Raises:
-            DriveError: mapping or scale of something needed is not known.
+            DriveError: mapping or scale of a needed signal is unknown.
         """
         try:
             return self._layout(self._believed_tpdos()), ""
@@ -99,7 +98,7 @@ class _PassiveNode:
             return layout, self.doubt()
 
     def doubt(self) -> str:
-        """One line on a mapping that is not believed, and what would settle it."""
+        """One line on a mapping that is not trusted, with the remedy."""
         role = self.role
         if self.restarted:
             why = "it has restarted, and its mapping was neither written nor read since"
@@ -113,7 +112,7 @@ class _PassiveNode:
         )
 
     def offered(self) -> str:
-        """What would state the mapping in the joint file: TOML to paste, where a data sheet gives it."""
+        """TOML for the joint file that declares the mapping, from a data sheet if there is one."""
         if self.role.tpdo:
             return f"default = true in {self._keys()}"
         tpdos = self._sheet_tpdos()
@@ -160,7 +159,7 @@ class _PassiveNode:
         )
 
     def _believed_tpdos(self) -> tuple[Tpdo, ...]:
-        """What the joint file states, as far as the node still has it, and what the traffic showed."""
+        """TPDOs from the joint file, as far as still valid, and from the traffic."""
         seen = {address: value for address, value in self.listener.values.items() if _is_mapping(address)}
         touched = {(index & 0x1FF) + 1 for index, _ in seen}
         stated, values = [], dict(seen)
@@ -182,7 +181,7 @@ class _PassiveNode:
         return _sent(tpdos_of({**self._sheet.values(), **seen}))
 
     def _number(self, section: TpdoSection, seen: dict[Address, int]) -> int:
-        """The number of a TPDO that the joint file states by its identifier; 0: not known."""
+        """The number of a TPDO that the joint file declares by its identifier; 0: unknown."""
         for (index, subindex), value in seen.items():
             if index < 0x1A00 and subindex == 1 and value & 0x7FF == section.cob_id:
                 return index - 0x17FF
@@ -212,7 +211,7 @@ def _is_mapping(address: Address) -> bool:
 
 
 def _objects_of(tpdo: Tpdo, number: int) -> dict[Address, int]:
-    """A TPDO as the objects that describe it."""
+    """A TPDO as its parameter objects."""
     communication, mapping = 0x17FF + number, 0x19FF + number
     entries = {
         (mapping, place): index << 16 | subindex << 8 | bits
@@ -227,7 +226,7 @@ def _objects_of(tpdo: Tpdo, number: int) -> dict[Address, int]:
 
 
 def _sent(tpdos: Iterable[Tpdo]) -> tuple[Tpdo, ...]:
-    """Those that are enabled and known, one for each identifier."""
+    """The enabled and known TPDOs, one per identifier."""
     found: dict[int, Tpdo] = {}
     for tpdo in tpdos:
         if tpdo.enabled and tpdo.known and 0x181 <= tpdo.cob_id <= 0x57F:
@@ -255,7 +254,7 @@ def _declared(section: TpdoSection) -> Tpdo:
 
 
 class PassiveConfigurator:
-    """The counterpart of `Configurator` for a bus that we may not touch; it has nothing to send with.
+    """The counterpart of `Configurator` for a passive daemon; it cannot send.
 
     Args:
         joints: joint files on this bus; the first one's bus section counts.
@@ -264,8 +263,7 @@ class PassiveConfigurator:
     Attributes:
         layouts: of the nodes that are known so far.
         missing: for the others, what is missing.
-        doubts: of the nodes in `layouts`, those whose layout is not believed now: why, and what would
-            settle it.
+        doubts: of the nodes in `layouts`, those whose layout is not trusted now: reason and remedy.
     """
 
     def __init__(self, joints: Sequence[JointFile], base_dirs: Sequence[Path] | None = None) -> None:
@@ -294,7 +292,7 @@ class PassiveConfigurator:
 
     @property
     def believed(self) -> frozenset[int]:
-        """Nodes whose frames mean what their layout says: it is known, not doubted, and not being changed."""
+        """Nodes whose layout is known, trusted, and not being changed."""
         return frozenset(
             node
             for node in self.layouts
@@ -302,7 +300,7 @@ class PassiveConfigurator:
         )
 
     def adopt(self, layouts: Iterable[NodeLayout]) -> None:
-        """Take layouts that are known from elsewhere; what the traffic shows later counts more."""
+        """Take layouts from another source; later traffic has priority."""
         for layout in layouts:
             node = self._nodes.get(layout.node_id)
             if node is not None:
@@ -311,15 +309,15 @@ class PassiveConfigurator:
                 self.doubts.pop(layout.node_id, None)
 
     def start(self, node: int, *, stopped: bool = False) -> None:
-        """Nothing: the master of this node configures it again."""
+        """Do nothing: the node's master configures it again."""
 
     def lose_sight(self) -> None:
-        """The bus was away: what the traffic showed may be out of date."""
+        """Handle a loss of the bus: knowledge from the traffic may be out of date."""
         for node in self._nodes.values():
             node.lose_sight()
 
     def feed(self, cob_id: int, data: bytes, now_s: float) -> None:
-        """Take a frame: SDO, boot-up and NMT resets are of interest, and which PDOs there are at all."""
+        """Take a frame: SDO, boot-up, NMT resets, PDOs."""
         if cob_id == 0:
             if len(data) == 2 and data[0] in _NMT_RESETS:
                 for node_id, node in self._nodes.items():
@@ -339,11 +337,11 @@ class PassiveConfigurator:
                 one.restart()
         elif 0x180 >> 7 <= function <= 0x480 >> 7 and function & 1:
             if cob_id not in one.heard and one.role.node_id in self.missing:
-                one.listener.changes += 1  # what is missing can be said better now
+                one.listener.changes += 1  # the message can be more specific now
             one.heard[cob_id] = len(data)
 
     def poll(self, now_s: float) -> list[tuple[int, NodeLayout | DriveError]]:
-        """Nodes whose layout became known or another one since the last call."""
+        """Nodes whose layout became known or changed since the last call."""
         ended: list[tuple[int, NodeLayout | DriveError]] = []
         for node_id, node in self._nodes.items():
             if node.seen_changes == node.listener.changes:
@@ -352,7 +350,7 @@ class PassiveConfigurator:
             try:
                 layout, doubt = node.layout()
             except DriveError as error:
-                # While a master rewrites the map there is none; what is known of the old one is kept.
+                # While a master changes the mapping there is none; the old layout is kept.
                 if node_id not in self.layouts:
                     self.missing[node_id] = error
                 else:
@@ -369,7 +367,7 @@ class PassiveConfigurator:
         return ended
 
     def load(self) -> BusLoad:
-        """Bus load of all that is known."""
+        """Bus load of all known TPDOs."""
         return bus_load(
             self.layouts.values(),
             period_s=self.bus.period_s,

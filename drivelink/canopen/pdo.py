@@ -1,6 +1,6 @@
-"""TPDOs as they are in a node: communication parameter 0x1800+n, mapping 0x1A00+n (CiA 301, 7.5.2).
+"""Reads the TPDOs of a node: communication parameter 0x1800+n, mapping 0x1A00+n (CiA 301, 7.5.2).
 
-They are read by programs of `drivelink.canopen.sdo`: canopen's own PDO code blocks until each answer comes.
+By programs of `drivelink.canopen.sdo`, because canopen's PDO code blocks until each answer.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ NO_RTR = 1 << 30
 EXTENDED = 1 << 29
 SYNC_TYPES = range(1, 241)
 
-_MOST_TPDOS = 16  # numbers that are looked at; no drive in the field maps what is needed further up
+_MOST_TPDOS = 16  # TPDO numbers that are read; no known drive uses higher ones
 _ALWAYS = 4  # some makers leave gaps among the first four
 
 
@@ -44,14 +44,14 @@ class Tpdo:
 
     Attributes:
         number: 1 for 0x1800/0x1A00.
-        cob: 0x1800:01 as it is: bit 31 invalid, bit 30 no RTR, the identifier below.
+        cob: 0x1800:01: bit 31 invalid, bit 30 no RTR, and the identifier.
         transmission_type: 0x1800:02.
         inhibit_100us: 0x1800:03.
         event_ms: 0x1800:05.
         entries: what is mapped, in order.
         fixed: whether its mapping cannot be changed.
         most: objects that can be mapped into it.
-        known: whether the entries are; an unknown mapping is not an empty one.
+        known: whether the entries are known.
     """
 
     number: int
@@ -71,7 +71,7 @@ class Tpdo:
 
     @property
     def enabled(self) -> bool:
-        """Whether it is sent at all."""
+        """Whether it is enabled."""
         return not self.cob & INVALID
 
     @property
@@ -86,13 +86,13 @@ class Tpdo:
 
 
 def entry_text(entry: Entry) -> str:
-    """An entry as people write it."""
+    """An entry as text."""
     index, subindex, bits = entry
     return f"0x{index:04X}:{subindex:02X} ({bits} bit)"
 
 
 def describe(tpdos: Iterable[Tpdo]) -> str:
-    """The maps in one line."""
+    """The mappings in one line."""
     parts = []
     for tpdo in tpdos:
         objects = " + ".join(f"0x{index:04X}:{subindex:02X}" for index, subindex, _ in tpdo.entries) or (
@@ -103,7 +103,7 @@ def describe(tpdos: Iterable[Tpdo]) -> str:
 
 
 def read_optional(node: int, index: int, subindex: int) -> Program[int | None]:
-    """An unsigned value, or None where the node does not give it."""
+    """Read an unsigned value; None if it is not available."""
     try:
         return (yield from read_number(node, index, subindex))
     except SdoAbort:
@@ -120,15 +120,15 @@ def _read_exactly(node: int, index: int, subindex: int) -> Program[int | None]:
 
 
 def read_tpdo(node: int, number: int, *, exactly: bool = False) -> Program[Tpdo | None]:
-    """One TPDO as it is, or None where there is none of that number.
+    """Read one TPDO; None if it does not exist.
 
     Args:
         node: node id.
         number: from 1.
-        exactly: its frames will be decoded by this: what cannot be read must not be guessed.
+        exactly: raise if part of the mapping cannot be read, because frames will be decoded by it.
 
     Raises:
-        SdoAbort: that is the case.
+        SdoAbort: `exactly`, and a read was aborted.
     """
     read = _read_exactly if exactly else read_optional
     communication, mapping = 0x17FF + number, 0x19FF + number
@@ -144,7 +144,7 @@ def read_tpdo(node: int, number: int, *, exactly: bool = False) -> Program[Tpdo 
     for subindex in range(1, min(count or 0, 64) + 1):
         raw = yield from read(node, mapping, subindex)
         known = known and raw is not None
-        if not raw:  # some count places that are empty
+        if not raw:  # some count empty entries
             break
         entries.append((raw >> 16, raw >> 8 & 0xFF, raw & 0xFF))
     return Tpdo(
@@ -171,7 +171,7 @@ def read_tpdos(node: int) -> Program[tuple[Tpdo, ...]]:
 
 
 def tpdos_of(values: Mapping[Address, int]) -> tuple[Tpdo, ...]:
-    """The TPDOs that the values of 0x1800 to 0x1BFF describe; one whose map is not complete is not `known`.
+    """TPDOs from the values of 0x1800 to 0x1BFF; one with an incomplete mapping is not `known`.
 
     Args:
         values: unsigned values by (index, subindex), from a data sheet or the traffic.
@@ -197,12 +197,12 @@ def tpdos_of(values: Mapping[Address, int]) -> tuple[Tpdo, ...]:
 
 
 def _entries(values: Mapping[Address, int], mapping: int) -> tuple[Entry, ...] | None:
-    """A map, or None where its count names entries that are not known."""
+    """The entries; None if one of them is unknown."""
     count = values.get((mapping, 0))
     entries: list[Entry] = []
     for subindex in range(1, 65 if count is None else min(count, 64) + 1):
         raw = values.get((mapping, subindex), 0)
-        if not raw:  # a data sheet without a count: the entries end with the first that is empty
+        if not raw:  # a data sheet without a count: the first empty entry ends the list
             return tuple(entries) if count is None and entries else None
         entries.append((raw >> 16 & 0xFFFF, raw >> 8 & 0xFF, raw & 0xFF))
     return tuple(entries)
@@ -211,11 +211,11 @@ def _entries(values: Mapping[Address, int], mapping: int) -> tuple[Entry, ...] |
 def decode(
     tpdos: Sequence[Tpdo], candidates: Mapping[Signal, Sequence[MappableObject]]
 ) -> tuple[TpdoLayout, ...]:
-    """The layout of TPDOs' frames: what is mapped decides, not what was wished.
+    """Layouts of the frames, from the mapping read back.
 
-    Where several objects for one signal are mapped, the best one counts; where one is mapped twice, its
-    place in a frame that is sent at every SYNC does, else the first. An object gives the first signal that it
-    can. Everything else is skipped over.
+    Of several mapped objects for one signal the best one is used; of an object that is mapped twice, its
+    place in a frame sent at every SYNC, else the first. An object serves the first signal it can. Others are
+    skipped.
 
     Args:
         tpdos: as read back, taken from the traffic, or declared.
@@ -224,7 +224,7 @@ def decode(
     mapped = {(index, subindex) for tpdo in tpdos for index, subindex, _ in tpdo.entries}
     chosen: dict[Address, MappableObject] = {}
     for objects in candidates.values():
-        left = mapped - chosen.keys()  # what serves one signal does not check it too
+        left = mapped - chosen.keys()  # an object does not check itself
         best = next((candidate for candidate in objects if candidate.address in left), None)
         if best is not None:
             chosen[best.address] = best

@@ -18,11 +18,11 @@ class Role:
     Attributes:
         node_id: 1 to 127.
         motor: index of the motor it drives, or None.
-        drive: what the joint file says of the drive, or None.
-        encoder: the link encoder, if this node gives it.
-        key: where it stands in the joint file, for messages.
+        drive: its section of the joint file, or None.
+        encoder: the link encoder, if connected to this node.
+        key: its key in the joint file, for messages.
         eds: its EDS or DCF file, if the joint file names one.
-        tpdo: its mapping, where the joint file gives it.
+        tpdo: its mapping, if the joint file declares it.
     """
 
     node_id: int
@@ -101,7 +101,7 @@ def object_address(text: str, key: str) -> tuple[int, int]:
     """Index and subindex of "0x60E4:01".
 
     Raises:
-        JointFileError: the text is something else; `key` says where it stands.
+        JointFileError: the text has another form.
     """
     index, _, subindex = text.partition(":")
     try:

@@ -1,7 +1,7 @@
-"""Finds the nodes on the bus by asking and listening; nothing is written.
+"""Finds the nodes on the bus by SDO uploads and listening.
 
-Every node id is asked for its device type (0x1000, mandatory in CiA 301), all at once; what answers, or
-is heard by heartbeat or boot-up, is there.
+Every node id is asked for its device type (0x1000, mandatory in CiA 301), all at once; nodes that answer, or
+send heartbeat or boot-up, are found.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from drivelink.errors import DriveError
 __all__ = ["FoundNode", "Traffic", "identify", "listen", "scan"]
 
 _ANSWER_S = 0.3  # for the slowest node
-_GAP_S = 0.001  # between two questions: 127 of them must not fill a transmit queue
+_GAP_S = 0.001  # between two requests: 127 of them must not fill a transmit queue
 _PROFILES = {301: "CiA 301", 401: "CiA 401 (I/O)", 402: "CiA 402 (drive)", 406: "CiA 406 (encoder)"}
 _STATES = {0x00: "boot-up", 0x04: "stopped", 0x05: "operational", 0x7F: "pre-operational"}
 _MOST_STAMPS = 200_000
@@ -30,11 +30,11 @@ _MOST_STAMPS = 200_000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FoundNode:
-    """A node that is there.
+    """A node found on the bus.
 
     Attributes:
         node_id: 1 to 127.
-        device_type: 0x1000; 0 where it has no value, None where it does not answer SDO.
+        device_type: 0x1000; 0: no value, None: no SDO answer.
         identity: 0x1018.
         name: 0x1008.
     """
@@ -55,7 +55,7 @@ class FoundNode:
 
 @dataclass(slots=True)
 class Traffic:
-    """What was heard in a while.
+    """Frames received in an interval.
 
     Attributes:
         seconds: how long.
@@ -111,10 +111,10 @@ def scan(bus: FrameBus, node_ids: Iterable[int] = range(1, 128)) -> tuple[list[i
 
     Args:
         bus: where.
-        node_ids: who is asked; every id, unless fewer will do.
+        node_ids: ids to ask; default: all.
 
     Returns:
-        Ids of the nodes that answered or were heard, and what else was heard meanwhile.
+        Ids of the nodes that answered or were heard, and the traffic meanwhile.
     """
     send = sender(bus)
     traffic = Traffic()
@@ -139,7 +139,7 @@ def _drain(bus: FrameBus, traffic: Traffic, seconds: float) -> None:
 
 
 def identify(bus: FrameBus, node_id: int, *, timeout_s: float, retries: int) -> FoundNode:
-    """What a node says of itself."""
+    """Read identity and name of a node."""
     try:
         return run_program(_identify(node_id), bus, timeout_s=timeout_s, retries=retries)
     except DriveError:

@@ -1,10 +1,9 @@
-"""SDO client as a state machine (CiA 301, section 7.2.4): it never waits, so it can run beside the loop.
+"""SDO client as a state machine (CiA 301, 7.2.4) that never blocks, so it can run beside the loop.
 
 A *program* is a generator that yields requests (`Read`, `Write`, `Nmt`, `Pause`) and gets their answers;
-`Session` runs one program over a bus that somebody else reads: frames come in by `feed`, time by `poll`.
-The same program thus serves the blocking configuration before the start and the reconfiguration of a
-drive that rebooted in the middle of a run, with no second thread and no second reader of the bus; canopen's
-own client blocks its caller until the answer comes.
+`Session` runs one program on a bus that the loop reads: frames come in by `feed`, time by `poll`. The same
+program serves the configuration before the start and that of a drive that rebooted in a run, without a second
+thread or reader of the bus; canopen's client blocks its caller until the answer.
 """
 
 from __future__ import annotations
@@ -41,8 +40,8 @@ _TOGGLE_ERROR = 0x05030000
 _TIMED_OUT = 0x05040000
 _WRONG_LENGTH, _TOO_LONG, _TOO_SHORT = 0x06070010, 0x06070012, 0x06070013
 _NUMBER_BYTES = 8  # of the longest integer (CiA 301, table 44)
-_TEXT_BYTES = 256  # the longest object that is read here is a device name
-_TRANSFER_TIMEOUTS = 4  # of a whole transfer in answer timeouts: many short answers must not last forever
+_TEXT_BYTES = 256  # the longest object read here is a device name
+_TRANSFER_TIMEOUTS = 4  # limit of a whole transfer, in timeouts
 
 
 def abort_text(code: int) -> str:
@@ -72,7 +71,7 @@ class SdoAbort(DriveError):  # noqa: N818 - the protocol's own word
 
 
 class SdoBreach(SdoAbort):
-    """The drive answered against the protocol; the transfer was aborted from here."""
+    """The drive violated the protocol; the client aborted the transfer."""
 
     def __init__(self, node: int, index: int, subindex: int, code: int, what: str) -> None:
         super().__init__(node, index, subindex, code)
@@ -100,12 +99,12 @@ class SdoTimeout(DriveError):  # noqa: N818 - as above
 
 
 class Unsized(bytes):
-    """The four bytes of an answer that does not say how many of them count."""
+    """The four bytes of an answer without size indication."""
 
 
 @dataclass(frozen=True, slots=True)
 class Read:
-    """Upload of one object; the answer is its bytes, `most` at most."""
+    """Upload of one object; the answer has at most `most` bytes."""
 
     node: int
     index: int
@@ -134,7 +133,7 @@ class Nmt:
 
 @dataclass(frozen=True, slots=True)
 class Pause:
-    """Nothing for so many seconds."""
+    """Wait for so many seconds."""
 
     seconds: float
 
@@ -147,17 +146,17 @@ def read_number(node: int, index: int, subindex: int) -> Program[int]:
     """An object as an unsigned number.
 
     Raises:
-        SdoAbort: the node refuses, or answers with more bytes than any number has.
+        SdoAbort: the node refuses, or answers with too many bytes.
     """
     return int.from_bytes((yield Read(node, index, subindex, _NUMBER_BYTES)), "little")
 
 
 class _Transfer:
-    """One upload or download: frames in, the next frame or the result out.
+    """One upload or download.
 
     Attributes:
         request: what it is for.
-        result: what came of it; None until it has ended.
+        result: its result; None until it has ended.
         answered: the server has begun to answer.
     """
 
@@ -186,19 +185,19 @@ class _Transfer:
 
         Raises:
             SdoAbort: the server aborted.
-            SdoBreach: it answered out of step, or with another number of bytes than it declared.
+            SdoBreach: a protocol error, or another number of bytes than declared.
         """
         request = self.request
         if len(data) != 8:
             return None
         command = data[0] >> 5
         ours = data[1] | data[2] << 8 == request.index and data[3] == request.subindex
-        if command == 4 and (ours or not any(data[1:4])):  # some servers do not say what they abort
+        if command == 4 and (ours or not any(data[1:4])):  # some servers abort without naming the object
             raise self._abort(int.from_bytes(data[4:8], "little"))
         if self._segmented:
             return self._segment(data) if command == 0 else None
         if not ours:
-            return None  # the late answer to a transfer that was given up, or to another master
+            return None  # a late answer to an abandoned transfer, or one to another master
         if isinstance(request, Write):
             self.result = b"" if command == 3 else None
             return None
@@ -252,7 +251,7 @@ class Session(Generic[T]):
     Args:
         program: what to do.
         send: puts a frame (identifier, data) on the bus.
-        timeout_s: for each answer; a whole transfer has four times as long.
+        timeout_s: for each answer; four times as long for a whole transfer.
         retries: further attempts after a timeout.
     """
 
@@ -283,7 +282,7 @@ class Session(Generic[T]):
         return self._result  # type: ignore[return-value]
 
     def feed(self, cob_id: int, data: bytes, now_s: float) -> None:
-        """Take a frame of the bus; what does not concern the transfer under way is ignored."""
+        """Take a frame of the bus; frames of other transfers are ignored."""
         transfer = self._transfer
         if transfer is None or cob_id != 0x580 + transfer.request.node:
             return
@@ -303,7 +302,7 @@ class Session(Generic[T]):
             self._advance(now_s, transfer.result)
 
     def poll(self, now_s: float) -> bool:
-        """Start, and let time pass; whether the program has ended."""
+        """Start or advance the program; return whether it has ended."""
         if not self._started:
             self._started = True
             self._advance(now_s, None)
@@ -331,7 +330,7 @@ class Session(Generic[T]):
         return self.done
 
     def _advance(self, now_s: float, answer: bytes | Exception | None) -> None:
-        """Give the program its answer and do what it asks next, up to the next thing to wait for."""
+        """Pass an answer to the program and execute its requests up to the next wait."""
         try:
             while True:
                 if isinstance(answer, Exception):

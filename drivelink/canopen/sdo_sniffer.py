@@ -1,6 +1,6 @@
-"""What another master writes to a node by SDO, taken from the traffic (CiA 301, 7.2.4.3).
+"""Reads another master's SDO transfers from the traffic (CiA 301, 7.2.4.3).
 
-A download counts when the node has confirmed it. Expedited and segmented transfers are followed; block
+A download counts once the node has confirmed it. Expedited and segmented transfers are followed; block
 transfers are not used for objects of a few bytes.
 """
 
@@ -19,12 +19,12 @@ class SdoSniffer:
     """Follows the SDO channel of one node.
 
     Args:
-        interesting: whether the value of an object is worth keeping.
+        interesting: whether to keep the value of an object.
 
     Attributes:
         values: confirmed unsigned values by (index, subindex).
-        written: of these, the ones that were written, not read.
-        changes: how often a value became known or another one, or was forgotten.
+        written: those of them that were written, not read.
+        changes: number of new, changed and forgotten values.
     """
 
     def __init__(self, interesting: Callable[[int, int], bool]) -> None:
@@ -40,11 +40,11 @@ class SdoSniffer:
 
     @property
     def pending(self) -> Address | None:
-        """The object that is being written: asked for, not yet confirmed."""
+        """The object being written, not yet confirmed."""
         return self._address if self._writing else None
 
     def forget(self, lost: Callable[[Address], bool]) -> None:
-        """The node has restarted: what was written is gone, and whatever else `lost` names."""
+        """Handle a restart of the node: forget written values and those that `lost` selects."""
         self._forget()
         for address in [a for a in self.values if a in self.written or lost(a)]:
             del self.values[address]

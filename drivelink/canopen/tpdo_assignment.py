@@ -1,7 +1,7 @@
-"""Assigns signals to TPDOs: a computation, nothing is sent from here.
+"""Assigns signals to TPDOs, without sending anything.
 
-The wish is one frame with position, torque and statusword, so that a sample is atomic; what does not fit
-goes into a second one. Where maps are fixed, those that carry what is needed are taken as they are.
+Preferred is one frame with position, torque and statusword, so that a sample is atomic; other signals go into
+a second one. Fixed mappings that carry the needed signals are used as they are.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ __all__ = ["CHECKS", "OPTIONAL", "Assignment", "assign", "choose_cob_id", "pack"
 
 FRAME_BITS = 64
 
-# Position and torque first: they must be of the same instant.
+# Position and torque first: they must belong to the same instant.
 _ORDER = (
     Signal.MOTOR_POSITION,
     Signal.MOTOR_TORQUE,
@@ -40,11 +40,11 @@ Available = Mapping[Signal, Sequence[MappableObject]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Assignment:
-    """One TPDO and what is to be in it.
+    """One TPDO and its assigned objects.
 
     Attributes:
         tpdo: as it is in the node.
-        objects: what to map, in order; None: its map stays as it is.
+        objects: objects to map in order; None: keep its mapping.
     """
 
     tpdo: Tpdo
@@ -65,7 +65,7 @@ def pack(objects: Iterable[MappableObject], most: int = FRAME_BITS) -> list[tupl
 
 
 def unused(wanted: Available, objects: Sequence[MappableObject]) -> tuple[MappableObject, ...]:
-    """Those of the objects that do not serve a signal already: an object does not check itself."""
+    """Objects that do not serve a signal already: an object does not check itself."""
     used = {candidates[0].address for candidates in wanted.values() if candidates}
     return tuple(candidate for candidate in objects if candidate.address not in used)
 
@@ -73,16 +73,16 @@ def unused(wanted: Available, objects: Sequence[MappableObject]) -> tuple[Mappab
 def assign(
     role: Role, available: Available, tpdos: Sequence[Tpdo], *, prefer_unused: bool
 ) -> tuple[Assignment, ...]:
-    """Signals onto TPDOs.
+    """Assign signals to TPDOs.
 
     Args:
         role: the node, for messages.
         available: for each signal wanted, the objects the node has for it, best first.
         tpdos: as they are in the node.
-        prefer_unused: take disabled TPDOs first, because another master may rely on the enabled ones.
+        prefer_unused: prefer disabled TPDOs, because another master may rely on the enabled ones.
 
     Raises:
-        DriveError: no way to get what is needed; the message shows the maps.
+        DriveError: a needed signal cannot be mapped; the message shows the mappings.
     """
     wanted = {signal: list(candidates) for signal, candidates in available.items() if candidates}
     result = _free(list(wanted.items()), tpdos, prefer_unused)
@@ -111,14 +111,14 @@ def assign(
 def _free(
     wanted: Sequence[tuple[Signal, Sequence[MappableObject]]], tpdos: Sequence[Tpdo], prefer_unused: bool
 ) -> tuple[Assignment, ...] | None:
-    """Everything in TPDOs that carry it already or can be mapped, or None where there are too few."""
+    """Assign all signals to TPDOs that carry them or can be mapped; None if there are too few."""
     left = list(tpdos)
     result, unplaced = [], []
     most = min((tpdo.most for tpdo in tpdos if not tpdo.fixed), default=FRAME_BITS)
     for frame in pack((candidates[0] for _, candidates in wanted), most):
         entries = {(*candidate.address, candidate.bits) for candidate in frame}
         carrying = [tpdo for tpdo in left if entries <= set(tpdo.entries)]
-        # The one that needs least: sent at every SYNC already, else the first.
+        # Prefer the one that is sent at every SYNC already.
         ready = min(
             carrying, key=lambda t: (not t.enabled or t.transmission_type != 1, t.number), default=None
         )
@@ -153,11 +153,11 @@ def _cannot(role: Role, wanted: Available, tpdos: Sequence[Tpdo]) -> str:
 
 
 def choose_cob_id(node: int, tpdo: Tpdo, taken: set[int]) -> int:
-    """Identifier for a TPDO: its own where it is good, else the predefined one, else a free one.
+    """Identifier for a TPDO: its own if usable, else the predefined one, else a free one.
 
     Args:
         node: node id.
-        tpdo: as it is in the node; a DCF may have left it with another node's identifier.
+        tpdo: the TPDO; a DCF may have given it another node's identifier.
         taken: identifiers that other TPDOs on this bus have.
 
     Raises:

@@ -1,8 +1,8 @@
-"""Counts become SI at the joint side here, and nowhere else.
+"""Conversion of counts to SI at the joint side, in this module only.
 
-What the joint file states is used; what it leaves out is taken from the drive (0x608F, 0x6091, 0x6075,
-0x6076, 0x60A8, 0x60A9 of CiA 402-2, the maker's own objects, 0x6501 of CiA 406). Where both give a value and
-disagree, a finding names both numbers and the one in use.
+The joint file has priority; missing values are taken from the drive (0x608F, 0x6091, 0x6075, 0x6076, 0x60A8,
+0x60A9 of CiA 402-2, the maker's own objects, 0x6501 of CiA 406). If both disagree, a finding names both
+numbers and the one in use.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ _ENCODER_OBJECTS: tuple[Address, ...] = ((0x6000, 0), (0x6001, 0), (0x6002, 0), 
 _SCALING = 1 << 2  # of 0x6000, CiA 406: counts per revolution are those of 0x6001
 
 _SAME = 1e-3  # relative; tables in data sheets are rounded to about that
-_MICRO_FROM = 20_000  # 0x6076 of a maker who uses µN·m and mN·m: nobody there sells a motor of 20 N·m
+_MICRO_FROM = 20_000  # 0x6076 of a maker that uses µN·m and mN·m but has no motor of 20 N·m
 
 
 def unit_objects(role: Role, vendor: Vendor) -> tuple[Address, ...]:
-    """Objects whose values `offer` wants to know."""
+    """Objects that `offer` needs the values of."""
     wanted: tuple[Address, ...] = ()
     if role.drive is not None:
         wanted += _DRIVE_OBJECTS + vendor.objects()
@@ -61,11 +61,11 @@ def unit_objects(role: Role, vendor: Vendor) -> tuple[Address, ...]:
 
 
 def offer(role: Role, reported: Mapping[Address, int], vendor: Vendor) -> Offer:
-    """What a node can give, and at what scale.
+    """Signals that a node can send, with their scales.
 
     Args:
-        role: what the node is there for, with what the joint file states.
-        reported: unsigned values of the objects the node has, as far as they are known.
+        role: role of the node, with its section of the joint file.
+        reported: known unsigned values of the node's objects.
         vendor: its maker.
     """
     result = Offer()
@@ -88,7 +88,7 @@ def offer(role: Role, reported: Mapping[Address, int], vendor: Vendor) -> Offer:
 
 
 class _Drive:
-    """The reasoning for one drive."""
+    """Units of one drive."""
 
     def __init__(
         self, role: Role, drive: DriveSection, reported: Mapping[Address, int], vendor: Vendor, result: Offer
@@ -117,7 +117,7 @@ class _Drive:
     def _choose(
         self, what: str, key: str, stated: float | None, reported: float | None, source: str
     ) -> float | None:
-        """The stated value, else the reported one; a finding where they disagree."""
+        """The declared value, else the reported one; a finding if they disagree."""
         if stated is None or reported is None:
             return reported if stated is None else stated
         if not math.isclose(stated, reported, rel_tol=_SAME):
@@ -284,7 +284,7 @@ class _Drive:
                 "rated_current_a or current_object"
             )
         if not by_current and rated_torque is not None and not own_unit:
-            # Unit unknown: a thousandth of rated current is about one of rated torque; the ratio follows.
+            # Unknown unit: assume that rated current gives rated torque.
             likely = _torque_candidate((0x6078, 0), 16, direction * gear * rated_torque / 1000)
             by_current = [likely]
         self._check("current", Signal.TORQUE_CHECK, (*by_current, *by_torque))
@@ -322,21 +322,21 @@ class _Drive:
             self._check("velocity", signal, objects)
 
     def _check(self, name: str, signal: Signal, objects: tuple[MappableObject, ...]) -> None:
-        """Objects that only check others: mapped where the joint file asks for it, else read where mapped."""
+        """Objects for cross-checks: mapped if the joint file asks for it, else read if mapped."""
         objects = tuple(replace(candidate, signal=signal) for candidate in dict.fromkeys(objects))
         if objects:
             asked = name in self._drive.checks or name == "second_encoder"
             (self._result.candidates if asked else self._result.checks)[signal] = objects
 
     def _following_error(self) -> None:
-        """0x60F4, and the demand 0x6062 that it is the difference to; both in the unit of the position."""
+        """0x60F4 and the demand 0x6062, both in the unit of the position."""
         for position in self._result.candidates.get(Signal.MOTOR_POSITION, ()):
             for signal, index in ((Signal.FOLLOWING_ERROR, 0x60F4), (Signal.POSITION_DEMAND, 0x6062)):
                 wraps = signal is Signal.POSITION_DEMAND
                 self._check("following_error", signal, (replace(position, address=(index, 0), wraps=wraps),))
 
     def _second_encoder(self, counts: float | None, gear: float) -> None:
-        """Another encoder of the motor; its scale and sign are estimated, so a wrong guess does no harm."""
+        """Another encoder of the motor; its scale and sign are estimated."""
         text = self._drive.second_encoder
         if text is None:
             return
@@ -422,8 +422,8 @@ def _offer_link(role: Role, encoder: EncoderSection, reported: Mapping[Address, 
 
 
 def _measuring_range(reported: Mapping[Address, int]) -> int:
-    """Counts after which an absolute encoder starts again (CiA 406); 0 where that is its full length."""
+    """Counts after which an absolute encoder rolls over (CiA 406); 0: at its full length."""
     range_ = reported.get((0x6002, 0), 0)
-    if range_ in (0, 0xFFFFFFFF):  # not reported, or as near to 2^32 as 32 bits can say
+    if range_ in (0, 0xFFFFFFFF):  # not reported, or the full 32 bits
         range_ = reported.get((0x6501, 0), 0) * reported.get((0x6502, 0), 0)
     return range_ if 1 < range_ < 1 << 32 else 0

@@ -1,7 +1,7 @@
 """Vendor peculiarities that the object dictionary does not show.
 
-Each line is taken from a maker's manual or data sheet file; what is not known for sure is not here, and
-is said in the joint file instead (`current_object`, `velocity_rad_s_per_count`, …).
+Each line is taken from a maker's manual or EDS file; anything uncertain is declared in the joint file instead
+(`current_object`, `velocity_rad_s_per_count`, …).
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ class Vendor:
 
     Attributes:
         name: as users know it.
-        current: where the current is, if not at 0x6078.
-        counts_per_rev: object with the counts per motor revolution, if not at 0x608F.
-        gear: objects with numerator and denominator of the gear, if not at 0x6091.
+        current: object of the current, if not 0x6078.
+        counts_per_rev: object with the counts per motor revolution, if not 0x608F.
+        gear: objects with numerator and denominator of the gear, if not 0x6091.
         torque_constant: object with the torque constant in µN·m/A.
         nominal_current: object with the nominal current in mA.
         rated_torque_micro: whether 0x6076 may be in µN·m.
         counts_factor: what that one is multiplied by: 4 where it counts the pulses of a quadrature encoder.
         velocity_rad_s: rad/s per count of 0x606C, where 0x60A9 does not give it.
         velocity_counts_s: counts per second and count of 0x606C, where 0x60A9 does not give it.
-        sensorless: object of 0x60E4 that is computed and no encoder.
+        sensorless: object of 0x60E4 that is a sensorless estimate.
         toggling_statusword_bits: bits of 0x6041 that change by themselves.
         others: (object, its like): the maker's drives that have this object and not `counts_per_rev` are
             another generation.
@@ -115,5 +115,5 @@ VENDORS = {
 
 
 def vendor_of(vendor_id: int) -> Vendor:
-    """The maker of 0x1018:01, or a generic one."""
+    """The vendor of 0x1018:01, or a generic one."""
     return VENDORS.get(vendor_id, GENERIC)

@@ -1,4 +1,4 @@
-"""What is commonly wrong with a first installation: one cause, and what it does to which channel."""
+"""Common errors of a first installation, and their effect on each channel."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ Kind = Literal["unit", "sign", "gear", "period"]
 
 _DEGREE = math.pi / 180.0
 _MILLI = 1e-3
-# What each kind costs beforehand, in nats: one installation in fifty has it.
+# Prior cost of each kind, in nats: one installation in fifty has it.
 _COST = 4.0
-_RARE = 1.0  # nats more for what hardly anybody does
-_FREE_RATIO = 6.0  # and what a ratio costs that is read off the data: decades of it against a few per cent
-_GEARED = 3.0  # ratios nearer to one than this are the transmission's bending, not a gear
+_RARE = 1.0  # additional nats for rare errors
+_FREE_RATIO = 6.0  # the same for a ratio that is fitted: decades of range at a few per cent of resolution
+_GEARED = 3.0  # ratios closer to one than this are explained by the deflection, not by a gear
 _LINK, _TIME = "link_position", "time"
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What one channel needs.
+    """Correction of one channel.
 
     Attributes:
         channel: "motor1_position", "motor1_torque", "motor1_inertia", …, "link_position" or "time".
@@ -39,13 +39,13 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """One thing that is wrong.
+    """One possible error.
 
     Attributes:
         kind: of it.
         what: in words, e.g. "looks like degrees".
         changes: of the channels that it touches.
-        cost: nats that speak against it beforehand.
+        cost: prior cost, nats.
     """
 
     kind: Kind
@@ -60,7 +60,7 @@ class Cause:
 
 
 def scales(found: Sequence[Cause], motor: int) -> Scales:
-    """What they do together to the balance of one motor."""
+    """The combined scales of some causes in the balance of one motor."""
     factors = {change.channel: change.factor for cause in found for change in cause.changes}
     own = f"motor{motor + 1}_"
     return Scales(
@@ -73,7 +73,7 @@ def scales(found: Sequence[Cause], motor: int) -> Scales:
 
 
 def causes(model: JointModel, linked: bool, ratios: Sequence[float | None]) -> list[Cause]:
-    """Every cause that is looked for.
+    """All causes that are tested.
 
     Args:
         model: the joint as declared.
@@ -139,6 +139,6 @@ def _gears(name: str, gear: float | None, ratio: float | None, linked: bool) -> 
 
 
 def _is_gear(ratio: float) -> bool:
-    """Whether two positions are apart by more than bending, and not by degrees."""
+    """Whether two positions differ by more than the deflection, and not by the factor of degrees."""
     units = (1.0, _DEGREE, 1.0 / _DEGREE)
     return all(abs(math.log(ratio / unit)) > math.log(_GEARED if unit == 1.0 else 1.3) for unit in units)

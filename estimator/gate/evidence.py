@@ -5,10 +5,10 @@ With theta = a theta_m, q = c q_m, tau = b tau_m of what was recorded, eq 5 in r
     tau_m = (a/b) (B theta_m'' + D theta_m') + (F_c/b) sgn(a theta_m')
             - f(c q_m - a theta_m)/b + offset + d tau_m'
 
-with everything positive that physics wants positive: the declared inertia B within a factor, D, the
-friction F_c and the slope of f anywhere. The transmission is any rising curve; a late link encoder adds
-q', a late torque tau', cogging and cables any curve of theta_m but a straight line. All channels pass the
-same filters. Errors are relative to the recorded torque, so hypotheses are compared on the same data.
+with the signs that physics requires: the declared inertia B within a factor, and D, the friction F_c and the
+slope of f not negative. The transmission is any rising curve; a late link encoder adds q', a late torque
+tau', cogging and cables any curve of theta_m but a straight line. All channels pass the same filters. Errors
+are relative to the recorded torque, so hypotheses are compared on the same data.
 """
 
 from __future__ import annotations
@@ -57,10 +57,10 @@ class Scales(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """What one hypothesis makes of a balance.
+    """The fit of a balance under one hypothesis.
 
     Attributes:
-        errors: (bands,) rms of what is left over the whole torque's, not below what real joints reach.
+        errors: (bands,) residual rms over the rms of the whole torque, at least `_FLOOR`.
         error: the same of all bands together.
         inertia: the motor's over the declared one, hypothesis' units.
         stiffness_nm_rad: mean slope of the transmission's curve, in the hypothesis' units; 0: rigid.
@@ -124,7 +124,7 @@ class Balance:
         return out
 
     def fit(self, scales: Scales) -> Fit:
-        """The best balance that this hypothesis allows."""
+        """Fit the balance under a hypothesis."""
         a, b, c, time, inertia = scales
         B = self.motor.inertia_kg_m2 * inertia * (a / b) / (self.period_s * time) ** 2 / self._unit
         flexible = self.motor.flexible and self._q is not None
@@ -167,10 +167,9 @@ class Balance:
         return Fit(errors, float(left.sum(axis=0).std()), float(x[0]) / B, slope, deflection)
 
     def _spring(self, ratio: float) -> tuple[list[FloatArray], float]:
-        """Pieces of a rising curve of q_m - ratio theta_m; its size over the motion's.
-
-        Two straight ones more, of the ratio a little less and a little more: any scale error of an encoder in
-        between is a sum of the two with positive weights.
+        """Basis of a rising curve of q_m - ratio theta_m, and the deflection's size over the motion's. Two
+        more straight lines, for a slightly smaller and a slightly larger ratio, cover scale errors of the
+        encoders: any error in between is their sum with positive weights.
         """
         if ratio not in self._springs:
             assert self._q is not None
@@ -183,7 +182,7 @@ class Balance:
         return self._springs[ratio]
 
     def _ratio(self) -> float | None:
-        """Link over motor position as the balance has it: the torque knows q_m and theta_m apart."""
+        """Link over motor position as seen in the torque, which depends on both separately."""
         if self._q is None or not self.motor.flexible or self._link_rate is None:
             return None
         free = (-math.inf, math.inf)
@@ -194,7 +193,7 @@ class Balance:
 
     @property
     def independent(self) -> FloatArray:
-        """(bands,) effective number of independent samples in what the best hypothesis leaves.
+        """(bands,) effective sample size of the best hypothesis' residual.
 
         n / sum r_k² over all lags, with the autocorrelation r of each band's residual.
         """
@@ -202,7 +201,7 @@ class Balance:
 
 
 def _pieces(x: FloatArray) -> list[FloatArray]:
-    """Straight pieces between evenly spaced knots: sums of them are any curve of x."""
+    """Hat functions on evenly spaced knots: a basis for curves of x."""
     low, high = np.quantile(x, (0.002, 0.998))
     width = max((high - low) / _SEGMENTS, 1e-300)
     unders = [-np.inf, *[0.0] * (_SEGMENTS - 1)]
@@ -223,7 +222,7 @@ def _independent(x: FloatArray) -> float:
 def _bounded(
     columns: list[tuple[FloatArray, float, float]], target: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Least squares within bounds, every band weighted by what it leaves: (x, left (bands, rows))."""
+    """Bounded least squares, each band weighted by its residual: (x, residual (bands, rows))."""
     A = np.stack([c[0] for c in columns], axis=-1)
     size = np.sqrt(np.mean(A**2, axis=(0, 1)))
     size[size == 0.0] = 1.0
@@ -252,13 +251,13 @@ def _gridded(record: Record, x: FloatArray) -> FloatArray:
 
 
 def _detrended(x: FloatArray) -> FloatArray:
-    """Without its straight line: what is left of a turning motion is what goes to and fro."""
+    """The signal without its linear trend: the oscillation within a turning motion."""
     k = np.arange(len(x)) - 0.5 * (len(x) - 1)
     return np.asarray(x - x.mean() - k * (float(k @ x) / max(float(k @ k), 1.0)))
 
 
 def _rows(record: Record, settling: int) -> NDArray[np.intp]:
-    """Rows that are looked at: not the filter's start, not gaps."""
+    """Rows that are used: without the filter's start and gaps."""
     sequence = record.sequence - record.sequence[0]
     usable = np.ones(int(sequence[-1]) + 1, dtype=bool)
     for k in np.flatnonzero(np.diff(sequence) > _GAP):
@@ -284,7 +283,7 @@ def _noise(x: FloatArray) -> float:
 
 
 def _filters(theta: FloatArray) -> list[StateVariableFilter]:
-    """From the widest whose upper band has an acceleration that is no noise, downwards."""
+    """Filters from the widest one whose upper band has an acceleration above the noise, downwards."""
     noise = _noise(theta)
 
     def acceleration(w: float) -> tuple[FloatArray, FloatArray]:

@@ -21,13 +21,11 @@ __all__ = ["Discrepancy", "GateError", "Judgement", "examine", "judge", "refuse"
 _DECISIVE = 6.0  # nats over "as declared": 400 to 1
 _LEAST_ROWS = 300  # a shorter recording decides nothing
 _ALIKE = 3.0  # nats (20 to 1) between causes that the data do not separate
-_LEFT = 0.8  # of the torque that a joint put right may leave: what explains less explains nothing
+_LEFT = 0.8  # largest relative residual of a corrected joint
 # Errors of the model are alike in every period of a motion: no band counts for more than so many samples.
 _INDEPENDENT = 30.0
-_RIGID = (
-    8.0  # samples that the size of the deflection counts for: transmissions bend little against the motion
-)
-# Where joints are, as decades about a centre (one standard deviation). None decides by itself.
+_RIGID = 8.0  # weight of the deflection's size, in samples: transmissions deflect little against the motion
+# Plausible joints, as decades around a centre (one standard deviation). None decides alone.
 _INERTIA = 1.5  # factor: how far a declared inertia is usually off, other effects that imitate it included
 _ACCELERATION = (30.0, 10.0)  # rad/s², factor: rms torque over motor inertia, from robots to small drives
 _FREQUENCY = (10.0, 6.0)  # Hz, factor: sqrt(K/B)/(2 pi)
@@ -40,17 +38,17 @@ _PERIOD = (3e-3, 8.0)  # s, factor: of a sampling period where none is declared
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Discrepancy:
-    """One thing that is wrong with a recording or with what is declared.
+    """An error of unit, sign, gear or time in a recording or joint file.
 
     Attributes:
         kind: "unit", "sign", "gear" or "period".
         what: in words, e.g. "looks like degrees, expected rad".
         changes: true over recorded value, channel by channel: the correction.
         motors: of the joint.
-        log_odds: nats by which the joint put right is likelier than as declared, all findings together.
-        left_before: rms of what the balance leaves of the torque as declared.
-        left_after: and put right.
-        alternatives: other causes that explain the data as well.
+        log_odds: evidence of all corrections together against "as declared", nats.
+        left_before: residual rms of the balance over the torque's, as declared.
+        left_after: the same after the correction.
+        alternatives: other causes that explain the data equally well.
     """
 
     kind: Kind
@@ -64,7 +62,7 @@ class Discrepancy:
 
     @property
     def subject(self) -> str:
-        """What is concerned, in words: "motor 1's torque", "the positions"."""
+        """The quantity concerned, in words: "motor 1's torque", "the positions"."""
         return _named(self.changes, self.motors)
 
     def __str__(self) -> str:
@@ -98,14 +96,13 @@ def _named(changes: Sequence[Change], motors: int) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judgement:
-    """What a recording says of units, signs, gears and time.
+    """What a recording reveals about units, signs, gears and time.
 
     Attributes:
-        findings: what is wrong; empty where nothing is, and where nothing can be decided.
-        undecided: units and signs that this motion does not reveal, in words: with them wrong it would look
-            as likely. Empty where something is found.
-        reason: why nothing can be decided at all; empty where something can.
-        left: share of the torque that the balance leaves, put right.
+        findings: errors found; empty also if nothing can be decided.
+        undecided: units and signs that this motion does not reveal, in words; empty if there are findings.
+        reason: why nothing can be decided at all, or empty.
+        left: residual of the corrected balance over the torque.
     """
 
     findings: tuple[Discrepancy, ...] = ()
@@ -115,7 +112,7 @@ class Judgement:
 
     @property
     def remark(self) -> str:
-        """What cannot be decided, in words; empty where everything can."""
+        """What cannot be decided, in words; empty if everything is decided."""
         if self.reason:
             return f"units and signs cannot be checked: {self.reason}"
         return f"this motion does not reveal {' or '.join(self.undecided)}" if self.undecided else ""
@@ -125,8 +122,8 @@ class GateError(EstimatorError):
     """Units, signs, gear ratio or time of a recording do not fit the joint as declared.
 
     Attributes:
-        findings: what is wrong, with the correction of each channel.
-        record: with which recording.
+        findings: the errors, with the correction of each channel.
+        record: the recording.
     """
 
     def __init__(self, findings: Sequence[Discrepancy], record: Record) -> None:
@@ -142,7 +139,7 @@ class GateError(EstimatorError):
 
 @dataclass(slots=True)
 class _Joint:
-    """A recording's balances, and what is known of the joint beside them."""
+    """A recording's balances and prior knowledge of the joint."""
 
     record: Record
     model: JointModel
@@ -157,7 +154,7 @@ class _Joint:
         return out
 
     def evidence(self, found: Sequence[Cause]) -> float:
-        """log of probability, up to a constant: likelihood, and how usual such a joint is."""
+        """Log posterior, up to a constant: likelihood, and how plausible such a joint is."""
         total = -sum(cause.cost for cause in found)
         for i, (s, fit) in self.fits(found).items():
             total -= float(self.counts[i] @ np.log(fit.errors))
@@ -186,22 +183,21 @@ class _Joint:
         return total
 
     def left(self, found: Sequence[Cause]) -> float:
-        """The largest share of a motor's torque that its balance leaves."""
+        """The largest relative residual of the motors' balances."""
         return max(fit.error for _, fit in self.fits(found).values())
 
 
 def judge(record: Record, model: JointModel) -> Judgement:
-    """What a recording says of units, signs, gear ratios and time.
-
-    Every hypothesis is one or two causes. It is weighed by how well the declared motor inertia (within a
-    factor), any rising transmission curve, friction that brakes and small delays explain each motor's torque
-    (eq 5, `Balance`), and by how usual a joint it makes. What is found beats "as declared" decisively, and
-    explains the torque. Where nothing is found, a cause that is not decisively less likely than "as declared"
-    is one that the motion does not reveal: of a link that is held, say, the sign.
+    """Check units, signs, gear ratios and time of a recording. Every hypothesis is one or two causes. It is
+    scored by how well the declared motor inertia (within a factor), any rising transmission curve,
+    dissipative friction and small delays explain each motor's torque (eq 5, `Balance`), and by how plausible
+    the resulting joint is. A finding beats "as declared" decisively and explains the torque. Without
+    findings, every cause that is not decisively less likely than "as declared" is
+    listed as undecided: the sign of a link that is held, for example.
 
     Args:
         record: the recording.
-        model: the joint as declared, with gear ratios and sampling period where they are.
+        model: the joint as declared, with gear ratios and sampling period if known.
 
     Raises:
         EstimatorError: the recording has other motors than the model.
@@ -235,7 +231,7 @@ def judge(record: Record, model: JointModel) -> Judgement:
 
 
 def _undecided(joint: _Joint, single: Sequence[Cause], declared: float) -> tuple[str, ...]:
-    """Units and signs that the data alone do not decide, what they cost beforehand aside."""
+    """Units and signs that the likelihood alone does not decide."""
     doubtful: dict[str, list[str]] = {}
     for cause in single:
         if cause.kind in ("unit", "sign") and declared - joint.evidence((cause,)) - cause.cost < _DECISIVE:
@@ -245,12 +241,12 @@ def _undecided(joint: _Joint, single: Sequence[Cause], declared: float) -> tuple
 
 
 def examine(record: Record, model: JointModel) -> list[Discrepancy]:
-    """What is wrong with units, signs, gear ratios or time of a recording: the findings of `judge`."""
+    """The findings of `judge`."""
     return list(judge(record, model).findings)
 
 
 def refuse(record: Record, model: JointModel) -> Judgement:
-    """Raise what is wrong with units, signs, gear ratios or time of a recording, if anything is.
+    """Raise the findings of `judge`, if there are any.
 
     Returns:
         What the recording does not reveal.
@@ -288,7 +284,7 @@ def _finding(
 
 
 def _balances(record: Record, model: JointModel) -> dict[int, Balance]:
-    """Those of the motors that move and have a torque."""
+    """The balances of the motors that move and have a torque."""
     found = {}
     for i, motor in enumerate(model.motors):
         lever = 0 if model.arrangement == "serial" and i == 1 else None
@@ -310,5 +306,5 @@ def _declared_stiffness(motor: Motor) -> float | None:
 
 
 def _off(ratio: float, factor: float) -> float:
-    """Nats that a ratio costs which is usually one, give or take a factor."""
+    """Cost in nats of a ratio that is log-normal around one."""
     return 0.5 * (math.log(max(ratio, 1e-30)) / math.log(factor)) ** 2

@@ -17,7 +17,7 @@ _ABSURD = 1e12
 
 
 def check(record: Record, model: JointModel) -> None:
-    """Refuse what no model can be fitted to.
+    """Refuse a recording that no model can be fitted to.
 
     Raises:
         EstimatorError: too short, constant, not finite, channels missing.

@@ -1,8 +1,7 @@
 """The object dictionary of a simulated device: typed entries with access rights, limits and hooks.
 
-A dictionary is made of `Item` descriptions (data: what an EDS file says of an object) and holds the live
-`Entry` of each sub-index. Process data are plain attribute reads of `Entry.value`: what packs a PDO
-touches no dictionary.
+A dictionary is made of `Item` descriptions (the content of an EDS file) and holds the live `Entry` of each
+sub-index. PDOs are packed from `Entry.value`, without a dictionary access.
 """
 
 from __future__ import annotations
@@ -61,7 +60,7 @@ class Kind(IntEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Item:
-    """What a data sheet says of one sub-index.
+    """Description of one sub-index, as in a data sheet.
 
     Attributes:
         subindex: 0 for the value of a VAR.
@@ -88,7 +87,7 @@ class Item:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Object:
-    """What a data sheet says of one index."""
+    """Description of one index, as in a data sheet."""
 
     index: int
     name: str
@@ -101,8 +100,8 @@ class Entry:
 
     Attributes:
         item: its description.
-        value: what a read gives and a PDO packs; an int, or bytes for strings and domains.
-        refresh: called before an SDO read, for values that follow the world.
+        value: the present value; an int, or bytes for strings and domains.
+        refresh: called before an SDO read, for values taken from the simulated joint.
         check: called with the new value before it is stored; raises `SdoAbortError` to refuse it.
         changed: called after a write has been stored.
     """
@@ -128,7 +127,7 @@ class Entry:
 
     @property
     def bits(self) -> int:
-        """Length in a PDO; 0 for what has no fixed length."""
+        """Length in a PDO; 0 if it is not fixed."""
         return struct.calcsize("<" + self.code) * 8 if self.code else 0
 
     @property
@@ -157,7 +156,7 @@ class Entry:
             raise SdoAbortError(Abort.READ_ONLY)
 
     def download(self, data: bytes) -> None:
-        """Check and store what an SDO write brings."""
+        """Check and store the bytes of an SDO write."""
         self.writable()
         if self.code is None:
             if len(data) > _LONGEST_STRING:
@@ -209,19 +208,23 @@ class Dictionary:
         return self._entries.get((index, subindex))
 
     def find(self, index: int, subindex: int) -> Entry:
-        """The entry; aborts as an SDO server does where there is none."""
+        """The entry.
+
+        Raises:
+            SdoAbortError: there is none.
+        """
         entry = self._entries.get((index, subindex))
         if entry is None:
             raise SdoAbortError(Abort.NO_SUBINDEX if index in self.objects else Abort.NO_OBJECT)
         return entry
 
     def optional(self, index: int, subindex: int = 0) -> Entry:
-        """The entry, or one that nobody sees, with the value 0, where this device lacks it."""
+        """The entry, or a hidden one with the value 0 if this device lacks it."""
         absent = Item(subindex=subindex, name="absent", type=DataType.INTEGER32)
         return self._entries.get((index, subindex)) or Entry(index, absent, 0)
 
     def store(self, low: int, high: int) -> None:
-        """Make the present values of what can be written the power-on values (0x1010)."""
+        """Make the present values of writable entries their power-on values (0x1010)."""
         for key, entry in self._entries.items():
             if low <= key[0] <= high and entry.item.access not in ("ro", "const"):
                 self._stored[key] = entry.value

@@ -31,7 +31,7 @@ _SECONDS = {0x03: 1.0, 0x47: 60.0}
 
 
 class DriveReadings(Protocol):
-    """What the drive's sensors say, at the motor shaft."""
+    """Readings of the drive's sensors, at the motor shaft."""
 
     @property
     def position_counts(self) -> int:
@@ -51,7 +51,7 @@ class DriveReadings(Protocol):
 
 
 class MeasuredPlant(Protocol):
-    """The part of a world that one drive is wired to (`sim.world.World`)."""
+    """The part of a world that one drive is connected to (`sim.world.World`)."""
 
     @property
     def period_s(self) -> float:
@@ -62,10 +62,10 @@ class MeasuredPlant(Protocol):
         """The present sampling instant."""
 
     def drive(self, motor: int) -> DriveReadings:
-        """What motor `motor` reports now."""
+        """Readings of motor `motor` now."""
 
     def command(self, motor: int, torque_nm: float | None) -> None:
-        """Torque at the motor shaft from the next period on; None: the rig's own."""
+        """Torque at the motor shaft from the next period on; None: the rig's excitation."""
 
     def link_counts(self) -> int:
         """The link encoder."""
@@ -212,7 +212,7 @@ class Cia402Drive(Node):
         self.emergency.raise_error(code, register, vendor)
 
     def on_control(self, periods: int) -> None:
-        """Control periods begin: the set-point that is in force becomes the rig's command."""
+        """Control periods begin: pass the active set-point to the rig."""
         self.machine.step()
         self._mode_shown.value = mode = self._mode.number
         self._following = self.machine.state is PowerState.OPERATION_ENABLED and mode in (
@@ -241,7 +241,7 @@ class Cia402Drive(Node):
         self._rig.command(self._motor, self._demand * self._torque_unit_nm)
 
     def on_pdos(self, mapped: frozenset[Entry]) -> None:
-        """Only what is mapped is brought up to the present with each sample."""
+        """Update only mapped entries with each sample."""
         self._sampled = tuple(read for read, entries in self._sensors if mapped & entries)
 
     def on_sample(self) -> None:
@@ -313,12 +313,12 @@ class Cia402Drive(Node):
         self._measure()
 
     def on_leave_operational(self) -> None:
-        """A drive that is enabled does not go on without its master."""
+        """An enabled drive stops without its master."""
         if self.state in (Nmt.STOPPED, Nmt.INITIALISING):
             self.on_connection_lost()
 
     def on_connection_lost(self) -> None:
-        """Do what 0x6007 says, if the drive is enabled."""
+        """React as 0x6007 says, if the drive is enabled."""
         if self.machine.state is not PowerState.OPERATION_ENABLED:
             return
         option = self.dictionary.optional(0x6007).number

@@ -1,4 +1,4 @@
-"""Electronic data sheets (CiA 306) of the simulated devices, written from the objects that they serve."""
+"""Electronic data sheets (CiA 306) of the simulated devices, written from their objects."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _DATED = ("11-20-2026", "12:00PM")
 
 
 def eds_directory() -> Path:
-    """Where the package keeps them."""
+    """Directory of the shipped EDS files."""
     return Path(__file__).parent.parent / "eds"
 
 
@@ -33,7 +33,7 @@ def eds_files() -> dict[str, str]:
     files = {"cia406-encoder.eds": eds_text("cia406-encoder.eds", encoder_objects(EncoderData(), Quirks()))}
     for name, quirks in PROFILES.items():
         if name != "strict" and not quirks.missing and not quirks.tpdos:
-            continue  # habits that no data sheet shows
+            continue  # behaviour that an EDS file cannot express
         file = "cia402-drive.eds" if name == "strict" else f"{name}.eds"
         files[file] = eds_text(file, drive_objects(DriveData(), quirks), quirks)
     return files
@@ -45,7 +45,7 @@ def eds_text(file_name: str, objects: Sequence[Object], quirks: Quirks | None = 
     Args:
         file_name: what the file will be called.
         objects: the dictionary that the device serves.
-        quirks: where it says so, of a drive that is like this maker's.
+        quirks: identity of a drive that imitates this maker's.
     """
     lines = [*_head(file_name, objects, quirks or Quirks())]
     indices = [described.index for described in objects]
@@ -67,7 +67,7 @@ def eds_text(file_name: str, objects: Sequence[Object], quirks: Quirks | None = 
 
 
 def node_eds(file_name: str, node: Node) -> str:
-    """The EDS of one device as it is."""
+    """The EDS of one device with its present data."""
     return eds_text(file_name, list(node.dictionary.objects.values()), node.quirks)
 
 

@@ -17,7 +17,7 @@ _GENERIC = 0x01
 
 
 class Emergency:
-    """Errors of one device: what is active, what was, and the message when that changes.
+    """Active and past errors of one device, and the message when they change.
 
     Args:
         dictionary: holds 0x1001, 0x1003, 0x1014.
@@ -47,7 +47,7 @@ class Emergency:
         return bool(self._active)
 
     def reset(self) -> None:
-        """Nothing is wrong and nothing was."""
+        """Forget all errors."""
         self._active.clear()
         self._queue.clear()
         self._inhibited = False
@@ -55,7 +55,7 @@ class Emergency:
         self._clear_history()
 
     def raise_error(self, code: int, register: int = 0, vendor: bytes = b"") -> None:
-        """An error begins; its message is sent once, until it has been cleared."""
+        """Set an error; its message is sent once until it is cleared."""
         if code in self._active:
             return
         self._active[code] = register | _GENERIC
@@ -67,7 +67,7 @@ class Emergency:
         self._emit(code, vendor)
 
     def clear_error(self, code: int) -> None:
-        """An error ends; with the last one comes the message "error reset"."""
+        """Clear an error; after the last one the message "error reset" is sent."""
         if self._active.pop(code, None) is not None:
             self._update()
             self._emit(0, struct.pack("<H", code) if self._active else b"")

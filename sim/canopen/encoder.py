@@ -20,7 +20,7 @@ _OPERATING_BITS = SCALING | REVERSED
 
 
 class Scale(Protocol):
-    """What the encoder reads (`sim.world.World`)."""
+    """The measured angle (`sim.world.World`)."""
 
     @property
     def time_s(self) -> float:
@@ -111,7 +111,7 @@ class Cia406Encoder(Node):
         self._measure()
 
     def _take_preset(self) -> None:
-        """Offset (0x6509) so that the present position reads as the preset value."""
+        """Set the offset (0x6509) so that the present position reads as the preset value."""
         offset = (self._preset.number - self._raw(self._scale.link_counts())) % self._modulus
         self._offset.value = offset - (1 << 32) if offset > 0x7FFF_FFFF else offset
         self._measure()

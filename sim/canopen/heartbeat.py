@@ -28,19 +28,19 @@ class HeartbeatProducer:
             self._timer = None
 
     def restart(self) -> None:
-        """Take over a changed period; the first heartbeat comes one period from now."""
+        """Apply a changed period; the first heartbeat is one period from now."""
         self.stop()
         if self._period.number:
             self._timer = self._timers.every(self._period.number * 1e-3, self._beat)
 
 
 class HeartbeatConsumer:
-    """Watches the nodes of 0x1016: each is expected from its first heartbeat on.
+    """Monitors the nodes of 0x1016, each from its first heartbeat on.
 
     Args:
-        lost: called with the node id when its time has passed.
-        back: called with the node id when it is heard again.
-        changed: called when other nodes are to be listened to.
+        lost: called with the node id on a timeout.
+        back: called with the node id when its heartbeat returns.
+        changed: called when the monitored nodes change.
     """
 
     def __init__(

@@ -57,11 +57,11 @@ class Node:
         timers: its appointments; the network moves their clock.
         state: NMT state.
         sync_id: identifier of the SYNC it listens to.
-        routes: what to call with the data of which identifier, besides NMT and SYNC.
+        routes: handlers by identifier, besides NMT and SYNC.
         tpdos: by number from 1.
         rpdos: by number from 1.
-        sends_on_change: whether changed process data are an event for types 254 and 255; if not, only the
-            event timer is.
+        sends_on_change: whether changed process data trigger types 254 and 255; if not, only the event timer
+            does.
     """
 
     sends_on_change = True
@@ -89,7 +89,7 @@ class Node:
     # Wiring to the network
 
     def attach(self, put: Callable[[int, bytes], None], rerouted: Callable[[], None]) -> None:
-        """Connect to a network: a way to send, and whom to notify of changed routes."""
+        """Connect to a network: how to send, and whom to notify of changed routes."""
         self._put = put
         self._rerouted = rerouted
 
@@ -275,7 +275,7 @@ class Node:
     # SYNC
 
     def latch(self, data: bytes) -> bool:
-        """A SYNC has come: take over what synchronous RPDOs brought.
+        """Handle a SYNC: apply the values of synchronous RPDOs.
 
         Returns:
             Whether this node will answer with its TPDOs (`transmit`).
@@ -293,7 +293,7 @@ class Node:
         return True
 
     def transmit(self) -> None:
-        """The sampling instant of a SYNC: sample, and send what is due."""
+        """The sampling instant of a SYNC: sample, and send the due TPDOs."""
         self.on_sample()
         for tpdo in self._synchronous:
             tpdo.sync(self._counter)
@@ -301,7 +301,7 @@ class Node:
             tpdo.event()
 
     def process(self) -> None:
-        """Time has passed without a SYNC: sample, and send what is event-driven."""
+        """Let time pass without a SYNC: sample, and send event-driven TPDOs."""
         self.on_sample()
         for tpdo in self._change_driven:
             tpdo.event()
@@ -327,13 +327,13 @@ class Node:
     # What a device does besides
 
     def on_pdos(self, mapped: frozenset[Entry]) -> None:
-        """Other TPDOs than before are active: these entries are in them."""
+        """The active TPDOs have changed; they contain these entries."""
 
     def on_control(self, periods: int) -> None:
         """Control periods begin."""
 
     def on_sample(self) -> None:
-        """Bring the process data up to the present."""
+        """Update the process data."""
 
     def on_reset_node(self) -> None:
         """The application has been reset."""
@@ -342,4 +342,4 @@ class Node:
         """The NMT state operational has been left."""
 
     def on_connection_lost(self) -> None:
-        """A watched node's heartbeat has failed to come."""
+        """A monitored node's heartbeat has timed out."""

@@ -1,4 +1,4 @@
-"""Descriptions of the communication profile area (CiA 301); dictionaries and EDS files are made of them."""
+"""Objects of the communication profile area (CiA 301), for dictionaries and EDS files."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MAPPED_AT_MOST = 8  # objects in one PDO
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Identity:
-    """What a device says it is: 0x1008 to 0x100A and 0x1018."""
+    """Identity of a device: 0x1008 to 0x100A and 0x1018."""
 
     name: str
     vendor_id: int = 0x0000_0D1C

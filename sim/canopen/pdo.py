@@ -1,7 +1,7 @@
 """Process data objects of a simulated device (CiA 301, 7.5.2.35 to 7.5.2.38).
 
-A PDO's parameters are dictionary entries; writing them is checked as a strict device does. Once a PDO is
-valid its layout is compiled to one `struct.Struct` and a tuple of entries: a cycle packs plain attributes.
+A PDO's parameters are dictionary entries; writes are checked as strictly as any known device does. The layout
+of a valid PDO is compiled to one `struct.Struct` and a tuple of entries.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _RESERVED_TYPES = range(241, 254)  # and RTR-only types, which this device does 
 
 
 def restricted(can_id: int) -> bool:
-    """Whether an identifier may not be given to a PDO, SYNC or EMCY (CiA 301, table 40)."""
+    """Whether an identifier is restricted: not allowed for PDO, SYNC or EMCY (CiA 301, table 40)."""
     return (
         can_id <= 0x07F
         or 0x101 <= can_id <= 0x180
@@ -42,7 +42,7 @@ def restricted(can_id: int) -> bool:
 
 
 class Pdo:
-    """What TPDOs and RPDOs share: parameters, their checks, the compiled layout.
+    """Common part of TPDOs and RPDOs: parameters, their checks, the compiled layout.
 
     Args:
         dictionary: holds the parameters at `communication` and `mapping`.
@@ -50,7 +50,7 @@ class Pdo:
         mapping: index of the mapping parameter record.
         quirks: how this device deviates.
         operational: whether the device is in NMT state operational.
-        changed: called after the PDO became valid, invalid or another.
+        changed: called after a change of validity or parameters.
 
     Attributes:
         valid: bit 31 of the COB-ID is clear.
@@ -58,7 +58,7 @@ class Pdo:
         can_id: its identifier on the bus.
         type: transmission type.
         event_s: event timer or deadline; 0: none.
-        entries: what is mapped, in order; None stands for a dummy.
+        entries: mapped entries in order; None: a dummy.
         layout: the frame.
     """
 

@@ -1,7 +1,6 @@
-"""Drives that behave like well-known makers' ones, and like devices with one awkward habit.
+"""Profiles of well-known makers' drives, and of devices with one unusual behaviour.
 
-The object lists follow public EDS and DCF files and manuals; names and vendor ids of the makers are not
-used, because these are not their drives.
+The object lists follow public EDS and DCF files and manuals; names and vendor ids are not the makers'.
 """
 
 from __future__ import annotations
@@ -142,7 +141,7 @@ PROFILES: dict[str, Quirks] = {
         Quirks(name="slow-boot", identity=_identity("slow-boot", 0x0F04), boot_s=1.5),
     )
 }
-"""By name, in the order in which they are listed to users."""
+"""By name, in the order shown to users."""
 
 
 def profile(name: str) -> Quirks:

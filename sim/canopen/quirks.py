@@ -13,16 +13,16 @@ __all__ = ["Quirks"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Quirks:
-    """Deviations of one maker's drive.
+    """Deviations of one maker's drive from the strict one.
 
     Attributes:
         name: how the profile is called.
         identity: 0x1008 to 0x1018; None: the device's own.
-        missing: objects, or (index, subindex), that it lacks.
+        missing: objects, or (index, subindex), that do not exist.
         constant: objects that cannot be written.
         defaults: other power-on values, by (index, subindex).
         tpdos: its TPDOs as they are at power-on; None: the device's own.
-        extra: objects that others lack.
+        extra: vendor objects.
         current_ma: vendor object with the current in mA (i32).
         velocity_exponents: powers of ten that 0x60A9 accepts.
         second_encoder: subindex of 0x60E4 at which a link encoder is found.

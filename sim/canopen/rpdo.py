@@ -44,7 +44,7 @@ class Rpdo(Pdo):
         return entry is None or entry.receivable
 
     def activate(self, active: bool) -> None:
-        """Begin or end to receive: forget what came, after a change of state or parameters."""
+        """Start or stop receiving, after a change of state or parameters; pending data are dropped."""
         if (active, self.generation) == self._condition:
             return
         self._condition = (active, self.generation)
@@ -54,7 +54,7 @@ class Rpdo(Pdo):
             self._deadline = None
 
     def receive(self, data: bytes) -> None:
-        """A frame has come: act on it now or, if synchronous, with the next SYNC."""
+        """Handle a frame now or, if synchronous, with the next SYNC."""
         if len(data) < self.layout.size:
             self._wrong_length(True)
             return
@@ -70,13 +70,13 @@ class Rpdo(Pdo):
             self.apply()
 
     def apply(self) -> None:
-        """Store the mapped values of the last frame, if one came since the last time."""
+        """Store the mapped values of a pending frame."""
         data, self._pending = self._pending, None
         if data is None:
             return
         values = iter(self.layout.unpack_from(data))
         for entry in self.entries:
-            if entry is None:  # a dummy: only takes up room
+            if entry is None:  # a dummy entry
                 continue
             try:
                 entry.write(next(values))

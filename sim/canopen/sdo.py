@@ -12,7 +12,7 @@ from sim.canopen.timers import Timer, Timers
 
 __all__ = ["SdoServer"]
 
-_TIMEOUT_S = 1.0  # between two frames of one transfer, then the server gives it up
+_TIMEOUT_S = 1.0  # timeout between two frames of a transfer
 
 _DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT = 0, 1, 2, 3
 _ABORT, _BLOCK_UPLOAD, _BLOCK_DOWNLOAD = 4, 5, 6
@@ -33,15 +33,14 @@ class SdoServer:
 
     Args:
         dictionary: what it serves.
-        timers: for transfers that the client forgets.
+        timers: for timeouts.
         send: puts the eight bytes of a response on the bus.
 
     Attributes:
         ignored: requests that it will not answer, for tests.
         refused: requests that it will abort, with `refusal`, for tests.
         refusal: the abort code.
-        endless: bytes in each segment of an upload that never ends, whatever is asked for, for tests;
-            -1: it is a sound server.
+        endless: for tests: bytes in each segment of an upload that never ends; -1: normal operation.
     """
 
     def __init__(self, dictionary: Dictionary, timers: Timers, send: Callable[[bytes], None]) -> None:
@@ -65,7 +64,7 @@ class SdoServer:
             self._timer = None
 
     def receive(self, data: bytes) -> None:
-        """Handle one request; what is not eight bytes long is no SDO frame."""
+        """Handle one request; frames of other than eight bytes are ignored."""
         if len(data) != 8:
             return
         if self.ignored:
@@ -91,7 +90,7 @@ class SdoServer:
         self._watch()
 
     def _endless(self, data: bytes) -> bytes:
-        """Four bytes are declared, and segment follows segment."""
+        """Declare four bytes, then send segments without end."""
         if data[0] >> 5 == _UPLOAD:
             return bytes([0x41]) + data[1:4] + struct.pack("<I", 4)
         return bytes([data[0] & 0x10 | (7 - self.endless) << 1]) + b"\xff" * 7

@@ -11,7 +11,7 @@ _QUICK_STOP_STAYS = range(5, 9)  # values of 0x605A with which the drive stays i
 
 
 class PowerState(IntEnum):
-    """States; the value is what the statusword shows of them (bits 0 to 3, 5, 6)."""
+    """States, with their statusword bits (0 to 3, 5, 6)."""
 
     NOT_READY = 0x00
     SWITCH_ON_DISABLED = 0x40
@@ -24,7 +24,7 @@ class PowerState(IntEnum):
 
 
 class StateMachine:
-    """Transitions 0 to 16 by controlwords, faults, and what happens by itself.
+    """Transitions 0 to 16 by controlwords, by faults, and automatic ones.
 
     Attributes:
         state: the present one.
@@ -47,7 +47,7 @@ class StateMachine:
             self.state = PowerState.FAULT_REACTION
 
     def step(self) -> None:
-        """What a control cycle brings by itself: the reaction to a fault and a quick stop end."""
+        """Automatic transitions of a control cycle: end of the fault reaction and of a quick stop."""
         if self.state is PowerState.FAULT_REACTION:
             self.state = PowerState.FAULT
         elif self.state is PowerState.QUICK_STOP_ACTIVE and self.quick_stop_option not in _QUICK_STOP_STAYS:

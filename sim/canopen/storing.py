@@ -16,11 +16,11 @@ _GROUPS = (
     (0x2000, 0xFFFF),
 )
 """Indices of sub-index 1 (all), 2 (communication), 3 (application)."""
-_ON_COMMAND = 1  # what the objects read as
+_ON_COMMAND = 1  # value of the objects on reading
 
 
 def watch_storing(dictionary: Dictionary) -> None:
-    """Let the two objects of a dictionary do their work, where it has them."""
+    """Connect the two objects of a dictionary, if present."""
     for index, text, act in (
         (0x1010, "save", dictionary.store),
         (0x1011, "load", dictionary.restore_defaults),

@@ -11,7 +11,7 @@ __all__ = ["Timer", "Timers"]
 
 
 class Timer:
-    """One appointment; `cancel` makes it void."""
+    """One scheduled call."""
 
     __slots__ = ("action", "due_s")
 
@@ -20,16 +20,16 @@ class Timer:
         self.action = action
 
     def cancel(self) -> None:
-        """Never happens."""
+        """Cancel the call."""
         self.action = None
 
 
 class Timers:
-    """Appointments in order of time.
+    """Scheduled calls in order of time.
 
     Attributes:
         now_s: the present, as last given to `run`.
-        next_s: when the first appointment is due; infinity with none. Cheap to compare in every cycle.
+        next_s: when the first call is due; infinity with none.
     """
 
     def __init__(self) -> None:
@@ -61,12 +61,12 @@ class Timers:
         return timer
 
     def clear(self) -> None:
-        """No appointment is left."""
+        """Cancel all calls."""
         self._heap.clear()
         self.next_s = math.inf
 
     def run(self, now_s: float) -> None:
-        """Move the present to `now_s` and keep every appointment up to it."""
+        """Advance to `now_s` and make all calls that are due."""
         self.now_s = now_s
         while self._heap and self._heap[0][0] <= now_s:
             _, _, timer = heapq.heappop(self._heap)

@@ -54,7 +54,7 @@ class Tpdo(Pdo):
         return self.type <= 240
 
     def activate(self, active: bool, counting: bool) -> None:
-        """Begin or end to transmit, after a change of the NMT state or of parameters.
+        """Start or stop transmitting, after a change of the NMT state or of parameters.
 
         Args:
             active: the device is operational and the PDO valid.
@@ -76,11 +76,11 @@ class Tpdo(Pdo):
             self._event_timer = self._timers.after(self.event_s, self._event_due)
 
     def pack(self) -> bytes:
-        """The frame as the entries are now."""
+        """The frame with the present values."""
         return self.layout.pack(*[entry.value for entry in self.entries if entry])
 
     def sync(self, counter: int | None) -> None:
-        """A SYNC has come and the process data have been sampled."""
+        """Handle a SYNC after the process data have been sampled."""
         if self.type == 1 and not self._waiting:
             self.emit(self.can_id, self.pack())
             return
@@ -101,7 +101,7 @@ class Tpdo(Pdo):
             self.emit(self.can_id, self.pack())
 
     def event(self) -> None:
-        """Process data may have changed: send an event-driven PDO if they have."""
+        """Send an event-driven PDO if its data have changed."""
         if not self._inhibited:
             data = self.pack()
             if data != self._last:

@@ -1,7 +1,7 @@
-"""Physics that can be switched on in the world, by name.
+"""Physical effects that can be switched on in the world, by name.
 
-`LISTED` are the effects of the estimator's vocabulary, with the same names and parameters and laws of their
-own; `UNLISTED` are others, for the tests of a diagnosis that has to say "unexplained".
+`LISTED` has the effects of the estimator's library, with the same names and parameters but independent laws;
+`UNLISTED` has others, which a diagnosis has to call "unexplained".
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ UNLISTED: dict[str, Definition] = {definition.name: definition for definition in
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlantEffect:
-    """One effect to be switched on.
+    """One effect with its parameters.
 
     Attributes:
         definition: what it is.
         values: all its parameters.
-        motor: index of the motor that it acts on, where it acts on one.
+        motor: index of the motor it acts on, if any.
     """
 
     definition: Definition
@@ -50,8 +50,8 @@ def make(name: str, parameters: Mapping[str, object], motor: int | None = None) 
 
     Args:
         name: of `LISTED` or `UNLISTED`.
-        parameters: by name; what has a default may be left out. "motor" (1 or 2) says which motor.
-        motor: index of the motor, where `parameters` does not say.
+        parameters: by name; those with a default are optional. "motor" (1 or 2) says which motor.
+        motor: index of the motor, unless `parameters` has it.
 
     Raises:
         SimError: unknown effect, unknown, missing or impossible parameter.
@@ -119,10 +119,10 @@ def _parsed(text: str, value: str) -> float:
 
 
 def assemble(plant: JointPlant, effects: Iterable[PlantEffect], step_s: float) -> Assembly:
-    """Put effects into a plant.
+    """Add effects to a plant.
 
     Raises:
-        SimError: an effect of a motor that the joint has not, or values that cannot be.
+        SimError: a motor that the joint does not have, or impossible values.
     """
     assembly = Assembly(plant, step_s)
     for effect in effects:

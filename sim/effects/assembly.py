@@ -19,7 +19,7 @@ TorquePath = Callable[[float, float, float], float]
 
 @dataclass(slots=True, kw_only=True)
 class MotorParts:
-    """What effects add to one motor, its drive and its transmission."""
+    """Contributions of effects to one motor, its drive and its transmission."""
 
     inertia_kg_m2: float = 0.0
     viscous_damping_nm_s_rad: float = 0.0
@@ -38,7 +38,7 @@ class MotorParts:
 
 @dataclass(slots=True, kw_only=True)
 class LinkParts:
-    """What effects add to the link and its encoder."""
+    """Contributions of effects to the link and its encoder."""
 
     inertia_kg_m2: float = 0.0
     viscous_damping_nm_s_rad: float = 0.0
@@ -49,14 +49,14 @@ class LinkParts:
 
 
 class Assembly:
-    """A plant that effects are being added to."""
+    """A plant to which effects are added."""
 
     def __init__(self, plant: JointPlant, step_s: float) -> None:
-        """Begin with the plant as it is.
+        """Start with a plant.
 
         Args:
             plant: the joint.
-            step_s: the integration step, which memories of time need.
+            step_s: the integration step, needed by effects with memory over time.
         """
         self.plant = plant
         self.step_s = step_s
@@ -64,7 +64,7 @@ class Assembly:
         self.link = LinkParts()
 
     def joint(self) -> JointPlant:
-        """The plant with everything that was added to its mechanics."""
+        """The plant with all mechanical contributions."""
         motors = tuple(
             replace(
                 motor,
@@ -105,7 +105,7 @@ class Parameter:
     Attributes:
         name: with its unit.
         meaning: what it is.
-        default: its value where it is left out, or that value as a function of the main one; None: required.
+        default: default value, or default as a function of the first parameter; None: required.
     """
 
     name: str
@@ -115,7 +115,7 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Definition:
-    """An effect that can be switched on.
+    """Definition of an effect.
 
     Attributes:
         name: of the effect.

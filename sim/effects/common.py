@@ -24,7 +24,7 @@ SLIP = (
 
 
 def at_speed(level: Dry, smoothing: float) -> Dry:
-    """The level of dry friction, made to vanish with the velocity over `smoothing` (rad/s); 0: as it is."""
+    """The level of dry friction, smoothed to zero at standstill over `smoothing` (rad/s); 0: unchanged."""
     if smoothing <= 0.0:
         return level
 

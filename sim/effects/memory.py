@@ -1,7 +1,7 @@
-"""Torque that depends on where the joint has been: friction in presliding, hysteresis, creep, delays.
+"""Torques with memory: presliding friction, hysteresis, creep, delays.
 
-Each memory keeps its state as of the last step. Asked for the torque at another displacement it works out
-where it would be; on commit, it moves there.
+Each memory keeps its state of the last step: `torque` evaluates another displacement without changing it,
+`commit` moves there.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Element = Callable[[float, float], float]
 
 
 class Slip:
-    """Elements that yield one after the other (P. Dahl 1968; Y. Wen 1976), side by side.
+    """Parallel elements that yield one after the other (P. Dahl 1968; Y. Wen 1976).
 
     Each follows dz/du = 1 - (s sign(dz u) + 1 - s) |z|^n over its displacement in units of its own scale:
     n = 1, s = 1 is Dahl's law, n = 2, s = 0.5 the usual Bouc-Wen, n >= 50 a spring that slips (Jenkins).
@@ -45,14 +45,14 @@ class Slip:
         self._element = _element(exponent, shape)
         self._per_rad = [1.0 / (displacement_rad * 2.0 ** (k - (count - 1) / 2)) for k in range(count)]
         self._z = [0.0] * count
-        self._x: float | None = None  # where it first finds itself, it begins without torque
+        self._x: float | None = None  # unloaded at its first position
 
     def torque(self, x: float) -> float:
         """Torque (N·m) at displacement x (rad)."""
         return self._each * sum(self._moved(x))
 
     def commit(self, x: float) -> None:
-        """Be at x."""
+        """Move to x."""
         self._z = self._moved(x)
         self._x = x
 
@@ -106,13 +106,15 @@ def _integrated(exponent: float, shape: float) -> Element:
 
 
 class Creep:
-    """A spring and a damper in a row beside the transmission (Maxwell): torque that relaxes in time_s."""
+    """A Maxwell element (spring and damper in series) parallel to the transmission: its torque relaxes in
+    time_s.
+    """
 
     def __init__(self, stiffness_nm_rad: float, time_s: float, step_s: float) -> None:
         self._k, self._decay = stiffness_nm_rad, math.exp(-step_s / time_s)
         self._mean = time_s / step_s * -math.expm1(-step_s / time_s)
         self._torque = 0.0
-        self._x: float | None = None  # where it first finds itself, it begins without torque
+        self._x: float | None = None  # unloaded at its first position
 
     def torque(self, x: float) -> float:
         """Torque (N·m) at deflection x (rad)."""
@@ -121,14 +123,14 @@ class Creep:
         return self._torque + self._k * (x - self._x)
 
     def commit(self, x: float) -> None:
-        """One step later, at x: the old torque has relaxed, and the new one in part."""
+        """Advance one step, to x: relax the torque and add the change."""
         way = 0.0 if self._x is None else x - self._x
         self._torque = self._torque * self._decay + self._k * way * self._mean
         self._x = x
 
 
 class Delayed:
-    """A held torque that acts later than it is reported: its mean over each step of a period."""
+    """A held torque that acts with a delay: its mean over each step of a period."""
 
     def __init__(self, delay_s: float, period_s: float, substeps: int) -> None:
         width = 1.0 / substeps
@@ -159,14 +161,14 @@ class Lag:
         self._torque = 0.0
 
     def passed(self, torque: float) -> float:
-        """Mean over the next step, in which this torque goes in."""
+        """Mean output over the next step with this input."""
         ahead = self._torque - torque
         self._torque = torque + ahead * self._keep
         return torque + ahead * self._mean
 
 
 class History:
-    """Where a body was some time ago: positions and velocities at plant steps, cubic between them."""
+    """Past positions of a body: samples at plant steps, cubic interpolation between them."""
 
     def __init__(self, delay_s: float, step_s: float, position: float) -> None:
         steps = delay_s / step_s
@@ -182,7 +184,7 @@ class History:
         self._past.append((position, velocity))
 
     def position(self) -> float:
-        """The position one delay ago."""
+        """The delayed position."""
         (a, va), s, h = self._past[0], self._along, self._step_s
         if s == 0.0:
             return a

@@ -1,7 +1,8 @@
-"""Effects of the transmission: what acts on both sides of it.
+"""Effects of the transmission, acting on both sides.
 
 Signs: x of a motor opposes it in eqs 5, 7, x of the link opposes it in eqs 4, 6, x of a transmission adds
-to tau_e. Names and parameters are the estimator's, so that a model can be simulated; the laws are not.
+to tau_e. Names and parameters are the estimator's, so that a model can be simulated; the laws are
+independent.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Effects that no diagnosis has in its vocabulary: to test what it says when it meets the unknown."""
+"""Effects outside the estimator's library, to test diagnosis on the unknown."""
 
 from __future__ import annotations
 

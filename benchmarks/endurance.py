@@ -20,8 +20,8 @@ from typing import Any
 
 from rig import PERIOD_S, free_endpoint, joint
 
+from drivelink._core import LatencyHistogram
 from drivelink.cycle import pacing, realtime
-from drivelink.cycle.latency_histogram import LatencyHistogram
 from drivelink.cycle.realtime import Alarm
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simulate import network_from_joint, open_sim_bus

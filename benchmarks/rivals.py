@@ -14,10 +14,9 @@ import numpy as np
 import zenoh
 from rig import AnsweringBus, Devices
 
-from drivelink._core import SYNC_COB_ID
+from drivelink._core import SYNC_COB_ID, LatencyHistogram
 from drivelink.canopen.layout import NodeLayout, Signal
 from drivelink.cycle.framesource import FrameSource
-from drivelink.cycle.latency_histogram import LatencyHistogram
 from drivelink.cycle.realtime import Alarm
 from drivelink.cycle.sources import open_source
 from drivelink.jointfile import JointFile

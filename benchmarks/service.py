@@ -21,8 +21,8 @@ from pathlib import Path
 import zenoh
 from rig import PERIOD_S, Devices, free_endpoint, joint, joint_text
 
+from drivelink._core import LatencyHistogram
 from drivelink.cycle import realtime
-from drivelink.cycle.latency_histogram import LatencyHistogram
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.session import close_session, open_session

@@ -165,6 +165,27 @@ class Assembler:
             DriveError: as in the constructor; then everything is as it was.
         """
 
+class LatencyHistogram:
+    """A distribution of durations: counts per microsecond up to 5 ms, and the maximum.
+
+    Attributes:
+        count: durations since the start.
+        maximum_us: the longest of them, in whole microseconds.
+    """
+
+    @property
+    def count(self) -> int: ...
+    @property
+    def maximum_us(self) -> int: ...
+    def add(self, duration_ns: int) -> None:
+        """Count one duration."""
+
+    def total(self) -> dict[str, float]:
+        """Since the start: p50_us, p90_us, p99_us, p999_us, max_us; empty before the first duration."""
+
+    def recent(self) -> dict[str, float]:
+        """The same since the last call; empty where nothing was counted."""
+
 class Tick:
     """What is published of one cycle.
 
@@ -227,7 +248,7 @@ class History:
         """How many came after one of that number."""
 
 class JointPipeline:
-    """One joint from frames to the bytes for zenoh: assembler, estimator, watch. No clock, no bus, no key.
+    """One joint from frames to the bytes for zenoh: assembler, estimator, monitor. No clock, no bus, no key.
 
     What the service knows of the estimate's quality is added to its status: drive faults, missing frames, and
     estimates carried on without fresh measurements. It is fed by one thread; others may look at it.
@@ -235,25 +256,26 @@ class JointPipeline:
     Args:
         assembler: makes the samples.
         estimator: steps once a sample.
-        watch: raises the model alarm, if there is one.
+        model_monitor: raises the model alarm, if there is one.
         keep: how many of the last samples are kept, for a new estimator to start from.
 
     Attributes:
         assembler: as given.
         estimator: the one in use.
-        watch: likewise.
+        model_monitor: likewise.
         history: the last samples.
         estimate: the last one, None before the first.
         external: likewise; None too where nothing is declared of the link.
         sample: what the last estimate was made from; None where it was carried on.
         missed: cycles that gave no sample.
+        complete: as of the assembler.
     """
 
     def __init__(
         self,
         assembler: Assembler,
         estimator: _Estimator,
-        watch: ResidualMonitor | None = None,
+        model_monitor: ResidualMonitor | None = None,
         *,
         keep: int = 0,
     ) -> None: ...
@@ -262,7 +284,7 @@ class JointPipeline:
     @property
     def estimator(self) -> _Estimator: ...
     @property
-    def watch(self) -> ResidualMonitor | None: ...
+    def model_monitor(self) -> ResidualMonitor | None: ...
     @property
     def history(self) -> History: ...
     @property
@@ -273,6 +295,8 @@ class JointPipeline:
     def sample(self) -> Sample | None: ...
     @property
     def missed(self) -> int: ...
+    @property
+    def complete(self) -> bool: ...
     def feed(self, cob_id: int, data: bytes, jump: int = 1, stamp_ns: int = 0) -> Tick | None:
         """Take one frame (see `Assembler.feed`); what is published of the cycle that it ends, if it does.
 
@@ -308,5 +332,7 @@ class JointPipeline:
             stamp_ns: UNIX time of its SYNC; None: from the SYNCs fed.
         """
 
-    def exchange(self, estimator: Any, watch: ResidualMonitor | None, unseen: Iterable[Sample] = ()) -> None:
+    def exchange(
+        self, estimator: Any, model_monitor: ResidualMonitor | None, unseen: Iterable[Sample] = ()
+    ) -> None:
         """Put another estimator in place between two cycles, after it has seen the last samples too."""

@@ -279,7 +279,7 @@ def _estimates(joint: str, samples: list[Sample], begin: int) -> tuple[kit.Estim
         estimates, _ = kit.play(kit.declared(name), samples, look=look)
     else:
         model, baseline = _fitted(name)
-        estimates, _ = kit.play(model, samples, watch=ModelMonitor(model, T, baseline), look=look)
+        estimates, _ = kit.play(model, samples, model_monitor=ModelMonitor(model, T, baseline), look=look)
     return estimates, suspects.most_common(1)[0][0] if suspects else ""
 
 

@@ -148,16 +148,17 @@ def play(
     model: JointModel,
     samples: Iterable[Sample],
     *,
-    watch: ResidualMonitor | None = None,
+    model_monitor: ResidualMonitor | None = None,
     look: Callable[[int, Estimator], object] = lambda _k, _estimator: None,
     **settings: Any,
 ) -> tuple[Estimates, Estimator]:
-    """An estimator's word on these samples, with a watch's as the service adds it, and the estimator.
+    """An estimator's word on these samples, with a model monitor's as the service adds it, and the estimator.
 
     `look` is called after each sample, with its place.
     """
     estimator = make_estimator(model, EstimatorSettings(**settings), PERIOD_S)
-    pipeline = JointPipeline(Assembler((), 0), estimator, watch)  # what it is given are samples already
+    # What it is given are samples already.
+    pipeline = JointPipeline(Assembler((), 0), estimator, model_monitor)
     rows = []
     for k, sample in enumerate(samples):
         e = pipeline.take(sample).estimate

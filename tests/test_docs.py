@@ -56,7 +56,9 @@ def test_the_architecture_names_exactly_the_parts_of_a_package(package: str) -> 
     named = re.findall(r"`([\w/.]+)`", " ".join(rows))
     folder = ROOT / package
     if package.endswith("/core"):
-        parts = {path.name for path in (folder / "src").glob("*.rs")} - {"lib.rs", "python.rs"}
+        source = folder / "src"
+        parts = {path.relative_to(source).as_posix() for path in source.rglob("*.rs")}
+        parts -= {"lib.rs", "python.rs"}
     else:
         parts = {path.name for path in folder.glob("*.py")} - {"__init__.py", "__main__.py"}
         parts |= {f"{path.name}/" for path in folder.iterdir() if path.is_dir() and path.name[0] != "_"}

@@ -110,7 +110,7 @@ def test_a_joint_file_with_a_stiffness_below_zero_is_neither_read_nor_written():
 
 
 class _Alarm:
-    """A watch whose alarm is always on."""
+    """A monitor whose alarm is always on."""
 
     def step(self, sample, estimate, residual_nm):
         return True
@@ -122,7 +122,7 @@ class _Alarm:
 def test_valid_and_the_model_alarm_do_not_stand_together():
     motion = kit.motion("constant", 3.0)
     quiet, _ = kit.play(kit.declared("constant"), motion.samples)
-    alarmed, _ = kit.play(kit.declared("constant"), motion.samples, watch=_Alarm())
+    alarmed, _ = kit.play(kit.declared("constant"), motion.samples, model_monitor=_Alarm())
     assert np.any(quiet.valid)
     assert np.all(alarmed.status & int(Status.MODEL_ALARM))
     assert not np.any(alarmed.valid)

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drivelink.cycle.latency_histogram import LatencyHistogram
+from drivelink._core import LatencyHistogram
 from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor
 from estimator.sample import Estimate, Status
@@ -101,7 +101,7 @@ def test_the_log_says_when_the_model_alarm_comes_and_goes_and_what_to_do(
 ) -> None:
     caplog.set_level(logging.INFO)
     described = {"residual_nm": [0.09, 0.01], "floor_nm": [0.03, 0.02], "location": "transmission"}
-    watch = SimpleNamespace(describe=lambda: described)
+    model_monitor = SimpleNamespace(describe=lambda: described)
     supervisor = Supervisor.__new__(Supervisor)
     supervisor._events, supervisor._alarmed = EventLog(logging.getLogger("drivelink")), set()
     for status in (
@@ -111,7 +111,9 @@ def test_the_log_says_when_the_model_alarm_comes_and_goes_and_what_to_do(
         Status.VALID,
         Status.VALID,
     ):
-        pipeline = SimpleNamespace(estimate=Estimate(1, int(status), 1.0, 1.0, 1.0, ()), watch=watch)
+        pipeline = SimpleNamespace(
+            estimate=Estimate(1, int(status), 1.0, 1.0, 1.0, ()), model_monitor=model_monitor
+        )
         supervisor._check_model(SimpleNamespace(name="elbow", pipeline=pipeline))  # type: ignore[arg-type]
         if status == Status.MODEL_ALARM:
             described |= {"residual_nm": [0.02, 0.01], "location": ""}

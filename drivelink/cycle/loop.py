@@ -14,10 +14,9 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Protocol
 
-from drivelink._core import SYNC_COB_ID, JointPipeline, Tick
+from drivelink._core import SYNC_COB_ID, JointPipeline, LatencyHistogram, Tick
 from drivelink.cycle.framesource import BusLostError, CanFrame, FrameSource, LostSource
 from drivelink.cycle.housekeeping import Housekeeping
-from drivelink.cycle.latency_histogram import LatencyHistogram
 from drivelink.cycle.syncclock import LATE, MEASURED_SYNCS, SyncClock
 from estimator.sample import Estimate, Sample
 
@@ -170,7 +169,7 @@ class CycleLoop:
     @property
     def complete(self) -> bool:
         """Whether every joint has its sample of this cycle."""
-        return all([pipeline.assembler.complete for pipeline in self._pipelines])  # noqa: C419 - twice as fast
+        return all([pipeline.complete for pipeline in self._pipelines])  # noqa: C419 - twice as fast
 
     def reroute(self) -> None:
         """Look up again which joint wants which frame."""

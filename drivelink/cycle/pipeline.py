@@ -72,7 +72,7 @@ def make_pipeline(joint: JointFile, layouts: Sequence[NodeLayout], *, keep: int 
 
 
 def rehearse(joint: JointFile) -> None:
-    """Step an estimator and a watch like this joint's: nothing is then done for the first time in the loop.
+    """Step an estimator and a monitor like this joint's: nothing is then done for the first time in the loop.
 
     What is loaded, allocated or started with the first use (a library's threads, say) is there afterwards.
     """

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Generator
 from typing import Any
 
 from drivelink.canopen.emcy import emergency_text
@@ -73,8 +72,8 @@ class JointStatus:
         self._timing: dict[str, Any] = {"latency": {}, "response": {}, "jitter": {}}
         self.real_time: RealTime | None = None
 
-    def refresh_timing(self) -> Generator[None]:
-        """Draw the percentiles anew, where it is time to; one part of the work at a time."""
+    def refresh_timing(self) -> None:
+        """Draw the percentiles anew, where it is time to."""
         self._asked += 1
         if self._asked % _TIMING_EVERY == 1:
             for name, meter in (
@@ -83,7 +82,6 @@ class JointStatus:
                 ("jitter", self._loop.lateness),
             ):
                 self._timing[name] = meter.recent()
-                yield
 
     def begin(self) -> None:
         """Percentiles are due with the next document, whatever was asked before."""
@@ -174,10 +172,10 @@ class JointStatus:
         return {str(bit.name).lower(): bool(status & bit) for bit in _QUALITY}
 
     def _alarm(self) -> dict[str, Any]:
-        watch = self._loop_joint.pipeline.watch
+        monitor = self._loop_joint.pipeline.model_monitor
         estimate = self._loop_joint.pipeline.estimate
         active = estimate is not None and bool(estimate.status & Status.MODEL_ALARM)
-        return {"active": active, **(watch.describe() if watch is not None else {})}
+        return {"active": active, **(monitor.describe() if monitor is not None else {})}
 
     def _external(self) -> dict[str, Any] | None:
         """What touches the link, and whether both sides of the joint agree on the flexibility torque."""
@@ -214,5 +212,5 @@ class JointStatus:
             )
         residual = loop_joint.pipeline.estimator.residual_nm
         if math.isfinite(residual):
-            text += f"; residual {residual:.3g} N·m" + residual_text(loop_joint.pipeline.watch)
+            text += f"; residual {residual:.3g} N·m" + residual_text(loop_joint.pipeline.model_monitor)
         return text

@@ -41,7 +41,7 @@ class Reloader:
         path: the joint file.
         joint: as it is in use.
         pipeline: whose estimator is exchanged.
-        build: makes estimator and watch of a joint file; called in a thread.
+        build: makes estimator and model monitor of a joint file; called in a thread.
         publish: called with the joint file in use after an exchange.
         events: where it is said.
     """
@@ -90,14 +90,14 @@ class Reloader:
         if self._ready is None or not self._turn.acquire(blocking=False):
             return
         try:
-            joint, (estimator, watch), sequence = self._ready
+            joint, (estimator, model_monitor), sequence = self._ready
             if self._history.behind(sequence) > _BEHIND:
                 self._slacks += 1
                 if self._slacks > _PATIENCE:
-                    self._lead(joint, (estimator, watch), self._history.after(sequence, _AID))
+                    self._lead(joint, (estimator, model_monitor), self._history.after(sequence, _AID))
                 return
             self._ready = self._thread = None
-            self._pipeline.exchange(estimator, watch, self._history.after(sequence))
+            self._pipeline.exchange(estimator, model_monitor, self._history.after(sequence))
         finally:
             self._turn.release()
         self._joint = joint

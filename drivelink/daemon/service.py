@@ -9,7 +9,6 @@ from __future__ import annotations
 import gc
 import logging
 import time
-from collections import deque
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -203,7 +202,7 @@ class Daemon:
     def documents(self) -> list[dict[str, Any]]:
         """What the status key of each joint would say now."""
         for status in self._status:
-            deque(status.refresh_timing(), maxlen=0)
+            status.refresh_timing()
         return [status.document() for status in self._status]
 
     def summary(self) -> str:
@@ -308,7 +307,8 @@ class Daemon:
 
 
 def _put_status(publisher: JointPublisher, status: JointStatus) -> Generator[None]:
-    yield from status.refresh_timing()
+    status.refresh_timing()
+    yield
     document = status.document()
     yield
     publisher.put_status(document)

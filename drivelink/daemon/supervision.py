@@ -267,7 +267,7 @@ class Supervisor:
 
     def _check_model(self, loop_joint: LoopJoint) -> None:
         """Say when the model alarm comes and goes, by how much, and what to do."""
-        estimate, watch = loop_joint.pipeline.estimate, loop_joint.pipeline.watch
+        estimate, monitor = loop_joint.pipeline.estimate, loop_joint.pipeline.model_monitor
         if estimate is None:
             return
         alarm = bool(estimate.status & _MODEL_ALARM)
@@ -276,13 +276,13 @@ class Supervisor:
         if alarm:
             self._alarmed.add(loop_joint.name)
             self._events.say(
-                f"{loop_joint.name}: model alarm{residual_text(watch)}: do not control on its numbers; "
+                f"{loop_joint.name}: model alarm{residual_text(monitor)}: do not control on its numbers; "
                 "record a minute of motion, then drivelink diagnose names the effect",
                 logging.WARNING,
             )
         else:
             self._alarmed.discard(loop_joint.name)
-            self._events.say(f"{loop_joint.name}: the model alarm is over{residual_text(watch)}")
+            self._events.say(f"{loop_joint.name}: the model alarm is over{residual_text(monitor)}")
 
     def _check_contradiction(self, loop_joint: LoopJoint) -> None:
         """Say which readings contradict each other, when that begins and when it is over."""
@@ -544,9 +544,9 @@ def _maps(layout: NodeLayout) -> str:
     )
 
 
-def residual_text(watch: ResidualMonitor | None) -> str:
+def residual_text(monitor: ResidualMonitor | None) -> str:
     """What the model leaves unexplained against its baseline, in words, as far as it is known."""
-    described = watch.describe() if watch is not None else {}
+    described = monitor.describe() if monitor is not None else {}
     residuals, baselines = described.get("residual_nm") or (), described.get("floor_nm") or ()
     ratios = [r / b for r, b in zip(residuals, baselines, strict=False) if b > 0.0 and math.isfinite(r)]
     where = f", likely at the {described['location']}" if described.get("location") else ""

@@ -7,6 +7,7 @@
 pub mod assembler;
 pub mod cross_check;
 pub mod frames;
+pub mod latency;
 pub mod layout;
 pub mod node;
 pub mod pipeline;

@@ -35,7 +35,7 @@ pub trait Step: Send {
     /// As for `step`.
     fn distrust(&mut self) -> Result<(), Failure>;
 
-    /// Whether the watch over the model's residual raises the alarm, after this step.
+    /// Whether the monitor of the model raises the alarm, after this step.
     ///
     /// # Errors
     /// As for `step`.

@@ -16,6 +16,7 @@ use pyo3::types::{PyBytes, PyDict, PyTuple};
 
 use crate::assembler::{self, SYNC_COB_ID};
 use crate::cross_check::{CrossCheck, Verdict};
+use crate::latency::{self, Percentiles};
 use crate::layout::{MappedObject, Node, Signal, Tpdo};
 use crate::node::Counters;
 use crate::pipeline::{self, Due, Failure, Pipeline, Step};
@@ -467,6 +468,57 @@ impl Assembler {
     }
 }
 
+// --- durations ------------------------------------------------------------------------------------------------------
+
+/// A distribution of durations.
+#[pyclass(frozen, module = "drivelink._core")]
+struct LatencyHistogram {
+    core: Mutex<latency::LatencyHistogram>,
+}
+
+fn percentiles<'py>(py: Python<'py>, found: Option<Percentiles>) -> PyResult<Bound<'py, PyDict>> {
+    let shown = PyDict::new(py);
+    if let Some(found) = found {
+        for (name, us) in ["p50_us", "p90_us", "p99_us", "p999_us"].into_iter().zip(found.at) {
+            shown.set_item(name, us)?;
+        }
+        shown.set_item("max_us", found.maximum)?;
+    }
+    Ok(shown)
+}
+
+#[pymethods]
+impl LatencyHistogram {
+    #[new]
+    fn new() -> LatencyHistogram {
+        LatencyHistogram { core: Mutex::default() }
+    }
+
+    #[getter]
+    fn count(&self) -> u64 {
+        lock(&self.core).count
+    }
+
+    #[getter]
+    fn maximum_us(&self) -> u64 {
+        lock(&self.core).maximum_us
+    }
+
+    fn add(&self, duration_ns: i64) {
+        lock(&self.core).add(duration_ns);
+    }
+
+    fn total<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let found = lock(&self.core).total();
+        percentiles(py, found)
+    }
+
+    fn recent<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let found = lock(&self.core).recent();
+        percentiles(py, found)
+    }
+}
+
 // --- pipeline -------------------------------------------------------------------------------------------------------
 
 /// What is published of one cycle.
@@ -593,8 +645,8 @@ impl History {
 struct Driver {
     estimator: Py<PyAny>,
     compiled: Option<Py<Estimator>>,
-    watch: Option<Py<PyAny>>,
-    monitor: Option<Py<ModelMonitor>>,
+    model_monitor: Option<Py<PyAny>>,
+    compiled_monitor: Option<Py<ModelMonitor>>,
     motors: usize,
 }
 
@@ -604,10 +656,10 @@ fn core_of<T: PyClass>(py: Python<'_>, object: &Py<PyAny>) -> Option<Py<T>> {
 }
 
 impl Driver {
-    fn new(py: Python<'_>, estimator: Py<PyAny>, watch: Option<Py<PyAny>>) -> Driver {
+    fn new(py: Python<'_>, estimator: Py<PyAny>, model_monitor: Option<Py<PyAny>>) -> Driver {
         let compiled = core_of(py, &estimator);
-        let monitor = watch.as_ref().and_then(|watch| core_of(py, watch));
-        Driver { estimator, compiled, watch, monitor, motors: 0 }
+        let compiled_monitor = model_monitor.as_ref().and_then(|monitor| core_of(py, monitor));
+        Driver { estimator, compiled, model_monitor, compiled_monitor, motors: 0 }
     }
 }
 
@@ -632,15 +684,15 @@ impl Step for Driver {
     }
 
     fn alarm(&mut self, sample: &Sample, estimate: &Estimate) -> Result<bool, Failure> {
-        let Some(watch) = &self.watch else { return Ok(false) };
+        let Some(model_monitor) = &self.model_monitor else { return Ok(false) };
         Python::attach(|py| {
-            if let Some(monitor) = &self.monitor {
+            if let Some(monitor) = &self.compiled_monitor {
                 return Ok(monitor.try_borrow_mut(py).map_err(PyErr::from)?.inner.step(sample));
             }
             let residual = self.estimator.getattr(py, "residual_nm")?;
             let sample = sample_object(py, sample, self.motors)?;
             let estimate = estimate_object(py, estimate)?;
-            watch.bind(py).call_method1("step", (sample, estimate, residual))?.extract()
+            model_monitor.bind(py).call_method1("step", (sample, estimate, residual))?.extract()
         })
         .map_err(Failure::from)
     }
@@ -665,7 +717,7 @@ struct JointPipeline {
     history: Py<History>,
     state: Mutex<Pipeline>,
     driver: Mutex<Driver>, // held while Python runs: by the cycle's thread only
-    objects: Mutex<(Py<PyAny>, Option<Py<PyAny>>)>, // estimator and watch, for whoever asks
+    objects: Mutex<(Py<PyAny>, Option<Py<PyAny>>)>, // estimator and model monitor, for whoever asks
 }
 
 impl JointPipeline {
@@ -692,20 +744,20 @@ impl JointPipeline {
 #[pymethods]
 impl JointPipeline {
     #[new]
-    #[pyo3(signature = (assembler, estimator, watch = None, *, keep = 0))]
+    #[pyo3(signature = (assembler, estimator, model_monitor = None, *, keep = 0))]
     fn new(
         py: Python<'_>,
         assembler: Py<Assembler>,
         estimator: Py<PyAny>,
-        watch: Option<Py<PyAny>>,
+        model_monitor: Option<Py<PyAny>>,
         keep: usize,
     ) -> PyResult<JointPipeline> {
-        let objects = (estimator.clone_ref(py), watch.as_ref().map(|watch| watch.clone_ref(py)));
+        let objects = (estimator.clone_ref(py), model_monitor.as_ref().map(|monitor| monitor.clone_ref(py)));
         Ok(JointPipeline {
             assembler,
             history: Py::new(py, History { keep, kept: Mutex::new(VecDeque::with_capacity(keep)) })?,
             state: Mutex::default(),
-            driver: Mutex::new(Driver::new(py, estimator, watch)),
+            driver: Mutex::new(Driver::new(py, estimator, model_monitor)),
             objects: Mutex::new(objects),
         })
     }
@@ -726,13 +778,18 @@ impl JointPipeline {
     }
 
     #[getter]
-    fn watch(&self, py: Python<'_>) -> Option<Py<PyAny>> {
-        lock(&self.objects).1.as_ref().map(|watch| watch.clone_ref(py))
+    fn model_monitor(&self, py: Python<'_>) -> Option<Py<PyAny>> {
+        lock(&self.objects).1.as_ref().map(|monitor| monitor.clone_ref(py))
     }
 
     #[getter]
     fn missed(&self) -> u64 {
         lock(&self.state).missed
+    }
+
+    #[getter]
+    fn complete(&self) -> bool {
+        lock(&self.assembler.get().core).complete()
     }
 
     #[getter]
@@ -783,12 +840,12 @@ impl JointPipeline {
         lock(&self.state).carry_on(sequence, flags, stamp_ns).map(|core| Tick { core })
     }
 
-    #[pyo3(signature = (estimator, watch, unseen = None))]
+    #[pyo3(signature = (estimator, model_monitor, unseen = None))]
     fn exchange(
         &self,
         py: Python<'_>,
         estimator: Py<PyAny>,
-        watch: Option<Py<PyAny>>,
+        model_monitor: Option<Py<PyAny>>,
         unseen: Option<&Bound<'_, PyAny>>,
     ) -> PyResult<()> {
         if let Some(unseen) = unseen {
@@ -796,8 +853,8 @@ impl JointPipeline {
                 estimator.bind(py).call_method1("step", (sample?,))?;
             }
         }
-        let objects = (estimator.clone_ref(py), watch.as_ref().map(|watch| watch.clone_ref(py)));
-        let next = Driver::new(py, estimator, watch);
+        let objects = (estimator.clone_ref(py), model_monitor.as_ref().map(|monitor| monitor.clone_ref(py)));
+        let next = Driver::new(py, estimator, model_monitor);
         let Ok(mut driver) = self.driver.try_lock() else {
             return Err(PyRuntimeError::new_err("two threads feed one joint"));
         };
@@ -817,8 +874,8 @@ mod extension {
 
     #[pymodule_export]
     use super::{
-        Assembler, Estimator, History, JointPipeline, ModelMonitor, NodeCounters, Tick, encode_estimate,
-        encode_external, encode_sample,
+        Assembler, Estimator, History, JointPipeline, LatencyHistogram, ModelMonitor, NodeCounters, Tick,
+        encode_estimate, encode_external, encode_sample,
     };
 
     #[pymodule_init]

@@ -10,16 +10,19 @@
 //! nothing on the motor side reveals it. Black-box estimation is the derivative of the same equation, with
 //! a local σ instead of f.
 
-use crate::change_detection::{LEAST_IN_WINDOW, UPDATES, WINDOW_TAILS};
-use crate::isolation::{CHANGES, Change, Explanation, Isolation, Layout, READINGS, Verdict};
-use crate::kalman::{Kalman, Matrix, NUISANCES, SIZE, Vector};
-use crate::laws::{Alpha, Law, PARAMETERS};
+mod reference;
+mod target_law;
+mod units;
+
+use crate::isolation::Isolation;
+use crate::kalman::{Kalman, NUISANCES, SIZE, Vector};
+use crate::laws::{Law, PARAMETERS};
 use crate::linear_algebra::{dot, times};
-use crate::linearisation::{Linearisation, bound};
+use crate::linearisation::Linearisation;
 use crate::model::{Motor, Transmission};
-use crate::model_switch::polynomial_to_law;
 use crate::settings::{Method, Priors, Settings};
 use crate::signals::Signals;
+use units::{NO_UNITS, Units};
 
 const MEMORY_S: f64 = 20.0; // of the regression; a sudden change is for the alarm to find
 const LOCAL_MEMORY_S: f64 = 2.0; // of the black box, whose model holds only locally
@@ -40,22 +43,12 @@ const SHARE: f64 = 2.0; // prior std of a higher power: its share of the torque 
 const CUT_OFF: f64 = 0.003; // … of the first power that a declared order leaves out
 const KNOWN: f64 = 0.3; // relative prior std of parameters that the model gives
 const KNOWN_SHARE: f64 = 0.02; // … and, of a power, of the torque at the largest deflection
-const REOPENED: f64 = 0.1; // std of a deflection's offset after an encoder has moved its zero
 const RELAX: f64 = 2.5; // a nuisance this many prior std off: the prior was too narrow
 const RMS: f64 = 0.5; // of a torque over its largest value, in usual motion
-const GROWN: f64 = 1.5; // peaks over units, from which on the units are outgrown
-const TINY: f64 = 1e-12;
 const LEAST_VARIANCE: f64 = 0.02; // however the noise is coloured, it leaves so much of what white would
 // Errors that are in no covariance: noise in h, its linearisation, what aligns the channels. Measured as the
 // error over its standard deviation without this, on 86 simulated joints that took no part in anything else.
 const UNSEEN: f64 = 1.3;
-const FAR: f64 = 1e3; // times what an equation is measured in: it says nothing of what has changed
-const REFERENCE_S: f64 = 5.0; // of updates, from one reference to the next
-const SETTLED_S: f64 = 2.0; // of updates, until there is a first one
-// Prior standard deviations of the amplitudes of changes, in the units of their columns: stiffness, friction
-// and offsets relative, delays in periods, scales relative, a drift relative a second.
-const CHANGE_STD: [f64; CHANGES] = [0.0, 0.5, 0.1, 0.3, 0.3, 3.0, 0.3, 0.3, 0.3, 3.0, 3.0, 0.3, 0.3];
-const HANDED_OVER: f64 = 3.0; // by which the covariance of parameters from a polynomial grows
 
 // Places of the nuisances behind α.
 const INERTIA: usize = 0;
@@ -64,18 +57,6 @@ const COULOMB: usize = 2;
 const OFFSET: usize = 3;
 const DELAY: usize = 4;
 const DEFLECTION_OFFSET: usize = 5;
-
-/// What the equation is measured in: its largest values so far.
-#[derive(Clone, Copy, Debug)]
-struct Units {
-    peaks: [f64; 3], // torque, deflection, velocity
-    torque: f64,
-    deflection: f64,
-    rate: f64,
-    of: Vector, // of the parameters
-}
-
-const NO_UNITS: Units = Units { peaks: [0.0; 3], torque: 0.0, deflection: 0.0, rate: 0.0, of: [1.0; SIZE] };
 
 /// See the module.
 #[derive(Clone, Debug)]
@@ -313,93 +294,6 @@ impl OnlineIdentification {
         (row, y)
     }
 
-    // -- its units ---------------------------------------------------------------------------------
-
-    /// Follow the largest torque, deflection and velocity; change units when they have outgrown them.
-    pub fn observe_scale(&mut self, signals: &Signals, link: &[f64; 4]) {
-        let k = usize::from(self.black_box);
-        let motor = &signals.position.main;
-        let inertial = self.inertia * motor[k + 2].abs();
-        let torque = self.balance(signals, k).abs().max(inertial).max(signals.torque.main[k].abs());
-        let now = [torque, (link[k] - motor[k]).abs(), motor[k + 1].abs()];
-        for (peak, now) in self.units.peaks.iter_mut().zip(now) {
-            *peak = peak.max(now);
-        }
-        let units = [self.units.torque, self.units.deflection, self.units.rate];
-        if self.kalman.is_some()
-            && self.units.peaks.iter().zip(units).any(|(peak, unit)| *peak > GROWN * unit)
-        {
-            self.change_units();
-        }
-    }
-
-    /// Noise of φ, rad: no prior of an offset is narrower.
-    pub fn observe_noise(&mut self, resolution: f64) {
-        self.resolution = resolution;
-    }
-
-    fn set_units(&mut self) {
-        let [torque, deflection, rate] = self.units.peaks.map(|peak| peak.max(TINY));
-        (self.units.torque, self.units.deflection, self.units.rate) = (torque, deflection, rate);
-        self.make_units();
-    }
-
-    fn make_units(&mut self) {
-        let Units { torque, deflection, rate, .. } = self.units;
-        let n = self.law.size;
-        self.units.of = [1.0; SIZE];
-        if self.law.is_polynomial() {
-            for h in 0..n {
-                self.units.of[h] = torque / deflection.powi(2 * h as i32 + 1);
-            }
-        } else if self.law.alpha0[0] == 0.0 {
-            self.units.of[0] = torque / self.law.law.at(deflection, &[1.0]).0.abs().max(1e-300);
-        } else {
-            for i in 0..n {
-                self.units.of[i] = self.law.alpha0[i].abs();
-            }
-        }
-        let nuisances = [self.inertia, torque / rate, torque, torque, self.period, deflection];
-        self.units.of[n..n + NUISANCES].copy_from_slice(&nuisances);
-    }
-
-    fn change_units(&mut self) {
-        let (old, old_std) = (self.units, self.nuisance_std());
-        self.set_units();
-        let n = self.law.size;
-        let mut ratio = [1.0; SIZE];
-        for i in 0..n + NUISANCES {
-            ratio[i] = old.of[i] / self.units.of[i];
-        }
-        let new_std = self.nuisance_std();
-        let noise = old.torque / self.units.torque;
-        for kalman in [&mut self.kalman, &mut self.reference, &mut self.candidate].into_iter().flatten() {
-            kalman.rescale(&ratio, noise);
-            for i in 0..NUISANCES {
-                kalman.inflate(n + i, (new_std[i].powi(2) - (old_std[i] * ratio[n + i]).powi(2)).max(0.0));
-            }
-            // The cut-off's prior, a share of the torque at the deflection reached then, is one of now.
-            let (power, most) = (n - 1, CUT_OFF * CUT_OFF);
-            let variance = kalman.p[power][power];
-            if self.cut_off && variance > most {
-                kalman.ceiling[power] = most;
-                kalman.draw(power, most / variance);
-            }
-        }
-        let columns = ratio.map(|ratio| noise / ratio);
-        self.window.rescale(&columns, noise, n + DEFLECTION_OFFSET);
-        self.law.remember_tangent(self.units.deflection);
-    }
-
-    /// α and the nuisances in SI, the shape where it can be.
-    fn unscale(&mut self) {
-        let Some(kalman) = &self.kalman else { return };
-        for i in 0..kalman.size() {
-            self.values[i] = kalman.x[i] * self.units.of[i];
-        }
-        bound(&self.law.law, &mut self.values);
-    }
-
     // -- before any equation -----------------------------------------------------------------------
 
     fn nuisance_std(&self) -> [f64; NUISANCES] {
@@ -520,264 +414,12 @@ impl OnlineIdentification {
         kalman.inflate_along(&scale);
     }
 
-    // -- the reference -----------------------------------------------------------------------------
-
-    /// There is nothing to hold the balance against.
-    pub fn forget_reference(&mut self) {
-        (self.reference, self.candidate) = (None, None);
-        self.refresh_at = self.updates.saturating_add(self.updates_in(SETTLED_S));
-        self.window.clear();
-    }
-
-    /// Hold what has been learned, while all is well: the reference is as old as one to two of its turns.
-    pub fn keep_reference(&mut self) {
-        if self.black_box || self.updates < self.refresh_at {
-            return;
-        }
-        self.refresh_at = self.updates + self.updates_in(REFERENCE_S);
-        let Some(kalman) = &self.kalman else { return };
-        if let (Some(old), Some(new)) = (&self.reference, &self.candidate) {
-            let mut change = [0.0; SIZE];
-            (0..SIZE).for_each(|i| change[i] = new.x[i] - old.x[i]);
-            self.window.rebase(&change);
-        }
-        self.reference = self.candidate.take().or_else(|| Some(kalman.clone()));
-        self.candidate = Some(kalman.clone());
-    }
-
-    /// s² of an equation that the reference foresees.
-    fn reference_noise(reference: &Kalman) -> f64 {
-        reference.noise * reference.tailed() + LEAST_IN_WINDOW * LEAST_IN_WINDOW
-    }
-
-    /// Take an equation into the window; what the reference leaves, and what is left of that where `suspect`
-    /// explains it, squared and over what is foreseen.
-    pub fn observe(
-        &mut self,
-        signals: &Signals,
-        link: &[f64; 4],
-        h: &Vector,
-        y: f64,
-        window: f64,
-        suspect: Option<(Change, Explanation)>,
-    ) -> Option<[f64; 2]> {
-        let reference = self.reference.as_ref()?;
-        // What a change does follows from the curve that is held against the window, not from the one that
-        // is being looked for in the meantime.
-        let mut known = [0.0; SIZE];
-        (0..reference.size()).for_each(|i| known[i] = reference.x[i] * self.units.of[i]);
-        bound(&self.law.law, &mut known);
-        let (n, mut row) = (self.law.size, *h);
-        let stiffness = self.law.filtered_stiffness(&signals.basis, 0, &known);
-        let late = self.law.law.at(link[0] - signals.position.main[0], &known[..n]).1 * link[1];
-        row[n + DELAY] = late * self.units.of[n + DELAY] / self.units.torque;
-        row[n + DEFLECTION_OFFSET] = stiffness * self.units.of[n + DEFLECTION_OFFSET] / self.units.torque;
-        let h = &row;
-        let readings = self.readings(signals, link, stiffness);
-        let left = reference.innovation(h, y);
-        // No motion of this joint, and no number that others may be added to.
-        if !h.iter().chain(&readings).chain([&left]).all(|value| value.abs() < FAR) {
-            return None;
-        }
-        let zero = n + DEFLECTION_OFFSET;
-        self.window.take(h, &readings, left, window, zero, self.dt);
-        let foreseen = Self::reference_noise(reference)
-            + reference.variance_over_scale() * dot(h, &times(&reference.sigma, h)).max(0.0);
-        let explained = suspect.map_or(0.0, |(change, explanation)| {
-            Isolation::effect(change, &explanation, h, &readings, reference, &self.layout())
-        });
-        Some([left * left / foreseen, (left - explained).powi(2) / foreseen])
-    }
-
-    /// What the balance of this moment gains with each reading that is not what it was, to first order.
-    fn readings(&self, signals: &Signals, link: &[f64; 4], stiffness: f64) -> [f64; READINGS] {
-        let (theta, torque) = (&signals.position.main, &signals.torque.main);
-        let (b, d, t) = (self.inertia, self.damping, self.period);
-        let si = [
-            b * theta[2] + d * theta[1] + stiffness * theta[0], // θ (1 + c)
-            -stiffness * link[0],                               // q (1 + c)
-            -torque[0],                                         // τ (1 + c)
-            -t * (b * theta[3] + d * theta[2] + stiffness * theta[1]), // θ late by c T
-            t * torque[1],                                      // τ late by c T
-            0.0,                                                // q − c t: nowhere else now
-            d * self.units.deflection,                          // θ + c t
-        ];
-        si.map(|value| value / self.units.torque)
-    }
-
-    fn layout(&self) -> Layout {
-        Layout {
-            law: self.law.size,
-            linear: self.law.linear(),
-            places: [COULOMB, OFFSET, DEFLECTION_OFFSET, DELAY],
-            std: CHANGE_STD,
-        }
-    }
-
-    /// What the window says of every change; `None` without a reference.
-    #[must_use]
-    pub fn judge(&self) -> Option<Verdict> {
-        let reference = self.reference.as_ref()?;
-        let (noise, correlated) =
-            (Self::reference_noise(reference), reference.correlation().max(UPDATES as f64));
-        Some(self.window.judge(reference, &self.layout(), noise, correlated, WINDOW_TAILS))
-    }
-
-    /// What was learned since the reference is void.
-    pub fn restore_reference(&mut self) {
-        self.window.clear();
-        let Some(reference) = &self.reference else { return };
-        self.kalman = Some(reference.clone());
-        self.candidate = Some(reference.clone());
-        self.refresh_at = self.updates.saturating_add(self.updates_in(REFERENCE_S));
-    }
-
-    /// SI units (s for delays) in which a change's amplitude is counted.
-    #[must_use]
-    pub fn unit_of(&self, change: Change) -> f64 {
-        match change {
-            Change::TorqueZero | Change::Friction => self.units.torque,
-            Change::PositionZero | Change::LinkDrift | Change::MotorDrift => self.units.deflection,
-            Change::LinkDelay | Change::MotorDelay | Change::TorqueDelay => self.period,
-            _ => 1.0,
-        }
-    }
-
-    /// What has been found changed is changed; the reference is another one from now on.
-    pub fn accept(&mut self, change: Change, verdict: &Verdict) {
-        let place = match change {
-            Change::Friction => COULOMB,
-            Change::TorqueZero => OFFSET,
-            Change::PositionZero => DEFLECTION_OFFSET,
-            Change::LinkDelay => DELAY,
-            _ => return self.renew_reference(), // the stiffness has been followed
-        };
-        self.restore_reference();
-        let (explanation, index) = (verdict.of(change), self.law.size + place);
-        if let Some(kalman) = &mut self.kalman {
-            kalman.x[index] += explanation.amplitude;
-            kalman.inflate(index, 4.0 * explanation.std * explanation.std);
-        }
-        self.renew_reference();
-    }
-
-    fn renew_reference(&mut self) {
-        (self.reference, self.candidate) = (self.kalman.clone(), self.kalman.clone());
-        self.refresh_at = self.updates.saturating_add(self.updates_in(REFERENCE_S));
-        self.window.clear();
-    }
-
-    /// The window begins anew.
-    pub fn look_again(&mut self) {
-        self.window.clear();
-    }
-
-    /// An encoder has moved its zero: the deflection's offset is not what it was to the last digit (`known`),
-    /// or anywhere within the largest deflection.
-    pub fn reopen_deflection_offset(&mut self, known: bool) {
-        let place = self.law.size + DEFLECTION_OFFSET;
-        let std = if known { REOPENED } else { 1.0 };
-        for kalman in [&mut self.kalman, &mut self.reference, &mut self.candidate].into_iter().flatten() {
-            kalman.inflate(place, std * std);
-        }
-        self.window.clear();
-    }
-
     /// Whether the parameters are numbers, and those of a spring that reaches as far as this one does.
     pub fn is_possible(&mut self) -> bool {
         self.unscale();
         let alpha = &self.values[..self.law.size];
         self.law.is_polynomial()
             || alpha[0] > 0.0 && self.law.law.reach(&alpha[1..]) >= 0.5 * self.units.deflection
-    }
-
-    // -- a nonlinear law ---------------------------------------------------------------------------
-
-    /// Go over from the polynomial to the law, or linearise that anew; whether the basis is another one now.
-    pub fn switch_model(&mut self) -> bool {
-        if self.law.is_polynomial() {
-            return self.adopt_target();
-        }
-        self.unscale();
-        let Some(kalman) = &self.kalman else { return false };
-        if !self.law.leaves_tangent(&self.values, &self.units.of, &kalman.sigma, kalman.caution) {
-            return false;
-        }
-        let change = self.law.relinearise(&self.values, &self.units.of, self.units.deflection);
-        let (old, mut mean) = (kalman.x, kalman.x);
-        for i in 0..self.law.size {
-            mean[i] = self.law.alpha0[i] / self.units.of[i];
-        }
-        let all = self.law.size + NUISANCES;
-        for kalman in [&mut self.kalman, &mut self.reference, &mut self.candidate].into_iter().flatten() {
-            let (mut own, mut off) = (mean, [0.0; SIZE]);
-            (0..all).for_each(|i| off[i] = kalman.x[i] - old[i]);
-            let off = times(&change, &off);
-            (0..all).for_each(|i| own[i] += off[i]);
-            *kalman = kalman.transformed(&own[..all], &kalman.ceiling[..all], &change);
-        }
-        true
-    }
-
-    /// From the polynomial to the nonlinear law that it approximates; false where it is too early.
-    fn adopt_target(&mut self) -> bool {
-        let (Some(kalman), Some(target)) = (&self.kalman, &self.target) else { return false };
-        let n_old = self.law.size;
-        let mut std = [0.0; PARAMETERS];
-        for i in 0..n_old {
-            std[i] = (kalman.caution * kalman.sigma[i][i].max(0.0)).sqrt() * self.units.of[i];
-        }
-        let coefficients = &self.values[..n_old];
-        let Some((alpha, slopes)) =
-            polynomial_to_law(target, coefficients, &std[..n_old], self.units.deflection)
-        else {
-            return false;
-        };
-        let (old_units, kalman) = (self.units.of, kalman.clone());
-        let target = target.clone();
-        self.forget_reference();
-        let size = 1 + target.shapes().len();
-        self.law = Linearisation::new(target, size, alpha);
-        self.make_units();
-        let (mean, ceiling, change) = self.adopted(&kalman, &alpha, &slopes, &old_units, n_old);
-        let n = self.law.size;
-        let mut adopted = kalman.transformed(&mean[..n + NUISANCES], &ceiling[..n + NUISANCES], &change);
-        for i in 0..n {
-            for j in 0..n {
-                let wider = HANDED_OVER * adopted.sigma[i][j];
-                adopted.p[i][j] += wider;
-                adopted.sigma[i][j] += wider;
-            }
-            adopted.ceiling[i] = adopted.ceiling[i].max(adopted.p[i][i]);
-        }
-        self.kalman = Some(adopted);
-        self.law.remember_tangent(self.units.deflection);
-        true
-    }
-
-    /// The law's parameters, their largest variances, and their slopes by the polynomial's, all scaled.
-    fn adopted(
-        &self,
-        kalman: &Kalman,
-        alpha: &Alpha,
-        slopes: &[Alpha; PARAMETERS],
-        old_units: &Vector,
-        n_old: usize,
-    ) -> (Vector, Vector, Matrix) {
-        let (mut mean, mut ceiling, mut change) = ([0.0; SIZE], [1.0; SIZE], [[0.0; SIZE]; SIZE]);
-        let n = self.law.size;
-        for i in 0..n {
-            mean[i] = alpha[i] / self.units.of[i];
-            for j in 0..n_old {
-                change[i][j] = slopes[i][j] * old_units[j] / self.units.of[i];
-            }
-        }
-        for i in 0..NUISANCES {
-            mean[n + i] = kalman.x[n_old + i];
-            ceiling[n + i] = kalman.ceiling[n_old + i];
-            change[n + i][n_old + i] = 1.0;
-        }
-        (mean, ceiling, change)
     }
 
     // -- the link encoder's delay ------------------------------------------------------------------

@@ -1,0 +1,96 @@
+//! What the declared link leaves of its own balance, identified.
+
+use super::{MEMORY_S, TINY};
+use crate::model::Link;
+
+const FRICTION_SPEEDS: f64 = 0.02; // of the largest velocity: over which dry friction changes its sign
+const ONE_WAY: f64 = 0.9; // mean direction beyond which less than a twentieth of the motion goes the other way
+const PARAMETERS: usize = 6;
+const CONSTANT: usize = 0;
+const DAMPING: usize = 2;
+pub(super) const DRY: usize = 3;
+
+/// How far the declared link is off: identified from the link's own balance, where that is as expected.
+///
+/// Parameters: a constant torque, inertia, viscous damping, dry friction, gravity's sine and cosine. The
+/// declared uncertainties are the priors. Recursive least squares with exponential forgetting in information
+/// form: Λ = Λ₀ + Σ e^(−t/20 s) x xᵀ/r.
+///
+/// The constant may be a push: it is identified with a flat prior so that the others have to explain what varies
+/// with the motion, and it is not taken off: a load on a link at rest is no gravity. Of a link that turns one way
+/// only, a load and friction are the same even so, since the load changes the speed: no friction is identified
+/// there. A skew between the encoders makes σ d q′, which looks like damping; from the motor's side it looks like
+/// the motor's friction.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct LinkErrors {
+    information: [[f64; PARAMETERS]; PARAMETERS], // of the data alone; the lower triangle
+    vector: [f64; PARAMETERS],
+    fastest: f64,
+    direction: Option<f64>, // its mean over the memory: ±1 one way only, 0 to and fro
+}
+
+pub(super) type Row = [f64; PARAMETERS];
+
+impl LinkErrors {
+    /// What the parameters multiply.
+    pub(super) fn row(&mut self, link: &Link, [q, velocity, acceleration]: [f64; 3]) -> Row {
+        self.fastest = self.fastest.max(velocity.abs());
+        let dry = (velocity / (FRICTION_SPEEDS * self.fastest).max(TINY)).tanh();
+        let (sine, cosine) = (q + link.gravity_phase).sin_cos();
+        [1.0, acceleration, velocity, dry, sine, cosine]
+    }
+
+    /// One period of motion in this direction (−1 to 1) passes.
+    pub(super) fn forget(&mut self, direction: f64, period_s: f64) {
+        let kept = 1.0 - period_s / MEMORY_S;
+        let mean = self.direction.unwrap_or(direction.signum());
+        self.direction = Some(direction + kept * (mean - direction));
+        self.information.iter_mut().flatten().chain(&mut self.vector).for_each(|x| *x *= kept);
+    }
+
+    /// The torque that these errors make, and its variance.
+    pub(super) fn at(&self, row: &Row, prior: &Row) -> (f64, f64) {
+        let mut factor = self.information;
+        let least = prior.map(|variance| if variance > 0.0 { 1.0 / variance } else { 1.0 });
+        for i in 0..PARAMETERS {
+            factor[i][i] += least[i];
+        }
+        // Cholesky, and L⁻¹ of both sides on the way. No pivot is less than what was known before any data.
+        let mut own = *row;
+        own[CONSTANT] = 0.0;
+        let mut vector = self.vector;
+        let (mut torque, mut variance) = (0.0, 0.0);
+        for i in 0..PARAMETERS {
+            for j in 0..=i {
+                let sum: f64 = (0..j).map(|k| factor[i][k] * factor[j][k]).sum();
+                let left = factor[i][j] - sum;
+                factor[i][j] =
+                    if i == j { left.max(least[i]).max(TINY * TINY).sqrt() } else { left / factor[j][j] };
+            }
+            for k in 0..i {
+                own[i] -= factor[i][k] * own[k];
+                vector[i] -= factor[i][k] * vector[k];
+            }
+            own[i] /= factor[i][i];
+            vector[i] /= factor[i][i];
+            torque += own[i] * vector[i];
+            variance += own[i] * own[i];
+        }
+        (torque, variance)
+    }
+
+    /// What the declared link leaves of one balance; `noise`: its variance, as if errors were independent.
+    pub(super) fn identify(&mut self, row: &Row, left: f64, noise: f64) {
+        let weight = 1.0 / noise.max(TINY * TINY);
+        let mut row = *row;
+        if self.direction.is_none_or(|mean| mean.abs() > ONE_WAY) {
+            (row[DAMPING], row[DRY]) = (0.0, 0.0);
+        }
+        for i in 0..PARAMETERS {
+            self.vector[i] += weight * row[i] * left;
+            for j in 0..=i {
+                self.information[i][j] += weight * row[i] * row[j];
+            }
+        }
+    }
+}

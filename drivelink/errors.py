@@ -8,7 +8,7 @@ class DrivelinkError(Exception):
 
 
 class UsageError(DrivelinkError):
-    """The command line asks for something that cannot be."""
+    """The command line is wrong."""
 
     exit_status = 2
 
@@ -26,13 +26,13 @@ class RecordingError(DrivelinkError):
 
 
 class BusError(DrivelinkError):
-    """The CAN interface is missing, down, or too slow for what is asked."""
+    """The CAN interface is missing, down, or too slow."""
 
     exit_status = 4
 
 
 class DriveError(DrivelinkError):
-    """A drive is absent, refuses its configuration, or cannot give a signal."""
+    """A drive is absent, refuses its configuration, or lacks a signal."""
 
     exit_status = 5
 

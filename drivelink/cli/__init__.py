@@ -1,8 +1,8 @@
-"""The command line: `drivelink VERB …`, one module of this package a verb.
+"""The command line: `drivelink VERB …`, one module per verb.
 
 A verb's module has `configure(parser)`, which adds its arguments, and `run(args)`, which does the job and
-returns the exit status. Only the module of the verb that is asked for is imported. What a user can cause
-ends here as one line on stderr and the exit status of its error.
+returns the exit status. Only the requested verb's module is imported. Every error that a user can cause ends
+here as one line on stderr and its exit status.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ first steps:
 
 
 class Verb(Protocol):
-    """What a verb's module offers."""
+    """Interface of a verb's module."""
 
     @staticmethod
     def configure(parser: argparse.ArgumentParser) -> None:
@@ -106,9 +106,9 @@ def main(argv: list[str] | None = None) -> int:
     """Run one command and return its exit status."""
     argv = sys.argv[1:] if argv is None else argv
     verb = argv[0] if argv and argv[0] in VERBS else ""
-    # Some interfaces report every partial read, or log what they raise with a traceback: we say it in a line.
+    # Some interfaces log every partial read, or a traceback for what they also raise.
     logging.getLogger("can").setLevel(logging.CRITICAL)
-    # Before numpy is imported: on matrices as small as ours threads only wait for each other.
+    # Before numpy is imported: threads do not help on small matrices.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         if not argv:
@@ -175,7 +175,7 @@ def add_recordings(parser: argparse.ArgumentParser) -> None:
 
 
 def require_distinct(paths: Sequence[Path]) -> None:
-    """Raise unless every recording is another one: none may validate a fit that it took part in.
+    """Require distinct recordings: none may validate a fit that it took part in.
 
     Raises:
         UsageError: one is given twice.

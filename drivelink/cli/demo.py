@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 class RigProcess(NamedTuple):
-    """The other process: its messages, and how to end it early."""
+    """The other process: its messages, and its early end."""
 
     connection: Connection
     stop: Callable[[], None]
@@ -79,7 +79,7 @@ class RigProcess(NamedTuple):
 
 @contextmanager
 def _rig(path: Path, seconds: float) -> Iterator[RigProcess]:
-    """Simulation and daemon in a process of their own, which is gone afterwards."""
+    """Run simulation and daemon in another process; end it on exit."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
     process = context.Process(target=serve, args=(path, seconds, theirs), name="drivelink-demo")
@@ -118,7 +118,7 @@ class DemoRun:
         self._next_line_s = 0.0
 
     def follow(self, rig: RigProcess, subscription: Subscription) -> bool:
-        """Until the rig has ended; returns whether Ctrl-C ended it early.
+        """Follow the rig to its end; return whether Ctrl-C ended it early.
 
         Raises:
             DrivelinkError: the rig could not run.
@@ -141,7 +141,7 @@ class DemoRun:
                 if interrupted:
                     raise
                 interrupted = True
-                rig.stop()  # it ends cleanly, and reports how the run went
+                rig.stop()  # let it end cleanly and send its summary
         return interrupted
 
     def _receive(self, connection: Connection) -> None:

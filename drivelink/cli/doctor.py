@@ -42,7 +42,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "joint", nargs="?", type=Path, metavar="JOINT", help="joint file; without: the machine"
     )
-    parser.add_argument("--eds", type=Path, metavar="FILE", help="what the drive of this EDS or DCF can give")
+    parser.add_argument("--eds", type=Path, metavar="FILE", help="what the drive of this EDS or DCF can send")
     parser.add_argument(
         "--seconds",
         type=float,
@@ -50,14 +50,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help=f"for each measurement (default: {_EXAMINED_S:g}, with --move {_AT_REST_S:g})",
     )
     parser.add_argument(
-        "--move", action="store_true", help="what to do by hand, and what each sign and scale turns out to be"
+        "--move", action="store_true", help="check each sign and scale with a person who moves the joint"
     )
     add_bus(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Examine, print, and return 1 where something prevents the job."""
+    """Examine, print, and return 1 if a problem prevents operation."""
     seconds = args.seconds if args.seconds is not None else _AT_REST_S if args.move else _EXAMINED_S
     if not 0 < seconds <= 3600:
         raise UsageError(f"--seconds: expected more than 0 and at most 3600, got {seconds:g}")
@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _by_hand(joint: JointFile | None, args: argparse.Namespace, seconds: float) -> int:
-    """Lead through the checks; 1 where a sign or scale is wrong, and where nothing was checked."""
+    """Lead through the checks; return 1 if a sign or scale is wrong or nothing was checked."""
     if joint is None:
         raise UsageError("--move: expected a joint file")
     with live_values(joint, args.joint.parent) as values:

@@ -45,14 +45,14 @@ def run(args: argparse.Namespace) -> int:
     folder = _plots_folder(args)
     require_distinct(args.recording)
     if args.joint is not None:
-        jointfile.load(args.joint)  # it is named first when both are wrong
+        jointfile.load(args.joint)  # its error comes first if both are wrong
     for path in args.recording:
         if not path.exists():
             raise RecordingError(f"{path}: no such file")
     if args.write is not None:  # the joint file itself may be brought up to date
         check_target(args.write, args.recording, force=args.force)
     source = joint_of(args.recording[0], args.joint)
-    from drivelink.cli.fitting import fit_recording  # a second; what can be wrong before is said before
+    from drivelink.cli.fitting import fit_recording  # takes a second; check the arguments first
 
     fit_recording(args, source, folder)
     return 0

@@ -37,7 +37,7 @@ _SIGMA_95 = 1.96
 
 
 def fit_recording(args: argparse.Namespace, source: JointText, folder: Path | None) -> None:
-    """Fit, print, and write what was asked for.
+    """Fit, print, and write the requested files.
 
     Args:
         args: of `drivelink fit`.
@@ -45,7 +45,7 @@ def fit_recording(args: argparse.Namespace, source: JointText, folder: Path | No
         folder: where plots go; None: no plots.
 
     Raises:
-        RecordingError: a recording cannot be read, or does not reveal what is asked.
+        RecordingError: a recording cannot be read or fitted.
     """
     joint = source.joint
     names = parse_column_map(args.map)
@@ -62,7 +62,7 @@ def fit_recording(args: argparse.Namespace, source: JointText, folder: Path | No
     if args.json:
         print(json.dumps(document))
     else:
-        _print(found, args.recording)  # before any file: a full disk takes no result
+        _print(found, args.recording)  # print before writing: a full disk loses no result
     made = []
     if args.out is not None:
         made.append(args.out / "fit.json")
@@ -132,7 +132,7 @@ def _entry(one: TransmissionFit, motor: Motor) -> dict[str, Any]:
 
 
 def _link(found: Identified) -> dict[str, Any]:
-    """[link] as found: its dynamics, and the effects at it and in its encoder."""
+    """The fitted [link]: dynamics, effects of link and encoder."""
     link: dict[str, Any] = {}
     if found.model.link is not None:
         link["dynamics"] = {name: x for name, x in asdict(found.model.link).items() if x is not None}
@@ -172,7 +172,7 @@ def _print(found: Identified, paths: Sequence[Path]) -> None:
 
 
 def _left(found: Identified, paths: Sequence[Path]) -> Table:
-    """What is left of each recording, relative to its motor torque."""
+    """Residual of each recording, relative to its motor torque."""
     table = Table(title="error of the torque balance", title_justify="left")
     for column in ("recording", "fitted", "left out"):
         table.add_column(column, justify="left" if column == "recording" else "right")

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _NEEDS = ("distributed", "fsspec", "pyarrow")
 _REPORT = "report"
-_WARNINGS = 20  # lines about single recordings that are shown; all are in the table
+_WARNINGS = 20  # shown lines about single recordings; the table has all
 _SPANS = {"d": 1, "w": 7}
 
 _EPILOG = """\
@@ -122,7 +122,7 @@ def _run(args: argparse.Namespace) -> int:
         validate=args.validate,
         again=args.again,
     )
-    _ = settings.limit_bytes  # what can be wrong before is said before
+    _ = settings.limit_bytes  # check the arguments first
     joints = Joints.load(args.joints)
     sources, empty = storage.find(args.recordings)
     for pattern in empty:

@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _where(args: argparse.Namespace) -> tuple[str | None, str, Path | None, str]:
-    """Joint, endpoint, configuration and prefix: from the joint file if one is given, and the options."""
+    """Joint, endpoint, configuration and prefix, from options and joint file."""
     name, endpoint, config, prefix = args.joint, ENDPOINT, None, "drivelink"
     if name is not None and (name.endswith(".toml") or "/" in name):
         path = Path(name)
@@ -131,7 +131,7 @@ def _picture(
 
 
 def _print(watcher: Watcher, end: float, every_s: float, *, as_json: bool) -> None:
-    """A plain line, or a JSON object, for each joint, again and again."""
+    """Print a line or JSON object per joint at each interval."""
     due = time.monotonic() + every_s
     while time.monotonic() < end:
         watcher.poll()
@@ -148,7 +148,7 @@ def _print(watcher: Watcher, end: float, every_s: float, *, as_json: bool) -> No
 
 
 def _serve(watcher: Watcher, port: int, end: float) -> None:
-    """The page, until the end or Ctrl-C."""
+    """Serve the page until the end or Ctrl-C."""
     web = WebView(watcher, port)
     print(f"live view: {web.url}   (Ctrl-C ends)", flush=True)
     try:

@@ -68,7 +68,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Ask what is not given, where somebody can answer, and write the file."""
+    """Ask for missing answers in a terminal, and write the file."""
     if args.inertia is not None and args.rotor_inertia is not None:
         raise UsageError("expected either --inertia or --rotor-inertia")
     text, name, remarks = _case_text(args) if args.case else _new_text(args)
@@ -91,12 +91,12 @@ def run(args: argparse.Namespace) -> int:
 def _next(args: argparse.Namespace, path: Path) -> str:
     if not args.case:
         return f"drivelink doctor {path}"
-    here = "" if args.interface else " --interface socketcand"  # the case's own bus lives inside one process
+    here = "" if args.interface else " --interface socketcand"  # a virtual bus ends at its process
     return f"drivelink sim {path}{here}, and in another terminal drivelink run {path}{here}"
 
 
 def _case_text(args: argparse.Namespace) -> tuple[str, str, list[str]]:
-    """A copy of the shipped joint, comments kept, with the flags that make sense for it."""
+    """A copy of the shipped joint file with its comments, changed by the options."""
     source = resources.files("drivelink") / "joints" / f"{args.case}.toml"
     document: Any = tomlkit.parse(source.read_text(encoding="utf-8"))
     if args.name:
@@ -221,7 +221,7 @@ _QUESTIONS: tuple[tuple[str, str, Callable[[str], Any]], ...] = (
 
 
 def _ask(answers: Answers, known: set[str]) -> None:
-    """A question for each thing that is not known; Enter keeps the default."""
+    """Ask for each missing answer; Enter keeps the default."""
     try:
         for key, question, check in _QUESTIONS:
             if key in known or (key == "rotor_inertia_gcm2" and "inertia_kg_m2" in known):
@@ -241,7 +241,7 @@ def _ask(answers: Answers, known: set[str]) -> None:
 
 
 def _asked(question: str, default: Any, check: Callable[[str], Any], *, needed: bool = False) -> Any:
-    """What is answered, asked for again until it can be; an empty line is the default, where there is one."""
+    """Ask until the reply is valid; an empty line is the default, if any."""
     while True:
         reply = input(f"{question}: " if default is None else f"{question} [{default}]: ").strip()
         if not reply and not needed:

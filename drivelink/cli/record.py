@@ -1,4 +1,4 @@
-"""`drivelink record JOINT --out FILE`: what a running daemon and the bus say, into a file."""
+"""`drivelink record JOINT --out FILE`: records a running daemon and the bus."""
 
 from __future__ import annotations
 
@@ -104,11 +104,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _add_taps(recorder: Recorder, source: str, text: JointText, stack: ExitStack) -> None:
-    """Listen to what there is: the daemon for samples and estimates, the bus for frames.
+    """Subscribe to the daemon for samples and estimates, listen to the bus for frames.
 
     Raises:
         BusError: the bus is needed and cannot be opened.
-        UsageError: raw frames of a bus that lives inside another process.
+        UsageError: the bus exists inside another process only.
     """
     sink, joint, folder = recorder.sink, text.joint, text.folder
     gate = FirstSource(sink)
@@ -169,7 +169,7 @@ def _alive(session: zenoh.Session, joint: JointFile) -> bool:
 
 
 def _session(joint: JointFile, folder: Path, needed: bool) -> zenoh.Session | None:
-    """A subscriber's session; None where it cannot be opened and is not needed.
+    """Open a subscriber's session; None if that fails and it is not required.
 
     Raises:
         ZenohError: it is needed.
@@ -184,9 +184,9 @@ def _session(joint: JointFile, folder: Path, needed: bool) -> zenoh.Session | No
 
 
 def _daemon_layouts(session: zenoh.Session, joint: JointFile) -> Sequence[NodeLayout]:
-    """How the running daemon has the nodes of the joint mapped; () if it does not say.
+    """Mapping of the joint's nodes by the running daemon; () if unknown.
 
-    Only a session whose liveliness token says that it is the daemon is believed; of several, none.
+    Only the one session with the joint's liveliness token is trusted; none of several.
     """
     key = f"{joint.zenoh.prefix}/{joint.name}"
     tokens = session.liveliness().get(f"{key}/alive/*", timeout=_ALIVE_S)
@@ -204,8 +204,8 @@ def _daemon_layouts(session: zenoh.Session, joint: JointFile) -> Sequence[NodeLa
 
 
 def _declared_layouts(joint: JointFile, folder: Path) -> Sequence[NodeLayout]:
-    """How the joint file, or a data sheet, says they are mapped; () if they do not."""
-    with suppress(DrivelinkError):  # no drives, no EDS: then it is unknown
+    """Mapping by the joint file or a data sheet; () if unknown."""
+    with suppress(DrivelinkError):  # no drives or EDS file: unknown
         listener = PassiveConfigurator([joint], [folder])
         if not listener.busy:
             return tuple(listener.layouts.values())
@@ -213,7 +213,7 @@ def _declared_layouts(joint: JointFile, folder: Path) -> Sequence[NodeLayout]:
 
 
 class _Summary:
-    """Says how the recording goes."""
+    """Prints the progress of the recording."""
 
     def __init__(self, path: Path, recorder: Recorder) -> None:
         self._path = path
@@ -222,7 +222,7 @@ class _Summary:
         self._next = self._begin + _SAY_EVERY_S
 
     def document(self) -> dict[str, Any]:
-        """What has been recorded, for machines."""
+        """Recorded counts as a JSON document."""
         return {
             "file": str(self._path),
             "seconds": round(time.monotonic() - self._begin, 3),
@@ -232,7 +232,7 @@ class _Summary:
         }
 
     def text(self) -> str:
-        """What has been recorded."""
+        """Recorded counts as text."""
         counts = [f"{n} {kind}s" for kind, n in self._recorder.sink.counts.items() if n] or ["nothing yet"]
         missed = self._missed()
         lost = f", {missed} cycles without sample" if missed else ""
@@ -249,7 +249,7 @@ class _Summary:
         return next((tap.missing for tap in taps if isinstance(tap, BusTap) and tap.missing), "")
 
     def tick(self) -> None:
-        """After each second: one line that is written over on a terminal, one now and then elsewhere."""
+        """Called each second: rewrite one line on a terminal, print an occasional line elsewhere."""
         if sys.stderr.isatty():
             print(f"\r\x1b[K{self._path}: {self.text()}, Ctrl-C ends ", end="", file=sys.stderr, flush=True)
         elif time.monotonic() >= self._next:

@@ -143,7 +143,7 @@ def _publication(
     playback: Playback,
     stack: ExitStack,
 ) -> Publication:
-    """Pacing and, where asked for, the keys on zenoh; both end with the stack."""
+    """Pacing and, on request, the keys on zenoh; both end with the stack."""
     publisher = None
     if args.publish:
         session = open_session(joint.zenoh, base_dir)
@@ -158,7 +158,7 @@ def _publication(
 
 
 def _await_subscriber(session: zenoh.Session, key: str) -> None:
-    """Give a subscriber that is just connecting the time to do so, that it may see the beginning."""
+    """Wait briefly for a subscriber that is connecting, so that it receives the beginning."""
     publisher: Any = session.declare_publisher(key)
     end = time.monotonic() + _SUBSCRIBER_S
     while not publisher.matching_status.matching and time.monotonic() < end:

@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
     loaded = [moved(load(path), args) for path in args.joints]
     if loaded[0].bus.interface == "virtual":
         logging.getLogger(__name__).warning(ALONE)
-    from drivelink.daemon.service import Daemon, ServedJoint  # a wrong joint file is said before this second
+    from drivelink.daemon.service import Daemon, ServedJoint  # takes a second: after the joint files
     from drivelink.pubsub.publisher import to_json
 
     joints = [ServedJoint(joint=joint, path=path) for joint, path in zip(loaded, args.joints, strict=True)]
@@ -120,7 +120,7 @@ def _show(daemon: Daemon, ended: threading.Event) -> None:
 
 @contextmanager
 def _stopped_by_signals() -> Iterator[list[Daemon]]:
-    """SIGINT and SIGTERM end the daemon, or the process while there is none yet; SIGHUP reloads."""
+    """SIGINT and SIGTERM end the daemon, or the process before it exists; SIGHUP reloads."""
     running: list[Daemon] = []
 
     def stop(_number: int, _frame: FrameType | None) -> None:

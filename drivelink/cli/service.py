@@ -72,7 +72,7 @@ def _install(args: argparse.Namespace, root: Path) -> int:
         if there.exists() and there.read_text(encoding="utf-8") != text and not args.force:
             raise UsageError(f"{there}: exists already and differs; --force replaces it")
     if args.root is None:
-        _systemctl("daemon-reload")  # where there is no systemd, nothing is written
+        _systemctl("daemon-reload")  # without systemd nothing is written
     for place, text in made.files.items():
         (root / place).parent.mkdir(parents=True, exist_ok=True)
         (root / place).write_text(text, encoding="utf-8")
@@ -125,7 +125,7 @@ def _uninstall(args: argparse.Namespace, root: Path) -> int:
 
 
 def _executable() -> Path:
-    """The installed program, by the path that stays."""
+    """The installed program by its permanent path."""
     beside = Path(sys.executable).with_name("drivelink")
     found = beside if beside.exists() else Path(shutil.which("drivelink") or "")
     if not found.is_file():
@@ -137,7 +137,7 @@ def _systemctl(*words: str) -> None:
     """Notify systemd.
 
     Raises:
-        DrivelinkError: there is none, or it says no.
+        DrivelinkError: systemctl is missing or fails.
     """
     try:
         done = subprocess.run(["systemctl", *words], capture_output=True, text=True, check=False)

@@ -57,7 +57,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--write-eds", type=Path, metavar="DIR", help="write the EDS file of every simulated node and go on"
     )
-    parser.add_argument("--json", action="store_true", help="say as one JSON object when it is ready")
+    parser.add_argument("--json", action="store_true", help="print one JSON object when ready")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -114,7 +114,7 @@ def _bus_section(joints: list[JointFile], args: argparse.Namespace) -> BusSectio
 
 @contextmanager
 def _until_signal(stop: threading.Event) -> Iterator[None]:
-    """SIGINT and SIGTERM set `stop`; what they did before comes back in the end."""
+    """SIGINT and SIGTERM set `stop`; restore the previous handlers afterwards."""
 
     def handle(_number: int, _frame: types.FrameType | None) -> None:
         stop.set()
@@ -129,7 +129,7 @@ def _until_signal(stop: threading.Event) -> Iterator[None]:
 
 @contextmanager
 def _prompt() -> Iterator[None]:
-    """Answer as promptly as a drive, which has a processor of its own: before the daemon, where permitted."""
+    """Run at higher priority than the daemon, if permitted: a real drive has its own processor."""
     obtained = acquire()
     if obtained.scheduling:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY + 1))
@@ -141,7 +141,7 @@ def _prompt() -> Iterator[None]:
 
 @contextmanager
 def _ending(stop: threading.Event, seconds: float | None) -> Iterator[None]:
-    """Set `stop` after so many seconds, where they are given."""
+    """Set `stop` after so many seconds, if given."""
     timer = threading.Timer(seconds or 0.0, stop.set)
     if seconds is not None:
         timer.start()

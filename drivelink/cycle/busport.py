@@ -1,4 +1,4 @@
-"""Sends on a daemon's bus: directly before the loop runs, through the loop afterwards."""
+"""Gives senders access to a daemon's bus: directly before the loop runs, through the loop afterwards."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ __all__ = ["BusPort"]
 
 
 class BusPort:
-    """The bus for senders of python-can messages: directly before the loop runs, by the loop afterwards.
+    """The bus for senders of python-can messages: directly before the loop runs, through the loop afterwards.
 
     Attributes:
-        bus: as it is open now.
-        loop: the one reader, once it runs.
+        bus: the open bus.
+        loop: the only reader, once it runs.
     """
 
     def __init__(self, bus: can.BusABC) -> None:
@@ -32,5 +32,5 @@ class BusPort:
             self.loop.send(msg.arbitration_id, bytes(msg.data))
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """The next frame; only before the loop runs, which then is the one reader."""
+        """The next frame; only before the loop runs."""
         return self.bus.recv(timeout)

@@ -1,8 +1,8 @@
-"""Mappings that another master writes: how the samples of a passive daemon are decoded, and from when on.
+"""Follows mappings that another master writes, to decode the samples of a passive daemon.
 
-The frames go past here after the assemblers have seen them, live or from a log. From the frame on that makes
-a map doubtful, the frames of that node are not used; a map that is known again holds from the next SYNC on,
-for that is the first one which the node answers with it.
+It receives the frames after the assemblers, live or from a log. From a frame that makes a mapping doubtful
+on, the node's frames are not used; a mapping that is known again applies from the next SYNC on, the first one
+that the node answers with it.
 """
 
 from __future__ import annotations
@@ -18,17 +18,16 @@ __all__ = ["MapFollower"]
 
 
 class MapFollower:
-    """Keeps the assemblers of passive joints to maps that are believed.
+    """Keeps the assemblers of passive joints to trusted mappings.
 
     Args:
-        configurator: takes the mappings from the traffic. Unknown nodes are taken to send by the
-            layouts given here.
+        configurator: takes the mappings from the traffic; starts with the layouts given here.
         assemblers: of each node's joint.
-        layouts: by which they decode now.
-        relaid: called when frames of another identifier have come into use.
+        layouts: the present layouts.
+        relaid: called when the set of identifiers in use has changed.
 
     Attributes:
-        changed: by node, the layouts that have come into use since somebody last cleared this.
+        changed: by node, layouts that have come into use since this was last cleared.
         refused: by node, why a mapping taken from the traffic cannot be used.
     """
 
@@ -59,7 +58,7 @@ class MapFollower:
         return {**self._configurator.doubts, **self.refused}
 
     def feed(self, cob_id: int, data: bytes) -> None:
-        """Take a frame, in the order of the bus."""
+        """Take a frame, in bus order."""
         if cob_id == SYNC_COB_ID:
             self.sync()
             return
@@ -68,7 +67,7 @@ class MapFollower:
         self._judge()
 
     def sync(self) -> None:
-        """A SYNC, after the assemblers have taken it: what is known by now holds from here on."""
+        """Take a SYNC, after the assemblers: new mappings apply from here on."""
         for node in self._due:
             layout, assembler = self._configurator.layouts[node], self._assemblers[node]
             before, self._in_use[node] = self._in_use[node], layout
@@ -87,7 +86,7 @@ class MapFollower:
         self._due.clear()
 
     def lose_sight(self) -> None:
-        """The bus was away: what the traffic showed may be out of date."""
+        """Handle a loss of the bus: knowledge from the traffic may be out of date."""
         self._configurator.lose_sight()
         self._configurator.poll(0.0)
         self._judge()

@@ -1,8 +1,7 @@
-"""The bus as the loop sees it: wait, take what is there, send. The seam to hardware stays `can.Bus`.
+"""The loop's interface to a bus: wait, take received frames, send. The seam to hardware is `can.Bus`.
 
-python-can makes a Message of every frame, which costs more than the whole cycle. Where the bus is
-SocketCAN its socket is read directly, where it is virtual its queue; every other interface goes through
-`recv`.
+python-can makes a Message of every frame, which costs more than the whole cycle. Therefore the socket of
+SocketCAN and the queue of the virtual bus are read directly; other interfaces through `recv`.
 """
 
 from __future__ import annotations
@@ -29,11 +28,11 @@ __all__ = [
     "note_error",
 ]
 
-OVERFLOW = "receive overflow"  # of `FrameSource.errors`: frames that were lost because nobody read them
-MOST_FRAMES = 256  # taken in one go, so that a babbling node cannot hold the loop up
+OVERFLOW = "receive overflow"  # key of `FrameSource.errors`: frames lost because they were not read in time
+MOST_FRAMES = 256  # limit per call, so that a babbling node cannot block the loop
 
 
-_ERROR_KINDS = {  # linux/can/error.h, which python-can keeps to
+_ERROR_KINDS = {  # linux/can/error.h, also used by python-can
     0x001: "transmit timeout",
     0x002: "arbitration lost",
     0x004: "controller",
@@ -55,10 +54,10 @@ class CanFrame(NamedTuple):
 
 
 class BusLostError(Exception):
-    """The bus is gone: interface down, removed, connection closed. The reason is one line.
+    """The bus is lost: interface down or removed, connection closed. The reason is one line.
 
     Args:
-        reason: as python-can or the system says it; some of python-can's messages carry a whole traceback.
+        reason: message of python-can or the system; some of python-can's contain a traceback.
     """
 
     def __init__(self, reason: str) -> None:
@@ -66,7 +65,7 @@ class BusLostError(Exception):
 
 
 class FrameSource(Protocol):
-    """What the loop needs of a bus.
+    """Interface of a bus for the loop.
 
     Attributes:
         lost_sends: frames that could not be sent because the transmit queue was full.
@@ -77,16 +76,16 @@ class FrameSource(Protocol):
     errors: dict[str, int]
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait for a frame; whether there is one."""
+        """Wait for a frame; return whether there is one."""
 
     def take(self) -> list[CanFrame]:
-        """What has been received, in order; data frames with 11-bit identifiers only."""
+        """The received data frames with 11-bit identifiers, in order."""
 
     def send(self, cob_id: int, data: bytes) -> None:
         """Put a frame on the bus; a full transmit queue is counted, not raised."""
 
     def narrow(self, cob_ids: Iterable[int]) -> None:
-        """Receive these identifiers only, where the kernel can filter."""
+        """Receive these identifiers only, if the kernel can filter."""
 
 
 def note_error(errors: dict[str, int], can_id: int, data: bytes) -> None:
@@ -138,7 +137,7 @@ class BusSource:
             raise BusLostError(str(error)) from error
 
     def narrow(self, cob_ids: Iterable[int]) -> None:
-        """Nothing to gain: python-can filters after it has received."""
+        """Do nothing: python-can filters after reception."""
 
     def _frames(self, messages: list[can.Message]) -> list[CanFrame]:
         frames = []
@@ -153,7 +152,7 @@ class BusSource:
     def _receive(self, timeout_s: float) -> can.Message | None:
         try:
             return self._bus.recv(timeout_s)
-        except Exception as error:  # python-can's interfaces raise what their parsers meet
+        except Exception as error:  # python-can's interfaces raise various exceptions
             raise BusLostError(str(error) or type(error).__name__) from error
 
 
@@ -197,7 +196,7 @@ class VirtualSource(BusSource):
         return self._frames(messages)
 
     def send(self, cob_id: int, data: bytes) -> None:
-        """Give every other bus of the channel a message of its own: python-can deep-copies."""
+        """Give every other bus of the channel its own message: python-can would deep-copy."""
         self._check()
         stamp_s = time.time()
         for receiver in self._channel:
@@ -218,11 +217,11 @@ class VirtualSource(BusSource):
 
 
 class PumpedSource(VirtualSource):
-    """The virtual bus with simulated devices that live in this thread, and answer as soon as they are asked.
+    """The virtual bus with simulated devices in this thread, which answer immediately.
 
     Args:
         bus: the virtual bus.
-        devices: lets them handle what has been sent, and whatever is due.
+        devices: lets them handle sent frames and due timers.
     """
 
     def __init__(self, bus: Any, devices: Callable[[], object]) -> None:
@@ -242,7 +241,7 @@ class PumpedSource(VirtualSource):
 
 
 class PumpedBus(BusSource):
-    """As `PumpedSource`, on a bus that delivers as promptly but by other means: vcan.
+    """As `PumpedSource`, for any bus with immediate delivery, such as vcan.
 
     Args:
         bus: any python-can bus.
@@ -265,7 +264,7 @@ class PumpedBus(BusSource):
 
 
 class LostSource:
-    """Stands in for a bus that is lost: nothing comes, nothing goes."""
+    """Stands in for a lost bus: receives and sends nothing."""
 
     def __init__(self) -> None:
         self.lost_sends = 0

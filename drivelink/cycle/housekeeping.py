@@ -1,4 +1,4 @@
-"""Periodic tasks, run in the slack of the cycle: one short task at a time.
+"""Runs periodic tasks in the slack of the cycle, one short task at a time.
 
 A task that is too long for one cycle is a generator: each `yield` leaves the rest to the next slack.
 """
@@ -11,8 +11,8 @@ __all__ = ["Housekeeping"]
 
 Task = Callable[[], object]
 
-_ENOUGH_NS = 250_000  # a task, or a part of one, takes less than this
-_PATIENCE_NS = 1_000_000_000  # a task that has waited so long is done even where there is no slack
+_ENOUGH_NS = 250_000  # upper limit of a task, or a part of one
+_PATIENCE_NS = 1_000_000_000  # a task that has waited so long runs even without slack
 
 
 def _raise(error: Exception) -> None:
@@ -29,12 +29,12 @@ class _Periodic:
 
 
 class Housekeeping:
-    """Periodic tasks, of which the loop runs one at a time when there is time for it.
+    """Periodic tasks; the loop runs one at a time if there is time.
 
-    An exception ends the task that raised it, for this time; nothing else.
+    An exception ends only this run of the task that raised it.
 
     Attributes:
-        urgent: called in every cycle that has slack; for what must go on step by step.
+        urgent: called in every cycle with slack, for stepwise work.
         on_fault: called with an exception.
     """
 
@@ -46,11 +46,11 @@ class Housekeeping:
         self.on_fault: Callable[[Exception], None] = _raise
 
     def every(self, period_s: float, action: Task) -> None:
-        """Have `action` called every so often; it, or each part of it, must be done in less than 0.2 ms."""
+        """Call `action` periodically; it, or each part of it, must take less than 0.2 ms."""
         self._tasks.append(_Periodic(period_s, action, self._next_ns))
 
     def run(self, now_ns: int, slack_ns: int) -> None:
-        """Run what is due, as far as `slack_ns` of monotonic time allows."""
+        """Run due tasks within `slack_ns` of monotonic time."""
         if slack_ns >= _ENOUGH_NS:
             for step in self.urgent:
                 try:
@@ -88,6 +88,6 @@ class Housekeeping:
             self.on_fault(error)
 
     def _finish(self) -> None:
-        """Where there was no slack for so long that another task can no longer wait."""
+        """Finish a task when there was no slack for so long that another one cannot wait."""
         while self._parts is not None:
             self._go_on(self._parts)

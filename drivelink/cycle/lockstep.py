@@ -34,11 +34,11 @@ def run_lockstep(
     start_ns: int = 0,
     each: Callable[[], object] | None = None,
 ) -> LoopJoint:
-    """Configure the devices, then run so many cycles of the very loop that the daemon runs.
+    """Configure the devices, then run so many cycles of the daemon's loop.
 
     Args:
-        joint: its bus is a virtual one that the devices are on.
-        devices: polled in this thread; SYNC moves their world on by one period.
+        joint: on the virtual bus of the devices.
+        devices: polled in this thread; SYNC advances their world by one period.
         sink: gets estimates and samples, e.g. a `JointPublisher`; None: only the loop_joint counts them.
         cycles: how many.
         folder: of the joint file.
@@ -46,7 +46,7 @@ def run_lockstep(
         each: called after every cycle, e.g. to look at the truth.
 
     Returns:
-        The loop_joint, with its pipeline and what was counted.
+        The loop_joint, with its pipeline and counters.
 
     Raises:
         DriveError, BusError: as the daemon's start does.

@@ -1,7 +1,7 @@
 """The cycle's work: SYNC, frames, estimate, publication, for all joints of one bus.
 
-`tick` and `receive` are all there is to a cycle. `drivelink.cycle.pacing` calls them by the clock or by the
-SYNC of another master; `run_lockstep` calls them with no clock at all.
+A cycle is `tick` and `receive`. `drivelink.cycle.pacing` calls them by the clock or by the SYNC of another
+master; `run_lockstep` without a clock.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ logger = logging.getLogger(__name__)
 
 Listener = Callable[[int, bytes], None]
 
-_MOST_BEHIND_NS = 10_000_000_000  # what seems to be more is a stamp of another clock
-_CLOCK_STEP_NS = 20_000_000  # NTP slews by less between two looks; more than that is a clock that was set
+_MOST_BEHIND_NS = 10_000_000_000  # a larger difference is a stamp of another clock
+_CLOCK_STEP_NS = 20_000_000  # NTP slews by less between two checks; more is a clock that was set
 
 
 class Sink(Protocol):
-    """Where estimates and samples go."""
+    """Receives estimates and samples."""
 
     def put(self, tick: Tick) -> None:
-        """Publish a cycle: its estimate first, then its sample where it has one."""
+        """Publish a cycle: its estimate, then its sample, if any."""
 
 
 class ObjectSink(ABC):
@@ -61,9 +61,9 @@ class LoopJoint:
 
     Attributes:
         name: of the joint.
-        pipeline: from its frames to its estimates.
-        sink: where they go; None: nowhere.
-        fault: what has ended its estimates; empty: nothing. A new estimator in the pipeline mends it.
+        pipeline: frames to estimates.
+        sink: receives its output, or None.
+        fault: the exception that ended its estimates, or empty; a new estimator in the pipeline clears it.
         estimates: published from fresh samples.
         stale: cycles without a sample.
         work: from the last frame in hand to the estimate published.
@@ -77,7 +77,7 @@ class LoopJoint:
         self.pipeline = pipeline
         self.sink = sink
         self.fault = ""
-        self.broken: object = None  # the estimator that it ended with
+        self.broken: object = None  # the estimator that failed
         self.estimates = 0
         self.stale = 0
         self.work = LatencyHistogram()
@@ -97,7 +97,7 @@ class CycleLoop:
         period_s: communication cycle.
         produce: make SYNC; else follow it.
         counter_overflow: 0x1019; 0: SYNC carries no counter.
-        world_steps: SYNC is all that moves the (simulated) world on; so a SYNC left out is no gap.
+        world_steps: only SYNC advances the (simulated) world, so a skipped SYNC is no gap.
 
     Attributes:
         produce: as given.
@@ -109,24 +109,23 @@ class CycleLoop:
         unix_ns: UNIX time less monotonic time.
         source: the bus; replaced when it is lost and reopened.
         housekeeping: what is done in the slack.
-        listeners: by identifier, who else wants a frame: SDO, heartbeat, EMCY.
+        listeners: further handlers by identifier: SDO, heartbeat, EMCY.
         after_sync: called at each SYNC, after the joints have taken it.
-        clock: what supervision goes by, ns.
+        clock: the clock of supervision, ns.
         on_lost: called when the bus is lost.
-        on_fault: called with an exception in what concerns one joint or one node, and whose; that one is left
-            out, the loop goes on.
+        on_fault: called with an exception of one joint or node, and its name; the loop continues without it.
         cycles: SYNCs since the start.
-        overruns: periods left out because this process was late.
-        foreign_syncs: SYNCs of another master while we make it, or that were not due.
-        behind: SYNCs, when following, that this process has read more than a period after their stamp.
-        skipped_periods: in which no SYNC came, when following.
-        late_syncs: SYNCs of the master we follow that came when their period was over.
-        sync_stamps: of the last SYNCs, when following.
-        counter_jumps: SYNCs whose counter did not follow the one before.
-        clock_step_ns: by how much the system's clock was last set.
-        clock_steps: how often that happened.
-        silent: following, and there is no SYNC.
-        lateness: of SYNC against its deadline; when following, of one SYNC against the one before.
+        overruns: periods skipped because this process was late.
+        foreign_syncs: SYNCs of another master while we produce it, or that were not due.
+        behind: when following, SYNCs read more than a period after their stamp.
+        skipped_periods: when following, periods without SYNC.
+        late_syncs: when following, SYNCs that came after their period.
+        sync_stamps: when following, stamps of the last SYNCs.
+        counter_jumps: SYNCs whose counter did not continue the previous one.
+        clock_step_ns: last change of the system's clock.
+        clock_steps: number of such changes.
+        silent: when following: there is no SYNC.
+        lateness: of SYNC against its deadline; when following, against the previous SYNC.
     """
 
     def __init__(
@@ -172,7 +171,7 @@ class CycleLoop:
         return all([pipeline.complete for pipeline in self._pipelines])  # noqa: C419 - twice as fast
 
     def reroute(self) -> None:
-        """Look up again which joint wants which frame."""
+        """Rebuild the table of which joint receives which frame."""
         self._loop_joints_of.clear()
         sound = [loop_joint for loop_joint in self.loop_joints if not loop_joint.fault]
         self._pipelines = [loop_joint.pipeline for loop_joint in sound]
@@ -181,11 +180,11 @@ class CycleLoop:
                 self._loop_joints_of.setdefault(cob_id, []).append(loop_joint)
 
     def receive_ids(self) -> set[int]:
-        """Identifiers that anybody here wants."""
+        """Identifiers with a receiver."""
         return {SYNC_COB_ID, *self._loop_joints_of, *self.listeners}
 
     def send(self, cob_id: int, data: bytes) -> None:
-        """Put a frame on the bus that is not SYNC; the joints see it, as they would in a log."""
+        """Send a frame other than SYNC; the joints see it, as in a log."""
         try:
             self.source.send(cob_id, data)
         except BusLostError as error:
@@ -194,13 +193,13 @@ class CycleLoop:
             self._feed(loop_joint, cob_id, data)
 
     def stop(self) -> None:
-        """Have the pacing end after the present cycle; from any thread or signal handler."""
+        """End the pacing after the present cycle; callable from any thread or signal handler."""
         self.stopped = True
 
     def run_lockstep(self, cycles: int, start_ns: int = 0) -> None:
-        """So many cycles without waiting for anything: for devices that answer within `send`.
+        """Run so many cycles without waiting, for devices that answer within `send`.
 
-        Supervision and housekeeping go by the stamps instead of the clock.
+        Supervision and housekeeping use the stamps as their clock.
 
         Args:
             cycles: how many.
@@ -217,7 +216,7 @@ class CycleLoop:
         return range(start_ns, start_ns + cycles * self.period_ns, self.period_ns)
 
     def tick(self, stamp_ns: int, jump: int = 1) -> None:
-        """Make SYNC. What was received before it belongs to the cycle that ends here.
+        """Produce SYNC. Frames received before it belong to the previous cycle.
 
         Args:
             stamp_ns: UNIX time of this SYNC.
@@ -235,7 +234,7 @@ class CycleLoop:
         self._sync(b"", stamp_ns, jump, now)
 
     def receive(self) -> None:
-        """Take what is there, and do what follows from it."""
+        """Take and process the received frames."""
         try:
             frames = self.source.take()
         except BusLostError as error:
@@ -246,7 +245,7 @@ class CycleLoop:
             self._dispatch(frames, self.received_ns)
 
     def refresh_unix_time(self) -> None:
-        """Follow the system's clock with the stamps, between two cycles."""
+        """Adjust the stamps to the system's clock, between two cycles."""
         before, self.unix_ns = self.unix_ns, time.time_ns() - time.monotonic_ns()
         if abs(self.unix_ns - before) > _CLOCK_STEP_NS:
             self.clock_step_ns = self.unix_ns - before
@@ -315,7 +314,7 @@ class CycleLoop:
     def _feed(
         self, loop_joint: LoopJoint, cob_id: int, data: bytes, jump: int = 1, stamp_ns: int = 0
     ) -> Tick | None:
-        """A frame for one joint; an exception ends its estimates, and nobody else's."""
+        """Pass a frame to one joint; an exception ends only its estimates."""
         try:
             return loop_joint.pipeline.feed(cob_id, data, jump, stamp_ns)
         except Exception as error:  # noqa: BLE001 - see above
@@ -326,7 +325,7 @@ class CycleLoop:
             return None
 
     def _carry_on_faulted(self, loop_joint: LoopJoint, jump: int, stamp_ns: int) -> Tick | None:
-        """What a joint in fault has to say at a SYNC: that its last estimate is not fresh."""
+        """At a SYNC, mark the last estimate of a joint in fault as stale."""
         pipeline = loop_joint.pipeline
         if pipeline.estimator is not loop_joint.broken:  # the joint file was mended
             loop_joint.fault, loop_joint.broken = "", None
@@ -339,7 +338,7 @@ class CycleLoop:
         if loop_joint.sink is not None:
             try:
                 loop_joint.sink.put(tick)
-            except Exception as error:  # noqa: BLE001 - the other joints' go out all the same
+            except Exception as error:  # noqa: BLE001 - the other joints' estimates are published
                 self.on_fault(loop_joint.name, error)
         if tick.current:
             loop_joint.work.add(time.monotonic_ns() - since_ns)
@@ -349,7 +348,7 @@ class CycleLoop:
             loop_joint.stale += 1
 
     def wait(self, timeout_s: float) -> None:
-        """Wait for frames and receive them; a bus that is lost ends the wait."""
+        """Wait for frames and receive them; a lost bus ends the wait."""
         try:
             if self.source.wait(timeout_s):
                 self.receive()
@@ -361,7 +360,7 @@ class CycleLoop:
         self.on_lost(str(error))
 
     def carry_on(self) -> None:
-        """No SYNC for a while: say that what was last published is not fresh."""
+        """Without SYNC, mark the last estimates as stale."""
         self.silent = True
         for loop_joint in self.loop_joints:
             tick = loop_joint.pipeline.carry_on(loop_joint.pipeline.assembler.sequence)

@@ -1,7 +1,7 @@
-"""When a cycle begins: on absolute deadlines of our own, or with the SYNC of another master.
+"""Starts the cycles: on absolute deadlines, or with the SYNC of another master.
 
-A late cycle does not shift the next one. One that is too late to be of use is left out, counted, and known
-to the estimators as a gap. Housekeeping is done in the slack between a cycle's work and the next SYNC.
+A late cycle does not shift the next one. One that is too late is skipped and counted, and is a gap to the
+estimators. Housekeeping runs in the slack between a cycle's work and the next SYNC.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from drivelink.cycle.realtime import Alarm
 
 __all__ = ["run"]
 
-_LATEST = 0.4  # of a period: a SYNC later than this is left out, for it would be nearer to the next one
-_MARGIN_NS = 120_000  # before the deadline, from where on no frame is waited for
-_SILENCE_PERIODS = 5  # without SYNC, when following, until the estimates are called stale
+_LATEST = 0.4  # of a period: a later SYNC is skipped, being nearer to the next one
+_MARGIN_NS = 120_000  # before the deadline, when waiting for frames ends
+_SILENCE_PERIODS = 5  # when following: time without SYNC until the estimates are stale
 _SILENCE_NS = 20_000_000  # and at least
 _LONGEST_WAIT_NS = 20_000_000
 
@@ -29,10 +29,10 @@ def run(loop: CycleLoop) -> None:
 
 
 class _Expectation:
-    """When, after SYNC, the cycle's last frame is usually there: until then it is enough to sleep.
+    """Estimates when the cycle's last frame arrives after SYNC: until then the loop sleeps.
 
-    Waking for every single frame costs more than all the rest of the cycle. The estimate errs on the
-    early side; a frame that comes before its time waits in the bus for a few tens of microseconds.
+    Waking for every frame costs more than the rest of the cycle. The estimate is on the early side; a frame
+    that comes earlier waits a few tens of microseconds.
     """
 
     _EARLIER, _LATER = 0.02, 0.1
@@ -44,7 +44,7 @@ class _Expectation:
         self.after_ns = 0.0
 
     def update(self, complete_ns: int, at_once: bool) -> None:
-        """The cycle was complete so long after SYNC, at the first look or after waiting for more."""
+        """Update with the time from SYNC to the complete cycle, found at the first check or after waiting."""
         if at_once:
             self.after_ns *= 1.0 - self._EARLIER
         else:
@@ -95,7 +95,7 @@ def _gather(loop: CycleLoop, deadline_ns: int, expectation: _Expectation) -> Non
 
 
 def _receive_until(loop: CycleLoop, time_ns: int) -> bool:
-    """Whether the cycle is complete by then."""
+    """Receive until the cycle is complete or the deadline; return whether it is complete."""
     while not loop.complete:
         left = time_ns - time.monotonic_ns()
         if left <= 0:

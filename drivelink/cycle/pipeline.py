@@ -17,31 +17,31 @@ from estimator.sample import Estimate, Sample
 
 __all__ = ["Built", "ResidualMonitor", "build", "make_assembler", "make_pipeline", "rehearse"]
 
-_REHEARSED = 500  # samples: half a second, in which an estimator has begun to estimate
+_REHEARSED = 500  # samples: half a second, enough for the first estimates
 _HOLD_S, _HOLD_PERIODS = 0.25, 10  # of silence, and at least so many, see `Assembler`
 
 
 class ResidualMonitor(Protocol):
-    """Judges on line whether the model is still sufficient."""
+    """Interface of the model monitor."""
 
     def step(self, sample: Sample, estimate: Estimate, residual_nm: float) -> bool:
-        """Whether the alarm is on after this tick."""
+        """Take a sample; return whether the alarm is on."""
 
     def describe(self) -> dict[str, Any]:
-        """What it found, for the status key: residual against its baseline, likely location."""
+        """Residual against its baseline and likely location, for the status key."""
 
 
 Built = tuple[Estimator, ResidualMonitor | None]
 
 
 def build(joint: JointFile) -> Built:
-    """Estimator and residual monitor of a joint."""
+    """Make estimator and model monitor of a joint."""
     estimator = make_estimator(joint.model(), joint.estimator, joint.bus.period_s, core=_core.Estimator)
     return estimator, make_model_monitor(joint)
 
 
 def make_assembler(joint: JointFile, layouts: Sequence[NodeLayout]) -> Assembler:
-    """The assembler of a joint file whose nodes send by these layouts.
+    """Make the assembler of a joint file for these layouts.
 
     Raises:
         DriveError: the layouts lack something that the joint's model needs.
@@ -63,7 +63,7 @@ def make_assembler(joint: JointFile, layouts: Sequence[NodeLayout]) -> Assembler
 
 
 def make_pipeline(joint: JointFile, layouts: Sequence[NodeLayout], *, keep: int = 0) -> JointPipeline:
-    """The pipeline of a joint file whose nodes send by these layouts; arguments as for `JointPipeline`.
+    """Make the pipeline of a joint file for these layouts; arguments as in `JointPipeline`.
 
     Raises:
         DriveError: the layouts lack something that the joint's model needs.
@@ -72,9 +72,9 @@ def make_pipeline(joint: JointFile, layouts: Sequence[NodeLayout], *, keep: int 
 
 
 def rehearse(joint: JointFile) -> None:
-    """Step an estimator and a monitor like this joint's: nothing is then done for the first time in the loop.
+    """Step an estimator and monitor like this joint's, so that the loop does nothing for the first time.
 
-    What is loaded, allocated or started with the first use (a library's threads, say) is there afterwards.
+    Libraries, memory and threads that the first use loads or starts are ready afterwards.
     """
     pipeline = JointPipeline(Assembler((), 0), *build(joint))
     motors = len(joint.motor)

@@ -1,7 +1,7 @@
-"""What the operating system can do for the cycle: scheduling, memory, timer, garbage collector.
+"""Prepares process and thread for the cycle: scheduling, memory, timer, garbage collector.
 
-Each is tried on its own; what is not permitted is one plain line with the command that would permit it,
-and the daemon runs without.
+Each is tried separately; a refusal is one line with the command that would permit it, and the daemon runs
+without.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 __all__ = ["PRIORITY", "Alarm", "RealTime", "acquire", "release"]
 
 PRIORITY = 80  # of 1 to 99: above the network's interrupt threads (50), below the kernel's watchdogs (99)
-SWITCH_INTERVAL_S = 100e-6  # how long another Python thread may hold the interpreter against the loop
+SWITCH_INTERVAL_S = 100e-6  # longest time for which another Python thread holds the interpreter
 
 _MCL_CURRENT, _MCL_FUTURE = 1, 2  # mlockall(2)
 _PR_SET_TIMERSLACK = 29  # prctl(2)
@@ -25,13 +25,13 @@ _PR_SET_TIMERSLACK = 29  # prctl(2)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RealTime:
-    """What was obtained, and what was there before.
+    """What was granted, and the previous settings.
 
     Attributes:
         scheduling: SCHED_FIFO was granted.
         memory: the process is locked into memory.
-        lines: what was refused, one line each, with the remedy.
-        switch_interval_s: as it was before.
+        lines: refusals, one line each, with the remedy.
+        switch_interval_s: previous value.
     """
 
     scheduling: bool
@@ -44,7 +44,7 @@ def acquire(*, privileged: bool = True) -> RealTime:
     """Prepare the calling thread and the process for a cycle of a millisecond.
 
     Args:
-        privileged: also ask for what needs permission: SCHED_FIFO and locked memory.
+        privileged: also request SCHED_FIFO and locked memory.
     """
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
@@ -53,7 +53,7 @@ def acquire(*, privileged: bool = True) -> RealTime:
     gc.disable()
     libc = ctypes.CDLL(None, use_errno=True)
     if hasattr(libc, "prctl"):
-        libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)  # wake when asked to, not up to 50 us later
+        libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)  # no timer slack (default 50 us)
     lines: list[str] = []
     scheduling = privileged and _attempt(_schedule, lines)
     memory = privileged and _attempt(lambda: _lock_memory(libc), lines)
@@ -61,7 +61,7 @@ def acquire(*, privileged: bool = True) -> RealTime:
 
 
 def release(obtained: RealTime) -> None:
-    """Give back what `acquire` took, for a process that goes on after the loop."""
+    """Undo `acquire`, for a process that continues after the loop."""
     if obtained.scheduling:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     if obtained.memory:
@@ -103,20 +103,19 @@ def _lock_memory(libc: ctypes.CDLL) -> None:
 class Alarm:
     """Sleeps until a deadline of the monotonic clock.
 
-    The kernel wakes late, by an amount that is steady but for its scatter. The steady part is estimated and
-    asked for in advance; what is then early is polled away. Being early is held rare, so that polling costs
-    a microsecond or two a cycle.
+    The kernel wakes late by a steady amount plus scatter. The steady part is estimated and subtracted; early
+    wake-ups are polled away, and kept rare so that polling costs one or two microseconds per cycle.
     """
 
     _OFTEN = 0.2  # share of the cycles that wake early
-    _STEP_NS = 500  # the most that one cycle moves what is asked for in advance
+    _STEP_NS = 500  # largest correction per cycle
     _MOST_NS = 200_000
 
     def __init__(self) -> None:
         self.early_ns = 0.0
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """Return at the deadline, or at once where it has passed."""
+        """Return at the deadline, or at once if it has passed."""
         clock = time.monotonic_ns
         left = deadline_ns - int(self.early_ns) - clock()
         if left > 0:

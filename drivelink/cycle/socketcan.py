@@ -1,4 +1,4 @@
-"""SocketCAN without python-can's Message: the socket is read directly, with the kernel's stamps."""
+"""Reads SocketCAN directly, with the kernel's stamps, without python-can's Message."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from drivelink.cycle.framesource import MOST_FRAMES, OVERFLOW, BusLostError, Can
 
 __all__ = ["SocketCanSource"]
 
-_SO_RXQ_OVFL = 40  # socket(7): with each frame, how many were dropped; not in the socket module
+_SO_RXQ_OVFL = 40  # socket(7): number of dropped frames; not in the socket module
 
 
 class SocketCanSource:
@@ -73,7 +73,7 @@ class SocketCanSource:
         return frames
 
     def _note_dropped(self, content: bytes) -> None:
-        """How many frames the kernel has dropped since the socket was opened, reported with the next one."""
+        """Count the frames that the kernel has dropped."""
         dropped = int.from_bytes(content[:4], sys.byteorder)
         if dropped != self._dropped:
             self.errors[OVERFLOW] = self.errors.get(OVERFLOW, 0) + (dropped - self._dropped) % (1 << 32)
@@ -85,7 +85,7 @@ class SocketCanSource:
         if frame is None:
             frame = self._FRAME.pack(cob_id, len(data), data)
             if len(data) <= 1:
-                self._sent[cob_id, data] = frame  # SYNC and its counters, again and again
+                self._sent[cob_id, data] = frame  # cached: SYNC with its counters
         try:
             self._socket.send(frame)
         except OSError as error:

@@ -1,4 +1,4 @@
-"""python-can's socketcand client, which waits forever when its server is gone: here that is a lost bus."""
+"""python-can's socketcand client with detection of a closed connection, for which it would wait forever."""
 
 from __future__ import annotations
 

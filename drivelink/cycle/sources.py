@@ -14,7 +14,7 @@ __all__ = ["open_source"]
 
 
 def open_source(bus: can.BusABC, devices: Callable[[], object] | None = None) -> FrameSource:
-    """The quickest way to read this bus; with devices that live in this thread, the way to run them too."""
+    """Open the fastest source for this bus, also with devices in this thread."""
     if devices is not None:
         return PumpedSource(bus, devices) if type(bus).__name__ == "VirtualBus" else PumpedBus(bus, devices)
     if type(bus).__name__ == "SocketcanBus":

@@ -1,4 +1,4 @@
-"""The start on a bus: configure the nodes, or listen how they are configured; wait for their frames."""
+"""Starts on a bus: configure the nodes or listen to their configuration, then wait for their frames."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Idle = Callable[[], object]
 
 logger = logging.getLogger(__name__)
 
-_PATIENCE_S = 5.0  # for another master's SYNC, and for the frames that answer it
+_PATIENCE_S = 5.0  # timeout for another master's SYNC, and for the frames that answer it
 _POLL_S = 0.01
 
 
@@ -40,18 +40,18 @@ def join_bus(
 ) -> Joined:
     """Get the layouts of all nodes, by configuring them or by listening.
 
-    Where another master makes SYNC its period is measured, and stands in the `bus` of the configurator that
-    is returned. Where the joint file says another one, that is said.
+    The period of another master's SYNC is measured and returned in the configurator's `bus`; a different
+    period in the joint file is logged.
 
     Args:
-        port: the bus, read by nobody else meanwhile.
+        port: the bus, without another reader.
         joints: joint files whose bus sections agree.
         folders: of the joint files.
         idle: called between receptions.
-        patience_s: for what others have to do.
+        patience_s: timeout for actions of others.
 
     Raises:
-        BusError: no SYNC where there should be one, one where there should be none, or the bus fails.
+        BusError: SYNC is missing or unexpected, or the bus fails.
         DriveError: a node is absent, refuses, or its mapping is not known.
     """
     section = joints[0].bus
@@ -76,7 +76,7 @@ def join_bus(
 
 
 def _timed(section: BusSection, stamps_ns: Sequence[int]) -> BusSection:
-    """The bus section with the period that the master's SYNCs have."""
+    """The bus section with the measured period of the master's SYNC."""
     measured = measure_period(stamps_ns, section.period_s)
     if measured is None or measured.same:
         return section
@@ -95,7 +95,7 @@ def _timed(section: BusSection, stamps_ns: Sequence[int]) -> BusSection:
 
 
 def _frames(port: BusPort, idle: Idle | None, seconds: float) -> Iterator[tuple[int, bytes, int]]:
-    """Data frames with 11-bit identifiers and their stamps in ns, for so long; -1 when nothing comes."""
+    """Data frames with 11-bit identifiers and their stamps in ns, for so long; -1 if there is none."""
     end_s = time.monotonic() + seconds
     while (left_s := end_s - time.monotonic()) > 0:
         if idle is not None:
@@ -122,7 +122,7 @@ def _listen(port: BusPort, passive: PassiveConfigurator, idle: Idle | None, pati
 
 
 def _overhear(passive: PassiveConfigurator, cob_id: int, data: bytes) -> bool:
-    """Take a frame; whether the layout of a node has changed by it."""
+    """Take a frame; return whether it has changed the layout of a node."""
     now_s = time.monotonic()
     if cob_id >= 0:
         passive.feed(cob_id, data, now_s)
@@ -130,7 +130,7 @@ def _overhear(passive: PassiveConfigurator, cob_id: int, data: bytes) -> bool:
 
 
 class _Expected:
-    """What must be heard before the loop may run: SYNC, and the frames of every node that answers it."""
+    """Frames required before the loop runs: SYNC, and the answers of every node."""
 
     def __init__(self, channel: str, layouts: Iterable[NodeLayout], synced: bool = False) -> None:
         self.channel = channel
@@ -177,10 +177,10 @@ def _await(
     patience_s: float,
     passive: PassiveConfigurator | None = None,
 ) -> list[int]:
-    """Listen until everything expected has been heard; a mapping that changes meanwhile is learnt.
+    """Listen until all expected frames have come; follow mapping changes meanwhile.
 
     Returns:
-        Stamps of the SYNCs, enough to measure their period where they come often enough.
+        Stamps of the SYNCs, if possible enough to measure their period.
     """
     stamps: list[int] = []
     for cob_id, data, stamp_ns in _frames(port, idle, patience_s):

@@ -1,4 +1,4 @@
-"""From the stamps of SYNC to the periods between them: time enters here, and only as whole periods."""
+"""Converts stamps of SYNC to whole periods between them."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ FloatArray = NDArray[np.float64]
 
 __all__ = ["LATE", "MEASURED_SYNCS", "MeasuredPeriod", "SyncClock", "measure_period"]
 
-MEASURED_SYNCS = 64  # give the period to 0.2 % where they jitter by half of it, to 0.01 % where by a fortieth
+MEASURED_SYNCS = 64  # enough for a period to 0.2 % at a jitter of half of it, to 0.01 % at a fortieth
 _FEWEST = 8
-_SAME = 0.01  # two periods are the same: the inertia torque is then 2 % off, less than inertias are known to
+_SAME = 0.01  # relative: periods that count as the same; 2 % of inertia torque
 _JITTERY = 0.15  # median deviation of the steps, in periods
 _SIGMAS = 3.0
 
@@ -27,7 +27,7 @@ class MeasuredPeriod(NamedTuple):
     """The period of a master.
 
     Attributes:
-        period_s: that SYNC really has; the expected one, where the stamps cannot separate the two.
+        period_s: measured; the expected one if the stamps cannot separate the two.
         same: whether it is the expected one.
     """
 
@@ -36,17 +36,17 @@ class MeasuredPeriod(NamedTuple):
 
 
 def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPeriod | None:
-    """The period of the SYNCs with these stamps, jitter and lost ones notwithstanding.
+    """The period of SYNCs from their stamps, robust to jitter and lost SYNCs.
 
-    The slope of a straight line through the stamps over their numbers; as the round value that is within
-    three of its standard deviations.
+    The slope of a line through the stamps over their numbers, rounded to a value within three standard
+    deviations.
 
     Args:
         stamps_ns: of SYNCs one after the other.
-        expected_s: what the joint file says, or would have said.
+        expected_s: the joint file's period, or its default.
 
     Returns:
-        None where there are fewer than eight stamps, or they stand still.
+        None for fewer than eight or constant stamps.
     """
     if len(stamps_ns) < _FEWEST:
         return None
@@ -60,12 +60,12 @@ def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPerio
     if period_s <= 0:
         return None
     if float(np.median(np.abs(gaps - period_s))) > _JITTERY * period_s:
-        # A step of nearly two periods may be jitter alone: what is lost is seen where it is more.
+        # A step of nearly two periods may be jitter; only larger ones count as lost.
         lost = np.where(gaps > 2.2 * period_s, np.rint(gaps / period_s) - 1, 0)
         slope, std = _slope(np.concatenate(([0.0], np.cumsum(1 + lost))), stamps)
     else:
         slope, std = period_s, period_s
-        for _ in range(2):  # each time numbered by a better period
+        for _ in range(2):  # renumber by the improved period
             clock = SyncClock(slope)
             jumps = np.array([clock.jump(stamp_ns) for stamp_ns in stamps_ns])
             if np.count_nonzero(jumps > 0) >= _FEWEST:
@@ -79,19 +79,19 @@ def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPerio
 
 
 def _slope(numbers: FloatArray, times_s: FloatArray) -> tuple[float, float]:
-    """Of a straight line through times over numbers, and its standard deviation."""
+    """Slope of a line through times over numbers, and its standard deviation."""
     n, t = numbers - numbers.mean(), times_s - times_s.mean()
     slope = float(n @ t / (n @ n))
     return slope, float(np.sqrt(np.mean((t - slope * n) ** 2) / (n @ n)))
 
 
 class SyncClock:
-    """How many periods lie between one SYNC and the next, from their stamps.
+    """Counts the periods between successive SYNCs, from their stamps.
 
-    A phase-locked loop of second order: a stamp is compared with where this SYNC was due, on the average of
-    all before it, not with the jitter of the last one. It is quick at first and slow later, when jitter of
-    half a period must not move it. Rates within two per cent of the expected one are followed. A SYNC is
-    taken for the next one unless it is off by half a period, or by more where its master jitters more.
+    A second-order phase-locked loop compares each stamp with its prediction. It is fast at first and slow
+    later, when a jitter of half a period must not move it. It follows rates within two per cent of the
+    expected one. A SYNC counts as the next one unless it is off by half a period, or by more if its master
+    jitters more.
 
     Args:
         period_s: the communication cycle.
@@ -99,8 +99,8 @@ class SyncClock:
 
     _SLOWEST = 0.01  # of the deviation, per SYNC: jitter of half a period then moves it by 2 % of a period
     _OFF_RATE = 0.02
-    _SIGMAS = 2.2  # that a SYNC may be off; uniform jitter ends at 1.73, the rest is for the loop's own
-    _MOST_OFF = 0.8  # periods: what is off by a whole one is another SYNC
+    _SIGMAS = 2.2  # allowed deviation of a SYNC; uniform jitter ends at 1.73, the rest is the loop's own
+    _MOST_OFF = 0.8  # periods: a deviation of a whole one is another SYNC
 
     def __init__(self, period_s: float) -> None:
         self._expected_ns = self._period_ns = period_s * 1e9
@@ -108,17 +108,17 @@ class SyncClock:
         self._last = (0, 0)
         self._count = 0
         self._variance = 0.0  # of the deviations, periods squared
-        self._skipped = 0  # periods that the last SYNCs have left out: they may only be late
+        self._skipped = 0  # periods without SYNC that may only be late
 
     def jump(self, stamp_ns: int, monotonic_ns: int | None = None) -> int:
-        """Periods since the SYNC before: 1 is normal, more is a gap, 0 is a SYNC that was not due.
+        """Periods since the previous SYNC: 1 is normal, more is a gap, 0 is a SYNC that was not due.
 
-        A SYNC that comes after its period was taken for lost is `LATE`: the master catches up, it is no
-        second one.
+        A SYNC that comes after its period was counted as lost is `LATE`.
 
         Args:
-            stamp_ns: when the SYNC was on the bus, by any clock, even one that is set from time to time.
-            monotonic_ns: when it was received, by one that is not; separates a step of the other from a gap.
+            stamp_ns: time of the SYNC, by any clock, even one that may be set.
+            monotonic_ns: time of reception, by a monotonic clock; separates a step of the other clock from a
+                gap.
         """
         if self._due_ns is None:
             self._due_ns = float(stamp_ns)
@@ -147,7 +147,7 @@ class SyncClock:
         return periods
 
     def _follow(self, error: float, periods: int) -> None:
-        """The SYNC came so many periods after it was due."""
+        """Update the loop: the SYNC came so many periods after its prediction."""
         assert self._due_ns is not None
         self._count += 1
         phase = max(1.0 / (self._count + 1), self._SLOWEST)

@@ -24,12 +24,12 @@ _REOPEN_S = 0.5
 
 
 class BusKeeper:
-    """Opens a lost bus again, in a thread since that may take a while, and gives it to the loop.
+    """Reopens a lost bus in a thread and hands it to the loop.
 
     Args:
-        port: whose bus it is.
+        port: the daemon's port.
         section: how to open it.
-        events: where loss and return are said.
+        events: reports loss and return.
         devices: simulated devices in the loop's thread, or None.
     """
 
@@ -44,11 +44,11 @@ class BusKeeper:
         self._opened: can.BusABC | None = None
 
     def lost(self, reason: str) -> None:
-        """The loop has lost the bus."""
+        """Handle a loss of the bus."""
         self._events.begin("bus", f"{self._section.channel}: the bus is lost: {reason}", logging.ERROR)
 
     def check(self) -> bool:
-        """In the slack: get a lost bus back; whether it has just come back."""
+        """In the slack: try to reopen a lost bus; return whether it is back."""
         loop = self._port.loop
         if loop is None or not isinstance(loop.source, LostSource):
             return False

@@ -1,4 +1,4 @@
-"""What two readings of one quantity have come to, in words and for the status key."""
+"""Results of the cross-checks, in words and for the status key."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _WORDS = {
 
 
 def cross_checks(assembler: Assembler) -> list[dict[str, Any]]:
-    """Every check that the mapping makes possible.
+    """All checks that the mapping makes possible.
 
     {"motor": from 1 on, "check": "velocity" | "current" | "second_encoder" | "following_error", "verdict":
     "untested" | "agrees" | "contradicts", "scale": of the second reading against the first, "std": of that}.
@@ -29,10 +29,10 @@ def cross_checks(assembler: Assembler) -> list[dict[str, Any]]:
 
 
 def contradiction(assembler: Assembler) -> dict[str, Any] | None:
-    """The reading that a cross-check suspects, as `Estimator.suspicion` gives its own; None: none.
+    """The reading that a cross-check suspects, in the form of `Estimator.suspicion`; None: none.
 
-    Where a second check clears the position, the other reading is the wrong one; where two contradict it and
-    none clears it, the position is; else nobody can say which of the two it is.
+    If a second check confirms the position, the other reading is wrong; if two contradict it and none
+    confirms it, the position is; otherwise it is undecided.
     """
     checks = cross_checks(assembler)
     failing = [check for check in checks if check["verdict"] == "contradicts"]

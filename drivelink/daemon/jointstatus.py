@@ -1,4 +1,4 @@
-"""The document of the status key: one joint of a running daemon, a few times a second."""
+"""Makes the document of the status key: one joint, a few times a second."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from estimator.sample import ExternalStatus, Status
 
 __all__ = ["JointStatus"]
 
-_TIMING_EVERY = 4  # documents; percentiles cost more than all the rest
+_TIMING_EVERY = 4  # documents between percentiles, which cost more than all the rest
 
-# In the order of the status document; those of one cycle alone are events or nothing.
+# In the order of the status document; bits of single cycles are events or not shown.
 _QUALITY = (
     Status.VALID,
     Status.OBSERVABLE,
@@ -45,9 +45,9 @@ class JointStatus:
     Args:
         joint: its joint file.
         loop: the cycle it runs in.
-        loop_joint: its place in it.
-        supervisor: knows its nodes.
-        events: what has happened.
+        loop_joint: the joint in the loop.
+        supervisor: of its nodes.
+        events: the event log.
         bus_load: fraction of the bit rate that the configured frames take.
     """
 
@@ -84,14 +84,14 @@ class JointStatus:
                 self._timing[name] = meter.recent()
 
     def begin(self) -> None:
-        """Percentiles are due with the next document, whatever was asked before."""
+        """Recompute the percentiles with the next document."""
         self._asked = 0
 
     def document(self, state: str = "") -> dict[str, Any]:
         """The state of the joint now.
 
         Args:
-            state: "starting" or "stopped"; left out: as it is found.
+            state: "starting" or "stopped"; default: determined from the loop.
         """
         loop, loop_joint, events = self._loop, self._loop_joint, self._events
         now, unix_s = time.monotonic(), time.time()
@@ -178,7 +178,7 @@ class JointStatus:
         return {"active": active, **(monitor.describe() if monitor is not None else {})}
 
     def _external(self) -> dict[str, Any] | None:
-        """What touches the link, and whether both sides of the joint agree on the flexibility torque."""
+        """External torque, and whether both sides of the joint agree on the flexibility torque."""
         touch = self._loop_joint.pipeline.external
         if touch is None:
             return None

@@ -1,9 +1,9 @@
 """Replaces the model of the running loop without losing a cycle.
 
-When the joint file is rewritten, or on SIGHUP, a new estimator is built beside the cycle, led through the
-last samples so that it starts where the old one is, and put in its place between two cycles. A thread leads
-it; where that thread gets too little time to catch up with the cycle, the cycle itself does the rest, more
-steps in each slack than there are new samples: the exchange comes, however slow the machine.
+When the joint file is rewritten, or on SIGHUP, a new estimator is built beside the cycle, stepped through the
+last samples so that it starts where the old one is, and swapped in between two cycles. A thread steps it; if
+the thread cannot catch up with the cycle, the cycle does the rest with more steps per slack than there are
+new samples, so the exchange always completes.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from estimator.sample import Sample
 
 __all__ = ["Reloader"]
 
-_EVERY_S = 1.0  # between the beginnings of two reloads: a file or a signal that flaps costs little
-_STEPS = 5  # of the new estimator in one go; then the cycle gets its turn
+_EVERY_S = 1.0  # minimum time between two reloads, against repeated changes
+_STEPS = 5  # steps of the new estimator before the cycle gets its turn
 _PAUSE_S = 0.0005
-_BEHIND = 4  # samples that the cycle itself may catch up with at the exchange
-_PATIENCE = 4000  # slacks that the thread is given for it; usually it takes a few hundred
-_AID = 2  # steps in one slack from then on
-_FIXED = ("name", "arrangement", "bus", "zenoh")  # what a running daemon does not change
+_BEHIND = 4  # samples that the cycle can process at the exchange
+_PATIENCE = 4000  # slacks until the cycle takes over; usually a few hundred suffice
+_AID = 2  # steps per slack from then on
+_FIXED = ("name", "arrangement", "bus", "zenoh")  # keys that a running daemon cannot change
 
 
 class Reloader:
-    """Watches one joint file, and exchanges the estimator of its pipeline.
+    """Watches one joint file and exchanges the estimator of its pipeline.
 
     Args:
         path: the joint file.
-        joint: as it is in use.
-        pipeline: whose estimator is exchanged.
+        joint: the joint file in use.
+        pipeline: its pipeline.
         build: makes estimator and model monitor of a joint file; called in a thread.
-        publish: called with the joint file in use after an exchange.
-        events: where it is said.
+        publish: called with the new joint file after an exchange.
+        events: the event log.
     """
 
     def __init__(
@@ -65,16 +65,16 @@ class Reloader:
         self._requested = False
         self._next_s = -math.inf
         self._thread: threading.Thread | None = None
-        self._turn = threading.Lock()  # the new estimator is stepped by one thread at a time
+        self._turn = threading.Lock()  # serialises the steps of the new estimator
         self._ready: tuple[JointFile, Built, int] | None = None
-        self._slacks = 0  # since it was ready to be followed
+        self._slacks = 0  # slacks since the new estimator was ready
 
     def request(self) -> None:
-        """Read the file again even if it looks the same; from a signal handler."""
+        """Reload even an unchanged file; callable from a signal handler."""
         self._requested = True
 
     def check(self) -> None:
-        """In the slack: begin to reload when the file has changed."""
+        """In the slack: start a reload if the file has changed."""
         if self._thread is not None or time.monotonic() < self._next_s:
             return
         signature = self._signature()
@@ -86,7 +86,7 @@ class Reloader:
         self._thread.start()
 
     def step(self, _now_ns: int) -> None:
-        """In the slack, between two cycles: put the new estimator in place when it is ready."""
+        """In the slack, between two cycles: swap in the new estimator when it is ready."""
         if self._ready is None or not self._turn.acquire(blocking=False):
             return
         try:
@@ -123,7 +123,7 @@ class Reloader:
         self._follow(joint, built)
 
     def _follow(self, joint: JointFile, built: Built) -> None:
-        """Lead the new estimator through the kept samples, and on until the loop takes or leads it."""
+        """Step the new estimator through the kept samples, and on until the loop takes over."""
         mine = threading.current_thread()
         sequence = -1
         while True:
@@ -134,7 +134,7 @@ class Reloader:
             time.sleep(_PAUSE_S)
 
     def _lead(self, joint: JointFile, built: Built, samples: Sequence[Sample]) -> int:
-        """Step the new estimator; the number of the last sample it has seen."""
+        """Step the new estimator; return the number of its last sample."""
         sequence = self._ready[2] if self._ready is not None else -1
         for sample in samples:
             built[0].step(sample)

@@ -1,7 +1,7 @@
-"""The daemon: one bus, its joints, their keys, from the first frame to a clean end.
+"""The daemon of one bus, from the first frame to a clean end.
 
-Everything that may take time or fail for good happens before the loop runs: opening the bus, claiming the
-names on zenoh, configuring the nodes. After that there is one thread, and nothing in it raises.
+Everything slow or final happens before the loop runs: opening the bus, claiming the names on zenoh,
+configuring the nodes. Then one thread runs, and nothing in it raises.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class ServedJoint:
 
     Attributes:
         joint: its joint file.
-        path: where that is; None: it cannot be reloaded, and names no other files.
+        path: its path; None: it cannot be reloaded and refers to no other files.
     """
 
     joint: JointFile
@@ -64,27 +64,27 @@ class ServedJoint:
 
     @property
     def folder(self) -> Path:
-        """What relative paths in it are relative to."""
+        """Base of its relative paths."""
         return self.path.parent if self.path else Path()
 
 
 class Daemon:
-    """Serves the joints of one bus: made ready by the constructor, then `run`, then `close`.
+    """Serves the joints of one bus: construct, `run`, `close`.
 
     Args:
         joints: their bus sections agree.
-        publish: on zenoh; False: estimates go nowhere.
-        session: an open zenoh session to publish on; None: one of its own.
-        real_time: ask the system for real-time scheduling and locked memory when it runs.
-        devices: simulated devices that live in the daemon's thread, by their `poll`. They answer at once,
-            and SYNC is what moves their world on; for demonstrations, tests and faster than real time.
+        publish: on zenoh.
+        session: an open zenoh session to publish on; None: open one.
+        real_time: request real-time scheduling and locked memory.
+        devices: simulated devices in the daemon's thread. They answer immediately, and SYNC advances their
+            world; for demonstrations, tests and faster than real time.
 
     Attributes:
         loop: the cycle.
-        events: what has happened.
+        events: the event log.
 
     Raises:
-        DrivelinkError: anything that keeps it from starting, in one line.
+        DrivelinkError: why it cannot start, in one line.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class Daemon:
             self._configurator, layouts = join_bus(
                 self._port, [s.joint for s in joints], [s.folder for s in joints], idle=devices
             )
-            self._section = self._configurator.bus  # with the period that another master's SYNC really has
+            self._section = self._configurator.bus  # with the measured period of another master's SYNC
             keep = round(_HISTORY_S / self._section.period_s)
             self._loop_joints = [
                 LoopJoint(
@@ -155,11 +155,11 @@ class Daemon:
 
     @property
     def layouts(self) -> Mapping[int, NodeLayout]:
-        """How the nodes send, by node id."""
+        """Layouts of the nodes, by node id."""
         return self._configurator.layouts
 
     def run(self, seconds: float | None = None) -> None:
-        """Cycle until `stop` is called, or for so long.
+        """Run until `stop` is called or the time is over.
 
         Args:
             seconds: of the wall clock; None: without end.
@@ -179,34 +179,34 @@ class Daemon:
             realtime.release(obtained)
 
     def run_lockstep(self, cycles: int) -> None:
-        """So many cycles as fast as they go, with devices that live in this thread."""
+        """Run so many cycles as fast as possible, with devices in this thread."""
         self.loop.run_lockstep(cycles, self._lockstep_ns)
         self._lockstep_ns += cycles * self.loop.period_ns
 
     def stop(self) -> None:
-        """Make `run` return within a few cycles; from any thread or signal handler."""
+        """Make `run` return within a few cycles; callable from any thread or signal handler."""
         self.loop.stop()
 
     def reload(self) -> None:
-        """Read the joint files again, changed or not; from any thread or signal handler."""
+        """Reload the joint files, changed or not; callable from any thread or signal handler."""
         for reloader in self._reloaders:
             reloader.request()
 
     def close(self) -> None:
-        """Say that it has stopped, and leave nothing behind; a second time does nothing."""
+        """Publish the last status and release everything; may be called twice."""
         if self._closing is not None:
             self._publish_status("stopped")
         self._closing.close()
         self._publishers = []
 
     def documents(self) -> list[dict[str, Any]]:
-        """What the status key of each joint would say now."""
+        """Status document of each joint now."""
         for status in self._status:
             status.refresh_timing()
         return [status.document() for status in self._status]
 
     def summary(self) -> str:
-        """The run, one line a joint."""
+        """Summary of the run, one line per joint."""
         return "\n".join(status.summary() for status in self._status)
 
     def _open_publishers(self, session: zenoh.Session | None) -> list[JointPublisher | None]:
@@ -271,7 +271,7 @@ class Daemon:
             housekeeping.every(watchdog_s, lambda: notify("WATCHDOG=1"))
 
     def _timed(self, joint: JointFile) -> JointFile:
-        """A joint file with the period that SYNC has."""
+        """A joint file with the measured period of SYNC."""
         return joint.model_copy(update={"bus": self._section})
 
     def _republish(
@@ -284,7 +284,7 @@ class Daemon:
         return publish
 
     def _rehearse(self) -> None:
-        """Do once, before the loop, what it will do: nothing is done for the first time in a cycle."""
+        """Rehearse the loop, so that nothing happens for the first time in a cycle."""
         for served in self._joints:
             rehearse(served.joint)
         self.documents()
@@ -315,10 +315,10 @@ def _put_status(publisher: JointPublisher, status: JointStatus) -> Generator[Non
 
 
 def _check_agreement(joints: Sequence[ServedJoint]) -> None:
-    """Several joints in one daemon share one bus and one zenoh session.
+    """Check that the joints share one bus and one zenoh session.
 
     Raises:
-        UsageError: two of one name, or their `bus` or `zenoh` sections differ.
+        UsageError: duplicate names, or different `bus` or `zenoh` sections.
     """
     first = joints[0]
     names = [served.joint.name for served in joints]

@@ -1,4 +1,4 @@
-"""Events of a run, reported once: in the log and in the status document."""
+"""Events of a run, for the log and the status document."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ __all__ = ["EventLog"]
 
 
 class EventLog:
-    """What has happened, said once: in the log, and among the last events of the status.
+    """Logs each event once and keeps the last ones for the status document.
 
-    A condition has a key. It is said when it begins, not while it lasts, and said again when it ends. What
-    comes again within ten seconds, be it with other figures, is counted and not logged.
+    A condition has a key and is reported when it begins and when it ends. Repetitions within ten seconds,
+    also with other numbers, are counted instead of logged.
 
     Args:
-        logger: where the lines go.
-        keep: how many events the status shows.
+        logger: receives the lines.
+        keep: number of events in the status.
         clock: UNIX time, s.
     """
 
-    _QUIET_S = 10.0  # a condition that comes and goes is counted, not repeated, for so long
+    _QUIET_S = 10.0  # for so long repetitions are counted instead of logged
 
     def __init__(
         self, logger: logging.Logger, keep: int = 16, clock: Callable[[], float] = time.time
@@ -32,7 +32,7 @@ class EventLog:
         self._clock = clock
         self._recent: deque[dict[str, Any]] = deque(maxlen=keep)
         self._active: dict[str, str] = {}
-        self._said: dict[str, tuple[dict[str, Any], float, int]] = {}  # event, when it was logged, since then
+        self._said: dict[str, tuple[dict[str, Any], float, int]] = {}  # event, when logged, count since
 
     @property
     def active(self) -> dict[str, str]:
@@ -44,24 +44,24 @@ class EventLog:
         return [dict(event) for event in self._recent]
 
     def say(self, text: str, level: int = logging.INFO, key: str = "") -> None:
-        """Something that has happened, once.
+        """Report an event.
 
         Args:
             text: what.
             level: of the log line.
-            key: the same of texts that say the same with other figures; left out: the text itself.
+            key: identifies texts that differ only in numbers; default: the text itself.
         """
         self._note(key or text, text, level)
 
     def begin(self, key: str, text: str, level: int = logging.WARNING) -> None:
-        """A condition holds; what follows while it holds is not said."""
+        """Report that a condition begins; ignored while it holds."""
         if key in self._active:
             return
         self._active[key] = text
         self._note(f"{key} begins", text, level)
 
     def end(self, key: str, text: str = "", level: int = logging.INFO) -> None:
-        """A condition holds no more."""
+        """Report that a condition has ended."""
         if self._active.pop(key, None) is not None and text:
             self._note(f"{key} ends", text, level)
 
@@ -70,7 +70,7 @@ class EventLog:
         event, since, count = self._said.get(key, ({}, -self._QUIET_S, 0))
         if 0 <= now - since < self._QUIET_S:
             self._said[key] = (event, since, count + 1)
-            event["text"] = text  # its figures of now
+            event["text"] = text  # its present numbers
             event["count"] += 1
             return
         if len(self._said) > 256:

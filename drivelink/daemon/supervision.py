@@ -1,7 +1,7 @@
 """Supervises the nodes beside the cycle: heartbeats, EMCY, reboots, and the recovery from each.
 
 A node that rebooted, fell silent or left the operational state is configured again by the Configurator,
-step by step in the slack. A passive daemon only watches. Every event is said once.
+stepwise in the slack. A passive daemon only observes. Every event is reported once.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ __all__ = ["Supervisor", "residual_text"]
 logger = logging.getLogger(__name__)
 
 _NS = 1_000_000_000
-_SILENT_NS = _NS // 2  # without a PDO, until the node is configured again
+_SILENT_NS = _NS // 2  # time without a PDO until the node is configured again
 _RETRY_NS = _NS  # between two attempts
-_MANY_SYNCS = 3  # more than there are periods, in a second
+_MANY_SYNCS = 3  # SYNCs beyond the number of periods in a second
 _HEARTBEATS_LOST = 3.5  # of them missing: the node is gone
 _STATES = {0x00: "boot-up", 0x04: "stopped", 0x05: "operational", 0x7F: "pre-operational"}
 _OPERATIONAL = 0x05
 _STATE_BITS, _ENABLED, _LIMIT = 0x6F, 0x27, 0x0800  # of the statusword (CiA 402-2, 8.4.2)
 _BOOT_UP, _STOPPED = 0x00, 0x04
-_COUNTED = (  # counter of a node; by how much it grows at least, and what is said then; and when it rests
+_COUNTED = (  # counter of a node; its smallest reported increase, message then, and message when it stops
     ("missing", 1, "frames are missing", "frames arrive again, {} were missing so far"),
     (
         "wrong_length",
@@ -51,7 +51,7 @@ _COUNTED = (  # counter of a node; by how much it grows at least, and what is sa
     ),
     (
         "conflicting",
-        3,  # a single one may be a frame that was late
+        3,  # a single one may be a late frame
         "different frames in one cycle are not used: does another device have its node ID or identifiers?",
         "one frame a cycle again, {} cycles had several so far",
     ),
@@ -59,13 +59,13 @@ _COUNTED = (  # counter of a node; by how much it grows at least, and what is sa
 
 
 _MODEL_ALARM = int(Status.MODEL_ALARM)
-_BRIEF = ("impossible", "jumped")  # of single samples; their status bit says it
+_BRIEF = ("impossible", "jumped")  # of single samples, reported by their status bit
 _BUNCHED = (
     "some frames are missing, others come several in one cycle and are not used: "
     "this machine or the bus is too slow for the cycle, or another device has its node id"
 )
-_BUNCH_NS = _NS // 5  # after a missing frame, in which several in one cycle may be late ones
-_BUNCHES_NS = _NS  # for which that goes on, until it is said
+_BUNCH_NS = _NS // 5  # after a missing frame, when several in one cycle may be late ones
+_BUNCHES_NS = _NS  # duration until it is reported
 
 
 class _Watched:
@@ -90,16 +90,14 @@ class _Watched:
         self.layout = layout
         self.loop_joint = loop_joint
         self.started = False  # since its last frame
-        self.enabled = False  # its drive, when last looked at
+        self.enabled = False  # state of its drive at the last check
         self.begin(NodeCounters(), now_ns)
 
     def begin(self, counters: NodeCounters, now_ns: int) -> None:
-        """Take what has been until now as it is."""
+        """Start from the present counters."""
         self.state = _OPERATIONAL
         self.seen_ns = self.heartbeat_ns = self.attempt_ns = now_ns
-        self.bunched_ns = (
-            0  # since when frames have been missing and come several in one cycle; 0: they do not
-        )
+        self.bunched_ns = 0  # start of missing and multiple frames; 0: none
         self.received = counters.received
         self.sent = counters.received + counters.ignored
         self.counted = {name: (getattr(counters, name), -_NS) for name, *_ in _COUNTED}
@@ -109,13 +107,13 @@ class Supervisor:
     """Heartbeats, faults and reconfiguration of all nodes of the loop.
 
     Args:
-        loop: its listeners are set here.
+        loop: its listeners are set.
         layouts: of each loop_joint's nodes.
-        events: where it is said.
-        configurator: configures nodes again, or, passive, notices that another master has.
+        events: the event log.
+        configurator: configures nodes again or, passive, follows another master.
 
     Attributes:
-        sync_period_s: of the master that is followed, as last measured; None: not yet, or SYNC is ours.
+        sync_period_s: last measured period of the followed master; None: not yet, or SYNC is produced.
     """
 
     def __init__(
@@ -127,13 +125,13 @@ class Supervisor:
     ) -> None:
         self._loop = loop
         self._events = events
-        self._alarmed: set[str] = set()  # joints whose model alarm is on
+        self._alarmed: set[str] = set()  # joints with a model alarm
         self._configurator = configurator
         self._follower: MapFollower | None = None
         self._counter_jumps = self._lost_sends = self._clock_steps = 0
         self._bus_offs = self._restarts = self._measured_ns = 0
         self._slow = self._slow_ns = 0
-        self._off_period = 0  # measurements in a row
+        self._off_period = 0  # consecutive measurements
         self._foreign = deque([(loop.clock(), 0, 0)])  # in the last second: SYNCs not due, periods without
         self.sync_period_s: float | None = None
         loop.on_fault = self._say_fault
@@ -149,7 +147,7 @@ class Supervisor:
             self._follow(configurator)
 
     def _follow(self, configurator: PassiveConfigurator) -> None:
-        """Another master maps the nodes: process every frame that shows it in its turn."""
+        """Follow another master's mapping: process its frames in bus order."""
         loop, nodes = self._loop, self._nodes
         self._follower = MapFollower(
             configurator,
@@ -164,11 +162,11 @@ class Supervisor:
 
     @property
     def receive_ids(self) -> tuple[int, ...]:
-        """Identifiers of the frames it listens to."""
+        """Identifiers it listens to."""
         return tuple(self._loop.listeners)
 
     def node_status(self, loop_joint: LoopJoint) -> dict[str, Any]:
-        """Of the nodes of one joint, for the status key."""
+        """State of one joint's nodes, for the status key."""
         now = self._loop.clock()
         counters = loop_joint.pipeline.assembler.counters
         faults, statuswords = loop_joint.pipeline.assembler.faults, loop_joint.pipeline.assembler.statuswords
@@ -191,7 +189,7 @@ class Supervisor:
         return status
 
     def step(self, now_ns: int) -> None:
-        """Go on with what is being configured."""
+        """Advance running configurations."""
         if self._configurator.busy and self._follower is None:
             self._proceed(now_ns)
 
@@ -219,9 +217,9 @@ class Supervisor:
             watched.started = True
 
     def check(self) -> None:
-        """What has changed since the last check; a few tens of microseconds."""
+        """Check for changes since the last call; a few tens of microseconds."""
         if isinstance(self._loop.source, LostSource):
-            return  # said already; what is not heard now says nothing of the nodes
+            return  # already reported; silence says nothing about the nodes now
         now = self._loop.clock()
         for node, watched in self._nodes.items():
             self._check_frames(node, watched, now)
@@ -266,7 +264,7 @@ class Supervisor:
             self._events.end(f"joint {loop_joint.name}", f"{loop_joint.name}: estimates restart")
 
     def _check_model(self, loop_joint: LoopJoint) -> None:
-        """Say when the model alarm comes and goes, by how much, and what to do."""
+        """Report begin and end of the model alarm, its amount and what to do."""
         estimate, monitor = loop_joint.pipeline.estimate, loop_joint.pipeline.model_monitor
         if estimate is None:
             return
@@ -285,7 +283,7 @@ class Supervisor:
             self._events.say(f"{loop_joint.name}: the model alarm is over{residual_text(monitor)}")
 
     def _check_contradiction(self, loop_joint: LoopJoint) -> None:
-        """Say which readings contradict each other, when that begins and when it is over."""
+        """Report begin and end of a contradiction between readings."""
         key, found = f"contradiction {loop_joint.name}", contradiction(loop_joint.pipeline.assembler)
         if found is None:
             self._events.end(key, f"{loop_joint.name}: no reading contradicts another")
@@ -293,7 +291,7 @@ class Supervisor:
             self._events.begin(key, f"{loop_joint.name}: {found['text']}")
 
     def _check_readings(self, loop_joint: LoopJoint) -> None:
-        """Say which reading is suspected, and of what, when that begins and when it is over."""
+        """Report begin and end of a suspicion against a reading."""
         suspicion = (
             loop_joint.pipeline.estimator.suspicion() if loop_joint.pipeline.estimate is not None else None
         )
@@ -308,7 +306,7 @@ class Supervisor:
         self._events.say(f"{where}: {type(error).__name__}: {error}", logging.ERROR)
 
     def reconfigure_all(self) -> None:
-        """The bus was away: the state of the nodes is unknown."""
+        """Configure all nodes again after a loss of the bus."""
         for node, watched in self._nodes.items():
             assembler = watched.loop_joint.pipeline.assembler
             if isinstance(self._configurator, Configurator):
@@ -339,7 +337,7 @@ class Supervisor:
         if counters.received + counters.ignored != watched.sent:
             watched.sent = counters.received + counters.ignored
             if watched.state == _BOOT_UP or now - watched.heartbeat_ns > _NS:
-                watched.state = _OPERATIONAL  # no node sends PDOs otherwise, and it says nothing else
+                watched.state = _OPERATIONAL  # required for PDOs, and no other state is reported
         if counters.received != watched.received:
             watched.received, watched.seen_ns = counters.received, now
             watched.started = False
@@ -377,7 +375,7 @@ class Supervisor:
             self._events.end(f"fault {node}", f"node {node} reports no fault")
 
     def _check_statusword(self, node: int, watched: _Watched) -> None:
-        """Say when a drive leaves the state in which it drives, and when it limits its set-point."""
+        """Report when a drive leaves operation enabled, or limits its set-point."""
         statusword = watched.loop_joint.pipeline.assembler.statuswords.get(node)
         if statusword is None:
             return
@@ -428,10 +426,10 @@ class Supervisor:
         self._check_controller()
 
     def _check_foreign_syncs(self) -> None:
-        """Whether two masters make SYNC.
+        """Check whether two masters produce SYNC.
 
-        When following, those that are not due prove nothing by themselves: one master alone makes some where
-        it leaves out as many periods. Two make more than there are periods.
+        When following, SYNCs that are not due prove nothing: one master produces some if it skips as many
+        periods. Two masters produce more SYNCs than periods.
         """
         loop, now = self._loop, self._loop.clock()
         self._foreign.append((now, loop.foreign_syncs, loop.skipped_periods))
@@ -451,7 +449,7 @@ class Supervisor:
         self._events.begin("foreign sync", what, logging.ERROR)
 
     def _check_period(self) -> None:
-        """Whether the master that is followed still keeps the period that the estimators work with."""
+        """Check that the followed master still has the period used by the estimators."""
         loop, now = self._loop, self._loop.clock()
         if loop.produce or now - self._measured_ns < _NS or len(loop.sync_stamps) < MEASURED_SYNCS:
             return
@@ -473,7 +471,7 @@ class Supervisor:
             )
 
     def _check_speed(self) -> None:
-        """Whether this machine keeps up with the cycle."""
+        """Check that this machine keeps up with the cycle."""
         loop, now = self._loop, self._loop.clock()
         unread = loop.source.errors.get(OVERFLOW, 0)
         total = loop.overruns + loop.behind + unread
@@ -515,11 +513,11 @@ class Supervisor:
         watched = self._nodes[node]
         watched.heartbeat_ns = self._loop.clock()
         state = data[0] & 0x7F
-        if state == 0:  # every time: it may reboot again while it is being configured
+        if state == 0:  # every time: it may reboot while being configured
             self._events.say(f"node {node} has rebooted", logging.WARNING)
             watched.attempt_ns = watched.heartbeat_ns
             self._configurator.start(node)
-            if self._follower is not None:  # its heartbeat, too, is as the node has it by itself
+            if self._follower is not None:  # its heartbeat has its default again
                 watched.layout = replace(watched.layout, heartbeat_ms=0)
         if self._follower is not None:
             self._follower.feed(cob_id, data)
@@ -534,7 +532,7 @@ class Supervisor:
     def _answer(self, cob_id: int, data: bytes) -> None:
         now_ns = self._loop.clock()
         self._configurator.feed(cob_id, data, now_ns / _NS)
-        self._proceed(now_ns)  # its frames must not be read by the old layout once it is started
+        self._proceed(now_ns)  # do not decode its frames by the old layout
 
 
 def _maps(layout: NodeLayout) -> str:
@@ -545,7 +543,7 @@ def _maps(layout: NodeLayout) -> str:
 
 
 def residual_text(monitor: ResidualMonitor | None) -> str:
-    """What the model leaves unexplained against its baseline, in words, as far as it is known."""
+    """The residual against its baseline in words, if known."""
     described = monitor.describe() if monitor is not None else {}
     residuals, baselines = described.get("residual_nm") or (), described.get("floor_nm") or ()
     ratios = [r / b for r, b in zip(residuals, baselines, strict=False) if b > 0.0 and math.isfinite(r)]

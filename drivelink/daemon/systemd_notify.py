@@ -1,4 +1,4 @@
-"""systemd's notification socket (sd_notify(3)): ready, stopping, watchdog. Without systemd, nothing."""
+"""systemd's notification socket (sd_notify(3)): ready, stopping, watchdog. Optional."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["notify", "watchdog_period_s"]
 
 
 def notify(*lines: str) -> bool:
-    """Send lines such as "READY=1"; whether systemd listens."""
+    """Send lines such as "READY=1"; return whether systemd listens."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address.startswith(("/", "@")):
         return False
@@ -25,7 +25,7 @@ def notify(*lines: str) -> bool:
 
 
 def watchdog_period_s() -> float | None:
-    """How often "WATCHDOG=1" is to be sent, half of what systemd allows; None: it does not watch."""
+    """Interval of "WATCHDOG=1", half of systemd's timeout, s; None: no watchdog."""
     if os.environ.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
         return None
     try:

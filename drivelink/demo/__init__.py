@@ -1,1 +1,1 @@
-"""The main job without hardware: a simulated joint and its daemon in one process, a subscriber in another."""
+"""The demo: a simulated joint and its daemon in one process, a subscriber in another."""

@@ -59,7 +59,7 @@ def closing_table(
 
 
 def as_json(case: str, comparison: Comparison, summary: Summary, received: int) -> dict[str, Any]:
-    """The same for a program; a figure that there is none of is null."""
+    """The same as a JSON object; missing numbers are null."""
     errors = comparison.errors()
     return {
         "case": case,

@@ -1,4 +1,4 @@
-"""Truth beside estimate, matched by sequence number, and how far they are apart."""
+"""Compares estimates with the truth, matched by sequence number."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ __all__ = ["Comparison", "Errors"]
 
 T = TypeVar("T")
 
-_UNMATCHED = 5_000  # sequence numbers kept while the other side is waited for
+_UNMATCHED = 5_000  # sequence numbers kept while waiting for the other side
 
 
 class Errors(NamedTuple):
     """Root-mean-square errors over the cycles whose estimate is valid, relative to the truth's rms.
 
     Attributes:
-        cycles: that were compared.
+        cycles: number of compared cycles.
         stiffness: relative error of the stiffness.
         flexibility_torque: relative error of the flexibility torque.
         covered: fraction of the cycles whose 95 % interval of the stiffness holds the truth.
@@ -33,7 +33,7 @@ class Errors(NamedTuple):
 
 
 class Comparison:
-    """Pairs what was received with what was true.
+    """Pairs received estimates with the truth.
 
     Attributes:
         latest: the last pair, for a view.
@@ -47,7 +47,7 @@ class Comparison:
         self._sums = [0.0, 0.0, 0.0, 0.0]  # squared errors and squared truths: stiffness, torque
 
     def received(self, estimate: EstimateLike) -> None:
-        """An estimate came in over zenoh."""
+        """Enter a received estimate."""
         truth = self._truth.pop(estimate.sequence, None)
         if truth is not None:
             self._pair(estimate, truth)
@@ -55,7 +55,7 @@ class Comparison:
             _keep(self._estimates, estimate.sequence, estimate)
 
     def known(self, truth: TruePoint) -> None:
-        """What was true at one SYNC."""
+        """Enter the truth at one SYNC."""
         estimate = self._estimates.pop(truth.sequence, None)
         if estimate is not None:
             self._pair(estimate, truth)
@@ -63,7 +63,7 @@ class Comparison:
             _keep(self._truth, truth.sequence, truth)
 
     def errors(self) -> Errors:
-        """Over everything paired so far; NaN before there is a valid estimate."""
+        """Errors over all pairs so far; NaN before the first valid estimate."""
         if self._cycles == 0:
             return Errors(0, math.nan, math.nan, math.nan)
         stiffness, true_stiffness, torque, true_torque = self._sums

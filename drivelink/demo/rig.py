@@ -1,9 +1,8 @@
 """The demo's other process: the simulated joint and the daemon that serves it, on one virtual bus.
 
-python-can's virtual bus lives inside one process, so both are in this one, and in one thread: two would wait
-for each other's hold on the interpreter, which no real drive does. For the same reason the subscriber is in
-another process. Truth goes to the watcher by a pipe, under the
-sequence numbers of the published estimates.
+python-can's virtual bus exists inside one process. Both share one thread, because two would wait for each
+other's hold on the interpreter, which no real drive does; for the same reason the subscriber is another
+process. The truth goes to it through a pipe, with the sequence numbers of the estimates.
 """
 
 from __future__ import annotations
@@ -25,11 +24,11 @@ from drivelink.pubsub.publisher import JointPublisher
 
 __all__ = ["Failure", "Summary", "TruePoint", "serve"]
 
-_BATCH = 50  # cycles between two messages to the watcher
+_BATCH = 50  # cycles per message to the watcher
 
 
 class TruePoint(NamedTuple):
-    """The joint as it really was at one SYNC."""
+    """True state of the joint at one SYNC."""
 
     sequence: int
     flexibility_torque_nm: float
@@ -37,7 +36,7 @@ class TruePoint(NamedTuple):
 
 
 class Summary(NamedTuple):
-    """How the run went, from the daemon."""
+    """The daemon's summary of the run."""
 
     cycles: int
     estimates: int
@@ -48,21 +47,21 @@ class Summary(NamedTuple):
 
 
 class Failure(NamedTuple):
-    """Why there was no run, in one line."""
+    """Why the run failed, in one line."""
 
     text: str
     exit_status: int
 
 
 class World(Protocol):
-    """What the rig needs of the simulated world."""
+    """Interface of the simulated world."""
 
     def truth(self) -> TruthLike:
-        """The joint as it is now."""
+        """True state of the joint now."""
 
 
 class TruthTap:
-    """Publishes as the daemon's publisher does, and notes what was true at the same SYNC."""
+    """Publishes like the daemon's publisher, and notes the truth at the same SYNC."""
 
     def __init__(self, publisher: JointPublisher, world: World, connection: Connection) -> None:
         self._publisher = publisher
@@ -79,9 +78,9 @@ class TruthTap:
             self.flush()
 
     def flush(self) -> None:
-        """Send what has been noted."""
+        """Send the noted truth."""
         points, self._points = self._points, []
-        with suppress(OSError):  # the watcher has gone; the run goes on to its clean end
+        with suppress(OSError):  # the watcher has gone; end cleanly
             self._connection.send(points)
 
 
@@ -93,7 +92,7 @@ def serve(path: Path, seconds: float | None, connection: Connection) -> None:
         seconds: of the run; None: until SIGTERM.
         connection: to the watcher.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both; the watcher decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; the watcher decides
     logging.getLogger("drivelink").propagate = False  # the watcher's view shows the daemon's events
     logging.getLogger("drivelink").addHandler(logging.NullHandler())
     try:

@@ -1,8 +1,8 @@
-"""Joint file to simulated world and devices: the only module of the service that knows `sim`.
+"""Builds simulated world and devices from a joint file; the only module of the service that imports `sim`.
 
-The truth is one of the paper's cases (`sim.case`), or what the joint file's model says, with the values of
-`sim.parameters` in place of the model's and `sim.effect` on top. Drives and encoders are those of the
-`drive` and `encoder` sections, so that a daemon with the same joint file finds what it expects.
+The truth is one of the paper's cases (`sim.case`), or the joint file's model changed by `sim.parameters`,
+plus `sim.effect`. Drives and encoders follow the `drive` and `encoder` sections, so that a daemon with the
+same joint file finds what it expects.
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ QUIRK_NAMES = tuple(PROFILES)
 
 _LOCAL = ("127.0.0.1", "localhost", "::1")
 
-# Springs of a joint file that declares none, by stiffness at rest and order: `new` makes such files.
-_NATURAL_HZ = 5.0  # sqrt(K/B)/(2 pi): a soft joint, which shows what drivelink estimates
-_STIFFENED_RAD = 0.15  # where the stiffness of a hardening one has doubled
+# Springs for a joint file without parameters (as `new` writes), by stiffness at rest.
+_NATURAL_HZ = 5.0  # sqrt(K/B)/(2 pi) of a soft joint
+_STIFFENED_RAD = 0.15  # deflection at which the stiffness of a hardening spring has doubled
 _ASSUMED: dict[str, Callable[[float, int], dict[str, float | tuple[float, ...]]]] = {
     "linear": lambda k, _: {"k_nm_rad": k},
     "polynomial": lambda k, order: {
@@ -94,7 +94,7 @@ def world_from_joint(
         file: the joint file, for messages.
 
     Raises:
-        JointFileError: the file lacks something, or says something that cannot be.
+        JointFileError: a missing or impossible value.
         UsageError: an effect that does not exist.
     """
     section = joint.sim or SimSection()
@@ -120,7 +120,7 @@ def world_from_joint(
 
 
 def assumptions(joint: JointFile) -> list[str]:
-    """What the world of a joint file takes where the file does not say, a line each."""
+    """Assumed values that the joint file does not declare, one line each."""
     if joint.sim is not None and joint.sim.case is not None:
         return []
     lines = []
@@ -142,7 +142,7 @@ def _assumed_stiffness(motor: MotorSection) -> float:
 
 
 def _spring(motor: MotorSection, index: int) -> Spring:
-    """The transmission as declared; where its parameters are not, one that suits the motor."""
+    """The declared transmission; without parameters one that suits the motor."""
     transmission = motor.transmission
     if transmission.model == "none" or transmission.parameters:
         return Spring(model=transmission.model, parameters=transmission.parameters)
@@ -155,7 +155,7 @@ def _spring(motor: MotorSection, index: int) -> Spring:
 
 
 def _plant(joint: JointFile) -> JointPlant:
-    """The joint as its model says; without link dynamics the link weighs twice the first motor."""
+    """The declared joint; without link dynamics the link has twice the first motor's inertia."""
     link = joint.link.dynamics or LinkDynamics(inertia_kg_m2=2.0 * joint.motor[0].inertia_kg_m2)
     return JointPlant(
         arrangement=joint.arrangement,
@@ -177,7 +177,7 @@ def _plant(joint: JointFile) -> JointPlant:
 
 
 def _declared(joint: JointFile, section: SimSection, given: Case | None) -> list[PlantEffect]:
-    """Effects of the file: those of the model too, where the model is the truth."""
+    """Effects of the file, including the model's if the model is the truth."""
     effects = [make(effect.name, effect.parameters) for effect in section.effect]
     if given is None:
         effects += [
@@ -195,7 +195,7 @@ def _asked(effects: Sequence[str]) -> list[PlantEffect]:
 
 
 def _excitation(section: SimSection, plant: JointPlant, given: Case | None) -> Mapping[str, Any]:
-    """The table of the file, completed by what suits the case or the plant."""
+    """The file's table, completed for the case or the plant."""
     table = section.excitation
     if given is not None and table.get("kind") in (None, given.excitation["kind"]):
         return {**given.excitation, **table}
@@ -207,7 +207,7 @@ def _excitation(section: SimSection, plant: JointPlant, given: Case | None) -> M
 
 
 def _hardware(joint: JointFile, index: int, plant: JointPlant, given: Case | None) -> DriveHardware:
-    """The drive of one motor: what the joint file says, completed by the case or by plausible values."""
+    """The drive of one motor: declared values, completed by the case or by plausible values."""
     drive = joint.motor[index].drive
     assumed = given.drives[index] if given else DriveHardware()
     if drive is None:
@@ -254,7 +254,7 @@ def nodes_from_joint(
 
     Args:
         joint: the joint file.
-        world: what they measure.
+        world: the world they measure.
         quirks: name of a profile instead of `sim.quirks`.
         file: the joint file, for messages.
 
@@ -317,8 +317,8 @@ def network_from_joint(
 def open_sim_bus(section: BusSection) -> can.BusABC:
     """Open the bus of a joint file from the devices' side.
 
-    For `interface = "socketcand"` at an address of this machine that nobody serves yet, serve it: the
-    daemon, or a second simulation, then connects to it. Where somebody does, it is a `JoinedBus`.
+    For `interface = "socketcand"` at an unused address of this machine, serve it: the daemon, or a second
+    simulation, then connects to it. If it is already served, return a `JoinedBus`.
 
     Raises:
         BusError: it cannot be opened.
@@ -338,9 +338,9 @@ def open_sim_bus(section: BusSection) -> can.BusABC:
 
 
 class JoinedBus(can.BusABC):
-    """A socketcand bus that another process serves; when that ends, it says so.
+    """A socketcand bus that another process serves; detects its end.
 
-    python-can's own client then returns at once, without a frame, forever.
+    python-can's client then returns immediately without a frame, forever.
 
     Args:
         bus: python-can's client.
@@ -377,13 +377,13 @@ class JoinedBus(can.BusABC):
 
 
 def require_free(bus: can.BusABC, node_ids: Sequence[int], section: BusSection) -> None:
-    """Ask whether anybody has one of the simulated devices' node ids already.
+    """Check that no other device uses a simulated device's node id.
 
     Raises:
-        BusError: somebody has: another simulation of the same joint, or real drives.
+        BusError: another simulation of the joint, or a real drive, does.
     """
     if section.interface == "virtual" or isinstance(bus, SocketcandServer):
-        return  # nobody else can be there
+        return  # no other process can be there
     there, _ = scan(bus, node_ids)
     taken = sorted(set(node_ids).intersection(there))
     if taken:

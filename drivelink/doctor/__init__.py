@@ -1,4 +1,4 @@
-"""Finds what keeps this machine, bus or drive from doing the job, and the fix. Nothing is changed."""
+"""Finds problems of machine, bus and drives, and the fix for each. Changes nothing."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LONGEST_TIMER_S = 2.0
 
 
 def examine(joint: JointFile | None, base_dir: Path, seconds: float) -> Report:
-    """The whole examination.
+    """Run all checks.
 
     Args:
         joint: the joint file; None: only the machine.
@@ -45,7 +45,7 @@ def examine(joint: JointFile | None, base_dir: Path, seconds: float) -> Report:
 
 
 def examine_eds(path: Path) -> Report:
-    """What a drive could give, from its EDS or DCF alone.
+    """Signals that a drive can send, from its EDS or DCF alone.
 
     Raises:
         DriveError: the file cannot be read at all.

@@ -1,7 +1,7 @@
-"""`doctor --move`: what to do by hand, and what each sign and scale turns out to be.
+"""`doctor --move`: checks each sign and scale with a person who moves the joint.
 
-drivelink never moves a drive: a person turns the joint, or jogs it with whatever controls it, and says by how
-much. Positions are compared with that; a torque by what a drive that holds its position does against a push.
+drivelink never moves a drive: a person turns or jogs the joint and enters the amount. Positions are compared
+with it, torques with the reaction of a holding drive to a push.
 """
 
 from __future__ import annotations
@@ -18,26 +18,26 @@ from estimator.gate import Change
 
 __all__ = ["ByHand", "Mark", "Person", "Value", "Values", "check_by_hand"]
 
-_STILL = 0.1  # of the motion that was asked for: what moves less has not taken part
-_BY_EYE = 0.15  # relative: how well an angle is turned by eye
-_FRICTION = 2.0  # factor: what friction in a gear and a push by hand leave uncertain of a torque
-_GEARED = 3.0  # ratios nearer to one than this are a scale, not a gear
+_STILL = 0.1  # of the requested motion: a channel that moves less did not follow
+_BY_EYE = 0.15  # relative accuracy of an angle turned by eye
+_FRICTION = 2.0  # factor: uncertainty of a torque by friction in the gear and a push by hand
+_GEARED = 3.0  # ratios closer to one than this are a scale error, not a gear
 _SIGMAS = 5.0  # standard deviations of the torque's noise that a push has to exceed
 _AMOUNT = re.compile(r"([+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*(\D*)", re.ASCII)  # number, unit
 
 
 class _Axis(NamedTuple):
-    """How people speak of the motion of an axis.
+    """Units and words for the motion of an axis.
 
     Attributes:
-        verb: what is done with it.
-        asked: rad or m, unless the person says another amount.
-        unit: the everyday one, by which a scale may be off, as it stands behind a number.
-        everyday: rad or m of it.
-        units: rad or m of every unit that an amount may have.
+        verb: "turn" or "move".
+        asked: default amount, rad or m.
+        unit: everyday unit as printed after a number; a scale may be wrong by it.
+        everyday: its value in rad or m.
+        units: accepted units in rad or m.
         example: amounts.
         force: unit of what a motor exerts.
-        known: how a push is computed.
+        known: formula for a push.
     """
 
     verb: str
@@ -50,7 +50,7 @@ class _Axis(NamedTuple):
     known: str
 
     def shown(self, value: float) -> str:
-        """An amount in people's unit, and in SI."""
+        """An amount in the everyday unit and in SI."""
         return f"{value / self.everyday:+.4g}{self.unit} ({value:+.3g})"
 
 
@@ -85,20 +85,20 @@ class Value(NamedTuple):
 
 
 class Values(Protocol):
-    """Where the channels' values come from."""
+    """Source of the channels' values."""
 
     def read(self, seconds: float) -> Mapping[str, Value]:
-        """Those of the next seconds: "motor1_position", "motor1_torque", …, "link_position"."""
+        """Values over the next seconds: "motor1_position", "motor1_torque", …, "link_position"."""
 
 
 class Person(Protocol):
-    """Who moves the joint."""
+    """The person who moves the joint."""
 
     def say(self, text: str) -> None:
         """Show a line."""
 
     def ask(self, text: str, meanwhile: Callable[[], object]) -> str:
-        """Ask for an answer; `meanwhile` is called again and again until it comes."""
+        """Ask for an answer; call `meanwhile` repeatedly until it comes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,7 +109,7 @@ class Mark:
         channel: e.g. "motor1_position".
         what: "sign" or "scale".
         good: whether it is right; None: not checked.
-        text: what was seen.
+        text: the observation.
     """
 
     channel: str
@@ -138,7 +138,7 @@ class ByHand:
 
     @property
     def good(self) -> bool | None:
-        """Whether everything that was checked is right; None: nothing was."""
+        """Whether all checks passed; None: nothing was checked."""
         checked = [mark.good for mark in self.marks if mark.good is not None]
         return all(checked) if checked else None
 
@@ -162,7 +162,7 @@ def check_by_hand(joint: JointFile, values: Values, person: Person, seconds: flo
         seconds: over which a channel at rest is averaged.
 
     Raises:
-        UsageError: the person has gone.
+        UsageError: nobody answers.
     """
     steps = _Steps(joint, values, person, seconds)
     person.say("drivelink moves nothing: you do, by hand or with whatever controls the drive.")
@@ -181,10 +181,10 @@ def check_by_hand(joint: JointFile, values: Values, person: Person, seconds: flo
 
 
 class _Steps:
-    """The checks, one after the other.
+    """The checks in order.
 
     Attributes:
-        done: how they went so far.
+        done: results so far.
     """
 
     def __init__(self, joint: JointFile, values: Values, person: Person, seconds: float) -> None:
@@ -193,7 +193,7 @@ class _Steps:
         self.done = ByHand()
 
     def positions(self, channels: Sequence[str], what: str) -> None:
-        """What the channels read when something is turned by an amount that the person knows."""
+        """Check positions against a motion of known amount."""
         axis = self._axis
         self._ask(f"Hold {what} still, then press Enter.")
         before = self._now()
@@ -232,17 +232,17 @@ class _Steps:
             self.done.needed[channel.replace("position", "torque")] = ratio
 
     def _is_gear(self, ratio: float) -> bool:
-        """Whether a scale is off by a gear that is not declared: by so much, and not by the unit."""
+        """Whether a scale is wrong by an undeclared gear rather than a unit."""
         return ratio > _GEARED and abs(math.log(ratio * self._axis.everyday)) > _BY_EYE
 
     def _gear_twice(self, ratio: float, channel: str) -> bool:
-        """Whether a motor moves less by the gear that is declared for it."""
+        """Whether a motor's motion is too small by its declared gear."""
         drive = self._joint.motor[int(channel[5]) - 1].drive
         gear = 1.0 if drive is None else drive.gear_ratio
         return gear > _GEARED and abs(ratio * gear - 1.0) < _BY_EYE
 
     def torques(self, channels: Sequence[str]) -> None:
-        """What the torques read when drives hold their position against a push."""
+        """Check torques of drives that hold their position against a push."""
         reply = self._ask(
             "Let the drives hold their position, by whatever controls them; drivelink enables none. "
             "Press Enter when they hold, or type s to skip the torques."
@@ -259,7 +259,7 @@ class _Steps:
         )
         after = self._now()
         direction = -1.0 if pushed is not None and pushed < 0.0 else 1.0
-        held: dict[str, float] = {}  # against the push, by the scales that were found so far
+        held: dict[str, float] = {}  # against the push, with the scales found so far
         unread = False
         for channel in channels:
             if channel not in before or channel not in after:
@@ -271,7 +271,7 @@ class _Steps:
                 text = f"no reaction ({change:+.3g} {unit}): does the drive hold?"
                 self._mark(channel, "sign", None, text)
                 continue
-            # The push turns the link ahead of the motor: +tau_e on the motor (eq 5), balanced by the drive.
+            # The push moves the link ahead of the motor: +tau_e on the motor (eq 5), balanced by the drive.
             good = change * direction < 0.0
             text = "against the push" if good else "with the push: it has the wrong sign"
             self._mark(channel, "sign", good, f"{change:+.3g} {unit} {text}")
@@ -282,7 +282,7 @@ class _Steps:
             self._torque_scale(held, abs(pushed), unread)
 
     def _torque_scale(self, held: Mapping[str, float], pushed: float, unread: bool) -> None:
-        """The motors' torques together against a torque that is known."""
+        """Compare the motors' total torque with a known torque."""
         total = sum(held.values())
         ratio = total / pushed
         text = f"{total:.3g} {self._axis.force} for {pushed:.3g} {self._axis.force}"
@@ -304,11 +304,11 @@ class _Steps:
                 self.done.needed[channel] = self.done.needed.get(channel, 1.0) / ratio
 
     def _ask(self, text: str) -> str:
-        """The reply; channels are read meanwhile, so that counters that roll over are followed."""
+        """Ask; channels are read meanwhile to follow counters that roll over."""
         return self._person.ask(text, lambda: self._values.read(0.05)).strip()
 
     def _now(self) -> Mapping[str, Value]:
-        """The channels at rest."""
+        """Read the channels at rest."""
         return self._values.read(self._seconds)
 
     def _mark(self, channel: str, what: str, good: bool | None, text: str) -> None:
@@ -317,7 +317,7 @@ class _Steps:
         self._person.say(f"  {mark}")
 
     def _amount(self, text: str) -> float | None:
-        """By how much something was moved, rad or m; None: skipped."""
+        """The amount of motion, rad or m; None: skipped."""
         axis = self._axis
         while True:
             reply = self._ask(text)
@@ -332,7 +332,7 @@ class _Steps:
             self._person.say(f"expected an amount like {axis.example}, got {reply}")
 
     def _torque(self, text: str) -> float | None:
-        """What the joint is pushed with, N·m or N; None where it is not known."""
+        """The torque or force of the push, N·m or N; None: unknown."""
         while True:
             reply = self._ask(text)
             if not reply:

@@ -1,4 +1,4 @@
-"""From an EDS or DCF alone: which signals the drive can send, and the mapping that would be used."""
+"""Examines an EDS or DCF: which signals the drive can send, and the mapping that would be used."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from drivelink.notice import Severity
 
 __all__ = ["examine_sheet", "planned_entries"]
 
-# Objects that can give a signal, best first; the vendor's own current object follows.
+# Objects for each signal, best first; the vendor's current object is last.
 _OBJECTS: dict[Signal, tuple[tuple[int, int], ...]] = {
     Signal.MOTOR_POSITION: ((0x6064, 0),),
     Signal.MOTOR_TORQUE: ((0x6077, 0), (0x6078, 0)),
@@ -49,7 +49,7 @@ def examine_sheet(section: Section, path: Path) -> None:
     """Findings about one file.
 
     Raises:
-        DriveError: it cannot be read at all.
+        DriveError: it cannot be read.
     """
     sheet = load_eds(path)
     section.ok(path.name, _title(sheet))
@@ -60,7 +60,7 @@ def examine_sheet(section: Section, path: Path) -> None:
     section.say(Severity.INFO, "by default", describe(tpdo for tpdo in tpdos if tpdo.enabled))
     role = _role(sheet)
     mappable = {signal: objects for signal, objects in available.items() if objects}
-    mappable.pop(Signal.MOTOR_VELOCITY, None)  # not mapped unless the joint file asks for it
+    mappable.pop(Signal.MOTOR_VELOCITY, None)  # not mapped by default
     if any(not available[signal] for signal in _needed(sheet) & available.keys()):
         return
     _units(section, sheet)
@@ -97,7 +97,7 @@ def _title(sheet: DataSheet) -> str:
 
 
 def planned_entries(assignment: Assignment) -> tuple[int, tuple[Entry, ...]]:
-    """Number and entries of a TPDO as it would be."""
+    """Number and entries of a TPDO as it would be configured."""
     if assignment.objects is None:
         return assignment.tpdo.number, assignment.tpdo.entries
     return assignment.tpdo.number, tuple((*c.address, c.bits) for c in assignment.objects)
@@ -149,7 +149,7 @@ def _signals(section: Section, sheet: DataSheet) -> dict[Signal, tuple[MappableO
 def _checks(
     sheet: DataSheet, available: Mapping[Signal, tuple[MappableObject, ...]]
 ) -> dict[Signal, tuple[MappableObject, ...]]:
-    """Objects that could check others: a second one of torque and current, velocity, following error."""
+    """Objects for cross-checks: a second torque or current, velocity, following error."""
 
     def mappable(signal: Signal, index: int) -> tuple[MappableObject, ...]:
         entry = sheet.objects.get((index, 0))
@@ -191,7 +191,7 @@ def _say_signal(
 
 
 def _more(signal: Signal, sheet: DataSheet, usable: list[tuple[int, int]]) -> str:
-    """What else there is to say of the object of a signal."""
+    """Remarks on the object of a signal."""
     if signal is Signal.MOTOR_VELOCITY:
         return ", mapped with velocity = true"
     index, subindex = usable[0]
@@ -208,7 +208,7 @@ def _more(signal: Signal, sheet: DataSheet, usable: list[tuple[int, int]]) -> st
 
 
 def _units(section: Section, sheet: DataSheet) -> None:
-    """The scaling that the file gives, and what the joint file has to declare."""
+    """Units in the file, and those that the joint file has to declare."""
     if _is_encoder(sheet):
         counts = sheet.value(0x6501)
         text = (

@@ -1,4 +1,4 @@
-"""Which cross-checks a drive could be made to send beside what is needed, and the line that asks for them."""
+"""Suggests cross-checks that a drive could send, with the line for the joint file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Available = Mapping[Signal, Sequence[MappableObject]]
 
 
 def asked_signals(role: Role) -> set[Signal]:
-    """Signals that the joint file wants only to check others."""
+    """Signals that the joint file requests for cross-checks."""
     if role.drive is None:
         return set()
     asked = {signal for name in role.drive.checks for signal in _SIGNALS[name]}
@@ -37,14 +37,14 @@ def asked_signals(role: Role) -> set[Signal]:
 def say_free_checks(
     section: Section, role: Role, wanted: Available, available: Available, tpdos: Sequence[Tpdo]
 ) -> None:
-    """Say which checks the drive can send, in how many more frames, and how to ask for them.
+    """Report which checks the drive can send, their cost in frames, and the line for the joint file.
 
     Args:
         section: of the drive.
         role: the drive.
-        wanted: what is mapped anyway.
-        available: what it has for signals that check others.
-        tpdos: as they are in the drive.
+        wanted: signals that are mapped anyway.
+        available: its objects for cross-checks.
+        tpdos: present TPDOs.
     """
     if role.drive is None:
         return
@@ -73,7 +73,7 @@ def _say(section: Section, role: Role, names: list[str], text: str, frames: int 
 
 
 def _cost(role: Role, wanted: Available, objects: Available, tpdos: Sequence[Tpdo]) -> int | None:
-    """Frames a cycle beyond what is mapped anyway; None: there is no room."""
+    """Additional frames per cycle; None: there is no room."""
     try:
         now = assign(role, wanted, tpdos, prefer_unused=False)
         return len(assign(role, {**wanted, **objects}, tpdos, prefer_unused=False)) - len(now)

@@ -1,4 +1,4 @@
-"""The CAN interface: is it there, up, at the right bit rate, healthy?"""
+"""Checks the CAN interface: existence, state, bit rate, errors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def can_interfaces() -> list[str]:
 
 
 def examine_interface(section: Section, bus: BusSection) -> None:
-    """Findings about the interface of a joint file; nothing is opened."""
+    """Check the interface of a joint file without opening it."""
     if bus.interface == "virtual":
         section.say(
             Severity.INFO,
@@ -70,12 +70,12 @@ def _links(*arguments: str) -> list[dict[str, Any]]:
 
 
 def judge_link(section: Section, link: dict[str, Any], bus: BusSection) -> None:
-    """Findings from what `ip -json -details -statistics link show` says.
+    """Check the output of `ip -json -details -statistics link show`.
 
     Args:
-        section: findings go here.
+        section: receives the findings.
         link: its object for the interface.
-        bus: what the joint file wants.
+        bus: section of the joint file.
     """
     name = bus.channel
     info = link.get("linkinfo", {})

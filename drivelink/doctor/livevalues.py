@@ -1,4 +1,4 @@
-"""A joint's channels as they are now: asked of its nodes, or heard where another master is in charge."""
+"""Reads a joint's channels now: by SDO, or from the traffic of another master."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from estimator.sample import Sample
 
 __all__ = ["AskedValues", "HeardValues", "live_values"]
 
-_PATIENCE_S = 5.0  # until the frames of a passive bus have made a sample
+_PATIENCE_S = 5.0  # timeout for a sample from the frames of a passive bus
 _CHANNELS = {Signal.MOTOR_POSITION: "position", Signal.MOTOR_TORQUE: "torque"}
 
 
@@ -67,8 +67,8 @@ class HeardValues:
     """Listens to the frames of a bus; sends nothing.
 
     Args:
-        bus: that may only be heard.
-        tap: makes samples of its frames.
+        bus: listened to only.
+        tap: makes samples from its frames.
     """
 
     def __init__(self, bus: SilentBus, tap: SampleTap) -> None:
@@ -100,7 +100,7 @@ def live_values(joint: JointFile, base_dir: Path) -> Iterator[Values]:
 
     Raises:
         BusError: the bus cannot be opened.
-        DriveError: a node does not answer, or its frames make no samples.
+        DriveError: a node does not answer, or its frames give no samples.
     """
     bus = open_bus(joint.bus)
     try:

@@ -23,7 +23,7 @@ def examine_machine(section: Section, period_s: float, seconds: float) -> None:
     """Kernel, rights and timer.
 
     Args:
-        section: findings go here.
+        section: receives the findings.
         period_s: of the cycle.
         seconds: how long the timer is measured.
     """
@@ -97,7 +97,7 @@ def _governor(section: Section) -> None:
 
 
 def _timer(section: Section, period_s: float, seconds: float) -> None:
-    """How late this process wakes, as it is: without the rights the daemon may have."""
+    """Measure how late this process wakes, without the daemon's rights."""
     late_us = []
     period_ns = int(period_s * 1e9)
     deadline = time.monotonic_ns() + period_ns
@@ -124,6 +124,6 @@ def _timer(section: Section, period_s: float, seconds: float) -> None:
 
 
 def percentile(values: list[float], fraction: float) -> float:
-    """The value below which that fraction of them lies."""
+    """The given quantile of the values."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, int(fraction * len(ordered)))]

@@ -1,6 +1,6 @@
-"""Units and signs, checked against each other: positions, velocity and torque of the nodes, as they answer.
+"""Checks units and signs of positions, velocity and torque against each other.
 
-The drives are only read; to find out more, move the joint meanwhile, by hand or by its controller.
+The drives are only read; move the joint meanwhile, by hand or by its controller.
 """
 
 from __future__ import annotations
@@ -36,25 +36,25 @@ __all__ = [
 
 _READ = (Signal.MOTOR_POSITION, Signal.MOTOR_VELOCITY, Signal.MOTOR_TORQUE, Signal.LINK_POSITION)
 _WINDOW_S = 0.02  # differences over less are mostly quantisation
-_LEAST_COUNTS = 50  # that have to pass for a judgement
+_LEAST_COUNTS = 50  # minimum number for a decision
 _TOLERANCE = 0.15  # relative; velocities are filtered in the drive
 _LINK_TOLERANCE = 0.35  # the transmission bends
-_STALL = 4.0  # turns without an answer after which the motion between is not known,
-_STALL_S = 0.01  # and so long: at 10 Hz a straight line over it is off by (2 pi f t)²/8 = 5 %
-_LONG_STALL_S = 0.25  # after which the recording ends; a shorter stall is a gap in it
-_LEAST_PERIOD_S = 0.001  # of the recording that is made of the answers: joints move no faster
-_PROMPT = 1.5  # times the usual wait for an answer: what came later says less about when it was read
+_STALL = 4.0  # turns without an answer that make a gap,
+_STALL_S = 0.01  # and their duration: at 10 Hz linear interpolation over it is off by (2 pi f t)²/8 = 5 %
+_LONG_STALL_S = 0.25  # stall that ends the recording; a shorter one is a gap
+_LEAST_PERIOD_S = 0.001  # of the recording made from the answers, enough for a joint's motion
+_PROMPT = 1.5  # times the usual answer time; later answers have an uncertain time and are omitted
 _LONGER = "move the joint during the check, by its controller (--seconds 20 gives more time)"
 
 
 @dataclass(frozen=True, slots=True)
 class MotionSample:
-    """What one node said in one turn.
+    """Answers of one node in one turn.
 
     Attributes:
         time_s: monotonic, of its position.
         values: SI at the joint side, by signal.
-        times_s: monotonic, of each value: in the middle between question and answer.
+        times_s: monotonic, of each value: halfway between request and answer.
         waits_s: time between the two.
     """
 
@@ -65,7 +65,7 @@ class MotionSample:
 
 
 class MotionReader:
-    """Reads positions, velocity and torque of nodes, in turn, as fast as they answer; writes nothing.
+    """Reads positions, velocity and torque of the nodes in turn, as fast as they answer; writes nothing.
 
     Args:
         surveys: of the nodes.
@@ -84,7 +84,7 @@ class MotionReader:
         }
 
     def program(self, seconds: float) -> Program[dict[int, list[MotionSample]]]:
-        """The samples of so many seconds, by node id; only signals that every one of a node's has."""
+        """The samples of so many seconds by node id, with the signals that all samples of a node have."""
         clock = self._clock
         samples: dict[int, list[MotionSample]] = {node: [] for node in self._counters}
         end_s = clock() + seconds
@@ -107,7 +107,7 @@ class MotionReader:
 
 
 def _complete(samples: list[MotionSample]) -> list[MotionSample]:
-    """Only what every sample has."""
+    """The signals that every sample has."""
     if not samples:
         return []
     everywhere = set(samples[0].values).intersection(*(sample.values for sample in samples))
@@ -121,19 +121,19 @@ def _complete(samples: list[MotionSample]) -> list[MotionSample]:
 def record_of_motion(
     surveys: Sequence[NodeSurvey], samples: Mapping[int, Sequence[MotionSample]], motors: int, linked: bool
 ) -> Record | None:
-    """What the nodes said, as a recording with one period: each value was read at a time of its own.
+    """The nodes' answers, each read at a different time, as a recording with one period.
 
-    An answer that took long is left out: its moment within that time is unknown. Where the
-    nodes did not answer for several turns there is a gap; where for long, the recording ends.
+    Slow answers are omitted because their time is uncertain. Several turns without an answer make a gap, a
+    long stall ends the recording.
 
     Args:
         surveys: of the nodes.
-        samples: what they said, by node id.
-        motors: how many the joint has.
+        samples: answers by node id.
+        motors: number of motors.
         linked: whether the link position is needed.
 
     Returns:
-        The recording; None where a channel is missing or there are less than three turns.
+        The recording; None if a channel is missing or there are fewer than three turns.
     """
     series: dict[tuple[Signal, int | None], tuple[FloatArray, FloatArray]] = {}
     for survey in surveys:
@@ -185,7 +185,7 @@ def _known(grid: FloatArray, channels: Sequence[FloatArray], most_s: float) -> N
 
 
 def judge_record(section: Section, joint: JointFile, record: Record | None) -> None:
-    """Units and signs of a joint that moves, by the gate that recordings pass (eq 5)."""
+    """Check units and signs of a moving joint by the gate for recordings (eq 5)."""
     if record is None:
         section.say(Severity.INFO, joint.name, "units and signs of torque: not every channel was read")
         return
@@ -201,7 +201,7 @@ def judge_record(section: Section, joint: JointFile, record: Record | None) -> N
 
 
 def judge_gathered(section: Section, joint: JointFile, gathered: Gathered) -> None:
-    """The same of samples that frames on the bus made."""
+    """The same for samples from frames on the bus."""
     try:
         _say_judgement(section, joint, gathered.judgement())
     except EstimatorError as error:
@@ -238,7 +238,7 @@ class _Unwrapped:
         return self._candidate.address
 
     def take(self, data: bytes) -> float:
-        """The value of what was read."""
+        """The SI value of the bytes."""
         data = data[: max(1, self._candidate.bits // 8)]
         count = int.from_bytes(data, "little", signed=self._candidate.signed)
         if self._candidate.wraps:
@@ -258,7 +258,7 @@ def slope(x: Sequence[float], y: Sequence[float]) -> float:
 
 
 def judge_motion(section: Section, survey: NodeSurvey, samples: Sequence[MotionSample]) -> bool:
-    """Compare what the samples say of each other; whether the motor moved."""
+    """Compare the channels of the samples; return whether the motor moved."""
     subject, key = survey.role.subject, survey.role.key
     position = next(iter(survey.available.get(Signal.MOTOR_POSITION, ())), None)
     if position is None or len(samples) < 3 or Signal.MOTOR_POSITION not in samples[0].values:

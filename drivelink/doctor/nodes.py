@@ -1,4 +1,4 @@
-"""Checks the bus: which nodes are there, what each is, sends and could send; SYNC and its jitter."""
+"""Checks the bus: nodes, their identity and TPDOs, SYNC and its jitter."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ __all__ = ["examine_bus"]
 def examine_bus(
     report: Report, joint: JointFile, base_dir: Path, seconds: float, alive: Sequence[str] = ()
 ) -> None:
-    """Everything that needs the bus to be open. Reads; in a passive joint file, listens only.
+    """Run all checks that need an open bus. Reads only; listens only if the joint file is passive.
 
     Args:
-        report: gets a section for the bus, and one for each node.
+        report: receives a section for the bus and one per node.
         joint: the joint file.
         base_dir: its folder.
         seconds: for each measurement.
-        alive: liveliness keys of the daemons that run; one of them may make the SYNC.
+        alive: liveliness keys of running daemons, one of which may produce SYNC.
     """
     section = report.section("Bus")
     names = [key.split("/")[-2] for key in alive]
@@ -112,7 +112,7 @@ def _ask(
 def _watch_motion(
     report: Report, bus: can.BusABC, joint: JointFile, surveys: Mapping[str, NodeSurvey], seconds: float
 ) -> None:
-    """What the nodes say of a motion, each of itself, and all together; by title of the nodes' sections."""
+    """Check the channels during a motion, per node and together; by title of the nodes' sections."""
     sections = {section.title: section for section in report.sections}
     nodes = list(surveys.values())
     together = report.section("Units and signs")
@@ -153,7 +153,7 @@ def _describe_node(node: FoundNode) -> str:
 def _examine_node(
     section: Section, bus: can.BusABC, joint: JointFile, role: Role, traffic: Traffic
 ) -> tuple[NodeSurvey | None, NodeLayout | None]:
-    """One node of the joint: what it says of itself, its frames as they would be."""
+    """Check one node of the joint: identity, and its frames as they would be configured."""
     subject = role.subject
     node = _identify(bus, joint.bus, role.node_id)
     state = traffic.heartbeats.get(role.node_id, "no heartbeat")
@@ -209,7 +209,7 @@ def _judge_eds(section: Section, role: Role, node: FoundNode) -> None:
 
 
 def _judge_mapping(section: Section, role: Role, survey: NodeSurvey) -> NodeLayout | None:
-    """What it sends now, and what it would be made to send."""
+    """Compare the present mapping with the one that would be configured."""
     available = dict(survey.available)
     velocity = available.pop(Signal.MOTOR_VELOCITY, ())
     available[Signal.VELOCITY_CHECK] = tuple(replace(o, signal=Signal.VELOCITY_CHECK) for o in velocity)
@@ -290,7 +290,7 @@ def _overhear(
     seconds: float,
     daemons: Daemons,
 ) -> None:
-    """A bus that may not be touched: only listen."""
+    """Check a passive bus by listening."""
     configurator = PassiveConfigurator([joint], [base_dir])
     tap = SampleTap(joint, configurator)
     traffic = listen(bus, seconds, tap.take)
@@ -317,7 +317,7 @@ def _overhear(
     _judge_load(section, list(configurator.layouts.values()), joint.bus)
     if tap.samples:
         judge_gathered(report.section("Units and signs"), tap.joint, tap.gathered)
-    elif not configurator.missing:  # which has been said
+    elif not configurator.missing:  # already reported
         text = f"units and signs cannot be checked: no sample in {seconds:g} s: {tap.missing}"
         section.say(Severity.INFO, joint.name, text)
 

@@ -1,4 +1,4 @@
-"""What the doctor found, as data and in the terminal."""
+"""The doctor's findings, as data and in the terminal."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class Section:
     """Findings that belong together.
 
     Attributes:
-        title: what they are about.
-        notices: in the order in which they were made.
+        title: their subject.
+        notices: the findings.
         facts: figures for `--json`.
     """
 
@@ -41,7 +41,7 @@ class Section:
         self.notices.append(Notice(severity=severity, subject=subject, text=text, fix=fix))
 
     def ok(self, subject: str, text: str) -> None:
-        """Add what is as it should be."""
+        """Add a passed check."""
         self.say(Severity.OK, subject, text)
 
 
@@ -51,7 +51,7 @@ class Report:
 
     Attributes:
         sections: in their order.
-        fine: what is said where nothing is wrong.
+        fine: summary without findings.
     """
 
     sections: list[Section] = field(default_factory=list)

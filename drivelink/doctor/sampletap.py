@@ -1,4 +1,4 @@
-"""Samples from the frames of a bus that may not be touched, as the daemon would make them of these."""
+"""Makes samples from the frames of a passive bus, as the daemon would."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ __all__ = ["SampleTap"]
 
 
 class SampleTap:
-    """Takes frames in the order of the bus, and makes the samples of one joint of them.
+    """Takes frames in bus order and makes the samples of one joint.
 
     Args:
         joint: the joint.
-        configurator: knows how its nodes are mapped, or takes it from the frames.
+        configurator: knows the mapping of its nodes, or takes it from the frames.
 
     Attributes:
-        joint: the joint, with the period that SYNC has.
+        joint: the joint, with the measured period of SYNC.
         gathered: the samples of the first minute.
-        samples: how many there have been.
-        latest: the last of them; None before.
+        samples: number of samples.
+        latest: the last sample, or None.
     """
 
     def __init__(self, joint: JointFile, configurator: PassiveConfigurator) -> None:
@@ -45,7 +45,7 @@ class SampleTap:
 
     @property
     def missing(self) -> str:
-        """Why there are no samples, as far as the frames so far say."""
+        """Why there are no samples."""
         reasons = [*map(str, self._configurator.missing.values()), self._missing]
         return next((text for text in reasons if text), "no SYNC, or not all of its frames")
 
@@ -71,7 +71,7 @@ class SampleTap:
                 self.gathered.add(sample)
 
     def _measure(self, cob_id: int, stamp_ns: int) -> None:
-        """The first SYNCs give the period."""
+        """Measure the period from the first SYNCs."""
         if cob_id != SYNC_COB_ID:
             return
         self._syncs_ns.append(stamp_ns)
@@ -87,7 +87,7 @@ class SampleTap:
         self._clock = SyncClock(period_s)
 
     def _begin(self) -> None:
-        """Make the assembler, where the mapping of every node is known."""
+        """Make the assembler once the mapping of every node is known."""
         if self._configurator.busy:
             return
         try:

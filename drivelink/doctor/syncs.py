@@ -1,4 +1,4 @@
-"""SYNC on the bus: its producer, period and jitter."""
+"""Checks SYNC on the bus: producer, period, jitter."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Daemons", "judge_sync"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Daemons:
-    """The drivelink daemons that run on this machine.
+    """Running drivelink daemons of this machine.
 
     Attributes:
         ours: whether one of them serves this joint.
@@ -30,13 +30,13 @@ class Daemons:
 def judge_sync(
     section: Section, stamps_s: Sequence[float], bus: BusSection, daemons: Daemons | None = None
 ) -> None:
-    """SYNC as it is on the bus: rate and jitter.
+    """Check rate and jitter of SYNC.
 
     Args:
-        section: findings go here.
+        section: receives the findings.
         stamps_s: receive stamps of the SYNC frames.
-        bus: what the joint file wants.
-        daemons: those that run now; it may be one of them that makes the SYNC.
+        bus: section of the joint file.
+        daemons: running daemons, one of which may produce SYNC.
     """
     if len(stamps_s) < 3:
         if bus.sync == "follow":

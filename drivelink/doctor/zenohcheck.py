@@ -1,4 +1,4 @@
-"""Checks the zenoh side as a subscriber on this machine would see it."""
+"""Checks zenoh as seen by a subscriber on this machine."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _WAIT_S = 2.0
 
 
 def examine_zenoh(section: Section, joint: JointFile, base_dir: Path) -> None:
-    """Who listens at the endpoint, which daemons are alive there, and whether this joint's key is taken."""
+    """Check who listens at the endpoint, which daemons are alive, and whether this joint's key is taken."""
     settings = joint.zenoh
     if settings.config is not None and not (base_dir / settings.config).is_file():
         section.say(

@@ -1,4 +1,4 @@
-"""Many recordings of many joints: fitted and diagnosed on Dask, kept in a table, watched for change.
+"""Fits and diagnoses many recordings of many joints on Dask, and detects changes.
 
 Needs the extra `fleet`; nothing else of the service imports this package.
 """

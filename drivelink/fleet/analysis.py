@@ -1,4 +1,4 @@
-"""What a worker computes of a record: the very functions behind `drivelink fit` and `drivelink diagnose`.
+"""Analyses a recording on a worker, by the functions of `drivelink fit` and `drivelink diagnose`.
 
 The only module of the fleet that calls the estimator.
 """
@@ -22,12 +22,12 @@ from estimator.transmissions import MODELS, RIGID
 
 __all__ = ["NAMED", "Analysis", "TransmissionRow", "analyse", "stiffness_at"]
 
-# Deflections at which every row states the stiffness: at rest, and quantiles of what the recording reached.
+# Deflections at which every row states the stiffness: zero, and quantiles of the recording.
 NAMED = {"zero": None, "middle": 0.5, "high": 0.95}
 
 
 class TransmissionRow(NamedTuple):
-    """What a record says of one transmission; the fields are columns of the table.
+    """Result for one transmission; the fields are columns of the table.
 
     Attributes:
         transmission: its number, from 1.
@@ -41,7 +41,7 @@ class TransmissionRow(NamedTuple):
         excited: whether the motion reveals the stiffness.
         inertia_kg_m2: B as refitted.
         viscous_damping_nm_s_rad: D as refitted.
-        fit_error_relative: what fit leaves of the torque balance, relative to the flexibility torque.
+        fit_error_relative: residual of the fit over the flexibility torque.
     """
 
     transmission: int
@@ -59,7 +59,7 @@ class TransmissionRow(NamedTuple):
 
 
 class Analysis(NamedTuple):
-    """What a record says: of each transmission, and of the joint."""
+    """Result of a recording: per transmission, and of the joint."""
 
     transmissions: list[TransmissionRow]
     verdict: str
@@ -84,7 +84,7 @@ def analyse(record: Record, joint: JointFile, validation: Record | None, title: 
         title: of the report.
 
     Raises:
-        EstimatorError: the gate of units and signs refuses it, or it does not reveal what is asked.
+        EstimatorError: wrong units or signs, or the recording cannot be fitted.
     """
     model = joint.model()
     outcome = diagnose(record, model, validation=validation)  # its gate comes before any fit
@@ -107,7 +107,7 @@ def analyse(record: Record, joint: JointFile, validation: Record | None, title: 
 
 
 def _names(outcome: Diagnosis) -> list[str]:
-    """Each finding as NAME@LOCATION, with the motor's number where there are two."""
+    """Each finding as NAME@LOCATION, with the motor's number if there are two."""
     several = len(outcome.transmissions) > 1
     return [
         f"{one.name}@{one.location}{one.motor + 1 if several and one.motor is not None else ''}"

@@ -6,6 +6,6 @@ __all__ = ["FleetError"]
 
 
 class FleetError(DrivelinkError):
-    """The scheduler, the joint folder or the result folder is not what it has to be."""
+    """The scheduler, the joint folder or the result folder cannot be used."""
 
     exit_status = 3

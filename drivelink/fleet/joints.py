@@ -1,4 +1,4 @@
-"""Which joint a recording is of, and the joint's last accepted model."""
+"""Finds the joint of a recording, and the joint's last accepted model."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Joint:
     Attributes:
         name: of the joint.
         text: of the joint file.
-        where: the file, for messages.
+        where: path of the file, for messages.
         eds: the EDS and DCF files it refers to: (name, content) each.
     """
 
@@ -50,7 +50,7 @@ class Joint:
 
     @contextmanager
     def base_dir(self) -> Iterator[Path]:
-        """A folder in which the files that the joint file refers to are found."""
+        """A folder with the files that the joint file refers to."""
         if not self.eds:
             yield Path(self.where).parent
             return
@@ -77,11 +77,11 @@ class Joints:
     def load(cls, folder: Path) -> Joints:
         """Read a folder of joint files, subfolders included.
 
-        Of several files for one joint the last accepted one counts: the one that `fit --write` or
-        `diagnose --write` wrote last, as its `[provenance]` says.
+        Of several files for one joint the last accepted one counts, by the `[provenance]` of `fit --write`
+        and `diagnose --write`.
 
         Raises:
-            FleetError: no such folder, no joint file in it, or two of one joint that cannot be ordered.
+            FleetError: no such folder, no joint file, or two of one joint without an order.
             JointFileError: a joint file is wrong.
         """
         paths = [folder] if folder.is_file() else sorted(folder.rglob("*.toml"))
@@ -102,14 +102,14 @@ class Joints:
         return cls({name: one for name, (_, one) in best.items()})
 
     def of(self, path: Path, url: str) -> Joint:
-        """The joint that a recording is of.
+        """The joint of a recording.
 
         Args:
             path: the recording, as a local file.
             url: its address, by which it is named.
 
         Raises:
-            RecordingError: it carries no joint, and its name has none or several of ours.
+            RecordingError: it carries no joint file, and its name contains none or several of the joints.
         """
         carried = carried_joint(path)
         if carried is not None:
@@ -117,10 +117,10 @@ class Joints:
         return self.named(url)
 
     def named(self, url: str) -> Joint:
-        """The joint whose name stands in an address: in the file's name, else in that of a folder above.
+        """The joint whose name is in an address: in the file's name, else in that of a folder above.
 
         Raises:
-            RecordingError: none does, or several do.
+            RecordingError: none, or several.
         """
         for part in reversed(re.split(r"[/\\]", unquote(url))):
             matches = [name for name in self.by_name if _stands_in(name, part)]
@@ -134,11 +134,11 @@ class Joints:
 
 
 def carried_joint(path: Path) -> Joint | None:
-    """The joint file that a recording carries, if it does.
+    """The joint file that a recording carries, if any.
 
     Raises:
-        RecordingError: it carries one that cannot be read.
-        JointFileError: the one that it carries is wrong.
+        RecordingError: the carried file cannot be read.
+        JointFileError: the carried file is wrong.
     """
     try:
         carried = joint_of(path, None)
@@ -148,12 +148,12 @@ def carried_joint(path: Path) -> Joint | None:
 
 
 def _stands_in(name: str, text: str) -> bool:
-    """Whether a name stands in a text as words of its own."""
+    """Whether a text contains a name as whole words."""
     return re.search(rf"(?<![A-Za-z0-9]){re.escape(name)}(?![A-Za-z0-9])", text) is not None
 
 
 def _written(provenance: dict[str, Any]) -> str:
-    """When fit or diagnose wrote the file; "" if neither did."""
+    """Time at which fit or diagnose wrote the file, or ""."""
     stamps = [entry.get("written") for entry in provenance.values() if isinstance(entry, dict)]
     return max((str(stamp) for stamp in stamps if stamp), default="")
 
@@ -165,7 +165,7 @@ def _eds(joint: JointFile, base: Path) -> tuple[tuple[str, bytes], ...]:
     found = []
     for name in sorted(names):
         if Path(name).is_absolute() or ".." in Path(name).parts:
-            continue  # only a path below the joint file can be laid out again elsewhere
+            continue  # only paths below the joint file can be recreated elsewhere
         try:
             found.append((name, (base / name).read_bytes()))
         except OSError as error:

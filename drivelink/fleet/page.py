@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 __all__ = ["page"]
 
-_CHARTS = 400  # joints whose charts are drawn, the most urgent first: beyond, a page is too large to open
+_CHARTS = 400  # joints with a chart, the most urgent first; more would make the page too large
 _BROKEN = 200
 _SIGMA_95 = 1.96
 _BLUE, _ORANGE, _GREY = "#005f9e", "#e0701a", "#999999"
@@ -40,7 +40,7 @@ class _Frame(NamedTuple):
 
 
 def page(document: dict[str, Any]) -> str:
-    """Draw what `summarise` says.
+    """Draw the document of `summarise`.
 
     Args:
         document: fleet.json.
@@ -127,7 +127,7 @@ def _frame(one: dict[str, Any], left: float, width: float, height: float) -> _Fr
     points = one["series"]
     values = [p["stiffness_nm_rad"] for p in points] + [p["fitted_nm_rad"] for p in points]
     low, high = min(values), max(values)
-    least = 0.01 * abs(values[0])  # a steady joint looks steady
+    least = 0.01 * abs(values[0])  # minimum span of the axis: a steady joint looks steady
     if high - low < 2.0 * least:
         low, high = 0.5 * (low + high) - least, 0.5 * (low + high) + least
     pad = 0.12 * (high - low)
@@ -190,7 +190,7 @@ def _points(one: dict[str, Any], frame: _Frame) -> str:
 
 
 def _strip(joint: dict[str, Any], effect: dict[str, Any], frame: _Frame, y: float) -> str:
-    """One line below the chart: at which recordings an effect was found at a place."""
+    """One line below the chart: recordings in which an effect was found at a location."""
     colour = _ORANGE if effect["significant"] else _GREY
     parts = [
         f'<text x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{html.escape(effect["location"])}</text>'

@@ -1,4 +1,4 @@
-"""A recording as records that fit into a worker's memory: whole, or in successive parts."""
+"""Reads a recording in parts that fit into a worker's memory."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ __all__ = ["Piece", "pieces"]
 # many bytes a sample, compressed formats have a fraction.
 _EXPANSION = {".csv": 30.0, ".log": 30.0, ".candump": 30.0, ".asc": 30.0, ".trc": 30.0}
 _EXPANSION_OTHER = 100.0
-_BASE_BYTES = 550 << 20  # a worker after many small recordings: interpreter, libraries, Dask, caches
-_LEAST_BYTES = 64 << 20  # planned with in any case: a part must hold enough motion
-_USED = 0.7  # share of the limit that is planned with: Dask pauses a worker at 0.8 and ends it at 0.95
+_BASE_BYTES = 550 << 20  # memory of a worker without a recording: interpreter, libraries, Dask, caches
+_LEAST_BYTES = 64 << 20  # minimum for a part, which must contain enough motion
+_USED = 0.7  # share of the limit that is used: Dask pauses a worker at 0.8 and ends it at 0.95
 
 
 class Piece(NamedTuple):
@@ -41,16 +41,16 @@ class Piece(NamedTuple):
 
 
 def pieces(path: Path, joint: JointFile, base_dir: Path, limit_bytes: float) -> Iterator[Piece]:
-    """Read a recording, cut into equal parts in time where it does not fit.
+    """Read a recording, in equal parts in time if it does not fit.
 
     Args:
         path: the recording.
-        joint: the joint that it is of.
+        joint: its joint.
         base_dir: folder in which the joint's EDS files are found.
         limit_bytes: memory of the worker; not above 0: no limit.
 
     Raises:
-        RecordingError: it cannot be read, or is too large and of a format that cannot be cut.
+        RecordingError: it cannot be read, or is too large in a format that cannot be split.
     """
     parts = _parts(path, limit_bytes)
     if parts == 1:
@@ -74,7 +74,7 @@ def _parts(path: Path, limit_bytes: float) -> int:
 
 
 def _as_csv(path: Path, joint: JointFile, base_dir: Path, folder: Path) -> Path:
-    """The samples of a recording as one CSV, read and written cycle by cycle."""
+    """Convert the samples of a recording to CSV, cycle by cycle."""
     motors = len(joint.motor)
     cycles: Iterator[Cycle]
     if is_frame_log(path):
@@ -93,7 +93,7 @@ def _as_csv(path: Path, joint: JointFile, base_dir: Path, folder: Path) -> Path:
 
 
 def _cut(table: Path, parts: int, target: Path) -> Iterator[Path]:
-    """Parts of a CSV of about the same size, each with the header; the same file is used for all."""
+    """Split a CSV into parts of about the same size, each with the header; one temporary file is reused."""
     share = math.ceil(table.stat().st_size / parts)
     with table.open("rb") as file:
         head = []

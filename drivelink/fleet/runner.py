@@ -27,23 +27,23 @@ from drivelink.fleet.task import Outcome, Task, broken_row, named_time, process,
 
 __all__ = ["Counts", "Settings", "run"]
 
-_AHEAD = 4  # recordings a worker thread is given before it has asked for them
+_AHEAD = 4  # recordings queued per worker thread
 _CONNECT_S = 10.0
 _EPOCH = datetime.fromtimestamp(0, UTC)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """How a run is to be done.
+    """Settings of a run.
 
     Attributes:
         scheduler: address of a running Dask scheduler; None: a local cluster.
         workers: processes of the local cluster; None: one a core.
-        memory: limit of each worker, e.g. "2GiB"; None: the local machine's memory in equal shares, or what
-            the scheduler's workers have declared.
-        since: earlier recordings are left out.
+        memory: limit of each worker, e.g. "2GiB"; None: equal shares of the local memory, or the limits of
+            the scheduler's workers.
+        since: omit earlier recordings.
         validate: "previous" validates on the joint's recording before; None: on held-out blocks.
-        again: also do what is in the table already.
+        again: repeat recordings that are in the table.
     """
 
     scheduler: str | None = None
@@ -55,10 +55,10 @@ class Settings:
 
     @property
     def limit_bytes(self) -> float:
-        """`memory` as a number; 0 where it is left to Dask.
+        """`memory` in bytes; 0: left to Dask.
 
         Raises:
-            FleetError: it is no size.
+            FleetError: not a size.
         """
         if self.memory is None:
             return 0.0
@@ -70,7 +70,7 @@ class Settings:
 
 @dataclass(slots=True)
 class Counts:
-    """What became of the recordings."""
+    """Number of recordings by outcome."""
 
     found: int = 0
     done: int = 0
@@ -88,9 +88,9 @@ def run(
     progress: Callable[[Counts], None] = lambda _: None,
     say: Callable[[str], None] = lambda _: None,
 ) -> Counts:
-    """Do what is not in the table yet.
+    """Process all recordings that are not in the table yet.
 
-    What is finished is in the table whenever the run ends, whyever it ends.
+    Finished work is in the table however the run ends.
 
     Args:
         sources: the recordings.
@@ -98,7 +98,7 @@ def run(
         store: the folder of results.
         settings: how.
         progress: called after each recording.
-        say: called with what the user should know, a line each.
+        say: called with messages for the user.
 
     Raises:
         FleetError: the scheduler is not reached or lost, or results cannot be written.
@@ -120,7 +120,7 @@ def run(
 
 
 def _wanted(source: Source, joints: Joints, table: Table, settings: Settings, counts: Counts) -> bool:
-    """Whether a recording is to be looked at, as far as its listing shows."""
+    """Whether a recording needs processing, by its listing."""
     latest = named_time(source) or source.modified
     if settings.since and latest and latest < settings.since:
         counts.early += 1
@@ -128,7 +128,7 @@ def _wanted(source: Source, joints: Joints, table: Table, settings: Settings, co
     known = table.at(source)
     if known is None or settings.again or known.version != __version__:
         return True
-    if known.failed:  # worth another try once there is a joint, or another model of it
+    if known.failed:  # retry if the joint or its model has changed
         now = joints.by_name.get(known.joint) if known.joint else None
         if known.joint is None or (now is not None and now.digest != known.accepted_model):
             return True
@@ -148,7 +148,7 @@ def _task(source: Source, previous: Source | None, table: Table, settings: Setti
 
 
 def _results(client: Client, tasks: Iterable[Task], shared: Any) -> Iterator[tuple[Task, Outcome]]:
-    """Outcomes in the order in which they are finished; never more than a few tasks a worker are out."""
+    """Outcomes in order of completion; at most a few tasks per worker are submitted."""
     tasks = iter(tasks)
     out: dict[str, Task] = {}
     finished = as_completed(loop=client.loop)
@@ -197,7 +197,7 @@ def _take(
     if outcome.kind == "known" or _already(outcome, table):
         counts.known += 1
         return
-    for name, text in outcome.reports:  # before the row that points to them
+    for name, text in outcome.reports:  # before their row
         store.write(name, text.encode())
     table.append(outcome.rows)
     if outcome.kind == "error":
@@ -209,13 +209,13 @@ def _take(
 
 
 def _already(outcome: Outcome, table: Table) -> bool:
-    """Whether the same content came in this very run: two copies of one recording."""
+    """Whether this run has already processed the same content."""
     return table.has_now(outcome.rows[0]["digest"], outcome.rows[0]["joint"])
 
 
 @contextmanager
 def _client(settings: Settings, tasks: int) -> Iterator[Client]:
-    """A client of the scheduler that was asked for, or of a local cluster that ends with it."""
+    """A client of the given scheduler, or of a local cluster that ends with it."""
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     dask.config.set(
         {
@@ -250,7 +250,7 @@ def _client(settings: Settings, tasks: int) -> Iterator[Client]:
 
 
 def _check_workers(client: Client, address: str) -> None:
-    """Raise unless every worker that is there has this version; those that come later are checked by task."""
+    """Check that all present workers have this version; later ones are checked per task."""
     try:
         versions = client.run(_worker_version)
     except Exception as error:
@@ -272,9 +272,9 @@ def _worker_version() -> str:
 
 
 def _previous(sources: list[Source], joints: Joints, shared: Any, client: Client) -> dict[str, Source]:
-    """Each recording's predecessor of the same joint, by address.
+    """The previous recording of the same joint, by address.
 
-    MCAP files carry joint and time: workers look them up. Others are known by name and date.
+    Workers read joint and time of MCAP files; others are known by name and date.
     """
     known = {s.url: _listed(s, joints) for s in sources if not s.name.lower().endswith(".mcap")}
     asked = [s for s in sources if s.url not in known]

@@ -1,6 +1,6 @@
-"""Where recordings come from and results go to: anything fsspec opens (`file:`, `sftp:`, `s3:`, `http:`).
+"""Access to recordings and results by fsspec (`file:`, `sftp:`, `s3:`, `http:`).
 
-Credentials and endpoints are fsspec's own (its configuration files, `FSSPEC_…` and `AWS_…` variables).
+Credentials and endpoints are those of fsspec (configuration files, `FSSPEC_…` and `AWS_…` variables).
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from drivelink.recording.mapping import side_file
 
 __all__ = ["SUFFIXES", "Source", "Store", "fetched", "find"]
 
-SUFFIXES = frozenset({".csv", ".mcap", ".mf4", *CAN_SUFFIXES})  # what a folder is searched for
+SUFFIXES = frozenset({".csv", ".mcap", ".mf4", *CAN_SUFFIXES})  # file name endings of recordings
 
 _CHUNK = 1 << 20
 _MODIFIED = ("mtime", "LastModified", "last_modified", "Last-Modified", "time", "created")
 
 
 class Source(NamedTuple):
-    """A recording as its storage lists it.
+    """Listing of a recording.
 
     Attributes:
-        url: where it is; a plain absolute path for local files.
-        size: bytes; -1 where the storage does not say.
+        url: address; an absolute path for local files.
+        size: bytes; -1: unknown.
         stamp: changes when the content does: the entity tag, else the time of modification; "" if unknown.
-        modified: time of modification, where it is known.
+        modified: time of modification, if known.
     """
 
     url: str
@@ -54,16 +54,16 @@ class Source(NamedTuple):
 
 
 def find(patterns: Iterable[str]) -> tuple[list[Source], list[str]]:
-    """Expand paths, globs, folders and URLs to recordings, each once, in order of name.
+    """Expand paths, globs, folders and URLs to distinct recordings, sorted by name.
 
     Args:
-        patterns: as the user gave them; a folder stands for every recording below it.
+        patterns: of the user; a folder stands for all recordings below it.
 
     Returns:
         The recordings, and the patterns that match nothing.
 
     Raises:
-        FleetError: a storage cannot be reached or is not known.
+        FleetError: a storage is unknown or cannot be reached.
     """
     found: dict[str, Source] = {}
     empty = []
@@ -130,7 +130,7 @@ def _opened(url: str) -> tuple[Any, str]:
 
 
 def _url(pattern: str, fs: Any, path: str) -> str:
-    """The address of what was listed: file systems name it without protocol, some without its host too."""
+    """The address of a listed file: file systems omit protocol and sometimes host."""
     if "://" in path:
         return path
     if "://" not in pattern or pattern.startswith(("file://", "local://")):
@@ -146,7 +146,7 @@ def _line(error: BaseException) -> str:
 
 @contextmanager
 def fetched(source: Source) -> Iterator[tuple[Path, str]]:
-    """A recording as a local file, with the SHA-256 of its content; a remote one is copied, in pieces.
+    """A recording as a local file, with the SHA-256 of its content; a remote one is copied.
 
     Raises:
         OSError: it cannot be read.
@@ -176,20 +176,20 @@ def _copy(url: str, path: Path) -> str:
 
 
 class Store:
-    """The folder of the results: whole files in, whole files out.
+    """The folder of results, with atomic writes.
 
-    A file is there with all of its content or not at all: locally and over SFTP it gets its name when it is
-    complete; an object store shows an object once it is complete anyway.
+    A file exists complete or not at all: locally and over SFTP it gets its name when complete; object stores
+    are atomic.
 
     Args:
-        url: the folder; made if it is missing.
+        url: the folder; created if missing.
 
     Attributes:
         url: as given.
-        folder: the local folder, None where it is elsewhere.
+        folder: the local folder, or None.
 
     Raises:
-        FleetError: it cannot be reached or made.
+        FleetError: it cannot be reached or created.
     """
 
     def __init__(self, url: str) -> None:
@@ -200,7 +200,7 @@ class Store:
         self._made: set[str] = set()
 
     def write(self, name: str, data: bytes) -> None:
-        """Put a file there, in place of one that has the name.
+        """Write or replace a file.
 
         Raises:
             FleetError: it cannot be written.
@@ -239,7 +239,7 @@ class Store:
             raise FleetError(f"{self.url}/{name}: cannot be read: {_line(error)}") from error
 
     def names(self, folder: str, suffix: str) -> list[str]:
-        """Names, relative to the store, of the files in a folder that end so; hidden ones are left out."""
+        """Names of the files in a folder with this ending, relative to the store, without hidden ones."""
         self._fs.invalidate_cache()
         try:
             paths = self._fs.ls(f"{self._root}/{folder}", detail=False)
@@ -251,7 +251,7 @@ class Store:
         return sorted(f"{folder}/{n}" for n in names if n.endswith(suffix) and not n.startswith("."))
 
     def remove(self, name: str) -> None:
-        """Delete a file; one that is gone already is fine."""
+        """Delete a file, if it exists."""
         try:
             self._fs.rm_file(f"{self._root}/{name}")
         except FileNotFoundError:

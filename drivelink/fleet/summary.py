@@ -1,4 +1,4 @@
-"""Summary of each joint from the table: trend, changes, effects that appear, urgency."""
+"""Summarises each joint from the table: trend, changes, new effects, urgency."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class _Series(NamedTuple):
 
 
 class _Place(NamedTuple):
-    """Findings of one joint at one place, e.g. "motor1": when, and the effects' names."""
+    """Findings of one joint at one location, e.g. "motor1": times and effects."""
 
     place: str
     rows: list[dict[str, Any]]
@@ -55,14 +55,14 @@ class _Place(NamedTuple):
 
 
 def summarise(rows: list[dict[str, Any]], false_discovery_rate: float) -> dict[str, Any]:
-    """The document that fleet.json holds and the page shows.
+    """The document of fleet.json and the page.
 
     Args:
         rows: of the table, in order of time, with at least `COLUMNS`, `recording` and `time`.
         false_discovery_rate: expected share of false ones among the changes called significant.
 
     Returns:
-        JSON values only; joints with the most urgent first.
+        JSON values only; the most urgent joints first.
     """
     rows = [row for row in rows if row["time"] is not None or row["status"] != "done"]
     ordered = sorted((row for row in rows if row["joint"]), key=lambda row: str(row["joint"]))
@@ -132,14 +132,14 @@ def _usable(row: dict[str, Any]) -> bool:
 
 
 def _stiffness(row: dict[str, Any], phi: float) -> tuple[float, float]:
-    """At the deflection that the joint's recordings are compared at; as recorded for an unknown model."""
+    """Stiffness at the joint's common deflection; as recorded for an unknown model."""
     if row["model"] not in MODELS:
         return row["stiffness_middle_nm_rad"], row["stiffness_std_middle_nm_rad"]
     return stiffness_at(row["model"], json.loads(row["parameters"]), row["covariance"], phi)
 
 
 def _places(rows: list[dict[str, Any]]) -> list[_Place]:
-    """The places at which anything was found, each tested as a whole and name by name."""
+    """Test the findings at each location, in total and per effect."""
     once = [row for row in rows if row["status"] == "done" and row["transmission"] == 1]
     able = [row for row in once if row["verdict"] != "insufficient_excitation"]
     found = Counter(name for row in able for name in row["effects"])
@@ -274,7 +274,7 @@ _URGENCY = {"changing": 4.0, "finding": 3.0, "unread": 2.0, "undecided": 1.0, "s
 def _state(
     transmissions: list[dict[str, Any]], effects: list[dict[str, Any]], last: dict[str, Any] | None
 ) -> tuple[str, float]:
-    """What a joint needs, and how much within that: relative size of the change."""
+    """Urgency of a joint, and relative size of the change to sort by."""
     moved = [abs(c["amount_relative"]) for t in transmissions for c in t["changes"]]
     appeared = [abs(e["error_relative"]) for e in effects if e["significant"]]
     if moved or appeared:
@@ -291,7 +291,7 @@ def _state(
 def _sentence(
     state: str, transmissions: list[dict[str, Any]], effects: list[dict[str, Any]], rows: list[dict[str, Any]]
 ) -> str:
-    """What is to be said of a joint, in words."""
+    """Summary of a joint in words."""
     said = []
     several = len(transmissions) > 1
     for one in transmissions:

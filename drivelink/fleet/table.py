@@ -1,8 +1,8 @@
-"""The table of results: a folder of Parquet files with one row a recording and transmission.
+"""The table of results: Parquet files with one row per recording and transmission.
 
-A run writes one part. Its file is replaced as a whole while it grows, so that a reader finds every row once
-or not yet, never twice, never half. A later run continues the last part while that is small; so there is
-nothing to compact. Results of a recording that is done again take the place of those before.
+A run writes one part, which is replaced as a whole while it grows, so that a reader never sees a row twice or
+incomplete. A later run continues a small last part, so compaction is not needed. New results of a recording
+replace the old ones.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ __all__ = ["FOLDER", "SCHEMA", "Known", "Table", "read_rows"]
 FOLDER = "table"
 
 _PART_ROWS = 5000  # a part is full: about 2 MB, rewritten in some 0.1 s
-_FLUSH_S = 5.0  # what a power loss may cost of finished work
-_FLUSH_SHARE = 0.05  # of the time may go into writing
+_FLUSH_S = 5.0  # finished work that a power loss may cost
+_FLUSH_SHARE = 0.05  # share of the time for writing
 
 _NAMED = [
     (f"{quantity}_{name}{unit}", pa.float64())
@@ -91,7 +91,7 @@ _INDEX = ["id", "joint", "recording", "digest", "size_bytes", "stamp", "status",
 
 
 class Known(NamedTuple):
-    """What the table says of a recording that is in it; `part` is the file its rows are in."""
+    """Entry of a recording in the table; `part` is the file with its rows."""
 
     digest: str
     joint: str | None
@@ -102,7 +102,7 @@ class Known(NamedTuple):
 
 
 class Table:
-    """The table, open for appending by one run. Use as a context manager: leaving it writes what is left.
+    """The table, open for appending by one run, as a context manager that flushes at the end.
 
     Args:
         store: where it is.
@@ -145,7 +145,7 @@ class Table:
                 self._lock = None
 
     def at(self, source: Source) -> Known | None:
-        """What is known of the recording at this place, if its size and stamp are as they were."""
+        """Entry of the recording at this address, if size and stamp are unchanged."""
         return self._by_place.get((source.url, source.size, source.stamp)) if source.stamp else None
 
     def has_now(self, digest: str, joint: str | None) -> bool:
@@ -153,12 +153,12 @@ class Table:
         return (digest, joint) in self._now
 
     def contents(self, size: int, version: str) -> frozenset[tuple[str, str | None]]:
-        """Digest and joint of what this version has done and has as many bytes."""
+        """Digest and joint of results of this version with the same size."""
         keys = self._sizes.get(size, set())
         return frozenset(k for k in keys if self._by_content[k].version == version)
 
     def append(self, rows: list[dict[str, Any]]) -> None:
-        """Add the rows of one recording, in place of earlier ones of the same content and joint.
+        """Add the rows of one recording; replace those of the same content and joint.
 
         Raises:
             FleetError: the table cannot be written.
@@ -182,7 +182,7 @@ class Table:
             self._rows, self._part = [], _next(self._part)
 
     def flush(self) -> None:
-        """Write what has been appended.
+        """Write the appended rows.
 
         Raises:
             FleetError: the table cannot be written.
@@ -191,7 +191,7 @@ class Table:
             return
         begin = time.monotonic()
         self._store.write(self._part, _bytes(pa.Table.from_pylist(self._rows, SCHEMA)))
-        if self._lock is not None:  # parts of others are left to a run that is alone
+        if self._lock is not None:  # other runs' parts are changed only under the lock
             for part, ids in self._stale.items():
                 self._drop(part, ids)
             self._stale.clear()
@@ -200,7 +200,7 @@ class Table:
         self._cost = self._flushed - begin
 
     def _open(self) -> None:
-        """Read what is in the parts; continue the last one if it is small and nobody else does."""
+        """Read the parts; continue the last one if it is small and not locked."""
         newest: dict[str, tuple[datetime, str]] = {}
         parts = self._store.names(FOLDER, ".parquet")
         for part in parts:
@@ -242,7 +242,7 @@ class Table:
             ids.append(row["id"])
 
     def _replace(self, key: tuple[str, str | None]) -> None:
-        """Take the rows of a recording out; those of other parts at the next flush."""
+        """Remove the rows of a recording; from other parts at the next flush."""
         known = self._by_content.pop(key, None)
         if known is None:
             return
@@ -267,7 +267,7 @@ def read_rows(store: Store, columns: list[str] | None = None) -> list[dict[str, 
 
     Args:
         store: where it is.
-        columns: those of interest; None: all.
+        columns: columns to read; None: all.
 
     Raises:
         FleetError: there is none, or a part cannot be read.
@@ -289,7 +289,7 @@ def read_rows(store: Store, columns: list[str] | None = None) -> list[dict[str, 
 
 
 def _read(store: Store, part: str, columns: list[str] | None = None) -> Any:
-    """A part; columns that it lacks, written by an older version, are empty."""
+    """Read a part; columns missing in an older version are empty."""
     wanted = SCHEMA if columns is None else pa.schema([SCHEMA.field(name) for name in columns])
     try:
         file = pq.ParquetFile(io.BytesIO(store.read(part)))
@@ -312,15 +312,15 @@ def _bytes(table: Any) -> bytes:
 
 
 def _next(part: str) -> str:
-    """The name of the part after one: names sort in the order of writing."""
+    """The name of the next part; names sort in order of writing."""
     stem, _, number = part.removesuffix(".parquet").partition("_")
     return f"{stem}_{int(number or 0) + 1:04d}.parquet"
 
 
 def _locked(store: Store) -> int | None:
-    """A lock that says that this run alone may change parts that are there; None if another has it.
+    """A lock for changing existing parts; None if another run has it.
 
-    On remote storage there is none: each run writes a part of its own.
+    Remote storage has none: each run writes its own part.
     """
     if store.folder is None:
         return None

@@ -1,4 +1,4 @@
-"""One recording, from its storage to the rows of the table: what runs on a worker."""
+"""The task on a worker: one recording, from its storage to rows of the table."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ __all__ = ["HELD_OUT", "Outcome", "Task", "broken_row", "named_time", "process",
 
 HELD_OUT = "held-out blocks"
 
-_UNIX = 1.0e9  # stamps from here on are UNIX time: they began in 2001
+_UNIX = 1.0e9  # larger stamps are UNIX time (from 2001 on)
 _DATE = re.compile(
     r"(?<!\d)(20\d\d)[-_.]?(0[1-9]|1[0-2])[-_.]?(0[1-9]|[12]\d|3[01])"
     r"(?:[T_ -]?([01]\d|2[0-3])[-:._]?([0-5]\d)(?:[-:._]?([0-5]\d))?)?(?!\d)"
@@ -42,15 +42,15 @@ _DATE = re.compile(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Task:
-    """What a worker is asked.
+    """Input of a task.
 
     Attributes:
         source: the recording.
-        version: of drivelink that is to do it.
-        done: contents, with their joints, that need not be done again: those of the same size.
-        previous: the joint's recording before, to validate with.
-        since: earlier recordings are left out.
-        limit_bytes: memory of a worker; 0: what Dask has declared.
+        version: required version of drivelink.
+        done: finished contents of the same size, with their joints.
+        previous: the joint's previous recording, for validation.
+        since: omit earlier recordings.
+        limit_bytes: memory of a worker; 0: Dask's limit.
     """
 
     source: Source
@@ -68,7 +68,7 @@ class Outcome(NamedTuple):
         kind: "done", "error", "known" (the same content is in the table already) or "early" (before `since`).
         rows: for the table.
         reports: (name below the result folder, content).
-        notes: a line each, for the user.
+        notes: messages for the user.
     """
 
     kind: str
@@ -78,7 +78,7 @@ class Outcome(NamedTuple):
 
 
 def process(task: Task, joints: Joints) -> Outcome:
-    """Fetch, identify, read, fit, diagnose. Whatever is wrong with the recording becomes a row.
+    """Fetch, identify, read, fit, diagnose. An error becomes a row.
 
     Args:
         task: what to do.
@@ -117,7 +117,7 @@ def process(task: Task, joints: Joints) -> Outcome:
 
 
 def broken_row(task: Task, error: str) -> dict[str, Any]:
-    """The row of a recording of which no more is known than where it is."""
+    """The row of a recording that could not be read."""
     time_ = named_time(task.source) or task.source.modified
     place = f"{task.source.url}|{task.source.size}|{task.source.stamp}"
     return {
@@ -211,7 +211,7 @@ def _of_transmission(one: TransmissionRow) -> dict[str, Any]:
 
 @contextmanager
 def _validation(task: Task, joint: Joint, base: Path) -> Iterator[Record | None]:
-    """The joint's recording before; where it cannot be read, none, which is said."""
+    """The joint's previous recording; None, with a note, if it cannot be read."""
     if task.previous is None:
         yield None
         return
@@ -227,7 +227,7 @@ def _validation(task: Task, joint: Joint, base: Path) -> Iterator[Record | None]
 
 
 def named_time(source: Source) -> datetime | None:
-    """The date, with the time of day where there is one (UTC), in the name of a file or of a folder above."""
+    """Date and, if present, time (UTC) in the name of a file or of a folder above."""
     for part in reversed(re.split(r"[/\\]", unquote(source.url))):
         for match in _DATE.finditer(part):
             year, month, day, hour, minute, second = (int(text or 0) for text in match.groups())
@@ -239,7 +239,7 @@ def named_time(source: Source) -> datetime | None:
 
 
 def recorded_time(path: Path, source: Source, channel: str = "") -> datetime | None:
-    """When a recording was made: its own UNIX stamps, else the date in its name, else its modification."""
+    """Time of a recording: UNIX stamps, else the date in its name, else its modification time."""
     stamp_s = 0.0
     suffix = path.suffix.lower()
     if suffix == ".mcap":
@@ -256,7 +256,7 @@ def recorded_time(path: Path, source: Source, channel: str = "") -> datetime | N
 
 
 def _first_time(path: Path) -> float:
-    """`time_s` of the first row of a CSV; 0 where it is not found."""
+    """`time_s` of the first row of a CSV; 0 if not found."""
     with path.open("r", encoding="utf-8-sig", errors="replace") as file:
         lines = (line.strip() for line in file)
         rows = (line for line in lines if line and not line.startswith("#"))
@@ -270,7 +270,7 @@ def _first_time(path: Path) -> float:
 
 
 def _declared_limit() -> float:
-    """Memory that Dask has declared for the worker that this runs on; 0: none, or no worker."""
+    """Dask's memory limit of this worker; 0: none, or not a worker."""
     from distributed import get_worker
 
     try:
@@ -282,7 +282,7 @@ def _declared_limit() -> float:
 
 @contextmanager
 def _notes() -> Iterator[list[str]]:
-    """What the readers warn of, as lines."""
+    """Collect the readers' warnings as lines."""
     lines: list[str] = []
 
     class Collect(logging.Handler):

@@ -32,9 +32,9 @@ class Notice:
 
     Attributes:
         severity: how bad it is.
-        subject: what it is about, e.g. "can0" or "node 1".
+        subject: e.g. "can0" or "node 1".
         text: one line: what was found, and what it should be.
-        fix: the command or the line of the joint file that puts it right; empty where nothing is needed.
+        fix: the command or joint-file line that fixes it, or empty.
     """
 
     severity: Severity
@@ -51,6 +51,6 @@ class Notice:
 
 
 def log_notices(logger: logging.Logger, findings: tuple[Notice, ...] | list[Notice]) -> None:
-    """One log line for each, at the level of its severity."""
+    """Log each at the level of its severity."""
     for finding in findings:
         logger.log(_LEVELS[finding.severity], "%s", finding)

@@ -1,4 +1,4 @@
-"""The version, in a module without imports, so that nothing imports the package root for it."""
+"""The version, in a module without imports."""
 
 __all__ = ["__version__"]
 

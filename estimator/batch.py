@@ -19,11 +19,11 @@ from estimator.diagnosis.choices import choice, least_rows
 from estimator.diagnosis.covariance import design_effects, hac_covariance
 from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.diagnosis.search import Search
-from estimator.diagnosis.stiffness import SIGMA_95, middle
+from estimator.diagnosis.stiffness import middle
 from estimator.errors import EstimatorError
 from estimator.gate import check, refuse
 from estimator.model import JointModel, ParameterValue, Transmission
-from estimator.sample import FloatArray, Record
+from estimator.sample import SIGMA_95, FloatArray, Record
 from estimator.transmissions import MODELS, RIGID, UNKNOWN
 
 __all__ = ["JointFit", "Key", "TransmissionFit", "fit", "fit_joint", "joint_problem", "transmission_fits"]

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from estimator.errors import EstimatorError
 
 __all__ = [
+    "SIGMA_95",
     "Consistency",
     "Estimate",
     "External",
@@ -29,6 +30,7 @@ __all__ = [
 ]
 
 FloatArray = NDArray[np.float64]
+SIGMA_95 = 1.959963984540054  # half a 95 % interval of a normal distribution, in standard deviations
 
 
 class Sample(NamedTuple):

@@ -29,7 +29,7 @@ from drivelink.recording.mcapfile import read_messages
 from drivelink.recording.mcapsamples import recorded_cycles
 from drivelink.recording.messages import message_schema
 from drivelink.recording.viewlayouts import write_layouts
-from estimator.sample import Sample, Status, TransmissionEstimate
+from estimator.sample import SIGMA_95, Sample, Status, TransmissionEstimate
 
 TEXT = 'name = "elbow"\n[[motor]]\ninertia_kg_m2 = 0.1\n'
 JOINT = parse(TEXT)
@@ -282,8 +282,8 @@ def test_an_estimate_says_what_a_view_draws(tmp_path: Path) -> None:
     assert (first["valid"], second["valid"]) == (1, 0)
     for part in ("", "motor1_"):
         value, std = first[f"{part}stiffness_nm_rad"], first[f"{part}stiffness_std_nm_rad"]
-        assert first[f"{part}stiffness_low_nm_rad"] == pytest.approx(value - 1.96 * std)
-        assert first[f"{part}stiffness_high_nm_rad"] == pytest.approx(value + 1.96 * std)
+        assert first[f"{part}stiffness_low_nm_rad"] == pytest.approx(value - SIGMA_95 * std)
+        assert first[f"{part}stiffness_high_nm_rad"] == pytest.approx(value + SIGMA_95 * std)
 
 
 @pytest.mark.parametrize("motors", [1, 2])

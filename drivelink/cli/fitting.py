@@ -28,12 +28,10 @@ from estimator.errors import EstimatorError
 from estimator.gate import GateError
 from estimator.identify import Identified, identify
 from estimator.model import Effect, Motor, ParameterValue
-from estimator.sample import Record
+from estimator.sample import SIGMA_95, Record
 from estimator.transmissions import RIGID
 
 __all__ = ["fit_recording"]
-
-_SIGMA_95 = 1.96
 
 
 def fit_recording(args: argparse.Namespace, source: JointText, folder: Path | None) -> None:
@@ -147,9 +145,9 @@ def _print(found: Identified, paths: Sequence[Path]) -> None:
         table = _table(f"motor {number}: {'rigid' if one.model == RIGID else one.model}")
         for name, value in one.parameters.items():
             for label, x, sigma in _rows(name, value, one.std[name]):
-                table.add_row(label, f"{x:.6g}", f"{_SIGMA_95 * sigma:.2g}")
+                table.add_row(label, f"{x:.6g}", f"{SIGMA_95 * sigma:.2g}")
         for name, key in (("inertia_kg_m2", "inertia"), ("viscous_damping_nm_s_rad", "damping")):
-            table.add_row(name, f"{getattr(motor, name):.6g}", f"{_SIGMA_95 * one.nuisance_std[key]:.2g}")
+            table.add_row(name, f"{getattr(motor, name):.6g}", f"{SIGMA_95 * one.nuisance_std[key]:.2g}")
         _add_effects(table, motor.effects)
         console.print(table)
         share = one.error_rms_nm / one.torque_rms_nm
@@ -162,7 +160,7 @@ def _print(found: Identified, paths: Sequence[Path]) -> None:
         table = _table("link")
         for name, x in _link(found).get("dynamics", {}).items():
             std = found.link_std.get(name)
-            table.add_row(name, f"{x:.6g}", "" if std is None else f"{_SIGMA_95 * std:.2g}")
+            table.add_row(name, f"{x:.6g}", "" if std is None else f"{SIGMA_95 * std:.2g}")
         _add_effects(table, found.model.link_effects)
         console.print(table)
     for line in found.notes:

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from drivelink.demo.comparison import Comparison
 from drivelink.demo.rig import Summary
-from estimator.sample import Status
+from estimator.sample import SIGMA_95, Status
 
 __all__ = ["as_json", "closing_table"]
 
@@ -30,7 +30,7 @@ def closing_table(
             "stiffness / N·m/rad",
             f"{truth.stiffness_nm_rad:.4g}",
             f"{estimate.stiffness_nm_rad:.4g}",
-            f"± {1.96 * estimate.stiffness_std_nm_rad:.2g}",
+            f"± {SIGMA_95 * estimate.stiffness_std_nm_rad:.2g}",
             _percent(errors.stiffness),
         )
         table.add_row(

@@ -7,7 +7,7 @@ from typing import NamedTuple, TypeVar
 
 from drivelink.demo.rig import TruePoint
 from drivelink.monitor.history import EstimateLike
-from estimator.sample import Status
+from estimator.sample import SIGMA_95, Status
 
 __all__ = ["Comparison", "Errors"]
 
@@ -80,7 +80,7 @@ class Comparison:
             return
         off = estimate.stiffness_nm_rad - truth.stiffness_nm_rad
         self._cycles += 1
-        self._covered += abs(off) <= 1.96 * estimate.stiffness_std_nm_rad
+        self._covered += abs(off) <= SIGMA_95 * estimate.stiffness_std_nm_rad
         sums = self._sums
         sums[0] += off**2
         sums[1] += truth.stiffness_nm_rad**2

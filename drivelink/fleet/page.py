@@ -10,11 +10,12 @@ from pathlib import Path
 from string import Template
 from typing import Any, NamedTuple
 
+from estimator.sample import SIGMA_95
+
 __all__ = ["page"]
 
 _CHARTS = 400  # joints with a chart, the most urgent first; more would make the page too large
 _BROKEN = 200
-_SIGMA_95 = 1.96
 _BLUE, _ORANGE, _GREY = "#005f9e", "#e0701a", "#999999"
 _WIDTH, _LEFT, _RIGHT, _HEIGHT, _ROW = 900.0, 80.0, 10.0, 190.0, 18.0
 
@@ -180,7 +181,7 @@ def _fitted(one: dict[str, Any], frame: _Frame) -> str:
 def _points(one: dict[str, Any], frame: _Frame) -> str:
     parts = []
     for p in one["series"]:
-        x, reach = frame.x(p["time"]), _SIGMA_95 * p["std_nm_rad"]
+        x, reach = frame.x(p["time"]), SIGMA_95 * p["std_nm_rad"]
         y, low, high = (frame.y(p["stiffness_nm_rad"] + d) for d in (0.0, -reach, reach))
         tip = f"{_minute(p['time'])}: {p['stiffness_nm_rad']:.5g} ± {reach:.2g} N·m/rad, {p['verdict']}"
         bar = f'<line x1="{x:.1f}" x2="{x:.1f}" y1="{low:.1f}" y2="{high:.1f}" stroke="{_BLUE}"/>'

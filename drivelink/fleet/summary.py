@@ -13,7 +13,7 @@ import numpy as np
 from drivelink import __version__
 from drivelink.fleet.analysis import stiffness_at
 from drivelink.fleet.changes import Appearance, Change, SeriesTest, appearance, changes, q_values, series_test
-from estimator.sample import FloatArray
+from estimator.sample import SIGMA_95, FloatArray
 from estimator.transmissions import MODELS
 
 __all__ = ["COLUMNS", "SCHEMA", "summarise"]
@@ -300,9 +300,9 @@ def _sentence(
             amount, std = 100.0 * change["amount_relative"], 100.0 * change["amount_std_relative"]
             day = change["since"][:10]
             if change["kind"] == "step":
-                said.append(f"{of} stepped by {_signed(amount)} ± {1.96 * std:.1f} % on {day}.")
+                said.append(f"{of} stepped by {_signed(amount)} ± {SIGMA_95 * std:.1f} % on {day}.")
             else:
-                said.append(f"{of} has drifted by {_signed(amount)} ± {1.96 * std:.1f} % since {day}.")
+                said.append(f"{of} has drifted by {_signed(amount)} ± {SIGMA_95 * std:.1f} % since {day}.")
     for effect in effects:
         if effect["significant"]:
             names = " or ".join(n.replace("_", " ") for n in effect["names"][:2])

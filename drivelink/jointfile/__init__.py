@@ -1,4 +1,4 @@
-"""The joint file: its schema, what a wrong key meant, a new one, and what fit and diagnose write into it."""
+"""Joint files: schema, hints for unknown keys, new files, changes by fit and diagnose."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A diagnosis into a joint file: the effects found, the transmission refitted, where it came from."""
+"""Writes a diagnosis into a joint file: effects, refitted transmission, provenance."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ def write(
     *,
     force: bool = False,
 ) -> JointFile:
-    """Copy a joint file with the effects that were found, and validate the copy.
+    """Copy a joint file with the effects found, and validate the copy.
 
     Args:
         source: the joint file the diagnosis was made with.
-        target: where the copy goes.
+        target: path of the copy.
         outcome: the diagnosis.
         record: the recording it was made from.
         recording: its name.
-        force: whether the copy may take the place of another file.
+        force: replace an existing file.
 
     Raises:
         JointFileError: the copy cannot be written.
@@ -65,7 +65,7 @@ def write(
 
 
 def diagnosed_model(joint: JointFile, outcome: Diagnosis) -> JointModel:
-    """The model as `write` puts it into the copy."""
+    """The model that `write` writes."""
     motors, at_link = _entries(joint, outcome)
     model = joint.model()
     changed = []
@@ -79,7 +79,7 @@ def diagnosed_model(joint: JointFile, outcome: Diagnosis) -> JointModel:
 
 
 def _entries(joint: JointFile, outcome: Diagnosis) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """What changes of each motor's table, and the effects at the link."""
+    """Changes of each motor's table, and the effects at the link."""
     motors = [
         {"effect": _all_effects(section.effect, outcome, i), **_transmission(joint, outcome, i)}
         for i, section in enumerate(joint.motor)
@@ -96,14 +96,14 @@ def _values(parameters: dict[str, Any]) -> dict[str, ParameterValue]:
 
 
 def _all_effects(declared: tuple[Effect, ...], outcome: Diagnosis, motor: int | None) -> list[dict[str, Any]]:
-    """What one table of effects holds: those declared, what was taken out of the readings, those found."""
+    """Effects of one table: declared, corrections of the readings, found."""
     made = [{"name": e.name, "parameters": _plain(dict(e.parameters))} for e in declared]
     made += _readings(outcome, motor)
     for finding in outcome.effects:
         kind = LIBRARY.get(finding.name)
         if kind is None:
             continue
-        # A zero that all deflections have in common belongs to every motor.
+        # A common zero of all deflections belongs to every motor.
         common = kind.channel == "deflection" and finding.motor is None and motor is not None
         here = kind.on_link if motor is None else not kind.on_link and finding.motor == motor
         if here or common:
@@ -112,7 +112,7 @@ def _all_effects(declared: tuple[Effect, ...], outcome: Diagnosis, motor: int | 
 
 
 def _readings(outcome: Diagnosis, motor: int | None) -> list[dict[str, Any]]:
-    """Skew and offsets between the channels: on the bus they are there as well."""
+    """Skew and offsets between the channels, which also exist on the bus."""
     if outcome.verdict == "insufficient_excitation":
         return []
     if motor is None:
@@ -130,7 +130,7 @@ def _readings(outcome: Diagnosis, motor: int | None) -> list[dict[str, Any]]:
 
 
 def _transmission(joint: JointFile, outcome: Diagnosis, motor: int) -> dict[str, Any]:
-    """The transmission's refitted parameters; nothing where it is rigid or was not named."""
+    """The transmission's refitted parameters; empty if it is rigid or undetermined."""
     parameters = outcome.transmissions[motor].parameters
     if not parameters or outcome.verdict in ("insufficient_excitation", "unexplained"):
         return {}

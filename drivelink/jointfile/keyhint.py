@@ -1,4 +1,4 @@
-"""What to say of a key that a joint file's schema does not know: the key that was probably meant."""
+"""Suggests the key that was probably meant by an unknown one."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ __all__ = ["unknown_key"]
 
 
 def unknown_key(root: type, location: tuple[int | str, ...]) -> str:
-    """The message for a key that is not one, by the keys that its table has.
+    """The message for an unknown key, from the keys of its table.
 
     Args:
         root: the schema of the whole file.
-        location: of the key, as pydantic gives it.
+        location: of the key, from pydantic.
     """
     section: Any = root
     for part in location[:-1]:

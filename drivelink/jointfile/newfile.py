@@ -1,4 +1,4 @@
-"""Text of a commented joint file, from a few answers or from what is on the bus."""
+"""Text of a commented joint file, from a few answers or from the nodes on the bus."""
 
 from __future__ import annotations
 
@@ -17,16 +17,15 @@ _PLACEHOLDER = 0.1  # kg·m², where the inertia is not known
 
 @dataclass(slots=True, kw_only=True)
 class Answers:
-    """What a new joint file is made from.
+    """Answers for a new joint file.
 
     Attributes:
         name: of the joint.
         arrangement: single, antagonistic or serial.
-        inertia_kg_m2: of each motor, joint side; None: not known, a placeholder is written.
-        rotor_inertia_gcm2: of each motor, as its data sheet has it; reflected through the gear ratio,
-            without which it says nothing of the joint side.
+        inertia_kg_m2: of each motor, joint side; None: unknown, a placeholder is written.
+        rotor_inertia_gcm2: of each motor, from its data sheet; requires the gear ratio.
         torque_constant_mnm_a: likewise; None: the drive reports a torque.
-        viscous_damping_nm_s_rad: of each motor, joint side; 0 where it is not known.
+        viscous_damping_nm_s_rad: of each motor, joint side; 0: unknown.
         model: of the transmission.
         nodes: node ids of the drives, motor by motor.
         gear_ratio: motor revolutions per joint revolution; None: read from the drive.
@@ -34,8 +33,8 @@ class Answers:
         interface: python-can's.
         channel: python-can's.
         bitrate: bit/s.
-        passive: another master configures the drives and makes SYNC.
-        remarks: about a node, written beside it.
+        passive: another master configures the drives and produces SYNC.
+        remarks: comments by node.
     """
 
     name: str = "joint"
@@ -61,14 +60,14 @@ class Answers:
 
     @property
     def joint_inertia_kg_m2(self) -> float | None:
-        """Of each motor at the joint side, as given or by the data sheet."""
+        """Inertia of each motor at the joint side, given or from the data sheet."""
         if self.inertia_kg_m2 is not None or self.rotor_inertia_gcm2 is None or self.gear_ratio is None:
             return self.inertia_kg_m2
         return self.rotor_inertia_gcm2 * _GCM2 * self.gear_ratio**2
 
     @property
     def conversion(self) -> str:
-        """How the inertia came about, in words; empty where it was given at the joint side."""
+        """The conversion of the inertia in words; empty if it was given at the joint side."""
         inertia = self.joint_inertia_kg_m2
         if inertia is None or self.inertia_kg_m2 is not None:
             return ""
@@ -76,10 +75,10 @@ class Answers:
 
 
 def joint_text(answers: Answers) -> str:
-    """The file; it is valid, or an error names the answer that is not.
+    """The text of the file, validated.
 
     Raises:
-        JointFileError: an answer makes no valid joint file.
+        JointFileError: an answer is invalid.
     """
     nodes = list(answers.nodes)
     free = (node for node in range(1, 128) if node not in nodes)
@@ -194,7 +193,7 @@ _ZENOH = (
 
 
 def answers_from_bus(answers: Answers, found: list[FoundNode]) -> Answers:
-    """Fill in what the nodes on the bus report.
+    """Add the data of the nodes on the bus.
 
     Raises:
         DriveError: there is no drive.

@@ -1,4 +1,4 @@
-"""The residual baseline of a joint's model, kept with it in the joint file, and the monitor that uses it."""
+"""The residual baseline in the joint file, and the model monitor that uses it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LOG = logging.getLogger(__name__)
 
 
 def floor_entry(record: Record | Sequence[Record], model: JointModel) -> dict[str, Any]:
-    """What [provenance] keeps of a model's baseline; nothing where it cannot be measured, which is logged."""
+    """Entry of [provenance] with the baseline; empty, with a log line, if it cannot be measured."""
     if not can_monitor(model):
         return {}
     try:
@@ -31,7 +31,7 @@ def floor_entry(record: Record | Sequence[Record], model: JointModel) -> dict[st
 
 
 def make_model_monitor(joint: JointFile) -> ModelMonitor | None:
-    """The monitor of a joint's model, where that is complete and its baseline is known."""
+    """The model monitor of a joint; None without complete model or baseline."""
     entry = joint.provenance.get(_KEY)
     baseline = ResidualBaseline.from_dict(entry) if isinstance(entry, dict) else None
     model = joint.model()

@@ -1,7 +1,6 @@
-"""Schema of the joint file: one TOML file says what a joint is, how it is reached, where its estimates go.
+"""Schema of the joint file.
 
-The schema below is the reference: `docs/` is generated from it. A wrong file is one line: file, key,
-what was expected.
+`docs/reference/joint-file.md` is generated from it. An error is one line: file, key, what was expected.
 """
 
 from __future__ import annotations
@@ -72,7 +71,7 @@ class _Section(BaseModel):
 
 
 class TpdoSection(_Section):
-    """A TPDO as it is on the wire, for a bus that we may not configure."""
+    """A TPDO of a node that another master configures."""
 
     cob_id: int = Field(ge=0x181, le=0x57F, description="identifier of the frame, e.g. 0x181")
     objects: tuple[str, ...] = Field(
@@ -94,7 +93,7 @@ class TpdoSection(_Section):
 
 
 class DriveSection(_Section):
-    """The drive of one motor, as a CANopen node. What the drive reports may be left out."""
+    """The drive of one motor. Values that the drive reports may be left out."""
 
     node_id: int = Field(ge=1, le=127, description="CANopen node id")
     counts_per_rev: float | None = Field(
@@ -111,7 +110,7 @@ class DriveSection(_Section):
         None, gt=0, description="unit of 0x6077 is a thousandth of it (0x6076)"
     )
     torque_source: Literal["auto", "torque", "current"] = Field(
-        "auto", description="which object the motor torque is taken from: 0x6077, or 0x6078 and the constant"
+        "auto", description="source of the motor torque: 0x6077, or 0x6078 and the constant"
     )
     current_object: str | None = Field(None, description='vendor object for the current, e.g. "0x30D1:02"')
     current_unit_a: float = Field(0.001, gt=0, description="amperes per count of current_object")
@@ -122,10 +121,10 @@ class DriveSection(_Section):
         None, gt=0, description="unit of 0x606C at the motor shaft, where 0x60A9 does not give it"
     )
     checks: tuple[Literal["velocity", "current", "following_error"], ...] = Field(
-        (), description="also map these, only to compare them with position and torque (cross-checks)"
+        (), description="also map these, for cross-checks"
     )
     second_encoder: str | None = Field(
-        None, description='position of a second encoder of the motor, likewise, e.g. "0x60E4:02"'
+        None, description='position of a second encoder of the motor, for a cross-check, e.g. "0x60E4:02"'
     )
     direction: Direction = Field(1, description="sign of the motor position against the joint's")
     torque_direction: Direction | None = Field(
@@ -169,14 +168,14 @@ class MotorSection(_Section):
         None,
         gt=0,
         le=1,
-        description="how sure the inertia is: standard deviation as a share of it; default 0.05",
+        description="relative standard deviation of the inertia; default 0.05",
     )
     viscous_damping_nm_s_rad: float = Field(0.0, ge=0, description="D_theta of eqs 5, 7, joint side")
     transmission: Transmission = Field(
         default_factory=Transmission, description="model of the flexibility torque"
     )
     effect: tuple[Effect, ...] = Field((), description="effects the model has been given")
-    drive: DriveSection | None = Field(None, description="only run, sim, record and doctor need it")
+    drive: DriveSection | None = Field(None, description="needed by run, sim, record and doctor")
 
     @model_validator(mode="after")
     def _parameters_can_be(self) -> MotorSection:
@@ -185,7 +184,7 @@ class MotorSection(_Section):
         return self
 
     def motor(self) -> Motor:
-        """Its part of the estimator's model."""
+        """The motor of the estimator's model."""
         drive = self.drive
         return Motor(
             inertia_kg_m2=self.inertia_kg_m2,
@@ -202,7 +201,7 @@ class LinkSection(_Section):
 
     encoder: EncoderSection | None = Field(None, description="the link encoder")
     dynamics: LinkDynamics | None = Field(
-        None, description="makes the external torque and the external residual (eq 12) available"
+        None, description="needed for the external torque and residual (eq 12)"
     )
     effect: tuple[Effect, ...] = Field((), description="effects at the link or in its encoder")
 
@@ -229,9 +228,9 @@ class BusSection(_Section):
     sdo_retries: int = Field(1, ge=0, description="further attempts after an SDO timeout")
 
     def moved(self, interface: str | None = None, channel: str | None = None) -> BusSection:
-        """The same cycle on another interface or channel, where one is given.
+        """The section with another interface or channel, if given.
 
-        `options` belong to the interface: another one does not get them.
+        `options` are dropped for another interface.
         """
         changes: dict[str, Any] = {}
         if channel:
@@ -242,7 +241,7 @@ class BusSection(_Section):
 
 
 class RecordingSection(_Section):
-    """What turns recordings of this joint into SI at the joint side."""
+    """Conversion of recordings to SI at the joint side."""
 
     scale: dict[str, float] = Field(
         default_factory=dict,
@@ -290,7 +289,7 @@ class SimSection(_Section):
     )
     effect: tuple[Effect, ...] = Field((), description="effects of the world that the model may not know")
     excitation: dict[str, Any] = Field(default_factory=dict, description="torque of the rig, see reference")
-    quirks: str | None = Field(None, description="behave like this vendor's drives")
+    quirks: str | None = Field(None, description="vendor profile of the drives")
     seed: int = Field(0, ge=0, description="of the sensor noise")
 
 
@@ -352,14 +351,14 @@ class JointFile(_Section):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JointText:
-    """A joint file and the text it was read from: what a copy of it starts from.
+    """A joint file and its text.
 
     Attributes:
-        joint: what the text says.
-        text: the whole of it, comments included.
-        folder: where its EDS and zenoh files are looked for.
-        name: begins every message about it.
-        path: the file; None: it came with a recording.
+        joint: the parsed file.
+        text: the whole text, comments included.
+        folder: base of its EDS and zenoh files.
+        name: for messages.
+        path: the file; None: from a recording.
     """
 
     joint: JointFile
@@ -409,7 +408,7 @@ def parse(text: str, where: str = "joint file") -> JointFile:
         raise JointFileError(f"{where}: {_NESTED}")
     try:
         document = tomllib.loads(text)
-        # By way of JSON: strict there means what a TOML author expects (an array is a tuple, 6 is a float).
+        # Validated as JSON, where strict mode accepts an array as tuple and 6 as float.
         return JointFile.model_validate_json(json.dumps(document, default=str))
     except ValidationError as error:
         raise JointFileError(f"{where}: {_one_line(error)}") from error
@@ -422,16 +421,16 @@ def parse(text: str, where: str = "joint file") -> JointFile:
 def write_model(
     source: JointText, target: Path, changes: dict[str, Any], *, force: bool = False
 ) -> JointFile:
-    """Copy a joint file, comments kept, with some of its values replaced, and validate the copy.
+    """Copy a joint file with its comments, replace some values, and validate the copy.
 
-    The copy ends with a check line, by which every reader knows that it is whole.
+    The copy ends with a check line, so that readers detect a truncated file.
 
     Args:
         source: joint file to start from.
-        target: where the copy goes; written in one step, and only if it is valid.
-        changes: nested like the file; a mapping is merged, anything else replaces. For the tables of an
-            array (`motor`), a list of mappings is merged element by element; `effect` is replaced whole.
-        force: whether the copy may take the place of another file.
+        target: path of the copy; written atomically, and only if valid.
+        changes: nested like the file. Mappings are merged, a list of mappings for an array (`motor`) element
+            by element; everything else, and `effect`, is replaced.
+        force: replace an existing file.
 
     Raises:
         JointFileError: the result is invalid, or the target cannot be written.
@@ -454,7 +453,7 @@ def _checked(text: str) -> str:
 
 
 def _unchecked(text: str) -> str:
-    """The text without these two lines."""
+    """The text without first and check line."""
     return _CHECK.sub("", text).replace(f"{_MARK}\n", "", 1)
 
 
@@ -463,7 +462,7 @@ def _digest(text: str) -> str:
 
 
 def _require_whole(text: str, where: str) -> None:
-    """Refuse what is only a part of a file that drivelink wrote; a file edited since then may be meant so.
+    """Refuse a truncated file that drivelink wrote; an edited one is accepted.
 
     Raises:
         JointFileError: its check line is missing.
@@ -480,7 +479,7 @@ def _require_whole(text: str, where: str) -> None:
 
 
 def _merge(table: Any, changes: dict[str, Any], *, dotted: bool = False) -> None:
-    """Put changes into a table; `dotted`: it has no header of its own, and takes what is new in one line."""
+    """Merge changes into a table; `dotted`: it has no header, so new values go into one line."""
     for key, value in changes.items():
         if isinstance(value, dict) and key in table and key != "parameters":
             _merge(table[key], value, dotted=dotted or _is_dotted(table, key))
@@ -492,14 +491,14 @@ def _merge(table: Any, changes: dict[str, Any], *, dotted: bool = False) -> None
 
 
 def _is_dotted(table: Any, key: str) -> bool:
-    """Whether a table stands as `key.name = …` and not below a header."""
+    """Whether a table is written as `key.name = …` instead of below a header."""
     container = table if isinstance(table, Container) else getattr(table, "value", None)
     body = container.body if isinstance(container, Container) else ()
     return any(k is not None and k.key == key and k.is_dotted() for k, _ in body)
 
 
 def _inline(value: Any) -> Any:
-    """A value that needs no header."""
+    """A value without header."""
     if isinstance(value, dict):
         made = tomlkit.inline_table()
         for key, one in value.items():

@@ -1,1 +1,1 @@
-"""Live views of a joint: history, terminal and web page. They read what is on zenoh and change nothing."""
+"""Live views of a joint in terminal and browser; read-only."""

@@ -18,7 +18,7 @@ _BLANK = 0x2800
 
 
 def number(value: float, digits: int = 4) -> str:
-    """A number in few characters: so many significant digits, 4.1e6 for the very large and small."""
+    """A number in few characters, with so many significant digits; very large and small ones like 4.1e6."""
     if not math.isfinite(value):
         return "–"
     if value != 0.0 and not 1e-3 <= abs(value) < 1e5:
@@ -29,9 +29,9 @@ def number(value: float, digits: int = 4) -> str:
 
 
 def sparkline(values: Sequence[float], width: int) -> str:
-    """The last values as bars, at most `width` of them: the mean of each share; blank where not finite.
+    """The values as at most `width` bars, each the mean of its share; blank if not finite.
 
-    What lies beyond the usual range gets the lowest or the highest bar.
+    Outliers get the lowest or highest bar.
     """
     if not values or width < 1:
         return ""
@@ -50,14 +50,14 @@ def sparkline(values: Sequence[float], width: int) -> str:
 
 
 def gauge(value: float, full: float, width: int) -> str:
-    """A bar of so many characters that is full at `full`; empty where the value is not finite."""
+    """A bar of so many characters, full at `full`; empty if the value is not finite."""
     eighths = round(8 * width * min(max(value / full, 0.0), 1.0)) if math.isfinite(value) else 0
     whole, rest = divmod(eighths, 8)
     return ("█" * whole + (" ▏▎▍▌▋▊▉"[rest] if rest else "")).ljust(width, "░")
 
 
 class DotPlot:
-    """Dots on a grid of characters, with the axes' ends written beside it.
+    """Dots on a grid of characters, with the ranges of the axes.
 
     Args:
         width: characters of the whole plot, labels included.
@@ -78,7 +78,7 @@ class DotPlot:
         self._note = ""
 
     def curve(self, points: Sequence[tuple[float, float]], style: str, every: int = 1) -> None:
-        """Join the points by lines; `every` > 1 draws dotted ones. What is not finite breaks the line."""
+        """Join the points by lines, dotted for `every` > 1. Non-finite points break the line."""
         last: tuple[float, float] | None = None
         count = 0
         for x, y in points:
@@ -98,13 +98,13 @@ class DotPlot:
             last = here
 
     def band(self, points: Sequence[tuple[float, float, float]], style: str) -> None:
-        """The edges of a band as dotted lines, from (x, low, high); what leaves the plot is not drawn."""
+        """The edges of a band as dotted lines, from (x, low, high), inside the plot."""
         below, above = self._y
         self.curve([(x, low if low >= below else math.nan) for x, low, _ in points], style, every=3)
         self.curve([(x, high if high <= above else math.nan) for x, _, high in points], style, every=3)
 
     def mark(self, x: float, y: float, style: str) -> None:
-        """One point that stands out, in place of the dots there; outside the plot there is none."""
+        """A highlighted point, if inside the plot."""
         if math.isfinite(x) and math.isfinite(y):
             across, down = self._place(x, y)
             column, row = math.floor(across / 2), math.floor(down / 4)
@@ -112,7 +112,7 @@ class DotPlot:
                 self._marks[row, column] = style
 
     def note(self, text: str) -> None:
-        """Say why there is nothing to see, in place of the axes."""
+        """Show a message in place of the axes."""
         self._note = text
 
     def render(self, title: str, x_unit: str = "") -> Text:
@@ -140,7 +140,7 @@ class DotPlot:
         return text
 
     def _place(self, x: float, y: float) -> tuple[float, float]:
-        """Column and row of the dot; what is far outside comes to lie just outside."""
+        """Column and row of the dot; far points are clipped to just outside."""
         (x0, x1), (y0, y1) = self._x, self._y
         across, down = min(max((x - x0) / (x1 - x0), -0.1), 1.1), min(max((y1 - y) / (y1 - y0), -0.1), 1.1)
         return across * (2 * self.columns - 1), down * (4 * self.rows - 1)
@@ -153,7 +153,7 @@ class DotPlot:
 
 
 def _opened(low: float, high: float) -> tuple[float, float]:
-    """A range that is none is opened around its value."""
+    """Widen an empty range around its value."""
     if not math.isfinite(high - low):
         return 0.0, 1.0
     if high - low <= 1e-9 * max(abs(low), abs(high)):

@@ -1,4 +1,4 @@
-"""Data of a live view: the last seconds, decimated, and stiffness over deflection as it grows.
+"""Data of a live view: the last seconds, decimated, and stiffness over deflection.
 
 Fed with every estimate (a few microseconds each), read a few times a second.
 """
@@ -17,7 +17,7 @@ __all__ = ["EstimateLike", "GrowingCurve", "History", "Moment", "Touch", "TruthL
 
 _BINS = 160
 _USABLE = int(Status.VALID | Status.OBSERVABLE)
-_NEAR = 8  # points to either side of one, among which its standard deviation is no outlier
+_NEAR = 8  # neighbouring points on either side for the outlier test
 _OUTDATED = 2.5  # times the usual one there
 
 
@@ -50,7 +50,7 @@ class EstimateLike(Protocol):
 
 
 class TruthLike(Protocol):
-    """What is known to be true in a simulation."""
+    """The truth of a simulation."""
 
     @property
     def flexibility_torque_nm(self) -> float:
@@ -74,7 +74,7 @@ class Moment(NamedTuple):
 
 
 class Touch(NamedTuple):
-    """What the world did to the link at one instant."""
+    """External torque at one instant."""
 
     time_s: float
     torque_nm: float
@@ -84,18 +84,18 @@ class Touch(NamedTuple):
 
 
 class GrowingCurve:
-    """Stiffness over deflection, the latest value of each place.
+    """Stiffness over deflection: the latest value in each bin.
 
-    Places are as wide as it takes for at most `_BINS` of them to be occupied: a wild value takes one place
-    and leaves the others as fine as they were.
+    Bins are as wide as needed to have at most `_BINS` occupied: an outlier takes one bin and does not coarsen
+    the others.
     """
 
     def __init__(self) -> None:
-        self._width = 0.0  # of one place; 0: nothing seen yet
+        self._width = 0.0  # of a bin; 0: no value yet
         self._places: dict[int, tuple[float, float, float]] = {}
 
     def add(self, deflection_rad: float, stiffness_nm_rad: float, std_nm_rad: float) -> None:
-        """Enter one estimate; what is not finite is left out."""
+        """Enter one estimate, if finite."""
         if not (math.isfinite(deflection_rad) and math.isfinite(stiffness_nm_rad)):
             return
         if self._width == 0.0:
@@ -111,8 +111,8 @@ class GrowingCurve:
     def points(self) -> list[tuple[float, float, float]]:
         """(deflection, stiffness, standard deviation), by deflection.
 
-        Left out is what its neighbours have outdated: a value from before the estimator knew the curve, at a
-        place where the joint has hardly been since, stands out by its standard deviation.
+        Omits outdated values: one from before the estimator knew the curve has a much larger standard
+        deviation than its neighbours.
         """
         points = [point for _, point in sorted(self._places.items())]
         stds = [std for _, _, std in points]
@@ -128,15 +128,15 @@ class History:
     """The last seconds of a joint and its curve.
 
     Args:
-        seconds: how far back it reaches.
-        points: how many moments it keeps of them.
+        seconds: its length.
+        points: number of moments kept.
 
     Attributes:
         moments: thinned estimates, oldest first.
         curves: stiffness over deflection of each transmission.
         latest: the newest estimate.
-        residuals: (time of the newest estimate then, s; largest residual over its baseline).
-        touches: thinned external torques, oldest first; empty where nothing is declared of the link.
+        residuals: (time of the newest estimate, s; largest residual over its baseline).
+        touches: thinned external torques, oldest first; empty without link dynamics.
         touch: the newest one.
     """
 
@@ -151,7 +151,7 @@ class History:
         self._apart_s = seconds / points
 
     def add(self, estimate: EstimateLike, time_s: float, truth: TruthLike | None = None) -> None:
-        """Enter one estimate; `time_s` is that of its SYNC, of any origin."""
+        """Enter one estimate; `time_s` is the time of its SYNC, with any origin."""
         if self.latest is not None and len(self.latest.transmissions) != len(estimate.transmissions):
             self.moments.clear()  # another joint has taken the name
         self.latest = estimate
@@ -200,12 +200,12 @@ class History:
         self.touches.append(self.touch)
 
     def add_residual(self, ratio: float) -> None:
-        """Enter what the model leaves unexplained now, over its baseline."""
+        """Enter the present residual over its baseline."""
         if self.moments and math.isfinite(ratio):
             self.residuals.append((self.moments[-1].time_s, ratio))
 
     def window(self) -> list[Moment]:
-        """The moments not older than `seconds` before the last one."""
+        """The moments within `seconds` of the last one."""
         if not self.moments:
             return []
         since = self.moments[-1].time_s - self.seconds
@@ -224,11 +224,11 @@ class History:
 
 
 def usual_range(values: Sequence[float], most: float = 0.02) -> tuple[float, float]:
-    """The range that a plot shows: of all values but the outermost, which stretch it by half at most.
+    """The range of a plot: that of all but the outermost values, extended to those by at most half.
 
     Args:
-        values: what is drawn; what is not finite is left out.
-        most: share of the values that counts as outermost, both ends together.
+        values: values to draw; non-finite ones are omitted.
+        most: fraction of outermost values, both ends together.
 
     Returns:
         (low, high); (nan, nan) where there is nothing finite.

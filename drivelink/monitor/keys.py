@@ -14,7 +14,7 @@ __all__ = ["Keys"]
 
 
 class Keys:
-    """Keys that are pressed in the terminal on standard input; none where that is no terminal."""
+    """Keys pressed in the terminal on standard input; none without a terminal."""
 
     def __init__(self) -> None:
         self._before: list[Any] | None = None
@@ -34,7 +34,7 @@ class Keys:
             termios.tcsetattr(self._terminal, termios.TCSADRAIN, self._before)
 
     def pressed(self) -> str:
-        """The keys pressed since; an arrow or function key gives its bytes' characters."""
+        """The keys pressed since the last call; an arrow or function key gives several characters."""
         if self._before is None or not select.select([self._terminal], [], [], 0)[0]:
             return ""
         return os.read(self._terminal, 64).decode("utf-8", "replace")

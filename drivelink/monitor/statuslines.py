@@ -1,8 +1,7 @@
-"""The status and model documents of a joint in words: cycle, nodes, residual, what is wrong, what to do.
+"""Shows the status and model documents of a joint in words.
 
-`shape` takes out of the documents what views show, each part checked for its type: whatever a document of
-another version or of somebody else holds, a view gets texts and finite numbers. Terminal, web page and plain
-lines are made from that.
+`shape` extracts the shown parts and checks their types, so that views get texts and finite numbers from any
+document. Terminal, web page and plain lines use its result.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ _FULL = 2.0  # times its baseline where a gauge is full
 
 
 class Node(NamedTuple):
-    """A node of the bus: its id, what it says, whether that is well."""
+    """A node of the bus: id, state, whether it is good."""
 
     id: str
     text: str
@@ -39,7 +38,7 @@ class Node(NamedTuple):
 
 
 class Event(NamedTuple):
-    """Something that has happened: UNIX time, s; words; how often."""
+    """An event: UNIX time, s; text; count."""
 
     time_s: float
     text: str
@@ -47,7 +46,7 @@ class Event(NamedTuple):
 
 
 class Balance(NamedTuple):
-    """What a torque balance leaves unexplained, and what it left where the model was fitted, N·m."""
+    """Residual of a torque balance, and its baseline, N·m."""
 
     name: str
     residual_nm: float
@@ -61,7 +60,7 @@ class Balance(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shown:
-    """What views show of the documents; empty where these do not say.
+    """Shown parts of the documents; empty if missing.
 
     Attributes:
         state: in a word.
@@ -70,10 +69,10 @@ class Shown:
         nodes: of the bus.
         wrong: faults and conditions that hold now.
         alarm: whether the model alarm is on.
-        location: where the effect that the model lacks is likely to sit.
-        residual_nm: of the whole model, N·m; None where the estimator has none.
-        balances: residual against baseline, one a motor and one of the link.
-        improved: relative error before and after the effects that diagnose has found.
+        location: likely location of the missing effect.
+        residual_nm: of the whole model, N·m, or None.
+        balances: residual and baseline per motor and of the link.
+        improved: relative error before and after diagnose.
         events: the last ones, newest first.
         recording: where to.
     """
@@ -101,13 +100,13 @@ class Shown:
 
     @property
     def advice(self) -> str:
-        """What to do about the model alarm; empty while there is none."""
+        """What to do about the model alarm; empty without one."""
         where = f" (likely at the {self.location})" if self.location else ""
         return f"model alarm{where}: {MODEL_ALARM_ADVICE}" if self.alarm else ""
 
 
 def shape(status: Mapping[str, Any], model: Mapping[str, Any] | None = None) -> Shown:
-    """What views show of a status and a model document, whatever these hold."""
+    """Extract the shown parts of a status and a model document, whatever they contain."""
     alarm = _part(status, "residual_alarm")
     transmissions = status.get("transmissions")
     motors = min(len(transmissions), 2) if isinstance(transmissions, list) else 1
@@ -140,7 +139,7 @@ _TIMES = (("latency", "work"), ("response", "answer"), ("jitter", "late"))
 
 
 def _part(document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    """A part of a document, empty where it is none."""
+    """A mapping in a document; empty if it is not one."""
     part = document.get(key)
     return part if isinstance(part, Mapping) else {}
 
@@ -178,7 +177,7 @@ def _events(value: Any) -> tuple[Event, ...]:
 
 
 def _balances(alarm: Mapping[str, Any], motors: int) -> tuple[Balance, ...]:
-    """Residual and baseline of each motor's balance and of the link's, where both are known."""
+    """Residual and baseline of each motor's and the link's balance, if both are known."""
     residuals, baselines = alarm.get("residual_nm"), alarm.get("floor_nm")
     if not isinstance(residuals, list) or not isinstance(baselines, list):
         return ()
@@ -192,14 +191,14 @@ def _balances(alarm: Mapping[str, Any], motors: int) -> tuple[Balance, ...]:
 
 
 def _improved(model: Mapping[str, Any]) -> tuple[float, float] | None:
-    """Relative error of the torque before and after what diagnose added, from the model's provenance."""
+    """Relative torque error before and after diagnose, from the model's provenance."""
     found = _part(_part(model, "provenance"), "diagnosis")
     before, after = _number(found.get("error_before_relative")), _number(found.get("error_after_relative"))
     return None if before is None or after is None else (before, after)
 
 
 def status_text(status: Mapping[str, Any], model: Mapping[str, Any] | None = None) -> str:
-    """The cycle, the residual and what to do in plain words; what the documents do not say is left out."""
+    """Cycle, residual and advice as text, as far as the documents contain them."""
     shown = shape(status, model)
     return " · ".join(part for part in (_cycle(shown), _cpu(shown), _residual(shown), shown.advice) if part)
 
@@ -209,14 +208,14 @@ def _cpu(shown: Shown) -> str:
 
 
 def _cycle(shown: Shown) -> str:
-    """Rate, missed cycles, and what takes how long; short enough for 80 columns."""
+    """Rate, missed cycles and durations, in at most 80 columns."""
     times = ", ".join(f"{name} {p99:.0f}" for name, p99 in shown.times)
     missed = f"missed {shown.missed.split(' ')[0]}" if shown.missed else ""
     return " · ".join(part for part in (shown.rate, missed, f"p99 {times} µs" if times else "") if part)
 
 
 def _residual(shown: Shown) -> str:
-    """What the model leaves, in words; before and after where diagnose has improved it."""
+    """The residual in words, with the improvement by diagnose."""
     if shown.ratio is not None:
         text = f"residual {number(shown.ratio, 2)} × baseline"
     elif shown.residual_nm is not None:
@@ -268,7 +267,7 @@ def _nodes(shown: Shown, width: int) -> Text | None:
 
 
 def _gauges(shown: Shown, width: int) -> Text | None:
-    """The residual of each balance against its baseline: the bar is half full at the baseline."""
+    """Gauges of each residual, half full at the baseline."""
     if not shown.balances:
         return _line("residual", _residual(shown).removeprefix("residual "), width)
     line = Text(no_wrap=True)

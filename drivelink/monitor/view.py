@@ -1,4 +1,4 @@
-"""Terminal widgets of a joint's live view, for `monitor` and `demo`; at home in 80 columns by 24 lines.
+"""Terminal widgets of a joint's live view, for `monitor` and `demo`, in 80 columns by 24 lines.
 
 view = JointView("elbow", subtitle="vsa-ii on the virtual bus")
 with rich.live.Live(view, refresh_per_second=10) as live:
@@ -22,7 +22,7 @@ from drivelink.monitor.braille import DotPlot, number, sparkline
 from drivelink.monitor.history import EstimateLike, History, TruthLike, usual_range
 from drivelink.monitor.statuslines import MODEL_ALARM_ADVICE, shape, status_lines, status_text
 from drivelink.pubsub.wire import ExternalMessage
-from estimator.sample import Status
+from estimator.sample import SIGMA_95, Status
 
 __all__ = ["JointView", "joints_table"]
 
@@ -30,7 +30,6 @@ ESTIMATE = "cyan"
 TRUTH = "yellow"
 BAND = "blue"
 _SECOND = "magenta"  # the second transmission
-_SIGMA_95 = 1.96
 
 _FLAGS = (  # bit, what is shown when set, style
     (Status.MODEL_ALARM, "model alarm", "bold red"),
@@ -45,16 +44,16 @@ _FLAGS = (  # bit, what is shown when set, style
     (Status.UNTIMED, "untimed", "yellow"),
     (Status.NODE_RESTARTED, "node restarted", "yellow"),
 )
-SILENT_S = 1.0  # without an estimate, after which what is shown is called the last there was
+SILENT_S = 1.0  # without an estimate, until the shown one is marked as old
 _HELP = (
     ("stiffness", "of the joint, N·m/rad, ± half its 95 % interval"),
     ("torque", "flexibility torque of the joint, N·m"),
-    ("external", "torque of the world on the link, N·m, ± half its 95 % interval"),
+    ("external", "external torque on the link, N·m, ± half its 95 % interval"),
     ("deflection", "φ = q − θ of each transmission, rad"),
     ("left plot", "stiffness over deflection, its 95 % band dotted, ● now; cyan motor 1, magenta 2"),
     ("right plot", "flexibility torque over time; yellow: truth of a simulation; gaps: not valid"),
     ("cycle", "99th percentiles, µs: work, answer (SYNC to last frame), SYNC late by"),
-    ("residual", "what the model leaves, times its baseline (where it was fitted): half a bar is 1"),
+    ("residual", "residual over its baseline (of the fit): half a bar is 1"),
     ("contact", "something touches the link"),
     ("valid", "the numbers may be used; not valid: do not control on them"),
     ("observable", "the motion reveals the stiffness; else it is held, and its interval widens"),
@@ -67,18 +66,18 @@ class JointView:
 
     Args:
         name: the joint's name.
-        subtitle: what it is, e.g. its case or bus.
-        seconds: how far back the plots over time reach.
-        height: lines it may take; left out: those of the terminal, at most 24.
+        subtitle: e.g. its case or bus.
+        seconds: length of the plots over time.
+        height: lines; default: those of the terminal, at most 24.
 
     Attributes:
-        history: everything the view remembers.
-        status: the joint's status message; empty until there is one.
-        model: the model message, likewise.
+        history: data of the view.
+        status: the joint's status document, or empty.
+        model: the model document, or empty.
         gone: the daemon has ended or died.
         silent_s: time since the last estimate.
-        help: show what the lines mean in place of the plots.
-        footer: a line at the lower edge, e.g. how to leave.
+        help: show the legend in place of the plots.
+        footer: the last line, e.g. how to quit.
     """
 
     def __init__(
@@ -119,12 +118,12 @@ class JointView:
 
     @property
     def live(self) -> bool:
-        """Whether the numbers are of now."""
+        """Whether the numbers are current."""
         return not self.gone and self.silent_s < SILENT_S
 
     @property
     def state(self) -> str:
-        """What the daemon says of itself, or that it is gone or silent."""
+        """The daemon's state, or that it is gone or silent."""
         if self.live:
             return shape(self.status).state
         since = f", last estimate {self.silent_s:.0f} s ago" if self.silent_s >= SILENT_S else ""
@@ -132,7 +131,7 @@ class JointView:
 
     @property
     def flags(self) -> list[tuple[str, str]]:
-        """What the newest estimate's status bits say, each with its style; of one that is past only that."""
+        """The newest estimate's status bits with their styles; only the fact if it is old."""
         estimate = self.history.latest
         if estimate is None:
             return []
@@ -235,13 +234,13 @@ class JointView:
         return table
 
     def _add_external(self, table: Table, spark: int, ink: str) -> None:
-        """The row of the external torque, where its link is declared."""
+        """The row of the external torque, with link dynamics."""
         touch = self.history.touch
         if touch is None:
             return
         series = [t.torque_nm if t.valid else math.nan for t in self.history.touches]
         value = number(touch.torque_nm) if touch.valid else "not valid"
-        band = f" ± {number(_SIGMA_95 * touch.std_nm, 2)} N·m" if touch.valid else ""
+        band = f" ± {number(SIGMA_95 * touch.std_nm, 2)} N·m" if touch.valid else ""
         contact = Text("contact", style="bold yellow") if touch.contact and self.live else Text("")
         table.add_row(
             "external",
@@ -258,7 +257,7 @@ class JointView:
 
     @staticmethod
     def _legend() -> Table:
-        """What the lines of the view mean."""
+        """The legend of the view."""
         table = Table.grid(padding=(0, 1, 0, 0))
         table.add_column(no_wrap=True, style="bold")
         table.add_column(overflow="fold")
@@ -282,7 +281,7 @@ class JointView:
         y = (low - margin, high + margin)
         plot = DotPlot(width, height, x, y)
         for k, curve in enumerate(curves):
-            plot.band([(p, s - _SIGMA_95 * d, s + _SIGMA_95 * d) for p, s, d in curve], BAND)
+            plot.band([(p, s - SIGMA_95 * d, s + SIGMA_95 * d) for p, s, d in curve], BAND)
             plot.curve([(p, s) for p, s, _ in curve], ESTIMATE if k == 0 else _SECOND)
         if self.live and self.history.latest is not None and points:
             for one in self.history.latest.transmissions:
@@ -312,7 +311,7 @@ class JointView:
 
 
 def flags(status: int) -> list[tuple[str, str]]:
-    """What the status bits say, each with its style, the two that matter most first."""
+    """The status bits with their styles, the two most important first."""
     found = [
         ("valid", "green") if status & Status.VALID else ("not valid", "red"),
         ("observable", "green") if status & Status.OBSERVABLE else ("not observable", "yellow"),
@@ -321,7 +320,7 @@ def flags(status: int) -> list[tuple[str, str]]:
 
 
 def joints_table(views: Mapping[str, JointView], width: int) -> Table:
-    """Several joints, one line each, for a terminal of so many columns: every column is whole or left out."""
+    """Several joints, one line each; columns that do not fit are omitted."""
     sparks = width - 100
     columns = [("joint", 10), ("stiffness / N·m/rad", 19), ("torque / N·m", 12)]
     if width >= 80:
@@ -355,4 +354,4 @@ def joints_table(views: Mapping[str, JointView], width: int) -> Table:
 
 def _half(estimate: EstimateLike) -> float:
     """Half the 95 % interval of the joint's stiffness."""
-    return _SIGMA_95 * estimate.stiffness_std_nm_rad
+    return SIGMA_95 * estimate.stiffness_std_nm_rad

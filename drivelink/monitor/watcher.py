@@ -1,7 +1,7 @@
-"""Collects what daemons publish for the live views: joints come and go, views are kept up to date.
+"""Collects the daemons' messages for the live views.
 
-A joint's numbers are those of one daemon, chosen as a controller's subscription chooses it, and everything
-passes `drivelink.pubsub.inbound`: nothing that is on the network ends a view or fills its memory.
+Each joint follows one daemon, as a controller's subscription does. Everything passes
+`drivelink.pubsub.inbound`, so no network input ends a view or fills its memory.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from drivelink.pubsub.inbound import DECODERS, clean_text
 
 __all__ = ["MAX_JOINTS", "Watcher"]
 
-MAX_JOINTS = 64  # shown at once; more than anybody reads, and a rogue that makes names up fills no memory
+MAX_JOINTS = 64  # limit on joints shown, also against invented names
 _QUEUE = 8192
 _NAME = 64  # characters of a joint's name that are shown
-_STALE_S = 1.0  # after which another session may take over where no token says who the daemon is
+_STALE_S = 1.0  # after which another session may take over without a liveliness token
 
 
 class _Joint:
-    """One joint: whose messages are taken, and what is shown of it."""
+    """One joint: its accepted session and its view."""
 
     def __init__(self, name: str) -> None:
         self.identity = DaemonIdentity()
@@ -37,7 +37,7 @@ class _Joint:
 
     @property
     def useful(self) -> bool:
-        """Whether a daemon is, or says anything."""
+        """Whether a daemon is alive or has sent anything."""
         return self.identity.bound is not None and self.identity.alive
 
 
@@ -47,11 +47,11 @@ class Watcher:
     Args:
         session: an open session; it stays open.
         prefix: first part of every key.
-        joint: only this one; None: every joint that there is, up to MAX_JOINTS.
+        joint: only this one; None: all joints, up to MAX_JOINTS.
 
     Attributes:
-        received: estimates taken in.
-        refused: messages of others, or that cannot be.
+        received: number of estimates.
+        refused: messages of other sessions, or invalid ones.
     """
 
     def __init__(self, session: zenoh.Session, prefix: str = "drivelink", joint: str | None = None) -> None:
@@ -83,16 +83,16 @@ class Watcher:
 
     @property
     def views(self) -> dict[str, JointView]:
-        """By the joint's name, those seen so far."""
+        """Views by joint name."""
         return {joint.view.name: joint.view for joint in self._joints.values()}
 
     @property
     def alive(self) -> set[str]:
-        """Names of the joints whose daemon is there."""
+        """Names of the joints with a live daemon."""
         return {joint.view.name for joint in self._joints.values() if joint.identity.alive}
 
     def poll(self) -> None:
-        """Take in everything that has come since."""
+        """Process all new messages."""
         while self._claims:
             name, session, there = self._claims.popleft()
             joint = self._joint(name)
@@ -142,11 +142,11 @@ class Watcher:
             self._claims.append((name, session, token.kind == zenoh.SampleKind.PUT))
 
     def _name(self, sample: zenoh.Sample) -> str:
-        """The joint's name: what follows the prefix in the key."""
+        """The joint's name from the key."""
         return str(sample.key_expr).removeprefix(self._prefix).split("/", 1)[0]
 
     def _joint(self, name: str) -> _Joint | None:
-        """The joint of that name; None where there is no room for one more."""
+        """The joint of that name; None if there are too many."""
         joint = self._joints.get(name)
         if joint is None:
             if len(self._joints) >= MAX_JOINTS:

@@ -1,7 +1,7 @@
 """The live view as a web page: one self-contained file, served on the loopback, fed by server-sent events.
 
-Nothing is loaded from anywhere else, nothing listens beyond this machine, and a page of another site that
-tries to read it by way of the user's browser is refused by its Host header.
+Nothing is loaded from other hosts, the server listens on loopback only, and requests with a foreign Host
+header (pages of other sites in the user's browser) are refused.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from drivelink.monitor.watcher import Watcher
 __all__ = ["MAX_CONNECTIONS", "WebView", "document", "snapshot"]
 
 MAX_CONNECTIONS = 16
-_PATIENCE_S = 5.0  # with a browser that sends or takes nothing
+_PATIENCE_S = 5.0  # timeout of a silent browser
 _EVENT_S = 0.1
 _LOCAL_HOSTS = frozenset({"localhost", "127.0.0.1", "[::1]"})
 _POLICY = (
@@ -39,11 +39,11 @@ class WebView:
     """Serves the page and its events.
 
     Args:
-        watcher: what is shown; polled here.
-        port: on the loopback; 0: any that is free.
+        watcher: source of the views; polled here.
+        port: on loopback; 0: any free one.
 
     Attributes:
-        url: where the page is.
+        url: address of the page.
 
     Raises:
         UsageError: the port is taken.
@@ -68,7 +68,7 @@ class WebView:
         self.url = f"http://127.0.0.1:{self._server.server_address[1]}/"
 
     def poll(self) -> None:
-        """Take in what has come; to be called often."""
+        """Process new messages; to be called often."""
         with self._lock:
             self._watcher.poll()
 
@@ -81,7 +81,7 @@ class WebView:
 
     @property
     def closing(self) -> bool:
-        """Whether the end has come."""
+        """Whether the server is closing."""
         return self._closing.is_set()
 
     def wait(self, seconds: float) -> None:
@@ -89,7 +89,7 @@ class WebView:
         self._closing.wait(seconds)
 
     def event(self, since: dict[str, float]) -> bytes:
-        """The state of every joint as JSON, with the moments newer than `since`, which is brought forward."""
+        """The state of every joint as JSON, with the moments newer than `since`, which is updated."""
         with self._lock:
             joints = {
                 name: snapshot(view, name in self._watcher.alive, since)
@@ -99,12 +99,12 @@ class WebView:
 
 
 def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str, Any]:
-    """What the page receives of one joint; what is not finite is null, and so is what is not valid.
+    """Data of one joint for the page; invalid and non-finite values are null.
 
     Args:
         view: of the joint.
-        alive: whether its daemon is there.
-        since: times of the newest moment and residual that the page has, by joint; brought forward.
+        alive: whether its daemon is alive.
+        since: times of the page's newest moment and residual, by joint; updated.
     """
     history = view.history
     last = since.get(view.name, -math.inf)
@@ -130,7 +130,7 @@ def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str,
 
 
 def document(view: JointView) -> dict[str, Any]:
-    """A joint as it is now, for `monitor --json`; what is not finite is null."""
+    """A joint's present state for `monitor --json`; non-finite values are null."""
     return {"joint": view.name, "time": time.time(), **_now(view), "status": view.status}
 
 
@@ -169,7 +169,7 @@ def _touch(touch: Touch) -> list[float | bool | None]:
 
 
 def _describe(shown: Shown) -> dict[str, Any]:
-    """The status in the rows that the page shows."""
+    """The rows of the status on the page."""
     return {
         "cycle": [
             ("rate", shown.rate),
@@ -191,7 +191,7 @@ def _describe(shown: Shown) -> dict[str, Any]:
 
 
 class _Server(ThreadingHTTPServer):
-    """A thread a connection, and no more connections than a few people's browsers need."""
+    """One thread per connection, with a limit on connections."""
 
     daemon_threads = True
     request_queue_size = 2 * MAX_CONNECTIONS
@@ -201,7 +201,7 @@ class _Server(ThreadingHTTPServer):
         super().__init__(address, handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Serve a connection, or refuse it where there are too many."""
+        """Serve a connection, or refuse it if there are too many."""
         if self._room.acquire(blocking=False):
             super().process_request(request, client_address)
             return
@@ -220,7 +220,7 @@ class _Server(ThreadingHTTPServer):
             self._room.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A connection that ends in the middle is nothing to write about."""
+        """Ignore connections that end early."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -273,7 +273,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self.wfile.write(b"data: " + self.web.event(since) + b"\n\n")
                 self.wfile.flush()
                 self.web.wait(max(0.0, _EVENT_S - (time.monotonic() - begin)))
-        except OSError:  # the browser has left, or no longer reads
+        except OSError:  # the browser has closed the connection or stopped reading
             return
 
 

@@ -1,1 +1,1 @@
-"""What people are shown and what is left on disk: files written whole, plots, progress, reports."""
+"""Output: atomic files, plots, progress, reports."""

@@ -1,4 +1,4 @@
-"""What `drivelink fit` draws: each transmission, and what the joint leaves over deflection and velocity."""
+"""The plot of `drivelink fit`: each transmission, and residuals over deflection and velocity."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ __all__ = ["fit_plot"]
 
 _CURVE_POINTS = 200
 _WIDTH = 10.0  # inches
-_IN_BIN = 15  # rows whose median is one point of the lines through what is left
+_IN_BIN = 15  # rows per median point of the lines through the residuals
 
 
 def fit_plot(fits: Sequence[TransmissionFit], joint: JointFile, path: Path) -> Path:
-    """Draw each flexible transmission: stiffness, torque, and what is left, in which a loop or step is seen.
+    """Draw stiffness, torque and residuals of each flexible transmission; residuals show a loop or a step.
 
     Args:
-        fits: one a motor.
+        fits: one per motor.
         joint: its joint file.
-        path: where the picture goes.
+        path: of the picture.
 
     Raises:
         UsageError: every transmission is rigid.
@@ -47,7 +47,7 @@ def fit_plot(fits: Sequence[TransmissionFit], joint: JointFile, path: Path) -> P
 
 
 def _transmission(stiffness: Axes, torque: Axes, one: TransmissionFit, whose: str, units: Units) -> None:
-    """Stiffness with its interval, and the torque it belongs to."""
+    """Stiffness with its interval, and torque."""
     law = MODELS[one.model]
     reach = float(np.max(np.abs(one.deflection_rad)))
     phi = np.linspace(-reach, reach, _CURVE_POINTS)
@@ -63,7 +63,7 @@ def _transmission(stiffness: Axes, torque: Axes, one: TransmissionFit, whose: st
 
 
 def _left(over_deflection: Axes, over_velocity: Axes, one: TransmissionFit, units: Units) -> None:
-    """What the fitted joint leaves: hysteresis parts the two directions, Coulomb friction is a step."""
+    """Residuals of the fit: hysteresis separates the two directions, Coulomb friction is a step."""
     phi, velocity, left = one.deflection_rad, one.velocity_rad_s, one.unexplained_nm
     label = units.label("torque / N·m")
     plots.dots(over_deflection, phi, left)

@@ -1,11 +1,10 @@
-"""Files we write: whole or not at all, nothing replaced unasked, and never what was read.
+"""Writes files atomically, without replacing existing files or inputs unasked.
 
-A file grows under another name beside its place, is put on the disk, and then takes its place in one step.
-Whatever happens, there is the old file or the new one there, never a part of it.
+A file is written under a temporary name in the same folder, synced and renamed, so that either the old or the
+new file exists, never a part.
 
-One rule for all verbs: a file that is named (`--out FILE`, `--write`, `new PATH`) is replaced only with
-`--force`, a recording or a joint file that was read never. The files of a results folder (`--out DIR`,
-`--plots DIR`) hold what the last run found.
+For all verbs: a named file (`--out FILE`, `--write`, `new PATH`) is replaced only with `--force`, an input
+never. Files of a results folder (`--out DIR`, `--plots DIR`) are replaced by each run.
 """
 
 from __future__ import annotations
@@ -26,15 +25,15 @@ _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.E
 
 
 def check_target(path: Path, inputs: Iterable[Path] = (), *, force: bool = False) -> None:
-    """Refuse a file to be written before any work is done for it.
+    """Check an output path before any work is done for it.
 
     Args:
-        path: where it is to go.
-        inputs: files that are read; the same file under another name counts, by symbolic or hard link.
-        force: whether the user allows an existing file to be replaced.
+        path: of the output.
+        inputs: input files; symbolic and hard links count as the same file.
+        force: replace an existing file.
 
     Raises:
-        UsageError: it is one of the inputs, a folder, or exists already.
+        UsageError: it is an input or a folder, or it exists.
     """
     for given in inputs:
         if _same(path, given):
@@ -56,16 +55,16 @@ class NewFile:
     """A file under way to its place.
 
     Args:
-        path: its place; a symbolic link there stays, and leads to the new file. What is no regular file (a
-            pipe, a device) is written as it is.
+        path: final path; a symbolic link stays and points to the new file. Pipes and devices are written
+            directly.
         force: whether it may take the place of another file.
 
     Attributes:
         fd: descriptor to write to.
-        placed: whether it is in its place.
+        placed: whether it has its final name.
 
     Raises:
-        OSError: it cannot be written there; `filename` is its place.
+        OSError: it cannot be written; `filename` is the final path.
     """
 
     def __init__(self, path: Path, *, force: bool = False) -> None:
@@ -79,7 +78,7 @@ class NewFile:
                 raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST))
             self._temporary = self._place if self.placed else _beside(self._place)
             if mode is not None and not os.access(self._place, os.W_OK):
-                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))  # a renaming would not ask
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))  # rename would replace it
             flags = os.O_WRONLY if self.placed else os.O_WRONLY | os.O_CREAT | os.O_EXCL
             self.fd = os.open(self._temporary, flags | os.O_CLOEXEC, 0o666)
             if mode is not None and not self.placed:
@@ -88,10 +87,10 @@ class NewFile:
             raise OSError(error.errno, error.strerror, str(path)) from error
 
     def place(self) -> None:
-        """Put what has been written on the disk, and the file in its place; a second time only the former.
+        """Sync the file and give it its final name; a second call only syncs.
 
         Raises:
-            OSError: it cannot be written, or there is a file by now and `force` is not given.
+            OSError: it cannot be written, or a file exists and `force` is not given.
         """
         try:
             sync(self.fd)
@@ -102,7 +101,7 @@ class NewFile:
             raise OSError(error.errno, error.strerror, str(self.path)) from error
 
     def close(self) -> None:
-        """Close it; a file that has not come to its place is removed. A second time does nothing."""
+        """Close it, and remove a file that was not placed. May be called twice."""
         if self.fd < 0:
             return
         os.close(self.fd)
@@ -113,15 +112,15 @@ class NewFile:
 
 
 def write_whole(path: Path, data: str | bytes, *, force: bool = False) -> None:
-    """Write a file in one step.
+    """Write a file atomically.
 
     Args:
         path: its place.
-        data: its bytes, or its text, which becomes UTF-8.
+        data: bytes, or text for UTF-8.
         force: whether it may take the place of another file.
 
     Raises:
-        OSError: it cannot be written; what was there is there still.
+        OSError: it cannot be written; an existing file is unchanged.
     """
     rest = memoryview(data.encode() if isinstance(data, str) else data)
     file = NewFile(path, force=force)
@@ -136,16 +135,16 @@ def write_whole(path: Path, data: str | bytes, *, force: bool = False) -> None:
 
 
 def put_in_place(temporary: Path, path: Path, *, force: bool) -> None:
-    """Give a file that is whole, and on the disk, its name; the disk knows the name on return.
+    """Give a complete, synced file its name, and sync the folder.
 
     Raises:
-        OSError: there is a file already and `force` is not given, or the folder cannot be written.
+        OSError: a file exists and `force` is not given, or the folder cannot be written.
     """
     if force:
         temporary.replace(path)
     else:
         try:
-            os.link(temporary, path)  # unlike a renaming, it refuses to replace a file
+            os.link(temporary, path)  # unlike rename, it refuses to replace a file
             temporary.unlink()
         except OSError as error:
             if error.errno not in _NO_LINKS:
@@ -161,7 +160,7 @@ def put_in_place(temporary: Path, path: Path, *, force: bool) -> None:
 
 
 def sync(fd: int) -> None:
-    """Wait until the disk has it; where there is no such thing (pipes, devices), do not."""
+    """Sync to disk; ignored for pipes and devices."""
     try:
         os.fsync(fd)
     except OSError as error:
@@ -177,5 +176,5 @@ def _mode(path: Path) -> int | None:
 
 
 def _beside(path: Path) -> Path:
-    """A hidden name in the same folder, that nobody has."""
+    """An unused hidden name in the same folder."""
     return path.with_name(f".{path.name[:200]}.{secrets.token_hex(4)}.tmp")

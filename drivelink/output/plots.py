@@ -1,4 +1,4 @@
-"""Plots of everything drivelink computes, in one style that stays distinguishable in black and white.
+"""Plots in one style that remains distinguishable in black and white.
 
 Figures are made without pyplot: no global state, no window, safe in any thread.
 
@@ -23,7 +23,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from drivelink.output.outfile import write_whole
-from estimator.sample import FloatArray
+from estimator.sample import SIGMA_95, FloatArray
 
 __all__ = [
     "Curve",
@@ -38,8 +38,8 @@ __all__ = [
     "xy",
 ]
 
-# After Okabe and Ito (distinguishable with any colour vision), each with its own line style, marker and
-# hatch; their lightness differs too, for a grey print.
+# Colours of Okabe and Ito (distinguishable with any colour vision), different in lightness for grey prints,
+# each with its line style, marker and hatch.
 COLORS = ("#005f9e", "#e0701a", "#000000", "#009e73", "#cc79a7", "#56b4e9")
 LINES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 2)))
 MARKERS = ("o", "s", "^", "D", "v", "x")
@@ -60,7 +60,7 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "legend.fontsize": 8,
     "lines.linewidth": 1.3,
-    "svg.hashsalt": "drivelink",  # the same figure is the same file
+    "svg.hashsalt": "drivelink",  # reproducible files
     "svg.fonttype": "none",
 }
 _INK = ("#000000", "#222222")
@@ -69,15 +69,14 @@ _THEMED = {
     "#dddddd": "var(--grid, #dddddd)",
     **{color: f"var(--curve-{k}, {color})" for k, color in enumerate(COLORS, 1) if color not in _INK},
 }
-_MAX_POINTS = 4000  # a curve of more points is thinned to the extremes of each pixel column
+_MAX_POINTS = 4000  # curves with more points are reduced to the extremes of each pixel column
 _BINS = 240
 _MIN_IN_BIN = 1
 _MARKERS_A_CURVE = 12
-_SIGMA_95 = 1.96
 
 
 class Curve(NamedTuple):
-    """One curve: y over x, with a standard deviation where there is one (drawn as a 95 % band)."""
+    """One curve: y over x, with an optional standard deviation (drawn as a 95 % band)."""
 
     x: FloatArray
     y: FloatArray
@@ -98,7 +97,7 @@ def new_figure(
 
 
 def xy(axes: Axes, curves: Mapping[str, Curve], x_label: str, y_label: str, title: str = "") -> None:
-    """Draw curves by their names, in order: each has colour, line style and marker of its own."""
+    """Draw named curves, each with its colour, line style and marker."""
     for k, (name, curve) in enumerate(curves.items()):
         thin = _thinned(curve)
         _draw(axes, thin, name, k)
@@ -147,7 +146,7 @@ def bars(
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write the figure; the ending of the name says the format (png, svg, pdf)."""
+    """Write the figure in the format of the file name's ending (png, svg, pdf)."""
     buffer = io.BytesIO()
     with rc_context(STYLE):
         metadata = {"Date": None} if path.suffix == ".svg" else None
@@ -157,7 +156,7 @@ def save(figure: Figure, path: Path) -> Path:
 
 
 def svg_text(figure: Figure) -> str:
-    """The figure as SVG, to be put inline into an HTML page: without paper, ink as the page's text.
+    """The figure as inline SVG for an HTML page, transparent and in the page's text colour.
 
     A page may define `--curve-1`, `--curve-2`, … and `--grid` for a theme of its own.
     """
@@ -172,7 +171,7 @@ def svg_text(figure: Figure) -> str:
 
 
 def medians(x: FloatArray, y: FloatArray, bins: int = 80) -> Curve:
-    """What scattered samples come to: the median in each part of all but the outermost x."""
+    """Medians of scattered samples in bins of x, without the outermost x."""
     low, high = np.quantile(x, [0.002, 0.998])
     edges = np.linspace(float(low), float(high), bins + 1)
     place = np.clip(np.searchsorted(edges, x) - 1, 0, bins - 1)
@@ -182,7 +181,7 @@ def medians(x: FloatArray, y: FloatArray, bins: int = 80) -> Curve:
 
 
 def dots(axes: Axes, x: FloatArray, y: FloatArray, name: str | None = None) -> None:
-    """Draw samples as dots, before the curves that go through them."""
+    """Draw samples as dots, below the curves."""
     axes.plot(x, y, ".", color="#aaaaaa", markersize=2.5, rasterized=True, label=name)
 
 
@@ -202,7 +201,7 @@ def _draw(axes: Axes, curve: Curve, name: str, k: int) -> None:
             markerfacecolor="none",
         )
     if curve.std is not None:
-        half = _SIGMA_95 * curve.std
+        half = SIGMA_95 * curve.std
         axes.fill_between(
             curve.x,
             curve.y - half,
@@ -233,7 +232,7 @@ def _finish(axes: Axes, x_label: str, y_label: str, title: str, legend: bool) ->
 
 
 def _thinned(curve: Curve) -> Curve:
-    """At most so many points, of each stretch its lowest and highest, so that no peak is lost."""
+    """At most so many points: the lowest and highest of each stretch, so that no peak is lost."""
     n = len(curve.x)
     if n <= _MAX_POINTS:
         return curve

@@ -1,4 +1,4 @@
-"""What a diagnosis says: report.json for machines, report.html for a drive engineer."""
+"""Writes the report of a diagnosis: report.json for programs, report.html for people."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _AXES = {
 
 
 class Title(NamedTuple):
-    """What the report is about."""
+    """Subject of the report."""
 
     joint: str
     recording: str
@@ -62,7 +62,7 @@ def write(outcome: Diagnosis, title: Title, folder: Path) -> list[Path]:
 
 
 def as_json(outcome: Diagnosis) -> dict[str, Any]:
-    """The report as it stands in report.json."""
+    """The content of report.json."""
     unlisted = next((c for c in outcome.curves if c.name == "unlisted"), None)
     return {
         "schema": _SCHEMA,
@@ -142,7 +142,7 @@ def sentence(outcome: Diagnosis) -> str:
 
 
 def unexplained(outcome: Diagnosis, units: Units | None = None) -> str:
-    """What is left, in one sentence."""
+    """The remaining error in one sentence."""
     unit = (units or Units(False)).shown("N·m")
     left = outcome.validation
     text = f"{left.after_relative:.2%} of the torque ({left.after_rms_nm:.3g} {unit} rms) stays unexplained"
@@ -161,7 +161,7 @@ def title_of(finding: Finding) -> str:
 
 
 def others_of(finding: Finding) -> str:
-    """What else an effect may be, each with its probability."""
+    """Alternatives of an effect, with their probabilities."""
     pairs = zip(finding.alternatives, finding.alternative_probabilities, strict=True)
     return ", ".join(f"{name.replace('_', ' ')} ({p:.2f})" for name, p in pairs)
 

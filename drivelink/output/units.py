@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from estimator.model import ParameterValue
+from estimator.sample import SIGMA_95
 
 __all__ = ["Units"]
 
-_SIGMA_95 = 1.96
 _RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
-_UNITS = (  # by the end of a parameter's name; the first that fits
+_UNITS = (  # by the end of a parameter's name; the first match
     ("_nm_s2_rad2", "N·m·s²/rad²"), ("_nm_s_rad", "N·m·s/rad"), ("_nm_rad2", "N·m/rad²"),
     ("_nm_rad", "N·m/rad"), ("_per_nm2", "1/(N·m)²"), ("_kg_m2", "kg·m²"),
     ("_rad_s2", "rad/s²"), ("_rad_s", "rad/s"), ("_per_rev", "per rev"), ("_per_rad", "1/rad"),
     ("_nm", "N·m"), ("_rad", "rad"), ("_hz", "Hz"), ("_s", "s"), ("_error", "relative"),
     ("_change", "relative"),
 )  # fmt: skip
-_LINEAR = {  # of an axis that moves straight: metres for rad, newtons for N·m
+_LINEAR = {  # of a linear axis: metres for rad, newtons for N·m
     "N·m·s/rad": "N·s/m", "N·m/rad": "N/m", "N·m·s²/rad²": "N·s²/m²", "kg·m²": "kg", "rad/s²": "m/s²",
     "rad/s": "m/s", "per rev": "per 2π m", "N·m/rad²": "N/m²", "1/(N·m)²": "1/N²", "N·m/s": "N/s",
     "1/rad": "1/m", "N·m": "N", "rad": "m",
@@ -23,17 +23,17 @@ _LINEAR = {  # of an axis that moves straight: metres for rad, newtons for N·m
 
 
 class Units:
-    """The units that a report of an axis shows.
+    """Units in reports of an axis.
 
     Args:
-        linear: whether it moves straight.
+        linear: whether it is a linear axis.
     """
 
     def __init__(self, linear: bool) -> None:
         self._linear = linear
 
     def shown(self, unit: str) -> str:
-        """A unit of a rotary axis as it is for this one."""
+        """The unit of this axis for one of a rotary axis."""
         return _LINEAR.get(unit, unit) if self._linear else unit
 
     def label(self, text: str) -> str:
@@ -43,7 +43,7 @@ class Units:
         return f"{quantity} / {unit.replace(bare, self.shown(bare))}"
 
     def of(self, name: str) -> str:
-        """The unit of a parameter, by the end of its name; empty where it has none."""
+        """The unit of a parameter by the end of its name, or empty."""
         return self.shown(next((unit for end, unit in _UNITS if f"_{name}".endswith(end)), ""))
 
     def value(self, name: str, value: ParameterValue, std: ParameterValue | None) -> str:
@@ -62,4 +62,4 @@ class Units:
 
 def _text(value: float, std: float | None) -> str:
     """A number with its 95 % interval."""
-    return f"{value:.5g} ± {_SIGMA_95 * std:.2g}" if std is not None and std > 0.0 else f"{value:.5g}"
+    return f"{value:.5g} ± {SIGMA_95 * std:.2g}" if std is not None and std > 0.0 else f"{value:.5g}"

@@ -1,1 +1,1 @@
-"""The zenoh side: bytes, keys, sessions, the publisher and the clients; ROS 2 by way of the same session."""
+"""zenoh: bytes, keys, sessions, publisher, clients, ROS 2."""

@@ -33,13 +33,13 @@ class Subscription(Client):
     """Estimates of one joint; see `subscribe`."""
 
     def wait(self, timeout_s: float | None = None) -> EstimateMessage | None:
-        """The next cycle: the newest estimate that was not read yet, waiting for one if there is none.
+        """The newest unread estimate; wait for one if there is none.
 
         Args:
-            timeout_s: how long at most; None: forever.
+            timeout_s: longest wait; None: forever.
 
         Returns:
-            The estimate, or None when the time is over or the subscription closed.
+            The estimate, or None after a timeout or when closed.
         """
         return self._wait(timeout_s, self._newest)
 
@@ -73,7 +73,7 @@ class Subscription(Client):
     def _declare_estimates(self, key: str) -> zenoh.Subscriber[Any]:
         self._alarm = _Alarm(self._wake)
         subscriber = self._session.declare_subscriber(key, zenoh.handlers.RingChannel(self._depth))
-        self._queue = subscriber.handler  # unlike the subscriber, it may wait while that is undeclared
+        self._queue = subscriber.handler  # may wait, unlike undeclaring the subscriber
         return subscriber
 
     def _pop(self) -> zenoh.Sample | None:
@@ -112,8 +112,8 @@ class Subscription(Client):
 class _Alarm:
     """Ends a blocking receive at its deadline, which zenoh's channels cannot do.
 
-    The thread starts with the first deadline. Moving the deadline later, once a cycle, is one assignment: the
-    thread finds out when it would have rung.
+    The thread starts with the first deadline. Moving the deadline later is one assignment, which the thread
+    notices when it wakes.
     """
 
     def __init__(self, ring: Callable[[], None]) -> None:
@@ -125,7 +125,7 @@ class _Alarm:
         self._thread: threading.Thread | None = None
 
     def set(self, deadline_s: float) -> None:
-        """Ring at this time of the monotonic clock; infinity: not at all."""
+        """Wake the receiver at this monotonic time; infinity: never."""
         self._deadline_s = deadline_s
         if deadline_s < self._wakes_s:
             with self._changed:

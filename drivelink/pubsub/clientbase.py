@@ -1,6 +1,6 @@
-"""The common part of the blocking and the asynchronous client: everything that does not wait.
+"""Common part of the blocking and the asyncio client: everything that does not wait.
 
-Estimates queue up in zenoh, outside the interpreter, and are taken in when something is asked.
+Estimates queue in zenoh, outside the interpreter, until a method is called.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from estimator.sample import Status
 __all__ = ["ENDPOINT", "Client"]
 
 ENDPOINT = "tcp/127.0.0.1:7447"
-# Of these bits a usable estimate has only VALID.
+# Of these bits a usable estimate has VALID only.
 _USABLE = int(
     Status.VALID
     | Status.MODEL_ALARM
@@ -39,12 +39,12 @@ _USABLE = int(
     | Status.NODE_RESTARTED
     | Status.CONTRADICTED
 )
-_TOGETHER = 5  # cycles that an estimate and an external torque may be apart, as either may be lost
+_TOGETHER = 5  # largest distance in cycles between estimate and external torque, as either may be lost
 _NAME = re.compile(r"[^*$#?\s/]+(/[^*$#?\s/]+)*")
 
 
 class Client:
-    """What both clients have: everything that does not wait."""
+    """Methods of both clients that do not wait."""
 
     def __init__(
         self,
@@ -80,8 +80,7 @@ class Client:
     def _declare(self) -> None:
         ring = zenoh.handlers.RingChannel
         liveliness = self._session.liveliness()
-        # In zenoh's thread (indirect=False), which never keeps the process from ending: no token is dropped,
-        # however many there are.
+        # In zenoh's thread (indirect=False), which does not block the process's end; no token is dropped.
         heard = zenoh.handlers.Callback(self._liveliness, indirect=False)
         self._tokens = liveliness.declare_subscriber(f"{self.key}/alive/**", heard, history=True)
         self._estimates = self._declare_estimates(self.key + "/estimate")
@@ -127,7 +126,7 @@ class Client:
 
     @property
     def age_s(self) -> float:
-        """Time since the latest estimate came in here, by the local clock; infinite before the first, s."""
+        """Time since the latest estimate arrived, by the local clock, s; infinite before the first."""
         self._drain()
         if self._feed.latest is None:
             return math.inf
@@ -135,38 +134,38 @@ class Client:
 
     @property
     def sync_age_s(self) -> float:
-        """Time since the SYNC of the latest estimate, as far as both machines' UNIX clocks agree, s."""
+        """Time since the SYNC of the latest estimate, s, if both machines' UNIX clocks agree."""
         latest = self.latest()
         return math.inf if latest is None else (time.time_ns() - latest.stamp_ns) / 1e9
 
     @property
     def stale(self) -> bool:
-        """The latest estimate is too old to act on, or there is none."""
+        """Whether the latest estimate is too old to act on, or missing."""
         self._drain()
         return self._feed.stale(time.monotonic_ns())
 
     @property
     def usable(self) -> bool:
-        """Fresh, valid, and nothing in its status speaks against it: what a controller checks."""
+        """Whether the latest estimate is fresh, valid, without alarm or fault: a controller's check."""
         self._drain()
         latest = self._feed.latest
         return latest is not None and latest.status & _USABLE == Status.VALID and not self.stale
 
     @property
     def valid(self) -> bool:
-        """The latest estimate is fresh, and its numbers may be used."""
+        """Whether the latest estimate is fresh and valid."""
         return self._fresh(Status.VALID)
 
     @property
     def observable(self) -> bool:
-        """The latest estimate is fresh, and the motion reveals the stiffness."""
+        """Whether the latest estimate is fresh and observable."""
         return self._fresh(Status.OBSERVABLE)
 
     @property
     def external(self) -> ExternalMessage | None:
-        """What the world does to the link, by the newest message, without waiting.
+        """External torque on the link by the newest message, without waiting.
 
-        None: none came that belongs to the latest estimates; the joint file may say nothing of the link.
+        None: none belongs to the latest estimates; link dynamics may not be declared.
         """
         self._drain()
         feed = self._feed
@@ -185,53 +184,53 @@ class Client:
 
     @property
     def contact(self) -> bool:
-        """Something touches the link, by a fresh and valid message."""
+        """Whether a fresh and valid message reports a contact."""
         external = self.external
         return external is not None and external.contact
 
     @property
     def gaps(self) -> int:
-        """Cycles that are missing in what came, by their sequence numbers."""
+        """Missing cycles, by sequence numbers."""
         self._drain()
         return self._feed.gaps
 
     @property
     def skipped(self) -> int:
-        """Cycles that came and were dropped because more than `depth` of them were left unread."""
+        """Cycles dropped because more than `depth` were unread."""
         self._drain()
         return self._feed.skipped
 
     @property
     def received(self) -> int:
-        """Estimates that came in."""
+        """Number of received estimates."""
         self._drain()
         return self._feed.received
 
     @property
     def foreign(self) -> int:
-        """Messages on the joint's keys that its daemon did not write, or that cannot be true: not used."""
+        """Unused messages on the joint's keys: of other sessions, or invalid."""
         self._drain()
         return self._feed.identity.refused + self._feed.unusable
 
     @property
     def daemon(self) -> str | None:
-        """The zenoh session whose messages are used; None until one is known."""
+        """The zenoh session whose messages are used, or None."""
         self._drain()
         return self._feed.identity.bound
 
     @property
     def rivals(self) -> int:
-        """Other sessions that claim to be the daemon of this joint; nothing of them is used."""
+        """Other sessions that claim to be the daemon of this joint; their messages are ignored."""
         return self._feed.identity.rivals
 
     @property
     def status(self) -> dict[str, Any] | None:
-        """The last status of the daemon; None until it came."""
+        """The daemon's last status, or None."""
         return self._document("status")
 
     @property
     def model(self) -> dict[str, Any] | None:
-        """The model in use; None until it came."""
+        """The model in use, or None."""
         return self._document("model")
 
     def close(self) -> None:
@@ -268,7 +267,7 @@ class Client:
         return document if writer == identity.bound else None
 
     def _drain(self) -> None:
-        """Take in everything that zenoh has queued."""
+        """Process all messages queued in zenoh."""
         if self._closed:
             return
         with suppress(zenoh.ZError):  # closed meanwhile by another thread

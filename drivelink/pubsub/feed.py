@@ -1,8 +1,7 @@
-"""Bookkeeping of a subscriber: which estimates arrived, when, from whom, and which are missing.
+"""Bookkeeping of a subscriber: arrivals, sources and gaps of estimates.
 
-No waiting here: this is the bookkeeping that the blocking and the asynchronous client share. It is fed
-with what zenoh has queued whenever the user asks for something, so that nothing runs, and the interpreter
-is not taken, while the user computes.
+Shared by the blocking and the asyncio client, without waiting. It processes zenoh's queue when the user calls
+a method, so that nothing runs while the user computes.
 """
 
 from __future__ import annotations
@@ -18,29 +17,28 @@ from estimator.sample import Status
 
 __all__ = ["WAKE", "Arrivals", "Feed", "State"]
 
-WAKE = b"drivelink.wake"  # attachment of a local message that only ends a blocking receive
-_DRIFT = 1e-4  # what two clocks may run apart: 100 ppm
+WAKE = b"drivelink.wake"  # attachment of a local message that ends a blocking receive
+_DRIFT = 1e-4  # drift between two clocks: 100 ppm
 _STALE_PERIODS = 5
 _STALE_AT_LEAST_NS = 20_000_000
 _STALE_UNKNOWN_NS = 500_000_000  # until two estimates have shown the period
-_LONGEST_PERIOD_NS = 1_000_000_000  # no drive cycles slower; a stamp that jumps does not make anything fresh
+_LONGEST_PERIOD_NS = 1_000_000_000  # upper limit of a period, against stamps that jump
 
 
 class State(StrEnum):
-    """How the daemon is doing, seen from here."""
+    """State of the daemon as seen by a subscriber."""
 
-    WAITING = "waiting"  # nothing has been seen of it yet
-    LIVE = "live"  # fresh estimates come in
-    STALE = "stale"  # it is there, but nothing fresh came
-    GONE = "gone"  # it has ended or died; it may come back
+    WAITING = "waiting"  # nothing received yet
+    LIVE = "live"  # fresh estimates arrive
+    STALE = "stale"  # alive, but nothing fresh arrives
+    GONE = "gone"  # ended or died; may come back
 
 
 class Arrivals:
-    """When the latest estimate came in, on the local monotonic clock, without a callback per estimate.
+    """Arrival time of the latest estimate on the local monotonic clock, without a callback per estimate.
 
-    It came after the queue was last seen empty and before it was read: that brackets it whatever the clocks
-    do. Inside the bracket the sender's stamp decides, moved by the smallest difference of the two clocks seen
-    so far (which may grow again by their drift).
+    It lies between the last time the queue was empty and the time of reading. Within these bounds it is the
+    sender's stamp plus the smallest difference of both clocks so far, which may grow by their drift.
     """
 
     __slots__ = ("_arrival_ns", "_empty_ns", "_offset_ns", "_read_ns")
@@ -52,7 +50,7 @@ class Arrivals:
         self._offset_ns: int | None = None
 
     def came(self, stamp_ns: int, now_ns: int) -> None:
-        """An estimate with this stamp was read from the queue now."""
+        """Note an estimate with this stamp read from the queue now."""
         difference = now_ns - stamp_ns
         if self._offset_ns is None:
             self._offset_ns = difference
@@ -63,24 +61,24 @@ class Arrivals:
         self._arrival_ns = min(max(stamp_ns + self._offset_ns, self._empty_ns), now_ns)
 
     def empty(self, now_ns: int) -> None:
-        """The queue was seen empty now."""
+        """Note that the queue is empty now."""
         self._empty_ns = now_ns
 
     def age_ns(self, now_ns: int) -> int:
-        """Time since the latest estimate came in."""
+        """Time since the arrival of the latest estimate."""
         return now_ns - self._arrival_ns
 
 
 class Feed:
-    """Estimates of one joint, admitted one by one.
+    """Estimates of one joint.
 
     Attributes:
         latest: the newest estimate, or None.
         unread: decoded and not yet handed to the user, oldest first.
         received: estimates admitted.
-        gaps: cycles that the daemon made and that never came, or that it lost itself.
-        skipped: cycles that came and were dropped here because nobody read them in time.
-        unusable: messages of the daemon that are no estimates, or are called valid and cannot be.
+        gaps: cycles lost in transport or by the daemon.
+        skipped: cycles dropped here because they were not read in time.
+        unusable: messages of the daemon that are malformed, or valid with impossible values.
         identity: whose messages are taken.
     """
 
@@ -96,12 +94,12 @@ class Feed:
         self._source: str | None = None  # session that wrote the latest estimate
 
     def trusts(self, source: str, now_ns: int) -> bool:
-        """Whether a message of this session is the daemon's; see `DaemonIdentity.accepts`."""
+        """Whether a message of this session is from the daemon; see `DaemonIdentity.accepts`."""
         identity = self.identity
         return identity.accepts(source, source != identity.bound and self.stale(now_ns))
 
     def admit(self, payload: bytes, now_ns: int, overrun: bool) -> EstimateMessage | None:
-        """Take one message of a trusted source; None: it is not an estimate.
+        """Decode one message of a trusted source; None: not an estimate.
 
         Args:
             payload: its bytes.
@@ -142,7 +140,7 @@ class Feed:
             self._period_ns = min(elapsed_ns // step, _LONGEST_PERIOD_NS)
 
     def stale(self, now_ns: int) -> bool:
-        """Whether the latest estimate is too old to act on, or says so itself."""
+        """Whether the latest estimate is too old to act on, or marked stale."""
         if self.latest is None or self.latest.status & Status.STALE:
             return True
         limit_ns = self._stale_after_ns

@@ -1,10 +1,9 @@
-"""Whose messages are accepted: a joint has one daemon, and everything of it comes from that session.
+"""Decides which session's messages of a joint are accepted.
 
-A daemon names its zenoh session in the liveliness token `<prefix>/<joint>/alive/<zid>`, and every message of
-a joint carries the session that wrote it. `DaemonIdentity` holds the two against each other: it takes the
-messages of one session whose token vouches for it, and stays with that session until its token is gone.
-Where no token is (a plain publisher, or access control that lets none through), it takes the session
-that writes first, until that is stale.
+A daemon names its zenoh session in the liveliness token `<prefix>/<joint>/alive/<zid>`, and every message
+carries the session that wrote it. `DaemonIdentity` accepts one session with a token until the token is gone.
+Without tokens (a plain publisher, or access control) it accepts the session that writes first, until that is
+stale.
 
 A session can forge its identity. What stops that is TLS and access control: docs/how-to/secure-zenoh.md.
 """
@@ -18,31 +17,31 @@ import zenoh
 __all__ = ["MAX_CLAIMS", "DaemonIdentity", "source_of"]
 
 MAX_CLAIMS = (
-    4096  # tokens remembered of one joint; from there on tokens decide nothing: a flood locks nobody out
+    4096  # limit on tokens of one joint; beyond it tokens are ignored, so that a flood locks nobody out
 )
 _ZID = re.compile(r"[0-9a-f]{1,32}")
 
 
 def source_of(sample: zenoh.Sample) -> str:
-    """The session that wrote a sample, "" where it does not say."""
+    """The session that wrote a sample, or ""."""
     info = sample.source_info
     return str(info.source_id.zid) if info else ""
 
 
 class DaemonIdentity:
-    """The daemon of one joint, as far as its subscriber can see.
+    """The daemon of one joint, as seen by a subscriber.
 
-    Tokens may be entered from zenoh's thread; everything else is the subscriber's.
+    `token` may be called from zenoh's thread, all else from the subscriber's.
 
     Attributes:
-        bound: the session whose messages are taken, None before the first.
-        refused: messages of others.
+        bound: the accepted session, or None.
+        refused: messages of other sessions.
     """
 
     def __init__(self) -> None:
         self.bound: str | None = None
         self.refused = 0
-        self._vouched = False  # whether a token vouched for the bound session, at least once
+        self._vouched = False  # whether the bound session ever had a token
         self._claims: set[str] = set()
         self._plain = False  # whether the token without a session is there
         self._overflow = False
@@ -50,25 +49,25 @@ class DaemonIdentity:
 
     @property
     def claims(self) -> frozenset[str]:
-        """Sessions that say they are this joint's daemon."""
+        """Sessions that claim to be this joint's daemon."""
         return frozenset(self._claims)
 
     @property
     def rivals(self) -> int:
-        """How many sessions claim to be this joint's daemon beside the one that is taken."""
+        """Number of other sessions that claim to be this joint's daemon."""
         claims = self._claims
         return max(0, len(claims) - (1 if self.bound in claims or self.bound is None else 0))
 
     @property
     def alive(self) -> bool:
-        """Whether the daemon's token is there: of the session that is taken, else of any."""
+        """Whether the accepted session, or else any session, has a token."""
         if self._vouched:
             return self.bound in self._claims
         return self._plain or bool(self._claims)
 
     @property
     def seen(self) -> bool:
-        """Whether a daemon was ever there."""
+        """Whether a daemon was ever seen."""
         return self._seen or self.bound is not None
 
     def token(self, session: str, there: bool) -> None:
@@ -90,11 +89,11 @@ class DaemonIdentity:
                 self._overflow = True
 
     def accepts(self, source: str, stale: bool) -> bool:
-        """Whether a message of this session is the daemon's; the first one accepted binds to its session.
+        """Whether to accept a message of this session; the first accepted one binds to its session.
 
         Args:
             source: as by `source_of`.
-            stale: whether nothing fresh has come from the bound session.
+            stale: whether the bound session is stale.
         """
         claims = self._claims
         if source == self.bound and (self._vouched or source in claims or not claims):

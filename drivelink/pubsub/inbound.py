@@ -1,9 +1,8 @@
-"""Validates input from the network in one place: bounded before it is parsed, checked, stripped.
+"""Validates all input from the network.
 
-Everything from the network passes here before a client hands it out, a
-view shows it or a recorder keeps it. The binary messages are as long as their layout says; a JSON document is
-bounded in bytes, depth, elements and text, its numbers are finite, and its texts hold nothing that moves a
-terminal's cursor, turns the direction of writing, or is half a character.
+Everything from the network passes here before a client, view or recorder uses it. Binary messages have the
+length of their layout. JSON documents are limited in bytes, depth, elements and text; their numbers are
+finite, and their texts contain no control or direction characters and no half surrogates.
 """
 
 from __future__ import annotations
@@ -27,12 +26,12 @@ MAX_TEXT = 4096  # characters of one text
 MAX_KEY = 256  # characters of a name
 _LARGEST_INTEGER = 1 << 64
 _TOO_DEEP = f"document: expected at most {MAX_DEPTH} levels"
-# Control and format characters (direction, zero width), halves of characters, private and unassigned ones.
+# Control and format characters (direction, zero width), surrogates, private and unassigned ones.
 _UNSHOWABLE = frozenset({"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"})
 
 
 def clean_text(text: str, length: int = MAX_TEXT) -> str:
-    """The text in one line without what a terminal or browser would take for more than characters.
+    """The text in one line, without control and format characters.
 
     Args:
         text: of the network.
@@ -53,10 +52,10 @@ def _shown(character: str) -> str:
 def decode_document(payload: bytes) -> dict[str, Any]:
     """Read a JSON document: `status`, `model`.
 
-    What is not finite in it is None, as on the wire; integers beyond 64 bits, too.
+    Non-finite numbers and integers beyond 64 bits become None.
 
     Raises:
-        ZenohError: it is too large, too deep, no JSON, or no object.
+        ZenohError: it is too large, too deep, or not a JSON object.
     """
     if len(payload) > MAX_BYTES:
         raise ZenohError(f"document: expected at most {MAX_BYTES} bytes, got {len(payload)}")

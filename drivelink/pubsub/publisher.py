@@ -1,12 +1,11 @@
 """Publishes one joint on zenoh.
 
-The 1 kHz keys are plain publishers: dropped rather than waited for, the estimate with real-time priority,
-the sample next to it in a queue of its own. `status` and `model` are latched: an advanced subscriber with
-history gets the last one at once, and so does a query, which also answers `schema`. Of the joints of one
-daemon the last one's messages are express: each sends what waits in its queue, so that a cycle of many
-joints leaves in one batch. Nothing here listens to anything but those queries: no key changes what the
-daemon does. Queries wait in zenoh until the slack answers them, a few at a time: a flood of them costs the
-cycle nothing, and drops those that nobody got round to.
+The 1 kHz keys are plain publishers that drop rather than wait: the estimate with real-time priority, the
+sample in a separate queue. `status` and `model` are latched: an advanced subscriber with history and a query
+get the last one at once; `schema` is answered by query. Of the joints of one daemon only the last one's
+messages are express: they flush the queues, so that a cycle of many joints leaves in one batch. Nothing else
+is received: no key changes what the daemon does. Queries wait in zenoh until they are answered in the slack,
+a few at a time; of a flood the oldest are dropped.
 """
 
 from __future__ import annotations
@@ -40,20 +39,19 @@ if TYPE_CHECKING:
 __all__ = ["JointPublisher", "describe_model", "schema", "to_json"]
 
 _CLAIM_TIMEOUT_S = 1.0
-_QUERIES = 8  # that wait for an answer, of each key; zenoh drops the oldest beyond
+_QUERIES = 8  # waiting queries per key; zenoh drops the oldest beyond
 _PARTIAL = int(Status.PARTIAL)
 _JSON = zenoh.Encoding.APPLICATION_JSON
 
 
 class JointPublisher:
-    """The keys `<prefix>/<joint>/…` of one joint, from its birth to its end.
+    """The keys `<prefix>/<joint>/…` of one joint.
 
     Args:
-        session: an open session, which it does not close.
+        session: an open session; it stays open.
         joint: gives the name, the prefix and the model as declared.
-        lossless: wait for slow subscribers rather than drop: for what is faster than real time, never for a
-            bus.
-        express: send at once, with what waits: for the last joint that the session publishes in a cycle.
+        lossless: wait for slow subscribers rather than drop: for replays, never for a bus.
+        express: flush the queues: for the last joint of a session's cycle.
 
     Raises:
         ZenohError: another daemon serves a joint of this name.
@@ -88,7 +86,7 @@ class JointPublisher:
         except ZenohError:
             self.close()
             raise
-        # who writes; the message carries its own sequence number
+        # the writing session; the message carries its sequence number
         self._estimate_source = zenoh.SourceInfo(self._estimate.id, 0)
         self._external_source = zenoh.SourceInfo(self._external.id, 0)
         self._sample_source = zenoh.SourceInfo(self._sample.id, 0)
@@ -124,7 +122,7 @@ class JointPublisher:
             self._ros2.latest = estimate
 
     def put_external(self, external: External, stamp_ns: int) -> None:
-        """Publish what the world does to the link in one cycle; never waits for a subscriber.
+        """Publish the external torque of one cycle; never waits for a subscriber.
 
         Args:
             external: of this cycle.
@@ -135,7 +133,7 @@ class JointPublisher:
             self._ros2.external = external
 
     def put_sample(self, sample: Sample, stamp_ns: int) -> None:
-        """Publish what was measured in one cycle; never waits for a subscriber.
+        """Publish the sample of one cycle; never waits for a subscriber.
 
         Args:
             sample: of this cycle.
@@ -147,14 +145,14 @@ class JointPublisher:
             ros2.put_cycle(ros2.latest, sample, stamp_ns)
 
     def put_status(self, status: Mapping[str, Any]) -> None:
-        """Publish the daemon's state; what is not finite becomes null."""
+        """Publish the daemon's status; non-finite values become null."""
         self._put_document("status", status)
         self.answer()
         if self._ros2 is not None:
             self._ros2.put_status(status, time.time_ns())
 
     def put_joint(self, joint: JointFile, layouts: Sequence[NodeLayout] = ()) -> None:
-        """Publish the model in use; to be called when it changes.
+        """Publish the model in use, on every change.
 
         Args:
             joint: the joint file in use.
@@ -165,7 +163,7 @@ class JointPublisher:
         self._put_document("model", describe_model(joint, layouts))
 
     def answer(self) -> None:
-        """Answer one waiting query of each key; to be called in the slack, some twenty times a second."""
+        """Answer one waiting query of each key; called in the slack, some twenty times a second."""
         for name, queryable in self._questions:
             with suppress(zenoh.ZError):
                 query = queryable.try_recv()
@@ -174,7 +172,7 @@ class JointPublisher:
                         query.reply(f"{self.key}/{name}", self._documents[name], encoding=_JSON, express=True)
 
     def close(self) -> None:
-        """Take the keys off zenoh, the liveliness token first; a second time does nothing."""
+        """Undeclare the keys, the liveliness token first; may be called twice."""
         if self._ros2 is not None:
             self._ros2.close()
         while self._entities:
@@ -182,7 +180,7 @@ class JointPublisher:
                 self._entities.pop().undeclare()
 
     def _claim(self, name: str) -> None:
-        """Make sure that nobody else serves this joint; of two who start at once the smaller id stays."""
+        """Check that no other daemon serves this joint; of two that start at once the smaller id stays."""
         own = f"{self.key}/alive/{self._session.zid()}"
         taken = f"another daemon already serves a joint named {name} ({self.key}): end it, or rename this one"
         if self._served():
@@ -192,7 +190,7 @@ class JointPublisher:
             raise ZenohError(taken)
 
     def _open_ros2(self, joint: JointFile) -> Ros2Publisher | None:
-        """The joint as a ROS 2 node, where the joint file asks for one."""
+        """The joint as a ROS 2 node, if declared."""
         if joint.ros2 is None or not joint.ros2.enabled:
             return None
         from drivelink.pubsub.ros2 import Ros2Publisher
@@ -247,11 +245,11 @@ class JointPublisher:
 
 
 def describe_model(joint: JointFile, layouts: Sequence[NodeLayout] = ()) -> dict[str, Any]:
-    """The model in use as declared in the joint file, with its effects and where it comes from.
+    """The model in use, with its effects and provenance.
 
     Args:
         joint: the joint file.
-        layouts: of its nodes, once they are known: with them, recorded frames can be decoded by themselves.
+        layouts: of its nodes, if known; they make recorded frames decodable.
     """
     return {
         "schema": "drivelink.model/1",
@@ -286,7 +284,7 @@ def _describe_effects(effects: tuple[Effect, ...]) -> list[dict[str, Any]]:
 
 
 def schema() -> dict[str, Any]:
-    """What `<prefix>/<joint>/schema` answers: every layout, and the status bits."""
+    """Answer to `<prefix>/<joint>/schema`: all layouts and status bits."""
     return {
         "schema": "drivelink.schema/1",
         "version": __version__,
@@ -306,7 +304,7 @@ def _bits(flags: type[IntFlag], meanings: Mapping[str, str]) -> list[dict[str, A
 
 
 def to_json(document: Mapping[str, Any]) -> bytes:
-    """JSON that every language reads: numbers that are not finite become null."""
+    """Portable JSON: non-finite numbers become null."""
     try:
         text = json.dumps(document, allow_nan=False, default=_plain)
     except ValueError:
@@ -325,5 +323,5 @@ def _finite(value: Any) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """What json does not know: numpy numbers and arrays become plain ones, anything else its text."""
+    """Convert numpy numbers and arrays to plain values, anything else to text."""
     return _finite(value.tolist()) if hasattr(value, "tolist") else str(value)

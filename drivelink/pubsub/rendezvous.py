@@ -1,9 +1,9 @@
 """Takes over the common endpoint when the session that listened there is gone.
 
-Zenoh can retry a listener by itself, but a session that still retries takes ten seconds to close (1.10). So
-a daemon that lost a connection looks whether anybody still answers at the endpoint; if not, it opens one
-more session there, whose only job is to listen. The other daemons and the clients keep reconnecting to the
-endpoint, and meet again there. Where a router was, nobody takes its place: it will be started again.
+Zenoh can retry a listener itself, but such a session takes ten seconds to close (1.10). Therefore a daemon
+that lost a connection checks whether anything answers at the endpoint; if not, it opens another session that
+only listens there. Daemons and clients keep reconnecting to the endpoint. A router is not replaced: it will
+restart.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import zenoh
 __all__ = ["Rendezvous", "answers"]
 
 _ATTEMPT_S = 0.2
-_LOOKS = 3  # in a row that must be answered: a killed process loses its connections before its listener
+_LOOKS = 3  # consecutive answers required: a killed process loses its connections before its listener
 _CONNECT_S = 0.5
 
 
@@ -41,10 +41,10 @@ def _address(endpoint: str) -> tuple[str, int] | None:
 
 
 class Rendezvous:
-    """Takes over from the daemon that listened at the endpoint, if it is on this machine.
+    """Takes over the endpoint of a dead daemon on this machine.
 
     Args:
-        endpoint: where everybody meets.
+        endpoint: the common endpoint.
     """
 
     def __init__(self, endpoint: str) -> None:
@@ -59,7 +59,7 @@ class Rendezvous:
         self._listener: Any = None
 
     def watch(self, session: zenoh.Session) -> None:
-        """Look after the endpoint whenever this session loses a connection."""
+        """Check the endpoint whenever this session loses a connection."""
         if self._here:
             # indirect=False: in zenoh's thread, which never keeps the process from ending
             handler = zenoh.handlers.Callback(self._changed, indirect=False)

@@ -1,7 +1,7 @@
-"""A joint as a ROS 2 node with rmw_zenoh sees it: found and received without a bridge.
+"""Publishes a joint as a ROS 2 node for rmw_zenoh, without a bridge.
 
-Keys, attachment and liveliness tokens are those of rmw_zenoh 0.12; payloads are XCDR1. The messages of every
-cycle have strings of fixed length only, so that each is one precompiled struct, padding included.
+Keys, attachment and liveliness tokens follow rmw_zenoh 0.12; payloads are XCDR1. Messages of every cycle have
+strings of fixed length only, so each is one precompiled struct with padding.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _QOS = "::,10:,:,:,,"  # reliable, volatile, keep last 10
 _ENCAPSULATION = b"\x00\x01\x00\x00"  # XCDR1, little-endian; alignment counts after it
 _ATTACHMENT = Struct("<qqB16s")  # sequence number, UNIX ns, length of the GID, GID
 _NS = 1_000_000_000
-_VELOCITY_FILTER_S = 0.005  # of the differentiated position, where no link velocity is measured
+_VELOCITY_FILTER_S = 0.005  # filter of the differentiated position, without a measured link velocity
 _entities = count()
 _FLAGS = (
     ("valid", int(Status.VALID)),
@@ -65,7 +65,7 @@ _OK, _WARN, _ERROR, _STALE = range(4)  # levels of diagnostic_msgs/DiagnosticSta
 
 
 class Template:
-    """An XCDR1 message whose lengths are all fixed, as one struct; numbers that change are given to pack."""
+    """An XCDR1 message of fixed length as one struct, packed with the changing numbers."""
 
     def __init__(self) -> None:
         self._format = "<4s"
@@ -74,7 +74,7 @@ class Template:
         self._changing: list[int] = []
 
     def number(self, code: str, value: int | None = None) -> Template:
-        """A number of struct code `code`, aligned to its size; None: it changes."""
+        """A number of struct code `code`, aligned to its size; None: variable."""
         size = Struct("<" + code).size
         padding = -self._offset % size
         self._format += f"{padding}x{code}" if padding else code
@@ -94,18 +94,18 @@ class Template:
         return self
 
     def doubles(self, length: int) -> Template:
-        """A sequence of float64 that change."""
+        """A sequence of variable float64."""
         self.number("I", length)
         for _ in range(length):
             self.number("d")
         return self
 
     def header(self, frame_id: str) -> Template:
-        """std_msgs/Header: the stamp changes."""
+        """std_msgs/Header with variable stamp."""
         return self.number("i").number("I").text(frame_id)
 
     def packer(self) -> Any:
-        """A function of the changing numbers that gives the message's bytes."""
+        """A function from the variable numbers to the message's bytes."""
         packing, values, changing = Struct(self._format).pack, self._values, self._changing
 
         def message(*numbers: float) -> bytes:
@@ -126,7 +126,7 @@ def joint_state(name: str) -> Any:
 def stiffness_array(transmissions: int) -> Any:
     """Packer of std_msgs/Float64MultiArray, (1 + transmissions, 2): stiffness and its standard deviation.
 
-    Row 0 is the joint, then one row a transmission; the labels of the dimensions name rows and columns.
+    Row 0 is the joint, then one row per transmission; the labels of the dimensions name rows and columns.
     """
     rows = ["joint", *(f"transmission{i + 1}" for i in range(transmissions))]
     columns = ["stiffness_nm_rad", "stiffness_std_nm_rad"]
@@ -147,11 +147,11 @@ def dynamic_joint_state(name: str, transmissions: int, linked: bool = False) -> 
 
 
 def interfaces(transmissions: int, linked: bool = False) -> tuple[str, ...]:
-    """What a DynamicJointState holds of a joint: numbers, flags (1 or 0), each transmission's numbers.
+    """Interfaces of a joint's DynamicJointState: numbers, flags (1 or 0), numbers of each transmission.
 
     Args:
         transmissions: how many it has.
-        linked: whether its link dynamics are declared: the external torque comes last.
+        linked: with declared link dynamics; adds the external torque at the end.
     """
     numbers = ("flexibility_torque_nm", "stiffness_nm_rad", "stiffness_std_nm_rad")
     own = (f"transmission{i + 1}_{number}" for i in range(transmissions) for number in numbers)
@@ -239,8 +239,8 @@ class Ros2Publisher:
         joint: with a `[ros2]` section.
 
     Attributes:
-        latest: the newest estimate, which diagnostics judge.
-        external: what the world does to the link in the cycle to be put next; None: nothing is known.
+        latest: the newest estimate, for diagnostics.
+        external: external torque of the cycle to be published next, or None.
 
     Raises:
         ZenohError: zenoh refuses a key.
@@ -313,7 +313,7 @@ class Ros2Publisher:
         self._stiffness.put(self._pack_stiffness[len(estimate.transmissions)](*pairs), stamp_ns)
 
     def _touch(self, second: int, ns: int, stamp_ns: int) -> tuple[float, ...]:
-        """Publish the wrench where it is valid; the values of the external torque's interfaces."""
+        """Publish the wrench if valid; return the values of the external torque's interfaces."""
         touch = self.external
         if touch is None or self._wrench is None:
             return (math.nan, math.nan, 0.0, 0.0)
@@ -324,7 +324,7 @@ class Ros2Publisher:
         return (touch.external_torque_nm, touch.external_torque_std_nm, float(valid), float(contact))
 
     def put_status(self, status: Mapping[str, Any], stamp_ns: int) -> None:
-        """Publish diagnostics, once a second however often it is called.
+        """Publish diagnostics, at most once a second.
 
         Args:
             status: as on the status key.
@@ -340,7 +340,7 @@ class Ros2Publisher:
         self._diagnostics.put(payload, stamp_ns)
 
     def close(self) -> None:
-        """Leave the ROS graph; a second time does nothing."""
+        """Leave the ROS graph; may be called twice."""
         while self._entities:
             with suppress(zenoh.ZError):
                 self._entities.pop().undeclare()
@@ -364,7 +364,7 @@ def _mangle(name: str) -> str:
 
 
 def _judge(status: int) -> tuple[int, str]:
-    """Level and message of diagnostics for the status bits of an estimate."""
+    """Diagnostic level and message for the status bits of an estimate."""
     flags = Status(status & sum(Status))
     faults = flags & (Status.DRIVE_FAULT | Status.BUS_FAULT)
     alarms = flags & (Status.MODEL_ALARM | Status.INPUT_REJECTED | Status.CHANGED)

@@ -1,11 +1,11 @@
-"""Opens zenoh sessions: safe defaults, or a whole configuration file; never blocks the end of the process.
+"""Opens zenoh sessions with safe defaults or a configuration file; they never block the end of the process.
 
-Without a configuration file a daemon is a peer on the loopback. The first one of a machine listens at the
+Without a configuration file a daemon is a peer on loopback. The first one of a machine listens at the
 endpoint, `tcp/127.0.0.1:7447`; the others connect to it, so that a plain client there receives all of them.
-When the first one dies, `drivelink.pubsub.rendezvous` lets another one take the endpoint over. Nothing
-listens beyond the loopback, and nothing is multicast, unless the joint file says so.
+When the first one dies, `drivelink.pubsub.rendezvous` lets another one take over. Nothing listens beyond
+loopback or is multicast.
 
-With a configuration file zenoh gets exactly that file and nothing of the below.
+A configuration file replaces all of these defaults.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["client_config", "close_session", "daemon_config", "one_line", "open_client", "open_session"]
 
-_MEETING_S = 2.0  # for a handshake on this machine; taken only if something else than zenoh answers
+_MEETING_S = 2.0  # timeout of a local handshake, reached only if another program answers
 _POLL_S = 0.01
 _EXAMPLE = "tcp/127.0.0.1:7447"
 _LINKS = ("tcp", "tls", "udp", "quic", "ws", "unixsock-stream", "serial", "vsock")
@@ -54,23 +54,23 @@ _open_sessions: list[tuple[zenoh.Session, Rendezvous | None]] = []
 
 
 def daemon_config(endpoint: str, listen: bool) -> zenoh.Config:
-    """A peer on the loopback that listens at `endpoint`, or connects to who does."""
+    """A peer on loopback that listens at `endpoint`, or connects to its listener."""
     if listen:
         return _config({"listen/endpoints": [endpoint]})
     return _config({"listen/endpoints": ["tcp/127.0.0.1:0"], "connect/endpoints": [endpoint], **_CONNECT})
 
 
 def client_config(endpoint: str) -> zenoh.Config:
-    """A peer that listens nowhere, connects to `endpoint`, and from there to every daemon of the machine."""
+    """A peer without listener that connects to `endpoint`, and through it to every daemon of the machine."""
     return _config({"listen/endpoints": [], "connect/endpoints": [endpoint], **_CONNECT})
 
 
 def open_session(section: ZenohSection, base_dir: Path) -> zenoh.Session:
-    """Open the daemon's session, in touch with the other daemons of the machine when it returns.
+    """Open the daemon's session, connected to the other daemons of the machine.
 
     Args:
         section: `[zenoh]` of the joint file.
-        base_dir: where a relative `config` is looked for: the joint file's directory.
+        base_dir: base of a relative `config`: the joint file's directory.
 
     Raises:
         ZenohError: the configuration file cannot be used, or the endpoint is taken by another program.
@@ -90,8 +90,8 @@ def open_client(endpoint: str, config: str | Path | None = None) -> zenoh.Sessio
     """Open a subscriber's session.
 
     Args:
-        endpoint: where a daemon or a router listens; it may not be there yet.
-        config: a zenoh configuration file (JSON5) instead; then the endpoint is not used.
+        endpoint: of a daemon or router, which may start later.
+        config: a zenoh configuration file (JSON5) instead of the endpoint.
 
     Raises:
         ZenohError: the endpoint or the configuration file cannot be used.
@@ -102,7 +102,7 @@ def open_client(endpoint: str, config: str | Path | None = None) -> zenoh.Sessio
 
 
 def _join(endpoint: str) -> zenoh.Session:
-    """Connect to who listens at the endpoint, and be ready to follow in its place."""
+    """Connect to the listener at the endpoint, and be ready to take over."""
     session = _open(daemon_config(endpoint, listen=False), Rendezvous(endpoint))
     if not _meet(session) and answers(endpoint):
         close_session(session)
@@ -114,7 +114,7 @@ def _join(endpoint: str) -> zenoh.Session:
 
 
 def close_session(session: zenoh.Session) -> None:
-    """Close a session; a second time does nothing."""
+    """Close a session; may be called twice."""
     for entry in [entry for entry in _open_sessions if entry[0] is session]:
         _open_sessions.remove(entry)
         if entry[1] is not None:
@@ -124,7 +124,7 @@ def close_session(session: zenoh.Session) -> None:
 
 
 def one_line(error: BaseException) -> str:
-    """A zenoh error without the places in zenoh's own sources."""
+    """A zenoh error without locations in zenoh's sources."""
     text = " ".join(str(error).split())
     return re.sub(r"\s+at /\S+?:\d+\.?(?=\]|\s|$)", "", text)
 
@@ -163,14 +163,14 @@ def _open(config: zenoh.Config, rendezvous: Rendezvous | None = None) -> zenoh.S
 
 
 def _keep(session: zenoh.Session, rendezvous: Rendezvous | None = None) -> zenoh.Session:
-    """Note the session, so that it is closed at the end of the process whatever happens."""
+    """Register the session to be closed at the end of the process."""
     _open_sessions[:] = [entry for entry in _open_sessions if not entry[0].is_closed()]
     _open_sessions.append((session, rendezvous))
     return session
 
 
 def _meet(session: zenoh.Session) -> bool:
-    """Wait until the session is connected to anybody."""
+    """Wait until the session has a connection."""
     deadline = time.monotonic() + _MEETING_S
     while time.monotonic() < deadline:
         if session.info.peers_zid() or session.info.routers_zid():

@@ -1,10 +1,10 @@
-"""The bytes of `estimate`, `external` and `sample` on zenoh.
+"""Layouts of `estimate`, `external` and `sample` on zenoh.
 
 Zenoh's serialization of a tuple of fixed-width numbers is the packed little-endian struct, and that of a
 sequence is its length as a LEB128 varint before the elements. So each message is one precompiled struct
 here, `z_deserialize` of zenoh-ext in Rust, C, C++, Kotlin and TypeScript, and a plain struct on a
-microcontroller. The tables below are the only statement of the layout: the structs, the answer of
-`<prefix>/<joint>/schema` and the table of the documentation are made from them.
+microcontroller. The tables below are the only definition: structs, the `schema` key and the documentation are
+made from them.
 """
 
 from __future__ import annotations
@@ -198,7 +198,7 @@ EXTERNAL_BITS: Mapping[str, str] = MappingProxyType(
 
 
 class EstimateMessage(NamedTuple):
-    """One estimate as it came over the wire: an `Estimate` and the UNIX time of its SYNC."""
+    """A received estimate: an `Estimate` and the UNIX time of its SYNC."""
 
     sequence: int
     stamp_ns: int
@@ -220,7 +220,7 @@ class EstimateMessage(NamedTuple):
 
 
 class ExternalMessage(NamedTuple):
-    """What the world does to the link at one SYNC, as it came over the wire."""
+    """A received external torque and its SYNC."""
 
     sequence: int
     stamp_ns: int
@@ -240,11 +240,11 @@ class ExternalMessage(NamedTuple):
 
 
 EXTERNAL_COLUMNS = (*ExternalMessage._fields[3:], "external_valid", "contact")
-"""Names of what an `ExternalMessage` says, where they stand among others."""
+"""Names of an `ExternalMessage`'s values among others."""
 
 
 class SampleMessage(NamedTuple):
-    """One sample as it came over the wire, and the UNIX time of its SYNC."""
+    """A received sample and the UNIX time of its SYNC."""
 
     sample: Sample
     stamp_ns: int
@@ -266,8 +266,8 @@ def decode_estimate(payload: bytes) -> EstimateMessage:
     """Read the bytes of `<prefix>/<joint>/estimate`.
 
     Raises:
-        ZenohError: these are no such bytes, or they are called valid and hold a number that no joint has:
-            not finite, a negative stiffness or standard deviation. NaN is taken where PARTIAL says so.
+        ZenohError: malformed, or valid with an impossible number: not finite, or a negative stiffness or
+            standard deviation. NaN is accepted with PARTIAL.
     """
     count = _count(payload, _ESTIMATE_COUNTS, ESTIMATE)
     *head, stated = _ESTIMATE_HEAD.unpack_from(payload)
@@ -280,7 +280,7 @@ def decode_estimate(payload: bytes) -> EstimateMessage:
 
 
 def _usable(message: EstimateMessage) -> bool:
-    """Whether every number may be used: finite, stiffness and standard deviation not negative."""
+    """Whether all numbers are possible: finite, stiffness and standard deviation not negative."""
     _, _, status, torque, stiffness, std, transmissions = message
     partial = bool(status & _PARTIAL)
     if not (math.isfinite(torque) and _magnitude(stiffness, partial) and _magnitude(std, partial)):
@@ -297,7 +297,7 @@ def _usable(message: EstimateMessage) -> bool:
 
 
 def _magnitude(number: float, partial: bool) -> bool:
-    """Whether it is finite and not negative, or NaN where that is said."""
+    """Whether it is finite and not negative, or an allowed NaN."""
     return 0.0 <= number < math.inf or (partial and number != number)
 
 
@@ -305,8 +305,8 @@ def decode_external(payload: bytes) -> ExternalMessage:
     """Read the bytes of `<prefix>/<joint>/external`.
 
     Raises:
-        ZenohError: these are no such bytes; or they are called valid and hold what is not finite, or a
-            negative standard deviation; or they say contact and are not valid.
+        ZenohError: malformed; valid with a non-finite number or negative standard deviation; or contact
+            without valid.
     """
     if len(payload) != _EXTERNAL.size:
         raise ZenohError(f"{EXTERNAL.schema}: expected {_EXTERNAL.size} bytes, got {len(payload)}")
@@ -324,7 +324,7 @@ def decode_sample(payload: bytes) -> SampleMessage:
     """Read the bytes of `<prefix>/<joint>/sample`.
 
     Raises:
-        ZenohError: these are no such bytes.
+        ZenohError: malformed.
     """
     count = _count(payload, _SAMPLE_COUNTS, SAMPLE)
     values = _SAMPLES[count].unpack(payload)

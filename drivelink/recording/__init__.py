@@ -1,7 +1,6 @@
 """Recordings: every file format, in and out, as a `Record`.
 
-`read` takes any of them. What a recording lacks or has too much of is said in one line each, as a warning
-of the logger `drivelink.recording`.
+`read` reads any of them. Irregularities are one-line warnings of the logger `drivelink.recording`.
 """
 
 from __future__ import annotations
@@ -33,16 +32,16 @@ def read(
     """Read a recording.
 
     Args:
-        path: the file; its name's ending says the format.
+        path: the file; its ending selects the format.
         joint: the joint it was made with: number of motors, torque constants, PDO mapping of raw CAN logs.
-        base_dir: folder of the joint file, where its EDS files are looked for.
+        base_dir: folder of the joint file, base of its EDS files.
         channel: of a raw CAN log with several.
-        keep_nan: leave rows with NaN in, for a consumer that takes them tick by tick; else they are gaps.
-        names: columns of a CSV or MF4 file that have other names or units there.
+        keep_nan: keep rows with NaN, for use tick by tick; else they become gaps.
+        names: columns of a CSV or MF4 file with other names or units.
 
     Raises:
-        RecordingError: it cannot be read, or lacks what is needed.
-        UsageError: `names` for a format that has names of its own.
+        RecordingError: it cannot be read, or is incomplete.
+        UsageError: `names` for a format with fixed names.
     """
     path = Path(path)
     if not path.exists():

@@ -1,7 +1,7 @@
-"""Prepares files of other tools for python-can's readers: bounded, and in the form they know.
+"""Prepares files of other tools for python-can's readers: bounded, and in a form they know.
 
-Its readers take lines and containers of any length, take a PCAN trace of an unknown version for one of
-version 1.0, and pass over the difference between relative and absolute stamps of an ASC file.
+Its readers accept lines and containers of any length, read a PCAN trace of an unknown version as version 1.0,
+and ignore relative stamps of an ASC file.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ __all__ = ["AscText", "BlfBytes", "TrcText"]
 _LOG = logging.getLogger("drivelink.recording")
 
 _DEFLATE_RATIO = 1032  # of zlib at its best
-_CONTAINER_HEAD = 16  # bytes of a BLF container before what is packed
+_CONTAINER_HEAD = 16  # header bytes of a BLF container
 _STAMP = re.compile(r"^[ \t]*(\d{1,12}\.\d{1,12})(?=[ \t])")
 _RELATIVE = re.compile(r"^\s*base\s+\w+\s+timestamps\s+relative", re.IGNORECASE)
 # time CANFD channel Rx identifier [name] BRS ESI DLC length duration bits flags …, of a frame without data
@@ -34,7 +34,7 @@ _TRC_VERSIONS = ("1.0", "1.1", "1.2", "1.3", "2.0", "2.1")
 
 
 class BlfBytes(io.BufferedIOBase):
-    """The bytes of a BLF file, no more at once than may be, packed or unpacked.
+    """The bytes of a BLF file, with limits on packed and unpacked containers.
 
     Args:
         file: open for reading bytes.
@@ -46,10 +46,10 @@ class BlfBytes(io.BufferedIOBase):
         self._file, self._path = file, path
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """So many bytes.
+        """Read so many bytes.
 
         Raises:
-            RecordingError: they are, or unpack to, more than may be.
+            RecordingError: a container exceeds the limit.
         """
         if size is None or not 0 <= size <= MAX_BLOCK_BYTES:
             raise self._too_large()
@@ -71,7 +71,7 @@ class BlfBytes(io.BufferedIOBase):
 
 
 class _Text(io.TextIOBase):
-    """The lines of a log; a last one without its end is left out, it may be cut off.
+    """The lines of a log; an incomplete last line is omitted.
 
     Args:
         file: open for reading bytes.
@@ -84,10 +84,10 @@ class _Text(io.TextIOBase):
         self._number = 0
 
     def readline(self, size: int = -1, /) -> str:  # type: ignore[override]
-        """The next line, as the reader knows it; "" at the end.
+        """The next line in the reader's form; "" at the end.
 
         Raises:
-            RecordingError: it is longer than a line may be, or of an unknown version.
+            RecordingError: it is too long, or of an unknown version.
         """
         line = self._file.readline(MAX_LINE_BYTES + 1)
         self._number += 1
@@ -102,12 +102,12 @@ class _Text(io.TextIOBase):
         return self._known(line.decode(errors="replace"))
 
     def _known(self, line: str) -> str:
-        """The line in the form that the reader knows."""
+        """The line in the reader's form."""
         raise NotImplementedError
 
 
 class AscText(_Text):
-    """An ASC file; stamps that count from the line before count from the beginning."""
+    """An ASC file with relative stamps converted to absolute ones."""
 
     def __init__(self, file: IO[bytes], path: Path) -> None:
         super().__init__(file, path)
@@ -121,12 +121,12 @@ class AscText(_Text):
             self._total += float(stamp[1])
             line = f"{self._total:.9f}{line[stamp.end() :]}"
         if (empty := _EMPTY_FD.match(line)) and not int(empty[5], 16) & _REMOTE:
-            return f"{empty[1]} {empty[2]} {empty[4]} {empty[3]} d 0\n"  # else it is taken for a remote frame
+            return f"{empty[1]} {empty[2]} {empty[4]} {empty[3]} d 0\n"  # else it is read as a remote frame
         return line
 
 
 class TrcText(_Text):
-    """A PCAN trace; version 1.2 lacks the empty column that 1.3 has before the length."""
+    """A PCAN trace; version 1.2 lacks the empty column before the length of version 1.3."""
 
     def __init__(self, file: IO[bytes], path: Path) -> None:
         super().__init__(file, path)

@@ -1,7 +1,7 @@
-"""Raw CAN recordings as cycles: which mapping the frames have, where SYNC is, and the samples they make.
+"""Converts raw CAN recordings to cycles: mapping, SYNC, samples.
 
-The frames go through the assembler that live frames go through. What they carry is known from the joint
-file, or from the SDO configuration that is in the recording itself.
+The frames go through the assembler of live frames. Their mapping is known from the joint file or the SDO
+configuration in the recording.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ _LOG = logging.getLogger("drivelink.recording")
 
 _SDO = range(0x581, 0x680)
 _OF_MAPS = frozenset({0, *_SDO, *range(0x701, 0x780)})  # NMT, SDO, boot-up
-_QUIET_SYNCS = 500  # without a change of the configuration: it is over
+_QUIET_SYNCS = 500  # without a change, the configuration has ended
 _PEEK = 20_000  # messages that show whether an MCAP file has samples
 
 
 def is_frame_log(path: Path, frames: bool | None = None) -> bool:
-    """Whether a recording is to be read as raw frames.
+    """Whether to read a recording as raw frames.
 
     Args:
         path: the recording.
-        frames: what the user asked for, of a file that may hold both; None: frames if there are no samples.
+        frames: the user's choice for a file with both; None: frames if there are no samples.
     """
     suffix = path.suffix.lower()
     if suffix in CAN_SUFFIXES:
@@ -75,7 +75,7 @@ class FrameLog:
     Args:
         path: the recording.
         joint: the joint.
-        base_dir: folder of the joint file, where its EDS files are looked for.
+        base_dir: folder of the joint file, base of its EDS files.
         channel: of a recording with several.
 
     Attributes:
@@ -83,7 +83,7 @@ class FrameLog:
         assembler: makes the samples.
 
     Raises:
-        RecordingError: no SYNC or no frames in it, or the mapping of a node is not known or lacks something.
+        RecordingError: no SYNC or no frames, or the mapping of a node is unknown or incomplete.
     """
 
     def __init__(self, path: Path, joint: JointFile, base_dir: Path, channel: str | None = None) -> None:
@@ -104,7 +104,7 @@ class FrameLog:
         declared = not self._listener.busy
         if not heard and (known := recorded_layouts(path, joint.name, daemon=declared)):
             self._listener = PassiveConfigurator([joint], [base_dir])
-            self._listener.adopt(known)  # the recording began when the nodes were configured already
+            self._listener.adopt(known)  # the nodes were configured before the recording began
             self._head, self._frames = [], frames()
         self._check_complete()
         self.period_s = self._period(syncs, joint.bus.period_s)
@@ -115,10 +115,10 @@ class FrameLog:
             raise RecordingError(f"{path}: {error}") from error
 
     def cycles(self) -> Iterator[Cycle]:
-        """The cycles that the frames make; once.
+        """The cycles of the frames; may be iterated once.
 
         Raises:
-            RecordingError: the recording is broken, or they make no sample.
+            RecordingError: the recording is damaged, or contains no sample.
         """
         assembler = self.assembler
         stamp_now = stamp_before = 0
@@ -139,7 +139,7 @@ class FrameLog:
         return self._fed(feed)
 
     def ticks(self, pipeline: JointPipeline) -> Iterator[Tick]:
-        """What is published of the cycles; once.
+        """The published output of the cycles; may be iterated once.
 
         Args:
             pipeline: made with `assembler`.
@@ -150,7 +150,7 @@ class FrameLog:
         return self._fed(pipeline.feed)
 
     def _fed(self, feed: Callable[[int, bytes, int, int], _Fed | None]) -> Iterator[_Fed]:
-        """What becomes of the frames."""
+        """Pass the frames through the assembler."""
         assembler = self.assembler
         follower = self._follower() if self._passive else None
         numbered = numbered_at_once if self._follow else numbered_ahead
@@ -174,7 +174,7 @@ class FrameLog:
             _LOG.warning("%s: at its end, %s", self._path, doubt)
 
     def _absent(self, heard: set[int]) -> str:
-        """Which frames of the mapping never came."""
+        """Frames of the mapping that are missing."""
         absent = [
             f"0x{tpdo.cob_id:03X} of node {layout.node_id}"
             for layout in self._listener.layouts.values()
@@ -186,18 +186,17 @@ class FrameLog:
         return f": expected frames {', '.join(absent)}, got none (another node id, channel or mapping?)"
 
     def _follower(self) -> MapFollower:
-        """Somebody else maps the nodes: the maps are followed as the daemon follows them."""
+        """Follow another master's mapping as the daemon does."""
         layouts = self._listener.layouts
         return MapFollower(self._listener, dict.fromkeys(layouts, self.assembler), layouts)
 
     def _learn_configuration(self) -> tuple[list[int], bool]:
-        """Listen to the SDO transfers until the mapping is known and at rest.
+        """Read the SDO transfers until the mapping is known and unchanged for a while.
 
-        Where somebody else maps the nodes it is enough that it is known: it may change at any time, and what
-        follows is heard in its turn.
+        With another master it is enough that it is known: later changes are followed.
 
         Returns:
-            Stamps of the SYNCs till then, and whether a node's mapping was in the traffic.
+            Stamps of the SYNCs until then, and whether the traffic contained a node's mapping.
         """
         listener, head = self._listener, self._head
         syncs: list[int] = []
@@ -219,7 +218,7 @@ class FrameLog:
         return syncs[-2 * _QUIET_SYNCS :], heard and not listener.busy
 
     def _check_complete(self) -> None:
-        """Raise where the mapping of a node is not known."""
+        """Raise if the mapping of a node is unknown."""
         if self._listener.busy:
             reason = next(iter(self._listener.missing.values()))
             raise RecordingError(
@@ -228,7 +227,7 @@ class FrameLog:
             )
 
     def _period(self, syncs: list[int], configured_s: float) -> float:
-        """The period that the recorded SYNCs have: the configured one, where they agree."""
+        """The period of the recorded SYNCs; the configured one if they agree."""
         if len(syncs) < 3:
             raise RecordingError(
                 f"{self._path}: expected SYNC frames (0x080), which give the time of a sample, got "
@@ -248,11 +247,11 @@ class FrameLog:
         return measured.period_s
 
     def _relayout(self, can_id: int, data: bytes, assembler: Assembler) -> None:
-        """A node is given another mapping in the middle of the recording."""
+        """Handle a change of a node's mapping within the recording."""
         self._listener.feed(can_id, data, 0.0)
         for _, layout in self._listener.poll(0.0):
             if isinstance(layout, NodeLayout):
-                with suppress(DriveError):  # what cannot be the daemon has not taken either
+                with suppress(DriveError):  # the daemon refuses it, too
                     assembler.relayout(layout)
 
 
@@ -260,7 +259,7 @@ def read_frame_record(path: Path, joint: JointFile | None, base_dir: Path, chann
     """Read the samples of a raw CAN recording.
 
     Raises:
-        RecordingError: no joint file, or the frames make no samples.
+        RecordingError: no joint file, or no samples.
     """
     if joint is None:
         raise RecordingError(f"{path}: a raw CAN recording needs the joint file that says what is in it")

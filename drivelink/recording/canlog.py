@@ -1,7 +1,6 @@
-"""Raw CAN logs as other tools write them: variants of candump, BLF, ASC, PCAN .trc, by python-can's readers.
+"""Reads raw CAN logs of other tools: variants of candump; BLF, ASC, PCAN .trc by python-can's readers.
 
-Frames come out as plain tuples in the order of the file. Only data frames with 11-bit identifiers are
-CANopen: all others are left out.
+Yields data frames with 11-bit identifiers as tuples, in file order.
 """
 
 from __future__ import annotations
@@ -31,23 +30,23 @@ CAN_SUFFIXES = frozenset({".log", ".candump", *_READERS})
 NO_STAMP = -1
 _EXTENDED_DIGITS = 8
 _LAST_ID = 0x7FF
-_LONGEST = 64  # bytes of a frame: those of CAN XL are no CANopen
+_LONGEST = 64  # bytes of a frame, excluding CAN XL
 _LINE = 16 << 10  # bytes; candump's longest, of CAN XL, has 6 KiB
-_BLOCK = 1 << 18  # bytes read at once
-_HOPELESS = 20  # strange lines at the beginning: it is no log
-_DISORDER_NS = 1_000_000_000  # by which stamps of frames in one file may be out of order
+_BLOCK = 1 << 18  # bytes per read
+_HOPELESS = 20  # unknown lines at the beginning after which it is not a log
+_DISORDER_NS = 1_000_000_000  # largest disorder of stamps within a file
 _GAP_NS = 1_000_000_000
-_LOOK_AHEAD = 2000  # frames that decide what the stamps mean, and which channels there are
+_LOOK_AHEAD = 2000  # frames examined for the meaning of stamps, and for channels
 
 
 class LoggedFrame(NamedTuple):
     """One frame of a log.
 
     Attributes:
-        stamp_ns: when it was on the bus, by the log's clock; NO_STAMP where the log has none.
+        stamp_ns: time by the log's clock; NO_STAMP if the log has none.
         can_id: its 11-bit identifier.
         data: its bytes.
-        channel: the interface it was on, as the log calls it.
+        channel: its interface, by the log's name.
     """
 
     stamp_ns: int
@@ -75,7 +74,7 @@ _DATE = re.compile(rb"^[ \t]*\((\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d)\.(\d+)\)")
 
 
 def read_frames(path: Path, channel: str | None = None, configured: str = "") -> Iterator[LoggedFrame]:
-    """The frames of a log, in its order, all of one channel.
+    """The frames of one channel of a log, in order.
 
     Args:
         path: its ending says the format; `.log` and `.candump` are text as candump writes it.
@@ -83,7 +82,7 @@ def read_frames(path: Path, channel: str | None = None, configured: str = "") ->
         configured: the joint file's channel, taken if the log has it among several.
 
     Raises:
-        RecordingError: it cannot be read, is not what its name says, or its channel is unknown.
+        RecordingError: it cannot be read, has another format, or its channel is unknown.
     """
     frames = _text_frames(path) if path.suffix.lower() in (".log", ".candump") else _library_frames(path)
     head = list(islice(frames, _LOOK_AHEAD))
@@ -95,9 +94,9 @@ def read_frames(path: Path, channel: str | None = None, configured: str = "") ->
 
 
 def in_order(frames: Iterable[LoggedFrame], path: Path) -> Iterator[LoggedFrame]:
-    """Frames whose stamps go on where they jump back: a clock that was set, or two logs in one file.
+    """Make stamps continue where they jump back (a clock that was set, or two logs in one file).
 
-    The time between them is unknown: it counts as a gap of a second and is reported.
+    The unknown time between counts as a gap of one second and is reported.
     """
     offset = last = 0
     for frame in frames:
@@ -117,7 +116,7 @@ def in_order(frames: Iterable[LoggedFrame], path: Path) -> Iterator[LoggedFrame]
 
 
 def _channel(head: list[LoggedFrame], configured: str, path: Path) -> str | None:
-    """Which channel to use, by the first frames of a log; None: there is only one.
+    """Select the channel by the first frames of a log; None: there is only one.
 
     Raises:
         RecordingError: no frame at all, or several channels and none is the configured one.
@@ -133,7 +132,7 @@ def _channel(head: list[LoggedFrame], configured: str, path: Path) -> str | None
 
 
 def _same_channel(name: str, wanted: str) -> bool:
-    """Whether names mean one channel; formats that number them call can0 "0"."""
+    """Whether two names mean the same channel; some formats call can0 "0"."""
     return name == wanted or (name.isdigit() and re.fullmatch(rf"\D*{name}", wanted) is not None)
 
 
@@ -148,7 +147,7 @@ def _text_frames(path: Path) -> Iterator[LoggedFrame]:
 
 
 def _parsed(file: IO[bytes], path: Path) -> Iterator[LoggedFrame]:
-    """The lines that are data frames with 11-bit identifiers; what is no frame at all is counted."""
+    """The data frames with 11-bit identifiers; lines that are no frames are counted."""
     tolerant = _Lines()
     while block := file.read(_BLOCK):
         block += file.readline(MAX_LINE_BYTES)
@@ -178,10 +177,10 @@ def _parsed(file: IO[bytes], path: Path) -> Iterator[LoggedFrame]:
 
 
 def _require_end(file: IO[bytes], length: int, path: Path) -> None:
-    """What has no end is the last line: it is left out, because its last byte may be incomplete.
+    """Check that only the last line has no end; it is omitted, because it may be incomplete.
 
     Raises:
-        RecordingError: it is no last line: more than a line may have, and more follows.
+        RecordingError: a line is too long.
     """
     if length >= MAX_LINE_BYTES or file.read(1):
         raise RecordingError(f"{path}: expected lines of at most {MAX_LINE_BYTES >> 10} KiB")
@@ -189,7 +188,7 @@ def _require_end(file: IO[bytes], length: int, path: Path) -> None:
 
 
 def _plain_frames(lines: list[tuple[str, ...]]) -> Iterator[LoggedFrame]:
-    """The frames of a block in which every line is as candump -L writes it: much quicker than one by one."""
+    """The frames of a block in the exact format of candump -L; much faster than line by line."""
     seconds, micros, channels, ids, data = zip(*lines, strict=True)
     stamps = [int(s + us) * 1000 for s, us in zip(seconds, micros, strict=True)]
     frames = map(LoggedFrame, stamps, [int(i, 16) for i in ids], map(bytes.fromhex, data), channels)
@@ -197,11 +196,11 @@ def _plain_frames(lines: list[tuple[str, ...]]) -> Iterator[LoggedFrame]:
 
 
 class _Lines:
-    """Lines read one by one, in either of candump's ways and with whatever a log file picks up.
+    """Reads lines one by one, in both formats of candump, tolerating foreign lines.
 
     Attributes:
-        understood: lines that are frames, also such that are left out.
-        strange: lines that are none.
+        understood: number of lines that are frames, also omitted ones.
+        strange: number of other lines.
         first_strange: the first of them, as a warning shows it.
     """
 
@@ -212,11 +211,11 @@ class _Lines:
 
     @property
     def hopeless(self) -> bool:
-        """Whether this is no log at all."""
+        """Whether this is not a log."""
         return not self.understood and self.strange > _HOPELESS
 
     def skip(self, lines: int) -> None:
-        """So many lines were understood by somebody else."""
+        """Count lines that were understood elsewhere."""
         self._number += lines
         self.understood += lines
 
@@ -240,7 +239,7 @@ class _Lines:
                 yield frame
 
     def _either(self, line: bytes) -> LoggedFrame | None:
-        """The frame, in the way of the line before, or in the other."""
+        """The frame, first in the format of the previous line."""
         try:
             return self._parse(line)
         except ValueError:
@@ -289,17 +288,17 @@ def _stamp(seconds: bytes | None, fraction: bytes) -> int:
 
 
 def _undated(line: bytes) -> bytes:
-    """A line that begins with date and time, with seconds instead."""
+    """Replace date and time at the beginning of a line by seconds."""
     match = _DATE.match(line)
     if match is None:
         raise ValueError
-    # As UTC: only differences matter, and these do not jump in spring.
+    # As UTC: only differences matter, without daylight saving time.
     moment = datetime.fromisoformat(match[1].decode() + "+00:00")
     return b"(%d.%s)" % (int(moment.timestamp()), match[2]) + line[match.end() :]
 
 
 def _dated(first: list[LoggedFrame], frames: Iterable[LoggedFrame], path: Path) -> Iterator[LoggedFrame]:
-    """Frames with stamps that increase: those of `candump -t d` are differences and are added up."""
+    """Frames with absolute stamps: the differences of `candump -t d` are added up."""
     stamps = [frame.stamp_ns for frame in first]
     falls = sum(b < a for a, b in pairwise(stamps))
     if len(stamps) < 8 or falls < 0.2 * len(stamps):
@@ -316,11 +315,11 @@ def _added_up(frames: Iterable[LoggedFrame]) -> Iterator[LoggedFrame]:
 
 
 def _library_frames(path: Path) -> Iterator[LoggedFrame]:
-    """By python-can's reader of the file's ending; a file that a crash cut off ends where it is whole."""
+    """Read by python-can's reader; a truncated file ends at its last complete frame."""
     kind = _READERS[path.suffix.lower()]
     count = 0
     try:
-        # Opened here: a reader that finds the file strange would leave it open.
+        # Opened here, because a reader leaves a malformed file open.
         with path.open("rb") as file:
             for message in kind(_BOUNDED[kind](file, path)):
                 if message.is_extended_id or message.is_error_frame or message.is_remote_frame:
@@ -334,7 +333,7 @@ def _library_frames(path: Path) -> Iterator[LoggedFrame]:
         raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
     except RecordingError:
         raise
-    except Exception as error:  # readers raise whatever a broken byte leads them to
+    except Exception as error:  # readers raise various exceptions for damaged files
         if not count:
             raise RecordingError(f"{path}: cannot be read as {path.suffix} log: {str(error)[:80]}") from error
         _LOG.warning("%s: broken after %d frames (%.80s): what follows is left out", path, count, error)

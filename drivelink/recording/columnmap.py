@@ -38,11 +38,11 @@ UNITS: dict[str, dict[str, float]] = {
     "_a": {"A": 1.0, "mA": 1e-3},
     "_s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0},
 }
-"""SI values of the units that a column may have, by the ending of its name; a linear axis has m and N."""
+"""Accepted units with their SI values, by the ending of a column's name; a linear axis has m and N."""
 
 
 class _Source(NamedTuple):
-    """Where one of our columns comes from: SI value = factor * what the file says."""
+    """Source of one of our columns: SI value = factor * value in the file."""
 
     column: str
     factor: float
@@ -53,10 +53,10 @@ ColumnMap = Mapping[str, _Source]
 
 
 def parse_column_map(texts: Sequence[str]) -> ColumnMap:
-    """What `--map` says, each `SOURCE=COLUMN[:UNIT]`; a number as unit is a factor.
+    """Parse `--map` options `SOURCE=COLUMN[:UNIT]`; a number as unit is a factor.
 
     Raises:
-        UsageError: it says something else.
+        UsageError: another form.
     """
     found: dict[str, _Source] = {}
     for text in texts:
@@ -89,10 +89,10 @@ def _factor(name: str, unit: str) -> float:
 
 
 def renamed(columns: Mapping[str, FloatArray], names: ColumnMap, where: str) -> dict[str, FloatArray]:
-    """The columns under our names and in SI units; a column that is a source is gone under its own name.
+    """The columns under our names in SI units; sources are no longer available by their own names.
 
     Raises:
-        RecordingError: a source is not there.
+        RecordingError: a source is missing.
     """
     for name, source in names.items():
         if source.column not in columns:

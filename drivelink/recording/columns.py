@@ -1,4 +1,4 @@
-"""The recording's columns by name, whatever the file format, and the `Record` they make."""
+"""Converts a recording's named columns, of any file format, to a `Record`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ KNOWN = frozenset({"time_s", *(f"motor{i}_{name}" for i in (1, 2) for name in _M
 
 
 def sample_columns(motors: int) -> tuple[str, ...]:
-    """Names of the columns that a sample of so many motors fills, in the order of `sample_row`."""
+    """Names of a sample's columns, in the order of `sample_row`."""
     per_motor = [f"motor{i}_{name}" for i in range(1, motors + 1) for name in _MOTOR[:3]]
     return ("time_s", *per_motor, *_LINK)
 
@@ -53,17 +53,17 @@ def record_from_columns(
     keep_nan: bool = False,
     ignored: Sequence[str] = (),
 ) -> Record:
-    """Make a record of named columns: find the grid, turn currents into torques, take NaN rows as gaps.
+    """Make a record of named columns: find the grid, convert currents to torques, make NaN rows gaps.
 
     Args:
-        columns: (rows,) each; names beyond `KNOWN` are ignored, saying so.
+        columns: (rows,) each; names other than `KNOWN` are ignored with a warning.
         where: begins every message.
-        joint: says how many motors there are, whether a link position is needed, and the torque constants.
-        keep_nan: leave rows with NaN in, for a consumer that takes them tick by tick.
-        ignored: names of columns that were there and are not in `columns`.
+        joint: gives the number of motors, whether a link position is needed, and torque constants.
+        keep_nan: keep rows with NaN, for use tick by tick.
+        ignored: names of columns in the file that are not in `columns`.
 
     Raises:
-        RecordingError: a column is missing, or the stamps make no uniform sampling.
+        RecordingError: a column is missing, or the sampling is not uniform.
     """
     columns = {**columns, **dict.fromkeys(ignored, np.empty(0))}
     if unknown := [name for name in columns if name not in KNOWN]:
@@ -104,7 +104,7 @@ def record_from_columns(
     velocity = None if all(v is None for v in velocities) else stacked(present)
     sequence = grid.sequence[rows]
     report_gaps(sequence, grid.period_s, where)
-    if not keep_nan:  # what takes it tick by tick has no room for the gaps
+    if not keep_nan:  # use tick by tick does not allocate the gaps
         require_samples(int(sequence[-1]) + 1, where)
     optional = {name: values[rows] for name in _LINK if (values := column(name)) is not None}
     try:
@@ -128,7 +128,7 @@ def _scaled(columns: Mapping[str, FloatArray], joint: JointFile | None) -> Mappi
 
 
 def _repeats(columns: Mapping[str, FloatArray]) -> NDArray[np.bool_]:
-    """(rows,) whether a row says the same as the one before, its time included."""
+    """(rows,) whether a row equals the previous one, its time included."""
     same = np.zeros(len(columns["time_s"]), dtype=np.bool_)
     if len(same) > 1 and np.any(np.diff(columns["time_s"]) == 0.0):
         same[1:] = np.all([v[1:] == v[:-1] for name, v in columns.items() if name in KNOWN], axis=0)

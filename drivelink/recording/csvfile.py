@@ -1,7 +1,6 @@
-"""Recordings as CSV: fast where the file is clean, forgiving where spreadsheets and crashes left marks.
+"""Reads CSV recordings: fast if the file is clean, tolerant of spreadsheets' formats and truncation.
 
-A file is read in blocks of lines, and of its columns only those that are known: what is held in memory is
-their numbers.
+A file is read in blocks of lines; only the numbers of known columns are kept in memory.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ __all__ = ["read_csv"]
 _LOG = logging.getLogger("drivelink.recording")
 
 _EMPTY = re.compile(rb"(?:(?<=,)|(?<=\n)|^)[ \t]*(?:null|none|n/a|na|-)?[ \t\r]*(?=,|\n|$)", re.IGNORECASE)
-_BLOCK = 1 << 22  # bytes read at once
+_BLOCK = 1 << 22  # bytes per read
 
 
 def read_csv(
@@ -37,7 +36,7 @@ def read_csv(
     """Read a CSV recording (columns as in docs/reference/recordings.md).
 
     Raises:
-        RecordingError: it cannot be read, or lacks what is needed.
+        RecordingError: it cannot be read, or is incomplete.
     """
     columns, ignored = _read_csv_columns(path, names)
     return record_from_columns(columns, str(path), joint, keep_nan, ignored)
@@ -48,17 +47,16 @@ def _read_csv_columns(
 ) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
     """(rows,) values of each known column by its name, and the names of the others; an empty cell is NaN.
 
-    Comma, semicolon or tab between the columns, decimal commas with the latter two, a byte-order mark,
-    `#` comments before the header, and a last line that a crash cut off are understood. A last line that
-    does not end is left out: its last number may be incomplete.
+    Accepts comma, semicolon or tab as separator, decimal commas with the latter two, a byte-order mark and
+    `#` comments before the header. A last line without end is omitted, because it may be incomplete.
 
     Args:
         path: the file.
-        names: columns that have other names or units in the file.
+        names: columns with other names or units in the file.
 
     Raises:
-        RecordingError: no header, a cell that is not a number, a line with another number of columns, or more
-            lines or columns than there may be.
+        RecordingError: no header, a cell that is not a number, a line with another number of columns, or too
+            many lines or columns.
     """
     try:
         with path.open("rb") as file:
@@ -93,7 +91,7 @@ class _Layout(NamedTuple):
     Attributes:
         names: of all of them.
         used: of those that are read.
-        places: where these are.
+        places: their indices.
         separator: between columns.
     """
 
@@ -146,11 +144,11 @@ def _layout(header: str, path: Path, wanted: ColumnMap) -> _Layout:
 
 
 def _blocks(file: IO[bytes], path: Path, line: int) -> Iterator[tuple[bytes, int]]:
-    """Whole lines, many at once, with the number of the first; what follows the last line end is left out."""
+    """Blocks of whole lines with the number of the first; text after the last line end is omitted."""
     rest, padding = b"", False
     while data := file.read(_BLOCK):
         if not data.strip(b"\0"):
-            padding = True  # what a power loss leaves at the end of a file
+            padding = True  # padding after a power loss
             continue
         end = data.rfind(b"\n") + 1
         if padding or (not end and len(rest) + len(data) > MAX_LINE_BYTES):
@@ -186,7 +184,7 @@ def _numbers(block: bytes, layout: _Layout, path: Path, first_line: int) -> Floa
 
 
 def _even(block: bytes, width: int) -> bool:
-    """Whether every line has so many columns: a reader of some columns only does not look."""
+    """Whether every line has so many columns, which a reader of some columns does not check."""
     if b"#" in block or b'"' in block or b"\n\n" in block or block.startswith(b"\n"):
         lines = (line.partition("#")[0] for line in io.StringIO(block.decode("utf-8", errors="replace")))
         return all(len(cells) == width for cells in csv.reader(lines) if "".join(cells).strip())
@@ -198,7 +196,7 @@ def _even(block: bytes, width: int) -> bool:
 
 
 def _wrong_line(block: bytes, layout: _Layout, path: Path, first_line: int) -> str:
-    """Say which line and cell is wrong: the slow look, after the fast reading failed."""
+    """Find the wrong line and cell after the fast reader failed."""
     for number, line in enumerate(block.split(b"\n"), first_line):
         text = line.decode("utf-8", errors="replace").partition("#")[0]
         if not text.strip():

@@ -1,4 +1,4 @@
-"""The cycles of a recording as pipeline input: the common part of raw frames and MCAP files."""
+"""Recorded cycles as input of the pipeline, for raw frames and MCAP files."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Cycle(NamedTuple):
     Attributes:
         sequence: number of its SYNC.
         stamp_ns: UNIX time of its SYNC.
-        sample: None where there was none.
-        flags: service bits of `Status` that hold for it.
+        sample: of this cycle, or None.
+        flags: its service bits of `Status`.
     """
 
     sequence: int
@@ -32,10 +32,9 @@ class Cycle(NamedTuple):
 
 
 def estimated(cycles: Iterable[Cycle], pipeline: JointPipeline) -> Iterator[Tick]:
-    """What the pipeline makes of the cycles, as the live loop would have published it.
+    """Pass the cycles through the pipeline; yield the output that the live loop publishes.
 
-    Reading and estimating take turns of many cycles: a processor that does one thing for a while is quicker
-    than one that changes between them every cycle.
+    Reading and estimating alternate in batches, which is faster than per cycle.
     """
     for batch in batches(cycles):
         for cycle in batch:
@@ -47,7 +46,7 @@ def estimated(cycles: Iterable[Cycle], pipeline: JointPipeline) -> Iterator[Tick
 
 
 def batches(cycles: Iterable[Cycle]) -> Iterator[list[Cycle]]:
-    """Lists of cycles; where the recording turns out to be broken, first those up to there."""
+    """Lists of cycles; before an error of the recording, the cycles up to it."""
     source = iter(cycles)
     error: DrivelinkError | None = None
     while error is None:

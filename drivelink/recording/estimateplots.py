@@ -40,5 +40,5 @@ def plot_over_time(columns: Mapping[str, FloatArray], path: Path, title: str) ->
     plots.over_time(axes[1], {"estimate": stiffness}, "stiffness / (N·m/rad)", "Stiffness")
     low, high = np.nanpercentile(stiffness.y, [1, 99]) if np.any(np.isfinite(stiffness.y)) else (0.0, 1.0)
     margin = 0.25 * (high - low) + 0.02 * abs(high)
-    axes[1].set_ylim(low - margin, high + margin)  # the band of the first moments would hide the rest
+    axes[1].set_ylim(low - margin, high + margin)  # the wide band of the first samples would hide the rest
     return plots.save(figure, path)

@@ -1,4 +1,4 @@
-"""The format that a recording's name asks for, and its writer."""
+"""Selects the writer of a recording by its file name."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ __all__ = ["open_sink"]
 def open_sink(
     path: Path, joint: JointFile, joint_text: str = "", folder: str = "", *, force: bool = False
 ) -> Sink:
-    """The writer of the format that the file's ending names.
+    """Open the writer for the file's ending.
 
     Args:
         path: the recording.
         joint: the joint.
-        joint_text: its joint file, for the formats that carry it.
-        folder: of that file, where its EDS files are looked for.
-        force: whether the recording may take the place of another file.
+        joint_text: its joint file, stored if the format allows.
+        folder: of the joint file, base of its EDS files.
+        force: replace an existing file.
 
     Raises:
         RecordingError: no such format, or the file cannot be written.

@@ -1,4 +1,4 @@
-"""What the gate found wrong with units, signs, gears or time, as lines for people and for the joint file."""
+"""Formats the gate's findings on units, signs, gears and time, with lines for the joint file."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from estimator.sample import Record, Sample
 __all__ = ["Correction", "Gathered", "corrections", "gate", "refusal"]
 
 _ON_THE_BUS = (".drive", ".encoder")
-_LONGEST_S = 60.0  # of a run that is examined: more adds nothing about units and signs
+_LONGEST_S = 60.0  # of a run that is examined; more adds no information
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Correction:
-    """One key of the joint file and what it should be.
+    """A corrected key of the joint file.
 
     Attributes:
-        table: where it stands, e.g. "motor[1].drive" or "recording.scale".
+        table: e.g. "motor[1].drive" or "recording.scale".
         key: its name.
-        value: what to write; None: not known here, only the factor is.
-        factor: value to be over value now.
+        value: its new value; None: only the factor is known.
+        factor: new value over old one.
     """
 
     table: str
@@ -47,7 +47,7 @@ class Correction:
 
 
 def refusal(path: Path, joint: JointFile, findings: Sequence[Discrepancy], message: str) -> RecordingError:
-    """The refusal of a recording in one line, with what to paste into the joint file."""
+    """The refusal of a recording in one line, with the correction for the joint file."""
     return RecordingError(f"{path}: {message}; {_text_of(joint, findings, live=is_frame_log(path))}")
 
 
@@ -55,7 +55,7 @@ def gate(path: Path, joint: JointFile, record: Record) -> None:
     """Refuse a recording whose units, signs, gears or time do not fit the joint.
 
     Raises:
-        RecordingError: in one line, what is wrong and what to paste into the joint file.
+        RecordingError: findings and correction in one line.
     """
     try:
         refuse(record, joint.model())
@@ -64,10 +64,10 @@ def gate(path: Path, joint: JointFile, record: Record) -> None:
 
 
 class Gathered:
-    """The first minute of what goes by, sample by sample, to be looked at afterwards.
+    """Keeps the first minute of samples for a later check of units and signs.
 
     Args:
-        joint: whose samples they are.
+        joint: of the samples.
         period_s: between them.
     """
 
@@ -77,18 +77,18 @@ class Gathered:
         self._samples: list[Sample] = []
 
     def add(self, sample: Sample) -> None:
-        """One more sample."""
+        """Add a sample."""
         if len(self._samples) < self._most:
             self._samples.append(sample)
 
     def take(self, played: Played) -> None:
-        """One more cycle of a replay."""
+        """Add a cycle of a replay."""
         sample = played.tick.sample if len(self._samples) < self._most else None
         if sample is not None:
             self._samples.append(sample)
 
     def judgement(self) -> Judgement:
-        """What the samples say of units and signs."""
+        """Judge units and signs of the samples."""
         model = self._joint.model()
         record = _record_of(self._samples, model, self._period_s)
         return (
@@ -96,7 +96,7 @@ class Gathered:
         )
 
     def remarks(self, *, live: bool) -> list[str]:
-        """What is wrong, with what to paste, or what the motion does not reveal; a line each."""
+        """Findings with corrections, or what the motion does not reveal, one line each."""
         try:
             judgement = self.judgement()
         except EstimatorError as error:
@@ -108,12 +108,12 @@ class Gathered:
 
 
 def _record_of(samples: Sequence[Sample], model: JointModel, period_s: float) -> Record | None:
-    """The samples as a recording, without those that are not complete; None where they are not one run."""
+    """The complete samples as a recording; None if they are not one run."""
     rows = [s for s in samples if np.all(np.isfinite((*s.motor_position_rad, *s.motor_torque_nm)))]
     linked = model.has_deflection
     rows = [s for s in rows if not linked or math.isfinite(s.link_position_rad)]
     sequence = np.array([s.sequence for s in rows], dtype=np.int64)
-    if len(rows) < 2 or np.any(np.diff(sequence) < 1):  # numbers that begin anew: two runs in one file
+    if len(rows) < 2 or np.any(np.diff(sequence) < 1):  # restarted numbering: two runs in one file
         return None
     return Record(
         period_s=period_s,
@@ -125,12 +125,12 @@ def _record_of(samples: Sequence[Sample], model: JointModel, period_s: float) ->
 
 
 def _text_of(joint: JointFile, findings: Sequence[Discrepancy], *, live: bool) -> str:
-    """The correction, ready to be pasted.
+    """The correction as text for the joint file.
 
     Args:
         joint: as it is.
         findings: of the gate.
-        live: whether the numbers came straight from the drives, by the joint file's scales.
+        live: whether the values come from the drives by the joint file's scales.
     """
     changes = [change for finding in findings for change in finding.changes]
     found = corrections(joint, changes, live=live)
@@ -147,13 +147,13 @@ def _text_of(joint: JointFile, findings: Sequence[Discrepancy], *, live: bool) -
 
 
 def corrections(joint: JointFile, needed: Sequence[Change], *, live: bool) -> list[Correction]:
-    """What to change in the joint file.
+    """Corrections of the joint file.
 
     Args:
         joint: as it is.
-        needed: what the channels need.
-        live: by the keys of drives and encoder, which recordings of frames and `run` go by; else by the
-            factors of `[recording]`, which files with columns are read with.
+        needed: corrections of the channels.
+        live: correct the keys of drives and encoder, used by `run` and recordings of frames; else the factors
+            of `[recording]`, used by files with columns.
     """
     changes = {change.channel: change for change in needed}
     found: list[Correction] = []
@@ -180,7 +180,7 @@ def _new(table: str, key: str, value: float | int | None, factor: float) -> Corr
 
 
 def _column(joint: JointFile, change: Change, number: int = 0) -> Correction:
-    """A factor for a column, on top of the one that is there."""
+    """A factor for a column, times the present one."""
     names = {"time": "time_s", "link_position": "link_position_rad"}
     names |= {f"motor{number}_position": f"motor{number}_position_rad"}
     scale = joint.recording.scale

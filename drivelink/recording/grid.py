@@ -1,7 +1,6 @@
-"""From time stamps to the grid of whole periods: which SYNC each row of a recording belongs to.
+"""Assigns the rows of a recording to a grid of whole periods by their time stamps.
 
-Everything behind this point counts periods. Stamps are only used here: to find the period, the gaps, and
-what is wrong with them.
+All later code counts periods. Stamps are only used here, to find period, gaps and errors.
 """
 
 from __future__ import annotations
@@ -21,24 +20,24 @@ __all__ = ["Grid", "find_grid", "report_gaps"]
 _LOG = logging.getLogger("drivelink.recording")
 
 MINIMUM_ROWS = 3
-# A step that is no whole multiple of the period within this share of it is jitter.
+# A step that differs from a multiple of the period by more than this fraction is jitter.
 _JITTER = 0.25
-# More than this share of steps longer than a period: the sampling is not uniform.
+# With more than this fraction of longer steps the sampling is not uniform.
 _MAX_GAP_SHARE = 0.35
-# Stamps may lie this many periods beside their place on the grid (arrival times of a loaded machine).
+# Largest deviation of a stamp from the grid, in periods (arrival times of a loaded machine).
 _MAX_JITTER_PERIODS = 3.0
-_AHEAD = 65  # stamps that separate a late one from a gap
-_MAX_GAPS = 0.1  # of the rows, among stamps that jitter
+_AHEAD = 65  # stamps needed to distinguish a late one from a gap
+_MAX_GAPS = 0.1  # fraction of rows, with jittering stamps
 
 
 class Grid(NamedTuple):
-    """The place of each row in time.
+    """Position of each row on the grid.
 
     Attributes:
         period_s: the sampling period T.
         sequence: (n,) whole periods since the first row, strictly increasing.
         start_s: time of sequence 0.
-        keep: (rows,) which rows of the input have a place: those with a stamp, repeated rows left out.
+        keep: (rows,) rows of the input on the grid: those with a stamp, without repetitions.
     """
 
     period_s: float
@@ -56,13 +55,13 @@ def find_grid(
     """Find the period (from the median step) and each row's number on the grid.
 
     Args:
-        time_s: (rows,) stamps; a row without one (NaN) is left out and becomes a gap.
+        time_s: (rows,) stamps; a row without one (NaN) becomes a gap.
         where: begins every message.
-        nominal_s: a period that is taken as it is where the stamps agree with it.
-        repeats: (rows,) whether a row is the one before once more; such rows are left out.
+        nominal_s: expected period, used if the stamps agree with it.
+        repeats: (rows,) whether a row repeats the previous one; such rows are omitted.
 
     Raises:
-        RecordingError: too few rows, time that stands still or runs backwards, or no uniform sampling.
+        RecordingError: too few rows, constant or decreasing time, or non-uniform sampling.
     """
     keep = np.isfinite(time_s)
     if missing := int(np.count_nonzero(~keep)):
@@ -84,7 +83,7 @@ def find_grid(
 
 
 def report_gaps(sequence: NDArray[np.int64], period_s: float, where: str) -> None:
-    """Say in one line how many periods are missing from a sequence, if any."""
+    """Report in one line how many periods of a sequence are missing, if any."""
     steps = np.diff(sequence)
     gaps = steps > 1
     if np.any(gaps):
@@ -111,7 +110,7 @@ def _require_forward(steps: FloatArray, rows: NDArray[np.int64], time: FloatArra
 
 
 def _number(time: FloatArray, period: float, where: str) -> NDArray[np.int64]:
-    """(n,) number of each stamp on a grid of the given period, that the stamps' own drift may stretch."""
+    """(n,) number of each stamp on a grid of the given period, adapted to the stamps' drift."""
     steps = np.diff(time)
     wide = np.count_nonzero(steps > 1.5 * period)
     if wide > _MAX_GAP_SHARE * len(steps):
@@ -126,16 +125,17 @@ def _number(time: FloatArray, period: float, where: str) -> NDArray[np.int64]:
 
 
 def _number_jittered(time: FloatArray, where: str) -> NDArray[np.int64]:
-    """Stamps that jitter like arrival times: a late one is followed by others that catch up, a gap is not.
+    """Number stamps that jitter like arrival times: after a late one others catch up, after a gap they do
+    not.
 
-    So the number is counted, plus the periods by which everything in a window ahead stays behind.
+    A number is the previous one plus one, plus the periods by which all stamps of the next window are behind.
     """
     index = np.arange(len(time))
     since = time - time[0]
     lag = max(1, min(_AHEAD, len(time) // 4))
-    period = float(np.median(time[lag:] - time[:-lag])) / lag  # jitter cancels, a rare gap does not matter
+    period = float(np.median(time[lag:] - time[:-lag])) / lag  # jitter averages out, rare gaps do not matter
     sequence = index
-    for _ in range(3):  # each time with a better period
+    for _ in range(3):  # repeat with the improved period
         behind = since / period - index
         least = minimum_filter1d(behind, _AHEAD, origin=-(_AHEAD // 2), mode="nearest")
         sequence = index + np.maximum.accumulate(np.rint(least - least[0]).astype(np.int64))
@@ -158,9 +158,9 @@ def _number_jittered(time: FloatArray, where: str) -> NDArray[np.int64]:
 
 
 def _rounded(time: FloatArray, sequence: NDArray[np.int64], nominal_s: float | None) -> float:
-    """The period as slope of time over number, as the round value it was meant to be.
+    """The period as slope of time over number, rounded if possible.
 
-    A round value is taken where the stamps cannot separate it from the slope, by three standard deviations.
+    A round value is used if it is within three standard deviations of the slope.
     """
     n = sequence - sequence.mean()
     power = float(np.dot(n, n))

@@ -1,7 +1,7 @@
 """Memory limits of recordings, checked before allocation.
 
-A file says itself how long its parts are, and may say anything. None of these bounds is near what a real
-recording has; docs/reference/recordings.md states them.
+A file declares the lengths of its parts and may declare anything. Real recordings are far below these limits
+(docs/reference/recordings.md).
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ __all__ = [
     "require_samples",
 ]
 
-_MAX_SAMPLES = 10_000_000  # periods from first to last where a recording is read as a whole: 2.7 h at 1 kHz
-MAX_COLUMNS = 4096  # of a CSV file; unknown ones are never held in memory
+_MAX_SAMPLES = 10_000_000  # periods from first to last sample of a recording in memory: 2.7 h at 1 kHz
+MAX_COLUMNS = 4096  # columns of a CSV file; unknown ones are not kept in memory
 MAX_LINE_BYTES = 1 << 20  # of a line of text
 MAX_BLOCK_BYTES = 64 << 20  # an MCAP chunk or a BLF container, unpacked; tools write up to 8 MiB
 
 
 def require_samples(count: int, where: str) -> None:
-    """Refuse more samples, or periods with their gaps, than are read as a whole.
+    """Refuse more samples, or periods including gaps, than fit into memory.
 
     Raises:
-        RecordingError: there are more.
+        RecordingError: the limit is exceeded.
     """
     if count > _MAX_SAMPLES:
         raise RecordingError(

@@ -1,7 +1,6 @@
 """Metadata of a raw recording: the mapping of its nodes, and the joint file.
 
-An MCAP file carries both. The other formats have no place for them that every tool would pass over, so they
-get a file beside them: `r.log` has `r.log.mapping.json`.
+An MCAP file carries both; other formats get a file beside them: `r.log` has `r.log.mapping.json`.
 """
 
 from __future__ import annotations
@@ -25,21 +24,21 @@ MAX_BYTES = 1 << 20  # of such a document
 
 
 def side_file(path: Path) -> Path:
-    """The file beside a raw CAN log that says how its nodes were mapped."""
+    """The mapping file beside a raw CAN log."""
     return path.with_name(path.name + ".mapping.json")
 
 
 def mapping_document(
     joint: str, layouts: Iterable[NodeLayout], text: str = "", folder: str = "", *, daemon: bool = False
 ) -> dict[str, Any]:
-    """What is kept of a recording of frames.
+    """The mapping document of a recording of frames.
 
     Args:
         joint: its name.
-        layouts: of its nodes, as far as they are known.
+        layouts: of its nodes, if known.
         text: the joint file.
-        folder: where its EDS files are looked for.
-        daemon: whether a daemon that has the nodes mapped so said it, not a file.
+        folder: base of its EDS files.
+        daemon: whether the layouts come from a daemon rather than a file.
     """
     nodes = [layout_document(layout) for layout in layouts]
     about = {"schema": _SCHEMA, "joint": joint, "source": "daemon" if daemon else "file", "nodes": nodes}
@@ -47,7 +46,7 @@ def mapping_document(
 
 
 def layouts_from(data: bytes, joint: str, *, daemon: bool = False) -> list[NodeLayout]:
-    """The layouts of a joint's nodes in a mapping or model document; none where it is another joint's.
+    """The layouts in a mapping or model document; none if it belongs to another joint.
 
     Args:
         data: the document.
@@ -55,7 +54,7 @@ def layouts_from(data: bytes, joint: str, *, daemon: bool = False) -> list[NodeL
         daemon: only what a daemon said.
 
     Raises:
-        ValueError: it is no such document.
+        ValueError: malformed.
     """
     if len(data) > MAX_BYTES:
         raise ValueError(f"expected at most {MAX_BYTES >> 10} KiB, got {len(data) >> 10} KiB")
@@ -69,12 +68,12 @@ def layouts_from(data: bytes, joint: str, *, daemon: bool = False) -> list[NodeL
 
 
 def recorded_layouts(path: Path, joint: str, *, daemon: bool) -> Sequence[NodeLayout]:
-    """The layouts that a recording knows of a joint's nodes, the first ones that it has; none: ().
+    """The first layouts of a joint's nodes in a recording, or ().
 
     Args:
         path: the recording.
         joint: name of the joint.
-        daemon: only what a daemon said: it is so on the bus, whatever the joint file or an EDS declares.
+        daemon: only from a daemon, whose layouts are those on the bus.
 
     Raises:
         RecordingError: the mapping is damaged.
@@ -92,12 +91,12 @@ def recorded_layouts(path: Path, joint: str, *, daemon: bool) -> Sequence[NodeLa
 
 
 def joint_of(path: Path, named: Path | None) -> JointText:
-    """The joint file that is named, else the one that the recording carries.
+    """The given joint file, or the one in the recording.
 
     Raises:
         JointFileError: it is wrong.
-        RecordingError: the recording does not exist, or what it carries is damaged.
-        UsageError: none is named and none is carried.
+        RecordingError: the recording does not exist or is damaged.
+        UsageError: none is given or carried.
     """
     if named is not None:
         return jointfile.load_text(named)
@@ -116,7 +115,7 @@ def joint_of(path: Path, named: Path | None) -> JointText:
 
 
 def _carried(path: Path) -> bytes | None:
-    """The document with the joint file's text, if there is one."""
+    """The document with the joint file's text, if any."""
     suffix = path.suffix.lower()
     if suffix == ".mcap":
         message = next(read_messages(path, frozenset({"joint"})), None)

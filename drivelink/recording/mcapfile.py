@@ -1,7 +1,7 @@
-"""Reading MCAP files, whole or cut off: records in order, straight from the bytes.
+"""Reads MCAP files, complete or truncated, records in file order.
 
-The `mcap` library reads them too; this reader is here because it is several times as fast, and because a
-file without its end (a kill, a power loss) is an ordinary file to it. Record layout: mcap.dev/spec.
+Unlike the `mcap` library's reader it is several times as fast, and accepts files without an end (after a kill
+or a power loss). Record layout: mcap.dev/spec.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ _CHUNK = struct.Struct("<QQQII")  # first, last, size, CRC, length of the compre
 _CHANNEL_HEAD = struct.Struct("<HHI")  # channel, schema, length of the topic
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE_OP, _CHUNK_OP, _DATA_END = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F
 _WANTED = frozenset({_CHANNEL, _MESSAGE_OP, _CHUNK_OP})
-_ZSTD_WINDOW = 128 << 20  # bytes that its decoder may ask for; zstd's own tools stop there, too
+_ZSTD_WINDOW = 128 << 20  # memory limit of its decoder, the same as in zstd's tools
 
 
 class McapMessage(NamedTuple):
-    """One message: where it belongs, when it was, what it says."""
+    """One message: topic, time, data."""
 
     topic: str
     log_time_ns: int
@@ -44,14 +44,14 @@ class McapMessage(NamedTuple):
 
 
 def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[McapMessage]:
-    """The messages of a file in its order, up to where it is whole.
+    """The messages of a file in order, up to a damaged place.
 
     Args:
         path: the file.
         topics: last parts of the topics of interest (`sample` for `/elbow/sample`); None: all.
 
     Raises:
-        RecordingError: it cannot be read, is no MCAP file, or has a record larger than `MAX_BLOCK_BYTES`.
+        RecordingError: it cannot be read, is not an MCAP file, or has a record larger than `MAX_BLOCK_BYTES`.
     """
     channels: dict[int, str | None] = {}
     try:
@@ -64,7 +64,7 @@ def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[
                 left -= _HEAD.size + length
                 if opcode in (_DATA_END, _FOOTER):
                     return
-                if left < 0:  # cut off, or a length that is damaged
+                if left < 0:  # truncated, or a damaged length
                     break
                 if opcode not in _WANTED:  # indexes, attachments, metadata: not read here
                     file.seek(length, os.SEEK_CUR)
@@ -82,12 +82,12 @@ def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[
 
 @lru_cache(maxsize=16)
 def _warn_once(path: Path, _mtime_ns: int) -> None:
-    """A file is looked at several times: for its joint, its mapping, its samples."""
+    """A file is read several times: for its joint, its mapping, its samples."""
     _LOG.warning("%s: cut off or damaged: read up to where it is whole", path)
 
 
 class _BrokenError(Exception):
-    """What follows cannot be read."""
+    """The rest cannot be read."""
 
 
 def _require_size(size: int, path: Path) -> None:
@@ -101,7 +101,7 @@ def _decompressed(body: bytes, path: Path) -> bytes:
     """The records of a chunk.
 
     Raises:
-        RecordingError: they are larger than the file says or than they may be, or packed in an unknown way.
+        RecordingError: too large, larger than declared, or of unknown compression.
     """
     try:
         _, _, size, crc, name_length = _CHUNK.unpack_from(body)
@@ -113,7 +113,7 @@ def _decompressed(body: bytes, path: Path) -> bytes:
     compression = body[_CHUNK.size : name_end].decode(errors="replace")
     data = body[name_end + 8 : name_end + 8 + packed]
     try:
-        # At most a byte more than it says: what does not end there is damaged, or made to fill memory.
+        # At most one byte more than declared: longer data are damaged or malicious.
         if compression == "zstd":
             decompressor = zstandard.ZstdDecompressor(max_window_size=_ZSTD_WINDOW)
             data = decompressor.stream_reader(data).read(size + 1)
@@ -131,7 +131,7 @@ def _decompressed(body: bytes, path: Path) -> bytes:
 def _messages(
     data: bytes, channels: dict[int, str | None], topics: frozenset[str] | None
 ) -> Iterator[McapMessage]:
-    """The messages among some records; `channels` takes up those that are declared on the way."""
+    """The messages among some records; new channels are added to `channels`."""
     at, end = 0, len(data)
     unpack_head, unpack_message, head_size = _HEAD.unpack_from, _MESSAGE.unpack_from, _HEAD.size
     while at < end:

@@ -1,4 +1,4 @@
-"""The samples of an MCAP recording, one by one or as a record."""
+"""Reads the samples of an MCAP recording, one by one or as a record."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ _SERVICE = int(
     Status.DRIVE_FAULT | Status.BUS_FAULT | Status.UNTIMED | Status.NODE_RESTARTED | Status.CONTRADICTED
 )
 _MESSAGE_BYTES = 64 << 10  # of a sample or an estimate: ours have some 500
-_APART = 64  # cycles that a sample and its estimate may be apart in the file
+_APART = 64  # largest distance in cycles between a sample and its estimate in the file
 
 
 def recorded_cycles(path: Path, motors: int, scale: Mapping[str, float] | None = None) -> Iterator[Cycle]:
-    """The cycles of a recording in order of their number.
+    """The cycles of a recording in order.
 
-    A sample gets the flags of its estimate; an estimate that was carried on is a cycle without sample.
+    A sample gets the flags of its estimate; a stale estimate is a cycle without sample.
 
     Args:
         path: the recording.
-        motors: how many the joint has.
+        motors: number of motors.
         scale: factors by column, as `[recording]` of the joint file gives them.
 
     Raises:
@@ -64,7 +64,7 @@ def recorded_cycles(path: Path, motors: int, scale: Mapping[str, float] | None =
                 cycle = Cycle(sequence, message.log_time_ns, before.sample if before else None, flags)
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise _strange(path, message.topic, error) from error
-        if cycle.sequence < newest - _APART:  # the daemon restarted: numbers begin again
+        if cycle.sequence < newest - _APART:  # the daemon restarted: numbering begins again
             yield from _released(waiting, newest + 1)
             newest = -1
         newest = max(newest, cycle.sequence)
@@ -77,7 +77,7 @@ def recorded_cycles(path: Path, motors: int, scale: Mapping[str, float] | None =
 
 
 def _released(waiting: dict[int, Cycle], until: int) -> Iterator[Cycle]:
-    """Take the cycles before `until` out, in order; an estimate whose sample was not recorded is dropped."""
+    """Yield the cycles before `until` in order; drop estimates without a recorded sample."""
     for sequence in sorted(waiting):
         if sequence >= until:
             break
@@ -90,7 +90,7 @@ def read_mcap(path: Path, joint: JointFile | None, keep_nan: bool) -> Record:
     """Read the samples of an MCAP recording.
 
     Raises:
-        RecordingError: it cannot be read, or has no samples in it, or more than are read as a whole.
+        RecordingError: it cannot be read, or has no or too many samples.
     """
     columns: dict[str, array[float]] = {}
     count = 0
@@ -113,10 +113,10 @@ def read_mcap(path: Path, joint: JointFile | None, keep_nan: bool) -> Record:
 
 
 def _fields(data: bytes) -> dict[str, Any]:
-    """What a message says.
+    """The fields of a message.
 
     Raises:
-        ValueError: it is too long, or no JSON object.
+        ValueError: it is too long, or not a JSON object.
     """
     if len(data) > _MESSAGE_BYTES:
         raise ValueError(f"expected at most {_MESSAGE_BYTES >> 10} KiB, got {len(data) >> 10} KiB")

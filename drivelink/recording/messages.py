@@ -1,7 +1,7 @@
 """The channels of an MCAP recording: JSON with a JSON schema each.
 
-JSON, since Foxglove and PlotJuggler plot it without a plugin; the names are those of the CSV columns. What
-is not finite is null: JSON has no word for it.
+Foxglove and PlotJuggler plot JSON without a plugin. Names are those of the CSV columns; non-finite values are
+null.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 from drivelink.pubsub.wire import EXTERNAL_COLUMNS, EstimateMessage, ExternalMessage
 from drivelink.recording.columns import sample_columns, sample_row
-from estimator.sample import External, ExternalStatus, Sample, Status, TransmissionEstimate
+from estimator.sample import SIGMA_95, External, ExternalStatus, Sample, Status, TransmissionEstimate
 
 __all__ = [
     "TOPICS",
@@ -33,11 +33,10 @@ TOPICS = ("sample", "estimate", "external", "status", "model", "joint", "mapping
 _PER_MOTOR = ("flexibility_torque_nm", "stiffness_nm_rad", "stiffness_std_nm_rad", "deflection_rad")
 _VALID, _OBSERVABLE = int(Status.VALID), int(Status.OBSERVABLE)
 _EXTERNAL_NAMES = ("time_s", *EXTERNAL_COLUMNS[:2], "valid", "contact")
-_SIGMA_95 = 1.96
 
 
 def estimate_columns(motors: int) -> tuple[str, ...]:
-    """Names of what an estimate of so many motors says, in the order of `estimate_row`."""
+    """Names of an estimate's values, in the order of `estimate_row`."""
     return (
         "time_s",
         "flexibility_torque_nm",
@@ -60,12 +59,12 @@ def estimate_row(
 
 
 def external_columns() -> tuple[str, ...]:
-    """Names of what an estimate of a joint with declared link dynamics says besides, see `external_row`."""
+    """Names of the further values with declared link dynamics, in the order of `external_row`."""
     return (*EXTERNAL_COLUMNS, "link_flexibility_torque_nm", "flexibility_difference_nm")
 
 
 def external_row(external: External | None) -> tuple[float, ...]:
-    """What the world does to the link as the values of `external_columns`."""
+    """An external torque as the values of `external_columns`."""
     if external is None:
         return (math.nan, math.nan, 0, 0, math.nan, math.nan)
     _, status, torque, std, link_torque, difference = external
@@ -74,16 +73,16 @@ def external_row(external: External | None) -> tuple[float, ...]:
 
 
 def _band_columns(motors: int) -> tuple[str, ...]:
-    """Names of what a view draws beside an estimate, in the order of `_band_row`."""
+    """Names of validity and band edges, in the order of `_band_row`."""
     each = ("", *(f"motor{i}_" for i in range(1, motors + 1)))
     return ("valid", *(f"{part}stiffness_{edge}_nm_rad" for part in each for edge in ("low", "high")))
 
 
 def _band_row(message: EstimateMessage) -> tuple[float, ...]:
-    """Whether it is valid, and the edges of the bands of 95 %: of the joint, then of each transmission."""
+    """Validity, and the edges of the 95 % bands of the joint and of each transmission."""
     stiffnesses = [(message.stiffness_nm_rad, message.stiffness_std_nm_rad)]
     stiffnesses += [(one.stiffness_nm_rad, one.stiffness_std_nm_rad) for one in message.transmissions]
-    edges = [x + side * _SIGMA_95 * std for x, std in stiffnesses for side in (-1.0, 1.0)]
+    edges = [x + side * SIGMA_95 * std for x, std in stiffnesses for side in (-1.0, 1.0)]
     return (1 if message.status & _VALID else 0, *edges)
 
 
@@ -122,7 +121,7 @@ def external_encoder(period_s: float) -> Callable[[ExternalMessage], bytes]:
 
 
 def read_sample(message: Mapping[str, Any], motors: int) -> Sample:
-    """The sample that a message was made from, bit for bit; null is NaN again."""
+    """The sample of a message, bit for bit; null becomes NaN."""
 
     def value(name: str) -> float:
         found = message.get(name)
@@ -177,7 +176,7 @@ def _numbers(names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _template(whole: tuple[str, ...], names: tuple[str, ...]) -> Callable[[tuple[float, ...]], bytes]:
-    """A JSON object with these names, to be filled with integers, then floats: their shortest exact text."""
+    """Template of a JSON object with these names, first integers, then floats in shortest exact form."""
     fields = [f'"{name}":%d' for name in whole] + [f'"{name}":%r' for name in names]
     template = "{" + ",".join(fields) + "}"
 

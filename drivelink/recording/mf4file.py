@@ -1,7 +1,7 @@
-"""Recordings as ASAM MDF 4 (.mf4), where asammdf is installed: `pip install drivelink-vsa[mf4]`.
+"""Recordings as ASAM MDF 4 (.mf4) by asammdf: `pip install drivelink-vsa[mf4]`.
 
-MDF cannot be written so that a kill leaves it readable. What is recorded goes to an MCAP file beside it
-first, which is whole at any moment, and becomes the .mf4 file at the end.
+An MDF file is not readable after a kill. Samples are therefore written to an MCAP file beside it and
+converted at the end.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _LOG = logging.getLogger("drivelink.recording")
 
 
 class Mf4Sink(McapSink):
-    """Samples as MF4; until `close` they are in `FILE.mcap`, which is whole at any moment."""
+    """Samples as MF4; until `close` they are in `FILE.mcap`."""
 
     wants = frozenset({"sample"})
 
@@ -40,11 +40,11 @@ class Mf4Sink(McapSink):
         _asammdf(path)  # before anything is recorded
         self._path, self._joint_file, self._force = path, joint, force
         self._journal = path.with_name(path.name + ".mcap")
-        check_target(self._journal)  # samples of a recording that was killed: never replaced
+        check_target(self._journal)  # samples of a killed recording: never replaced
         super().__init__(self._journal, joint, joint_text, folder)
 
     def close(self) -> None:
-        """Make the .mf4 file of what has been recorded."""
+        """Convert the recorded samples to the .mf4 file."""
         super().close()
         if not self.counts["sample"]:
             self._journal.unlink()
@@ -54,7 +54,7 @@ class Mf4Sink(McapSink):
         self._journal.unlink()
 
     def abandon(self) -> None:
-        """Leave what has been recorded as MCAP."""
+        """Keep the recorded samples as MCAP."""
         super().abandon()
         _LOG.warning("%s: not written; the samples are in %s", self._path, self._journal)
 
@@ -64,8 +64,8 @@ def write_mf4(path: Path, record: Record, *, force: bool = False) -> None:
 
     Args:
         path: the file.
-        record: what goes into it.
-        force: whether it may take the place of another file.
+        record: its content.
+        force: replace an existing file.
 
     Raises:
         RecordingError: asammdf is not installed, or the file cannot be written.
@@ -96,7 +96,7 @@ def read_mf4(
     """Read an MF4 file whose channels are named like the CSV columns.
 
     Raises:
-        RecordingError: asammdf is not installed, or the file lacks what is needed.
+        RecordingError: asammdf is not installed, or the file is incomplete.
     """
     mdf_module = _asammdf(path)
     try:
@@ -120,7 +120,7 @@ def read_mf4(
 
 
 def _at(times: FloatArray, signal: Any) -> FloatArray:
-    """A channel at the times of the first one: its own samples, or the last before each."""
+    """A channel at the times of the first one, held between its samples."""
     values = np.asarray(signal.samples, dtype=np.float64)
     own = np.asarray(signal.timestamps, dtype=np.float64)
     if len(own) == len(times) and np.array_equal(own, times):

@@ -21,27 +21,27 @@ from drivelink.recording.messages import (
     external_row,
 )
 from drivelink.recording.playback import Played
-from estimator.sample import FloatArray, Status
+from estimator.sample import SIGMA_95, FloatArray, Status
 
 __all__ = ["EstimatesFile", "Publication", "Summary"]
 
 _STATUS_EVERY_S = 0.25
-_ROWS = 2048  # that are written at once
+_ROWS = 2048  # rows per write
 # Plain integers: an IntFlag costs a microsecond.
 _VALID, _OBSERVABLE = int(Status.VALID), int(Status.OBSERVABLE)
 
 
 class EstimatesFile:
-    """estimates.csv, a row for each cycle as it comes; it is in its place when it is closed.
+    """Writes estimates.csv, one row per cycle; placed on `close`.
 
     Args:
         path: the file.
         motors: of the joint.
-        linked: whether its link dynamics are declared: the external torque has columns of its own.
-        force: whether it may take the place of another file.
+        linked: with declared link dynamics; adds columns of the external torque.
+        force: replace an existing file.
 
     Raises:
-        RecordingError: it cannot be opened or, later, written; what was there is there still.
+        RecordingError: it cannot be opened or, later, written; an existing file is unchanged.
     """
 
     def __init__(self, path: Path, motors: int, *, linked: bool = False, force: bool = False) -> None:
@@ -66,7 +66,7 @@ class EstimatesFile:
             self._write()
 
     def close(self) -> None:
-        """Put the file in its place; nothing where it could not be written."""
+        """Place the file, unless writing has failed."""
         if self._file.fd < 0:
             return
         try:
@@ -92,12 +92,12 @@ class EstimatesFile:
 
 
 class Publication:
-    """Puts the cycles on zenoh as the daemon does, stamped as if they were measured now.
+    """Publishes the cycles like the daemon, with present stamps.
 
     Args:
         publisher: of the joint.
-        speed: recorded seconds that pass in a second; None: as fast as possible, no waiting.
-        about: what the status message says of the replay.
+        speed: recorded seconds per second; None: as fast as possible.
+        about: text on the replay in the status document.
     """
 
     def __init__(self, publisher: JointPublisher | None, speed: float | None, about: dict[str, Any]) -> None:
@@ -110,7 +110,7 @@ class Publication:
         self._count = 0
 
     def take(self, played: Played) -> None:
-        """Wait until it is time for a cycle, and publish it."""
+        """Wait until a cycle is due, and publish it."""
         if not self._count:
             self._begin_s = played.time_s
             self._begin_ns, self._begin_unix_ns = time.monotonic_ns(), time.time_ns()
@@ -130,7 +130,7 @@ class Publication:
             self._status("replay", passed_s)
 
     def close(self) -> None:
-        """Say that it is over."""
+        """Publish the end of the replay."""
         if self._publisher is not None:
             self._status("ended", self._status_due_s)
 
@@ -141,7 +141,7 @@ class Publication:
 
 
 class Summary:
-    """Counts, and the columns that plots need."""
+    """Counts cycles, and keeps the columns for plots."""
 
     def __init__(self, motors: int, keep: bool) -> None:
         self.count = self.valid = self.observable = 0
@@ -174,7 +174,7 @@ class Summary:
             return "no cycle in it"
         seconds = self._last.time_s - self._first_s
         estimate = self._last.tick.estimate
-        half = 1.96 * estimate.stiffness_std_nm_rad
+        half = SIGMA_95 * estimate.stiffness_std_nm_rad
         return (
             f"{self.count} cycles, {seconds:.6g} s, in {took_s:.3g} s "
             f"({seconds / max(took_s, 1e-9):.3g} × real time); "
@@ -184,7 +184,7 @@ class Summary:
         )
 
     def document(self) -> dict[str, Any]:
-        """The replay for machines; what is not finite is None."""
+        """Summary of the replay as a JSON document; non-finite values are None."""
         estimate = self._last.tick.estimate if self._last is not None else None
         end = {
             name: value if estimate is not None and math.isfinite(value := getattr(estimate, name)) else None
@@ -196,7 +196,7 @@ class Summary:
 
     def plot(self, folder: Path, title: str) -> list[Path]:
         """Write stiffness over deflection, and torque and stiffness over time."""
-        from drivelink.recording.estimateplots import plot_curves, plot_over_time  # matplotlib, where wanted
+        from drivelink.recording.estimateplots import plot_curves, plot_over_time  # matplotlib on demand
 
         folder.mkdir(parents=True, exist_ok=True)
         table = np.frombuffer(self._values, dtype=np.float64).reshape(-1, self._width)

@@ -22,12 +22,12 @@ __all__ = ["Playback", "Played", "open_playback"]
 
 
 class Played(NamedTuple):
-    """One cycle of a recording and what the estimator made of it.
+    """One recorded cycle and its estimate.
 
     Attributes:
-        time_s: of its SYNC, as the recording counts time.
-        tick: as the daemon would have published it, stamped with the UNIX time of its SYNC, where the
-            recording has it; else with `time_s` in nanoseconds.
+        time_s: of its SYNC, in the recording's time.
+        tick: output as published by the daemon, stamped with the UNIX time of its SYNC if recorded, else with
+            `time_s` in ns.
     """
 
     time_s: float
@@ -35,13 +35,13 @@ class Played(NamedTuple):
 
 
 class Playback:
-    """The cycles of a recording, in order, each estimated as it is asked for.
+    """The cycles of a recording in order, estimated on iteration.
 
     Attributes:
-        motors: how many the joint has.
-        period_s: of the recording; the estimator works with it.
-        total: number of cycles, where the recording states it.
-        pipeline: what they go through.
+        motors: number of motors.
+        period_s: of recording and estimator.
+        total: number of cycles, if known.
+        pipeline: their pipeline.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class Playback:
         self.period_s = period_s
         self.total = total
         timed = joint.model_copy(update={"bus": joint.bus.model_copy(update={"period_s": period_s})})
-        # Without an assembler what it is given are samples already.
+        # Without an assembler its input are samples.
         self.pipeline = JointPipeline(assembler or Assembler((), 0), *build(timed))
         self._cycles = cycles
 
@@ -67,7 +67,7 @@ class Playback:
 
 @contextmanager
 def _calm_collector() -> Iterator[None]:
-    """Let the garbage collector look seldom: a cycle leaves nothing to it, and its looking costs a fifth."""
+    """Run the garbage collector rarely: cycles leave no garbage, and it would cost a fifth of the time."""
     before = gc.get_threshold()
     gc.set_threshold(100_000, *before[1:])
     try:
@@ -85,19 +85,19 @@ def open_playback(
     channel: str | None = None,
     names: ColumnMap | None = None,
 ) -> Playback:
-    """Open a recording of any format for playing.
+    """Open a recording of any format for playback.
 
     Args:
         path: the recording.
         joint: the joint it was made with.
-        base_dir: folder of the joint file, where its EDS files are looked for.
+        base_dir: folder of the joint file, base of its EDS files.
         frames: of an MCAP file, play the raw frames (True) or the samples (False); None: the samples, and
             the frames where there are none.
         channel: of a raw CAN log with several.
-        names: columns of a CSV or MF4 file that have other names or units there.
+        names: columns of a CSV or MF4 file with other names or units.
 
     Raises:
-        RecordingError: it cannot be read, or lacks what is needed.
+        RecordingError: it cannot be read, or is incomplete.
     """
     if is_frame_log(path, frames):
         log = FrameLog(path, joint, base_dir, channel)

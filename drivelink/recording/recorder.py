@@ -1,7 +1,6 @@
-"""Records a daemon and a bus, in a process of its own, never in the loop's.
+"""Records a daemon and a bus in a separate process.
 
-Nothing is ever sent: on zenoh it subscribes, on the bus it only receives. What comes faster than it is
-written waits in zenoh's and the kernel's queues; what these drop is counted, not waited for.
+It only subscribes and receives. Data wait in zenoh's and the kernel's queues; drops are counted.
 """
 
 from __future__ import annotations
@@ -37,14 +36,14 @@ from estimator.sample import Sample
 
 __all__ = ["BusTap", "FirstSource", "Recorder", "ZenohTap"]
 
-_QUEUE = 30_000  # messages of a key that may wait: half a minute at 1 kHz
+_QUEUE = 30_000  # waiting messages per key: half a minute at 1 kHz
 _FLUSH_S = 1.0
 _POLL_S = 0.005
-_STALE_S = 1.0  # after which another session may take over where no token says who the daemon is
+_STALE_S = 1.0  # after which another session may take over without a liveliness token
 
 
 class FirstSource:
-    """Lets the samples of one source through, where the daemon and the bus both give them: the first's.
+    """Passes the samples of one source, the first of daemon and bus.
 
     Args:
         sink: where they go.
@@ -63,7 +62,7 @@ class FirstSource:
 
 
 class ZenohTap:
-    """What a daemon publishes of a joint: of one daemon, and nothing that cannot be of this joint.
+    """Receives the messages of one daemon of a joint.
 
     Args:
         session: an open session; it stays open.
@@ -72,8 +71,8 @@ class ZenohTap:
         gate: decides between its samples and others.
 
     Attributes:
-        missed: cycles whose sample did not come.
-        newest_s: UNIX time of the newest sample, 0 before the first.
+        missed: cycles without sample.
+        newest_s: UNIX time of the newest sample, or 0.
     """
 
     def __init__(
@@ -113,7 +112,7 @@ class ZenohTap:
 
     @property
     def refused(self) -> int:
-        """Messages of others, or that are no message of this joint: not recorded."""
+        """Messages of other sessions, or invalid ones, which are not recorded."""
         return self._identity.refused + self._impossible
 
     def poll(self) -> None:
@@ -130,7 +129,7 @@ class ZenohTap:
                     self._impossible += 1
 
     def finish(self) -> None:
-        """Nothing waits here."""
+        """Do nothing."""
 
     def close(self) -> None:
         """Stop listening."""
@@ -170,15 +169,15 @@ class ZenohTap:
 
 
 class BusTap:
-    """What is on the bus: every frame, and the samples they make where no daemon gives them.
+    """Receives the frames of a bus, and makes samples of them without a daemon.
 
     Args:
         bus: an open bus; it stays open.
         joint: the joint.
         sink: where it goes.
-        base_dir: folder of the joint file; None: no samples are made.
+        base_dir: folder of the joint file; None: make no samples.
         gate: decides between its samples and others.
-        layouts: of its nodes, where a daemon reported them.
+        layouts: of its nodes, if reported by a daemon.
 
     Attributes:
         frames: received so far.
@@ -203,7 +202,7 @@ class BusTap:
             self._listener.adopt(layouts)
         self._assembler: Assembler | None = None
         self._follower: MapFollower | None = None
-        self._lacking = ""  # what the mapping lacks, where it is known
+        self._lacking = ""  # missing parts of a known mapping
         self._numbering = SyncNumbering(joint.bus.period_s, measure=True)
         self._stamp_ns = 0
         self.frames = 0
@@ -239,7 +238,7 @@ class BusTap:
             raise BusError(f"the bus is gone: {error}") from error
 
     def finish(self) -> None:
-        """Take the samples that wait for later SYNCs."""
+        """Take the samples waiting for later SYNCs."""
         for frame, jump in self._numbering.rest():
             self._assemble(frame, jump)
 
@@ -254,7 +253,7 @@ class BusTap:
             listener.feed(cob_id, data, 0.0)
             for _, layout in listener.poll(0.0):
                 if self._assembler is not None and isinstance(layout, NodeLayout):
-                    with suppress(DriveError):  # what cannot be the daemon has not taken either
+                    with suppress(DriveError):  # the daemon refuses it, too
                         self._assembler.relayout(layout)
         if self._assembler is None:
             if listener.busy:
@@ -264,7 +263,7 @@ class BusTap:
                 if passive:
                     nodes = dict.fromkeys(listener.layouts, self._assembler)
                     self._follower = MapFollower(listener, nodes, listener.layouts)
-            except DriveError as error:  # the frames are recorded all the same
+            except DriveError as error:  # frames are recorded anyway
                 self._lacking, self._listener = str(error), None
                 return
         before_ns = self._stamp_ns
@@ -279,11 +278,11 @@ class BusTap:
 
 
 class Recorder:
-    """Polls its taps, and puts the sink on the disk once a second.
+    """Polls its taps and flushes the sink once a second.
 
     Args:
         sink: the recording; closed at the end.
-        taps: what it listens to.
+        taps: its sources.
     """
 
     def __init__(self, sink: Sink, taps: list[ZenohTap | BusTap]) -> None:
@@ -302,10 +301,10 @@ class Recorder:
             self.sink.abandon()
 
     def run(self, stop: Callable[[], bool], tick: Callable[[], None] = lambda: None) -> None:
-        """Record until `stop` says so; `tick` is called after each flush.
+        """Record until `stop` returns True; call `tick` after each flush.
 
         Raises:
-            RecordingError: the disk takes no more; what is on it is whole.
+            RecordingError: the disk is full; the file is readable.
         """
         flush_at = time.monotonic() + _FLUSH_S
         while not stop():

@@ -1,4 +1,4 @@
-"""A file that survives a kill, a full disk or a power loss up to its last flush."""
+"""A file that is readable up to its last flush after a kill, a full disk or a power loss."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ __all__ = ["SafeFile"]
 class SafeFile(io.BufferedIOBase):
     """Binary file for writers: whole blocks reach the disk, or none of a block.
 
-    `write` keeps bytes in memory; `flush` hands them to the system as one block; `sync` also waits until
-    the disk has them. The first `sync` gives the file its name: from then on a reader finds it there. If
-    there is no room, the file is cut back to the last whole block, so that it ends between two records.
+    `write` buffers bytes; `flush` writes them as one block; `sync` also syncs to disk. The first `sync` gives
+    the file its name. If the disk is full, the file is truncated to the last whole block, so that it ends
+    between two records.
 
     Args:
         path: the file.
-        force: whether it may take the place of another one, which is there until the first `sync`.
+        force: replace an existing file, at the first `sync`.
 
     Attributes:
-        name: the path, as files give it.
+        name: the path.
 
     Raises:
         RecordingError: it cannot be opened or, later, written.
@@ -37,7 +37,7 @@ class SafeFile(io.BufferedIOBase):
         self._path = path
         self.name = str(path)
         self._pending = bytearray()
-        self._place: int | None = None  # of a write somewhere else than at the end
+        self._place: int | None = None  # position of a write before the end
         self._size = 0
         try:
             self._file = NewFile(path, force=force)
@@ -49,22 +49,22 @@ class SafeFile(io.BufferedIOBase):
         return True
 
     def seekable(self) -> bool:
-        """Always: a header may be written again at the end."""
+        """Always True: a header may be rewritten at the end."""
         return True
 
     def tell(self) -> int:
-        """Where the next byte goes."""
+        """Position of the next byte."""
         return self._size + len(self._pending) if self._place is None else self._place
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Go to a place; what is pending is written before."""
+        """Set the position, after writing pending bytes."""
         self.flush()
         end = whence == os.SEEK_END
         self._place = None if end else offset
         return self.tell()
 
     def write(self, data: bytes) -> int:  # type: ignore[override]
-        """Take bytes; at the end of the file they wait for `flush`."""
+        """Write bytes; at the end of the file they are buffered until `flush`."""
         if self._place is not None:
             self._put(bytes(data), self._place)
             self._place += len(data)
@@ -73,7 +73,7 @@ class SafeFile(io.BufferedIOBase):
         return len(data)
 
     def flush(self) -> None:
-        """Hand everything pending to the system, as one block."""
+        """Write all pending bytes as one block."""
         if self._file.fd < 0 or not self._pending:
             return
         self._put(bytes(self._pending), self._size)
@@ -81,7 +81,7 @@ class SafeFile(io.BufferedIOBase):
         self._pending.clear()
 
     def sync(self) -> None:
-        """Flush, and wait until the disk has it, and its name."""
+        """Flush, and sync file and name to disk."""
         self.flush()
         try:
             self._file.place()
@@ -89,7 +89,7 @@ class SafeFile(io.BufferedIOBase):
             raise self._failed(error) from error
 
     def close(self) -> None:
-        """Flush and close; nothing more is said once the disk has refused."""
+        """Flush and close; after a write error only close."""
         if self._file.fd < 0:
             return
         try:
@@ -99,7 +99,7 @@ class SafeFile(io.BufferedIOBase):
             super().close()
 
     def abandon(self) -> None:
-        """Close without writing what is pending; a file that was never synced is not there at all."""
+        """Close without writing pending bytes; remove a file that was never synced."""
         self._pending.clear()
         self._file.close()
         super().close()

@@ -1,7 +1,6 @@
-"""Writers of recordings, one class a family of formats, all fed alike.
+"""Writers of recordings with one interface, one class per family of formats.
 
-A sink keeps what it is given in memory and puts it on the disk with `flush`, once a second: what is there
-is whole, whatever happens next.
+A sink buffers in memory; `flush`, called once a second, writes whole blocks to disk.
 """
 
 from __future__ import annotations
@@ -36,11 +35,11 @@ __all__ = ["CanSink", "CsvSink", "McapSink", "Sink"]
 
 
 class Sink:
-    """A recording being written; each format takes what it has a place for and leaves out the rest.
+    """A recording being written; each format ignores kinds that it cannot store.
 
     Attributes:
-        counts: how many of each kind it has taken.
-        wants: which kinds it takes: "sample", "estimate", "external", "document", "frame".
+        counts: number of items of each kind.
+        wants: the kinds it stores: "sample", "estimate", "external", "document", "frame".
     """
 
     wants: frozenset[str] = frozenset()
@@ -65,7 +64,7 @@ class Sink:
         """Take one CAN frame."""
 
     def mapping(self, document: dict[str, Any], stamp_ns: int) -> None:
-        """Take what makes samples of the frames, see `drivelink.recording.mapping`."""
+        """Take the mapping document, see `drivelink.recording.mapping`."""
 
     def flush(self) -> None:
         """Put everything on the disk."""
@@ -76,7 +75,7 @@ class Sink:
         self._file.close()
 
     def abandon(self) -> None:
-        """Close it as it is on the disk."""
+        """Close it without writing more."""
         self._file.abandon()
 
 
@@ -158,10 +157,10 @@ class McapSink(Sink):
     def mapping(self, document: dict[str, Any], stamp_ns: int) -> None:
         """Take what makes samples of the frames."""
         fields = {key: value for key, value in document.items() if key not in ("text", "folder")}
-        self._put("mapping", stamp_ns, json.dumps(fields).encode())  # the joint file has a channel of its own
+        self._put("mapping", stamp_ns, json.dumps(fields).encode())  # the joint file has a separate channel
 
     def flush(self) -> None:
-        """Put everything on the disk, as a chunk of its own."""
+        """Write everything to disk as one chunk."""
         self._writer.flush()
         super().flush()
 
@@ -178,10 +177,10 @@ class McapSink(Sink):
 
 
 class _BlfWriter(can.BLFWriter):
-    """python-can's writer, whose containers can be closed early."""
+    """python-can's writer with early closing of containers."""
 
     def end_container(self) -> None:
-        """Write the container begun."""
+        """Write the open container."""
         self._flush()
 
 
@@ -207,7 +206,7 @@ class CanSink(Sink):
             }
             self._text = io.TextIOWrapper(self._file, encoding="ascii", newline="\n", write_through=True)
             self._writer = kinds[suffix](self._text)
-        # Formats that number their channels know no names.
+        # Formats with numbered channels have no names.
         self._channel: str | int = joint.bus.channel.replace(" ", "_") if suffix == ".log" else 0
 
     def frame(self, stamp_ns: int, cob_id: int, data: bytes) -> None:
@@ -224,7 +223,7 @@ class CanSink(Sink):
         self.counts["frame"] += 1
 
     def mapping(self, document: dict[str, Any], stamp_ns: int) -> None:
-        """Take what the file beside the log says."""
+        """Take the content of the mapping file."""
         self._beside = json.dumps(document, indent=1) + "\n"
 
     def flush(self) -> None:

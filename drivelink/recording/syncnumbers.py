@@ -1,8 +1,7 @@
-"""Numbers for the SYNCs of a recording: the following stamps separate a late stamp from a lost SYNC.
+"""Numbers the SYNCs of a recording; later stamps distinguish a late stamp from a lost SYNC.
 
-Recorded stamps are often times of arrival, and these come in bursts. A SYNC that was only late is followed
-by ones that catch up; after a lost one all others stay behind. `SyncClock`, which has to decide at once,
-cannot know.
+Recorded stamps are often arrival times, which come in bursts. After a late SYNC others catch up; after a lost
+one all stay behind. `SyncClock` has to decide at once and cannot distinguish them.
 """
 
 from __future__ import annotations
@@ -19,13 +18,13 @@ __all__ = ["SyncNumbering", "numbered_ahead", "numbered_at_once"]
 
 _LOG = logging.getLogger("drivelink.recording")
 
-_AHEAD = 64  # SYNCs that are looked at before one is numbered
-_EXTRA = -0.5  # periods before it was due: a SYNC of another master
+_AHEAD = 64  # later SYNCs used to number one
+_EXTRA = -0.5  # periods too early: a SYNC of another master
 _FOLLOW = 0.05  # of the deviation, per SYNC: the two clocks drift
 
 
 def numbered_at_once(frames: Iterable[LoggedFrame], period_s: float) -> Iterator[tuple[LoggedFrame, int]]:
-    """Each frame with the jump of its SYNC, decided as the live loop does that follows a SYNC."""
+    """Each frame with the jump of its SYNC, decided as in the live loop."""
     clock = SyncClock(period_s)
     for frame in frames:
         if frame.can_id == SYNC_COB_ID and frame.stamp_ns != NO_STAMP:
@@ -35,7 +34,7 @@ def numbered_at_once(frames: Iterable[LoggedFrame], period_s: float) -> Iterator
 
 
 def numbered_ahead(frames: Iterable[LoggedFrame], period_s: float) -> Iterator[tuple[LoggedFrame, int]]:
-    """Each frame with the jump of its SYNC: whole periods since the one before, 0 for one that is not due."""
+    """Each frame with the jump of its SYNC: periods since the previous one, 0 if not due."""
     numbering = SyncNumbering(period_s)
     for frame in frames:
         yield from numbering.push(frame)
@@ -43,11 +42,11 @@ def numbered_ahead(frames: Iterable[LoggedFrame], period_s: float) -> Iterator[t
 
 
 class SyncNumbering:
-    """Numbers the SYNCs of a stream, each when enough others have followed it.
+    """Numbers the SYNCs of a stream once enough others have followed.
 
     Args:
         period_s: the communication cycle.
-        measure: take the period that the first SYNCs have, where that is another one.
+        measure: use the period of the first SYNCs if it differs.
     """
 
     def __init__(self, period_s: float, *, measure: bool = False) -> None:
@@ -55,11 +54,11 @@ class SyncNumbering:
         self._measure = measure
         self._last: int | None = None
         self._due_ns: float | None = None
-        self._cycles: deque[list[LoggedFrame]] = deque()  # each SYNC that waits, and what follows it
+        self._cycles: deque[list[LoggedFrame]] = deque()  # each waiting SYNC and its frames
         self._stamps: deque[int] = deque()  # of these SYNCs
 
     def push(self, frame: LoggedFrame) -> list[tuple[LoggedFrame, int]]:
-        """Take a frame; returns those that are certain now, each with its jump."""
+        """Take a frame; return the frames decided now, each with its jump."""
         if frame.can_id == SYNC_COB_ID:
             self._cycles.append([frame])
             self._stamps.append(frame.stamp_ns)
@@ -70,11 +69,11 @@ class SyncNumbering:
         return [(frame, 1)]
 
     def rest(self) -> list[tuple[LoggedFrame, int]]:
-        """The stream has ended: everything that still waits."""
+        """End the stream; return all waiting frames."""
         return [numbered for _ in range(len(self._cycles)) for numbered in self._released()]
 
     def _released(self) -> list[tuple[LoggedFrame, int]]:
-        """The first cycle that waits."""
+        """Release the first waiting cycle."""
         sync, *others = self._cycles.popleft()
         return [(sync, self._jump()), *[(frame, 1) for frame in others]]
 
@@ -85,7 +84,7 @@ class SyncNumbering:
             self._period_ns = measured.period_s * 1e9
 
     def _jump(self) -> int:
-        """The jump of the first SYNC that waits."""
+        """The jump of the first waiting SYNC."""
         stamps = self._stamps
         if self._measure:
             self._measure = False

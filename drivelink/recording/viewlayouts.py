@@ -16,7 +16,7 @@ _COLOURS = ("#0072b2", "#9ec9e2", "#9ec9e2", "#d55e00", "#009e73")
 
 
 def _plots(motors: int) -> list[tuple[str, str, list[str]]]:
-    """(title, topic, fields) of each plot; its first field is drawn strongest."""
+    """(title, topic, fields) of each plot; the first field is emphasised."""
     numbers = range(1, motors + 1)
     band = ["stiffness_nm_rad", "stiffness_low_nm_rad", "stiffness_high_nm_rad"]
     return [
@@ -34,7 +34,7 @@ def write_layouts(joint: JointFile, folder: Path) -> list[Path]:
 
     Args:
         joint: the joint; its name is part of the topics.
-        folder: where they go.
+        folder: of the files.
 
     Raises:
         OSError: they cannot be written.
@@ -85,7 +85,7 @@ def _foxglove(joint: str, plots: Sequence[tuple[str, str, list[str]]]) -> str:
 
 
 def _column(panels: list[str]) -> object:
-    """Panels one below the other, of equal height."""
+    """Stack panels of equal height."""
     if len(panels) == 1:
         return panels[0]
     share = 100.0 / len(panels)

@@ -1,7 +1,7 @@
-"""The systemd unit of a joint, and the network files that set its CAN interface up.
+"""The systemd unit of a joint, and the network files for its CAN interface.
 
-The unit runs the installed `drivelink` on the joint file where both are. What of them lies below a home
-directory, which the unit otherwise does not see, is let in read-only.
+The unit runs the installed `drivelink` on the joint file in place. Parts below a home directory, otherwise
+invisible to the unit, are mounted read-only.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _BARE = re.compile(r"[A-Za-z0-9_./:@+-]+")
 
 @dataclass(frozen=True, slots=True)
 class Installation:
-    """What is written for a joint: files by their path below the root, and the unit's name."""
+    """Files for a joint by their path below the root, and the unit's name."""
 
     unit: str
     files: dict[Path, str]
@@ -41,7 +41,7 @@ def unit_name(joint: str) -> str:
     """The unit of a joint.
 
     Raises:
-        UsageError: the name is none that systemd takes.
+        UsageError: not a name for systemd.
     """
     if not _NAME.fullmatch(joint):
         raise UsageError(f'joint name: a unit takes letters, digits, ".", "-" and "_", got "{joint}"')
@@ -63,13 +63,13 @@ def installation(
         joint: the joint file's content.
         path: where it is.
         executable: the installed `drivelink`.
-        bus: options of `drivelink run` that name the bus, where it is another than the joint file's.
+        bus: options of `drivelink run` for another bus than the joint file's.
         allow: addresses beside this machine that may connect, e.g. "10.0.0.0/24".
         credentials: "NAME=FILE": keys that the unit hands to the daemon as
             `/run/credentials/drivelink@JOINT.service/NAME`.
 
     Raises:
-        UsageError: something of it cannot be in a unit.
+        UsageError: a value that a unit cannot contain.
     """
     unit, path = unit_name(joint.name), path.absolute()
     interface, channel = joint.bus.interface, joint.bus.channel
@@ -105,12 +105,12 @@ def installation(
 
 
 def network_files(channel: str) -> tuple[Path, ...]:
-    """Where the files of a CAN interface are, those that there may be."""
+    """Possible paths of a CAN interface's network files."""
     return tuple(NETWORKS / f"80-drivelink-{channel}.{kind}" for kind in ("network", "netdev"))
 
 
 def _network(channel: str, bitrate: int) -> dict[Path, str]:
-    """The interface as systemd-networkd sets it up: bit rate, and up again after bus-off."""
+    """Configuration of the interface for systemd-networkd: bit rate, restart after bus-off."""
     network, netdev = network_files(channel)
     head = "# Written by `drivelink service install`.\n"
     if channel.startswith("vcan"):
@@ -123,7 +123,7 @@ def _network(channel: str, bitrate: int) -> dict[Path, str]:
 
 
 def _python() -> Iterable[Path]:
-    """Where this Python and the package are."""
+    """Directories of Python and the package."""
     yield Path(sys.prefix)
     yield Path(sys.base_prefix)
     yield Path(sysconfig.get_paths()["purelib"])
@@ -131,28 +131,28 @@ def _python() -> Iterable[Path]:
 
 
 def _below_home(places: Iterable[Path]) -> list[Path]:
-    """Those below a home directory, none twice or inside another."""
+    """Distinct paths below a home directory, none inside another."""
     below = {place.resolve() for place in places} | set(places)
     below = {place for place in below if any(home in place.parents for home in _HOMES)}
     return sorted(place for place in below if not below & set(place.parents))
 
 
 def _plain(path: Path) -> str:
-    """A path as it stands in a unit, where spaces and percent signs mean something."""
+    """A path for a unit, where spaces and percent signs are special."""
     if not _BARE.fullmatch(str(path)):
         raise UsageError(f"{path}: expected a path without spaces and special characters for a unit")
     return str(path)
 
 
 def _word(text: str) -> str:
-    """An option as it stands in a unit."""
+    """An option for a unit."""
     if not _BARE.fullmatch(text):
         raise UsageError(f"{text}: expected no spaces and special characters for a unit")
     return text
 
 
 def _escape(channel: str) -> str:
-    """A name as systemd writes it in the name of a unit."""
+    """A name escaped for the name of a unit."""
     return channel.replace("-", "\\x2d")
 
 

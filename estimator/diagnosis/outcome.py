@@ -15,10 +15,10 @@ from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.diagnosis.result import Curve, Finding, Refitted, Rival, Series
 from estimator.diagnosis.search import Search
 from estimator.diagnosis.stack import curve_columns
-from estimator.diagnosis.stiffness import SIGMA_95, middle
+from estimator.diagnosis.stiffness import middle
 from estimator.effects import LIBRARY
 from estimator.model import ParameterValue
-from estimator.sample import FloatArray
+from estimator.sample import SIGMA_95, FloatArray
 
 __all__ = ["alignment_of", "curves_of", "findings_of", "rivals_of", "series_of", "transmissions_of"]
 

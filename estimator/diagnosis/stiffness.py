@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -10,13 +9,12 @@ import numpy as np
 from estimator.diagnosis.covariance import hac_covariance
 from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.diagnosis.result import StiffnessCurve
-from estimator.sample import FloatArray
+from estimator.sample import SIGMA_95, FloatArray
 from estimator.transmissions import TransmissionModel
 
-__all__ = ["SIGMA_95", "Middle", "middle", "stiffness_curves"]
+__all__ = ["Middle", "middle", "stiffness_curves"]
 
 _POINTS = 121
-SIGMA_95 = NormalDist().inv_cdf(0.975)
 
 
 class Middle(NamedTuple):

@@ -265,6 +265,7 @@ class JointPipeline:
         model_monitor: likewise.
         history: the last samples.
         estimate: the last one, None before the first.
+        status: its bits of `Status`, likewise.
         external: likewise; None too where nothing is declared of the link.
         sample: what the last estimate was made from; None where it was carried on.
         missed: cycles that gave no sample.
@@ -289,6 +290,8 @@ class JointPipeline:
     def history(self) -> History: ...
     @property
     def estimate(self) -> Estimate | None: ...
+    @property
+    def status(self) -> int | None: ...
     @property
     def external(self) -> External | None: ...
     @property

@@ -10,7 +10,7 @@ import pytest
 from drivelink._core import LatencyHistogram
 from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor
-from estimator.sample import Estimate, Status
+from estimator.sample import Status
 
 
 def test_percentiles_are_those_of_the_durations() -> None:
@@ -111,9 +111,7 @@ def test_the_log_says_when_the_model_alarm_comes_and_goes_and_what_to_do(
         Status.VALID,
         Status.VALID,
     ):
-        pipeline = SimpleNamespace(
-            estimate=Estimate(1, int(status), 1.0, 1.0, 1.0, ()), model_monitor=model_monitor
-        )
+        pipeline = SimpleNamespace(status=int(status), model_monitor=model_monitor)
         supervisor._check_model(SimpleNamespace(name="elbow", pipeline=pipeline))  # type: ignore[arg-type]
         if status == Status.MODEL_ALARM:
             described |= {"residual_nm": [0.02, 0.01], "location": ""}

@@ -78,16 +78,14 @@ def _produce(loop: CycleLoop) -> None:
 def _gather(loop: CycleLoop, deadline_ns: int, expectation: _Expectation) -> None:
     """Receive until the cycle is complete; housekeeping then, or from the middle of the period on."""
     clock = time.monotonic_ns
-    complete = loop.complete
-    if not complete:
-        left = loop.sync_ns + int(expectation.after_ns) - clock()
-        if left > 0:
-            time.sleep(left * 1e-9)
-        loop.receive()
-        at_once = loop.complete
-        complete = at_once or _receive_until(loop, deadline_ns - loop.period_ns // 2)
-        if complete:
-            expectation.update(loop.received_ns - loop.sync_ns, at_once)
+    left = loop.sync_ns + int(expectation.after_ns) - clock()
+    if left > 0:
+        time.sleep(left * 1e-9)
+    loop.receive()
+    at_once = loop.complete
+    complete = at_once or _receive_until(loop, deadline_ns - loop.period_ns // 2)
+    if complete:
+        expectation.update(loop.received_ns - loop.sync_ns, at_once)
     now = clock()
     loop.housekeeping.run(now, deadline_ns - now)
     if not complete:

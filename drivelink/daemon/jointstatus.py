@@ -20,22 +20,26 @@ from estimator.sample import ExternalStatus, Status
 
 __all__ = ["JointStatus"]
 
-_TIMING_EVERY = 4  # documents between percentiles, which cost more than all the rest
+_MODEL_ALARM, _STALE = int(Status.MODEL_ALARM), int(Status.STALE)
+_TIMING_EVERY = 4  # documents between percentiles
 
 # In the order of the status document; bits of single cycles are events or not shown.
-_QUALITY = (
-    Status.VALID,
-    Status.OBSERVABLE,
-    Status.GAP,
-    Status.CHANGED,
-    Status.MODEL_ALARM,
-    Status.INPUT_REJECTED,
-    Status.RESTARTED,
-    Status.DRIVE_FAULT,
-    Status.BUS_FAULT,
-    Status.STALE,
-    Status.UNTIMED,
-    Status.CONTRADICTED,
+_QUALITY = tuple(
+    (str(bit.name).lower(), int(bit))
+    for bit in (
+        Status.VALID,
+        Status.OBSERVABLE,
+        Status.GAP,
+        Status.CHANGED,
+        Status.MODEL_ALARM,
+        Status.INPUT_REJECTED,
+        Status.RESTARTED,
+        Status.DRIVE_FAULT,
+        Status.BUS_FAULT,
+        Status.STALE,
+        Status.UNTIMED,
+        Status.CONTRADICTED,
+    )
 )
 
 
@@ -132,16 +136,16 @@ class JointStatus:
 
     def _state(self) -> str:
         loop, loop_joint = self._loop, self._loop_joint
-        estimate = loop_joint.pipeline.estimate
+        status = loop_joint.pipeline.status
         if isinstance(loop.source, LostSource):
             return "bus lost"
         if loop_joint.fault:
             return "fault"
         if loop.silent:
             return "no SYNC"
-        if estimate is None:
+        if status is None:
             return "waiting for samples" if loop.cycles else "starting"
-        if estimate.status & Status.STALE:
+        if status & _STALE:
             return "stale"
         return "running"
 
@@ -167,14 +171,12 @@ class JointStatus:
         ]
 
     def _quality(self) -> dict[str, bool]:
-        estimate = self._loop_joint.pipeline.estimate
-        status = int(estimate.status) if estimate is not None else 0
-        return {str(bit.name).lower(): bool(status & bit) for bit in _QUALITY}
+        status = self._loop_joint.pipeline.status or 0
+        return {name: bool(status & bit) for name, bit in _QUALITY}
 
     def _alarm(self) -> dict[str, Any]:
         monitor = self._loop_joint.pipeline.model_monitor
-        estimate = self._loop_joint.pipeline.estimate
-        active = estimate is not None and bool(estimate.status & Status.MODEL_ALARM)
+        active = bool((self._loop_joint.pipeline.status or 0) & _MODEL_ALARM)
         return {"active": active, **(monitor.describe() if monitor is not None else {})}
 
     def _external(self) -> dict[str, Any] | None:

@@ -43,7 +43,7 @@ __all__ = ["Daemon", "ServedJoint"]
 logger = logging.getLogger("drivelink")
 
 _STATUS_S = 0.25
-_CHECK_S = 0.05
+_CHECK_S = 0.1
 _ANSWER_S = 0.05
 _FILE_S = 0.2
 _COLLECT_S = 5.0

@@ -265,12 +265,13 @@ class Supervisor:
 
     def _check_model(self, loop_joint: LoopJoint) -> None:
         """Report begin and end of the model alarm, its amount and what to do."""
-        estimate, monitor = loop_joint.pipeline.estimate, loop_joint.pipeline.model_monitor
-        if estimate is None:
+        status = loop_joint.pipeline.status
+        if status is None:
             return
-        alarm = bool(estimate.status & _MODEL_ALARM)
+        alarm = bool(status & _MODEL_ALARM)
         if alarm == (loop_joint.name in self._alarmed):
             return
+        monitor = loop_joint.pipeline.model_monitor
         if alarm:
             self._alarmed.add(loop_joint.name)
             self._events.say(
@@ -293,7 +294,7 @@ class Supervisor:
     def _check_readings(self, loop_joint: LoopJoint) -> None:
         """Report begin and end of a suspicion against a reading."""
         suspicion = (
-            loop_joint.pipeline.estimator.suspicion() if loop_joint.pipeline.estimate is not None else None
+            loop_joint.pipeline.estimator.suspicion() if loop_joint.pipeline.status is not None else None
         )
         key = f"reading {loop_joint.name}"
         if suspicion is None:

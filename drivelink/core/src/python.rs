@@ -799,6 +799,11 @@ impl JointPipeline {
     }
 
     #[getter]
+    fn status(&self) -> Option<u32> {
+        lock(&self.state).last().map(|tick| tick.estimate.status)
+    }
+
+    #[getter]
     fn external<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
         let last = lock(&self.state).last().copied();
         last.and_then(|tick| tick.external).map(|external| external_object(py, &external)).transpose()

@@ -10,12 +10,14 @@
 //! interval and can be followed, is followed; where a reading explains it better, or nothing does, it is
 //! suspected, and nothing is valid until the reference holds again.
 
+use crate::identification::MEMORY_S;
 use crate::isolation::{Change, Explanation, Verdict};
+use crate::kalman;
 use crate::student::f_quantile;
 
-const TAILS: f64 = 4.0; // degrees of freedom of the level over the filters' correlation time …
-/// … and over the window, in which bursts average out.
-pub const WINDOW_TAILS: f64 = 8.0;
+/// Degrees of freedom of the noise's level over the filters' correlation time; over the window bursts average out, as
+/// over the memory of [`crate::kalman`].
+pub const TAILS: f64 = 4.0;
 /// Over which innovations are averaged: the correlation time of the filters …
 pub const UPDATES: usize = 3;
 const EXPLAINED: usize = 10; // … and over which they have to be as foreseen before the curve is believed again
@@ -26,7 +28,6 @@ const LEAST: f64 = 0.004; // of the torque: no smaller step is called one …
 pub const LEAST_IN_WINDOW: f64 = 0.002;
 const FLUSH_DELAYS: f64 = 2.6; // until less than a thousandth of what was before a change is in the filters
 const FOLLOW_S: f64 = 0.6; // after an alarm, in which the change is still being followed
-const LONGEST_S: f64 = 20.0; // without an explanation, as the memory is: from then on it starts anew
 const WINDOW_S: f64 = 2.0; // of the window while all is well …
 const LONG_WINDOW_S: f64 = 6.0; // … and while a change is being explained
 const LEAST_UPDATES: f64 = 15.0; // in a window that is judged …
@@ -97,7 +98,7 @@ impl ChangeDetection {
         let in_an_hour = false_alarms_per_hour / 3600.0;
         let mut limits = [0.0; QUANTILES];
         for (i, limit) in limits.iter_mut().enumerate() {
-            *limit = f_quantile(2f64.powi(i as i32), WINDOW_TAILS, in_an_hour * WINDOW_S);
+            *limit = f_quantile(2f64.powi(i as i32), kalman::TAILS, in_an_hour * WINDOW_S);
         }
         ChangeDetection {
             dt: dt_s,
@@ -234,7 +235,7 @@ impl ChangeDetection {
         }
         let seen_s = verdict.updates * self.dt;
         self.explained_by = explained_by;
-        if since_s > LONGEST_S && explained_by.is_none() {
+        if since_s > MEMORY_S && explained_by.is_none() {
             return self.end(Action::Relearn);
         }
         if explained_by.is_none() && seen_s > WINDOW_S {

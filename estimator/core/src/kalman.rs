@@ -23,7 +23,8 @@ const MEMORY: f64 = 500.0; // updates over which the noise's autocorrelation is 
 const QUICK: f64 = 3.0; // the noise is an average over this share, one in so many, of the updates so far
 const HALVED: f64 = 6.0; // updates in which the noise assumed at the start may at most be halved
 const LEAST_FREEDOM: f64 = 4.0; // independent errors that are left over parameters
-const TAILS: f64 = 8.0; // degrees of freedom of the noise's t distribution: an outlier in a few hundred
+/// Degrees of freedom of the noise's t distribution: an outlier in a few hundred.
+pub const TAILS: f64 = 8.0;
 
 /// Constant parameters x from scalar equations y = h x + e with coloured e; all in scaled units.
 #[derive(Clone, Debug)]

@@ -13,7 +13,10 @@ use crate::settings::{Priors, Settings};
 use crate::signals::{Channel, Excitation, Filters, Signals};
 
 const DUE_S: f64 = 0.1; // of updates between two looks at a nonlinear law's linearisation
-const USEFUL: f64 = 0.25; // relative standard deviation of the stiffness up to which it is of use
+/// Relative error up to which an estimate is of use: standard deviation of the stiffness over the stiffness, and rms
+/// of what the curve leaves of the balance over the balance's own. Above it, the 95 % interval is wider than
+/// 0.6 to 1.4 times the number.
+const USEFUL: f64 = 0.2;
 const DRIFT: f64 = 1e-4; // relative growth of the standard deviation per second held
 const RESTED_S: f64 = 0.05; // without motion: from then on the interval grows …
 const WIDEST: f64 = 0.02; // … up to this
@@ -22,8 +25,7 @@ const VARIES_S: f64 = 2.0; // over which the balance's variance is taken: a cons
 const VARIED_S: f64 = 30.0; // … and how long a lively phase is remembered
 const QUIET: f64 = 0.25; // of the liveliest variance: the least that misses are held against
 const EXPLAINED_S: f64 = 0.3; // over which the curve is held against the balance
-const UNEXPLAINED: f64 = 0.04; // share of that variance that the curve may miss …
-const UNEXPLAINED_LOCAL: f64 = 0.5; // … and the black box, which sees the derivative of both
+const USEFUL_LOCAL: f64 = 0.7; // the same of the black box's balance, a derivative: noise grows by the bandwidth over ω
 const FIRST_S: f64 = 0.12; // of updates that are not held against a curve which has only begun
 const BEYOND: f64 = 1.5; // times the largest deflection behind the filter: no more is known of the curve
 const EDGE: f64 = 0.98; // of where a law ends
@@ -57,8 +59,9 @@ impl Fit {
         self.missed += (dt / EXPLAINED_S).min(1.0) * (innovation * innovation - self.missed);
     }
 
+    /// Whether what is missed is at most this share of the balance, in rms.
     fn is_good(&self, share: f64) -> bool {
-        self.missed <= share * self.varies.max(QUIET * self.varied)
+        self.missed <= share * share * self.varies.max(QUIET * self.varied)
     }
 }
 
@@ -396,7 +399,7 @@ impl TransmissionEstimator {
 
     /// Whether the curve leaves only a part of the balance unexplained.
     fn explains(&self) -> bool {
-        self.fit.is_good(if self.identification.black_box { UNEXPLAINED_LOCAL } else { UNEXPLAINED })
+        self.fit.is_good(if self.identification.black_box { USEFUL_LOCAL } else { USEFUL })
     }
 
     /// Whether the estimate has long been where it cannot be: no way back by small steps.

@@ -1,9 +1,9 @@
 //! What was learned some time ago, while all was well, and what the balance of the last seconds says of it.
 
 use super::{COULOMB, DEFLECTION_OFFSET, DELAY, OFFSET, OnlineIdentification};
-use crate::change_detection::{LEAST_IN_WINDOW, UPDATES, WINDOW_TAILS};
+use crate::change_detection::{LEAST_IN_WINDOW, UPDATES};
 use crate::isolation::{CHANGES, Change, Explanation, Isolation, Layout, READINGS, Verdict};
-use crate::kalman::{Kalman, SIZE, Vector};
+use crate::kalman::{Kalman, SIZE, TAILS, Vector};
 use crate::linear_algebra::{dot, times};
 use crate::linearisation::bound;
 use crate::signals::Signals;
@@ -115,7 +115,7 @@ impl OnlineIdentification {
         let reference = self.reference.as_ref()?;
         let (noise, correlated) =
             (Self::reference_noise(reference), reference.correlation().max(UPDATES as f64));
-        Some(self.window.judge(reference, &self.layout(), noise, correlated, WINDOW_TAILS))
+        Some(self.window.judge(reference, &self.layout(), noise, correlated, TAILS))
     }
 
     /// What was learned since the reference is void.

@@ -13,14 +13,24 @@ multiplications of a tick are counted.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
 from pathlib import Path
 
 import numpy as np
-from ensembles import CASES, USABLE, T, draw_joints
+from ensembles import (
+    CASES,
+    SETTLED_S,
+    USABLE,
+    T,
+    arguments,
+    draw_joints,
+    judged,
+    percent,
+    summary,
+    table,
+)
 
 from drivelink.output.progress import track
 from estimator import EstimatorSettings, make_estimator
@@ -173,25 +183,12 @@ class Filter:
         return 2 * dense * self.n + 2 * (2 * self.n**2 + 3 * self.n)
 
 
-def measured(stiffness, std, truth, usable):
-    """(usable share, relative RMSE, coverage) of one joint."""
-    error = stiffness[usable] - truth[usable]
-    after = usable[round(5 / T) :]
-    if not usable.any():
-        return 0.0, np.nan, np.nan
-    return (
-        np.mean(after),
-        np.sqrt(np.mean((error / truth[usable]) ** 2)),
-        np.mean(np.abs(error) < 1.96 * std[usable]),
-    )
-
-
 def compare(case, n_joints, seconds, seed):
     """One row."""
     drawn = list(draw_joints(case, n_joints, seconds, seed))
     _, model, order, *_ = CASES[case]
     steps, ours, us = len(drawn[0].record.link_position_rad), [], []
-    late = np.arange(steps) * T >= 5.0
+    late = np.arange(steps) * T >= SETTLED_S
     for joint in drawn:
         estimator, samples = make_estimator(joint.model, EstimatorSettings(), T), joint.record.samples()
         samples = list(samples)
@@ -199,7 +196,7 @@ def compare(case, n_joints, seconds, seed):
         out = np.array([estimator.step(sample)[:5] for sample in samples])
         us.append(1e6 * (time.process_time() - start) / steps)
         usable = (out[:, 1].astype(int) & USABLE == USABLE) & late
-        ours.append(measured(out[:, 3], out[:, 4], joint.stiffness_nm_rad, usable))
+        ours.append(judged(out[:, 3], out[:, 4], joint.stiffness_nm_rad, usable))
     with np.errstate(all="ignore"):
         ekf = Filter(Law(model, order), drawn)
         stepped = np.array([ekf.step(k) for k in range(1, steps)])  # (steps, 2, joints)
@@ -207,7 +204,7 @@ def compare(case, n_joints, seconds, seed):
         for j, joint in enumerate(drawn):
             stiffness, std = (np.concatenate([[np.nan], stepped[:, i, j]]) for i in (0, 1))
             usable = late & np.isfinite(stiffness) & (std < 0.25 * stiffness)
-            theirs.append(measured(stiffness, std, joint.stiffness_nm_rad, usable))
+            theirs.append(judged(stiffness, std, joint.stiffness_nm_rad, usable))
         single = Filter(Law(model, order), drawn[:1])
         start = time.process_time()
         for k in range(1, 1000):
@@ -215,41 +212,27 @@ def compare(case, n_joints, seconds, seed):
     row = {"case": case, "ours_us": float(np.median(us)), "ekf_numpy_us": 1e3 * (time.process_time() - start)}
     row |= {"ekf_states": ekf.n, "ekf_multiplications": ekf.multiplications()}
     for name, found in (("ours", ours), ("ekf", theirs)):
-        usable, rmse, coverage = np.array(found).T
-        row |= {
-            f"{name}_usable": float(np.mean(usable)),
-            f"{name}_median": float(np.nanmedian(rmse)),
-            f"{name}_worst": float(np.nanmax(rmse)) if np.isfinite(rmse).any() else None,
-            f"{name}_coverage": float(np.nanmean(coverage)),
-        }
+        row |= {f"{name}_{key}": value for key, value in summary(found).items()}
     return row
 
 
 def main():
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--joints", type=int, default=8)
-    parser.add_argument("--seconds", type=float, default=20.0)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--cases", default=",".join(name.replace(",", ";") for name in CASES))
-    parser.add_argument("--json", action="store_true")
-    args = parser.parse_args()
-    names = [name.replace(";", ",") for name in args.cases.split(",")]
-    rows = [compare(name, args.joints, args.seconds, args.seed) for name in track(names, "cases")]
+    args = arguments(__doc__)
+    rows = [compare(name, args.joints, args.seconds, args.seed) for name in track(args.cases, "cases")]
     if args.json:
         print(json.dumps(rows))
         return
-    print("| springs | usable: ours, EKF | RMSE %, median: ours, EKF | worst | 95 % intervals cover |")
-    print("|---|---|---|---|---|")
-    for r in rows:
-        columns = [
-            f"{100 * r[f'ours_{key}']:.{digits}f}, {100 * r[f'ekf_{key}']:.{digits}f}"
-            if r[f"ekf_{key}"] is not None
-            else f"{100 * r[f'ours_{key}']:.{digits}f}, none"
-            for key, digits in (("usable", 0), ("median", 2), ("worst", 2), ("coverage", 0))
-        ]
-        print(f"| {r['case']} | " + " | ".join(columns) + " |")
+    measures = {"usable": 0, "rmse_relative_median": 2, "rmse_relative_worst": 2, "coverage": 0}
+    table(
+        ("springs", "usable %: ours, EKF", "RMSE %, median", "worst", "95 % intervals cover %"),
+        (
+            (
+                r["case"],
+                *(f"{percent(r[f'ours_{m}'], d)}, {percent(r[f'ekf_{m}'], d)}" for m, d in measures.items()),
+            )
+            for r in rows
+        ),
+    )
     ours, theirs = (np.median([r[key] for r in rows]) for key in ("ours_us", "ekf_numpy_us"))
     print(f"\nCPU of a tick: ours {ours:.1f} µs (compiled), the EKF {theirs:.0f} µs (numpy, one joint);")
     most = max(rows, key=lambda r: r["ekf_states"])

@@ -17,6 +17,7 @@ import numpy as np
 from estimator.diagnosis.bandwidth import choose_bandwidth
 from estimator.diagnosis.choices import choice, least_rows
 from estimator.diagnosis.covariance import design_effects, hac_covariance
+from estimator.diagnosis.frame import Frame
 from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.diagnosis.search import Search
 from estimator.diagnosis.stiffness import middle
@@ -32,6 +33,15 @@ _LOOKED_AT = 33  # deflections from zero to the largest one
 _HIGHEST_ORDER = 4
 _DELAYS = ("encoder_delay", "torque_delay")  # a zero of the encoders is always there
 _OF_RIGID = ("coulomb_friction", "torque_offset")
+_NUISANCES = {  # everyday errors by the names of `TransmissionFit.nuisance_std`
+    "inertia": "motor_inertia",
+    "damping": "viscous_damping",
+    "coulomb": "coulomb_friction",
+    "offset": "torque_offset",
+    "shift": "deflection_offset",
+    "link_delay": "encoder_delay",
+    "torque_delay": "torque_delay",
+}
 
 Key = tuple[str, int | None]  # an everyday error and its motor
 
@@ -315,6 +325,11 @@ def _friction(joint: JointFit, motor: int) -> FloatArray:
     return np.asarray(design[:, mine] @ x[mine], dtype=np.float64)
 
 
+def _rows_of(frames: Sequence[Frame], motor: int, coordinate: str) -> FloatArray:
+    """(rows,) a motor's filtered coordinate over all recordings."""
+    return np.concatenate([f.project(getattr(f.motors[motor], coordinate)) for f in frames])
+
+
 def transmission_fits(joint: JointFit) -> list[TransmissionFit]:
     """The result of a fit for each motor and its transmission."""
     problem, fitted = joint.problem, joint.fitted
@@ -337,13 +352,10 @@ def transmission_fits(joint: JointFit) -> list[TransmissionFit]:
         std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         torque = (spring + fitted.regression.design[:, mine] @ fitted.posterior.x[mine])[rows]
         measured = problem.torque()[rows]
-        inertia, inertia_std = joint.mean("motor_inertia", i)
-        damping, damping_std = joint.mean("viscous_damping", i)
-        coulomb, coulomb_std = joint.mean("coulomb_friction", i)
-        offset, offset_std = joint.mean("torque_offset", i)
-        shift, shift_std = joint.mean("deflection_offset", i)
-        link_delay, link_delay_std = joint.mean("encoder_delay", None)
-        torque_delay, torque_delay_std = joint.mean("torque_delay", i)
+        errors = {
+            name: joint.mean(error, None if error == "encoder_delay" else i)
+            for name, error in _NUISANCES.items()
+        }
         made.append(
             TransmissionFit(
                 model=RIGID if law is None else law.name,
@@ -351,31 +363,21 @@ def transmission_fits(joint: JointFit) -> list[TransmissionFit]:
                 std=law.parameters(std) if law is not None and excited else {},
                 alpha=alpha,
                 covariance=covariance,
-                deflection_rad=np.concatenate([f.project(f.motors[i].deflection) for f in frames]),
-                deflection_rate_rad_s=np.concatenate(
-                    [f.project(f.motors[i].deflection_rate) for f in frames]
-                ),
-                velocity_rad_s=np.concatenate([f.project(f.motors[i].velocity) for f in frames]),
+                deflection_rad=_rows_of(frames, i, "deflection"),
+                deflection_rate_rad_s=_rows_of(frames, i, "deflection_rate"),
+                velocity_rad_s=_rows_of(frames, i, "velocity"),
                 torque_nm=torque + left[rows],
                 unexplained_nm=(left + _friction(joint, i))[rows],
                 error_rms_nm=float(np.sqrt(np.mean(left[rows] ** 2))),
                 torque_rms_nm=float(np.std(torque if excited else measured)),
-                inertia_kg_m2=motor.inertia_kg_m2 + inertia,
-                viscous_damping_nm_s_rad=max(motor.viscous_damping_nm_s_rad + damping, 0.0),
-                coulomb_nm=coulomb,
-                offset_nm=offset,
-                deflection_offset_rad=shift,
-                link_delay_s=link_delay if motor.flexible else 0.0,
-                torque_delay_s=torque_delay,
-                nuisance_std={
-                    "inertia": inertia_std,
-                    "damping": damping_std,
-                    "coulomb": coulomb_std,
-                    "offset": offset_std,
-                    "shift": shift_std,
-                    "link_delay": link_delay_std,
-                    "torque_delay": torque_delay_std,
-                },
+                inertia_kg_m2=motor.inertia_kg_m2 + errors["inertia"][0],
+                viscous_damping_nm_s_rad=max(motor.viscous_damping_nm_s_rad + errors["damping"][0], 0.0),
+                coulomb_nm=errors["coulomb"][0],
+                offset_nm=errors["offset"][0],
+                deflection_offset_rad=errors["shift"][0],
+                link_delay_s=errors["link_delay"][0] if motor.flexible else 0.0,
+                torque_delay_s=errors["torque_delay"][0],
+                nuisance_std={name: std for name, (_, std) in errors.items()},
                 excited=excited,
             )
         )

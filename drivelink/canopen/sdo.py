@@ -167,6 +167,7 @@ class _Transfer:
         self._toggle = 0
         self._segmented = False
         self._declared: int | None = None
+        self._most = 0
         self.answered = False
 
     def first(self) -> bytes:
@@ -211,19 +212,17 @@ class _Transfer:
             self._declared = int.from_bytes(data[4:8], "little")
         if self._declared is not None and self._declared > request.most:
             raise self._breach(_TOO_LONG, f"{self._declared} bytes, expected {request.most} at most")
+        self._most = request.most if self._declared is None else self._declared
         self._segmented = self.answered = True
         return b"\x60" + bytes(7)
 
     def _segment(self, data: bytes) -> bytes | None:
-        request = self.request
-        assert isinstance(request, Read)
         if (data[0] >> 4) & 1 != self._toggle:
             raise self._breach(_TOGGLE_ERROR, "a segment out of turn")
         part, last = data[1 : 8 - ((data[0] >> 1) & 7)], bool(data[0] & 0x01)
         self._buffer += part
-        most = request.most if self._declared is None else self._declared
-        if len(self._buffer) > most:
-            raise self._breach(_TOO_LONG, f"more than {most} bytes")
+        if len(self._buffer) > self._most:
+            raise self._breach(_TOO_LONG, f"more than {self._most} bytes")
         if last and self._declared is not None and len(self._buffer) < self._declared:
             raise self._breach(_TOO_SHORT, f"{len(self._buffer)} bytes after declaring {self._declared}")
         if last:

@@ -67,7 +67,7 @@ class SdoSniffer:
                 else:
                     self._segments = bytearray()
         elif command == 0 and self._writing and self._segments is not None:
-            self._segment(data)
+            self._segment(self._segments, data)
         elif command in (4, 5, 6):
             self._forget()
 
@@ -80,7 +80,7 @@ class SdoSniffer:
             self._forget()
             return
         if self._segments is not None and command in (0, 1):
-            self._confirm_segment(command, data)
+            self._confirm_segment(self._segments, command, data)
             return
         if (data[1] | data[2] << 8, data[3]) != self._address:
             return
@@ -92,17 +92,16 @@ class SdoSniffer:
             else:
                 self._segments = bytearray()
 
-    def _segment(self, data: bytes) -> None:
-        assert self._segments is not None
-        self._segments += data[1 : 8 - (data[0] >> 1 & 7)]
+    def _segment(self, segments: bytearray, data: bytes) -> None:
+        segments += data[1 : 8 - (data[0] >> 1 & 7)]
         self._last = bool(data[0] & 0x01)
-        if len(self._segments) > _MAX_BYTES:
+        if len(segments) > _MAX_BYTES:
             self._forget()
 
-    def _confirm_segment(self, command: int, data: bytes) -> None:
+    def _confirm_segment(self, segments: bytearray, command: int, data: bytes) -> None:
         """A segment of an upload, or the answer to one of a download."""
         if command == 0 and not self._writing:
-            self._segment(data)
+            self._segment(segments, data)
         elif command != 1 or not self._writing:
             return
         if self._last and self._segments is not None:

@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -195,11 +196,8 @@ def _add_effects(table: Table, effects: Iterable[Effect]) -> None:
 
 
 def _rows(name: str, value: ParameterValue, std: ParameterValue) -> list[tuple[str, float, float]]:
-    if isinstance(value, tuple) and isinstance(std, tuple):
-        return [(f"{name}[{i}]", x, s) for i, (x, s) in enumerate(zip(value, std, strict=True), start=1)]
-    assert isinstance(value, float)
-    assert isinstance(std, float)
-    return [(name, value, std)]
+    labels = [f"{name}[{i + 1}]" for i in range(len(value))] if isinstance(value, tuple) else [name]
+    return list(zip(labels, np.atleast_1d(value).tolist(), np.atleast_1d(std).tolist(), strict=True))
 
 
 def _remarks(one: TransmissionFit) -> list[str]:

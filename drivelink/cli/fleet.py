@@ -14,7 +14,7 @@ from drivelink.errors import UsageError
 from drivelink.output.progress import Meter
 
 if TYPE_CHECKING:
-    from drivelink.fleet.runner import Counts
+    from drivelink.fleet.runner import Counts, Settings
 
 _NEEDS = ("distributed", "fsspec", "pyarrow")
 _REPORT = "report"
@@ -101,7 +101,15 @@ def run(args: argparse.Namespace) -> int:
     return _run(args)
 
 
-def _run(args: argparse.Namespace) -> int:
+def _settings(args: argparse.Namespace) -> Settings:
+    """The settings of a run.
+
+    Raises:
+        UsageError: an option is wrong, or the folder of joints is missing.
+        FleetError: `--memory` is not a size.
+    """
+    from drivelink.fleet.runner import Settings
+
     if args.joints is None:
         raise UsageError("--joints: expected the folder of the joint files")
     if args.workers is not None and args.workers < 1:
@@ -111,10 +119,7 @@ def _run(args: argparse.Namespace) -> int:
     since = None if args.since is None else _since(args.since)
     if not args.joints.exists():
         raise UsageError(f"--joints: expected a folder of joint files, there is no {args.joints}")
-    from drivelink.fleet import runner, storage
-    from drivelink.fleet.joints import Joints
-
-    settings = runner.Settings(
+    settings = Settings(
         scheduler=args.scheduler,
         workers=args.workers,
         memory=args.memory,
@@ -122,7 +127,15 @@ def _run(args: argparse.Namespace) -> int:
         validate=args.validate,
         again=args.again,
     )
-    _ = settings.limit_bytes  # check the arguments first
+    _ = settings.limit_bytes  # raises
+    return settings
+
+
+def _run(args: argparse.Namespace) -> int:
+    settings = _settings(args)
+    from drivelink.fleet import runner, storage
+    from drivelink.fleet.joints import Joints
+
     joints = Joints.load(args.joints)
     sources, empty = storage.find(args.recordings)
     for pattern in empty:

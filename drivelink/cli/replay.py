@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,8 @@ from drivelink.recording.gate import Gathered, gate
 from drivelink.recording.mapping import joint_of
 from drivelink.recording.outputs import EstimatesFile, Publication, Summary
 from drivelink.recording.playback import Playback, Played, open_playback
+
+Taker = Callable[[Played], None]
 
 _INTERRUPTED = 130
 _METER_EVERY = 512
@@ -90,9 +92,8 @@ def run(args: argparse.Namespace) -> int:
     summary = Summary(playback.motors, keep=args.plots is not None)
     begin = time.perf_counter()
     gathered = Gathered(joint, playback.period_s)
-    interrupted = False
     with ExitStack() as stack:
-        takers: list[Callable[[Played], None]] = [summary.take, gathered.take]
+        takers: list[Taker] = [summary.take, gathered.take]
         if args.out is not None:
             linked = joint.link.dynamics is not None
             rows = EstimatesFile(args.out, playback.motors, linked=linked, force=args.force)
@@ -101,15 +102,7 @@ def run(args: argparse.Namespace) -> int:
         if args.publish or speed is not None:
             publication = _publication(args, joint, base_dir, speed, playback, stack)
             takers.append(publication.take)
-        try:
-            with Meter(f"replay {args.file.name}", playback.total) as meter:
-                for count, played in enumerate(playback, 1):
-                    for take in takers:
-                        take(played)
-                    if not count % _METER_EVERY:
-                        meter.update(count)
-        except KeyboardInterrupt:
-            interrupted = True
+        interrupted = _play(playback, takers, f"replay {args.file.name}")
     took_s = time.perf_counter() - begin
     live = is_frame_log(args.file, True if args.frames else None)
     warnings = [] if args.strict or interrupted else gathered.remarks(live=live)
@@ -117,22 +110,38 @@ def run(args: argparse.Namespace) -> int:
         print(f"{args.file}: warning: {line}", file=sys.stderr)
     made = summary.plot(args.plots, f"{joint.name}: {args.file.name}") if args.plots and summary.count else []
     if args.json:
-        files = {"estimates": str(args.out) if args.out else None, "plots": [str(path) for path in made]}
         document = {
             "recording": str(args.file),
             "joint": joint.name,
             **summary.document(),
-            **files,
+            "estimates": str(args.out) if args.out else None,
+            "plots": [str(path) for path in made],
             "warnings": warnings,
+            "took_s": round(took_s, 3),
+            "interrupted": interrupted,
         }
-        print(json.dumps({**document, "took_s": round(took_s, 3), "interrupted": interrupted}))
-        return _INTERRUPTED if interrupted else 0
-    print(f"{args.file}: {summary.text(took_s)}")
-    for path in made:
-        print(f"plot: {path}")
-    if args.out is not None:
-        print(f"estimates: {args.out}" + (" (up to the interruption)" if interrupted else ""))
+        print(json.dumps(document))
+    else:
+        print(f"{args.file}: {summary.text(took_s)}")
+        for path in made:
+            print(f"plot: {path}")
+        if args.out is not None:
+            print(f"estimates: {args.out}" + (" (up to the interruption)" if interrupted else ""))
     return _INTERRUPTED if interrupted else 0
+
+
+def _play(playback: Playback, takers: Sequence[Taker], title: str) -> bool:
+    """Pass every cycle to the takers; return whether Ctrl-C ended it."""
+    try:
+        with Meter(title, playback.total) as meter:
+            for count, played in enumerate(playback, 1):
+                for take in takers:
+                    take(played)
+                if not count % _METER_EVERY:
+                    meter.update(count)
+    except KeyboardInterrupt:
+        return True
+    return False
 
 
 def _publication(

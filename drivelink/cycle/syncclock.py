@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -104,7 +105,7 @@ class SyncClock:
 
     def __init__(self, period_s: float) -> None:
         self._expected_ns = self._period_ns = period_s * 1e9
-        self._due_ns: float | None = None
+        self._due_ns = math.nan  # before the first SYNC
         self._last = (0, 0)
         self._count = 0
         self._variance = 0.0  # of the deviations, periods squared
@@ -120,7 +121,7 @@ class SyncClock:
             monotonic_ns: time of reception, by a monotonic clock; separates a step of the other clock from a
                 gap.
         """
-        if self._due_ns is None:
+        if math.isnan(self._due_ns):
             self._due_ns = float(stamp_ns)
             self._last = (stamp_ns, monotonic_ns or 0)
             return 1
@@ -148,7 +149,6 @@ class SyncClock:
 
     def _follow(self, error: float, periods: int) -> None:
         """Update the loop: the SYNC came so many periods after its prediction."""
-        assert self._due_ns is not None
         self._count += 1
         phase = max(1.0 / (self._count + 1), self._SLOWEST)
         rate = min(phase, 0.1) ** 2 / (2.0 - min(phase, 0.1))  # Benedict and Bordner, 1962

@@ -16,11 +16,11 @@ from typing import NamedTuple, Protocol
 
 from drivelink import jointfile
 from drivelink._core import Tick
+from drivelink.cycle.loop import Sink
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simulate import network_from_joint, open_sim_bus, world_from_joint
 from drivelink.errors import DrivelinkError
 from drivelink.monitor.history import TruthLike
-from drivelink.pubsub.publisher import JointPublisher
 
 __all__ = ["Failure", "Summary", "TruePoint", "serve"]
 
@@ -63,15 +63,16 @@ class World(Protocol):
 class TruthTap:
     """Publishes like the daemon's publisher, and notes the truth at the same SYNC."""
 
-    def __init__(self, publisher: JointPublisher, world: World, connection: Connection) -> None:
-        self._publisher = publisher
+    def __init__(self, sink: Sink | None, world: World, connection: Connection) -> None:
+        self._sink = sink
         self._world = world
         self._connection = connection
         self._points: list[TruePoint] = []
 
     def put(self, tick: Tick) -> None:
         """Publish, then note the truth: the world stands still until the next SYNC."""
-        self._publisher.put(tick)
+        if self._sink is not None:
+            self._sink.put(tick)
         truth = self._world.truth()
         self._points.append(TruePoint(tick.sequence, truth.flexibility_torque_nm, truth.stiffness_nm_rad))
         if len(self._points) >= _BATCH:
@@ -113,7 +114,6 @@ def _run(path: Path, seconds: float | None, connection: Connection) -> Summary:
         with Daemon([ServedJoint(joint=joint, path=path)], devices=network.poll) as daemon:
             signal.signal(signal.SIGTERM, lambda *_: daemon.stop())
             (loop_joint,) = daemon.loop.loop_joints
-            assert isinstance(loop_joint.sink, JointPublisher)
             tap = TruthTap(loop_joint.sink, world, connection)
             loop_joint.sink = tap
             daemon.run(seconds)

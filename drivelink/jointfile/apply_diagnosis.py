@@ -137,9 +137,7 @@ def _transmission(joint: JointFile, outcome: Diagnosis, motor: int) -> dict[str,
     section = joint.motor[motor].transmission
     change: dict[str, Any] = {"model": section.model, "parameters": _plain(parameters)}
     if section.model == "polynomial":
-        coefficients = parameters["coefficients_nm_rad"]
-        assert isinstance(coefficients, tuple)
-        change["order"] = len(coefficients)
+        change["order"] = len(change["parameters"]["coefficients_nm_rad"])
     return {"transmission": change}
 
 

@@ -75,50 +75,60 @@ def record_from_columns(
     _require(columns, "time_s", where)
     nominal = joint.bus.period_s if joint else None
     grid = find_grid(columns["time_s"], where, nominal, _repeats(columns))
-
-    def column(name: str) -> FloatArray | None:
-        values = columns.get(name)
-        if values is None or not np.any(np.isfinite(values)):
-            return None
-        return np.where(np.isfinite(values), values, np.nan)[grid.keep]
-
-    positions = [_needed(columns, f"motor{i}_position_rad", where)[grid.keep] for i in range(1, motors + 1)]
-    torques = [_torque(columns, i, joint, where)[grid.keep] for i in range(1, motors + 1)]
-    velocities = [column(f"motor{i}_velocity_rad_s") for i in range(1, motors + 1)]
-    link = column("link_position_rad")
-    if link is None and (joint.model().has_deflection if joint else False):
+    columns = {name: values[grid.keep] if values.size else values for name, values in columns.items()}
+    numbers = range(1, motors + 1)
+    positions = [_needed(columns, f"motor{i}_position_rad", where) for i in numbers]
+    torques = [_torque(columns, i, joint, where) for i in numbers]
+    velocities = [_optional(columns, f"motor{i}_velocity_rad_s") for i in numbers]
+    link = {name: values for name in _LINK if (values := _optional(columns, name)) is not None}
+    if "link_position_rad" not in link and joint and joint.model().has_deflection:
         _needed(columns, "link_position_rad", where)
-    _report_constant({f"motor{i + 1}_position_rad": p for i, p in enumerate(positions)}, where)
-    needed = [*positions, *torques] + ([] if link is None else [link])
-    usable = np.all(np.isfinite(needed), axis=0)
-    if lost := int(np.count_nonzero(~usable)):
-        _LOG.warning("%s: %d row(s) with missing values are taken as gaps", where, lost)
-    if int(np.count_nonzero(usable)) < 3:
-        raise RecordingError(f"{where}: expected at least 3 complete samples, got {np.count_nonzero(usable)}")
+    _report_constant({f"motor{i}_position_rad": p for i, p in zip(numbers, positions, strict=True)}, where)
+    usable = _usable([*positions, *torques, link.get("link_position_rad", positions[0])], where)
     rows = np.ones_like(usable) if keep_nan else usable
 
     def stacked(arrays: list[FloatArray]) -> FloatArray:
         return np.ascontiguousarray(np.stack(arrays, axis=1)[rows])
 
     present = [v if v is not None else np.full(len(rows), np.nan) for v in velocities]
-    velocity = None if all(v is None for v in velocities) else stacked(present)
     sequence = grid.sequence[rows]
     report_gaps(sequence, grid.period_s, where)
     if not keep_nan:  # use tick by tick does not allocate the gaps
         require_samples(int(sequence[-1]) + 1, where)
-    optional = {name: values[rows] for name in _LINK if (values := column(name)) is not None}
     try:
         return Record(
             period_s=grid.period_s,
             sequence=sequence,
             motor_position_rad=stacked(positions),
             motor_torque_nm=stacked(torques),
-            motor_velocity_rad_s=velocity,
+            motor_velocity_rad_s=None if all(v is None for v in velocities) else stacked(present),
             start_s=grid.start_s,
-            **optional,
+            **{name: values[rows] for name, values in link.items()},
         )
     except EstimatorError as error:
         raise RecordingError(f"{where}: {error}") from error
+
+
+def _optional(columns: Mapping[str, FloatArray], name: str) -> FloatArray | None:
+    """A column, infinities as NaN; None if it has no finite value."""
+    values = columns.get(name)
+    if values is None or not np.any(np.isfinite(values)):
+        return None
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def _usable(needed: Sequence[FloatArray], where: str) -> NDArray[np.bool_]:
+    """(rows,) whether all needed values are finite.
+
+    Raises:
+        RecordingError: fewer than three rows are.
+    """
+    usable: NDArray[np.bool_] = np.all(np.isfinite(needed), axis=0)
+    if lost := int(np.count_nonzero(~usable)):
+        _LOG.warning("%s: %d row(s) with missing values are taken as gaps", where, lost)
+    if int(np.count_nonzero(usable)) < 3:
+        raise RecordingError(f"{where}: expected at least 3 complete samples, got {np.count_nonzero(usable)}")
+    return usable
 
 
 def _scaled(columns: Mapping[str, FloatArray], joint: JointFile | None) -> Mapping[str, FloatArray]:

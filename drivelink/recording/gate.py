@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from drivelink.errors import RecordingError
-from drivelink.jointfile import JointFile
+from drivelink.jointfile import DriveSection, EncoderSection, JointFile
 from drivelink.recording.canframes import is_frame_log
 from drivelink.recording.playback import Played
 from estimator.errors import EstimatorError
@@ -164,12 +164,13 @@ def corrections(joint: JointFile, needed: Sequence[Change], *, live: bool) -> li
             value = motor.inertia_kg_m2 * inertia.factor
             found.append(_new(f"motor[{number}]", "inertia_kg_m2", value, inertia.factor))
         if live and motor.drive is not None:
-            found += _of_drive(joint, number, position, torque)
+            found += _of_drive(motor.drive, f"motor[{number}].drive", position, torque)
         else:
             found += [_column(joint, change, number) for change in (position, torque) if change is not None]
     link, time = changes.get("link_position"), changes.get("time")
     if link is not None:
-        found.append(_of_link(joint, link) if live and joint.link.encoder else _column(joint, link))
+        encoder = joint.link.encoder if live else None
+        found.append(_of_link(encoder, link) if encoder else _column(joint, link))
     if time is not None:
         found.append(_column(joint, time))
     return found
@@ -192,11 +193,9 @@ def _column(joint: JointFile, change: Change, number: int = 0) -> Correction:
 
 
 def _of_drive(
-    joint: JointFile, number: int, position: Change | None, torque: Change | None
+    drive: DriveSection, table: str, position: Change | None, torque: Change | None
 ) -> list[Correction]:
     """The keys of a motor's drive: directions, counts, gear ratio, torque's scale."""
-    drive, table = joint.motor[number - 1].drive, f"motor[{number}].drive"
-    assert drive is not None
     a = position.factor if position else 1.0
     b = torque.factor if torque else 1.0
     found = []
@@ -220,9 +219,7 @@ def _of_drive(
     return found
 
 
-def _of_link(joint: JointFile, link: Change) -> Correction:
-    encoder = joint.link.encoder
-    assert encoder is not None
+def _of_link(encoder: EncoderSection, link: Change) -> Correction:
     if link.factor < 0.0:
         return _new("link.encoder", "direction", -encoder.direction, -1.0)
     counts = None if encoder.counts_per_rev is None else encoder.counts_per_rev / link.factor

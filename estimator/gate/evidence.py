@@ -146,8 +146,8 @@ class Balance:
             (self._rate, *free),
         ]
         first, deflection = len(columns), 0.0
-        if self.motor.flexible and self._link_rate is not None:
-            ramps, deflection = self._spring(a / c)
+        if self.motor.flexible and self._q is not None and self._link_rate is not None:
+            ramps, deflection = self._spring(self._q, a / c)
             columns += [(-math.copysign(1.0, b * c) * x, 0.0, math.inf) for x in ramps]
             columns.append((self._link_rate, *free))
             columns += [(x, *free) for x in self._position]
@@ -166,18 +166,18 @@ class Balance:
             self._best = score, left
         return Fit(errors, float(left.sum(axis=0).std()), float(x[0]) / B, slope, deflection)
 
-    def _spring(self, ratio: float) -> tuple[list[FloatArray], float]:
-        """Basis of a rising curve of q_m - ratio theta_m, and the deflection's size over the motion's. Two
-        more straight lines, for a slightly smaller and a slightly larger ratio, cover scale errors of the
+    def _spring(self, q: FloatArray, ratio: float) -> tuple[list[FloatArray], float]:
+        """Basis of a rising curve of q - ratio theta_m, and the deflection's size over the motion's.
+
+        Two more straight lines, for a slightly smaller and a slightly larger ratio, cover scale errors of the
         encoders: any error in between is their sum with positive weights.
         """
         if ratio not in self._springs:
-            assert self._q is not None
-            phi = self._q - ratio * self._theta
+            phi = q - ratio * self._theta
             ramps = [self._through(x)[0] for x in _pieces(phi)]
             ends = (ratio * (1.0 - _RATIO), ratio * (1.0 + _RATIO))
-            ramps += [self._through(self._q - end * self._theta)[0] for end in ends]
-            moved = math.hypot(float(self._q.std()), abs(ratio) * float(self._theta.std()))
+            ramps += [self._through(q - end * self._theta)[0] for end in ends]
+            moved = math.hypot(float(q.std()), abs(ratio) * float(self._theta.std()))
             self._springs[ratio] = (ramps, float(phi.std()) / max(moved, 1e-300))
         return self._springs[ratio]
 

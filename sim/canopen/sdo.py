@@ -100,7 +100,7 @@ class SdoServer:
             self.reset()
             return None
         if self._block is not None:
-            return self._answer_block(data)
+            return self._answer_block(self._block, data)
         command = data[0] >> 5
         if command == _DOWNLOAD_SEGMENT:
             return self._download_segment(data)
@@ -191,10 +191,9 @@ class SdoServer:
         self._block = BlockDownload(entry, size, crc=bool(data[0] & 4))
         return struct.pack("<BHBB3x", 0xA4, *self._multiplexer, self._block.blksize)
 
-    def _answer_block(self, data: bytes) -> bytes | None:
-        assert self._block is not None
-        frames = self._block.receive(data)
-        if self._block.done:
+    def _answer_block(self, block: BlockUpload | BlockDownload, data: bytes) -> bytes | None:
+        frames = block.receive(data)
+        if block.done:
             self.reset()
         for frame in frames:
             self._send(frame)

@@ -114,6 +114,7 @@ def test_simulated_drives_daemon_and_subscriber_are_three_processes(joint: Path,
             assert (end["event"], status["joint"]) == ("end", "elbow") and status["estimates"] > 0
 
 
+@pytest.mark.slow
 def test_a_bus_without_drives_is_one_line(tmp_path: Path) -> None:
     path = tmp_path / "elbow.toml"
     path.write_text(vsa_text(endpoint=free_endpoint()), encoding="utf-8")

@@ -32,15 +32,15 @@ def run(*command, **options):
 @pytest.mark.parametrize(
     ("name", "seconds", "expected"),
     [
-        ("subscribe_latest.py", "3", "live     gain    70.0 N·m/rad"),
-        ("subscribe_wait.py", "4", "in control from cycle"),
-        ("subscribe_async.py", "4.5", "elbow: cycle 500, 700.0 N·m/rad, running"),
+        ("subscribe_latest.py", "1.2", "live     gain    70.0 N·m/rad"),
+        ("subscribe_wait.py", "1.5", "in control from cycle"),
+        ("subscribe_async.py", "3.2", "elbow: cycle 500, 700.0 N·m/rad, running"),
         ("subscribe_numpy.py", "0.5", "stiffness 700.0 N·m/rad"),
     ],
 )
 def test_the_python_examples_run(endpoint, name, seconds, expected):
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    for longer in (1, 4, 10):  # on a loaded machine the first seconds may pass before anything has come
+    for longer in (1, 3, 10, 30):  # on a loaded machine the first seconds may pass before anything has come
         out = run(
             sys.executable, EXAMPLES / name, "elbow", endpoint, float(seconds) * longer, env=environment
         )

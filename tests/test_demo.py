@@ -147,6 +147,7 @@ def test_the_demo_finds_the_stiffness_it_does_not_know(case: str) -> None:
     assert "Traceback" not in run.stderr
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_the_demo_with_its_results_and_leaves_nothing_running() -> None:
     process = subprocess.Popen(
         [*DEMO, "--seconds", "60", "--headless"],

@@ -88,6 +88,7 @@ def test_skew_within_a_sample_is_aligned_and_reported(records: dict[str, Record]
     assert found.alignment["link_position_delay_s"] == pytest.approx(0.0007, abs=5e-5)
 
 
+@pytest.mark.slow
 def test_two_effects_are_both_named(records: dict[str, Record]) -> None:
     names = {effect.name for effect in diagnose(records["two"], kit.model()).effects}
     assert {"coulomb_friction", "gravity"} <= names

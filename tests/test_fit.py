@@ -85,7 +85,7 @@ def test_intervals_cover_about_as_often_as_they_say(elbow):
     assert 0.3 < np.sqrt(np.mean(np.square(z))) < 1.6
 
 
-@pytest.mark.parametrize("b", [2.0, 8.0, 40.0])
+@pytest.mark.parametrize("b", [8.0, *(pytest.param(b, marks=pytest.mark.slow) for b in (2.0, 40.0))])
 def test_an_exponential_spring_is_found_from_nothing_in_batch_and_on_line(b):
     rng = np.random.default_rng(1)
     n = 6000
@@ -223,7 +223,7 @@ def wrist():
     return plants, truth
 
 
-@pytest.mark.parametrize("late", [0, 1])
+@pytest.mark.parametrize("late", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_no_delay_is_made_of_noise_and_one_that_is_there_has_an_honest_interval(wrist, late):
     plants, truth = wrist
     z = []

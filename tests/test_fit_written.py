@@ -171,7 +171,11 @@ def test_a_rigid_joint_is_written_as_printed(folder: Path, capsys: pytest.Captur
     assert entry.get("effects", []) == motor.get("effect", [])
 
 
-@pytest.mark.parametrize("link", ["", LINK], ids=["no link dynamics", "link dynamics"])
+@pytest.mark.parametrize(
+    "link",
+    [pytest.param("", marks=pytest.mark.slow), LINK],
+    ids=["no link dynamics", "link dynamics"],
+)
 def test_skew_and_zero_of_the_readings_are_written_and_fitted_again_they_stay(
     link: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

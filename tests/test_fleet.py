@@ -161,6 +161,7 @@ def test_another_version_is_refused(fleet: Path, joints: Joints) -> None:
 # Storage
 
 
+@pytest.mark.slow
 def test_a_remote_storage_holds_recordings_and_results(fleet: Path, joints: Joints) -> None:
     """fsspec's own in-memory file system stands for the protocols that benchmarks/fleet_storage.py tries for real."""
     import fsspec
@@ -360,6 +361,7 @@ def run_fleet(fleet: Path, out: Path, *more: str, recordings: Path | None = None
 
 
 @pytest.mark.timeout(300)  # starts a cluster of its own
+@pytest.mark.slow
 def test_from_recordings_to_a_page(fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recordings = shutil.copytree(fleet / "recordings", tmp_path / "recordings")
     (recordings / "wrist-2026-01-05.csv").unlink()

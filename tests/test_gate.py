@@ -84,7 +84,7 @@ def test_each_fault_is_named(kind: str) -> None:
 
 @pytest.mark.parametrize(
     "kind",
-    [k if k in ("soft", "antagonistic") else pytest.param(k, marks=pytest.mark.slow) for k in gatekit.KINDS],
+    [k if k == "soft" else pytest.param(k, marks=pytest.mark.slow) for k in gatekit.KINDS],
 )
 def test_a_rich_motion_decides_every_sign_and_the_unit_of_the_link(kind: str) -> None:
     judgements = [

@@ -109,7 +109,10 @@ def ends(model, order, parameters, noisy):
     [pytest.param(1.0, marks=pytest.mark.slow), 0.6, pytest.param(1.4, marks=pytest.mark.slow)],
     ids=["right", "40 % low", "40 % high"],
 )
-@pytest.mark.parametrize("model", SPRINGS)
+@pytest.mark.parametrize(
+    "model",
+    [m if m in ("polynomial", "vsa-ii") else pytest.param(m, marks=pytest.mark.slow) for m in SPRINGS],
+)
 def test_an_estimate_ends_at_the_truth_however_its_spring_was_declared(model, off, noisy):
     for order in ORDERS.get(model, (None,)):
         valid, outside = ends(model, order, SPRINGS[model][2](off), noisy)

@@ -75,7 +75,10 @@ def test_report_json_is_as_promised(folder: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "effect"),
-    [("coulomb", "coulomb_friction"), pytest.param("late", "encoder_delay", marks=pytest.mark.slow)],
+    [
+        pytest.param("coulomb", "coulomb_friction", marks=pytest.mark.slow),
+        pytest.param("late", "encoder_delay", marks=pytest.mark.slow),
+    ],
 )
 def test_the_written_joint_file_knows_the_effect_and_its_floor(folder: Path, name: str, effect: str) -> None:
     better = f"{name}-better.toml"
@@ -94,7 +97,7 @@ def test_an_unlisted_effect_comes_with_its_curve(folder: Path) -> None:
 
 
 def test_json_is_pure_and_what_the_file_says(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    report = _diagnose(folder, "coulomb", "joint.toml", "--json")
+    report = _diagnose(folder, "clean", "joint.toml", "--json")
     assert json.loads(capsys.readouterr().out) == report
 
 
@@ -130,12 +133,14 @@ def test_the_page_is_self_contained_and_says_the_verdict(folder: Path) -> None:
 
 
 def test_a_page_without_a_curve_has_no_empty_section(folder: Path) -> None:
+    _diagnose(folder, "clean", "joint.toml", "--json")
+    _diagnose(folder, "coulomb")
     for name, there in (("clean", False), ("coulomb", True)):
-        _diagnose(folder, name)
         page = (folder / f"{name}-joint.toml" / "report.html").read_text(encoding="utf-8")
         assert ("What reveals it" in page) is there
 
 
+@pytest.mark.slow
 def test_a_fitted_joint_file_is_calibrated_and_watched(folder: Path) -> None:
     fitted = folder / "healthy.toml"
     arguments = [

@@ -128,7 +128,7 @@ def test_a_stiffness_step_is_announced_and_followed_within_half_a_second(changin
         assert np.median(error) < 0.02
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in (1, 2))])
 def test_the_first_reversal_of_a_motion_is_no_change(seed):
     """Coulomb friction is unknown before it, so one large innovation is foreseen there; three are not."""
     rng = np.random.default_rng(seed)

@@ -163,7 +163,8 @@ def test_a_client_that_forgets_to_close_ends_too(endpoint):
     assert done.stderr.endswith("RuntimeError: uncaught\n")
 
 
-def test_another_program_on_the_endpoint_is_one_line(endpoint):
+def test_another_program_on_the_endpoint_is_one_line(endpoint, monkeypatch):
+    monkeypatch.setattr("drivelink.pubsub.session._MEETING_S", 0.3)
     port = int(endpoint.rpartition(":")[2])
     with socket.create_server(("127.0.0.1", port)), pytest.raises(ZenohError) as error:
         open_session(ZenohSection(endpoint=endpoint), Path())

@@ -116,7 +116,11 @@ def quintic():
     del MODELS["quintic-for-test"]
 
 
-@pytest.mark.parametrize("declared", [{}, {"k_nm_rad": 130.0, "a": 25.0, "c": 80.0}])
+@pytest.mark.parametrize(
+    "declared",
+    [{}, pytest.param({"k_nm_rad": 130.0, "a": 25.0, "c": 80.0}, marks=pytest.mark.slow)],
+    ids=["from nothing", "declared"],
+)
 def test_a_registered_model_with_two_shape_parameters_is_estimated_on_line(quintic, declared):
     rng = np.random.default_rng(1)
     n, T = 7000, 1e-3

@@ -6,7 +6,7 @@ In lockstep on the project's simulated joints, seeded (--seed): seconds of healt
 (kinds, sizes and signals: `tests/faultmatrix.py`). Wrong is off by more than 10 % and by more than five
 standard deviations. Named is a fault whose signal `suspected` names most often, of those in which it names
 any. Then true changes of the stiffness, which are to be followed: the share of the last two seconds that is
-valid and within 5 %.
+within 5 % and valid, or, with a fitted file, has the model alarm instead.
 
 With --sizes instead: for each kind of fault the largest size up to which nothing is said of it in eight
 seconds (every sample valid, no flag), and by how much the stiffness is off then.

@@ -29,6 +29,7 @@ __all__ = [
     "STEPS",
     "Fault",
     "Outcome",
+    "errors",
     "faults",
     "garbled",
     "outcome",
@@ -252,17 +253,32 @@ def outcome(joint: str, fault: Fault | None, health_s: float, fault_s: float, se
     return _count(*_estimates(joint, samples, begin), motion.stiffness_nm_rad, begin)
 
 
+def errors(
+    joint: str, fault: Fault, health_s: float, fault_s: float, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """From the begin of a fault on: which samples are valid, and the relative error of the stiffness."""
+    motion, begin = _healthy(joint, health_s + fault_s, seed), round(health_s / T)
+    estimates, _ = _estimates(joint, _spoilt(motion.samples, begin, fault, seed), len(motion.samples))
+    return estimates.valid[begin:], np.abs(
+        estimates.stiffness_nm_rad[begin:] / motion.stiffness_nm_rad[begin:] - 1.0
+    )
+
+
 def stepped(
     joint: str, factor: float, health_s: float, after_s: float, seed: int = 0
 ) -> tuple[Outcome, float]:
-    """A true change of the stiffness; also the share of the last two seconds that is valid and within 5 %."""
+    """A true change of the stiffness; also the share of the last two seconds in which it is followed.
+
+    That is: within 5 %, and valid, or, where a fitted file says what the joint was, with the model alarm.
+    """
     name = joint.removesuffix(" fitted")
     motion = kit.motion(name, health_s + after_s, seed=seed, step=(health_s, factor))
     begin = round(health_s / T)
     estimates, suspected = _estimates(joint, motion.samples, begin)
     end = slice(-round(2.0 / T), None)
     off = np.abs(estimates.stiffness_nm_rad[end] / motion.stiffness_nm_rad[end] - 1.0)
-    followed = float(np.mean(estimates.valid[end] & (off < 0.05)))
+    said = int(Status.VALID | (Status.MODEL_ALARM if joint != name else 0))
+    followed = float(np.mean((estimates.status[end] & said > 0) & (off < 0.05)))
     return _count(estimates, suspected, motion.stiffness_nm_rad, begin), followed
 
 

@@ -42,6 +42,15 @@ def test_health_keeps_its_valid(joint):
     assert healthy.valid >= 0.999 * healthy.samples
 
 
+@pytest.mark.parametrize("share", [0.003, 0.01])
+def test_noise_that_begins_on_the_link_encoder_costs_neither_valid_nor_accuracy(share):
+    """What the deflection filter has taken up before the noise is measured counts in its covariance."""
+    fault = matrix.Fault("noise", ("link",), lambda x, size, rng: x + share * size * rng.normal(size=len(x)))
+    valid, error = matrix.errors("vsa-ii", fault, HEALTH_S, 2.0)
+    assert valid.all()
+    assert error.max() < 0.02
+
+
 @pytest.mark.parametrize("factor", matrix.STEPS)
 @pytest.mark.parametrize("joint", ["constant", "vsa-ii"])
 def test_a_true_change_of_the_stiffness_is_followed_and_called_valid(joint, factor):

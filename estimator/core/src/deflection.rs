@@ -9,7 +9,8 @@
 //! Fine encoders break it, as their steps are neither. So the innovations of φ are held against it: where
 //! their mean square e² is more than the S = P + R it foresees, the covariance is e²/S times as large (the
 //! normalised innovation squared of Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking
-//! and Navigation", 2001, section 5.4).
+//! and Navigation", 2001, section 5.4). Likewise where the encoders turn out to be noisier than assumed: the
+//! state has taken up that noise already, so its covariance grows with the noise's.
 
 const ASTRAY: f64 = 10.0; // rad, and times what is measured: no prediction of one period is so far off
 const STATES: usize = 5;
@@ -40,6 +41,7 @@ pub struct DeflectionFilter {
     gains: [State; 2], // by θ and by φ
     x: State,
     p: Option<Covariance>,
+    noise: f64,     // variance of φ's noise that p assumes
     modelled: bool, // whether the motor's equation is of use
     pull: f64,      // what half a period of φ′ adds to the motor's mean acceleration
     jerk: f64,
@@ -94,6 +96,7 @@ impl DeflectionFilter {
             gains: plain,
             x: [0.0; STATES],
             p: None,
+            noise: 0.0,
             modelled: false,
             pull: 0.0,
             jerk: 0.0,
@@ -108,7 +111,7 @@ impl DeflectionFilter {
 
     /// Forget everything.
     pub fn reset(&mut self) {
-        (self.jerk, self.peak, self.p, self.modelled) = (0.0, 0.0, None, false);
+        (self.jerk, self.peak, self.p, self.noise, self.modelled) = (0.0, 0.0, None, 0.0, false);
         (self.gains, self.pull, self.squares, self.counted) = (self.plain, 0.0, [0.0; 2], 0.0);
         (self.missed, self.foreseen) = (1.0, f64::INFINITY);
         self.restart(0.0, 0.0);
@@ -197,7 +200,11 @@ impl DeflectionFilter {
         for (i, power) in [0, 2, 0, 2, 4].into_iter().enumerate() {
             start[i][i] = noise * w.powi(power);
         }
-        let before = self.p.unwrap_or(start);
+        let mut before = self.p.unwrap_or(start);
+        // Noise is measured late: the state has errors of its size by now.
+        let grown = if noise > self.noise && self.noise > 0.0 { noise / self.noise } else { 1.0 };
+        before.iter_mut().flatten().for_each(|entry| *entry *= grown);
+        self.noise = noise;
         let moved = self.moved(&before, c, drift * t, density * natural.powi(6) * t);
         // Kalman gains for measured θ and φ = q − θ, whose noises share θ's.
         let (s00, s01, s11) =

@@ -158,6 +158,9 @@ class Assembler:
     def trust(self, node_id: int) -> None:
         """A node has been configured and started."""
 
+    def contradict(self, node_id: int, contradicted: bool) -> None:
+        """A node says by SDO what its frames do not: no estimate is valid; or it does no longer."""
+
     def relayout(self, layout: NodeLayout) -> None:
         """A node has been configured differently: from now on its frames are read by this layout.
 

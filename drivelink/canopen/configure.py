@@ -19,7 +19,7 @@ from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.mapping import NMT_START
 from drivelink.canopen.node import configure_node
 from drivelink.canopen.roles import Role, roles
-from drivelink.canopen.sdo import Program, SdoTimeout, Session
+from drivelink.canopen.sdo import Program, Read, SdoTimeout, Session
 from drivelink.errors import BusError, DriveError
 from drivelink.jointfile import BusSection, JointFile
 from drivelink.notice import log_notices
@@ -29,6 +29,7 @@ __all__ = ["Configurator", "configure", "configure_joints", "refuse_foreign_sync
 logger = logging.getLogger(__name__)
 
 _DEVICE_TYPE = 0x1000  # what a node is asked for first
+_NUMBER_BYTES = 8
 
 
 class Configurator:
@@ -86,6 +87,10 @@ class Configurator:
             retries=self.bus.sdo_retries,
         )
 
+    def ask(self, node: int, address: tuple[int, int]) -> Session[bytes]:
+        """Begin to read an object of a node, once; the caller feeds and polls the session."""
+        return Session(_reading(node, address), self._send, timeout_s=self.bus.sdo_timeout_s, retries=0)
+
     @property
     def busy(self) -> bool:
         """Whether any configuration is under way."""
@@ -133,6 +138,10 @@ class Configurator:
             bitrate=self.bus.bitrate,
             sync_bytes=1 if self.bus.sync_counter_overflow else 0,
         )
+
+
+def _reading(node: int, address: tuple[int, int]) -> Program[bytes]:
+    return (yield Read(node, *address, most=_NUMBER_BYTES))
 
 
 def configure_joints(

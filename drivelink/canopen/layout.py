@@ -95,6 +95,7 @@ class NodeLayout:
         other_tpdos: enabled frames of this node that are not used but load the bus.
         heartbeat_ms: period of the heartbeat the node produces, as read back; 0: none, or not known.
         identity: (vendor, product code, revision, serial number) of 0x1018; 0 where not reported.
+        reported: unit objects with their unsigned values, as read while it was configured.
         notices: findings of its configuration.
     """
 
@@ -104,13 +105,14 @@ class NodeLayout:
     other_tpdos: tuple[TpdoLayout, ...] = ()
     heartbeat_ms: int = 0
     identity: tuple[int, int, int, int] = (0, 0, 0, 0)
+    reported: tuple[tuple[tuple[int, int], int], ...] = ()
     notices: tuple[Notice, ...] = ()
 
 
 def layout_document(layout: NodeLayout) -> dict[str, Any]:
-    """A layout as plain values, for the model document; without notices."""
+    """A layout as plain values, for the model document; without unit objects and notices."""
     document = asdict(layout)
-    del document["notices"]
+    del document["reported"], document["notices"]
     return document
 
 

@@ -26,16 +26,19 @@ from drivelink.canopen.sdo import (
 )
 from drivelink.canopen.tpdo_assignment import CHECKS, OPTIONAL, unused
 from drivelink.canopen.units import offer, unit_objects
-from drivelink.canopen.vendors import vendor_of
+from drivelink.canopen.vendors import Vendor, vendor_of
 from drivelink.errors import DriveError
 from drivelink.jointfile import BusSection
 from drivelink.notice import Notice, Severity
 
 __all__ = ["NodeSurvey", "configure_node", "survey_node"]
 
+Address = tuple[int, int]
+
 _SYNC_PRODUCER = 1 << 30
 _ENCODER_HEARTBEAT_MS = 100
 _VALUE_BYTES = 8  # of the longest object that can be mapped
+_ATTEMPTS = 2  # to configure a node whose units change meanwhile
 BOOT_S = 3.0  # until a node answers after power-on; the slowest take two seconds
 
 
@@ -57,7 +60,7 @@ class NodeSurvey:
     role: Role
     device_type: int
     identity: tuple[int, int, int, int]
-    reported: Mapping[tuple[int, int], int]
+    reported: Mapping[Address, int]
     offer: Offer
     refused: SdoAbort | None
     available: Mapping[Signal, tuple[MappableObject, ...]]
@@ -74,17 +77,9 @@ def survey_node(role: Role, patience: int = 1, *, wake: bool = False) -> Program
     """
     node = role.node_id
     device_type = yield from _first_contact(node, patience, wake)
-    identity = [0, 0, 0, 0]
-    for subindex in (1, 2, 3, 4):
-        identity[subindex - 1] = (yield from read_optional(node, 0x1018, subindex)) or 0
+    identity = yield from _identity(node)
     vendor = vendor_of(identity[0])
-    reported: dict[tuple[int, int], int] = {}
-    refused = None
-    for address in unit_objects(role, vendor):
-        try:
-            reported[address] = yield from read_number(node, *address)
-        except SdoAbort as abort:
-            refused = refused if abort.code in ABSENT else abort
+    reported, refused = yield from _units(role, vendor)
     offered = offer(role, reported, vendor)
     available: dict[Signal, tuple[MappableObject, ...]] = {}
     for signal, candidates in offered.candidates.items():
@@ -92,13 +87,50 @@ def survey_node(role: Role, patience: int = 1, *, wake: bool = False) -> Program
     return NodeSurvey(
         role=role,
         device_type=device_type,
-        identity=(identity[0], identity[1], identity[2], identity[3]),
+        identity=identity,
         reported=reported,
         offer=offered,
         refused=refused,
         available=available,
         tpdos=(yield from read_tpdos(node)),
     )
+
+
+def _identity(node: int) -> Program[tuple[int, int, int, int]]:
+    vendor = (yield from read_optional(node, 0x1018, 1)) or 0
+    product = (yield from read_optional(node, 0x1018, 2)) or 0
+    revision = (yield from read_optional(node, 0x1018, 3)) or 0
+    return vendor, product, revision, (yield from read_optional(node, 0x1018, 4)) or 0
+
+
+def _units(role: Role, vendor: Vendor) -> Program[tuple[dict[Address, int], SdoAbort | None]]:
+    """Unit objects that the node has, and the last read that it aborted although the object may exist."""
+    reported: dict[Address, int] = {}
+    refused = None
+    for address in unit_objects(role, vendor):
+        try:
+            reported[address] = yield from read_number(role.node_id, *address)
+        except SdoAbort as abort:
+            refused = refused if abort.code in ABSENT else abort
+    return reported, refused
+
+
+def _changed(survey: NodeSurvey) -> Program[str]:
+    """What the node says otherwise than before it was configured; empty: nothing.
+
+    The answer of somebody else comes once, and a unit that is wrong scales everything that follows.
+    """
+    node, before = survey.role.node_id, {(0x1018, k + 1): x for k, x in enumerate(survey.identity)}
+    before |= survey.reported
+    identity = yield from _identity(node)
+    units, _ = yield from _units(survey.role, vendor_of(survey.identity[0]))
+    now = {(0x1018, k + 1): x for k, x in enumerate(identity)} | units
+    for index, subindex in sorted(before.keys() | now.keys()):
+        first, second = before.get((index, subindex)), now.get((index, subindex))
+        if first != second:
+            first_text, second_text = ("nothing" if x is None else x for x in (first, second))
+            return f"0x{index:04X}:{subindex:02X} was {first_text} and is {second_text}"
+    return ""
 
 
 def _first_contact(node: int, patience: int, wake: bool) -> Program[int]:
@@ -139,6 +171,8 @@ def configure_node(
 ) -> Program[NodeLayout]:
     """Make a node send what the joint needs at every SYNC.
 
+    Its identity and units are read before and after: where they differ, it is configured once more.
+
     Args:
         role: what the node is there for.
         bus: the bus section of the joint file.
@@ -148,11 +182,28 @@ def configure_node(
         stopped: the node is stopped and does not answer SDO until it is woken.
 
     Raises:
-        DriveError: the node is absent, refuses, or cannot give what is needed.
+        DriveError: the node is absent, refuses, cannot give what is needed, or says different things.
     """
     if stopped:
         yield Nmt(role.node_id, NMT_PRE_OPERATIONAL)
         yield Pause(SETTLE_S)
+    for _ in range(_ATTEMPTS):
+        survey, layout = yield from _configured(role, bus, taken, drop_others)
+        changed = yield from _changed(survey)
+        if not changed:
+            break
+    else:
+        raise DriveError(
+            f"{role.subject} ({role.key}): {changed} when asked again: does another device answer for it?"
+        )
+    if start:
+        yield Nmt(role.node_id, NMT_START)
+    return layout
+
+
+def _configured(
+    role: Role, bus: BusSection, taken: set[int], drop_others: bool
+) -> Program[tuple[NodeSurvey, NodeLayout]]:
     attempt_s = bus.sdo_timeout_s * (1 + bus.sdo_retries)
     survey = yield from survey_node(role, max(2, math.ceil(BOOT_S / attempt_s)), wake=True)
     notices = list(survey.offer.notices)
@@ -173,15 +224,14 @@ def configure_node(
     others = yield from _others(role, others, {layout.cob_id for layout in layouts}, drop_others, notices)
     yield from _sync(role, bus, notices)
     heartbeat_ms = yield from _heartbeat(role, notices)
-    if start:
-        yield Nmt(role.node_id, NMT_START)
-    return NodeLayout(
+    return survey, NodeLayout(
         node_id=role.node_id,
         motor=role.motor,
         tpdos=layouts,
         other_tpdos=decode(others, {}),
         heartbeat_ms=heartbeat_ms,
         identity=survey.identity,
+        reported=tuple(survey.reported.items()),
         notices=tuple(notices),
     )
 

@@ -11,7 +11,7 @@ from drivelink.canopen.emcy import emergency_text
 from drivelink.cycle.framesource import LostSource
 from drivelink.cycle.loop import CycleLoop, LoopJoint
 from drivelink.cycle.realtime import RealTime
-from drivelink.daemon.crosschecks import contradiction, cross_checks
+from drivelink.daemon.crosschecks import cross_checks
 from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor, residual_text
 from drivelink.jointfile import JointFile
@@ -127,7 +127,7 @@ class JointStatus:
             "residual_nm": loop_joint.pipeline.estimator.residual_nm,
             "residual_alarm": self._alarm(),
             "external": self._external(),
-            "suspected": contradiction(loop_joint.pipeline.assembler)
+            "suspected": self._supervisor.contradiction(loop_joint)
             or loop_joint.pipeline.estimator.suspicion(),
             "cross_checks": cross_checks(loop_joint.pipeline.assembler),
             "conditions": sorted(events.active.values()),

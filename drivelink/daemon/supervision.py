@@ -24,6 +24,7 @@ from drivelink.cycle.loop import CycleLoop, LoopJoint
 from drivelink.cycle.pipeline import ResidualMonitor
 from drivelink.cycle.syncclock import MEASURED_SYNCS, measure_period
 from drivelink.daemon.crosschecks import contradiction
+from drivelink.daemon.readback import ReadBack
 from drivelink.daemon.status import EventLog
 from drivelink.errors import DriveError
 from estimator.sample import Status
@@ -128,6 +129,7 @@ class Supervisor:
         self._alarmed: set[str] = set()  # joints with a model alarm
         self._configurator = configurator
         self._follower: MapFollower | None = None
+        self._read_back: ReadBack | None = None
         self._counter_jumps = self._lost_sends = self._clock_steps = 0
         self._bus_offs = self._restarts = self._measured_ns = 0
         self._slow = self._slow_ns = 0
@@ -143,8 +145,13 @@ class Supervisor:
                 loop.listeners[0x700 + layout.node_id] = self._heartbeat
                 loop.listeners[0x080 + layout.node_id] = self._emergency
                 loop.listeners[0x580 + layout.node_id] = self._answer
+                loop.listeners[0x600 + layout.node_id] = self._foreign_request
         if isinstance(configurator, PassiveConfigurator):
             self._follow(configurator)
+        elif configurator.bus.read_back_s:
+            self._read_back = ReadBack(configurator.ask, configurator.bus.read_back_s)
+            for watched in self._nodes.values():
+                self._read_back.watch(watched.layout, watched.loop_joint.pipeline)
 
     def _follow(self, configurator: PassiveConfigurator) -> None:
         """Follow another master's mapping: process its frames in bus order."""
@@ -164,6 +171,14 @@ class Supervisor:
     def receive_ids(self) -> tuple[int, ...]:
         """Identifiers it listens to."""
         return tuple(self._loop.listeners)
+
+    def contradiction(self, loop_joint: LoopJoint) -> dict[str, Any] | None:
+        """The reading that a second one contradicts, see `crosschecks`; None: none."""
+        pipeline = loop_joint.pipeline
+        found = contradiction(pipeline.assembler)
+        if found is None and self._read_back is not None:
+            found = self._read_back.contradiction(pipeline)
+        return found
 
     def node_status(self, loop_joint: LoopJoint) -> dict[str, Any]:
         """State of one joint's nodes, for the status key."""
@@ -192,6 +207,19 @@ class Supervisor:
         """Advance running configurations."""
         if self._configurator.busy and self._follower is None:
             self._proceed(now_ns)
+        elif self._read_back is not None:
+            self._ask_back(self._read_back, now_ns)
+
+    def _ask_back(self, read_back: ReadBack, now_ns: int) -> None:
+        """Hold what nodes say by SDO against what is in use; where it is another, configure that one anew."""
+        finding = read_back.step(now_ns / _NS)
+        if finding is None:
+            return
+        watched = self._nodes[finding.node]
+        watched.loop_joint.pipeline.assembler.distrust(finding.node)
+        watched.attempt_ns = now_ns
+        self._events.say(f"{finding.text}: it is configured again", logging.WARNING)
+        self._configurator.start(finding.node)
 
     def _proceed(self, now_ns: int) -> None:
         configurator = self._configurator
@@ -210,6 +238,8 @@ class Supervisor:
                 self._loop.reroute()
                 self._events.say(f"node {node} has another mapping now: {_maps(result)}")
             watched.layout = result
+            if self._read_back is not None:
+                self._read_back.watch(result, watched.loop_joint.pipeline)
             self._events.end(f"configure {node}")
             watched.loop_joint.pipeline.assembler.trust(node)
             if not watched.started:
@@ -285,7 +315,7 @@ class Supervisor:
 
     def _check_contradiction(self, loop_joint: LoopJoint) -> None:
         """Report begin and end of a contradiction between readings."""
-        key, found = f"contradiction {loop_joint.name}", contradiction(loop_joint.pipeline.assembler)
+        key, found = f"contradiction {loop_joint.name}", self.contradiction(loop_joint)
         if found is None:
             self._events.end(key, f"{loop_joint.name}: no reading contradicts another")
         else:
@@ -532,8 +562,16 @@ class Supervisor:
 
     def _answer(self, cob_id: int, data: bytes) -> None:
         now_ns = self._loop.clock()
+        if self._read_back is not None and not self._configurator.busy:
+            self._read_back.feed(cob_id, data, now_ns / _NS)
+            return
         self._configurator.feed(cob_id, data, now_ns / _NS)
         self._proceed(now_ns)  # do not decode its frames by the old layout
+
+    def _foreign_request(self, cob_id: int, data: bytes) -> None:
+        """Somebody else talks to a node by SDO; our own frames are not heard."""
+        if self._read_back is not None:
+            self._read_back.feed(cob_id, data, self._loop.clock() / _NS)
 
 
 def _maps(layout: NodeLayout) -> str:

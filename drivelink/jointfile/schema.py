@@ -226,6 +226,9 @@ class BusSection(_Section):
     configure: bool = Field(True, description="configure the nodes; false: passive, never sends a frame")
     sdo_timeout_s: float = Field(0.5, gt=0, description="for each SDO transfer")
     sdo_retries: int = Field(1, ge=0, description="further attempts after an SDO timeout")
+    read_back_s: float = Field(
+        2.0, ge=0, description="between two SDO uploads that check units and mapped values; 0: none"
+    )
 
     def moved(self, interface: str | None = None, channel: str | None = None) -> BusSection:
         """The section with another interface or channel, if given.

@@ -62,8 +62,9 @@ pub struct Assembler {
     restart: bool,
     unnumbered: bool,
     faulted: u32,
-    contradicted: u32,
-    untimed: u32, // cycles for which SYNCs of another master discredit the samples
+    contradicted: u32, // by a cross-check
+    misread: u32,      // by what a node says of itself
+    untimed: u32,      // cycles for which SYNCs of another master discredit the samples
     awaited: usize,
     /// Number of the current SYNC, from 0; -1 before the first.
     pub sequence: i64,
@@ -114,6 +115,7 @@ impl Assembler {
             unnumbered: false,
             faulted: 0,
             contradicted: 0,
+            misread: 0,
             untimed: 0,
             awaited: 0,
             sequence: -1,
@@ -285,7 +287,7 @@ impl Assembler {
         let all_arrived = self.decoders.iter().all(|decoder| decoder.arrived || !decoder.timed());
         if self.note_missing() || self.spoiled || all_arrived {
             self.missed = Some(self.sequence);
-            self.flags = BUS_FAULT | self.faulted | self.contradicted;
+            self.flags = BUS_FAULT | self.faulted | self.contradicted | self.misread;
         }
         None
     }
@@ -410,7 +412,7 @@ impl Assembler {
 
     fn sample(&mut self) -> Sample {
         self.open = false;
-        let mut flags = self.faulted | self.contradicted;
+        let mut flags = self.faulted | self.contradicted | self.misread;
         if self.cycle_fault {
             flags |= BUS_FAULT;
         }
@@ -450,6 +452,15 @@ impl Assembler {
         for node in self.nodes.iter_mut().filter(|node| node.node_id == node_id) {
             node.trusted = false;
         }
+    }
+
+    /// A node says by SDO what its frames do not, or does no longer.
+    pub fn contradict(&mut self, node_id: u32, contradicted: bool) {
+        for node in self.nodes.iter_mut().filter(|node| node.node_id == node_id) {
+            node.contradicted = contradicted;
+        }
+        let any = self.nodes.iter().any(|node| node.contradicted);
+        self.misread = if any { CONTRADICTED } else { 0 };
     }
 
     /// A node has been configured and started.

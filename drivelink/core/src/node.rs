@@ -49,6 +49,8 @@ pub struct Node {
     pub counters: Counters,
     /// Whether its PDOs are used.
     pub trusted: bool,
+    /// Its frames carry something else than their maps say; for who reads its objects by SDO to know.
+    pub contradicted: bool,
     /// As last heard.
     pub statusword: Option<i64>,
     /// The fault bit of it.
@@ -68,6 +70,7 @@ impl Node {
             supervised: false,
             counters: Counters::default(),
             trusted: true,
+            contradicted: false,
             statusword: None,
             faulted: false,
             emergency: 0,

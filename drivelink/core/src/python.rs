@@ -461,6 +461,10 @@ impl Assembler {
         lock(&self.core).trust(node_id);
     }
 
+    fn contradict(&self, node_id: u32, contradicted: bool) {
+        lock(&self.core).contradict(node_id, contradicted);
+    }
+
     fn relayout(&self, py: Python<'_>, layout: &Bound<'_, PyAny>) -> PyResult<()> {
         let layout = layout_from(py, layout)?;
         let changed = lock(&self.core).relayout(&layout);

@@ -1,0 +1,147 @@
+"""Units and values of running nodes asked for again by SDO: a lie is found, health costs nothing."""
+
+import itertools
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import pytest
+from daemonkit import DaemonRig, Listener, rig, vsa
+
+from drivelink.canopen.layout import Signal
+from estimator.sample import Status
+
+OFTEN = "read_back_s = 0.05"
+CONFIRMED = 2500  # cycles: every object of three nodes has been asked for once
+
+
+def forge(made: DaemonRig, node: int, address: tuple[int, int], number: int, times: int) -> None:
+    """Somebody else answers for this object, before the node does."""
+    server = made.node(node).sdo
+    left, inner = [times], server._send
+
+    def send(data: bytes) -> None:
+        if left[0] and data[0] & 0xE0 == 0x40 and struct.unpack_from("<HB", data, 1) == address:
+            left[0] -= 1
+            inner(data[:4] + number.to_bytes(4, "little"))
+        inner(data)
+
+    server._send = send
+
+
+@contextmanager
+def carrying(made: DaemonRig, node: int, change: Callable[[bytes], bytes]) -> Iterator[None]:
+    """Meanwhile the node's first frame carries something else."""
+    tpdo = made.node(node).tpdos[made.tpdo(node)[0]]
+    inner = tpdo.emit
+    tpdo.emit = lambda can_id, data: inner(can_id, change(data))
+    yield
+    tpdo.emit = inner
+
+
+def scales(made: DaemonRig, node: int) -> dict[Signal, float]:
+    return {o.signal: o.scale for tpdo in made.daemon.layouts[node].tpdos for o in tpdo.objects}
+
+
+def uploads(made: DaemonRig) -> list[tuple[int, bytes]]:
+    """SDO requests that are sent from now on."""
+    found, inner = [], made.daemon.loop.source.send
+
+    def send(cob_id: int, data: bytes) -> None:
+        if cob_id >= 0x600:
+            found.append((cob_id, data))
+        inner(cob_id, data)
+
+    made.daemon.loop.source.send = send
+    return found
+
+
+def test_in_health_units_and_values_are_confirmed_and_nothing_is_said() -> None:
+    with rig() as made:
+        sent = uploads(made)
+        estimates = made.run(CONFIRMED)
+        assert not any(e.status & Status.CONTRADICTED for e in estimates)
+        asked = {(cob_id - 0x600, *struct.unpack_from("<HB", data, 1)) for cob_id, data in sent}
+        assert {(1, 0x6064, 0), (2, 0x6077, 0), (1, 0x6076, 0), (3, 0x6004, 0), (3, 0x6501, 0)} <= asked
+        assert made.events == []
+        before = len(sent)
+        made.run(6000)
+        assert len(sent) - before <= 4  # then one in two seconds
+
+
+def test_while_somebody_else_talks_to_a_node_nothing_is_asked() -> None:
+    with rig(vsa(bus=OFTEN)) as made:
+        made.run(CONFIRMED)
+        sent, other = uploads(made), Listener(made.joint)
+        other.send(0x602, bytes.fromhex("4000100000000000"))
+        made.run(5000)
+        other.close()
+        assert len(sent) <= 1  # what was under way
+
+
+def test_where_it_is_not_wanted_nothing_is_asked() -> None:
+    with rig(vsa(bus="read_back_s = 0")) as made:
+        sent = uploads(made)
+        made.run(CONFIRMED)
+        assert sent == []
+
+
+def test_a_forged_answer_while_a_node_is_configured_changes_no_unit() -> None:
+    with rig() as made:
+        made.run(200)
+        before = scales(made, 2)
+        forge(made, 2, (0x6076, 0), 5000, times=1)
+        made.faults.reboot(made.node(2))
+        made.run(1000)
+        assert scales(made, 2) == before
+        assert not any("cannot be configured" in text for text in made.events)
+
+
+def test_a_node_that_says_other_units_time_after_time_is_not_used() -> None:
+    with rig() as made:
+        made.run(200)
+        entry, answers = made.node(2).dictionary.find(0x6076, 0), itertools.count(1000)
+        right = entry.value
+
+        def drift() -> None:
+            entry.value = next(answers)
+
+        entry.refresh = drift
+        made.faults.reboot(made.node(2))
+        estimates = made.run(3000)
+        (line,) = {text for text in made.events if "cannot be configured" in text}
+        assert "0x6076:00 was" in line
+        assert "does another device answer for it?" in line
+        assert not any(e.status & Status.VALID for e in estimates[-1000:])
+        entry.refresh, entry.value = None, right
+        assert any(e.status & Status.VALID for e in made.run(8000)[-1000:])
+
+
+def test_a_unit_that_changes_in_the_run_has_the_node_configured_anew() -> None:
+    with rig(vsa(bus=OFTEN)) as made:
+        made.run(CONFIRMED)
+        before = scales(made, 1)[Signal.MOTOR_TORQUE]
+        entry = made.node(1).dictionary.find(0x6076, 0)
+        entry.value = 2 * entry.value
+        made.run(5000)  # more than a round of all objects
+        said = [text for text in made.events if "0x6076:00 was" in text]
+        assert len(said) == 1
+        assert said[0].startswith("node 1: ")
+        assert said[0].endswith(" now: it is configured again")
+        assert scales(made, 1)[Signal.MOTOR_TORQUE] == pytest.approx(2 * before)
+
+
+def test_a_frame_that_carries_another_object_than_is_mapped_is_contradicted_until_it_does() -> None:
+    with rig(vsa(bus=OFTEN)) as made:
+        made.run(CONFIRMED)
+        other = itertools.count(123_456, 7)
+        with carrying(made, 1, lambda data: struct.pack("<i", next(other)) + data[4:]):
+            made.run(5000)
+            assert any("as 0x6064:00, by SDO it is" in text for text in made.events)
+            last = made.run(2000)
+            assert all(e.status & Status.CONTRADICTED and not e.status & Status.VALID for e in last)
+            suspected = made.status["suspected"]
+        assert (suspected["signal"], suspected["motor"]) == ("motor_position", 1)
+        assert suspected["reason"] == "contradicted"
+        end = made.run(5000)
+        assert not end[-1].status & Status.CONTRADICTED

@@ -166,7 +166,11 @@ SCRIPT: tuple[Fault, ...] = (
     ),
     Fault(
         name="SDO aborts while it is configured again",
-        steps=(at(0.1, "reboot", 2), at(0.1, "refuse_sdo", 2, 0x08000022, 200)),
+        steps=(
+            at(0.1, "reboot", 2),
+            at(0.1, "refuse_sdo", 2, 0x08000022, 10_000),
+            at(3.5, "refuse_sdo", 2, 0x08000022, 0),
+        ),
         flags=Status.STALE | Status.RESTARTED,
         gaps=True,
         says=(REBOOTED, r"^node 2 cannot be configured: .*0x08000022 \(.+\)", STARTED),

@@ -11,8 +11,7 @@ from vsacontrol.drive import PowerState, Wiring
 from vsacontrol.master import Master
 from vsacontrol.sdo import Client, Read, SdoError, Write
 
-from sim.canopen.cia402_objects import DriveData
-from sim.canopen.drive import Cia402Drive
+from sim.canopen.drive import Cia402Drive, DriveData
 from sim.canopen.profiles import profile
 from sim.network import Network
 

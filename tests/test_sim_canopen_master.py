@@ -7,6 +7,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import can
 import canopen
@@ -15,11 +16,9 @@ from canopen.objectdictionary import ODArray, ODRecord, ODVariable
 from canopen.sdo.exceptions import SdoAbortedError
 from simkit import StubRig
 
-from sim.canopen.cia402_objects import DriveData
-from sim.canopen.cia406_objects import EncoderData
-from sim.canopen.drive import Cia402Drive
-from sim.canopen.edsfile import eds_directory, eds_files
-from sim.canopen.encoder import Cia406Encoder
+from sim.canopen.drive import Cia402Drive, DriveData
+from sim.canopen.edsfile import eds_directory, node_eds
+from sim.canopen.encoder import Cia406Encoder, EncoderData
 from sim.canopen.node import Node
 from sim.canopen.profiles import PROFILES, profile
 from sim.network import Network
@@ -82,7 +81,7 @@ def variables(od: canopen.ObjectDictionary) -> Iterator[ODVariable]:
 EDS = {
     "cia402-drive.eds": "strict",
     "cia406-encoder.eds": None,
-    **{f"{name}.eds": name for name in PROFILES if f"{name}.eds" in eds_files()},
+    **{f"{name}.eds": name for name, quirks in PROFILES.items() if quirks.eds == name},
 }
 
 
@@ -109,15 +108,30 @@ def test_every_object_of_the_eds_is_served_with_its_type_and_default(eds: str) -
         assert served == {(entry.index, entry.item.subindex) for entry in node.dictionary}
 
 
-def test_the_shipped_eds_files_are_those_of_the_served_objects() -> None:
-    shipped = {path.name: path.read_text(encoding="ascii") for path in eds_directory().glob("*.eds")}
-    # If this fails: python -m sim.canopen.edsfile
-    assert shipped == eds_files()
+@pytest.mark.parametrize("eds", EDS)
+def test_the_eds_file_that_a_device_writes_is_the_one_it_was_made_from(eds: str) -> None:
+    rig = StubRig()
+    node: Node = drive(rig, EDS[eds]) if EDS[eds] else Cia406Encoder(1, rig, EncoderData())
+    assert node_eds(eds, node) == (eds_directory() / eds).read_text(encoding="ascii")
+
+
+def test_every_shipped_eds_file_is_of_a_device() -> None:
+    assert {path.name for path in eds_directory().glob("*.eds")} == set(EDS)
+
+
+def test_an_eds_file_has_the_nameplate_of_its_device() -> None:
+    data = DriveData(counts_per_rev=8192, gear=(50, 3), link_counts_per_rev=65536)
+    node = Cia402Drive(1, StubRig(), 0, data, replace(profile("epos4"), second_encoder=3))
+    text = node_eds("elbow.eds", node)
+    assert "FileName=elbow.eds" in text and "ProductName=drivelink simulated drive, EPOS4-like" in text
+    assert "[60E4sub3]\nParameterName=Additional position actual value, sensor 3" in text
+    strict = node_eds("elbow.eds", Cia402Drive(1, StubRig(), 0, data))
+    assert "[608Fsub1]" in strict and "DefaultValue=0x2000" in strict.split("[608Fsub1]")[1][:160]
 
 
 @pytest.mark.parametrize("eds", EDS)
 def test_an_eds_file_lists_what_it_describes(eds: str) -> None:
-    text = eds_files()[eds]
+    text = (eds_directory() / eds).read_text(encoding="ascii")
     sections = [line.strip("[]") for line in text.splitlines() if line.startswith("[")]
     assert len(sections) == len(set(sections))
     listed = [line.split("=0x")[1] for line in text.splitlines() if line[0:1].isdigit() and "=0x" in line]

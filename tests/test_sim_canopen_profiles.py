@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 from simkit import StubRig, Wire, wired
 
-from sim.canopen.cia402_objects import DriveData
-from sim.canopen.drive import Cia402Drive
+from sim.canopen.drive import Cia402Drive, DriveData
 from sim.canopen.profiles import PROFILES, profile
 from sim.errors import SimError
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 import pytest
 from simkit import TRANSCRIPTS, StubRig, play, wired
 
-from sim.canopen.cia402_objects import DriveData
-from sim.canopen.cia406_objects import EncoderData
-from sim.canopen.drive import Cia402Drive
-from sim.canopen.encoder import Cia406Encoder
+from sim.canopen.drive import Cia402Drive, DriveData
+from sim.canopen.encoder import Cia406Encoder, EncoderData
 from sim.canopen.node import Node
 from sim.canopen.profiles import profile
 

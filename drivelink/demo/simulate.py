@@ -24,10 +24,8 @@ from drivelink.errors import BusError, JointFileError, UsageError
 from drivelink.jointfile import BusSection, JointFile, MotorSection, SimSection
 from estimator.model import LinkDynamics
 from sim.bench import Bench
-from sim.canopen.cia402_objects import DriveData
-from sim.canopen.cia406_objects import EncoderData
-from sim.canopen.drive import Cia402Drive
-from sim.canopen.encoder import Cia406Encoder
+from sim.canopen.drive import Cia402Drive, DriveData
+from sim.canopen.encoder import Cia406Encoder, EncoderData
 from sim.canopen.node import Node
 from sim.canopen.profiles import PROFILES, profile
 from sim.canopen.quirks import Quirks

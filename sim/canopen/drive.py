@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from sim.canopen.aborts import Abort, SdoAbortError
-from sim.canopen.cia402_objects import DEVICE_TYPE, RPDOS, TPDOS, DriveData, cia402_objects
-from sim.canopen.dictionary import Entry, Object
+from sim.canopen.dictionary import Entry, Object, Value
+from sim.canopen.edsfile import load_eds, with_values
 from sim.canopen.node import Nmt, Node
-from sim.canopen.objects import Identity, communication_objects, rpdo_objects, tpdo_objects
 from sim.canopen.quirks import Quirks
 from sim.canopen.statemachine import PowerState, StateMachine
 
-__all__ = ["Cia402Drive", "DriveReadings", "MeasuredPlant", "drive_objects"]
+__all__ = ["Cia402Drive", "DriveData", "DriveReadings", "MeasuredPlant"]
 
 _PROFILE_TORQUE, _CYCLIC_TORQUE = 4, 10
 _MODES = (0, _PROFILE_TORQUE, _CYCLIC_TORQUE)
@@ -24,6 +25,7 @@ _TOGGLE = 0x0400
 _FAULT_SIGNAL, _DISABLE_VOLTAGE, _QUICK_STOP = 1, 2, 3  # 0x6007
 _HEARTBEAT_LOST = 0x8130
 _POSITION_REVERSED, _VELOCITY_REVERSED = 0x80, 0x40
+_SENSORS = (0x60E4, 0x60E5, 0x60E6, 0x60EB)  # arrays with an entry per encoder
 
 # 0x60A9: units of a numerator per radian, and seconds in a denominator.
 _RADIAN, _DEGREE, _REVOLUTION, _INCREMENT = 0x10, 0x41, 0xB4, 0xB5
@@ -71,18 +73,61 @@ class MeasuredPlant(Protocol):
         """The link encoder."""
 
 
-IDENTITY = Identity(name="drivelink simulated CiA 402 drive", product_code=0x402)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DriveData:
+    """The nameplate of one drive with its motor, encoders and gear.
+
+    Attributes:
+        rated_current_ma: 0x6075.
+        rated_torque_mnm: 0x6076, at the motor shaft.
+        max_current_per_mille: 0x6073.
+        counts_per_rev: 0x608F:1, per motor revolution.
+        gear: 0x6091: motor revolutions per shaft revolutions.
+        link_counts_per_rev: 0x60E6:1, of the second encoder; None: it is not wired.
+    """
+
+    rated_current_ma: int = 2000
+    rated_torque_mnm: int = 100
+    max_current_per_mille: int = 3000
+    counts_per_rev: int = 4096
+    gear: tuple[int, int] = (1, 1)
+    link_counts_per_rev: int | None = None
+
+    def values(self) -> dict[tuple[int, int], Value]:
+        """Power-on values, by (index, subindex)."""
+        motor, shaft = self.gear
+        return {
+            (0x6073, 0): self.max_current_per_mille,
+            (0x6075, 0): self.rated_current_ma,
+            (0x6076, 0): self.rated_torque_mnm,
+            (0x608F, 1): self.counts_per_rev,
+            (0x6091, 1): motor,
+            (0x6091, 2): shaft,
+            (0x6092, 1): self.counts_per_rev * motor // shaft,
+        }
 
 
-def drive_objects(data: DriveData, quirks: Quirks) -> list[Object]:
-    """The dictionary of a drive, as a maker's quirks leave it."""
-    objects = communication_objects(DEVICE_TYPE, quirks.identity or IDENTITY)
-    for number, pdo in enumerate(RPDOS, start=1):
-        objects += rpdo_objects(number, pdo)
-    for number, pdo in enumerate(quirks.tpdos or TPDOS, start=1):
-        objects += tpdo_objects(number, pdo)
-    objects += cia402_objects(data, quirks.second_encoder)
-    return sorted(quirks.applied(objects), key=lambda described: described.index)
+def _drive_objects(data: DriveData, quirks: Quirks) -> list[Object]:
+    """The dictionary of a drive, by its EDS file and nameplate."""
+    second = quirks.second_encoder
+    objects = [_with_sensors(one, second) if one.index in _SENSORS else one for one in load_eds(quirks.eds)]
+    values: dict[tuple[int, int], Value] = {
+        (0x60E6, second): data.link_counts_per_rev or 0,
+        (0x60EB, second): 1,
+    }
+    if quirks.identity is not None:
+        values |= {(0x1008, 0): quirks.identity[0].encode(), (0x1018, 2): quirks.identity[1]}
+    return with_values(objects, {**data.values(), **values})
+
+
+def _with_sensors(described: Object, count: int) -> Object:
+    """An array of the second encoder's values with so many sensors, all zero."""
+    highest, first = described.items[:2]
+    sensors = (
+        replace(first, subindex=k, name=re.sub(r"\d+$", str(k), first.name), default=0)
+        for k in range(1, count + 1)
+    )
+    return replace(described, items=(replace(highest, default=count), *sensors))
 
 
 def _limited(value: float, bound: int) -> int:
@@ -113,7 +158,7 @@ class Cia402Drive(Node):
         self.data = data or DriveData()
         quirks = quirks or Quirks()
         self._sampled: tuple[Callable[[DriveReadings], None], ...] = ()
-        super().__init__(node_id, drive_objects(self.data, quirks), quirks)
+        super().__init__(node_id, _drive_objects(self.data, quirks), quirks)
         self.machine = StateMachine()
         self._torque_unit_nm = max(1, self.data.rated_torque_mnm) * 1e-6
         self._current_unit_a = max(1, self.data.rated_current_ma) * 1e-6
@@ -141,7 +186,7 @@ class Cia402Drive(Node):
         self._max_torque, self._slope = live(0x6072), live(0x6087)
         self._polarity, self._velocity_unit = live(0x607E), live(0x60A9)
         if (0x60A9, 0) not in self.dictionary:
-            self._velocity_unit.value = self.quirks.defaults.get((0x60A9, 0), self.data.velocity_unit)
+            self._velocity_unit.value = self.quirks.velocity_unit
         self._error_code = live(0x603F)
         self._sensors: list[tuple[Callable[[DriveReadings], None], frozenset[Entry]]] = [
             (self._read_position, frozenset({self._position, self._internal})),

@@ -1,26 +1,26 @@
-"""Electronic data sheets (CiA 306) of the simulated devices, written from their objects."""
+"""Electronic data sheets (CiA 306): the object dictionaries of the simulated devices."""
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from typing import Any
 
-from sim.canopen.cia402_objects import DriveData
-from sim.canopen.cia406_objects import EncoderData
-from sim.canopen.dictionary import Item, Kind, Object, Value
-from sim.canopen.drive import drive_objects
-from sim.canopen.encoder import encoder_objects
+import canopen
+
+from sim.canopen.dictionary import DataType, Item, Kind, Object, Value
 from sim.canopen.node import Node
-from sim.canopen.profiles import PROFILES
-from sim.canopen.quirks import Quirks
 
-__all__ = ["eds_directory", "eds_files", "eds_text", "main", "node_eds"]
+__all__ = ["eds_directory", "load_eds", "node_eds", "with_values"]
 
-_MANDATORY = (0x1000, 0x1001, 0x1018)
-_BAUD_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
-_DUMMIES = {1: 0, 2: 1, 3: 1, 4: 1, 5: 1, 6: 1, 7: 1}
-_DATED = ("11-20-2026", "12:00PM")
+_KINDS: dict[type, Kind] = {
+    canopen.objectdictionary.ODArray: Kind.ARRAY,
+    canopen.objectdictionary.ODRecord: Kind.RECORD,
+}
+_STRINGS = (DataType.VISIBLE_STRING, DataType.OCTET_STRING, DataType.DOMAIN)
 
 
 def eds_directory() -> Path:
@@ -28,107 +28,86 @@ def eds_directory() -> Path:
     return Path(__file__).parent.parent / "eds"
 
 
-def eds_files() -> dict[str, str]:
-    """File name to text, of every device and profile that is shipped."""
-    files = {"cia406-encoder.eds": eds_text("cia406-encoder.eds", encoder_objects(EncoderData(), Quirks()))}
-    for name, quirks in PROFILES.items():
-        if name != "strict" and not quirks.missing and not quirks.tpdos:
-            continue  # behaviour that an EDS file cannot express
-        file = "cia402-drive.eds" if name == "strict" else f"{name}.eds"
-        files[file] = eds_text(file, drive_objects(DriveData(), quirks), quirks)
-    return files
+@cache
+def load_eds(name: str) -> tuple[Object, ...]:
+    """The objects of a shipped EDS file, by index."""
+    dictionary = canopen.import_od(str(eds_directory() / f"{name}.eds"), 0)
+    return tuple(_read(dictionary[index]) for index in sorted(dictionary) if index >= 0x1000)
 
 
-def eds_text(file_name: str, objects: Sequence[Object], quirks: Quirks | None = None) -> str:
-    """One EDS.
+def _read(described: Any) -> Object:
+    kind = _KINDS.get(type(described), Kind.VAR)
+    variables = [described] if kind is Kind.VAR else list(described.subindices.values())
+    return Object(
+        index=described.index,
+        name=described.name,
+        kind=kind,
+        items=tuple(
+            Item(
+                subindex=v.subindex,
+                name=v.name,
+                type=DataType(v.data_type),
+                access=v.access_type,
+                default=v.default.encode() if v.data_type in _STRINGS else v.default,
+                low=v.min,
+                high=v.max,
+                pdo=v.pdo_mappable,
+                plus_node_id=v.relative,
+            )
+            for v in variables
+        ),
+    )
 
-    Args:
-        file_name: what the file will be called.
-        objects: the dictionary that the device serves.
-        quirks: identity of a drive that imitates this maker's.
-    """
-    lines = [*_head(file_name, objects, quirks or Quirks())]
-    indices = [described.index for described in objects]
-    groups = {
-        "MandatoryObjects": [index for index in indices if index in _MANDATORY],
-        "OptionalObjects": [
-            index
-            for index in indices
-            if index not in _MANDATORY and (index < 0x2000 or 0x6000 <= index <= 0xFFFF)
-        ],
-        "ManufacturerObjects": [index for index in indices if 0x2000 <= index < 0x6000],
-    }
-    for group, members in groups.items():
-        lines += ["", f"[{group}]", f"SupportedObjects={len(members)}"]
-        lines += [f"{number}=0x{index:04X}" for number, index in enumerate(members, start=1)]
-    for described in objects:
-        lines += _object(described)
-    return "\n".join([*lines, ""])
+
+def with_values(objects: Sequence[Object], values: Mapping[tuple[int, int], Value]) -> list[Object]:
+    """The objects with other power-on values, by (index, subindex); those of missing objects are ignored."""
+    return [
+        replace(
+            described,
+            items=tuple(
+                replace(item, default=values.get((described.index, item.subindex), item.default))
+                for item in described.items
+            ),
+        )
+        for described in objects
+    ]
 
 
 def node_eds(file_name: str, node: Node) -> str:
-    """The EDS of one device with its present data."""
-    return eds_text(file_name, list(node.dictionary.objects.values()), node.quirks)
+    """The EDS file of a device, with its present power-on values."""
+    shipped = (eds_directory() / f"{node.quirks.eds}.eds").read_text(encoding="ascii")
+    head = shipped.partition("\n[1000]\n")[0]
+    objects = node.dictionary.objects
+    name = _default(objects[0x1008].items[0])
+    for key, value in (
+        ("FileName", file_name),
+        ("Description", name),
+        ("ProductName", name),
+        ("ProductNumber", str(objects[0x1018].items[2].default)),
+        ("OrderCode", node.quirks.name),
+    ):
+        head = re.sub(f"^{key}=.*$", f"{key}={value}", head, flags=re.MULTILINE)
+    return "\n".join([head, *(line for described in objects.values() for line in _object(described))])
 
 
-def _head(file_name: str, objects: Sequence[Object], quirks: Quirks) -> Iterable[str]:
-    item = {
-        (described.index, item.subindex): _text(item.default)
-        for described in objects
-        for item in described.items
-    }
-    text = item[0x1008, 0]
-    date, time = _DATED
-    yield from ("[FileInfo]", f"FileName={file_name}", "FileVersion=1", "FileRevision=0", "EDSVersion=4.0")
-    yield f"Description={text}"
-    for noun, verb in (("Creation", "Created"), ("Modification", "Modified")):
-        yield from (f"{noun}Time={time}", f"{noun}Date={date}", f"{verb}By=drivelink")
-    yield from ("", "[DeviceInfo]", "VendorName=drivelink", f"VendorNumber={item[0x1018, 1]}")
-    yield from (f"ProductName={text}", f"ProductNumber={item[0x1018, 2]}")
-    yield from (f"RevisionNumber={item.get((0x1018, 3), 0)}", f"OrderCode={quirks.name}")
-    yield from (f"BaudRate_{rate}=1" for rate in _BAUD_RATES)
-    indices = [described.index for described in objects]
-    yield from ("SimpleBootUpMaster=0", "SimpleBootUpSlave=1", "Granularity=8", "DynamicChannelsSupported=0")
-    yield from ("GroupMessaging=0", f"NrOfRXPDO={sum(0x1400 <= index < 0x1600 for index in indices)}")
-    yield from (f"NrOfTXPDO={sum(0x1800 <= index < 0x1A00 for index in indices)}", "LSS_Supported=0")
-    yield from ("", "[DummyUsage]", *(f"Dummy{code:04X}={used}" for code, used in _DUMMIES.items()))
-    yield from ("", "[Comments]", "Lines=1", "Line1=Served by drivelink sim; written by sim.canopen.edsfile")
-
-
-def _text(value: Value) -> str:
-    return value.decode() if isinstance(value, bytes) else str(value)
-
-
-def _object(described: Object) -> list[str]:
+def _object(described: Object) -> Iterator[str]:
     section = f"{described.index:04X}"
     if described.kind is Kind.VAR:
-        return ["", f"[{section}]", *_item(described.items[0], described.name)]
-    lines = [
-        "",
-        f"[{section}]",
-        f"ParameterName={described.name}",
-        f"ObjectType=0x{described.kind:X}",
-        f"SubNumber={len(described.items)}",
-    ]
+        yield from (f"[{section}]", *_item(described.items[0], described.name), "")
+        return
+    yield from (f"[{section}]", f"ParameterName={described.name}", f"ObjectType=0x{described.kind:X}")
+    yield from (f"SubNumber={len(described.items)}", "")
     for item in described.items:
-        lines += ["", f"[{section}sub{item.subindex:X}]", *_item(item, item.name)]
-    return lines
+        yield from (f"[{section}sub{item.subindex:X}]", *_item(item, item.name), "")
 
 
-def _item(item: Item, name: str) -> list[str]:
-    lines = [
-        f"ParameterName={name}",
-        f"ObjectType=0x{Kind.VAR:X}",
-        f"DataType=0x{item.type:04X}",
-        f"AccessType={item.access}",
-        f"DefaultValue={_default(item)}",
-        f"PDOMapping={int(item.pdo)}",
-    ]
+def _item(item: Item, name: str) -> Iterator[str]:
+    yield from (f"ParameterName={name}", f"ObjectType=0x{Kind.VAR:X}", f"DataType=0x{item.type:04X}")
+    yield from (f"AccessType={item.access}", f"DefaultValue={_default(item)}", f"PDOMapping={int(item.pdo)}")
     if item.low is not None:
-        lines.append(f"LowLimit={item.low}")
+        yield f"LowLimit={item.low}"
     if item.high is not None:
-        lines.append(f"HighLimit={item.high}")
-    return lines
+        yield f"HighLimit={item.high}"
 
 
 def _default(item: Item) -> str:
@@ -136,16 +115,3 @@ def _default(item: Item) -> str:
         return item.default.decode()
     text = f"0x{item.default:X}" if item.default >= 10 else str(item.default)
     return f"$NODEID+{text}" if item.plus_node_id else text
-
-
-def main(argv: Sequence[str] | None = None) -> None:
-    """Write every shipped EDS file anew."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("--directory", type=Path, default=eds_directory())
-    directory: Path = parser.parse_args(argv).directory
-    for name, text in eds_files().items():
-        (directory / name).write_text(text, encoding="ascii")
-
-
-if __name__ == "__main__":
-    main()

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from sim.canopen.aborts import Abort, SdoAbortError
 from sim.canopen.dictionary import Dictionary
-from sim.canopen.objects import COB_INVALID
+from sim.canopen.pdo import COB_INVALID
 from sim.canopen.timers import Timers
 
 __all__ = ["Emergency"]

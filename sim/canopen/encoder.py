@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from sim.canopen.aborts import Abort, SdoAbortError
-from sim.canopen.cia406_objects import DEVICE_TYPE, REVERSED, SCALING, TPDOS, EncoderData, cia406_objects
-from sim.canopen.dictionary import Object
+from sim.canopen.dictionary import Value
+from sim.canopen.edsfile import load_eds, with_values
 from sim.canopen.node import Node
-from sim.canopen.objects import Identity, communication_objects, tpdo_objects
 from sim.canopen.quirks import Quirks
 
-__all__ = ["Cia406Encoder", "Scale", "encoder_objects"]
+__all__ = ["Cia406Encoder", "EncoderData", "Scale"]
 
-IDENTITY = Identity(name="drivelink simulated CiA 406 encoder", product_code=0x406)
+SCALING, REVERSED = 0x04, 0x01  # bits of 0x6000
 
 _FASTEST = 0x7FFF
 _OPERATING_BITS = SCALING | REVERSED
@@ -30,12 +30,26 @@ class Scale(Protocol):
         """The link's position in counts, unbounded."""
 
 
-def encoder_objects(data: EncoderData, quirks: Quirks) -> list[Object]:
-    """The dictionary of an encoder, as a maker's quirks leave it."""
-    objects = communication_objects(DEVICE_TYPE, quirks.identity or IDENTITY)
-    for number, pdo in enumerate(quirks.tpdos or TPDOS, start=1):
-        objects += tpdo_objects(number, pdo)
-    return sorted(quirks.applied([*objects, *cia406_objects(data)]), key=lambda described: described.index)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EncoderData:
+    """The nameplate of an encoder.
+
+    Attributes:
+        counts_per_rev: 0x6501.
+        range_counts: where the position rolls over, 2 to 2**32.
+    """
+
+    counts_per_rev: int = 262144
+    range_counts: int = 1 << 32
+
+    def values(self) -> dict[tuple[int, int], Value]:
+        """Power-on values, by (index, subindex)."""
+        return {
+            (0x6001, 0): self.counts_per_rev,
+            (0x6002, 0): min(0xFFFF_FFFF, self.range_counts),
+            (0x6501, 0): self.counts_per_rev,
+            (0x6502, 0): min(0xFFFF, max(1, self.range_counts // self.counts_per_rev)),
+        }
 
 
 class Cia406Encoder(Node):
@@ -55,8 +69,8 @@ class Cia406Encoder(Node):
     ) -> None:
         self._scale = scale
         self.data = data or EncoderData()
-        quirks = quirks or Quirks()
-        super().__init__(node_id, encoder_objects(self.data, quirks), quirks)
+        quirks = replace(quirks or Quirks(), eds="cia406-encoder")
+        super().__init__(node_id, with_values(load_eds(quirks.eds), self.data.values()), quirks)
         find = self.dictionary.find
         self._position, self._speed = find(0x6004, 0), find(0x6030, 1)
         self._offset, self._preset = find(0x6509, 0), find(0x6003, 0)

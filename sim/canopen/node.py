@@ -9,8 +9,7 @@ from sim.canopen.aborts import Abort, SdoAbortError
 from sim.canopen.dictionary import Dictionary, Entry, Object
 from sim.canopen.emergency import Emergency
 from sim.canopen.heartbeat import HeartbeatConsumer, HeartbeatProducer
-from sim.canopen.objects import COB_INVALID
-from sim.canopen.pdo import restricted
+from sim.canopen.pdo import COB_INVALID, restricted
 from sim.canopen.quirks import Quirks
 from sim.canopen.rpdo import Rpdo
 from sim.canopen.sdo import SdoServer

@@ -11,10 +11,13 @@ from collections.abc import Callable
 
 from sim.canopen.aborts import Abort, SdoAbortError
 from sim.canopen.dictionary import DataType, Dictionary, Entry
-from sim.canopen.objects import COB_INVALID, COB_NO_RTR, MAPPED_AT_MOST
 from sim.canopen.quirks import Quirks
 
-__all__ = ["Pdo", "restricted"]
+__all__ = ["COB_INVALID", "COB_NO_RTR", "Pdo", "restricted"]
+
+COB_INVALID = 1 << 31
+COB_NO_RTR = 1 << 30
+MAPPED_AT_MOST = 8  # objects in one PDO
 
 _FRAME_29_BIT = 1 << 29
 _LONGEST_BITS = 64

@@ -1,12 +1,8 @@
-"""How makers' drives differ from the strict one, as data, after their manuals, EDS and DCF files."""
+"""How makers' drives differ from the strict one, after their manuals, EDS and DCF files."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
-
-from sim.canopen.dictionary import Item, Object
-from sim.canopen.objects import Identity, PdoDefault
+from dataclasses import dataclass
 
 __all__ = ["Quirks"]
 
@@ -17,13 +13,10 @@ class Quirks:
 
     Attributes:
         name: how the profile is called.
-        identity: 0x1008 to 0x1018; None: the device's own.
-        missing: objects, or (index, subindex), that do not exist.
-        constant: objects that cannot be written.
-        defaults: other power-on values, by (index, subindex).
-        tpdos: its TPDOs as they are at power-on; None: the device's own.
-        extra: vendor objects.
+        eds: its shipped EDS file, without the ending: objects, access, power-on values, TPDOs.
+        identity: 0x1008 and product code (0x1018:02), where they differ from the EDS file.
         current_ma: vendor object with the current in mA (i32).
+        velocity_unit: unit of velocities as in 0x60A9, for a drive without that object.
         velocity_exponents: powers of ten that 0x60A9 accepts.
         second_encoder: subindex of 0x60E4 at which a link encoder is found.
         keep_bit_30: aborts a COB-ID write that changes bit 30.
@@ -38,13 +31,10 @@ class Quirks:
     """
 
     name: str = "strict"
-    identity: Identity | None = None
-    missing: frozenset[int | tuple[int, int]] = frozenset()
-    constant: frozenset[int] = frozenset()
-    defaults: Mapping[tuple[int, int], int] = field(default_factory=dict)
-    tpdos: tuple[PdoDefault, ...] | None = None
-    extra: tuple[Object, ...] = ()
+    eds: str = "cia402-drive"
+    identity: tuple[str, int] | None = None
     current_ma: tuple[int, int] | None = None
+    velocity_unit: int = 0xFDB4_4700  # 0.001 rpm
     velocity_exponents: tuple[int, ...] = tuple(range(-9, 1))
     second_encoder: int = 1
     keep_bit_30: bool = False
@@ -56,22 +46,3 @@ class Quirks:
     self_starting: bool = False
     keeps_pdos: bool = False
     boot_s: float = 0.0
-
-    def applied(self, objects: Iterable[Object]) -> Iterator[Object]:
-        """The objects as this maker has them."""
-        for described in (*objects, *self.extra):
-            if described.index in self.missing:
-                continue
-            items = [
-                self._applied(described.index, item)
-                for item in described.items
-                if (described.index, item.subindex) not in self.missing
-            ]
-            if len(items) > 1 and items[0].access == "const":  # the highest sub-index that is left
-                items[0] = replace(items[0], default=items[-1].subindex)
-            yield replace(described, items=tuple(items))
-
-    def _applied(self, index: int, item: Item) -> Item:
-        default = self.defaults.get((index, item.subindex), item.default)
-        access = "const" if index in self.constant else item.access
-        return replace(item, default=default, access=access)

@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 from sim.canopen.aborts import Abort, SdoAbortError
 from sim.canopen.dictionary import Dictionary, Entry
-from sim.canopen.objects import signature
 
 __all__ = ["watch_storing"]
 
@@ -28,7 +27,7 @@ def watch_storing(dictionary: Dictionary) -> None:
         for group, bounds in enumerate(_GROUPS, start=1):
             entry = dictionary.get(index, group)
             if entry is not None:
-                entry.check = _signed(signature(text))
+                entry.check = _signed(int.from_bytes(text.encode(), "little"))
                 entry.changed = _acting(entry, bounds, act)
 
 

@@ -1,4 +1,4 @@
-"""The bandwidth that all channels share, and the noise it lets into each equation."""
+"""Chooses the bandwidth of all channels, and computes the noise it passes into each equation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["choose_bandwidth", "equation_noise", "torque_rms"]
 
 
 def torque_rms(record: Record) -> float:
-    """rms of the motor torque without its mean, N·m; of the motor that has more of it."""
+    """rms of the motor torque without its mean, N·m; the larger one of two motors."""
     return float(np.max(np.std(record.motor_torque_nm, axis=0)))
 
 

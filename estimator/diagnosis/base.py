@@ -1,4 +1,4 @@
-"""The declared model at its best fit: transmission parameters free, everything else as declared."""
+"""Transmission parameters of the declared model, and their linearisation."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Base:
         return total
 
     def moved(self, frame: Frame, step: FloatArray) -> Base:
-        """Alpha plus a step, shape parameters kept inside their bounds."""
+        """Alpha plus a step, with shape parameters limited to their bounds."""
         alpha, begin = [], 0
         for model, old in zip(self.models(frame), self.alpha, strict=True):
             new = old + step[begin : begin + len(old)]
@@ -72,7 +72,7 @@ class Base:
 
 
 def start(frame: Frame) -> Base:
-    """Alpha to begin with: as declared, or by a search over the shape, motor by motor."""
+    """Start values of alpha: declared, or by a search over the shape for each motor."""
     alpha = []
     for i, motor in enumerate(frame.model.motors):
         model = transmission_model(motor.transmission) if frame.flexible[i] else None
@@ -108,11 +108,11 @@ def _search(frame: Frame, i: int, model: TransmissionModel, order: int) -> Float
 
 
 def with_flexibility(frame: Frame, base: Base) -> Frame:
-    """The frame with tau_e and stiffness filled into its coordinates."""
+    """The frame with tau_e and stiffness in its coordinates."""
     motors = []
     for c, model, alpha in zip(frame.motors, base.models(frame), base.alpha, strict=True):
         if model is None:
-            # Rigid: what the motor passes on is not known; its own torque stands for the load.
+            # Rigid: the transmitted torque is unknown; the motor's torque stands for it.
             motors.append(c)
             continue
         motors.append(

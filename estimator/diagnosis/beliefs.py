@@ -1,4 +1,4 @@
-"""What is believed about one joint before any data: the table of priors in the joint's own units."""
+"""Priors of one joint, in its units."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _AT_MOTOR = (
 )
 _AT_LINK = ("encoder_delay", "link_inertia", "link_viscous_damping", "gravity")
 
-# Effects that take energy, never give it.
+# Effects that only dissipate energy.
 _POSITIVE = {
     "coulomb_friction",
     "presliding_friction",
@@ -45,7 +45,7 @@ _POSITIVE = {
 
 
 def everyday(frame: Frame) -> list[Candidate]:
-    """The errors that every rig has: declared numbers that are not quite right, readings that are askew."""
+    """Errors of every rig: inexact declared numbers, and offsets and skews of readings."""
     made = []
     for i, flexible in enumerate(frame.flexible):
         names = [n for n in _AT_MOTOR if flexible or n not in ("deflection_offset", "torque_delay")]
@@ -62,13 +62,13 @@ def everyday(frame: Frame) -> list[Candidate]:
 def everyday_std(
     frames: Sequence[Frame], candidate: Candidate, torque_rms: float, calibrating: bool
 ) -> tuple[float, ...]:
-    """Prior standard deviation of each linear parameter of an everyday error; 0: it is none here.
+    """Prior standard deviation of each linear parameter of an everyday error; 0: it does not apply.
 
     Args:
         frames: of all recordings.
         candidate: the error.
         torque_rms: of the motor torque without its mean, N·m.
-        calibrating: the recordings are of a healthy joint, and show what its declared numbers should be.
+        calibrating: the recordings are of a healthy joint and determine its declared numbers.
     """
     model, linked = frames[0].model, frames[0].linked
     name, motor, link = candidate.kind.name, model.motors[candidate.motor or 0], model.link
@@ -77,10 +77,10 @@ def everyday_std(
         return (std * frames[0].signals.period_s,)
     if name == "coulomb_friction":
         back = any(reverses(f.motors[candidate.motor or 0].velocity) for f in frames)
-        # Undeclared friction is a missing effect like any other.
+        # Undeclared friction is a missing effect.
         return (PRIORS["effect"].std * torque_rms,) if calibrating and back else (0.0,)
     if name == "torque_offset":
-        # A healthy joint's constant is the zero between its encoders: the two cannot be separated.
+        # A healthy joint's constant torque is attributed to the encoders' zero: the two cannot be separated.
         if calibrating and frames[0].flexible[candidate.motor or 0]:
             return (0.0,)
         return ((choice("floor") if linked and not calibrating else std) * torque_rms,)
@@ -88,12 +88,12 @@ def everyday_std(
         phi = frames[0].motors[candidate.motor or 0].deflection
         if calibrating:  # a healthy joint's encoders may start anywhere
             return (std * float(np.ptp(phi) + abs(np.mean(phi))),)
-        # What is left of a zero that has been set is no effect: half a count of an encoder is as much.
+        # The remainder of a zero that has been set is not an effect: half an encoder count is as large.
         return ((choice("floor") * float(np.std(phi)) if linked else std * float(np.ptp(phi))),)
     if name == "torque_constant" and calibrating:
         return (0.0,)  # the anchor
     if linked and not calibrating:
-        # Both balances show a declared number that is off: then it is an effect, and has a name.
+        # With both balances a wrong declared number is identifiable, so it is an effect with a name.
         std = PRIORS["declared"].std
     if name == "torque_constant":
         return (std,)
@@ -113,7 +113,7 @@ def everyday_std(
 
 
 def effect_std(model: JointModel, candidate: Candidate, by_torque: float) -> float:
-    """Prior standard deviation of an effect's linear parameter: by torque, or by what a reading is off."""
+    """Prior standard deviation of an effect's linear parameter, by torque or by reading error."""
     name = candidate.kind.name
     if name == "motor_inertia":
         return PRIORS["anchor"].std * model.motors[candidate.motor or 0].inertia_kg_m2
@@ -131,7 +131,7 @@ def effect_std(model: JointModel, candidate: Candidate, by_torque: float) -> flo
 
 
 def least(model: JointModel, candidate: Candidate) -> float:
-    """The bound that physics sets an effect's linear parameters, beyond what is declared."""
+    """Physical lower bound of an effect's linear parameters, beyond the declared value."""
     name = candidate.kind.name
     motor, link = model.motors[candidate.motor or 0], model.link
     if name in _POSITIVE:

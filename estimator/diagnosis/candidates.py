@@ -29,7 +29,7 @@ Values = Mapping[str, float]
 
 # Laws of friction and hysteresis with memory: Dahl, Bouc-Wen, elastic up to the limit.
 LAWS = ((1.0, 1.0), (2.0, 0.5), (50.0, 1.0))
-# Without a second equation for the same torque its scale is that of inertia and stiffness together.
+# Without a second equation the torque's scale cannot be separated from inertia and stiffness.
 _FREE_ZEROS = ("torque_offset", "deflection_offset")  # fitted anyway where nothing ties them
 _SCALES = ("torque_constant", "torque_saturation", "torque_drift")
 
@@ -43,7 +43,7 @@ class Candidate:
 
     @property
     def key(self) -> tuple[str, int | None]:
-        """What identifies it."""
+        """Its identity: name and motor."""
         return self.kind.name, self.motor
 
     @property
@@ -54,15 +54,15 @@ class Candidate:
 
     @property
     def family(self) -> tuple[str, str, str, int | None]:
-        """What it shares with other laws for the same thing: place, channel and coordinate."""
+        """Family of laws for the same phenomenon: place, channel and coordinate."""
         kind = self.kind
-        # Friction with memory is friction: a function of the position's past that changes with the direction.
+        # Friction with memory belongs to friction: it changes with the direction.
         coordinate = "velocity" if kind.remembers and kind.location == "motor" else kind.coordinates[0]
         return kind.location, kind.channel, coordinate, self.motor
 
 
 def members(frame: Frame) -> list[Candidate]:
-    """The effects that this joint can have and these data could show."""
+    """Effects that this joint can have and these data can reveal."""
     found = []
     external = frame.linked
     for kind in LIBRARY.values():
@@ -87,12 +87,12 @@ def members(frame: Frame) -> list[Candidate]:
 
 
 def reverses(velocity: FloatArray) -> bool:
-    """Whether a motion has both directions: dry friction is a constant torque in only one."""
+    """Whether a motion has both directions: in one alone dry friction is a constant torque."""
     return bool(np.quantile(velocity, 0.05) < 0.0 < np.quantile(velocity, 0.95))
 
 
 def sign_smoothing(frames: Sequence[Frame], motor: int) -> float:
-    """Velocity over which everyday dry friction changes its sign, rad/s: as declared, else by the motion."""
+    """Velocity over which everyday dry friction changes its sign, rad/s: declared, else from the motion."""
     for effect in frames[0].model.motors[motor].effects:
         if effect.name == "coulomb_friction":
             return elements(effect)[1][0]["smoothing_rad_s"]
@@ -135,7 +135,7 @@ def columns(frame: Frame, candidate: Candidate, values: Values) -> FloatArray:
 
 
 def _zero(frame: Frame, error: FloatArray) -> FloatArray:
-    """Column of an error that all deflections have in common."""
+    """Column of a common error of all deflections."""
     parts: list[FloatArray | None] = [frame.project(-c.stiffness * error) for c in frame.motors]
     if frame.linked:
         force = [-c.stiffness * error for c, pulls in zip(frame.motors, frame.pulls, strict=True) if pulls]
@@ -144,7 +144,7 @@ def _zero(frame: Frame, error: FloatArray) -> FloatArray:
 
 
 def _reading(frame: Frame, error: FloatArray) -> FloatArray:
-    """Column of an error e that the link's reading has too much: through tau_e and the link's balance."""
+    """Column of an error e of the link's reading, through tau_e and the link's balance."""
     narrow, response = frame.signals.narrow, frame.signals.response
     parts: list[FloatArray | None] = []
     total = np.zeros_like(error)
@@ -166,7 +166,7 @@ def _reading(frame: Frame, error: FloatArray) -> FloatArray:
 
 
 def grid(frame: Frame, candidate: Candidate, smoothing_rad_s: float) -> list[dict[str, float]]:
-    """Values of the nonlinear parameters to start from.
+    """Start values of the nonlinear parameters.
 
     Args:
         frame: the recording.
@@ -210,7 +210,9 @@ def grid(frame: Frame, candidate: Candidate, smoothing_rad_s: float) -> list[dic
 
 
 def _shortest_drift() -> float:
-    """Time constant of a drift, in recordings, at least: half a stretch; one over sooner is a start."""
+    """Shortest time constant of a drift, in recordings: half a stretch; a shorter one is a start-up
+    transient.
+    """
     return 0.5 / whole("groups")
 
 
@@ -219,7 +221,7 @@ def _vary(fixed: Values, name: str, values: Iterable[float]) -> list[dict[str, f
 
 
 def _waves(frame: Frame, c: Coordinates) -> FloatArray:
-    """Periods per revolution whose ripple is inside the bandwidth for a good part of the motion."""
+    """Periods per revolution whose ripple is within the bandwidth for much of the motion."""
     spread = _spread(c.position)
     if spread <= 0.0:
         return np.array([])
@@ -232,7 +234,7 @@ def _waves(frame: Frame, c: Coordinates) -> FloatArray:
 
 
 def least_periods(position: FloatArray) -> float:
-    """Fewest periods per revolution that the range of motion lets one call a ripple."""
+    """Fewest periods per revolution that count as a ripple in this range of motion."""
     return choice("ripple_periods") * 2.0 * np.pi / max(_spread(position), 1e-300)
 
 
@@ -261,7 +263,7 @@ def reach_of(frame: Frame, candidate: Candidate, name: str) -> float | None:
 
 
 def bounds_of(frame: Frame, candidate: Candidate, name: str) -> tuple[float, float]:
-    """Where a positive nonlinear parameter keeps its meaning: resolved, and within the motion."""
+    """Bounds of a positive nonlinear parameter: resolved, and within the motion."""
     c = frame.motors[candidate.motor or 0]
     fast = float(np.max(np.abs(c.link_velocity if candidate.motor is None else c.velocity)))
     if name == "smoothing_rad_s":
@@ -280,7 +282,7 @@ def bounds_of(frame: Frame, candidate: Candidate, name: str) -> tuple[float, flo
 
 
 def spread_of(frame: Frame, candidate: Candidate, name: str) -> float:
-    """How far a nonlinear parameter may move in one step about where it is: between points of its grid."""
+    """Largest step of a nonlinear parameter: between points of its grid."""
     c = frame.motors[candidate.motor or 0]
     if name == "periods_per_rev":
         return 0.5 * np.pi / max(_spread(c.position), 1e-300)

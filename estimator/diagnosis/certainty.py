@@ -1,9 +1,9 @@
-"""How sure each name is: the accounts of the data that are about as likely, and what they call it.
+"""Probability of each named effect, from all explanations that are about as likely.
 
-An account is a set of effects at its best fit. Its weight beside the account found is the odds that it would
-turn out the better one, had the recording gone on (`Search.chance`): the pairwise form of weighting models by
-how their predictive densities vary over the data (pseudo-BMA+; Yao, Vehtari, Simpson and Gelman, Bayesian
-Analysis 13, 2018).
+An account is a fitted set of effects. Its weight relative to the one found is the odds that it would be
+better on a longer recording (`Search.chance`): the pairwise form of model weights from the variation of
+predictive densities over the data (pseudo-BMA+; Yao, Vehtari, Simpson and Gelman, Bayesian Analysis 13,
+2018).
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ class Account(NamedTuple):
 
     @property
     def keys(self) -> Keys:
-        """Its effects and where they are; a free curve is an unlisted one."""
+        """Its effects and their places; a free curve counts as unlisted."""
         return self.fitted.keys
 
 
 class Standing(NamedTuple):
-    """How sure a name is, and what else the data may show: (name, probability), likeliest first."""
+    """Probability of a name, and its alternatives as (name, probability), the most probable first."""
 
     probability: float
     alternatives: tuple[tuple[str, float], ...]
 
 
 def accounts(search: Search, found: Fitted, others: Sequence[Fitted]) -> list[Account]:
-    """The account found and others with as many effects at most; of one set of effects the likeliest fit."""
+    """The account found and others with at most as many effects; the best fit for each set of effects."""
     made: dict[Keys, Account] = {found.keys: Account(1.0, found)}
     for other in others:
         if len(other.terms) > len(found.terms) or other.keys == found.keys:
@@ -51,7 +51,7 @@ def accounts(search: Search, found: Fitted, others: Sequence[Fitted]) -> list[Ac
 
 
 def standing(search: Search, found: Fitted, k: int, beside: Sequence[Account]) -> Standing:
-    """How sure the k-th effect of the account found is."""
+    """Probability and alternatives of the k-th effect found."""
     key = found.terms[k].candidate.key
     own = {name for name, _ in found.keys}
     total = sum(a.weight for a in beside)
@@ -62,7 +62,7 @@ def standing(search: Search, found: Fitted, k: int, beside: Sequence[Account]) -
             for name in {name for name, _ in account.keys} - own:
                 others[name] = others.get(name, 0.0) + account.weight / total
     if key[0] == "motor_inertia" and not search.problem.frames[0].linked:
-        # Without a second balance the torque's scale and the inertia's are one number.
+        # Without a second balance torque scale and inertia scale cannot be separated.
         probability, others["torque_constant"] = probability / 2.0, probability / 2.0
     listed = sorted(((n, p) for n, p in others.items() if p > choice("even")), key=lambda pair: -pair[1])
     return Standing(probability, tuple(listed))

@@ -1,6 +1,6 @@
-"""The choices of a diagnosis that are neither physics nor belief: one table, each with its reason.
+"""Choices of a diagnosis that are neither physics nor priors: one table with reasons.
 
-What is believed of a joint before any data is in `estimator.priors`. `python benchmarks/constants.py` halves
+Priors are in `estimator.priors`. `python benchmarks/constants.py` halves
 and doubles each entry of both.
 """
 
@@ -12,7 +12,7 @@ __all__ = ["CHOICES", "Choice", "choice", "least_rows", "whole"]
 
 
 class Choice(NamedTuple):
-    """A number that was chosen.
+    """A chosen number.
 
     Attributes:
         value: in its unit.
@@ -130,10 +130,10 @@ def choice(name: str) -> float:
 
 
 def whole(name: str) -> int:
-    """That number, where it counts something."""
+    """That number as an integer."""
     return max(1, round(CHOICES[name].value))
 
 
 def least_rows() -> int:
-    """Rows that a recording needs: two in each period of the bandwidth."""
+    """Fewest rows of a recording: two in each period of the bandwidth."""
     return 2 * whole("fit_periods")

@@ -1,10 +1,10 @@
-"""How sure a fitted hypothesis is on a machine, where errors are no noise.
+"""Covariance of a fitted hypothesis under model errors, which are not noise.
 
-What a model lacks leaves errors that last (they are alike at neighbouring times) and that depend on what the
-joint does (they are alike in like states, however far apart in time). So rows are grouped twice, by stretches
-of time and by kinds of motion, and errors of one group belong together: a heteroscedasticity and
-autocorrelation consistent covariance by clusters (CR2 of Bell and McCaffrey, Survey Methodology 28, 2002),
-clustered two ways (Cameron, Gelbach and Miller, J. of Business and Economic Statistics 29, 2011).
+Model errors persist (they are similar at neighbouring times) and depend on the motion (they are similar in
+similar states at any time). Rows are therefore grouped twice, by stretches of time and by kinds of motion,
+and errors within a group are correlated: a heteroscedasticity and autocorrelation consistent covariance by
+clusters (CR2 of Bell and McCaffrey, Survey Methodology 28, 2002), clustered two ways (Cameron, Gelbach and
+Miller, J. of Business and Economic Statistics 29, 2011).
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from estimator.sample import FloatArray
 __all__ = ["design_effects", "hac_covariance"]
 
 
-_FULL = 1e-9  # leverage is below one by the priors; this only keeps a division from rounding
+_FULL = 1e-9  # leverage is below one by the priors; guards a division against rounding
 _LEVEL = 0.975  # of a two-sided 95 % interval
 
 Labels = NDArray[np.int64]
 
 
 def hac_covariance(problem: Problem, fitted: Fitted) -> FloatArray:
-    """(k, k) covariance of the posterior's parameters, never less than the posterior's own.
+    """(k, k) covariance of the parameters, at least that of the posterior.
 
-    Standard deviations are those whose 1.96-fold is the 95 % interval of a t distribution: few groups of rows
-    leave a variance unsure, and a parameter that only some of them determine has fewer still.
+    Standard deviations are scaled so that 1.96 of them are the 95 % interval of a t distribution, whose
+    degrees of freedom follow from the number of groups that determine the parameter.
 
     Args:
         problem: the recordings.
@@ -47,9 +47,9 @@ def hac_covariance(problem: Problem, fitted: Fitted) -> FloatArray:
 
 
 def design_effects(problem: Problem, fitted: Fitted) -> FloatArray:
-    """(k,) variance of each parameter over what it had if rows were as independent as they look, at least 1.
+    """(k,) variance of each parameter over that of independent rows, at least 1.
 
-    So many rows say no more than one (Kish, Survey Sampling, 1965).
+    So many rows have the information of one (Kish, Survey Sampling, 1965).
     """
     free, moderated, _ = _moderated(problem, fitted)
     out = np.ones(len(fitted.posterior.x))
@@ -65,10 +65,10 @@ def _unit(fitted: Fitted, free: NDArray[np.int64]) -> FloatArray:
 def _moderated(problem: Problem, fitted: Fitted) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
     """(free parameters, their covariance over the posterior's deviations, degrees of freedom of each).
 
-    The clustered covariance is that by stretches of time, and what kinds of motion add to it beyond rows that
-    share both; the part of the priors is added. Of few groups it is itself a guess, so it is moderated by the
-    posterior's own, which counts as so many groups (Smyth, Statistical Applications in Genetics and Molecular
-    Biology 3, 2004).
+    The clustered covariance is that by stretches of time plus that by kinds of motion minus that of rows that
+    share both, plus the priors' part. With few groups it is uncertain, so it is moderated by the posterior's,
+    which counts as a number of groups (Smyth, Statistical Applications in Genetics and Molecular Biology 3,
+    2004).
     """
     posterior = fitted.posterior
     free = np.flatnonzero(~posterior.bound)
@@ -94,7 +94,7 @@ def _clustered(
 ) -> tuple[FloatArray, FloatArray]:
     """(covariance of x / unit where errors of one group of rows belong together, degrees of freedom).
 
-    What a fit takes of a group's errors by its leverage H is given back: (1 - H)^(-1/2) e (CR2). The
+    Residuals are corrected for the leverage H of their group: (1 - H)^(-1/2) e (CR2). The
     effective number of groups is (sum h)^2 / sum h^2, h the part of each in a parameter's variance.
     """
     regression = fitted.regression
@@ -119,7 +119,7 @@ def _clustered(
 
 
 def _kinds(problem: Problem, fitted: Fitted) -> Labels:
-    """(n,) kind of motion of each row: position, velocity, acceleration and deflection alike (k-means)."""
+    """(n,) kind of motion of each row, by position, velocity, acceleration and deflection (k-means)."""
     made = []
     for frame in problem.at(fitted.corrections, fitted.base):
         parts = []

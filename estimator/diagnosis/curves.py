@@ -1,4 +1,4 @@
-"""The fallback: a free curve at each location, over each coordinate, for what is in no library."""
+"""Free curves at each location over each coordinate, for effects outside the library."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Basis = Callable[[Coordinates], FloatArray]
 
 
 class _Splines:
-    """Cubic B-splines over the range of x, knots between its even spread and its quantiles."""
+    """Cubic B-splines over the range of x, knots halfway between evenly spaced ones and quantiles."""
 
     def __init__(self, x: FloatArray, knots: int) -> None:
         self._low, self._high = float(np.min(x)), float(np.max(x))
@@ -36,18 +36,18 @@ class _Splines:
         self._t = np.concatenate(([self._low] * _DEGREE, inner, [self._high] * _DEGREE))
 
     def __call__(self, x: FloatArray) -> FloatArray:
-        """(n, k) on x, beyond the range as at its ends."""
+        """(n, k) at x, constant beyond the range."""
         inside = np.clip(x, self._low, self._high)
         return np.asarray(BSpline.design_matrix(inside, self._t, _DEGREE).toarray())
 
 
 def best_curve(search: Search, beside: Fitted, place: tuple[str, int | None] | None = None) -> Fitted | None:
-    """The free curve with the most evidence beside a model, over all places and coordinates.
+    """The free curve with the most evidence when added to a model, over all places and coordinates.
 
     Args:
         search: the recordings.
         beside: the model.
-        place: location and motor where something is missing for sure: the curve that leaves least there.
+        place: location and motor of a certain deficit: choose the curve with the least residual there.
     """
     problem = search.problem
     frame = problem.at(beside.corrections, beside.base)[0]
@@ -112,7 +112,7 @@ def _over(name: str, splines: _Splines) -> Basis:
 
 
 def _beyond_scale(splines: _Splines) -> Basis:
-    """Functions of the torque without what is proportional to it: that would explain anything."""
+    """Functions of the torque without a proportional part, which would explain anything."""
 
     def basis(c: Coordinates) -> FloatArray:
         path = splines(c.torque)
@@ -130,7 +130,7 @@ def _both_ways(place: str, rate: str, smoothing: float, splines: _Splines) -> Ba
 
 
 def _scaled(factor: str, over: str, splines: _Splines, c: Coordinates, alone: bool = False) -> Basis:
-    """What is proportional to one coordinate, by a factor that depends on another."""
+    """Terms proportional to one coordinate, with a factor that depends on another."""
     size = max(float(np.sqrt(np.mean(getattr(c, factor) ** 2))), 1e-300)
 
     def basis(c: Coordinates) -> FloatArray:
@@ -142,7 +142,7 @@ def _scaled(factor: str, over: str, splines: _Splines, c: Coordinates, alone: bo
 
 
 def _creeping(c: Coordinates) -> FloatArray:
-    """What follows the deflection with a lag: creep and relaxation, several time constants."""
+    """Terms that follow the deflection with a lag: creep and relaxation, several time constants."""
     period = float(c.time[1] - c.time[0])
     made = []
     for lag in _LAGS_S:
@@ -186,13 +186,13 @@ def _waves(frame: Frame, beside: Fitted, frequency: float, resolution: float, eq
 
 
 def _residual(frame: Frame, beside: Fitted, equation: int) -> FloatArray:
-    """What a model leaves of one balance of the first recording."""
+    """Residual of one balance of the first recording."""
     left = beside.regression.residual(beside.posterior.x)
     return left[equation * frame.rows : (equation + 1) * frame.rows]
 
 
 def _line(frame: Frame, beside: Fitted, location: str, motor: int) -> tuple[float, float, int]:
-    """The strongest spectral line of one equation's residual that harmonics may belong to.
+    """The strongest spectral line of one equation's residual, for a curve with harmonics.
 
     Returns:
         Its frequency and the resolution, rad/s, and the equation.

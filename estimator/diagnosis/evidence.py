@@ -1,9 +1,9 @@
 """Bayesian linear regression of stacked balances, each with its own noise, and the evidence for a model.
 
-y_g = X_g x + e_g for each balance g, x ~ N(mean, std²) by the priors. The variance of e_g is estimated with
-x (evidence approximation; MacKay, Neural Computation 4, 1992), so a balance that the model fits badly loses
-its say. Errors behind a filter are correlated: n_g rows count as n_g / t_g independent ones, t_g from the
-autocorrelation of what is left (Bartlett, J. Royal Statistical Society B 8, 1946).
+y_g = X_g x + e_g for each balance g, x ~ N(mean, std²) by the priors. The variance of e_g is estimated with x
+(evidence approximation; MacKay, Neural Computation 4, 1992), so a badly fitted balance has less weight.
+Errors behind a filter are correlated: n_g rows count as n_g / t_g independent ones, t_g from the
+autocorrelation of the residual (Bartlett, J. Royal Statistical Society B 8, 1946).
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ __all__ = ["Posterior", "Regression", "Scale", "autocorrelation_time"]
 
 
 class Scale(NamedTuple):
-    """How a balance is scaled against its measurement: r_t changes by s_t = 1 + slopes_t x per N·m.
+    """Scaling of a balance's torque: r_t changes by s_t = 1 + slopes_t x per N·m.
 
-    Errors of the torque are those of r / s, errors of the model those of r. Taken for the former, they become
-    small where s is large; taken for the latter, where it is small. Nobody knows which they are, so x is what
-    lies between (geometric mean regression), and the evidence is the lower of the two: no scale pays that
-    makes errors small in one reading only.
+    If errors are the torque's, r / s is the residual; if they are the model's, r is. Minimising the first
+    favours a large s, minimising the second a small one. As the source is unknown, x is the compromise of
+    geometric mean regression, and the evidence is the lower of the two: a scale that reduces errors under one
+    assumption only does not pay.
 
     Attributes:
         groups: the balances. columns: (j,) the entries of x that scale them.
@@ -42,7 +42,7 @@ class Scale(NamedTuple):
         return np.maximum(1.0 + self.slopes @ x[self.columns], choice("least_scale"))
 
     def size(self, x: FloatArray) -> float:
-        """What r is divided by in the reading that makes it larger: geometric mean of s, one at most."""
+        """Divisor of r in the less favourable of both assumptions: geometric mean of s, at most one."""
         return min(float(np.exp(np.mean(np.log(self.sizes(x))))), 1.0)
 
 
@@ -51,10 +51,10 @@ class Posterior(NamedTuple):
 
     Attributes:
         x: (k,) maximum a posteriori.
-        covariance: (k, k) if rows were as independent as assumed.
+        covariance: (k, k) for the assumed number of independent rows.
         sigma: (groups,) standard deviation of each balance's errors, N·m.
         evidence: logarithm of the marginal likelihood, up to a constant of the data.
-        bound: (k,) where a sign holds x at its bound.
+        bound: (k,) whether x is at its bound.
     """
 
     x: FloatArray
@@ -79,11 +79,11 @@ class _Gram(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Regression:
-    """Rows of all balances and what is believed of x before.
+    """Rows of all balances, and the prior of x.
 
     Attributes:
         design: (n, k). target: (n,).
-        mean, std: (k,) of the prior. low: (k,) bounds from below, -inf where there are none.
+        mean, std: (k,) of the prior. low: (k,) lower bounds, or -inf.
         group: (n,) which balance a row belongs to, from 0.
         used: (n,) whether a row takes part.
         floor: (groups,) smallest standard deviation of each balance, N·m.
@@ -115,7 +115,7 @@ class Regression:
         floor: FloatArray,
         scales: tuple[Scale, ...] = (),
     ) -> Regression:
-        """The normal equations of each balance, made once; every column has norm one in them."""
+        """Make the normal equations of each balance, with columns of norm one."""
         unit = np.linalg.norm(design, axis=0)
         unit[unit == 0.0] = 1.0
         scaled = design / unit
@@ -127,7 +127,7 @@ class Regression:
         return cls(design, target, mean, std, low, group, used, floor, scales, grams, unit)
 
     def solve(self, times: FloatArray, start: FloatArray | None = None) -> Posterior:
-        """Parameters, noise and evidence: a fixed point of parameters and noise, bounds by an active set.
+        """Parameters, noise and evidence by fixed-point iteration, with an active set for bounds.
 
         Args:
             times: (groups,) autocorrelation times of the errors, in rows.
@@ -179,7 +179,7 @@ class Regression:
         return precision, side
 
     def _sizes(self, x: FloatArray) -> FloatArray:
-        """(groups,) by how much each balance is smaller than as measured."""
+        """(groups,) scale of each balance against the measurement."""
         sizes = np.ones(len(self._grams))
         for scale in self.scales:
             sizes[list(scale.groups)] = scale.size(x)
@@ -208,11 +208,11 @@ class Regression:
         )
 
     def residual(self, x: FloatArray) -> FloatArray:
-        """(n,) what is left of every row."""
+        """(n,) residual of every row."""
         return np.asarray(self.target - self.design @ x)
 
     def autocorrelation_times(self, x: FloatArray) -> FloatArray:
-        """(groups,) autocorrelation times of what is left, in rows."""
+        """(groups,) autocorrelation times of the residual, in rows."""
         residual = self.residual(x)
         return np.array([autocorrelation_time(residual[self.group == g]) for g in range(len(self._grams))])
 

@@ -1,4 +1,4 @@
-"""Whether the motion separates the effects, and which motion would."""
+"""Judges whether the motion separates the effects, and advises a better one."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def lines(x: FloatArray) -> float:
 
 
 def poor(frame: Frame) -> bool:
-    """Whether the motion is hardly more than one sine."""
+    """Whether the motion is little more than one sine."""
     return all(
         lines(frame.project(c.velocity)) < choice("one_sine")
         and lines(frame.project(c.torque)) < choice("one_sine")
@@ -63,7 +63,7 @@ _HINTS = {
 
 
 def advice_for(name: str, alternatives: tuple[str, ...]) -> list[str]:
-    """Which motion, or which knowledge, would decide between an effect and its alternatives."""
+    """Advice: the motion or knowledge that would separate an effect from its alternatives."""
     said = []
     for other in alternatives:
         hint = _HINTS.get(frozenset({name, other}))

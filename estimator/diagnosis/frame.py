@@ -1,8 +1,8 @@
 """A recording as regression rows: coordinates of every part of the joint, and the balances of its equations.
 
-Two filters act on everything alike. The light one, G, gives smooth coordinates for nonlinear terms at a
-reduced rate; the second, F, has the bandwidth of the diagnosis and gives the rows. Both have no phase.
-The torque of row k acts from t_k to t_(k+1): its hold, a delay of half a period and sin(x)/x, is part of G.
+Two zero-phase filters act on all channels. The light one, G, gives smooth coordinates for nonlinear terms at
+a reduced rate; the second, F, has the bandwidth of the diagnosis and gives the rows. The torque of row k acts
+from t_k to t_(k+1): its hold, a delay of half a period and sin(x)/x, is part of G.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ __all__ = ["Corrections", "Frame", "Signals"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Corrections:
-    """Errors of the readings that are taken out before anything else is computed.
+    """Corrections of the readings, applied before anything else.
 
     Attributes:
-        torque_delay_s: per motor, the torque acts so much later than reported.
+        torque_delay_s: per motor, delay of the acting torque after the reported one.
         torque_lag_s: per motor, time constant by which the acting torque lags the reported one, in first
             order; negative: the reported one lags.
-        offset_rad: per motor, deflection that is read when there is none.
-        encoder_delay_s: the link position is read so much later than the rest.
-        encoder_sin_rad: the link reading has sin(q) times this too much.
-        encoder_cos_rad: and cos(q) times this.
-        encoder_scale: and q times this.
+        offset_rad: per motor, reading of a zero deflection.
+        encoder_delay_s: delay of the link position after the other channels.
+        encoder_sin_rad: error of the link reading per sin(q).
+        encoder_cos_rad: per cos(q).
+        encoder_scale: per q.
     """
 
     torque_delay_s: tuple[float, ...]
@@ -48,16 +48,16 @@ class Corrections:
 
     @classmethod
     def none(cls, motors: int) -> Corrections:
-        """Readings as they are."""
+        """No corrections."""
         none = (0.0,) * motors
         return cls(torque_delay_s=none, torque_lag_s=none, offset_rad=none)
 
 
 class Signals:
-    """The raw channels' spectra, made once, and the noise of each channel.
+    """Spectra of the raw channels, and their noise.
 
     Args:
-        record: the recording; gaps are bridged by lines and not used as rows.
+        record: the recording; gaps are interpolated and not used as rows.
         bandwidth_hz: of F.
     """
 
@@ -101,7 +101,7 @@ class Signals:
         return keep
 
     def noise(self, spectrum: Spectrum, response: NDArray[Any]) -> float:
-        """Variance that a channel's white noise has after a filter; the noise is read off the upper end.
+        """Variance of a channel's white noise after a filter; the noise is read from the upper end.
 
         Args:
             spectrum: of the channel.
@@ -137,11 +137,11 @@ class Frame:
 
     Attributes:
         model: the joint as declared.
-        signals: where it comes from.
-        corrections: what has been taken out of the readings.
+        signals: its source.
+        corrections: applied to the readings.
         motors: coordinates per motor; flexibility torque and stiffness are filled in by the base fit.
-        external: tau_k on the grid, zero where it is not measured.
-        linked: whether the link's equation is there.
+        external: tau_k on the grid, zero if not measured.
+        linked: whether it has the link's equation.
         flexible: per motor, whether it has a deflection.
     """
 
@@ -159,7 +159,7 @@ class Frame:
 
     @classmethod
     def make(cls, model: JointModel, signals: Signals, corrections: Corrections) -> Frame:
-        """Coordinates from the spectra, the readings corrected."""
+        """Make the coordinates from the spectra of the corrected readings."""
         band = signals.light
         f, period = band.frequency_hz, signals.period_s
         light = light_response(signals)
@@ -262,7 +262,7 @@ class Frame:
 
 
 def _link_path(signals: Signals, light: FloatArray, corrections: Corrections) -> tuple[FloatArray, ...]:
-    """The link's position, velocity and acceleration, corrected for what its encoder has too much."""
+    """The link's position, velocity and acceleration, corrected for the encoder's error."""
     assert signals.q is not None
     q, rate, acceleration = (
         signals.light.apply(signals.q, light, order, -corrections.encoder_delay_s) for order in range(3)

@@ -20,12 +20,12 @@ _Left = tuple[FloatArray, FloatArray, NDArray[np.bool_]]  # error, torque, rows 
 
 
 class Held:
-    """Where models are judged.
+    """Held-out data for judging models.
 
     Args:
-        problem: what they are fitted to.
-        others: problems of recordings that take no part, with the recordings that are fitted for each; empty:
-            the blocks of `problem` that are held out.
+        problem: the data for fitting.
+        others: problems of held-out recordings, each with the fitted recordings; empty: the held-out blocks
+            of `problem`.
     """
 
     def __init__(self, problem: Problem, others: Sequence[tuple[Problem, Problem]]) -> None:
@@ -44,14 +44,14 @@ class Held:
         )
 
     def log_likelihood(self, fitted: Fitted, like: Fitted) -> float:
-        """Of the data that took no part, up to a constant, errors as under another hypothesis."""
+        """Log likelihood of the held-out data, up to a constant, with the noise of another hypothesis."""
         rows = sum(len(left) for left, _, _ in self._left(fitted))
         least = float(np.mean(like.regression.floor**2)) / self._problem.torque_rms**2
-        error = self.squared(fitted) + least  # what models and rounding leave means nothing
+        error = self.squared(fitted) + least  # errors at the level of rounding are not compared
         return -0.5 * rows / float(np.mean(like.times)) * float(np.log(error))
 
     def errors(self, before: Fitted, after: Fitted) -> Errors:
-        """Errors of all that is held out."""
+        """Errors of all held-out data."""
         first, second = self._left(before), self._left(after)
         return _errors(
             np.concatenate([x[m] for x, _, m in first]),
@@ -60,14 +60,14 @@ class Held:
         )
 
     def of(self, k: int, before: Fitted, after: Fitted) -> Errors | None:
-        """Errors of the k-th recording when it took no part; None where it always takes part."""
+        """Errors of the k-th recording when held out; None if it never is."""
         if len(self._others) < 2:
             return None
         (first, torque, motors), (second, _, _) = self._left(before)[k], self._left(after)[k]
         return _errors(first[motors], second[motors], torque[motors])
 
     def _left(self, fitted: Fitted) -> list[_Left]:
-        """What is left of each recording that takes no part."""
+        """Residual of each held-out recording."""
         if id(fitted) in self._memo:
             return self._memo[id(fitted)][1]
         problem = self._problem
@@ -111,9 +111,9 @@ def errors_of(problem: Problem, before: Fitted, after: Fitted, rows: NDArray[np.
 
 
 def on_other(other: Problem, fitted: Fitted) -> _Left:
-    """What another recording leaves under a model fitted elsewhere.
+    """Errors of another recording under a model fitted elsewhere.
 
-    What belongs to a run, its offsets, is fitted there; all else is as it was.
+    Only the recording's own offsets are fitted.
     """
     corrections = replace(
         fitted.corrections[0],
@@ -152,7 +152,7 @@ def _balances(problem: Problem, fitted: Fitted, rows: NDArray[np.bool_]) -> _Lef
 
 
 def _scaled(problem: Problem, fitted: Fitted, left: FloatArray) -> FloatArray:
-    """Errors as those of the declared torque, where the torque's own scale has been fitted."""
+    """Errors relative to the declared torque if the torque's scale has been fitted."""
     left = left.copy()
     for scale in fitted.regression.scales:
         motor = scale.groups[0] % problem.equations

@@ -1,8 +1,8 @@
 """A model of the joint, fitted to recordings: as declared, everyday errors within their priors, effects.
 
-Everything is fitted at once: transmission parameters, the declared numbers and the readings within what
-`estimator.priors` says of them, and the effects of the hypothesis. What enters nonlinearly (shapes of springs
-and of friction, delays, zeros of readings) is followed by Gauss-Newton steps.
+Everything is fitted at once: transmission parameters, declared numbers and readings within their priors
+(`estimator.priors`), and the effects of the hypothesis. Nonlinear parameters (shapes of springs and friction,
+delays, zeros of readings) are iterated by Gauss-Newton steps.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ Keys = frozenset[tuple[str, int | None]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """A hypothesis at its best fit.
+    """A fitted hypothesis.
 
     Attributes:
         terms: its effects.
-        base: transmission parameters about which it was linearised.
+        base: transmission parameters at the linearisation.
         corrections: of the readings, one a recording.
-        slots: what the columns are.
+        slots: meaning of the columns.
         regression: the rows.
-        times: autocorrelation times of what is left.
+        times: autocorrelation times of the residual.
         posterior: of the columns.
         extra: a free curve, where there is one.
-        pinned: everyday errors that were held at a value, by name and motor.
+        pinned: everyday errors held at a value, by name and motor.
     """
 
     terms: tuple[Term, ...]
@@ -59,7 +59,7 @@ class Fitted:
     pinned: Pinned = field(default_factory=dict)
 
     def evidence(self, like: Fitted) -> float:
-        """Logarithm of the marginal likelihood, errors as correlated and as small as another one's can be."""
+        """Log marginal likelihood, with the error correlation and noise floor of another hypothesis."""
         if like is self:
             return self.posterior.evidence
         regression = replace(self.regression, floor=like.regression.floor)
@@ -67,13 +67,13 @@ class Fitted:
 
     @property
     def keys(self) -> Keys:
-        """Its effects and the motors they are at, whatever their order; a free curve is an unlisted one."""
+        """Its effects and their motors, unordered; a free curve counts as unlisted."""
         own = frozenset(t.candidate.key for t in self.terms)
         return own if self.extra is None else own | {("unlisted", self.extra.motor)}
 
     @property
     def real(self) -> bool:
-        """Whether every effect takes part: no friction held at zero, no spring without stiffness."""
+        """Whether every effect contributes: no friction at zero, no spring without stiffness."""
         return not any(
             held
             for slot, held in zip(self.slots, self.posterior.bound, strict=True)
@@ -88,7 +88,7 @@ class Fitted:
         return self.base.moved(problem.frames[0], own)
 
     def total(self, kind: str, name: str, motor: int | None, run: int | None = None) -> list[float]:
-        """The quantity that slots stand for, with what had been corrected before."""
+        """The total quantity of some slots, including corrections already applied."""
         return [
             slot.taken + float(x)
             for slot, x in zip(self.slots, self.posterior.x, strict=True)
@@ -97,15 +97,15 @@ class Fitted:
 
 
 class Problem:
-    """Recordings of one joint, the declared model, and models tried on them.
+    """Recordings of one joint and its declared model; fits hypotheses to them.
 
     Args:
         records: of one joint.
         model: as declared.
         bandwidth_hz: of the filter that all channels share.
-        held: some blocks of each recording take no part.
-        calibrating: the recordings are of a healthy joint, and show what its declared numbers should be.
-        least: independent rows that each recording needs.
+        held: hold out some blocks of each recording.
+        calibrating: the recordings are of a healthy joint and determine its declared numbers.
+        least: required independent rows per recording.
 
     Raises:
         EstimatorError: a recording has fewer.
@@ -183,7 +183,7 @@ class Problem:
     # -- fitting ------------------------------------------------------------------------------------------
 
     def null(self, pinned: Pinned | None = None) -> Fitted:
-        """The declared model at its best fit, everyday errors within their priors or pinned."""
+        """The fitted declared model, everyday errors within their priors or pinned."""
         corrections = tuple(self.declared for _ in self.signals)
         widest = max(self.frames, key=lambda f: max(float(np.ptp(c.deflection)) for c in f.motors))
         return self.fit((), start(widest), corrections, pinned=pinned)
@@ -208,10 +208,10 @@ class Problem:
         extra: Extra | None = None,
         pinned: Pinned | None = None,
     ) -> Fitted:
-        """Gauss-Newton from a given point; the best point on the way.
+        """Gauss-Newton iteration from a given point; return the best point.
 
-        A step from far promises more than it holds, so the first promise is not believed, and the fit of a
-        healthy joint goes on until it stands still.
+        The evidence of the first steps is too optimistic far from the optimum and is not used to stop; the
+        fit of a healthy joint continues until it converges.
         """
         best: Fitted | None = None
         for k in range((steps or whole("patient_steps" if self.calibrating else "newton_steps")) + 1):
@@ -227,22 +227,22 @@ class Problem:
         return best
 
     def added(self, fitted: Fitted, term: Term, steps: int | None = None) -> Fitted:
-        """A hypothesis with one term more."""
+        """The hypothesis with one more term."""
         return self.fit((*fitted.terms, term), fitted.base, fitted.corrections, steps)
 
     def without(self, fitted: Fitted, k: int, pinned: Pinned | None = None) -> Fitted:
-        """The same less one term; a reading it corrected is as it was."""
+        """The hypothesis without one term; its correction of a reading is undone."""
         term = fitted.terms[k]
         terms = fitted.terms[:k] + fitted.terms[k + 1 :]
         corrections = tuple(restored(c, self.declared, term.candidate) for c in fitted.corrections)
         return self.fit(terms, fitted.base, corrections, extra=fitted.extra, pinned=pinned)
 
     def with_curve(self, fitted: Fitted, extra: Extra) -> Fitted:
-        """The same with a free curve."""
+        """The hypothesis with a free curve."""
         return self.fit(fitted.terms, fitted.base, fitted.corrections, 1, extra=extra)
 
     def transferred(self, fitted: Fitted, corrections: Corrections) -> Fitted:
-        """A model that was fitted to other recordings, on the only one here, parameters as they were."""
+        """A model fitted to other recordings, evaluated on this one without refitting."""
         bare = tuple(replace(t, weights=()) for t in fitted.terms)
         kept = [(s, x) for s, x in zip(fitted.slots, fitted.posterior.x, strict=True) if s.kind != "shape"]
         there = self._linearised(bare, fitted.base, (corrections,), fitted.extra, fitted.pinned)
@@ -304,7 +304,7 @@ class Problem:
         return Fitted(terms, base, corrections, slots, regression, times, posterior, extra, pinned)
 
     def _floor(self, regression: Regression, slots: list[Slot], x: FloatArray) -> FloatArray:
-        """(groups,) what no model gets below: rounding, and the share by which an effect's law differs."""
+        """(groups,) noise floor: rounding, and the typical error of an effect's law."""
         effect = [j for j, s in enumerate(slots) if s.kind == "term" and LIBRARY[s.name].nonlinear]
         square = np.full(len(regression.floor), (choice("floor") * self.torque_rms) ** 2)
         torque = regression.design[:, effect] @ x[effect]
@@ -313,7 +313,7 @@ class Problem:
         return np.asarray(np.sqrt(square))
 
     def _moved(self, fitted: Fitted) -> tuple[tuple[Term, ...], Base, tuple[Corrections, ...]]:
-        """Where the linearised model says that the best point is."""
+        """The optimum of the linearised model."""
         x = fitted.posterior.x
         own = np.array([v for slot, v in zip(fitted.slots, x, strict=True) if slot.kind == "base"])
         base = fitted.base.moved(self.frames[0], own)
@@ -330,7 +330,7 @@ class Problem:
 
 
 def stretches(problem: Problem) -> NDArray[np.int64]:
-    """(n,) stretch of time of each row, the same in all balances of a recording; -1: takes no part."""
+    """(n,) stretch of time of each row, equal in all balances of a recording; -1: not used."""
     made = []
     count = whole("groups")
     for k, frame in enumerate(problem.frames):

@@ -1,4 +1,4 @@
-"""Polynomials of open order: a higher order belongs to the model and is not a missing effect."""
+"""Polynomials of open order: a higher order is part of the model, not a missing effect."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ __all__ = ["raised"]
 
 
 def raised(model: JointModel, effects: Iterable[Finding]) -> JointModel | None:
-    """The model with the orders that a diagnosis asks for, where they were left to the data (eq 24).
+    """The model with open orders raised to those found by a diagnosis (eq 24).
 
     Args:
         model: as it was diagnosed.
         effects: what the diagnosis has found missing.
 
     Returns:
-        The model with the open orders raised to the odd power found; None where there is nothing to raise.
+        The model with raised orders; None if there is nothing to raise.
     """
     powers = {
         finding.motor: finding.parameters["power"]

@@ -1,4 +1,4 @@
-"""A fitted hypothesis as findings: parameters with intervals, curves, transmissions, readings."""
+"""Converts a fitted hypothesis to findings: parameters with intervals, curves, transmissions, readings."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _CHANNELS = {"torque_delay": "torque_delay_s", "deflection_offset": "deflection_
 def findings_of(
     problem: Problem, found: Fitted, null: Fitted, standings: Sequence[Standing]
 ) -> list[Finding]:
-    """The effects, the one that explains most first; delays of more than a sample among them."""
+    """The effects, the most important first, including delays of more than a sample."""
     std = np.sqrt(np.maximum(np.diag(hac_covariance(problem, found)), 0.0))
     made = []
     total = float(np.sum(null.posterior.sigma**2))
@@ -74,7 +74,7 @@ def findings_of(
 
 
 def _offsets(problem: Problem, found: Fitted, std: FloatArray) -> list[Finding]:
-    """A constant torque that is all there is: without link dynamics, an offset of torque or of encoders."""
+    """A constant torque as the only finding: without link dynamics, an offset of torque or of encoders."""
     if problem.frames[0].linked:
         return []
     for i, flexible in enumerate(problem.frames[0].flexible):
@@ -101,7 +101,7 @@ def _offsets(problem: Problem, found: Fitted, std: FloatArray) -> list[Finding]:
 
 
 def _everyday(problem: Problem, finding: Finding) -> bool:
-    """Whether a delay is a skew of up to a sample: it is aligned and reported, not diagnosed."""
+    """Whether a delay is a skew of up to a sample, which is reported but not diagnosed."""
     if finding.name not in ("encoder_delay", "torque_delay"):
         return False
     delay, std = finding.parameters["delay_s"], finding.std["delay_s"]
@@ -110,12 +110,12 @@ def _everyday(problem: Problem, finding: Finding) -> bool:
 
 
 def _absolute(problem: Problem, found: Fitted, k: int, name: str, x: float) -> float:
-    """Standard deviation of a nonlinear parameter in its unit, from that of its slot."""
+    """Standard deviation of a nonlinear parameter in its unit."""
     return x * problem.unit_of(found.terms[k], name)
 
 
 def alignment_of(problem: Problem, after: Fitted, effects: list[Finding]) -> dict[str, float]:
-    """What was taken out of the readings as everyday, by channel."""
+    """Everyday corrections of the readings, by channel."""
     named = {(f.name, f.motor) for f in effects}
     pairs: dict[str, float] = {}
     std = np.sqrt(np.maximum(np.diag(hac_covariance(problem, after)), 0.0))
@@ -140,11 +140,9 @@ def transmissions_of(
 ) -> tuple[tuple[Refitted, ...], list[str]]:
     """Each motor's transmission, and doubts about them.
 
-    Its covariance is that of the fit and that between the accounts of the data (Bayesian model averaging;
-    Hoeting et al., Statistical Science 14, 1999): where another set of effects would do as well, it may ask
-    for another stiffness. And it holds what the effects that were not needed could make of it.
-
-    A stiffness that these data do not determine has no parameters, and a doubt says so.
+    The covariance is that of the fit plus that between explanations (Bayesian model averaging; Hoeting et
+    al., Statistical Science 14, 1999), because another set of effects may imply another stiffness, plus the
+    possible contribution of rejected effects. An undetermined stiffness has no parameters, and a doubt.
     """
     problem = search.problem
     covariance, effects = hac_covariance(problem, after), design_effects(problem, after)
@@ -189,7 +187,7 @@ def _between(
 
 
 def rivals_of(search: Search) -> list[Rival]:
-    """Where each promising effect stands alone, best first, as error relative to the torque."""
+    """Relative error with each promising effect alone, best first."""
     standing = []
     for found in search.singles():
         candidate = found.terms[-1].candidate
@@ -201,7 +199,7 @@ def rivals_of(search: Search) -> list[Rival]:
 
 
 def curves_of(problem: Problem, after: Fitted) -> tuple[Curve, ...]:
-    """Residual without each effect against what reveals it, and the effect, on the first recording."""
+    """Residual without each effect over its revealing coordinate, with the effect, on the first recording."""
     frame = problem.at(after.corrections, after.base)[0]
     rows = np.arange(frame.rows)
     left = after.regression.residual(after.posterior.x)
@@ -245,7 +243,7 @@ def curves_of(problem: Problem, after: Fitted) -> tuple[Curve, ...]:
 
 
 def series_of(problem: Problem, before: Fitted, after: Fitted) -> Series:
-    """Torque of the first motor over time, and what is left of it."""
+    """Torque of the first motor and its residual over time."""
     frame = problem.frames[0]
     keep = frame.signals.keep
     return Series(

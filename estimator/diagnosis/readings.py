@@ -1,4 +1,4 @@
-"""Effects that are errors of a reading: what of them has been taken out, and what is still to be."""
+"""Effects that are errors of a reading: their corrections."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ READINGS = (
 
 
 def read(c: Corrections, candidate: Candidate) -> tuple[float, ...]:
-    """What of an effect the readings are corrected by."""
+    """The correction of the readings by an effect."""
     motor = candidate.motor or 0
     return {
         "torque_delay": (c.torque_delay_s[motor],),
@@ -33,7 +33,7 @@ def read(c: Corrections, candidate: Candidate) -> tuple[float, ...]:
 
 
 def corrected(c: Corrections, name: str, motor: int | None, part: int, more: float) -> Corrections:
-    """Corrections with more of one effect's part."""
+    """Corrections with an increment for one effect."""
 
     def put(values: tuple[float, ...]) -> tuple[float, ...]:
         return tuple(v + more if motor in (None, i) else v for i, v in enumerate(values))
@@ -54,7 +54,7 @@ def corrected(c: Corrections, name: str, motor: int | None, part: int, more: flo
 
 
 def restored(c: Corrections, declared: Corrections, candidate: Candidate) -> Corrections:
-    """Corrections with those of one effect as declared."""
+    """Corrections with one effect reset to its declared value."""
     name = candidate.kind.name
     if name not in READINGS:
         return c

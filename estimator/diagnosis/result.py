@@ -1,4 +1,4 @@
-"""What a diagnosis says."""
+"""Result of a diagnosis."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ class Finding:
         location: motor, transmission, link or measurement.
         motor: index of the motor; None at the link.
         parameters: by their names in the joint file.
-        std: their standard deviations, where they are known.
-        probability: that it is this effect and not another one.
-        alternatives: effects that may stand in its place, the likeliest first.
-        alternative_probabilities: of each of them.
-        share: of the squared error of the declared model that it explains beside the others.
-        coordinates: of an unlisted effect, what its curve depends on.
+        std: their standard deviations, if known.
+        probability: of this effect against its alternatives.
+        alternatives: other possible effects, the most probable first.
+        alternative_probabilities: their probabilities.
+        share: fraction of the declared model's squared error that it explains in addition to the others.
+        coordinates: of the curve of an unlisted effect.
     """
 
     name: str
@@ -63,7 +63,7 @@ class Finding:
 
 
 class Rival(NamedTuple):
-    """Where a candidate stood: the error that it alone would leave, relative to the measured torque."""
+    """A candidate with the relative error of a model with it alone."""
 
     name: str
     location: str
@@ -80,7 +80,7 @@ class Curve:
         coordinates: fields of `Coordinates`; a second one where the curve depends on two.
         x: (n,) first coordinate.
         second: (n,) second coordinate.
-        residual_nm: (n,) what is left without the effect.
+        residual_nm: (n,) residual without the effect.
         fitted_nm: (n,) the effect.
     """
 
@@ -94,7 +94,7 @@ class Curve:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Series:
-    """Torque over time: measured, and what the model leaves of it before and after; per row."""
+    """Torque over time per row: measured, and residuals before and after."""
 
     time_s: FloatArray
     torque_nm: FloatArray
@@ -103,7 +103,7 @@ class Series:
 
 
 class Refitted(NamedTuple):
-    """One transmission as refitted; empty where it is rigid or the data do not reveal its stiffness."""
+    """One refitted transmission; empty if it is rigid or undetermined."""
 
     model: str
     parameters: dict[str, ParameterValue]
@@ -129,7 +129,7 @@ class StiffnessCurve(NamedTuple):
 
 
 class RecordingErrors(NamedTuple):
-    """Errors of one recording: where it was fitted, and where it took no part (None: it always did)."""
+    """Errors of one recording, fitted and held out (None: never held out)."""
 
     train: Errors
     validation: Errors | None
@@ -142,17 +142,17 @@ class Diagnosis:
     Attributes:
         verdict: what it comes to.
         bandwidth_hz: of the filter that all channels share.
-        effects: the missing effects, the one that explains most first.
+        effects: the missing effects, the most important first.
         train: errors on the training data.
-        validation: errors on data that took no part.
-        floor_nm: per motor, rms of what the augmented model leaves of the torque balance.
+        validation: errors on held-out data.
+        floor_nm: per motor, residual rms of the augmented model.
         transmissions: per motor, refitted with the effects.
-        alignment: skew and offset between channels that were taken out; names carry the unit.
+        alignment: corrected skew and offset between channels; names carry the unit.
         rivals: the candidates' standing, best first.
         curves: one for each effect.
         series: of the first motor, on the training recording.
-        advice: which motion would distinguish what could not be distinguished.
-        notes: what else is to be said, a line each.
+        advice: motions that would separate the alternatives.
+        notes: further remarks, one line each.
         recordings: errors of each recording.
         stiffness: of each flexible transmission, before and after.
     """

@@ -1,8 +1,8 @@
 """The search for missing effects: a beam of hypotheses, compared by evidence.
 
-Hypotheses with one effect more are grown from the best ones so far, the effect's nonlinear parameters fitted
-beside all else. An effect must earn the odds that it is one of all that could be missing: each has the prior
-probability of one in their number (Scott and Berger, Annals of Statistics 38, 2010).
+The best hypotheses so far are extended by one effect, with its nonlinear parameters fitted together with all
+others. Each effect pays for multiple testing: its prior probability is one over the number of candidates
+(Scott and Berger, Annals of Statistics 38, 2010).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class _Columns:
 
 
 class _Tried(NamedTuple):
-    """An effect beside a hypothesis: its nonlinear parameters, gain of evidence, how x moves with it."""
+    """An effect added to a hypothesis: nonlinear parameters, gain of evidence, change of x."""
 
     values: dict[str, float]
     gain: float
@@ -47,7 +47,7 @@ class _Tried(NamedTuple):
     precision: FloatArray  # (m, m) of these
 
     def more(self, effect: float) -> FloatArray:
-        """(k, k) by which the covariance of x grows; so many rows say of the effect what one does."""
+        """(k, k) increase of the covariance of x, with the design effect of the rows."""
         if not math.isfinite(self.gain):
             return np.zeros((len(self.shift),) * 2)
         eye = np.eye(len(self.precision))
@@ -65,7 +65,7 @@ class Search:
     Args:
         problem: the recordings and the declared model.
         progress: called with the current step.
-        null: the declared model at its best fit, where that is known.
+        null: the fitted declared model, if available.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class Search:
         self.price = math.log(max(len(self._library), 1))  # log odds against any one effect
 
     def run(self) -> list[Fitted]:
-        """The hypotheses with the most evidence, best first, pruned; single effects among them."""
+        """The pruned hypotheses with the most evidence, best first, including single effects."""
         seen = self.seen
         beam, best = [self.null], self.null
         for size in range(1, whole("effects") + 1):
@@ -113,12 +113,12 @@ class Search:
         return self._ranked(self._singles)[: whole("beam")] if self._singles else []
 
     def children(self, parent: Fitted, like: Candidate | None = None) -> list[Fitted]:
-        """The most promising hypotheses with one effect more; `like`: see `screen`."""
+        """The most promising extensions by one effect; `like`: see `screen`."""
         grown = (self._grown(parent, term) for term in self.screen(parent, like))
         return [child for child in grown if child.real]
 
     def _grown(self, parent: Fitted, term: Term) -> Fitted:
-        """One more effect; how sharply a friction changes its sign has several optima, so from two starts."""
+        """Add one effect; from two starts, as the smoothing of friction has several optima."""
         child = self.problem.added(parent, term, whole("rough_steps"))
         if _SMOOTHING not in term.values:
             return child
@@ -127,20 +127,20 @@ class Search:
         return max(child, other, key=lambda h: h.evidence(child))
 
     def score(self, hypothesis: Fitted, like: Fitted) -> float:
-        """Log posterior odds, up to a constant of the data, errors as under another hypothesis."""
+        """Log posterior odds, up to a constant, with the noise of another hypothesis."""
         return hypothesis.evidence(like) - self.price * len(hypothesis.terms)
 
     def advantage(self, one: Fitted, other: Fitted) -> float:
-        """Log odds of one hypothesis over another; errors as correlated as under the one that leaves less."""
+        """Log odds of one hypothesis over another, with the error correlation of the better-fitting one."""
         best = min((one, other), key=_left)
         return self.score(one, best) - self.score(other, best)
 
     def chance(self, found: Fitted, rival: Fitted) -> float:
-        """Probability that the rival is the better account, had the recording gone on.
+        """Probability that the rival would be better on a longer recording.
 
-        By the odds, and by how they scatter: the log odds of the stretches of time differ among themselves,
-        so their sum has a standard deviation (Vuong, Econometrica 57, 1989). Without it a model that is wrong
-        in detail is as sure as its many rows make it.
+        From the log odds and their scatter between stretches of time, which gives their sum a standard
+        deviation (Vuong, Econometrica 57, 1989). Otherwise the many rows would make a slightly wrong model
+        overconfident.
         """
         gain = self._by_stretch(found) - self._by_stretch(rival)
         spread = math.sqrt(len(gain)) * float(np.std(gain, ddof=1))
@@ -148,7 +148,7 @@ class Search:
         return max(1.0 / (1.0 + math.exp(min(odds, 700.0))), NormalDist(0.0, spread + 1e-9).cdf(-odds))
 
     def _by_stretch(self, hypothesis: Fitted) -> FloatArray:
-        """Log likelihood of each stretch of time, errors as independent as all of them are on average."""
+        """Log likelihood of each stretch of time, with the average independence of errors."""
         regression, posterior = hypothesis.regression, hypothesis.posterior
         sigma, times = posterior.sigma[regression.group], hypothesis.times[regression.group]
         left = regression.residual(posterior.x)
@@ -157,7 +157,7 @@ class Search:
         return np.bincount(labels[labels >= 0], each[labels >= 0]).astype(np.float64)
 
     def _ranked(self, hypotheses: list[Fitted]) -> list[Fitted]:
-        """Best first, without doublets."""
+        """Best first, without duplicates."""
         best = min(hypotheses, key=_left)
         order = sorted(hypotheses, key=lambda h: -self.score(h, best))
         unique: dict[Keys, Fitted] = {}
@@ -176,7 +176,7 @@ class Search:
         return hypothesis
 
     def _merged(self, hypothesis: Fitted) -> Fitted:
-        """Two terms replaced by one, where that is nearly as good an account."""
+        """Two terms replaced by one, if that is nearly as good."""
         for k in range(len(hypothesis.terms)):
             for j in range(k):
                 rest = self.problem.without(self.problem.without(hypothesis, k), j)
@@ -199,18 +199,18 @@ class Search:
         return hypothesis
 
     def rivals(self, hypothesis: Fitted, k: int) -> list[Fitted]:
-        """What could stand in place of a term, most evidence first."""
+        """Alternatives to a term, most evidence first."""
         own = hypothesis.terms[k].candidate
         grown = self.children(self.problem.without(hypothesis, k), like=own)
         made = [child for child in grown if child.terms[-1].candidate.key != own.key]
         return self._ranked(made) if made else []
 
     def screen(self, parent: Fitted, like: Candidate | None = None) -> list[Term]:
-        """The effects that promise most beside a hypothesis, at the best point of their grid.
+        """The most promising additional effects, at the best point of their grid.
 
         Args:
             parent: the hypothesis.
-            like: an effect whose whole family is wanted, whatever it promises.
+            like: an effect whose whole family is included.
         """
         found = []
         for beside in self._library_beside(parent):
@@ -223,22 +223,23 @@ class Search:
         return [term for _, term in found[:tried]] + more
 
     def unseen(self, parent: Fitted, place: int, effect: float) -> FloatArray:
-        """What the effects that are not in a hypothesis add to its covariance, as large as effects may be.
+        """Increase of a hypothesis' covariance by effects that it does not contain, at their prior size.
 
-        An effect that was not needed may be there all the same, where the motion does not tell it from the
-        rest: a gear that loses torque, and is always driven the same way, looks like a softer spring. It adds
-        the covariance of the larger model less that of the hypothesis (consider covariance; S. F. Schmidt,
-        Advances in Control Systems 3, 1966). Families of effects are independent contributions (JCGM 100,
-        5.1.2); laws of one family are the same thing, and the one that adds most stands for it.
+        A rejected effect may still be present if the motion does not separate it: a gear with losses that is
+        always driven in one direction looks like a softer spring. It adds the covariance of the larger model
+        minus that of the hypothesis (consider covariance; S. F. Schmidt, Advances in Control Systems 3,
+        1966). Families of effects are independent contributions (JCGM 100, 5.1.2); of the laws of one family
+        the largest contribution counts.
 
         Args:
             parent: the hypothesis.
             place: of the parameter in question.
-            effect: so many rows say what one independent row does (`design_effects`).
+            effect: design effect of the rows (`design_effects`).
 
         Returns:
-            (k, k), each effect at the shape that promises most. Those that bend the transmission's curve make
-            another model of it and have no part, nor has the scale of the torque in a fit: it is the anchor.
+            (k, k), each effect at its most promising shape. Excluded are effects that change the
+            transmission's curve, which are another model, and in a fit the torque's scale, which is the
+            anchor.
         """
         families: dict[tuple[object, ...], FloatArray] = {}
         nothing = np.zeros_like(parent.posterior.covariance)
@@ -253,7 +254,7 @@ class Search:
         return np.asarray(sum(families.values(), nothing))
 
     def _library_beside(self, parent: Fitted) -> Iterator[_Beside]:
-        """Every effect that a hypothesis has not, over its grid, linearised."""
+        """All additional effects over their grids, linearised."""
         problem, posterior = self.problem, parent.posterior
         rows = parent.regression.used
         weight = (1.0 / (parent.times * posterior.sigma**2))[problem.group[rows]]
@@ -287,5 +288,5 @@ def _parameters(term: Term) -> int:
 
 
 def _left(hypothesis: Fitted) -> float:
-    """Logarithm of what a hypothesis leaves, over all balances."""
+    """Logarithm of a hypothesis' residual over all balances."""
     return float(np.sum(np.log(hypothesis.posterior.sigma)))

@@ -1,7 +1,7 @@
 """Zero-phase filters, exact derivatives, delays and decimation of whole recordings, by Fourier transform.
 
-A recording is continued at both ends by its own point reflection and freed of the line between the ends,
-so that value and slope are continuous all round; near the ends the results are not used.
+A recording is extended at both ends by point reflection and detrended, so that value and slope are periodic;
+results near the ends are not used.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Band:
         samples: n, length of the arrays.
         period_s: their sampling period.
         step: every step-th sample is kept.
-        margin_s: how far the arrays are continued at each end, at least.
+        margin_s: least extension at each end.
 
     Attributes:
         frequency_hz: of the transform's bins.
@@ -55,7 +55,7 @@ class Band:
         self._omega = 2j * np.pi * self.frequency_hz
 
     def transform(self, x: FloatArray) -> Spectrum:
-        """Spectrum of the continued array less its line, and that line's value at sample 0 and slope."""
+        """Spectrum of the extended, detrended array, with the trend's value at sample 0 and slope."""
         pad, n = self._pad, self._samples
         left = 2.0 * x[0] - x[pad:0:-1]
         right = min(self._right, n - 1)

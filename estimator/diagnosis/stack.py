@@ -1,4 +1,4 @@
-"""The columns of one linearised hypothesis: what each stands for, what is believed of it."""
+"""The columns of one linearised hypothesis: meaning and prior of each."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from estimator.sample import FloatArray
 __all__ = ["Extra", "Pinned", "Slot", "Stack", "Term", "curve_columns", "step_of", "stepped"]
 
 
-_SIGNED = ("position_rad",)  # nonlinear parameters that may be negative
+_SIGNED = ("position_rad",)  # nonlinear parameters of either sign
 
-# How much more torque acts per unit of what is measured, for one unit of the parameter.
+# Relative change of the acting torque per unit of the parameter.
 _TORQUE_SCALES: dict[str, Callable[[Coordinates, dict[str, float]], FloatArray]] = {
     "torque_constant": lambda c, p: np.ones_like(c.torque),
     "torque_saturation": lambda c, p: -3.0 * c.torque**2,
@@ -34,7 +34,7 @@ _TORQUE_SCALES: dict[str, Callable[[Coordinates, dict[str, float]], FloatArray]]
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """A missing effect with its nonlinear parameters, and its linear ones as last fitted."""
+    """A missing effect with its nonlinear and last fitted linear parameters."""
 
     candidate: Candidate
     values: dict[str, float]
@@ -56,18 +56,18 @@ class Extra(NamedTuple):
     basis: Callable[..., FloatArray]
 
 
-# Everyday errors held at values, one for each part, by name and motor.
+# Fixed values of everyday errors, by name and motor.
 Pinned = Mapping[tuple[str, int | None], tuple[float, ...]]
 
 
 class Slot(NamedTuple):
-    """What one column of the regression stands for.
+    """Meaning of one column of the regression.
 
     Attributes:
         kind: "base", "everyday", "term", "shape" (a nonlinear parameter), "curve".
         name: of effect or parameter. motor: where it is. run: of which recording; None: of all.
         place: index of the motor's alpha, of the term, or of the parameter of an effect.
-        taken: what has already been corrected, so that taken + x is the quantity.
+        taken: correction already applied; the quantity is taken + x.
     """
 
     kind: str
@@ -123,7 +123,7 @@ class Stack:
         self.low.append(low - slot.taken)
 
     def transmissions(self, base: Base) -> None:
-        """Transmission parameters; the first of each, its stiffness, is not negative."""
+        """Add transmission parameters; the first of each, the stiffness, is not negative."""
         design = np.concatenate([base.design(f) for f in self._frames])
         wide = PRIORS["transmission"].std * self._torque_rms
         j = 0
@@ -135,7 +135,7 @@ class Stack:
                 j += 1
 
     def everyday(self, without: set[tuple[str, int | None]], pinned: Pinned) -> None:
-        """The errors that every rig has, but for those that are terms."""
+        """Add the everyday errors that are not terms."""
         for candidate in everyday(self._frames[0]):
             widths = everyday_std(self._frames, candidate, self._torque_rms, self._calibrating)
             if candidate.key in without or not any(widths):
@@ -157,7 +157,7 @@ class Stack:
                         self._add(column, slot, choice("exact") * width, centre=held[p])
 
     def term(self, k: int, term: Term) -> None:
-        """An effect, and once it has a size, its nonlinear parameters."""
+        """Add an effect and, once its size is not zero, its nonlinear parameters."""
         candidate = term.candidate
         parts = [columns(f, candidate, term.values) for f in self._frames]
         taken = self._taken(candidate, 0)
@@ -194,7 +194,7 @@ class Stack:
         return tuple(made)
 
     def _torque_scale(self, slot: Slot, terms: Sequence[Term]) -> FloatArray:
-        """(m,) how much more torque acts per unit of what is measured, by one unit of a slot."""
+        """(m,) relative change of the acting torque per unit of a slot."""
         values = terms[slot.place].values if slot.kind == "term" else {}
         slope = _TORQUE_SCALES[slot.name]
         return np.concatenate(
@@ -237,7 +237,7 @@ def step_of(term: Term, name: str, frame: Frame) -> tuple[float, float]:
 
 
 def stepped(term: Term, name: str, x: float, frame: Frame) -> dict[str, float]:
-    """The nonlinear parameters after a step; what is positive moves by factors, at most by two."""
+    """The nonlinear parameters after a step; positive ones change by factors of at most two."""
     value, scale = term.values[name], reach_of(frame, term.candidate, name)
     if scale is None:
         low, high = bounds_of(frame, term.candidate, name)
@@ -255,6 +255,6 @@ def _of_run(parts: list[FloatArray], p: int, run: int | None) -> FloatArray:
 
 
 def _rms_of(column: FloatArray) -> float:
-    """rms over the rows that a column enters; one where it enters none."""
+    """rms over the non-zero rows of a column, or one."""
     used = column[np.abs(column) > 1e-100]
     return float(np.sqrt(np.mean(used**2))) if len(used) else 1.0

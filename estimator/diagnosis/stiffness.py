@@ -1,4 +1,4 @@
-"""Stiffness over deflection with its uncertainty, and whether it may be said at all."""
+"""Stiffness over deflection with its uncertainty, and whether it is determined."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _POINTS = 121
 
 
 class Middle(NamedTuple):
-    """A transmission's stiffness at the middle of the deflections seen.
+    """A transmission's stiffness at the median of the observed deflections.
 
     Attributes:
         stiffness_nm_rad: N·m/rad. std_nm_rad: its standard deviation.
@@ -31,9 +31,9 @@ class Middle(NamedTuple):
 
     @property
     def determined(self) -> bool:
-        """Whether it is known to half of itself (95 %).
+        """Whether its 95 % interval is within half of it.
 
-        A control loop has a gain margin of two as a rule: with a stiffness that is further off it has none.
+        A control loop usually has a gain margin of two, which a larger error would exceed.
         """
         return SIGMA_95 * self.std_nm_rad < 0.5 * self.stiffness_nm_rad
 
@@ -44,7 +44,7 @@ def middle(model: TransmissionModel, alpha: FloatArray, covariance: FloatArray, 
     Args:
         model: the transmission.
         alpha: (n,) its parameters. covariance: (n, n) of them.
-        phi: deflections seen, rad.
+        phi: observed deflections, rad.
     """
     at = np.array([float(np.median(np.abs(phi)))])
     slope = np.asarray(model.stiffness_jacobian(at, alpha))[0]

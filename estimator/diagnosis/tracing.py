@@ -1,4 +1,4 @@
-"""The whole diagnosis: recordings and model in; verdict, effects, transmissions and errors out."""
+"""The diagnosis: verdict, effects, transmissions and errors from recordings and model."""
 
 from __future__ import annotations
 
@@ -43,22 +43,22 @@ def diagnose(
     validation: Record | None = None,
     progress: Progress = lambda _: None,
 ) -> Diagnosis:
-    """Trace what a model leaves unexplained to the effect that is missing.
+    """Trace a model's residual to the missing effects.
 
     Args:
         record: the recording, or several of one joint: stiffness, inertia, delays and effects are shared,
             offsets and encoder zeros belong to each.
         model: the joint as it is declared.
         bandwidth_hz: of the filter that all channels share; None: chosen from the data.
-        validation: a recording that takes no part in any fit; a term stays only if it lowers its error. None:
-            with several recordings each is left out in turn, with one some blocks are held out.
+        validation: a held-out recording; a term is kept only if it lowers the error there. None: each of
+            several recordings in turn, or blocks of a single one, are held out.
         progress: called with the current step.
 
     Returns:
         The diagnosis.
 
     Raises:
-        EstimatorError: the recordings do not allow one.
+        EstimatorError: the recordings cannot be diagnosed.
         GateError: units, signs, gear ratio or time of a recording do not fit the joint.
     """
     records = [record] if isinstance(record, Record) else list(record)
@@ -86,7 +86,7 @@ def diagnose(
 
 
 def _chosen(search: Search, held: Held, hypotheses: list[Fitted]) -> Fitted:
-    """Of hypotheses past the gate, the best by its odds on all data."""
+    """Of the hypotheses that pass the held-out test, the one with the best odds on all data."""
     best = hypotheses[0]
 
     def odds(one: Fitted) -> float:
@@ -96,7 +96,7 @@ def _chosen(search: Search, held: Held, hypotheses: list[Fitted]) -> Fitted:
 
 
 def _gated(search: Search, held: Held, found: Fitted) -> Fitted:
-    """The hypothesis without the terms that do not lower the error on data that took no part."""
+    """The hypothesis without the terms that do not lower the error on held-out data."""
     while found.terms:
         error = held.squared(found)
         as_found = search.problem.numbers(found)
@@ -110,7 +110,7 @@ def _gated(search: Search, held: Held, found: Fitted) -> Fitted:
 
 
 class _Judge:
-    """What the search has found, turned into a verdict."""
+    """Turns the result of the search into a verdict."""
 
     def __init__(
         self, search: Search, held: Held, found: Fitted, validated: bool, progress: Callable[[str], None]
@@ -119,7 +119,7 @@ class _Judge:
         self.problem, self.progress = search.problem, progress
 
     def _sides(self, before: Fitted, after: Fitted) -> list[str]:
-        """What either side of the transmission leaves, before and after; both have a balance."""
+        """Residuals of both balances, after over before, in words."""
         problem = self.problem
         if not problem.frames[0].linked:
             return []
@@ -133,7 +133,7 @@ class _Judge:
         return [f"the motor's balance (eq 5) leaves {motor:.1%} of what it did, the link's (eq 4) {link:.1%}"]
 
     def diagnosis(self) -> Diagnosis:
-        """Verdict, findings, errors."""
+        """Make verdict, findings and errors."""
         problem, found, null = self.problem, self.found, self.search.null
         rivals = [self.search.rivals(found, k) for k in range(len(found.terms))]
         self.progress("free curves")
@@ -197,7 +197,7 @@ class _Judge:
         )
 
     def _declared(self, effects: list[Finding]) -> Fitted:
-        """The declared model at its best fit: numbers as declared, readings aligned if that is everyday."""
+        """The fitted declared model: declared numbers, readings aligned within everyday errors."""
         pinned = dict(self.problem.numbers())
         for finding in effects:
             kind = LIBRARY[finding.name]
@@ -210,7 +210,7 @@ class _Judge:
         return self.problem.null(pinned)
 
     def _unlisted(self, curve: Fitted) -> bool:
-        """Whether a free curve is a better account than all that has a name, here and on held-out data."""
+        """Whether a free curve explains more than all named effects, here and on held-out data."""
         if self.search.advantage(curve, self.found) <= 0.0:
             return False
         named = min(self.held.squared(h) for h in (self.found, *self.search.leading()))
@@ -218,7 +218,7 @@ class _Judge:
         return free < before and free < (choice("curve") ** 2 if self.found.terms else 1.0) * named
 
     def _remaining(self) -> Fitted | None:
-        """A curve at the balance that names leave far from explained, where all its physics is declared."""
+        """A curve for a balance that named effects leave unexplained although its physics is declared."""
         problem, found = self.problem, self.found
         if not problem.frames[0].linked:
             return None
@@ -230,7 +230,7 @@ class _Judge:
         return best_curve(self.search, found, ("link", None) if link else ("motor", worst))
 
     def _doubts(self, effects: list[Finding]) -> list[str]:
-        """What these data cannot decide, in one sentence each."""
+        """What these data cannot decide, one sentence each."""
         link = self.problem.model.link
         for finding in effects:
             if finding.name not in ("motor_inertia", "link_inertia"):
@@ -253,7 +253,7 @@ class _Judge:
         return []
 
     def _left(self, found: Fitted) -> float:
-        """Error of the motors' balances over the torque."""
+        """Relative error of the motors' balances."""
         return float(np.sqrt(np.mean(np.square(self._floor(found))))) / self.problem.torque_rms
 
     def _floor(self, after: Fitted) -> list[float]:

@@ -2,11 +2,13 @@
 
     python benchmarks/endurance.py [--seconds S] [--json FILE]
 
-Three loops take turns, a few seconds each: the daemon with the simulated devices in a thread of their own,
-the daemon with the devices in its own thread, and a bare loop that does nothing but sleep until the same
-deadlines with the same scheduling. A period that is left out is the daemon's where its own work (CPU time
-since the last SYNC) filled the period, the machine's where it was ready in time and was not woken. A cycle
-without a sample is the devices' where their frames were not there before the next SYNC.
+Four loops take turns, a few seconds each: the daemon with the simulated devices in a thread of their own,
+the daemon with the devices in its own thread, a bare loop that does nothing but sleep until the same
+deadlines with the same scheduling, and one that adds integers for as long as the daemon works. A period
+that is left out is put down to own work where the thread's CPU time since the last SYNC filled the period,
+to the machine where the loop was ready in time and was not woken. A virtual machine counts what its host
+takes from it as CPU time: the additions, which never take longer, show how much of own work is the host's.
+A cycle without a sample is the devices' where their frames were not there before the next SYNC.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ from drivelink.jointfile import JointFile
 from drivelink.pubsub.session import close_session, open_session
 
 BLOCK_S = 5.0
+WORK_US = 120  # of arithmetic in each cycle of the third loop: about what the daemon and its devices take
 PERIOD_NS = round(PERIOD_S * 1e9)
 LATEST_NS = round(0.4 * PERIOD_NS)  # a SYNC that would be later than this is left out
 
@@ -61,8 +64,18 @@ def total() -> dict[str, Any]:
     return {"due": 0, "left_out_own": 0, "left_out_machine": 0, "without_sample": 0, "worst_late_us": 0.0}
 
 
-def bare_block(row: dict[str, Any], seconds: float) -> None:
-    """Nothing but sleeping."""
+def additions() -> int:
+    """How many of them take `WORK_US`, by the quickest of some trials."""
+    many, spent_ns = 2_000, []
+    for _ in range(200):
+        before_ns = time.thread_time_ns()
+        sum(range(many))
+        spent_ns.append(time.thread_time_ns() - before_ns)
+    return round(many * WORK_US * 1000 / min(spent_ns))
+
+
+def bare_block(row: dict[str, Any], seconds: float, work: int = 0) -> None:
+    """Nothing but sleeping, and so many additions a cycle."""
     obtained = realtime.acquire()
     alarm, meter = Witness(), LatencyHistogram()
     deadline = time.monotonic_ns() + PERIOD_NS
@@ -75,6 +88,7 @@ def bare_block(row: dict[str, Any], seconds: float) -> None:
             deadline += (1 + (late - LATEST_NS) // PERIOD_NS) * PERIOD_NS
             continue
         meter.add(late)
+        sum(range(work))
         deadline += PERIOD_NS
     realtime.release(obtained)
     add(row, round(seconds / PERIOD_S), meter, 0)
@@ -126,15 +140,18 @@ def measure(seconds: float) -> dict[str, dict[str, Any]]:
     which = joint("robust", free_endpoint())
     rows = {
         "bare loop, only sleeping": total(),
+        f"bare loop, {WORK_US} µs of additions": total(),
         "drivelink, devices in its own thread": total(),
         "drivelink, devices in another thread": total(),
     }
-    bare, polled, threaded = rows.values()
+    bare, adding, polled, threaded = rows.values()
+    work = additions()
     block = min(BLOCK_S, seconds)
     alarm, pacing.Alarm = pacing.Alarm, Witness  # type: ignore[misc]
     try:
         for _ in range(max(1, round(seconds / block))):
             bare_block(bare, block)
+            bare_block(adding, block, work)
             daemon_block(polled, which, block, own_thread=False)
             daemon_block(threaded, which, block, own_thread=True)
     finally:
@@ -162,7 +179,7 @@ def report(rows: dict[str, dict[str, Any]]) -> str:
 def main() -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=60.0, help="of each of the three")
+    parser.add_argument("--seconds", type=float, default=60.0, help="of each of the four")
     parser.add_argument("--json", type=Path, help="also write the numbers there")
     args = parser.parse_args()
     rows = measure(args.seconds)

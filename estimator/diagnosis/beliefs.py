@@ -103,7 +103,8 @@ def everyday_std(
         fast = max(float(np.max(np.abs(f.motors[candidate.motor or 0].velocity))) for f in frames)
         floor = 0.0 if linked else PRIORS["viscous_damping_floor"].std * torque_rms / max(fast, 1e-300)
         return (float(np.hypot(std * motor.viscous_damping_nm_s_rad, floor)),)
-    assert link is not None
+    if link is None:
+        return (0.0,)
     if name == "link_inertia":
         return (std * link.inertia_kg_m2,)
     if name == "link_viscous_damping":

@@ -152,9 +152,8 @@ def _reading(frame: Frame, error: FloatArray) -> FloatArray:
         parts.append(frame.project(-c.stiffness * error) if flexible else None)
         if pulls:
             total = total + c.stiffness
-    if frame.linked:
-        link = frame.model.link
-        assert link is not None
+    link = frame.model.link
+    if frame.linked and link is not None:
         slope = link.gravity_nm * np.cos(frame.motors[0].link_position + link.gravity_phase_rad)
         spectrum = narrow.transform(error)
         rate = narrow.apply(spectrum, response, 1)[frame.signals.keep]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from estimator.diagnosis.choices import choice, whole
 from estimator.diagnosis.spectral import Band, Spectrum, lowpass
 from estimator.effects import Coordinates
-from estimator.model import JointModel
+from estimator.model import JointModel, LinkDynamics
 from estimator.sample import FloatArray, Record
 
 __all__ = ["Corrections", "Frame", "Signals"]
@@ -165,9 +165,10 @@ class Frame:
         light = light_response(signals)
         hold = light * np.sinc(f * period) * np.exp(-1j * np.pi * f * period)
         zero = np.zeros(band.kept)
-        flexible = tuple(m.transmission.model != "none" and signals.q is not None for m in model.motors)
+        q = signals.q
+        flexible = tuple(m.transmission.model != "none" and q is not None for m in model.motors)
         paths = [tuple(band.apply(x, light, order) for order in range(3)) for x in signals.theta]
-        link = _link_path(signals, light, corrections) if any(flexible) else paths[0]
+        link = _link_path(signals, q, light, corrections) if q is not None and any(flexible) else paths[0]
         motors = []
         for i, (theta, velocity, acceleration) in enumerate(paths):
             delay = corrections.torque_delay_s[i]
@@ -234,10 +235,8 @@ class Frame:
             parts[-1] = self.project(on_link)
         return self.stack(parts)
 
-    def link_balance(self) -> FloatArray:
+    def link_balance(self, link: LinkDynamics) -> FloatArray:
         """tau_k - M q" - D_q q' - g(q) on the grid, which is tau_e by eq 4."""
-        link = self.model.link
-        assert link is not None
         c = self.motors[0]
         gravity = link.gravity_nm * np.sin(c.link_position + link.gravity_phase_rad)
         own = link.inertia_kg_m2 * c.link_acceleration + link.viscous_damping_nm_s_rad * c.link_velocity
@@ -245,10 +244,10 @@ class Frame:
 
     def motor_balance(self, i: int) -> FloatArray:
         """B theta" + D theta' - tau on the grid, which is tau_e by eq 5."""
-        motor, c = self.model.motors[i], self.motors[i]
+        motor, link, c = self.model.motors[i], self.model.link, self.motors[i]
         own = motor.inertia_kg_m2 * c.acceleration + motor.viscous_damping_nm_s_rad * c.velocity
-        if self.carried and i == 0:
-            own = own - self.link_balance()
+        if link is not None and self.carried and i == 0:
+            own = own - self.link_balance(link)
         return np.asarray(own - c.torque)
 
     def target(self) -> FloatArray:
@@ -256,16 +255,17 @@ class Frame:
         parts: list[FloatArray | None] = [
             self.project(self.motor_balance(i)) for i in range(len(self.motors))
         ]
-        if self.linked:
-            parts.append(self.project(self.link_balance()))
+        if self.linked and self.model.link is not None:
+            parts.append(self.project(self.link_balance(self.model.link)))
         return self.stack(parts)
 
 
-def _link_path(signals: Signals, light: FloatArray, corrections: Corrections) -> tuple[FloatArray, ...]:
+def _link_path(
+    signals: Signals, spectrum: Spectrum, light: FloatArray, corrections: Corrections
+) -> tuple[FloatArray, ...]:
     """The link's position, velocity and acceleration, corrected for the encoder's error."""
-    assert signals.q is not None
     q, rate, acceleration = (
-        signals.light.apply(signals.q, light, order, -corrections.encoder_delay_s) for order in range(3)
+        signals.light.apply(spectrum, light, order, -corrections.encoder_delay_s) for order in range(3)
     )
     a, b, scale = corrections.encoder_sin_rad, corrections.encoder_cos_rad, corrections.encoder_scale
     if not (a or b or scale):

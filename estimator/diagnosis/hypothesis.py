@@ -213,17 +213,14 @@ class Problem:
         The evidence of the first steps is too optimistic far from the optimum and is not used to stop; the
         fit of a healthy joint continues until it converges.
         """
-        best: Fitted | None = None
-        for k in range((steps or whole("patient_steps" if self.calibrating else "newton_steps")) + 1):
-            now = self._linearised(terms, base, corrections, extra, pinned or {})
-            believed = k > 1 and not self.calibrating
-            if believed and best is not None and now.posterior.evidence < best.evidence(now):
+        best = self._linearised(terms, base, corrections, extra, pinned or {})
+        for k in range(steps or whole("patient_steps" if self.calibrating else "newton_steps")):
+            if not self._curved(best) or _converged(best):
+                break
+            now = self._linearised(*self._moved(best), extra, pinned or {})
+            if k and not self.calibrating and now.posterior.evidence < best.evidence(now):
                 break
             best = now
-            if not self._curved(now) or _converged(now):
-                break
-            terms, base, corrections = self._moved(now)
-        assert best is not None
         return best
 
     def added(self, fitted: Fitted, term: Term, steps: int | None = None) -> Fitted:

@@ -104,9 +104,8 @@ def _everyday(problem: Problem, finding: Finding) -> bool:
     """Whether a delay is a skew of up to a sample, which is reported but not diagnosed."""
     if finding.name not in ("encoder_delay", "torque_delay"):
         return False
-    delay, std = finding.parameters["delay_s"], finding.std["delay_s"]
-    assert isinstance(delay, float) and isinstance(std, float)
-    return abs(delay) <= problem.period_s + choice("sure") * std
+    delay, std = (np.max(values["delay_s"]) for values in (finding.parameters, finding.std))
+    return bool(abs(delay) <= problem.period_s + choice("sure") * std)
 
 
 def _absolute(problem: Problem, found: Fitted, k: int, name: str, x: float) -> float:

@@ -148,10 +148,8 @@ class _Judge:
         before = self._declared(effects)
         if curve is None or not self._unlisted(curve):
             curve = self._remaining()
-        if curve is not None:
+        if curve is not None and (extra := curve.extra) is not None:
             verdict, after = "unexplained", curve
-            extra = curve.extra
-            assert extra is not None
             gone = 1.0 - self.held.squared(curve) / max(self.held.squared(before), 1e-300)
             effects = [
                 Finding(

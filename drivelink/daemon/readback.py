@@ -20,7 +20,7 @@ from drivelink.canopen.sdo import Session
 from drivelink.errors import DriveError
 from estimator.sample import Sample
 
-__all__ = ["Ask", "Finding", "ReadBack"]
+__all__ = ["Ask", "Mismatch", "ReadBack"]
 
 Address = tuple[int, int]
 Ask = Callable[[int, Address], Session[bytes]]
@@ -33,7 +33,7 @@ _FOREIGN_S = 10.0  # of silence after an answer to somebody else's request
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class Mismatch:
     """A node says something else than what is in use: which node, what, and the signal, if it is mapped."""
 
     node: int
@@ -99,7 +99,7 @@ class ReadBack:
         self._doubts: Counter[tuple[int, Address]] = Counter()  # answers in a row against what is in use
         self._pending: _Pending | None = None
         self._due_s = self._quiet_s = 0.0
-        self._contradicted: dict[int, Finding] = {}  # nodes whose frames carry something else than is mapped
+        self._contradicted: dict[int, Mismatch] = {}  # nodes whose frames carry something else than is mapped
 
     def watch(self, layout: NodeLayout, pipeline: JointPipeline) -> None:
         """A node has been configured: ask it first."""
@@ -131,7 +131,7 @@ class ReadBack:
             return
         pending.session.feed(cob_id, data, now_s)
 
-    def step(self, now_s: float) -> Finding | None:
+    def step(self, now_s: float) -> Mismatch | None:
         """Let time pass; what has been found, when it is sure."""
         pending = self._pending
         if pending is None:
@@ -189,7 +189,7 @@ class ReadBack:
         (self._units if question.mapped is None else self._values).append(question)
         self._due_s = now_s + (_FIRST_S if self._first else self._period_s)
 
-    def _conclude(self, question: _Question, against: str, now_s: float) -> Finding | None:
+    def _conclude(self, question: _Question, against: str, now_s: float) -> Mismatch | None:
         node, key = question.node, (question.node, question.address)
         signal = question.signal
         found = self._contradicted.get(node)
@@ -204,7 +204,7 @@ class ReadBack:
         self._due_s = now_s + (_FIRST_S if self._doubts[key] < _SURE else self._period_s)
         if self._doubts[key] != _SURE or found is not None:
             return None
-        finding = Finding(node, f"node {node}: {against}", signal)
+        finding = Mismatch(node, f"node {node}: {against}", signal)
         if signal is not None:
             self._contradicted[node] = finding
             self._nodes[node].pipeline.assembler.contradict(node, True)

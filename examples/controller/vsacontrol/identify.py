@@ -20,7 +20,7 @@ class Excitation:
         small_nm: pretension at first.
         small_s: for how long.
         low_nm: least pretension afterwards.
-        high_nm: largest pretension.
+        high_nm: largest pretension; with it and the tones, errors of the curve fall in proportion.
         swing_hz: of the pretension between the two.
         tones_nm: rms of a sine of this amplitude have all tones together.
         tones_hz: of motor 1; motor 2 has them a little higher, so that the two can be separated.
@@ -30,9 +30,9 @@ class Excitation:
     small_nm: float = 0.04
     small_s: float = 4.0
     low_nm: float = 0.06
-    high_nm: float = 0.15
+    high_nm: float = 0.2
     swing_hz: float = 0.25
-    tones_nm: float = 0.05
+    tones_nm: float = 0.09
     tones_hz: tuple[float, ...] = (0.7, 1.3, 2.1, 3.4, 5.0)
     fade_s: float = 0.5
 

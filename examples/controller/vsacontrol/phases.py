@@ -68,7 +68,7 @@ class Settings:
         fade_s: from one phase's torque to the next one's.
         torque_nm: limit of each motor's torque.
         position_rad: limit of |q|.
-        deflection_rad: limit of |phi_i|.
+        deflection_rad: limit of |phi_i|; the VSA-II's linkage is stretched out at 1.217 rad.
         speed_rad_s: limit of the link's speed.
         motor_mismatch_nm: undeclared torque at a motor from which the model is not believed.
         mismatch_cycles: for which it must last.
@@ -90,7 +90,7 @@ class Settings:
     fade_s: float = 0.1
     torque_nm: float = 0.4
     position_rad: float = 1.2
-    deflection_rad: float = 1.1
+    deflection_rad: float = 1.15
     speed_rad_s: float = 15.0
     motor_mismatch_nm: float = 0.01
     mismatch_cycles: int = 3

@@ -1,12 +1,12 @@
 //! Frames in, one sample per SYNC out (CiA 301, 7.2.2 and 7.2.5).
 //!
-//! Frames after SYNC k and before SYNC k+1 belong to sample k. The sample is given out with the last frame it needs. A
-//! frame that does not come leaves a gap: counted by node, never filled with an older value. What comes after a missing
-//! frame may be the missing one, late: for a while such cycles are judged only at their end, where a second frame shows
-//! the first to have been late, and are flagged.
+//! Frames after SYNC k and before SYNC k+1 belong to sample k. A sample is complete with its last frame. A
+//! missing frame leaves a gap, counted by node, never filled with an older value. The frame after a missing
+//! one may be the missing one, late: for a while such cycles are flagged and decided only at their end, when
+//! a second frame shows that the first was late.
 //!
-//! No clock is read here: the same frames in the same order give the same samples, live or from a log. How many periods
-//! have passed since the last SYNC is given by the caller, who has its stamp.
+//! No clock is read here: the same frames in the same order give the same samples, live or from a log. The
+//! caller, who has the stamps, gives the number of periods since the last SYNC.
 
 use estimator_core::sample::{MOTORS, Sample};
 

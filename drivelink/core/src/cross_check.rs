@@ -1,16 +1,15 @@
-//! Two readings of one quantity, held against each other.
+//! Compares two readings of one quantity.
 //!
 //! A drive often reports a quantity twice: its velocity beside its position, its current beside its torque, a second
-//! encoder, its following error. The second reading is a line of the first, y = s x + l ẋ + o: a scale, a
-//! lag and a zero, which are learned while both agree. In blocks of [`BLOCK_PERIODS`] the means of both are compared
-//! (of a velocity: what it integrates to, and how far the position has come). The last [`WINDOW`] blocks with
-//! information in them are tested together: r = y - h x̂ ~ N(0, κ² (I + H P Hᵀ)) in units of what a block is allowed,
-//! so rᵀ(I + H P Hᵀ)⁻¹ r / κ² ~ χ² of [`WINDOW`] degrees of freedom. One test finds a changed scale, a stuck or
-//! drifting reading, noise and slips alike; [`LIMIT`] states how often it errs.
+//! encoder, its following error. The second reading is a line of the first, y = s x + l ẋ + o: scale, lag and
+//! zero are estimated while both agree. In blocks of [`BLOCK_PERIODS`] the means of both are compared (of a
+//! velocity: what it integrates to, and how far the position has come). The last [`WINDOW`] blocks with
+//! information in them are tested together: r = y - h x̂ ~ N(0, κ² (I + H P Hᵀ)) in units of what a block is
+//! allowed, so rᵀ(I + H P Hᵀ)⁻¹ r / κ² ~ χ² of [`WINDOW`] degrees of freedom. One test finds a changed scale,
+//! a stuck or drifting reading, noise and slips alike; [`LIMIT`] states how often it errs.
 //!
-//! A block is allowed what the readings' counts cannot resolve, one period between the two, and [`SAME`] of the
-//! change: two readings that agree better are the same. To that comes what is seen beyond it in health: a noise, the
-//! same in every block, and κ >= 1 where that does not do.
+//! The tolerance of a block is the resolution of both readings, one period between them, and [`SAME`] of the
+//! change. Added are the noise observed in health, equal in every block, and κ >= 1 if that does not suffice.
 
 /// Communication periods in one block, at least: longer than the filters in drives.
 const BLOCK_PERIODS: i64 = 50;

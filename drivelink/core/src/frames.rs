@@ -1,7 +1,6 @@
 //! One TPDO from bytes to SI values.
 //!
-//! A frame is decoded when it arrives. Positions that roll over are unwrapped here, so that everything behind
-//! sees angles without seams.
+//! A frame is decoded on arrival. Positions that roll over are unwrapped here.
 
 use crate::layout::{MappedObject, Signal, Tpdo};
 

@@ -1,4 +1,4 @@
-//! Distribution of durations: counted by the microsecond, percentiles when they are asked for.
+//! Distribution of durations: counts per microsecond, percentiles on request.
 
 const RANGE_US: usize = 5_000; // what is longer is counted as this long; the maximum is kept exactly
 

@@ -1,4 +1,4 @@
-//! Which frame carries which signal, at what scale: what the configuration of the nodes came to.
+//! Which frame carries which signal, at what scale: the result of the nodes' configuration.
 
 /// What a mapped object means to the joint.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

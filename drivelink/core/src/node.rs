@@ -1,6 +1,6 @@
 //! The state of a node from its other messages: NMT commands, boot-up, heartbeat, EMCY (CiA 301, 7.2.8).
 //!
-//! Made from frames alone, so that a replayed log comes to the same judgement as the live run.
+//! Derived from frames alone, so that a replayed log gives the same states as the live run.
 
 use crate::frames::TpdoDecoder;
 

@@ -1,7 +1,6 @@
 //! One joint from frames to the bytes for zenoh. The one path for live, lockstep and replay.
 //!
-//! What the service knows of the estimate's quality is added to the status here: drive faults, missing frames, and
-//! estimates carried on without fresh measurements.
+//! Adds the service's status bits: drive faults, missing frames, stale estimates.
 
 use estimator_core::estimator::Estimator;
 use estimator_core::external::External;

@@ -1,4 +1,4 @@
-//! The Python module `drivelink._core`: `Assembler`, `JointPipeline` and what they give.
+//! The Python module `drivelink._core`: `Assembler`, `JointPipeline` and their results.
 //!
 //! No lock is held while Python code runs.
 

@@ -1,4 +1,4 @@
-//! Channels that are late against each other, shifted back onto one time.
+//! Shifts late channels back to a common time.
 
 use crate::sample::MOTORS;
 

@@ -1,14 +1,14 @@
 //! Is the balance explained? One test on normalised innovations, with a declared rate of false alarms.
 //!
-//! What noise and parameters foresee of an innovation is its variance. The mean square of a few innovations
-//! over that has an F distribution: as many degrees of freedom above as there are independent errors, few
-//! below, as the noise's level is not quite known and model errors (dry friction at a reversal) come in
-//! bursts. Its quantile at the rate of false alarms that is asked for is the limit, over the filter's
-//! correlation time (a step shows at once) and over the window of [`crate::isolation`] (what is small, or
-//! comes slowly). Beyond it nothing is learned until what was before the change has left the filters. Then
-//! the changes that can be are held against each other: what explains the new balance within its own
-//! interval and can be followed, is followed; where a reading explains it better, or nothing does, it is
-//! suspected, and nothing is valid until the reference holds again.
+//! Noise and parameter covariance predict the variance of an innovation. The mean square of a few innovations
+//! over it has an F distribution: the numerator's degrees of freedom are the number of independent errors,
+//! the denominator's are few, because the noise level is uncertain and model errors (dry friction at a
+//! reversal) come in bursts. The limit is its quantile at the declared rate of false alarms, over the
+//! filter's correlation time (a step) and over the window of [`crate::isolation`] (small or slow changes).
+//! Above it parameters are frozen until the data before the change have left the filters. Then all possible
+//! changes are compared: one that explains the new balance within its interval and can be followed is
+//! followed; if a reading explains it better, or nothing does, that reading is suspected, and nothing is
+//! valid until the reference holds again.
 
 use crate::identification::MEMORY_S;
 use crate::isolation::{Change, Explanation, Verdict};

@@ -1,4 +1,4 @@
-//! What a model's effects do to readings: a sample as perfect sensors would have given it.
+//! Corrects a sample for the declared effects of its sensors.
 
 use crate::effects::{MotorEffects, link_sum};
 use crate::error::Error;

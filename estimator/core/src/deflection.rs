@@ -1,16 +1,16 @@
-//! The deflection of this moment: what a controller wants, without the delay of the regression's filter.
+//! The present deflection, without the delay of the regression's filter.
 //!
 //! A steady-state Kalman filter with the states [θ, θ′, φ, φ′, φ″]: the motor moves by its own equation (eq
 //! 5, with the stiffness that has been estimated), the deflection by a random third derivative, and θ and
-//! q = θ + φ are measured. Where encoders are coarse it so leans on the torque balance, where they are fine
-//! on the encoders. Its covariance is iterated at the update rate, not at every tick.
+//! q = θ + φ are measured. With coarse encoders it relies on the torque balance, with fine ones on the
+//! encoders. Its covariance is iterated at the update rate, not at every tick.
 //!
-//! That covariance is a model's: of white noise and of a white third derivative, at a bandwidth with limits.
-//! Fine encoders break it, as their steps are neither. So the innovations of φ are held against it: where
-//! their mean square e² is more than the S = P + R it foresees, the covariance is e²/S times as large (the
-//! normalised innovation squared of Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking
-//! and Navigation", 2001, section 5.4). Likewise where the encoders turn out to be noisier than assumed: the
-//! state has taken up that noise already, so its covariance grows with the noise's.
+//! That covariance assumes white noise and a white third derivative. Fine encoders violate it. So the
+//! innovations of φ are compared with it: where their mean square e² is more than the S = P + R it foresees,
+//! the covariance is e²/S times as large (the normalised innovation squared of Bar-Shalom, Li, Kirubarajan,
+//! "Estimation with Applications to Tracking and Navigation", 2001, section 5.4). Likewise where the encoders
+//! turn out to be noisier than assumed: the state has taken up that noise already, so its covariance grows
+//! with the noise's.
 
 const ASTRAY: f64 = 10.0; // rad, and times what is measured: no prediction of one period is so far off
 const STATES: usize = 5;

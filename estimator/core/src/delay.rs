@@ -1,9 +1,9 @@
 //! Delay of the link encoder: candidate delays run in parallel, each with its own balance.
 //!
-//! On a stiff joint one period of delay moves q by more than the transmission deflects, so nothing linear
-//! repairs it: φ has to be formed anew for each candidate. Each of them passes the regression's filter with
-//! its cube; of all rows of a while a small least-squares problem is accumulated, and the candidate whose
-//! balance leaves least, refined by a parabola, is the delay.
+//! On a stiff joint one period of delay moves q by more than the transmission deflects, so a linear
+//! correction fails: φ is computed for each candidate. It and its cube pass the regression's filter; a small
+//! least-squares problem is accumulated per candidate, and the delay is the candidate with the smallest
+//! residual, refined by a parabola.
 
 use crate::filters::StateVariableFilter;
 

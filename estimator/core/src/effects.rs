@@ -1,5 +1,5 @@
-//! The effects that a model has been given, as a tick needs them: sorted by where they act, with their
-//! memories. What each one is stands in [`crate::library`].
+//! The declared effects, evaluated per tick: sorted by location, with their memories. [`crate::library`]
+//! defines them.
 
 pub use crate::corrections::Corrections;
 use crate::error::Error;

@@ -1,13 +1,12 @@
-//! What touches the link: the torque of the environment as a residual of the link's momentum (eqs 4, 6).
+//! External torque on the link, as a residual of the link's momentum (eqs 4, 6).
 //!
 //! ```text
 //! τ_k = M q″ + D_q q′ + g(q) + x_link + τ_e                                                    (eqs 4, 6)
 //! ```
 //! Every term passes the same filter, so nothing is differentiated: M q′ is the momentum, its derivative
 //! behind the filter is M q″. Robust mode takes τ_e from the transmission's curve at the measured deflection,
-//! which knows nothing of the motor's friction; mode paper takes it from eq 14. Without τ_e the same sum is
-//! eqs 12 and 13, the flexibility torque from the link side; the difference of the two is the external
-//! torque, less what was measured of it.
+//! free of the motor's friction; mode paper takes it from eq 14. Without τ_e the same sum is eqs 12 and 13,
+//! the flexibility torque from the link side; their difference is the external torque minus its measurement.
 //!
 //! What is not noise does not average out: an inertia 5 % off is 5 % off as long as the link accelerates. So
 //! the declared uncertainties, and that of the curve, make a band that nothing inside of it is called a

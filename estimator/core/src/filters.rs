@@ -1,8 +1,8 @@
-//! Discretisations that keep the physics: exact where a torque is held, exact ratios of derivatives elsewhere.
+//! Discretised filters: exact for a held torque, with exact ratios between derivatives for a position.
 //!
-//! A torque command is held over a period (zero-order hold); a position is smooth, and is taken as straight
-//! between samples (first-order hold). Filters built on these two assumptions give a signal and its
-//! derivatives without ever differentiating a sample.
+//! A torque command is held over a period (zero-order hold); a position is interpolated linearly between
+//! samples (first-order hold). Filters built on these assumptions give a signal and its derivatives without
+//! differentiating samples.
 
 const TERMS: usize = 18; // of the exponential's series: at a norm of 1/2 the next one is below rounding
 

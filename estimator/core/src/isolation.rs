@@ -1,11 +1,11 @@
-//! What has changed? One fault or change at a time, each held against the balance of the last seconds.
+//! Isolates a change: each possible fault or change is tested on the balance of the last seconds.
 //!
-//! The reference is what was learned while the balance was explained: parameters x̄ with their covariance Σ,
+//! The reference was estimated while the balance was explained: parameters x̄ with their covariance Σ,
 //! and the noise s². Against it the equations of a window leave r = y − h x̄. Under the hypothesis that
 //! nothing has changed, r = h δ + e with δ ~ (0, Σ), e ~ (0, s²). Under every other one, one column with an
 //! unknown amplitude is added: f itself where the stiffness has changed, F[σ q] where the link encoder has
-//! another scale, F[τ] where the torque has, … What is left under each, and how probable it makes the window,
-//! follow from the same small system: the generalised likelihood ratio of Willsky and Jones ("A generalized
+//! another scale, F[τ] where the torque has, … The residual and the probability of the window under each
+//! follow from one small system: the generalised likelihood ratio of Willsky and Jones ("A generalized
 //! likelihood ratio approach to the detection and estimation of jumps in linear systems", IEEE TAC 1976), its
 //! amplitudes integrated out.
 

@@ -1,10 +1,9 @@
-//! Joint recursive estimation whose standard deviations stay honest when the noise is coloured.
+//! Recursive joint estimation with a covariance that is valid under coloured noise.
 //!
-//! A Kalman filter for constant parameters computes a covariance P that is true for white noise only. Behind
-//! a filter the noise is anything but white. So a second covariance, Σ, is carried along: the covariance of
-//! the estimate that these very gains produce under noise with the autocorrelation that is measured on the
-//! innovations (the sandwich of a misspecified likelihood, White 1982, one equation at a time). P decides
-//! the gains, Σ is what is published.
+//! A Kalman filter for constant parameters computes a covariance P that is valid for white noise only. Behind
+//! a filter the noise is coloured. So a second covariance, Σ, is computed: that of the estimate with the same
+//! gains under noise with the autocorrelation measured on the innovations (the sandwich of a misspecified
+//! likelihood, White 1982, one equation at a time). P decides the gains, Σ is what is published.
 
 use crate::laws::PARAMETERS;
 use crate::linear_algebra::{congruent, dot, is_positive, symmetric, times};

@@ -1,12 +1,12 @@
-//! The library of physical effects a model may have been given: what each one is, and its law.
+//! The library of physical effects.
 //!
-//! One entry of [`LIBRARY`] is the whole definition of an effect: the tick, `fit`, `diagnose` and the
-//! documentation take it from there.
+//! An entry of [`LIBRARY`] is the only definition of an effect, for the tick, `fit`, `diagnose` and the
+//! documentation.
 //!
 //! Signs: with x in N·m, B θ″ + D θ′ + x_motor − τ_e(φ) − x_transmission = τ and
 //! M q″ + D_q q′ + g(q) + τ_e + x_transmission + x_link = τ_k. x is the sum over an effect's terms, each
-//! times its linear parameter. A measured torque has x too much: the torque that acts is τ − x. A reading
-//! has its error too much: the true position is the reading less the error.
+//! times its linear parameter. A measured torque is the acting torque plus x; a reading is the true position
+//! plus its error.
 
 use crate::error::Error;
 use crate::memory::Memory;

@@ -1,4 +1,4 @@
-//! A transmission's law as the equation has it: linear in α, by itself or along its tangent at α0 (eq 25).
+//! A transmission's law linear in α: by itself, or by its tangent at α0 (eq 25).
 
 use crate::kalman::{Matrix, NUISANCES, SIZE, Vector};
 use crate::laws::{Alpha, Law, PARAMETERS, powers};

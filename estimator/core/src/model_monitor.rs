@@ -1,17 +1,17 @@
-//! Is the model still sufficient? Its residual beside what it left when it was fitted.
+//! Tests whether the model is still sufficient: its residual against the baseline of its fit.
 //!
 //! The balances of eqs 5 and 4 are formed with the model's own parameters and effects, not with those that
 //! the estimator adapts. All channels pass one light filter that gives derivatives, the balances a second one.
 //!
-//! Of each second the mean square S of a balance is foreseen: what the healthy recording's seconds had, more
-//! where there is more torque, as errors of a model grow with it. x = ln(S/foreseen) of N healthy seconds has
-//! the standard deviation s; one more second is then Student's t with N − 1 degrees of freedom about 0 with
-//! the variance s² (1 + 1/N), and another motion than the recorded one adds its own. The alarm is the quantile
-//! of x at the rate of false alarms that is declared, shared by the balances and by the seconds of an hour.
+//! The mean square S of a balance in a second is predicted from the healthy recording, larger with more
+//! torque, as model errors grow with it. x = ln(S/predicted) of N healthy seconds has the standard deviation
+//! s; one more second is then Student's t with N − 1 degrees of freedom about 0 with the variance s² (1 +
+//! 1/N), and another motion than the recorded one adds its own. The alarm is the quantile of x at the rate of
+//! false alarms that is declared, shared by the balances and by the seconds of an hour.
 //!
-//! Where nobody measures τ_k, what the link's balance leaves may be a push as well as an error of the model, and
-//! neither says anything against the flexibility torque: it is measured, helps to say where an effect sits, and
-//! raises no alarm (see [`crate::external`]).
+//! If τ_k is not measured, the residual of the link's balance may be a push as well as a model error, and
+//! neither affects the flexibility torque: it helps to locate an effect, but raises no alarm (see
+//! [`crate::external`]).
 
 use crate::effects::{Coordinates, JointEffects, Torques};
 use crate::error::Error;

@@ -1,4 +1,4 @@
-//! From a polynomial that has been estimated to the nonlinear law it approximates, with its slopes.
+//! Converts an estimated polynomial to the nonlinear law it approximates, with slopes.
 
 use crate::laws::{Alpha, Law, PARAMETERS, powers};
 use crate::linear_algebra::solve;

@@ -1,5 +1,5 @@
-//! How noisy are the encoders? From the third differences of what they read, and never less than the
-//! rounding of a count: uniform, so its variance is a twelfth of the count's square.
+//! Encoder noise from third differences of the readings, at least the uniform rounding of a count (variance
+//! 1/12 count²).
 
 const MEMORY_S: f64 = 2.0; // over which the noise is measured
 const OUTLIER: f64 = 100.0; // times the variance: no noise

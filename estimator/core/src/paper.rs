@@ -1,8 +1,7 @@
 //! Mode "paper": eqs 14, 28, 32, 33 as printed, correctly discretised, one tick at a time.
 //!
-//! Faithful on purpose: regressors are not filtered like the residual, velocities are taken as the drive
-//! gives them (a difference of positions where it gives none). What that costs on a real drive's signals is
-//! what the robust mode is for.
+//! As printed: regressors are not filtered like the residual, velocities are the drive's (else differences of
+//! positions). The robust mode avoids the resulting errors on real drives.
 
 use crate::external::{External, PaperMomentum};
 use crate::filters::{first_order_pole, tustin_biquad};

@@ -1,4 +1,4 @@
-//! The binding: what Python's objects of `estimator.model` and `estimator.settings` are here.
+//! The Python binding: converts objects of `estimator.model` and `estimator.settings`.
 //!
 //! `drivelink._core` uses the conversions too.
 

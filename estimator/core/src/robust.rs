@@ -1,8 +1,8 @@
-//! Mode "robust": the joint's estimator for the signals real drives give.
+//! Mode "robust": the estimator for real drives' signals.
 //!
 //! Each tick, in order: validate the input, correct the readings, bridge gaps, align the channels, filter them,
-//! follow the deflection; every so many ticks, as the errors' correlation allows, the balance of a motor
-//! becomes an equation of its recursive estimation; torque and stiffness are read off the curve.
+//! track the deflection; at intervals of the errors' correlation time update the recursive estimation with a
+//! motor's balance; evaluate torque and stiffness on the curve.
 
 use crate::align::{Alignment, Inputs};
 use crate::delay::{DelaySearch, Known};

@@ -1,4 +1,4 @@
-//! What goes into an estimator and what comes out of it, one tick at a time.
+//! Inputs and outputs of an estimator, one tick at a time.
 
 use crate::model::Arrangement;
 

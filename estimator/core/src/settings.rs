@@ -1,4 +1,4 @@
-//! How an estimator is to work.
+//! Settings of an estimator.
 
 /// Which estimator.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,4 +1,4 @@
-//! The signals of one motor's balance behind the filters that all of them share, and what their motion reveals.
+//! The filtered signals of one motor's balance, and the excitation of their motion.
 
 use crate::filters::StateVariableFilter;
 use crate::laws::PARAMETERS;

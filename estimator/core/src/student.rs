@@ -1,4 +1,4 @@
-//! Student's t and Fisher's F distribution: tails of what is normal but for a variance that is known from few data.
+//! Student's t and Fisher's F distribution: tails under a variance estimated from few data.
 
 /// |t| that a t distribution exceeds with this probability.
 #[must_use]

@@ -1,4 +1,4 @@
-//! Which reading is suspected, and of what: said of a joint while what it reads cannot be.
+//! Which reading is suspected, and why, while readings contradict the model.
 
 use crate::change_detection::SURE;
 use crate::isolation::{Change, Verdict};

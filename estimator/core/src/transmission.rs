@@ -1,4 +1,4 @@
-//! One motor and its transmission on line: fed every tick, learning at every update, read off at any time.
+//! One motor and its transmission on line: takes every sample, estimates at every update.
 
 use crate::change_detection::{Action, ChangeDetection, Innovation};
 use crate::deflection::{DeflectionFilter, Tuning};

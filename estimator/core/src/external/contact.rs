@@ -1,4 +1,4 @@
-//! Does something touch the link? A sequential test on what is beyond the band of what is declared.
+//! Contact detection: a sequential test on the external torque beyond the band of declared uncertainties.
 
 use super::{BAND_SIGMA, TINY};
 use crate::settings::Settings;

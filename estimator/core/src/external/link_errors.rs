@@ -1,4 +1,4 @@
-//! What the declared link leaves of its own balance, identified.
+//! Identifies the errors of the declared link from its balance.
 
 use super::{MEMORY_S, TINY};
 use crate::model::Link;

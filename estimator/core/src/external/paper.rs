@@ -1,4 +1,4 @@
-//! What touches the link, in mode "paper": eqs 12 and 13 as printed.
+//! External torque in mode "paper": eqs 12 and 13 as printed.
 
 use super::contact::Judge;
 use super::{Consistency, External, SETTLED, TINY, gravity, status};

@@ -1,4 +1,5 @@
-//! What was learned some time ago, while all was well, and what the balance of the last seconds says of it.
+//! The reference: parameters estimated some time ago while the balance was explained, and their test on the
+//! last seconds.
 
 use super::{COULOMB, DEFLECTION_OFFSET, DELAY, OFFSET, OnlineIdentification};
 use crate::change_detection::{LEAST_IN_WINDOW, UPDATES};

@@ -1,4 +1,4 @@
-//! From the polynomial to the nonlinear law that is wanted, and that law linearised anew as its parameters move.
+//! The switch from polynomial to the declared nonlinear law, and its linearisation as parameters move.
 
 use super::OnlineIdentification;
 use crate::kalman::{Kalman, Matrix, NUISANCES, SIZE, Vector};

@@ -1,4 +1,4 @@
-//! What the equation is measured in: torque, deflection and velocity near one, whatever the joint.
+//! Units of the equation: they scale torque, deflection and velocity of any joint to about one.
 
 use super::{CUT_OFF, DEFLECTION_OFFSET, OnlineIdentification};
 use crate::kalman::{NUISANCES, SIZE, Vector};

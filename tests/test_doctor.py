@@ -113,6 +113,8 @@ def test_a_healthy_bus_is_found_healthy_and_nothing_is_written(rig):
         "current (0x6078:00) can be compared with torque"
     )
     assert '[motor.drive] checks = ["velocity", "current"]' in offered
+    assert offered["[bus] sync_counter_overflow = 240"].startswith("node ")
+    assert offered['[motor.drive] second_encoder = "0x60E4:01"'].startswith("second encoder (0x60E4:01)")
     questions = [(cob_id, data) for cob_id, data in sent if cob_id == 0 or 0x601 <= cob_id <= 0x67F]
     assert len(questions) > 127
     for cob_id, data in questions:  # uploads and their segments only
@@ -290,6 +292,12 @@ def test_from_an_eds_file_alone_the_mapping_is_shown(path):
     assert "0x6041:00:16" in mapped
     assert facts["motor_position"] == ["0x6064:00"]
     assert report.worst < Severity.ERROR
+
+
+def test_of_a_data_sheet_the_second_encoder_that_is_not_the_links_is_offered(tmp_path):
+    report = sheet_of("6064", "6077", "60E4sub1", "60E4sub2", tmp_path=tmp_path)
+    (line,) = [line for line in texts(report) if line.startswith("cross-check: second encoder")]
+    assert "0x60E4:02" in line
 
 
 def test_a_check_that_was_asked_for_is_planned_and_not_offered(rig):

@@ -14,7 +14,7 @@ from drivelink.canopen.roles import Role
 from drivelink.canopen.tpdo_assignment import Assignment, assign
 from drivelink.canopen.units import offer
 from drivelink.canopen.vendors import vendor_of
-from drivelink.doctor.freechecks import say_free_checks
+from drivelink.doctor.freechecks import say_free_checks, say_second_encoder
 from drivelink.doctor.report import Section
 from drivelink.errors import DriveError
 from drivelink.jointfile import DriveSection, EncoderSection
@@ -79,7 +79,9 @@ def examine_sheet(section: Section, path: Path) -> None:
         kept = "" if assignment.objects is not None else "its map as it is, "
         text = " + ".join(entry_text(entry) for entry in entries)
         section.ok("configured", f"TPDO{number} = {text}, {kept}at every SYNC")
-    say_free_checks(section, role, mappable, _checks(sheet, available), tpdos)
+    checks = _checks(sheet, available)
+    say_free_checks(section, role, mappable, checks, tpdos)
+    say_second_encoder(section, role, mappable, checks, tpdos)
     section.facts["mapping"] = [
         {"tpdo": number, "objects": [f"0x{i:04X}:{s:02X}:{b}" for i, s, b in entries]}
         for number, entries in map(planned_entries, plan)
@@ -151,11 +153,13 @@ def _checks(
 ) -> dict[Signal, tuple[MappableObject, ...]]:
     """Objects for cross-checks: a second torque or current, velocity, following error."""
 
-    def mappable(signal: Signal, index: int) -> tuple[MappableObject, ...]:
-        entry = sheet.objects.get((index, 0))
+    def mappable(signal: Signal, index: int, subindex: int = 0) -> tuple[MappableObject, ...]:
+        entry = sheet.objects.get((index, subindex))
         if entry is None or not entry.pdo_mappable:
             return ()
-        return (MappableObject(signal=signal, address=(index, 0), bits=len(entry), signed=True, scale=1.0),)
+        return (
+            MappableObject(signal=signal, address=(index, subindex), bits=len(entry), signed=True, scale=1.0),
+        )
 
     as_check = {
         Signal.VELOCITY_CHECK: available.get(Signal.MOTOR_VELOCITY, ()),
@@ -165,6 +169,7 @@ def _checks(
         **{signal: tuple(replace(o, signal=signal) for o in objects) for signal, objects in as_check.items()},
         Signal.FOLLOWING_ERROR: mappable(Signal.FOLLOWING_ERROR, 0x60F4),
         Signal.POSITION_DEMAND: mappable(Signal.POSITION_DEMAND, 0x6062),
+        Signal.SECOND_POSITION: mappable(Signal.SECOND_POSITION, 0x60E4, 2),
     }
 
 

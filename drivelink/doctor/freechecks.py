@@ -12,9 +12,16 @@ from drivelink.canopen.roles import Role
 from drivelink.canopen.tpdo_assignment import assign, unused
 from drivelink.doctor.report import Section
 from drivelink.errors import DriveError
+from drivelink.jointfile import BusSection
 from drivelink.notice import Severity
 
-__all__ = ["asked_signals", "say_free_checks"]
+__all__ = [
+    "asked_signals",
+    "say_free_checks",
+    "say_second_encoder",
+    "say_sync_counter",
+    "second_encoder",
+]
 
 _SIGNALS = {  # as `checks` of [motor.drive] names them
     "velocity": (Signal.VELOCITY_CHECK,),
@@ -22,6 +29,8 @@ _SIGNALS = {  # as `checks` of [motor.drive] names them
     "following_error": (Signal.FOLLOWING_ERROR, Signal.POSITION_DEMAND),
 }
 _AGAINST = {"velocity": "position", "current": "torque", "following_error": "position and its demand"}
+_ENCODERS = ("0x60E4:01", "0x60E4:02")  # beside the one of the position
+_COUNTER = 240  # CiA 301, 7.5.2.22: the longest
 
 Available = Mapping[Signal, Sequence[MappableObject]]
 
@@ -32,6 +41,39 @@ def asked_signals(role: Role) -> set[Signal]:
         return set()
     asked = {signal for name in role.drive.checks for signal in _SIGNALS[name]}
     return asked | ({Signal.SECOND_POSITION} if role.drive.second_encoder else set())
+
+
+def second_encoder(role: Role) -> str:
+    """The object where a second encoder of the motor would be: the first that is not the link's."""
+    link = "" if role.encoder is None else role.encoder.object or _ENCODERS[0]
+    return next(each for each in _ENCODERS if each.lower() != link.lower())
+
+
+def say_second_encoder(
+    section: Section, role: Role, wanted: Available, available: Available, tpdos: Sequence[Tpdo]
+) -> None:
+    """Report an encoder that nothing uses, and the line for the joint file."""
+    if role.drive is None or role.drive.second_encoder is not None:
+        return
+    objects = {Signal.SECOND_POSITION: unused(wanted, available.get(Signal.SECOND_POSITION, ()))}
+    frames = _cost(role, wanted, objects, tpdos) if all(objects.values()) else None
+    if frames is not None:
+        index, subindex = objects[Signal.SECOND_POSITION][0].address
+        name = f"0x{index:04X}:{subindex:02X}"
+        section.say(
+            Severity.INFO,
+            "cross-check",
+            f"second encoder ({name}), if on the motor, can be compared with position: {_frames(frames)}",
+            f'[motor.drive] second_encoder = "{name}"',
+        )
+
+
+def say_sync_counter(section: Section, subject: str, bus: BusSection) -> None:
+    """Report a SYNC counter (0x1019) that is off: it shows each lost SYNC."""
+    if bus.sync == "produce" and not bus.sync_counter_overflow:
+        line = f"[bus] sync_counter_overflow = {_COUNTER}"
+        text = f"{subject} has a SYNC counter (0x1019), which numbers each SYNC in logs: no further frame"
+        section.say(Severity.INFO, "cross-check", text, line)
 
 
 def say_free_checks(
@@ -67,9 +109,12 @@ def say_free_checks(
 def _say(section: Section, role: Role, names: list[str], text: str, frames: int | None) -> None:
     if role.drive is None or frames is None:
         return
-    cost = f"{frames} more frame{'s' if frames > 1 else ''} a cycle" if frames else "no further frame"
     line = f"[motor.drive] checks = {json.dumps([*role.drive.checks, *names])}"
-    section.say(Severity.INFO, "cross-check", f"{text}: {cost}", line)
+    section.say(Severity.INFO, "cross-check", f"{text}: {_frames(frames)}", line)
+
+
+def _frames(more: int) -> str:
+    return f"{more} more frame{'s' if more > 1 else ''} a cycle" if more else "no further frame"
 
 
 def _cost(role: Role, wanted: Available, objects: Available, tpdos: Sequence[Tpdo]) -> int | None:

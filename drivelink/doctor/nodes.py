@@ -16,13 +16,19 @@ from drivelink.canopen.guard import SilentBus
 from drivelink.canopen.layout import NodeLayout, Signal, TpdoLayout
 from drivelink.canopen.node import NodeSurvey, survey_node
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.canopen.pdo import decode, describe, entry_text
+from drivelink.canopen.pdo import decode, describe, entry_text, read_optional
 from drivelink.canopen.roles import Role, roles
 from drivelink.canopen.scan import FoundNode, Traffic, identify, listen, scan
 from drivelink.canopen.tpdo_assignment import CHECKS, assign, unused
 from drivelink.canopen.vendors import vendor_of
 from drivelink.doctor.datasheet import planned_entries
-from drivelink.doctor.freechecks import asked_signals, say_free_checks
+from drivelink.doctor.freechecks import (
+    asked_signals,
+    say_free_checks,
+    say_second_encoder,
+    say_sync_counter,
+    second_encoder,
+)
 from drivelink.doctor.motion import MotionReader, judge_gathered, judge_motion, judge_record, record_of_motion
 from drivelink.doctor.report import Report, Section
 from drivelink.doctor.sampletap import SampleTap
@@ -160,7 +166,11 @@ def _examine_node(
     section.ok(subject, f"{_describe_node(node)}, {state}")
     curious = role
     if role.drive is not None:
-        update = {"velocity": True, "checks": ("current", "following_error")}
+        update = {
+            "velocity": True,
+            "checks": ("current", "following_error"),
+            "second_encoder": role.drive.second_encoder or second_encoder(role),
+        }
         curious = replace(role, drive=role.drive.model_copy(update=update))
     try:
         survey = run_program(
@@ -172,7 +182,21 @@ def _examine_node(
     _judge_profile(section, role, node)
     _judge_eds(section, role, node)
     section.notices += survey.offer.notices
-    return survey, _judge_mapping(section, role, survey)
+    planned = _judge_mapping(section, role, survey)
+    if _has(bus, joint.bus, role.node_id, 0x1019):
+        say_sync_counter(section, subject, joint.bus)
+    return survey, planned
+
+
+def _has(bus: can.BusABC, section: BusSection, node: int, index: int) -> bool:
+    program = read_optional(node, index, 0)
+    try:
+        return (
+            run_program(program, bus, timeout_s=section.sdo_timeout_s, retries=section.sdo_retries)
+            is not None
+        )
+    except DriveError:
+        return False
 
 
 def _judge_profile(section: Section, role: Role, node: FoundNode) -> None:
@@ -254,6 +278,9 @@ def _judge_mapping(section: Section, role: Role, survey: NodeSurvey) -> NodeLayo
             "drivelink run does it",
         )
     say_free_checks(section, role, wanted, available, survey.tpdos)
+    seconds = available.get(Signal.SECOND_POSITION, ())
+    if all(o.address != vendor_of(survey.identity[0]).sensorless for o in seconds):
+        say_second_encoder(section, role, wanted, available, survey.tpdos)
     tpdos = tuple(
         TpdoLayout(cob_id=0x181, objects=tuple(c.mapped() for c in a.objects))
         if a.objects is not None

@@ -35,8 +35,8 @@ endpoint = "{endpoint}"
 case = "{case}"
 """
 MOTOR = """[[motor]]
-inertia_kg_m2 = 0.0005
-viscous_damping_nm_s_rad = 0.005
+inertia_kg_m2 = {}
+viscous_damping_nm_s_rad = {}
 [motor.transmission]
 model = "polynomial"
 order = 2
@@ -45,6 +45,7 @@ node_id = {}
 gear_ratio = 20.0
 torque_constant_nm_a = 0.02
 """
+CONSTANTS = {1: (0.05, 0.001), 2: (0.0005, 0.005)}  # inertia and damping of the simulated cases, by motors
 SUBSCRIBER = """
 import sys, time
 from drivelink.pubsub.session import open_client
@@ -71,7 +72,7 @@ def joint_text(mode: str, endpoint: str, *, index: int = 0, motors: int = 2) -> 
     return JOINT.format(
         name="bench" if index == 0 else f"bench{index}",
         arrangement="antagonistic" if motors == 2 else "single",
-        motors="".join(MOTOR.format(first + i) for i in range(motors)),
+        motors="".join(MOTOR.format(*CONSTANTS[motors], first + i) for i in range(motors)),
         link_node=first + 2,
         mode=mode,
         endpoint=endpoint,

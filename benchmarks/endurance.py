@@ -6,9 +6,10 @@ Four loops take turns, a few seconds each: the daemon with the simulated devices
 the daemon with the devices in its own thread, a bare loop that does nothing but sleep until the same
 deadlines with the same scheduling, and one that adds integers for as long as the daemon works. A period
 that is left out is put down to own work where the thread's CPU time since the last SYNC filled the period,
-to the machine where the loop was ready in time and was not woken. A virtual machine counts what its host
-takes from it as CPU time: the additions, which never take longer, show how much of own work is the host's.
-A cycle without a sample is the devices' where their frames were not there before the next SYNC.
+to the machine where the loop was ready in time and was not woken. A virtual machine may book time that its
+host takes as CPU time of the thread: the additions, a fixed amount of work, are the control for that. Own
+work that they do not show is the daemon's. A cycle without a sample is the devices' where their frames were
+not there before the next SYNC.
 """
 
 from __future__ import annotations

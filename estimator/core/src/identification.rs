@@ -48,11 +48,9 @@ const KNOWN_SHARE: f64 = 0.02; // … and, of a power, of the torque at the larg
 const RELAX: f64 = 2.5; // a nuisance this many prior std off: the prior was too narrow
 const RMS: f64 = 0.5; // of a torque over its largest value, in usual motion
 const LEAST_VARIANCE: f64 = 0.02; // however the noise is coloured, it leaves so much of what white would
-// Published over computed standard deviation, without unit: errors of about a thousandth that are no noise (the motion
-// between two samples, what is left of a delay) are in no covariance. Encoder noise needs no term of its own: what it
-// does to y is in the innovations, and in h² it is less than a millionth. Without the factor, the 95 % intervals of
-// `benchmarks/ensembles.py` cover too little, above all where the link encoder is late; a covariance from products of
-// single innovations (Newey, West, Econometrica 1987) covers less still.
+// Published over computed standard deviation, without unit: errors that are in no covariance, measured, their cause not
+// isolated. Without the factor, the 95 % intervals of `benchmarks/ensembles.py` cover too little, above all where the
+// link encoder is late; a covariance from products of single innovations (Newey, West, Econometrica 1987) covers less.
 const UNSEEN: f64 = 1.3;
 
 // Places of the nuisances behind α.

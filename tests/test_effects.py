@@ -140,6 +140,7 @@ def test_correct_undoes_what_the_sensors_did() -> None:
     q = 0.8
     reading = (1.0 + scale) * q + sine * math.sin(q)
     corrected = effects.correct(Sample(0, (0.5,), (math.nan,), (2.0,), reading))
+    assert corrected is not None
     # Two steps of a fixed point that contracts by 3 %: off by 3e-2 cubed of the error.
     assert corrected.link_position_rad == pytest.approx(q, abs=2e-5)
     assert corrected.motor_position_rad == pytest.approx((0.55,))
@@ -155,20 +156,21 @@ def test_delays_bring_all_channels_to_the_latest_one() -> None:
         1e-3,
     )
     out = [effects.correct(Sample(k, (1.0 * k,), (math.nan,), (1.0 * k,), 1.0 * k)) for k in range(12)]
+    # The torque waits 3.5 periods: before, nobody knows what it was.
+    assert out[:4] == [None] * 4 and None not in out[4:]
+    assert out[-1] is not None
     assert out[-1].motor_position_rad == pytest.approx((11 - 2.5,))
     assert out[-1].motor_torque_nm == pytest.approx((11 - 3.5,))
     assert out[-1].link_position_rad == pytest.approx(11.0)
     gap = effects.correct(Sample(15, (15.0,), (math.nan,), (15.0,), 15.0))
-    assert gap.motor_position_rad == pytest.approx((12.5,))
+    assert gap is not None and gap.motor_position_rad == pytest.approx((12.5,))
 
 
 def test_a_torque_that_acts_with_a_lag_is_the_mean_of_what_acts_in_each_period() -> None:
     lag_s = 0.006
     effects = OnlineEffects(_joint(Effect(name="torque_lag", parameters={"time_constant_s": lag_s})), 1e-3)
-    acting = [
-        effects.correct(Sample(k, (0.0,), (0.0,), (float(k >= 1),), 0.0)).motor_torque_nm[0]
-        for k in range(40)
-    ]
+    corrected = [effects.correct(Sample(k, (0.0,), (0.0,), (float(k >= 1),), 0.0)) for k in range(40)]
+    acting = [one.motor_torque_nm[0] for one in corrected if one is not None]
     # The mean of 1 - exp(-t/T) from (k - 1) to k milliseconds after the step.
     t = 1e-3 * np.arange(40)
     mean = 1.0 - (np.exp(-t[:-1] / lag_s) - np.exp(-t[1:] / lag_s)) * lag_s / 1e-3

@@ -4,28 +4,59 @@ use crate::sample::MOTORS;
 
 const LONGEST: usize = 12; // periods
 
-/// What is measured of a joint at one tick: q, θ_i, τ_i.
+/// Positions of a joint at one moment.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Inputs {
+pub struct Positions {
     /// q, rad.
     pub link: f64,
     /// θ, rad.
     pub motor: [f64; MOTORS],
+}
+
+impl Positions {
+    fn towards(&self, to: &Positions, share: f64) -> Positions {
+        Positions {
+            link: self.link + share * (to.link - self.link),
+            motor: std::array::from_fn(|i| self.motor[i] + share * (to.motor[i] - self.motor[i])),
+        }
+    }
+
+    /// φ of one transmission.
+    #[must_use]
+    pub fn deflection(&self, i: usize) -> f64 {
+        self.link - self.motor[i]
+    }
+
+    /// The same from other zeros.
+    #[must_use]
+    pub fn from_zeros(&self, zeros: &Positions) -> Positions {
+        Positions {
+            link: self.link - zeros.link,
+            motor: std::array::from_fn(|i| self.motor[i] - zeros.motor[i]),
+        }
+    }
+}
+
+/// What is measured of a joint at one tick.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Inputs {
+    /// q and θ as of the moment of the torques.
+    pub at: Positions,
     /// τ, N·m.
     pub torque: [f64; MOTORS],
+    /// q and θ as of now, where the torques are later.
+    pub present: Positions,
 }
 
 impl Inputs {
     /// Everything a share of the way to `to`.
     #[must_use]
     pub fn towards(&self, to: &Inputs, share: f64) -> Inputs {
-        let mut out = *self;
-        out.link += share * (to.link - self.link);
-        for i in 0..MOTORS {
-            out.motor[i] += share * (to.motor[i] - self.motor[i]);
-            out.torque[i] += share * (to.torque[i] - self.torque[i]);
+        Inputs {
+            at: self.at.towards(&to.at, share),
+            torque: std::array::from_fn(|i| self.torque[i] + share * (to.torque[i] - self.torque[i])),
+            present: self.present.towards(&to.present, share),
         }
-        out
     }
 }
 
@@ -66,10 +97,11 @@ impl Alignment {
         let newer = &self.past[(self.newest + length - whole) % length];
         let older = &self.past[(self.newest + length - whole - 1) % length];
         let late = newer.towards(older, lag - whole as f64);
-        if self.periods > 0.0 {
-            Inputs { link: inputs.link, ..late }
-        } else {
-            Inputs { link: late.link, ..*inputs }
+        let (link, motor) = if self.periods > 0.0 { (inputs, &late) } else { (&late, inputs) };
+        Inputs {
+            at: Positions { link: link.at.link, motor: motor.at.motor },
+            torque: motor.torque,
+            present: Positions { link: link.present.link, motor: motor.present.motor },
         }
     }
 }
@@ -85,8 +117,9 @@ mod tests {
         let mut out = Inputs::default();
         for k in 0..20 {
             let k = f64::from(k);
-            out = alignment.align(&Inputs { link: k, motor: [k; 2], torque: [k; 2] }, k == 0.0);
+            let at = Positions { link: k, motor: [k; 2] };
+            out = alignment.align(&Inputs { at, torque: [k; 2], present: at }, k == 0.0);
         }
-        assert!((out.motor[0] - 16.75).abs() < 1e-12 && (out.link - 19.0).abs() < 1e-12);
+        assert!((out.at.motor[0] - 16.75).abs() < 1e-12 && (out.at.link - 19.0).abs() < 1e-12);
     }
 }

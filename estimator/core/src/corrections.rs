@@ -38,6 +38,23 @@ impl Lag {
     }
 }
 
+/// How many periods each channel waits.
+#[derive(Clone, Copy, Debug)]
+struct Waits {
+    motor: f64,
+    link: f64,
+    torque: [f64; MOTORS],
+}
+
+/// A sample as perfect sensors would have given it.
+#[derive(Clone, Copy, Debug)]
+pub struct Corrected {
+    /// All channels as of one moment, the latest that all are known of.
+    pub aligned: Sample,
+    /// Positions and external torque as of the latest moment that these are known of; the torque may be later.
+    pub present: Sample,
+}
+
 /// What makes a sample one of perfect sensors.
 #[derive(Clone, Debug)]
 pub struct Corrections {
@@ -50,9 +67,8 @@ pub struct Corrections {
     // The torque acts its delay later than reported, the link position is read late: with the largest of
     // these delays as common, motor positions wait that long, the rest what is left of it. In periods.
     delayed: bool,
-    motor: f64,
-    link: f64,
-    torque: [f64; MOTORS],
+    aligned: Waits,
+    present: Waits, // the positions wait for each other only
     first: Option<u64>,
     last: u64,
     past: Vec<Sample>,
@@ -80,9 +96,13 @@ impl Corrections {
             lag[i] = Lag::new(motor.lag / period_s);
         }
         let common = delays.iter().fold(encoder_delay.max(0.0), |latest, delay| latest.max(-delay));
-        let torque = delays.map(|delay| (common + delay) / period_s);
-        let (motor, late) = (common / period_s, (common - encoder_delay) / period_s);
-        let longest = torque.iter().fold(motor.max(late), |a, b| a.max(*b));
+        let waits = |common: f64| Waits {
+            motor: common / period_s,
+            link: (common - encoder_delay) / period_s,
+            torque: delays.map(|delay| (common + delay).max(0.0) / period_s),
+        };
+        let (aligned, present) = (waits(common), waits(encoder_delay.max(0.0)));
+        let longest = aligned.torque.iter().fold(aligned.motor.max(aligned.link), |a, b| a.max(*b));
         let delayed = encoder_delay != 0.0 || delays.iter().any(|delay| *delay != 0.0);
         let nothing = Sample {
             sequence: 0,
@@ -103,9 +123,8 @@ impl Corrections {
             offset,
             lag,
             delayed,
-            motor,
-            link: late,
-            torque,
+            aligned,
+            present,
             first: None,
             last: 0,
             past: vec![nothing; longest as usize + 2],
@@ -127,10 +146,24 @@ impl Corrections {
         self.lag = self.lag.map(|lag| Lag::new(lag.periods));
     }
 
-    /// The sample as perfect sensors would have given it.
-    pub fn correct(&mut self, sample: &Sample) -> Sample {
+    /// By how much the aligned channels are older than the present ones, s.
+    #[must_use]
+    pub fn behind_s(&self) -> f64 {
+        (self.aligned.motor - self.present.motor) * self.period
+    }
+
+    /// How old the present positions are, s: they wait for a link that is read late.
+    #[must_use]
+    pub fn age_s(&self) -> f64 {
+        self.present.motor * self.period
+    }
+
+    /// The sample as perfect sensors would have given it; `None` until every channel has the past it waits for.
+    ///
+    /// `restart`: this sample does not go on from the one before.
+    pub fn correct(&mut self, sample: &Sample, restart: bool) -> Option<Corrected> {
         if !self.active {
-            return *sample;
+            return Some(Corrected { aligned: *sample, present: *sample });
         }
         if self.first.is_none() {
             self.last = sample.sequence;
@@ -138,22 +171,32 @@ impl Corrections {
         let first = *self.first.get_or_insert(sample.sequence);
         let after = (sample.sequence.wrapping_sub(self.last) as f64).max(1.0);
         self.last = sample.sequence;
-        let mut out = if self.delayed { self.delay(sample) } else { *sample };
-        let read = out.link_position;
-        if !self.reading.is_empty() && read.abs() < ABSURD {
-            out.link_position = read - self.error(read - self.error(read));
+        let mut out = Corrected { aligned: *sample, present: *sample };
+        if self.delayed {
+            if restart {
+                self.known = 0;
+            }
+            self.remember(sample);
+            out.aligned = self.delay(sample.sequence, &self.aligned)?;
+            out.present = self.delay(sample.sequence, &self.present)?;
         }
         let time = sample.sequence.wrapping_sub(first) as f64 * self.period;
         for (i, elements) in self.drive.iter().enumerate() {
-            let torque = out.motor_torque[i];
+            let torque = out.aligned.motor_torque[i];
             if torque.abs() < ABSURD {
                 let c = Coordinates { torque, time, ..Coordinates::default() };
                 let acting = torque - elements.iter().map(|e| e.torque(&c)).sum::<f64>();
-                out.motor_torque[i] = self.lag[i].acting(acting, after);
+                out.aligned.motor_torque[i] = self.lag[i].acting(acting, after);
             }
-            out.motor_position[i] += self.offset[i];
         }
-        out
+        for one in [&mut out.aligned, &mut out.present] {
+            let read = one.link_position;
+            if !self.reading.is_empty() && read.abs() < ABSURD {
+                one.link_position = read - self.error(read - self.error(read));
+            }
+            (0..MOTORS).for_each(|i| one.motor_position[i] += self.offset[i]);
+        }
+        Some(out)
     }
 
     fn error(&self, link_position: f64) -> f64 {
@@ -161,30 +204,34 @@ impl Corrections {
         self.reading.iter().map(|element| element.torque(&c)).sum()
     }
 
-    fn delay(&mut self, sample: &Sample) -> Sample {
+    fn remember(&mut self, sample: &Sample) {
         self.newest = (self.newest + 1) % self.past.len();
         self.past[self.newest] = *sample;
         self.known = (self.known + 1).min(self.past.len());
-        let mut out = *sample;
-        let (a, b, share) = self.at(sample.sequence, self.motor);
+    }
+
+    /// Each channel as it was before it waited; `None` where that is not known yet.
+    fn delay(&self, now: u64, waits: &Waits) -> Option<Sample> {
+        let mut out = self.past[self.newest];
         let mix = |old: f64, new: f64, share: f64| if share == 0.0 { old } else { old + share * (new - old) };
+        let (a, b, share) = self.at(now, waits.motor)?;
         for i in 0..MOTORS {
             out.motor_position[i] = mix(a.motor_position[i], b.motor_position[i], share);
             out.motor_velocity[i] = mix(a.motor_velocity[i], b.motor_velocity[i], share);
         }
         out.external_torque = mix(a.external_torque, b.external_torque, share);
         for i in 0..MOTORS {
-            let (a, b, share) = self.at(sample.sequence, self.torque[i]);
+            let (a, b, share) = self.at(now, waits.torque[i])?;
             out.motor_torque[i] = mix(a.motor_torque[i], b.motor_torque[i], share);
         }
-        let (a, b, share) = self.at(sample.sequence, self.link);
+        let (a, b, share) = self.at(now, waits.link)?;
         out.link_position = mix(a.link_position, b.link_position, share);
         out.link_velocity = mix(a.link_velocity, b.link_velocity, share);
-        out
+        Some(out)
     }
 
     /// The samples around a time so many periods ago, and the share of the newer one.
-    fn at(&self, now: u64, periods: f64) -> (&Sample, &Sample, f64) {
+    fn at(&self, now: u64, periods: f64) -> Option<(&Sample, &Sample, f64)> {
         let mut newer = &self.past[self.newest];
         for k in 0..self.known {
             let older = &self.past[(self.newest + self.past.len() - k) % self.past.len()];
@@ -192,11 +239,11 @@ impl Corrections {
             if age >= periods {
                 let span = newer.sequence.wrapping_sub(older.sequence) as f64;
                 let share = if span > 0.0 { (age - periods) / span } else { 0.0 };
-                return (older, newer, share);
+                return Some((older, newer, share));
             }
             newer = older;
         }
-        (newer, newer, 0.0)
+        None
     }
 }
 

@@ -12,6 +12,8 @@
 //! turn out to be noisier than assumed: the state has taken up that noise already, so its covariance grows
 //! with the noise's.
 
+use crate::transmission::Present;
+
 const ASTRAY: f64 = 10.0; // rad, and times what is measured: no prediction of one period is so far off
 const STATES: usize = 5;
 type State = [f64; STATES];
@@ -41,7 +43,6 @@ pub struct DeflectionFilter {
     gains: [State; 2], // by θ and by φ
     x: State,
     p: Option<Covariance>,
-    noise: f64,     // variance of φ's noise that p assumes
     modelled: bool, // whether the motor's equation is of use
     pull: f64,      // what half a period of φ′ adds to the motor's mean acceleration
     jerk: f64,
@@ -50,6 +51,8 @@ pub struct DeflectionFilter {
     counted: f64,
     missed: f64, // mean square of φ's innovation, over what is foreseen
     foreseen: f64,
+    noise: f64,  // R, the variance of φ's noise that p assumes, rad²
+    wander: f64, // spectral density of φ‴, rad²/s⁵
     /// Periods until the last start is forgotten.
     pub unsettled: i64,
 }
@@ -96,7 +99,6 @@ impl DeflectionFilter {
             gains: plain,
             x: [0.0; STATES],
             p: None,
-            noise: 0.0,
             modelled: false,
             pull: 0.0,
             jerk: 0.0,
@@ -105,6 +107,8 @@ impl DeflectionFilter {
             counted: 0.0,
             missed: 1.0,
             foreseen: f64::INFINITY,
+            noise: 0.0,
+            wander: 0.0,
             unsettled: settling,
         }
     }
@@ -127,6 +131,28 @@ impl DeflectionFilter {
     #[must_use]
     pub fn at(&self, ahead_s: f64) -> f64 {
         self.x[2] + ahead_s * (self.x[3] + 0.5 * ahead_s * self.x[4])
+    }
+
+    /// φ now: foreseen from the moment of the torque, and corrected by the latest reading, whose noise is R.
+    ///
+    /// What is foreseen has the variance that P grows to by the random third derivative.
+    #[must_use]
+    pub fn now(&self, present: &Present) -> f64 {
+        let t = present.behind_s;
+        let foreseen = self.at(t + present.ahead_s);
+        if t == 0.0 {
+            return foreseen;
+        }
+        let share = self.p.map_or(1.0, |p| {
+            let slope = [1.0, t, 0.5 * t * t];
+            let grown: f64 = (0..3)
+                .flat_map(|i| (0..3).map(move |j| (i, j)))
+                .map(|(i, j)| slope[i] * p[2 + i][2 + j] * slope[j])
+                .sum();
+            let variance = self.missed.max(1.0) * (grown + self.wander * t.powi(5) / 20.0);
+            variance / (variance + self.noise)
+        });
+        foreseen + share * (present.phi - self.at(t))
     }
 
     /// Velocity of the link at the last sample, rad/s.
@@ -204,8 +230,8 @@ impl DeflectionFilter {
         // Noise is measured late: the state has errors of its size by now.
         let grown = if noise > self.noise && self.noise > 0.0 { noise / self.noise } else { 1.0 };
         before.iter_mut().flatten().for_each(|entry| *entry *= grown);
-        self.noise = noise;
-        let moved = self.moved(&before, c, drift * t, density * natural.powi(6) * t);
+        (self.noise, self.wander) = (noise, density * natural.powi(6));
+        let moved = self.moved(&before, c, drift * t, self.wander * t);
         // Kalman gains for measured θ and φ = q − θ, whose noises share θ's.
         let (s00, s01, s11) =
             (moved[0][0] + tuning.motor_noise, moved[0][2] - tuning.motor_noise, moved[2][2] + noise);

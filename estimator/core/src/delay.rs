@@ -14,7 +14,7 @@ const LOOKS_S: [f64; 3] = [2.0, 6.0, 20.0]; // of rows, after a start or the las
 const ROW_S: f64 = 0.01;
 const GAIN: f64 = 0.8; // the error has to fall to this share, else no delay is assumed …
 const LATER_GAIN: f64 = 0.5; // … to this one once there has been a look
-const NOISE: f64 = 1e-3; // share of the balance's variance that is taken for noise
+const NOISE: f64 = 1e-3; // share of the balance's variance taken for noise, until it is known what no delay leaves
 const OFFSET: f64 = 1.0; // prior std of a constant torque, as a share of the balance
 
 type Gram = [[f64; COLUMNS + 1]; COLUMNS + 1];
@@ -175,11 +175,17 @@ impl DelaySearch {
 
     /// The candidate that leaves least of the balance, if it leaves less than `gain` of what no delay does.
     fn look(&self, gain: f64) -> Option<f64> {
-        let mut costs = [0.0; CANDIDATES];
-        for (cost, gram) in costs.iter_mut().zip(&self.grams) {
-            *cost = self.left(gram);
-        }
         let mut best = 2 * LATEST;
+        // What no delay leaves is the noise that all candidates are judged by.
+        let rows = f64::from(self.rows);
+        let none = &self.grams[best];
+        let (none, _) = self.cost(none, NOISE * none[COLUMNS][COLUMNS] / rows);
+        let mut costs = [f64::INFINITY; CANDIDATES];
+        for (cost, gram) in costs.iter_mut().zip(&self.grams) {
+            if let (least, true) = self.cost(gram, none / rows) {
+                *cost = least;
+            }
+        }
         for c in 0..CANDIDATES {
             if costs[c] < costs[best] {
                 best = c;
@@ -188,30 +194,30 @@ impl DelaySearch {
         let (mut periods, mut least) = (0.5 * best as f64 - LATEST as f64, costs[best]);
         if best > 0 && best + 1 < CANDIDATES {
             let (before, after) = (costs[best - 1] - least, costs[best + 1] - least);
-            if before + after > 0.0 {
+            if before + after > 0.0 && (before + after).is_finite() {
                 let share = 0.5 * (before - after) / (before + after);
                 periods += 0.5 * share;
                 least -= 0.25 * share * (before - after);
             }
         }
-        let found = least.max(0.0) < gain * gain * costs[2 * LATEST];
-        (found && costs.iter().all(|cost| cost.is_finite())).then_some(periods)
+        (least.max(0.0) < gain * gain * none).then_some(periods)
     }
 
-    /// Sum of squared errors with the motor's own parameters held near what is declared.
-    fn left(&self, gram: &Gram) -> f64 {
+    /// Squared error of the motor's own parameters and of the balance, at its least: -2 log of the posterior
+    /// times the noise's variance, so that no delay pays by a motor that nobody declared. And whether the
+    /// transmission pulls back.
+    fn cost(&self, gram: &Gram, noise: f64) -> (f64, bool) {
         let rows = f64::from(self.rows);
         let square = gram[COLUMNS][COLUMNS];
         let mean = gram[COLUMNS][4] / rows;
         let size = (square / rows - mean * mean).max(0.0).sqrt();
-        let noise = NOISE * square / rows;
         let damping = self.damping_std * self.damping + self.damping_share * size / (self.rate + 1e-12);
         let prior = [f64::INFINITY, f64::INFINITY, self.inertia_std * self.inertia, damping, OFFSET * size];
         let mut scale = [0.0; COLUMNS];
         for i in 0..COLUMNS {
             scale[i] = gram[i][i].sqrt() + 1e-300;
         }
-        // Cholesky of the scaled normal equations, then |y|² − 2 x·b + x·G x with the prior left out.
+        // Cholesky of the scaled normal equations, then |y|² − x·b.
         let (mut lower, mut x) = ([[0.0; COLUMNS]; COLUMNS], [0.0; COLUMNS]);
         for i in 0..COLUMNS {
             for j in 0..=i {
@@ -230,14 +236,8 @@ impl DelaySearch {
             let rest: f64 = (i + 1..COLUMNS).map(|k| lower[k][i] * x[k]).sum();
             x[i] = (x[i] - rest) / lower[i][i];
         }
-        let mut left = square;
-        for i in 0..COLUMNS {
-            left -= 2.0 * x[i] * b(i);
-            for j in 0..COLUMNS {
-                left += x[i] * x[j] * gram[i.max(j)][i.min(j)] / (scale[i] * scale[j]);
-            }
-        }
-        left.max(1e-12 * square)
+        let cost = square - (0..COLUMNS).map(|i| x[i] * b(i)).sum::<f64>(); // at the least
+        (cost.max(1e-12 * square), x[0] > 0.0)
     }
 }
 
@@ -245,29 +245,46 @@ impl DelaySearch {
 mod tests {
     use super::*;
 
-    #[test]
-    fn a_late_encoder_is_found_to_a_fraction_of_a_period() {
-        // A linear spring between prescribed motions; τ = B θ″ + D θ′ − K φ, which acts over the next period.
-        let (period, k, b, d) = (1e-3, 9000.0, 0.7, 5.0);
+    /// What the search finds of a link that is late by so many periods.
+    ///
+    /// A linear spring between prescribed motions; τ = B θ″ + D θ′ − K φ, which acts over the next period.
+    /// `spin`: rad/s that the motor turns at beside its motion; `lost`: damping of that motion alone, N·m·s/rad.
+    fn found([k, b, d]: [f64; 3], load: f64, late: f64, [spin, lost]: [f64; 2]) -> Option<f64> {
+        let period = 1e-3;
         let known =
             Known { inertia: b, damping: d, inertia_std: 0.05, damping_std: 0.2, damping_share: 0.02 };
-        for late in [0.0, 1.0, 2.3, -1.5] {
-            let mut search = DelaySearch::new(&known, 60.0, period);
-            let theta = |t: f64| 0.5 * (3.0 * t).sin() + 0.1 * (11.0 * t).sin();
-            let phi = |t: f64| 2e-3 * (5.0 * t).sin() + 1e-3 * (13.0 * t).cos();
-            let rate = |t: f64| 1.5 * (3.0 * t).cos() + 1.1 * (11.0 * t).cos();
-            let acceleration = |t: f64| -4.5 * (3.0 * t).sin() - 12.1 * (11.0 * t).sin();
-            search.restart(phi(0.0), 0.0, 0.0);
-            let mut found = None;
-            for n in 1..4000 {
-                let t = f64::from(n) * period;
-                let middle = t + 0.5 * period;
-                let torque = b * acceleration(middle) + d * rate(middle) - k * phi(middle);
-                let read = t - late * period;
-                let now = search.see(theta(read) + phi(read), theta(t), torque, n > 300);
-                found = found.or(now);
-            }
+        let mut search = DelaySearch::new(&known, 60.0, period);
+        let theta = |t: f64| spin * t + 0.5 * (3.0 * t).sin() + 0.1 * (11.0 * t).sin();
+        let phi = |t: f64| load / k * ((5.0 * t).sin() + 0.5 * (13.0 * t).cos());
+        let rate = |t: f64| 1.5 * (3.0 * t).cos() + 1.1 * (11.0 * t).cos();
+        let acceleration = |t: f64| -4.5 * (3.0 * t).sin() - 12.1 * (11.0 * t).sin();
+        search.restart(phi(0.0), 0.0, 0.0);
+        let mut found = None;
+        for n in 1..4000 {
+            let t = f64::from(n) * period;
+            let acting = t + 0.5 * period;
+            let damping = d * (spin + rate(acting)) + lost * rate(acting);
+            let torque = b * acceleration(acting) + damping - k * phi(acting);
+            let read = t - late * period;
+            let now = search.see(theta(read) + phi(read), theta(t), torque, n > 300);
+            found = found.or(now);
+        }
+        found
+    }
+
+    #[test]
+    fn a_late_encoder_is_found_to_a_fraction_of_a_period() {
+        for late in [0.0, 1.0, 2.3, -1.5, 3.0] {
+            let found = found([9000.0, 0.7, 5.0], 18.0, late, [0.0, 0.0]);
             assert!((found.unwrap_or(0.0) - late).abs() < 0.1, "{found:?} is not {late}");
         }
+    }
+
+    #[test]
+    fn no_late_encoder_is_made_of_a_torque_that_a_spinning_shaft_does_not_have() {
+        // A delay T explains what is lost by K T θ′, and asks for K T times the spin as well: 14 N·m.
+        let [k, spin, lost] = [35.0, 200.0, 0.07];
+        assert!(found([k, 0.009, 0.003], 0.3, 0.0, [0.0, lost]).is_some());
+        assert_eq!(found([k, 0.009, 0.003], 0.3, 0.0, [spin, lost]), None);
     }
 }

@@ -106,6 +106,7 @@ pub struct ModelMonitor {
     period: f64,
 
     last: Option<u64>,
+    begins: bool, // with the next sample that the corrections let pass
     inputs: [f64; CHANNELS],
     torque: [f64; MOTORS], // as it acts since the last sample
     channels: [[f64; 3]; CHANNELS],
@@ -178,6 +179,7 @@ impl ModelMonitor {
             narrow,
             motors,
             last: None,
+            begins: true,
             inputs: [0.0; CHANNELS],
             torque: [0.0; MOTORS],
             channels: [[0.0; 3]; CHANNELS],
@@ -240,10 +242,13 @@ impl ModelMonitor {
             self.effects.reset();
         }
         self.measured &= sample.external_torque.is_finite();
-        let corrected = self.effects.corrections.correct(sample);
-        let mut now = self.inputs_of(&corrected);
         self.last = Some(sample.sequence);
-        if !goes_on {
+        self.begins |= !goes_on;
+        let Some(corrected) = self.effects.corrections.correct(sample, !goes_on) else {
+            return self.alarm;
+        };
+        let mut now = self.inputs_of(&corrected.aligned);
+        if std::mem::take(&mut self.begins) {
             self.restart(&now);
             return self.alarm;
         }

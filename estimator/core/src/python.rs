@@ -471,21 +471,27 @@ impl OnlineEffects {
         self.inner.reset();
     }
 
-    /// The sample as perfect sensors would have given it, with the same sequence number.
-    fn correct<'py>(&mut self, sample: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
+    /// The sample as perfect sensors would have given it, all channels as of one moment, with the same
+    /// sequence number; None until every channel has the past that it waits for.
+    fn correct<'py>(&mut self, sample: &Bound<'py, PyAny>) -> PyResult<Option<Bound<'py, PyAny>>> {
         let py = sample.py();
-        let corrected = self.inner.corrections.correct(&self::sample(sample)?.0);
+        let Some(corrected) = self.inner.corrections.correct(&self::sample(sample)?.0, false) else {
+            return Ok(None);
+        };
+        let corrected = corrected.aligned;
         let each = |values: &[f64; MOTORS]| PyTuple::new(py, &values[..self.motors]);
         let class = py.import("estimator.sample")?.getattr("Sample")?;
-        class.call1((
-            corrected.sequence as i64,
-            each(&corrected.motor_position)?,
-            each(&corrected.motor_velocity)?,
-            each(&corrected.motor_torque)?,
-            corrected.link_position,
-            corrected.link_velocity,
-            corrected.external_torque,
-        ))
+        class
+            .call1((
+                corrected.sequence as i64,
+                each(&corrected.motor_position)?,
+                each(&corrected.motor_velocity)?,
+                each(&corrected.motor_torque)?,
+                corrected.link_position,
+                corrected.link_velocity,
+                corrected.external_torque,
+            ))
+            .map(Some)
     }
 
     /// (x_motor and x_transmission of each motor, x_link) at one tick's `Coordinates`.

@@ -4,7 +4,7 @@
 //! track the deflection; at intervals of the errors' correlation time update the recursive estimation with a
 //! motor's balance; evaluate torque and stiffness on the curve.
 
-use crate::align::{Alignment, Inputs};
+use crate::align::{Alignment, Inputs, Positions};
 use crate::delay::{DelaySearch, Known};
 use crate::effects::{Corrections, MotorEffects};
 use crate::error::Error;
@@ -18,7 +18,7 @@ use crate::sample_validator::SampleValidator;
 use crate::settings::{Priors, Settings};
 use crate::signals::{Channel, Filters};
 use crate::suspicion::{Suspicion, suspected};
-use crate::transmission::{Moment, TransmissionEstimator};
+use crate::transmission::{Moment, Present, TransmissionEstimator};
 
 const SAID_S: f64 = 0.5; // how long a restart is reported
 const TRUST_S: f64 = 0.02; // how long an estimate is carried over rejected samples
@@ -50,9 +50,11 @@ pub struct Robust {
     momentum: Option<LinkMomentum>,
     external: Option<External>,
     noise: [NoiseMeter; MOTORS + 1],
-    zeros: Inputs, // where the encoders' zeros have moved to
+    zeros: Positions, // where the encoders' zeros have moved to
     last: Inputs,
-    measured: f64, // τ_k
+    begins: bool,                      // with the next sample that the corrections let pass …
+    jumped: Option<[f64; MOTORS + 1]>, // … after encoders moved their zeros
+    measured: f64,                     // τ_k
     tick: u64,
     unsettled: i64, // periods for which the filters still hold something wrong
     said: i64,
@@ -111,8 +113,10 @@ impl Robust {
             momentum: LinkMomentum::new(model, settings, priors, period_s),
             external: None,
             noise: [NoiseMeter::default(); MOTORS + 1],
-            zeros: Inputs::default(),
+            zeros: Positions::default(),
             last: Inputs::default(),
+            begins: true,
+            jumped: None,
             measured: f64::NAN,
             tick: 0,
             unsettled: 0,
@@ -137,7 +141,8 @@ impl Robust {
         self.momentum.iter_mut().for_each(LinkMomentum::reset);
         self.external = None;
         self.noise = [NoiseMeter::default(); MOTORS + 1];
-        (self.zeros, self.last) = (Inputs::default(), Inputs::default());
+        (self.zeros, self.last) = (Positions::default(), Inputs::default());
+        (self.begins, self.jumped) = (true, None);
         (self.tick, self.unsettled, self.said, self.rejected) = (0, self.settle, 0, 0);
         (self.started, self.sequence, self.refused, self.estimate) = (false, 0, None, None);
     }
@@ -195,29 +200,32 @@ impl Robust {
         if accepted.periods == 0 {
             return self.carry(sample.sequence, accepted.status);
         }
-        self.rejected = 0;
-        let corrected = self.corrections.correct(sample);
-        self.measured = corrected.external_torque;
-        let mut inputs = Inputs {
-            link: if self.flexible { corrected.link_position } else { 0.0 },
-            motor: corrected.motor_position,
-            torque: corrected.motor_torque,
-        };
-        for i in self.motors..MOTORS {
-            (inputs.motor[i], inputs.torque[i]) = (0.0, 0.0);
-        }
+        self.begins |= accepted.restart;
         if let Some(jumps) = accepted.jumps {
-            self.move_zeros(jumps, &inputs, sample.sequence);
+            let before = self.jumped.unwrap_or_default();
+            self.jumped = Some(std::array::from_fn(|k| before[k] + jumps[k]));
+        }
+        let Some(corrected) = self.corrections.correct(sample, accepted.restart) else {
+            return self.carry(sample.sequence, accepted.status);
+        };
+        self.rejected = 0;
+        self.measured = corrected.present.external_torque;
+        let (at, present) = (self.positions(&corrected.aligned), self.positions(&corrected.present));
+        if let Some(jumps) = self.jumped.take() {
+            self.move_zeros(jumps, &at, sample.sequence);
         }
         self.sequence = sample.sequence;
-        inputs.link -= self.zeros.link;
-        (0..MOTORS).for_each(|i| inputs.motor[i] -= self.zeros.motor[i]);
+        let mut torque = corrected.aligned.motor_torque;
+        torque[self.motors..].fill(0.0);
+        let inputs =
+            Inputs { at: at.from_zeros(&self.zeros), torque, present: present.from_zeros(&self.zeros) };
         if accepted.frozen {
             self.distrust();
         }
         // All channels as of one moment, and every period between the last sample and this one.
-        let inputs = self.alignment.align(&inputs, accepted.restart);
-        if accepted.restart {
+        let begins = std::mem::take(&mut self.begins);
+        let inputs = self.alignment.align(&inputs, begins);
+        if begins {
             self.restart(&inputs);
         } else {
             let (from, periods) = (self.last, f64::from(accepted.periods));
@@ -233,11 +241,18 @@ impl Robust {
         self.conclude(sample.sequence, accepted.status)
     }
 
+    /// Positions of a sample; 0 where the joint has none.
+    fn positions(&self, sample: &Sample) -> Positions {
+        let mut motor = sample.motor_position;
+        motor[self.motors..].fill(0.0);
+        Positions { link: if self.flexible { sample.link_position } else { 0.0 }, motor }
+    }
+
     /// One period: filters, deflections, and, when its turn has come, what a motor's balance teaches.
     fn advance(&mut self, now: &Inputs) {
         let usable = self.unsettled <= 0;
         self.tick += 1;
-        self.link.smooth(&self.filters, now.link);
+        self.link.smooth(&self.filters, now.at.link);
         // Noise is that of usual times: what lies is not measured by it.
         let doubtful = !usable || self.transmissions.iter().any(TransmissionEstimator::changed);
         let mut see = |place: usize, value: f64| {
@@ -247,17 +262,17 @@ impl Robust {
                 self.noise[place].see(value, self.period);
             }
         };
-        see(self.motors, now.link);
+        see(self.motors, now.at.link);
         let time = self.tick as f64 * self.period;
         for (i, transmission) in self.transmissions.iter_mut().enumerate() {
-            let (theta, torque, before) = (now.motor[i], now.torque[i], self.last.torque[i]);
-            transmission.feed(&self.filters, theta, now.link - theta, torque, before, usable);
+            let (theta, torque, before) = (now.at.motor[i], now.torque[i], self.last.torque[i]);
+            transmission.feed(&self.filters, theta, now.at.deflection(i), torque, before, usable);
             transmission.feed_effects(&self.filters, &self.link, time);
             see(i, theta);
         }
         if self.momentum.is_some() {
+            let (now, measured) = (&now.present, self.measured);
             let carried = self.carried(now).map(|carried| carried.torque);
-            let measured = self.measured;
             self.momentum.iter_mut().for_each(|momentum| momentum.feed(now.link, carried, measured));
         }
         self.last = *now;
@@ -268,20 +283,20 @@ impl Robust {
             self.update(i, usable);
         }
         if self.flexible {
-            let (motor, torque) = (now.motor[self.lead], now.torque[self.lead]);
-            if let Some(late) = self.search.see(now.link, motor, torque, usable) {
+            let (motor, torque) = (now.at.motor[self.lead], now.torque[self.lead]);
+            if let Some(late) = self.search.see(now.at.link, motor, torque, usable) {
                 self.realign(late);
             }
         }
     }
 
     /// What the transmissions do to the link; `None` where a curve is not trusted.
-    fn carried(&self, now: &Inputs) -> Option<Carried> {
+    fn carried(&self, now: &Positions) -> Option<Carried> {
         let pulls = if self.arrangement == Arrangement::Antagonistic { self.motors } else { 1 };
         let mut all = Carried::default();
         for (i, transmission) in self.transmissions[..pulls].iter().enumerate() {
             let noise = self.noise[i].variance(self.validator.resolution()[i]);
-            all = all.and(transmission.carried(now.link - now.motor[i], noise)?);
+            all = all.and(transmission.carried(now.deflection(i), noise)?);
         }
         Some(all)
     }
@@ -319,20 +334,20 @@ impl Robust {
         self.momentum.iter_mut().for_each(LinkMomentum::distrust);
         for (i, transmission) in self.transmissions.iter_mut().enumerate() {
             transmission.relearn();
-            transmission.deflection.restart(self.last.motor[i], self.last.link - self.last.motor[i]);
+            transmission.deflection.restart(self.last.at.motor[i], self.last.at.deflection(i));
         }
     }
 
     /// Everything that has a past begins anew where the joint is now; what has been learned is kept.
     fn restart(&mut self, now: &Inputs) {
-        self.link = Channel::rest(now.link);
+        self.link = Channel::rest(now.at.link);
         for (i, transmission) in self.transmissions.iter_mut().enumerate() {
-            transmission.restart(now.motor[i], now.link - now.motor[i], now.torque[i]);
+            transmission.restart(now.at.motor[i], now.at.deflection(i), now.torque[i]);
         }
         self.noise.iter_mut().for_each(NoiseMeter::restart);
-        let carried = self.carried(now).map_or(0.0, |carried| carried.torque);
-        self.momentum.iter_mut().for_each(|momentum| momentum.restart(now.link, carried));
-        self.search.restart(now.link, now.motor[self.lead], now.torque[self.lead]);
+        let carried = self.carried(&now.present).map_or(0.0, |carried| carried.torque);
+        self.momentum.iter_mut().for_each(|momentum| momentum.restart(now.present.link, carried));
+        self.search.restart(now.at.link, now.at.motor[self.lead], now.torque[self.lead]);
         self.last = *now;
         self.unsettled = self.settle;
         self.said = if self.started { (SAID_S / self.period).round() as i64 } else { 0 };
@@ -340,18 +355,18 @@ impl Robust {
     }
 
     /// Encoders have moved their zeros: go on as if they had not.
-    fn move_zeros(&mut self, mut jumps: [f64; MOTORS + 1], inputs: &Inputs, sequence: u64) {
+    fn move_zeros(&mut self, mut jumps: [f64; MOTORS + 1], at: &Positions, sequence: u64) {
         let m = self.motors;
         let ahead =
             (sequence.wrapping_sub(self.sequence) as f64 + self.alignment.periods.abs()) * self.period;
         // A deflection that went on as it was measures a jump; the validator is coarse.
-        let link = inputs.link - self.zeros.link;
+        let now = at.from_zeros(&self.zeros);
         for i in 0..m {
             let transmission = &self.transmissions[i];
             if ahead > FORESEEN_S || transmission.is_rigid() || transmission.deflection.unsettled > 0 {
                 continue;
             }
-            let off = link - (inputs.motor[i] - self.zeros.motor[i]) - transmission.deflection.at(ahead);
+            let off = now.deflection(i) - transmission.deflection.at(ahead);
             if jumps[i] != 0.0 && jumps[m] == 0.0 {
                 jumps[i] = -off;
             } else if jumps[m] != 0.0 && jumps[i] == 0.0 {
@@ -369,11 +384,11 @@ impl Robust {
         if self.flexible {
             self.zeros.link = moved(self.zeros.link, jumps[m]);
         }
-        let link_now = inputs.link - self.zeros.link;
+        let now = at.from_zeros(&self.zeros);
         for (i, transmission) in self.transmissions.iter_mut().enumerate() {
-            let known = !transmission.is_beyond(link_now - (inputs.motor[i] - self.zeros.motor[i]));
+            let known = !transmission.is_beyond(now.deflection(i));
             if !known {
-                self.zeros.motor[i] = inputs.motor[i] - link_now; // in the middle of where it can be
+                self.zeros.motor[i] = at.motor[i] - now.link; // in the middle of where it can be
             }
             transmission.reopen_deflection_offset(known);
         }
@@ -405,7 +420,7 @@ impl Robust {
         }
         if self.momentum.is_some() {
             let valid = flags & status::VALID != 0;
-            let carried = self.carried(&self.last).unwrap_or_default();
+            let carried = self.carried(&self.last.present).unwrap_or_default();
             let noise = self.noise[self.motors].variance(self.validator.resolution()[self.motors]);
             self.external =
                 self.momentum.as_mut().map(|momentum| momentum.conclude(sequence, &carried, noise, valid));
@@ -437,10 +452,16 @@ impl Robust {
 
     /// Each transmission's estimate, so long after the last sample, and whether it is of use.
     fn read(&mut self, since_s: f64) -> ([TransmissionEstimate; MOTORS], [bool; MOTORS]) {
-        let ahead = since_s + self.alignment.periods.abs() * self.period; // what waits for the latest channel
+        // What has been waited for the latest channel, declared late or found to be.
+        let waited = self.corrections.age_s() + self.alignment.periods.abs() * self.period;
         let (mut parts, mut of_use) = ([TransmissionEstimate::NOTHING; MOTORS], [true; MOTORS]);
         for (i, transmission) in self.transmissions.iter_mut().enumerate() {
-            (parts[i], of_use[i]) = transmission.estimate(ahead, self.filters.delay);
+            let present = Present {
+                phi: self.last.present.deflection(i),
+                behind_s: self.corrections.behind_s(),
+                ahead_s: since_s + waited,
+            };
+            (parts[i], of_use[i]) = transmission.estimate(&present, self.filters.delay);
         }
         (parts, of_use)
     }

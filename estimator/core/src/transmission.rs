@@ -41,6 +41,17 @@ pub struct Moment {
     pub noise: [f64; 2],
 }
 
+/// What is known of the deflection since the moment of the torque.
+#[derive(Clone, Copy, Debug)]
+pub struct Present {
+    /// φ as it was last measured, rad.
+    pub phi: f64,
+    /// By how much the torque is older than that, s.
+    pub behind_s: f64,
+    /// How long ago that was, s.
+    pub ahead_s: f64,
+}
+
 /// How much of the balance's variation the curve leaves over.
 #[derive(Clone, Copy, Debug, Default)]
 struct Fit {
@@ -486,10 +497,11 @@ impl TransmissionEstimator {
         largest > 0.0 && phi.abs() > BEYOND * largest
     }
 
-    /// The estimate at a deflection a little ahead of the last sample, and whether it is of use.
+    /// The estimate at the present deflection, and whether it is of use.
     ///
     /// `delay`: of the filters; the torque behind them is brought up to the present by its own slope.
-    pub fn estimate(&mut self, ahead_s: f64, delay: f64) -> (TransmissionEstimate, bool) {
+    pub fn estimate(&mut self, present: &Present, delay: f64) -> (TransmissionEstimate, bool) {
+        let ahead_s = present.behind_s + present.ahead_s;
         let signals = &self.signals;
         let (motor, tau, x) = (&signals.position.main, &signals.torque.main, &signals.effects.main);
         let value = self.inertia * motor[2] + self.damping * motor[1] + x[0] - tau[0];
@@ -500,7 +512,7 @@ impl TransmissionEstimator {
             let torque = self.lead;
             return (TransmissionEstimate { flexibility_torque: torque, ..nothing }, torque.is_finite());
         }
-        let (now, learned) = (self.deflection.at(ahead_s), &self.identification);
+        let (now, learned) = (self.deflection.now(present), &self.identification);
         if !self.concluded {
             let (mut torque, mut stiffness) = (self.lead, f64::NAN);
             if let Some((law, known)) = learned.declared() {

@@ -179,10 +179,12 @@ impl DelaySearch {
         // What no delay leaves is the noise that all candidates are judged by.
         let rows = f64::from(self.rows);
         let none = &self.grams[best];
-        let (none, _) = self.cost(none, NOISE * none[COLUMNS][COLUMNS] / rows);
+        let (first, _) = self.cost(none, NOISE * none[COLUMNS][COLUMNS] / rows);
+        let noise = first / rows;
+        let (none, _) = self.cost(none, noise);
         let mut costs = [f64::INFINITY; CANDIDATES];
         for (cost, gram) in costs.iter_mut().zip(&self.grams) {
-            if let (least, true) = self.cost(gram, none / rows) {
+            if let (least, true) = self.cost(gram, noise) {
                 *cost = least;
             }
         }

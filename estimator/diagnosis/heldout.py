@@ -50,6 +50,24 @@ class Held:
         error = self.squared(fitted) + least  # errors at the level of rounding are not compared
         return -0.5 * rows / float(np.mean(like.times)) * float(np.log(error))
 
+    def surplus(self, fitted: Fitted) -> float:
+        """Mean squared error on held-out data over that on the fitted data, at least 1.
+
+        A true model leaves as much in both. A wrong one claims too much information, by this factor (tempered
+        likelihood; Grünwald and van Ommen, Bayesian Analysis 12, 2017). The smaller of the absolute and the
+        relative error's: noise does not grow with the torque, a model's error does.
+        """
+        problem = self._problem
+        least = float(np.mean(fitted.regression.floor**2))
+        here, torque, motors = _balances(problem, fitted, problem.used)
+        inside, scale = float(np.mean(here**2)) + least, float(np.mean(torque[motors] ** 2))
+        outside = [
+            (float(np.mean(left**2)) + least, float(np.mean(t[m] ** 2))) for left, t, m in self._left(fitted)
+        ]
+        absolute = float(np.mean([error for error, _ in outside])) / inside
+        relative = float(np.mean([error / max(size, 1e-300) for error, size in outside])) * scale / inside
+        return max(min(absolute, relative), 1.0)
+
     def errors(self, before: Fitted, after: Fitted) -> Errors:
         """Errors of all held-out data."""
         first, second = self._left(before), self._left(after)

@@ -135,16 +135,17 @@ def alignment_of(problem: Problem, after: Fitted, effects: list[Finding]) -> dic
 
 
 def transmissions_of(
-    search: Search, after: Fitted, accounts: Sequence[tuple[float, Fitted]] = ()
+    search: Search, after: Fitted, accounts: Sequence[tuple[float, Fitted]] = (), surplus: float = 1.0
 ) -> tuple[tuple[Refitted, ...], list[str]]:
     """Each motor's transmission, and doubts about them.
 
     The covariance is that of the fit plus that between explanations (Bayesian model averaging; Hoeting et
     al., Statistical Science 14, 1999), because another set of effects may imply another stiffness, plus the
-    possible contribution of rejected effects. An undetermined stiffness has no parameters, and a doubt.
+    possible contribution of rejected effects. The information of the data counts as much less as the error on
+    held-out data is larger (`surplus`). An undetermined stiffness has no parameters, and a doubt.
     """
     problem = search.problem
-    covariance, effects = hac_covariance(problem, after), design_effects(problem, after)
+    covariance, effects = surplus * hac_covariance(problem, after), surplus * design_effects(problem, after)
     made: list[Refitted] = []
     doubts = []
     for i, model in enumerate(after.base.models(problem.frames[0])):

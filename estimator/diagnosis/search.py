@@ -135,8 +135,8 @@ class Search:
         best = min((one, other), key=_left)
         return self.score(one, best) - self.score(other, best)
 
-    def chance(self, found: Fitted, rival: Fitted) -> float:
-        """Probability that the rival would be better on a longer recording.
+    def chance(self, found: Fitted, rival: Fitted, surplus: float = 1.0) -> float:
+        """Probability that the rival would be better on a longer recording; `surplus`: see `Held.surplus`.
 
         From the log odds and their scatter between stretches of time, which gives their sum a standard
         deviation (Vuong, Econometrica 57, 1989). Otherwise the many rows would make a slightly wrong model
@@ -144,7 +144,7 @@ class Search:
         """
         gain = self._by_stretch(found) - self._by_stretch(rival)
         spread = math.sqrt(len(gain)) * float(np.std(gain, ddof=1))
-        odds = self.advantage(found, rival)
+        odds, spread = self.advantage(found, rival) / surplus, spread / surplus
         return max(1.0 / (1.0 + math.exp(min(odds, 700.0))), NormalDist(0.0, spread + 1e-9).cdf(-odds))
 
     def _by_stretch(self, hypothesis: Fitted) -> FloatArray:

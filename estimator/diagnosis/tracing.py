@@ -77,8 +77,9 @@ def diagnose(
     search = Search(problem, progress)
     progress("held-out data")
     held = held_out(records, model, bandwidth, validation, problem)
-    found = _chosen(search, held, [_gated(search, held, one) for one in search.run()])
-    outcome = _Judge(search, held, found, validation is not None, progress).diagnosis()
+    leading = search.run()
+    found = _chosen(search, held, [_gated(search, held, one) for one in leading])
+    outcome = _Judge(search, held, leading[0], found, progress).diagnosis()
     higher = raised(model, outcome.effects)
     if higher is not None:
         return diagnose(records, higher, bandwidth, validation, progress)
@@ -113,9 +114,9 @@ class _Judge:
     """Turns the result of the search into a verdict."""
 
     def __init__(
-        self, search: Search, held: Held, found: Fitted, validated: bool, progress: Callable[[str], None]
+        self, search: Search, held: Held, first: Fitted, found: Fitted, progress: Callable[[str], None]
     ) -> None:
-        self.search, self.held, self.found, self.validated = search, held, found, validated
+        self.search, self.held, self.first, self.found = search, held, first, found
         self.problem, self.progress = search.problem, progress
 
     def _sides(self, before: Fitted, after: Fitted) -> list[str]:
@@ -171,8 +172,10 @@ class _Judge:
         if verdict == "effect" and self.held.squared(after) > self.held.squared(before):
             verdict = "insufficient_excitation"
             notes.append("on data that took no part the effects do not lower the error: they are not written")
-        chances = [(self.search.chance(after, h), h) for h in (found, *others) if h is not after]
-        transmissions, unsure = transmissions_of(self.search, after, chances)
+        surplus = self._surplus()
+        transmissions, unsure = transmissions_of(
+            self.search, after, self._accounts(after, [found, *others], surplus), surplus
+        )
         notes += unsure + self._doubts(effects)
         if verdict in ("effect", "unexplained"):
             notes += self._sides(before, after)
@@ -193,6 +196,20 @@ class _Judge:
             recordings=self._recordings(before, after),
             stiffness=stiffness_curves(problem, before, after),
         )
+
+    def _surplus(self) -> float:
+        """Of the explanation found, or of the one that the fitted data alone prefer, if that has more.
+
+        Held-out data took part in choosing the former.
+        """
+        return max(self.held.surplus(one) for one in (self.first, self.found))
+
+    def _accounts(
+        self, after: Fitted, explanations: list[Fitted], surplus: float
+    ) -> list[tuple[float, Fitted]]:
+        """The other explanations, and all that the search visited, with their chances of at most a half."""
+        distinct = {id(h): h for h in (*explanations, *self.search.seen) if h is not after}
+        return [(min(self.search.chance(after, h, surplus), 0.5), h) for h in distinct.values()]
 
     def _declared(self, effects: list[Finding]) -> Fitted:
         """The fitted declared model: declared numbers, readings aligned within everyday errors."""

@@ -173,9 +173,9 @@ class _Judge:
             verdict = "insufficient_excitation"
             notes.append("on data that took no part the effects do not lower the error: they are not written")
         surplus = self._surplus()
-        transmissions, unsure = transmissions_of(
-            self.search, after, self._accounts(after, [found, *others], surplus), surplus
-        )
+        explanations = [h for h in (found, *others) if h is not after]
+        chances = [(self.search.chance(after, h, surplus), h) for h in explanations]
+        transmissions, unsure = transmissions_of(self.search, after, chances, surplus)
         notes += unsure + self._doubts(effects)
         if verdict in ("effect", "unexplained"):
             notes += self._sides(before, after)
@@ -203,13 +203,6 @@ class _Judge:
         Held-out data took part in choosing the former.
         """
         return max(self.held.surplus(one) for one in (self.first, self.found))
-
-    def _accounts(
-        self, after: Fitted, explanations: list[Fitted], surplus: float
-    ) -> list[tuple[float, Fitted]]:
-        """The other explanations, and all that the search visited, with their chances of at most a half."""
-        distinct = {id(h): h for h in (*explanations, *self.search.seen) if h is not after}
-        return [(min(self.search.chance(after, h, surplus), 0.5), h) for h in distinct.values()]
 
     def _declared(self, effects: list[Finding]) -> Fitted:
         """The fitted declared model: declared numbers, readings aligned within everyday errors."""

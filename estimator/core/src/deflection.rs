@@ -12,8 +12,6 @@
 //! turn out to be noisier than assumed: the state has taken up that noise already, so its covariance grows
 //! with the noise's.
 
-use crate::transmission::Present;
-
 const ASTRAY: f64 = 10.0; // rad, and times what is measured: no prediction of one period is so far off
 const STATES: usize = 5;
 type State = [f64; STATES];
@@ -55,6 +53,17 @@ pub struct DeflectionFilter {
     wander: f64, // spectral density of φ‴, rad²/s⁵
     /// Periods until the last start is forgotten.
     pub unsettled: i64,
+}
+
+/// What is known of the deflection since the moment of the torque.
+#[derive(Clone, Copy, Debug)]
+pub struct Present {
+    /// φ as it was last measured, rad.
+    pub phi: f64,
+    /// By how much the torque is older than that, s.
+    pub behind_s: f64,
+    /// How long ago that was, s.
+    pub ahead_s: f64,
 }
 
 /// What one update of the estimation gives a deflection filter.

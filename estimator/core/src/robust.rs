@@ -5,6 +5,7 @@
 //! motor's balance; evaluate torque and stiffness on the curve.
 
 use crate::align::{Alignment, Inputs, Positions};
+use crate::deflection::Present;
 use crate::delay::{DelaySearch, Known};
 use crate::effects::{Corrections, MotorEffects};
 use crate::error::Error;
@@ -18,7 +19,7 @@ use crate::sample_validator::SampleValidator;
 use crate::settings::{Priors, Settings};
 use crate::signals::{Channel, Filters};
 use crate::suspicion::{Suspicion, suspected};
-use crate::transmission::{Moment, Present, TransmissionEstimator};
+use crate::transmission::{Moment, TransmissionEstimator};
 
 const SAID_S: f64 = 0.5; // how long a restart is reported
 const TRUST_S: f64 = 0.02; // how long an estimate is carried over rejected samples

@@ -1,7 +1,7 @@
 //! One motor and its transmission on line: takes every sample, estimates at every update.
 
 use crate::change_detection::{Action, ChangeDetection, Innovation};
-use crate::deflection::{DeflectionFilter, Tuning};
+use crate::deflection::{DeflectionFilter, Present, Tuning};
 use crate::effects::{Coordinates, MotorEffects};
 use crate::external::Carried;
 use crate::identification::OnlineIdentification;
@@ -39,17 +39,6 @@ pub struct Moment {
     pub usable: bool,
     /// Variance of θ's and of q's noise, rad².
     pub noise: [f64; 2],
-}
-
-/// What is known of the deflection since the moment of the torque.
-#[derive(Clone, Copy, Debug)]
-pub struct Present {
-    /// φ as it was last measured, rad.
-    pub phi: f64,
-    /// By how much the torque is older than that, s.
-    pub behind_s: f64,
-    /// How long ago that was, s.
-    pub ahead_s: f64,
 }
 
 /// How much of the balance's variation the curve leaves over.

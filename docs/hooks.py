@@ -1,4 +1,4 @@
-"""Hooks of the documentation's build: the commands' help, formulas as MathML, diagrams as part of the page.
+"""Hooks of the documentation's build: parts made from the code, formulas as MathML, diagrams in the page.
 
 Browsers render MathML themselves, so formulas need no script. A diagram inside the page takes the page's
 colours, in light and dark mode.
@@ -13,22 +13,19 @@ from pathlib import Path
 from typing import Any
 
 from latex2mathml.converter import convert
-from mkdocs.structure.pages import Page
 
 HERE = Path(__file__).parent
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
 _DIAGRAM = re.compile(r'<img alt="([^"]*)" class="diagram" src="(?:\.\./)*pictures/([\w-]+\.svg)"\s*/?>')
 
 
-def on_page_markdown(text: str, page: Page, **_: Any) -> str:
-    """Add the help of every command to its page."""
-    if page.file.src_uri != "reference/commands.md":
-        return text
+def on_page_markdown(text: str, **_: Any) -> str:
+    """Fill in the parts that a page asks for (docs/generate.py)."""
     specification = importlib.util.spec_from_file_location("generate", HERE / "generate.py")
     assert specification is not None and specification.loader is not None
     generate = importlib.util.module_from_spec(specification)
     specification.loader.exec_module(generate)
-    return text + str(generate.commands_help())
+    return str(generate.filled(text))
 
 
 def on_page_content(text: str, **_: Any) -> str:

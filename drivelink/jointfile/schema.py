@@ -1,6 +1,6 @@
 """Schema of the joint file.
 
-`docs/reference/joint-file.md` is generated from it. An error is one line: file, key, what was expected.
+The tables of its reference page are made from it. An error is one line: file, key, what was expected.
 """
 
 from __future__ import annotations

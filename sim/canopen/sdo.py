@@ -1,4 +1,7 @@
-"""The SDO server of a simulated device: expedited, segmented and block transfers (CiA 301, 7.2.4)."""
+"""The SDO server of a simulated device: expedited, segmented and block transfers (CiA 301, 7.2.4).
+
+canopen's server has no block transfers.
+"""
 
 from __future__ import annotations
 

@@ -146,30 +146,104 @@ def test_a_mapping_that_the_master_changes_in_the_run_is_followed():
     assert any(frame.cob_id == 0x285 for frame in configurator.layouts[5].other_tpdos)
 
 
+TIMEOUT_S = 0.5
+UPLOAD, ANSWER, FORGED = (
+    bytes.fromhex(x) for x in ("4076600000000000", "4376600020030000", "4376600088130000")
+)
+
+
+def heard(*frames, listener=None, now_s=0.0):
+    """What a listener makes of a transfer; ">" from the master, "<" from the node, one second apart where "1"."""
+    listener = listener or SdoSniffer(lambda index, subindex: True, TIMEOUT_S)
+    for frame in frames:
+        if frame == "1":
+            now_s += 1.0
+            continue
+        data = bytes.fromhex(frame[1:])
+        listener.request(data, now_s) if frame[0] == ">" else listener.response(data, now_s)
+    return listener
+
+
 def test_a_download_counts_only_when_the_node_confirms_it():
-    listener = SdoSniffer(lambda index, subindex: True)
-    listener.request(bytes.fromhex("2b 17 10 00 64 00 00 00"))
+    write, refused, done = ">2b17100064000000", "<8017100030000906", "<6017100000000000"
+    listener = heard(write)
     assert listener.values == {}
-    listener.response(bytes.fromhex("80 17 10 00 30 00 09 06"))
-    listener.response(bytes.fromhex("60 17 10 00 00 00 00 00"))
-    assert listener.values == {}
-    listener.request(bytes.fromhex("2b 17 10 00 64 00 00 00"))
-    listener.response(bytes.fromhex("60 17 10 00 00 00 00 00"))
-    assert listener.values == {(0x1017, 0): 100}
+    assert heard(refused, listener=listener).values == {}
+    assert heard(write, done).values == {(0x1017, 0): 100}
 
 
 def test_segmented_transfers_are_followed_both_ways():
-    listener = SdoSniffer(lambda index, subindex: True)
-    listener.request(bytes.fromhex("21 01 1a 01 04 00 00 00"))  # download, 4 bytes in segments
-    listener.response(bytes.fromhex("60 01 1a 01 00 00 00 00"))
-    listener.request(bytes.fromhex("07 20 00 64 60 00 00 00"))  # last segment, 3 bytes unused
-    listener.response(bytes.fromhex("20 00 00 00 00 00 00 00"))
+    listener = heard(
+        ">21011a0104000000",  # download, 4 bytes in segments
+        "<60011a0100000000",
+        ">0720006460000000",  # last segment, 3 bytes unused
+        "<2000000000000000",
+    )
     assert listener.values == {(0x1A01, 1): 0x60640020}
-    listener.request(bytes.fromhex("40 76 60 00 00 00 00 00"))
-    listener.response(bytes.fromhex("41 76 60 00 04 00 00 00"))
-    listener.request(bytes.fromhex("60 00 00 00 00 00 00 00"))
-    listener.response(bytes.fromhex("07 20 03 00 00 00 00 00"))
-    assert listener.values[0x6076, 0] == 800
+    upload = (">4076600000000000", "<4176600004000000", ">6000000000000000", "<0720030000000000")
+    assert heard(*upload, listener=listener).values[0x6076, 0] == 800
+    assert listener.unasked == 0
+
+
+WRITE = ">2b17100064000000"
+DONE = "<6017100000000000"
+ASKED, TOLD, LIE = f">{UPLOAD.hex()}", f"<{ANSWER.hex()}", f"<{FORGED.hex()}"
+SEGMENTS = (ASKED, "<4176600004000000", ">6000000000000000")
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        (LIE,),  # nobody has asked
+        (DONE,),
+        (ASKED, "1", LIE),  # long ago
+        (WRITE, "1", DONE),
+        (">4075600000000000", LIE),  # for another object
+        (ASKED, "<6076600000000000"),  # a download's confirmation
+        (ASKED, "<0720030000000000"),  # a segment of a transfer that has none
+        (*SEGMENTS, "<1720030000000000"),  # the wrong toggle bit
+        (*SEGMENTS[:2], "<0720030000000000"),  # a segment before it is asked for
+        (*SEGMENTS[:2], ">7000000000000000", "<1720030000000000"),  # asked for out of order
+        (WRITE, ">8017100000000405", DONE),  # given up by the master
+    ],
+)
+def test_an_answer_that_belongs_to_no_request_is_counted_and_ignored(frames):
+    listener = heard(*frames)
+    assert listener.values == {}
+    assert listener.unasked == 1
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        (ASKED, LIE, TOLD),
+        (ASKED, TOLD, LIE),
+        (ASKED, LIE, "<8076600000000206"),  # the node has no such object
+        (ASKED, "<8076600000000206", LIE),
+        (*SEGMENTS, "<0788130000000000", "<0720030000000000"),
+    ],
+)
+def test_two_different_answers_to_one_request_dispute_the_object_until_it_is_read_again(frames):
+    listener = heard(*frames)
+    assert listener.disputed == {(0x6076, 0)}
+    assert heard(ASKED, TOLD, listener=listener).values == {(0x6076, 0): 800}
+    assert listener.disputed == set()
+    assert heard(ASKED, TOLD, TOLD).disputed == set()  # the same again is no dispute
+
+
+@pytest.mark.parametrize("next_request", [">8017100000000405", ">4076600000000000"])
+def test_a_download_that_is_given_up_may_have_been_made(next_request):
+    assert heard(WRITE, next_request).disputed == {(0x1017, 0)}
+    assert heard(WRITE, next_request, WRITE, DONE).disputed == set()
+    assert heard(WRITE, "<8017100030000906", next_request).disputed == set()  # refused: it was not
+
+
+def test_long_and_block_transfers_of_others_are_no_forgeries():
+    name = (">4008100000000000", "<4108100010000000")
+    name += (">6000000000000000", "<0041424344454647", ">7000000000000000", "<1041424344454647")
+    listener = heard(*name, ">6000000000000000", "<0B41420000000000")
+    assert (listener.values, listener.unasked) == ({}, 0)
+    assert heard(">c0501f0100000000", "<a4501f017f000000").unasked == 0
 
 
 def test_reset_communication_to_all_is_survived():
@@ -224,6 +298,23 @@ def after(configurator, *frames):
         configurator.feed(cob_id, data, 0.0)
         configurator.poll(0.0)
     return configurator
+
+
+def test_a_forged_answer_changes_no_scale_of_a_passive_node():
+    """Somebody else answers for the drive: unasked, or beside it."""
+    joint = parse(joint_text(bus=PASSIVE))
+    configurator = after(
+        PassiveConfigurator([joint]), *exchanged(Slave(5, drive_objects(5)), parse(joint_text()))
+    )
+    assert configurator.believed == {5}
+    before = configurator.layouts[5]
+    after(configurator, (0x585, FORGED), (0x585, FORGED))
+    assert (configurator.layouts[5], configurator.believed, configurator.unasked(5)) == (before, {5}, 2)
+    after(configurator, (0x605, UPLOAD), (0x585, FORGED), (0x585, ANSWER))
+    assert configurator.believed == set()
+    assert "0x6076:00 has two different answers" in configurator.doubts[5]
+    after(configurator, (0x605, UPLOAD), (0x585, ANSWER))
+    assert (configurator.layouts[5], configurator.believed) == (before, {5})
 
 
 BOOT = (0x705, b"\x00")

@@ -95,6 +95,43 @@ def read_scales(master: Master) -> None:
         master.read(3, index)
 
 
+def map_all(master: Master) -> None:
+    """A configuration that a passive listener hears from its first frame on."""
+    read_scales(master)
+    for node, entries in ((1, (POSITION, TORQUE, STATUSWORD)), (3, (0x60040020,))):
+        master.nmt(PRE, node)
+        master.map(node, 1, *entries)
+        master.nmt(START, node)
+    master.nmt(PRE, 2)
+    master.disable_others()
+    master.map(2, 1, POSITION, TORQUE, STATUSWORD)
+    master.nmt(START, 2)
+
+
+def test_an_sdo_answer_that_nobody_asked_for_changes_nothing_and_one_beside_the_nodes_own_ends_validity() -> (
+    None
+):
+    master = Master()
+    map_all(master)
+    master.syncs(50)
+    layout, valid = master.run.configurator.layouts[1], len(master.valid)
+    lie = b"\x43\x76\x60\x00" + (7 * 800).to_bytes(4, "little")  # rated torque
+    master.send(0x581, lie)
+    master.syncs(50)
+    assert len(master.valid) == valid + 50
+    assert master.run.configurator.layouts[1] == layout
+    assert "node 1: 1 SDO answers so far belong to no request" in master.run.events.recent()[-1]["text"]
+    master.read(1, 0x6076)
+    master.send(0x581, lie)
+    master.syncs(50)
+    assert len(master.valid) == valid + 50
+    assert "0x6076:00 has two different answers" in master.conditions
+    master.read(1, 0x6076)
+    master.syncs(50)
+    assert len(master.valid) > valid + 95
+    assert master.run.configurator.layouts[1] == layout
+
+
 @pytest.mark.parametrize("syncs", [0, 1, 3])
 @pytest.mark.parametrize("stopped_by", [PRE, STOP], ids=["pre-operational", "stopped"])
 def test_a_map_that_changes_holds_from_its_sync_on(syncs: int, stopped_by: int) -> None:
@@ -196,15 +233,7 @@ def test_a_map_rewritten_while_the_node_sends_is_never_half_believed() -> None:
 
 def test_a_log_gives_the_samples_of_the_live_run(tmp_path: Path) -> None:
     master = Master()
-    read_scales(master)
-    for node, entries in ((1, (POSITION, TORQUE, STATUSWORD)), (3, (0x60040020,))):
-        master.nmt(PRE, node)
-        master.map(node, 1, *entries)
-        master.nmt(START, node)
-    master.nmt(PRE, 2)
-    master.disable_others()
-    master.map(2, 1, POSITION, TORQUE, STATUSWORD)
-    master.nmt(START, 2)
+    map_all(master)
     begun = len(master.valid)
     master.syncs(100)
     master.nmt(PRE, 2)

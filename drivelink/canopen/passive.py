@@ -44,13 +44,13 @@ class _PassiveNode:
     factory setting, which may have changed, so it is only suggested.
     """
 
-    def __init__(self, role: Role) -> None:
+    def __init__(self, role: Role, sdo_timeout_s: float) -> None:
         self.role = role
         self._sheet = load_eds(role.eds, role.node_id) if role.eds is not None else None
         self._units = {
             address for vendor in VENDORS.values() for address in unit_objects(role, vendor)
         } | _COMMUNICATION
-        self.listener = SdoSniffer(self._interesting)
+        self.listener = SdoSniffer(self._interesting, sdo_timeout_s)
         self.seen_changes = -1
         self.adopted: NodeLayout | None = None
         self.restarted = False
@@ -70,6 +70,17 @@ class _PassiveNode:
         """Handle a loss of the bus: the state of the node is unknown."""
         self.adopted = None
         self.listener.forget(_is_mapping)
+
+    def dispute(self) -> str:
+        """One line on an object whose value is not known although it was transferred; empty: none."""
+        if not self.listener.disputed:
+            return ""
+        index, subindex = min(self.listener.disputed)
+        return (
+            f"{self.role.subject} ({self.role.key}): the SDO transfer of 0x{index:04X}:{subindex:02X} has "
+            "two different answers, or was given up: its frames are not used until the object is read or "
+            "written again; does another device answer for it?"
+        )
 
     @property
     def being_mapped(self) -> bool:
@@ -274,7 +285,7 @@ class PassiveConfigurator:
             for role in roles(joint, folder):
                 if role.node_id in self._nodes:
                     raise BusError(f"node {role.node_id} is claimed by two joints on one bus")
-                self._nodes[role.node_id] = _PassiveNode(role)
+                self._nodes[role.node_id] = _PassiveNode(role, self.bus.sdo_timeout_s)
         self.layouts: dict[int, NodeLayout] = {}
         self.missing: dict[int, DriveError] = {}
         self.doubts: dict[int, str] = {}
@@ -299,6 +310,10 @@ class PassiveConfigurator:
             if node not in self.doubts and not (node in self._nodes and self._nodes[node].being_mapped)
         )
 
+    def unasked(self, node: int) -> int:
+        """SDO answers for a node that belong to no request heard; they are not used."""
+        return self._nodes[node].listener.unasked
+
     def adopt(self, layouts: Iterable[NodeLayout]) -> None:
         """Take layouts from another source; later traffic has priority."""
         for layout in layouts:
@@ -317,7 +332,13 @@ class PassiveConfigurator:
             node.lose_sight()
 
     def feed(self, cob_id: int, data: bytes, now_s: float) -> None:
-        """Take a frame: SDO, boot-up, NMT resets, PDOs."""
+        """Take a frame: SDO, boot-up, NMT resets, PDOs.
+
+        Args:
+            cob_id: its identifier.
+            data: its bytes.
+            now_s: time by any clock, for the SDO time-out.
+        """
         if cob_id == 0:
             if len(data) == 2 and data[0] in _NMT_RESETS:
                 for node_id, node in self._nodes.items():
@@ -329,9 +350,9 @@ class PassiveConfigurator:
             return
         function = cob_id >> 7
         if function == 0x600 >> 7:
-            one.listener.request(data)
+            one.listener.request(data, now_s)
         elif function == 0x580 >> 7:
-            one.listener.response(data)
+            one.listener.response(data, now_s)
         elif function == 0x700 >> 7:
             if len(data) == 1 and data[0] & 0x7F == 0:
                 one.restart()
@@ -349,6 +370,7 @@ class PassiveConfigurator:
             node.seen_changes = node.listener.changes
             try:
                 layout, doubt = node.layout()
+                doubt = node.dispute() or doubt
             except DriveError as error:
                 # While a master changes the mapping there is none; the old layout is kept.
                 if node_id not in self.layouts:

@@ -1,5 +1,10 @@
 """Reads another master's SDO transfers from the traffic (CiA 301, 7.2.4.3).
 
+An answer is used only if it belongs to a request that was heard: of the same object, in order, within the
+time-out. Every other one is counted and ignored. Where two different answers follow one request, or a
+download is given up before its answer, the object's value is not known: it is disputed until it is
+transferred again.
+
 A download counts once the node has confirmed it. Expedited and segmented transfers are followed; block
 transfers are not used for objects of a few bytes.
 """
@@ -7,12 +12,45 @@ transfers are not used for objects of a few bytes.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 __all__ = ["SdoSniffer"]
 
 Address = tuple[int, int]
 
 _MAX_BYTES = 8  # no object of interest is longer
+_DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = range(5)  # commands of the client
+_SEGMENT_SENT, _SEGMENT_TAKEN, _UPLOADED, _DOWNLOADED = range(4)  # commands of the server; it aborts with 4
+_TOGGLE = 0x10
+
+
+@dataclass(slots=True)
+class _Transfer:
+    """One transfer.
+
+    Attributes:
+        address: the object.
+        writing: whether it is a download.
+        asked_s: time of the present request.
+        segmented: it goes on in segments.
+        data: to or from the node so far.
+        due: the command that answers the present request; None: it has been answered.
+        answer: the last one accepted.
+        toggle: toggle bit of the present segment.
+        last: the present segment is the last one.
+        ended: complete, aborted or disputed.
+    """
+
+    address: Address
+    writing: bool
+    asked_s: float
+    due: int | None
+    segmented: bool = False
+    data: bytearray = field(default_factory=bytearray)
+    answer: bytes = b""
+    toggle: int = _TOGGLE
+    last: bool = False
+    ended: bool = False
 
 
 class SdoSniffer:
@@ -20,107 +58,150 @@ class SdoSniffer:
 
     Args:
         interesting: whether to keep the value of an object.
+        timeout_s: of an answer.
 
     Attributes:
         values: confirmed unsigned values by (index, subindex).
         written: those of them that were written, not read.
-        changes: number of new, changed and forgotten values.
+        disputed: objects with two different answers to one request, or a download that was given up.
+        unasked: answers that belong to no request.
+        changes: number of new, changed, forgotten and disputed values.
     """
 
-    def __init__(self, interesting: Callable[[int, int], bool]) -> None:
+    def __init__(self, interesting: Callable[[int, int], bool], timeout_s: float) -> None:
         self._interesting = interesting
+        self._timeout_s = timeout_s
         self.values: dict[Address, int] = {}
         self.written: set[Address] = set()
+        self.disputed: set[Address] = set()
+        self.unasked = 0
         self.changes = 0
-        self._address: Address | None = None
-        self._writing = False
-        self._segments: bytearray | None = None
-        self._expedited: bytes | None = None
-        self._last = False
+        self._transfer: _Transfer | None = None
+        self._blocks = False  # a block transfer
 
     @property
     def pending(self) -> Address | None:
         """The object being written, not yet confirmed."""
-        return self._address if self._writing else None
+        transfer = self._transfer
+        return transfer.address if transfer is not None and transfer.writing and not transfer.ended else None
 
     def forget(self, lost: Callable[[Address], bool]) -> None:
         """Handle a restart of the node: forget written values and those that `lost` selects."""
-        self._forget()
+        self._transfer = None
         for address in [a for a in self.values if a in self.written or lost(a)]:
             del self.values[address]
         self.written.clear()
+        self.disputed = {address for address in self.disputed if not lost(address)}
         self.changes += 1
 
-    def request(self, data: bytes) -> None:
-        """A frame of the master, 0x600 + node."""
+    def request(self, data: bytes, now_s: float) -> None:
+        """Take a frame of the master, 0x600 + node."""
         if len(data) != 8:
             return
+        command, transfer = data[0] >> 5, self._transfer
+        self._blocks = command > _ABORT
+        if command in (_DOWNLOAD, _UPLOAD):
+            self._transfer = _begun(data, now_s)
+        elif transfer is not None and _may_follow(transfer, data):
+            transfer.asked_s, transfer.toggle = now_s, data[0] & _TOGGLE
+            transfer.due = _SEGMENT_TAKEN if transfer.writing else _SEGMENT_SENT
+            if transfer.writing:
+                _add_segment(transfer, data)
+            return
+        else:  # an abort, a block transfer, or out of order
+            self._transfer = None
+        if transfer is not None and transfer.writing and not transfer.ended:
+            self._dispute(transfer.address)
+
+    def response(self, data: bytes, now_s: float) -> None:
+        """Take a frame of the node, 0x580 + node."""
+        transfer = self._transfer
+        if len(data) != 8 or self._blocks:
+            return
+        if transfer is None or now_s - transfer.asked_s > self._timeout_s or not _names(transfer, data):
+            self.unasked += 1
+        elif transfer.due is None:
+            self._repeated(transfer, data)
+        elif data[0] >> 5 in (transfer.due, _ABORT):
+            self._accept(transfer, data)
+        else:
+            self.unasked += 1
+
+    def _accept(self, transfer: _Transfer, data: bytes) -> None:
+        """Take the answer that is due."""
         command = data[0] >> 5
-        if command in (1, 2):
-            self._address = (data[1] | data[2] << 8, data[3])
-            self._writing = command == 1
-            self._segments = self._expedited = None
-            self._last = False
-            if command == 1:
-                if data[0] & 0x02:
-                    self._expedited = _expedited(data)
-                else:
-                    self._segments = bytearray()
-        elif command == 0 and self._writing and self._segments is not None:
-            self._segment(self._segments, data)
-        elif command in (4, 5, 6):
-            self._forget()
+        transfer.due, transfer.answer = None, data
+        if command == _ABORT:
+            transfer.ended = True
+        elif command == _UPLOADED:
+            transfer.segmented = not data[0] & 0x02
+            transfer.data += b"" if transfer.segmented else _expedited(data)
+        elif command == _SEGMENT_SENT:
+            _add_segment(transfer, data)
+        if not transfer.ended and (transfer.last or not transfer.segmented):
+            self._complete(transfer)
 
-    def response(self, data: bytes) -> None:
-        """A frame of the node, 0x580 + node."""
-        if len(data) != 8 or self._address is None:
+    def _repeated(self, transfer: _Transfer, data: bytes) -> None:
+        """Take a further answer to a request."""
+        if data == transfer.answer:
             return
-        command = data[0] >> 5
-        if command == 4:
-            self._forget()
-            return
-        if self._segments is not None and command in (0, 1):
-            self._confirm_segment(self._segments, command, data)
-            return
-        if (data[1] | data[2] << 8, data[3]) != self._address:
-            return
-        if command == 3 and self._writing and self._expedited is not None:
-            self._keep(self._expedited)
-        elif command == 2 and not self._writing:
-            if data[0] & 0x02:
-                self._keep(_expedited(data))
-            else:
-                self._segments = bytearray()
+        self.unasked += 1
+        transfer.ended = True
+        self._dispute(transfer.address)
 
-    def _segment(self, segments: bytearray, data: bytes) -> None:
-        segments += data[1 : 8 - (data[0] >> 1 & 7)]
-        self._last = bool(data[0] & 0x01)
-        if len(segments) > _MAX_BYTES:
-            self._forget()
-
-    def _confirm_segment(self, segments: bytearray, command: int, data: bytes) -> None:
-        """A segment of an upload, or the answer to one of a download."""
-        if command == 0 and not self._writing:
-            self._segment(segments, data)
-        elif command != 1 or not self._writing:
-            return
-        if self._last and self._segments is not None:
-            self._keep(bytes(self._segments))
-
-    def _forget(self) -> None:
-        self._address = self._segments = self._expedited = None
-
-    def _keep(self, data: bytes) -> None:
-        address = self._address
-        self._forget()
-        if address is not None and self._writing:
-            self.written.add(address) if self._interesting(*address) else None
-        if address is None or not self._interesting(*address):
-            return
-        value = int.from_bytes(data, "little")
-        if self.values.get(address) != value:
-            self.values[address] = value
+    def _dispute(self, address: Address) -> None:
+        if self._interesting(*address) and address not in self.disputed:
+            self.disputed.add(address)
             self.changes += 1
+
+    def _complete(self, transfer: _Transfer) -> None:
+        transfer.ended = True
+        address = transfer.address
+        if not self._interesting(*address) or len(transfer.data) > _MAX_BYTES:
+            return
+        if transfer.writing:
+            self.written.add(address)
+        value = int.from_bytes(transfer.data, "little")
+        if self.values.get(address) != value or address in self.disputed:
+            self.values[address] = value
+            self.disputed.discard(address)
+            self.changes += 1
+
+
+def _begun(data: bytes, now_s: float) -> _Transfer:
+    writing, expedited = data[0] >> 5 == _DOWNLOAD, bool(data[0] & 0x02)
+    return _Transfer(
+        address=_address(data),
+        writing=writing,
+        asked_s=now_s,
+        due=_DOWNLOADED if writing else _UPLOADED,
+        segmented=writing and not expedited,
+        data=bytearray(_expedited(data) if writing and expedited else b""),
+    )
+
+
+def _may_follow(transfer: _Transfer, data: bytes) -> bool:
+    """Whether a request is the next segment: the answer before it has come, and the toggle bit alternates."""
+    wanted = _DOWNLOAD_SEGMENT if transfer.writing else _UPLOAD_SEGMENT
+    ready = transfer.segmented and transfer.due is None and not transfer.ended
+    return ready and data[0] >> 5 == wanted and data[0] & _TOGGLE != transfer.toggle
+
+
+def _names(transfer: _Transfer, data: bytes) -> bool:
+    """Whether an answer names the object, or the segment, of the present request."""
+    if data[0] >> 5 in (_SEGMENT_SENT, _SEGMENT_TAKEN):
+        return transfer.segmented and data[0] & _TOGGLE == transfer.toggle
+    return _address(data) == transfer.address
+
+
+def _add_segment(transfer: _Transfer, data: bytes) -> None:
+    if len(transfer.data) <= _MAX_BYTES:  # else the value is not kept
+        transfer.data += data[1 : 8 - (data[0] >> 1 & 7)]
+    transfer.last = bool(data[0] & 0x01)
+
+
+def _address(data: bytes) -> Address:
+    return data[1] | data[2] << 8, data[3]
 
 
 def _expedited(data: bytes) -> bytes:

@@ -57,13 +57,13 @@ class MapFollower:
         """Nodes whose frames are not used, and why."""
         return {**self._configurator.doubts, **self.refused}
 
-    def feed(self, cob_id: int, data: bytes) -> None:
-        """Take a frame, in bus order."""
+    def feed(self, cob_id: int, data: bytes, now_s: float) -> None:
+        """Take a frame, in bus order; `now_s` as for `PassiveConfigurator.feed`."""
         if cob_id == SYNC_COB_ID:
             self.sync()
             return
-        self._configurator.feed(cob_id, data, 0.0)
-        self._configurator.poll(0.0)
+        self._configurator.feed(cob_id, data, now_s)
+        self._configurator.poll(now_s)
         self._judge()
 
     def sync(self) -> None:
@@ -84,6 +84,10 @@ class MapFollower:
                 self._trusted[node] = True
                 assembler.trust(node)
         self._due.clear()
+
+    def unasked(self, node: int) -> int:
+        """SDO answers for a node that belong to no request heard."""
+        return self._configurator.unasked(node)
 
     def lose_sight(self) -> None:
         """Handle a loss of the bus: knowledge from the traffic may be out of date."""

@@ -85,6 +85,7 @@ class _Watched:
         "sent",
         "started",
         "state",
+        "unasked",
     )
 
     def __init__(self, layout: NodeLayout, loop_joint: LoopJoint, now_ns: int) -> None:
@@ -92,6 +93,7 @@ class _Watched:
         self.loop_joint = loop_joint
         self.started = False  # since its last frame
         self.enabled = False  # state of its drive at the last check
+        self.unasked = 0  # SDO answers without a request, as reported
         self.begin(NodeCounters(), now_ns)
 
     def begin(self, counters: NodeCounters, now_ns: int) -> None:
@@ -162,10 +164,14 @@ class Supervisor:
             {node: watched.layout for node, watched in nodes.items()},
             self._listen_anew,
         )
-        loop.listeners[0] = self._follower.feed
+        loop.listeners[0] = self._overhear
         for node in nodes:
-            loop.listeners[0x580 + node] = loop.listeners[0x600 + node] = self._follower.feed
+            loop.listeners[0x580 + node] = loop.listeners[0x600 + node] = self._overhear
         loop.after_sync.append(self._follower.sync)
+
+    def _overhear(self, cob_id: int, data: bytes) -> None:
+        if self._follower is not None:
+            self._follower.feed(cob_id, data, self._loop.clock() / _NS)
 
     @property
     def receive_ids(self) -> tuple[int, ...]:
@@ -281,6 +287,11 @@ class Supervisor:
                 self._events.begin(f"mapping {node}", follower.doubts[node])
             else:
                 self._events.end(f"mapping {node}", f"node {node}: its mapping is known, its frames are used")
+            watched, unasked = self._nodes[node], follower.unasked(node)
+            if unasked > watched.unasked:
+                watched.unasked = unasked
+                text = f"node {node}: {unasked} SDO answers so far belong to no request heard: not used"
+                self._events.say(text, logging.WARNING, key=f"unasked {node}")
 
     def _check_joint(self, loop_joint: LoopJoint) -> None:
         if loop_joint.fault:
@@ -550,8 +561,7 @@ class Supervisor:
             self._configurator.start(node)
             if self._follower is not None:  # its heartbeat has its default again
                 watched.layout = replace(watched.layout, heartbeat_ms=0)
-        if self._follower is not None:
-            self._follower.feed(cob_id, data)
+        self._overhear(cob_id, data)
         if state in _STATES:
             watched.state = state
 

@@ -54,10 +54,11 @@ class SampleTap:
         if message.is_extended_id or message.is_remote_frame or message.is_error_frame:
             return
         cob_id, data = message.arbitration_id, bytes(message.data)
-        self._configurator.feed(cob_id, data, 0.0)
-        if self._configurator.poll(0.0):
+        stamp_s = message.timestamp or time.time()
+        self._configurator.feed(cob_id, data, stamp_s)
+        if self._configurator.poll(stamp_s):
             self._assembler = None  # a node has another mapping now
-        stamp_ns = round((message.timestamp or time.time()) * 1e9)
+        stamp_ns = round(stamp_s * 1e9)
         if self._clock is None:
             self._measure(cob_id, stamp_ns)
         elif self._assembler is None:

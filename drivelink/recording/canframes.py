@@ -160,9 +160,10 @@ class FrameLog:
             fed = feed(can_id, data, jump, stamp_ns)
             heard.add(can_id)
             if follower is not None and (can_id in _OF_MAPS or can_id == SYNC_COB_ID):
-                follower.feed(can_id, data)
+                follower.feed(can_id, data, _seconds(stamp_ns, assembler.sequence, self.period_s))
             elif can_id in _SDO:
-                self._relayout(can_id, data, assembler)
+                now_s = _seconds(stamp_ns, assembler.sequence, self.period_s)
+                self._relayout(can_id, data, now_s, assembler)
             if fed is not None:
                 samples = samples or fed.sample is not None
                 yield fed
@@ -211,8 +212,9 @@ class FrameLog:
                 if quiet > _QUIET_SYNCS and not listener.busy:
                     break
             elif can_id in (_OF_MAPS if self._passive else _SDO) and (listener.busy or not self._passive):
-                listener.feed(can_id, data, 0.0)
-                if listener.poll(0.0):
+                now_s = _seconds(stamp_ns, len(syncs), listener.bus.period_s)
+                listener.feed(can_id, data, now_s)
+                if listener.poll(now_s):
                     head.clear()
                     quiet, heard = 0, True
         return syncs[-2 * _QUIET_SYNCS :], heard and not listener.busy
@@ -246,10 +248,10 @@ class FrameLog:
         )
         return measured.period_s
 
-    def _relayout(self, can_id: int, data: bytes, assembler: Assembler) -> None:
+    def _relayout(self, can_id: int, data: bytes, now_s: float, assembler: Assembler) -> None:
         """Handle a change of a node's mapping within the recording."""
-        self._listener.feed(can_id, data, 0.0)
-        for _, layout in self._listener.poll(0.0):
+        self._listener.feed(can_id, data, now_s)
+        for _, layout in self._listener.poll(now_s):
             if isinstance(layout, NodeLayout):
                 with suppress(DriveError):  # the daemon refuses it, too
                     assembler.relayout(layout)
@@ -294,6 +296,11 @@ def read_frame_record(path: Path, joint: JointFile | None, base_dir: Path, chann
         link_position_rad=known(columns["link_position_rad"]),
         link_velocity_rad_s=known(columns["link_velocity_rad_s"]),
     )
+
+
+def _seconds(stamp_ns: int, sync: int, period_s: float) -> float:
+    """Time of a frame; in a log without stamps, that of its SYNC."""
+    return stamp_ns * 1e-9 if stamp_ns != NO_STAMP else sync * period_s
 
 
 def _mcap_frames(path: Path) -> Iterator[LoggedFrame]:

@@ -250,8 +250,8 @@ class BusTap:
         passive = not self._joint.bus.configure
         sdo = 0x581 <= cob_id <= 0x67F
         if self._follower is None and (sdo or (passive and (cob_id == 0 or cob_id >= 0x700))):
-            listener.feed(cob_id, data, 0.0)
-            for _, layout in listener.poll(0.0):
+            listener.feed(cob_id, data, stamp_ns * 1e-9)
+            for _, layout in listener.poll(stamp_ns * 1e-9):
                 if self._assembler is not None and isinstance(layout, NodeLayout):
                     with suppress(DriveError):  # the daemon refuses it, too
                         self._assembler.relayout(layout)
@@ -271,7 +271,7 @@ class BusTap:
             self._stamp_ns = stamp_ns
         sample = self._assembler.feed(cob_id, data, jump)
         if self._follower is not None:
-            self._follower.feed(cob_id, data)
+            self._follower.feed(cob_id, data, stamp_ns * 1e-9)
         if sample is not None:
             late = sample.sequence != self._assembler.sequence
             self._gate.sample(self, sample, before_ns if late else self._stamp_ns)

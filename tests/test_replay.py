@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import logging
 import math
@@ -19,6 +20,7 @@ import daemonkit
 import numpy as np
 import pytest
 import zenohkit
+from test_read_back import forge
 
 from drivelink import cli, jointfile
 from drivelink.canopen.layout import NodeLayout
@@ -49,22 +51,28 @@ class Recorded:
     """A daemon in lockstep with its devices, all its frames and estimates recorded in every format."""
 
     def __init__(
-        self, folder: Path, text: str, disturb: Callable[[daemonkit.DaemonRig], None] | None
+        self,
+        folder: Path,
+        text: str,
+        disturb: Callable[[daemonkit.DaemonRig], None] | None,
+        cycles: int = CYCLES,
+        formats: Sequence[str] = FORMATS,
     ) -> None:
         self.folder = folder
         self.joint = parse(text)
         self.tap = can.Bus(interface="virtual", channel=self.joint.bus.channel)
         self.sinks: list[Sink] = [
-            open_sink(folder / f"r{suffix}", self.joint, text, str(folder)) for suffix in FORMATS
+            open_sink(folder / f"r{suffix}", self.joint, text, str(folder)) for suffix in formats
         ]
         self.stamp_ns = BEGIN_NS - 1_000_000_000
         with daemonkit.rig(self.joint) as rig:
             self.drain()
             if disturb:
                 disturb(rig)
-            for _ in range(CYCLES):
+            for _ in range(cycles):
                 rig.run(1)
                 self.drain()
+            self.events = rig.events
             self.live = [estimate for estimate, _ in rig.collector.estimates]
             samples = {sample.sequence: sample for sample, _ in rig.collector.samples}
             for estimate in self.live:
@@ -138,6 +146,75 @@ def test_what_begins_anew_or_is_not_learned_from_does_so_in_the_replay_of_sample
     assert any(status & Status.NODE_RESTARTED for status in statuses)
     assert any(status & Status.UNTIMED for status in statuses)
     assert [bits(e) for e in recorded.replayed(".mcap")] == [bits(e) for e in recorded.live]
+
+
+def another_object(rig: daemonkit.DaemonRig) -> None:
+    """Node 1's position frames carry something else for a while."""
+    tpdo, other = rig.node(1).tpdos[rig.tpdo(1)[0]], itertools.count(123_456, 7)
+    inner, syncs = tpdo.emit, rig.network.syncs
+
+    def lie(can_id: int, data: bytes) -> None:
+        begun = 2500 <= rig.network.syncs - syncs < 4500
+        inner(can_id, struct.pack("<i", next(other)) + data[4:] if begun else data)
+
+    tpdo.emit = lie
+
+
+def another_unit(rig: daemonkit.DaemonRig) -> None:
+    entry = rig.node(1).dictionary.find(0x6076, 0)
+
+    def double() -> None:
+        entry.value *= 2
+
+    rig.faults.at(rig.network.syncs + 2500, double)
+
+
+def one_forged_answer(rig: daemonkit.DaemonRig) -> None:
+    """Somebody else answers once, before node 2, when its rated torque is read back."""
+    rig.faults.at(rig.network.syncs + 2500, lambda: forge(rig, 2, (0x6076, 0), 5000, times=1))
+
+
+def another_mapping(rig: daemonkit.DaemonRig) -> None:
+    """Somebody else exchanges two objects of node 1's frame, which keeps its identifier and length."""
+    number, cob_id = rig.tpdo(1)
+    other = daemonkit.Listener(rig.joint)
+    mapping, entries = 0x19FF + number, rig.daemon.layouts[1].tpdos[0].objects
+    steps = [(0x17FF + number, 1, 1 << 31 | cob_id, 4), (mapping, 0, 0, 1)]
+    for place, one in enumerate(reversed(entries), start=1):
+        steps.append((mapping, place, one.index << 16 | one.subindex << 8 | one.bits, 4))
+    steps += [(mapping, 0, len(entries), 1), (0x17FF + number, 1, cob_id, 4)]
+
+    def write() -> None:
+        for index, subindex, value, size in steps:
+            head = bytes([0x23 | (4 - size) << 2]) + index.to_bytes(2, "little") + bytes([subindex])
+            other.send(0x601, head + value.to_bytes(size, "little").ljust(4, b"\0"))
+        other.close()
+
+    rig.faults.at(rig.network.syncs + 2500, write)
+
+
+@pytest.mark.parametrize(
+    ("disturb", "event"),
+    [
+        (another_object, "as 0x6064:00, by SDO it is"),
+        (another_unit, "0x6076:00 was"),
+        (one_forged_answer, ""),
+        (another_mapping, "somebody else writes its mapping"),
+    ],
+)
+def test_what_a_daemon_reads_back_and_rejects_is_rejected_in_the_replay_at_the_same_cycle(
+    disturb: Callable[[daemonkit.DaemonRig], None], event: str, tmp_path: Path
+) -> None:
+    text = daemonkit.vsa_text(bus="read_back_s = 0.05")
+    recorded = Recorded(tmp_path, text, disturb, cycles=6500, formats=(".log", ".mcap"))
+    rejected = [e for e in recorded.live[2500:] if not e.status & Status.VALID]
+    if event:
+        assert any(event in text for text in recorded.events)
+        assert len(rejected) > 100
+    else:
+        assert rejected == []
+    for suffix in (".log", ".mcap"):
+        assert [bits(e) for e in recorded.replayed(suffix)] == [bits(e) for e in recorded.live]
 
 
 def test_what_is_strange_in_a_log_is_said(

@@ -22,7 +22,7 @@ from drivelink.errors import BusError, DriveError
 from drivelink.jointfile import BusSection, JointFile, TpdoSection
 from drivelink.notice import Notice, Severity, log_notices
 
-__all__ = ["PassiveConfigurator"]
+__all__ = ["PassiveConfigurator", "is_mapping"]
 
 logger = logging.getLogger(__name__)
 
@@ -47,9 +47,7 @@ class _PassiveNode:
     def __init__(self, role: Role, sdo_timeout_s: float) -> None:
         self.role = role
         self._sheet = load_eds(role.eds, role.node_id) if role.eds is not None else None
-        self._units = {
-            address for vendor in VENDORS.values() for address in unit_objects(role, vendor)
-        } | _COMMUNICATION
+        self._units = {address for vendor in VENDORS.values() for address in unit_objects(role, vendor)}
         self.listener = SdoSniffer(self._interesting, sdo_timeout_s)
         self.seen_changes = -1
         self.adopted: NodeLayout | None = None
@@ -57,19 +55,23 @@ class _PassiveNode:
         self.heard: dict[int, int] = {}  # lengths of frames with its predefined identifiers
 
     def _interesting(self, index: int, subindex: int) -> bool:
-        if _is_mapping((index, subindex)):
+        if is_mapping((index, subindex)):
             return subindex <= _MOST_ENTRIES
-        return (index, subindex) in self._units
+        return (index, subindex) in self._units | _COMMUNICATION
+
+    def is_unit(self, address: Address) -> bool:
+        """Whether the scale of a signal depends on an object."""
+        return address in self._units
 
     def restart(self) -> None:
         """Handle a boot-up: mapping and parameters are the node's defaults again."""
         self.restarted, self.adopted = True, None
-        self.listener.forget(lambda address: _is_mapping(address) or address in _VOLATILE)
+        self.listener.forget(lambda address: is_mapping(address) or address in _VOLATILE)
 
     def lose_sight(self) -> None:
         """Handle a loss of the bus: the state of the node is unknown."""
         self.adopted = None
-        self.listener.forget(_is_mapping)
+        self.listener.forget(is_mapping)
 
     def dispute(self) -> str:
         """One line on an object whose value is not known although it was transferred; empty: none."""
@@ -86,7 +88,7 @@ class _PassiveNode:
     def being_mapped(self) -> bool:
         """Whether the master is changing its mapping now."""
         pending = self.listener.pending
-        return pending is not None and _is_mapping(pending)
+        return pending is not None and is_mapping(pending)
 
     def layout(self) -> tuple[NodeLayout, str]:
         """The best known layout, and why it is not trusted (empty: it is).
@@ -97,7 +99,7 @@ class _PassiveNode:
         try:
             return self._layout(self._believed_tpdos()), ""
         except DriveError as error:
-            if self.adopted is not None and not any(map(_is_mapping, self.listener.written)):
+            if self.adopted is not None and not any(map(is_mapping, self.listener.written)):
                 return self.adopted, ""
             sheet = self._sheet_tpdos()
             if not sheet:
@@ -171,7 +173,7 @@ class _PassiveNode:
 
     def _believed_tpdos(self) -> tuple[Tpdo, ...]:
         """TPDOs from the joint file, as far as still valid, and from the traffic."""
-        seen = {address: value for address, value in self.listener.values.items() if _is_mapping(address)}
+        seen = {address: value for address, value in self.listener.values.items() if is_mapping(address)}
         touched = {(index & 0x1FF) + 1 for index, _ in seen}
         stated, values = [], dict(seen)
         for section in self.role.tpdo:
@@ -188,7 +190,7 @@ class _PassiveNode:
     def _sheet_tpdos(self) -> tuple[Tpdo, ...]:
         if self._sheet is None:
             return ()
-        seen = {address: value for address, value in self.listener.values.items() if _is_mapping(address)}
+        seen = {address: value for address, value in self.listener.values.items() if is_mapping(address)}
         return _sent(tpdos_of({**self._sheet.values(), **seen}))
 
     def _number(self, section: TpdoSection, seen: dict[Address, int]) -> int:
@@ -217,7 +219,8 @@ class _PassiveNode:
         ) + (f"; it sends {heard}" if heard else "")
 
 
-def _is_mapping(address: Address) -> bool:
+def is_mapping(address: Address) -> bool:
+    """Whether an object is a parameter of a TPDO (CiA 301, 7.5.2.37 and 38)."""
     return 0x1800 <= address[0] <= 0x1BFF
 
 
@@ -313,6 +316,11 @@ class PassiveConfigurator:
     def unasked(self, node: int) -> int:
         """SDO answers for a node that belong to no request heard; they are not used."""
         return self._nodes[node].listener.unasked
+
+    def units(self, node: int) -> dict[Address, int]:
+        """The unit objects of a node as heard, with their unsigned values."""
+        one = self._nodes[node]
+        return {address: value for address, value in one.listener.values.items() if one.is_unit(address)}
 
     def adopt(self, layouts: Iterable[NodeLayout]) -> None:
         """Take layouts from another source; later traffic has priority."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-__all__ = ["SdoSniffer"]
+__all__ = ["SdoSniffer", "written_object"]
 
 Address = tuple[int, int]
 
@@ -59,6 +59,7 @@ class SdoSniffer:
     Args:
         interesting: whether to keep the value of an object.
         timeout_s: of an answer.
+        read: called with each object of interest that was read, and its bytes.
 
     Attributes:
         values: confirmed unsigned values by (index, subindex).
@@ -68,9 +69,15 @@ class SdoSniffer:
         changes: number of new, changed, forgotten and disputed values.
     """
 
-    def __init__(self, interesting: Callable[[int, int], bool], timeout_s: float) -> None:
+    def __init__(
+        self,
+        interesting: Callable[[int, int], bool],
+        timeout_s: float,
+        read: Callable[[Address, bytes], None] = lambda _address, _data: None,
+    ) -> None:
         self._interesting = interesting
         self._timeout_s = timeout_s
+        self._read = read
         self.values: dict[Address, int] = {}
         self.written: set[Address] = set()
         self.disputed: set[Address] = set()
@@ -166,6 +173,13 @@ class SdoSniffer:
             self.values[address] = value
             self.disputed.discard(address)
             self.changes += 1
+        if not transfer.writing:
+            self._read(address, bytes(transfer.data))
+
+
+def written_object(data: bytes) -> Address | None:
+    """The object that a frame of the master begins to write."""
+    return _address(data) if len(data) == 8 and data[0] >> 5 == _DOWNLOAD else None
 
 
 def _begun(data: bytes, now_s: float) -> _Transfer:

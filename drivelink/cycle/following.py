@@ -1,8 +1,8 @@
-"""Follows mappings that another master writes, to decode the samples of a passive daemon.
+"""Follows mappings in the traffic: another master's, live or from a log, and in a log the daemon's own.
 
-It receives the frames after the assemblers, live or from a log. From a frame that makes a mapping doubtful
-on, the node's frames are not used; a mapping that is known again applies from the next SYNC on, the first one
-that the node answers with it.
+The followers take the frames after the assemblers. From a frame that makes a mapping doubtful on, the node's
+frames are not used. Another master's mapping that is known again applies from the next SYNC on, the first one
+that the node answers with it; the daemon's own from the first SYNC after the start of the node on.
 """
 
 from __future__ import annotations
@@ -11,10 +11,14 @@ from collections.abc import Callable, Mapping
 
 from drivelink._core import SYNC_COB_ID, Assembler
 from drivelink.canopen.layout import NodeLayout
-from drivelink.canopen.passive import PassiveConfigurator
+from drivelink.canopen.passive import PassiveConfigurator, is_mapping
+from drivelink.canopen.sdo_sniffer import written_object
+from drivelink.cycle.objectcheck import ObjectCheck, RecentSamples, Samples
 from drivelink.errors import DriveError
 
-__all__ = ["MapFollower"]
+__all__ = ["ConfigurationFollower", "MapFollower", "follow_log"]
+
+_START, _BOOT_UP = 0x01, b"\0"  # NMT
 
 
 class MapFollower:
@@ -108,3 +112,93 @@ class MapFollower:
                     assembler.distrust(node)
                 self.refused.pop(node, None)
                 self._due.add(node)
+
+
+class ConfigurationFollower:
+    """Repeats from a log how a daemon that configures the nodes has used their frames.
+
+    Args:
+        configurator: takes the mappings from the traffic; starts with the layouts given here.
+        assembler: of the joint.
+        layouts: the present layouts.
+        samples: the joint's samples after a SYNC, at most so many; None: the daemon read nothing back.
+    """
+
+    def __init__(
+        self,
+        configurator: PassiveConfigurator,
+        assembler: Assembler,
+        layouts: Mapping[int, NodeLayout],
+        samples: Samples | None,
+    ) -> None:
+        self._configurator = configurator
+        self._assembler = assembler
+        self._in_use = dict(layouts)
+        self._samples = samples
+        self._check = ObjectCheck(configurator.bus.sdo_timeout_s)
+        self._started: set[int] = set()  # since the last SYNC
+        assembler.supervise()
+        for node in self._in_use:
+            self._watch(node)
+
+    @property
+    def doubts(self) -> dict[int, str]:
+        """Nodes whose frames are not used, and why: none for long, the daemon configures them."""
+        return {}
+
+    def feed(self, cob_id: int, data: bytes, now_s: float) -> None:
+        """Take a frame, in bus order; `now_s` as for `PassiveConfigurator.feed`."""
+        if cob_id == SYNC_COB_ID:
+            self._check.sync()
+            for node in self._started:
+                self._begin(node)
+            self._started.clear()
+        elif cob_id == 0:
+            if len(data) == 2 and data[0] == _START and data[1] in self._in_use:
+                self._started.add(data[1])
+        elif cob_id > 0x700 and data == _BOOT_UP:
+            self._started.discard(cob_id - 0x700)
+        elif 0x580 < cob_id < 0x600:
+            self._configurator.feed(cob_id, data, now_s)
+            self._check.response(cob_id - 0x580, data, now_s)
+        elif 0x600 < cob_id < 0x680:
+            self._configurator.feed(cob_id, data, now_s)
+            self._check.request(cob_id - 0x600, data, now_s)
+            address = written_object(data)
+            if address is not None and is_mapping(address):
+                self._assembler.distrust(cob_id - 0x600)
+
+    def _begin(self, node: int) -> None:
+        """Use a node that was started as it has been configured."""
+        self._configurator.poll(0.0)
+        layout = self._configurator.layouts[node]
+        if layout.tpdos != self._in_use[node].tpdos:
+            try:
+                self._assembler.relayout(layout)
+            except DriveError:  # the daemon has refused it, too
+                return
+        self._in_use[node] = layout
+        self._watch(node)
+        self._assembler.trust(node)
+
+    def _watch(self, node: int) -> None:
+        if self._samples is not None:
+            units = dict(self._in_use[node].reported) | self._configurator.units(node)
+            self._check.watch(self._in_use[node], units, self._assembler, self._samples)
+
+
+def follow_log(
+    configurator: PassiveConfigurator, assembler: Assembler, recent: RecentSamples
+) -> MapFollower | ConfigurationFollower:
+    """Follow the mappings in a log of one joint as its daemon did.
+
+    Args:
+        configurator: knows the mapping of every node.
+        assembler: of the joint.
+        recent: is given every sample, before the follower takes the frame that has completed it.
+    """
+    layouts = configurator.layouts
+    if not configurator.bus.configure:
+        return MapFollower(configurator, dict.fromkeys(layouts, assembler), layouts)
+    samples = recent.after if configurator.bus.read_back_s else None
+    return ConfigurationFollower(configurator, assembler, layouts, samples)

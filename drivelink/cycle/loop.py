@@ -112,9 +112,11 @@ class CycleLoop:
         listeners: further handlers by identifier: SDO, heartbeat, EMCY.
         after_sync: called at each SYNC, after the joints have taken it.
         clock: the clock of supervision, ns.
+        on_sent: called with each frame that `send` has sent.
         on_lost: called when the bus is lost.
         on_fault: called with an exception of one joint or node, and its name; the loop continues without it.
         cycles: SYNCs since the start.
+        syncs: those on the bus; when producing, one more than `cycles` while frames before it are processed.
         overruns: periods skipped because this process was late.
         foreign_syncs: SYNCs of another master while we produce it, or that were not due.
         behind: when following, SYNCs read more than a period after their stamp.
@@ -145,11 +147,13 @@ class CycleLoop:
         self.listeners: dict[int, Listener] = {}
         self.after_sync: list[Callable[[], None]] = []
         self.clock: Callable[[], int] = time.monotonic_ns
+        self.on_sent: Callable[[int, bytes], None] = lambda _cob_id, _data: None
         self.on_lost: Callable[[str], None] = lambda _reason: None
         self.on_fault: Callable[[str, Exception], None] = _log_fault
         self.housekeeping.on_fault = lambda error: self.on_fault("housekeeping", error)
         self.behind = self.skipped_periods = 0
-        self.cycles = self.overruns = self.foreign_syncs = self.late_syncs = self.counter_jumps = 0
+        self.cycles = self.syncs = self.overruns = 0
+        self.foreign_syncs = self.late_syncs = self.counter_jumps = 0
         self.sync_stamps: deque[int] = deque(maxlen=MEASURED_SYNCS)
         self.clock_step_ns = self.clock_steps = 0
         self.silent = False
@@ -191,6 +195,7 @@ class CycleLoop:
             self._lose(error)
         for loop_joint in list(self._loop_joints_of.get(cob_id, ())):
             self._feed(loop_joint, cob_id, data)
+        self.on_sent(cob_id, data)
 
     def stop(self) -> None:
         """End the pacing after the present cycle; callable from any thread or signal handler."""
@@ -222,6 +227,7 @@ class CycleLoop:
             stamp_ns: UNIX time of this SYNC.
             jump: periods since the one before.
         """
+        self.syncs += 1
         try:
             frames = self.source.take()
             self.source.send(SYNC_COB_ID, self._next_counter())
@@ -300,6 +306,7 @@ class CycleLoop:
     def _sync(self, data: bytes, stamp_ns: int, jump: int, now_ns: int) -> None:
         if jump > 0:
             self.cycles += 1
+            self.syncs = self.cycles
             self.silent = False
         for loop_joint in self.loop_joints:
             if loop_joint.fault:

@@ -24,6 +24,7 @@ from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle import pacing, realtime
 from drivelink.cycle.busport import BusPort
 from drivelink.cycle.loop import CycleLoop, LoopJoint
+from drivelink.cycle.objectcheck import HISTORY_S
 from drivelink.cycle.pipeline import build, make_pipeline, rehearse
 from drivelink.cycle.sources import open_source
 from drivelink.cycle.startup import join_bus
@@ -47,7 +48,6 @@ _CHECK_S = 0.1
 _ANSWER_S = 0.05
 _FILE_S = 0.2
 _COLLECT_S = 5.0
-_HISTORY_S = 2.0  # of samples that a new estimator starts from
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,7 +114,7 @@ class Daemon:
                 self._port, [s.joint for s in joints], [s.folder for s in joints], idle=devices
             )
             self._section = self._configurator.bus  # with the measured period of another master's SYNC
-            keep = round(_HISTORY_S / self._section.period_s)
+            keep = round(HISTORY_S / self._section.period_s)
             self._loop_joints = [
                 LoopJoint(
                     served.joint.name, make_pipeline(self._timed(served.joint), mine, keep=keep), publisher

@@ -17,10 +17,12 @@ from drivelink._core import NodeCounters
 from drivelink.canopen.configure import Configurator
 from drivelink.canopen.emcy import drive_state, parse_emergency
 from drivelink.canopen.layout import NodeLayout
-from drivelink.canopen.passive import PassiveConfigurator
+from drivelink.canopen.passive import PassiveConfigurator, is_mapping
+from drivelink.canopen.sdo_sniffer import written_object
 from drivelink.cycle.following import MapFollower
 from drivelink.cycle.framesource import OVERFLOW, LostSource
 from drivelink.cycle.loop import CycleLoop, LoopJoint
+from drivelink.cycle.objectcheck import ObjectCheck
 from drivelink.cycle.pipeline import ResidualMonitor
 from drivelink.cycle.syncclock import MEASURED_SYNCS, measure_period
 from drivelink.daemon.crosschecks import contradiction
@@ -139,6 +141,7 @@ class Supervisor:
         self._foreign = deque([(loop.clock(), 0, 0)])  # in the last second: SYNCs not due, periods without
         self.sync_period_s: float | None = None
         loop.on_fault = self._say_fault
+        self._due: dict[int, tuple[NodeLayout, int]] = {}  # configured nodes, and the SYNC before their start
         self._nodes: dict[int, _Watched] = {}
         for loop_joint, mine in layouts.items():
             loop_joint.pipeline.assembler.supervise()
@@ -151,9 +154,15 @@ class Supervisor:
         if isinstance(configurator, PassiveConfigurator):
             self._follow(configurator)
         elif configurator.bus.read_back_s:
-            self._read_back = ReadBack(configurator.ask, configurator.bus.read_back_s)
+            section = configurator.bus
+            self._read_back = ReadBack(
+                configurator.ask, section.read_back_s, ObjectCheck(section.sdo_timeout_s)
+            )
             for watched in self._nodes.values():
                 self._read_back.watch(watched.layout, watched.loop_joint.pipeline)
+            loop.on_sent = self._sent
+            loop.after_sync.append(self._check_objects)
+        loop.after_sync.append(self._use_configured)
 
     def _follow(self, configurator: PassiveConfigurator) -> None:
         """Follow another master's mapping: process its frames in bus order."""
@@ -183,7 +192,7 @@ class Supervisor:
         pipeline = loop_joint.pipeline
         found = contradiction(pipeline.assembler)
         if found is None and self._read_back is not None:
-            found = self._read_back.contradiction(pipeline)
+            found = self._read_back.contradiction(pipeline.assembler)
         return found
 
     def node_status(self, loop_joint: LoopJoint) -> dict[str, Any]:
@@ -214,18 +223,19 @@ class Supervisor:
         if self._configurator.busy and self._follower is None:
             self._proceed(now_ns)
         elif self._read_back is not None:
-            self._ask_back(self._read_back, now_ns)
+            self._read_back.step(now_ns / _NS)
 
-    def _ask_back(self, read_back: ReadBack, now_ns: int) -> None:
-        """Hold what nodes say by SDO against what is in use; where it is another, configure that one anew."""
-        finding = read_back.step(now_ns / _NS)
-        if finding is None:
-            return
-        watched = self._nodes[finding.node]
-        watched.loop_joint.pipeline.assembler.distrust(finding.node)
-        watched.attempt_ns = now_ns
-        self._events.say(f"{finding.text}: it is configured again", logging.WARNING)
-        self._configurator.start(finding.node)
+    def _check_objects(self) -> None:
+        """At a SYNC, configure nodes anew that say something else by SDO than is in use."""
+        for found in self._read_back.check.sync() if self._read_back is not None else ():
+            self._nodes[found.node].attempt_ns = self._loop.clock()
+            self._events.say(f"{found.text}: it is configured again", logging.WARNING)
+            self._configure(found.node)
+
+    def _configure(self, node: int, *, stopped: bool = False) -> None:
+        """Begin to configure a node."""
+        self._due.pop(node, None)
+        self._configurator.start(node, stopped=stopped)
 
     def _proceed(self, now_ns: int) -> None:
         configurator = self._configurator
@@ -235,6 +245,15 @@ class Supervisor:
             if not isinstance(result, NodeLayout):
                 self._events.begin(f"configure {node}", f"node {node} cannot be configured: {result}")
                 continue
+            self._due[node] = result, self._loop.syncs
+
+    def _use_configured(self) -> None:
+        """At a SYNC, use the nodes that were started before it: from here on a log shows it, too."""
+        for node, (result, started) in list(self._due.items()):
+            if self._loop.cycles <= started:
+                continue
+            del self._due[node]
+            watched = self._nodes[node]
             if result.tpdos != watched.layout.tpdos:
                 try:
                     watched.loop_joint.pipeline.assembler.relayout(result)
@@ -354,7 +373,7 @@ class Supervisor:
             if isinstance(self._configurator, Configurator):
                 assembler.distrust(node)
             watched.begin(assembler.counters[node], self._loop.clock())
-            self._configurator.start(node)
+            self._configure(node)
         if self._follower is not None:
             self._follower.lose_sight()
 
@@ -388,7 +407,7 @@ class Supervisor:
         lost = lost or (watched.state != _OPERATIONAL and now - watched.heartbeat_ns < _NS)
         if lost and not self._configurator.busy and now - watched.attempt_ns > _RETRY_NS:
             watched.attempt_ns = now
-            self._configurator.start(node, stopped=watched.state == _STOPPED)
+            self._configure(node, stopped=watched.state == _STOPPED)
             if watched.started:
                 self._say_unstarted(node, watched)
 
@@ -558,7 +577,7 @@ class Supervisor:
         if state == 0:  # every time: it may reboot while being configured
             self._events.say(f"node {node} has rebooted", logging.WARNING)
             watched.attempt_ns = watched.heartbeat_ns
-            self._configurator.start(node)
+            self._configure(node)
             if self._follower is not None:  # its heartbeat has its default again
                 watched.layout = replace(watched.layout, heartbeat_ms=0)
         self._overhear(cob_id, data)
@@ -570,18 +589,30 @@ class Supervisor:
         if emergency is not None and not emergency.is_reset:
             self._events.say(f"node {cob_id - 0x080}: {emergency}", logging.WARNING)
 
+    def _sent(self, cob_id: int, data: bytes) -> None:
+        if self._read_back is not None and 0x600 < cob_id < 0x680:
+            self._read_back.check.request(cob_id - 0x600, data, self._loop.clock() / _NS)
+
     def _answer(self, cob_id: int, data: bytes) -> None:
         now_ns = self._loop.clock()
-        if self._read_back is not None and not self._configurator.busy:
-            self._read_back.feed(cob_id, data, now_ns / _NS)
-            return
+        if self._read_back is not None:
+            self._read_back.check.response(cob_id - 0x580, data, now_ns / _NS)
+            if not self._configurator.busy:
+                self._read_back.feed(cob_id, data, now_ns / _NS)
+                return
         self._configurator.feed(cob_id, data, now_ns / _NS)
         self._proceed(now_ns)  # do not decode its frames by the old layout
 
     def _foreign_request(self, cob_id: int, data: bytes) -> None:
         """Somebody else talks to a node by SDO; our own frames are not heard."""
+        self._sent(cob_id, data)
         if self._read_back is not None:
             self._read_back.feed(cob_id, data, self._loop.clock() / _NS)
+        node, address = cob_id - 0x600, written_object(data)
+        if address is not None and is_mapping(address):
+            self._nodes[node].loop_joint.pipeline.assembler.distrust(node)
+            text = f"node {node}: somebody else writes its mapping: it is configured again"
+            self._events.say(text, logging.WARNING)
 
 
 def _maps(layout: NodeLayout) -> str:

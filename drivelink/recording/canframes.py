@@ -10,17 +10,16 @@ import json
 import logging
 from array import array
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from itertools import chain, islice
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
-from drivelink._core import SYNC_COB_ID, Assembler, JointPipeline, Tick
-from drivelink.canopen.layout import NodeLayout
+from drivelink._core import SYNC_COB_ID, JointPipeline, Tick
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cycle.following import MapFollower
+from drivelink.cycle.following import follow_log
+from drivelink.cycle.objectcheck import RecentSamples
 from drivelink.cycle.pipeline import make_assembler
 from drivelink.cycle.syncclock import measure_period
 from drivelink.errors import DriveError, RecordingError
@@ -152,26 +151,26 @@ class FrameLog:
     def _fed(self, feed: Callable[[int, bytes, int, int], _Fed | None]) -> Iterator[_Fed]:
         """Pass the frames through the assembler."""
         assembler = self.assembler
-        follower = self._follower() if self._passive else None
+        recent = RecentSamples(self.period_s)
+        follower = follow_log(self._listener, self.assembler, recent)
         numbered = numbered_at_once if self._follow else numbered_ahead
         heard: set[int] = set()
         samples = False
         for (stamp_ns, can_id, data, _), jump in numbered(chain(self._head, self._frames), self.period_s):
             fed = feed(can_id, data, jump, stamp_ns)
             heard.add(can_id)
-            if follower is not None and (can_id in _OF_MAPS or can_id == SYNC_COB_ID):
+            if fed is not None and fed.sample is not None:
+                recent.add(fed.sample)
+                samples = True
+            if can_id in _OF_MAPS or can_id == SYNC_COB_ID:
                 follower.feed(can_id, data, _seconds(stamp_ns, assembler.sequence, self.period_s))
-            elif can_id in _SDO:
-                now_s = _seconds(stamp_ns, assembler.sequence, self.period_s)
-                self._relayout(can_id, data, now_s, assembler)
             if fed is not None:
-                samples = samples or fed.sample is not None
                 yield fed
+        doubts = list(follower.doubts.values())
         if not samples:
-            doubts = list(follower.doubts.values()) if follower is not None else []
             why = f": {doubts[0]}" if doubts else self._absent(heard)
             raise RecordingError(f"{self._path}: no complete sample in it{why}")
-        for doubt in follower.doubts.values() if follower is not None else ():
+        for doubt in doubts:
             _LOG.warning("%s: at its end, %s", self._path, doubt)
 
     def _absent(self, heard: set[int]) -> str:
@@ -185,11 +184,6 @@ class FrameLog:
         if not absent:
             return ""
         return f": expected frames {', '.join(absent)}, got none (another node id, channel or mapping?)"
-
-    def _follower(self) -> MapFollower:
-        """Follow another master's mapping as the daemon does."""
-        layouts = self._listener.layouts
-        return MapFollower(self._listener, dict.fromkeys(layouts, self.assembler), layouts)
 
     def _learn_configuration(self) -> tuple[list[int], bool]:
         """Read the SDO transfers until the mapping is known and unchanged for a while.
@@ -247,14 +241,6 @@ class FrameLog:
             configured_s,
         )
         return measured.period_s
-
-    def _relayout(self, can_id: int, data: bytes, now_s: float, assembler: Assembler) -> None:
-        """Handle a change of a node's mapping within the recording."""
-        self._listener.feed(can_id, data, now_s)
-        for _, layout in self._listener.poll(now_s):
-            if isinstance(layout, NodeLayout):
-                with suppress(DriveError):  # the daemon refuses it, too
-                    assembler.relayout(layout)
 
 
 def read_frame_record(path: Path, joint: JointFile | None, base_dir: Path, channel: str | None) -> Record:

@@ -9,7 +9,6 @@ import json
 import math
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -21,8 +20,9 @@ import zenoh.ext
 from drivelink._core import SYNC_COB_ID, Assembler
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cycle.following import MapFollower
+from drivelink.cycle.following import ConfigurationFollower, MapFollower, follow_log
 from drivelink.cycle.framesource import BusLostError
+from drivelink.cycle.objectcheck import RecentSamples
 from drivelink.cycle.pipeline import make_assembler
 from drivelink.cycle.sources import open_source
 from drivelink.errors import BusError, DriveError, ZenohError
@@ -201,7 +201,8 @@ class BusTap:
         if self._listener is not None:
             self._listener.adopt(layouts)
         self._assembler: Assembler | None = None
-        self._follower: MapFollower | None = None
+        self._follower: MapFollower | ConfigurationFollower | None = None
+        self._recent = RecentSamples(joint.bus.period_s)
         self._lacking = ""  # missing parts of a known mapping
         self._numbering = SyncNumbering(joint.bus.period_s, measure=True)
         self._stamp_ns = 0
@@ -251,18 +252,13 @@ class BusTap:
         sdo = 0x581 <= cob_id <= 0x67F
         if self._follower is None and (sdo or (passive and (cob_id == 0 or cob_id >= 0x700))):
             listener.feed(cob_id, data, stamp_ns * 1e-9)
-            for _, layout in listener.poll(stamp_ns * 1e-9):
-                if self._assembler is not None and isinstance(layout, NodeLayout):
-                    with suppress(DriveError):  # the daemon refuses it, too
-                        self._assembler.relayout(layout)
+            listener.poll(stamp_ns * 1e-9)
         if self._assembler is None:
             if listener.busy:
                 return
             try:
                 self._assembler = make_assembler(self._joint, tuple(listener.layouts.values()))
-                if passive:
-                    nodes = dict.fromkeys(listener.layouts, self._assembler)
-                    self._follower = MapFollower(listener, nodes, listener.layouts)
+                self._follower = follow_log(listener, self._assembler, self._recent)
             except DriveError as error:  # frames are recorded anyway
                 self._lacking, self._listener = str(error), None
                 return
@@ -270,6 +266,8 @@ class BusTap:
         if cob_id == SYNC_COB_ID and jump > 0:
             self._stamp_ns = stamp_ns
         sample = self._assembler.feed(cob_id, data, jump)
+        if sample is not None:
+            self._recent.add(sample)
         if self._follower is not None:
             self._follower.feed(cob_id, data, stamp_ns * 1e-9)
         if sample is not None:

@@ -1,0 +1,281 @@
+"""Holds what nodes say of their objects by SDO against what is in use: units as configured, values as mapped.
+
+It takes SDO frames and SYNCs in the order of the bus, live or from a log, and decides at a SYNC: a replay
+comes to the same at the same cycle. Who has asked makes no difference.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import islice
+
+from drivelink._core import Assembler
+from drivelink.canopen.layout import MappedObject, NodeLayout, Signal
+from drivelink.canopen.sdo_sniffer import SdoSniffer
+from estimator.sample import Sample
+
+__all__ = ["HISTORY_S", "Mismatch", "ObjectCheck", "RecentSamples", "Samples"]
+
+Address = tuple[int, int]
+Samples = Callable[[int, int], Sequence[Sample]]
+
+HISTORY_S = 2.0  # of samples: longer than a transfer and its surroundings; a new estimator starts from them
+_AROUND = 20  # cycles before a request and after its answer: a value of these is one of that time
+_ROUNDING = 2.0  # counts
+_SURE = 3  # answers in a row that contradict what is in use
+
+
+@dataclass(frozen=True, slots=True)
+class Mismatch:
+    """A node says something else than what is in use.
+
+    Attributes:
+        node: its id.
+        text: what.
+        signal: whose value differs; None: a unit.
+    """
+
+    node: int
+    text: str
+    signal: Signal | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Value:
+    """A mapped object, and where a sample has it."""
+
+    mapped: MappedObject
+    pick: Callable[[Sample], float]
+
+
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    """What a node has said of an object, and the numbers of the SYNCs before request and answer."""
+
+    address: Address
+    data: bytes
+    asked: int
+    answered: int
+
+
+@dataclass(slots=True)
+class _Node:
+    """One node.
+
+    Attributes:
+        assembler: of its joint.
+        samples: those after a SYNC, oldest first, at most so many.
+        motor: its motor, from 1 on (0: the link's).
+        since: the SYNC since which its frames are read as now.
+        units: unit objects with their numbers, as configured.
+        values: mapped objects.
+        sniffer: follows its SDO transfers.
+        asked: the SYNC before the present request.
+        answers: not judged yet.
+        doubts: by object, answers in a row that contradict what is in use.
+        found: the value that is contradicted.
+    """
+
+    assembler: Assembler
+    samples: Samples
+    motor: int
+    since: int
+    units: Mapping[Address, int]
+    values: Mapping[Address, _Value]
+    sniffer: SdoSniffer
+    asked: int = -1
+    answers: deque[_Answer] = field(default_factory=deque)
+    doubts: Counter[Address] = field(default_factory=Counter)
+    found: Mismatch | None = None
+
+
+class RecentSamples:
+    """The last samples of a joint.
+
+    Args:
+        period_s: of the cycle.
+    """
+
+    def __init__(self, period_s: float) -> None:
+        self._samples: deque[Sample] = deque(maxlen=round(HISTORY_S / period_s))
+
+    def add(self, sample: Sample) -> None:
+        """Take the next one."""
+        self._samples.append(sample)
+
+    def after(self, sequence: int, most: int) -> list[Sample]:
+        """Those after a SYNC, oldest first, at most so many."""
+        return list(islice((sample for sample in self._samples if sample.sequence > sequence), most))
+
+
+class ObjectCheck:
+    """The objects of all nodes of one bus.
+
+    Args:
+        timeout_s: of an SDO answer.
+    """
+
+    def __init__(self, timeout_s: float) -> None:
+        self._timeout_s = timeout_s
+        self._nodes: dict[int, _Node] = {}
+
+    def watch(
+        self, layout: NodeLayout, units: Mapping[Address, int], assembler: Assembler, samples: Samples
+    ) -> None:
+        """Begin with a node that has been configured.
+
+        Args:
+            layout: its frames.
+            units: its unit objects, as configured.
+            assembler: of its joint.
+            samples: the joint's samples after a SYNC, at most so many.
+        """
+        node_id, before = layout.node_id, self._nodes.get(layout.node_id)
+        node = self._nodes[node_id] = _Node(
+            assembler=assembler,
+            samples=samples,
+            motor=0 if layout.motor is None else layout.motor + 1,
+            since=assembler.sequence,
+            units=units,
+            values=_values(layout),
+            sniffer=SdoSniffer(
+                partial(self._watched, node_id), self._timeout_s, partial(self._take, node_id)
+            ),
+        )
+        if before is not None and before.found is not None:
+            if before.found.signal in {value.mapped.signal for value in node.values.values()}:
+                node.found = before.found
+            else:
+                assembler.contradict(node_id, False)
+
+    def objects(self, node: int) -> list[Address]:
+        """What can be asked of a node: values, then units."""
+        return [*self._nodes[node].values, *self._nodes[node].units]
+
+    def request(self, node: int, data: bytes, now_s: float) -> None:
+        """Take an SDO frame of a master."""
+        if node in self._nodes:
+            self._nodes[node].asked = self._nodes[node].assembler.sequence
+            self._nodes[node].sniffer.request(data, now_s)
+
+    def response(self, node: int, data: bytes, now_s: float) -> None:
+        """Take an SDO frame of a node."""
+        if node in self._nodes:
+            self._nodes[node].sniffer.response(data, now_s)
+
+    def undecided(self, node: int, address: Address) -> bool:
+        """Whether an answer waits for the cycles that it is compared with."""
+        return any(answer.address == address for answer in self._nodes[node].answers)
+
+    def doubts(self, node: int, address: Address) -> int:
+        """Answers in a row that contradict what is in use."""
+        return self._nodes[node].doubts[address]
+
+    def sync(self) -> list[Mismatch]:
+        """Take a SYNC, after the assemblers; return what has become sure.
+
+        The node's frames are not used until it is configured again.
+        """
+        found = []
+        for node_id, node in self._nodes.items():
+            while node.answers and _due(node, node.answers[0]):
+                answer = node.answers.popleft()
+                mismatch = self._judge(node_id, node, answer)
+                if mismatch is not None:
+                    node.assembler.distrust(node_id)
+                    found.append(mismatch)
+        return found
+
+    def contradiction(self, assembler: Assembler) -> tuple[int, Mismatch] | None:
+        """A motor (0: the link) of a joint whose frames carry something else than it says, and what."""
+        for node in self._nodes.values():
+            if node.assembler is assembler and node.found is not None:
+                return node.motor, node.found
+        return None
+
+    def _watched(self, node: int, index: int, subindex: int) -> bool:
+        return (index, subindex) in self._nodes[node].values or (index, subindex) in self._nodes[node].units
+
+    def _take(self, node_id: int, address: Address, data: bytes) -> None:
+        node = self._nodes[node_id]
+        node.answers.append(_Answer(address, data, node.asked, node.assembler.sequence))
+
+    def _judge(self, node_id: int, node: _Node, answer: _Answer) -> Mismatch | None:
+        address = answer.address
+        value = node.values.get(address)
+        signal = value.mapped.signal if value is not None else None
+        text: str | None
+        if address in node.sniffer.disputed:
+            text = f"{_name(address)} has two different answers: does another device answer for it?"
+        elif value is not None:
+            text = _value_text(node, value, answer)
+        else:
+            text = _unit_text(node.units[address], answer)
+        if text is None:
+            return None
+        if not text:
+            del node.doubts[address]
+            if value is not None and node.found is not None and node.found.signal is signal:
+                node.found = None
+                node.assembler.contradict(node_id, False)
+            return None
+        node.doubts[address] += 1
+        if node.doubts[address] != _SURE or node.found is not None:
+            return None
+        mismatch = Mismatch(node_id, f"node {node_id}: {text}", signal)
+        if value is not None:
+            node.found = mismatch
+            node.assembler.contradict(node_id, True)
+        return mismatch
+
+
+def _due(node: _Node, answer: _Answer) -> bool:
+    return node.assembler.sequence > answer.answered + _AROUND
+
+
+def _unit_text(configured: int, answer: _Answer) -> str:
+    """What an answer contradicts; empty: nothing."""
+    number = int.from_bytes(answer.data, "little")
+    if number == configured:
+        return ""
+    return f"{_name(answer.address)} was {configured} when it was configured, it is {number} now"
+
+
+def _value_text(node: _Node, value: _Value, answer: _Answer) -> str | None:
+    """What an answer contradicts; empty: nothing; None: there is too little to be compared."""
+    mapped, data = value.mapped, answer.data
+    size, before = (mapped.bits + 7) // 8, max(answer.asked - _AROUND - 1, node.since)
+    samples = node.samples(before, answer.answered + _AROUND - before)
+    places = [(value.pick(sample) + mapped.offset) / mapped.scale for sample in samples]
+    places = [place for place in places if math.isfinite(place)]
+    if len(data) < size or len(places) < _AROUND:
+        return None
+    low, high = min(places), max(places)
+    count = int.from_bytes(data[:size], "little", signed=mapped.signed)
+    off = count - 0.5 * (low + high)
+    if mapped.wraps:
+        off = math.remainder(off, mapped.modulus or 2**mapped.bits)
+    if abs(off) <= 1.5 * (high - low) + _ROUNDING:
+        return ""
+    return f"its frames carry {low:.0f} to {high:.0f} as {_name(answer.address)}, by SDO it is {count}"
+
+
+def _name(address: Address) -> str:
+    return f"0x{address[0]:04X}:{address[1]:02X}"
+
+
+def _values(layout: NodeLayout) -> dict[Address, _Value]:
+    """What a sample has of a node's frames."""
+    motor = layout.motor or 0
+    picks: dict[Signal, Callable[[Sample], float]] = {
+        Signal.MOTOR_POSITION: lambda sample: sample.motor_position_rad[motor],
+        Signal.MOTOR_TORQUE: lambda sample: sample.motor_torque_nm[motor],
+        Signal.MOTOR_VELOCITY: lambda sample: sample.motor_velocity_rad_s[motor],
+        Signal.LINK_POSITION: lambda sample: sample.link_position_rad,
+    }
+    mapped = [mapped for tpdo in layout.tpdos for mapped in tpdo.objects if mapped.signal in picks]
+    return {(one.index, one.subindex): _Value(one, picks[one.signal]) for one in mapped}

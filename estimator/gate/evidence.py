@@ -14,6 +14,7 @@ are relative to the recorded torque, so hypotheses are compared on the same data
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -108,9 +109,14 @@ class Balance:
             phi = self._q - _gridded(record, record.motor_position_rad[:, lever])
             self._loads = [self._through(phi**k)[0] for k in (1, 2)]
         self._springs: dict[float, tuple[list[FloatArray], float]] = {}
+        self._factors: dict[float, _Factors] = {}
         self.ratio = self._ratio()
         self._fits: dict[tuple[float, ...], Fit] = {}
-        self._best: tuple[float, FloatArray] = (math.inf, self._target)
+        self._best: tuple[float, float, FloatArray] = (
+            math.inf,
+            1.0,
+            np.zeros(0),
+        )
 
     def _through(self, x: FloatArray, derivatives: int = 0, *, held: bool = False) -> list[FloatArray]:
         """The signal and its derivatives (per sample) in every band, (bands, rows) each, without means."""
@@ -136,35 +142,41 @@ class Balance:
         return fit._replace(stiffness_nm_rad=fit.stiffness_nm_rad * abs(b / c))
 
     def _solve(self, a: float, b: float, c: float, B: float) -> Fit:
-        free = (-math.inf, math.inf)
-        low, high = sorted((B / INERTIA_FACTOR, B * INERTIA_FACTOR))
-        sense = math.copysign(1.0, a * b)
-        columns = [
-            (self._acceleration, low, high),
-            (sense * self._velocity, 0.0, math.inf),
-            (sense * self._sign, 0.0, math.inf),
-            (self._rate, *free),
+        free, sense = (-math.inf, math.inf), math.copysign(1.0, a * b)
+        bounds = [
+            (B / INERTIA_FACTOR, B * INERTIA_FACTOR),
+            (0.0, sense * math.inf),
+            (0.0, sense * math.inf),
+            free,
         ]
-        first, deflection = len(columns), 0.0
-        if self.motor.flexible and self._q is not None and self._link_rate is not None:
-            ramps, deflection = self._spring(self._q, a / c)
-            columns += [(-math.copysign(1.0, b * c) * x, 0.0, math.inf) for x in ramps]
-            columns.append((self._link_rate, *free))
-            columns += [(x, *free) for x in self._position]
-        else:
-            angle = a * self._theta  # gravity of whatever moves with a rigid joint
-            loads = [self._through(x)[0] for x in (np.sin(angle), np.cos(angle))]
-            columns += [(x, *free) for x in (*loads, *self._loads)]
-        x, left = _bounded(columns, self._target)
-        slope = 0.0
-        if self.motor.flexible:
-            pieces = x[first : first + _SEGMENTS + 2]
-            slope = float(np.mean(pieces[:_SEGMENTS]) + np.sum(pieces[_SEGMENTS:])) * self._unit
-        errors = np.hypot(left.std(axis=1), _FLOOR)
+        flexible = self.motor.flexible and self._q is not None
+        ratio = a / c if flexible else a
+        if ratio not in self._factors:
+            self._factors[ratio] = _factors(self._columns(ratio), self._target)
+        factors = self._factors[ratio]
+        pieces = slice(len(bounds), len(bounds) + _SEGMENTS + 2)
+        slope = deflection = 0.0
+        if flexible:
+            bounds += [(0.0, -math.copysign(math.inf, b * c))] * (_SEGMENTS + 2)
+        bounds += [free] * (len(factors.sizes) - len(bounds))
+        x, left = _bounded(factors, np.sort(np.array(bounds), axis=1))
+        if flexible:
+            rises = -math.copysign(1.0, b * c) * x[pieces]
+            slope = float(np.mean(rises[:_SEGMENTS]) + np.sum(rises[_SEGMENTS:])) * self._unit
+            deflection = self._springs[ratio][1]
+        errors = np.hypot(left[:-1], _FLOOR)
         score = float(np.sum(np.log(errors)))
         if score < self._best[0]:
-            self._best = score, left
-        return Fit(errors, float(left.sum(axis=0).std()), float(x[0]) / B, slope, deflection)
+            self._best = score, ratio, x
+        return Fit(errors, float(left[-1]), float(x[0]) / B, slope, deflection)
+
+    def _columns(self, ratio: float) -> list[FloatArray]:
+        """Columns of the balance, (bands, rows) each; `ratio` of q over theta_m, or the position's scale."""
+        own = [self._acceleration, self._velocity, self._sign, self._rate]
+        if self.motor.flexible and self._q is not None and self._link_rate is not None:
+            return [*own, *self._spring(self._q, ratio)[0], self._link_rate, *self._position]
+        angle = ratio * self._theta  # gravity of whatever moves with a rigid joint
+        return [*own, *(self._through(x)[0] for x in (np.sin(angle), np.cos(angle))), *self._loads]
 
     def _spring(self, q: FloatArray, ratio: float) -> tuple[list[FloatArray], float]:
         """Basis of a rising curve of q - ratio theta_m, and the deflection's size over the motion's.
@@ -185,10 +197,10 @@ class Balance:
         """Link over motor position as seen in the torque, which depends on both separately."""
         if self._q is None or not self.motor.flexible or self._link_rate is None:
             return None
-        free = (-math.inf, math.inf)
         q, theta = (self._through(x)[0] for x in (self._q, self._theta))
         nuisances = (self._acceleration, self._velocity, self._sign, self._rate, self._link_rate)
-        x, _ = _bounded([(c, *free) for c in (*nuisances, q, theta)], self._target)
+        factors = _factors([*nuisances, q, theta], self._target)
+        x, _ = _bounded(factors, np.tile((-math.inf, math.inf), (len(factors.sizes), 1)))
         return float(-x[-1] / x[-2]) if x[-2] else None
 
     @property
@@ -197,7 +209,9 @@ class Balance:
 
         n / sum r_k² over all lags, with the autocorrelation r of each band's residual.
         """
-        return np.array([_independent(x) for x in self._best[1]])
+        _, ratio, x = self._best
+        left = self._target - np.stack(self._columns(ratio), axis=-1) @ x
+        return np.array([_independent(one) for one in left])
 
 
 def _pieces(x: FloatArray) -> list[FloatArray]:
@@ -219,28 +233,45 @@ def _independent(x: FloatArray) -> float:
     return float(len(x) / (2.0 * float(r @ r) - 1.0))
 
 
-def _bounded(
-    columns: list[tuple[FloatArray, float, float]], target: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Bounded least squares, each band weighted by its residual: (x, residual (bands, rows))."""
-    A = np.stack([c[0] for c in columns], axis=-1)
-    size = np.sqrt(np.mean(A**2, axis=(0, 1)))
-    size[size == 0.0] = 1.0
-    A = A / size
-    low, high = (np.array([c[k] for c in columns]) * size for k in (1, 2))
-    joined = np.concatenate((A, target[..., None]), axis=-1) / math.sqrt(A.shape[1])
-    roots = np.stack(
-        [np.linalg.qr(band, mode="r") for band in joined]
-    )  # not squared: K and B are near to parallel
-    k = A.shape[-1]
+class _Factors(NamedTuple):
+    """Columns of a balance and its target, reduced to what least squares needs of them.
+
+    Attributes:
+        roots: (bands + 1, k + 1, k + 1) triangular factors of [columns, target], each band and their sum,
+            scaled so that norms are rms; not squared, as K and B are nearly parallel.
+        sizes: (k,) rms of the columns, by which they are divided.
+    """
+
+    roots: FloatArray
+    sizes: FloatArray
+
+
+def _factors(columns: Sequence[FloatArray], target: FloatArray) -> _Factors:
+    A = np.stack(columns, axis=-1)
+    sizes = np.sqrt(np.mean(A**2, axis=(0, 1)))
+    sizes[sizes == 0.0] = 1.0
+    joined = np.concatenate((A / sizes, target[..., None]), axis=-1) / math.sqrt(A.shape[1])
+    every = np.concatenate((joined, joined.sum(axis=0)[None]))
+    return _Factors(np.asarray(np.linalg.qr(every, mode="r")), sizes)
+
+
+def _bounded(factors: _Factors, bounds: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Least squares with (k, 2) bounds, each band weighted by its residual.
+
+    Returns:
+        (k,) coefficients; (bands + 1,) residual rms of each band and of their sum.
+    """
+    roots, sizes = factors
+    k = len(sizes)
     ridge = np.hstack((_RIDGE * np.eye(k), np.zeros((k, 1))))
+    limits = (bounds[:, 0] * sizes, bounds[:, 1] * sizes)
     left = np.linalg.norm(roots[:, :, -1], axis=1)
     for _ in range(_ROUNDS):
-        weighted = (roots / np.hypot(left, _FLOOR)[:, None, None]).reshape(-1, k + 1)
+        weighted = (roots[:-1] / np.hypot(left[:-1], _FLOOR)[:, None, None]).reshape(-1, k + 1)
         R = np.asarray(np.linalg.qr(np.vstack([weighted, ridge]), mode="r"))
-        x = lsq_linear(R[:k, :k], R[:k, k], (low, high), method="bvls").x
+        x = lsq_linear(R[:k, :k], R[:k, k], limits, method="bvls").x
         left = np.linalg.norm(roots @ np.append(-x, 1.0), axis=1)
-    return x / size, target - A @ x
+    return x / sizes, left
 
 
 def _gridded(record: Record, x: FloatArray) -> FloatArray:

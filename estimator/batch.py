@@ -18,6 +18,7 @@ from estimator.diagnosis.bandwidth import choose_bandwidth
 from estimator.diagnosis.choices import choice, least_rows
 from estimator.diagnosis.covariance import design_effects, hac_covariance
 from estimator.diagnosis.frame import Frame
+from estimator.diagnosis.heldout import Held, held_out
 from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.diagnosis.search import Search
 from estimator.diagnosis.stiffness import middle
@@ -27,7 +28,7 @@ from estimator.model import JointModel, ParameterValue, Transmission
 from estimator.sample import SIGMA_95, FloatArray, Record
 from estimator.transmissions import MODELS, RIGID, UNKNOWN
 
-__all__ = ["JointFit", "Key", "TransmissionFit", "fit", "fit_joint", "joint_problem", "transmission_fits"]
+__all__ = ["JointFit", "Key", "TransmissionFit", "fit", "fit_joint", "transmission_fits"]
 
 _LOOKED_AT = 33  # deflections from zero to the largest one
 _HIGHEST_ORDER = 4
@@ -112,19 +113,21 @@ class JointFit(NamedTuple):
     """A fitted joint.
 
     Attributes:
-        records: the recordings without rows that contain NaN.
-        problem: the recordings, and the joint with its orders chosen.
+        problem: the recordings without rows that contain NaN, and the joint with its orders chosen.
+        held: each recording in turn, or blocks of the only one.
+        surplus: mean square of the errors on held-out data over that on the fitted data, see `Held.surplus`.
         fitted: the hypothesis.
         covariance: (k, k) of its parameters; includes the uncertainty whether a reading has an error at all.
         absent: optional errors that the data do not support.
         doubts: units and signs that the recordings do not reveal, one line each.
     """
 
-    records: Sequence[Record]
     problem: Problem
+    held: Held
+    surplus: float
     fitted: Fitted
     covariance: FloatArray
-    absent: frozenset[Key]
+    absent: frozenset[Key] = frozenset()
     doubts: tuple[str, ...] = ()
 
     def places(self, key: Key) -> list[int]:
@@ -189,11 +192,14 @@ def fit_joint(
             f"bandwidth: expected more than 0 and at most {nyquist:g} Hz, got {bandwidth_hz:g}"
         )
     problem, fitted = _ordered(usable, _bare(model), bandwidth_hz)
+    held = held_out(problem)
+    surplus = held.surplus(fitted)
     doubts = tuple(dict.fromkeys(remark for remark in remarks if remark))
-    return _aligned(usable, problem, fitted)._replace(doubts=doubts)
+    free = JointFit(problem, held, surplus, fitted, _covariance(problem, fitted, surplus), doubts=doubts)
+    return _aligned(free)
 
 
-def joint_problem(records: Sequence[Record], model: JointModel, bandwidth_hz: float) -> Problem:
+def _joint_problem(records: Sequence[Record], model: JointModel, bandwidth_hz: float) -> Problem:
     """The regression of a healthy joint.
 
     Raises:
@@ -241,7 +247,7 @@ def _bare(model: JointModel) -> JointModel:
 
 def _ordered(records: Sequence[Record], model: JointModel, bandwidth_hz: float) -> tuple[Problem, Fitted]:
     """The best fit; each undeclared polynomial order is the one with the most evidence."""
-    problem = joint_problem(records, model, bandwidth_hz)
+    problem = _joint_problem(records, model, bandwidth_hz)
     fitted = problem.null()
     for i, motor in enumerate(model.motors):
         if motor.transmission.model != "polynomial" or motor.transmission.order is not None:
@@ -250,42 +256,40 @@ def _ordered(records: Sequence[Record], model: JointModel, bandwidth_hz: float) 
         for order in range(1, _HIGHEST_ORDER + 1):
             own = replace(motor, transmission=replace(motor.transmission, order=order))
             motors = (*problem.model.motors[:i], own, *problem.model.motors[i + 1 :])
-            one = joint_problem(records, replace(problem.model, motors=motors), bandwidth_hz)
+            one = _joint_problem(records, replace(problem.model, motors=motors), bandwidth_hz)
             tried.append((one, one.null()))
         closest = min((h for _, h in tried), key=lambda h: float(np.sum(np.log(h.posterior.sigma))))
         problem, fitted = max(tried, key=lambda pair: pair[1].evidence(closest))
     return problem, fitted
 
 
-def _aligned(records: Sequence[Record], problem: Problem, free: Fitted) -> JointFit:
+def _aligned(free: JointFit) -> JointFit:
     """The fit without unsupported optional errors, removed one at a time, the least probable first.
 
     The covariance is that of the mixture of both hypotheses, weighted by their odds.
     """
-    everything = _covariance(problem, free)
-    fitted, covariance, absent = free, everything, frozenset[Key]()
+    joint, problem = free, free.problem
     while True:
-        joint = JointFit(records, problem, fitted, covariance, absent)
         odds = {key: _odds_of_zero(joint, [key]) for key in _optional(joint)}
         doubtful = [key for key in odds if odds[key] > math.log(choice("even") / (1.0 - choice("even")))]
         if not doubtful:
             break
-        absent |= {max(doubtful, key=lambda key: odds[key])}
+        absent = joint.absent | {max(doubtful, key=lambda key: odds[key])}
         pinned = dict.fromkeys(absent, (0.0,))
-        fitted = problem.fit((), fitted.base, fitted.corrections, pinned=pinned)
-        covariance = _covariance(problem, fitted)
-    if not absent:
+        fitted = problem.fit((), joint.fitted.base, joint.fitted.corrections, pinned=pinned)
+        covariance = _covariance(problem, fitted, joint.surplus)
+        joint = joint._replace(fitted=fitted, covariance=covariance, absent=absent)
+    if not joint.absent:
         return joint
-    full = JointFit(records, problem, free, everything, frozenset())
-    weight = 1.0 / (1.0 + math.exp(min(_odds_of_zero(full, sorted(absent, key=str)), 700.0)))
-    apart = _totals(free) - _totals(fitted)
-    mixed = (1.0 - weight) * covariance + weight * (everything + np.outer(apart, apart))
+    weight = 1.0 / (1.0 + math.exp(min(_odds_of_zero(free, sorted(joint.absent, key=str)), 700.0)))
+    apart = _totals(free.fitted) - _totals(joint.fitted)
+    mixed = (1.0 - weight) * joint.covariance + weight * (free.covariance + np.outer(apart, apart))
     return joint._replace(covariance=mixed)
 
 
-def _covariance(problem: Problem, fitted: Fitted) -> FloatArray:
+def _covariance(problem: Problem, fitted: Fitted, surplus: float) -> FloatArray:
     """Covariance of the parameters; one held at its bound by a sign constraint keeps its prior variance."""
-    covariance = hac_covariance(problem, fitted)
+    covariance = hac_covariance(problem, fitted, surplus)
     held = np.flatnonzero(fitted.posterior.bound & [s.kind in ("everyday", "base") for s in fitted.slots])
     covariance[held, held] = fitted.regression.std[held] ** 2
     return covariance
@@ -337,7 +341,7 @@ def transmission_fits(joint: JointFit) -> list[TransmissionFit]:
     left = fitted.regression.residual(fitted.posterior.x)
     base = fitted.moved_base(problem)
     spring = np.concatenate([fitted.base.torque(frame) for frame in frames])
-    search, effects = Search(problem, null=fitted), design_effects(problem, fitted)
+    search, effects = Search(problem, null=fitted), design_effects(problem, fitted, joint.surplus)
     made = []
     for i, (motor, law) in enumerate(zip(problem.model.motors, base.models(frames[0]), strict=True)):
         rows = problem.group % problem.equations == i

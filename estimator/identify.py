@@ -10,12 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtrc
 
-from estimator.batch import JointFit, TransmissionFit, fit_joint, joint_problem, transmission_fits
+from estimator.batch import JointFit, TransmissionFit, fit_joint, transmission_fits
 from estimator.diagnosis.candidates import sign_smoothing
-from estimator.diagnosis.heldout import on_other
+from estimator.diagnosis.heldout import Residual, residual_of, wider
 from estimator.effects import elements
 from estimator.model import Effect, JointModel, LinkDynamics, Motor, Transmission
-from estimator.sample import FloatArray, Record
+from estimator.sample import Record
 from estimator.transmissions import RIGID
 
 __all__ = ["Identified", "Left", "RecordingFit", "identify"]
@@ -38,10 +38,10 @@ class Left(NamedTuple):
 
 
 class RecordingFit(NamedTuple):
-    """Residual of one recording: fitted with the others, and under a fit of the others alone."""
+    """Residual of one recording: fitted, and under a fit of the others alone (of blocks of the only one)."""
 
     train: Left
-    validation: Left | None
+    validation: Left
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,6 +53,7 @@ class Identified:
         model: the joint with fitted transmissions, inertias, dampings, link and readings.
         link_std: standard deviations of the link's dynamics, by name.
         recordings: residual of each recording.
+        surplus: mean square of the errors on held-out data over that on the fitted data.
         notes: remarks on the numbers, one line each.
     """
 
@@ -60,6 +61,7 @@ class Identified:
     model: JointModel
     link_std: dict[str, float] = field(default_factory=dict)
     recordings: tuple[RecordingFit, ...] = ()
+    surplus: float = 1.0
     notes: tuple[str, ...] = ()
 
 
@@ -82,7 +84,7 @@ def identify(
     """
     joint = fit_joint(record, model, bandwidth_rad_s)
     fits = transmission_fits(joint)
-    notes = list(joint.doubts)
+    notes = [*joint.doubts, *wider(joint.surplus)]
     motors = tuple(
         replace(_fitted(motor, one), effects=motor.effects)
         if motor.flexible and not one.excited  # the readings' errors show through the spring
@@ -93,7 +95,12 @@ def identify(
     link_effects = _effects(joint, model.link_effects, None, notes)
     found = replace(model, motors=motors, link=link, link_effects=link_effects)
     return Identified(
-        fits=fits, model=found, link_std=link_std, recordings=_recordings(joint), notes=tuple(notes)
+        fits=fits,
+        model=found,
+        link_std=link_std,
+        recordings=_recordings(joint),
+        surplus=joint.surplus,
+        notes=tuple(notes),
     )
 
 
@@ -180,32 +187,13 @@ def _link(joint: JointFit) -> tuple[LinkDynamics | None, dict[str, float]]:
 
 
 def _recordings(joint: JointFit) -> tuple[RecordingFit, ...]:
-    """Residual of each recording, fitted and left out."""
-    problem, fitted = joint.problem, joint.fitted
-    residual, torque = fitted.regression.residual(fitted.posterior.x), problem.torque()
-    motors = problem.group % problem.equations < len(problem.model.motors)
-    made = []
-    for k in range(len(problem.signals)):
-        mine = motors & (problem.group // problem.equations == k)
-        made.append(RecordingFit(_left(residual[mine], torque[mine]), _left_out(joint, k)))
-    return tuple(made)
+    """Residual of each recording, fitted and held out."""
+    recording = joint.problem.group // joint.problem.equations
+    return tuple(
+        RecordingFit(_left(residual_of(joint.problem, joint.fitted, recording == k)), _left(one))
+        for k, one in enumerate(joint.held.residuals(joint.fitted))
+    )
 
 
-def _left_out(joint: JointFit, k: int) -> Left | None:
-    """Residual of the k-th recording under a fit of the others; only its own zeros and offsets are fitted."""
-    problem, fitted = joint.problem, joint.fitted
-    records = joint.records
-    if len(records) < 2:
-        return None
-    rest = [j for j in range(len(records)) if j != k]
-    bandwidth = problem.signals[0].bandwidth_hz
-    others = joint_problem([records[j] for j in rest], problem.model, bandwidth)
-    corrections = tuple(fitted.corrections[j] for j in rest)
-    there = others.fit((), fitted.base, corrections, pinned=fitted.pinned)
-    left, torque, motors = on_other(joint_problem([records[k]], problem.model, bandwidth), there)
-    return _left(left[motors], torque[motors])
-
-
-def _left(residual: FloatArray, torque: FloatArray) -> Left:
-    rms = float(np.sqrt(np.mean(residual**2)))
-    return Left(rms, rms / max(float(np.sqrt(np.mean(torque**2))), 1e-300))
+def _left(residual: Residual) -> Left:
+    return Left(residual.rms_nm, residual.relative)

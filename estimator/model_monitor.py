@@ -73,8 +73,15 @@ def can_monitor(model: JointModel) -> bool:
     return all(m.transmission.model == "none" or m.transmission.parameters for m in model.motors)
 
 
-def measure_baseline(record: Record | Sequence[Record], model: JointModel) -> ResidualBaseline:
+def measure_baseline(
+    record: Record | Sequence[Record], model: JointModel, surplus: float = 1.0
+) -> ResidualBaseline:
     """Measure the baseline of a model on recordings that it explains (at most two minutes of each).
+
+    Args:
+        record: of one or several runs.
+        model: fitted to them.
+        surplus: mean square of its errors on other data over that on these.
 
     Raises:
         EstimatorError: they have less than two whole seconds after the filters have settled.
@@ -95,7 +102,7 @@ def measure_baseline(record: Record | Sequence[Record], model: JointModel) -> Re
     usual = np.sqrt(np.mean(torque**2, axis=0))
     logarithm = 2.0 * np.log(residual / np.maximum(torque / usual, 1.0))
     return ResidualBaseline(
-        residual_nm=tuple(np.exp(0.5 * np.mean(logarithm, axis=0)).tolist()),
+        residual_nm=tuple((math.sqrt(surplus) * np.exp(0.5 * np.mean(logarithm, axis=0))).tolist()),
         torque_nm=tuple(usual.tolist()),
         log_std=tuple(np.std(logarithm, axis=0, ddof=1).tolist()),
         seconds=len(residuals),

@@ -183,5 +183,5 @@ def test_a_baseline_that_cannot_be_measured_is_a_warning(caplog: pytest.LogCaptu
     )
     known = Transmission(model="linear", parameters={"k_nm_rad": 100.0})
     model = JointModel(arrangement="single", motors=(Motor(inertia_kg_m2=0.1, transmission=known),))
-    assert floor_entry(record, model) == {}
+    assert floor_entry(record, model, 1.0) == {}
     assert "the daemon cannot raise the model alarm: " in caplog.text

@@ -103,7 +103,7 @@ def _as_json(found: Identified, paths: Sequence[Path]) -> dict[str, Any]:
             {
                 "recording": path.name,
                 "train": one.train._asdict(),
-                "validation": one.validation and one.validation._asdict(),
+                "validation": one.validation._asdict(),
             }
             for path, one in zip(paths, found.recordings, strict=True)
         ]
@@ -176,7 +176,7 @@ def _left(found: Identified, paths: Sequence[Path]) -> Table:
     for column in ("recording", "fitted", "left out"):
         table.add_column(column, justify="left" if column == "recording" else "right")
     for path, one in zip(paths, found.recordings, strict=True):
-        cells = [f"{left.rms_nm:.3g} N·m  {left.relative:.2%}" if left else "" for left in one]
+        cells = [f"{left.rms_nm:.3g} N·m  {left.relative:.2%}" for left in one]
         table.add_row(path.name, *cells)
     return table
 
@@ -256,7 +256,7 @@ def _write(args: argparse.Namespace, source: JointText, found: Identified, recor
     if link:
         changes["link"] = link
     provenance = {
-        **floor_entry(records, model),
+        **floor_entry(records, model, found.surplus),
         "fit": {
             "recording": ", ".join(path.name for path in args.recording),
             "seconds": sum(float((one.sequence[-1] - one.sequence[0]) * one.period_s) for one in records),

@@ -47,7 +47,7 @@ def write(
     if at_link:
         changes["link"] = {"effect": at_link}
     changes["provenance"] = {
-        **floor_entry(record, diagnosed_model(joint, outcome)),
+        **floor_entry(record, diagnosed_model(joint, outcome), outcome.surplus),
         "diagnosis": {
             "recording": recording,
             "seconds": float((record.sequence[-1] - record.sequence[0]) * record.period_s),

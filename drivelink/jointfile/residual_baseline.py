@@ -19,12 +19,14 @@ _KEY = "floor"
 _LOG = logging.getLogger(__name__)
 
 
-def floor_entry(record: Record | Sequence[Record], model: JointModel) -> dict[str, Any]:
-    """Entry of [provenance] with the baseline; empty, with a log line, if it cannot be measured."""
+def floor_entry(record: Record | Sequence[Record], model: JointModel, surplus: float) -> dict[str, Any]:
+    """Entry of [provenance] with the baseline (see `measure_baseline`); empty, with a log line, if it cannot
+    be measured.
+    """
     if not can_monitor(model):
         return {}
     try:
-        return {_KEY: measure_baseline(record, model).as_dict()}
+        return {_KEY: measure_baseline(record, model, surplus).as_dict()}
     except EstimatorError as error:
         _LOG.warning("no residual baseline is written, so the daemon cannot raise the model alarm: %s", error)
         return {}

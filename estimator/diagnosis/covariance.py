@@ -27,7 +27,7 @@ _LEVEL = 0.975  # of a two-sided 95 % interval
 Labels = NDArray[np.int64]
 
 
-def hac_covariance(problem: Problem, fitted: Fitted) -> FloatArray:
+def hac_covariance(problem: Problem, fitted: Fitted, surplus: float = 1.0) -> FloatArray:
     """(k, k) covariance of the parameters, at least that of the posterior.
 
     Standard deviations are scaled so that 1.96 of them are the 95 % interval of a t distribution, whose
@@ -36,24 +36,24 @@ def hac_covariance(problem: Problem, fitted: Fitted) -> FloatArray:
     Args:
         problem: the recordings.
         fitted: to all of them.
+        surplus: mean square of the errors over that of the residual (`Held.surplus`).
     """
-    free, moderated, freedom = _moderated(problem, fitted)
+    free, moderated, freedom = _moderated(problem, fitted, surplus)
     out = np.zeros((len(fitted.posterior.x),) * 2)
     wider = student.ppf(_LEVEL, freedom) / student.ppf(_LEVEL, np.inf)
-    least = np.sqrt(np.maximum(1.0 / np.maximum(np.diag(moderated), 1e-300), 1.0))
-    unit = _unit(fitted, free) * wider * least
+    unit = _unit(fitted, free) * wider
     out[np.ix_(free, free)] = moderated * np.outer(unit, unit)
     return out
 
 
-def design_effects(problem: Problem, fitted: Fitted) -> FloatArray:
+def design_effects(problem: Problem, fitted: Fitted, surplus: float = 1.0) -> FloatArray:
     """(k,) variance of each parameter over that of independent rows, at least 1.
 
     So many rows have the information of one (Kish, Survey Sampling, 1965).
     """
-    free, moderated, _ = _moderated(problem, fitted)
+    free, moderated, _ = _moderated(problem, fitted, surplus)
     out = np.ones(len(fitted.posterior.x))
-    out[free] = np.maximum(np.diag(moderated), 1.0)
+    out[free] = np.diag(moderated)
     return out
 
 
@@ -62,13 +62,15 @@ def _unit(fitted: Fitted, free: NDArray[np.int64]) -> FloatArray:
     return np.sqrt(np.maximum(np.diag(fitted.posterior.covariance)[free], 1e-300))
 
 
-def _moderated(problem: Problem, fitted: Fitted) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
+def _moderated(
+    problem: Problem, fitted: Fitted, surplus: float
+) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
     """(free parameters, their covariance over the posterior's deviations, degrees of freedom of each).
 
     The clustered covariance is that by stretches of time plus that by kinds of motion minus that of rows that
-    share both, plus the priors' part. With few groups it is uncertain, so it is moderated by the posterior's,
-    which counts as a number of groups (Smyth, Statistical Applications in Genetics and Molecular Biology 3,
-    2004).
+    share both. With few groups it is uncertain, so it is moderated by that of independent errors, which
+    counts as a number of groups (Smyth, Statistical Applications in Genetics and Molecular Biology 3, 2004).
+    The priors' part is added; errors beyond the residual do not change it.
     """
     posterior = fitted.posterior
     free = np.flatnonzero(~posterior.bound)
@@ -82,11 +84,13 @@ def _moderated(problem: Problem, fitted: Fitted) -> tuple[NDArray[np.int64], Flo
     by_time, freedom = _clustered(fitted, free, unit, bread, stretch)
     by_kind, by_both = (_clustered(fitted, free, unit, bread, x)[0] for x in (kind, both))
     values, vectors = np.linalg.eigh(by_kind - by_both)
-    prior = np.diag((unit / fitted.regression.std[free]) ** 2)
-    clustered = by_time + (vectors * np.maximum(values, 0.0)) @ vectors.T + bread @ prior @ bread
+    clustered = by_time + (vectors * np.maximum(values, 0.0)) @ vectors.T
+    prior = bread @ np.diag((unit / fitted.regression.std[free]) ** 2) @ bread
     total = freedom + choice("moderation")
     own, theirs = np.sqrt(choice("moderation") / total), np.sqrt(freedom / total)
-    return free, bread * np.outer(own, own) + clustered * np.outer(theirs, theirs), total
+    errors = (bread - prior) * np.outer(own, own) + clustered * np.outer(theirs, theirs)
+    least = np.sqrt(np.maximum(1.0 / np.maximum(np.diag(prior + errors), 1e-300), 1.0))
+    return free, (prior + surplus * errors) * np.outer(least, least), total
 
 
 def _clustered(

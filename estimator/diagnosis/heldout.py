@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +12,59 @@ from numpy.typing import NDArray
 from estimator.diagnosis.beliefs import OF_RUN
 from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.diagnosis.result import Errors
-from estimator.model import JointModel
 from estimator.sample import FloatArray, Record
 
-__all__ = ["Held", "errors_of", "held_out"]
+__all__ = ["Held", "Residual", "errors_of", "held_out", "residual_of", "wider"]
 
-_Left = tuple[FloatArray, FloatArray, NDArray[np.bool_]]  # error, torque, rows of the motors' balances
+
+class Residual(NamedTuple):
+    """What a model leaves of some rows.
+
+    Attributes:
+        left_nm: (n,) residual.
+        torque_nm: (n,) measured torque without its mean.
+        motors: (n,) whether a row belongs to a motor's balance.
+    """
+
+    left_nm: FloatArray
+    torque_nm: FloatArray
+    motors: NDArray[np.bool_]
+
+    @property
+    def rms_nm(self) -> float:
+        """Of the motors' balances."""
+        return float(np.sqrt(np.mean(self.left_nm[self.motors] ** 2)))
+
+    @property
+    def relative(self) -> float:
+        """The same over the rms of the measured torque."""
+        return self.rms_nm / max(float(np.sqrt(self.torque_square)), 1e-300)
+
+    @property
+    def square(self) -> float:
+        """Mean square of all balances."""
+        return float(np.mean(self.left_nm**2))
+
+    @property
+    def torque_square(self) -> float:
+        """Mean square of the measured torque."""
+        return float(np.mean(self.torque_nm[self.motors] ** 2))
+
+
+class Fold(NamedTuple):
+    """A fit, and what takes no part in it.
+
+    Attributes:
+        fitted: the data fitted.
+        kept: which of all recordings these are.
+        other: the held-out recording; None: the held-out blocks of `fitted`.
+        like: rows of the whole problem whose residual it should equal.
+    """
+
+    fitted: Problem
+    kept: Sequence[int]
+    other: Problem | None
+    like: NDArray[np.bool_]
 
 
 class Held:
@@ -24,28 +72,37 @@ class Held:
 
     Args:
         problem: the data for fitting.
-        others: problems of held-out recordings, each with the fitted recordings; empty: the held-out blocks
-            of `problem`.
+        folds: how they are held out.
     """
 
-    def __init__(self, problem: Problem, others: Sequence[tuple[Problem, Problem]]) -> None:
-        self._problem, self._others = problem, others
-        self._memo: dict[int, tuple[Fitted, list[_Left]]] = {}
+    def __init__(self, problem: Problem, folds: Sequence[Fold]) -> None:
+        self._problem, self._folds = problem, folds
+        self._memo: dict[int, tuple[Fitted, list[Residual]]] = {}
+
+    def residuals(self, fitted: Fitted) -> list[Residual]:
+        """Held-out residual of each fold, the model fitted again to what is kept."""
+        if id(fitted) not in self._memo:
+            self._memo[id(fitted)] = fitted, [self._residual(fitted, fold) for fold in self._folds]
+        return self._memo[id(fitted)][1]
+
+    def _residual(self, fitted: Fitted, fold: Fold) -> Residual:
+        again = fitted
+        if fold.fitted is not self._problem:
+            corrections = tuple(fitted.corrections[k] for k in fold.kept)
+            again = fold.fitted.fit(
+                fitted.terms, fitted.base, corrections, extra=fitted.extra, pinned=fitted.pinned
+            )
+        if fold.other is None:
+            return residual_of(fold.fitted, again, ~fold.fitted.used)
+        return _on_other(fold.other, again)
 
     def squared(self, fitted: Fitted) -> float:
         """Mean squared error of all balances, relative to each recording's torque."""
-        return float(
-            np.mean(
-                [
-                    np.mean(left**2) / np.mean(torque[motors] ** 2)
-                    for left, torque, motors in self._left(fitted)
-                ]
-            )
-        )
+        return float(np.mean([one.square / one.torque_square for one in self.residuals(fitted)]))
 
     def log_likelihood(self, fitted: Fitted, like: Fitted) -> float:
         """Log likelihood of the held-out data, up to a constant, with the noise of another hypothesis."""
-        rows = sum(len(left) for left, _, _ in self._left(fitted))
+        rows = sum(len(one.left_nm) for one in self.residuals(fitted))
         least = float(np.mean(like.regression.floor**2)) / self._problem.torque_rms**2
         error = self.squared(fitted) + least  # errors at the level of rounding are not compared
         return -0.5 * rows / float(np.mean(like.times)) * float(np.log(error))
@@ -54,82 +111,66 @@ class Held:
         """Mean squared error on held-out data over that on the fitted data, at least 1.
 
         A true model leaves as much in both. A wrong one claims too much information, by this factor (tempered
-        likelihood; Grünwald and van Ommen, Bayesian Analysis 12, 2017). The smaller of the absolute and the
-        relative error's: noise does not grow with the torque, a model's error does.
+        likelihood; Grünwald and van Ommen, Bayesian Analysis 12, 2017). A recording is compared with itself
+        where it is fitted as well, as each has its own noise. The smaller of the absolute and the relative
+        error's: noise does not grow with the torque, a model's error does.
         """
-        problem = self._problem
         least = float(np.mean(fitted.regression.floor**2))
-        here, torque, motors = _balances(problem, fitted, problem.used)
-        inside, scale = float(np.mean(here**2)) + least, float(np.mean(torque[motors] ** 2))
-        outside = [
-            (float(np.mean(left**2)) + least, float(np.mean(t[m] ** 2))) for left, t, m in self._left(fitted)
-        ]
-        absolute = float(np.mean([error for error, _ in outside])) / inside
-        relative = float(np.mean([error / max(size, 1e-300) for error, size in outside])) * scale / inside
-        return max(min(absolute, relative), 1.0)
+        ratios = []
+        for fold, outside in zip(self._folds, self.residuals(fitted), strict=True):
+            inside = residual_of(self._problem, fitted, fold.like)
+            larger = max(outside.torque_square / max(inside.torque_square, 1e-300), 1.0)
+            ratios.append((outside.square + least) / (inside.square + least) / larger)
+        return max(float(np.mean(ratios)), 1.0)
 
     def errors(self, before: Fitted, after: Fitted) -> Errors:
         """Errors of all held-out data."""
-        first, second = self._left(before), self._left(after)
-        return _errors(
-            np.concatenate([x[m] for x, _, m in first]),
-            np.concatenate([x[m] for x, _, m in second]),
-            np.concatenate([t[m] for _, t, m in first]),
-        )
+        return _errors(_joined(self.residuals(before)), _joined(self.residuals(after)))
 
     def of(self, k: int, before: Fitted, after: Fitted) -> Errors | None:
         """Errors of the k-th recording when held out; None if it never is."""
-        if len(self._others) < 2:
+        if len(self._folds) < 2:
             return None
-        (first, torque, motors), (second, _, _) = self._left(before)[k], self._left(after)[k]
-        return _errors(first[motors], second[motors], torque[motors])
-
-    def _left(self, fitted: Fitted) -> list[_Left]:
-        """Residual of each held-out recording."""
-        if id(fitted) in self._memo:
-            return self._memo[id(fitted)][1]
-        problem = self._problem
-        if not self._others:
-            made = [_balances(problem, fitted, ~problem.used)]
-        else:
-            made = []
-            for rest, other in self._others:
-                again = fitted if rest is problem else _refitted(rest, fitted)
-                made.append(on_other(other, again))
-        self._memo[id(fitted)] = fitted, made
-        return made
+        return _errors(self.residuals(before)[k], self.residuals(after)[k])
 
 
-def held_out(
-    records: Sequence[Record],
-    model: JointModel,
-    bandwidth_hz: float,
-    validation: Record | None,
-    problem: Problem,
-) -> Held:
+def held_out(problem: Problem, validation: Record | None = None) -> Held:
     """The validation recording; or each recording in turn; or blocks of the only one."""
+    records, every = problem.records, range(len(problem.records))
     if validation is not None:
-        return Held(problem, [(problem, Problem([validation], model, bandwidth_hz))])
+        return Held(problem, [Fold(problem, every, problem.alike([validation]), problem.used)])
     if len(records) == 1:
-        return Held(problem, [])
-    pairs = []
-    for k, record in enumerate(records):
-        rest = [r for j, r in enumerate(records) if j != k]
-        pairs.append((Problem(rest, model, bandwidth_hz), Problem([record], model, bandwidth_hz)))
-    return Held(problem, pairs)
+        blocks = problem if problem.held else problem.alike(records, held=True)
+        return Held(problem, [Fold(blocks, every, None, problem.used)])
+    folds = []
+    for k in every:
+        kept = [j for j in every if j != k]
+        rest, other = problem.alike([records[j] for j in kept]), problem.alike([records[k]])
+        folds.append(Fold(rest, kept, other, problem.group // problem.equations == k))
+    return Held(problem, folds)
+
+
+def residual_of(problem: Problem, fitted: Fitted, rows: NDArray[np.bool_]) -> Residual:
+    """Residual of some rows under a model fitted to that problem."""
+    left, torque, motors = _residual(problem, fitted, fitted.regression.residual(fitted.posterior.x))
+    return Residual(left[rows], torque[rows], motors[rows])
 
 
 def errors_of(problem: Problem, before: Fitted, after: Fitted, rows: NDArray[np.bool_]) -> Errors:
     """Errors of the motors' balances over some of the rows that were fitted."""
-    (first, torque, motors), (second, _, _) = (
-        _balances(problem, before, rows),
-        _balances(problem, after, rows),
-    )
-    return _errors(first[motors], second[motors], torque[motors])
+    return _errors(residual_of(problem, before, rows), residual_of(problem, after, rows))
 
 
-def on_other(other: Problem, fitted: Fitted) -> _Left:
-    """Errors of another recording under a model fitted elsewhere.
+def wider(surplus: float) -> list[str]:
+    """One sentence on a `Held.surplus` that shows in the intervals."""
+    factor = f"{np.sqrt(surplus):.1f}"
+    if factor == "1.0":
+        return []
+    return [f"held-out data leave {factor} times the error of the fitted data, which widens the intervals"]
+
+
+def _on_other(other: Problem, fitted: Fitted) -> Residual:
+    """Residual of another recording under a model fitted elsewhere.
 
     Only the recording's own offsets are fitted.
     """
@@ -151,34 +192,22 @@ def on_other(other: Problem, fitted: Fitted) -> _Left:
     if run:
         free = there.regression.design[:, run]
         left = left - free @ np.linalg.lstsq(free, left, rcond=1e-9)[0]
-    return (
-        _scaled(other, fitted, left),
-        other.torque(),
-        other.group % other.equations < len(other.model.motors),
-    )
+    return _residual(other, fitted, left)
 
 
-def _refitted(rest: Problem, fitted: Fitted) -> Fitted:
-    corrections = fitted.corrections[: len(rest.signals)]
-    return rest.fit(fitted.terms, fitted.base, corrections, extra=fitted.extra, pinned=fitted.pinned)
-
-
-def _balances(problem: Problem, fitted: Fitted, rows: NDArray[np.bool_]) -> _Left:
-    left = _scaled(problem, fitted, fitted.regression.residual(fitted.posterior.x))
-    motors = problem.group % problem.equations < len(problem.model.motors)
-    return left[rows], problem.torque()[rows], motors[rows]
-
-
-def _scaled(problem: Problem, fitted: Fitted, left: FloatArray) -> FloatArray:
-    """Errors relative to the declared torque if the torque's scale has been fitted."""
+def _residual(problem: Problem, fitted: Fitted, left: FloatArray) -> Residual:
+    """Residual of all rows; relative to the declared torque if the torque's scale has been fitted."""
     left = left.copy()
+    equation = problem.group % problem.equations
     for scale in fitted.regression.scales:
-        motor = scale.groups[0] % problem.equations
-        left[problem.group % problem.equations == motor] /= scale.size(fitted.posterior.x)
-    return left
+        left[equation == scale.groups[0] % problem.equations] /= scale.size(fitted.posterior.x)
+    return Residual(left, problem.torque(), equation < len(problem.model.motors))
 
 
-def _errors(before: FloatArray, after: FloatArray, torque: FloatArray) -> Errors:
-    sizes = [float(np.sqrt(np.mean(x**2))) for x in (before, after, torque)]
-    scale = max(sizes[2], 1e-300)
-    return Errors(sizes[0], sizes[1], sizes[0] / scale, sizes[1] / scale)
+def _joined(parts: Sequence[Residual]) -> Residual:
+    left, torque, motors = zip(*parts, strict=True)
+    return Residual(np.concatenate(left), np.concatenate(torque), np.concatenate(motors))
+
+
+def _errors(before: Residual, after: Residual) -> Errors:
+    return Errors(before.rms_nm, after.rms_nm, before.relative, after.relative)

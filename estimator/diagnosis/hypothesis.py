@@ -120,8 +120,8 @@ class Problem:
         calibrating: bool = False,
         least: int = 1,
     ) -> None:
-        self.model = model
-        self.calibrating = calibrating
+        self.records, self.model, self.bandwidth_hz = records, model, bandwidth_hz
+        self.held, self.calibrating = held, calibrating
         self.signals = [Signals(record, bandwidth_hz) for record in records]
         declared = declared_corrections(model)
         self.declared = declared
@@ -153,6 +153,10 @@ class Problem:
         self.smoothing_rad_s = max(
             signals.velocity_noise(i) for signals in self.signals for i in range(len(model.motors))
         )
+
+    def alike(self, records: Sequence[Record], held: bool = False) -> Problem:
+        """The same joint and filter with other recordings."""
+        return Problem(records, self.model, self.bandwidth_hz, held, self.calibrating)
 
     @property
     def period_s(self) -> float:

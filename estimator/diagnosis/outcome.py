@@ -26,10 +26,10 @@ _CHANNELS = {"torque_delay": "torque_delay_s", "deflection_offset": "deflection_
 
 
 def findings_of(
-    problem: Problem, found: Fitted, null: Fitted, standings: Sequence[Standing]
+    problem: Problem, found: Fitted, null: Fitted, standings: Sequence[Standing], surplus: float
 ) -> list[Finding]:
     """The effects, the most important first, including delays of more than a sample."""
-    std = np.sqrt(np.maximum(np.diag(hac_covariance(problem, found)), 0.0))
+    std = np.sqrt(np.maximum(np.diag(hac_covariance(problem, found, surplus)), 0.0))
     made = []
     total = float(np.sum(null.posterior.sigma**2))
     for k, term in enumerate(found.terms):
@@ -113,11 +113,11 @@ def _absolute(problem: Problem, found: Fitted, k: int, name: str, x: float) -> f
     return x * problem.unit_of(found.terms[k], name)
 
 
-def alignment_of(problem: Problem, after: Fitted, effects: list[Finding]) -> dict[str, float]:
+def alignment_of(problem: Problem, after: Fitted, effects: list[Finding], surplus: float) -> dict[str, float]:
     """Everyday corrections of the readings, by channel."""
     named = {(f.name, f.motor) for f in effects}
     pairs: dict[str, float] = {}
-    std = np.sqrt(np.maximum(np.diag(hac_covariance(problem, after)), 0.0))
+    std = np.sqrt(np.maximum(np.diag(hac_covariance(problem, after, surplus)), 0.0))
     for slot, x, sigma in zip(after.slots, after.posterior.x, std, strict=True):
         if abs(slot.taken + float(x)) < choice("sure") * sigma:
             continue
@@ -135,7 +135,7 @@ def alignment_of(problem: Problem, after: Fitted, effects: list[Finding]) -> dic
 
 
 def transmissions_of(
-    search: Search, after: Fitted, accounts: Sequence[tuple[float, Fitted]] = (), surplus: float = 1.0
+    search: Search, after: Fitted, accounts: Sequence[tuple[float, Fitted]], surplus: float
 ) -> tuple[tuple[Refitted, ...], list[str]]:
     """Each motor's transmission, and doubts about them.
 
@@ -145,7 +145,8 @@ def transmissions_of(
     held-out data is larger (`surplus`). An undetermined stiffness has no parameters, and a doubt.
     """
     problem = search.problem
-    covariance, effects = surplus * hac_covariance(problem, after), surplus * design_effects(problem, after)
+    covariance = hac_covariance(problem, after, surplus)
+    effects = design_effects(problem, after, surplus)
     made: list[Refitted] = []
     doubts = []
     for i, model in enumerate(after.base.models(problem.frames[0])):

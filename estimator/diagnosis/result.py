@@ -155,6 +155,7 @@ class Diagnosis:
         notes: further remarks, one line each.
         recordings: errors of each recording.
         stiffness: of each flexible transmission, before and after.
+        surplus: mean square of the errors on held-out data over that on the fitted data, at least 1.
     """
 
     verdict: Verdict
@@ -172,3 +173,4 @@ class Diagnosis:
     notes: tuple[str, ...] = ()
     recordings: tuple[RecordingErrors, ...] = ()
     stiffness: tuple[StiffnessCurve, ...] = ()
+    surplus: float = 1.0

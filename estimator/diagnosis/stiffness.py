@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimator.diagnosis.covariance import hac_covariance
+from estimator.diagnosis.frame import Frame
 from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.diagnosis.result import StiffnessCurve
 from estimator.sample import SIGMA_95, FloatArray
@@ -52,31 +53,33 @@ def middle(model: TransmissionModel, alpha: FloatArray, covariance: FloatArray, 
     return Middle(float(np.asarray(model.stiffness(at, alpha))[0]), float(np.sqrt(max(variance, 0.0))), slope)
 
 
-def stiffness_curves(problem: Problem, before: Fitted, after: Fitted) -> tuple[StiffnessCurve, ...]:
+def stiffness_curves(
+    problem: Problem, before: Fitted, after: Fitted, surplus: float
+) -> tuple[StiffnessCurve, ...]:
     """One curve for each flexible transmission, over the deflections of the first recording."""
+    both = [(fitted, hac_covariance(problem, fitted, surplus)) for fitted in (before, after)]
     frame, made = problem.frames[0], []
     for i, motor in enumerate(problem.model.motors):
         if not motor.flexible:
             continue
         reach = float(np.max(np.abs(frame.motors[i].deflection)))
         phi = np.linspace(-reach, reach, _POINTS)
-        made.append(
-            StiffnessCurve(i, phi, *_stiffness(problem, before, i, phi), *_stiffness(problem, after, i, phi))
-        )
+        curves = [_stiffness(frame, *one, i, phi) for one in both]
+        made.append(StiffnessCurve(i, phi, *curves[0], *curves[1]))
     return tuple(made)
 
 
 def _stiffness(
-    problem: Problem, fitted: Fitted, motor: int, phi: FloatArray
+    frame: Frame, fitted: Fitted, covariance: FloatArray, motor: int, phi: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """(stiffness, standard deviation) of one motor's transmission."""
-    model = fitted.base.models(problem.frames[0])[motor]
+    model = fitted.base.models(frame)[motor]
     nothing = np.full_like(phi, np.nan)
     if model is None:
         return nothing, nothing
     mine = [j for j, slot in enumerate(fitted.slots) if slot.kind == "base" and slot.motor == motor]
     alpha = np.array([fitted.slots[j].taken + fitted.posterior.x[j] for j in mine])
-    own = hac_covariance(problem, fitted)[np.ix_(mine, mine)]
+    own = covariance[np.ix_(mine, mine)]
     slopes = model.stiffness_jacobian(phi, alpha)
     variance = np.einsum("ij,jk,ik->i", slopes, own, slopes)
     return np.asarray(model.stiffness(phi, alpha)), np.sqrt(np.maximum(variance, 0.0))

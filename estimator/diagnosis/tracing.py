@@ -12,7 +12,7 @@ from estimator.diagnosis.certainty import accounts, standing
 from estimator.diagnosis.choices import choice, least_rows
 from estimator.diagnosis.curves import best_curve
 from estimator.diagnosis.excitation import advice_for, poor
-from estimator.diagnosis.heldout import Held, errors_of, held_out
+from estimator.diagnosis.heldout import Held, errors_of, held_out, wider
 from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.diagnosis.openorder import raised
 from estimator.diagnosis.outcome import (
@@ -76,7 +76,7 @@ def diagnose(
     problem = Problem(records, model, bandwidth, held=alone, least=least_rows())
     search = Search(problem, progress)
     progress("held-out data")
-    held = held_out(records, model, bandwidth, validation, problem)
+    held = held_out(problem, validation)
     leading = search.run()
     found = _chosen(search, held, [_gated(search, held, one) for one in leading])
     outcome = _Judge(search, held, leading[0], found, progress).diagnosis()
@@ -136,6 +136,7 @@ class _Judge:
     def diagnosis(self) -> Diagnosis:
         """Make verdict, findings and errors."""
         problem, found, null = self.problem, self.found, self.search.null
+        surplus = self._surplus()
         rivals = [self.search.rivals(found, k) for k in range(len(found.terms))]
         self.progress("free curves")
         curve = best_curve(self.search, null)
@@ -143,7 +144,7 @@ class _Judge:
         free = [] if curve is None else [curve]
         beside = accounts(self.search, found, [*others, *self.search.seen, *free])
         standings = [standing(self.search, found, k, beside) for k in range(len(found.terms))]
-        effects = findings_of(problem, found, null, standings)
+        effects = findings_of(problem, found, null, standings, surplus)
         verdict: Verdict = "effect" if effects else "sufficient"
         after, notes = found, []
         before = self._declared(effects)
@@ -172,7 +173,6 @@ class _Judge:
         if verdict == "effect" and self.held.squared(after) > self.held.squared(before):
             verdict = "insufficient_excitation"
             notes.append("on data that took no part the effects do not lower the error: they are not written")
-        surplus = self._surplus()
         explanations = [h for h in (found, *others) if h is not after]
         chances = [(self.search.chance(after, h, surplus), h) for h in explanations]
         transmissions, unsure = transmissions_of(self.search, after, chances, surplus)
@@ -187,14 +187,15 @@ class _Judge:
             validation=validation,
             floor_nm=tuple(self._floor(after)),
             transmissions=transmissions,
-            alignment=alignment_of(problem, after, effects),
+            alignment=alignment_of(problem, after, effects, surplus),
             rivals=tuple(rivals_of(self.search)),
             curves=curves_of(problem, after),
             series=series_of(problem, before, after),
             advice=tuple(dict.fromkeys(line for f in effects for line in advice_for(f.name, f.alternatives))),
-            notes=tuple(dict.fromkeys(notes)),
+            notes=tuple(dict.fromkeys((*notes, *wider(surplus)))),
+            surplus=surplus,
             recordings=self._recordings(before, after),
-            stiffness=stiffness_curves(problem, before, after),
+            stiffness=stiffness_curves(problem, before, after, surplus),
         )
 
     def _surplus(self) -> float:

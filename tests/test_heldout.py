@@ -1,0 +1,132 @@
+"""What data that took no part in a fit say about its intervals: ratios of errors that are known in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import diagnosiskit as kit
+import numpy as np
+import pytest
+
+from estimator.batch import fit_joint
+from estimator.diagnosis.covariance import hac_covariance
+from estimator.diagnosis.heldout import held_out
+from estimator.diagnosis.hypothesis import Problem
+from estimator.identify import identify
+from estimator.model import JointModel, Transmission
+from estimator.model_monitor import measure_baseline
+from estimator.sample import FloatArray, Record
+
+T, SECONDS, BANDWIDTH_HZ = 1e-3, 20.0, 15.0
+TONES_HZ = (0.35, 0.8, 1.25)  # of the motion; all have whole periods in the recording
+SOFT, STIFF = 130.0, 150.0
+STRANGE_HZ, STRANGE_NM = 3.1, 0.5  # of a torque that no law of the joint explains
+
+
+def motion(amplitude: float = 1.0) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(theta, phi, the motor's own torque B theta" + D theta') half a period after each sample."""
+    w = 2.0 * np.pi * np.array(TONES_HZ)
+    size = amplitude * np.array([0.4, 0.2, 0.1])
+    time = np.arange(round(SECONDS / T)) * T
+
+    def wave(order: int, at: FloatArray, scale: FloatArray) -> FloatArray:
+        """A derivative of a sum of the tones."""
+        return np.asarray(np.sin(np.outer(at, w) + 0.5 * np.pi * order) @ (scale * w**order))
+
+    later = time + 0.5 * T
+    own = kit.INERTIA * wave(2, later, size) + kit.DAMPING * wave(1, later, size)
+    # Not the shape of the acceleration: inertia and stiffness stay apart.
+    return wave(0, time, size), wave(0, time, amplitude * np.array([0.010, -0.008, 0.012])), own
+
+
+def record(stiffness: float, amplitude: float = 1.0, strange_nm: float = STRANGE_NM) -> Record:
+    """A joint with that spring, and one torque from elsewhere, at its balance to the last digit."""
+    theta, phi, own = motion(amplitude)
+    strange = strange_nm * np.sin(2.0 * np.pi * STRANGE_HZ * (np.arange(len(theta)) + 0.5) * T)
+    torque = own - stiffness * np.interp(np.arange(len(phi)) + 0.5, np.arange(len(phi)), phi) + strange
+    return Record(
+        period_s=T,
+        sequence=np.arange(len(theta)),
+        motor_position_rad=theta[:, None],
+        motor_torque_nm=torque[:, None],
+        link_position_rad=theta + phi,
+    )
+
+
+def mean_squares(amplitude: float = 1.0) -> tuple[float, float]:
+    """(of the deflection, of the strange torque)."""
+    return float(np.mean(motion(amplitude)[1] ** 2)), 0.5 * STRANGE_NM**2
+
+
+@pytest.fixture
+def model() -> JointModel:
+    return kit.model(linked=False)
+
+
+def test_a_true_model_leaves_as_much_in_data_that_took_no_part(model: JointModel) -> None:
+    first, second = (kit.World([{}], seed=seed).run()[0] for seed in (21, 22))
+    alone, both = Problem([first], model, BANDWIDTH_HZ), Problem([first, second], model, BANDWIDTH_HZ)
+    for found, problem in (
+        (held_out(alone), alone),
+        (held_out(alone, second), alone),
+        (held_out(both), both),
+    ):
+        assert 1.0 <= found.surplus(problem.null()) < 1.1
+
+
+def test_a_model_that_holds_in_one_recording_only_is_found_out_by_the_other(model: JointModel) -> None:
+    """Another stiffness there leaves (K2 - K1) phi beside the strange torque, which both have."""
+    deflection, strange = mean_squares()
+    expected = ((STIFF - SOFT) ** 2 * deflection + strange) / strange
+    soft, stiff = record(SOFT), record(STIFF)
+    problem = Problem([stiff], model, BANDWIDTH_HZ)
+    fitted = problem.null()
+    assert held_out(problem, soft).surplus(fitted) == pytest.approx(expected, rel=0.02)
+    # Blocks of one recording are alike: they cannot show it.
+    assert held_out(problem).surplus(fitted) == pytest.approx(1.0, abs=0.02)
+    # Where the torque is larger, so much of the error may be the torque's.
+    problem = Problem([soft], model, BANDWIDTH_HZ)
+    larger = float(np.var(stiff.motor_torque_nm) / np.var(soft.motor_torque_nm))
+    assert held_out(problem, stiff).surplus(problem.null()) == pytest.approx(expected / larger, rel=0.02)
+
+
+def test_a_larger_motion_alone_is_no_error_of_the_model(model: JointModel) -> None:
+    """The same relative error, an absolute one that is four times as large."""
+    small, large = record(SOFT, 1.0, STRANGE_NM), record(SOFT, 2.0, 2.0 * STRANGE_NM)
+    problem = Problem([small], model, BANDWIDTH_HZ)
+    assert held_out(problem, large).surplus(problem.null()) == pytest.approx(1.0, abs=0.02)
+    problem = Problem([large], model, BANDWIDTH_HZ)
+    assert held_out(problem, small).surplus(problem.null()) == 1.0
+
+
+def test_fit_widens_by_what_each_recording_shows_when_left_out(model: JointModel) -> None:
+    """Together they are fitted by the mean stiffness: half of the difference is left in each."""
+    records = [record(SOFT), record(STIFF)]
+    deflection, strange = mean_squares()
+    square = (STIFF - SOFT) ** 2 * deflection
+    expected = (square + strange) / (0.25 * square + strange)
+    joint = fit_joint(records, model, 2.0 * np.pi * BANDWIDTH_HZ)
+    assert joint.surplus == pytest.approx(expected, rel=0.02)
+    wide, narrow = joint.covariance, hac_covariance(joint.problem, joint.fitted)
+    assert wide[0, 0] == pytest.approx(expected * narrow[0, 0], rel=0.05)
+    found = identify(records, model, 2.0 * np.pi * BANDWIDTH_HZ)
+    assert found.fits[0].covariance[0, 0] >= wide[0, 0]
+    assert any(f"{np.sqrt(expected):.1f} times the error" in note for note in found.notes)
+
+
+def test_the_residual_baseline_expects_the_error_of_other_data(model: JointModel) -> None:
+    known = Transmission(model="linear", parameters={"k_nm_rad": SOFT})
+    model = replace(model, motors=(replace(model.motors[0], transmission=known),))
+    once, twice = (measure_baseline(record(SOFT), model, surplus) for surplus in (1.0, 4.0))
+    assert twice.residual_nm[0] == pytest.approx(2.0 * once.residual_nm[0])
+    assert twice.log_std == once.log_std
+
+
+def test_errors_beyond_the_residual_widen_what_the_data_tell_not_what_is_declared(model: JointModel) -> None:
+    certain = replace(model, motors=(replace(model.motors[0], inertia_std_relative=1e-6),))
+    problem = Problem([record(SOFT)], certain, BANDWIDTH_HZ)
+    fitted = problem.null()
+    (inertia,) = (j for j, slot in enumerate(fitted.slots) if slot.name == "motor_inertia")
+    before, after = (np.diag(hac_covariance(problem, fitted, surplus)) for surplus in (1.0, 4.0))
+    assert after[0] == pytest.approx(4.0 * before[0], rel=0.02)
+    assert after[inertia] == pytest.approx(before[inertia], rel=1e-3)

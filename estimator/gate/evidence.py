@@ -112,11 +112,8 @@ class Balance:
         self._factors: dict[float, _Factors] = {}
         self.ratio = self._ratio()
         self._fits: dict[tuple[float, ...], Fit] = {}
-        self._best: tuple[float, float, FloatArray] = (
-            math.inf,
-            1.0,
-            np.zeros(0),
-        )
+        # Score, ratio and coefficients of the best hypothesis.
+        self._best: tuple[float, float, FloatArray] = math.inf, 1.0, np.zeros(0)
 
     def _through(self, x: FloatArray, derivatives: int = 0, *, held: bool = False) -> list[FloatArray]:
         """The signal and its derivatives (per sample) in every band, (bands, rows) each, without means."""

@@ -238,20 +238,28 @@ def test_a_subscriber_that_dies_does_not_disturb_the_others(publisher, client, e
     assert len([n for n in numbers if n > 150]) > 100  # a busy machine may drop some
 
 
-def test_what_is_faster_than_real_time_can_be_published_without_loss(endpoint):
+def test_what_is_faster_than_real_time_is_published_without_loss_documents_too(endpoint):
     joint = make_joint("elbow", endpoint)
     session = open_session(joint.zenoh, Path())
     client = open_client(endpoint)
     try:
         publisher = JointPublisher(session, joint, lossless=True)
-        subscriber = client.declare_subscriber("drivelink/elbow/estimate", zenoh.handlers.RingChannel(8192))
+        ring = zenoh.handlers.RingChannel
+        subscriber = client.declare_subscriber("drivelink/elbow/estimate", ring(8192))
+        documents = client.declare_subscriber("drivelink/elbow/status", ring(1024))
         until(lambda: publisher.put_estimate(make_estimate(0), 0) or subscriber.try_recv())
+        until(lambda: publisher.put_status({"cycles": 0}) or documents.try_recv())
         for sequence in range(1, 2001):
             publisher.put_estimate(make_estimate(sequence), 0)
-        numbers = []
+            if not sequence % 10:
+                publisher.put_status({"cycles": sequence})
+        numbers, cycles = [], []
         while not numbers or numbers[-1] != 2000:
             numbers.append(number(subscriber.recv()))
+        while not cycles or cycles[-1] != 2000:
+            cycles.append(json.loads(documents.recv().payload.to_bytes())["cycles"])
         assert [n for n in numbers if n] == list(range(1, 2001))
+        assert [n for n in cycles if n] == list(range(10, 2001, 10))
     finally:
         close_session(client)
         close_session(session)

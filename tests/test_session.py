@@ -151,7 +151,9 @@ def test_an_uncaught_exception_ends_the_process(endpoint):
 
 def test_a_client_that_forgets_to_close_ends_too(endpoint):
     code = (
-        "import drivelink, time\n"
+        "import atexit, threading\n"  # registered first, called last
+        "atexit.register(lambda: print([t.name for t in threading.enumerate() if 'drivelink' in t.name]))\n"
+        "import drivelink\n"
         f"joint = drivelink.subscribe('elbow', endpoint='{endpoint}')\n"
         "joint.wait(0.05); joint.status\n"
         "raise RuntimeError('uncaught')\n"
@@ -161,6 +163,7 @@ def test_a_client_that_forgets_to_close_ends_too(endpoint):
     )
     assert done.returncode == 1
     assert done.stderr.endswith("RuntimeError: uncaught\n")
+    assert done.stdout == "[]\n"  # a thread that comes out of zenoh now would abort the process
 
 
 def test_another_program_on_the_endpoint_is_one_line(endpoint, monkeypatch):

@@ -11,6 +11,7 @@ What happens to the daemon is `state`, never an exception.
 
 from __future__ import annotations
 
+import atexit
 import math
 import threading
 import time
@@ -113,7 +114,8 @@ class _Alarm:
     """Ends a blocking receive at its deadline, which zenoh's channels cannot do.
 
     The thread starts with the first deadline. Moving the deadline later is one assignment, which the thread
-    notices when it wakes.
+    notices when it wakes. It ends before the interpreter does: a daemon thread that comes out of zenoh
+    while the interpreter finalizes aborts the process.
     """
 
     def __init__(self, ring: Callable[[], None]) -> None:
@@ -132,10 +134,12 @@ class _Alarm:
                 if self._thread is None and not self._closed:
                     self._thread = threading.Thread(target=self._run, name="drivelink-alarm", daemon=True)
                     self._thread.start()
+                    atexit.register(self.close)
                 self._changed.notify()
 
     def close(self) -> None:
-        """End the thread."""
+        """End the thread; a second time does nothing."""
+        atexit.unregister(self.close)
         with self._changed:
             self._closed = True
             self._changed.notify()

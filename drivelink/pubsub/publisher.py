@@ -220,7 +220,7 @@ class JointPublisher:
             self._session,
             f"{self.key}/{name}",
             encoding=_JSON,
-            congestion_control=zenoh.CongestionControl.DROP,
+            congestion_control=self._congestion_control,
             express=True,
             cache=zenoh.ext.CacheConfig(max_samples=1),
             sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),

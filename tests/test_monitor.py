@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import fcntl
 import io
 import json
 import math
+import os
+import pty
+import select
 import socket
+import struct
+import subprocess
+import sys
+import termios
 import threading
 import urllib.error
 import urllib.request
@@ -251,6 +259,43 @@ def test_without_a_terminal_monitor_prints_plain_lines(
     assert cli.main(["monitor", "elbow", "--endpoint", daemon, "--seconds", "2", "--every", "0.5"]) == 0
     out = capsys.readouterr().out
     assert "elbow: stiffness 700.0 ± 5.9 N·m/rad" in out and "\x1b" not in out
+
+
+def test_in_a_terminal_question_mark_shows_the_legend_and_q_quits(daemon: str) -> None:
+    master, slave = pty.openpty()
+    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
+    before = termios.tcgetattr(slave)
+    command = [sys.executable, "-m", "drivelink", "monitor", "elbow", "--endpoint", daemon]
+    environment = os.environ | {"TERM": "xterm"}
+    with subprocess.Popen(command, stdin=slave, stdout=slave, stderr=slave, env=environment) as process:
+        try:
+            until_shown(master, "N·m/rad")
+            os.write(master, b"?")
+            until_shown(master, "half its 95 % interval")
+            os.write(master, b"?")
+            until_shown(master, "valid", "? legend")
+            os.write(master, b"q")
+            zenohkit.until(lambda: drained(master) and process.poll() is not None)
+            assert process.returncode == 0
+            assert termios.tcgetattr(slave) == before  # the terminal shows what is typed again
+        finally:
+            process.kill()
+    os.close(slave)
+    os.close(master)
+
+
+def drained(terminal: int) -> list[str]:
+    """What a terminal has shown since the last call."""
+    read = []
+    while select.select([terminal], [], [], 0.01)[0]:
+        read.append(os.read(terminal, 65536).decode(errors="replace"))
+    return read or [""]
+
+
+def until_shown(terminal: int, *parts: str) -> None:
+    """Wait until a terminal shows all parts at once, having shown anything else before."""
+    drained(terminal)
+    zenohkit.until(lambda: all(part in "".join(drained(terminal)) for part in parts))
 
 
 def test_monitor_prints_json_lines(daemon: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -96,6 +96,44 @@ def test_the_last_events_are_kept_and_no_more() -> None:
     assert [event["text"] for event in events.recent()] == [f"event {k}" for k in range(984, 1000)]
 
 
+def supervisor(clock: list[float]) -> Supervisor:
+    made = Supervisor.__new__(Supervisor)
+    made._events, made._alarmed = log(clock), set()
+    return made
+
+
+def test_a_model_alarm_that_flickers_is_counted_whatever_its_residual(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    made = supervisor([0.0])
+    for k in range(1000):
+        described = {"residual_nm": [1e-4 * k], "floor_nm": [0.03], "location": ""}
+        monitor = SimpleNamespace(describe=lambda d=described: d)
+        status = int(Status.VALID if k % 2 else Status.MODEL_ALARM)
+        pipeline = SimpleNamespace(status=status, model_monitor=monitor)
+        made._check_model(SimpleNamespace(name="elbow", pipeline=pipeline))  # type: ignore[arg-type]
+    assert len(caplog.records) == 2
+    assert [event["count"] for event in made._events.recent()] == [500, 500]
+    assert "3.3 times its baseline" in made._events.recent()[1]["text"]
+
+
+def test_emergencies_with_other_bytes_of_the_maker_are_counted(caplog: pytest.LogCaptureFixture) -> None:
+    made = supervisor([0.0])
+    for k in range(1000):
+        made._emergency(0x081, b"\x10\x23\x02" + k.to_bytes(5, "little"))
+        made._emergency(0x082, b"\x10\x23\x02" + k.to_bytes(5, "little"))
+    assert len(caplog.records) == 2
+    assert [event["count"] for event in made._events.recent()] == [1000, 1000]
+
+
+def test_faults_of_one_kind_in_one_place_are_counted(caplog: pytest.LogCaptureFixture) -> None:
+    made = supervisor([0.0])
+    for k in range(1000):
+        made._say_fault("elbow", IndexError(f"index {k} is out of range"))
+    assert len(caplog.records) == 1 and made._events.recent()[0]["count"] == 1000
+
+
 def test_the_log_says_when_the_model_alarm_comes_and_goes_and_what_to_do(
     caplog: pytest.LogCaptureFixture,
 ) -> None:

@@ -229,7 +229,8 @@ class Supervisor:
         """At a SYNC, configure nodes anew that say something else by SDO than is in use."""
         for found in self._read_back.check.sync() if self._read_back is not None else ():
             self._nodes[found.node].attempt_ns = self._loop.clock()
-            self._events.say(f"{found.text}: it is configured again", logging.WARNING)
+            text = f"{found.text}: it is configured again"
+            self._events.say(text, logging.WARNING, key=f"read back {found.node}")
             self._configure(found.node)
 
     def _configure(self, node: int, *, stopped: bool = False) -> None:
@@ -338,10 +339,12 @@ class Supervisor:
                 f"{loop_joint.name}: model alarm{residual_text(monitor)}: do not control on its numbers; "
                 "record a minute of motion, then drivelink diagnose names the effect",
                 logging.WARNING,
+                key=f"{loop_joint.name}: model alarm",
             )
         else:
             self._alarmed.discard(loop_joint.name)
-            self._events.say(f"{loop_joint.name}: the model alarm is over{residual_text(monitor)}")
+            text = f"{loop_joint.name}: the model alarm is over{residual_text(monitor)}"
+            self._events.say(text, key=f"{loop_joint.name}: no model alarm")
 
     def _check_contradiction(self, loop_joint: LoopJoint) -> None:
         """Report begin and end of a contradiction between readings."""
@@ -364,7 +367,8 @@ class Supervisor:
 
     def _say_fault(self, where: str, error: Exception) -> None:
         logger.debug("%s", where, exc_info=error)
-        self._events.say(f"{where}: {type(error).__name__}: {error}", logging.ERROR)
+        kind = type(error).__name__
+        self._events.say(f"{where}: {kind}: {error}", logging.ERROR, key=f"{where}: {kind}")
 
     def reconfigure_all(self) -> None:
         """Configure all nodes again after a loss of the bus."""
@@ -587,7 +591,8 @@ class Supervisor:
     def _emergency(self, cob_id: int, data: bytes) -> None:
         emergency = parse_emergency(data)
         if emergency is not None and not emergency.is_reset:
-            self._events.say(f"node {cob_id - 0x080}: {emergency}", logging.WARNING)
+            node, code = cob_id - 0x080, emergency.code
+            self._events.say(f"node {node}: {emergency}", logging.WARNING, key=f"EMCY {node} {code}")
 
     def _sent(self, cob_id: int, data: bytes) -> None:
         if self._read_back is not None and 0x600 < cob_id < 0x680:

@@ -1,0 +1,159 @@
+"""The script of the live view's page, run by node on what the server sends: reading values, pause, axes, the end."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivelink.monitor.view import JointView
+from drivelink.monitor.web import snapshot
+from estimator.sample import Estimate, Status, TransmissionEstimate
+
+NODE = shutil.which("node")
+pytestmark = pytest.mark.skipif(NODE is None, reason="needs node")
+HERE = Path(__file__).parent
+PAGE = HERE.parent / "drivelink" / "monitor" / "page.html"
+STATUS = {
+    "state": "running",
+    "rate_hz": 1000.0,
+    "nodes": {"1": {"state": "operational", "fault": False}},
+    "residual_alarm": {"active": False, "residual_nm": [0.01], "floor_nm": [0.02]},
+    "transmissions": [{}],
+}
+
+
+def fed(seconds: float = 4.0, wild: float | None = None) -> JointView:
+    """A joint whose torque is a sine of 2 N·m; one torque of it may be wild."""
+    view = JointView("elbow")
+    for k in range(int(1000 * seconds)):
+        phi = 0.02 * math.sin(2.0e-3 * k)
+        torque = wild if wild is not None and k == 2000 else 100.0 * phi
+        one = TransmissionEstimate(torque, 100.0, 1.0, phi)
+        status = int(Status.VALID | Status.OBSERVABLE)
+        view.update(Estimate(k, status, torque, 100.0, 1.0, (one,)), 1e-3 * k)
+    view.status = STATUS
+    return view
+
+
+def page(scenario: str, *views: JointView) -> Any:
+    """What a scenario returns; `sent[i]` is what the server sends of each view."""
+    script = re.search(r"<script>(.*)</script>", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    assert script is not None
+    sent = json.dumps([{"joints": {view.name: snapshot(view, True, {})}} for view in views])
+    program = (
+        (HERE / "page.js").read_text(encoding="utf-8")
+        + script[1]
+        + f"const sent = {sent};\nconsole.log(JSON.stringify((() => {{ {scenario} }})()));\n"
+    )
+    assert NODE is not None
+    done = subprocess.run([NODE, "-"], input=program, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_the_page_shows_numbers_flags_gauge_and_nodes() -> None:
+    texts = page(
+        "take(sent[0]); return ['stiffness', 'band', 'state', 'flags', 'gauges', 'nodes'].map(shown);", fed()
+    )
+    assert texts[:4] == ["100.0", "± 2.0", "running", "valid observable"]
+    assert "0.50 × baseline" in texts[4] and "node 1 operational" in texts[5]
+
+
+def test_the_pointer_reads_the_curve_at_its_place() -> None:
+    text, moment, left = page(
+        """
+        take(sent[0]);
+        const m = joints.elbow.moments.at(-50), now = joints.elbow.moments.at(-1)[0];
+        const { X, Y } = $("torqueplot").shown;
+        hover("torqueplot", X(m[0] - now), Y(m[1]));
+        const text = $("tip").textContent;
+        $("torqueplot").onmouseleave();
+        return [text, [number(m[0] - now, 3), number(m[1])], $("tip").hidden];
+        """,
+        fed(),
+    )
+    assert text == f"time {moment[0]} s\n{moment[1]} N·m"
+    assert left is True  # hidden again
+
+
+def test_the_band_is_read_with_the_stiffness() -> None:
+    text = page(
+        """
+        take(sent[0]);
+        const { X, Y } = $("stiffnessplot").shown;
+        hover("stiffnessplot", X(-1.0), Y(100.0));
+        return $("tip").textContent;
+        """,
+        fed(),
+    )
+    assert text.startswith("time −1.0") and text.endswith("\n100.0 ± 2.0 N·m/rad")
+
+
+@pytest.mark.parametrize("how", ["press(' ');", "$('pause').onclick();"])
+def test_a_pause_holds_numbers_and_curves_and_what_came_is_there_afterwards(how: str) -> None:
+    first, second = fed(4.0), fed(5.5)
+    states = page(
+        f"""
+        const look = () => [shown("torque"), $("torqueplot").shown.series[0].length, shown("link"), shown("pause")];
+        take(sent[0]);
+        const before = look();
+        {how}
+        take(sent[1]);
+        hover("torqueplot", 300, 100);
+        const held = look();
+        {how}
+        return [before, held, look()];
+        """,
+        first,
+        second,
+    )
+    before, held, after = states
+    assert held[:2] == before[:2] and held[2:] == ["paused", "go on"]
+    assert after[0] != before[0] and after[1] > before[1] and after[2:] == ["connected", "pause"]
+
+
+@pytest.mark.parametrize("wild", [1e6, -1e6])
+def test_one_wild_value_does_not_flatten_an_axis(wild: float) -> None:
+    low, high, height = page(
+        """
+        take(sent[0]);
+        const { Y, T, B } = $("torqueplot").shown;
+        return [Y(-2), Y(2), B - T];
+        """,
+        fed(4.0, wild),
+    )
+    assert low - high > 0.5 * height  # the sine fills more than half of the plot
+
+
+def test_a_daemon_that_is_gone_leaves_no_green_and_no_live_numbers() -> None:
+    gone = fed()
+    gone.gone, gone.silent_s = True, 12.0
+    state, style, flags, number_style, gauges, rows = page(
+        """
+        take(sent[0]);
+        take(sent[1]);
+        const styles = $("flags").children.map(flag => flag.className);
+        return [shown("state"), $("state").className, styles, $("stiffness").className, $("gauges").hidden,
+                $("cycle").children.length + $("nodes").children.length];
+        """,
+        fed(),
+        gone,
+    )
+    assert state == "daemon gone, last estimate 12 s ago" and style == "red"
+    assert flags == ["flag red"] and number_style == "past"
+    assert gauges and rows == 0
+
+
+def test_a_monitor_that_has_ended_is_shown_too() -> None:
+    state, flags, link = page(
+        "take(sent[0]); events.onerror(); return ['state', 'flags', 'link'].map(shown);", fed()
+    )
+    assert state == "no connection: these are the last numbers"
+    assert flags == "no connection" and link.startswith("drivelink monitor has ended")

@@ -248,3 +248,32 @@ def test_gaps_are_left_out(records: dict[str, Record]) -> None:
         link_position_rad=whole.link_position_rad[keep],
     )
     assert [e.name for e in diagnose(holed, kit.model()).effects] == ["coulomb_friction"]
+
+
+def test_friction_is_named_where_the_declared_spring_carries_nothing() -> None:
+    # A coupling that has come loose: the link moves on its own, and drags the motor along a little, so that no
+    # stiffness above zero fits better than none. The motor's friction is still in its balance.
+    time = 1e-3 * np.arange(20_000)
+    motor = kit.model(linked=False).motors[0]
+    w = np.array([2.0, 5.3])
+    theta, velocity, acceleration = (
+        np.array([0.5, 0.2]) @ (w[:, None] ** k * np.sin(np.outer(w, time) + 0.5 * np.pi * k))
+        for k in range(3)
+    )
+    apart = 0.05 * np.sin(9.1 * time)
+    torque = motor.inertia_kg_m2 * acceleration + motor.viscous_damping_nm_s_rad * velocity
+    torque += 0.4 * np.tanh(velocity / 0.05) + 0.5 * apart
+    rng = np.random.default_rng(7)
+    record = Record(
+        period_s=1e-3,
+        sequence=np.arange(len(time)),
+        motor_position_rad=theta[:, None] + 1e-5 * rng.standard_normal((len(time), 1)),
+        motor_torque_nm=torque[:, None] + 0.01 * rng.standard_normal((len(time), 1)),
+        link_position_rad=theta + apart,
+    )
+    found = diagnose(record, kit.model(linked=False))
+    (first,) = found.effects
+    assert first.name == "coulomb_friction"
+    assert first.parameters["torque_nm"] == pytest.approx(0.4, abs=0.02)  # as among the cases above
+    assert found.transmissions[0].parameters == {}
+    assert any("no positive one fits better than none" in note for note in found.notes)

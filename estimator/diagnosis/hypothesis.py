@@ -71,14 +71,18 @@ class Fitted:
         own = frozenset(t.candidate.key for t in self.terms)
         return own if self.extra is None else own | {("unlisted", self.extra.motor)}
 
-    @property
-    def real(self) -> bool:
-        """Whether every effect contributes: no friction at zero, no spring without stiffness."""
-        return not any(
-            held
+    def is_real_beside(self, parent: Fitted) -> bool:
+        """Whether every effect contributes, and no spring is at zero that has a stiffness in the parent."""
+        lost = self._at_zero("base") - parent._at_zero("base")
+        return not lost and not self._at_zero("term")
+
+    def _at_zero(self, kind: str) -> set[tuple[str, int | None, int]]:
+        """Parameters of a kind that their sign constraint holds at its bound."""
+        return {
+            (slot.name, slot.motor, slot.part)
             for slot, held in zip(self.slots, self.posterior.bound, strict=True)
-            if slot.kind in ("term", "base")
-        )
+            if held and slot.kind == kind
+        }
 
     def moved_base(self, problem: Problem) -> Base:
         """The transmission parameters as fitted."""

@@ -159,10 +159,10 @@ def transmissions_of(
         own = own + _between(after, accounts, i, alpha)
         found = middle(model, alpha, own, problem.frames[0].motors[i].deflection)
         if not found.determined or any(after.posterior.bound[mine]):
-            doubts.append(
-                f"these data do not determine the stiffness of motor {i + 1}: {found.stiffness_nm_rad:.4g} "
-                f"± {SIGMA_95 * found.std_nm_rad:.2g} N·m/rad (95 %)"
-            )
+            value = f"{found.stiffness_nm_rad:.4g} ± {SIGMA_95 * found.std_nm_rad:.2g} N·m/rad (95 %)"
+            if any(after.posterior.bound[mine]):
+                value = "no positive one fits better than none"
+            doubts.append(f"these data do not determine the stiffness of motor {i + 1}: {value}")
             made.append(Refitted(model.name, {}, {}))
             continue
         std_of_alpha = np.sqrt(np.maximum(np.diag(own), 0.0))

@@ -115,7 +115,7 @@ class Search:
     def children(self, parent: Fitted, like: Candidate | None = None) -> list[Fitted]:
         """The most promising extensions by one effect; `like`: see `screen`."""
         grown = (self._grown(parent, term) for term in self.screen(parent, like))
-        return [child for child in grown if child.real]
+        return [child for child in grown if child.is_real_beside(parent)]
 
     def _grown(self, parent: Fitted, term: Term) -> Fitted:
         """Add one effect; from two starts, as the smoothing of friction has several optima."""

@@ -26,7 +26,7 @@ from estimator.errors import EstimatorError
 from estimator.gate import check, refuse
 from estimator.model import JointModel, ParameterValue, Transmission
 from estimator.sample import SIGMA_95, FloatArray, Record
-from estimator.transmissions import MODELS, RIGID, UNKNOWN
+from estimator.transmissions import MODELS, RIGID, UNKNOWN, TransmissionModel
 
 __all__ = ["JointFit", "Key", "TransmissionFit", "fit", "fit_joint", "transmission_fits"]
 
@@ -338,51 +338,72 @@ def transmission_fits(joint: JointFit) -> list[TransmissionFit]:
     """The result of a fit for each motor and its transmission."""
     problem, fitted = joint.problem, joint.fitted
     frames = problem.at(fitted.corrections, fitted.base)
-    left = fitted.regression.residual(fitted.posterior.x)
     base = fitted.moved_base(problem)
-    spring = np.concatenate([fitted.base.torque(frame) for frame in frames])
+    covariances = _spring_covariances(joint)
+    pairs = zip(base.models(frames[0]), base.alpha, covariances, strict=True)
+    return [_transmission_fit(joint, frames, i, *one) for i, one in enumerate(pairs)]
+
+
+def _spring_columns(fitted: Fitted, motor: int) -> list[int]:
+    """Columns of a transmission's parameters."""
+    return [j for j, s in enumerate(fitted.slots) if s.kind == "base" and s.motor == motor]
+
+
+def _spring_covariances(joint: JointFit) -> list[FloatArray]:
+    """Covariance of each transmission's parameters, with what undeclared effects may contribute."""
+    problem, fitted = joint.problem, joint.fitted
     search, effects = Search(problem, null=fitted), design_effects(problem, fitted, joint.surplus)
     made = []
-    for i, (motor, law) in enumerate(zip(problem.model.motors, base.models(frames[0]), strict=True)):
-        rows = problem.group % problem.equations == i
-        mine = [j for j, s in enumerate(fitted.slots) if s.kind == "base" and s.motor == i]
-        alpha, covariance = base.alpha[i], joint.covariance[np.ix_(mine, mine)]
-        excited = False
-        if law is not None:
-            unseen = search.unseen(fitted, mine[0], float(effects[mine[0]]))
-            covariance = covariance + unseen[np.ix_(mine, mine)]
-            phi = np.concatenate([f.motors[i].deflection for f in frames])
-            excited = middle(law, alpha, covariance, phi).determined and not any(fitted.posterior.bound[mine])
-        std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        torque = (spring + fitted.regression.design[:, mine] @ fitted.posterior.x[mine])[rows]
-        measured = problem.torque()[rows]
-        errors = {
-            name: joint.mean(error, None if error == "encoder_delay" else i)
-            for name, error in _NUISANCES.items()
-        }
-        made.append(
-            TransmissionFit(
-                model=RIGID if law is None else law.name,
-                parameters=law.parameters(alpha) if law is not None and excited else {},
-                std=law.parameters(std) if law is not None and excited else {},
-                alpha=alpha,
-                covariance=covariance,
-                deflection_rad=_rows_of(frames, i, "deflection"),
-                deflection_rate_rad_s=_rows_of(frames, i, "deflection_rate"),
-                velocity_rad_s=_rows_of(frames, i, "velocity"),
-                torque_nm=torque + left[rows],
-                unexplained_nm=(left + _friction(joint, i))[rows],
-                error_rms_nm=float(np.sqrt(np.mean(left[rows] ** 2))),
-                torque_rms_nm=float(np.std(torque if excited else measured)),
-                inertia_kg_m2=motor.inertia_kg_m2 + errors["inertia"][0],
-                viscous_damping_nm_s_rad=max(motor.viscous_damping_nm_s_rad + errors["damping"][0], 0.0),
-                coulomb_nm=errors["coulomb"][0],
-                offset_nm=errors["offset"][0],
-                deflection_offset_rad=errors["shift"][0],
-                link_delay_s=errors["link_delay"][0] if motor.flexible else 0.0,
-                torque_delay_s=errors["torque_delay"][0],
-                nuisance_std={name: std for name, (_, std) in errors.items()},
-                excited=excited,
-            )
-        )
+    for i in range(len(problem.model.motors)):
+        mine = _spring_columns(fitted, i)
+        own = joint.covariance
+        if mine:
+            own = own + search.unseen(fitted, mine[0], float(effects[mine[0]]))
+        made.append(own[np.ix_(mine, mine)])
     return made
+
+
+def _transmission_fit(
+    joint: JointFit,
+    frames: Sequence[Frame],
+    i: int,
+    law: TransmissionModel | None,
+    alpha: FloatArray,
+    covariance: FloatArray,
+) -> TransmissionFit:
+    """The result of a fit for the i-th motor."""
+    problem, fitted, motor = joint.problem, joint.fitted, joint.problem.model.motors[i]
+    rows, mine = problem.group % problem.equations == i, _spring_columns(fitted, i)
+    left = fitted.regression.residual(fitted.posterior.x)
+    spring = np.concatenate([fitted.base.torque(frame) for frame in frames])
+    torque = (spring + fitted.regression.design[:, mine] @ fitted.posterior.x[mine])[rows]
+    phi = np.concatenate([f.motors[i].deflection for f in frames])
+    excited = law is not None and middle(law, alpha, covariance, phi).determined
+    excited = excited and not any(fitted.posterior.bound[mine])
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    errors = {
+        name: joint.mean(error, None if error == "encoder_delay" else i) for name, error in _NUISANCES.items()
+    }
+    return TransmissionFit(
+        model=RIGID if law is None else law.name,
+        parameters=law.parameters(alpha) if law is not None and excited else {},
+        std=law.parameters(std) if law is not None and excited else {},
+        alpha=alpha,
+        covariance=covariance,
+        deflection_rad=_rows_of(frames, i, "deflection"),
+        deflection_rate_rad_s=_rows_of(frames, i, "deflection_rate"),
+        velocity_rad_s=_rows_of(frames, i, "velocity"),
+        torque_nm=torque + left[rows],
+        unexplained_nm=(left + _friction(joint, i))[rows],
+        error_rms_nm=float(np.sqrt(np.mean(left[rows] ** 2))),
+        torque_rms_nm=float(np.std(torque if excited else problem.torque()[rows])),
+        inertia_kg_m2=motor.inertia_kg_m2 + errors["inertia"][0],
+        viscous_damping_nm_s_rad=max(motor.viscous_damping_nm_s_rad + errors["damping"][0], 0.0),
+        coulomb_nm=errors["coulomb"][0],
+        offset_nm=errors["offset"][0],
+        deflection_offset_rad=errors["shift"][0],
+        link_delay_s=errors["link_delay"][0] if motor.flexible else 0.0,
+        torque_delay_s=errors["torque_delay"][0],
+        nuisance_std={name: std for name, (_, std) in errors.items()},
+        excited=excited,
+    )

@@ -140,19 +140,11 @@ def fit_alpha(
         EstimatorError: it did not converge.
     """
     alpha = np.array([1.0, *model.shape_start]) if start is None else np.asarray(start, dtype=np.float64)
-    low = np.array([-np.inf, *(bound[0] + 1e-9 * abs(bound[0]) for bound in model.shape_bounds)])
-    high = np.array([np.inf, *(bound[1] for bound in model.shape_bounds)])
     damping = 1e-3 if damped else 0.0
     error = target - model.torque(phi, alpha)
     squares = float(error @ error)
     for iteration in range(1, most + 1):
-        J = model.jacobian(phi, alpha)
-        gram = J.T @ J
-        gram += damping * np.diag(np.diag(gram))
-        step = np.linalg.pinv(gram, hermitian=True) @ (J.T @ error)
-        trial = alpha + step
-        if damped:
-            trial = np.clip(trial, low, high)
+        trial = _trial(model, phi, alpha, error, damping)
         new = target - model.torque(phi, trial)
         new_squares = float(new @ new)
         if damped and not new_squares <= squares:
@@ -170,6 +162,21 @@ def fit_alpha(
     if damped and np.isfinite(squares):
         return _finished(model, phi, alpha, squares, most)
     raise EstimatorError(f"{model.name}: least squares diverged from the start that was given")
+
+
+def _trial(
+    model: TransmissionModel, phi: FloatArray, alpha: FloatArray, error: FloatArray, damping: float
+) -> FloatArray:
+    """The next alpha; a damped one has its shape inside the model's bounds."""
+    J = model.jacobian(phi, alpha)
+    gram = J.T @ J
+    gram += damping * np.diag(np.diag(gram))
+    trial = np.asarray(alpha + np.linalg.pinv(gram, hermitian=True) @ (J.T @ error))
+    if not damping:
+        return trial
+    low = np.array([-np.inf, *(bound[0] + 1e-9 * abs(bound[0]) for bound in model.shape_bounds)])
+    high = np.array([np.inf, *(bound[1] for bound in model.shape_bounds)])
+    return np.clip(trial, low, high)
 
 
 def _finished(

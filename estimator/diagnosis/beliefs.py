@@ -70,47 +70,69 @@ def everyday_std(
         torque_rms: of the motor torque without its mean, N·m.
         calibrating: the recordings are of a healthy joint and determine its declared numbers.
     """
-    model, linked = frames[0].model, frames[0].linked
-    name, motor, link = candidate.kind.name, model.motors[candidate.motor or 0], model.link
+    if candidate.kind.name in OF_RUN:
+        return (_of_run_std(frames, candidate, torque_rms, calibrating),)
+    if candidate.kind.name in ("torque_delay", "encoder_delay"):
+        return (PRIORS[candidate.kind.name].std * frames[0].signals.period_s,)
+    if candidate.kind.name in _AT_LINK:
+        return _of_link_std(frames[0], candidate, torque_rms, calibrating)
+    return (_of_motor_std(frames, candidate, torque_rms, calibrating),)
+
+
+def _of_run_std(frames: Sequence[Frame], candidate: Candidate, torque_rms: float, calibrating: bool) -> float:
+    """Of friction, a constant torque, and a zero of the encoders."""
+    name, motor, linked = candidate.kind.name, candidate.motor or 0, frames[0].linked
     std = PRIORS[name].std
-    if name in ("torque_delay", "encoder_delay"):
-        return (std * frames[0].signals.period_s,)
     if name == "coulomb_friction":
-        back = any(reverses(f.motors[candidate.motor or 0].velocity) for f in frames)
+        back = any(reverses(f.motors[motor].velocity) for f in frames)
         # Undeclared friction is a missing effect.
-        return (PRIORS["effect"].std * torque_rms,) if calibrating and back else (0.0,)
+        return PRIORS["effect"].std * torque_rms if calibrating and back else 0.0
     if name == "torque_offset":
         # A healthy joint's constant torque is attributed to the encoders' zero: the two cannot be separated.
-        if calibrating and frames[0].flexible[candidate.motor or 0]:
-            return (0.0,)
-        return ((choice("floor") if linked and not calibrating else std) * torque_rms,)
-    if name == "deflection_offset":
-        phi = frames[0].motors[candidate.motor or 0].deflection
-        if calibrating:  # a healthy joint's encoders may start anywhere
-            return (std * float(np.ptp(phi) + abs(np.mean(phi))),)
-        # The remainder of a zero that has been set is not an effect: half an encoder count is as large.
-        return ((choice("floor") * float(np.std(phi)) if linked else std * float(np.ptp(phi))),)
-    if name == "torque_constant" and calibrating:
-        return (0.0,)  # the anchor
-    if linked and not calibrating:
-        # With both balances a wrong declared number is identifiable, so it is an effect with a name.
-        std = PRIORS["declared"].std
+        if calibrating and frames[0].flexible[motor]:
+            return 0.0
+        return (choice("floor") if linked and not calibrating else std) * torque_rms
+    phi = frames[0].motors[motor].deflection
+    if calibrating:  # a healthy joint's encoders may start anywhere
+        return std * float(np.ptp(phi) + abs(np.mean(phi)))
+    # The remainder of a zero that has been set is not an effect: half an encoder count is as large.
+    return choice("floor") * float(np.std(phi)) if linked else std * float(np.ptp(phi))
+
+
+def _of_motor_std(
+    frames: Sequence[Frame], candidate: Candidate, torque_rms: float, calibrating: bool
+) -> float:
+    """Of torque scale, inertia and damping."""
+    name, i, linked = candidate.kind.name, candidate.motor or 0, frames[0].linked
+    motor, std = frames[0].model.motors[i], _declared_std(frames[0], name, calibrating)
     if name == "torque_constant":
-        return (std,)
+        return 0.0 if calibrating else std  # the anchor
     if name == "motor_inertia":
-        return ((motor.inertia_std_relative or std) * motor.inertia_kg_m2,)
-    if name == "viscous_damping":
-        fast = max(float(np.max(np.abs(f.motors[candidate.motor or 0].velocity))) for f in frames)
-        floor = 0.0 if linked else PRIORS["viscous_damping_floor"].std * torque_rms / max(fast, 1e-300)
-        return (float(np.hypot(std * motor.viscous_damping_nm_s_rad, floor)),)
+        return (motor.inertia_std_relative or std) * motor.inertia_kg_m2
+    fast = max(float(np.max(np.abs(f.motors[i].velocity))) for f in frames)
+    floor = 0.0 if linked else PRIORS["viscous_damping_floor"].std * torque_rms / max(fast, 1e-300)
+    return float(np.hypot(std * motor.viscous_damping_nm_s_rad, floor))
+
+
+def _of_link_std(
+    frame: Frame, candidate: Candidate, torque_rms: float, calibrating: bool
+) -> tuple[float, ...]:
+    """Of inertia, damping and gravity of the link."""
+    name, link = candidate.kind.name, frame.model.link
+    std = _declared_std(frame, name, calibrating)
     if link is None:
         return (0.0,)
     if name == "link_inertia":
         return (std * link.inertia_kg_m2,)
     if name == "link_viscous_damping":
         return (std * link.viscous_damping_nm_s_rad,)
-    unknown = PRIORS["effect"].std * torque_rms if calibrating and frames[0].carried else 0.0
+    unknown = PRIORS["effect"].std * torque_rms if calibrating and frame.carried else 0.0
     return (float(np.hypot(std * link.gravity_nm, unknown)),) * 2
+
+
+def _declared_std(frame: Frame, name: str, calibrating: bool) -> float:
+    """Of a declared number; with both balances a wrong one is identifiable, an effect with a name."""
+    return PRIORS["declared" if frame.linked and not calibrating else name].std
 
 
 def effect_std(model: JointModel, candidate: Candidate, by_torque: float) -> float:

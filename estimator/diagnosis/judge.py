@@ -1,0 +1,229 @@
+"""The verdict on what a search has found, and what is reported of it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from estimator.diagnosis.certainty import accounts, standing
+from estimator.diagnosis.choices import choice
+from estimator.diagnosis.curves import best_curve
+from estimator.diagnosis.excitation import advice_for, poor
+from estimator.diagnosis.heldout import Held, errors_of, wider
+from estimator.diagnosis.hypothesis import Fitted
+from estimator.diagnosis.outcome import (
+    alignment_of,
+    curves_of,
+    findings_of,
+    rivals_of,
+    series_of,
+    transmissions_of,
+)
+from estimator.diagnosis.result import Diagnosis, Errors, Finding, RecordingErrors, Verdict
+from estimator.diagnosis.search import Progress, Search
+from estimator.diagnosis.stiffness import stiffness_curves
+from estimator.effects import LIBRARY
+from estimator.priors import PRIORS
+
+__all__ = ["Judge"]
+
+
+class _Judged(NamedTuple):
+    """A verdict.
+
+    Attributes:
+        verdict: in a word.
+        effects: the missing effects.
+        before, after: the model as declared, and with what was found.
+        notes: what qualifies the verdict.
+    """
+
+    verdict: Verdict
+    effects: list[Finding]
+    before: Fitted
+    after: Fitted
+    notes: list[str]
+
+
+class Judge:
+    """Turns the result of a search into a verdict.
+
+    Args:
+        search: the candidates.
+        held: held-out data.
+        first: the explanation that the fitted data alone prefer.
+        found: the one that held-out data confirm.
+        progress: called with the current step.
+    """
+
+    def __init__(self, search: Search, held: Held, first: Fitted, found: Fitted, progress: Progress) -> None:
+        self.search, self.held, self.found = search, held, found
+        self.problem, self.progress = search.problem, progress
+        # Held-out data took part in choosing the one found: they may show less of its error.
+        self.surplus = max(held.surplus(one) for one in (first, found))
+
+    def diagnosis(self) -> Diagnosis:
+        """Make verdict, findings and errors."""
+        rivals = [h for k in range(len(self.found.terms)) for h in self.search.rivals(self.found, k)]
+        self.progress("free curves")
+        curve = best_curve(self.search, self.search.null)
+        others = [self.search.null, *rivals]
+        judged = self._judged(self._effects(others, curve), curve)
+        return self._stated(judged, [h for h in (self.found, *others) if h is not judged.after])
+
+    def _effects(self, others: list[Fitted], curve: Fitted | None) -> list[Finding]:
+        """The effects found, with their probabilities beside all other explanations."""
+        free = [] if curve is None else [curve]
+        beside = accounts(self.search, self.found, [*others, *self.search.seen, *free])
+        standings = [standing(self.search, self.found, k, beside) for k in range(len(self.found.terms))]
+        return findings_of(self.problem, self.found, self.search.null, standings, self.surplus)
+
+    def _judged(self, effects: list[Finding], curve: Fitted | None) -> _Judged:
+        """The verdict on the effects found, or on a free curve that explains more than they do."""
+        before = self._declared(effects)
+        if curve is None or not self._unlisted(curve):
+            curve = self._remaining()
+        if curve is not None and (extra := curve.extra) is not None:
+            gone = 1.0 - self.held.squared(curve) / max(self.held.squared(before), 1e-300)
+            unlisted = Finding(
+                name="unlisted", location=extra.location, motor=extra.motor, parameters={}, std={},
+                coordinates=extra.coordinates, share=float(gone),
+            )  # fmt: skip
+            return _Judged("unexplained", [unlisted], before, curve, [])
+        verdict, notes = self._named(effects)
+        if verdict == "effect" and self.held.squared(self.found) > self.held.squared(before):
+            verdict = "insufficient_excitation"
+            notes.append("on data that took no part the effects do not lower the error: they are not written")
+        return _Judged(verdict, effects, before, self.found, notes)
+
+    def _named(self, effects: list[Finding]) -> tuple[Verdict, list[str]]:
+        """(verdict on named effects, what the motion cannot decide)."""
+        verdict: Verdict = "effect" if effects else "sufficient"
+        if all(poor(frame) for frame in self.problem.frames):
+            if not self.problem.frames[0].linked or not effects or any(f.alternatives for f in effects):
+                verdict = "insufficient_excitation"
+            return verdict, ["the motion is hardly more than one sine: many effects look alike in it"]
+        left = self._left(self.found)
+        if verdict == "sufficient" and left > PRIORS["effect"].std:
+            hidden = f"the model leaves {left:.0%} of the torque, and the recording hides what is missing"
+            return "insufficient_excitation", [hidden]
+        return verdict, []
+
+    def _stated(self, judged: _Judged, others: list[Fitted]) -> Diagnosis:
+        """What is reported of a verdict."""
+        problem, surplus = self.problem, self.surplus
+        effects, before, after = judged.effects, judged.before, judged.after
+        chances = [(self.search.chance(after, h, surplus), h) for h in others]
+        transmissions, unsure = transmissions_of(self.search, after, chances, surplus)
+        sides = self._sides(before, after) if judged.verdict in ("effect", "unexplained") else []
+        notes = [*judged.notes, *unsure, *self._doubts(effects), *sides, *wider(surplus)]
+        return Diagnosis(
+            verdict=judged.verdict,
+            bandwidth_hz=problem.bandwidth_hz,
+            effects=tuple(effects),
+            train=errors_of(problem, before, after, problem.used),
+            validation=self.held.errors(before, after),
+            floor_nm=tuple(self._floor(after)),
+            transmissions=transmissions,
+            alignment=alignment_of(problem, after, effects, surplus),
+            rivals=tuple(rivals_of(self.search)),
+            curves=curves_of(problem, after),
+            series=series_of(problem, before, after),
+            advice=tuple(dict.fromkeys(line for f in effects for line in advice_for(f.name, f.alternatives))),
+            notes=tuple(dict.fromkeys(notes)),
+            surplus=surplus,
+            recordings=self._recordings(before, after),
+            stiffness=stiffness_curves(problem, before, after, surplus),
+        )
+
+    def _declared(self, effects: list[Finding]) -> Fitted:
+        """The fitted declared model: declared numbers, readings aligned within everyday errors."""
+        pinned = dict(self.problem.numbers())
+        for finding in effects:
+            kind = LIBRARY[finding.name]
+            if kind.channel != "torque" or kind.name == "torque_offset":
+                pinned[kind.name, finding.motor] = (0.0,) * len(kind.linear)
+        zeros = ("torque_offset", "deflection_offset")
+        if self.problem.frames[0].linked or "torque_offset" in {f.name for f in effects}:
+            motors = range(len(self.problem.model.motors))
+            pinned |= {(name, i): (0.0,) for name in zeros for i in motors}
+        return self.problem.null(pinned)
+
+    def _unlisted(self, curve: Fitted) -> bool:
+        """Whether a free curve explains more than all named effects, here and on held-out data."""
+        if self.search.advantage(curve, self.found) <= 0.0:
+            return False
+        named = min(self.held.squared(h) for h in (self.found, *self.search.leading()))
+        free, before = self.held.squared(curve), self.held.squared(self.search.null)
+        return free < before and free < (choice("curve") ** 2 if self.found.terms else 1.0) * named
+
+    def _remaining(self) -> Fitted | None:
+        """A curve for a balance that named effects leave unexplained although its physics is declared."""
+        problem, found = self.problem, self.found
+        if not problem.frames[0].linked:
+            return None
+        left = found.posterior.sigma / found.regression.floor
+        worst = int(np.argmax(left)) % problem.equations
+        if float(np.max(left)) < choice("far"):
+            return None
+        link = worst == problem.equations - 1
+        return best_curve(self.search, found, ("link", None) if link else ("motor", worst))
+
+    def _doubts(self, effects: list[Finding]) -> list[str]:
+        """What these data cannot decide, one sentence each."""
+        link = self.problem.model.link
+        for finding in effects:
+            if finding.name not in ("motor_inertia", "link_inertia"):
+                continue
+            at_link = finding.name == "link_inertia" and link is not None
+            motor = self.problem.model.motors[finding.motor or 0]
+            declared = link.inertia_kg_m2 if at_link and link is not None else motor.inertia_kg_m2
+            more = finding.parameters["inertia_kg_m2"]
+            if self.problem.frames[0].linked and isinstance(more, float):
+                if abs(more) > PRIORS["anchor"].std * declared:
+                    return [
+                        f"an inertia of {more:.3g} kg·m² beyond the declared {declared:.3g} kg·m² is hardly "
+                        "to be believed: check it, and what may be missing in the library"
+                    ]
+            elif isinstance(more, float):
+                return [
+                    "without [link.dynamics] a wrong motor inertia, a wrong torque constant and a wrong "
+                    "stiffness look alike: check the declared inertia and torque constant first"
+                ]
+        return []
+
+    def _sides(self, before: Fitted, after: Fitted) -> list[str]:
+        """Residuals of both balances, after over before, in words."""
+        problem = self.problem
+        if not problem.frames[0].linked:
+            return []
+        equation = problem.group % problem.equations
+        sides = [equation < problem.equations - 1, equation == problem.equations - 1]
+        residuals = [h.regression.residual(h.posterior.x) for h in (before, after)]
+        left = np.array(
+            [[np.sqrt(np.mean(r[side & problem.used] ** 2)) for side in sides] for r in residuals]
+        )
+        motor, link = left[1] / np.maximum(left[0], 1e-300)
+        return [f"the motor's balance (eq 5) leaves {motor:.1%} of what it did, the link's (eq 4) {link:.1%}"]
+
+    def _left(self, found: Fitted) -> float:
+        """Relative error of the motors' balances."""
+        return float(np.sqrt(np.mean(np.square(self._floor(found))))) / self.problem.torque_rms
+
+    def _floor(self, after: Fitted) -> list[float]:
+        left = after.regression.residual(after.posterior.x)
+        motors = len(self.problem.model.motors)
+        return [
+            float(np.sqrt(np.mean(left[self.problem.group % self.problem.equations == i] ** 2)))
+            for i in range(motors)
+        ]
+
+    def _recordings(self, before: Fitted, after: Fitted) -> tuple[RecordingErrors, ...]:
+        problem, equations = self.problem, self.problem.equations
+        made: list[RecordingErrors] = []
+        for k in range(len(problem.signals)):
+            mine = (problem.group // equations == k) & problem.used
+            train: Errors = errors_of(problem, before, after, mine)
+            made.append(RecordingErrors(train, self.held.of(k, before, after)))
+        return tuple(made)

@@ -20,6 +20,7 @@ from estimator.diagnosis.covariance import design_effects, hac_covariance
 from estimator.diagnosis.frame import Frame
 from estimator.diagnosis.heldout import Held, held_out
 from estimator.diagnosis.hypothesis import Fitted, Problem
+from estimator.diagnosis.outcome import DELAYS, stamped_wrongly
 from estimator.diagnosis.search import Search
 from estimator.diagnosis.stiffness import middle
 from estimator.errors import EstimatorError
@@ -32,7 +33,6 @@ __all__ = ["JointFit", "Key", "TransmissionFit", "fit", "fit_joint", "transmissi
 
 _LOOKED_AT = 33  # deflections from zero to the largest one
 _HIGHEST_ORDER = 4
-_DELAYS = ("encoder_delay", "torque_delay")  # a zero of the encoders is always there
 _OF_RIGID = ("coulomb_friction", "torque_offset")
 _NUISANCES = {  # everyday errors by the names of `TransmissionFit.nuisance_std`
     "inertia": "motor_inertia",
@@ -119,7 +119,7 @@ class JointFit(NamedTuple):
         fitted: the hypothesis.
         covariance: (k, k) of its parameters; includes the uncertainty whether a reading has an error at all.
         absent: optional errors that the data do not support.
-        doubts: units and signs that the recordings do not reveal, one line each.
+        doubts: units, signs and time stamps that may be wrong, one line each.
     """
 
     problem: Problem
@@ -194,9 +194,10 @@ def fit_joint(
     problem, fitted = _ordered(usable, _bare(model), bandwidth_hz)
     held = held_out(problem)
     surplus = held.surplus(fitted)
-    doubts = tuple(dict.fromkeys(remark for remark in remarks if remark))
-    free = JointFit(problem, held, surplus, fitted, _covariance(problem, fitted, surplus), doubts=doubts)
-    return _aligned(free)
+    free = JointFit(problem, held, surplus, fitted, _covariance(problem, fitted, surplus))
+    stamps = (_stamped_wrongly(free, key) for key in _optional(free))
+    doubts = tuple(dict.fromkeys(one for one in (*remarks, *stamps) if one))
+    return _aligned(free._replace(doubts=doubts))
 
 
 def _joint_problem(records: Sequence[Record], model: JointModel, bandwidth_hz: float) -> Problem:
@@ -266,11 +267,15 @@ def _ordered(records: Sequence[Record], model: JointModel, bandwidth_hz: float) 
 def _aligned(free: JointFit) -> JointFit:
     """The fit without unsupported optional errors, removed one at a time, the least probable first.
 
-    The covariance is that of the mixture of both hypotheses, weighted by their odds.
+    A delay beyond those of any drive or bus is none, whatever the data say. The covariance is that of the
+    mixture of both hypotheses, weighted by their odds.
     """
     joint, problem = free, free.problem
     while True:
-        odds = {key: _odds_of_zero(joint, [key]) for key in _optional(joint)}
+        odds = {
+            key: math.inf if _stamped_wrongly(joint, key) else _odds_of_zero(joint, [key])
+            for key in _optional(joint)
+        }
         doubtful = [key for key in odds if odds[key] > math.log(choice("even") / (1.0 - choice("even")))]
         if not doubtful:
             break
@@ -287,6 +292,12 @@ def _aligned(free: JointFit) -> JointFit:
     return joint._replace(covariance=mixed)
 
 
+def _stamped_wrongly(joint: JointFit, key: Key) -> str | None:
+    """One sentence on a delay beyond those of any drive or bus."""
+    delay = max((float(x) for x in joint.values(key)), key=abs)
+    return stamped_wrongly(key[0], delay, joint.problem.period_s)
+
+
 def _covariance(problem: Problem, fitted: Fitted, surplus: float) -> FloatArray:
     """Covariance of the parameters; one held at its bound by a sign constraint keeps its prior variance."""
     covariance = hac_covariance(problem, fitted, surplus)
@@ -296,11 +307,11 @@ def _covariance(problem: Problem, fitted: Fitted, surplus: float) -> FloatArray:
 
 
 def _optional(joint: JointFit) -> list[Key]:
-    """Optional errors: delays, and friction and offset of a rigid joint."""
+    """Optional errors: delays, and friction and offset of a rigid joint; a zero is always there."""
     motors = joint.problem.model.motors
     keys = {(s.name, s.motor) for s in joint.fitted.slots if s.kind == "everyday"}
     rigid = {(name, i) for i, motor in enumerate(motors) if not motor.flexible for name in _OF_RIGID}
-    return sorted((k for k in keys - joint.absent if k[0] in _DELAYS or k in rigid), key=str)
+    return sorted((k for k in keys - joint.absent if k[0] in DELAYS or k in rigid), key=str)
 
 
 def _odds_of_zero(joint: JointFit, keys: Sequence[Key]) -> float:

@@ -63,7 +63,7 @@ def write(outcome: Diagnosis, title: Title, folder: Path) -> list[Path]:
 
 def as_json(outcome: Diagnosis) -> dict[str, Any]:
     """The content of report.json."""
-    unlisted = next((c for c in outcome.curves if c.name == "unlisted"), None)
+    unlisted = _curve_of_unlisted(outcome)
     return {
         "schema": _SCHEMA,
         "verdict": outcome.verdict,
@@ -83,6 +83,10 @@ def as_json(outcome: Diagnosis) -> dict[str, Any]:
         "advice": list(outcome.advice),
         "notes": list(outcome.notes),
     }
+
+
+def _curve_of_unlisted(outcome: Diagnosis) -> Curve | None:
+    return next((c for c in outcome.curves if c.name == "unlisted"), None)
 
 
 def _effect(finding: Finding, unlisted: Curve | None) -> dict[str, Any]:
@@ -130,7 +134,7 @@ def sentence(outcome: Diagnosis) -> str:
         over = " and ".join(name.replace("_", " ") for name in where.coordinates)
         return (
             f"Something at the {_place(where)} that is in no library, a function of {over}, is missing: "
-            f"with a free curve {fall}."
+            f"{'with a free curve' if _curve_of_unlisted(outcome) else 'with it'} {fall}."
         )
     if outcome.verdict == "insufficient_excitation":
         said = f" (it might be {names})" if names else ""

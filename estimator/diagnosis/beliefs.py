@@ -13,7 +13,7 @@ from estimator.effects import LIBRARY
 from estimator.model import JointModel
 from estimator.priors import PRIORS
 
-__all__ = ["OF_RUN", "effect_std", "everyday", "everyday_std", "least"]
+__all__ = ["OF_RUN", "effect_std", "everyday", "everyday_std", "least", "longest_delay_s"]
 
 OF_RUN = ("coulomb_friction", "torque_offset", "deflection_offset")  # all else belongs to the machine
 _AT_MOTOR = (
@@ -151,6 +151,11 @@ def effect_std(model: JointModel, candidate: Candidate, by_torque: float) -> flo
     return (
         min(PRIORS[name].std, by_torque) if name in ("encoder_scale", "encoder_eccentricity") else by_torque
     )
+
+
+def longest_delay_s(period_s: float) -> float:
+    """Beyond this a delay is an error of the time stamps: three deviations of its prior, or three samples."""
+    return choice("sure") * max(PRIORS["late"].std, period_s)
 
 
 def least(model: JointModel, candidate: Candidate) -> float:

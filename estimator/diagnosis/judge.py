@@ -18,6 +18,7 @@ from estimator.diagnosis.outcome import (
     findings_of,
     rivals_of,
     series_of,
+    stamped_wrongly,
     transmissions_of,
 )
 from estimator.diagnosis.result import Diagnosis, Errors, Finding, RecordingErrors, Verdict
@@ -91,11 +92,23 @@ class Judge:
                 coordinates=extra.coordinates, share=float(gone),
             )  # fmt: skip
             return _Judged("unexplained", [unlisted], before, curve, [])
+        stamps = self._stamped_wrongly(effects)
+        if stamps:
+            return _Judged("unexplained", [_unlisted(f) for f in effects], before, self.found, stamps)
         verdict, notes = self._named(effects)
         if verdict == "effect" and self.held.squared(self.found) > self.held.squared(before):
             verdict = "insufficient_excitation"
             notes.append("on data that took no part the effects do not lower the error: they are not written")
         return _Judged(verdict, effects, before, self.found, notes)
+
+    def _stamped_wrongly(self, effects: list[Finding]) -> list[str]:
+        """Delays beyond those of any drive or bus, one sentence each."""
+        return [
+            said
+            for finding in effects
+            if isinstance(delay := finding.parameters.get("delay_s"), float)
+            and (said := stamped_wrongly(finding.name, delay, self.problem.period_s))
+        ]
 
     def _named(self, effects: list[Finding]) -> tuple[Verdict, list[str]]:
         """(verdict on named effects, what the motion cannot decide)."""
@@ -227,3 +240,12 @@ class Judge:
             train: Errors = errors_of(problem, before, after, mine)
             made.append(RecordingErrors(train, self.held.of(k, before, after)))
         return tuple(made)
+
+
+def _unlisted(finding: Finding) -> Finding:
+    """A finding without its name and numbers."""
+    coordinates = LIBRARY[finding.name].coordinates[:1]
+    return Finding(
+        name="unlisted", location=finding.location, motor=finding.motor, parameters={}, std={},
+        coordinates=coordinates, share=finding.share,
+    )  # fmt: skip

@@ -7,6 +7,7 @@ from statistics import NormalDist
 
 import numpy as np
 
+from estimator.diagnosis.beliefs import longest_delay_s
 from estimator.diagnosis.candidates import columns
 from estimator.diagnosis.certainty import Standing
 from estimator.diagnosis.choices import choice
@@ -20,8 +21,18 @@ from estimator.effects import LIBRARY
 from estimator.model import ParameterValue
 from estimator.sample import SIGMA_95, FloatArray
 
-__all__ = ["alignment_of", "curves_of", "findings_of", "rivals_of", "series_of", "transmissions_of"]
+__all__ = [
+    "DELAYS",
+    "alignment_of",
+    "curves_of",
+    "findings_of",
+    "rivals_of",
+    "series_of",
+    "stamped_wrongly",
+    "transmissions_of",
+]
 
+DELAYS = ("encoder_delay", "torque_delay")
 _CHANNELS = {"torque_delay": "torque_delay_s", "deflection_offset": "deflection_offset_rad"}
 
 
@@ -61,7 +72,7 @@ def findings_of(
     for slot, x, sigma in zip(found.slots, found.posterior.x, std, strict=True):
         value = slot.taken + float(x)
         late = abs(value) > problem.period_s + choice("sure") * sigma
-        if slot.kind == "everyday" and slot.name in ("encoder_delay", "torque_delay") and late:
+        if slot.kind == "everyday" and slot.name in DELAYS and late:
             kind = LIBRARY[slot.name]
             made.append((0.0, Finding(
                 name=slot.name, location=kind.location, motor=slot.motor, parameters={"delay_s": value},
@@ -102,7 +113,7 @@ def _offsets(problem: Problem, found: Fitted, std: FloatArray) -> list[Finding]:
 
 def _everyday(problem: Problem, finding: Finding) -> bool:
     """Whether a delay is a skew of up to a sample, which is reported but not diagnosed."""
-    if finding.name not in ("encoder_delay", "torque_delay"):
+    if finding.name not in DELAYS:
         return False
     delay, std = (np.max(values["delay_s"]) for values in (finding.parameters, finding.std))
     return bool(abs(delay) <= problem.period_s + choice("sure") * std)
@@ -113,13 +124,25 @@ def _absolute(problem: Problem, found: Fitted, k: int, name: str, x: float) -> f
     return x * problem.unit_of(found.terms[k], name)
 
 
+def stamped_wrongly(name: str, delay_s: float, period_s: float) -> str | None:
+    """One sentence on a delay that no drive and no bus has."""
+    longest = longest_delay_s(period_s)
+    if name not in DELAYS or abs(delay_s) <= longest:
+        return None
+    return (
+        f"the best fit has {name} of {delay_s:.3g} s, more than the {longest:.2g} s of drives and buses: "
+        "check the time stamps of the channels, or declare it"
+    )
+
+
 def alignment_of(problem: Problem, after: Fitted, effects: list[Finding], surplus: float) -> dict[str, float]:
     """Everyday corrections of the readings, by channel."""
     named = {(f.name, f.motor) for f in effects}
     pairs: dict[str, float] = {}
     std = np.sqrt(np.maximum(np.diag(hac_covariance(problem, after, surplus)), 0.0))
     for slot, x, sigma in zip(after.slots, after.posterior.x, std, strict=True):
-        if abs(slot.taken + float(x)) < choice("sure") * sigma:
+        value = slot.taken + float(x)
+        if abs(value) < choice("sure") * sigma or stamped_wrongly(slot.name, value, problem.period_s):
             continue
         if (
             slot.kind not in ("everyday", "term")
@@ -128,9 +151,9 @@ def alignment_of(problem: Problem, after: Fitted, effects: list[Finding], surplu
         ):
             continue
         if slot.name == "encoder_delay":
-            pairs["link_position_delay_s"] = slot.taken + float(x)
+            pairs["link_position_delay_s"] = value
         elif slot.name in _CHANNELS:
-            pairs[f"motor{(slot.motor or 0) + 1}_{_CHANNELS[slot.name]}"] = slot.taken + float(x)
+            pairs[f"motor{(slot.motor or 0) + 1}_{_CHANNELS[slot.name]}"] = value
     return pairs
 
 

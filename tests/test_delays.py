@@ -1,0 +1,68 @@
+"""Delays that a drive or a bus has are fitted and found; longer ones are errors of the time stamps."""
+
+from __future__ import annotations
+
+import diagnosiskit as kit
+import numpy as np
+import pytest
+
+from estimator.diagnosis import diagnose
+from estimator.diagnosis.outcome import stamped_wrongly
+from estimator.identify import identify
+from estimator.sample import Record
+
+EVERY = 5  # samples of a millisecond in one period of the slow recording
+
+
+def slow(record: Record) -> Record:
+    """The same motion with a longer period: the torque is that of its hold."""
+    assert record.link_position_rad is not None
+    return Record(
+        period_s=EVERY * record.period_s,
+        sequence=np.arange(len(record) // EVERY),
+        motor_position_rad=record.motor_position_rad[::EVERY],
+        motor_torque_nm=record.motor_torque_nm.reshape(-1, EVERY).mean(axis=1)[:, None],
+        link_position_rad=record.link_position_rad[::EVERY],
+    )
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "period_s", "usual"),
+    [
+        (0.014, 1e-3, True),
+        (-0.014, 1e-3, True),
+        (0.016, 1e-3, False),
+        (-0.016, 1e-3, False),
+        (0.025, 1e-2, True),
+    ],
+)
+def test_tens_of_milliseconds_are_no_delay_of_a_drive_unless_it_samples_as_slowly(
+    delay_s: float, period_s: float, usual: bool
+) -> None:
+    assert (stamped_wrongly("encoder_delay", delay_s, period_s) is None) == usual
+    assert stamped_wrongly("torque_offset", delay_s, period_s) is None
+
+
+def test_fit_writes_a_delay_of_two_samples_and_none_of_tens_of_milliseconds() -> None:
+    usual, long = (slow(one) for one in kit.World([{"late_s": 0.010}, {"late_s": 0.022}]).run())
+    found = identify(usual, kit.model(linked=False))
+    (effect,) = found.model.link_effects
+    assert effect.parameters["delay_s"] == pytest.approx(0.010, abs=2e-4)
+    assert found.fits[0].parameters["k_nm_rad"] == pytest.approx(kit.STIFFNESS, rel=0.02)
+    found = identify(long, kit.model(linked=False))
+    assert found.model.link_effects == ()
+    assert found.fits[0].link_delay_s == 0.0
+    assert any("encoder_delay of 0.022 s" in note and "time stamps" in note for note in found.notes)
+    # Without the delay the model does not hold: the interval covers the other explanation.
+    assert abs(found.fits[0].alpha[0] - kit.STIFFNESS) < 3.0 * np.sqrt(found.fits[0].covariance[0, 0])
+
+
+def test_diagnose_names_no_delay_of_tens_of_milliseconds() -> None:
+    (record,) = kit.World([{"late_s": 0.030}]).run()
+    found = diagnose(record, kit.model(), 15.0)
+    assert found.verdict == "unexplained"
+    assert [(e.name, e.location, e.coordinates, e.parameters) for e in found.effects] == [
+        ("unlisted", "measurement", ("link_velocity",), {})
+    ]
+    assert "link_position_delay_s" not in found.alignment
+    assert any("encoder_delay of 0.03 s" in note for note in found.notes)

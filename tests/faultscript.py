@@ -188,7 +188,7 @@ SCRIPT: tuple[Fault, ...] = (
         name="another master makes SYNC too",
         steps=(at(0.1, "foreign_sync", 5),),
         says=(
-            r"^another master makes SYNC: its cycles are not used",
+            r"^another master produces SYNC: its cycles are not used",
             r"^the other master stopped producing SYNC",
         ),
     ),

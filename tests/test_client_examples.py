@@ -1,6 +1,7 @@
 """The examples run against a daemon in another process, in every language whose tools are here."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -32,10 +33,10 @@ def run(*command, **options):
 @pytest.mark.parametrize(
     ("name", "seconds", "expected"),
     [
-        ("subscribe_latest.py", "1.2", "live     gain    70.0 N·m/rad"),
+        ("subscribe_latest.py", "1.2", r"live     gain    70\.0 N·m/rad"),
         ("subscribe_wait.py", "1.5", "in control from cycle"),
-        ("subscribe_async.py", "3.2", "elbow: cycle 500, 700.0 N·m/rad, running"),
-        ("subscribe_numpy.py", "0.5", "stiffness 700.0 N·m/rad"),
+        ("subscribe_async.py", "3.2", r"elbow: cycle \d*[05]00, 700\.0 N·m/rad, running"),
+        ("subscribe_numpy.py", "0.5", r"stiffness 700\.0 N·m/rad"),
     ],
 )
 def test_the_python_examples_run(endpoint, name, seconds, expected):
@@ -44,7 +45,7 @@ def test_the_python_examples_run(endpoint, name, seconds, expected):
         out = run(
             sys.executable, EXAMPLES / name, "elbow", endpoint, float(seconds) * longer, env=environment
         )
-        if expected in out:
+        if re.search(expected, out):
             return
     pytest.fail(out)
 

@@ -150,7 +150,7 @@ def live(change=lambda text: text, seconds=8.0):
 def test_a_moving_joint_passes_the_gate_that_recordings_pass():
     (finding,) = live().notices
     assert finding.severity is Severity.OK, finding
-    assert "positions and torque fit in unit and sign" in finding.text
+    assert "units and signs of positions and torque agree" in finding.text
 
 
 def test_too_short_a_look_is_no_judgement():
@@ -250,7 +250,7 @@ def test_a_node_that_is_not_there_is_an_error_that_names_who_is(rig):
 
 def test_an_empty_bus_is_an_error():
     report = examine(parse(joint_on("empty bus")), Path(), 0.1)
-    assert any("nobody answers" in line for line in texts(report, Severity.ERROR))
+    assert any("no node answers" in line for line in texts(report, Severity.ERROR))
 
 
 def test_a_wrong_bus_is_one_finding():
@@ -495,7 +495,7 @@ def sync(period_s, jitter_s=0.0, count=500):
         (sync(0.002), {"sync": "follow"}, Severity.OK, "every 2.000 ms"),
         ([], {"sync": "follow"}, Severity.ERROR, "nobody makes SYNC"),
         ([], {}, Severity.OK, "drivelink run will"),
-        (sync(0.001), {}, Severity.WARNING, "another master makes it"),
+        (sync(0.001), {}, Severity.WARNING, "another master produces it"),
     ],
 )
 def test_sync_is_judged_by_rate_and_role(stamps, bus, severity, expected):
@@ -511,7 +511,7 @@ def test_a_sync_of_our_own_daemon_is_no_reason_to_follow():
     judge_sync(section, sync(0.001), BusSection(), Daemons(ours=True, others=()))
     (finding,) = section.notices
     assert finding.severity is Severity.OK
-    assert "made by the drivelink daemon" in finding.text
+    assert "produced by the drivelink daemon" in finding.text
     assert not finding.fix
 
 

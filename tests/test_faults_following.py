@@ -152,7 +152,7 @@ def test_a_second_master_is_named_when_following_too(monkeypatch: pytest.MonkeyP
         follower.run.bus.sync(follower.stamp_ns + PERIOD_NS // 3)
         follower.run.loop.receive()
     follower.run.supervisor.check()
-    assert any(text.startswith("a second master makes SYNC too") for text in follower.events)
+    assert any(text.startswith("a second master produces SYNC too") for text in follower.events)
 
 
 def test_a_master_that_changes_its_period_is_named_with_both(monkeypatch: pytest.MonkeyPatch) -> None:

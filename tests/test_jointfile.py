@@ -210,7 +210,7 @@ def test_no_part_of_a_written_file_is_taken_for_a_model(written: Path) -> None:
             jointfile.load(written)
         assert "\n" not in str(caught.value) and str(caught.value).startswith(str(written))
         if end > 100:
-            assert "cut off: its check line, the last one, is missing" in str(caught.value)
+            assert "truncated: its last line, the check line, is missing" in str(caught.value)
 
 
 def test_a_written_file_may_be_edited_and_that_is_said(
@@ -240,7 +240,7 @@ def test_the_daemon_does_not_take_a_part_of_a_joint_file_over(written: Path) -> 
     written.write_bytes(written.read_bytes()[:-40])
     reloader._prepare()
     (said,) = [event["text"] for event in events.recent()]
-    assert said.startswith("the model stays as it is") and "cut off" in said
+    assert said.startswith("the model stays as it is") and "truncated" in said
 
 
 @pytest.mark.parametrize(

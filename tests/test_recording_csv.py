@@ -204,7 +204,7 @@ def test_a_last_line_that_a_crash_cut_off_is_left_out(tmp_path: Path, said: pyte
         path.write_bytes(whole[:-cut])
         record = read(path)
         assert np.array_equal(record.motor_torque_nm[:, 0], rows()[:49, 2])
-        assert "the last line has no end and is left out" in said.text
+        assert "the last line has no end and is omitted" in said.text
         said.clear()
 
 

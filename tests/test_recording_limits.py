@@ -283,7 +283,7 @@ def test_no_cut_of_a_log_makes_another_frame(
     path.write_bytes(good[: good.rindex(b"181") + 12])
     caplog.clear()
     list(read_frames(path))
-    assert "the last line has no end and is left out" in caplog.text
+    assert "the last line has no end and is omitted" in caplog.text
 
 
 def test_messages_of_others_in_an_mcap_file_are_one_line(whole: Path, tmp_path: Path) -> None:

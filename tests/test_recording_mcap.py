@@ -319,7 +319,7 @@ def test_a_file_that_is_cut_off_is_one_warning_however_often_it_is_read(
     for _ in range(3):
         list(read_messages(path))
     assert [entry.getMessage() for entry in caplog.records].count(
-        f"{path}: cut off or damaged: read up to where it is whole"
+        f"{path}: truncated or damaged: read up to the damage"
     ) == 1
 
 

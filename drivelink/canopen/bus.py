@@ -41,8 +41,8 @@ _WITHOUT_BITRATE = frozenset({"virtual", "socketcan", "socketcand", "udp_multica
 _REASONS = {
     errno.ENODEV: "there is no such interface",
     errno.ENETDOWN: "the interface is down",
-    errno.EPERM: "this user may not use it",
-    errno.EACCES: "this user may not use it",
+    errno.EPERM: "permission denied",
+    errno.EACCES: "permission denied",
     errno.ENOENT: "there is no such device",
     errno.EAFNOSUPPORT: "this kernel has no SocketCAN (AF_CAN)",
     errno.EPROTONOSUPPORT: "this kernel has no raw CAN sockets",
@@ -139,7 +139,7 @@ def _check_socketcand(section: BusSection) -> None:
             greeting = connection.recv(64)
     except TimeoutError as error:
         raise BusError(
-            f"socketcand {host}:{port}: nobody accepts, or the server says nothing for {_CONNECT_S:g} s: "
+            f"socketcand {host}:{port}: no connection, or no greeting for {_CONNECT_S:g} s: "
             "is it a socketcand?"
         ) from error
     except OSError as error:

@@ -238,7 +238,7 @@ def refuse_foreign_sync(bus: FrameBus, section: BusSection, idle: Idle | None) -
     syncs = sum(1 for cob_id in heard if cob_id == 0x80)
     if syncs > 1:
         raise BusError(
-            f"another master already makes SYNC on {section.interface} {section.channel}: "
+            f"another master already produces SYNC on {section.interface} {section.channel}: "
             'set bus.sync = "follow", or stop it'
         )
 

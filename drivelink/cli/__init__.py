@@ -163,7 +163,7 @@ def add_recordings(parser: argparse.ArgumentParser) -> None:
         help="measured data of one joint: CSV, MCAP, CAN log; of several each is validated by the others",
     )
     parser.add_argument(
-        "--joint", type=Path, metavar="JOINT", help="joint file; left out: the one that the recording carries"
+        "--joint", type=Path, metavar="JOINT", help="joint file (default: the one in the recording)"
     )
     parser.add_argument(
         "--bandwidth-hz",

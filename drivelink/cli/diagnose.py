@@ -45,14 +45,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--validate",
         type=Path,
         metavar="RECORDING2",
-        help="data that takes no part in any fit: an effect is kept only if it lowers the error there",
+        help="held-out data: an effect is kept only if it lowers the error there",
     )
     parser.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="where the reports go")
     parser.add_argument(
         "--write", type=Path, metavar="JOINT2", help="write a joint file with the effects found"
     )
     parser.add_argument("--force", action="store_true", help="replace the file of --write if it exists")
-    parser.add_argument("--json", action="store_true", help="print what report.json says, and nothing else")
+    parser.add_argument(
+        "--json", action="store_true", help="print the content of report.json and nothing else"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -119,6 +121,6 @@ def _print(outcome: Diagnosis, units: Units) -> None:
             text = units.value(name, value, refitted.std[name])
             print(f"  transmission {number}, refitted: {name} = {text}")
     for name, value in outcome.alignment.items():
-        print(f"  taken out of the readings: {name} = {units.value(name, value, None)}")
+        print(f"  corrected in the readings: {name} = {units.value(name, value, None)}")
     for line in (*outcome.notes, *outcome.advice):
         print(f"  {line}")

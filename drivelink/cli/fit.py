@@ -15,7 +15,7 @@ _EPILOG = """\
 examples:
   drivelink fit healthy.csv --joint elbow.toml --out fit/ --plots --write elbow-fitted.toml
   drivelink fit monday.csv tuesday.csv --joint elbow.toml      runs of one joint, each validated by the others
-  drivelink fit healthy.mcap --json                   a recording of drivelink carries its joint file
+  drivelink fit healthy.mcap --json                   a recording of drivelink contains its joint file
 
 Of several recordings stiffness, inertias, dampings, link dynamics and delays are shared; zeros of encoders,
 offsets and the level of friction belong to each.
@@ -37,7 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--plots", nargs="?", type=Path, const=Path(), metavar="DIR", help="write plots there, or into --out"
     )
-    parser.add_argument("--json", action="store_true", help="print what fit.json says, and nothing else")
+    parser.add_argument("--json", action="store_true", help="print the content of fit.json and nothing else")
 
 
 def run(args: argparse.Namespace) -> int:

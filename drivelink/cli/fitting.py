@@ -206,12 +206,12 @@ def _remarks(one: TransmissionFit) -> list[str]:
         return remarks
     if not one.excited:
         remarks.append(
-            "the motion does not determine the stiffness to half of itself, so none is reported: "
+            "the 95 % interval of the stiffness is wider than ± 50 %, so none is reported: "
             "record one with more deflection, driven both ways and by either side"
         )
     elif not one.stiffens:
         remarks.append(
-            "the stiffness is not above zero, or its interval is not: no spring is like that. "
+            "the stiffness or its interval is not above zero, as a spring's is. "
             "Check the signs of position and torque, and the inertia"
         )
     std = one.nuisance_std

@@ -25,14 +25,14 @@ _EPILOG = """\
 examples:
   drivelink fleet night/ --joints joints/ --out fleet/
   drivelink fleet 's3://plant/2026-11-*/*.mcap' --joints joints/ --scheduler tcp://10.0.0.5:8786
-  drivelink fleet report fleet/                    the page again, from the table alone
+  drivelink fleet report fleet/                    make the page again from the table
 
-RECORDINGS are files, globs, folders or URLs of fsspec (file:, sftp:, s3:, http:). A recording is of the joint
-whose file it carries (MCAP), else of the one of --joints whose name stands in its name or folder. The date
-is its own, where it has one, else that in its name, else that of the file.
+RECORDINGS are files, globs, folders or URLs of fsspec (file:, sftp:, s3:, http:). The joint of a
+recording is the one whose file it contains (MCAP), else the one of --joints whose name is in the recording's
+name or folder. Its date is that of its stamps, else that in its name, else that of the file.
 
 Writes a table with a row for each recording and transmission (DIR/table/*.parquet), each diagnosis,
-fleet.html and fleet.json. What is in the table is not done again: start it every night with the same line.
+fleet.html and fleet.json. Recordings that are in the table are skipped: run the same command every night.
 """
 
 
@@ -50,30 +50,30 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="RECORDINGS",
         help="measured data; or `report` and the folder of results",
     )
-    parser.add_argument("--joints", type=Path, metavar="DIR", help="folder of joint files, a joint each")
+    parser.add_argument("--joints", type=Path, metavar="DIR", help="folder of joint files, one per joint")
     parser.add_argument(
-        "--out", default="fleet", metavar="DIR", help="where results go, a URL too (default: fleet)"
+        "--out", default="fleet", metavar="DIR", help="folder or URL of the results (default: fleet)"
     )
     parser.add_argument(
-        "--since", metavar="DATE", help="leave earlier ones out: 2026-11-22, or 30d, 4w for days, weeks"
+        "--since", metavar="DATE", help="omit earlier recordings: 2026-11-22, or 30d, 4w for days, weeks"
     )
     parser.add_argument(
         "--scheduler", metavar="ADDRESS", help="a running Dask scheduler, e.g. tcp://10.0.0.5:8786"
     )
     parser.add_argument(
-        "--workers", type=int, metavar="N", help="processes on this machine (default: one a core)"
+        "--workers", type=int, metavar="N", help="processes on this machine (default: one per CPU core)"
     )
     parser.add_argument(
         "--memory",
         metavar="SIZE",
-        help="limit of each worker, e.g. 2GiB; a larger recording is cut into parts",
+        help="limit of each worker, e.g. 2GiB; a larger recording is split",
     )
     parser.add_argument(
         "--validate",
         choices=["previous"],
-        help="validate on the joint's recording before, not on held-out blocks",
+        help="validate on the joint's previous recording instead of held-out blocks",
     )
-    parser.add_argument("--again", action="store_true", help="also do what is in the table already")
+    parser.add_argument("--again", action="store_true", help="repeat recordings that are in the table")
     parser.add_argument(
         "--fdr",
         type=float,
@@ -81,7 +81,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="Q",
         help="false discovery rate of the changes (default: 0.05)",
     )
-    parser.add_argument("--json", action="store_true", help="print what fleet.json says, and nothing else")
+    parser.add_argument(
+        "--json", action="store_true", help="print the content of fleet.json and nothing else"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -159,7 +161,7 @@ def _run(args: argparse.Namespace) -> int:
             counts = runner.run(sources, joints, storage.Store(args.out), settings, progress, say)
         except KeyboardInterrupt:
             print(
-                f"interrupted; what was finished is in {args.out}: the same line goes on from there",
+                f"interrupted; what was finished is in {args.out}: repeat the command to continue",
                 file=sys.stderr,
             )
             raise

@@ -41,14 +41,24 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("joint", nargs="?", metavar="JOINT", help="name of a joint, or its joint file")
     parser.add_argument("--web", action="store_true", help="serve a page with live plots on this machine")
-    parser.add_argument("--port", type=int, default=8765, help="of the page (default %(default)s, 0: any)")
-    parser.add_argument("--seconds", type=float, metavar="S", help="end after so long; else with Ctrl-C")
-    parser.add_argument("--every", type=float, default=1.0, metavar="S", help="between two plain lines")
+    parser.add_argument(
+        "--port", type=int, default=8765, help="port of the page (default %(default)s, 0: any)"
+    )
+    parser.add_argument(
+        "--seconds", type=float, metavar="S", help="end after S seconds (default: with Ctrl-C)"
+    )
+    parser.add_argument(
+        "--every",
+        type=float,
+        default=1.0,
+        metavar="S",
+        help="interval of the plain lines (default: %(default)s)",
+    )
     parser.add_argument("--endpoint", help=f"where a daemon or router listens (default {ENDPOINT})")
     parser.add_argument("--config", type=Path, help="zenoh configuration file (JSON5) instead")
     parser.add_argument("--prefix", help='first part of every key (default "drivelink")')
     parser.add_argument(
-        "--json", action="store_true", help="in place of a plain line: one JSON object a joint and line"
+        "--json", action="store_true", help="print one JSON object per joint instead of each plain line"
     )
 
 

@@ -42,27 +42,31 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("path", nargs="?", type=Path, metavar="PATH", help="default: NAME.toml; -: print it")
     parser.add_argument("--case", choices=_CASES, help="one of the paper's joints, simulated")
     parser.add_argument("--scan", action="store_true", help="take the nodes from what answers on the bus")
-    parser.add_argument("--name", help="of the joint")
+    parser.add_argument("--name", help="name of the joint")
     parser.add_argument("--arrangement", choices=_ARRANGEMENTS, help="how the motors act on the joint")
     parser.add_argument(
-        "--rotor-inertia", type=float, metavar="G_CM2", help="of each motor, g·cm², as its data sheet has it"
+        "--rotor-inertia", type=float, metavar="G_CM2", help="rotor inertia of each motor, g·cm² (data sheet)"
     )
-    parser.add_argument("--inertia", type=float, metavar="KG_M2", help="instead: of each motor, joint side")
+    parser.add_argument(
+        "--inertia", type=float, metavar="KG_M2", help="instead: inertia of each motor, joint side"
+    )
     parser.add_argument(
         "--torque-constant",
         type=float,
         metavar="MNM_A",
-        help="of each motor, mN·m/A, where the drive reports no torque",
+        help="torque constant of each motor, mN·m/A, if the drive reports no torque",
     )
-    parser.add_argument("--damping", type=float, metavar="NM_S_RAD", help="of each motor, joint side")
-    parser.add_argument("--model", choices=_MODELS, help="of the transmission")
-    parser.add_argument("--node", type=int, action="append", metavar="ID", help="of a drive; twice for a VSA")
+    parser.add_argument("--damping", type=float, metavar="NM_S_RAD", help="damping of each motor, joint side")
+    parser.add_argument("--model", choices=_MODELS, help="model of the transmission")
+    parser.add_argument(
+        "--node", type=int, action="append", metavar="ID", help="node ID of a drive; twice for a VSA"
+    )
     parser.add_argument("--gear", type=float, metavar="RATIO", help="motor revolutions per joint revolution")
     parser.add_argument("--encoder", metavar="drive|none|ID", help="link encoder: ID of a CiA 406 node")
     parser.add_argument("--interface", help="python-can interface (default: socketcan)")
     parser.add_argument("--channel", help="python-can channel (default: can0)")
     parser.add_argument("--bitrate", type=int, help="bit/s (default: 1000000)")
-    parser.add_argument("--passive", action="store_true", help="another master is in charge of the bus")
+    parser.add_argument("--passive", action="store_true", help="another master controls the bus")
     parser.add_argument("--force", action="store_true", help="replace PATH if it exists")
     parser.add_argument("--json", action="store_true", help="print what was made as one JSON object")
 
@@ -237,7 +241,7 @@ def _ask(answers: Answers, known: set[str]) -> None:
             question = "Link encoder: drive, none, or node id of a CiA 406 encoder"
             answers.encoder = _asked(question, answers.encoder, _encoder) or answers.encoder
     except EOFError:
-        raise UsageError("the questions were left unanswered; options answer them, too: --help") from None
+        raise UsageError("the questions were not answered; options answer them, too: --help") from None
 
 
 def _asked(question: str, default: Any, check: Callable[[str], Any], *, needed: bool = False) -> Any:

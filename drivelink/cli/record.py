@@ -61,7 +61,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument("joint", type=Path, metavar="JOINT", help="joint file")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the recording")
-    parser.add_argument("--seconds", type=float, metavar="S", help="end after so long; else with Ctrl-C")
+    parser.add_argument(
+        "--seconds", type=float, metavar="S", help="end after S seconds (default: with Ctrl-C)"
+    )
     parser.add_argument(
         "--source",
         choices=("auto", "daemon", "bus"),
@@ -237,7 +239,7 @@ class _Summary:
         missed = self._missed()
         lost = f", {missed} cycles without sample" if missed else ""
         refused = sum(tap.refused for tap in self._recorder.taps if isinstance(tap, ZenohTap))
-        lost += f", {refused} messages of others left out" if refused else ""
+        lost += f", {refused} messages of others ignored" if refused else ""
         lost += f", no samples: {why}" if (why := self._why()) else ""
         return f"{', '.join(counts)} in {time.monotonic() - self._begin:.0f} s{lost}"
 

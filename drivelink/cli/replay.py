@@ -39,7 +39,7 @@ formats: .csv, .mcap, .mf4 (with asammdf), and raw CAN: candump .log in its vari
 
 examples:
   drivelink replay run.csv --joint elbow.toml --out estimates.csv --plots plots/
-  drivelink replay run.mcap --publish --realtime        a recording of drivelink carries its joint file
+  drivelink replay run.mcap --publish --realtime        a recording of drivelink contains its joint file
   drivelink replay candump.log --joint elbow.toml --channel can1
   drivelink replay rig.csv --joint elbow.toml --map t=time_s:ms --map q_link=link_position_rad:deg
 """

@@ -45,7 +45,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "joints", nargs="+", type=Path, metavar="JOINT", help="joint files; several share one bus"
     )
     parser.add_argument(
-        "--seconds", type=float, metavar="S", help="end after so long; left out: run until stopped"
+        "--seconds", type=float, metavar="S", help="end after S seconds (default: run until stopped)"
     )
     add_bus(parser)
     parser.add_argument("--no-publish", action="store_true", help="compute, but publish nothing")
@@ -54,7 +54,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="do not ask for real-time scheduling and locked memory",
     )
-    parser.add_argument("--log-level", choices=_LEVELS, default="info", help="what goes to stderr")
+    parser.add_argument(
+        "--log-level", choices=_LEVELS, default="info", help="least severe messages that go to stderr"
+    )
     parser.add_argument(
         "--json",
         action="store_true",

@@ -43,13 +43,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="ADDRESS",
-        help="who else may connect; else this machine",
+        help="address that may connect besides this machine; may be repeated",
     )
     parser.add_argument(
-        "--credential", action="append", default=[], metavar="NAME=FILE", help="a key that zenoh.config names"
+        "--credential",
+        action="append",
+        default=[],
+        metavar="NAME=FILE",
+        help="file of a key that zenoh.config names; may be repeated",
     )
     add_bus(parser)
-    parser.add_argument("--force", action="store_true", help="replace files that are there and differ")
+    parser.add_argument("--force", action="store_true", help="replace existing files that differ")
     parser.add_argument("--json", action="store_true", help="print what was done as one JSON object")
 
 

@@ -52,10 +52,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--case", choices=CASE_NAMES, help="one of the paper's cases as the world")
     parser.add_argument("--quirks", metavar="NAME", help=f"drives that behave like: {', '.join(QUIRK_NAMES)}")
     add_bus(parser)
-    parser.add_argument("--seconds", type=float, metavar="S", help="end by itself after so long")
-    parser.add_argument("--seed", type=int, help="of the sensor noise")
     parser.add_argument(
-        "--write-eds", type=Path, metavar="DIR", help="write the EDS file of every simulated node and go on"
+        "--seconds", type=float, metavar="S", help="end after S seconds (default: with Ctrl-C)"
+    )
+    parser.add_argument("--seed", type=int, help="seed of the sensor noise")
+    parser.add_argument(
+        "--write-eds", type=Path, metavar="DIR", help="also write the EDS file of every simulated node"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object when ready")
 

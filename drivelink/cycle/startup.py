@@ -161,7 +161,7 @@ class _Expected:
         if not self.synced:
             return BusError(
                 f'no SYNC on {self.channel} in {patience_s:g} s: with bus.sync = "follow" another master '
-                'must make it; set bus.sync = "produce" if there is none'
+                'must produce it; set bus.sync = "produce" if there is none'
             )
         cob_id, (node, _) = next(iter(self._frames.items()))
         return DriveError(

@@ -151,7 +151,7 @@ class Reloader:
         ]
         if changed:
             self._events.say(
-                f"{self._path.name}: {', '.join(changed)} changed, which takes a restart of the daemon",
+                f"{self._path.name}: {', '.join(changed)} changed, which requires a restart of the daemon",
                 logging.WARNING,
             )
         if joint.arrangement != self._joint.arrangement:

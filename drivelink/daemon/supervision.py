@@ -50,13 +50,13 @@ _COUNTED = (  # counter of a node; its smallest reported increase, message then,
         "wrong_length",
         1,
         "frames of the wrong length are not used",
-        "frames have their length, {} had not so far",
+        "frames have the right length again, {} were wrong so far",
     ),
     (
         "conflicting",
         3,  # a single one may be a late frame
         "different frames in one cycle are not used: does another device have its node ID or identifiers?",
-        "one frame a cycle again, {} cycles had several so far",
+        "one frame per cycle again, {} cycles had several so far",
     ),
 )
 
@@ -418,7 +418,7 @@ class Supervisor:
     def _say_unstarted(self, node: int, watched: _Watched) -> None:
         state = _STATES.get(watched.state, f"0x{watched.state:02X}")
         code = watched.loop_joint.pipeline.assembler.faults.get(node)
-        why = f" and EMCY 0x{code:04X}: its error may want a reset or its supply off and on" if code else ""
+        why = f" and EMCY 0x{code:04X}: its error may need a reset or a power cycle" if code else ""
         self._events.begin(
             f"start {node}",
             f"node {node} is configured and was started, but sends none of its frames; it says {state}{why}",
@@ -503,11 +503,11 @@ class Supervisor:
         _, foreign, skipped = self._foreign[0]
         if loop.produce and loop.foreign_syncs > foreign:
             what = (
-                "another master makes SYNC: its cycles are not used; "
+                "another master produces SYNC: its cycles are not used; "
                 'set bus.sync = "follow", or stop the other one'
             )
         elif (loop.foreign_syncs - foreign) - (loop.skipped_periods - skipped) >= _MANY_SYNCS:
-            what = "a second master makes SYNC too: its cycles are not used; stop one of the two"
+            what = "a second master produces SYNC too: its cycles are not used; stop one of the two"
         else:
             self._events.end("foreign sync", "the other master stopped producing SYNC")
             return
@@ -550,7 +550,7 @@ class Supervisor:
             self._events.begin(
                 "too slow",
                 f"this machine is too slow for the cycle of {loop.period_ns / 1e6:g} ms: "
-                f"{', '.join(filter(None, counted))}; drivelink doctor says what keeps it",
+                f"{', '.join(filter(None, counted))}; drivelink doctor names the cause",
             )
         elif now - self._slow_ns > _NS:
             self._slow = total  # the count restarts with a reopened bus

@@ -192,7 +192,7 @@ def _say_signal(
         section.say(severity, name, f"{', '.join(parts)} is there, but cannot be mapped into a TPDO")
     else:
         severity = Severity.ERROR if signal in _needed(sheet) else Severity.INFO
-        section.say(severity, name, "no object that gives it")
+        section.say(severity, name, "no object provides it")
 
 
 def _more(signal: Signal, sheet: DataSheet, usable: list[tuple[int, int]]) -> str:

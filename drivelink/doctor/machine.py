@@ -118,7 +118,7 @@ def _timer(section: Section, period_s: float, seconds: float) -> None:
         section.say(
             Severity.WARNING,
             "timer",
-            text + f": more than the period of {period_s * 1000:g} ms bears",
+            text + f": more than a period of {period_s * 1000:g} ms allows",
             "a kernel with PREEMPT_RT, fewer programs beside it, or a longer bus.period_s",
         )
 

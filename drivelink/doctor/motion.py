@@ -220,7 +220,9 @@ def _say_judgement(section: Section, joint: JointFile, judgement: Judgement) -> 
     elif judgement.remark:
         section.say(Severity.INFO, joint.name, judgement.remark, f"{_LONGER}; or drivelink doctor --move")
     else:
-        text = f"positions and torque fit in unit and sign: the torque balance leaves {judgement.left:.1%}"
+        text = (
+            f"units and signs of positions and torque agree: the torque balance leaves {judgement.left:.1%}"
+        )
         section.ok(joint.name, text)
 
 
@@ -342,7 +344,7 @@ def _judge_link(section: Section, subject: str, ratio: float) -> None:
     text = f"the link moves {ratio:.3g} times as far as the motor, both at the joint side"
     if ratio < 0:
         section.say(
-            Severity.WARNING, subject, text, "turn the sign of link.encoder.direction, or the drive's"
+            Severity.WARNING, subject, text, "reverse the sign of link.encoder.direction, or the drive's"
         )
     else:
         section.say(

@@ -92,7 +92,7 @@ def _ask(
         section.say(
             Severity.ERROR,
             joint.bus.channel,
-            "nobody answers and nobody is heard",
+            "no node answers or sends",
             "power the drives; check cable, termination, bit rate and node ids",
         )
     layouts, surveys = [], {}

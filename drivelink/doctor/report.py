@@ -55,7 +55,7 @@ class Report:
     """
 
     sections: list[Section] = field(default_factory=list)
-    fine: str = "everything is as it should be"
+    fine: str = "no problem found"
 
     def section(self, title: str) -> Section:
         """Begin a section."""
@@ -99,7 +99,7 @@ class Report:
             plural = "s" if errors > 1 else ""
             return f"[red]{errors} problem{plural} to solve[/red], {warnings} to look at"
         if warnings:
-            return f"[yellow]{warnings} to look at[/yellow], nothing that prevents the job"
+            return f"[yellow]{warnings} to look at[/yellow], nothing that prevents operation"
         return f"[green]{self.fine}[/green]"
 
 

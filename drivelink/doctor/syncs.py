@@ -44,7 +44,7 @@ def judge_sync(
                 Severity.ERROR, "SYNC", "nobody makes SYNC", 'start the other master, or bus.sync = "produce"'
             )
         else:
-            section.ok("SYNC", "nobody makes it yet: drivelink run will")
+            section.ok("SYNC", "not produced yet: drivelink run will produce it")
         return
     gaps = [after - before for before, after in itertools.pairwise(stamps_s)]
     period_s = percentile(gaps, 0.5)
@@ -54,7 +54,7 @@ def judge_sync(
     text = f"every {period_s * 1000:.3f} ms, jitter {p99:.0f} µs (p99), {worst:.0f} µs (max)"
     daemons = daemons or Daemons(ours=False, others=())
     if bus.sync == "produce" and daemons.ours:
-        section.ok("SYNC", f"{text}, made by the drivelink daemon that runs")
+        section.ok("SYNC", f"{text}, produced by the drivelink daemon that runs")
     elif bus.sync == "produce" and daemons.others:
         section.say(
             Severity.WARNING,
@@ -67,7 +67,7 @@ def judge_sync(
         section.say(
             Severity.WARNING,
             "SYNC",
-            f"{text}: another master makes it, no drivelink daemon is alive",
+            f"{text}: another master produces it, no drivelink daemon is alive",
             'bus.sync = "follow", or stop the other master',
         )
     elif "period_s" in bus.model_fields_set and abs(period_s - bus.period_s) > 0.02 * bus.period_s:

@@ -222,7 +222,7 @@ def _minute(time: str) -> str:
 def _effects(joint: dict[str, Any]) -> str:
     if not joint["effects"]:
         return ""
-    heads = ("found", "at", "recordings", "since", "error it takes away", "")
+    heads = ("found", "at", "recordings", "since", "error that it removes", "")
     lines = []
     for effect in joint["effects"]:
         names = html.escape(", ".join(name.replace("_", " ") for name in effect["names"]))

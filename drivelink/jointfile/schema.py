@@ -221,7 +221,9 @@ class BusSection(_Section):
         le=1.0,
         description="communication cycle: one SYNC, one sample; when following and left out: measured",
     )
-    sync: Literal["produce", "follow"] = Field("produce", description="make SYNC, or follow another master's")
+    sync: Literal["produce", "follow"] = Field(
+        "produce", description="produce SYNC, or follow another master's"
+    )
     sync_counter_overflow: int = Field(0, ge=0, le=240, description="0x1019: 0, or 2 to 240")
     configure: bool = Field(True, description="configure the nodes; false: passive, never sends a frame")
     sdo_timeout_s: float = Field(0.5, gt=0, description="for each SDO transfer")
@@ -293,7 +295,7 @@ class SimSection(_Section):
     effect: tuple[Effect, ...] = Field((), description="effects of the world that the model may not know")
     excitation: dict[str, Any] = Field(default_factory=dict, description="torque of the rig, see reference")
     quirks: str | None = Field(None, description="vendor profile of the drives")
-    seed: int = Field(0, ge=0, description="of the sensor noise")
+    seed: int = Field(0, ge=0, description="seed of the sensor noise")
 
 
 class JointFile(_Section):
@@ -474,7 +476,7 @@ def _require_whole(text: str, where: str) -> None:
     if not checks:
         if _MARK in text:
             raise JointFileError(
-                f"{where}: cut off: its check line, the last one, is missing (write it anew; if you "
+                f"{where}: truncated: its last line, the check line, is missing (write it again; if you "
                 "removed that line yourself, remove the first one as well)"
             )
     elif _digest(text[: checks[-1].start()]) != checks[-1][1]:

@@ -123,7 +123,7 @@ def sentence(outcome: Diagnosis) -> str:
     """The verdict in one sentence."""
     lower = outcome.validation.after_rms_nm <= outcome.validation.before_rms_nm
     fall = (
-        f"the torque balance's error on data that took no part {'falls' if lower else 'rises'} from "
+        f"the torque balance's error on held-out data {'falls' if lower else 'rises'} from "
         f"{outcome.validation.before_relative:.2%} to {outcome.validation.after_relative:.2%}"
     )
     names = " and ".join(title_of(finding) for finding in outcome.effects)
@@ -226,7 +226,7 @@ def _effects(outcome: Diagnosis, units: Units) -> str:
             text = units.value(name, value, one.std[name])
             rows.append(f"<tr><td><code>{html.escape(name)}</code></td><td>{text}</td></tr>")
     if outcome.alignment:
-        rows.append('<tr class="effect"><th colspan="2">taken out of the readings</th></tr>')
+        rows.append('<tr class="effect"><th colspan="2">corrected in the readings</th></tr>')
     for name, value in outcome.alignment.items():
         rows.append(f"<tr><td><code>{name}</code></td><td>{units.value(name, value, None)}</td></tr>")
     return "".join(rows)
@@ -258,7 +258,7 @@ def _curve_figure(curve: Curve, units: Units) -> str:
 
 def _caption(curve: Curve) -> str:
     over = " and ".join(name.replace("_", " ") for name in curve.coordinates)
-    return f"What the declared model leaves over {over}, and {html.escape(curve.name.replace('_', ' '))}."
+    return f"Residual of the declared model over {over}, and {html.escape(curve.name.replace('_', ' '))}."
 
 
 def _is_function(curve: Curve) -> bool:
@@ -285,8 +285,8 @@ def _stiffness_figure(curve: StiffnessCurve, units: Units) -> str:
     }
     plots.xy(axes, curves, units.label("deflection / rad"), units.label("stiffness / (N·m/rad)"))
     caption = (
-        f"Stiffness of transmission {curve.motor + 1}, with 95 % bands. The declared model's band takes its "
-        "other numbers for exact, and for complete."
+        f"Stiffness of transmission {curve.motor + 1}, with 95 % bands. The declared model's band "
+        "assumes that its other parameters are exact and complete."
     )
     return f"<figure>{plots.svg_text(figure)}<figcaption>{caption}</figcaption></figure>"
 

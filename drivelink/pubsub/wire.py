@@ -181,7 +181,7 @@ STATUS_BITS: Mapping[str, str] = MappingProxyType(
         "DRIVE_FAULT": "a drive reports a fault or is not operational",
         "BUS_FAULT": "frames of this cycle were late or missing",
         "STALE": "the estimate is carried on without fresh measurements",
-        "UNTIMED": "another master made SYNC: values may be of another moment; no parameter is updated",
+        "UNTIMED": "another master produced SYNC: values may be of another moment; no parameter is updated",
         "NODE_RESTARTED": "positions may have restarted: the estimator restarts with this sample",
         "PARTIAL": "not given where NaN: stiffness of a rigid joint, standard deviation in mode paper",
         "CONTRADICTED": "two readings of one quantity contradict each other; no parameter is updated",

@@ -97,7 +97,7 @@ class _Text(io.TextIOBase):
             )
         if not line.endswith(b"\n"):
             if line.strip():
-                _LOG.warning("%s: the last line has no end and is left out: it may be cut off", self._path)
+                _LOG.warning("%s: the last line has no end and is omitted: it may be truncated", self._path)
             return ""
         return self._known(line.decode(errors="replace"))
 

@@ -184,7 +184,7 @@ def _require_end(file: IO[bytes], length: int, path: Path) -> None:
     """
     if length >= MAX_LINE_BYTES or file.read(1):
         raise RecordingError(f"{path}: expected lines of at most {MAX_LINE_BYTES >> 10} KiB")
-    _LOG.warning("%s: the last line has no end and is left out: it may be cut off", path)
+    _LOG.warning("%s: the last line has no end and is omitted: it may be truncated", path)
 
 
 def _plain_frames(lines: list[tuple[str, ...]]) -> Iterator[LoggedFrame]:
@@ -336,4 +336,4 @@ def _library_frames(path: Path) -> Iterator[LoggedFrame]:
     except Exception as error:  # readers raise various exceptions for damaged files
         if not count:
             raise RecordingError(f"{path}: cannot be read as {path.suffix} log: {str(error)[:80]}") from error
-        _LOG.warning("%s: broken after %d frames (%.80s): what follows is left out", path, count, error)
+        _LOG.warning("%s: broken after %d frames (%.80s): the rest is omitted", path, count, error)

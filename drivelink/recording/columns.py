@@ -71,7 +71,7 @@ def record_from_columns(
     columns = _scaled(columns, joint)
     motors = _motors(columns, joint)
     if motors == 1 and "motor2_position_rad" in columns:
-        _LOG.warning("%s: has a second motor, the joint file has not: its columns are left out", where)
+        _LOG.warning("%s: has a second motor, the joint file has not: its columns are ignored", where)
     _require(columns, "time_s", where)
     nominal = joint.bus.period_s if joint else None
     grid = find_grid(columns["time_s"], where, nominal, _repeats(columns))

@@ -160,7 +160,7 @@ def _blocks(file: IO[bytes], path: Path, line: int) -> Iterator[tuple[bytes, int
         else:
             rest += data
     if rest.strip(b" \t\r\0"):
-        _LOG.warning("%s: the last line has no end and is left out: it may be cut off", path)
+        _LOG.warning("%s: the last line has no end and is omitted: it may be truncated", path)
 
 
 def _numbers(block: bytes, layout: _Layout, path: Path, first_line: int) -> FloatArray:

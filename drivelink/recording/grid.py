@@ -67,7 +67,7 @@ def find_grid(
     if missing := int(np.count_nonzero(~keep)):
         _LOG.warning("%s: %d row(s) without a time stamp are taken as gaps", where, missing)
     if repeats is not None and (repeated := int(np.count_nonzero(repeats & keep))):
-        _LOG.warning("%s: %d row(s) repeat the row before and are left out", where, repeated)
+        _LOG.warning("%s: %d row(s) repeat the row before and are omitted", where, repeated)
         keep &= ~repeats
     time = time_s[keep]
     if len(time) < MINIMUM_ROWS:

@@ -57,7 +57,7 @@ def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[
     try:
         with path.open("rb") as file:
             if file.read(len(_MAGIC)) != _MAGIC:
-                raise RecordingError(f"{path}: expected an MCAP file, its first bytes are others")
+                raise RecordingError(f"{path}: expected an MCAP file, its first bytes are not those of one")
             left = os.fstat(file.fileno()).st_size - len(_MAGIC)
             while len(head := file.read(_HEAD.size)) == _HEAD.size:
                 opcode, length = _HEAD.unpack(head)
@@ -83,7 +83,7 @@ def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[
 @lru_cache(maxsize=16)
 def _warn_once(path: Path, _mtime_ns: int) -> None:
     """A file is read several times: for its joint, its mapping, its samples."""
-    _LOG.warning("%s: cut off or damaged: read up to where it is whole", path)
+    _LOG.warning("%s: truncated or damaged: read up to the damage", path)
 
 
 class _BrokenError(Exception):

@@ -98,7 +98,7 @@ class Judge:
         verdict, notes = self._named(effects)
         if verdict == "effect" and self.held.squared(self.found) > self.held.squared(before):
             verdict = "insufficient_excitation"
-            notes.append("on data that took no part the effects do not lower the error: they are not written")
+            notes.append("on held-out data the effects do not lower the error: they are not written")
         return _Judged(verdict, effects, before, self.found, notes)
 
     def _stamped_wrongly(self, effects: list[Finding]) -> list[str]:

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import gatekit
+import heldmotor
 import numpy as np
 import pytest
 
@@ -104,6 +105,21 @@ def test_the_sign_of_a_link_that_is_held_is_reported_as_undecided() -> None:
     reversed_link = gatekit.faulty(drawn.record, {"link_position": -1.0})
     undecided = judge(reversed_link, drawn.model).undecided
     assert any("sign" in text and "link" in text for text in undecided), undecided
+
+
+@pytest.mark.parametrize(("kp", "hand_rad"), [(heldmotor.KP, 0.02), (0.0, 0.3)], ids=["holds", "damps"])
+def test_a_motor_that_its_controller_holds_is_not_called_wrong(kp: float, hand_rad: float) -> None:
+    samples = heldmotor.moved(8.0, kp=kp, hand_rad=hand_rad)
+    record = Record(
+        period_s=1e-3,
+        sequence=np.arange(len(samples)),
+        motor_position_rad=np.array([s.motor_position_rad for s in samples]),
+        motor_torque_nm=np.array([s.motor_torque_nm for s in samples]),
+        link_position_rad=np.array([s.link_position_rad for s in samples]),
+    )
+    judgement = judge(record, heldmotor.declared())
+    assert judgement.findings == ()
+    assert any("sign" in text and "motor" in text for text in judgement.undecided), judgement
 
 
 def test_a_torque_that_is_only_noise_decides_nothing() -> None:

@@ -200,6 +200,22 @@ class Balance:
         x, _ = _bounded(factors, np.tile((-math.inf, math.inf), (len(factors.sizes), 1)))
         return float(-x[-1] / x[-2]) if x[-2] else None
 
+    def controlled(self) -> FloatArray:
+        """Fit a controller that makes the torque from the motor's own reading: PID of any delay.
+
+        No gain is negative. Where it leaves no more than the joint does, the torque says what the controller
+        does, not what the joint is (closed-loop identification without excitation of its own: Ljung, System
+        Identification, 1999, section 13.4).
+
+        Returns:
+            (bands,) residual rms over the rms of the whole torque, at least `_FLOOR`.
+        """
+        position, integral = (self._through(x)[0] for x in (self._theta, np.cumsum(self._theta)))
+        factors = _factors([position, integral, self._velocity, self._rate], self._target)
+        restoring, free = (-math.inf, 0.0), (-math.inf, math.inf)
+        _, left = _bounded(factors, np.array([restoring, restoring, restoring, free]))
+        return np.asarray(np.hypot(left[:-1], _FLOOR))
+
     @property
     def independent(self) -> FloatArray:
         """(bands,) effective sample size of the best hypothesis' residual.

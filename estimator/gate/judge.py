@@ -13,6 +13,7 @@ from estimator.errors import EstimatorError
 from estimator.gate.causes import Cause, Change, Kind, causes, scales
 from estimator.gate.evidence import Balance, Fit, Scales
 from estimator.model import JointModel, Motor
+from estimator.priors import PRIORS
 from estimator.sample import FloatArray, Record
 from estimator.transmissions import transmission_model
 
@@ -145,6 +146,7 @@ class _Joint:
     model: JointModel
     balances: dict[int, Balance]
     counts: dict[int, FloatArray] = field(default_factory=dict)
+    least: float = 0.0  # of an error that counts
 
     def fits(self, found: Sequence[Cause]) -> dict[int, tuple[Scales, Fit]]:
         out = {}
@@ -157,7 +159,7 @@ class _Joint:
         """Log posterior, up to a constant: likelihood, and how plausible such a joint is."""
         total = -sum(cause.cost for cause in found)
         for i, (s, fit) in self.fits(found).items():
-            total -= float(self.counts[i] @ np.log(fit.errors))
+            total -= float(self.counts[i] @ np.log(np.maximum(fit.errors, self.least)))
             total -= self._unusual(i, s, fit)
         period_s = self.record.period_s * scales(found, 0).time
         if self.model.period_s is not None:
@@ -182,6 +184,20 @@ class _Joint:
             total += 2.0 * math.log1p(x * x / 3.0)
         return total
 
+    def weighed(self, hypotheses: Sequence[tuple[Cause, ...]]) -> list[tuple[float, tuple[Cause, ...]]]:
+        """Evidence and hypothesis, the best one first."""
+        return sorted(((self.evidence(h), h) for h in hypotheses), key=lambda e: -e[0])
+
+    def controlled(self, found: Sequence[Cause]) -> bool:
+        """Whether controllers that see only their motors explain the torques as well as these corrections."""
+        return (
+            sum(
+                float(self.counts[i] @ np.log(self.balances[i].controlled() / fit.errors))
+                for i, (_, fit) in self.fits(found).items()
+            )
+            < _DECISIVE
+        )
+
     def left(self, found: Sequence[Cause]) -> float:
         """The largest relative residual of the motors' balances."""
         return max(fit.error for _, fit in self.fits(found).values())
@@ -193,7 +209,8 @@ def judge(record: Record, model: JointModel) -> Judgement:
     dissipative friction and small delays explain each motor's torque (eq 5, `Balance`), and by how plausible
     the resulting joint is. A finding beats "as declared" decisively and explains the torque. Without
     findings, every cause that is not decisively less likely than "as declared" is
-    listed as undecided: the sign of a link that is held, for example.
+    listed as undecided: the sign of a link that is held, for example. Where a controller that holds the motor
+    explains the torque as well as a finding does, no balance is better than undeclared friction leaves it.
 
     Args:
         record: the recording.
@@ -216,7 +233,10 @@ def judge(record: Record, model: JointModel) -> Judgement:
     for found in hypotheses:
         joint.fits(found)
     joint.counts = {i: np.minimum(b.independent, _INDEPENDENT) for i, b in joint.balances.items()}
-    weighed = sorted(((joint.evidence(h), h) for h in hypotheses), key=lambda e: -e[0])
+    weighed = joint.weighed(hypotheses)
+    if joint.controlled(weighed[0][1]):
+        joint.least = PRIORS["coulomb_friction"].std
+        weighed = joint.weighed(hypotheses)
     best, found = weighed[0]
     declared = joint.evidence(())
     odds, before, after = best - declared, joint.left(()), joint.left(found)

@@ -35,6 +35,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 from chromium import Chromium  # noqa: E402
 
 COLUMNS, LINES = 80, 24
+PAUSE_S = 0.03  # without output: a view that draws ten times a second has drawn it whole
 DRIVELINK = (sys.executable, "-m", "drivelink")
 # rich's own template, without the web fonts it loads from another host.
 SVG = """\
@@ -67,8 +68,8 @@ def terminal(command: tuple[str, ...], seconds: float, title: str, path: Path) -
     )
     os.close(slave)
     end = time.monotonic() + seconds
-    while (left := end - time.monotonic()) > 0:
-        if select.select([master], [], [], left)[0]:
+    while (left := end - time.monotonic()) > 0 or select.select([master], [], [], PAUSE_S)[0]:
+        if select.select([master], [], [], max(left, 0.0))[0]:
             stream.feed(os.read(master, 65536))
     text = picture(screen)
     process.send_signal(signal.SIGINT)

@@ -66,12 +66,12 @@ class DotPlot:
         y: (low, high) of the vertical axis.
     """
 
-    LABEL = 6
-
     def __init__(self, width: int, height: int, x: tuple[float, float], y: tuple[float, float]) -> None:
-        self.columns = max(4, width - self.LABEL - 1)
-        self.rows = max(2, height - 2)
         self._x, self._y = _opened(*x), _opened(*y)
+        self._labels = number(self._y[1], 3), number(self._y[0], 3)
+        self._margin = max(6, *map(len, self._labels))
+        self.columns = max(4, width - self._margin - 1)
+        self.rows = max(2, height - 2)
         self._cells = [[0] * self.columns for _ in range(self.rows)]
         self._styles = [[""] * self.columns for _ in range(self.rows)]
         self._marks: dict[tuple[int, int], str] = {}
@@ -118,15 +118,15 @@ class DotPlot:
     def render(self, title: str, x_unit: str = "") -> Text:
         """The plot as lines of text."""
         text = Text(no_wrap=True)
-        text.append(" " * (self.LABEL + 1) + title[: self.columns], style="bold")
+        text.append(" " * (self._margin + 1) + title[: self.columns], style="bold")
         if self._note:
-            pad = " " * (self.LABEL + 1 + max(0, (self.columns - len(self._note)) // 2))
+            pad = " " * (self._margin + 1 + max(0, (self.columns - len(self._note)) // 2))
             above, below = self.rows // 2, self.rows - self.rows // 2
             text.append("\n" * (above + 1) + pad + self._note[: self.columns] + "\n" * below, style="dim")
             return text
         for row, (cells, styles) in enumerate(zip(self._cells, self._styles, strict=True)):
-            label = {0: number(self._y[1], 3), self.rows - 1: number(self._y[0], 3)}.get(row, "")
-            text.append(f"\n{label:>{self.LABEL}}", style="dim")
+            label = {0: self._labels[0], self.rows - 1: self._labels[1]}.get(row, "")
+            text.append(f"\n{label:>{self._margin}}", style="dim")
             text.append("┤" if label else "│", style="dim")
             for column, (dots, style) in enumerate(zip(cells, styles, strict=True)):
                 mark = self._marks.get((row, column))
@@ -136,7 +136,7 @@ class DotPlot:
                     text.append(chr(_BLANK + dots) if dots else " ", style=style)
         low, high = number(self._x[0], 3), f"{number(self._x[1], 3)} {x_unit}".rstrip()
         axis = low + high.rjust(self.columns - len(low))
-        text.append("\n" + " " * (self.LABEL + 1) + axis, style="dim")
+        text.append("\n" + " " * (self._margin + 1) + axis, style="dim")
         return text
 
     def _place(self, x: float, y: float) -> tuple[float, float]:

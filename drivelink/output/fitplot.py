@@ -70,10 +70,10 @@ def _left(over_deflection: Axes, over_velocity: Axes, one: TransmissionFit, unit
     grows = one.deflection_rate_rad_s > 0.0
     directions = {"deflection grows": grows, "shrinks": ~grows}
     curves = {name: _line(phi[rows], left[rows]) for name, rows in directions.items()}
-    plots.xy(over_deflection, curves, units.label("deflection / rad"), label, "left over deflection")
+    plots.xy(over_deflection, curves, units.label("deflection / rad"), label, "residual over deflection")
     plots.dots(over_velocity, velocity, left)
     across = units.label("motor velocity / (rad/s)")
-    plots.xy(over_velocity, {"median": _line(velocity, left)}, across, label, "left over velocity")
+    plots.xy(over_velocity, {"median": _line(velocity, left)}, across, label, "residual over velocity")
 
 
 def _line(x: FloatArray, y: FloatArray) -> plots.Curve:

@@ -245,12 +245,12 @@ def _curve_figure(curve: Curve, units: Units) -> str:
     order = np.argsort(curve.x)
     name = curve.name.replace("_", " ")
     if curve.second is None and _is_function(curve):
-        curves = {"left by the model": plots.medians(curve.x, curve.residual_nm)}
+        curves = {"residual of the model": plots.medians(curve.x, curve.residual_nm)}
         curves[name] = plots.medians(curve.x, curve.fitted_nm)
         plots.xy(axes, curves, across, torque)
     else:
         axes.plot(curve.x[order], curve.fitted_nm[order], ".", color=plots.COLORS[1], markersize=2.0)
-        axes.plot([], [], ".", color="#aaaaaa", label="left by the model")
+        axes.plot([], [], ".", color="#aaaaaa", label="residual of the model")
         axes.plot([], [], ".", color=plots.COLORS[1], label=name)
         plots.xy(axes, {}, across, torque)
     return f"<figure>{plots.svg_text(figure)}<figcaption>{_caption(curve)}</figcaption></figure>"

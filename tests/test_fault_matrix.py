@@ -67,7 +67,7 @@ def test_a_fitted_file_gives_no_wrong_valid_on_another_healthy_run():
 
 
 @pytest.mark.parametrize("positions", [True, False])
-@pytest.mark.parametrize("share", [0.1, 0.5])
+@pytest.mark.parametrize("share", [0.1, 0.5, 1.0])
 @pytest.mark.parametrize("joint", ["constant", "vsa-ii"])
 def test_after_garbage_of_five_seconds_the_way_back_takes_less_than_five(joint, share, positions):
     """What was learned before holds again; how large and how noisy the garbage was is no measure of the joint."""

@@ -177,7 +177,13 @@ impl ChangeDetection {
     /// Whether the last innovations are beyond what noise does.
     fn steps(&self) -> bool {
         let (square, foreseen) = self.mean(UPDATES);
-        self.known >= UPDATES && square > self.limit_square * foreseen + LEAST * LEAST
+        self.known >= UPDATES && self.is_step(square, foreseen)
+    }
+
+    /// Whether the square of an innovation is beyond what noise does.
+    #[must_use]
+    pub fn is_step(&self, square: f64, foreseen: f64) -> bool {
+        square > self.limit_square * foreseen + LEAST * LEAST
     }
 
     /// Whether the reference leaves more of the window than noise does, or a reading that is not what it was

@@ -43,17 +43,26 @@ pub struct DeflectionFilter {
     p: Option<Covariance>,
     modelled: bool, // whether the motor's equation is of use
     pull: f64,      // what half a period of φ′ adds to the motor's mean acceleration
-    jerk: f64,
-    peak: f64,
-    squares: [f64; 2], // mean squares of the velocities of motor and link
+    motion: Motion,
     counted: f64,
-    missed: f64, // mean square of φ's innovation, over what is foreseen
     foreseen: f64,
     noise: f64,  // R, the variance of φ's noise that p assumes, rad²
     wander: f64, // spectral density of φ‴, rad²/s⁵
     /// Periods until the last start is forgotten.
     pub unsettled: i64,
 }
+
+/// How the joint moves, and how well that is foreseen.
+#[derive(Clone, Copy, Debug)]
+pub struct Motion {
+    jerk: f64,         // mean square of φ‴ …
+    peak: f64,         // … and its largest value of late
+    squares: [f64; 2], // mean squares of the velocities of motor and link
+    missed: f64,       // mean square of φ's innovation, over what is foreseen
+}
+
+/// Nothing has been seen.
+pub const AT_REST: Motion = Motion { jerk: 0.0, peak: 0.0, squares: [0.0; 2], missed: 1.0 };
 
 /// What is known of the deflection since the moment of the torque.
 #[derive(Clone, Copy, Debug)]
@@ -110,11 +119,8 @@ impl DeflectionFilter {
             p: None,
             modelled: false,
             pull: 0.0,
-            jerk: 0.0,
-            peak: 0.0,
-            squares: [0.0; 2],
+            motion: AT_REST,
             counted: 0.0,
-            missed: 1.0,
             foreseen: f64::INFINITY,
             noise: 0.0,
             wander: 0.0,
@@ -124,9 +130,8 @@ impl DeflectionFilter {
 
     /// Forget everything.
     pub fn reset(&mut self) {
-        (self.jerk, self.peak, self.p, self.noise, self.modelled) = (0.0, 0.0, None, 0.0, false);
-        (self.gains, self.pull, self.squares, self.counted) = (self.plain, 0.0, [0.0; 2], 0.0);
-        (self.missed, self.foreseen) = (1.0, f64::INFINITY);
+        (self.motion, self.p, self.noise, self.modelled) = (AT_REST, None, 0.0, false);
+        (self.gains, self.pull, self.counted, self.foreseen) = (self.plain, 0.0, 0.0, f64::INFINITY);
         self.restart(0.0, 0.0);
     }
 
@@ -158,7 +163,7 @@ impl DeflectionFilter {
                 .flat_map(|i| (0..3).map(move |j| (i, j)))
                 .map(|(i, j)| slope[i] * p[2 + i][2 + j] * slope[j])
                 .sum();
-            let variance = self.missed.max(1.0) * (grown + self.wander * t.powi(5) / 20.0);
+            let variance = self.motion.missed.max(1.0) * (grown + self.wander * t.powi(5) / 20.0);
             variance / (variance + self.noise)
         });
         foreseen + share * (present.phi - self.at(t))
@@ -177,7 +182,7 @@ impl DeflectionFilter {
     /// independent errors that average out.
     #[must_use]
     pub fn variance(&self) -> f64 {
-        self.p.map_or(0.0, |p| (p[2][2] * self.missed.max(1.0)).max(self.counted))
+        self.p.map_or(0.0, |p| (p[2][2] * self.motion.missed.max(1.0)).max(self.counted))
     }
 
     /// One period later: measured θ and φ, and the torque that acted, τ + τ_e − x, N·m.
@@ -205,23 +210,40 @@ impl DeflectionFilter {
         if plain {
             self.unsettled -= 1;
         } else {
-            self.missed += t / JERK_S * (f * f / self.foreseen - self.missed);
+            self.motion.missed += t / JERK_S * (f * f / self.foreseen - self.motion.missed);
         }
+    }
+
+    /// How the joint moves, to be recalled.
+    #[must_use]
+    pub fn motion(&self) -> Motion {
+        self.motion
+    }
+
+    /// What has been read since may be no motion: the joint moves as it did.
+    pub fn recall(&mut self, motion: Motion) {
+        self.motion = motion;
     }
 
     /// One step towards the steady-state gains.
     pub fn tune(&mut self, tuning: &Tuning) {
         let (t, w) = (self.period, self.w);
         (self.inertia, self.damping) = (tuning.inertia, tuning.damping);
-        self.jerk += self.average * (LIVELY * tuning.jerk * tuning.jerk - self.jerk);
-        self.peak = (self.fade * self.peak).max(self.jerk);
+        let rates = [self.x[1], self.x[1] + self.x[3]];
+        let motion = &mut self.motion;
+        motion.jerk += self.average * (LIVELY * tuning.jerk * tuning.jerk - motion.jerk);
+        motion.peak = (self.fade * motion.peak).max(motion.jerk);
+        for (square, rate) in motion.squares.iter_mut().zip(rates) {
+            *square += self.average * (rate * rate - *square);
+        }
         let noise = tuning.motor_noise + tuning.link_noise;
-        if !(noise > 0.0 && self.peak > 0.0 && tuning.unmodelled < f64::INFINITY) {
+        if !(noise > 0.0 && self.motion.peak > 0.0 && tuning.unmodelled < f64::INFINITY) {
             self.modelled = false; // the motor's balance is unknown: it cannot predict its motion
             return;
         }
         let density = noise * t;
-        let natural = (self.jerk.max(0.1 * self.peak) * CORRELATION_S / density).powf(1.0 / 6.0);
+        let natural =
+            (self.motion.jerk.max(0.1 * self.motion.peak) * CORRELATION_S / density).powf(1.0 / 6.0);
         let natural = natural.clamp(SLOWEST * w, FASTEST * w);
         self.count_steps(tuning, natural);
         let mut c = tuning.stiffness.max(0.0) / self.inertia;
@@ -292,12 +314,10 @@ impl DeflectionFilter {
 
     /// The variance of φ that quantisation leaves, were all noise quantisation.
     fn count_steps(&mut self, tuning: &Tuning, memory_rad_s: f64) {
-        let rates = [self.x[1], self.x[1] + self.x[3]];
         self.counted = 0.0;
         for (i, noise) in [tuning.motor_noise, tuning.link_noise].into_iter().enumerate() {
-            self.squares[i] += self.average * (rates[i] * rates[i] - self.squares[i]);
             if noise > 0.0 {
-                let counts = (self.squares[i] / (12.0 * noise)).sqrt() / memory_rad_s;
+                let counts = (self.motion.squares[i] / (12.0 * noise)).sqrt() / memory_rad_s;
                 self.counted += noise / (1.0 + counts);
             }
         }

@@ -2,7 +2,7 @@
 
 use crate::change_detection::{Action, ChangeDetection, Innovation};
 use crate::controller_law::ControllerLaw;
-use crate::deflection::{DeflectionFilter, Present, Tuning};
+use crate::deflection::{AT_REST, DeflectionFilter, Motion, Present, Tuning};
 use crate::effects::{Coordinates, MotorEffects};
 use crate::external::Carried;
 use crate::identification::{MEMORY_S, OnlineIdentification};
@@ -89,8 +89,9 @@ pub struct TransmissionEstimator {
     excited: bool,
     fit: Fit,
     controller: ControllerLaw,
-    apart: u32,  // updates since when the torque is the joint's …
-    closed: u32, // … and for which, before, it was only its controller's
+    apart: u32,                          // updates since when the torque is the joint's …
+    closed: u32,                         // … and for which, before, it was only its controller's
+    usual: [(Fit, Motion, [f64; 3]); 2], // beside the reference, and beside what is to be it next
     impossible: u32,
     missing: u32,
     misfit: f64,
@@ -148,6 +149,7 @@ impl TransmissionEstimator {
             controller: ControllerLaw::default(),
             apart: 0,
             closed: 0,
+            usual: [(Fit::default(), AT_REST, [0.0; 3]); 2],
             impossible: 0,
             missing: 0,
             misfit: f64::NAN,
@@ -186,6 +188,7 @@ impl TransmissionEstimator {
         self.identification.reset();
         self.changes.reset();
         (self.impossible, self.missing, self.fit) = (0, 0, Fit::default());
+        self.usual = [(Fit::default(), AT_REST, [0.0; 3]); 2];
         (self.concluded, self.std, self.reach, self.held_s, self.trusted) =
             (false, f64::NAN, 0.0, 0.0, false);
         (self.acting, self.stiffness, self.unmodelled) = (0.0, 0.0, f64::INFINITY);
@@ -321,7 +324,7 @@ impl TransmissionEstimator {
         }
         self.identification.observe_noise(resolution);
         // How large motion is: what is not explained does not tell.
-        if now.usable && !self.changes.changed() {
+        if now.usable && !self.changes.changed() && !self.is_beyond_noise(now) {
             self.identification.observe_scale(&self.signals, &now.link);
         }
         if self.identification.kalman().is_none() && now.usable && self.excited {
@@ -379,15 +382,24 @@ impl TransmissionEstimator {
         if now.usable {
             let verdict = self.identification.judge();
             let seen = Innovation { value: innovation, predicted_variance: predicted, noise, of_reference };
-            match self.changes.watch(&seen, verdict, settled) {
+            let usual = !self.changes.changed();
+            let action = self.changes.watch(&seen, verdict, settled);
+            if usual && self.changes.changed() && self.identification.has_reference() {
+                self.identification.recall_scale(self.usual[1].2); // what raised the alarm is no measure
+            }
+            match action {
                 Action::GoOn => {}
                 Action::OpenUp => {
                     self.identification.restore_reference();
                     self.identification.open_up();
                     return;
                 }
-                Action::Restore => return self.identification.restore_reference(),
+                Action::Restore => {
+                    self.recall();
+                    return self.identification.restore_reference();
+                }
                 Action::Accept(change) => {
+                    self.recall();
                     if let Some(verdict) = verdict {
                         self.identification.accept(change, &verdict);
                     }
@@ -403,12 +415,34 @@ impl TransmissionEstimator {
         if now.usable && self.excited && self.changes.may_learn() {
             self.held_s = 0.0;
             self.identification.learn(&h, innovation, predicted, self.changes.may_learn_noise());
-            if !self.changes.changed() && self.is_apart() {
-                self.identification.keep_reference();
+            if !self.changes.changed() && self.is_apart() && self.identification.keep_reference() {
+                let now = (self.fit, self.deflection.motion(), self.identification.scale());
+                let first = self.usual[1].0.varied == 0.0;
+                self.usual = [if first { now } else { self.usual[1] }, now];
             }
         } else {
             self.identification.pass_over(innovation, predicted);
         }
+    }
+
+    /// Whether the equation of this moment is not explained by what was learned in good times.
+    fn is_beyond_noise(&mut self, now: &Moment) -> bool {
+        if !self.identification.has_reference() {
+            return false;
+        }
+        let (h, y) = self.identification.equation(&self.signals, &now.link);
+        self.identification.kalman().is_some_and(|kalman| {
+            let foreseen = kalman.noise + kalman.predicted_variance(&h);
+            self.changes.is_step(kalman.innovation(&h, y).powi(2), foreseen)
+        })
+    }
+
+    /// A change has been explained: what was read meanwhile is no measure of how the joint moves.
+    fn recall(&mut self) {
+        self.usual[1] = self.usual[0];
+        let (fit, motion, _) = self.usual[0];
+        self.fit = fit;
+        self.deflection.recall(motion);
     }
 
     /// Whether the curve leaves only a part of the balance unexplained.

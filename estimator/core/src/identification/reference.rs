@@ -26,12 +26,14 @@ impl OnlineIdentification {
     }
 
     /// Hold what has been learned, while all is well: the reference is as old as one to two of its turns.
-    pub fn keep_reference(&mut self) {
+    ///
+    /// Whether it was time to.
+    pub fn keep_reference(&mut self) -> bool {
         if self.black_box || self.updates < self.refresh_at {
-            return;
+            return false;
         }
         self.refresh_at = self.updates + self.updates_in(REFERENCE_S);
-        let Some(kalman) = &self.kalman else { return };
+        let Some(kalman) = &self.kalman else { return false };
         if let (Some(old), Some(new)) = (&self.reference, &self.candidate) {
             let mut change = [0.0; SIZE];
             (0..SIZE).for_each(|i| change[i] = new.x[i] - old.x[i]);
@@ -39,6 +41,7 @@ impl OnlineIdentification {
         }
         self.reference = self.candidate.take().or_else(|| Some(kalman.clone()));
         self.candidate = Some(kalman.clone());
+        true
     }
 
     /// s² of an equation that the reference foresees.

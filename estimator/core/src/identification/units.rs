@@ -40,6 +40,21 @@ impl OnlineIdentification {
         }
     }
 
+    /// Largest torque, deflection and velocity so far.
+    #[must_use]
+    pub fn scale(&self) -> [f64; 3] {
+        self.units.peaks
+    }
+
+    /// Those are the largest ones: what was larger since is not explained, and would be the unit for ever.
+    pub fn recall_scale(&mut self, peaks: [f64; 3]) {
+        self.units.peaks = peaks;
+        if [self.units.torque, self.units.deflection, self.units.rate].iter().zip(peaks).any(|(x, y)| *x > y)
+        {
+            self.change_units();
+        }
+    }
+
     /// Noise of φ, rad: no prior of an offset is narrower.
     pub fn observe_noise(&mut self, resolution: f64) {
         self.resolution = resolution;

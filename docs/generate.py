@@ -1,6 +1,7 @@
 """Makes the parts of the documentation that the code describes: keys, effects, layouts, commands, modules.
 
-A page asks for a part by a line `{{ name }}`; docs/hooks.py fills it in when the documentation is built.
+A page asks for a part by a link to its source, alone in a line, with the title "from the code". In the
+repository it is that link; docs/hooks.py puts the part in its place when the documentation is built.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from sim.effects import LISTED, UNLISTED, Definition
 
 ROOT = Path(__file__).parent.parent
 SIZES = {"u64": 8, "u32": 4, "f64": 8}
-ASKED = re.compile(r"^\{\{ (.+) \}\}$", re.MULTILINE)
+ASKED = re.compile(r'^\[(.+)\]\(\S+ "from the code"\)$', re.MULTILINE)
 
 SECTIONS: list[tuple[str, type]] = [
     ("Top level", jointfile.JointFile),

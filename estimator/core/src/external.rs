@@ -107,24 +107,38 @@ impl Carried {
     }
 }
 
-/// Do both sides of the joint agree on the flexibility torque? Mean squares of their difference and of the link's.
-#[derive(Clone, Copy, Debug, Default)]
-struct Consistency {
+/// What was said last; and mean squares of the flexibility torque's difference between both sides, and of the link's.
+#[derive(Clone, Copy, Debug)]
+pub struct Said {
+    now: External,
     squares: Option<[f64; 2]>,
 }
 
-impl Consistency {
-    fn see(&mut self, external: &External, period_s: f64) {
-        if external.status & status::VALID == 0 {
-            return;
-        }
-        let now = [external.difference * external.difference, external.link_torque * external.link_torque];
-        let squares = self.squares.get_or_insert(now);
-        let gain = (period_s / CONSISTENCY_S).min(1.0);
-        (0..2).for_each(|i| squares[i] += gain * (now[i] - squares[i]));
+impl Said {
+    fn nothing() -> Said {
+        Said { now: External::nothing(0), squares: None }
     }
 
-    fn rms(&self) -> Option<[f64; 2]> {
+    fn say(&mut self, external: External, span_s: f64) -> External {
+        self.now = external;
+        if external.status & status::VALID != 0 {
+            let now = [external.difference, external.link_torque].map(|torque| torque * torque);
+            let squares = self.squares.get_or_insert(now);
+            let gain = (span_s / CONSISTENCY_S).min(1.0);
+            (0..2).for_each(|i| squares[i] += gain * (now[i] - squares[i]));
+        }
+        external
+    }
+
+    /// The same of a sample that was not used.
+    #[must_use]
+    pub fn carry(&self, sequence: u64) -> External {
+        self.now.void(sequence)
+    }
+
+    /// rms of the difference and of the link's flexibility torque over some seconds, N·m.
+    #[must_use]
+    pub fn consistency(&self) -> Option<[f64; 2]> {
         self.squares.map(|squares| squares.map(f64::sqrt))
     }
 }
@@ -153,8 +167,8 @@ pub struct LinkMomentum {
     dry: f64,       // undeclared dry friction, as a share of the torque carried
     errors: LinkErrors,
     judge: Judge,
-    consistency: Consistency,
-    now: External,
+    /// See [`Said`].
+    pub said: Said,
 }
 
 impl LinkMomentum {
@@ -190,8 +204,7 @@ impl LinkMomentum {
             skew: priors.encoder_delay * period_s,
             dry: priors.coulomb_friction,
             errors: LinkErrors::default(),
-            consistency: Consistency::default(),
-            now: External::nothing(0),
+            said: Said::nothing(),
         })
     }
 
@@ -199,8 +212,7 @@ impl LinkMomentum {
     pub fn reset(&mut self) {
         self.judge.reset();
         self.errors = LinkErrors::default();
-        self.consistency = Consistency::default();
-        self.now = External::nothing(0);
+        self.said = Said::nothing();
         self.unsettled = self.settle;
     }
 
@@ -241,8 +253,7 @@ impl LinkMomentum {
     /// `valid`: whether the estimate is; `noise`: variance of q's noise, rad².
     pub fn conclude(&mut self, sequence: u64, carried: &Carried, noise: f64, valid: bool) -> External {
         if !self.known {
-            self.now = External::nothing(sequence);
-            return self.now;
+            return self.said.say(External::nothing(sequence), self.period);
         }
         let link = &self.link;
         let [position, velocity, acceleration] = self.position;
@@ -275,7 +286,7 @@ impl LinkMomentum {
             let lasting = (read + white) / self.filter.bandwidth + curve * MEMORY_S;
             self.errors.identify(&row, sum - self.measured[0], lasting / self.period);
         }
-        self.now = External {
+        let external = External {
             sequence,
             status: if valid { status::VALID } else { 0 } | if contact { status::CONTACT } else { 0 },
             torque,
@@ -283,20 +294,7 @@ impl LinkMomentum {
             link_torque: self.measured[0] - own,
             difference: sum - self.measured[0],
         };
-        self.consistency.see(&self.now, self.period);
-        self.now
-    }
-
-    /// rms of the difference and of the link's flexibility torque over some seconds, N·m.
-    #[must_use]
-    pub fn consistency(&self) -> Option<[f64; 2]> {
-        self.consistency.rms()
-    }
-
-    /// What was said last, of a sample that was not used.
-    #[must_use]
-    pub fn carry(&self, sequence: u64) -> External {
-        self.now.void(sequence)
+        self.said.say(external, self.period)
     }
 }
 

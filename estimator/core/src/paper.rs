@@ -331,7 +331,7 @@ impl Paper {
     /// See [`PaperMomentum::consistency`].
     #[must_use]
     pub fn consistency(&self) -> Option<[f64; 2]> {
-        self.link.as_ref()?.consistency()
+        self.link.as_ref()?.said.consistency()
     }
 
     /// The coefficients of each transmission's polynomial with their standard deviations, or the black box's
@@ -384,7 +384,7 @@ impl Paper {
             self.external = Some(if accepted.periods > 0 {
                 link.update(sample, accepted.periods, estimate.flexibility_torque, balance, valid)
             } else {
-                link.carry(sample.sequence)
+                link.said.carry(sample.sequence)
             });
         }
         estimate

@@ -161,10 +161,10 @@ impl Robust {
         self.external
     }
 
-    /// See [`LinkMomentum::consistency`].
+    /// See [`crate::external::Said::consistency`].
     #[must_use]
     pub fn consistency(&self) -> Option<[f64; 2]> {
-        self.momentum.as_ref()?.consistency()
+        self.momentum.as_ref()?.said.consistency()
     }
 
     /// Largest misfit among the motors' balances at the last update, N·m; NaN until there is a model.
@@ -434,7 +434,7 @@ impl Robust {
     /// What is said where the sample cannot be used: the last estimate, for a while.
     fn carry(&mut self, sequence: u64, flags: u32) -> Estimate {
         self.rejected += 1;
-        self.external = self.momentum.as_ref().map(|momentum| momentum.carry(sequence));
+        self.external = self.momentum.as_ref().map(|momentum| momentum.said.carry(sequence));
         let since = self.rejected as f64 * self.period;
         let Some(last) = self.estimate else {
             let (parts, _) = self.read(0.0);

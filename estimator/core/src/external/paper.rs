@@ -1,7 +1,7 @@
 //! External torque in mode "paper": eqs 12 and 13 as printed.
 
 use super::contact::Judge;
-use super::{Consistency, External, SETTLED, TINY, gravity, status};
+use super::{External, SETTLED, Said, TINY, gravity, status};
 use crate::filters::first_order_pole;
 use crate::model::{Link, Model};
 use crate::noise::NoiseMeter;
@@ -43,8 +43,8 @@ pub struct PaperMomentum {
     last: Option<[f64; 3]>, // q, g, τ_k
     noise: NoiseMeter,
     judge: Judge,
-    consistency: Consistency,
-    now: External,
+    /// See [`Said`].
+    pub said: Said,
 }
 
 impl PaperMomentum {
@@ -67,16 +67,14 @@ impl PaperMomentum {
             last: None,
             noise: NoiseMeter::default(),
             judge: Judge::new(settings, settings.k_tau, period_s),
-            consistency: Consistency::default(),
-            now: External::nothing(0),
+            said: Said::nothing(),
         })
     }
 
     /// Forget everything.
     pub fn reset(&mut self) {
         self.judge.reset();
-        self.consistency = Consistency::default();
-        self.now = External::nothing(0);
+        self.said = Said::nothing();
         self.restart();
     }
 
@@ -112,7 +110,7 @@ impl PaperMomentum {
             self.momentum.last = measured.map(|velocity| self.link.inertia * velocity);
             self.damped.last = Some(self.link.damping * q);
             (self.fallen.last, self.pushed.last) = (Some(0.0), Some(0.0));
-            return self.carry(sample.sequence);
+            return self.said.carry(sample.sequence);
         };
         let velocity =
             if sample.link_velocity.is_finite() { sample.link_velocity } else { (q - before[0]) / span };
@@ -136,7 +134,7 @@ impl PaperMomentum {
         let white = gain * self.noise.variance(f64::INFINITY);
         let valid = valid && self.unsettled <= 0 && (sum + uncertain + white).is_finite();
         let (torque, contact) = self.judge.see(sum, internal, uncertain, white, valid);
-        self.now = External {
+        let external = External {
             sequence: sample.sequence,
             status: if valid { status::VALID } else { 0 } | if contact { status::CONTACT } else { 0 },
             torque,
@@ -144,19 +142,6 @@ impl PaperMomentum {
             link_torque: known - inertial - viscous - weight,
             difference: sum - known,
         };
-        self.consistency.see(&self.now, span);
-        self.now
-    }
-
-    /// See [`LinkMomentum::consistency`].
-    #[must_use]
-    pub fn consistency(&self) -> Option<[f64; 2]> {
-        self.consistency.rms()
-    }
-
-    /// What was said last, of a sample that was not used.
-    #[must_use]
-    pub fn carry(&self, sequence: u64) -> External {
-        self.now.void(sequence)
+        self.said.say(external, span)
     }
 }

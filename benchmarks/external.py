@@ -124,8 +124,7 @@ class JointUnderTest:
 def _friction(name: str, shape: dict[str, float] | None = None, **torques: float) -> Effect:
     """As diagnose finds it: 10 % too low."""
     values = {key: KNOWN * value for key, value in torques.items()}
-    smoothing = {} if name == "load_dependent_friction" else {"smoothing_rad_s": 0.01}
-    return Effect(name=name, parameters=values | smoothing | (shape or {}))
+    return Effect(name=name, parameters=values | {"smoothing_rad_s": 0.01} | (shape or {}))
 
 
 def _vsa() -> JointUnderTest:

@@ -99,7 +99,7 @@ class EffectType:
             deflection (the zero between the encoders); the link encoder's reading.
         coordinates: the fields of `Coordinates` that it depends on; first the one that reveals it.
         parameters: its parameters.
-        remembers: whether it depends on past motion (hysteresis, the last direction).
+        remembers: whether it has memory (hysteresis).
         description: for reports, in a few words.
     """
 

@@ -64,24 +64,6 @@ def test_two_recordings_of_a_machine_find_what_belongs_to_it() -> None:
     assert all(one.validation is not None for one in both.recordings)
 
 
-def test_a_gear_that_is_loaded_in_one_direction_loses_by_its_load_at_rest_too() -> None:
-    """The series elastic drive whose spring is known: a loss that ends at rest left 44 % and no stiffness held."""
-    known, period = 0.462, 0.005
-    declared = jointfile.parse(
-        f'name = "uw_sea"\n[[motor]]\ninertia_kg_m2 = 5.878e-4\ntransmission = {{ model = "linear" }}\n'
-        f"[bus]\nperiod_s = {period}\n"
-    )
-    train, other = (
-        recording.read(DATA / f"uw_sea/uw_{name}.csv", declared)
-        for name in ("InnerLoop", "DoubleLoopDisturbance")
-    )
-    found = diagnose(other, declared.model(), 10.0, train)
-    assert [effect.name for effect in found.effects] == ["load_dependent_friction"]
-    assert found.validation.after_relative < 0.2
-    reported = diagnose(train, declared.model(), 10.0, other).transmissions[0]
-    assert abs(_number(reported.parameters) - known) < 1.96 * _number(reported.std)
-
-
 def _number(values: dict[str, ParameterValue]) -> float:
     value = values["k_nm_rad"]
     assert isinstance(value, float)

@@ -188,12 +188,10 @@ def grid(frame: Frame, candidate: Candidate, smoothing_rad_s: float) -> list[dic
                 if v > 3.0 * s
             ]
         return _vary(fixed, "smoothing_rad_s", smooth)
-    if "exponent" in kind.nonlinear:
+    if kind.remembers:
         path = c.position if kind.location == "motor" else c.deflection
         scales = _spread(path) * np.geomspace(0.0002, 0.5, 11 if _spread(path) > 0.0 else 0)
         return [{"displacement_rad": float(d), "exponent": n, "shape": b} for n, b in LAWS for d in scales]
-    if "displacement_rad" in kind.nonlinear:
-        return _vary(fixed, "displacement_rad", _directions(c))
     if kind.name in ("cogging", "kinematic_error"):
         return _vary(fixed, "periods_per_rev", _waves(frame, c))
     if kind.name == "backlash":
@@ -208,11 +206,6 @@ def grid(frame: Frame, candidate: Candidate, smoothing_rad_s: float) -> list[dic
         places = np.quantile(c.link_position, np.linspace(0.04, 0.96, 12))
         return [{"position_rad": float(x), "side": side} for side in (1.0, -1.0) for x in places]
     return [fixed]
-
-
-def _directions(c: Coordinates) -> FloatArray:
-    """Motions over which the direction of a loss changes, rad: as sharp as a memory's, to presliding."""
-    return _spread(c.position) * np.geomspace(0.0002, choice("smoothing"), 5)
 
 
 def _shortest_drift() -> float:

@@ -38,7 +38,10 @@ impl Sum {
         }
         let mut total = 0.0;
         for (element, memory) in &mut self.elements {
-            total += element.advanced(c, memory, period_s);
+            total += match element.kind.law {
+                Law::Memory { rate, .. } => element.values[0] * memory.advance(rate(c) * period_s),
+                _ => element.torque(c),
+            };
         }
         total
     }

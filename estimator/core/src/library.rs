@@ -164,24 +164,6 @@ pub enum Law {
         /// Its derivative, rad/s.
         rate: fn(&Coordinates) -> f64,
     },
-    /// Terms, one a linear parameter, of the coordinates and the motor's direction of motion from −1 to 1,
-    /// which lasts at rest: the state of a [`Memory`] by Dahl's law, the second value its displacement.
-    Directed(fn(&Coordinates, f64) -> [f64; 2]),
-}
-
-/// What a memory moves along, and the rate at which it does.
-pub type Track = (fn(&Coordinates) -> f64, fn(&Coordinates) -> f64);
-
-impl Law {
-    /// What its memory moves along, if it has one.
-    #[must_use]
-    pub fn track(&self) -> Option<Track> {
-        match *self {
-            Law::Memory { path, rate } => Some((path, rate)),
-            Law::Directed(_) => Some((|c| c.position, |c| c.velocity)),
-            Law::Terms(_) | Law::Spring(_) => None,
-        }
-    }
 }
 
 /// One kind of effect.
@@ -214,8 +196,6 @@ const fn scale(name: &'static str, meaning: &'static str, default: Option<f64>) 
 }
 
 const SMOOTHING: Parameter = scale("smoothing_rad_s", "velocity over which the sign changes", Some(0.01));
-const DIRECTION: Parameter =
-    scale("displacement_rad", "motion over which the direction of the loss changes", Some(0.001));
 const PERIODS: Parameter = shape("periods_per_rev", "periods in one joint revolution", None);
 const RELATIVE_ERROR: Parameter = linear("relative_error", "share by which the scale is off");
 const DAMPING: Parameter = linear("damping_nm_s_rad", "damping beyond what is declared");
@@ -292,9 +272,9 @@ pub static LIBRARY: &[Kind] = &[
     Kind {
         name: "load_dependent_friction",
         place: Place::Motor,
-        coordinates: &["velocity", "position", "flexibility_torque"],
-        parameters: &[linear("coefficient", "friction per flexibility torque"), DIRECTION],
-        law: Law::Directed(|c, direction| one(c.flexibility_torque.abs() * direction)),
+        coordinates: &["velocity", "flexibility_torque"],
+        parameters: &[linear("coefficient", "friction per flexibility torque"), SMOOTHING],
+        law: Law::Terms(|c, v| one(c.flexibility_torque.abs() * sign(c.velocity, v[1]))),
         description: "dry friction that grows with the transmitted torque",
     },
     Kind {
@@ -605,16 +585,7 @@ impl Element {
         match self.kind.law {
             Law::Terms(terms) => terms(c, &self.values),
             Law::Spring(term) => one(term(c.deflection, &self.values).0),
-            Law::Memory { .. } | Law::Directed(_) => [0.0; 2],
-        }
-    }
-
-    /// Its terms, unweighted, with its memory in a state.
-    fn remembered(&self, c: &Coordinates, state: f64) -> [f64; 2] {
-        match self.kind.law {
-            Law::Memory { .. } => one(state),
-            Law::Directed(terms) => terms(c, state),
-            Law::Terms(_) | Law::Spring(_) => self.terms(c),
+            Law::Memory { .. } => [0.0; 2],
         }
     }
 
@@ -623,12 +594,12 @@ impl Element {
         let mut memory = Memory::of(self);
         let mut from = None;
         for (k, c) in moments.enumerate() {
-            let terms = match self.kind.law.track() {
-                Some((path, _)) => {
+            let terms = match self.kind.law {
+                Law::Memory { path, .. } => {
                     let now = path(&c);
-                    self.remembered(&c, memory.advance(now - from.replace(now).unwrap_or(now)))
+                    one(memory.advance(now - from.replace(now).unwrap_or(now)))
                 }
-                None => self.terms(&c),
+                _ => self.terms(&c),
             };
             for (column, term) in out.iter_mut().zip(terms) {
                 column[k] = term;
@@ -645,18 +616,7 @@ impl Element {
     /// x of an element without a memory.
     #[must_use]
     pub fn torque(&self, c: &Coordinates) -> f64 {
-        self.weighted(self.terms(c))
-    }
-
-    /// x one period after the last coordinates.
-    pub fn advanced(&self, c: &Coordinates, memory: &mut Memory, period_s: f64) -> f64 {
-        match self.kind.law.track() {
-            Some((_, rate)) => self.weighted(self.remembered(c, memory.advance(rate(c) * period_s))),
-            None => self.torque(c),
-        }
-    }
-
-    fn weighted(&self, terms: [f64; 2]) -> f64 {
+        let terms = self.terms(c);
         let weighted = self.values[0] * terms[0];
         if self.kind.terms() == 2 { weighted + self.values[1] * terms[1] } else { weighted }
     }
@@ -704,10 +664,9 @@ mod tests {
             let place = |k: usize| kind.coordinates.contains(&Coordinates::NAMES[k]);
             let others = Coordinates::from_fn(|k| if place(k) { 0.7 } else { f64::NAN });
             assert_eq!(element.terms(&named), element.terms(&others), "{}", kind.name);
-            if let Some((path, rate)) = kind.law.track() {
+            if let Law::Memory { path, rate } = kind.law {
                 assert!(path(&others) + rate(&others) == 1.4);
             }
-            assert_eq!(element.remembered(&named, 0.3), element.remembered(&others, 0.3), "{}", kind.name);
         }
     }
 
@@ -727,6 +686,7 @@ mod tests {
                 vec![(v / 0.2).tanh(), (v / 0.2).tanh() * (-(v / 0.3).powi(2)).exp()],
             ),
             ("asymmetric_friction", vec![1.0, 1.0, 0.2], vec![(v / 0.2).tanh(), 0.0]),
+            ("load_dependent_friction", vec![1.0, 0.2], vec![c.flexibility_torque * (v / 0.2).tanh()]),
             ("back_driving_loss", vec![1.0, 0.2], vec![c.flexibility_torque * (v / 0.2).tanh()]),
             ("viscous_damping", vec![1.0], vec![v]),
             ("quadratic_damping", vec![1.0], vec![v * v]),
@@ -756,30 +716,6 @@ mod tests {
         // While the motor drives the link, there is no back-driving loss.
         let driving = Coordinates { velocity: -v, ..c };
         assert!(element("back_driving_loss", &[1.0, 0.2]).terms(&driving)[0].abs() < 1e-12);
-    }
-
-    #[test]
-    fn the_loss_of_a_loaded_gear_keeps_its_direction_at_rest() {
-        let (share, load, displacement) = (0.3, 2.0, 0.001);
-        let loss = element("load_dependent_friction", &[share, displacement]);
-        let at = |position: f64| Coordinates { position, flexibility_torque: load, ..Coordinates::default() };
-        // There and back, with stops.
-        let positions = [0.0, 0.004, 0.004, 0.0035, 0.0035, -0.006, -0.006];
-        let mut terms = vec![0.0; positions.len()];
-        loss.along(positions.iter().map(|x| at(*x)), &mut [&mut terms]);
-        let (mut memory, mut direction, mut before) = (Memory::of(&loss), 0.0, 0.0);
-        for (position, term) in positions.into_iter().zip(terms) {
-            let moved: f64 = position - before;
-            let ticked = loss.advanced(&Coordinates { velocity: moved, ..at(position) }, &mut memory, 1.0);
-            if moved != 0.0 {
-                let gap = (1.0 - direction * moved.signum()) * (-moved.abs() / displacement).exp();
-                direction = moved.signum() * (1.0 - gap);
-            }
-            before = position;
-            assert!((share * term - share * load * direction).abs() < 1e-8);
-            assert!((ticked - share * load * direction).abs() < 1e-8);
-        }
-        assert!(direction < -0.99);
     }
 
     #[test]

@@ -26,11 +26,8 @@ impl Memory {
     /// Begun at z = 0; of an element without one, what never moves.
     #[must_use]
     pub fn of(element: &Element) -> Memory {
-        let [_, displacement, exponent, shape] = match element.kind.law {
-            Law::Directed(_) => [0.0, element.values[1], 1.0, 1.0],
-            _ => element.values,
-        };
-        let elastic = element.kind.law.track().is_none() || exponent >= STOP_EXPONENT;
+        let [_, displacement, exponent, shape] = element.values;
+        let elastic = !matches!(element.kind.law, Law::Memory { .. }) || exponent >= STOP_EXPONENT;
         let arc = if elastic { Vec::new() } else { Memory::curve(exponent.max(1.0), shape) };
         Memory { displacement, arc, state: 0.0 }
     }

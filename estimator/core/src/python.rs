@@ -757,7 +757,7 @@ mod extension {
             .map(|kind| {
                 let (location, channel) = kind.place.names();
                 let parameters = kind.parameters.iter().map(parameter).collect();
-                let remembers = kind.law.track().is_some();
+                let remembers = matches!(kind.law, crate::library::Law::Memory { .. });
                 (
                     kind.name,
                     location,

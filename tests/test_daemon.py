@@ -153,7 +153,7 @@ def test_a_bus_without_drives_is_one_line() -> None:
 
 def test_a_master_that_already_makes_sync_is_one_line() -> None:
     joint = vsa()
-    one_line = pytest.raises(BusError, match="another master already makes SYNC")
+    one_line = pytest.raises(BusError, match="another master already produces SYNC")
     with served(joint), running(daemon(joint, publish=False)), one_line:
         daemon(joint, publish=False)
 

@@ -141,7 +141,7 @@ def test_another_master_that_makes_sync_is_noticed_once_and_its_cycles_are_not_u
             made.faults.at(made.network.syncs + 5 + 3 * sync, lambda: made.network.send(0x80, b""))
         estimates = made.run(200)
         assert made.status["bus"]["foreign_syncs"] == 10
-        assert sum("another master makes SYNC" in text for text in made.events) == 1
+        assert sum("another master produces SYNC" in text for text in made.events) == 1
         assert valid(estimates)[-1]
 
 

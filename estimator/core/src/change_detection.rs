@@ -213,8 +213,6 @@ impl ChangeDetection {
             // There is no reference to hold it against.
             if since_s > FOLLOW_S && self.is_as_foreseen() {
                 self.phase = Phase::Explained;
-            } else if since_s > WINDOW_S {
-                return self.end(Action::Relearn);
             }
             return Action::GoOn;
         }

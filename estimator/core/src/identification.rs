@@ -222,14 +222,6 @@ impl OnlineIdentification {
         self.units.peaks[1]
     }
 
-    /// Standard deviation of what the balance leaves, N·m; before there is an estimate, what is assumed of it.
-    #[must_use]
-    pub fn noise(&self) -> f64 {
-        self.kalman
-            .as_ref()
-            .map_or(NOISE_SHARE * self.units.peaks[0], |kalman| kalman.noise.sqrt() * self.units.torque)
-    }
-
     /// What the equation is divided by, N·m.
     #[must_use]
     pub fn torque_unit(&self) -> f64 {

@@ -10,7 +10,6 @@
 
 pub mod align;
 pub mod change_detection;
-pub mod controller_law;
 pub mod corrections;
 pub mod deflection;
 pub mod delay;

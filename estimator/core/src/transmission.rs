@@ -1,11 +1,10 @@
 //! One motor and its transmission on line: takes every sample, estimates at every update.
 
 use crate::change_detection::{Action, ChangeDetection, Innovation};
-use crate::controller_law::ControllerLaw;
 use crate::deflection::{AT_REST, DeflectionFilter, Motion, Present, Tuning};
 use crate::effects::{Coordinates, MotorEffects};
 use crate::external::Carried;
-use crate::identification::{MEMORY_S, OnlineIdentification};
+use crate::identification::OnlineIdentification;
 use crate::isolation::{Change, Verdict};
 use crate::laws::Law;
 use crate::model::Motor;
@@ -18,7 +17,6 @@ const DUE_S: f64 = 0.1; // of updates between two looks at a nonlinear law's lin
 /// of what the curve leaves of the balance over the balance's own. Above it, the 95 % interval is wider than
 /// 0.6 to 1.4 times the number.
 const USEFUL: f64 = 0.2;
-const APART: f64 = 0.1; // half of it: of a bias, whose bound `controller_law` gives and no interval holds
 const DRIFT: f64 = 1e-4; // relative growth of the standard deviation per second held
 const RESTED_S: f64 = 0.05; // without motion: from then on the interval grows …
 const WIDEST: f64 = 0.02; // … up to this
@@ -88,9 +86,6 @@ pub struct TransmissionEstimator {
     excitation: Excitation,
     excited: bool,
     fit: Fit,
-    controller: ControllerLaw,
-    apart: u32,                          // updates since when the torque is the joint's …
-    closed: u32,                         // … and for which, before, it was only its controller's
     usual: [(Fit, Motion, [f64; 3]); 2], // beside the reference, and beside what is to be it next
     impossible: u32,
     missing: u32,
@@ -146,9 +141,6 @@ impl TransmissionEstimator {
             excitation: Excitation::default(),
             excited: false,
             fit: Fit::default(),
-            controller: ControllerLaw::default(),
-            apart: 0,
-            closed: 0,
             usual: [(Fit::default(), AT_REST, [0.0; 3]); 2],
             impossible: 0,
             missing: 0,
@@ -177,7 +169,6 @@ impl TransmissionEstimator {
         self.signals.reset();
         self.deflection.reset();
         self.excitation = Excitation::default();
-        self.controller = ControllerLaw::default();
         (self.effect, self.transmitted) = (0.0, 0.0);
         (self.lead, self.misfit) = (f64::NAN, f64::NAN);
         self.relearn();
@@ -317,11 +308,6 @@ impl TransmissionEstimator {
             !self.changes.changed(),
             self.dt,
         );
-        self.controller.pass(motor[0], self.dt);
-        if now.usable && self.excited {
-            self.controller.take(&motor, &self.signals.torque.main, MEMORY_S / self.dt);
-            self.tell_apart();
-        }
         self.identification.observe_noise(resolution);
         // How large motion is: what is not explained does not tell.
         if now.usable && !self.changes.changed() && !self.is_beyond_noise(now) {
@@ -415,7 +401,7 @@ impl TransmissionEstimator {
         if now.usable && self.excited && self.changes.may_learn() {
             self.held_s = 0.0;
             self.identification.learn(&h, innovation, predicted, self.changes.may_learn_noise());
-            if !self.changes.changed() && self.is_apart() && self.identification.keep_reference() {
+            if !self.changes.changed() && self.identification.keep_reference() {
                 let now = (self.fit, self.deflection.motion(), self.identification.scale());
                 let first = self.usual[1].0.varied == 0.0;
                 self.usual = [if first { now } else { self.usual[1] }, now];
@@ -448,34 +434,6 @@ impl TransmissionEstimator {
     /// Whether the curve leaves only a part of the balance unexplained.
     fn explains(&self) -> bool {
         self.fit.is_good(if self.identification.black_box { USEFUL_LOCAL } else { USEFUL })
-    }
-
-    /// Is the torque the joint's, or only that of a controller that holds the motor?
-    ///
-    /// What was learned in the meantime, if it was for long, is void as soon as the joint's has been told for a while.
-    fn tell_apart(&mut self) {
-        let learned = &mut self.identification;
-        let (a_while, long) = (learned.updates_in(EXPLAINED_S), learned.updates_in(ASTRAY_S));
-        if !learned.black_box && learned.noise() > APART * self.controller.left().sqrt() {
-            (self.apart, self.closed) = (0, self.closed.saturating_add(1));
-            return;
-        }
-        self.apart = self.apart.saturating_add(1);
-        if self.apart < a_while {
-            return;
-        }
-        if std::mem::take(&mut self.closed) > long {
-            if learned.has_reference() {
-                learned.restore_reference();
-            } else {
-                self.relearn();
-            }
-        }
-    }
-
-    /// Whether the torque has been the joint's for a while, and not only that of a controller that holds the motor.
-    fn is_apart(&self) -> bool {
-        self.apart >= self.identification.updates_in(EXPLAINED_S)
     }
 
     /// Whether the estimate has long been where it cannot be: no way back by small steps.
@@ -525,7 +483,8 @@ impl TransmissionEstimator {
         if let Some((inertia, damping)) = motor {
             (self.inertia_now, self.damping_now) = (inertia, damping);
         }
-        self.unmodelled = learned.noise().hypot(learned.coulomb_friction());
+        let noise = learned.kalman().map_or(f64::NAN, |kalman| kalman.noise.sqrt() * learned.torque_unit());
+        self.unmodelled = noise.hypot(learned.coulomb_friction());
         let link_rate = self.deflection.link_rate();
         let phi = self.deflection.at(0.0) + learned.deflection_offset() + learned.late() * link_rate;
         self.std = learned.stiffness_std(phi, link_rate, self.deflection.variance());
@@ -534,7 +493,7 @@ impl TransmissionEstimator {
         if !learned.law().is_polynomial() {
             self.reach = self.reach.min(EDGE * learned.law().law.reach(&learned.alpha()[1..]));
         }
-        if motor.is_none() || !self.explains() || !self.is_apart() || !self.changes.explained() {
+        if motor.is_none() || !self.explains() || !self.changes.explained() {
             self.reach = 0.0;
         }
     }

@@ -22,7 +22,7 @@ from estimator.diagnosis.hypothesis import Fitted, Keys, Problem, Term, stretche
 from estimator.priors import PRIORS
 from estimator.sample import FloatArray
 
-__all__ = ["Progress", "Search"]
+__all__ = ["Progress", "Search", "parameters"]
 
 _SMOOTHING = "smoothing_rad_s"
 
@@ -192,7 +192,7 @@ class Search:
         """Each term in turn replaced by one with more evidence, or by a simpler one that is nearly even."""
         for k in range(len(hypothesis.terms)):
             for other in self.rivals(hypothesis, k):
-                simpler = _parameters(other.terms[-1]) < _parameters(hypothesis.terms[k])
+                simpler = parameters(other.terms[-1]) < parameters(hypothesis.terms[k])
                 if self.advantage(other, hypothesis) > (math.log(choice("even")) if simpler else 0.0):
                     hypothesis = self._settled(other)
                     break
@@ -282,7 +282,7 @@ class Search:
             yield _Beside(entry.candidate, tried)
 
 
-def _parameters(term: Term) -> int:
+def parameters(term: Term) -> int:
     """Number of an effect's parameters."""
     return len(term.candidate.kind.parameters)
 

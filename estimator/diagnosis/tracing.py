@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from estimator.diagnosis.bandwidth import choose_bandwidth
-from estimator.diagnosis.choices import least_rows
+from estimator.diagnosis.choices import choice, least_rows
 from estimator.diagnosis.heldout import Held, held_out
 from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.diagnosis.judge import Judge
 from estimator.diagnosis.openorder import raised
 from estimator.diagnosis.result import Diagnosis
-from estimator.diagnosis.search import Progress, Search
+from estimator.diagnosis.search import Progress, Search, parameters
 from estimator.errors import EstimatorError
 from estimator.gate import check, refuse
 from estimator.model import JointModel
@@ -74,13 +75,20 @@ def diagnose(
 
 
 def _chosen(search: Search, held: Held, hypotheses: list[Fitted]) -> Fitted:
-    """Of the hypotheses that pass the held-out test, the one with the best odds on all data."""
-    best = hypotheses[0]
+    """Of the hypotheses that pass the held-out test, the one with the best odds on all data.
 
-    def odds(one: Fitted) -> float:
-        return search.advantage(one, best) + held.log_likelihood(one, best)
+    As in the search, laws with fewer parameters are preferred while they are an alternative.
+    """
+    first = hypotheses[0]
+    odds = [search.advantage(one, first) + held.log_likelihood(one, first) for one in hypotheses]
+    best = int(np.argmax(odds))
+    least = odds[best] + math.log(choice("even"))
 
-    return max(hypotheses, key=odds)
+    def simplicity(k: int) -> tuple[int, float]:
+        return sum(parameters(term) for term in hypotheses[k].terms), -odds[k]
+
+    alike = [k for k, one in enumerate(hypotheses) if len(one.terms) == len(hypotheses[best].terms)]
+    return hypotheses[min((k for k in alike if odds[k] >= least), key=simplicity)]
 
 
 def _gated(search: Search, held: Held, found: Fitted) -> Fitted:

@@ -272,7 +272,7 @@ def test_a_foreign_sync_is_refused_before_anything_is_sent():
     wire = Wire([drive()])
     for _ in range(5):
         wire.put(0x80, b"")
-    with pytest.raises(BusError, match=r'another master already makes SYNC.*bus\.sync = "follow"'):
+    with pytest.raises(BusError, match=r'another master already produces SYNC.*bus\.sync = "follow"'):
         configure(wire, parse(joint_text()))
     assert wire.sent == []
 

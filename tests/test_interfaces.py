@@ -201,7 +201,7 @@ def test_a_second_daemon_under_another_name_is_refused_on_socketcand() -> None:
             until(lambda: is_fresh(daemon.pipelines[0]))
             other = joint.model_copy(update={"name": "other"})
             reboots = [c.reboots for c in daemon.pipelines[0].assembler.counters.values()]
-            with pytest.raises(BusError, match="another master already makes SYNC"):
+            with pytest.raises(BusError, match="another master already produces SYNC"):
                 Daemon([ServedJoint(joint=other)], publish=False, real_time=False)
             assert [c.reboots for c in daemon.pipelines[0].assembler.counters.values()] == reboots
             assert not any("configured again" in e["text"] for e in daemon.events.recent())
@@ -215,6 +215,6 @@ def test_a_socketcand_server_that_says_nothing_is_one_line(monkeypatch: pytest.M
             channel="can0",
             options={"host": "127.0.0.1", "port": server.getsockname()[1]},
         )
-        with pytest.raises(BusError, match=r"the server says nothing for 0.2 s"):
+        with pytest.raises(BusError, match=r"no greeting for 0.2 s"):
             open_bus(section)
     assert socket.getdefaulttimeout() is None

@@ -77,18 +77,21 @@ def diagnose(
 def _chosen(search: Search, held: Held, hypotheses: list[Fitted]) -> Fitted:
     """Of the hypotheses that pass the held-out test, the one with the best odds on all data.
 
-    As in the search, laws with fewer parameters are preferred while they are an alternative.
+    Of laws of one family, fewer parameters are preferred while they are an alternative, as in the search.
     """
     first = hypotheses[0]
     odds = [search.advantage(one, first) + held.log_likelihood(one, first) for one in hypotheses]
     best = int(np.argmax(odds))
     least = odds[best] + math.log(choice("even"))
 
+    def families(k: int) -> list[tuple[str, ...]]:
+        return sorted(tuple(map(str, term.candidate.family)) for term in hypotheses[k].terms)
+
     def simplicity(k: int) -> tuple[int, float]:
         return sum(parameters(term) for term in hypotheses[k].terms), -odds[k]
 
-    alike = [k for k, one in enumerate(hypotheses) if len(one.terms) == len(hypotheses[best].terms)]
-    return hypotheses[min((k for k in alike if odds[k] >= least), key=simplicity)]
+    alike = (k for k, x in enumerate(odds) if x >= least and families(k) == families(best))
+    return hypotheses[min(alike, key=simplicity)]
 
 
 def _gated(search: Search, held: Held, found: Fitted) -> Fitted:

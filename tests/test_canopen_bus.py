@@ -151,7 +151,11 @@ def test_a_passive_serial_adapter_is_opened_listen_only():
 
 
 def test_errors_of_the_system_are_distinguished(monkeypatch):
-    for number, expected in ((errno.EPERM, "permission denied"), (errno.ENETDOWN, "is down"), (errno.EIO, "Input")):
+    for number, expected in (
+        (errno.EPERM, "permission denied"),
+        (errno.ENETDOWN, "is down"),
+        (errno.EIO, "Input"),
+    ):
 
         def refuse(number=number, **_):
             raise can.CanInitializationError("cannot") from OSError(number, "Input/output error")

@@ -161,24 +161,7 @@ def compute() -> tuple[dict[str, Any], list[tuple[str, str, str, str, str]], dic
     taylor = "140.625, 112.793, 73.139, 45.830, 28.711 (Taylor)"
     rows += [_row(f"C: polynomial {i + 1}", paper_c[i], raw["C"][i], best["C"][i], taylor) for i in range(2)]
     found = [nonlinear(motions["C"], i) for i in range(2)]
-    paper_k = ("499.22, 1.7536, 55 it.", "499.96, 1.7527, 32 it.")
-    for i in range(2):
-        loose = fit_alpha(
-            MODELS["vsa-ii"], motions["C"].phi[:, i], residual(motions["C"], i)[1], np.array([0.1, 1.1])
-        )
-        ours = f"{found[i]['k_nmm_rad']:.4f}, {found[i]['c']:.6f}, {found[i]['iterations']} eval."
-        text = f"{1e3 * loose.alpha[0]:.2f}, {loose.alpha[1]:.4f}, {loose.iterations} it."
-        rows.append((f"C: k, C of transmission {i + 1}", paper_k[i], text, ours, "500, 1.75"))
-        small = nonlinear(printed, i)
-        rows.append(
-            (
-                "   … with the printed 10 N·mm",
-                "",
-                "",
-                f"{small['k_nmm_rad']:.3f}, {small['c']:.5f}",
-                "500, 1.75",
-            )
-        )
+    rows += _vsa_rows(motions["C"], printed, found)
     bbe = _black_boxes(motions, rows)
     result = {
         "A": {"k_nmm_rad": 1e3 * best["A"][0][0], "order": int(best["A"][0].size)},
@@ -192,6 +175,30 @@ def compute() -> tuple[dict[str, Any], list[tuple[str, str, str, str, str]], dic
         "bbe": bbe,
     }
     return result, rows, motions
+
+
+def _vsa_rows(
+    motion: Motion, printed: Motion, found: list[dict[str, float]]
+) -> list[tuple[str, str, str, str, str]]:
+    """Rows of the VSA-II's parameters: of both transmissions, and with the torque that the paper prints."""
+    rows = []
+    paper_k = ("499.22, 1.7536, 55 it.", "499.96, 1.7527, 32 it.")
+    for i in range(2):
+        loose = fit_alpha(MODELS["vsa-ii"], motion.phi[:, i], residual(motion, i)[1], np.array([0.1, 1.1]))
+        ours = f"{found[i]['k_nmm_rad']:.4f}, {found[i]['c']:.6f}, {found[i]['iterations']} eval."
+        text = f"{1e3 * loose.alpha[0]:.2f}, {loose.alpha[1]:.4f}, {loose.iterations} it."
+        rows.append((f"C: k, C of transmission {i + 1}", paper_k[i], text, ours, "500, 1.75"))
+        small = nonlinear(printed, i)
+        rows.append(
+            (
+                "   … with the printed 10 N·mm",
+                "",
+                "",
+                f"{small['k_nmm_rad']:.3f}, {small['c']:.5f}",
+                "500, 1.75",
+            )
+        )
+    return rows
 
 
 def _black_boxes(motions: dict[str, Motion], rows: list[tuple[str, str, str, str, str]]) -> dict[str, float]:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import diagnosiskit as kit
 import numpy as np
 import pytest
 
-from estimator.diagnosis import diagnose
+from estimator.diagnosis import diagnose, tracing
+from estimator.diagnosis.candidates import Candidate
 from estimator.diagnosis.choices import choice
+from estimator.diagnosis.hypothesis import Term
+from estimator.effects import LIBRARY
 from estimator.errors import EstimatorError
 from estimator.identify import identify
 from estimator.model import Effect
@@ -248,6 +252,27 @@ def test_gaps_are_left_out(records: dict[str, Record]) -> None:
         link_position_rad=whole.link_position_rad[keep],
     )
     assert [e.name for e in diagnose(holed, kit.model()).effects] == ["coulomb_friction"]
+
+
+@pytest.mark.parametrize(
+    ("behind", "other", "chosen"),
+    [
+        (19.0, "coulomb_friction", "coulomb_friction"),  # still an alternative
+        (21.0, "coulomb_friction", "asymmetric_friction"),
+        (1.0, "motor_inertia", "asymmetric_friction"),  # another phenomenon is not simpler, it is another one
+    ],
+)
+def test_of_laws_of_one_family_the_simpler_one_is_chosen_while_it_is_an_alternative(
+    behind: float, other: str, chosen: str
+) -> None:
+    hypotheses = [
+        SimpleNamespace(terms=(Term(Candidate(LIBRARY[name], 0), {}),), odds=odds)
+        for name, odds in (("asymmetric_friction", 0.0), (other, -np.log(behind)))
+    ]
+    search = SimpleNamespace(advantage=lambda one, _: one.odds)
+    held = SimpleNamespace(log_likelihood=lambda *_: 0.0)
+    (term,) = tracing._chosen(search, held, hypotheses).terms
+    assert term.candidate.kind.name == chosen
 
 
 def test_friction_is_named_where_the_declared_spring_carries_nothing() -> None:

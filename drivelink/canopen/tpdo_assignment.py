@@ -15,7 +15,7 @@ from drivelink.canopen.pdo import Tpdo, describe
 from drivelink.canopen.roles import Role
 from drivelink.errors import DriveError
 
-__all__ = ["CHECKS", "OPTIONAL", "Assignment", "assign", "choose_cob_id", "pack", "unused"]
+__all__ = ["CHECKS", "OPTIONAL", "Assignment", "Available", "assign", "choose_cob_id", "pack", "unused"]
 
 FRAME_BITS = 64
 

@@ -106,28 +106,40 @@ def run(args: argparse.Namespace) -> int:
     took_s = time.perf_counter() - begin
     live = is_frame_log(args.file, True if args.frames else None)
     warnings = [] if args.strict or interrupted else gathered.remarks(live=live)
+    _report(args, joint.name, summary, warnings, took_s, interrupted)
+    return _INTERRUPTED if interrupted else 0
+
+
+def _report(
+    args: argparse.Namespace,
+    joint: str,
+    summary: Summary,
+    warnings: Sequence[str],
+    took_s: float,
+    interrupted: bool,
+) -> None:
+    """Draw what is asked for, and print the result."""
     for line in warnings:
         print(f"{args.file}: warning: {line}", file=sys.stderr)
-    made = summary.plot(args.plots, f"{joint.name}: {args.file.name}") if args.plots and summary.count else []
+    made = summary.plot(args.plots, f"{joint}: {args.file.name}") if args.plots and summary.count else []
     if args.json:
         document = {
             "recording": str(args.file),
-            "joint": joint.name,
+            "joint": joint,
             **summary.document(),
             "estimates": str(args.out) if args.out else None,
             "plots": [str(path) for path in made],
-            "warnings": warnings,
+            "warnings": list(warnings),
             "took_s": round(took_s, 3),
             "interrupted": interrupted,
         }
         print(json.dumps(document))
-    else:
-        print(f"{args.file}: {summary.text(took_s)}")
-        for path in made:
-            print(f"plot: {path}")
-        if args.out is not None:
-            print(f"estimates: {args.out}" + (" (up to the interruption)" if interrupted else ""))
-    return _INTERRUPTED if interrupted else 0
+        return
+    print(f"{args.file}: {summary.text(took_s)}")
+    for path in made:
+        print(f"plot: {path}")
+    if args.out is not None:
+        print(f"estimates: {args.out}" + (" (up to the interruption)" if interrupted else ""))
 
 
 def _play(playback: Playback, takers: Sequence[Taker], title: str) -> bool:

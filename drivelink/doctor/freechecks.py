@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from drivelink.canopen.layout import Signal
-from drivelink.canopen.mappable import MappableObject
 from drivelink.canopen.pdo import Tpdo
 from drivelink.canopen.roles import Role
-from drivelink.canopen.tpdo_assignment import assign, unused
+from drivelink.canopen.tpdo_assignment import Available, assign, unused
 from drivelink.doctor.report import Section
 from drivelink.errors import DriveError
 from drivelink.jointfile import BusSection
@@ -31,8 +30,6 @@ _SIGNALS = {  # as `checks` of [motor.drive] names them
 _AGAINST = {"velocity": "position", "current": "torque", "following_error": "position and its demand"}
 _ENCODERS = ("0x60E4:01", "0x60E4:02")  # beside the one of the position
 _COUNTER = 240  # CiA 301, 7.5.2.22: the longest
-
-Available = Mapping[Signal, Sequence[MappableObject]]
 
 
 def asked_signals(role: Role) -> set[Signal]:

@@ -19,7 +19,7 @@ from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.canopen.pdo import decode, describe, entry_text, read_optional
 from drivelink.canopen.roles import Role, roles
 from drivelink.canopen.scan import FoundNode, Traffic, identify, listen, scan
-from drivelink.canopen.tpdo_assignment import CHECKS, assign, unused
+from drivelink.canopen.tpdo_assignment import CHECKS, Available, assign, unused
 from drivelink.canopen.vendors import vendor_of
 from drivelink.doctor.datasheet import planned_entries
 from drivelink.doctor.freechecks import (
@@ -244,20 +244,7 @@ def _judge_mapping(section: Section, role: Role, survey: NodeSurvey) -> NodeLayo
     wanted |= {s: unused(wanted, objects) for s, objects in available.items() if s in asked}
     enabled = [tpdo for tpdo in survey.tpdos if tpdo.enabled]
     section.say(Severity.INFO, role.subject, f"sends {describe(enabled)}")
-    complete = True
-    for signal, candidates in wanted.items():
-        if not candidates:
-            offered = survey.offer.candidates.get(signal, ())
-            tried = [f"0x{c.address[0]:04X}:{c.address[1]:02X}" for c in offered] or ["object for it"]
-            needed = signal not in (Signal.STATUSWORD, *CHECKS)
-            severity = Severity.ERROR if needed else Severity.WARNING
-            section.say(severity, role.subject, f"gives no {signal}: it has no {', '.join(tried)}")
-            complete = complete and severity is not Severity.ERROR
-    for signal, reason in survey.offer.missing.items():
-        if signal is not Signal.MOTOR_VELOCITY:
-            section.say(Severity.ERROR, role.subject, reason)
-            complete = False
-    if not complete:
+    if not _has_all(section, role, survey, wanted):
         return None
     try:
         plan = assign(role, wanted, survey.tpdos, prefer_unused=False)
@@ -290,6 +277,24 @@ def _judge_mapping(section: Section, role: Role, survey: NodeSurvey) -> NodeLayo
     planned = {assignment.tpdo.number for assignment in plan}
     others = decode([tpdo for tpdo in enabled if tpdo.number not in planned], {})
     return NodeLayout(node_id=role.node_id, motor=role.motor, tpdos=tpdos, other_tpdos=others)
+
+
+def _has_all(section: Section, role: Role, survey: NodeSurvey, wanted: Available) -> bool:
+    """Whether the node has an object for each signal that is needed; say those that it lacks."""
+    complete = True
+    for signal, candidates in wanted.items():
+        if not candidates:
+            offered = survey.offer.candidates.get(signal, ())
+            tried = [f"0x{c.address[0]:04X}:{c.address[1]:02X}" for c in offered] or ["object for it"]
+            needed = signal not in (Signal.STATUSWORD, *CHECKS)
+            severity = Severity.ERROR if needed else Severity.WARNING
+            section.say(severity, role.subject, f"gives no {signal}: it has no {', '.join(tried)}")
+            complete = complete and severity is not Severity.ERROR
+    for signal, reason in survey.offer.missing.items():
+        if signal is not Signal.MOTOR_VELOCITY:
+            section.say(Severity.ERROR, role.subject, reason)
+            complete = False
+    return complete
 
 
 def _judge_load(section: Section, layouts: Sequence[NodeLayout], bus: BusSection) -> None:

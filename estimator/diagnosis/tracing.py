@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -84,8 +85,8 @@ def _chosen(search: Search, held: Held, hypotheses: list[Fitted]) -> Fitted:
     best = int(np.argmax(odds))
     least = odds[best] + math.log(choice("even"))
 
-    def families(k: int) -> list[tuple[str, ...]]:
-        return sorted(tuple(map(str, term.candidate.family)) for term in hypotheses[k].terms)
+    def families(k: int) -> Counter[tuple[str, str, str, int | None]]:
+        return Counter(term.candidate.family for term in hypotheses[k].terms)
 
     def simplicity(k: int) -> tuple[int, float]:
         return sum(parameters(term) for term in hypotheses[k].terms), -odds[k]

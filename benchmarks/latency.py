@@ -20,11 +20,11 @@ import numpy as np
 import zenoh
 
 import drivelink
+from drivelink._core import encode_estimate
 from drivelink.cycle import realtime
 from drivelink.jointfile import parse
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_client, open_session
-from drivelink.pubsub.wire import encode_estimate
 from estimator.sample import Estimate, TransmissionEstimate
 
 ENDPOINT = "tcp/127.0.0.1:17447"

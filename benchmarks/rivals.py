@@ -14,13 +14,12 @@ import numpy as np
 import zenoh
 from rig import AnsweringBus, Devices
 
-from drivelink._core import SYNC_COB_ID, LatencyHistogram
+from drivelink._core import SYNC_COB_ID, LatencyHistogram, encode_estimate
 from drivelink.canopen.layout import NodeLayout, Signal
 from drivelink.cycle.framesource import FrameSource
 from drivelink.cycle.realtime import Alarm
 from drivelink.cycle.sources import open_source
 from drivelink.jointfile import JointFile
-from drivelink.pubsub.wire import encode_estimate
 from estimator.sample import Estimate, TransmissionEstimate
 from sim.canopen.edsfile import node_eds
 from sim.canopen.node import Node

@@ -25,7 +25,7 @@ import zenoh
 from rig import PERIOD_S, free_endpoint, joint, subscriber
 from rivals import Floor
 
-from drivelink._core import SYNC_COB_ID
+from drivelink._core import SYNC_COB_ID, encode_estimate, encode_sample
 from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle import realtime
 from drivelink.cycle.pipeline import make_pipeline
@@ -35,7 +35,6 @@ from drivelink.demo.simulate import network_from_joint, open_sim_bus
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_session
-from drivelink.pubsub.wire import encode_estimate, encode_sample
 
 STAGES = ("receive", "decode", "estimate", "encode", "put")
 CASES = ((1, 1), (1, 2), (2, 2), (4, 2), (8, 2), (16, 2))  # joints, motors of each

@@ -10,13 +10,13 @@ from drivelink.version import __version__ as __version__
 if TYPE_CHECKING:
     from drivelink.pubsub.asyncclient import AsyncSubscription as AsyncSubscription
     from drivelink.pubsub.asyncclient import subscribe_async as subscribe_async
-    from drivelink.pubsub.client import State as State
     from drivelink.pubsub.client import Subscription as Subscription
     from drivelink.pubsub.client import subscribe as subscribe
+    from drivelink.pubsub.feed import State as State
 
 _LAZY = {  # imported when asked for, so that `import drivelink` stays cheap
     "AsyncSubscription": "drivelink.pubsub.asyncclient",
-    "State": "drivelink.pubsub.client",
+    "State": "drivelink.pubsub.feed",
     "Subscription": "drivelink.pubsub.client",
     "subscribe": "drivelink.pubsub.client",
     "subscribe_async": "drivelink.pubsub.asyncclient",

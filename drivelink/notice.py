@@ -6,8 +6,6 @@ import logging
 from dataclasses import asdict, dataclass
 from enum import IntEnum
 
-__all__ = ["Notice", "Severity", "log_notices"]
-
 
 class Severity(IntEnum):
     """How bad it is."""

@@ -15,8 +15,6 @@ from sim.errors import SimError
 from sim.network import Network
 from sim.world import World
 
-__all__ = ["Bench"]
-
 
 class Bench:
     """Several joints on one bus.

@@ -30,8 +30,6 @@ from sim.sensors import RPM_RAD_S, DriveHardware, LinkEncoder
 from sim.springs import Spring
 from sim.world import World
 
-__all__ = ["CASES", "Assumption", "Case", "case"]
-
 
 @dataclass(frozen=True, slots=True)
 class Assumption:

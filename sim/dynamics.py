@@ -17,16 +17,6 @@ from collections.abc import Callable
 
 from sim.plant import JointPlant, LinkPlant, Load, MotorPlant
 
-__all__ = [
-    "Pair",
-    "State",
-    "Triple",
-    "elasticity",
-    "equations",
-    "spring_deflection",
-    "transmission_torques",
-]
-
 State = list[float]
 """[q, q', theta_1, theta_1', theta_2, theta_2'], rad and rad/s."""
 

@@ -15,8 +15,6 @@ from typing import Any
 
 from sim.errors import SimError
 
-__all__ = ["KINDS", "Excitation", "build"]
-
 Profile = Callable[[float], float]
 
 

@@ -9,8 +9,6 @@ from sim.canopen.node import Node
 from sim.canopen.tpdo import Tpdo
 from sim.network import Network
 
-__all__ = ["Faults"]
-
 Action = Callable[[], None]
 
 

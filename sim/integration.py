@@ -16,8 +16,6 @@ from sim.dynamics import Pair, State, Triple, equations, spring_deflection, tran
 from sim.errors import SimError
 from sim.plant import Dry, JointPlant
 
-__all__ = ["Settle", "Step", "integrator", "settling", "whole_fraction"]
-
 Step = Callable[[State, float, float, float], None]
 """(state, tau_1, tau_2, tau_k): moves the state by one step, in place."""
 Settle = Callable[[State, float], None]

@@ -18,8 +18,6 @@ import can
 
 from sim.canopen.node import Node
 
-__all__ = ["Network"]
-
 _log = logging.getLogger(__name__)
 
 _WITHOUT_SYNC_S = 0.05  # without a SYNC for so long, the wall clock advances the world

@@ -10,19 +10,6 @@ from typing import Literal
 from sim.errors import SimError
 from sim.springs import Law, Spring
 
-__all__ = [
-    "Arrangement",
-    "Commit",
-    "Dry",
-    "Extra",
-    "JointPlant",
-    "Kinematics",
-    "LinkPlant",
-    "Load",
-    "MotorPlant",
-    "Terms",
-]
-
 Arrangement = Literal["single", "antagonistic", "serial"]
 Load = Callable[[float, float], float]
 """Torque (N·m) that opposes the motion, of position and velocity."""

@@ -8,8 +8,6 @@ from sim.effects.assembly import LinkParts, MotorParts, Reading
 from sim.effects.memory import Delayed, History, Lag
 from sim.sensors import DriveHardware, DriveSignals, LinkEncoder
 
-__all__ = ["Amplifier", "LinkScale"]
-
 
 class Amplifier:
     """A drive's current loop and its sampled signals.

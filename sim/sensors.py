@@ -15,8 +15,6 @@ import numpy as np
 
 from sim.errors import SimError
 
-__all__ = ["RPM_RAD_S", "DriveHardware", "DriveSignals", "LinkEncoder", "noise"]
-
 RPM_RAD_S = 2.0 * math.pi / 60.0
 """One revolution per minute."""
 _BLOCK = 4096

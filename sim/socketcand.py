@@ -16,8 +16,6 @@ from typing import Any
 
 import can
 
-__all__ = ["DEFAULT_PORT", "SocketcandServer"]
-
 DEFAULT_PORT = 29536
 
 _LARGEST_BACKLOG = 1 << 20  # unread bytes at which a client is dropped

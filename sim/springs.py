@@ -12,8 +12,6 @@ from dataclasses import dataclass, field
 
 from sim.errors import SimError
 
-__all__ = ["MODELS", "RIGID", "Law", "Spring"]
-
 Scalar = Callable[[float], float]
 Parameters = Mapping[str, float | tuple[float, ...]]
 

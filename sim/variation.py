@@ -11,8 +11,6 @@ from typing import Any
 from sim.errors import SimError
 from sim.plant import JointPlant, LinkPlant, MotorPlant
 
-__all__ = ["suitable", "typical_torque_nm", "with_parameters"]
-
 _SOFT_NM_RAD = 200.0  # springs up to this are soft
 _SOFT_DEFLECTION_RAD = 0.15
 

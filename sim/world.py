@@ -23,8 +23,6 @@ from sim.plant import JointPlant
 from sim.readout import Amplifier, LinkScale
 from sim.sensors import DriveHardware, DriveSignals, LinkEncoder, noise
 
-__all__ = ["MotorTruth", "Truth", "World", "record"]
-
 
 class MotorTruth(NamedTuple):
     """True state of one motor and its transmission, joint side.

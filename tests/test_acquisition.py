@@ -7,9 +7,9 @@ import struct
 import pytest
 from canlayouts import COUNT_RAD, LINK_RAD, TORQUE_NM, VSA, drive, encoder, link, pdo, vsa_cycle
 
-from drivelink._core import Assembler
+from drivelink._core import LATE, Assembler
 from drivelink.canopen.layout import MappedObject, NodeLayout, Signal, TpdoLayout
-from drivelink.cycle.syncclock import LATE, SyncClock, measure_period
+from drivelink.cycle.syncclock import SyncClock, measure_period
 from drivelink.errors import DriveError
 from estimator.sample import Sample, Status
 

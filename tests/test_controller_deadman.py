@@ -10,7 +10,8 @@ import vsacontrol.process
 from vsacontrol.phases import Phase
 from vsacontrol.process import Process
 
-from drivelink.pubsub.wire import EstimateMessage, encode_sample
+from drivelink._core import encode_sample
+from drivelink.pubsub.wire import EstimateMessage
 from estimator.sample import Sample, TransmissionEstimate
 
 SAFE = (0.0, 0.0)

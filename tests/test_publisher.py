@@ -22,6 +22,7 @@ from zenohkit import (
     until,
 )
 
+from drivelink._core import encode_estimate, encode_external, encode_sample
 from drivelink.pubsub import wire
 from drivelink.pubsub.publisher import JointPublisher, describe_model, schema, to_json
 from drivelink.pubsub.session import close_session, open_client, open_session
@@ -80,19 +81,19 @@ def test_estimate_and_sample_arrive_as_the_contract_says(publisher, client):
         return estimates.try_recv()
 
     message = until(both)
-    assert message.payload.to_bytes() == wire.encode_estimate(make_estimate(7), 123)
+    assert message.payload.to_bytes() == encode_estimate(make_estimate(7), 123)
     assert str(message.encoding) == "zenoh/serialized;drivelink.estimate/1"
     assert message.express
     assert message.priority == zenoh.Priority.REAL_TIME
     assert message.congestion_control == zenoh.CongestionControl.DROP
     assert message.source_info.source_id.zid == client.info.peers_zid()[0]
-    assert received(samples).payload.to_bytes() == wire.encode_sample(make_sample(7), 123)
+    assert received(samples).payload.to_bytes() == encode_sample(make_sample(7), 123)
 
 
 def test_an_external_torque_arrives_as_the_contract_says(publisher, client):
     externals = client.declare_subscriber("drivelink/elbow/external", zenoh.handlers.RingChannel(4))
     message = until(lambda: publisher.put_external(make_external(7, status=3), 123) or externals.try_recv())
-    assert message.payload.to_bytes() == wire.encode_external(make_external(7, status=3), 123)
+    assert message.payload.to_bytes() == encode_external(make_external(7, status=3), 123)
     assert len(message.payload.to_bytes()) == 36
     assert str(message.encoding) == "zenoh/serialized;drivelink.external/1"
     assert message.express

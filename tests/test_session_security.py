@@ -11,8 +11,8 @@ import zenoh
 from zenohkit import free_endpoint, make_estimate, make_joint, until
 
 import drivelink
+from drivelink._core import encode_estimate
 from drivelink.errors import ZenohError
-from drivelink.pubsub import wire
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_session
 
@@ -171,7 +171,7 @@ def test_a_controller_can_subscribe_but_not_publish_into_the_daemons_keys(config
         ) as intruder,
     ):
         put_until(publisher, lambda: joint.valid)
-        forged = wire.encode_estimate(make_estimate(999_999), 0)
+        forged = encode_estimate(make_estimate(999_999), 0)
         for _ in range(20):
             for name in ("estimate", "status", "model"):
                 intruder.put(f"drivelink/elbow/{name}", forged)

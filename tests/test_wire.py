@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from zenoh.ext import Float64, UInt32, UInt64, z_deserialize, z_serialize
 
+from drivelink._core import encode_estimate, encode_external, encode_sample
 from drivelink.errors import ZenohError
 from drivelink.pubsub import wire
 from estimator.sample import Estimate, External, ExternalStatus, Sample, Status, TransmissionEstimate
@@ -46,7 +47,7 @@ def test_an_estimate_is_the_bytes_that_zenoh_serializes(payload, numbers):
     sequence, stamp_ns, status, *totals = numbers[:6]
     transmissions = tuple(TransmissionEstimate(*group) for group in groups(numbers[7:], 4))
     estimate = Estimate(sequence, status, *totals, transmissions)
-    assert wire.encode_estimate(estimate, stamp_ns) == payload
+    assert encode_estimate(estimate, stamp_ns) == payload
 
     message = wire.decode_estimate(payload)
     assert message[:3] == (sequence, stamp_ns, status)
@@ -71,7 +72,7 @@ def test_what_is_no_estimate_or_cannot_be_valid_is_refused(payload):
 def test_an_external_torque_is_the_bytes_that_zenoh_serializes(payload, numbers):
     sequence, stamp_ns, status, torque, std = numbers
     external = External(sequence, status, torque, std, math.nan, math.nan)
-    assert wire.encode_external(external, stamp_ns) == payload
+    assert encode_external(external, stamp_ns) == payload
     message = wire.decode_external(payload)
     assert message[:3] == (sequence, stamp_ns, status)
     assert same(message[3:], [torque, std])
@@ -90,7 +91,7 @@ def test_what_is_no_external_torque_or_cannot_be_valid_is_refused(payload):
 def test_a_sample_is_the_bytes_that_zenoh_serializes(payload, numbers):
     sequence, stamp_ns, link, velocity, external = numbers[:5]
     motors = tuple(zip(*groups(numbers[6:], 3), strict=True))
-    assert wire.encode_sample(Sample(sequence, *motors, link, velocity, external), stamp_ns) == payload
+    assert encode_sample(Sample(sequence, *motors, link, velocity, external), stamp_ns) == payload
 
     sample, stamp = wire.decode_sample(payload)
     assert (sample.sequence, stamp) == (sequence, stamp_ns)
@@ -107,7 +108,7 @@ def test_a_sample_is_the_bytes_that_zenoh_serializes(payload, numbers):
 )
 def test_any_estimate_can_be_read_by_zenohs_deserializer(sequence, stamp_ns, status, totals, transmissions):
     estimate = Estimate(sequence, status, *totals, tuple(TransmissionEstimate(*t) for t in transmissions))
-    payload = wire.encode_estimate(estimate, stamp_ns)
+    payload = encode_estimate(estimate, stamp_ns)
     number = Float64
     kind = tuple[UInt64, UInt64, UInt32, number, number, number, list[tuple[number, number, number, number]]]
     assert z_deserialize(kind, zenoh.ZBytes(payload)) == (sequence, stamp_ns, status, *totals, transmissions)
@@ -117,7 +118,7 @@ def test_any_estimate_can_be_read_by_zenohs_deserializer(sequence, stamp_ns, sta
 
 def test_numpy_reads_the_same_bytes_as_records():
     estimate = Estimate(7, 3, 1.0, 2.0, 3.0, (TransmissionEstimate(4.0, 5.0, 6.0, 7.0),) * 2)
-    records = np.frombuffer(wire.encode_estimate(estimate, 9) * 3, wire.ESTIMATE.dtype(2))
+    records = np.frombuffer(encode_estimate(estimate, 9) * 3, wire.ESTIMATE.dtype(2))
     assert records["stiffness_nm_rad"].tolist() == [2.0] * 3
     assert records["transmissions"]["deflection_rad"].shape == (3, 2)
     assert set(records["count"]) == {2}
@@ -147,7 +148,7 @@ def test_bytes_that_are_no_sample_are_refused():
 
 def test_a_status_that_carries_higher_bits_fits_its_field():
     estimate = Estimate(1, -1, 0.0, 0.0, 0.0, ())
-    assert wire.decode_estimate(wire.encode_estimate(estimate, 0)).status == 2**32 - 1
+    assert wire.decode_estimate(encode_estimate(estimate, 0)).status == 2**32 - 1
 
 
 def test_every_status_bit_is_described():

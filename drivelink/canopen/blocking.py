@@ -13,8 +13,6 @@ import can
 from drivelink.canopen.sdo import Program, Session
 from drivelink.errors import BusError
 
-__all__ = ["POLL_S", "FrameBus", "Idle", "receive", "run_program", "sender"]
-
 T = TypeVar("T")
 Idle = Callable[[], object]
 

@@ -21,8 +21,6 @@ from can.interfaces import VALID_INTERFACES
 from drivelink.errors import BusError
 from drivelink.jointfile import BusSection
 
-__all__ = ["interface_is_up", "listening_s", "open_bus", "receive_buffer_frames", "server_has_gone"]
-
 logger = logging.getLogger(__name__)
 
 _SO_RCVBUFFORCE = 33  # Linux, not in the socket module: beyond net.core.rmem_max, with CAP_NET_ADMIN

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from drivelink.canopen.layout import NodeLayout, TpdoLayout
 from drivelink.errors import BusError
 
-__all__ = ["BusLoad", "bus_load", "check_capacity", "frame_bits"]
-
 CAPACITY = 1.0  # of the bit rate, worst-case stuffing
 COMFORTABLE = 0.7  # above it, event-driven frames of others begin to delay the cycle
 

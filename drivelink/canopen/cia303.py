@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["angle_unit_rad", "velocity_unit_rad_s"]
-
 # CiA 303-2, notation of units as numbers: angle and time.
 _ANGLES_RAD = {0x10: 1.0, 0x41: math.pi / 180, 0x42: math.pi / 10800, 0x43: math.pi / 648000, 0xB4: math.tau}
 _TIMES_S = {0x03: 1.0, 0x47: 60.0, 0x48: 3600.0}

@@ -24,8 +24,6 @@ from drivelink.errors import BusError, DriveError
 from drivelink.jointfile import BusSection, JointFile
 from drivelink.notice import log_notices
 
-__all__ = ["Configurator", "configure", "configure_joints", "refuse_foreign_sync"]
-
 logger = logging.getLogger(__name__)
 
 _DEVICE_TYPE = 0x1000  # what a node is asked for first

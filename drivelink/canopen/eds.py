@@ -19,8 +19,6 @@ from canopen.objectdictionary.eds import RECORD, import_eds
 from drivelink.canopen.pdo import Tpdo, tpdos_of
 from drivelink.errors import DriveError
 
-__all__ = ["DataSheet", "load_eds"]
-
 Sections = dict[str, dict[str, str]]
 Address = tuple[int, int]
 

@@ -6,8 +6,6 @@ import struct
 from dataclasses import dataclass
 from enum import StrEnum
 
-__all__ = ["DriveState", "Emergency", "drive_state", "emergency_text", "parse_emergency"]
-
 _EMCY = struct.Struct("<HB5s")
 
 # Error codes of CiA 301 (table 26) and CiA 402-2 (annex); the most specific entry that matches is taken.

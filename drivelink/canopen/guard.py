@@ -12,8 +12,6 @@ import can
 from drivelink._core import SYNC_COB_ID
 from drivelink.errors import BusError
 
-__all__ = ["ForbiddenFrameError", "SilentBus", "check_frame"]
-
 _NMT_START = 0x01
 _NMT_PRE_OPERATIONAL = 0x80
 _WRITABLE = frozenset({0x1005, 0x1006, 0x1016, 0x1017, 0x1019})

@@ -12,8 +12,6 @@ from typing import Any
 
 from drivelink.notice import Notice
 
-__all__ = ["MappedObject", "NodeLayout", "Signal", "TpdoLayout", "layout_document", "layout_from"]
-
 
 class Signal(StrEnum):
     """Meaning of a mapped object for the joint."""

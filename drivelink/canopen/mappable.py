@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from drivelink.canopen.layout import MappedObject, Signal
 from drivelink.notice import Notice
 
-__all__ = ["MappableObject", "Offer"]
-
 Address = tuple[int, int]
 
 

@@ -30,8 +30,6 @@ from drivelink.canopen.tpdo_assignment import OPTIONAL, Assignment, assign, choo
 from drivelink.errors import DriveError
 from drivelink.notice import Notice, Severity
 
-__all__ = ["NMT_PRE_OPERATIONAL", "NMT_START", "Mapper", "disable"]
-
 NMT_START = 0x01
 NMT_PRE_OPERATIONAL = 0x80
 _TIMING_NAMES = {2: "transmission type", 3: "inhibit time", 5: "event timer", 6: "SYNC start value"}

@@ -31,8 +31,6 @@ from drivelink.errors import DriveError
 from drivelink.jointfile import BusSection
 from drivelink.notice import Notice, Severity
 
-__all__ = ["NodeSurvey", "configure_node", "survey_node"]
-
 Address = tuple[int, int]
 
 _SYNC_PRODUCER = 1 << 30

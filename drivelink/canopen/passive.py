@@ -22,8 +22,6 @@ from drivelink.errors import BusError, DriveError
 from drivelink.jointfile import BusSection, JointFile, TpdoSection
 from drivelink.notice import Notice, Severity, log_notices
 
-__all__ = ["PassiveConfigurator", "is_mapping"]
-
 logger = logging.getLogger(__name__)
 
 Address = tuple[int, int]

@@ -12,19 +12,6 @@ from drivelink.canopen.layout import MappedObject, Signal, TpdoLayout
 from drivelink.canopen.mappable import MappableObject
 from drivelink.canopen.sdo import Program, SdoAbort, read_number
 
-__all__ = [
-    "ABSENT",
-    "Entry",
-    "Tpdo",
-    "decode",
-    "describe",
-    "entry_text",
-    "read_optional",
-    "read_tpdo",
-    "read_tpdos",
-    "tpdos_of",
-]
-
 Address = tuple[int, int]
 Entry = tuple[int, int, int]  # index, subindex, bits
 

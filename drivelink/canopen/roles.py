@@ -8,8 +8,6 @@ from pathlib import Path
 from drivelink.errors import JointFileError
 from drivelink.jointfile import DriveSection, EncoderSection, JointFile, TpdoSection
 
-__all__ = ["Role", "object_address", "roles"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Role:

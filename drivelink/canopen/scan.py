@@ -19,8 +19,6 @@ from drivelink.canopen.pdo import read_optional
 from drivelink.canopen.sdo import Program, Read, SdoAbort
 from drivelink.errors import DriveError
 
-__all__ = ["FoundNode", "Traffic", "identify", "listen", "scan"]
-
 _ANSWER_S = 0.3  # for the slowest node
 _GAP_S = 0.001  # between two requests: 127 of them must not fill a transmit queue
 _PROFILES = {301: "CiA 301", 401: "CiA 401 (I/O)", 402: "CiA 402 (drive)", 406: "CiA 406 (encoder)"}

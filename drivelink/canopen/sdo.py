@@ -17,22 +17,6 @@ from canopen.sdo.exceptions import SdoAbortedError
 from drivelink.canopen.guard import check_frame
 from drivelink.errors import DriveError
 
-__all__ = [
-    "Nmt",
-    "Pause",
-    "Program",
-    "Read",
-    "SdoAbort",
-    "SdoBreach",
-    "SdoTimeout",
-    "Send",
-    "Session",
-    "Unsized",
-    "Write",
-    "abort_text",
-    "read_number",
-]
-
 T = TypeVar("T")
 Send = Callable[[int, bytes], None]
 

@@ -14,8 +14,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-__all__ = ["SdoSniffer", "written_object"]
-
 Address = tuple[int, int]
 
 _MAX_BYTES = 8  # no object of interest is longer

@@ -15,8 +15,6 @@ from drivelink.canopen.pdo import Tpdo, describe
 from drivelink.canopen.roles import Role
 from drivelink.errors import DriveError
 
-__all__ = ["CHECKS", "OPTIONAL", "Assignment", "Available", "assign", "choose_cob_id", "pack", "unused"]
-
 FRAME_BITS = 64
 
 # Position and torque first: they must belong to the same instant.

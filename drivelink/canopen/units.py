@@ -19,8 +19,6 @@ from drivelink.canopen.vendors import Vendor
 from drivelink.jointfile import DriveSection, EncoderSection
 from drivelink.notice import Notice, Severity
 
-__all__ = ["offer", "unit_objects"]
-
 Address = tuple[int, int]
 
 _DRIVE_OBJECTS: tuple[Address, ...] = (

@@ -10,8 +10,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-__all__ = ["GENERIC", "VENDORS", "CurrentObject", "Vendor", "vendor_of"]
-
 Address = tuple[int, int]
 
 

@@ -27,8 +27,6 @@ from drivelink.jointfile import JointFile
 from drivelink.monitor.view import JointView
 from drivelink.pubsub.client import Subscription, subscribe
 
-__all__ = ["configure", "run"]
-
 CASES = ("constant", "quadratic", "vsa-ii")
 _PATIENCE_S = 20.0  # for the other process to start, and to end
 _LINE_S = 1.0

@@ -20,8 +20,6 @@ from drivelink.errors import UsageError
 from drivelink.jointfile import JointFile, load
 from drivelink.notice import Severity
 
-__all__ = ["configure", "run"]
-
 _EXAMINED_S = 3.0
 _AT_REST_S = 0.3  # a person waits for each of these
 

@@ -32,8 +32,6 @@ from estimator.model import Effect, Motor, ParameterValue
 from estimator.sample import SIGMA_95, Record
 from estimator.transmissions import RIGID
 
-__all__ = ["fit_recording"]
-
 
 def fit_recording(args: argparse.Namespace, source: JointText, folder: Path | None) -> None:
     """Fit, print, and write the requested files.

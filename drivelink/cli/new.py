@@ -20,8 +20,6 @@ from drivelink.jointfile import BusSection, parse
 from drivelink.jointfile.newfile import Answers, answers_from_bus, joint_text
 from drivelink.output.outfile import check_target, write_whole
 
-__all__ = ["configure", "run"]
-
 _CASES = ("constant", "quadratic", "vsa-ii")
 _ARRANGEMENTS = ("single", "antagonistic", "serial")
 _MODELS = ("polynomial", "linear", "exponential", "vsa-ii", "none")

@@ -21,8 +21,6 @@ from drivelink.jointfile import BusSection, load
 if TYPE_CHECKING:
     from drivelink.daemon.service import Daemon
 
-__all__ = ["configure", "run"]
-
 _EPILOG = """\
 examples:
   drivelink run elbow.toml                          until Ctrl-C or SIGTERM

@@ -9,8 +9,6 @@ import can
 if TYPE_CHECKING:
     from drivelink.cycle.loop import CycleLoop
 
-__all__ = ["BusPort"]
-
 
 class BusPort:
     """The bus for senders of python-can messages: directly before the loop runs, through the loop afterwards.

@@ -16,8 +16,6 @@ from drivelink.canopen.sdo_sniffer import written_object
 from drivelink.cycle.objectcheck import ObjectCheck, RecentSamples, Samples
 from drivelink.errors import DriveError
 
-__all__ = ["ConfigurationFollower", "MapFollower", "follow_log"]
-
 _START, _BOOT_UP = 0x01, b"\0"  # NMT
 
 

@@ -14,20 +14,6 @@ from typing import Any, NamedTuple, Protocol
 
 import can
 
-__all__ = [
-    "MOST_FRAMES",
-    "OVERFLOW",
-    "BusLostError",
-    "BusSource",
-    "CanFrame",
-    "FrameSource",
-    "LostSource",
-    "PumpedBus",
-    "PumpedSource",
-    "VirtualSource",
-    "note_error",
-]
-
 OVERFLOW = "receive overflow"  # key of `FrameSource.errors`: frames lost because they were not read in time
 MOST_FRAMES = 256  # limit per call, so that a babbling node cannot block the loop
 

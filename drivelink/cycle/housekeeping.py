@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 
-__all__ = ["Housekeeping"]
-
 Task = Callable[[], object]
 
 _ENOUGH_NS = 250_000  # upper limit of a task, or a part of one

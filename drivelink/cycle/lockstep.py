@@ -14,8 +14,6 @@ from drivelink.cycle.pipeline import make_pipeline
 from drivelink.cycle.startup import join_bus
 from drivelink.jointfile import JointFile
 
-__all__ = ["Devices", "run_lockstep"]
-
 
 class Devices(Protocol):
     """Simulated devices on the joint's bus (`sim.network.Network`)."""

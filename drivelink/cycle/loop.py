@@ -14,13 +14,11 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Protocol
 
-from drivelink._core import SYNC_COB_ID, JointPipeline, LatencyHistogram, Tick
+from drivelink._core import LATE, SYNC_COB_ID, JointPipeline, LatencyHistogram, Tick
 from drivelink.cycle.framesource import BusLostError, CanFrame, FrameSource, LostSource
 from drivelink.cycle.housekeeping import Housekeeping
-from drivelink.cycle.syncclock import LATE, MEASURED_SYNCS, SyncClock
+from drivelink.cycle.syncclock import MEASURED_SYNCS, SyncClock
 from estimator.sample import Estimate, Sample
-
-__all__ = ["CycleLoop", "LoopJoint", "ObjectSink", "Sink"]
 
 logger = logging.getLogger(__name__)
 

@@ -18,8 +18,6 @@ from drivelink.canopen.layout import MappedObject, NodeLayout, Signal
 from drivelink.canopen.sdo_sniffer import SdoSniffer
 from estimator.sample import Sample
 
-__all__ = ["HISTORY_S", "Mismatch", "ObjectCheck", "RecentSamples", "Samples"]
-
 Address = tuple[int, int]
 Samples = Callable[[int, int], Sequence[Sample]]
 

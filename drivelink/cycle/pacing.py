@@ -11,8 +11,6 @@ import time
 from drivelink.cycle.loop import CycleLoop
 from drivelink.cycle.realtime import Alarm
 
-__all__ = ["run"]
-
 _LATEST = 0.4  # of a period: a later SYNC is skipped, being nearer to the next one
 _MARGIN_NS = 120_000  # before the deadline, when waiting for frames ends
 _SILENCE_PERIODS = 5  # when following: time without SYNC until the estimates are stale

@@ -15,8 +15,6 @@ from drivelink.jointfile.residual_baseline import make_model_monitor
 from estimator import Estimator, make_estimator
 from estimator.sample import Estimate, Sample
 
-__all__ = ["Built", "ResidualMonitor", "build", "make_assembler", "make_pipeline", "rehearse"]
-
 _REHEARSED = 500  # samples: half a second, enough for the first estimates
 _HOLD_S, _HOLD_PERIODS = 0.25, 10  # of silence, and at least so many, see `Assembler`
 

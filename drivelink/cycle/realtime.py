@@ -14,8 +14,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-__all__ = ["PRIORITY", "Alarm", "RealTime", "acquire", "release"]
-
 PRIORITY = 80  # of 1 to 99: above the network's interrupt threads (50), below the kernel's watchdogs (99)
 SWITCH_INTERVAL_S = 100e-6  # longest time for which another Python thread holds the interpreter
 

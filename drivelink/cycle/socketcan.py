@@ -13,8 +13,6 @@ from typing import Any
 
 from drivelink.cycle.framesource import MOST_FRAMES, OVERFLOW, BusLostError, CanFrame, note_error
 
-__all__ = ["SocketCanSource"]
-
 _SO_RXQ_OVFL = 40  # socket(7): number of dropped frames; not in the socket module
 
 

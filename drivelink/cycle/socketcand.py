@@ -5,8 +5,6 @@ from __future__ import annotations
 from drivelink.canopen.bus import server_has_gone
 from drivelink.cycle.framesource import BusLostError, BusSource
 
-__all__ = ["SocketcandSource"]
-
 
 class SocketcandSource(BusSource):
     """A socketcand connection."""

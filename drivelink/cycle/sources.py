@@ -10,8 +10,6 @@ from drivelink.cycle.framesource import BusSource, FrameSource, PumpedBus, Pumpe
 from drivelink.cycle.socketcan import SocketCanSource
 from drivelink.cycle.socketcand import SocketcandSource
 
-__all__ = ["open_source"]
-
 
 def open_source(bus: can.BusABC, devices: Callable[[], object] | None = None) -> FrameSource:
     """Open the fastest source for this bus, also with devices in this thread."""

@@ -19,8 +19,6 @@ from drivelink.cycle.syncclock import MEASURED_SYNCS, measure_period
 from drivelink.errors import BusError, DriveError
 from drivelink.jointfile import BusSection, JointFile
 
-__all__ = ["Joined", "join_bus"]
-
 Joined = tuple[Configurator | PassiveConfigurator, tuple[tuple[NodeLayout, ...], ...]]
 Idle = Callable[[], object]
 

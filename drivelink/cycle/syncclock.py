@@ -13,8 +13,6 @@ from drivelink._core import LATE
 
 FloatArray = NDArray[np.float64]
 
-__all__ = ["LATE", "MEASURED_SYNCS", "MeasuredPeriod", "SyncClock", "measure_period"]
-
 MEASURED_SYNCS = 64  # enough for a period to 0.2 % at a jitter of half of it, to 0.01 % at a fortieth
 _FEWEST = 8
 _SAME = 0.01  # relative: periods that count as the same; 2 % of inertia torque

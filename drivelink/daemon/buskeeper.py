@@ -18,8 +18,6 @@ from drivelink.daemon.status import EventLog
 from drivelink.errors import BusError
 from drivelink.jointfile import BusSection
 
-__all__ = ["BusKeeper"]
-
 _REOPEN_S = 0.5
 
 

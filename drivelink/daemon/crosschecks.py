@@ -6,8 +6,6 @@ from typing import Any
 
 from drivelink._core import Assembler
 
-__all__ = ["contradiction", "cross_checks"]
-
 _WORDS = {
     "velocity": "velocity (0x606C)",
     "current": "current",

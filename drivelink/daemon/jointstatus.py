@@ -18,8 +18,6 @@ from drivelink.jointfile import JointFile
 from drivelink.version import __version__
 from estimator.sample import ExternalStatus, Status
 
-__all__ = ["JointStatus"]
-
 _MODEL_ALARM, _STALE = int(Status.MODEL_ALARM), int(Status.STALE)
 _TIMING_EVERY = 4  # documents between percentiles
 

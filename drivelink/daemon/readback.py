@@ -20,8 +20,6 @@ from drivelink.canopen.sdo import Session
 from drivelink.cycle.objectcheck import ObjectCheck
 from drivelink.errors import DriveError
 
-__all__ = ["Ask", "ReadBack"]
-
 Address = tuple[int, int]
 Ask = Callable[[int, Address], Session[bytes]]
 

@@ -23,8 +23,6 @@ from drivelink.jointfile import JointFile, load
 from estimator.errors import EstimatorError
 from estimator.sample import Sample
 
-__all__ = ["Reloader"]
-
 _EVERY_S = 1.0  # minimum time between two reloads, against repeated changes
 _STEPS = 5  # steps of the new estimator before the cycle gets its turn
 _PAUSE_S = 0.0005

@@ -39,8 +39,6 @@ from drivelink.jointfile import JointFile
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_session
 
-__all__ = ["Daemon", "ServedJoint"]
-
 logger = logging.getLogger("drivelink")
 
 _STATUS_S = 0.25

@@ -8,8 +8,6 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-__all__ = ["EventLog"]
-
 
 class EventLog:
     """Logs each event once and keeps the last ones for the status document.

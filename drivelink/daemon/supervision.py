@@ -31,8 +31,6 @@ from drivelink.daemon.status import EventLog
 from drivelink.errors import DriveError
 from estimator.sample import Status
 
-__all__ = ["Supervisor", "residual_text"]
-
 logger = logging.getLogger(__name__)
 
 _NS = 1_000_000_000

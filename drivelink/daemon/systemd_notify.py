@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import socket
 
-__all__ = ["notify", "watchdog_period_s"]
-
 
 def notify(*lines: str) -> bool:
     """Send lines such as "READY=1"; return whether systemd listens."""

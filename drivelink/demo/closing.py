@@ -13,8 +13,6 @@ from drivelink.demo.comparison import Comparison
 from drivelink.demo.rig import Summary
 from estimator.sample import SIGMA_95, Status
 
-__all__ = ["as_json", "closing_table"]
-
 
 def closing_table(
     case: str, comparison: Comparison, summary: Summary, received: int, period_s: float

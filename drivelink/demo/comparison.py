@@ -9,8 +9,6 @@ from drivelink.demo.rig import TruePoint
 from drivelink.monitor.history import EstimateLike
 from estimator.sample import SIGMA_95, Status
 
-__all__ = ["Comparison", "Errors"]
-
 T = TypeVar("T")
 
 _UNMATCHED = 5_000  # sequence numbers kept while waiting for the other side

@@ -22,8 +22,6 @@ from drivelink.demo.simulate import network_from_joint, open_sim_bus, world_from
 from drivelink.errors import DrivelinkError
 from drivelink.monitor.history import TruthLike
 
-__all__ = ["Failure", "Summary", "TruePoint", "serve"]
-
 _BATCH = 50  # cycles per message to the watcher
 
 

@@ -41,19 +41,6 @@ from sim.springs import Spring
 from sim.variation import suitable, typical_torque_nm, with_parameters
 from sim.world import World
 
-__all__ = [
-    "CASE_NAMES",
-    "QUIRK_NAMES",
-    "JoinedBus",
-    "assumptions",
-    "bench_from_joints",
-    "network_from_joint",
-    "nodes_from_joint",
-    "open_sim_bus",
-    "require_free",
-    "world_from_joint",
-]
-
 CASE_NAMES = tuple(CASES)
 QUIRK_NAMES = tuple(PROFILES)
 

@@ -16,8 +16,6 @@ from drivelink.jointfile import JointFile
 from drivelink.recording.gate import corrections
 from estimator.gate import Change
 
-__all__ = ["ByHand", "Mark", "Person", "Value", "Values", "check_by_hand"]
-
 _STILL = 0.1  # of the requested motion: a channel that moves less did not follow
 _BY_EYE = 0.15  # relative accuracy of an angle turned by eye
 _FRICTION = 2.0  # factor: uncertainty of a torque by friction in the gear and a push by hand

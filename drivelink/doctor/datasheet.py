@@ -20,8 +20,6 @@ from drivelink.errors import DriveError
 from drivelink.jointfile import DriveSection, EncoderSection
 from drivelink.notice import Severity
 
-__all__ = ["examine_sheet", "planned_entries"]
-
 # Objects for each signal, best first; the vendor's current object is last.
 _OBJECTS: dict[Signal, tuple[tuple[int, int], ...]] = {
     Signal.MOTOR_POSITION: ((0x6064, 0),),

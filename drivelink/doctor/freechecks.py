@@ -14,14 +14,6 @@ from drivelink.errors import DriveError
 from drivelink.jointfile import BusSection
 from drivelink.notice import Severity
 
-__all__ = [
-    "asked_signals",
-    "say_free_checks",
-    "say_second_encoder",
-    "say_sync_counter",
-    "second_encoder",
-]
-
 _SIGNALS = {  # as `checks` of [motor.drive] names them
     "velocity": (Signal.VELOCITY_CHECK,),
     "current": (Signal.TORQUE_CHECK,),

@@ -11,8 +11,6 @@ from drivelink.doctor.report import Section
 from drivelink.jointfile import BusSection
 from drivelink.notice import Severity
 
-__all__ = ["can_interfaces", "examine_interface", "judge_link"]
-
 _GOOD_QUEUE = 100  # frames; the kernel's default of 10 is full with two cycles of a VSA
 
 

@@ -24,8 +24,6 @@ from drivelink.errors import DriveError
 from drivelink.jointfile import BusSection, JointFile
 from estimator.sample import Sample
 
-__all__ = ["AskedValues", "HeardValues", "live_values"]
-
 _PATIENCE_S = 5.0  # timeout for a sample from the frames of a passive bus
 _CHANNELS = {Signal.MOTOR_POSITION: "position", Signal.MOTOR_TORQUE: "torque"}
 

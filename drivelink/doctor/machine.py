@@ -11,8 +11,6 @@ from pathlib import Path
 from drivelink.doctor.report import Section
 from drivelink.notice import Severity
 
-__all__ = ["examine_machine", "percentile"]
-
 _CPU = Path("/sys/devices/system/cpu")
 _NEEDED_LOCKED = 256 << 20  # bytes; the daemon's resident size is below
 _GOOD_JITTER_US, _BAD_JITTER_US = 150.0, 1000.0

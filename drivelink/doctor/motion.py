@@ -24,16 +24,6 @@ from estimator.errors import EstimatorError
 from estimator.gate import Judgement, check, judge
 from estimator.sample import FloatArray, Record
 
-__all__ = [
-    "MotionReader",
-    "MotionSample",
-    "judge_gathered",
-    "judge_motion",
-    "judge_record",
-    "record_of_motion",
-    "slope",
-]
-
 _READ = (Signal.MOTOR_POSITION, Signal.MOTOR_VELOCITY, Signal.MOTOR_TORQUE, Signal.LINK_POSITION)
 _WINDOW_S = 0.02  # differences over less are mostly quantisation
 _LEAST_COUNTS = 50  # minimum number for a decision

@@ -37,8 +37,6 @@ from drivelink.errors import BusError, DriveError, JointFileError
 from drivelink.jointfile import BusSection, JointFile
 from drivelink.notice import Notice, Severity
 
-__all__ = ["examine_bus"]
-
 
 def examine_bus(
     report: Report, joint: JointFile, base_dir: Path, seconds: float, alive: Sequence[str] = ()

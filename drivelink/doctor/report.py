@@ -12,8 +12,6 @@ from rich.table import Table
 
 from drivelink.notice import Notice, Severity
 
-__all__ = ["Report", "Section"]
-
 _MARKS = {
     Severity.OK: ("✓", "green"),
     Severity.INFO: ("·", "cyan"),

@@ -15,8 +15,6 @@ from drivelink.jointfile import JointFile
 from drivelink.recording.gate import Gathered
 from estimator.sample import Sample
 
-__all__ = ["SampleTap"]
-
 
 class SampleTap:
     """Takes frames in bus order and makes the samples of one joint.

@@ -11,8 +11,6 @@ from drivelink.doctor.report import Section
 from drivelink.jointfile import BusSection
 from drivelink.notice import Severity
 
-__all__ = ["Daemons", "judge_sync"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Daemons:

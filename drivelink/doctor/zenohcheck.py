@@ -14,8 +14,6 @@ from drivelink.notice import Severity
 from drivelink.pubsub.rendezvous import answers
 from drivelink.pubsub.session import close_session, open_client
 
-__all__ = ["examine_zenoh"]
-
 _WAIT_S = 2.0
 
 

@@ -20,8 +20,6 @@ from estimator.model import ParameterValue
 from estimator.sample import FloatArray, Record
 from estimator.transmissions import MODELS, RIGID
 
-__all__ = ["NAMED", "Analysis", "TransmissionRow", "analyse", "stiffness_at"]
-
 # Deflections at which every row states the stiffness: zero, and quantiles of the recording.
 NAMED = {"zero": None, "middle": 0.5, "high": 0.95}
 

@@ -30,8 +30,6 @@ from scipy.stats import hypergeom
 
 from estimator.sample import FloatArray
 
-__all__ = ["LEAST", "Appearance", "Change", "SeriesTest", "appearance", "changes", "q_values", "series_test"]
-
 LEAST = 6  # recordings: fewer leave no degrees of freedom once one is left out and a shape is fitted
 _SEGMENT = 2  # recordings on either side of a step: one alone is an odd one
 _RAMP = 3  # recordings on a ramp: two are a step

@@ -2,8 +2,6 @@
 
 from drivelink.errors import DrivelinkError
 
-__all__ = ["FleetError"]
-
 
 class FleetError(DrivelinkError):
     """The scheduler, the joint folder or the result folder cannot be used."""

@@ -19,8 +19,6 @@ from drivelink.fleet.errors import FleetError
 from drivelink.jointfile import JointFile
 from drivelink.recording.mapping import joint_of
 
-__all__ = ["Joint", "Joints"]
-
 
 @dataclass(frozen=True, slots=True)
 class Joint:

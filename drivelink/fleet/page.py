@@ -12,8 +12,6 @@ from typing import Any, NamedTuple
 
 from estimator.sample import SIGMA_95
 
-__all__ = ["page"]
-
 _CHARTS = 400  # joints with a chart, the most urgent first; more would make the page too large
 _BROKEN = 200
 _BLUE, _ORANGE, _GREY = "#005f9e", "#e0701a", "#999999"

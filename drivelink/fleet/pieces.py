@@ -20,8 +20,6 @@ from drivelink.recording.cycles import Cycle
 from drivelink.recording.mcapsamples import recorded_cycles
 from estimator.sample import Record
 
-__all__ = ["Piece", "pieces"]
-
 # Rise of the peak memory of fit, diagnosis and report over that of the file's size. Of a CSV it is measured
 # (22 at 500 Hz, benchmarks/fleet.py memory; less at a higher rate) and rounded up. A text log has about as
 # many bytes a sample, compressed formats have a fraction.

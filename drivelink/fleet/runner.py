@@ -25,8 +25,6 @@ from drivelink.fleet.storage import Source, Store, fetched
 from drivelink.fleet.table import Table
 from drivelink.fleet.task import Outcome, Task, broken_row, named_time, process, recorded_time
 
-__all__ = ["Counts", "Settings", "run"]
-
 _AHEAD = 4  # recordings queued per worker thread
 _CONNECT_S = 10.0
 _EPOCH = datetime.fromtimestamp(0, UTC)

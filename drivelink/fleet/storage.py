@@ -24,8 +24,6 @@ from drivelink.fleet.errors import FleetError
 from drivelink.recording.canlog import CAN_SUFFIXES
 from drivelink.recording.mapping import side_file
 
-__all__ = ["SUFFIXES", "Source", "Store", "fetched", "find"]
-
 SUFFIXES = frozenset({".csv", ".mcap", ".mf4", *CAN_SUFFIXES})  # file name endings of recordings
 
 _CHUNK = 1 << 20

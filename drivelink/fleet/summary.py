@@ -16,8 +16,6 @@ from drivelink.fleet.changes import Appearance, Change, SeriesTest, appearance, 
 from estimator.sample import SIGMA_95, FloatArray
 from estimator.transmissions import MODELS
 
-__all__ = ["COLUMNS", "SCHEMA", "summarise"]
-
 SCHEMA = "drivelink.fleet/1"
 _METHOD = (
     "sup-F test against steps and ramps with Bonferroni's bound, robust to any one recording left out; "

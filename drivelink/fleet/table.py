@@ -24,8 +24,6 @@ from drivelink.fleet.analysis import NAMED
 from drivelink.fleet.errors import FleetError
 from drivelink.fleet.storage import Source, Store
 
-__all__ = ["FOLDER", "SCHEMA", "Known", "Table", "read_rows"]
-
 FOLDER = "table"
 
 _PART_ROWS = 5000  # a part is full: about 2 MB, rewritten in some 0.1 s

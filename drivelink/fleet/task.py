@@ -29,8 +29,6 @@ from estimator.errors import EstimatorError
 from estimator.gate import GateError
 from estimator.sample import Record
 
-__all__ = ["HELD_OUT", "Outcome", "Task", "broken_row", "named_time", "process", "recorded_time"]
-
 HELD_OUT = "held-out blocks"
 
 _UNIX = 1.0e9  # larger stamps are UNIX time (from 2001 on)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import signal
 
-__all__ = ["dask_setup"]
-
 
 def dask_setup(worker: object) -> None:
     """Leave Ctrl-C to the client, which ends the workers in order."""

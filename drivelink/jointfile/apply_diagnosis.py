@@ -16,8 +16,6 @@ from estimator.effects import LIBRARY
 from estimator.model import Effect, JointModel, ParameterValue
 from estimator.sample import Record
 
-__all__ = ["diagnosed_model", "write"]
-
 
 def write(
     source: JointText,

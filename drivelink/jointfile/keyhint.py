@@ -9,8 +9,6 @@ from typing import Any
 
 from pydantic import BaseModel
 
-__all__ = ["unknown_key"]
-
 
 def unknown_key(root: type, location: tuple[int | str, ...]) -> str:
     """The message for an unknown key, from the keys of its table.

@@ -9,8 +9,6 @@ from drivelink.canopen.vendors import vendor_of
 from drivelink.errors import DriveError
 from drivelink.jointfile import JointFile, parse
 
-__all__ = ["Answers", "answers_from_bus", "joint_text"]
-
 _GCM2 = 1e-7  # kg·m² a g·cm²
 _PLACEHOLDER = 0.1  # kg·m², where the inertia is not known
 

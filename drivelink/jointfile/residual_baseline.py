@@ -13,8 +13,6 @@ from estimator.model import JointModel
 from estimator.model_monitor import ModelMonitor, ResidualBaseline, can_monitor, measure_baseline
 from estimator.sample import Record
 
-__all__ = ["floor_entry", "make_model_monitor"]
-
 _KEY = "floor"
 _LOG = logging.getLogger(__name__)
 

@@ -25,26 +25,6 @@ from estimator.model import Arrangement, Effect, JointModel, LinkDynamics, Motor
 from estimator.settings import EstimatorSettings
 from estimator.transmissions import MODELS, transmission_model
 
-__all__ = [
-    "MAX_BYTES",
-    "BusSection",
-    "DriveSection",
-    "EncoderSection",
-    "JointFile",
-    "JointText",
-    "LinkSection",
-    "MotorSection",
-    "RecordingSection",
-    "Ros2Section",
-    "SimSection",
-    "TpdoSection",
-    "ZenohSection",
-    "load",
-    "load_text",
-    "parse",
-    "write_model",
-]
-
 _LOG = logging.getLogger(__name__)
 
 MAX_BYTES = 256 << 10  # of a joint file; the longest that fit and diagnose write have some 10 KiB

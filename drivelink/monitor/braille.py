@@ -9,8 +9,6 @@ from rich.text import Text
 
 from drivelink.monitor.history import usual_range
 
-__all__ = ["DotPlot", "gauge", "number", "sparkline"]
-
 _BARS = "▁▂▃▄▅▆▇█"
 # Bit of the dot at column c (0, 1) and row r (0 on top) of a braille character.
 _DOTS = ((0x01, 0x02, 0x04, 0x40), (0x08, 0x10, 0x20, 0x80))

@@ -13,8 +13,6 @@ from typing import NamedTuple, Protocol
 from drivelink.pubsub.wire import ExternalMessage
 from estimator.sample import Status, TransmissionEstimate
 
-__all__ = ["EstimateLike", "GrowingCurve", "History", "Moment", "Touch", "TruthLike", "usual_range"]
-
 _BINS = 160
 _USABLE = int(Status.VALID | Status.OBSERVABLE)
 _NEAR = 8  # neighbouring points on either side for the outlier test

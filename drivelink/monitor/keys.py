@@ -10,8 +10,6 @@ import tty
 from types import TracebackType
 from typing import Any, Self
 
-__all__ = ["Keys"]
-
 
 class Keys:
     """Keys pressed in the terminal on standard input; none without a terminal."""

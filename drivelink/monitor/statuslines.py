@@ -16,8 +16,6 @@ from rich.text import Text
 from drivelink.monitor.braille import gauge, number
 from drivelink.pubsub.inbound import clean_text
 
-__all__ = ["MODEL_ALARM_ADVICE", "Balance", "Event", "Node", "Shown", "shape", "status_lines", "status_text"]
-
 MODEL_ALARM_ADVICE = (
     "the model is not sufficient: do not control on its numbers; record a minute of motion "
     "(drivelink record), then drivelink diagnose names the effect and writes a better joint file"

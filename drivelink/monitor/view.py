@@ -24,8 +24,6 @@ from drivelink.monitor.statuslines import MODEL_ALARM_ADVICE, shape, status_line
 from drivelink.pubsub.wire import ExternalMessage
 from estimator.sample import SIGMA_95, Status
 
-__all__ = ["JointView", "joints_table"]
-
 ESTIMATE = "cyan"
 TRUTH = "yellow"
 BAND = "blue"

@@ -18,8 +18,6 @@ from drivelink.monitor.view import JointView
 from drivelink.pubsub.identity import MAX_CLAIMS, DaemonIdentity, source_of
 from drivelink.pubsub.inbound import DECODERS, clean_text
 
-__all__ = ["MAX_JOINTS", "Watcher"]
-
 MAX_JOINTS = 64  # limit on joints shown, also against invented names
 _QUEUE = 8192
 _NAME = 64  # characters of a joint's name that are shown

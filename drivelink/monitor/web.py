@@ -23,8 +23,6 @@ from drivelink.monitor.statuslines import Shown, shape
 from drivelink.monitor.view import JointView
 from drivelink.monitor.watcher import Watcher
 
-__all__ = ["MAX_CONNECTIONS", "WebView", "document", "snapshot"]
-
 MAX_CONNECTIONS = 16
 _PATIENCE_S = 5.0  # timeout of a silent browser
 _EVENT_S = 0.1

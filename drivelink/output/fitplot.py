@@ -16,8 +16,6 @@ from estimator.batch import TransmissionFit
 from estimator.sample import FloatArray
 from estimator.transmissions import MODELS, RIGID
 
-__all__ = ["fit_plot"]
-
 _CURVE_POINTS = 200
 _WIDTH = 10.0  # inches
 _IN_BIN = 15  # rows per median point of the lines through the residuals

@@ -19,8 +19,6 @@ from pathlib import Path
 
 from drivelink.errors import UsageError
 
-__all__ = ["NewFile", "check_target", "put_in_place", "sync", "write_whole"]
-
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
 
 

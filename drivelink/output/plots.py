@@ -25,19 +25,6 @@ from matplotlib.figure import Figure
 from drivelink.output.outfile import write_whole
 from estimator.sample import SIGMA_95, FloatArray
 
-__all__ = [
-    "Curve",
-    "bars",
-    "dots",
-    "medians",
-    "new_figure",
-    "over_time",
-    "save",
-    "stiffness_against_deflection",
-    "svg_text",
-    "xy",
-]
-
 # Colours of Okabe and Ito (distinguishable with any colour vision), different in lightness for grey prints,
 # each with its line style, marker and hatch.
 COLORS = ("#005f9e", "#e0701a", "#000000", "#009e73", "#cc79a7", "#56b4e9")

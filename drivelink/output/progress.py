@@ -13,8 +13,6 @@ from typing import Self, TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-__all__ = ["Meter", "track"]
-
 T = TypeVar("T")
 
 _QUIET_S = 1.0  # nothing is shown before

@@ -16,8 +16,6 @@ from drivelink.output.units import Units
 from estimator.diagnosis import Curve, Diagnosis, Errors, Finding, StiffnessCurve
 from estimator.effects import LIBRARY
 
-__all__ = ["Title", "as_json", "sentence", "title_of", "unexplained", "write"]
-
 _SCHEMA = "drivelink.diagnosis/1"
 _CURVE_POINTS = 200
 _RIVALS = 8

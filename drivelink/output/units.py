@@ -5,8 +5,6 @@ from __future__ import annotations
 from estimator.model import ParameterValue
 from estimator.sample import SIGMA_95
 
-__all__ = ["Units"]
-
 _RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 _UNITS = (  # by the end of a parameter's name; the first match
     ("_nm_s2_rad2", "N·m·s²/rad²"), ("_nm_s_rad", "N·m·s/rad"), ("_nm_rad2", "N·m/rad²"),

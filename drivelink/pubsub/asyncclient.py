@@ -20,8 +20,6 @@ import zenoh
 from drivelink.pubsub.clientbase import ENDPOINT, Client
 from drivelink.pubsub.wire import EstimateMessage
 
-__all__ = ["AsyncSubscription", "subscribe_async"]
-
 
 class AsyncSubscription(Client):
     """Estimates of one joint for asyncio; see `subscribe_async`."""

@@ -24,10 +24,8 @@ from typing import Any, Self
 import zenoh
 
 from drivelink.pubsub.clientbase import ENDPOINT, Client
-from drivelink.pubsub.feed import WAKE, State
+from drivelink.pubsub.feed import WAKE
 from drivelink.pubsub.wire import EstimateMessage
-
-__all__ = ["State", "Subscription", "subscribe"]
 
 
 class Subscription(Client):

@@ -25,8 +25,6 @@ from drivelink.pubsub.session import close_session, one_line, open_client
 from drivelink.pubsub.wire import ESTIMATE, EstimateMessage, ExternalMessage
 from estimator.sample import Status
 
-__all__ = ["ENDPOINT", "Client"]
-
 ENDPOINT = "tcp/127.0.0.1:7447"
 # Of these bits a usable estimate has VALID only.
 _USABLE = int(

@@ -15,8 +15,6 @@ from drivelink.pubsub.inbound import DECODERS
 from drivelink.pubsub.wire import EstimateMessage
 from estimator.sample import Status
 
-__all__ = ["WAKE", "Arrivals", "Feed", "State"]
-
 WAKE = b"drivelink.wake"  # attachment of a local message that ends a blocking receive
 _DRIFT = 1e-4  # drift between two clocks: 100 ppm
 _STALE_PERIODS = 5

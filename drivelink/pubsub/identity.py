@@ -14,8 +14,6 @@ import re
 
 import zenoh
 
-__all__ = ["MAX_CLAIMS", "DaemonIdentity", "source_of"]
-
 MAX_CLAIMS = (
     4096  # limit on tokens of one joint; beyond it tokens are ignored, so that a flood locks nobody out
 )

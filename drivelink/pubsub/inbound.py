@@ -17,8 +17,6 @@ from typing import Any
 from drivelink.errors import ZenohError
 from drivelink.pubsub.wire import decode_estimate, decode_external, decode_sample
 
-__all__ = ["DECODERS", "clean_text", "decode_document"]
-
 MAX_BYTES = 1 << 20  # of a document; a status has some 3 kB, a model with its nodes some 10 kB
 MAX_DEPTH = 16
 MAX_ELEMENTS = 20_000  # numbers, texts and containers of a document

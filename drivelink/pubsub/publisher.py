@@ -36,8 +36,6 @@ from estimator.transmissions import RIGID
 if TYPE_CHECKING:
     from drivelink.pubsub.ros2 import Ros2Publisher
 
-__all__ = ["JointPublisher", "describe_model", "schema", "to_json"]
-
 _CLAIM_TIMEOUT_S = 1.0
 _QUERIES = 8  # waiting queries per key; zenoh drops the oldest beyond
 _PARTIAL = int(Status.PARTIAL)

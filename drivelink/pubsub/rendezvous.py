@@ -16,8 +16,6 @@ from typing import Any
 
 import zenoh
 
-__all__ = ["Rendezvous", "answers"]
-
 _ATTEMPT_S = 0.2
 _LOOKS = 3  # consecutive answers required: a killed process loses its connections before its listener
 _CONNECT_S = 0.5

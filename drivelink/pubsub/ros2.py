@@ -22,16 +22,6 @@ from drivelink.pubsub.session import one_line
 from drivelink.pubsub.wire import EXTERNAL_COLUMNS
 from estimator.sample import Estimate, External, ExternalStatus, Sample, Status
 
-__all__ = [
-    "TYPE_HASHES",
-    "Ros2Publisher",
-    "dynamic_joint_state",
-    "interfaces",
-    "joint_state",
-    "stiffness_array",
-    "wrench",
-]
-
 TYPE_HASHES = {
     "sensor_msgs::msg::dds_::JointState_": (
         "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"

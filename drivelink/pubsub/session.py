@@ -25,8 +25,6 @@ from drivelink.pubsub.rendezvous import Rendezvous, answers
 if TYPE_CHECKING:
     from drivelink.jointfile import ZenohSection  # a subscriber need not wait for its validator's import
 
-__all__ = ["client_config", "close_session", "daemon_config", "one_line", "open_client", "open_session"]
-
 _MEETING_S = 2.0  # timeout of a local handshake, reached only if another program answers
 _POLL_S = 0.01
 _EXAMPLE = "tcp/127.0.0.1:7447"

@@ -18,30 +18,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drivelink._core import encode_estimate, encode_external, encode_sample
 from drivelink.errors import ZenohError
 from estimator.sample import ExternalStatus, Sample, Status, TransmissionEstimate
-
-__all__ = [
-    "ESTIMATE",
-    "EXTERNAL",
-    "EXTERNAL_BITS",
-    "EXTERNAL_COLUMNS",
-    "MAX_ELEMENTS",
-    "SAMPLE",
-    "STATUS_BITS",
-    "EstimateMessage",
-    "ExternalMessage",
-    "Field",
-    "Layout",
-    "SampleMessage",
-    "decode_estimate",
-    "decode_external",
-    "decode_sample",
-    "encode_estimate",
-    "encode_external",
-    "encode_sample",
-]
 
 MAX_ELEMENTS = 8  # transmissions or motors in one message; below 128 the varint is one byte
 _STRUCT_CODES = {"u64": "Q", "u32": "I", "f64": "d"}

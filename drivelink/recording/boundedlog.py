@@ -16,8 +16,6 @@ from typing import IO
 from drivelink.errors import RecordingError
 from drivelink.recording.limits import MAX_BLOCK_BYTES, MAX_LINE_BYTES
 
-__all__ = ["AscText", "BlfBytes", "TrcText"]
-
 _LOG = logging.getLogger("drivelink.recording")
 
 _DEFLATE_RATIO = 1032  # of zlib at its best

@@ -34,8 +34,6 @@ from drivelink.recording.mcapfile import read_messages
 from drivelink.recording.syncnumbers import numbered_ahead, numbered_at_once
 from estimator.sample import FloatArray, Record
 
-__all__ = ["FrameLog", "is_frame_log", "read_frame_record"]
-
 _LOG = logging.getLogger("drivelink.recording")
 
 _SDO = range(0x581, 0x680)

@@ -20,8 +20,6 @@ from drivelink.errors import RecordingError
 from drivelink.recording.boundedlog import AscText, BlfBytes, TrcText
 from drivelink.recording.limits import MAX_LINE_BYTES
 
-__all__ = ["CAN_SUFFIXES", "NO_STAMP", "LoggedFrame", "in_order", "read_frames"]
-
 _LOG = logging.getLogger("drivelink.recording")
 
 _READERS: dict[str, Any] = {".blf": can.BLFReader, ".asc": can.ASCReader, ".trc": can.TRCReader}

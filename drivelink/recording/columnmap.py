@@ -10,8 +10,6 @@ from drivelink.errors import RecordingError, UsageError
 from drivelink.recording.columns import KNOWN
 from estimator.sample import FloatArray
 
-__all__ = ["UNITS", "ColumnMap", "parse_column_map", "renamed"]
-
 _REVOLUTION = 2.0 * math.pi
 
 UNITS: dict[str, dict[str, float]] = {

@@ -16,8 +16,6 @@ from drivelink.recording.limits import require_samples
 from estimator.errors import EstimatorError
 from estimator.sample import FloatArray, Record, Sample
 
-__all__ = ["KNOWN", "record_from_columns", "sample_columns", "sample_row"]
-
 _LOG = logging.getLogger("drivelink.recording")
 
 _SHOWN = 12  # names in a message

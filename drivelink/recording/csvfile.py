@@ -22,8 +22,6 @@ from drivelink.recording.columns import KNOWN, record_from_columns
 from drivelink.recording.limits import MAX_COLUMNS, MAX_LINE_BYTES, require_samples
 from estimator.sample import FloatArray, Record
 
-__all__ = ["read_csv"]
-
 _LOG = logging.getLogger("drivelink.recording")
 
 _EMPTY = re.compile(rb"(?:(?<=,)|(?<=\n)|^)[ \t]*(?:null|none|n/a|na|-)?[ \t\r]*(?=,|\n|$)", re.IGNORECASE)

@@ -10,8 +10,6 @@ from drivelink._core import JointPipeline, Tick
 from drivelink.errors import DrivelinkError
 from estimator.sample import Sample
 
-__all__ = ["Cycle", "batches", "estimated"]
-
 _BATCH = 512
 
 

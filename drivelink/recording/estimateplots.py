@@ -11,8 +11,6 @@ from drivelink.output import plots
 from drivelink.output.plots import Curve
 from estimator.sample import FloatArray
 
-__all__ = ["plot_curves", "plot_over_time"]
-
 
 def plot_curves(columns: Mapping[str, FloatArray], motors: int, path: Path, title: str) -> Path:
     """Stiffness over deflection of each transmission; columns as in estimates.csv."""

@@ -9,8 +9,6 @@ from drivelink.jointfile import JointFile
 from drivelink.recording.mf4file import Mf4Sink
 from drivelink.recording.sinks import CanSink, CsvSink, McapSink, Sink
 
-__all__ = ["open_sink"]
-
 
 def open_sink(
     path: Path, joint: JointFile, joint_text: str = "", folder: str = "", *, force: bool = False

@@ -18,8 +18,6 @@ from estimator.gate import Change, Discrepancy, GateError, Judgement, judge, ref
 from estimator.model import JointModel
 from estimator.sample import Record, Sample
 
-__all__ = ["Correction", "Gathered", "corrections", "gate", "refusal"]
-
 _ON_THE_BUS = (".drive", ".encoder")
 _LONGEST_S = 60.0  # of a run that is examined; more adds no information
 

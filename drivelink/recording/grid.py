@@ -15,8 +15,6 @@ from scipy.ndimage import minimum_filter1d
 from drivelink.errors import RecordingError
 from estimator.sample import FloatArray
 
-__all__ = ["Grid", "find_grid", "report_gaps"]
-
 _LOG = logging.getLogger("drivelink.recording")
 
 MINIMUM_ROWS = 3

@@ -8,13 +8,6 @@ from __future__ import annotations
 
 from drivelink.errors import RecordingError
 
-__all__ = [
-    "MAX_BLOCK_BYTES",
-    "MAX_COLUMNS",
-    "MAX_LINE_BYTES",
-    "require_samples",
-]
-
 _MAX_SAMPLES = 10_000_000  # periods from first to last sample of a recording in memory: 2.7 h at 1 kHz
 MAX_COLUMNS = 4096  # columns of a CSV file; unknown ones are not kept in memory
 MAX_LINE_BYTES = 1 << 20  # of a line of text

@@ -17,8 +17,6 @@ from drivelink.jointfile import JointText
 from drivelink.recording.canlog import CAN_SUFFIXES
 from drivelink.recording.mcapfile import read_messages
 
-__all__ = ["joint_of", "layouts_from", "mapping_document", "recorded_layouts", "side_file"]
-
 _SCHEMA = "drivelink.mapping/1"
 MAX_BYTES = 1 << 20  # of such a document
 

@@ -21,8 +21,6 @@ import zstandard
 from drivelink.errors import RecordingError
 from drivelink.recording.limits import MAX_BLOCK_BYTES
 
-__all__ = ["McapMessage", "read_messages"]
-
 _LOG = logging.getLogger("drivelink.recording")
 
 _MAGIC = b"\x89MCAP0\r\n"

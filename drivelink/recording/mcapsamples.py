@@ -20,8 +20,6 @@ from drivelink.recording.mcapfile import read_messages
 from drivelink.recording.messages import read_sample
 from estimator.sample import Record, Status
 
-__all__ = ["read_mcap", "recorded_cycles"]
-
 _STALE = int(Status.STALE)
 _SERVICE = int(
     Status.DRIVE_FAULT | Status.BUS_FAULT | Status.UNTIMED | Status.NODE_RESTARTED | Status.CONTRADICTED

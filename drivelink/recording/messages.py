@@ -15,19 +15,6 @@ from drivelink.pubsub.wire import EXTERNAL_COLUMNS, EstimateMessage, ExternalMes
 from drivelink.recording.columns import sample_columns, sample_row
 from estimator.sample import SIGMA_95, External, ExternalStatus, Sample, Status, TransmissionEstimate
 
-__all__ = [
-    "TOPICS",
-    "estimate_columns",
-    "estimate_encoder",
-    "estimate_row",
-    "external_columns",
-    "external_encoder",
-    "external_row",
-    "message_schema",
-    "read_sample",
-    "sample_encoder",
-]
-
 TOPICS = ("sample", "estimate", "external", "status", "model", "joint", "mapping", "can")
 
 _PER_MOTOR = ("flexibility_torque_nm", "stiffness_nm_rad", "stiffness_std_nm_rad", "deflection_rad")

@@ -24,8 +24,6 @@ from drivelink.recording.mcapsamples import read_mcap
 from drivelink.recording.sinks import McapSink
 from estimator.sample import FloatArray, Record
 
-__all__ = ["Mf4Sink", "read_mf4", "write_mf4"]
-
 _LOG = logging.getLogger("drivelink.recording")
 
 

@@ -23,8 +23,6 @@ from drivelink.recording.messages import (
 from drivelink.recording.playback import Played
 from estimator.sample import SIGMA_95, FloatArray, Status
 
-__all__ = ["EstimatesFile", "Publication", "Summary"]
-
 _STATUS_EVERY_S = 0.25
 _ROWS = 2048  # rows per write
 # Plain integers: an IntFlag costs a microsecond.

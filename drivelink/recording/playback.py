@@ -18,8 +18,6 @@ from drivelink.recording.cycles import estimated
 from drivelink.recording.mcapsamples import recorded_cycles
 from estimator.sample import Sample
 
-__all__ = ["Playback", "Played", "open_playback"]
-
 
 class Played(NamedTuple):
     """One recorded cycle and its estimate.

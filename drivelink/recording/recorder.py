@@ -34,8 +34,6 @@ from drivelink.recording.sinks import Sink
 from drivelink.recording.syncnumbers import SyncNumbering
 from estimator.sample import Sample
 
-__all__ = ["BusTap", "FirstSource", "Recorder", "ZenohTap"]
-
 _QUEUE = 30_000  # waiting messages per key: half a minute at 1 kHz
 _FLUSH_S = 1.0
 _POLL_S = 0.005

@@ -11,8 +11,6 @@ from typing import Self
 from drivelink.errors import RecordingError
 from drivelink.output.outfile import NewFile
 
-__all__ = ["SafeFile"]
-
 
 class SafeFile(io.BufferedIOBase):
     """Binary file for writers: whole blocks reach the disk, or none of a block.

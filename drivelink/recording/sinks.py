@@ -31,8 +31,6 @@ from drivelink.recording.safefile import SafeFile
 from drivelink.version import __version__
 from estimator.sample import Sample
 
-__all__ = ["CanSink", "CsvSink", "McapSink", "Sink"]
-
 
 class Sink:
     """A recording being written; each format ignores kinds that it cannot store.

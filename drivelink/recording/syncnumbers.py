@@ -14,8 +14,6 @@ from drivelink._core import SYNC_COB_ID
 from drivelink.cycle.syncclock import SyncClock, measure_period
 from drivelink.recording.canlog import NO_STAMP, LoggedFrame
 
-__all__ = ["SyncNumbering", "numbered_ahead", "numbered_at_once"]
-
 _LOG = logging.getLogger("drivelink.recording")
 
 _AHEAD = 64  # later SYNCs used to number one

@@ -10,8 +10,6 @@ from xml.etree import ElementTree
 from drivelink.jointfile import JointFile
 from drivelink.output.outfile import write_whole
 
-__all__ = ["write_layouts"]
-
 _COLOURS = ("#0072b2", "#9ec9e2", "#9ec9e2", "#d55e00", "#009e73")
 
 

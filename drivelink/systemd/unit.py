@@ -19,8 +19,6 @@ import drivelink
 from drivelink.errors import UsageError
 from drivelink.jointfile import JointFile
 
-__all__ = ["UNITS", "Installation", "installation", "network_files", "unit_name"]
-
 UNITS = Path("etc/systemd/system")
 NETWORKS = Path("etc/systemd/network")
 _HOMES = (Path("/home"), Path("/root"), Path("/run/user"))

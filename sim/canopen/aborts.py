@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-__all__ = ["Abort", "SdoAbortError"]
-
 
 class Abort(IntEnum):
     """The codes this server answers with."""

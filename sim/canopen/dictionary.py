@@ -13,8 +13,6 @@ from enum import IntEnum
 
 from sim.canopen.aborts import Abort, SdoAbortError
 
-__all__ = ["DataType", "Dictionary", "Entry", "Item", "Kind", "Object", "Value"]
-
 Value = int | bytes
 
 _LONGEST_STRING = 889  # bytes: 127 segments of 7, the most one block transfer moves at once

@@ -15,8 +15,6 @@ from sim.canopen.node import Nmt, Node
 from sim.canopen.quirks import Quirks
 from sim.canopen.statemachine import PowerState, StateMachine
 
-__all__ = ["Cia402Drive", "DriveData", "DriveReadings", "MeasuredPlant"]
-
 _PROFILE_TORQUE, _CYCLIC_TORQUE = 4, 10
 _MODES = (0, _PROFILE_TORQUE, _CYCLIC_TORQUE)
 _HALT = 0x0100

@@ -14,8 +14,6 @@ import canopen
 from sim.canopen.dictionary import DataType, Item, Kind, Object, Value
 from sim.canopen.node import Node
 
-__all__ = ["eds_directory", "load_eds", "node_eds", "with_values"]
-
 _KINDS: dict[type, Kind] = {
     canopen.objectdictionary.ODArray: Kind.ARRAY,
     canopen.objectdictionary.ODRecord: Kind.RECORD,

@@ -10,8 +10,6 @@ from sim.canopen.dictionary import Dictionary
 from sim.canopen.pdo import COB_INVALID
 from sim.canopen.timers import Timers
 
-__all__ = ["Emergency"]
-
 _HISTORY = 8
 _GENERIC = 0x01
 

@@ -11,8 +11,6 @@ from sim.canopen.edsfile import load_eds, with_values
 from sim.canopen.node import Node
 from sim.canopen.quirks import Quirks
 
-__all__ = ["Cia406Encoder", "EncoderData", "Scale"]
-
 SCALING, REVERSED = 0x04, 0x01  # bits of 0x6000
 
 _FASTEST = 0x7FFF

@@ -8,8 +8,6 @@ from sim.canopen.aborts import Abort, SdoAbortError
 from sim.canopen.dictionary import Dictionary, Entry
 from sim.canopen.timers import Timer, Timers
 
-__all__ = ["HeartbeatConsumer", "HeartbeatProducer"]
-
 
 class HeartbeatProducer:
     """Calls `beat` with the period of 0x1017."""

@@ -17,8 +17,6 @@ from sim.canopen.storing import watch_storing
 from sim.canopen.timers import Timers
 from sim.canopen.tpdo import Tpdo
 
-__all__ = ["Nmt", "Node"]
-
 _SYNC_PRODUCER = 1 << 30
 _FRAME_29_BIT = 1 << 29
 _APPLICATION = (0x2000, 0xFFFF)

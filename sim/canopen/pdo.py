@@ -13,8 +13,6 @@ from sim.canopen.aborts import Abort, SdoAbortError
 from sim.canopen.dictionary import DataType, Dictionary, Entry
 from sim.canopen.quirks import Quirks
 
-__all__ = ["COB_INVALID", "COB_NO_RTR", "Pdo", "restricted"]
-
 COB_INVALID = 1 << 31
 COB_NO_RTR = 1 << 30
 MAPPED_AT_MOST = 8  # objects in one PDO

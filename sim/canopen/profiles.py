@@ -9,8 +9,6 @@ from __future__ import annotations
 from sim.canopen.quirks import Quirks
 from sim.errors import SimError
 
-__all__ = ["PROFILES", "profile"]
-
 _RPM, _COUNTS_PER_S, _TENTH_COUNTS_PER_S = 0x00B4_4700, 0x00B5_0300, 0xFFB5_0300  # as 0x60A9
 
 

@@ -10,8 +10,6 @@ from sim.canopen.pdo import Pdo
 from sim.canopen.quirks import Quirks
 from sim.canopen.timers import Timer, Timers
 
-__all__ = ["Rpdo"]
-
 
 class Rpdo(Pdo):
     """A PDO that the device receives.

@@ -13,8 +13,6 @@ from sim.canopen.dictionary import Dictionary, Entry
 from sim.canopen.sdo_block import BlockDownload, BlockUpload
 from sim.canopen.timers import Timer, Timers
 
-__all__ = ["SdoServer"]
-
 _TIMEOUT_S = 1.0  # timeout between two frames of a transfer
 
 _DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT = 0, 1, 2, 3

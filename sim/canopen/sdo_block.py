@@ -8,8 +8,6 @@ import struct
 from sim.canopen.aborts import Abort, SdoAbortError
 from sim.canopen.dictionary import Entry
 
-__all__ = ["BlockDownload", "BlockUpload"]
-
 _LARGEST_BLOCK = 127  # segments
 _LARGEST_DOWNLOAD = 1 << 16  # bytes a client may send before the server stops it
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-__all__ = ["PowerState", "StateMachine"]
-
 _FAULT_RESET = 0x80
 _QUICK_STOP_STAYS = range(5, 9)  # values of 0x605A with which the drive stays in quick stop active
 

@@ -7,8 +7,6 @@ from collections.abc import Callable
 from sim.canopen.aborts import Abort, SdoAbortError
 from sim.canopen.dictionary import Dictionary, Entry
 
-__all__ = ["watch_storing"]
-
 _GROUPS = (
     (0x1000, 0xFFFF),
     (0x1000, 0x1FFF),

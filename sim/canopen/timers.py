@@ -7,8 +7,6 @@ import itertools
 import math
 from collections.abc import Callable
 
-__all__ = ["Timer", "Timers"]
-
 
 class Timer:
     """One scheduled call."""

@@ -9,8 +9,6 @@ from sim.canopen.pdo import Pdo
 from sim.canopen.quirks import Quirks
 from sim.canopen.timers import Timer, Timers
 
-__all__ = ["Tpdo"]
-
 
 class Tpdo(Pdo):
     """A PDO that the device sends.

@@ -8,8 +8,6 @@ from dataclasses import dataclass, field, replace
 from sim.plant import Commit, Dry, Extra, JointPlant, Kinematics, Load, Terms
 from sim.springs import Law
 
-__all__ = ["Apply", "Assembly", "Definition", "LinkParts", "MotorParts", "Parameter", "Reading", "Values"]
-
 Values = Mapping[str, float]
 Reading = Callable[[float], float]
 """True angle (rad) -> the angle that is read."""

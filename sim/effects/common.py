@@ -9,8 +9,6 @@ from sim.effects.memory import Slip
 from sim.errors import SimError
 from sim.plant import Dry
 
-__all__ = ["SLIP", "SMOOTHING", "at_speed", "not_negative", "slip", "wave"]
-
 SMOOTHING = Parameter(
     "smoothing_rad_s", "velocity below which an oil film carries the load; 0: dry, it sticks", 0.0
 )

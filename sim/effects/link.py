@@ -12,8 +12,6 @@ import math
 from sim.effects.assembly import Assembly, Definition, Parameter, Values
 from sim.effects.common import SMOOTHING, at_speed, not_negative, wave
 
-__all__ = ["DEFINITIONS"]
-
 
 def _gravity(a: Assembly, m: int, p: Values) -> None:
     height, phase = wave(p["sin_nm"], p["cos_nm"], 1.0)

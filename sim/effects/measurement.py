@@ -7,8 +7,6 @@ import math
 from sim.effects.assembly import Assembly, Definition, Parameter, Values
 from sim.effects.common import not_negative, wave
 
-__all__ = ["DEFINITIONS"]
-
 
 def _eccentricity(a: Assembly, m: int, p: Values) -> None:
     height, phase = wave(p["sin_rad"], p["cos_rad"], 1.0)

@@ -12,9 +12,6 @@ from collections.abc import Callable
 
 from sim.errors import SimError
 
-__all__ = ["Creep", "Delayed", "History", "Lag", "Slip"]
-
-
 Element = Callable[[float, float], float]
 """(state y, way U >= 0), both counted in the direction of motion -> state after it."""
 

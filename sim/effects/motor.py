@@ -12,8 +12,6 @@ import math
 from sim.effects.assembly import Assembly, Definition, Parameter, Values
 from sim.effects.common import SLIP, SMOOTHING, at_speed, not_negative, slip, wave
 
-__all__ = ["DEFINITIONS"]
-
 
 def _coulomb(a: Assembly, m: int, p: Values) -> None:
     level = not_negative(p, "torque_nm")

@@ -15,8 +15,6 @@ from sim.effects.common import SLIP, not_negative, slip, wave
 from sim.errors import SimError
 from sim.springs import Law
 
-__all__ = ["DEFINITIONS"]
-
 
 def _hysteresis(a: Assembly, m: int, p: Values) -> None:
     element = slip(p)

@@ -9,8 +9,6 @@ from sim.effects.common import not_negative
 from sim.effects.memory import Creep
 from sim.errors import SimError
 
-__all__ = ["DEFINITIONS"]
-
 
 def _damaged_tooth(a: Assembly, m: int, p: Values) -> None:
     level, at, per, exp = not_negative(p, "torque_nm"), p["position_rad"], 1.0 / p["width_rad"], math.exp

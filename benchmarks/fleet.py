@@ -40,7 +40,7 @@ from drivelink import __version__, cli
 from drivelink.fleet.changes import q_values, series_test
 from drivelink.fleet.joints import Joints
 from drivelink.fleet.storage import Store, find
-from drivelink.fleet.table import Table, read_rows
+from drivelink.fleet.table import FleetTable, read_rows
 from drivelink.fleet.task import Task, process
 
 BIN = Path(sys.executable).parent
@@ -250,7 +250,7 @@ def run_table(args: argparse.Namespace) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         store = Store(folder)
         begin = time.monotonic()
-        with Table(store) as table:
+        with FleetTable(store) as table:
             for k in range(args.rows):
                 table.append([_row(k // joints, k % joints, rng)])
         appended = time.monotonic() - begin

@@ -231,7 +231,7 @@ def _list(alpha: Array) -> str:
 
 def plot(motions: dict[str, Motion], folder: Path) -> None:
     """Figures 1 to 9 of the paper."""
-    from drivelink.output.plots import Curve, new_figure, over_time, save, xy
+    from drivelink.output.plots import PlotCurve, new_figure, over_time, save, xy
 
     folder.mkdir(parents=True, exist_ok=True)
     t = np.arange(N) * T
@@ -240,7 +240,10 @@ def plot(motions: dict[str, Motion], folder: Path) -> None:
         count = m.tau.shape[1]
         figure, axes = new_figure(f"Figure {number}: flexibility torque, case {name}", rows=count)
         for i in range(count):
-            curves = {"true": Curve(t, 1e3 * m.tau_e[:, i]), "residual": Curve(t, 1e3 * residual(m, i)[1])}
+            curves = {
+                "true": PlotCurve(t, 1e3 * m.tau_e[:, i]),
+                "residual": PlotCurve(t, 1e3 * residual(m, i)[1]),
+            }
             over_time(axes[i], curves, "torque / N·mm")
         save(figure, folder / f"figure{number}.png")
     for number, name, k_max in ((2, "A", None), (3, "A", 1.9), (5, "B", 1.9)):
@@ -252,10 +255,10 @@ def plot(motions: dict[str, Motion], folder: Path) -> None:
         with np.errstate(all="ignore"):
             estimate = regressor(second_order(y, 300.0, 1.0, T), m.phi_rate[:, 0], 1900.0, k_max)
         shown = np.where(np.abs(estimate) < 1.0, estimate, np.nan)
-        curves = {"true": Curve(t, 1e3 * m.sigma[:, 0]), "estimate": Curve(t, 1e3 * shown)}
+        curves = {"true": PlotCurve(t, 1e3 * m.sigma[:, 0]), "estimate": PlotCurve(t, 1e3 * shown)}
         over_time(axes[0], curves, "stiffness / (N·mm/rad)")
         if k_max is None:
-            over_time(axes[1], {"K_R φ̇²": Curve(t, 1900.0 * m.phi_rate[:, 0] ** 2)}, "K_R φ̇²")
+            over_time(axes[1], {"K_R φ̇²": PlotCurve(t, 1900.0 * m.phi_rate[:, 0] ** 2)}, "K_R φ̇²")
         save(figure, folder / f"figure{number}.png")
     m = motions["C"]
     figure, axes = new_figure("Figure 7: stiffness by polynomials, VSA-II", rows=2)
@@ -263,21 +266,21 @@ def plot(motions: dict[str, Motion], folder: Path) -> None:
         phi = np.linspace(-1, 1, 200) * np.max(np.abs(m.phi[:, i]))
         alpha = fits(m, i, True)
         curves = {
-            "true": Curve(phi, 1e3 * MODELS["vsa-ii"].stiffness(phi, ALPHA["C"])),
-            "polynomial": Curve(phi, 1e3 * MODELS["polynomial"].stiffness(phi, alpha)),
+            "true": PlotCurve(phi, 1e3 * MODELS["vsa-ii"].stiffness(phi, ALPHA["C"])),
+            "polynomial": PlotCurve(phi, 1e3 * MODELS["polynomial"].stiffness(phi, alpha)),
         }
         xy(axes[i], curves, "deflection / rad", "stiffness / (N·mm/rad)")
     save(figure, folder / "figure7.png")
     estimates = [black_box(m, i, 5000.0, 1.0, 1.0, False) for i in range(2)]
     figure, axes = new_figure("Figure 8: black-box stiffness, VSA-II", rows=2)
     for i in range(2):
-        curves = {"true": Curve(t, 1e3 * m.sigma[:, i]), "estimate": Curve(t, 1e3 * estimates[i])}
+        curves = {"true": PlotCurve(t, 1e3 * m.sigma[:, i]), "estimate": PlotCurve(t, 1e3 * estimates[i])}
         over_time(axes[i], curves, "stiffness / (N·mm/rad)")
     save(figure, folder / "figure8.png")
     figure, axes = new_figure("Figure 9: total stiffness, VSA-II")
     total = {
-        "true": Curve(t, 1e3 * m.sigma.sum(1)),
-        "estimate": Curve(t, 1e3 * (estimates[0] + estimates[1])),
+        "true": PlotCurve(t, 1e3 * m.sigma.sum(1)),
+        "estimate": PlotCurve(t, 1e3 * (estimates[0] + estimates[1])),
     }
     over_time(axes[0], total, "stiffness / (N·mm/rad)")
     save(figure, folder / "figure9.png")

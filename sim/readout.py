@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from sim.effects.assembly import LinkParts, MotorParts, Reading
-from sim.effects.memory import Delayed, History, Lag
+from sim.effects.memory import Delayed, Lag, PositionHistory
 from sim.sensors import DriveHardware, DriveSignals, LinkEncoder
 
 
@@ -98,7 +98,7 @@ class LinkScale:
             noise: of the reading, counts.
         """
         self.counts = 0
-        self.history: History | None = None
+        self.history: PositionHistory | None = None
         self._encoder, self._noise = encoder, noise
         self._readings: tuple[Reading, ...] = ()
 
@@ -106,7 +106,7 @@ class LinkScale:
         """Add effects, with an integration step of step_s and the link at this position (rad)."""
         delay = parts.reading_delay_s
         self._readings = tuple(parts.readings)
-        self.history = History(delay, step_s, position) if delay > 0.0 else None
+        self.history = PositionHistory(delay, step_s, position) if delay > 0.0 else None
 
     def sample(self, position: float) -> None:
         """Sample at this link position (rad)."""

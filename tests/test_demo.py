@@ -18,7 +18,7 @@ from drivelink.cycle.loop import ObjectSink
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.closing import as_json, closing_table
 from drivelink.demo.comparison import Comparison
-from drivelink.demo.rig import Summary, TruePoint
+from drivelink.demo.rig import RunSummary, TruePoint
 from drivelink.demo.simulate import network_from_joint, open_sim_bus, world_from_joint
 from drivelink.pubsub.wire import EstimateMessage
 from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
@@ -91,7 +91,7 @@ def test_an_interval_that_misses_the_truth_is_not_covered() -> None:
     assert comparison.errors().covered == 0.0
 
 
-SUMMARY = Summary(1200, 1150, 3, 180.0, 40.0, "")
+SUMMARY = RunSummary(1200, 1150, 3, 180.0, 40.0, "")
 
 
 def closing(comparison: Comparison) -> str:

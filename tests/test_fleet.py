@@ -30,7 +30,7 @@ from drivelink.fleet.errors import FleetError  # noqa: E402
 from drivelink.fleet.joints import Joints  # noqa: E402
 from drivelink.fleet.storage import Source, Store  # noqa: E402
 from drivelink.fleet.summary import COLUMNS, summarise  # noqa: E402
-from drivelink.fleet.table import Table, read_rows  # noqa: E402
+from drivelink.fleet.table import FleetTable, read_rows  # noqa: E402
 
 # Dask's own: a process that was ended on purpose leaves sockets behind.
 pytestmark = pytest.mark.filterwarnings(
@@ -181,7 +181,7 @@ def test_a_remote_storage_holds_recordings_and_results(fleet: Path, joints: Join
     (row,), (here,) = outcome.rows, done(local, joints).rows
     assert row["parameters"] == here["parameters"]
     assert row["id"] == here["id"]
-    with Table(Store("memory://plant/out")) as one:
+    with FleetTable(Store("memory://plant/out")) as one:
         one.append([row])
     assert [r["id"] for r in read_rows(Store("memory://plant/out"))] == [row["id"]]
 
@@ -290,7 +290,7 @@ def ids(folder: Path) -> list[str]:
 
 def test_rows_are_appended_over_runs_and_stand_in_one_part(tmp_path: Path) -> None:
     for digest in "abc":
-        with Table(Store(str(tmp_path))) as one:
+        with FleetTable(Store(str(tmp_path))) as one:
             one.append([row(digest)])
     assert ids(tmp_path) == ["a-elbow", "b-elbow", "c-elbow"]
     assert len(list(tmp_path.glob("table/*.parquet"))) == 1
@@ -302,10 +302,10 @@ def test_full_parts_follow_each_other_and_a_newer_row_takes_the_place_of_an_old_
 ) -> None:
     monkeypatch.setattr(table, "_PART_ROWS", 2)
     for digest in "abcde":
-        with Table(Store(str(tmp_path))) as one:
+        with FleetTable(Store(str(tmp_path))) as one:
             one.append([row(digest)])
     assert len(list(tmp_path.glob("table/*.parquet"))) == 3
-    with Table(Store(str(tmp_path))) as one:
+    with FleetTable(Store(str(tmp_path))) as one:
         one.append([row("a", version="2")])
     assert ids(tmp_path) == [f"{digest}-elbow" for digest in "abcde"]
     assert {r["id"]: r["version"] for r in read_rows(Store(str(tmp_path)))}["a-elbow"] == "2"
@@ -313,21 +313,21 @@ def test_full_parts_follow_each_other_and_a_newer_row_takes_the_place_of_an_old_
 
 def test_what_a_kill_between_two_writes_leaves_double_is_read_once_and_mended(tmp_path: Path) -> None:
     store = Store(str(tmp_path))
-    with Table(store) as one:
+    with FleetTable(store) as one:
         one.append([row("a")])
     (part,) = tmp_path.glob("table/*.parquet")
     shutil.copy(part, part.with_name("part-0.parquet"))
     assert len(read_rows(store)) == 1
-    with Table(store) as one:
+    with FleetTable(store) as one:
         one.append([row("b")])
     assert ids(tmp_path) == ["a-elbow", "b-elbow"]
 
 
 def test_two_runs_at_once_lose_nothing(tmp_path: Path) -> None:
     store = Store(str(tmp_path))
-    with Table(store) as one:
+    with FleetTable(store) as one:
         one.append([row("a")])
-    with Table(store) as first, Table(store) as second:
+    with FleetTable(store) as first, FleetTable(store) as second:
         first.append([row("b")])
         second.append([row("c")])
     assert ids(tmp_path) == ["a-elbow", "b-elbow", "c-elbow"]
@@ -335,9 +335,9 @@ def test_two_runs_at_once_lose_nothing(tmp_path: Path) -> None:
 
 def test_an_error_gives_way_to_the_result_of_the_same_recording(tmp_path: Path) -> None:
     store = Store(str(tmp_path))
-    with Table(store) as one:
+    with FleetTable(store) as one:
         one.append([row("unread-1", None, recording="a.csv", status="error", error="no such host")])
-    with Table(store) as one:
+    with FleetTable(store) as one:
         assert one.at(Source("a.csv", 1, "s", None)).failed  # type: ignore[union-attr]
         one.append([row("a")])
     assert ids(tmp_path) == ["a-elbow"]
@@ -549,7 +549,7 @@ def test_the_examples_of_the_documentation_read_the_table(
     text = (Path(__file__).parent.parent / "docs" / "how-to" / "fleet.md").read_text(encoding="utf-8")
     examples = [block.split("```")[0] for block in text.split("```python\n")[1:]]
     assert len(examples) == 2
-    with Table(Store(str(tmp_path / "fleet"))) as one:
+    with FleetTable(Store(str(tmp_path / "fleet"))) as one:
         for k in range(3):
             one.append([row(str(k), excited=True, stiffness_middle_nm_rad=100.0 + k)])
         one.append([row("bad", None, status="error", error="broken", recording="bad.csv")])

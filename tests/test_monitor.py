@@ -28,7 +28,7 @@ from rich.console import Console
 
 from drivelink import cli
 from drivelink.monitor.braille import DotPlot, number, sparkline
-from drivelink.monitor.history import GrowingCurve, History, usual_range
+from drivelink.monitor.history import GrowingCurve, JointHistory, usual_range
 from drivelink.monitor.statuslines import shape, status_lines, status_text
 from drivelink.monitor.view import JointView, joints_table
 from drivelink.monitor.watcher import Watcher
@@ -181,14 +181,14 @@ def test_the_curve_grows_and_keeps_the_latest_value_of_each_place() -> None:
 
 
 def test_unobservable_estimates_leave_the_curve_as_it_is() -> None:
-    history = History()
+    history = JointHistory()
     history.add(estimate(1, 1), 0.0)
     history.add(estimate(400, 1, status=int(Status.VALID)), 0.4)
     assert len(history.curves[0].points()) == 1 and len(history.moments) == 2
 
 
 def test_a_daemon_that_starts_anew_clears_the_history() -> None:
-    history = History()
+    history = JointHistory()
     for t in (10.0, 10.5, 2.0):
         history.add(estimate(1), t)
     assert [m.time_s for m in history.window()] == [2.0]
@@ -445,7 +445,7 @@ def test_a_silent_daemon_is_not_shown_as_live() -> None:
 
 
 def test_what_is_not_valid_is_a_gap_in_every_curve() -> None:
-    history = History()
+    history = JointHistory()
     for k, status in enumerate([3] * 10 + [0] * 5 + [3] * 10):
         history.add(estimate(k, 1, status=status), 0.05 * k)
     view = JointView("elbow")

@@ -9,7 +9,7 @@ import pytest
 
 from drivelink.output.plots import (
     COLORS,
-    Curve,
+    PlotCurve,
     bars,
     new_figure,
     over_time,
@@ -28,7 +28,7 @@ def wave(n: int = 20_000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_curves_differ_in_line_style_and_marker_not_only_in_colour() -> None:
     _, (axes,) = new_figure()
     t, phi, _ = wave(100)
-    over_time(axes, {name: Curve(t, k + phi) for k, name in enumerate("abcdef")}, "y")
+    over_time(axes, {name: PlotCurve(t, k + phi) for k, name in enumerate("abcdef")}, "y")
     looks = [(line.get_linestyle(), line.get_marker()) for line in axes.lines]
     assert len(set(looks)) == len(looks) == 6
 
@@ -53,7 +53,7 @@ def test_stiffness_over_scattered_deflections_becomes_one_curve() -> None:
     rng = np.random.default_rng(1)
     _, (axes,) = new_figure()
     noisy = sigma + rng.normal(0, 5, len(t))
-    stiffness_against_deflection(axes, {"estimate": Curve(phi, noisy, np.full(len(t), 5.0))})
+    stiffness_against_deflection(axes, {"estimate": PlotCurve(phi, noisy, np.full(len(t), 5.0))})
     x, y = (np.asarray(values, float) for values in axes.lines[0].get_data())
     assert len(x) < 500 and np.all(np.diff(x) > 0)
     inside = np.abs(x) < 0.095  # the outermost bins average over the steepest part
@@ -66,16 +66,16 @@ def test_thinning_loses_no_peak() -> None:
     y = np.zeros_like(t)
     y[123_456] = 7.0
     _, (axes,) = new_figure()
-    over_time(axes, {"a": Curve(t, y)}, "y")
+    over_time(axes, {"a": PlotCurve(t, y)}, "y")
     assert len(axes.lines[0].get_xdata()) < 5000 and max(axes.lines[0].get_ydata()) == 7.0
 
 
 def test_what_is_not_finite_or_constant_or_empty_can_be_drawn(tmp_path: Path) -> None:
     figure, axes = new_figure("title", rows=3)
     nan = np.full(5000, np.nan)
-    over_time(axes[0], {"a": Curve(nan, nan, nan)}, "y")
-    stiffness_against_deflection(axes[1], {"a": Curve(np.zeros(5000), np.ones(5000), nan)})
-    stiffness_against_deflection(axes[2], {"a": Curve(np.zeros(0), np.zeros(0))})
+    over_time(axes[0], {"a": PlotCurve(nan, nan, nan)}, "y")
+    stiffness_against_deflection(axes[1], {"a": PlotCurve(np.zeros(5000), np.ones(5000), nan)})
+    stiffness_against_deflection(axes[2], {"a": PlotCurve(np.zeros(0), np.zeros(0))})
     assert save(figure, tmp_path / "x.png").stat().st_size > 1000
 
 
@@ -85,13 +85,13 @@ def test_the_same_data_are_the_same_file(suffix: str, tmp_path: Path) -> None:
     for name in ("a", "b"):
         figure, (axes,) = new_figure("t")
         t, phi, _ = wave(200)
-        over_time(axes, {"φ": Curve(t, phi)}, "φ / rad")
+        over_time(axes, {"φ": PlotCurve(t, phi)}, "φ / rad")
         contents.append(save(figure, tmp_path / f"{name}{suffix}").read_bytes())
     assert contents[0] == contents[1]
 
 
 def test_svg_for_a_page_is_one_element() -> None:
     figure, (axes,) = new_figure()
-    over_time(axes, {"a": Curve(np.arange(3.0), np.arange(3.0))}, "y")
+    over_time(axes, {"a": PlotCurve(np.arange(3.0), np.arange(3.0))}, "y")
     text = svg_text(figure)
     assert text.startswith("<svg") and text.rstrip().endswith("</svg>")

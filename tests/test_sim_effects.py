@@ -9,7 +9,7 @@ import pytest
 from simjoints import HARDENING, LINEAR, PERFECT, PERFECT_ENCODER, RIGID, measured, sea
 
 from sim.effects import LISTED, UNLISTED, make, parse
-from sim.effects.memory import Delayed, History, Slip
+from sim.effects.memory import Delayed, PositionHistory, Slip
 from sim.errors import SimError
 from sim.plant import JointPlant
 from sim.world import World
@@ -266,7 +266,7 @@ def test_a_late_encoder_reads_where_the_link_was(delay_s: float) -> None:
 
 
 def test_history_is_exact_on_a_parabola() -> None:
-    history = History(0.0024, 0.001, 0.0)
+    history = PositionHistory(0.0024, 0.001, 0.0)
     for k in range(1, 10):
         t = 0.001 * k
         history.push(5.0 * t * t, 10.0 * t)

@@ -21,7 +21,7 @@ from rich.live import Live
 from drivelink import jointfile
 from drivelink.demo.closing import as_json, closing_table
 from drivelink.demo.comparison import Comparison
-from drivelink.demo.rig import Failure, Summary, TruePoint, serve
+from drivelink.demo.rig import Failure, RunSummary, TruePoint, serve
 from drivelink.errors import DrivelinkError
 from drivelink.jointfile import JointFile
 from drivelink.monitor.view import JointView
@@ -107,7 +107,7 @@ class DemoRun:
     def __init__(self, joint: JointFile, console: Console, *, live: bool) -> None:
         self.comparison = Comparison()
         self.received = 0
-        self.summary: Summary | None = None
+        self.summary: RunSummary | None = None
         self._view = JointView(joint.name, subtitle="simulated, on the virtual bus")
         self._view.footer = "Ctrl-C ends"
         self._console = console
@@ -143,8 +143,8 @@ class DemoRun:
         return interrupted
 
     def _receive(self, connection: Connection) -> None:
-        message: list[TruePoint] | Summary | Failure = connection.recv()
-        if isinstance(message, Summary):
+        message: list[TruePoint] | RunSummary | Failure = connection.recv()
+        if isinstance(message, RunSummary):
             self.summary = message
         elif isinstance(message, Failure):
             error = DrivelinkError(message.text)

@@ -9,7 +9,7 @@ from typing import Protocol
 from drivelink.canopen.bus import open_bus
 from drivelink.cycle.busport import BusPort
 from drivelink.cycle.framesource import PumpedSource
-from drivelink.cycle.loop import CycleLoop, LoopJoint, Sink
+from drivelink.cycle.loop import CycleLoop, CycleSink, LoopJoint
 from drivelink.cycle.pipeline import make_pipeline
 from drivelink.cycle.startup import join_bus
 from drivelink.jointfile import JointFile
@@ -25,7 +25,7 @@ class Devices(Protocol):
 def run_lockstep(
     joint: JointFile,
     devices: Devices,
-    sink: Sink | None,
+    sink: CycleSink | None,
     cycles: int,
     *,
     folder: Path = Path(),

@@ -28,7 +28,7 @@ _MOST_BEHIND_NS = 10_000_000_000  # a larger difference is a stamp of another cl
 _CLOCK_STEP_NS = 20_000_000  # NTP slews by less between two checks; more is a clock that was set
 
 
-class Sink(Protocol):
+class CycleSink(Protocol):
     """Receives estimates and samples."""
 
     def put(self, tick: Tick) -> None:
@@ -39,7 +39,7 @@ class ObjectSink(ABC):
     """A sink that takes Python objects instead of the bytes for zenoh."""
 
     def put(self, tick: Tick) -> None:
-        """See Sink."""
+        """See `CycleSink`."""
         self.put_estimate(tick.estimate, tick.stamp_ns)
         sample = tick.sample
         if sample is not None:
@@ -70,7 +70,7 @@ class LoopJoint:
 
     __slots__ = ("broken", "estimates", "fault", "name", "pipeline", "response", "sink", "stale", "work")
 
-    def __init__(self, name: str, pipeline: JointPipeline, sink: Sink | None) -> None:
+    def __init__(self, name: str, pipeline: JointPipeline, sink: CycleSink | None) -> None:
         self.name = name
         self.pipeline = pipeline
         self.sink = sink

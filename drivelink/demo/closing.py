@@ -10,12 +10,12 @@ from rich.table import Table
 from rich.text import Text
 
 from drivelink.demo.comparison import Comparison
-from drivelink.demo.rig import Summary
+from drivelink.demo.rig import RunSummary
 from estimator.sample import SIGMA_95, Status
 
 
 def closing_table(
-    case: str, comparison: Comparison, summary: Summary, received: int, period_s: float
+    case: str, comparison: Comparison, summary: RunSummary, received: int, period_s: float
 ) -> RenderableType:
     """The last pair of truth and estimate, the errors of the whole run, and the cycle's figures."""
     errors = comparison.errors()
@@ -56,7 +56,7 @@ def closing_table(
     return Group(table, *map(Text, lines))
 
 
-def as_json(case: str, comparison: Comparison, summary: Summary, received: int) -> dict[str, Any]:
+def as_json(case: str, comparison: Comparison, summary: RunSummary, received: int) -> dict[str, Any]:
     """The same as a JSON object; missing numbers are null."""
     errors = comparison.errors()
     return {

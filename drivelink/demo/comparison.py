@@ -14,7 +14,7 @@ T = TypeVar("T")
 _UNMATCHED = 5_000  # sequence numbers kept while waiting for the other side
 
 
-class Errors(NamedTuple):
+class RmsErrors(NamedTuple):
     """Root-mean-square errors over the cycles whose estimate is valid, relative to the truth's rms.
 
     Attributes:
@@ -60,12 +60,12 @@ class Comparison:
         else:
             _keep(self._truth, truth.sequence, truth)
 
-    def errors(self) -> Errors:
+    def errors(self) -> RmsErrors:
         """Errors over all pairs so far; NaN before the first valid estimate."""
         if self._cycles == 0:
-            return Errors(0, math.nan, math.nan, math.nan)
+            return RmsErrors(0, math.nan, math.nan, math.nan)
         stiffness, true_stiffness, torque, true_torque = self._sums
-        return Errors(
+        return RmsErrors(
             self._cycles,
             math.sqrt(stiffness / true_stiffness) if true_stiffness else math.nan,
             math.sqrt(torque / true_torque) if true_torque else math.nan,

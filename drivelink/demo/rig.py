@@ -16,7 +16,7 @@ from typing import NamedTuple, Protocol
 
 from drivelink import jointfile
 from drivelink._core import Tick
-from drivelink.cycle.loop import Sink
+from drivelink.cycle.loop import CycleSink
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simulate import network_from_joint, open_sim_bus, world_from_joint
 from drivelink.errors import DrivelinkError
@@ -33,7 +33,7 @@ class TruePoint(NamedTuple):
     stiffness_nm_rad: float
 
 
-class Summary(NamedTuple):
+class RunSummary(NamedTuple):
     """The daemon's summary of the run."""
 
     cycles: int
@@ -51,7 +51,7 @@ class Failure(NamedTuple):
     exit_status: int
 
 
-class World(Protocol):
+class SimulatedWorld(Protocol):
     """Interface of the simulated world."""
 
     def truth(self) -> TruthLike:
@@ -61,7 +61,7 @@ class World(Protocol):
 class TruthTap:
     """Publishes like the daemon's publisher, and notes the truth at the same SYNC."""
 
-    def __init__(self, sink: Sink | None, world: World, connection: Connection) -> None:
+    def __init__(self, sink: CycleSink | None, world: SimulatedWorld, connection: Connection) -> None:
         self._sink = sink
         self._world = world
         self._connection = connection
@@ -84,7 +84,7 @@ class TruthTap:
 
 
 def serve(path: Path, seconds: float | None, connection: Connection) -> None:
-    """Run simulation and daemon, and send the watcher batches of `TruePoint`, then a `Summary` or `Failure`.
+    """Run simulation and daemon, and send the watcher `TruePoint` batches, then a `RunSummary` or `Failure`.
 
     Args:
         path: joint file with a `[sim]` section, on the virtual bus.
@@ -95,7 +95,7 @@ def serve(path: Path, seconds: float | None, connection: Connection) -> None:
     logging.getLogger("drivelink").propagate = False  # the watcher's view shows the daemon's events
     logging.getLogger("drivelink").addHandler(logging.NullHandler())
     try:
-        summary: Summary | Failure = _run(path, seconds, connection)
+        summary: RunSummary | Failure = _run(path, seconds, connection)
     except DrivelinkError as error:
         summary = Failure(str(error), error.exit_status)
     with suppress(OSError):
@@ -103,7 +103,7 @@ def serve(path: Path, seconds: float | None, connection: Connection) -> None:
         connection.close()
 
 
-def _run(path: Path, seconds: float | None, connection: Connection) -> Summary:
+def _run(path: Path, seconds: float | None, connection: Connection) -> RunSummary:
     joint = jointfile.load(path)
     world = world_from_joint(joint)
     bus = open_sim_bus(joint.bus)
@@ -117,7 +117,7 @@ def _run(path: Path, seconds: float | None, connection: Connection) -> Summary:
             daemon.run(seconds)
             tap.flush()
             loop = daemon.loop
-            return Summary(
+            return RunSummary(
                 cycles=loop.cycles,
                 estimates=loop_joint.estimates,
                 missed_cycles=loop_joint.pipeline.missed + loop.overruns,

@@ -38,7 +38,7 @@ _MOST = 4  # changes looked for in one series
 _MAD = 1.4826  # standard deviation of a normal variable over its median absolute deviation
 
 
-class Change(NamedTuple):
+class SeriesChange(NamedTuple):
     """One change of a series.
 
     Attributes:
@@ -105,7 +105,7 @@ def series_test(time_s: FloatArray, value: FloatArray, std: FloatArray) -> Serie
     return SeriesTest(p_value, scatter)
 
 
-def changes(time_s: FloatArray, value: FloatArray, std: FloatArray, level: float) -> list[Change]:
+def changes(time_s: FloatArray, value: FloatArray, std: FloatArray, level: float) -> list[SeriesChange]:
     """The changes of a series, one after the other as long as the next is significant.
 
     Args:
@@ -227,7 +227,7 @@ def _independent(residual: FloatArray) -> float:
 
 def _change(
     shapes: _Shapes, place: int, row: int, design: FloatArray, value: FloatArray, weight: FloatArray
-) -> Change:
+) -> SeriesChange:
     """A chosen shape with its size beside the others, and the places that fit as well."""
     n, used = len(value), len(design)
     normal = (design * weight) @ design.T
@@ -243,7 +243,7 @@ def _change(
     kind = np.array([k == shapes.kinds[place] for k in shapes.kinds])
     near = shapes.first[kind & (cost <= cost[place] + _CHI2_95 * scale)]
     amount = float(solution[row])
-    return Change(
+    return SeriesChange(
         shapes.kinds[place],
         int(shapes.first[place]),
         int(near.min()),

@@ -22,7 +22,7 @@ from drivelink import __version__
 from drivelink.fleet.errors import FleetError
 from drivelink.fleet.joints import Joints, carried_joint
 from drivelink.fleet.storage import Source, Store, fetched
-from drivelink.fleet.table import Table
+from drivelink.fleet.table import FleetTable
 from drivelink.fleet.task import Outcome, Task, broken_row, named_time, process, recorded_time
 
 _AHEAD = 4  # recordings queued per worker thread
@@ -103,7 +103,7 @@ def run(
         KeyboardInterrupt: Ctrl-C or SIGTERM.
     """
     counts = Counts(found=len(sources))
-    with Table(store) as table:
+    with FleetTable(store) as table:
         wanted = [source for source in sources if _wanted(source, joints, table, settings, counts)]
         if not wanted:
             return counts
@@ -117,7 +117,7 @@ def run(
     return counts
 
 
-def _wanted(source: Source, joints: Joints, table: Table, settings: Settings, counts: Counts) -> bool:
+def _wanted(source: Source, joints: Joints, table: FleetTable, settings: Settings, counts: Counts) -> bool:
     """Whether a recording needs processing, by its listing."""
     latest = named_time(source) or source.modified
     if settings.since and latest and latest < settings.since:
@@ -134,7 +134,7 @@ def _wanted(source: Source, joints: Joints, table: Table, settings: Settings, co
     return False
 
 
-def _task(source: Source, previous: Source | None, table: Table, settings: Settings) -> Task:
+def _task(source: Source, previous: Source | None, table: FleetTable, settings: Settings) -> Task:
     return Task(
         source=source,
         version=__version__,
@@ -185,7 +185,7 @@ def _outcome(future: Any, task: Task) -> Outcome:
 
 
 def _take(
-    task: Task, outcome: Outcome, table: Table, store: Store, counts: Counts, say: Callable[[str], None]
+    task: Task, outcome: Outcome, table: FleetTable, store: Store, counts: Counts, say: Callable[[str], None]
 ) -> None:
     for note in outcome.notes:
         say(note)
@@ -206,7 +206,7 @@ def _take(
         counts.done += 1
 
 
-def _already(outcome: Outcome, table: Table) -> bool:
+def _already(outcome: Outcome, table: FleetTable) -> bool:
     """Whether this run has already processed the same content."""
     return table.has_now(outcome.rows[0]["digest"], outcome.rows[0]["joint"])
 

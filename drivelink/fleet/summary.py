@@ -12,7 +12,15 @@ import numpy as np
 
 from drivelink import __version__
 from drivelink.fleet.analysis import stiffness_at
-from drivelink.fleet.changes import Appearance, Change, SeriesTest, appearance, changes, q_values, series_test
+from drivelink.fleet.changes import (
+    Appearance,
+    SeriesChange,
+    SeriesTest,
+    appearance,
+    changes,
+    q_values,
+    series_test,
+)
 from estimator.sample import SIGMA_95, FloatArray
 from estimator.transmissions import MODELS
 
@@ -184,14 +192,14 @@ def _transmission(series: _Series, q: float, rate: float, level: float) -> dict[
     }
 
 
-def _start(series: _Series, found: list[Change]) -> float:
+def _start(series: _Series, found: list[SeriesChange]) -> float:
     """The level before any change."""
     return float(
         np.median(series.value - sum((change.shape for change in found), np.zeros(len(series.value))))
     )
 
 
-def _changed(series: _Series, change: Change, base: float) -> dict[str, Any]:
+def _changed(series: _Series, change: SeriesChange, base: float) -> dict[str, Any]:
     days = (series.time_s[-1] - series.time_s[change.first]) / _DAY_S
     document = {
         "kind": change.kind,

@@ -99,7 +99,7 @@ class Known(NamedTuple):
     part: str
 
 
-class Table:
+class FleetTable:
     """The table, open for appending by one run, as a context manager that flushes at the end.
 
     Args:

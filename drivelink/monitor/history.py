@@ -122,7 +122,7 @@ class GrowingCurve:
         return kept
 
 
-class History:
+class JointHistory:
     """The last seconds of a joint and its curve.
 
     Args:

@@ -27,7 +27,7 @@ _GAUGE = 10  # characters
 _FULL = 2.0  # times its baseline where a gauge is full
 
 
-class Node(NamedTuple):
+class NodeState(NamedTuple):
     """A node of the bus: id, state, whether it is good."""
 
     id: str
@@ -43,7 +43,7 @@ class Event(NamedTuple):
     times: int
 
 
-class Balance(NamedTuple):
+class ResidualGauge(NamedTuple):
     """Residual of a torque balance, and its baseline, N·m."""
 
     name: str
@@ -81,12 +81,12 @@ class Shown:
     cpu: str = ""
     load: str = ""
     times: tuple[tuple[str, float], ...] = ()
-    nodes: tuple[Node, ...] = ()
+    nodes: tuple[NodeState, ...] = ()
     wrong: tuple[str, ...] = ()
     alarm: bool = False
     location: str = ""
     residual_nm: float | None = None
-    balances: tuple[Balance, ...] = ()
+    balances: tuple[ResidualGauge, ...] = ()
     improved: tuple[float, float] | None = None
     events: tuple[Event, ...] = ()
     recording: str = ""
@@ -155,14 +155,14 @@ def _texts(value: Any) -> list[str]:
     return [_text(item) for item in value[:_MOST] if _text(item)] if isinstance(value, list) else []
 
 
-def _node(name: str, node: Any) -> Node:
+def _node(name: str, node: Any) -> NodeState:
     """One entry of `nodes`."""
     if not isinstance(node, Mapping):
-        return Node(_text(name), _text(node), False)
+        return NodeState(_text(name), _text(node), False)
     state, fault = _text(node.get("state")), bool(node.get("fault"))
     emergency = _text(node.get("emergency"))
     text = f"{state}{' FAULT' if fault else ''}{f' EMCY {emergency}' if emergency else ''}"
-    return Node(_text(name), text, state == "operational" and not fault)
+    return NodeState(_text(name), text, state == "operational" and not fault)
 
 
 def _events(value: Any) -> tuple[Event, ...]:
@@ -174,7 +174,7 @@ def _events(value: Any) -> tuple[Event, ...]:
     return tuple(events)
 
 
-def _balances(alarm: Mapping[str, Any], motors: int) -> tuple[Balance, ...]:
+def _balances(alarm: Mapping[str, Any], motors: int) -> tuple[ResidualGauge, ...]:
     """Residual and baseline of each motor's and the link's balance, if both are known."""
     residuals, baselines = alarm.get("residual_nm"), alarm.get("floor_nm")
     if not isinstance(residuals, list) or not isinstance(baselines, list):
@@ -182,7 +182,7 @@ def _balances(alarm: Mapping[str, Any], motors: int) -> tuple[Balance, ...]:
     pairs = [(_number(r), _number(b)) for r, b in zip(residuals[:3], baselines[:3], strict=False)]
     names = ["motor"] if motors == 1 else [f"motor {i + 1}" for i in range(motors)]
     return tuple(
-        Balance(name, residual, baseline)
+        ResidualGauge(name, residual, baseline)
         for name, (residual, baseline) in zip([*names, "link"], pairs, strict=False)
         if residual is not None and baseline is not None and residual >= 0.0 and baseline > 0.0
     )

@@ -19,7 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from drivelink.monitor.braille import DotPlot, number, sparkline
-from drivelink.monitor.history import EstimateLike, History, TruthLike, usual_range
+from drivelink.monitor.history import EstimateLike, JointHistory, TruthLike, usual_range
 from drivelink.monitor.statuslines import MODEL_ALARM_ADVICE, shape, status_lines, status_text
 from drivelink.pubsub.wire import ExternalMessage
 from estimator.sample import SIGMA_95, Status
@@ -84,7 +84,7 @@ class JointView:
         self.name = name
         self.subtitle = subtitle
         self.footer = ""
-        self.history = History(seconds)
+        self.history = JointHistory(seconds)
         self._status: Mapping[str, Any] = {}
         self.model: Mapping[str, Any] = {}
         self.gone = False

@@ -51,12 +51,12 @@ def _transmission(stiffness: Axes, torque: Axes, one: TransmissionFit, whose: st
     phi = np.linspace(-reach, reach, _CURVE_POINTS)
     slopes = law.stiffness_jacobian(phi, one.alpha)
     std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", slopes, one.covariance, slopes), 0.0))
-    fitted = plots.Curve(phi, law.stiffness(phi, one.alpha), std)
+    fitted = plots.PlotCurve(phi, law.stiffness(phi, one.alpha), std)
     across = units.label("deflection / rad")
     label = units.label("stiffness / (N·m/rad)")
     plots.xy(stiffness, {"fitted": fitted}, across, label, f"{whose}stiffness")
     plots.dots(torque, one.deflection_rad, one.torque_nm, "from the motor's balance")
-    curve = plots.Curve(phi, law.torque(phi, one.alpha))
+    curve = plots.PlotCurve(phi, law.torque(phi, one.alpha))
     plots.xy(torque, {"fitted": curve}, across, units.label("torque / N·m"), f"{whose}flexibility torque")
 
 
@@ -74,5 +74,5 @@ def _left(over_deflection: Axes, over_velocity: Axes, one: TransmissionFit, unit
     plots.xy(over_velocity, {"median": _line(velocity, left)}, across, label, "residual over velocity")
 
 
-def _line(x: FloatArray, y: FloatArray) -> plots.Curve:
-    return plots.medians(x, y, max(4, len(x) // _IN_BIN)) if len(x) else plots.Curve(x, y)
+def _line(x: FloatArray, y: FloatArray) -> plots.PlotCurve:
+    return plots.medians(x, y, max(4, len(x) // _IN_BIN)) if len(x) else plots.PlotCurve(x, y)

@@ -3,8 +3,8 @@
 Figures are made without pyplot: no global state, no window, safe in any thread.
 
     figure, axes = new_figure("Elbow", rows=2)
-    stiffness_against_deflection(axes[0], {"estimate": Curve(phi, sigma, std), "truth": Curve(phi, true)})
-    over_time(axes[1], {"flexibility torque": Curve(t, torque)}, "torque / N·m")
+    stiffness_against_deflection(axes[0], {"estimate": PlotCurve(phi, sigma, std)})
+    over_time(axes[1], {"flexibility torque": PlotCurve(t, torque)}, "torque / N·m")
     save(figure, Path("joint.png"))
 """
 
@@ -62,7 +62,7 @@ _MIN_IN_BIN = 1
 _MARKERS_A_CURVE = 12
 
 
-class Curve(NamedTuple):
+class PlotCurve(NamedTuple):
     """One curve: y over x, with an optional standard deviation (drawn as a 95 % band)."""
 
     x: FloatArray
@@ -83,7 +83,7 @@ def new_figure(
     return figure, axes
 
 
-def xy(axes: Axes, curves: Mapping[str, Curve], x_label: str, y_label: str, title: str = "") -> None:
+def xy(axes: Axes, curves: Mapping[str, PlotCurve], x_label: str, y_label: str, title: str = "") -> None:
     """Draw named curves, each with its colour, line style and marker."""
     for k, (name, curve) in enumerate(curves.items()):
         thin = _thinned(curve)
@@ -91,13 +91,13 @@ def xy(axes: Axes, curves: Mapping[str, Curve], x_label: str, y_label: str, titl
     _finish(axes, x_label, y_label, title, legend=len(curves) > 1)
 
 
-def over_time(axes: Axes, curves: Mapping[str, Curve], y_label: str, title: str = "") -> None:
+def over_time(axes: Axes, curves: Mapping[str, PlotCurve], y_label: str, title: str = "") -> None:
     """Draw curves over time in seconds."""
     xy(axes, curves, "time / s", y_label, title)
 
 
 def stiffness_against_deflection(
-    axes: Axes, curves: Mapping[str, Curve], title: str = "", unit: str = "N·m/rad"
+    axes: Axes, curves: Mapping[str, PlotCurve], title: str = "", unit: str = "N·m/rad"
 ) -> None:
     """Draw stiffness over deflection: samples in any order become one curve, the median in each bin.
 
@@ -157,14 +157,14 @@ def svg_text(figure: Figure) -> str:
     return text
 
 
-def medians(x: FloatArray, y: FloatArray, bins: int = 80) -> Curve:
+def medians(x: FloatArray, y: FloatArray, bins: int = 80) -> PlotCurve:
     """Medians of scattered samples in bins of x, without the outermost x."""
     low, high = np.quantile(x, [0.002, 0.998])
     edges = np.linspace(float(low), float(high), bins + 1)
     place = np.clip(np.searchsorted(edges, x) - 1, 0, bins - 1)
     middle = 0.5 * (edges[1:] + edges[:-1])
     filled = [k for k in range(bins) if np.count_nonzero(place == k) > 2]
-    return Curve(middle[filled], np.array([np.median(y[place == k]) for k in filled]))
+    return PlotCurve(middle[filled], np.array([np.median(y[place == k]) for k in filled]))
 
 
 def dots(axes: Axes, x: FloatArray, y: FloatArray, name: str | None = None) -> None:
@@ -172,7 +172,7 @@ def dots(axes: Axes, x: FloatArray, y: FloatArray, name: str | None = None) -> N
     axes.plot(x, y, ".", color="#aaaaaa", markersize=2.5, rasterized=True, label=name)
 
 
-def _draw(axes: Axes, curve: Curve, name: str, k: int) -> None:
+def _draw(axes: Axes, curve: PlotCurve, name: str, k: int) -> None:
     color = COLORS[k % len(COLORS)]
     few = max(1, len(curve.x) // _MARKERS_A_CURVE)
     with rc_context(STYLE):
@@ -218,7 +218,7 @@ def _finish(axes: Axes, x_label: str, y_label: str, title: str, legend: bool) ->
         )
 
 
-def _thinned(curve: Curve) -> Curve:
+def _thinned(curve: PlotCurve) -> PlotCurve:
     """At most so many points: the lowest and highest of each stretch, so that no peak is lost."""
     n = len(curve.x)
     if n <= _MAX_POINTS:
@@ -230,16 +230,16 @@ def _thinned(curve: Curve) -> Curve:
     low = base + np.argmin(np.where(np.isfinite(y), y, np.inf), axis=1)
     high = base + np.argmax(np.where(np.isfinite(y), y, -np.inf), axis=1)
     keep = np.unique(np.minimum(np.concatenate((low, high)), n - 1))
-    return Curve(curve.x[keep], curve.y[keep], None if curve.std is None else curve.std[keep])
+    return PlotCurve(curve.x[keep], curve.y[keep], None if curve.std is None else curve.std[keep])
 
 
-def _binned(curve: Curve) -> Curve:
+def _binned(curve: PlotCurve) -> PlotCurve:
     """Scattered samples as one curve over x: the median of each bin; gaps where there are no samples."""
     finite = np.isfinite(curve.x) & np.isfinite(curve.y)
     x, y = curve.x[finite], curve.y[finite]
     if len(x) <= _BINS or float(np.ptp(x)) == 0.0:
         order = np.argsort(x, kind="stable")
-        return Curve(x[order], y[order], None if curve.std is None else curve.std[finite][order])
+        return PlotCurve(x[order], y[order], None if curve.std is None else curve.std[finite][order])
     edges = np.linspace(x.min(), x.max(), _BINS + 1)
     place = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, _BINS - 1)
     order = np.argsort(place, kind="stable")
@@ -255,4 +255,4 @@ def _binned(curve: Curve) -> Curve:
         )
 
     std = None if curve.std is None else medians(curve.std[finite])
-    return Curve((edges[1:] + edges[:-1]) / 2, medians(y), std)
+    return PlotCurve((edges[1:] + edges[:-1]) / 2, medians(y), std)

@@ -278,8 +278,8 @@ def _stiffness_figure(curve: StiffnessCurve, units: Units) -> str:
     figure, (axes,) = plots.new_figure(width=_WIDTH, height=3.0)
     phi = curve.deflection_rad
     curves = {
-        "as declared": plots.Curve(phi, curve.before_nm_rad, curve.before_std_nm_rad),
-        "refitted": plots.Curve(phi, curve.after_nm_rad, curve.after_std_nm_rad),
+        "as declared": plots.PlotCurve(phi, curve.before_nm_rad, curve.before_std_nm_rad),
+        "refitted": plots.PlotCurve(phi, curve.after_nm_rad, curve.after_std_nm_rad),
     }
     plots.xy(axes, curves, units.label("deflection / rad"), units.label("stiffness / (N·m/rad)"))
     caption = (
@@ -319,10 +319,10 @@ def _series_figure(outcome: Diagnosis, units: Units) -> str:
         return ""
     figure, axes = plots.new_figure(rows=2, width=_WIDTH, height=2.2)
     torque = units.label("torque / N·m")
-    plots.over_time(axes[0], {"measured": plots.Curve(series.time_s, series.torque_nm)}, torque)
+    plots.over_time(axes[0], {"measured": plots.PlotCurve(series.time_s, series.torque_nm)}, torque)
     curves = {
-        "left before": plots.Curve(series.time_s, series.before_nm),
-        "left after": plots.Curve(series.time_s, series.after_nm),
+        "left before": plots.PlotCurve(series.time_s, series.before_nm),
+        "left after": plots.PlotCurve(series.time_s, series.after_nm),
     }
     plots.over_time(axes[1], curves, torque)
     return f"<figure>{plots.svg_text(figure)}</figure>"

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from drivelink.output import plots
-from drivelink.output.plots import Curve
+from drivelink.output.plots import PlotCurve
 from estimator.sample import FloatArray
 
 
@@ -17,7 +17,7 @@ def plot_curves(columns: Mapping[str, FloatArray], motors: int, path: Path, titl
     figure, axes = plots.new_figure(title, height=3.6)
     seen = columns["observable"] > 0
     curves = {
-        f"motor {i}": Curve(
+        f"motor {i}": PlotCurve(
             columns[f"motor{i}_deflection_rad"][seen],
             columns[f"motor{i}_stiffness_nm_rad"][seen],
             columns[f"motor{i}_stiffness_std_nm_rad"][seen],
@@ -32,9 +32,9 @@ def plot_over_time(columns: Mapping[str, FloatArray], path: Path, title: str) ->
     """The joint's flexibility torque and stiffness over time."""
     figure, axes = plots.new_figure(title, rows=2)
     t = columns["time_s"]
-    torque = {"estimate": Curve(t, columns["flexibility_torque_nm"])}
+    torque = {"estimate": PlotCurve(t, columns["flexibility_torque_nm"])}
     plots.over_time(axes[0], torque, "torque / N·m", "Flexibility torque")
-    stiffness = Curve(t, columns["stiffness_nm_rad"], columns["stiffness_std_nm_rad"])
+    stiffness = PlotCurve(t, columns["stiffness_nm_rad"], columns["stiffness_std_nm_rad"])
     plots.over_time(axes[1], {"estimate": stiffness}, "stiffness / (N·m/rad)", "Stiffness")
     low, high = np.nanpercentile(stiffness.y, [1, 99]) if np.any(np.isfinite(stiffness.y)) else (0.0, 1.0)
     margin = 0.25 * (high - low) + 0.02 * abs(high)

@@ -17,7 +17,7 @@ _FASTEST = 0x7FFF
 _OPERATING_BITS = SCALING | REVERSED
 
 
-class Scale(Protocol):
+class MeasuredAngle(Protocol):
     """The measured angle (`sim.world.World`)."""
 
     @property
@@ -63,7 +63,11 @@ class Cia406Encoder(Node):
     sends_on_change = False  # CiA 406: the asynchronous TPDO goes by the cyclic timer
 
     def __init__(
-        self, node_id: int, scale: Scale, data: EncoderData | None = None, quirks: Quirks | None = None
+        self,
+        node_id: int,
+        scale: MeasuredAngle,
+        data: EncoderData | None = None,
+        quirks: Quirks | None = None,
     ) -> None:
         self._scale = scale
         self.data = data or EncoderData()

@@ -97,7 +97,7 @@ Apply = Callable[[Assembly, int, Values], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Parameter:
+class EffectParameter:
     """A parameter of an effect.
 
     Attributes:
@@ -126,5 +126,5 @@ class Definition:
     name: str
     location: str
     meaning: str
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[EffectParameter, ...]
     apply: Apply

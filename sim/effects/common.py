@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import math
 
-from sim.effects.assembly import Parameter, Values
+from sim.effects.assembly import EffectParameter, Values
 from sim.effects.memory import Slip
 from sim.errors import SimError
 from sim.plant import Dry
 
-SMOOTHING = Parameter(
+SMOOTHING = EffectParameter(
     "smoothing_rad_s", "velocity below which an oil film carries the load; 0: dry, it sticks", 0.0
 )
 SLIP = (
-    Parameter("torque_nm", "torque once everything slides"),
-    Parameter("displacement_rad", "displacement over which it builds up", 0.01),
-    Parameter("exponent", "n of the law (1: Dahl, 2: Bouc-Wen, 50: a spring that slips)", 2.0),
-    Parameter("shape", "s of the law (1: Dahl, 0.5: Bouc-Wen)", 0.5),
-    Parameter("elements", "elements side by side, their scales a factor of two apart", 3.0),
+    EffectParameter("torque_nm", "torque once everything slides"),
+    EffectParameter("displacement_rad", "displacement over which it builds up", 0.01),
+    EffectParameter("exponent", "n of the law (1: Dahl, 2: Bouc-Wen, 50: a spring that slips)", 2.0),
+    EffectParameter("shape", "s of the law (1: Dahl, 0.5: Bouc-Wen)", 0.5),
+    EffectParameter("elements", "elements side by side, their scales a factor of two apart", 3.0),
 )
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from sim.effects.assembly import Assembly, Definition, Parameter, Values
+from sim.effects.assembly import Assembly, Definition, EffectParameter, Values
 from sim.effects.common import SMOOTHING, at_speed, not_negative, wave
 
 
@@ -42,8 +42,8 @@ DEFINITIONS = (
         location="link",
         meaning="gravity beyond what is declared",
         parameters=(
-            Parameter("sin_nm", "torque times sin q"),
-            Parameter("cos_nm", "torque times cos q", 0.0),
+            EffectParameter("sin_nm", "torque times sin q"),
+            EffectParameter("cos_nm", "torque times cos q", 0.0),
         ),
         apply=_gravity,
     ),
@@ -51,21 +51,21 @@ DEFINITIONS = (
         name="link_coulomb_friction",
         location="link",
         meaning="dry friction of the link, which sticks",
-        parameters=(Parameter("torque_nm", "friction torque"), SMOOTHING),
+        parameters=(EffectParameter("torque_nm", "friction torque"), SMOOTHING),
         apply=_link_coulomb,
     ),
     Definition(
         name="link_viscous_damping",
         location="link",
         meaning="viscous damping beyond what is declared",
-        parameters=(Parameter("damping_nm_s_rad", "torque per velocity"),),
+        parameters=(EffectParameter("damping_nm_s_rad", "torque per velocity"),),
         apply=_link_viscous,
     ),
     Definition(
         name="link_inertia",
         location="link",
         meaning="inertia beyond what is declared",
-        parameters=(Parameter("inertia_kg_m2", "that inertia"),),
+        parameters=(EffectParameter("inertia_kg_m2", "that inertia"),),
         apply=_link_inertia,
     ),
     Definition(
@@ -73,9 +73,9 @@ DEFINITIONS = (
         location="link",
         meaning="the link touches something elastic",
         parameters=(
-            Parameter("stiffness_nm_rad", "stiffness of what is touched"),
-            Parameter("position_rad", "link position of the first touch", 0.3),
-            Parameter("side", "1: touched from below, -1: from above", 1.0),
+            EffectParameter("stiffness_nm_rad", "stiffness of what is touched"),
+            EffectParameter("position_rad", "link position of the first touch", 0.3),
+            EffectParameter("side", "1: touched from below, -1: from above", 1.0),
         ),
         apply=_contact,
     ),

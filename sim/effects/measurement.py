@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from sim.effects.assembly import Assembly, Definition, Parameter, Values
+from sim.effects.assembly import Assembly, Definition, EffectParameter, Values
 from sim.effects.common import not_negative, wave
 
 
@@ -35,7 +35,7 @@ DEFINITIONS = (
         name="deflection_offset",
         location="measurement",
         meaning="constant offset of the link encoder, or with two motors of that motor's encoder",
-        parameters=(Parameter("offset_rad", "deflection that is read where there is none"),),
+        parameters=(EffectParameter("offset_rad", "deflection that is read where there is none"),),
         apply=_deflection_offset,
     ),
     Definition(
@@ -43,8 +43,8 @@ DEFINITIONS = (
         location="measurement",
         meaning="the link encoder's disc is off centre",
         parameters=(
-            Parameter("sin_rad", "error of the reading, sine of q"),
-            Parameter("cos_rad", "error of the reading, cosine of q", 0.0),
+            EffectParameter("sin_rad", "error of the reading, sine of q"),
+            EffectParameter("cos_rad", "error of the reading, cosine of q", 0.0),
         ),
         apply=_eccentricity,
     ),
@@ -52,14 +52,14 @@ DEFINITIONS = (
         name="encoder_delay",
         location="measurement",
         meaning="the link position is older than the rest",
-        parameters=(Parameter("delay_s", "by this time"),),
+        parameters=(EffectParameter("delay_s", "by this time"),),
         apply=_encoder_delay,
     ),
     Definition(
         name="encoder_scale",
         location="measurement",
         meaning="the link encoder's scale is wrong",
-        parameters=(Parameter("relative_error", "share by which it reads too much"),),
+        parameters=(EffectParameter("relative_error", "share by which it reads too much"),),
         apply=_encoder_scale,
     ),
 )

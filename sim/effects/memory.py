@@ -164,7 +164,7 @@ class Lag:
         return torque + ahead * self._mean
 
 
-class History:
+class PositionHistory:
     """Past positions of a body: samples at plant steps, cubic interpolation between them."""
 
     def __init__(self, delay_s: float, step_s: float, position: float) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from sim.effects.assembly import Assembly, Definition, Parameter, Values
+from sim.effects.assembly import Assembly, Definition, EffectParameter, Values
 from sim.effects.common import SLIP, SMOOTHING, at_speed, not_negative, slip, wave
 
 
@@ -104,7 +104,7 @@ DEFINITIONS = (
         name="coulomb_friction",
         location="motor",
         meaning="dry friction of one level, which sticks",
-        parameters=(Parameter("torque_nm", "friction torque"), SMOOTHING),
+        parameters=(EffectParameter("torque_nm", "friction torque"), SMOOTHING),
         apply=_coulomb,
     ),
     Definition(
@@ -112,9 +112,9 @@ DEFINITIONS = (
         location="motor",
         meaning="dry friction that falls with velocity",
         parameters=(
-            Parameter("torque_nm", "friction torque while sliding"),
-            Parameter("stribeck_nm", "what is added near standstill", lambda torque: 0.8 * torque),
-            Parameter("stribeck_velocity_rad_s", "velocity at which it has decayed", 0.1),
+            EffectParameter("torque_nm", "friction torque while sliding"),
+            EffectParameter("stribeck_nm", "what is added near standstill", lambda torque: 0.8 * torque),
+            EffectParameter("stribeck_velocity_rad_s", "velocity at which it has decayed", 0.1),
             SMOOTHING,
         ),
         apply=_stribeck,
@@ -124,8 +124,10 @@ DEFINITIONS = (
         location="motor",
         meaning="dry friction that differs between the directions",
         parameters=(
-            Parameter("positive_nm", "friction torque in positive motion"),
-            Parameter("negative_nm", "friction torque in negative motion", lambda positive: 0.4 * positive),
+            EffectParameter("positive_nm", "friction torque in positive motion"),
+            EffectParameter(
+                "negative_nm", "friction torque in negative motion", lambda positive: 0.4 * positive
+            ),
             SMOOTHING,
         ),
         apply=_asymmetric,
@@ -141,21 +143,21 @@ DEFINITIONS = (
         name="load_dependent_friction",
         location="motor",
         meaning="dry friction in proportion to the transmitted torque",
-        parameters=(Parameter("coefficient", "friction per transmission torque"), SMOOTHING),
+        parameters=(EffectParameter("coefficient", "friction per transmission torque"), SMOOTHING),
         apply=_load_dependent,
     ),
     Definition(
         name="viscous_damping",
         location="motor",
         meaning="viscous damping beyond what is declared",
-        parameters=(Parameter("damping_nm_s_rad", "torque per velocity"),),
+        parameters=(EffectParameter("damping_nm_s_rad", "torque per velocity"),),
         apply=_viscous,
     ),
     Definition(
         name="quadratic_damping",
         location="motor",
         meaning="damping with the square of velocity",
-        parameters=(Parameter("damping_nm_s2_rad2", "torque per squared velocity"),),
+        parameters=(EffectParameter("damping_nm_s2_rad2", "torque per squared velocity"),),
         apply=_quadratic,
     ),
     Definition(
@@ -163,9 +165,9 @@ DEFINITIONS = (
         location="motor",
         meaning="torque ripple over the motor position",
         parameters=(
-            Parameter("sin_nm", "amplitude of the sine"),
-            Parameter("cos_nm", "amplitude of the cosine", 0.0),
-            Parameter("periods_per_rev", "periods in one joint revolution", 24.0),
+            EffectParameter("sin_nm", "amplitude of the sine"),
+            EffectParameter("cos_nm", "amplitude of the cosine", 0.0),
+            EffectParameter("periods_per_rev", "periods in one joint revolution", 24.0),
         ),
         apply=_cogging,
     ),
@@ -173,21 +175,21 @@ DEFINITIONS = (
         name="torque_offset",
         location="motor",
         meaning="a constant torque that opposes what the drive reports",
-        parameters=(Parameter("torque_nm", "that torque"),),
+        parameters=(EffectParameter("torque_nm", "that torque"),),
         apply=_torque_offset,
     ),
     Definition(
         name="torque_constant",
         location="motor",
         meaning="torque per ampere is another one than the drive believes",
-        parameters=(Parameter("relative_error", "share by which more torque acts than is reported"),),
+        parameters=(EffectParameter("relative_error", "share by which more torque acts than is reported"),),
         apply=_torque_constant,
     ),
     Definition(
         name="torque_saturation",
         location="motor",
         meaning="iron saturates: large torques fall short, tau / sqrt(1 + 2 c tau²)",
-        parameters=(Parameter("coefficient_per_nm2", "c; small torques lose c tau³"),),
+        parameters=(EffectParameter("coefficient_per_nm2", "c; small torques lose c tau³"),),
         apply=_saturation,
     ),
     Definition(
@@ -195,8 +197,8 @@ DEFINITIONS = (
         location="motor",
         meaning="torque per ampere changes as the motor warms up",
         parameters=(
-            Parameter("relative_change", "change in the long run"),
-            Parameter("time_constant_s", "time constant of the change", 20.0),
+            EffectParameter("relative_change", "change in the long run"),
+            EffectParameter("time_constant_s", "time constant of the change", 20.0),
         ),
         apply=_drift,
     ),
@@ -204,14 +206,14 @@ DEFINITIONS = (
         name="motor_inertia",
         location="motor",
         meaning="inertia beyond what is declared",
-        parameters=(Parameter("inertia_kg_m2", "that inertia, at the joint"),),
+        parameters=(EffectParameter("inertia_kg_m2", "that inertia, at the joint"),),
         apply=_motor_inertia,
     ),
     Definition(
         name="torque_delay",
         location="motor",
         meaning="the torque acts later than it is reported",
-        parameters=(Parameter("delay_s", "by this time"),),
+        parameters=(EffectParameter("delay_s", "by this time"),),
         apply=_torque_delay,
     ),
     Definition(
@@ -219,7 +221,9 @@ DEFINITIONS = (
         location="motor",
         meaning="the torque acts behind a first-order lag",
         parameters=(
-            Parameter("time_constant_s", "of the lag; negative: the reported torque lags the acting one"),
+            EffectParameter(
+                "time_constant_s", "of the lag; negative: the reported torque lags the acting one"
+            ),
         ),
         apply=_torque_lag,
     ),
@@ -227,7 +231,7 @@ DEFINITIONS = (
         name="back_driving_loss",
         location="motor",
         meaning="the gear loses a share of the torque while the link drives the motor",
-        parameters=(Parameter("coefficient", "loss per transmission torque"), SMOOTHING),
+        parameters=(EffectParameter("coefficient", "loss per transmission torque"), SMOOTHING),
         apply=_back_driving,
     ),
 )

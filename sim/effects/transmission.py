@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from sim.effects.assembly import Assembly, Definition, Parameter, Values
+from sim.effects.assembly import Assembly, Definition, EffectParameter, Values
 from sim.effects.common import SLIP, not_negative, slip, wave
 from sim.errors import SimError
 from sim.springs import Law
@@ -93,8 +93,8 @@ DEFINITIONS = (
         location="transmission",
         meaning="play: a range of deflection without torque",
         parameters=(
-            Parameter("half_gap_rad", "half of the gap"),
-            Parameter(
+            EffectParameter("half_gap_rad", "half of the gap"),
+            EffectParameter(
                 "stiffness_nm_rad", "stiffness that is missing inside the gap; 0: the spring as a whole", 0.0
             ),
         ),
@@ -104,7 +104,7 @@ DEFINITIONS = (
         name="asymmetric_stiffness",
         location="transmission",
         meaning="stiffness that differs between the directions",
-        parameters=(Parameter("coefficient_nm_rad2", "torque per squared deflection"),),
+        parameters=(EffectParameter("coefficient_nm_rad2", "torque per squared deflection"),),
         apply=_asymmetric_stiffness,
     ),
     Definition(
@@ -112,8 +112,8 @@ DEFINITIONS = (
         location="transmission",
         meaning="stiffening beyond the declared law",
         parameters=(
-            Parameter("coefficient", "torque per power of deflection, N·m/rad^power"),
-            Parameter("power", "power of the deflection", 5.0),
+            EffectParameter("coefficient", "torque per power of deflection, N·m/rad^power"),
+            EffectParameter("power", "power of the deflection", 5.0),
         ),
         apply=_higher_order,
     ),
@@ -121,7 +121,7 @@ DEFINITIONS = (
         name="transmission_damping",
         location="transmission",
         meaning="viscous damping of the transmission",
-        parameters=(Parameter("damping_nm_s_rad", "torque per deflection rate"),),
+        parameters=(EffectParameter("damping_nm_s_rad", "torque per deflection rate"),),
         apply=_transmission_damping,
     ),
     Definition(
@@ -129,9 +129,9 @@ DEFINITIONS = (
         location="transmission",
         meaning="the gear turns unevenly: the spring sees more deflection than there is",
         parameters=(
-            Parameter("sin_rad", "amplitude of the sine, as a deflection"),
-            Parameter("cos_rad", "amplitude of the cosine", 0.0),
-            Parameter("periods_per_rev", "periods in one joint revolution", 16.0),
+            EffectParameter("sin_rad", "amplitude of the sine, as a deflection"),
+            EffectParameter("cos_rad", "amplitude of the cosine", 0.0),
+            EffectParameter("periods_per_rev", "periods in one joint revolution", 16.0),
         ),
         apply=_kinematic_error,
     ),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from sim.effects.assembly import Assembly, Definition, Parameter, Values
+from sim.effects.assembly import Assembly, Definition, EffectParameter, Values
 from sim.effects.common import not_negative
 from sim.effects.memory import Creep
 from sim.errors import SimError
@@ -59,7 +59,7 @@ def _interpolation_error(a: Assembly, m: int, p: Values) -> None:
     a.link.readings.append(lambda q: q + height * sin(n * q))
 
 
-_WIDTH = Parameter("width_rad", "how far it reaches", 0.1)
+_WIDTH = EffectParameter("width_rad", "how far it reaches", 0.1)
 
 DEFINITIONS = (
     Definition(
@@ -67,8 +67,8 @@ DEFINITIONS = (
         location="motor",
         meaning="dry friction in one place only",
         parameters=(
-            Parameter("torque_nm", "friction torque there"),
-            Parameter("position_rad", "where, as motor position at the joint", 0.0),
+            EffectParameter("torque_nm", "friction torque there"),
+            EffectParameter("position_rad", "where, as motor position at the joint", 0.0),
             _WIDTH,
         ),
         apply=_damaged_tooth,
@@ -78,8 +78,8 @@ DEFINITIONS = (
         location="motor",
         meaning="dry friction that fades as the joint warms up",
         parameters=(
-            Parameter("torque_nm", "friction torque at the start"),
-            Parameter("time_constant_s", "in which it fades", 5.0),
+            EffectParameter("torque_nm", "friction torque at the start"),
+            EffectParameter("time_constant_s", "in which it fades", 5.0),
         ),
         apply=_cold_grease,
     ),
@@ -88,8 +88,8 @@ DEFINITIONS = (
         location="motor",
         meaning="ripple in proportion to the torque, over the motor position",
         parameters=(
-            Parameter("relative", "share of the torque"),
-            Parameter("periods_per_rev", "periods in one joint revolution", 20.0),
+            EffectParameter("relative", "share of the torque"),
+            EffectParameter("periods_per_rev", "periods in one joint revolution", 20.0),
         ),
         apply=_phase_imbalance,
     ),
@@ -98,8 +98,8 @@ DEFINITIONS = (
         location="transmission",
         meaning="stiffness that varies over the motor position",
         parameters=(
-            Parameter("relative", "share of the stiffness"),
-            Parameter("periods_per_rev", "periods in one joint revolution", 10.0),
+            EffectParameter("relative", "share of the stiffness"),
+            EffectParameter("periods_per_rev", "periods in one joint revolution", 10.0),
         ),
         apply=_mesh_stiffness,
     ),
@@ -108,8 +108,8 @@ DEFINITIONS = (
         location="transmission",
         meaning="a further spring that relaxes (Maxwell)",
         parameters=(
-            Parameter("stiffness_nm_rad", "stiffness at once"),
-            Parameter("time_constant_s", "in which it relaxes", 0.5),
+            EffectParameter("stiffness_nm_rad", "stiffness at once"),
+            EffectParameter("time_constant_s", "in which it relaxes", 0.5),
         ),
         apply=_creep,
     ),
@@ -118,8 +118,8 @@ DEFINITIONS = (
         location="link",
         meaning="a cable that is pushed aside in one place",
         parameters=(
-            Parameter("torque_nm", "largest torque, on either side of it"),
-            Parameter("position_rad", "where", 0.1),
+            EffectParameter("torque_nm", "largest torque, on either side of it"),
+            EffectParameter("position_rad", "where", 0.1),
             _WIDTH,
         ),
         apply=_cable_pull,
@@ -128,7 +128,7 @@ DEFINITIONS = (
         name="air_drag",
         location="link",
         meaning="drag with the square of the link velocity",
-        parameters=(Parameter("damping_nm_s2_rad2", "torque per squared velocity"),),
+        parameters=(EffectParameter("damping_nm_s2_rad2", "torque per squared velocity"),),
         apply=_air_drag,
     ),
     Definition(
@@ -136,8 +136,8 @@ DEFINITIONS = (
         location="measurement",
         meaning="the link encoder errs within each of its lines",
         parameters=(
-            Parameter("amplitude_rad", "largest error"),
-            Parameter("periods_per_rev", "lines of its disc", 64.0),
+            EffectParameter("amplitude_rad", "largest error"),
+            EffectParameter("periods_per_rev", "lines of its disc", 64.0),
         ),
         apply=_interpolation_error,
     ),

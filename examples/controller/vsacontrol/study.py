@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from drivelink import jointfile
-from drivelink.output.plots import Curve, new_figure, over_time, save
+from drivelink.output.plots import PlotCurve, new_figure, over_time, save
 from estimator.sample import FloatArray
 from sim.cases import case
 from sim.excitation import build
@@ -219,11 +219,11 @@ def draw(outcomes: Sequence[Outcome], folder: Path) -> list[Path]:
         figure, axes = new_figure(f"{LAWS[law].title}: {scene}", rows=4, width=8.0, height=2.1)
         for axis, value, name in ((0, "q", "q / rad"), (1, "sigma", "σ / (N·m/rad)")):
             pairs = {o.knowledge: (o.time_s, getattr(o, value)) for o in runs}
-            curves = {knowledge: Curve(t, pair[:, 0]) for knowledge, (t, pair) in pairs.items()}
-            curves["wanted"] = Curve(runs[0].time_s, getattr(runs[0], value)[:, 1])
+            curves = {knowledge: PlotCurve(t, pair[:, 0]) for knowledge, (t, pair) in pairs.items()}
+            curves["wanted"] = PlotCurve(runs[0].time_s, getattr(runs[0], value)[:, 1])
             over_time(axes[axis], curves, name)
             off = {
-                knowledge: Curve(t, 1e3 * np.abs(pair[:, 0] - pair[:, 1]) + _LEAST)
+                knowledge: PlotCurve(t, 1e3 * np.abs(pair[:, 0] - pair[:, 1]) + _LEAST)
                 for knowledge, (t, pair) in pairs.items()
             }
             over_time(axes[axis + 2], off, f"|error of {name.replace(' / ', '| / m').replace('m(', '(m')}")

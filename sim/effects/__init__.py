@@ -1,7 +1,10 @@
 """Physical effects that can be switched on in the world, by name.
 
-`LISTED` has the effects of the estimator's library, with the same names and parameters but independent laws;
-`UNLISTED` has others, which a diagnosis has to call "unexplained".
+Each module defines the effects of one place, and fills `LISTED` or `UNLISTED` with them.
+
+Signs: x of a motor opposes it in eqs 5, 7, x of the link opposes it in eqs 4, 6, x of a transmission adds
+to tau_e. Names and parameters are the estimator's, so that a model can be simulated; the laws are
+independent.
 """
 
 from __future__ import annotations
@@ -9,20 +12,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from importlib import import_module
 
-from sim.effects import link, measurement, motor, transmission, unlisted
-from sim.effects.assembly import Assembly, Definition, Values
+from sim.effects.assembly import LISTED, UNLISTED, Assembly, Definition, Values
 from sim.errors import SimError
 from sim.plant import JointPlant
 
 __all__ = ["LISTED", "UNLISTED", "Assembly", "Definition", "PlantEffect", "assemble", "make", "parse"]
 
-LISTED: dict[str, Definition] = {
-    definition.name: definition
-    for module in (motor, transmission, measurement, link)
-    for definition in module.DEFINITIONS
-}
-UNLISTED: dict[str, Definition] = {definition.name: definition for definition in unlisted.DEFINITIONS}
+for _place in ("motor", "transmission", "measurement", "link", "unlisted"):
+    import_module(f"sim.effects.{_place}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -128,3 +128,23 @@ class Definition:
     meaning: str
     parameters: tuple[EffectParameter, ...]
     apply: Apply
+
+
+LISTED: dict[str, Definition] = {}
+"""Effects of the estimator's library, with the same names and parameters but independent laws."""
+UNLISTED: dict[str, Definition] = {}
+"""Others, which a diagnosis has to call "unexplained"."""
+
+
+def define(
+    library: dict[str, Definition], location: str, name: str, meaning: str, *parameters: Parameter
+) -> Callable[[Apply], Apply]:
+    """Put a function into a library as an effect; the arguments are those of `Definition`."""
+
+    def put(apply: Apply) -> Apply:
+        library[name] = Definition(
+            name=name, location=location, meaning=meaning, parameters=parameters, apply=apply
+        )
+        return apply
+
+    return put

@@ -3,34 +3,75 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
-from sim.effects.assembly import Assembly, Definition, EffectParameter, Values
+from sim.effects.assembly import UNLISTED, Assembly, EffectParameter, Values, define
 from sim.effects.common import not_negative
 from sim.effects.memory import Creep
 from sim.errors import SimError
 
+_effect = partial(define, UNLISTED)
 
+_WIDTH = EffectParameter("width_rad", "how far it reaches", 0.1)
+
+
+@_effect(
+    "motor",
+    "damaged_tooth",
+    "dry friction in one place only",
+    EffectParameter("torque_nm", "friction torque there"),
+    EffectParameter("position_rad", "where, as motor position at the joint", 0.0),
+    _WIDTH,
+)
 def _damaged_tooth(a: Assembly, m: int, p: Values) -> None:
     level, at, per, exp = not_negative(p, "torque_nm"), p["position_rad"], 1.0 / p["width_rad"], math.exp
     a.motors[m].dry.append(lambda theta, w, te, t: level * exp(-(((theta - at) * per) ** 2)))
 
 
+@_effect(
+    "motor",
+    "cold_grease",
+    "dry friction that fades as the joint warms up",
+    EffectParameter("torque_nm", "friction torque at the start"),
+    EffectParameter("time_constant_s", "in which it fades", 5.0),
+)
 def _cold_grease(a: Assembly, m: int, p: Values) -> None:
     level, rate, exp = not_negative(p, "torque_nm"), 1.0 / p["time_constant_s"], math.exp
     a.motors[m].dry.append(lambda theta, w, te, t: level * exp(-rate * t))
 
 
+@_effect(
+    "motor",
+    "phase_imbalance",
+    "ripple in proportion to the torque, over the motor position",
+    EffectParameter("relative", "share of the torque"),
+    EffectParameter("periods_per_rev", "periods in one joint revolution", 20.0),
+)
 def _phase_imbalance(a: Assembly, m: int, p: Values) -> None:
     share, n, sin = p["relative"], p["periods_per_rev"], math.sin
     a.motors[m].torque_path.append(lambda tau, t, theta: tau * (1.0 + share * sin(n * theta)))
 
 
+@_effect(
+    "transmission",
+    "mesh_stiffness",
+    "stiffness that varies over the motor position",
+    EffectParameter("relative", "share of the stiffness"),
+    EffectParameter("periods_per_rev", "periods in one joint revolution", 10.0),
+)
 def _mesh_stiffness(a: Assembly, m: int, p: Values) -> None:
     share, n, sin = p["relative"], p["periods_per_rev"], math.sin
     torque = a.plant.motors[m].law().torque
     a.motors[m].extras.append(lambda phi, rate, theta: share * sin(n * theta) * torque(phi))
 
 
+@_effect(
+    "transmission",
+    "creep",
+    "a further spring that relaxes (Maxwell)",
+    EffectParameter("stiffness_nm_rad", "stiffness at once"),
+    EffectParameter("time_constant_s", "in which it relaxes", 0.5),
+)
 def _creep(a: Assembly, m: int, p: Values) -> None:
     if p["time_constant_s"] <= 0.0:
         raise SimError(f"time_constant_s: expected a number > 0, got {p['time_constant_s']!r}")
@@ -39,6 +80,14 @@ def _creep(a: Assembly, m: int, p: Values) -> None:
     a.motors[m].commits.append(lambda theta, phi: element.commit(phi))
 
 
+@_effect(
+    "link",
+    "cable_pull",
+    "a cable that is pushed aside in one place",
+    EffectParameter("torque_nm", "largest torque, on either side of it"),
+    EffectParameter("position_rad", "where", 0.1),
+    _WIDTH,
+)
 def _cable_pull(a: Assembly, m: int, p: Values) -> None:
     height, at, per, exp = p["torque_nm"], p["position_rad"], 1.0 / p["width_rad"], math.exp
 
@@ -49,96 +98,24 @@ def _cable_pull(a: Assembly, m: int, p: Values) -> None:
     a.link.loads.append(pull)
 
 
+@_effect(
+    "link",
+    "air_drag",
+    "drag with the square of the link velocity",
+    EffectParameter("damping_nm_s2_rad2", "torque per squared velocity"),
+)
 def _air_drag(a: Assembly, m: int, p: Values) -> None:
     c = p["damping_nm_s2_rad2"]
     a.link.loads.append(lambda q, v: c * v * abs(v))
 
 
+@_effect(
+    "measurement",
+    "interpolation_error",
+    "the link encoder errs within each of its lines",
+    EffectParameter("amplitude_rad", "largest error"),
+    EffectParameter("periods_per_rev", "lines of its disc", 64.0),
+)
 def _interpolation_error(a: Assembly, m: int, p: Values) -> None:
     height, n, sin = p["amplitude_rad"], p["periods_per_rev"], math.sin
     a.link.readings.append(lambda q: q + height * sin(n * q))
-
-
-_WIDTH = EffectParameter("width_rad", "how far it reaches", 0.1)
-
-DEFINITIONS = (
-    Definition(
-        name="damaged_tooth",
-        location="motor",
-        meaning="dry friction in one place only",
-        parameters=(
-            EffectParameter("torque_nm", "friction torque there"),
-            EffectParameter("position_rad", "where, as motor position at the joint", 0.0),
-            _WIDTH,
-        ),
-        apply=_damaged_tooth,
-    ),
-    Definition(
-        name="cold_grease",
-        location="motor",
-        meaning="dry friction that fades as the joint warms up",
-        parameters=(
-            EffectParameter("torque_nm", "friction torque at the start"),
-            EffectParameter("time_constant_s", "in which it fades", 5.0),
-        ),
-        apply=_cold_grease,
-    ),
-    Definition(
-        name="phase_imbalance",
-        location="motor",
-        meaning="ripple in proportion to the torque, over the motor position",
-        parameters=(
-            EffectParameter("relative", "share of the torque"),
-            EffectParameter("periods_per_rev", "periods in one joint revolution", 20.0),
-        ),
-        apply=_phase_imbalance,
-    ),
-    Definition(
-        name="mesh_stiffness",
-        location="transmission",
-        meaning="stiffness that varies over the motor position",
-        parameters=(
-            EffectParameter("relative", "share of the stiffness"),
-            EffectParameter("periods_per_rev", "periods in one joint revolution", 10.0),
-        ),
-        apply=_mesh_stiffness,
-    ),
-    Definition(
-        name="creep",
-        location="transmission",
-        meaning="a further spring that relaxes (Maxwell)",
-        parameters=(
-            EffectParameter("stiffness_nm_rad", "stiffness at once"),
-            EffectParameter("time_constant_s", "in which it relaxes", 0.5),
-        ),
-        apply=_creep,
-    ),
-    Definition(
-        name="cable_pull",
-        location="link",
-        meaning="a cable that is pushed aside in one place",
-        parameters=(
-            EffectParameter("torque_nm", "largest torque, on either side of it"),
-            EffectParameter("position_rad", "where", 0.1),
-            _WIDTH,
-        ),
-        apply=_cable_pull,
-    ),
-    Definition(
-        name="air_drag",
-        location="link",
-        meaning="drag with the square of the link velocity",
-        parameters=(EffectParameter("damping_nm_s2_rad2", "torque per squared velocity"),),
-        apply=_air_drag,
-    ),
-    Definition(
-        name="interpolation_error",
-        location="measurement",
-        meaning="the link encoder errs within each of its lines",
-        parameters=(
-            EffectParameter("amplitude_rad", "largest error"),
-            EffectParameter("periods_per_rev", "lines of its disc", 64.0),
-        ),
-        apply=_interpolation_error,
-    ),
-)

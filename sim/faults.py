@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from sim.canopen.drive import Cia402Drive, DriveReadings
+from sim.canopen.drive import Cia402Drive
 from sim.canopen.node import Node
 from sim.canopen.tpdo import Tpdo
 from sim.network import Network
+from sim.sensors import DriveSignals
 
 Action = Callable[[], None]
 
@@ -81,7 +82,7 @@ class Faults:
         else:
             node.emergency.raise_error(code, register, vendor)
 
-    def misread(self, node: Cia402Drive, lie: Callable[[DriveReadings], DriveReadings] | None) -> None:
+    def misread(self, node: Cia402Drive, lie: Callable[[DriveSignals], DriveSignals] | None) -> None:
         """Falsify its sensors from now on; None: correct readings again."""
         node.misread = lie
 

@@ -12,11 +12,11 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from typing import Protocol
 
 import can
 
 from sim.canopen.node import Node
+from sim.world import World
 
 _log = logging.getLogger(__name__)
 
@@ -25,17 +25,6 @@ _LONGEST_CATCH_UP_S = 0.2
 _PHASE_GAIN = 0.05  # of the lock of control periods to the SYNC
 _TICK_S = 0.005
 _RETRY_S = 0.1
-
-
-class Moving(Protocol):
-    """What a SYNC advances (`sim.world.World`)."""
-
-    @property
-    def period_s(self) -> float:
-        """Control period."""
-
-    def advance(self, periods: int = 1) -> None:
-        """Advance by whole periods."""
 
 
 class Network:
@@ -60,7 +49,7 @@ class Network:
         self,
         bus: can.BusABC,
         nodes: Iterable[Node],
-        *worlds: Moving,
+        *worlds: World,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.nodes = list(nodes)

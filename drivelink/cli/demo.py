@@ -21,9 +21,10 @@ from rich.live import Live
 from drivelink import jointfile
 from drivelink.demo.closing import as_json, closing_table
 from drivelink.demo.comparison import Comparison
-from drivelink.demo.rig import Failure, RunSummary, TruePoint, serve
+from drivelink.demo.rig import Failure, RunSummary, serve
 from drivelink.errors import DrivelinkError
 from drivelink.jointfile import JointFile
+from drivelink.monitor.history import TruePoint
 from drivelink.monitor.view import JointView
 from drivelink.pubsub.client import Subscription, subscribe
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple, TypeVar
 
-from drivelink.demo.rig import TruePoint
-from drivelink.monitor.history import EstimateLike
+from drivelink.monitor.history import TruePoint
+from drivelink.pubsub.wire import EstimateMessage
 from estimator.sample import SIGMA_95, Status
 
 T = TypeVar("T")
@@ -38,13 +38,13 @@ class Comparison:
     """
 
     def __init__(self) -> None:
-        self.latest: tuple[EstimateLike, TruePoint] | None = None
-        self._estimates: dict[int, EstimateLike] = {}
+        self.latest: tuple[EstimateMessage, TruePoint] | None = None
+        self._estimates: dict[int, EstimateMessage] = {}
         self._truth: dict[int, TruePoint] = {}
         self._cycles = self._covered = 0
         self._sums = [0.0, 0.0, 0.0, 0.0]  # squared errors and squared truths: stiffness, torque
 
-    def received(self, estimate: EstimateLike) -> None:
+    def received(self, estimate: EstimateMessage) -> None:
         """Enter a received estimate."""
         truth = self._truth.pop(estimate.sequence, None)
         if truth is not None:
@@ -72,7 +72,7 @@ class Comparison:
             self._covered / self._cycles,
         )
 
-    def _pair(self, estimate: EstimateLike, truth: TruePoint) -> None:
+    def _pair(self, estimate: EstimateMessage, truth: TruePoint) -> None:
         self.latest = estimate, truth
         if not estimate.status & Status.VALID:
             return

@@ -12,25 +12,17 @@ import signal
 from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from drivelink import jointfile
 from drivelink._core import Tick
 from drivelink.cycle.loop import CycleSink
 from drivelink.daemon.service import Daemon, ServedJoint
-from drivelink.demo.simulate import network_from_joint, open_sim_bus, world_from_joint
+from drivelink.demo.simulate import World, network_from_joint, open_sim_bus, world_from_joint
 from drivelink.errors import DrivelinkError
-from drivelink.monitor.history import TruthLike
+from drivelink.monitor.history import TruePoint
 
 _BATCH = 50  # cycles per message to the watcher
-
-
-class TruePoint(NamedTuple):
-    """True state of the joint at one SYNC."""
-
-    sequence: int
-    flexibility_torque_nm: float
-    stiffness_nm_rad: float
 
 
 class RunSummary(NamedTuple):
@@ -51,17 +43,10 @@ class Failure(NamedTuple):
     exit_status: int
 
 
-class SimulatedWorld(Protocol):
-    """Interface of the simulated world."""
-
-    def truth(self) -> TruthLike:
-        """True state of the joint now."""
-
-
 class TruthTap:
     """Publishes like the daemon's publisher, and notes the truth at the same SYNC."""
 
-    def __init__(self, sink: CycleSink | None, world: SimulatedWorld, connection: Connection) -> None:
+    def __init__(self, sink: CycleSink | None, world: World, connection: Connection) -> None:
         self._sink = sink
         self._world = world
         self._connection = connection

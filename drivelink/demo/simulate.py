@@ -39,7 +39,7 @@ from sim.sensors import DriveHardware, LinkEncoder
 from sim.socketcand import DEFAULT_PORT, SocketcandServer
 from sim.springs import Spring
 from sim.variation import suitable, typical_torque_nm, with_parameters
-from sim.world import World
+from sim.world import World as World
 
 CASE_NAMES = tuple(CASES)
 QUIRK_NAMES = tuple(PROFILES)

@@ -8,10 +8,10 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
-from drivelink.pubsub.wire import ExternalMessage
-from estimator.sample import Status, TransmissionEstimate
+from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
+from estimator.sample import Status
 
 _BINS = 160
 _USABLE = int(Status.VALID | Status.OBSERVABLE)
@@ -19,44 +19,12 @@ _NEAR = 8  # neighbouring points on either side for the outlier test
 _OUTDATED = 2.5  # times the usual one there
 
 
-class EstimateLike(Protocol):
-    """An `Estimate`, or the message of one."""
+class TruePoint(NamedTuple):
+    """True state of a simulated joint at one SYNC."""
 
-    @property
-    def sequence(self) -> int:
-        """Number of the SYNC."""
-
-    @property
-    def status(self) -> int:
-        """Bits of `Status`."""
-
-    @property
-    def flexibility_torque_nm(self) -> float:
-        """The joint's flexibility torque."""
-
-    @property
-    def stiffness_nm_rad(self) -> float:
-        """The joint's stiffness."""
-
-    @property
-    def stiffness_std_nm_rad(self) -> float:
-        """Its standard deviation."""
-
-    @property
-    def transmissions(self) -> tuple[TransmissionEstimate, ...]:
-        """Each transmission's own."""
-
-
-class TruthLike(Protocol):
-    """The truth of a simulation."""
-
-    @property
-    def flexibility_torque_nm(self) -> float:
-        """The joint's flexibility torque."""
-
-    @property
-    def stiffness_nm_rad(self) -> float:
-        """The joint's stiffness."""
+    sequence: int
+    flexibility_torque_nm: float
+    stiffness_nm_rad: float
 
 
 class Moment(NamedTuple):
@@ -145,10 +113,10 @@ class JointHistory:
         self.residuals: deque[tuple[float, float]] = deque(maxlen=points)
         self.touches: deque[Touch] = deque(maxlen=points)
         self.touch: Touch | None = None
-        self.latest: EstimateLike | None = None
+        self.latest: EstimateMessage | None = None
         self._apart_s = seconds / points
 
-    def add(self, estimate: EstimateLike, time_s: float, truth: TruthLike | None = None) -> None:
+    def add(self, estimate: EstimateMessage, time_s: float, truth: TruePoint | None = None) -> None:
         """Enter one estimate; `time_s` is the time of its SYNC, with any origin."""
         if self.latest is not None and len(self.latest.transmissions) != len(estimate.transmissions):
             self.moments.clear()  # another joint has taken the name

@@ -19,9 +19,9 @@ from rich.table import Table
 from rich.text import Text
 
 from drivelink.monitor.braille import DotPlot, number, sparkline
-from drivelink.monitor.history import EstimateLike, JointHistory, TruthLike, usual_range
+from drivelink.monitor.history import JointHistory, TruePoint, usual_range
 from drivelink.monitor.statuslines import MODEL_ALARM_ADVICE, shape, status_lines, status_text
-from drivelink.pubsub.wire import ExternalMessage
+from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from estimator.sample import SIGMA_95, Status
 
 ESTIMATE = "cyan"
@@ -92,7 +92,7 @@ class JointView:
         self.help = False
         self._height = height
 
-    def update(self, estimate: EstimateLike, time_s: float, truth: TruthLike | None = None) -> None:
+    def update(self, estimate: EstimateMessage, time_s: float, truth: TruePoint | None = None) -> None:
         """Enter one estimate and, in a simulation, the truth at the same instant."""
         self.history.add(estimate, time_s, truth)
 
@@ -248,7 +248,7 @@ class JointView:
         )
 
     @staticmethod
-    def _each(estimate: EstimateLike) -> str:
+    def _each(estimate: EstimateMessage) -> str:
         if len(estimate.transmissions) < 2:
             return ""
         return "each " + " | ".join(number(one.stiffness_nm_rad) for one in estimate.transmissions)
@@ -350,6 +350,6 @@ def joints_table(views: Mapping[str, JointView], width: int) -> Table:
     return table
 
 
-def _half(estimate: EstimateLike) -> float:
+def _half(estimate: EstimateMessage) -> float:
     """Half the 95 % interval of the joint's stiffness."""
     return SIGMA_95 * estimate.stiffness_std_nm_rad

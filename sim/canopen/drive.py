@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 from sim.canopen.aborts import Abort, SdoAbortError
 from sim.canopen.dictionary import Entry, Object, Value
@@ -14,6 +13,8 @@ from sim.canopen.edsfile import load_eds, with_values
 from sim.canopen.node import Nmt, Node
 from sim.canopen.quirks import Quirks
 from sim.canopen.statemachine import PowerState, StateMachine
+from sim.sensors import DriveSignals
+from sim.world import World
 
 _PROFILE_TORQUE, _CYCLIC_TORQUE = 4, 10
 _MODES = (0, _PROFILE_TORQUE, _CYCLIC_TORQUE)
@@ -28,47 +29,6 @@ _SENSORS = (0x60E4, 0x60E5, 0x60E6, 0x60EB)  # arrays with an entry per encoder
 # 0x60A9: units of a numerator per radian, and seconds in a denominator.
 _RADIAN, _DEGREE, _REVOLUTION, _INCREMENT = 0x10, 0x41, 0xB4, 0xB5
 _SECONDS = {0x03: 1.0, 0x47: 60.0}
-
-
-class DriveReadings(Protocol):
-    """Readings of the drive's sensors, at the motor shaft."""
-
-    @property
-    def position_counts(self) -> int:
-        """Encoder counts, unbounded."""
-
-    @property
-    def velocity_rad_s(self) -> float:
-        """Of the motor shaft."""
-
-    @property
-    def current_a(self) -> float:
-        """Of the motor."""
-
-    @property
-    def torque_nm(self) -> float:
-        """At the motor shaft."""
-
-
-class MeasuredPlant(Protocol):
-    """The part of a world that one drive is connected to (`sim.world.World`)."""
-
-    @property
-    def period_s(self) -> float:
-        """Control period."""
-
-    @property
-    def time_s(self) -> float:
-        """The present sampling instant."""
-
-    def drive(self, motor: int) -> DriveReadings:
-        """Readings of motor `motor` now."""
-
-    def command(self, motor: int, torque_nm: float | None) -> None:
-        """Torque at the motor shaft from the next period on; None: the rig's excitation."""
-
-    def link_counts(self) -> int:
-        """The link encoder."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -146,7 +106,7 @@ class Cia402Drive(Node):
     def __init__(
         self,
         node_id: int,
-        rig: MeasuredPlant,
+        rig: World,
         motor: int,
         data: DriveData | None = None,
         quirks: Quirks | None = None,
@@ -155,7 +115,7 @@ class Cia402Drive(Node):
         self._motor = motor
         self.data = data or DriveData()
         quirks = quirks or Quirks()
-        self._sampled: tuple[Callable[[DriveReadings], None], ...] = ()
+        self._sampled: tuple[Callable[[DriveSignals], None], ...] = ()
         super().__init__(node_id, _drive_objects(self.data, quirks), quirks)
         self.machine = StateMachine()
         self._torque_unit_nm = max(1, self.data.rated_torque_mnm) * 1e-6
@@ -163,7 +123,7 @@ class Cia402Drive(Node):
         self._demand = 0.0  # per mille of rated torque
         self._following = self._limiting = self._reached = False
         self._toggle = 0
-        self.misread: Callable[[DriveReadings], DriveReadings] | None = None  # a fault of its sensors
+        self.misread: Callable[[DriveSignals], DriveSignals] | None = None  # a fault of its sensors
         self._link_counts = rig.link_counts()
         self._link_time_s = rig.time_s
         self._bind()
@@ -186,7 +146,7 @@ class Cia402Drive(Node):
         if (0x60A9, 0) not in self.dictionary:
             self._velocity_unit.value = self.quirks.velocity_unit
         self._error_code = live(0x603F)
-        self._sensors: list[tuple[Callable[[DriveReadings], None], frozenset[Entry]]] = [
+        self._sensors: list[tuple[Callable[[DriveSignals], None], frozenset[Entry]]] = [
             (self._read_position, frozenset({self._position, self._internal})),
             (self._read_velocity, frozenset({self._velocity, self._sensor_velocity})),
             (self._read_torque, frozenset({self._torque})),
@@ -302,28 +262,28 @@ class Cia402Drive(Node):
             read(signals)
         self._status.value = self._statusword()
 
-    def _signals(self) -> DriveReadings:
+    def _signals(self) -> DriveSignals:
         signals = self._rig.drive(self._motor)
         return signals if self.misread is None else self.misread(signals)
 
-    def _read_position(self, signals: DriveReadings) -> None:
+    def _read_position(self, signals: DriveSignals) -> None:
         counts = signals.position_counts
         self._internal.value = (counts + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
         counts *= self._position_sign
         self._position.value = (counts + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
 
-    def _read_velocity(self, signals: DriveReadings) -> None:
+    def _read_velocity(self, signals: DriveSignals) -> None:
         velocity = _limited(signals.velocity_rad_s * self._velocity_scale, 0x7FFF_FFFF)
         self._velocity.value = self._sensor_velocity.value = velocity
 
-    def _read_torque(self, signals: DriveReadings) -> None:
+    def _read_torque(self, signals: DriveSignals) -> None:
         self._torque.value = _limited(signals.torque_nm / self._torque_unit_nm, 0x7FFF)
 
-    def _read_current(self, signals: DriveReadings) -> None:
+    def _read_current(self, signals: DriveSignals) -> None:
         self._current.value = _limited(signals.current_a / self._current_unit_a, 0x7FFF)
         self._milliampere.value = round(signals.current_a * 1e3)
 
-    def _read_link(self, _signals: DriveReadings) -> None:
+    def _read_link(self, _signals: DriveSignals) -> None:
         counts, time_s = self._rig.link_counts(), self._rig.time_s
         self._link.value = (counts + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
         elapsed_s = time_s - self._link_time_s

@@ -3,29 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 from sim.canopen.aborts import Abort, SdoAbortError
 from sim.canopen.dictionary import Value
 from sim.canopen.edsfile import load_eds, with_values
 from sim.canopen.node import Node
 from sim.canopen.quirks import Quirks
+from sim.world import World
 
 SCALING, REVERSED = 0x04, 0x01  # bits of 0x6000
 
 _FASTEST = 0x7FFF
 _OPERATING_BITS = SCALING | REVERSED
-
-
-class MeasuredAngle(Protocol):
-    """The measured angle (`sim.world.World`)."""
-
-    @property
-    def time_s(self) -> float:
-        """The present sampling instant."""
-
-    def link_counts(self) -> int:
-        """The link's position in counts, unbounded."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,11 +52,7 @@ class Cia406Encoder(Node):
     sends_on_change = False  # CiA 406: the asynchronous TPDO goes by the cyclic timer
 
     def __init__(
-        self,
-        node_id: int,
-        scale: MeasuredAngle,
-        data: EncoderData | None = None,
-        quirks: Quirks | None = None,
+        self, node_id: int, scale: World, data: EncoderData | None = None, quirks: Quirks | None = None
     ) -> None:
         self._scale = scale
         self.data = data or EncoderData()

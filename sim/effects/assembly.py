@@ -137,7 +137,7 @@ UNLISTED: dict[str, Definition] = {}
 
 
 def define(
-    library: dict[str, Definition], location: str, name: str, meaning: str, *parameters: Parameter
+    library: dict[str, Definition], location: str, name: str, meaning: str, *parameters: EffectParameter
 ) -> Callable[[Apply], Apply]:
     """Put a function into a library as an effect; the arguments are those of `Definition`."""
 

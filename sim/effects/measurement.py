@@ -35,7 +35,9 @@ def _eccentricity(a: Assembly, m: int, p: Values) -> None:
     a.link.readings.append(lambda q: q + height * math.sin(q + phase))
 
 
-@_effect("encoder_delay", "the link position is older than the rest", EffectParameter("delay_s", "by this time"))
+@_effect(
+    "encoder_delay", "the link position is older than the rest", EffectParameter("delay_s", "by this time")
+)
 def _encoder_delay(a: Assembly, m: int, p: Values) -> None:
     a.link.reading_delay_s += not_negative(p, "delay_s")
 

@@ -151,7 +151,9 @@ def _motor_inertia(a: Assembly, m: int, p: Values) -> None:
     a.motors[m].inertia_kg_m2 += p["inertia_kg_m2"]
 
 
-@_effect("torque_delay", "the torque acts later than it is reported", EffectParameter("delay_s", "by this time"))
+@_effect(
+    "torque_delay", "the torque acts later than it is reported", EffectParameter("delay_s", "by this time")
+)
 def _torque_delay(a: Assembly, m: int, p: Values) -> None:
     a.motors[m].torque_delay_s += not_negative(p, "delay_s")
 

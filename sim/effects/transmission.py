@@ -36,7 +36,9 @@ def _hysteresis(a: Assembly, m: int, p: Values) -> None:
     "backlash",
     "play: a range of deflection without torque",
     EffectParameter("half_gap_rad", "half of the gap"),
-    EffectParameter("stiffness_nm_rad", "stiffness that is missing inside the gap; 0: the spring as a whole", 0.0),
+    EffectParameter(
+        "stiffness_nm_rad", "stiffness that is missing inside the gap; 0: the spring as a whole", 0.0
+    ),
 )
 def _backlash(a: Assembly, m: int, p: Values) -> None:
     gap, k = not_negative(p, "half_gap_rad"), p["stiffness_nm_rad"]

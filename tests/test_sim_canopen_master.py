@@ -105,7 +105,7 @@ def test_every_object_of_the_eds_is_served_with_its_type_and_default(eds: str) -
                 assert len(data) * 8 == len(variable), variable.name
             if not variable.pdo_mappable and variable.default is not None:
                 assert variable.decode_raw(data) == variable.default, variable.name
-        assert served == {(entry.index, entry.item.subindex) for entry in node.dictionary}
+        assert served == {(entry.item.index, entry.item.subindex) for entry in node.dictionary}
 
 
 @pytest.mark.parametrize("eds", EDS)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from copy import copy
+from dataclasses import dataclass
 
 from sim.canopen.aborts import Abort, SdoAbortError
-from sim.canopen.dictionary import Entry, Object, Value
-from sim.canopen.edsfile import load_eds, with_values
+from sim.canopen.dictionary import Entry, Object, variables
+from sim.canopen.edsfile import load_eds, with_members, with_values
 from sim.canopen.node import Nmt, Node
 from sim.canopen.quirks import Quirks
 from sim.canopen.statemachine import PowerState, StateMachine
@@ -51,7 +52,7 @@ class DriveData:
     gear: tuple[int, int] = (1, 1)
     link_counts_per_rev: int | None = None
 
-    def values(self) -> dict[tuple[int, int], Value]:
+    def values(self) -> dict[tuple[int, int], int]:
         """Power-on values, by (index, subindex)."""
         motor, shaft = self.gear
         return {
@@ -69,23 +70,23 @@ def _drive_objects(data: DriveData, quirks: Quirks) -> list[Object]:
     """The dictionary of a drive, by its EDS file and nameplate."""
     second = quirks.second_encoder
     objects = [_with_sensors(one, second) if one.index in _SENSORS else one for one in load_eds(quirks.eds)]
-    values: dict[tuple[int, int], Value] = {
+    values: dict[tuple[int, int], int | str] = {
         (0x60E6, second): data.link_counts_per_rev or 0,
         (0x60EB, second): 1,
     }
     if quirks.identity is not None:
-        values |= {(0x1008, 0): quirks.identity[0].encode(), (0x1018, 2): quirks.identity[1]}
+        values |= {(0x1008, 0): quirks.identity[0], (0x1018, 2): quirks.identity[1]}
     return with_values(objects, {**data.values(), **values})
 
 
 def _with_sensors(described: Object, count: int) -> Object:
     """An array of the second encoder's values with so many sensors, all zero."""
-    highest, first = described.items[:2]
-    sensors = (
-        replace(first, subindex=k, name=re.sub(r"\d+$", str(k), first.name), default=0)
-        for k in range(1, count + 1)
-    )
-    return replace(described, items=(replace(highest, default=count), *sensors))
+    highest, first = map(copy, variables(described)[:2])
+    highest.default = count
+    sensors = [copy(first) for _ in range(count)]
+    for k, sensor in enumerate(sensors, start=1):
+        sensor.subindex, sensor.name, sensor.default = k, re.sub(r"\d+$", str(k), first.name), 0
+    return with_members(described, [highest, *sensors])
 
 
 def _limited(value: float, bound: int) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from sim.canopen.aborts import Abort, SdoAbortError
-from sim.canopen.dictionary import Value
 from sim.canopen.edsfile import load_eds, with_values
 from sim.canopen.node import Node
 from sim.canopen.quirks import Quirks
@@ -29,7 +28,7 @@ class EncoderData:
     counts_per_rev: int = 262144
     range_counts: int = 1 << 32
 
-    def values(self) -> dict[tuple[int, int], Value]:
+    def values(self) -> dict[tuple[int, int], int]:
         """Power-on values, by (index, subindex)."""
         return {
             (0x6001, 0): self.counts_per_rev,

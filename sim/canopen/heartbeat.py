@@ -53,7 +53,7 @@ class HeartbeatConsumer:
         self._lost = lost
         self._back = back
         self._changed = changed
-        self._entries = [entry for entry in dictionary if entry.index == 0x1016 and entry.item.subindex]
+        self._entries = [entry for entry in dictionary if entry.item.index == 0x1016 and entry.item.subindex]
         self._deadlines: dict[int, Timer] = {}
         self._missing: set[int] = set()
         for entry in self._entries:

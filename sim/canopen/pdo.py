@@ -10,7 +10,7 @@ import struct
 from collections.abc import Callable
 
 from sim.canopen.aborts import Abort, SdoAbortError
-from sim.canopen.dictionary import DataType, Dictionary, Entry
+from sim.canopen.dictionary import Dictionary, Entry
 from sim.canopen.quirks import Quirks
 
 COB_INVALID = 1 << 31
@@ -19,14 +19,7 @@ MAPPED_AT_MOST = 8  # objects in one PDO
 
 _FRAME_29_BIT = 1 << 29
 _LONGEST_BITS = 64
-_DUMMIES = {
-    DataType.INTEGER8: 8,
-    DataType.INTEGER16: 16,
-    DataType.INTEGER32: 32,
-    DataType.UNSIGNED8: 8,
-    DataType.UNSIGNED16: 16,
-    DataType.UNSIGNED32: 32,
-}
+_DUMMIES = {2: 8, 3: 16, 4: 32, 5: 8, 6: 16, 7: 32}  # bits of the data types that stand for no object
 _RESERVED_TYPES = range(241, 254)  # and RTR-only types, which this device does not do
 
 
@@ -165,7 +158,7 @@ class Pdo:
     def _check_mappable(self, word: int) -> None:
         index, subindex, bits = word >> 16, (word >> 8) & 0xFF, word & 0xFF
         if index in _DUMMIES and subindex == 0:
-            mappable, length = self._allows(None), _DUMMIES[DataType(index)]
+            mappable, length = self._allows(None), _DUMMIES[index]
         else:
             entry = self._dictionary.find(index, subindex)
             mappable, length = self._allows(entry), entry.bits

@@ -1,6 +1,7 @@
 """What a ROS 2 node with rmw_zenoh would find and receive; rosbags is the independent reading of it."""
 
 import struct
+import sys
 import time
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import xxhash
 import zenoh
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from zenoh.ext import Int64, z_serialize
-from zenohkit import free_endpoint, make_external, make_joint, until
+from zenohkit import free_endpoint, make_external, make_joint, ready, script, until
 
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.ros2 import (
@@ -23,6 +24,9 @@ from drivelink.pubsub.ros2 import (
 )
 from drivelink.pubsub.session import close_session, open_client, open_session
 from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
+
+sys.path.append(str(Path(__file__).parents[1] / "examples"))
+import ros2_stiffness
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 STORE.register(  # as ros2_control has them
@@ -301,16 +305,17 @@ def test_humble_knows_no_type_hashes(ros2):
 def test_every_nth_cycle_only_where_that_is_asked(ros2):
     publisher, client = ros2("every = 10")
     subscriber = client.declare_subscriber(f"0/joint_states/{STATE}/**", zenoh.handlers.RingChannel(64))
-    until(lambda: publisher.put_cycle(estimate(10), sample(10), 10) or subscriber.try_recv())
-    while subscriber.try_recv() is not None:
-        pass
-    for sequence in range(11, 41):
-        publisher.put_cycle(estimate(sequence), sample(sequence), sequence)
-        time.sleep(0.001)
-    stamps = []
-    until(lambda: stamps.append(stamp_of(until(subscriber.try_recv))) or stamps[-1] == 40)
-    # Those of the tenth that were still under way when the subscriber was found come first.
-    assert [stamp for stamp in stamps if stamp > 10] == [20, 30, 40]
+    stamps = set()
+
+    def put():
+        for sequence in range(1, 41):
+            publisher.put_cycle(estimate(sequence), sample(sequence), sequence)
+        while (message := subscriber.try_recv()) is not None:
+            stamps.add(stamp_of(message))
+        return {10, 20, 30, 40} <= stamps
+
+    until(put)
+    assert stamps == {10, 20, 30, 40}
 
 
 def test_a_velocity_that_is_not_measured_is_the_filtered_change_of_position(ros2):
@@ -369,3 +374,47 @@ def test_a_joint_without_the_table_or_with_it_switched_off_is_no_ros_node():
             publisher.close()
         finally:
             close_session(session)
+
+
+def test_when_the_daemon_is_killed_the_example_node_sees_it_and_the_graph_is_empty():
+    endpoint = free_endpoint()
+    client = open_client(endpoint)
+    subscriber = client.declare_subscriber(
+        f"0/dynamic_joint_states/{DYNAMIC}/**", zenoh.handlers.RingChannel(64)
+    )
+    stiffness = ros2_stiffness.Stiffness("elbow")
+
+    def state():
+        while (received := subscriber.try_recv()) is not None:
+            message = STORE.deserialize_cdr(received.payload.to_bytes(), "control_msgs/msg/DynamicJointState")
+            stiffness.receive(message, time.monotonic())
+        return stiffness.state(time.monotonic())
+
+    try:
+        assert state() == "stale"
+        for _ in range(2):  # it comes back, too
+            with script("elbow", endpoint, "[ros2]\n") as daemon:
+                ready(daemon)
+                until(lambda: state() == "live" and stiffness.value_nm_rad(time.monotonic()) == 700.0)
+                assert len(tokens(client)) == 5
+                daemon.kill()  # SIGKILL
+                until(lambda: state() == "stale")
+                assert stiffness.value_nm_rad(time.monotonic()) == ros2_stiffness.FALLBACK_NM_RAD
+                until(lambda: not tokens(client))  # `ros2 topic info` counts no publisher
+    finally:
+        close_session(client)
+
+
+@pytest.mark.parametrize(
+    ("status", "expected"),
+    [(Status.VALID, "live"), (Status.OBSERVABLE, "invalid"), (Status.VALID | Status.MODEL_ALARM, "invalid")],
+)
+def test_the_example_node_uses_what_is_valid_only(ros2, status, expected):
+    publisher, client = ros2()
+    put = lambda: publisher.put_cycle(estimate(status=status), sample(), STAMP_NS)  # noqa: E731
+    received = receive(client, f"0/dynamic_joint_states/{DYNAMIC}/*", put)
+    stiffness = ros2_stiffness.Stiffness("elbow")
+    message = STORE.deserialize_cdr(received.payload.to_bytes(), "control_msgs/msg/DynamicJointState")
+    stiffness.receive(message, 10.0)
+    assert stiffness.state(10.0) == expected
+    assert stiffness.state(10.0 + 2 * ros2_stiffness.STALE_S) == "stale"

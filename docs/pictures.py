@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import fcntl
 import io
+import json
 import os
 import pty
 import re
@@ -119,13 +120,15 @@ def running(*arguments: str) -> Iterator[subprocess.Popen[str]]:
         process.communicate(timeout=30)
 
 
-def pages(url: str, name: str, height: int, wait_s: float = 1.0) -> None:
-    """A page in light and in dark mode."""
+def pages(url: str, name: str, below: str, wait_s: float = 1.0) -> None:
+    """A page in light and in dark mode, from its top to the end of the element that `below` selects."""
     with tempfile.TemporaryDirectory() as profile, Chromium(Path(profile)) as browser:
-        browser.resize(1200, height)
+        browser.resize(1200, 900)
         browser.open(url)
         browser.evaluate("document.documentElement.style.scrollbarWidth = 'none'")
         time.sleep(wait_s)
+        end = f"document.querySelector({json.dumps(below)}).getBoundingClientRect().bottom"
+        browser.resize(1200, round(browser.evaluate(end)) + 16)
         for dark in (False, True):
             browser.prefer(dark=dark)
             time.sleep(1.0)
@@ -148,7 +151,7 @@ def views(_: Path) -> None:
         assert address is not None
         command = (*DRIVELINK, "monitor", "vsa-ii")
         terminal(command, 25.0, "drivelink monitor vsa-ii", PICTURES / "monitor.svg")
-        pages(address[0], "web", 900, wait_s=35.0)
+        pages(address[0], "web", "main", wait_s=35.0)
 
 
 def loop(folder: Path) -> None:

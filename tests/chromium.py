@@ -70,7 +70,7 @@ class Chromium:
         assert "exceptionDetails" not in result, result["exceptionDetails"]
         return result["result"].get("value")
 
-    def wait_for(self, script: str, seconds: float = 30.0) -> Any:
+    def wait_for(self, script: str, seconds: float = 60.0) -> Any:
         """What a script says once it says anything that is true."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:

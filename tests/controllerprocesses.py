@@ -1,7 +1,6 @@
 """The controller in a process of its own, beside the daemon in another, on drives that this process simulates."""
 
 import json
-import math
 import signal
 import socket
 import subprocess
@@ -21,13 +20,10 @@ from drivelink import jointfile
 from drivelink.cycle import realtime
 from drivelink.demo.simulate import nodes_from_joint, open_sim_bus, world_from_joint
 from sim.canopen.statemachine import PowerState
-from sim.effects import parse
-from sim.excitation import build
 from sim.faults import Faults
 from sim.network import Network
 
-SYNC, RPDO3 = 0x080, 0x400
-ENDS_ESTIMATES = ("zenoh cut", "daemon killed")
+RPDO3 = 0x400
 SLOW_S = 120.0  # for what takes seconds even on an idle machine
 
 
@@ -76,39 +72,34 @@ class Cut:
 
 
 class Observed:
-    """The drives' end of the bus, with a note of when SYNC and torque commands came in, monotonic.
+    """The drives' end of the bus, with a note of the torque commands.
 
     Attributes:
-        syncs: times of the SYNCs.
-        torques: (time, identifier, per mille) of the torque commands.
+        torques: (monotonic time, identifier, per mille) of each.
     """
 
     def __init__(self, bus: can.BusABC) -> None:
         self._bus = bus
-        self.syncs: deque[float] = deque(maxlen=100_000)
         self.torques: deque[tuple[float, int, int]] = deque(maxlen=100_000)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         message = self._bus.recv(timeout)
         if message is not None:
-            now_s, cob_id = time.monotonic(), message.arbitration_id
-            if cob_id == SYNC:
-                self.syncs.append(now_s)
-            elif cob_id & 0x780 == RPDO3:
+            cob_id = message.arbitration_id
+            if cob_id & 0x780 == RPDO3:
                 per_mille = int.from_bytes(message.data[2:4], "little", signed=True)
-                self.torques.append((now_s, cob_id, per_mille))
+                self.torques.append((time.monotonic(), cob_id, per_mille))
         return message
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._bus, name)
 
-    def ended_s(self, since_s: float) -> float:
-        """When, after that time, the last drive was first commanded to give no torque."""
-        first: dict[int, float] = {}
-        for time_s, cob_id, per_mille in list(self.torques):
-            if time_s >= since_s and per_mille == 0:
-                first.setdefault(cob_id, time_s)
-        return max(first.values()) if len(first) == 2 else math.inf
+    def ended(self, since_s: float) -> bool:
+        """Whether, after that time, both drives were commanded to give no torque."""
+        zero = {
+            cob_id for time_s, cob_id, per_mille in list(self.torques) if time_s >= since_s and not per_mille
+        }
+        return len(zero) == 2
 
 
 class Plant:
@@ -192,10 +183,6 @@ class Plant:
             time.sleep(0.01)
         return found[0]
 
-    def demanded(self) -> list[int]:
-        """Torque demand (0x6074) of the drives."""
-        return [node.dictionary.find(0x6074, 0).number for node in self.network.nodes[:2]]
-
     def enabled(self) -> bool:
         """Whether any drive's power stage is on."""
         return any(node.machine.state is PowerState.OPERATION_ENABLED for node in self.network.nodes[:2])
@@ -209,64 +196,20 @@ class Plant:
 
 
 def go_through_faults(plant: Plant) -> list[dict]:
-    """Each fault on the running joint, and back to moving; the events of safe torque, in order."""
+    """Each fault on the moving joint, and back to moving; the events of safe torque, in order."""
     outcomes = []
-
-    def safe(why: str) -> None:
-        before = len(plant.events)
-        begin_s = time.monotonic()
-        acts[why][0]()
-        event = plant.reaches("safe", before)
-        until(lambda: plant.demanded() == [0, 0])
-        # Of what ends the estimates only the last one counts: it may be a period older than the fault.
-        if why in ENDS_ESTIMATES:
-            begin_s = event["time_s"] - event["age_s"]
-        ended_s = plant.observed.ended_s(begin_s)
-        outcomes.append({"fault": why, "torque_ended_s": ended_s - begin_s, **event})
-        acts[why][1]()
-        # A machine that is busy with something else may stop it again on the way: that is what it is for.
-        plant.reaches("run", before)
-
     acts = {
         "a drive in fault": (lambda: plant.faults.emergency(plant.network.nodes[0], 0x2310), lambda: None),
         "zenoh cut": (plant.relay.open.clear, plant.relay.open.set),
-        "an undeclared effect": (
-            lambda: plant.world.alter(effects=[parse("torque_offset=0.04,motor=2")]),
-            lambda: plant.world.alter(effects=[]),
-        ),
         "daemon killed": (plant.daemon.kill, plant.start_daemon),
     }
-    plant.reaches("run")
-    for why in acts:
-        safe(why)
-    return outcomes
-
-
-WALL = "contact=3.0,position_rad={:.4f},side={:d}"
-
-
-def go_through_contacts(plant: Plant) -> list[dict]:
-    """A wall, a push and a clamp on the running joint, and back to moving; the events of its reactions."""
-    world, outcomes = plant.world, []
-
-    def wall(*sides: int) -> None:
-        q = world.truth().link_position_rad
-        world.alter(effects=[parse(WALL.format(q, side)) for side in sides])
-
-    def push(torque_nm: float) -> None:
-        world.excitation = build({"kind": "none", "external": {"kind": "none", "offset_nm": torque_nm}}, 2)
-
-    acts = {
-        "a wall": (lambda: wall(1 if world.truth().link_velocity_rad_s > 0.0 else -1), lambda: wall()),
-        "a push": (lambda: push(0.12), lambda: push(0.0)),
-        "a clamp": (lambda: wall(1, -1), lambda: wall()),
-    }
-    plant.reaches("run")
-    for what, (begin, end) in acts.items():
-        before, begin_s = len(plant.events), time.monotonic()
+    plant.reaches("identify")
+    for why, (begin, end) in acts.items():
+        before = len(plant.events)
         begin()
-        event = plant.reaches("react", before)
-        outcomes.append({"touch": what, "took_s": event["time_s"] - begin_s, **event})
+        event = plant.reaches("safe", before)
+        until(lambda since_s=event["time_s"]: plant.observed.ended(since_s))
+        outcomes.append({"fault": why, **event})
         end()
-        plant.reaches("run", len(plant.events))
+        plant.reaches("identify", before)
     return outcomes

@@ -10,7 +10,7 @@ from pathlib import Path
 import can
 import pytest
 from can.interfaces import virtual
-from zenohkit import until
+from zenohkit import LIMIT_S, until
 
 from drivelink._core import Tick
 from drivelink.cycle.loop import ObjectSink
@@ -183,7 +183,7 @@ def running(daemon: Daemon) -> Iterator[threading.Thread]:
         yield thread
     finally:
         daemon.stop()
-        thread.join(10.0)
+        thread.join(LIMIT_S)
         daemon.close()
         assert not thread.is_alive()
 

@@ -1,42 +1,26 @@
 """Drives, daemon and controller in three processes: CAN over TCP between them, zenoh through a relay.
 
-What is asserted is that each fault ends in safe torque and that the controller comes back. How fast is asserted
-in bus time by the tests in lockstep and of the process's own clock by `test_controller_deadman.py`, and here only
-reported: the machine may be doing something else.
+What is asserted is that each fault ends in safe torque and that the controller moves the joint again. How fast is
+asserted in bus time by the tests in lockstep and of the process's own clock by `test_controller_deadman.py`, and
+here only reported. What the controller does once the springs are identified is asserted in lockstep too: a machine
+that others use may lose so many cycles that they never are.
 """
 
 import socket
 
 import pytest
-from controllerprocesses import Plant, go_through_contacts, go_through_faults
+from controllerprocesses import Plant, go_through_faults
 from zenohkit import until
 
 
-def start(folder, *options):
+def start(folder):
     """The three processes, the drives being in this one."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     where = f'{{ host = "127.0.0.1", port = {port}, tcp_tune = true }}'
     bus = f'interface = "socketcand"\nchannel = "vsa"\noptions = {where}\nperiod_s = 0.002'
     # The example's own 10 ms belong to a machine of its own: here others may hold a core for longer.
-    return Plant(folder, bus, "--deadline", "0.08", *options)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-@pytest.mark.parametrize("reaction", ["stop", "retract", "soften"])
-def test_it_reacts_to_a_wall_a_push_and_a_clamp_in_three_processes(tmp_path, capsys, reaction):
-    plant = start(tmp_path, "--reaction", reaction)
-    try:
-        outcomes = go_through_contacts(plant)
-        assert plant.end_controller() == 0
-        until(lambda: not plant.enabled())
-    finally:
-        plant.close()
-    assert [event["reason"] for event in outcomes] == [f"contact: {reaction}"] * 3
-    with capsys.disabled():
-        for event in outcomes:
-            print(f"\n{event['touch']}: {event['reason']} after {1e3 * event['took_s']:.0f} ms", end="")
+    return Plant(folder, bus, "--deadline", "0.08")
 
 
 @pytest.mark.slow
@@ -52,7 +36,6 @@ def test_each_fault_and_the_way_back_in_three_processes(tmp_path, capsys):
     with capsys.disabled():
         for event in outcomes:
             print(
-                f"\n{event['fault']}: {event['reason']}; {1e3 * event['age_s']:.1f} ms after the last "
-                f"estimate, no torque at the drives after {1e3 * event['torque_ended_s']:.1f} ms",
+                f"\n{event['fault']}: {event['reason']}, {1e3 * event['age_s']:.1f} ms after the last estimate",
                 end="",
             )

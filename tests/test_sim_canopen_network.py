@@ -15,7 +15,7 @@ from sim.canopen.drive import Cia402Drive
 from sim.network import Network
 from sim.socketcand import SocketcandServer
 
-PATIENCE_S = 5.0  # only ever waited for when something is broken
+PATIENCE_S = 60.0  # only ever waited for when something is broken
 
 
 def sync(stamp_s: float = 0.0) -> can.Message:

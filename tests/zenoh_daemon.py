@@ -17,7 +17,7 @@ from drivelink.pubsub.session import open_session
 def main(name: str, endpoint: str, more: str = "", how: str = "") -> None:
     joint = make_joint(name, endpoint, more)
     session = open_session(joint.zenoh, Path())
-    publisher = JointPublisher(session, joint)
+    publisher = JointPublisher(session, joint, lossless=True)
     print("ready", flush=True)
     sequence = 0
     while True:

@@ -69,6 +69,12 @@ def script(*args: str, name: str = "zenoh_daemon.py"):
         process.communicate()
 
 
+def connected(publisher, joint) -> None:
+    """Wait until a joint's publisher knows of this subscription: from then on nothing is lost."""
+    until(lambda: joint.model is not None)
+    until(lambda: publisher._estimate.matching_status.matching)
+
+
 def ready(process: subprocess.Popen) -> None:
     """Wait for the process's word that it is at work."""
     line = process.stdout.readline()

@@ -135,7 +135,7 @@ class RealStage(Stage):
 
     def close(self) -> None:
         self.daemon.stop()
-        self._thread.join(10.0)
+        self._thread.join(60.0)
         self.network.stop()
         super().close()
 

@@ -22,6 +22,7 @@ from zenohkit import (
 )
 
 import drivelink
+from drivelink._core import encode_estimate
 from drivelink.errors import ZenohError
 from drivelink.jointfile import parse
 from drivelink.pubsub import wire
@@ -73,9 +74,7 @@ def test_the_latest_value_comes_without_waiting(publisher, joint):
     assert joint.age_s == math.inf
     publish(publisher, 1, 2)
     until(lambda: joint.received == 2)
-    assert joint.latest() == wire.decode_estimate(
-        wire.encode_estimate(make_estimate(2), joint.latest().stamp_ns)
-    )
+    assert joint.latest() == wire.decode_estimate(encode_estimate(make_estimate(2), joint.latest().stamp_ns))
     assert joint.valid
     assert joint.observable
     assert not joint.stale
@@ -283,7 +282,7 @@ def test_a_foreign_writer_is_noticed_and_not_believed(publisher, joint, endpoint
         config.insert_json5(key, value)
     with zenoh.open(config) as other:
         intruder = other.declare_publisher("drivelink/elbow/estimate")
-        until(lambda: intruder.put(wire.encode_estimate(make_estimate(999), 0)) or joint.foreign)
+        until(lambda: intruder.put(encode_estimate(make_estimate(999), 0)) or joint.foreign)
         intruder.put(b"not an estimate")
         publish(publisher, 2)
         until(lambda: joint.received == 2)
@@ -303,7 +302,7 @@ def test_bytes_that_are_no_estimate_do_no_harm(endpoint):
         until(lambda: session.put("drivelink/elbow/estimate", b"junk") or joint.foreign)
         until(
             lambda: (
-                session.put("drivelink/elbow/estimate", wire.encode_estimate(make_estimate(3), 0))
+                session.put("drivelink/elbow/estimate", encode_estimate(make_estimate(3), 0))
                 or joint.received
             )
         )

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 from daemonkit import Collector, DaemonRig, Listener, listens, patient, rig, running, served, vsa, vsa_text
-from zenohkit import free_endpoint, until
+from zenohkit import LIMIT_S, free_endpoint, until
 
 from drivelink._core import SYNC_COB_ID
 from drivelink.canopen.guard import check_frame
@@ -119,7 +119,7 @@ def test_after_stop_the_loop_ends_within_a_few_cycles_and_nothing_stays() -> Non
         loop.start()
         until(lambda: made.loop.cycles > 50)
         made.stop()
-        loop.join(10.0)
+        loop.join(LIMIT_S)
         assert not loop.is_alive()
         made.close()
         made.close()
@@ -153,9 +153,12 @@ def test_a_bus_without_drives_is_one_line() -> None:
 
 def test_a_master_that_already_makes_sync_is_one_line() -> None:
     joint = vsa()
-    one_line = pytest.raises(BusError, match="another master already produces SYNC")
-    with served(joint), running(daemon(joint, publish=False)), one_line:
-        daemon(joint, publish=False)
+    with served(joint):
+        first = daemon(joint, publish=False)
+        with running(first):
+            until(lambda: first.loop.cycles > 50)
+            with pytest.raises(BusError, match="another master already produces SYNC"):
+                daemon(joint, publish=False)
 
 
 @pytest.mark.parametrize(

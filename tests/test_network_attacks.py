@@ -16,12 +16,13 @@ from rich.console import Console
 from zenohkit import free_endpoint, make_estimate, make_joint, make_sample, until
 
 import drivelink
+from drivelink._core import encode_estimate, encode_sample
 from drivelink.errors import ZenohError
 from drivelink.monitor.statuslines import shape, status_lines, status_text
 from drivelink.monitor.view import JointView, joints_table
 from drivelink.monitor.watcher import MAX_JOINTS, Watcher
 from drivelink.monitor.web import snapshot
-from drivelink.pubsub import inbound, wire
+from drivelink.pubsub import inbound
 from drivelink.pubsub.identity import MAX_CLAIMS, DaemonIdentity
 from drivelink.pubsub.publisher import JointPublisher, to_json
 from drivelink.pubsub.session import close_session, daemon_config, open_client, open_session
@@ -211,7 +212,7 @@ def test_a_subscriber_stays_with_its_daemon_whatever_another_session_writes(publ
             writers = {
                 name: source(intruder, f"drivelink/elbow/{name}") for name in ("estimate", "status", "model")
             }
-            forged = {"estimate": wire.encode_estimate(make_estimate(999_999), time.time_ns()),
+            forged = {"estimate": encode_estimate(make_estimate(999_999), time.time_ns()),
                       "status": b'{"state": "forged"}', "model": b'{"joint": "forged"}'}  # fmt: skip
 
             def attacked():
@@ -271,8 +272,8 @@ def test_the_monitor_and_the_recorder_take_a_joint_from_its_daemon_only(publishe
         writers = {
             name: source(intruder, f"drivelink/elbow/{name}") for name in ("estimate", "sample", "status")
         }
-        sample = wire.encode_sample(Sample(999_999, (9.0,), (9.0,), (9.0,), 9.0), 1)
-        forged = {"estimate": wire.encode_estimate(make_estimate(999_999), 1), "sample": sample,
+        sample = encode_sample(Sample(999_999, (9.0,), (9.0,), (9.0,), 9.0), 1)
+        forged = {"estimate": encode_estimate(make_estimate(999_999), 1), "sample": sample,
                   "status": b'{"state": "forged"}'}  # fmt: skip
 
         def attacked():
@@ -311,7 +312,7 @@ def test_nothing_that_is_published_ends_the_monitor_the_recorder_or_a_client(end
             pack("<QQ3dB3d", 2**64 - 1, 2**64 - 1, *[math.inf] * 3, 1, *[math.nan] * 3),
         ]
         attacks = [("estimate", payload) for payload in ESTIMATES.values()]
-        attacks += [("estimate", wire.encode_estimate(eight, 1))]
+        attacks += [("estimate", encode_estimate(eight, 1))]
         attacks += [(key, payload) for key in ("status", "model") for payload in DOCUMENTS.values()]
         attacks += [("sample", payload) for payload in samples]
         publishers = {
@@ -324,7 +325,7 @@ def test_nothing_that_is_published_ends_the_monitor_the_recorder_or_a_client(end
             entity.put(payload, source_info=info)
             time.sleep(0.002)
 
-        good = wire.encode_estimate(make_estimate(1), time.time_ns())
+        good = encode_estimate(make_estimate(1), time.time_ns())
         until(lambda: put("estimate", good) or client.received)
         for name, payload in attacks:
             put(name, payload)
@@ -334,7 +335,7 @@ def test_nothing_that_is_published_ends_the_monitor_the_recorder_or_a_client(end
             for view in watcher.views.values():
                 assert view.line() and json.dumps(snapshot(view, True, since), allow_nan=False)
             assert client.latest() and (client.status, client.model)
-        last = wire.encode_estimate(make_estimate(77), time.time_ns())
+        last = encode_estimate(make_estimate(77), time.time_ns())
         until(lambda: put("estimate", last) or (client.latest().sequence == 77 and client.valid))
         until(
             lambda: (

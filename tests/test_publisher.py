@@ -57,7 +57,7 @@ def client(publisher, endpoint):
 
 def ask(session, key):
     """The only answer to a query."""
-    (reply,) = list(session.get(key, timeout=5.0))
+    (reply,) = list(session.get(key, timeout=LIMIT_S))
     assert reply.ok is not None
     assert str(reply.ok.encoding) == "application/json"
     return json.loads(reply.ok.payload.to_bytes())

@@ -10,10 +10,11 @@ import pytest
 
 from drivelink import jointfile
 from drivelink.errors import JointFileError
+from estimator.batch import fit
 from estimator.diagnosis.covariance import hac_covariance
 from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.model import JointModel
-from estimator.sample import FloatArray, Record
+from estimator.sample import SIGMA_95, FloatArray, Record
 
 PARTS = 4
 BANDWIDTH_HZ = 20.0
@@ -68,6 +69,16 @@ def test_parts_of_a_recording_agree_within_what_is_said_though_physics_is_missin
     ratio = sum(chi_squared(k, std) for k, std in pairs) / freedom
     # 18 degrees of freedom: chance alone moves the ratio between 0.46 and 1.75 (95 %).
     assert 0.4 < ratio < 1.75
+
+
+def test_an_effect_that_moves_the_stiffness_is_in_the_interval_of_a_fit() -> None:
+    """Undeclared hysteresis, which stiffens the joint in all parts of the motion alike."""
+    missing = [{"hysteresis_nm": nm, "hysteresis_rad": rad} for nm, rad in ((0.6, 0.01), (2.0, 0.05))]
+    for record in kit.World(missing).run():
+        (found,) = fit(record, kit.model(linked=False))
+        k, std = found.parameters["k_nm_rad"], found.std["k_nm_rad"]
+        assert isinstance(k, float) and isinstance(std, float)
+        assert 0.04 < k / kit.STIFFNESS - 1.0 < SIGMA_95 * std / kit.STIFFNESS
 
 
 def test_an_inertia_moves_as_far_as_it_is_declared_unsure() -> None:

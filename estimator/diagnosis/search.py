@@ -14,6 +14,7 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import softmax
 
 from estimator.diagnosis.beliefs import effect_std
 from estimator.diagnosis.candidates import Candidate, columns, grid, members
@@ -45,13 +46,30 @@ class _Tried(NamedTuple):
     gain: float
     shift: FloatArray  # (k, m) of x per prior standard deviation of the effect's parameters
     precision: FloatArray  # (m, m) of these
+    side: FloatArray  # (m,) this precision times their estimates
 
-    def more(self, effect: float) -> FloatArray:
-        """(k, k) increase of the covariance of x, with the design effect of the rows."""
+    def independent(self, effect: float) -> _Tried:
+        """The same where so many rows have the information of one (`design_effects`)."""
+        eye = np.eye(len(self.precision))
+        return _tried(self.values, self.shift, eye + (self.precision - eye) / effect, self.side / effect)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(k, k) increase of the covariance of x."""
         if not math.isfinite(self.gain):
             return np.zeros((len(self.shift),) * 2)
-        eye = np.eye(len(self.precision))
-        return np.asarray(self.shift @ np.linalg.solve(eye + (self.precision - eye) / effect, self.shift.T))
+        return np.asarray(self.shift @ np.linalg.solve(self.precision, self.shift.T))
+
+    @property
+    def change(self) -> FloatArray:
+        """(k,) change of x."""
+        return np.asarray(self.shift @ np.linalg.solve(self.precision, self.side))
+
+
+def _tried(values: dict[str, float], shift: FloatArray, precision: FloatArray, side: FloatArray) -> _Tried:
+    sign, logdet = np.linalg.slogdet(precision)
+    gain = 0.5 * float(side @ np.linalg.solve(precision, side)) - 0.5 * float(logdet)
+    return _Tried(values, gain if sign > 0.0 and math.isfinite(gain) else -math.inf, shift, precision, side)
 
 
 class _Beside(NamedTuple):
@@ -229,7 +247,9 @@ class Search:
         always driven in one direction looks like a softer spring. It adds the covariance of the larger model
         minus that of the hypothesis (consider covariance; S. F. Schmidt, Advances in Control Systems 3,
         1966). Families of effects are independent contributions (JCGM 100, 5.1.2); of the laws of one family
-        the largest contribution counts.
+        the largest contribution counts. An effect that the data support also changes x: the squares of these
+        changes are added, each with the probability of its effect (Bayesian model averaging; Hoeting et al.,
+        Statistical Science 14, 1999), as the residual has one explanation.
 
         Args:
             parent: the hypothesis.
@@ -237,21 +257,26 @@ class Search:
             effect: design effect of the rows (`design_effects`).
 
         Returns:
-            (k, k), each effect at its most promising shape. Excluded are effects that change the
-            transmission's curve, which are another model, and in a fit the torque's scale, which is the
-            anchor.
+            (k, k), each effect at its most promising shape. Excluded are, in a fit, the torque's scale, which
+            is the anchor, and, unless the data support them, effects that change the transmission's curve,
+            which are another model.
         """
         families: dict[tuple[object, ...], FloatArray] = {}
         nothing = np.zeros_like(parent.posterior.covariance)
+        odds, apart = [0.0], [nothing]
         for one in self._library_beside(parent):
             candidate = one.candidate
-            if candidate.bends or (self.problem.calibrating and candidate.kind.channel == "motor_torque"):
+            if self.problem.calibrating and candidate.kind.channel == "motor_torque":
                 continue
-            more = max(one.tried, key=lambda x: x.gain).more(effect)
+            best = max(one.tried, key=lambda x: x.gain).independent(effect)
+            odds.append(best.gain - math.log(len(one.tried)) - self.price)
+            apart.append(np.outer(best.change, best.change) if math.isfinite(best.gain) else nothing)
+            more = nothing if candidate.bends else best.covariance
             _, *family = candidate.family  # either side of the motor's balance is the same to it
             before = families.get(tuple(family), nothing)
             families[tuple(family)] = max(more, before, key=lambda x: float(x[place, place]))
-        return np.asarray(sum(families.values(), nothing))
+        between = np.tensordot(softmax(odds), apart, axes=1)
+        return np.asarray(sum(families.values(), between))
 
     def _library_beside(self, parent: Fitted) -> Iterator[_Beside]:
         """All additional effects over their grids, linearised."""
@@ -274,11 +299,7 @@ class Search:
                 shift = posterior.covariance @ (design.T @ c) * std
                 inner = (c.T @ (c * weight[:, None])) * np.outer(std, std) - (design.T @ c * std).T @ shift
                 side = (c.T @ left) * std
-                scaled = np.eye(len(std)) + inner
-                sign, logdet = np.linalg.slogdet(scaled)
-                gain = 0.5 * float(side @ np.linalg.solve(scaled, side)) - 0.5 * float(logdet)
-                usable = sign > 0.0 and math.isfinite(gain)
-                tried.append(_Tried(values, gain if usable else -math.inf, shift, scaled))
+                tried.append(_tried(values, shift, np.eye(len(std)) + inner, side))
             yield _Beside(entry.candidate, tried)
 
 

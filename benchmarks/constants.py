@@ -1,12 +1,15 @@
 """Every choice constant of `estimator/`, halved and doubled: does any figure get worse by more than a fifth?
 
-    python benchmarks/constants.py [--list] [--only NAME ...] [--seeds N] [--state FILE] [--data DIR]
+    python benchmarks/constants.py [--list | --report] [--only NAME ...] [--seeds N] [--state FILE]
 
-A constant is a number written at the top of a module, or an entry of a table of choices or priors; numbers
-that are computed there are not. For each one the figures are formed with half and with twice its value, on a
-few short recordings that are made once, in a forked process, and appended to --state (JSON lines): a run that
-was interrupted goes on where it ended. A figure that gets worse by more than a fifth names a mechanism to
-replace, not a number. The constants of `estimator/core` are compiled: they are counted, not varied.
+A choice is an entry of the tables `estimator.choices.CHOICES` and `estimator.priors.PRIORS`, and any other
+number that a module defines at its top, unless `NO_CHOICE` says what it is instead. For each one the figures
+are formed with half and with twice its value (of a share above one half: of what it leaves to one), on a few
+short recordings that are made once, in a forked process, and appended to --state (JSON lines): a run that was
+interrupted goes on where it ended. What the gate does not read is not tried on the gate's faults, and what
+only the gate reads is tried on nothing else. A figure that gets worse by more than a fifth names a mechanism
+to replace, not a number. --report prints what --state holds. The constants of `estimator/core` are compiled:
+they are counted, sizes of arrays included, and not varied.
 """
 
 from __future__ import annotations
@@ -28,7 +31,26 @@ from estimator.model import JointModel
 from estimator.sample import Record
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests"))  # gatekit
+NO_CHOICE = {  # mathematics, units, rounding, and what a format or the literature defines
+    "diagnosis.candidates.LAWS": "Dahl's law, Bouc-Wen with equal parts, elastic up to the limit",
+    "diagnosis.covariance._FULL": "keeps rounding from dividing by zero",
+    "diagnosis.curves._DEGREE": "cubic splines",
+    "filters._TERMS": "of a series, the next one is below rounding",
+    "flexibility.RELATIVE_STEP": "of central differences: cube root of the rounding",
+    "gate.causes._DEGREE": "unit",
+    "gate.causes._MILLI": "unit",
+    "gate.evidence._RIDGE": "keeps rounding from deciding between parallel columns",
+    "gate.judge._TURN": "one revolution",
+    "gate.usable._ABSURD": "one over the rounding",
+    "model.HIGHEST_ORDER": "of a polynomial in the joint file",
+    "model_monitor._LEAST_SECONDS": "that a standard deviation takes",
+    "model_monitor._NOTHING": "keeps a logarithm finite",
+    "sample.SIGMA_95": "quantile of the normal distribution",
+}
 FACTORS = (0.5, 2.0)
+STATE = Path(__file__).with_suffix(".jsonl")
+GATE_KINDS = ("soft", "geared")
 FIFTH = 1.2
 SEED = 300  # of the simulated recordings: none that a constant was chosen on
 SECONDS = 10.0
@@ -47,6 +69,21 @@ class Constant(NamedTuple):
     name: str
     key: str | None
     value: float | tuple[float, ...]
+
+    @property
+    def gate(self) -> bool:
+        """Whether the gate reads it."""
+        return self._read("estimator/gate/*.py")
+
+    @property
+    def fits(self) -> bool:
+        """Whether anything else does."""
+        return self._read("estimator/*.py") or self._read("estimator/diagnosis/*.py")
+
+    def _read(self, modules: str) -> bool:
+        name = self.name if self.key is None else f'"{self.key}"'
+        paths = [path for path in ROOT.glob(modules) if path.stem not in ("choices", "priors")]
+        return any(name in path.read_text(encoding="utf-8") for path in paths)
 
     @property
     def label(self) -> str:
@@ -69,6 +106,8 @@ class Constant(NamedTuple):
 def _times(value: Any, factor: float) -> Any:
     if isinstance(value, tuple):
         return tuple(_times(x, factor) for x in value)
+    if 0.5 < value < 1.0:  # a share
+        return 1.0 - (1.0 - value) / factor
     return max(1, round(value * factor)) if isinstance(value, int) else value * factor
 
 
@@ -82,17 +121,14 @@ def constants() -> list[Constant]:
             if not isinstance(node, ast.Assign | ast.AnnAssign) or not isinstance(target, ast.Name):
                 continue
             value = getattr(importlib.import_module(module), target.id, None)
-            written = node.value is not None and not any(
-                isinstance(part, ast.Name | ast.Call | ast.BinOp) for part in ast.walk(node.value)
-            )
             if target.id in ("PRIORS", "CHOICES") and isinstance(value, dict):
                 found += [
                     Constant(module, target.id, key, entry.std if hasattr(entry, "std") else entry.value)
                     for key, entry in value.items()
                 ]
-            elif written and _number(value):
+            elif _number(value):
                 found.append(Constant(module, target.id, None, value))
-    return found
+    return [constant for constant in found if constant.label not in NO_CHOICE]
 
 
 def _number(value: object) -> bool:
@@ -110,6 +146,34 @@ class Case(NamedTuple):
     bandwidth_hz: float | None = None
     baseline: float | None = None
     stiffness_nm_rad: float | None = None
+
+
+Fault = tuple[Record, JointModel, dict[str, float]]
+
+
+def faults() -> list[Fault]:
+    """Recordings of joints that are healthy and that have each fault of a first installation."""
+    import gatekit
+
+    made: list[Fault] = []
+    for kind in GATE_KINDS:
+        drawn = gatekit.draw(kind, SEED)
+        every = ({}, *gatekit.faults(drawn).values())
+        made += [(gatekit.faulty(drawn.record, factors), drawn.model, factors) for factors in every]
+    return made
+
+
+def gate_figures(recordings: Sequence[Fault]) -> dict[str, float]:
+    """Errors of the gate."""
+    from gate import outcome
+
+    from estimator.gate import examine
+
+    found = [(examine(record, model), factors) for record, model, factors in recordings]
+    return {
+        "healthy joints refused": float(sum(bool(f) for f, factors in found if not factors)),
+        "faults not named": float(sum(outcome(f, factors) != "named" for f, factors in found if factors)),
+    }
 
 
 def cases(data: Path, seeds: int) -> list[Case]:
@@ -166,7 +230,9 @@ def figures(recordings: Sequence[Case]) -> dict[str, float]:
     }
 
 
-def _forked(recordings: Sequence[Case], constant: Constant | None, factor: float) -> dict[str, float] | str:
+def _forked(
+    recordings: Sequence[Case], faulty: Sequence[Fault], constant: Constant | None, factor: float
+) -> dict[str, float] | str:
     """The figures with one constant changed, in a process that ends with it."""
     reader, writer = os.pipe()
     child = os.fork()
@@ -174,7 +240,10 @@ def _forked(recordings: Sequence[Case], constant: Constant | None, factor: float
         try:
             if constant is not None:
                 constant.set(factor)
-            outcome: object = figures(recordings)
+            outcome: object = {
+                **(figures(recordings) if constant is None or constant.fits else {}),
+                **(gate_figures(faulty) if constant is None or constant.gate else {}),
+            }
         except Exception as error:  # noqa: BLE001 - whatever a wild constant breaks is the answer
             outcome = f"{type(error).__name__}: {error}"
         with os.fdopen(writer, "w", encoding="utf-8") as pipe:
@@ -201,9 +270,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     default = Path(os.environ.get("DRIVELINK_DATA", ROOT.parent / "shared" / "data"))
     parser.add_argument("--list", action="store_true", help="only list the constants")
+    parser.add_argument("--report", action="store_true", help="only print what has been measured")
     parser.add_argument("--only", nargs="*", metavar="NAME", help="beginnings of names as --list gives them")
     parser.add_argument("--seeds", type=int, default=1, help="simulated joints of each kind")
-    parser.add_argument("--state", type=Path, default=Path("constants.jsonl"), metavar="FILE")
+    parser.add_argument("--state", type=Path, default=STATE, metavar="FILE")
     parser.add_argument("--data", type=Path, default=default, metavar="DIR")
     args = parser.parse_args()
     everything = constants()
@@ -221,13 +291,14 @@ def main() -> None:
             entry = json.loads(line)
             done[entry["constant"], entry["factor"]] = entry["figures"]
     recordings: list[Case] = []
+    faulty: list[Fault] = []
     by_label = {c.label: c for c in chosen}
     jobs = [("as it is", 1.0), *((label, factor) for label in by_label for factor in FACTORS)]
     for label, factor in jobs:
-        if (label, factor) in done:
+        if args.report or (label, factor) in done:
             continue
-        recordings = recordings or cases(args.data, args.seeds)
-        done[label, factor] = _forked(recordings, by_label.get(label), factor)
+        recordings, faulty = recordings or cases(args.data, args.seeds), faulty or faults()
+        done[label, factor] = _forked(recordings, faulty, by_label.get(label), factor)
         with args.state.open("a", encoding="utf-8") as state:
             state.write(
                 json.dumps({"constant": label, "factor": factor, "figures": done[label, factor]}) + "\n"
@@ -237,17 +308,24 @@ def main() -> None:
 
 
 def _report(done: dict[tuple[str, float], Any], jobs: list[tuple[str, float]]) -> None:
+    """The figures as they are, and the changes that make one worse by more than a fifth."""
     reference = done["as it is", 1.0]
+    changed = [job for job in jobs[1:] if job in done]
+    print(
+        f"{len(jobs) // 2} choice constants, and {compiled()} compiled ones that are not varied. "
+        f"{len(changed)} of {len(jobs) - 1} changes were measured.\n"
+    )
     print("| constant | factor | " + " | ".join(reference) + " | worse by more than a fifth |")
     print("|---" * (len(reference) + 3) + "|")
-    for label, factor in jobs:
+    for label, factor in [jobs[0], *changed]:
         found = done[label, factor]
         if isinstance(found, str):
             print(f"| {label} | {factor:g} | {found} |" + " |" * len(reference))
             continue
         worse = [name for name, value in found.items() if value > FIFTH * reference[name] + 1e-12]
-        numbers = " | ".join(f"{value:.3g}" for value in found.values())
-        print(f"| {label} | {factor:g} | {numbers} | {', '.join(worse)} |")
+        if worse or (label, factor) == jobs[0]:
+            numbers = " | ".join(f"{found[name]:.3g}" if name in found else "" for name in reference)
+            print(f"| {label} | {factor:g} | {numbers} | {', '.join(worse)} |")
 
 
 if __name__ == "__main__":

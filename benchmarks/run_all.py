@@ -140,6 +140,9 @@ SECTIONS = (
         quick=("--seeds", "1", "--kinds", "serial"),
     ),
     Section(
+        name="constants", title="Choice constants halved and doubled", full=("--report",), quick=("--report",)
+    ),
+    Section(
         name="external",
         title="External torque and contact",
         quick=("--minutes", "2", "--errors", "2", "--joints", "sea"),

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimator.diagnosis.bandwidth import choose_bandwidth
-from estimator.diagnosis.choices import choice, least_rows
+from estimator.choices import choice, least_rows, log_odds
+from estimator.diagnosis.bandwidth import choose_bandwidth, widest
 from estimator.diagnosis.covariance import design_effects, hac_covariance
 from estimator.diagnosis.frame import Frame
 from estimator.diagnosis.heldout import Held, held_out
@@ -25,14 +25,12 @@ from estimator.diagnosis.search import Search
 from estimator.diagnosis.stiffness import middle
 from estimator.errors import EstimatorError
 from estimator.gate import check, refuse
-from estimator.model import JointModel, ParameterValue, Transmission
+from estimator.model import HIGHEST_ORDER, JointModel, ParameterValue, Transmission
 from estimator.sample import SIGMA_95, FloatArray, Record
 from estimator.transmissions import MODELS, RIGID, UNKNOWN, TransmissionModel
 
 __all__ = ["JointFit", "Key", "TransmissionFit", "fit", "fit_joint", "transmission_fits"]
 
-_LOOKED_AT = 33  # deflections from zero to the largest one
-_HIGHEST_ORDER = 4
 _OF_RIGID = ("coulomb_friction", "torque_offset")
 _NUISANCES = {  # everyday errors by the names of `TransmissionFit.nuisance_std`
     "inertia": "motor_inertia",
@@ -102,8 +100,7 @@ class TransmissionFit:
     def stiffens(self) -> bool:
         """Whether the stiffness is positive, its 95 % interval too, at every deflection of the recordings."""
         law = MODELS[self.model]
-        reach = float(np.max(np.abs(self.deflection_rad)))
-        phi = np.linspace(0.0, reach, _LOOKED_AT)
+        phi = np.abs(self.deflection_rad)
         slopes = law.stiffness_jacobian(phi, self.alpha)
         std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", slopes, self.covariance, slopes), 0.0))
         return bool(np.all(law.stiffness(phi, self.alpha) > SIGMA_95 * std))
@@ -186,11 +183,9 @@ def fit_joint(
         )
     else:
         bandwidth_hz = bandwidth_rad_s / (2.0 * math.pi)
-    nyquist = 0.4 / max(one.period_s for one in usable)
-    if not 0.0 < bandwidth_hz <= nyquist:
-        raise EstimatorError(
-            f"bandwidth: expected more than 0 and at most {nyquist:g} Hz, got {bandwidth_hz:g}"
-        )
+    most = widest(max(one.period_s for one in usable))
+    if not 0.0 < bandwidth_hz <= most:
+        raise EstimatorError(f"bandwidth: expected more than 0 and at most {most:g} Hz, got {bandwidth_hz:g}")
     problem, fitted = _ordered(usable, _bare(model), bandwidth_hz)
     held = held_out(problem)
     surplus = held.surplus(fitted)
@@ -247,20 +242,21 @@ def _bare(model: JointModel) -> JointModel:
 
 
 def _ordered(records: Sequence[Record], model: JointModel, bandwidth_hz: float) -> tuple[Problem, Fitted]:
-    """The best fit; each undeclared polynomial order is the one with the most evidence."""
+    """The best fit; each undeclared polynomial order is raised for as long as the evidence rises."""
     problem = _joint_problem(records, model, bandwidth_hz)
     fitted = problem.null()
     for i, motor in enumerate(model.motors):
         if motor.transmission.model != "polynomial" or motor.transmission.order is not None:
             continue
-        tried = []
-        for order in range(1, _HIGHEST_ORDER + 1):
+        for order in range(1, HIGHEST_ORDER + 1):
             own = replace(motor, transmission=replace(motor.transmission, order=order))
             motors = (*problem.model.motors[:i], own, *problem.model.motors[i + 1 :])
             one = _joint_problem(records, replace(problem.model, motors=motors), bandwidth_hz)
-            tried.append((one, one.null()))
-        closest = min((h for _, h in tried), key=lambda h: float(np.sum(np.log(h.posterior.sigma))))
-        problem, fitted = max(tried, key=lambda pair: pair[1].evidence(closest))
+            raised = one.null()
+            closest = min((fitted, raised), key=lambda h: float(np.sum(np.log(h.posterior.sigma))))
+            if order > 1 and raised.evidence(closest) <= fitted.evidence(closest):
+                break
+            problem, fitted = one, raised
     return problem, fitted
 
 
@@ -276,7 +272,7 @@ def _aligned(free: JointFit) -> JointFit:
             key: math.inf if _stamped_wrongly(joint, key) else _odds_of_zero(joint, [key])
             for key in _optional(joint)
         }
-        doubtful = [key for key in odds if odds[key] > math.log(choice("even") / (1.0 - choice("even")))]
+        doubtful = [key for key in odds if odds[key] > log_odds(choice("even"))]
         if not doubtful:
             break
         absent = joint.absent | {max(doubtful, key=lambda key: odds[key])}

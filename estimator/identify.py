@@ -11,6 +11,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from estimator.batch import JointFit, TransmissionFit, fit_joint, transmission_fits
+from estimator.choices import chance
 from estimator.diagnosis.candidates import sign_smoothing
 from estimator.diagnosis.heldout import Residual, residual_of, wider
 from estimator.effects import elements
@@ -20,7 +21,6 @@ from estimator.transmissions import RIGID
 
 __all__ = ["Identified", "Left", "RecordingFit", "identify"]
 
-_CHANCE = 0.01  # significance level at which recordings disagree on a value
 _PARAMETER = {
     "encoder_delay": "delay_s",
     "torque_delay": "delay_s",
@@ -146,7 +146,7 @@ def _shared(joint: JointFit, mine: list[int]) -> float | None:
     mean = float(np.sum(precision @ values) / np.sum(precision))
     apart = values - mean
     freedom = len(mine) - 1
-    if freedom and chdtrc(freedom, float(apart @ precision @ apart)) < _CHANCE:
+    if freedom and chdtrc(freedom, float(apart @ precision @ apart)) < chance():
         return None
     return mean
 

@@ -9,16 +9,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
+from estimator.choices import choice, whole
 from estimator.errors import EstimatorError
 from estimator.flexibility import Polynomial, TransmissionModel
 from estimator.sample import FloatArray
 
 __all__ = ["ArrayFit", "fit_alpha", "fit_polynomial", "fit_projected", "solve"]
-
-_GRID = 30  # starts of the one-dimensional search over a shape parameter
-_FOLDS = 10
-_HIGHEST_ORDER = 9
-_NEGLIGIBLE = 1e-4  # an error of this share of the torque needs no further order
 
 
 class ArrayFit(NamedTuple):
@@ -69,10 +65,10 @@ def fit_polynomial(
         rule: "paper": stop when the sum of squared errors changes by less than gamma (in N²·m², so it
             depends on units and number of samples); "bic": smallest s ln(e/s) + p ln s;
             "cross-validation": smallest error on blocks left out, and by more than 1 %. The last two are
-            scale-free, and also stop at an error of 1e-4 of the torque.
+            scale-free, and also stop at the error that filters leave of exact data.
         gamma: threshold of the paper's rule.
     """
-    highest = min(columns.shape[1], _HIGHEST_ORDER)
+    highest = columns.shape[1]
     fits = [solve(columns[:, :p], target) for p in range(1, highest + 1)]
     if rule == "paper":
         # e^(0) is the error of no model; the paper reports the order at which the last gain was made.
@@ -87,7 +83,7 @@ def fit_polynomial(
         for p, fit in enumerate(fits, start=1)
     ]
     best = 0
-    enough = _NEGLIGIBLE**2 * float(target @ target)
+    enough = choice("exact") ** 2 * float(target @ target)
     for p in range(1, highest):
         if fits[best].sum_of_squares < enough:
             break
@@ -102,7 +98,7 @@ def _bic(fit: ArrayFit, order: int, samples: int) -> float:
 
 
 def _cross_validated(columns: FloatArray, target: FloatArray) -> float:
-    blocks = np.array_split(np.arange(len(target)), _FOLDS)
+    blocks = np.array_split(np.arange(len(target)), whole("groups"))
     error = 0.0
     for block in blocks:
         keep = np.ones(len(target), dtype=bool)
@@ -252,7 +248,7 @@ def search_shape(
             options={"xatol": 1e-8, "fatol": 0.0, "maxfev": 400},
         )
         return tuple(result.x.tolist())
-    grid = model.shapes(1.001 * reach_rad, _GRID)
+    grid = model.shapes(1.001 * reach_rad, whole("points"))
     if grid.size == 0:
         raise EstimatorError(
             f"{model.name}: no {model.shape_names[0]} reaches deflections of {reach_rad:g} rad"
@@ -269,6 +265,6 @@ def search_shape(
     return (float(found.x),)
 
 
-def polynomial_columns(phi: FloatArray, order: int = _HIGHEST_ORDER) -> FloatArray:
+def polynomial_columns(phi: FloatArray, order: int) -> FloatArray:
     """f_h(phi) = phi^(2h-1), h = 1 … order (eq 24)."""
     return Polynomial().basis(phi, order=order)

@@ -13,7 +13,18 @@ from typing import Any, ClassVar, Literal
 from estimator.errors import EstimatorError
 from estimator.priors import PRIORS
 
-__all__ = ["Arrangement", "Effect", "JointModel", "LinkDynamics", "Motor", "ParameterValue", "Transmission"]
+__all__ = [
+    "HIGHEST_ORDER",
+    "Arrangement",
+    "Effect",
+    "JointModel",
+    "LinkDynamics",
+    "Motor",
+    "ParameterValue",
+    "Transmission",
+]
+
+HIGHEST_ORDER = 9  # of a polynomial in the joint file: what the compiled core has room for
 
 Arrangement = Literal["single", "antagonistic", "serial"]
 ParameterValue = float | tuple[float, ...]
@@ -68,7 +79,10 @@ class Transmission:
     parameters: Mapping[str, ParameterValue] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        require(self.order is None or 1 <= self.order <= 9, f"order: expected 1 to 9, got {self.order}")
+        require(
+            self.order is None or 1 <= self.order <= HIGHEST_ORDER,
+            f"order: expected 1 to {HIGHEST_ORDER}, got {self.order}",
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -21,7 +21,6 @@ from estimator.settings import EstimatorSettings
 __all__ = ["ModelMonitor", "ResidualBaseline", "can_monitor", "measure_baseline"]
 
 _SETTINGS = EstimatorSettings()
-_LONGEST_S = 120.0  # of a recording that a baseline is measured on
 _LEAST_SECONDS = 2  # that a standard deviation takes
 _NOTHING = 1e-12  # N·m: keeps the logarithm of a second without residual or torque finite
 
@@ -76,7 +75,7 @@ def can_monitor(model: JointModel) -> bool:
 def measure_baseline(
     record: Record | Sequence[Record], model: JointModel, surplus: float = 1.0
 ) -> ResidualBaseline:
-    """Measure the baseline of a model on recordings that it explains (at most two minutes of each).
+    """Measure the baseline of a model on recordings that it explains.
 
     Args:
         record: of one or several runs.
@@ -90,8 +89,6 @@ def measure_baseline(
     for one in [record] if isinstance(record, Record) else record:
         monitor, seconds = ModelMonitor(model, one.period_s, None), 0
         for sample in one.samples():
-            if sample.sequence - one.sequence[0] > _LONGEST_S / one.period_s:
-                break
             monitor.core.step(sample)
             if monitor.core.seconds > seconds:
                 seconds = monitor.core.seconds

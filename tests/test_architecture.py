@@ -61,6 +61,13 @@ def test_the_estimator_reads_no_clock_and_touches_no_file_or_socket() -> None:
         assert not calls & {"open", "print", "input"}, f"{path.relative_to(ROOT)}"
 
 
+def test_every_number_that_the_estimator_chooses_is_in_a_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    from constants import constants
+
+    assert [constant.label for constant in constants() if constant.key is None] == []
+
+
 def test_only_the_fleet_imports_what_its_extra_brings() -> None:
     extra = {"dask", "distributed", "fsspec", "pyarrow"}
     for path in modules("drivelink"):

@@ -9,9 +9,9 @@ import diagnosiskit as kit
 import numpy as np
 import pytest
 
+from estimator.choices import choice
 from estimator.diagnosis import diagnose, tracing
 from estimator.diagnosis.candidates import Candidate
-from estimator.diagnosis.choices import choice
 from estimator.diagnosis.hypothesis import Term
 from estimator.effects import LIBRARY
 from estimator.errors import EstimatorError

@@ -1,17 +1,18 @@
-"""Chooses the bandwidth of all channels, and computes the noise it passes into each equation."""
+"""Chooses the bandwidth of all channels, from the motion and the noise that it passes into each balance."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy import fft
+from scipy.optimize import brentq
 
-from estimator.diagnosis.choices import choice
+from estimator.choices import choice
 from estimator.diagnosis.frame import Signals
 from estimator.diagnosis.spectral import lowpass
 from estimator.model import JointModel
 from estimator.sample import FloatArray, Record
 
-__all__ = ["choose_bandwidth", "equation_noise", "torque_rms"]
+__all__ = ["choose_bandwidth", "torque_rms", "widest"]
 
 
 def torque_rms(record: Record) -> float:
@@ -20,26 +21,32 @@ def torque_rms(record: Record) -> float:
 
 
 def choose_bandwidth(record: Record, model: JointModel) -> float:
-    """A bandwidth from the data, Hz: wide enough for the motion, narrow enough for the encoders' noise."""
-    rate = 1.0 / record.period_s
+    """A bandwidth from the data, Hz: wide enough for the motion, narrow enough for the noise."""
     torque = record.motor_torque_nm - record.motor_torque_nm.mean(axis=0)
     power = np.sum(np.abs(fft.rfft(torque, axis=0)) ** 2, axis=1)
     share = np.cumsum(power) / max(float(power.sum()), 1e-300)
-    content = float(np.searchsorted(share, choice("content"))) * rate / len(torque)
+    content = float(np.searchsorted(share, choice("content"))) / (record.period_s * len(torque))
     wanted = min(
-        max(choice("wider") * content, choice("least_bandwidth")),
+        max(choice("harmonics") * content, choice("least_bandwidth")),
         choice("most_bandwidth"),
-        choice("sampled") * rate,
+        widest(record.period_s),
     )
-    limit = 2.0 * choice("floor") * torque_rms(record)
-    stiffness = rough_stiffness(record, model)
-    bandwidth = wanted
-    while bandwidth > choice("narrowest"):
-        signals = Signals(record, bandwidth)
-        if float(np.max(equation_noise(signals, model, stiffness, linked=False))) <= limit:
-            break
-        bandwidth *= choice("narrowing")
-    return float(min(max(bandwidth, choice("narrowest")), wanted))
+    signals, stiffness = Signals(record, wanted), rough_stiffness(record, model)
+
+    def beyond(bandwidth_hz: float) -> float:
+        """Noise beyond what is allowed; rises with the bandwidth."""
+        noise = equation_noise(signals, model, stiffness, bandwidth_hz)
+        return float(np.max(noise)) - 2.0 * choice("floor") * torque_rms(record)
+
+    narrowest = min(choice("narrowest"), wanted)
+    if beyond(wanted) <= 0.0:
+        return wanted
+    return float(brentq(beyond, narrowest, wanted)) if beyond(narrowest) < 0.0 else narrowest
+
+
+def widest(period_s: float) -> float:
+    """Largest bandwidth, Hz: every sample is a row."""
+    return 1.0 / (choice("rows") * period_s)
 
 
 def rough_stiffness(record: Record, model: JointModel) -> list[float]:
@@ -56,12 +63,13 @@ def rough_stiffness(record: Record, model: JointModel) -> list[float]:
     return found
 
 
-def equation_noise(signals: Signals, model: JointModel, stiffness: list[float], linked: bool) -> FloatArray:
-    """Standard deviation that the channels' noise has in each equation's balance, N·m."""
+def equation_noise(
+    signals: Signals, model: JointModel, stiffness: list[float], bandwidth_hz: float
+) -> FloatArray:
+    """Standard deviation that the channels' noise has in each motor's balance at a bandwidth, N·m."""
     f = signals.light.frequency_hz
     s = 2j * np.pi * f
-    narrow = lowpass(f, signals.bandwidth_hz)
-
+    narrow = lowpass(f, bandwidth_hz)
     variances = []
     for i, motor in enumerate(model.motors):
         k = stiffness[i]
@@ -69,12 +77,5 @@ def equation_noise(signals: Signals, model: JointModel, stiffness: list[float], 
         variance = signals.noise(signals.theta[i], own * narrow) + signals.noise(signals.tau[i], narrow)
         if k and signals.q is not None:
             variance += signals.noise(signals.q, k * narrow)
-        variances.append(variance)
-    if linked and model.link is not None and signals.q is not None:
-        k = sum(stiffness)
-        own = model.link.inertia_kg_m2 * s**2 + model.link.viscous_damping_nm_s_rad * s + k
-        variance = signals.noise(signals.q, own * narrow)
-        for spectrum, each in zip(signals.theta, stiffness, strict=True):
-            variance += signals.noise(spectrum, each * narrow)
         variances.append(variance)
     return np.asarray(np.sqrt(np.array(variances)))

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimator.diagnosis.choices import whole
+from estimator.choices import whole
 from estimator.diagnosis.frame import Frame
 from estimator.model import ParameterValue
 from estimator.sample import FloatArray
@@ -94,7 +94,7 @@ def _search(frame: Frame, i: int, model: TransmissionModel, order: int) -> Float
         low, high = model.shape_bounds[0]
         rest = model.shape_start[1:]
         first = 1.02 * low if low > 0.5 else 0.02 / max(most, 1e-9)
-        near = np.geomspace(first, min(high, max(20.0 / max(most, 1e-9), 1.1 * first)), whole("shapes"))
+        near = np.geomspace(first, min(high, max(20.0 / max(most, 1e-9), 1.1 * first)), whole("points"))
         shapes = [(float(x), *rest) for x in near if model.reach((float(x), *rest)) > most * 1.001]
     best, found = np.inf, np.zeros(0)
     for shape in shapes:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from estimator.choices import choice
 from estimator.diagnosis.candidates import Candidate, reverses
-from estimator.diagnosis.choices import choice
 from estimator.diagnosis.frame import Frame
 from estimator.effects import LIBRARY
 from estimator.model import JointModel

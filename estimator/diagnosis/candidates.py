@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimator.diagnosis.choices import choice, whole
+from estimator.choices import choice, whole
 from estimator.diagnosis.frame import Frame
 from estimator.effects import LIBRARY, Coordinates, EffectType, elements
 from estimator.sample import FloatArray
@@ -99,7 +99,7 @@ def sign_smoothing(frames: Sequence[Frame], motor: int) -> float:
     fast = max(float(np.max(np.abs(f.motors[motor].velocity))) for f in frames)
     noise = max(f.signals.velocity_noise(motor) for f in frames)
     least, most = choice("floor") * fast, choice("smoothing") * fast
-    return min(max(choice("sign_noise") * noise, least), most)
+    return min(max(choice("sure") * noise, least), most)
 
 
 def _needs_deflection(kind: EffectType) -> bool:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from estimator.diagnosis.choices import choice
+from estimator.choices import choice
 from estimator.diagnosis.hypothesis import Fitted, Keys
 from estimator.diagnosis.search import Search
 

@@ -9,20 +9,21 @@ Miller, J. of Business and Economic Statistics 29, 2011).
 
 from __future__ import annotations
 
+from statistics import NormalDist
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.stats import t as student
 
-from estimator.diagnosis.choices import choice, whole
+from estimator.choices import choice, whole
 from estimator.diagnosis.hypothesis import Fitted, Problem, stretches
-from estimator.sample import FloatArray
+from estimator.sample import SIGMA_95, FloatArray
 
 __all__ = ["design_effects", "hac_covariance"]
 
 
 _FULL = 1e-9  # leverage is below one by the priors; guards a division against rounding
-_LEVEL = 0.975  # of a two-sided 95 % interval
 
 Labels = NDArray[np.int64]
 
@@ -40,7 +41,7 @@ def hac_covariance(problem: Problem, fitted: Fitted, surplus: float = 1.0) -> Fl
     """
     free, moderated, freedom = _moderated(problem, fitted, surplus)
     out = np.zeros((len(fitted.posterior.x),) * 2)
-    wider = student.ppf(_LEVEL, freedom) / student.ppf(_LEVEL, np.inf)
+    wider = student.ppf(NormalDist().cdf(SIGMA_95), freedom) / SIGMA_95
     unit = _unit(fitted, free) * wider
     out[np.ix_(free, free)] = moderated * np.outer(unit, unit)
     return out

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.signal import lfilter
 
-from estimator.diagnosis.choices import choice, whole
+from estimator.choices import choice, whole
 from estimator.diagnosis.frame import Frame
 from estimator.diagnosis.hypothesis import Extra, Fitted
 from estimator.diagnosis.search import Search
@@ -17,10 +18,7 @@ from estimator.sample import FloatArray
 
 __all__ = ["best_curve"]
 
-_DEGREE = 3
-_LEAST_HARMONICS = 3
-_FINE = 24  # steps in which a line's frequency is refined
-_LAGS_S = (0.05, 0.1, 0.2, 0.4, 0.8)
+_DEGREE = 3  # cubic
 
 Basis = Callable[[Coordinates], FloatArray]
 
@@ -79,14 +77,14 @@ def _bases(frame: Frame, beside: Fitted, location: str, motor: int) -> list[tupl
         "link": ("link_position", "link_velocity"),
     }[location]
     made: list[tuple[tuple[str, ...], Basis]] = [
-        ((name,), _over(name, _Splines(getattr(c, name), whole("knots")))) for name in (place, rate, *others)
+        ((name,), _over(name, _Splines(getattr(c, name), whole("points")))) for name in (place, rate, *others)
     ]
     v = getattr(c, rate)
     slow = _Splines(c.time, whole("groups"))
     if location == "motor" and frame.linked:
-        made.append((("torque",), _beyond_scale(_Splines(c.torque, whole("knots")))))
+        made.append((("torque",), _beyond_scale(_Splines(c.torque, whole("points")))))
         made.append(
-            (("position", "torque"), _scaled("torque", "position", _Splines(c.position, whole("knots")), c))
+            (("position", "torque"), _scaled("torque", "position", _Splines(c.position, whole("points")), c))
         )
     smoothing = max(choice("smoothing") * float(np.sqrt(np.mean(v * v))), 1e-12)
     made.append(
@@ -99,7 +97,7 @@ def _bases(frame: Frame, beside: Fitted, location: str, motor: int) -> list[tupl
         made.append((("velocity", "time"), _fading(slow, smoothing, c)))
     if location == "transmission":
         made.append((("deflection", "time"), _scaled("deflection", "time", slow, c)))
-        made.append((("deflection", "deflection_rate"), _creeping))
+        made.append((("deflection", "deflection_rate"), _creeping(1.0 / frame.signals.bandwidth_hz)))
         path = _Splines(c.link_position, whole("groups"))
         made.append((("deflection", "link_position"), _scaled("deflection", "link_position", path, c, True)))
     made.append((("time",), _waves(frame, beside, *_line(frame, beside, location, motor))))
@@ -141,15 +139,19 @@ def _scaled(factor: str, over: str, splines: _Splines, c: Coordinates, alone: bo
     return basis
 
 
-def _creeping(c: Coordinates) -> FloatArray:
-    """Terms that follow the deflection with a lag: creep and relaxation, several time constants."""
-    period = float(c.time[1] - c.time[0])
-    made = []
-    for lag in _LAGS_S:
-        keep = float(np.exp(-period / lag))
-        start = np.array([keep * c.deflection[0]])
-        made.append(lfilter([1.0 - keep], [1.0, -keep], c.deflection, zi=start)[0])
-    return np.stack(made, axis=1)
+def _creeping(shortest_s: float) -> Basis:
+    """Terms that follow the deflection with a lag: creep and relaxation, time constants an octave apart."""
+
+    def basis(c: Coordinates) -> FloatArray:
+        period, longest = float(c.time[1] - c.time[0]), float(c.time[-1]) / whole("groups")
+        made = []
+        for lag in shortest_s * 2.0 ** np.arange(max(math.log2(longest / shortest_s), 0.0) + 1.0):
+            keep = math.exp(-period / lag)
+            start = np.array([keep * c.deflection[0]])
+            made.append(lfilter([1.0 - keep], [1.0, -keep], c.deflection, zi=start)[0])
+        return np.stack(made, axis=1)
+
+    return basis
 
 
 def _fading(splines: _Splines, smoothing: float, c: Coordinates) -> Basis:
@@ -166,8 +168,7 @@ def _fading(splines: _Splines, smoothing: float, c: Coordinates) -> Basis:
 
 def _waves(frame: Frame, beside: Fitted, frequency: float, resolution: float, equation: int) -> Basis:
     """A line and its harmonics, the line refined; both in rad/s."""
-    most = 2.0 * np.pi * frame.signals.bandwidth_hz / frequency
-    count = int(np.clip(most, _LEAST_HARMONICS, whole("harmonics")))
+    count = int(np.clip(2.0 * np.pi * frame.signals.bandwidth_hz / frequency, 1, whole("points") // 2))
 
     def made(time: FloatArray, w: float) -> FloatArray:
         return np.stack([f(k * w * time) for k in range(1, count + 1) for f in (np.sin, np.cos)], axis=1)
@@ -180,7 +181,7 @@ def _waves(frame: Frame, beside: Fitted, frequency: float, resolution: float, eq
         solution = np.linalg.lstsq(columns, residual, rcond=None)[0]
         return float(np.sum((residual - columns @ solution) ** 2))
 
-    near = frequency + resolution * np.linspace(-1.0, 1.0, 2 * _FINE + 1)
+    near = frequency + resolution * np.linspace(-1.0, 1.0, 2 * whole("points") + 1)
     best = float(min(near, key=left))
     return lambda c: made(c.time, best)
 
@@ -206,7 +207,7 @@ def _line(frame: Frame, beside: Fitted, location: str, motor: int) -> tuple[floa
     first = int(np.ceil(3.0 * size / len(part)))
     harmonic = power[first:].copy()
     index = np.arange(first, len(power))
-    for k in range(2, _LEAST_HARMONICS + 5):
+    for k in range(2, whole("harmonics") + 1):
         ok = k * index < len(power)
         harmonic[ok] += power[k * index[ok]]
     unit = 2.0 * np.pi / (size * period)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.diagnosis.choices import choice, whole
+from estimator.choices import choice, whole
 from estimator.sample import FloatArray
 
 __all__ = ["Posterior", "Regression", "Scale", "autocorrelation_time"]

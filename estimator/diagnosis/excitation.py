@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import fft
 
-from estimator.diagnosis.choices import choice
+from estimator.choices import choice
 from estimator.diagnosis.frame import Frame
 from estimator.sample import FloatArray
 

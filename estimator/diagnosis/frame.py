@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.diagnosis.choices import choice, whole
+from estimator.choices import choice, whole
 from estimator.diagnosis.spectral import Band, Spectrum, lowpass
 from estimator.effects import Coordinates
 from estimator.model import JointModel, LinkDynamics
@@ -72,12 +72,9 @@ class Signals:
         def bridged(x: FloatArray) -> FloatArray:
             return x if unbroken else np.interp(grid, sequence, x)
 
-        rate = choice("grid") * bandwidth_hz
+        rate = choice("rows") * choice("harmonics") * bandwidth_hz
         step = max(1, int(1.0 / (record.period_s * rate)))
-        if self.samples / step > choice("long"):
-            coarse = max(1, int(1.0 / (record.period_s * 2.2 * choice("light") * bandwidth_hz)))
-            step = min(coarse, max(step, -(-self.samples // whole("long"))))
-        margin = 3.0 / bandwidth_hz
+        margin = choice("edge") / bandwidth_hz
         self.light = Band(self.samples, record.period_s, step, margin)
         link = record.link_position_rad
         self.theta = [self.light.transform(bridged(x)) for x in record.motor_position_rad.T]
@@ -88,7 +85,7 @@ class Signals:
         rows_step = max(1, int(1.0 / (self.light.period_s * choice("rows") * bandwidth_hz)))
         self.narrow = Band(self.light.kept, self.light.period_s, rows_step, margin)
         self.response = lowpass(self.narrow.frequency_hz, bandwidth_hz)
-        self.keep = self._rows(record, sequence, choice("edge") / bandwidth_hz)
+        self.keep = self._rows(record, sequence, margin)
 
     def _rows(self, record: Record, sequence: NDArray[np.int64], edge: float) -> NDArray[np.bool_]:
         """Rows away from the ends and from gaps by so many seconds."""
@@ -127,7 +124,7 @@ def _lag(frequency_hz: FloatArray, time_constant_s: float) -> NDArray[Any]:
 def light_response(signals: Signals) -> FloatArray:
     """Response of G."""
     return lowpass(
-        signals.light.frequency_hz, min(choice("light") * signals.bandwidth_hz, 0.45 / signals.period_s)
+        signals.light.frequency_hz, min(choice("harmonics") * signals.bandwidth_hz, 0.45 / signals.period_s)
     )
 
 

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.choices import choice, whole
 from estimator.diagnosis.base import Base, start, with_flexibility
 from estimator.diagnosis.beliefs import OF_RUN, everyday
-from estimator.diagnosis.choices import choice, whole
 from estimator.diagnosis.evidence import Posterior, Regression
 from estimator.diagnosis.frame import Corrections, Frame, Signals
 from estimator.diagnosis.known import declared_corrections, declared_torque
@@ -222,7 +222,7 @@ class Problem:
         fit of a healthy joint continues until it converges.
         """
         best = self._linearised(terms, base, corrections, extra, pinned or {})
-        for k in range(steps or whole("patient_steps" if self.calibrating else "newton_steps")):
+        for k in range(steps or whole("newton_steps")):
             if not self._curved(best) or _converged(best):
                 break
             now = self._linearised(*self._moved(best), extra, pinned or {})

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from estimator.choices import choice
 from estimator.diagnosis.certainty import accounts, standing
-from estimator.diagnosis.choices import choice
 from estimator.diagnosis.curves import best_curve
 from estimator.diagnosis.excitation import advice_for, poor
 from estimator.diagnosis.heldout import Held, errors_of, wider

@@ -7,10 +7,10 @@ from statistics import NormalDist
 
 import numpy as np
 
+from estimator.choices import choice
 from estimator.diagnosis.beliefs import longest_delay_s
 from estimator.diagnosis.candidates import columns
 from estimator.diagnosis.certainty import Standing
-from estimator.diagnosis.choices import choice
 from estimator.diagnosis.covariance import design_effects, hac_covariance
 from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.diagnosis.result import Curve, Finding, Refitted, Rival, Series

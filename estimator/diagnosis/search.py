@@ -7,6 +7,7 @@ others. Each effect pays for multiple testing: its prior probability is one over
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -16,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import softmax
 
+from estimator.choices import choice, whole
 from estimator.diagnosis.beliefs import effect_std
 from estimator.diagnosis.candidates import Candidate, columns, grid, members
-from estimator.diagnosis.choices import choice, whole
 from estimator.diagnosis.hypothesis import Fitted, Keys, Problem, Term, stretches
 from estimator.priors import PRIORS
 from estimator.sample import FloatArray
@@ -106,7 +107,7 @@ class Search:
         """The pruned hypotheses with the most evidence, best first, including single effects."""
         seen = self.seen
         beam, best = [self.null], self.null
-        for size in range(1, whole("effects") + 1):
+        for size in itertools.count(1):
             self._progress(f"term {size}")
             grown = [child for parent in beam for child in self.children(parent)]
             self._singles = self._singles or grown

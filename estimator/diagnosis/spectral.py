@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from estimator.diagnosis.choices import whole
+from estimator.choices import whole
 from estimator.sample import FloatArray
 
 __all__ = ["Band", "Spectrum", "lowpass"]

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from estimator.choices import choice
 from estimator.diagnosis.base import Base
 from estimator.diagnosis.beliefs import OF_RUN, effect_std, everyday, everyday_std, least
 from estimator.diagnosis.candidates import Candidate, bounds_of, columns, reach_of, sign_smoothing, spread_of
-from estimator.diagnosis.choices import choice
 from estimator.diagnosis.evidence import Scale
 from estimator.diagnosis.frame import Corrections, Frame
 from estimator.diagnosis.readings import read

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from estimator.choices import whole
 from estimator.diagnosis.covariance import hac_covariance
 from estimator.diagnosis.frame import Frame
 from estimator.diagnosis.hypothesis import Fitted, Problem
@@ -14,8 +15,6 @@ from estimator.sample import SIGMA_95, FloatArray
 from estimator.transmissions import TransmissionModel
 
 __all__ = ["Middle", "middle", "stiffness_curves"]
-
-_POINTS = 121
 
 
 class Middle(NamedTuple):
@@ -63,7 +62,7 @@ def stiffness_curves(
         if not motor.flexible:
             continue
         reach = float(np.max(np.abs(frame.motors[i].deflection)))
-        phi = np.linspace(-reach, reach, _POINTS)
+        phi = np.linspace(-reach, reach, 2 * whole("points") + 1)
         curves = [_stiffness(frame, *one, i, phi) for one in both]
         made.append(StiffnessCurve(i, phi, *curves[0], *curves[1]))
     return tuple(made)

@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimator.diagnosis.bandwidth import choose_bandwidth
-from estimator.diagnosis.choices import choice, least_rows
+from estimator.choices import choice, least_rows
+from estimator.diagnosis.bandwidth import choose_bandwidth, widest
 from estimator.diagnosis.heldout import Held, held_out
 from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.diagnosis.judge import Judge
@@ -58,9 +58,9 @@ def diagnose(
     doubts = [remark for one in everything if (remark := refuse(one, model).remark)]
     progress("bandwidth")
     bandwidth = bandwidth_hz or choose_bandwidth(records[0], model)
-    nyquist = 0.4 / max(r.period_s for r in records)
-    if not 0.0 < bandwidth <= nyquist:
-        raise EstimatorError(f"bandwidth: expected more than 0 and at most {nyquist:g} Hz, got {bandwidth:g}")
+    most = widest(max(r.period_s for r in records))
+    if not 0.0 < bandwidth <= most:
+        raise EstimatorError(f"bandwidth: expected more than 0 and at most {most:g} Hz, got {bandwidth:g}")
     alone = validation is None and len(records) == 1
     problem = Problem(records, model, bandwidth, held=alone, least=least_rows())
     search = Search(problem, progress)

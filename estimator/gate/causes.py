@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from estimator.choices import choice
 from estimator.gate.evidence import Scales
 from estimator.model import JointModel
 
@@ -16,11 +17,6 @@ Kind = Literal["unit", "sign", "gear", "period"]
 
 _DEGREE = math.pi / 180.0
 _MILLI = 1e-3
-# Prior cost of each kind, in nats: one installation in fifty has it.
-_COST = 4.0
-_RARE = 1.0  # additional nats for rare errors
-_FREE_RATIO = 6.0  # the same for a ratio that is fitted: decades of range at a few per cent of resolution
-_GEARED = 3.0  # ratios closer to one than this are explained by the deflection, not by a gear
 _LINK, _TIME = "link_position", "time"
 
 
@@ -45,13 +41,18 @@ class Cause:
         kind: of it.
         what: in words, e.g. "looks like degrees".
         changes: of the channels that it touches.
-        cost: prior cost, nats.
+        extra: prior cost beyond that of any fault, nats.
     """
 
     kind: Kind
     what: str
     changes: tuple[Change, ...]
-    cost: float = _COST
+    extra: float = 0.0
+
+    @property
+    def cost(self) -> float:
+        """Prior cost, nats."""
+        return choice("fault") + self.extra
 
     @property
     def channels(self) -> frozenset[str]:
@@ -105,7 +106,7 @@ def _units(positions: list[str], torques: list[str], linked: bool) -> list[Cause
     found = [Cause("unit", degrees, _all(group, _DEGREE)) for group in groups]
     for group in (torques, *([[t] for t in torques] if len(torques) > 1 else [])):
         found.append(Cause("unit", f"looks like {small}, expected N·m", _all(group, _MILLI)))
-        found.append(Cause("unit", f"looks like {large}, expected N·m", _all(group, 1e3), _COST + _RARE))
+        found.append(Cause("unit", f"looks like {large}, expected N·m", _all(group, 1e3)))
     return found
 
 
@@ -122,23 +123,26 @@ def _signs(positions: list[str], torques: list[str], linked: bool) -> list[Cause
 def _gears(name: str, gear: float | None, ratio: float | None, linked: bool) -> list[Cause]:
     position, torque = f"{name}_position", f"{name}_torque"
     found = []
-    if gear is not None and abs(math.log(gear)) > math.log(_GEARED):
+    if gear is not None and abs(math.log(gear)) > math.log(choice("declared_factor")):
         shaft, twice = "is of the motor shaft, expected the joint's side", "has the gear ratio in it twice"
         for what, n in ((shaft, gear), (twice, 1.0 / gear)):
             found.append(Cause("gear", what, (Change(position, 1.0 / n), Change(torque, n))))
             found.append(Cause("gear", what, (Change(position, 1.0 / n),)))
             found.append(Cause("gear", what, (Change(torque, n),)))
             if linked:
-                found.append(Cause("gear", what, (Change(_LINK, 1.0 / n),), _COST + _RARE))
+                found.append(Cause("gear", what, (Change(_LINK, 1.0 / n),)))
         rotor = "is the rotor's own, expected the joint's side"
         found.append(Cause("gear", rotor, (Change(f"{name}_inertia", gear * gear),)))
     elif ratio is not None and ratio != 0.0 and _is_gear(abs(ratio)):
         what = "does not belong to the link's (wrong gear ratio?)"
-        found.append(Cause("gear", what, (Change(position, abs(ratio)),), _COST + _FREE_RATIO))
+        found.append(Cause("gear", what, (Change(position, abs(ratio)),), choice("free_ratio")))
     return found
 
 
 def _is_gear(ratio: float) -> bool:
     """Whether two positions differ by more than the deflection, and not by the factor of degrees."""
     units = (1.0, _DEGREE, 1.0 / _DEGREE)
-    return all(abs(math.log(ratio / unit)) > math.log(_GEARED if unit == 1.0 else 1.3) for unit in units)
+    return all(
+        abs(math.log(ratio / unit)) > math.log(choice("declared_factor") if unit == 1.0 else 1.3)
+        for unit in units
+    )

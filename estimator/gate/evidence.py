@@ -22,26 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from estimator.choices import choice, whole
 from estimator.filters import StateVariableFilter
 from estimator.model import Motor
+from estimator.priors import PRIORS
 from estimator.sample import FloatArray, Record
 
 __all__ = ["Balance", "Fit", "Scales"]
 
-INERTIA_FACTOR = 3.0  # declared inertias are that good, or gravely wrong: rotor alone, or a unit
-_ORDER = 4  # of the shared filter: two derivatives, and steep enough beyond its bandwidth
-_BANDS = 5  # each with an error of its own: friction is slow, inertia is fast
-_OCTAVES = 3.0  # ratio of neighbouring bandwidths
-_NOISE = 0.1  # of a band's acceleration that may be the encoder's noise: the inertia looks that much smaller
-_ROWS = 2000  # of each band; more add nothing about scales
-_ROUNDS = 4  # of weights from what is left and what is left under the weights
-_MOST = 60_000  # samples that are looked at; a longer recording is thinned to these by averages
-_RATIO = 0.06  # that two encoders' scales may differ by, beside the hypothesis' own factors
-_SEGMENTS = 8  # straight pieces of the transmission's curve
-_FRICTION_SPEED = 0.02  # of the largest velocity: over which Coulomb friction changes its sign
 _RIDGE = 1e-6  # of what a column explains: no two terms of a real joint cancel to a millionth
-_FLOOR = 0.01  # of the torque's rms: no balance of a real joint closes better
-_GAP = 3  # periods that are bridged without a trace
 
 
 class Scales(NamedTuple):
@@ -61,7 +50,7 @@ class Fit(NamedTuple):
     """The fit of a balance under one hypothesis.
 
     Attributes:
-        errors: (bands,) residual rms over the rms of the whole torque, at least `_FLOOR`.
+        errors: (bands,) residual rms over the rms of the whole torque, at least `gate_floor`.
         error: the same of all bands together.
         inertia: the motor's over the declared one, hypothesis' units.
         stiffness_nm_rad: mean slope of the transmission's curve, in the hypothesis' units; 0: rigid.
@@ -141,7 +130,7 @@ class Balance:
     def _solve(self, a: float, b: float, c: float, B: float) -> Fit:
         free, sense = (-math.inf, math.inf), math.copysign(1.0, a * b)
         bounds = [
-            (B / INERTIA_FACTOR, B * INERTIA_FACTOR),
+            (B / choice("declared_factor"), B * choice("declared_factor")),
             (0.0, sense * math.inf),
             (0.0, sense * math.inf),
             free,
@@ -151,17 +140,17 @@ class Balance:
         if ratio not in self._factors:
             self._factors[ratio] = _factors(self._columns(ratio), self._target)
         factors = self._factors[ratio]
-        pieces = slice(len(bounds), len(bounds) + _SEGMENTS + 2)
+        pieces = slice(len(bounds), len(bounds) + whole("groups") + 2)
         slope = deflection = 0.0
         if flexible:
-            bounds += [(0.0, -math.copysign(math.inf, b * c))] * (_SEGMENTS + 2)
+            bounds += [(0.0, -math.copysign(math.inf, b * c))] * (whole("groups") + 2)
         bounds += [free] * (len(factors.sizes) - len(bounds))
         x, left = _bounded(factors, np.sort(np.array(bounds), axis=1))
         if flexible:
             rises = -math.copysign(1.0, b * c) * x[pieces]
-            slope = float(np.mean(rises[:_SEGMENTS]) + np.sum(rises[_SEGMENTS:])) * self._unit
+            slope = float(np.mean(rises[: whole("groups")]) + np.sum(rises[whole("groups") :])) * self._unit
             deflection = self._springs[ratio][1]
-        errors = np.hypot(left[:-1], _FLOOR)
+        errors = np.hypot(left[:-1], choice("gate_floor"))
         score = float(np.sum(np.log(errors)))
         if score < self._best[0]:
             self._best = score, ratio, x
@@ -184,7 +173,8 @@ class Balance:
         if ratio not in self._springs:
             phi = q - ratio * self._theta
             ramps = [self._through(x)[0] for x in _pieces(phi)]
-            ends = (ratio * (1.0 - _RATIO), ratio * (1.0 + _RATIO))
+            other = choice("sure") * PRIORS["encoder_scale"].std
+            ends = (ratio * (1.0 - other), ratio * (1.0 + other))
             ramps += [self._through(q - end * self._theta)[0] for end in ends]
             moved = math.hypot(float(q.std()), abs(ratio) * float(self._theta.std()))
             self._springs[ratio] = (ramps, float(phi.std()) / max(moved, 1e-300))
@@ -208,13 +198,13 @@ class Balance:
         Identification, 1999, section 13.4).
 
         Returns:
-            (bands,) residual rms over the rms of the whole torque, at least `_FLOOR`.
+            (bands,) residual rms over the rms of the whole torque, at least `gate_floor`.
         """
         position, integral = (self._through(x)[0] for x in (self._theta, np.cumsum(self._theta)))
         factors = _factors([position, integral, self._velocity, self._rate], self._target)
         restoring, free = (-math.inf, 0.0), (-math.inf, math.inf)
         _, left = _bounded(factors, np.array([restoring, restoring, restoring, free]))
-        return np.asarray(np.hypot(left[:-1], _FLOOR))
+        return np.asarray(np.hypot(left[:-1], choice("gate_floor")))
 
     @property
     def independent(self) -> FloatArray:
@@ -230,9 +220,9 @@ class Balance:
 def _pieces(x: FloatArray) -> list[FloatArray]:
     """Hat functions on evenly spaced knots: a basis for curves of x."""
     low, high = np.quantile(x, (0.002, 0.998))
-    width = max((high - low) / _SEGMENTS, 1e-300)
-    unders = [-np.inf, *[0.0] * (_SEGMENTS - 1)]
-    overs = [*[width] * (_SEGMENTS - 1), np.inf]
+    width = max((high - low) / whole("groups"), 1e-300)
+    unders = [-np.inf, *[0.0] * (whole("groups") - 1)]
+    overs = [*[width] * (whole("groups") - 1), np.inf]
     return [
         np.clip(x - (low + k * width), under, over)
         for k, (under, over) in enumerate(zip(unders, overs, strict=True))
@@ -279,8 +269,8 @@ def _bounded(factors: _Factors, bounds: FloatArray) -> tuple[FloatArray, FloatAr
     ridge = np.hstack((_RIDGE * np.eye(k), np.zeros((k, 1))))
     limits = (bounds[:, 0] * sizes, bounds[:, 1] * sizes)
     left = np.linalg.norm(roots[:, :, -1], axis=1)
-    for _ in range(_ROUNDS):
-        weighted = (roots[:-1] / np.hypot(left[:-1], _FLOOR)[:, None, None]).reshape(-1, k + 1)
+    for _ in range(whole("rough_steps")):
+        weighted = (roots[:-1] / np.hypot(left[:-1], choice("gate_floor"))[:, None, None]).reshape(-1, k + 1)
         R = np.asarray(np.linalg.qr(np.vstack([weighted, ridge]), mode="r"))
         x = lsq_linear(R[:k, :k], R[:k, k], limits, method="bvls").x
         left = np.linalg.norm(roots @ np.append(-x, 1.0), axis=1)
@@ -304,18 +294,18 @@ def _rows(record: Record, settling: int) -> NDArray[np.intp]:
     """Rows that are used: without the filter's start and gaps."""
     sequence = record.sequence - record.sequence[0]
     usable = np.ones(int(sequence[-1]) + 1, dtype=bool)
-    for k in np.flatnonzero(np.diff(sequence) > _GAP):
+    for k in np.flatnonzero(np.diff(sequence) > whole("bridged")):
         usable[sequence[k] : sequence[k + 1] + 1] = False
     usable[: min(settling, len(usable) // 4)] = False
     rows = np.flatnonzero(usable)
-    return rows[:: max(1, len(rows) // _ROWS)]
+    return rows[:: max(1, len(rows) // whole("gate_rows"))]
 
 
 def _sense(theta: FloatArray, filter_: StateVariableFilter) -> FloatArray:
     """Direction of the motion: tanh of the velocity over a small share of its largest."""
     velocity = filter_.apply(theta, 1)[1]
     largest = float(np.max(np.abs(velocity))) or 1.0
-    return np.asarray(np.tanh(velocity / (_FRICTION_SPEED * largest)))
+    return np.asarray(np.tanh(velocity / (choice("smoothing") * largest)))
 
 
 def _noise(x: FloatArray) -> float:
@@ -331,18 +321,18 @@ def _filters(theta: FloatArray) -> list[StateVariableFilter]:
     noise = _noise(theta)
 
     def acceleration(w: float) -> tuple[FloatArray, FloatArray]:
-        f = StateVariableFilter(_ORDER, w, 1.0)
+        f = StateVariableFilter(whole("gate_order"), w, 1.0)
         return f.apply(theta, 2)[2], f.impulse(f.settling_periods)[:, 2]
 
     w, least = 1.0, 60.0 / len(theta)
     wide, pulse = acceleration(w)
-    while w / _OCTAVES > least:
-        narrow, other = acceleration(w / _OCTAVES)
+    while w / choice("band_ratio") > least:
+        narrow, other = acceleration(w / choice("band_ratio"))
         pulse = np.pad(pulse, (0, len(other) - len(pulse)))
         # Over the rows that are used at most: a jerk at the start says nothing about them.
         acceleration_power = float(np.var((wide - narrow)[max(len(other), len(theta) // 4) :]))
-        if noise**2 * float(np.sum((pulse - other) ** 2)) < _NOISE * acceleration_power:
+        if noise**2 * float(np.sum((pulse - other) ** 2)) < choice("band_noise") * acceleration_power:
             break
-        w, wide, pulse = w / _OCTAVES, narrow, other
-    widths = [w / _OCTAVES**k for k in range(_BANDS)]
-    return [StateVariableFilter(_ORDER, x, 1.0) for x in widths if x > least or x == w]
+        w, wide, pulse = w / choice("band_ratio"), narrow, other
+    widths = [w / choice("band_ratio") ** k for k in range(whole("bands"))]
+    return [StateVariableFilter(whole("gate_order"), x, 1.0) for x in widths if x > least or x == w]

@@ -9,6 +9,7 @@ from itertools import combinations
 
 import numpy as np
 
+from estimator.choices import chance, choice, log_odds, whole
 from estimator.errors import EstimatorError
 from estimator.gate.causes import Cause, Change, Kind, causes, scales
 from estimator.gate.evidence import Balance, Fit, Scales
@@ -19,22 +20,7 @@ from estimator.transmissions import transmission_model
 
 __all__ = ["Discrepancy", "GateError", "Judgement", "examine", "judge", "refuse"]
 
-_DECISIVE = 6.0  # nats over "as declared": 400 to 1
-_LEAST_ROWS = 300  # a shorter recording decides nothing
-_ALIKE = 3.0  # nats (20 to 1) between causes that the data do not separate
-_LEFT = 0.8  # largest relative residual of a corrected joint
-# Errors of the model are alike in every period of a motion: no band counts for more than so many samples.
-_INDEPENDENT = 30.0
-_RIGID = 8.0  # weight of the deflection's size, in samples: transmissions deflect little against the motion
-# Plausible joints, as decades around a centre (one standard deviation). None decides alone.
-_INERTIA = 1.5  # factor: how far a declared inertia is usually off, other effects that imitate it included
-_ACCELERATION = (30.0, 10.0)  # rad/s², factor: rms torque over motor inertia, from robots to small drives
-_FREQUENCY = (10.0, 6.0)  # Hz, factor: sqrt(K/B)/(2 pi)
-_NO_SPRING = 4.5  # nats against a flexible joint without a stiffness
-_DECLARED_STIFFNESS = 2.0  # factor
-_ARC = (2.0 * math.pi, 3.0)  # rad, factor: of a motion to and fro
-_DECLARED_PERIOD = 4.0  # factor: of the sampling period against the declared one
-_PERIOD = (3e-3, 8.0)  # s, factor: of a sampling period where none is declared
+_TURN = 2.0 * math.pi
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,24 +149,25 @@ class _Joint:
             total -= self._unusual(i, s, fit)
         period_s = self.record.period_s * scales(found, 0).time
         if self.model.period_s is not None:
-            return total - _off(period_s / self.model.period_s, _DECLARED_PERIOD)
-        return total - _off(period_s / _PERIOD[0], _PERIOD[1])
+            return total - _off(period_s / self.model.period_s, choice("declared_factor"))
+        return total - _off(period_s / choice("usual_period"), choice("usual_factor"))
 
     def _unusual(self, i: int, s: Scales, fit: Fit) -> float:
         motor, balance = self.model.motors[i], self.balances[i]
         B = motor.inertia_kg_m2 * s.inertia
-        total = _off(abs(s.torque) * balance.torque_rms / B / _ACCELERATION[0], _ACCELERATION[1])
-        total += _off(fit.inertia, _INERTIA)
-        total += _off(max(abs(s.position) * balance.arc / _ARC[0], 1.0), _ARC[1])
+        usual, declared = choice("usual_factor"), choice("declared_factor")
+        total = _off(abs(s.torque) * balance.torque_rms / B / choice("usual_acceleration"), usual)
+        total += _off(fit.inertia, declared ** (1.0 / choice("sure")))
+        total += _off(max(abs(s.position) * balance.arc / _TURN, 1.0), usual)
         if not motor.flexible:
             return total
-        total += _RIGID * math.log(max(fit.deflection, 1e-6))
+        total += choice("rigid") * math.log(max(fit.deflection, 1e-6))
         if fit.stiffness_nm_rad <= 0.0:
-            return total + _NO_SPRING
-        total += _off(math.sqrt(fit.stiffness_nm_rad / B) / (2.0 * math.pi * _FREQUENCY[0]), _FREQUENCY[1])
-        declared = _declared_stiffness(motor)
-        if declared is not None:  # heavy tails: a declared value can be a mere guess
-            x = math.log(fit.stiffness_nm_rad / declared) / math.log(_DECLARED_STIFFNESS)
+            return total + choice("fault")
+        total += _off(math.sqrt(fit.stiffness_nm_rad / B) / (_TURN * choice("usual_frequency")), usual)
+        known = _declared_stiffness(motor)
+        if known is not None:  # heavy tails: a declared value can be a mere guess
+            x = math.log(fit.stiffness_nm_rad / known) / math.log(declared)
             total += 2.0 * math.log1p(x * x / 3.0)
         return total
 
@@ -195,7 +182,7 @@ class _Joint:
                 float(self.counts[i] @ np.log(self.balances[i].controlled() / fit.errors))
                 for i, (_, fit) in self.fits(found).items()
             )
-            < _DECISIVE
+            < _decisive()
         )
 
     def left(self, found: Sequence[Cause]) -> float:
@@ -221,8 +208,8 @@ def judge(record: Record, model: JointModel) -> Judgement:
     """
     if record.motors != len(model.motors):
         raise EstimatorError(f"recording: expected {len(model.motors)} motor(s), got {record.motors}")
-    if len(record) < _LEAST_ROWS:
-        return Judgement(reason=f"{len(record)} samples, expected at least {_LEAST_ROWS}")
+    if len(record) < whole("samples"):
+        return Judgement(reason=f"{len(record)} samples, expected at least {whole('samples')}")
     joint = _Joint(record, model, _balances(record, model))
     if not joint.balances:
         return Judgement(reason="no motor moves and has a torque")
@@ -232,7 +219,7 @@ def judge(record: Record, model: JointModel) -> Judgement:
     hypotheses += [pair for pair in combinations(single, 2) if not pair[0].channels & pair[1].channels]
     for found in hypotheses:
         joint.fits(found)
-    joint.counts = {i: np.minimum(b.independent, _INDEPENDENT) for i, b in joint.balances.items()}
+    joint.counts = {i: np.minimum(b.independent, choice("independent")) for i, b in joint.balances.items()}
     weighed = joint.weighed(hypotheses)
     if joint.controlled(weighed[0][1]):
         joint.least = PRIORS["coulomb_friction"].std
@@ -240,11 +227,11 @@ def judge(record: Record, model: JointModel) -> Judgement:
     best, found = weighed[0]
     declared = joint.evidence(())
     odds, before, after = best - declared, joint.left(()), joint.left(found)
-    if odds < _DECISIVE or after > _LEFT:
-        if before > _LEFT:
+    if odds < _decisive() or after > choice("unexplained"):
+        if before > choice("unexplained"):
             return Judgement(reason=f"the motion explains {1.0 - before:.0%} of the torque", left=before)
         return Judgement(undecided=_undecided(joint, single, declared), left=before)
-    alike = [h for e, h in weighed[1:] if best - e < _ALIKE and len(h) == len(found)]
+    alike = [h for e, h in weighed[1:] if best - e < -log_odds(choice("even")) and len(h) == len(found)]
     motors = record.motors
     findings = [_finding(found, k, alike, odds, before, after, motors) for k in range(len(found))]
     return Judgement(findings=tuple(findings), left=after)
@@ -254,7 +241,7 @@ def _undecided(joint: _Joint, single: Sequence[Cause], declared: float) -> tuple
     """Units and signs that the likelihood alone does not decide."""
     doubtful: dict[str, list[str]] = {}
     for cause in single:
-        if cause.kind in ("unit", "sign") and declared - joint.evidence((cause,)) - cause.cost < _DECISIVE:
+        if cause.kind in ("unit", "sign") and declared - joint.evidence((cause,)) - cause.cost < _decisive():
             kinds = doubtful.setdefault(_named(cause.changes, joint.record.motors), [])
             kinds += [cause.kind] if cause.kind not in kinds else []
     return tuple(f"the {' and '.join(sorted(kinds))} of {name}" for name, kinds in doubtful.items())
@@ -323,6 +310,11 @@ def _declared_stiffness(motor: Motor) -> float | None:
     except (AttributeError, EstimatorError, KeyError, TypeError):
         return None
     return k if k > 0.0 else None
+
+
+def _decisive() -> float:
+    """Log odds at which a finding is certain, nats."""
+    return -log_odds(chance())
 
 
 def _off(ratio: float, factor: float) -> float:

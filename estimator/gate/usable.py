@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from estimator.choices import choice, whole
 from estimator.errors import EstimatorError
 from estimator.model import JointModel
 from estimator.sample import FloatArray, Record
 
 __all__ = ["check"]
 
-_LEAST_S = 1.0
-_LEAST_ROWS = 300
-_MOST_GAPS = 0.2  # of the samples
-_ABSURD = 1e12
+_ABSURD = 1.0 / np.finfo(float).eps  # where numbers are no longer told apart by one unit
 
 
 def check(record: Record, model: JointModel) -> None:
@@ -24,9 +22,10 @@ def check(record: Record, model: JointModel) -> None:
     """
     n = len(record)
     seconds = n * record.period_s
-    if n < _LEAST_ROWS or seconds < _LEAST_S:
+    least, least_s = whole("samples"), choice("fit_periods") / choice("most_bandwidth")
+    if n < least or seconds < least_s:
         raise EstimatorError(
-            f"the recording is too short: expected at least {_LEAST_S:g} s and {_LEAST_ROWS} rows, "
+            f"the recording is too short: expected at least {least_s:g} s and {least} rows, "
             f"got {seconds:.3g} s and {n} rows"
         )
     if record.motors != len(model.motors):
@@ -39,8 +38,9 @@ def check(record: Record, model: JointModel) -> None:
             'the recording has no link_position_rad: expected it unless transmission.model is "none"'
         )
     span = int(record.sequence[-1] - record.sequence[0]) + 1
-    if span - n > _MOST_GAPS * span:
-        raise EstimatorError(f"{span - n} of {span} samples are missing: expected at most {_MOST_GAPS:.0%}")
+    gaps = choice("gaps")
+    if span - n > gaps * span:
+        raise EstimatorError(f"{span - n} of {span} samples are missing: expected at most {gaps:.0%}")
     for i in range(record.motors):
         _channel(f"motor{i + 1}_position_rad", record.motor_position_rad[:, i])
         _channel(f"motor{i + 1}_torque_nm", record.motor_torque_nm[:, i])

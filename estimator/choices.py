@@ -1,14 +1,15 @@
-"""Choices of a diagnosis that are neither physics nor priors: one table with reasons.
+"""Choices that are neither physics nor priors: one table with reasons for the whole package.
 
-Priors are in `estimator.priors`. `python benchmarks/constants.py` halves
-and doubles each entry of both.
+Priors are in `estimator.priors`. `python benchmarks/constants.py` halves and doubles each entry of both.
 """
 
 from __future__ import annotations
 
+import math
+from statistics import NormalDist
 from typing import NamedTuple
 
-__all__ = ["CHOICES", "Choice", "choice", "least_rows", "whole"]
+__all__ = ["CHOICES", "Choice", "chance", "choice", "least_rows", "log_odds", "whole"]
 
 
 class Choice(NamedTuple):
@@ -29,17 +30,11 @@ class Choice(NamedTuple):
 
 CHOICES: dict[str, Choice] = {
     # How a recording becomes rows.
-    "light": Choice(
-        4.0, "bandwidths", "bandwidth of the coordinates over the rows'", "friction has harmonics to there"
-    ),
-    "grid": Choice(
-        14.0, "1/period of the bandwidth", "rate of the coordinates", "above twice that of the light filter"
+    "harmonics": Choice(
+        4.0, "", "bandwidth of what repeats, over its frequency", "friction has harmonics to there"
     ),
     "rows": Choice(
-        3.0, "1/period of the bandwidth", "rate of the rows", "Nyquist's two, and the filter's skirt"
-    ),
-    "long": Choice(
-        90_000, "points", "grid beyond which it gets coarser", "memory: ten minutes at full rate"
+        3.0, "1/period of the bandwidth", "rate behind a low-pass", "Nyquist's two, and the filter's skirt"
     ),
     "edge": Choice(
         3.0, "periods of the bandwidth", "left out at ends and gaps",
@@ -52,11 +47,8 @@ CHOICES: dict[str, Choice] = {
     ),
     # The bandwidth, where it is not given.
     "content": Choice(0.98, "", "share of the torque's power that is the motion", "all but the noise"),
-    "wider": Choice(4.0, "", "bandwidth over the frequency of that content", "effects have harmonics"),
     "least_bandwidth": Choice(12.0, "Hz", "asked for at least", "slow motions have sharp friction too"),
     "most_bandwidth": Choice(25.0, "Hz", "asked for at most", "above it joints have modes of their own"),
-    "sampled": Choice(0.2, "sampling rates", "bandwidth at most", "five samples in a period"),
-    "narrowing": Choice(0.75, "", "step by which it is narrowed", "noise halves, with two derivatives"),
     "narrowest": Choice(4.0, "Hz", "bandwidth at least, whatever the noise", "below it nothing is known"),
     # Models and their errors.
     "floor": Choice(0.002, "torque rms", "error that no model gets below", "filters, sampling and rounding"),
@@ -72,19 +64,12 @@ CHOICES: dict[str, Choice] = {
     "least_scale": Choice(
         0.05, "", "torque scale that ends its linearisation", "twenty times off is no scale error"
     ),
-    "newton_steps": Choice(6, "", "of a hypothesis that is kept", "three are usual"),
+    "newton_steps": Choice(20, "", "of a hypothesis that is kept, at most", "three are usual"),
     "rough_steps": Choice(3, "", "of hypotheses that are compared", "what they still gain decides nothing"),
     "converged": Choice(0.02, "standard deviations", "step that ends the iteration", "small beside one"),
-    "patient_steps": Choice(
-        20, "", "of a healthy joint's fit", "it starts from springs and readings that nobody knows"
-    ),
     "fit_periods": Choice(
         30, "periods of the bandwidth", "in a recording, at least", "five rows for each parameter"
     ),
-    "sign_noise": Choice(
-        5.0, "velocity noise", "over which everyday friction changes its sign", "no row sees it sharper"
-    ),
-    "shapes": Choice(25, "points", "start of a spring's shape parameter", "an octave in four steps"),
     # Which effects are tried.
     "ripple_periods": Choice(
         2.0, "periods", "of a ripple in the range of motion, at least", "fewer are a bend"
@@ -96,7 +81,6 @@ CHOICES: dict[str, Choice] = {
     "softer": Choice(5.0, "", "step of the grid of smoothings", "a sign changes as sharply or not"),
     "beam": Choice(3, "hypotheses", "grown at once", "enough for an imitation beside the true effect"),
     "tried": Choice(8, "effects", "tried beside each", "the families of friction and ripple have six"),
-    "effects": Choice(5, "effects", "at most", "a joint with more is declared wrongly"),
     # Verdicts.
     "even": Choice(0.05, "probability", "at which another account is an alternative", "one in twenty"),
     "sure": Choice(3.0, "standard deviations", "at which a reading's error is reported", "one in 400"),
@@ -117,10 +101,45 @@ CHOICES: dict[str, Choice] = {
     "one_sine": Choice(
         1.08, "spectral lines", "of a motion that separates nothing", "one, and what its window leaks"
     ),
-    # Free curves.
-    "knots": Choice(20, "", "of a spline over one coordinate", "a bump of a twentieth of the range"),
-    "harmonics": Choice(15, "", "of a line in time at most", "a push that is short in its period"),
+    # Curves.
+    "points": Choice(
+        20, "", "that resolve a range: of a coordinate, of a parameter that is searched",
+        "a bump of a twentieth of the range; an octave in four steps",
+    ),
     "curve_width": Choice(3.0, "effect's prior", "prior of a curve's coefficients", "they share the torque"),
+    # The gate: whether a recording is usable.
+    "samples": Choice(300, "", "in a recording at least", "a few for each of the balance's columns"),
+    "gaps": Choice(0.2, "samples", "that may be missing", "more is no gap but another sampling rate"),
+    # The gate: the balance under a hypothesis about units and signs.
+    "gate_order": Choice(4, "", "of its filters", "two derivatives, and steep beyond the bandwidth"),
+    "bands": Choice(5, "", "each with an error of its own", "friction is slow, inertia is fast"),
+    "band_ratio": Choice(3.0, "", "of neighbouring bandwidths", "an octave and a half"),
+    "band_noise": Choice(
+        0.1, "acceleration power", "in the widest band that may be noise", "it biases the inertia by as much"
+    ),
+    "gate_rows": Choice(2000, "", "of each band", "more add nothing about scales"),
+    "gate_floor": Choice(0.01, "torque rms", "error of any balance", "models of this kind close no better"),
+    "independent": Choice(
+        30.0, "samples", "that a band counts for at most", "errors repeat in every period of a motion"
+    ),
+    "unexplained": Choice(0.8, "torque rms", "left at most by a finding", "it has to explain something"),
+    # The gate: what installations and joints are like.
+    "fault": Choice(4.0, "nats", "against each fault", "one installation in fifty has it"),
+    "free_ratio": Choice(
+        6.0, "nats", "more against a gear ratio that is fitted", "decades at a few per cent of resolution"
+    ),
+    "declared_factor": Choice(
+        3.0, "", "by which a declared number is off at most", "more is a rotor's inertia, a gear or a unit"
+    ),
+    "rigid": Choice(
+        8.0, "samples", "weight of the deflection's size", "transmissions deflect little against the motion"
+    ),
+    "usual_acceleration": Choice(30.0, "rad/s²", "rms torque over inertia", "from robots to small drives"),
+    "usual_frequency": Choice(10.0, "Hz", "of a motor on its spring", "from soft actuators to stiff gears"),
+    "usual_period": Choice(0.003, "s", "of sampling", "from 1 kHz to 100 Hz"),
+    "usual_factor": Choice(
+        8.0, "", "standard deviation of the three, and of arcs beyond a turn", "none decides alone"
+    ),
 }  # fmt: skip
 
 
@@ -137,3 +156,13 @@ def whole(name: str) -> int:
 def least_rows() -> int:
     """Fewest rows of a recording: two in each period of the bandwidth."""
     return 2 * whole("fit_periods")
+
+
+def chance() -> float:
+    """Probability that a correct reading is `sure` standard deviations or more off."""
+    return 2.0 * NormalDist().cdf(-choice("sure"))
+
+
+def log_odds(probability: float) -> float:
+    """Logarithm of the odds, in nats."""
+    return math.log(probability / (1.0 - probability))

@@ -32,7 +32,7 @@ class Signal(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MappedObject:
-    """One object in a TPDO.
+    """One object in a TPDO, or one that a node could send in one.
 
     Attributes:
         signal: what it means.
@@ -56,6 +56,11 @@ class MappedObject:
     wraps: bool = False
     offset: float = 0.0
     modulus: int = 0
+
+    @property
+    def address(self) -> tuple[int, int]:
+        """Index and subindex."""
+        return self.index, self.subindex
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

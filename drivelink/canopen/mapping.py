@@ -10,8 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from drivelink.canopen.layout import Signal, TpdoLayout
-from drivelink.canopen.mappable import MappableObject
+from drivelink.canopen.layout import MappedObject, Signal, TpdoLayout
 from drivelink.canopen.pdo import (
     EXTENDED,
     INVALID,
@@ -51,7 +50,7 @@ class _MapFixed(Exception):  # noqa: N818
 class _ObjectRefused(Exception):  # noqa: N818
     """A TPDO refuses one object."""
 
-    candidate: MappableObject
+    candidate: MappedObject
     code: int
 
 
@@ -71,13 +70,13 @@ class Mapper:
     """
 
     role: Role
-    available: Mapping[Signal, Sequence[MappableObject]]
+    available: Mapping[Signal, Sequence[MappedObject]]
     tpdos: list[Tpdo]
     taken: set[int]
     prefer_unused: bool
     notices: list[Notice]
     period_s: float = 0.001
-    readable: Mapping[Signal, Sequence[MappableObject]] = field(default_factory=dict)
+    readable: Mapping[Signal, Sequence[MappedObject]] = field(default_factory=dict)
     _pre_operational: bool = field(default=False, init=False)
     _chosen: dict[int, int] = field(default_factory=dict, init=False)
     _patience_s: float = field(default=_STATE_S, init=False)
@@ -113,7 +112,7 @@ class Mapper:
     def _say(self, severity: Severity, text: str, fix: str = "") -> None:
         self.notices.append(Notice(severity=severity, subject=self.role.subject, text=text, fix=fix))
 
-    def _drop(self, available: dict[Signal, list[MappableObject]], refused: _ObjectRefused) -> None:
+    def _drop(self, available: dict[Signal, list[MappedObject]], refused: _ObjectRefused) -> None:
         signal = refused.candidate.signal
         index, subindex = refused.candidate.address
         available[signal].remove(refused.candidate)
@@ -147,7 +146,7 @@ class Mapper:
         self._replace(changed)
 
     def _write(
-        self, tpdo: Tpdo, cob_id: int, entries: tuple[Entry, ...], objects: tuple[MappableObject, ...] | None
+        self, tpdo: Tpdo, cob_id: int, entries: tuple[Entry, ...], objects: tuple[MappedObject, ...] | None
     ) -> Program[Tpdo]:
         if not self._pre_operational:
             self._pre_operational = True
@@ -191,7 +190,7 @@ class Mapper:
     def _cob(self, tpdo: Tpdo, value: int) -> Program[None]:
         yield from self._put(tpdo.communication, 1, value, 4)
 
-    def _stays_on(self, tpdo: Tpdo, abort: SdoAbort, objects: tuple[MappableObject, ...] | None) -> None:
+    def _stays_on(self, tpdo: Tpdo, abort: SdoAbort, objects: tuple[MappedObject, ...] | None) -> None:
         """The TPDO cannot be disabled: its mapping is fixed.
 
         Raises:
@@ -241,7 +240,7 @@ class Mapper:
             return False
         return True
 
-    def _entries(self, tpdo: Tpdo, objects: tuple[MappableObject, ...]) -> Program[None]:
+    def _entries(self, tpdo: Tpdo, objects: tuple[MappedObject, ...]) -> Program[None]:
         try:
             yield from self._put(tpdo.mapping, 0, 0, 1)
         except SdoAbort as abort:

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from drivelink._core import SYNC_COB_ID
-from drivelink.canopen.layout import NodeLayout, Signal
-from drivelink.canopen.mappable import MappableObject, Offer
+from drivelink.canopen.layout import MappedObject, NodeLayout, Signal
 from drivelink.canopen.mapping import NMT_PRE_OPERATIONAL, NMT_START, SETTLE_S, Mapper, disable
+from drivelink.canopen.offer import Offer
 from drivelink.canopen.pdo import ABSENT, Tpdo, decode, read_optional, read_tpdos
 from drivelink.canopen.roles import Role
 from drivelink.canopen.sdo import (
@@ -61,7 +61,7 @@ class NodeSurvey:
     reported: Mapping[Address, int]
     offer: Offer
     refused: SdoAbort | None
-    available: Mapping[Signal, tuple[MappableObject, ...]]
+    available: Mapping[Signal, tuple[MappedObject, ...]]
     tpdos: tuple[Tpdo, ...]
 
 
@@ -79,7 +79,7 @@ def survey_node(role: Role, patience: int = 1, *, wake: bool = False) -> Program
     vendor = vendor_of(identity[0])
     reported, refused = yield from _units(role, vendor)
     offered = offer(role, reported, vendor)
-    available: dict[Signal, tuple[MappableObject, ...]] = {}
+    available: dict[Signal, tuple[MappedObject, ...]] = {}
     for signal, candidates in offered.candidates.items():
         available[signal] = yield from _existing(node, candidates)
     return NodeSurvey(
@@ -142,7 +142,7 @@ def _first_contact(node: int, patience: int, wake: bool) -> Program[int]:
     return (yield from read_optional(node, 0x1000, 0)) or 0
 
 
-def _existing(node: int, candidates: tuple[MappableObject, ...]) -> Program[tuple[MappableObject, ...]]:
+def _existing(node: int, candidates: tuple[MappedObject, ...]) -> Program[tuple[MappedObject, ...]]:
     """The objects that exist, with their actual length; some have no value before the drive runs."""
     found = []
     for candidate in candidates:
@@ -234,7 +234,7 @@ def _configured(
     )
 
 
-def _wanted(survey: NodeSurvey, notices: list[Notice]) -> dict[Signal, tuple[MappableObject, ...]]:
+def _wanted(survey: NodeSurvey, notices: list[Notice]) -> dict[Signal, tuple[MappedObject, ...]]:
     """Signals to map, each with the objects that carry it.
 
     Raises:
@@ -246,7 +246,7 @@ def _wanted(survey: NodeSurvey, notices: list[Notice]) -> dict[Signal, tuple[Map
             why = f"; {survey.refused}" if survey.refused is not None else ""
             raise DriveError(f"{subject} ({survey.role.key}): {reason}{why}")
         notices.append(Notice(severity=Severity.WARNING, subject=subject, text=f"no {signal}: {reason}"))
-    wanted: dict[Signal, tuple[MappableObject, ...]] = {}
+    wanted: dict[Signal, tuple[MappedObject, ...]] = {}
     for signal, objects in survey.available.items():
         candidates = unused(wanted, objects) if signal in CHECKS else objects
         if candidates:

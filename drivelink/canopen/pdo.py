@@ -6,10 +6,9 @@ By programs of `drivelink.canopen.sdo`, because canopen's PDO code blocks until 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from drivelink.canopen.layout import MappedObject, Signal, TpdoLayout
-from drivelink.canopen.mappable import MappableObject
 from drivelink.canopen.sdo import Program, SdoAbort, read_number
 
 Address = tuple[int, int]
@@ -196,7 +195,7 @@ def _entries(values: Mapping[Address, int], mapping: int) -> tuple[Entry, ...] |
 
 
 def decode(
-    tpdos: Sequence[Tpdo], candidates: Mapping[Signal, Sequence[MappableObject]]
+    tpdos: Sequence[Tpdo], candidates: Mapping[Signal, Sequence[MappedObject]]
 ) -> tuple[TpdoLayout, ...]:
     """Layouts of the frames, from the mapping read back.
 
@@ -209,7 +208,7 @@ def decode(
         candidates: for each signal the objects that can give it, best first.
     """
     mapped = {(index, subindex) for tpdo in tpdos for index, subindex, _ in tpdo.entries}
-    chosen: dict[Address, MappableObject] = {}
+    chosen: dict[Address, MappedObject] = {}
     for objects in candidates.values():
         left = mapped - chosen.keys()  # an object does not check itself
         best = next((candidate for candidate in objects if candidate.address in left), None)
@@ -220,13 +219,13 @@ def decode(
     return tuple(layouts[k] for k in range(len(tpdos)))
 
 
-def _layout(tpdo: Tpdo, chosen: dict[Address, MappableObject]) -> TpdoLayout:
+def _layout(tpdo: Tpdo, chosen: dict[Address, MappedObject]) -> TpdoLayout:
     """One frame; what it carries is taken out of `chosen`."""
     objects = []
     for index, subindex, bits in tpdo.entries:
         candidate = chosen.pop((index, subindex), None)
         if candidate is not None:
-            objects.append(candidate.mapped(bits))
+            objects.append(replace(candidate, bits=bits))
             continue
         objects.append(
             MappedObject(signal=Signal.OTHER, index=index, subindex=subindex, bits=bits, signed=False)

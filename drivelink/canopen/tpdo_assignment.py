@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from drivelink.canopen.layout import Signal
-from drivelink.canopen.mappable import MappableObject
+from drivelink.canopen.layout import MappedObject, Signal
 from drivelink.canopen.pdo import Tpdo, describe
 from drivelink.canopen.roles import Role
 from drivelink.errors import DriveError
@@ -33,7 +32,7 @@ _ORDER = (
 CHECKS = _ORDER[5:]
 OPTIONAL = (Signal.MOTOR_VELOCITY, Signal.STATUSWORD, *CHECKS)
 
-Available = Mapping[Signal, Sequence[MappableObject]]
+Available = Mapping[Signal, Sequence[MappedObject]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,12 +45,12 @@ class Assignment:
     """
 
     tpdo: Tpdo
-    objects: tuple[MappableObject, ...] | None
+    objects: tuple[MappedObject, ...] | None
 
 
-def pack(objects: Iterable[MappableObject], most: int = FRAME_BITS) -> list[tuple[MappableObject, ...]]:
+def pack(objects: Iterable[MappedObject], most: int = FRAME_BITS) -> list[tuple[MappedObject, ...]]:
     """Frames of at most eight bytes and `most` objects, first fit, in the order of importance."""
-    frames: list[list[MappableObject]] = []
+    frames: list[list[MappedObject]] = []
     for candidate in sorted(objects, key=lambda candidate: _ORDER.index(candidate.signal)):
         for frame in frames:
             if len(frame) < most and sum(other.bits for other in frame) + candidate.bits <= FRAME_BITS:
@@ -62,7 +61,7 @@ def pack(objects: Iterable[MappableObject], most: int = FRAME_BITS) -> list[tupl
     return [tuple(frame) for frame in frames]
 
 
-def unused(wanted: Available, objects: Sequence[MappableObject]) -> tuple[MappableObject, ...]:
+def unused(wanted: Available, objects: Sequence[MappedObject]) -> tuple[MappedObject, ...]:
     """Objects that do not serve a signal already: an object does not check itself."""
     used = {candidates[0].address for candidates in wanted.values() if candidates}
     return tuple(candidate for candidate in objects if candidate.address not in used)
@@ -107,7 +106,7 @@ def assign(
 
 
 def _free(
-    wanted: Sequence[tuple[Signal, Sequence[MappableObject]]], tpdos: Sequence[Tpdo], prefer_unused: bool
+    wanted: Sequence[tuple[Signal, Sequence[MappedObject]]], tpdos: Sequence[Tpdo], prefer_unused: bool
 ) -> tuple[Assignment, ...] | None:
     """Assign all signals to TPDOs that carry them or can be mapped; None if there are too few."""
     left = list(tpdos)
@@ -134,7 +133,7 @@ def _free(
     return tuple(result)
 
 
-def _carried(tpdo: Tpdo, wanted: Mapping[Signal, Sequence[MappableObject]]) -> list[Signal]:
+def _carried(tpdo: Tpdo, wanted: Mapping[Signal, Sequence[MappedObject]]) -> list[Signal]:
     mapped = {(index, subindex) for index, subindex, _ in tpdo.entries}
     return [
         signal for signal, objects in wanted.items() if any(object_.address in mapped for object_ in objects)

@@ -10,29 +10,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 
 from drivelink.canopen.cia303 import angle_unit_rad, velocity_unit_rad_s
-from drivelink.canopen.layout import Signal
-from drivelink.canopen.mappable import MappableObject, Offer
+from drivelink.canopen.layout import MappedObject, Signal
+from drivelink.canopen.offer import Offer
 from drivelink.canopen.roles import Role, object_address
 from drivelink.canopen.vendors import Vendor
 from drivelink.jointfile import DriveSection, EncoderSection
-from drivelink.notice import Notice, Severity
+from drivelink.notice import Severity
 
 Address = tuple[int, int]
 
 _DRIVE_OBJECTS: tuple[Address, ...] = (
-    (0x608F, 1),
-    (0x608F, 2),
-    (0x6091, 1),
-    (0x6091, 2),
-    (0x6092, 1),
-    (0x6092, 2),
-    (0x60A8, 0),
-    (0x60A9, 0),
-    (0x6075, 0),
-    (0x6076, 0),
-    (0x607E, 0),
+    *((index, subindex) for index in (0x608F, 0x6091, 0x6092) for subindex in (1, 2)),
+    *((index, 0) for index in (0x60A8, 0x60A9, 0x6075, 0x6076, 0x607E)),
 )
 _ENCODER_OBJECTS: tuple[Address, ...] = ((0x6000, 0), (0x6001, 0), (0x6002, 0), (0x6501, 0), (0x6502, 0))
 _SCALING = 1 << 2  # of 0x6000, CiA 406: counts per revolution are those of 0x6001
@@ -74,13 +66,11 @@ def offer(role: Role, reported: Mapping[Address, int], vendor: Vendor) -> Offer:
         _offer_link(role, role.encoder, reported, result)
         if vendor.sensorless == _encoder_address(role.encoder, role.key) and role.encoder.object is None:
             index, subindex = vendor.sensorless
-            result.notices.append(
-                Notice(
-                    severity=Severity.WARNING,
-                    subject=role.subject,
-                    text=f"0x{index:04X}:{subindex:02X} is {vendor.name}'s sensorless position, no encoder",
-                    fix=f'link.encoder.object = "0x{index:04X}:{subindex + 1:02X}" for the one wired to it',
-                )
+            result.say(
+                Severity.WARNING,
+                role.subject,
+                f"0x{index:04X}:{subindex:02X} is {vendor.name}'s sensorless position, no encoder",
+                f'link.encoder.object = "0x{index:04X}:{subindex + 1:02X}" for the one wired to it',
             )
     return result
 
@@ -91,17 +81,12 @@ class _Drive:
     def __init__(
         self, role: Role, drive: DriveSection, reported: Mapping[Address, int], vendor: Vendor, result: Offer
     ) -> None:
-        self._role, self._drive, self._reported, self._vendor, self._result = (
-            role,
-            drive,
-            reported,
-            vendor,
-            result,
-        )
+        self._role, self._drive, self._vendor = role, drive, vendor
+        self._reported, self._result = reported, result
 
     def offer(self) -> None:
         self._result.candidates[Signal.STATUSWORD] = (
-            MappableObject(signal=Signal.STATUSWORD, address=(0x6041, 0), bits=16, signed=False, scale=1.0),
+            MappedObject(signal=Signal.STATUSWORD, index=0x6041, subindex=0, bits=16, signed=False),
         )
         gear = self._gear()
         counts = self._counts_per_rev()
@@ -129,7 +114,7 @@ class _Drive:
         return stated
 
     def _say(self, severity: Severity, text: str, fix: str = "") -> None:
-        self._result.notices.append(Notice(severity=severity, subject=self._role.subject, text=text, fix=fix))
+        self._result.say(severity, self._role.subject, text, fix)
 
     def _ratio(self, numerator: Address, denominator: Address) -> float | None:
         above, below = self._reported.get(numerator, 0), self._reported.get(denominator, 1)
@@ -194,14 +179,7 @@ class _Drive:
                 f"encoder and gear {counts * gear:.6g}; {counts * gear:.6g} is used",
             )
         self._result.candidates[Signal.MOTOR_POSITION] = (
-            MappableObject(
-                signal=Signal.MOTOR_POSITION,
-                address=(0x6064, 0),
-                bits=32,
-                signed=True,
-                scale=scale,
-                wraps=True,
-            ),
+            _object(Signal.MOTOR_POSITION, (0x6064, 0), 32, scale, wraps=True),
         )
 
     def _rated_torque(self) -> float | None:
@@ -253,20 +231,20 @@ class _Drive:
             rated_torque = constant * rated_current  # Nanotec: no 0x6076, the torque of the rated current
         own = self._vendor.current
         own_unit = own is not None and own.address == (0x6078, 0)  # and then no rated values either
-        by_torque: list[MappableObject] = []
-        by_current: list[MappableObject] = []
+        candidate = partial(_object, Signal.MOTOR_TORQUE)
+        by_torque: list[MappedObject] = []
+        by_current: list[MappedObject] = []
         if rated_torque is not None:
-            by_torque.append(_torque_candidate((0x6077, 0), 16, direction * gear * rated_torque / 1000))
+            by_torque.append(candidate((0x6077, 0), 16, direction * gear * rated_torque / 1000))
         if constant is not None:
             per_ampere = direction * gear * constant
-            if rated_current is not None and not own_unit:
-                by_current.append(_torque_candidate((0x6078, 0), 16, per_ampere * rated_current / 1000))
             if drive.current_object:
                 address = object_address(drive.current_object, f"{self._role.key}.current_object")
-                stated = _torque_candidate(address, 32, per_ampere * drive.current_unit_a)
-                by_current.insert(0, stated)
+                by_current.append(candidate(address, 32, per_ampere * drive.current_unit_a))
+            if rated_current is not None and not own_unit:
+                by_current.append(candidate((0x6078, 0), 16, per_ampere * rated_current / 1000))
             if own is not None:
-                by_current.append(_torque_candidate(own.address, own.bits, per_ampere * own.unit_a))
+                by_current.append(candidate(own.address, own.bits, per_ampere * own.unit_a))
         sources = {
             "torque": by_torque,
             "current": by_current,
@@ -283,8 +261,7 @@ class _Drive:
             )
         if not by_current and rated_torque is not None and not own_unit:
             # Unknown unit: assume that rated current gives rated torque.
-            likely = _torque_candidate((0x6078, 0), 16, direction * gear * rated_torque / 1000)
-            by_current = [likely]
+            by_current = [candidate((0x6078, 0), 16, direction * gear * rated_torque / 1000)]
         self._check("current", Signal.TORQUE_CHECK, (*by_current, *by_torque))
 
     def _velocity(self, counts: float | None, gear: float) -> None:
@@ -313,13 +290,13 @@ class _Drive:
         if chosen is None:
             return
         scale = self._drive.direction * chosen / gear
-        objects = (MappableObject(signal=signal, address=(0x606C, 0), bits=32, signed=True, scale=scale),)
+        objects = (_object(signal, (0x606C, 0), 32, scale),)
         if self._drive.velocity:
             self._result.candidates[signal] = objects
         else:
             self._check("velocity", signal, objects)
 
-    def _check(self, name: str, signal: Signal, objects: tuple[MappableObject, ...]) -> None:
+    def _check(self, name: str, signal: Signal, objects: tuple[MappedObject, ...]) -> None:
         """Objects for cross-checks: mapped if the joint file asks for it, else read if mapped."""
         objects = tuple(replace(candidate, signal=signal) for candidate in dict.fromkeys(objects))
         if objects:
@@ -331,7 +308,7 @@ class _Drive:
         for position in self._result.candidates.get(Signal.MOTOR_POSITION, ()):
             for signal, index in ((Signal.FOLLOWING_ERROR, 0x60F4), (Signal.POSITION_DEMAND, 0x6062)):
                 wraps = signal is Signal.POSITION_DEMAND
-                self._check("following_error", signal, (replace(position, address=(index, 0), wraps=wraps),))
+                self._check("following_error", signal, (replace(position, index=index, wraps=wraps),))
 
     def _second_encoder(self, counts: float | None, gear: float) -> None:
         """Another encoder of the motor; its scale and sign are estimated."""
@@ -342,14 +319,8 @@ class _Drive:
         reported = self._ratio((0x60E6, address[1]), (0x60EB, address[1]))
         per_rev = reported if reported is not None and reported > 1 else counts
         if per_rev is not None:
-            encoder = MappableObject(
-                signal=Signal.SECOND_POSITION,
-                address=address,
-                bits=32,
-                signed=True,
-                scale=self._drive.direction * math.tau / (per_rev * gear),
-                wraps=True,
-            )
+            scale = self._drive.direction * math.tau / (per_rev * gear)
+            encoder = _object(Signal.SECOND_POSITION, address, 32, scale, wraps=True)
             self._check("second_encoder", Signal.SECOND_POSITION, (encoder,))
 
     def _polarity(self) -> None:
@@ -368,8 +339,13 @@ class _Drive:
             )
 
 
-def _torque_candidate(address: Address, bits: int, scale: float) -> MappableObject:
-    return MappableObject(signal=Signal.MOTOR_TORQUE, address=address, bits=bits, signed=True, scale=scale)
+def _object(
+    signal: Signal, address: Address, bits: int, scale: float, *, wraps: bool = False
+) -> MappedObject:
+    index, subindex = address
+    return MappedObject(
+        signal=signal, index=index, subindex=subindex, bits=bits, signed=True, scale=scale, wraps=wraps
+    )
 
 
 def _encoder_address(encoder: EncoderSection, key: str) -> Address:
@@ -397,18 +373,17 @@ def _offer_link(role: Role, encoder: EncoderSection, reported: Mapping[Address, 
         return
     if stated is not None and counts is not None and not math.isclose(stated, counts, rel_tol=_SAME):
         text = f"link encoder, counts per revolution: the node says {counts:.6g} ({source}), "
-        result.notices.append(
-            Notice(
-                severity=Severity.WARNING,
-                subject=role.subject,
-                text=text + f"the joint file {stated:.6g}; {stated:.6g} is used",
-                fix=f"link.encoder: counts_per_rev = {counts:.6g}, or leave it out",
-            )
+        result.say(
+            Severity.WARNING,
+            role.subject,
+            f"{text}the joint file {stated:.6g}; {stated:.6g} is used",
+            f"link.encoder: counts_per_rev = {counts:.6g}, or leave it out",
         )
     result.candidates[Signal.LINK_POSITION] = (
-        MappableObject(
+        MappedObject(
             signal=Signal.LINK_POSITION,
-            address=address,
+            index=address[0],
+            subindex=address[1],
             bits=32,
             signed=address[0] != 0x6004,
             scale=encoder.direction * math.tau / used,

@@ -1,8 +1,8 @@
 """The command line: `drivelink VERB …`, one module per verb.
 
-A verb's module has `configure(parser)`, which adds its arguments, and `run(args)`, which does the job and
-returns the exit status. Only the requested verb's module is imported. Every error that a user can cause ends
-here as one line on stderr and its exit status.
+A verb's module has `configure(parser)`, which adds its arguments, `run(args)`, which does the job and returns
+the exit status, and `EPILOG`, the end of its help. Only the requested verb's module is imported. Every error
+that a user can cause ends here as one line on stderr and its exit status.
 """
 
 from __future__ import annotations
@@ -72,6 +72,8 @@ first steps:
 class Verb(Protocol):
     """Interface of a verb's module."""
 
+    EPILOG: str
+
     @staticmethod
     def configure(parser: argparse.ArgumentParser) -> None:
         """Add the verb's arguments."""
@@ -93,10 +95,14 @@ def make_parser(verbs: list[str]) -> argparse.ArgumentParser:
     subparsers = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
     for name, summary in VERBS.items():
         subparser = subparsers.add_parser(
-            name, help=summary, description=summary[0].upper() + summary[1:] + "."
+            name,
+            help=summary,
+            description=summary[0].upper() + summary[1:] + ".",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         if name in verbs:
             module: Verb = importlib.import_module(f"drivelink.cli.{name}")  # type: ignore[assignment]
+            subparser.epilog = module.EPILOG
             module.configure(subparser)
             subparser.set_defaults(run=module.run)
     return parser

@@ -9,7 +9,7 @@ import shtab
 
 from drivelink import cli
 
-_EPILOG = """\
+EPILOG = """\
 bash:  drivelink completion bash > ~/.local/share/bash-completion/completions/drivelink
 zsh:   drivelink completion zsh > ~/.zfunc/_drivelink      (with ~/.zfunc in fpath)
 tcsh:  drivelink completion tcsh | source /dev/stdin
@@ -18,8 +18,6 @@ tcsh:  drivelink completion tcsh | source /dev/stdin
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = _EPILOG
     parser.add_argument("shell", choices=shtab.SUPPORTED_SHELLS, help="the shell")
     parser.add_argument("--json", action="store_true", help="print shell and script as one JSON object")
 

@@ -32,6 +32,12 @@ CASES = ("constant", "quadratic", "vsa-ii")
 _PATIENCE_S = 20.0  # for the other process to start, and to end
 _LINE_S = 1.0
 
+EPILOG = """\
+examples:
+  drivelink demo                                   watch the estimates beside the truth
+  drivelink demo --case constant --seconds 30 --json
+"""
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Arguments of `demo`."""

@@ -24,7 +24,7 @@ from estimator.diagnosis import Diagnosis, diagnose
 from estimator.errors import EstimatorError
 from estimator.gate import GateError
 
-_EPILOG = """\
+EPILOG = """\
 examples:
   drivelink diagnose suspect.csv --joint elbow.toml --out diagnosis/
   drivelink diagnose train.csv --joint axis.toml --validate other.csv --write axis-better.toml
@@ -38,8 +38,6 @@ Writes report.json and report.html into --out (default: the current folder).
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = _EPILOG
     add_recordings(parser)
     parser.add_argument(
         "--validate",

@@ -23,7 +23,7 @@ from drivelink.notice import Severity
 _EXAMINED_S = 3.0
 _AT_REST_S = 0.3  # a person waits for each of these
 
-_EPILOG = """\
+EPILOG = """\
 examples:
   drivelink doctor                     this machine: real time, memory, CAN, zenoh
   drivelink doctor elbow.toml          also the bus, nodes, mappings, units; moves nothing. While the joint
@@ -35,8 +35,6 @@ examples:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = _EPILOG
     parser.add_argument(
         "joint", nargs="?", type=Path, metavar="JOINT", help="joint file; without: the machine"
     )

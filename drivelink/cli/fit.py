@@ -11,7 +11,7 @@ from drivelink.errors import RecordingError, UsageError
 from drivelink.output.outfile import check_target
 from drivelink.recording.mapping import joint_of
 
-_EPILOG = """\
+EPILOG = """\
 examples:
   drivelink fit healthy.csv --joint elbow.toml --out fit/ --plots --write elbow-fitted.toml
   drivelink fit monday.csv tuesday.csv --joint elbow.toml      runs of one joint, each validated by the others
@@ -28,8 +28,6 @@ the readings and friction of a rigid joint, as effects. `run`, `replay` and `dia
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = _EPILOG
     add_recordings(parser)
     parser.add_argument("--out", type=Path, metavar="DIR", help="write fit.json there")
     parser.add_argument("--write", type=Path, metavar="JOINT2", help="write a copy of the joint file")

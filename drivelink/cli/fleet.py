@@ -21,7 +21,7 @@ _REPORT = "report"
 _WARNINGS = 20  # shown lines about single recordings; the table has all
 _SPANS = {"d": 1, "w": 7}
 
-_EPILOG = """\
+EPILOG = """\
 examples:
   drivelink fleet night/ --joints joints/ --out fleet/
   drivelink fleet 's3://plant/2026-11-*/*.mcap' --joints joints/ --scheduler tcp://10.0.0.5:8786
@@ -38,8 +38,6 @@ fleet.html and fleet.json. Recordings that are in the table are skipped: run the
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = _EPILOG
     parser.usage = (
         "drivelink fleet [-h] --joints DIR [options] RECORDINGS [RECORDINGS ...]\n"
         "       drivelink fleet report [--fdr Q] DIR"

@@ -26,7 +26,7 @@ _POLL_S = 0.02
 _FRAME_S = 0.1
 _HINT_S = 3.0
 
-_EPILOG = """\
+EPILOG = """\
 examples:
   drivelink monitor                    every joint on this machine
   drivelink monitor elbow              one joint, with its curve
@@ -37,8 +37,6 @@ examples:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = _EPILOG
     parser.add_argument("joint", nargs="?", metavar="JOINT", help="name of a joint, or its joint file")
     parser.add_argument("--web", action="store_true", help="serve a page with live plots on this machine")
     parser.add_argument(

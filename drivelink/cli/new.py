@@ -24,7 +24,7 @@ _CASES = ("constant", "quadratic", "vsa-ii")
 _ARRANGEMENTS = ("single", "antagonistic", "serial")
 _MODELS = ("polynomial", "linear", "exponential", "vsa-ii", "none")
 
-_EPILOG = """\
+EPILOG = """\
 examples:
   drivelink new elbow.toml                            asks what no drive can report
   drivelink new elbow.toml --rotor-inertia 48 --gear 100 --torque-constant 53
@@ -35,8 +35,6 @@ examples:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = _EPILOG
     parser.add_argument("path", nargs="?", type=Path, metavar="PATH", help="default: NAME.toml; -: print it")
     parser.add_argument("--case", choices=_CASES, help="one of the paper's joints, simulated")
     parser.add_argument("--scan", action="store_true", help="take the nodes from what answers on the bus")

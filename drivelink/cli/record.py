@@ -35,7 +35,7 @@ from drivelink.recording.viewlayouts import write_layouts
 _ALIVE_S = 1.0  # in which a daemon answers
 _SAY_EVERY_S = 10.0
 
-_EPILOG = """\
+EPILOG = """\
 The ending of FILE says the format:
   .mcap                     samples, estimates, status, model, joint file and raw CAN: replays everything,
                             opens in Foxglove and PlotJuggler
@@ -57,8 +57,6 @@ examples:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = _EPILOG
     parser.add_argument("joint", type=Path, metavar="JOINT", help="joint file")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the recording")
     parser.add_argument(

@@ -34,7 +34,7 @@ _INTERRUPTED = 130
 _METER_EVERY = 512
 _SUBSCRIBER_S = 1.5
 
-_EPILOG = """\
+EPILOG = """\
 formats: .csv, .mcap, .mf4 (with asammdf), and raw CAN: candump .log in its variants, .blf, .asc, .trc
 
 examples:
@@ -47,8 +47,6 @@ examples:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = _EPILOG
     parser.add_argument("file", type=Path, metavar="FILE", help="the recording")
     parser.add_argument("--joint", type=Path, metavar="JOINT", help="joint file it was made with")
     parser.add_argument("--out", type=Path, metavar="CSV", help="write the estimates, a row for each cycle")

@@ -21,7 +21,7 @@ from drivelink.jointfile import BusSection, load
 if TYPE_CHECKING:
     from drivelink.daemon.service import Daemon
 
-_EPILOG = """\
+EPILOG = """\
 examples:
   drivelink run elbow.toml                          until Ctrl-C or SIGTERM
   drivelink run left.toml right.toml                two joints on one bus, with one SYNC
@@ -37,8 +37,6 @@ _LEVELS = ("debug", "info", "warning", "error")
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `run`."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = _EPILOG
     parser.add_argument(
         "joints", nargs="+", type=Path, metavar="JOINT", help="joint files; several share one bus"
     )

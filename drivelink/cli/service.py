@@ -15,7 +15,7 @@ from drivelink.cli import add_bus, moved
 from drivelink.errors import DrivelinkError, UsageError
 from drivelink.systemd.unit import UNITS, installation, network_files, unit_name
 
-_EPILOG = """\
+EPILOG = """\
 Writes the unit drivelink@NAME.service, and for a SocketCAN interface the files with which systemd-networkd
 sets it up; then enables and starts it. Joint file and program are used where they are: a rewritten joint file
 is taken over by the running daemon.
@@ -31,8 +31,6 @@ examples:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = _EPILOG
     parser.add_argument(
         "action", metavar="ACTION", choices=("install", "uninstall"), help="install or uninstall"
     )

@@ -27,7 +27,7 @@ from drivelink.demo.simulate import (
 from drivelink.errors import BusError, UsageError
 from drivelink.jointfile import BusSection, JointFile, load
 
-_EPILOG = """\
+EPILOG = """\
 examples:
   drivelink sim elbow.toml                             on the bus of the joint file
   drivelink sim elbow.toml --interface socketcand      serve a bus over TCP: no SocketCAN needed; the daemon
@@ -38,8 +38,6 @@ examples:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = _EPILOG
     parser.add_argument("joints", nargs="+", type=Path, metavar="JOINT", help="joint files on one bus")
     parser.add_argument(
         "--effect",

@@ -7,8 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from drivelink.canopen.eds import DataSheet, load_eds
-from drivelink.canopen.layout import Signal
-from drivelink.canopen.mappable import MappableObject
+from drivelink.canopen.layout import MappedObject, Signal
 from drivelink.canopen.pdo import Entry, describe, entry_text
 from drivelink.canopen.roles import Role
 from drivelink.canopen.tpdo_assignment import Assignment, assign
@@ -126,11 +125,11 @@ def _role(sheet: DataSheet) -> Role:
     )
 
 
-def _signals(section: Section, sheet: DataSheet) -> dict[Signal, tuple[MappableObject, ...]]:
+def _signals(section: Section, sheet: DataSheet) -> dict[Signal, tuple[MappedObject, ...]]:
     """Which signals the drive can put into a TPDO, with a finding for each."""
     vendor = vendor_of(sheet.vendor_id)
     carried = {(i, s) for tpdo in sheet.tpdos() for i, s, _ in tpdo.entries}
-    found: dict[Signal, tuple[MappableObject, ...]] = {}
+    found: dict[Signal, tuple[MappedObject, ...]] = {}
     for signal, addresses in (_CIA406 if _is_encoder(sheet) else _OBJECTS).items():
         if signal is Signal.MOTOR_TORQUE and vendor.current is not None:
             addresses += (vendor.current.address,)
@@ -139,7 +138,7 @@ def _signals(section: Section, sheet: DataSheet) -> dict[Signal, tuple[MappableO
             there = [(0x60E4, 1)]  # subindex 0 is then only the count
         usable = [a for a in there if sheet.objects[a].pdo_mappable or a in carried]
         found[signal] = tuple(
-            MappableObject(signal=signal, address=a, bits=len(sheet.objects[a]), signed=True, scale=1.0)
+            MappedObject(signal=signal, index=a[0], subindex=a[1], bits=len(sheet.objects[a]), signed=True)
             for a in usable
         )
         _say_signal(section, signal, sheet, there, usable)
@@ -147,17 +146,15 @@ def _signals(section: Section, sheet: DataSheet) -> dict[Signal, tuple[MappableO
 
 
 def _checks(
-    sheet: DataSheet, available: Mapping[Signal, tuple[MappableObject, ...]]
-) -> dict[Signal, tuple[MappableObject, ...]]:
+    sheet: DataSheet, available: Mapping[Signal, tuple[MappedObject, ...]]
+) -> dict[Signal, tuple[MappedObject, ...]]:
     """Objects for cross-checks: a second torque or current, velocity, following error."""
 
-    def mappable(signal: Signal, index: int, subindex: int = 0) -> tuple[MappableObject, ...]:
+    def mappable(signal: Signal, index: int, subindex: int = 0) -> tuple[MappedObject, ...]:
         entry = sheet.objects.get((index, subindex))
         if entry is None or not entry.pdo_mappable:
             return ()
-        return (
-            MappableObject(signal=signal, address=(index, subindex), bits=len(entry), signed=True, scale=1.0),
-        )
+        return (MappedObject(signal=signal, index=index, subindex=subindex, bits=len(entry), signed=True),)
 
     as_check = {
         Signal.VELOCITY_CHECK: available.get(Signal.MOTOR_VELOCITY, ()),

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from drivelink.canopen.layout import Signal
-from drivelink.canopen.mappable import MappableObject
+from drivelink.canopen.layout import MappedObject, Signal
 from drivelink.canopen.node import NodeSurvey
 from drivelink.canopen.sdo import Program, Read, SdoAbort
 from drivelink.doctor.report import Section
@@ -219,7 +218,7 @@ def _say_judgement(section: Section, joint: JointFile, judgement: Judgement) -> 
 class _Unwrapped:
     """One object's bytes to SI, rolled-over counters straightened."""
 
-    def __init__(self, candidate: MappableObject) -> None:
+    def __init__(self, candidate: MappedObject) -> None:
         self._candidate = candidate
         self._last: int | None = None
         self._total = 0

@@ -267,9 +267,7 @@ def _judge_mapping(section: Section, role: Role, survey: NodeSurvey) -> NodeLayo
     if all(o.address != vendor_of(survey.identity[0]).sensorless for o in seconds):
         say_second_encoder(section, role, wanted, available, survey.tpdos)
     tpdos = tuple(
-        TpdoLayout(cob_id=0x181, objects=tuple(c.mapped() for c in a.objects))
-        if a.objects is not None
-        else decode([a.tpdo], wanted)[0]
+        TpdoLayout(cob_id=0x181, objects=a.objects) if a.objects is not None else decode([a.tpdo], wanted)[0]
         for a in plan
     )
     planned = {assignment.tpdo.number for assignment in plan}

@@ -8,10 +8,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import can
 from canopen.objectdictionary import datatypes
 
+from drivelink.canopen.configure import configure_joints
 from drivelink.canopen.eds import DataSheet
 
 NOT_VALID_NOW = 0x06010000
@@ -296,3 +298,8 @@ sdo_timeout_s = 0.02
 def joint_text(drive: str = "", link: str = "", bus: str = "") -> str:
     """A joint of one motor at node 5."""
     return JOINT.format(drive=drive, link=link, bus=bus)
+
+
+def configure(bus, joint, base_dir=Path(), *, idle=None):
+    """The layouts of one joint's nodes, configured."""
+    return configure_joints(bus, [joint], [base_dir], idle=idle)[1][0]

@@ -13,12 +13,13 @@ from canopenkit import (
     TOO_MANY,
     Slave,
     Wire,
+    configure,
     drive_objects,
     joint_text,
     tpdo,
 )
 
-from drivelink.canopen import Signal, configure
+from drivelink.canopen.layout import Signal
 from drivelink.errors import DriveError
 from drivelink.jointfile import parse
 

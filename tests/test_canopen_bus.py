@@ -7,9 +7,8 @@ import tty
 
 import can
 import pytest
-from canopenkit import Slave, drive_objects, joint_text
+from canopenkit import Slave, configure, drive_objects, joint_text
 
-from drivelink.canopen import configure
 from drivelink.canopen.bus import interface_is_up, open_bus, receive_buffer_frames
 from drivelink.canopen.busload import bus_load, check_capacity, frame_bits
 from drivelink.canopen.layout import MappedObject, NodeLayout, Signal, TpdoLayout

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 from canopen.objectdictionary import datatypes
-from canopenkit import Slave, Wire, joint_text, sheet_objects
+from canopenkit import Slave, Wire, configure, joint_text, sheet_objects
 
-from drivelink.canopen import Signal, configure
 from drivelink.canopen.eds import load_eds
+from drivelink.canopen.layout import Signal
 from drivelink.canopen.pdo import describe
 from drivelink.errors import DriveError
 from drivelink.jointfile import parse

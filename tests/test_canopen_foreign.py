@@ -6,10 +6,10 @@ from pathlib import Path
 import can
 import canopen
 import pytest
-from canopenkit import joint_text
+from canopenkit import configure, joint_text
 from test_canopen_eds import REAL, STATED, needs_real
 
-from drivelink.canopen import Signal, configure
+from drivelink.canopen.layout import Signal
 from drivelink.jointfile import parse
 
 OURS = Path(__file__).parents[1] / "sim/eds/cia402-drive.eds"

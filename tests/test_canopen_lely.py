@@ -8,10 +8,9 @@ from pathlib import Path
 
 import lelykit
 import pytest
-from canopenkit import Wire, joint_text
+from canopenkit import Wire, configure, joint_text
 
 from drivelink._core import SYNC_COB_ID, Assembler
-from drivelink.canopen import configure
 from drivelink.canopen.layout import NodeLayout
 from drivelink.jointfile import parse
 

@@ -11,14 +11,16 @@ from canopenkit import (
     Item,
     Slave,
     Wire,
+    configure,
     drive_objects,
     joint_text,
     tpdo,
     u32,
 )
 
-from drivelink.canopen import Signal, configure, configure_joints
+from drivelink.canopen.configure import configure_joints
 from drivelink.canopen.guard import check_frame
+from drivelink.canopen.layout import Signal
 from drivelink.errors import BusError, DriveError
 from drivelink.jointfile import parse
 

@@ -1,9 +1,10 @@
 import random
 
 import pytest
-from canopenkit import NO_RTR, Slave, Wire, drive_objects, joint_text, tpdo, u32
+from canopenkit import NO_RTR, Slave, Wire, configure, drive_objects, joint_text, tpdo, u32
 
-from drivelink.canopen import PassiveConfigurator, Signal, configure
+from drivelink.canopen.layout import Signal
+from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.canopen.sdo_sniffer import SdoSniffer
 from drivelink.errors import DriveError
 from drivelink.jointfile import parse

@@ -4,10 +4,11 @@ import math
 
 import can
 import pytest
-from canopenkit import joint_text
+from canopenkit import configure, joint_text
 
-from drivelink.canopen import Signal, configure, configure_joints
+from drivelink.canopen.configure import configure_joints
 from drivelink.canopen.guard import check_frame
+from drivelink.canopen.layout import Signal
 from drivelink.demo.simulate import network_from_joint
 from drivelink.errors import DriveError
 from drivelink.jointfile import parse

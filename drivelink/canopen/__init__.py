@@ -10,21 +10,3 @@ In the run the loop alone reads the bus. It calls `configurator.start(node)` aft
 `configure = false` it is a `PassiveConfigurator` with the same methods, which sends nothing, also takes the
 frames 0x601 to 0x67F, and reports in `poll` when another master has changed a mapping.
 """
-
-from drivelink.canopen.bus import interface_is_up, open_bus
-from drivelink.canopen.configure import Configurator, configure, configure_joints
-from drivelink.canopen.layout import MappedObject, NodeLayout, Signal, TpdoLayout
-from drivelink.canopen.passive import PassiveConfigurator
-
-__all__ = [
-    "Configurator",
-    "MappedObject",
-    "NodeLayout",
-    "PassiveConfigurator",
-    "Signal",
-    "TpdoLayout",
-    "configure",
-    "configure_joints",
-    "interface_is_up",
-    "open_bus",
-]

@@ -1,7 +1,7 @@
 """Configures the nodes of a joint file: before the start (blocking), and beside the loop.
 
-`configure` runs before the start. In a run, `Configurator.start(node)` configures a rebooted node again: the
-loop passes every SDO response to `feed`, calls `poll` regularly, and takes the new layout from it. Nothing
+`configure_joints` runs before the start. In a run, `Configurator.start(node)` configures a rebooted node again:
+the loop passes every SDO response to `feed`, calls `poll` regularly, and takes the new layout from it. Nothing
 here waits or reads the bus.
 """
 
@@ -195,13 +195,6 @@ def _actively(
             if configurator.layouts[node].other_tpdos:
                 _configure_one(configurator, node, bus, idle)
     return configurator
-
-
-def configure(
-    bus: FrameBus, joint: JointFile, base_dir: Path = Path(), *, idle: Idle | None = None
-) -> tuple[NodeLayout, ...]:
-    """Configure the nodes of one joint: `configure_joints` for one."""
-    return configure_joints(bus, [joint], [base_dir], idle=idle)[1][0]
 
 
 def _configure_one(configurator: Configurator, node: int, bus: FrameBus, idle: Idle | None) -> None:

@@ -2,42 +2,20 @@
 
 from __future__ import annotations
 
-from drivelink.jointfile.schema import (
-    MAX_BYTES,
-    BusSection,
-    DriveSection,
-    EncoderSection,
-    JointFile,
-    JointText,
-    LinkSection,
-    MotorSection,
-    RecordingSection,
-    Ros2Section,
-    SimSection,
-    TpdoSection,
-    ZenohSection,
-    load,
-    load_text,
-    parse,
-    write_model,
-)
-
-__all__ = [
-    "MAX_BYTES",
-    "BusSection",
-    "DriveSection",
-    "EncoderSection",
-    "JointFile",
-    "JointText",
-    "LinkSection",
-    "MotorSection",
-    "RecordingSection",
-    "Ros2Section",
-    "SimSection",
-    "TpdoSection",
-    "ZenohSection",
-    "load",
-    "load_text",
-    "parse",
-    "write_model",
-]
+from drivelink.jointfile.document import MAX_BYTES as MAX_BYTES
+from drivelink.jointfile.document import JointText as JointText
+from drivelink.jointfile.document import load as load
+from drivelink.jointfile.document import load_text as load_text
+from drivelink.jointfile.document import parse as parse
+from drivelink.jointfile.document import write_model as write_model
+from drivelink.jointfile.schema import BusSection as BusSection
+from drivelink.jointfile.schema import DriveSection as DriveSection
+from drivelink.jointfile.schema import EncoderSection as EncoderSection
+from drivelink.jointfile.schema import JointFile as JointFile
+from drivelink.jointfile.schema import LinkSection as LinkSection
+from drivelink.jointfile.schema import MotorSection as MotorSection
+from drivelink.jointfile.schema import RecordingSection as RecordingSection
+from drivelink.jointfile.schema import Ros2Section as Ros2Section
+from drivelink.jointfile.schema import SimSection as SimSection
+from drivelink.jointfile.schema import TpdoSection as TpdoSection
+from drivelink.jointfile.schema import ZenohSection as ZenohSection

@@ -8,11 +8,12 @@ from pathlib import Path
 import can
 import canopen
 import pytest
+from canopenkit import configure
 from zenohkit import LIMIT_S, until
 
 from drivelink._core import SYNC_COB_ID, Assembler
-from drivelink.canopen import Signal, configure
 from drivelink.canopen.bus import interface_is_up, open_bus
+from drivelink.canopen.layout import Signal
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.framesource import OVERFLOW
 from drivelink.cycle.socketcan import SocketCanSource

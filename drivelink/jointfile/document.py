@@ -1,0 +1,228 @@
+"""Reads, validates and rewrites joint files. An error is one line: file, key, what was expected."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import re
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+from pydantic import ValidationError
+from tomlkit.container import Container
+
+from drivelink.errors import JointFileError
+from drivelink.jointfile.keyhint import unknown_key
+from drivelink.jointfile.schema import JointFile
+from drivelink.output.outfile import write_whole
+
+_LOG = logging.getLogger(__name__)
+
+MAX_BYTES = 256 << 10  # of a joint file; the longest that fit and diagnose write have some 10 KiB
+_SHOWN = 80  # characters of a wrong value in a message
+_DEEP = re.compile(r"(?:[\w\"' \t-]+\.){32}")  # parts of one key
+_NESTED = "expected a joint file, got tables nested without end"
+_MARK = "# drivelink wrote this file, and ends it with a check line: a part of it is refused."
+_CHECK = re.compile(r"^# drivelink check: sha256 ([0-9a-f]{16})$\n?", re.MULTILINE)
+
+_PATTERNS = {  # in words, by key
+    "name": "letters, digits, '.', '-' and '_', a letter or digit first",
+    "prefix": "parts of a zenoh key with '/' between, without spaces and without any of *$#?",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JointText:
+    """A joint file and its text.
+
+    Attributes:
+        joint: the parsed file.
+        text: the whole text, comments included.
+        folder: base of its EDS and zenoh files.
+        name: for messages.
+        path: the file; None: from a recording.
+    """
+
+    joint: JointFile
+    text: str
+    folder: Path
+    name: str
+    path: Path | None = None
+
+
+def load(path: str | Path) -> JointFile:
+    """Read and validate a joint file.
+
+    Raises:
+        JointFileError: it cannot be read, is not TOML, or a key is unknown, wrong or missing.
+    """
+    return load_text(path).joint
+
+
+def load_text(path: str | Path) -> JointText:
+    """Read and validate a joint file, and keep its text.
+
+    Raises:
+        JointFileError: as `load`.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+        text = data.decode().replace("\r\n", "\n")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "expected UTF-8 text"
+        raise JointFileError(f"{path}: cannot be read as a joint file: {reason}") from error
+    joint = parse(text, str(path))
+    return JointText(joint=joint, text=text, folder=path.absolute().parent, name=str(path), path=path)
+
+
+def parse(text: str, where: str = "joint file") -> JointFile:
+    """Validate the text of a joint file; `where` begins every message.
+
+    Raises:
+        JointFileError: too large, cut off, not TOML, or a key is unknown, wrong or missing.
+    """
+    if len(text) > MAX_BYTES:
+        raise JointFileError(f"{where}: expected a joint file, of at most {MAX_BYTES >> 10} KiB, got more")
+    _require_whole(text, where)
+    if _DEEP.search(text):  # tomllib's time grows with the square of it
+        raise JointFileError(f"{where}: {_NESTED}")
+    try:
+        document = tomllib.loads(text)
+        # Validated as JSON, where strict mode accepts an array as tuple and 6 as float.
+        return JointFile.model_validate_json(json.dumps(document, default=str))
+    except ValidationError as error:
+        raise JointFileError(f"{where}: {_one_line(error)}") from error
+    except RecursionError as error:
+        raise JointFileError(f"{where}: {_NESTED}") from error
+    except ValueError as error:
+        raise JointFileError(f"{where}: expected TOML: {error}") from error
+
+
+def write_model(
+    source: JointText, target: Path, changes: dict[str, Any], *, force: bool = False
+) -> JointFile:
+    """Copy a joint file with its comments, replace some values, and validate the copy.
+
+    The copy ends with a check line, so that readers detect a truncated file.
+
+    Args:
+        source: joint file to start from.
+        target: path of the copy; written atomically, and only if valid.
+        changes: nested like the file. Mappings are merged, a list of mappings for an array (`motor`) element
+            by element; everything else, and `effect`, is replaced.
+        force: replace an existing file.
+
+    Raises:
+        JointFileError: the result is invalid, or the target cannot be written.
+    """
+    document = tomlkit.parse(_unchecked(source.text))
+    _merge(document, changes)
+    text = _checked(tomlkit.dumps(document))
+    joint = parse(text, str(target))
+    try:
+        write_whole(target, text, force=force)
+    except OSError as error:
+        raise JointFileError(f"{target}: cannot be written: {error.strerror}") from error
+    return joint
+
+
+def _checked(text: str) -> str:
+    """A joint file's text with its first line and its check line."""
+    text = f"{_MARK}\n{text.rstrip()}\n"
+    return f"{text}# drivelink check: sha256 {_digest(text)}\n"
+
+
+def _unchecked(text: str) -> str:
+    """The text without first and check line."""
+    return _CHECK.sub("", text).replace(f"{_MARK}\n", "", 1)
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _require_whole(text: str, where: str) -> None:
+    """Refuse a truncated file that drivelink wrote; an edited one is accepted.
+
+    Raises:
+        JointFileError: its check line is missing.
+    """
+    checks = list(_CHECK.finditer(text))
+    if not checks:
+        if _MARK in text:
+            raise JointFileError(
+                f"{where}: truncated: its last line, the check line, is missing (write it again; if you "
+                "removed that line yourself, remove the first one as well)"
+            )
+    elif _digest(text[: checks[-1].start()]) != checks[-1][1]:
+        _LOG.warning("%s: edited since drivelink wrote it: read as it is now", where)
+
+
+def _merge(table: Any, changes: dict[str, Any], *, dotted: bool = False) -> None:
+    """Merge changes into a table; `dotted`: it has no header, so new values go into one line."""
+    for key, value in changes.items():
+        if isinstance(value, dict) and key in table and key != "parameters":
+            _merge(table[key], value, dotted=dotted or _is_dotted(table, key))
+        elif key == "motor":
+            for element, change in zip(table[key], value, strict=True):
+                _merge(element, change)
+        else:
+            table[key] = _inline(value) if dotted else value
+
+
+def _is_dotted(table: Any, key: str) -> bool:
+    """Whether a table is written as `key.name = …` instead of below a header."""
+    container = table if isinstance(table, Container) else getattr(table, "value", None)
+    body = container.body if isinstance(container, Container) else ()
+    return any(k is not None and k.key == key and k.is_dotted() for k, _ in body)
+
+
+def _inline(value: Any) -> Any:
+    """A value without header."""
+    if isinstance(value, dict):
+        made = tomlkit.inline_table()
+        for key, one in value.items():
+            made[key] = _inline(one)
+        return made
+    if isinstance(value, list):
+        array = tomlkit.array()
+        array.extend([_inline(one) for one in value])
+        return array
+    return value
+
+
+def _one_line(error: ValidationError) -> str:
+    problems = error.errors(include_url=False)
+    # A table that is wrong inside also makes its array "too short": that says nothing.
+    problems = [problem for problem in problems if problem["type"] != "too_short"] or problems
+    first = problems[0]
+    key = _key(first["loc"])
+    message = first["msg"].removeprefix("Value error, ")
+    if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+        message = unknown_key(JointFile, first["loc"])
+    elif first["type"] == "missing":
+        message = "expected this key, it is missing"
+    elif first["type"] == "string_pattern_mismatch" and first["loc"][-1] in _PATTERNS:
+        message = f"expected {_PATTERNS[str(first['loc'][-1])]}, got {_shown(first['input'])}"
+    elif first["type"] != "value_error":
+        message = f"{message[0].lower()}{message[1:]}, got {_shown(first['input'])}"
+    rest = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    return f"{key}: {message}{rest}" if key else f"{message}{rest}"
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
+
+
+def _key(location: tuple[int | str, ...]) -> str:
+    text = ""
+    for part in location:
+        text += f"[{part + 1}]" if isinstance(part, int) else f".{part}"
+    return text.lstrip(".")

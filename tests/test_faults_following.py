@@ -159,7 +159,7 @@ def test_a_master_that_changes_its_period_is_named_with_both(monkeypatch: pytest
     follower = Follower()
     monkeypatch.setattr(time, "monotonic_ns", lambda: follower.stamp_ns)
     follower.jittering(1500, lambda: 0.0)
-    assert follower.run.supervisor.sync_period_s == 0.001
+    assert follower.run.supervisor.bus.sync_period_s == 0.001
     follower.jittering(2500, lambda: 0.0, 1.5 * PERIOD_NS)
     text = "SYNC comes every 1.5 ms now, 1 ms is in use"
     assert any(active.startswith(text) for active in follower.run.events.active.values())

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from drivelink._core import LatencyHistogram
+from drivelink.daemon.jointwatch import JointWatch
 from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor
 from estimator.sample import Status
@@ -98,7 +99,7 @@ def test_the_last_events_are_kept_and_no_more() -> None:
 
 def supervisor(clock: list[float]) -> Supervisor:
     made = Supervisor.__new__(Supervisor)
-    made._events, made._alarmed = log(clock), set()
+    made._events = log(clock)
     return made
 
 
@@ -106,16 +107,17 @@ def test_a_model_alarm_that_flickers_is_counted_whatever_its_residual(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.INFO)
-    made = supervisor([0.0])
+    events = log([0.0])
+    watch = JointWatch(events, lambda _joint: None)
     for k in range(1000):
         described = {"residual_nm": [1e-4 * k], "floor_nm": [0.03], "location": ""}
         monitor = SimpleNamespace(describe=lambda d=described: d)
         status = int(Status.VALID if k % 2 else Status.MODEL_ALARM)
         pipeline = SimpleNamespace(status=status, model_monitor=monitor)
-        made._check_model(SimpleNamespace(name="elbow", pipeline=pipeline))  # type: ignore[arg-type]
+        watch._check_model(SimpleNamespace(name="elbow", pipeline=pipeline))  # type: ignore[arg-type]
     assert len(caplog.records) == 2
-    assert [event["count"] for event in made._events.recent()] == [500, 500]
-    assert "3.3 times its baseline" in made._events.recent()[1]["text"]
+    assert [event["count"] for event in events.recent()] == [500, 500]
+    assert "3.3 times its baseline" in events.recent()[1]["text"]
 
 
 def test_emergencies_with_other_bytes_of_the_maker_are_counted(caplog: pytest.LogCaptureFixture) -> None:
@@ -140,8 +142,7 @@ def test_the_log_says_when_the_model_alarm_comes_and_goes_and_what_to_do(
     caplog.set_level(logging.INFO)
     described = {"residual_nm": [0.09, 0.01], "floor_nm": [0.03, 0.02], "location": "transmission"}
     model_monitor = SimpleNamespace(describe=lambda: described)
-    supervisor = Supervisor.__new__(Supervisor)
-    supervisor._events, supervisor._alarmed = EventLog(logging.getLogger("drivelink")), set()
+    watch = JointWatch(EventLog(logging.getLogger("drivelink")), lambda _joint: None)
     for status in (
         Status.VALID,
         Status.VALID | Status.MODEL_ALARM,
@@ -150,7 +151,7 @@ def test_the_log_says_when_the_model_alarm_comes_and_goes_and_what_to_do(
         Status.VALID,
     ):
         pipeline = SimpleNamespace(status=int(status), model_monitor=model_monitor)
-        supervisor._check_model(SimpleNamespace(name="elbow", pipeline=pipeline))  # type: ignore[arg-type]
+        watch._check_model(SimpleNamespace(name="elbow", pipeline=pipeline))  # type: ignore[arg-type]
         if status == Status.MODEL_ALARM:
             described |= {"residual_nm": [0.02, 0.01], "location": ""}
     begun, over = [record.getMessage() for record in caplog.records]

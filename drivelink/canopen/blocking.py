@@ -12,6 +12,7 @@ import can
 
 from drivelink.canopen.sdo import Program, Session
 from drivelink.errors import BusError
+from drivelink.jointfile import BusSection
 
 T = TypeVar("T")
 Idle = Callable[[], object]
@@ -54,9 +55,8 @@ def sender(bus: FrameBus) -> Callable[[int, bytes], None]:
 def run_program(
     program: Program[T],
     bus: FrameBus,
+    section: BusSection | None = None,
     *,
-    timeout_s: float = 0.5,
-    retries: int = 1,
     idle: Idle | None = None,
 ) -> T:
     """Run a program to its end on a bus without another reader.
@@ -64,15 +64,15 @@ def run_program(
     Args:
         program: what to do.
         bus: where.
-        timeout_s: for each SDO answer.
-        retries: further attempts after a timeout.
+        section: of the joint file, for SDO timeout and retries; None: the defaults.
         idle: called between receptions, e.g. the simulated devices' `poll` in lockstep.
 
     Raises:
         DriveError: the program failed.
         BusError: the bus did.
     """
-    session = Session(program, sender(bus), timeout_s=timeout_s, retries=retries)
+    section = section or BusSection()
+    session = Session(program, sender(bus), timeout_s=section.sdo_timeout_s, retries=section.sdo_retries)
     while not session.poll(time.monotonic()):
         if idle is not None:
             idle()

@@ -1,8 +1,8 @@
 """Configures the nodes of a joint file: before the start (blocking), and beside the loop.
 
-`configure_joints` runs before the start. In a run, `Configurator.start(node)` configures a rebooted node again:
-the loop passes every SDO response to `feed`, calls `poll` regularly, and takes the new layout from it. Nothing
-here waits or reads the bus.
+`configure_joints` runs before the start. In a run, `Configurator.start(node)` configures a rebooted node
+again: the loop passes every SDO response to `feed`, calls `poll` regularly, and takes the new layout from it.
+Nothing here waits or reads the bus.
 """
 
 from __future__ import annotations
@@ -201,11 +201,7 @@ def _configure_one(configurator: Configurator, node: int, bus: FrameBus, idle: I
     section = configurator.bus
     try:
         configurator.layouts[node] = run_program(
-            configurator.program(node, start=False),
-            bus,
-            timeout_s=section.sdo_timeout_s,
-            retries=section.sdo_retries,
-            idle=idle,
+            configurator.program(node, start=False), bus, section, idle=idle
         )
     except SdoTimeout as error:
         if error.index != _DEVICE_TYPE:

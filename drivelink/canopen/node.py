@@ -10,7 +10,7 @@ from drivelink._core import SYNC_COB_ID
 from drivelink.canopen.layout import MappedObject, NodeLayout, Signal
 from drivelink.canopen.mapping import NMT_PRE_OPERATIONAL, NMT_START, SETTLE_S, Mapper, disable
 from drivelink.canopen.offer import Offer
-from drivelink.canopen.pdo import ABSENT, Tpdo, decode, read_optional, read_tpdos
+from drivelink.canopen.pdo import ABSENT, Tpdo, decode, read_identity, read_optional, read_tpdos
 from drivelink.canopen.roles import Role
 from drivelink.canopen.sdo import (
     Nmt,
@@ -75,7 +75,7 @@ def survey_node(role: Role, patience: int = 1, *, wake: bool = False) -> Program
     """
     node = role.node_id
     device_type = yield from _first_contact(node, patience, wake)
-    identity = yield from _identity(node)
+    identity = yield from read_identity(node)
     vendor = vendor_of(identity[0])
     reported, refused = yield from _units(role, vendor)
     offered = offer(role, reported, vendor)
@@ -92,13 +92,6 @@ def survey_node(role: Role, patience: int = 1, *, wake: bool = False) -> Program
         available=available,
         tpdos=(yield from read_tpdos(node)),
     )
-
-
-def _identity(node: int) -> Program[tuple[int, int, int, int]]:
-    vendor = (yield from read_optional(node, 0x1018, 1)) or 0
-    product = (yield from read_optional(node, 0x1018, 2)) or 0
-    revision = (yield from read_optional(node, 0x1018, 3)) or 0
-    return vendor, product, revision, (yield from read_optional(node, 0x1018, 4)) or 0
 
 
 def _units(role: Role, vendor: Vendor) -> Program[tuple[dict[Address, int], SdoAbort | None]]:
@@ -120,7 +113,7 @@ def _changed(survey: NodeSurvey) -> Program[str]:
     """
     node, before = survey.role.node_id, {(0x1018, k + 1): x for k, x in enumerate(survey.identity)}
     before |= survey.reported
-    identity = yield from _identity(node)
+    identity = yield from read_identity(node)
     units, _ = yield from _units(survey.role, vendor_of(survey.identity[0]))
     now = {(0x1018, k + 1): x for k, x in enumerate(identity)} | units
     for index, subindex in sorted(before.keys() | now.keys()):

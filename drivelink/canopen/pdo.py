@@ -96,6 +96,14 @@ def read_optional(node: int, index: int, subindex: int) -> Program[int | None]:
         return None
 
 
+def read_identity(node: int) -> Program[tuple[int, int, int, int]]:
+    """Vendor, product code, revision and serial number of 0x1018; 0 where not reported."""
+    vendor = (yield from read_optional(node, 0x1018, 1)) or 0
+    product = (yield from read_optional(node, 0x1018, 2)) or 0
+    revision = (yield from read_optional(node, 0x1018, 3)) or 0
+    return vendor, product, revision, (yield from read_optional(node, 0x1018, 4)) or 0
+
+
 def _read_exactly(node: int, index: int, subindex: int) -> Program[int | None]:
     try:
         return (yield from read_number(node, index, subindex))

@@ -15,9 +15,10 @@ import can
 from drivelink._core import SYNC_COB_ID
 from drivelink.canopen.blocking import FrameBus, receive, run_program, sender
 from drivelink.canopen.guard import check_frame
-from drivelink.canopen.pdo import read_optional
+from drivelink.canopen.pdo import read_identity, read_optional
 from drivelink.canopen.sdo import Program, Read, SdoAbort
 from drivelink.errors import DriveError
+from drivelink.jointfile import BusSection
 
 _ANSWER_S = 0.3  # for the slowest node
 _GAP_S = 0.001  # between two requests: 127 of them must not fill a transmit queue
@@ -136,19 +137,17 @@ def _drain(bus: FrameBus, traffic: Traffic, seconds: float) -> None:
             traffic.add(message)
 
 
-def identify(bus: FrameBus, node_id: int, *, timeout_s: float, retries: int) -> FoundNode:
+def identify(bus: FrameBus, section: BusSection, node_id: int) -> FoundNode:
     """Read identity and name of a node."""
     try:
-        return run_program(_identify(node_id), bus, timeout_s=timeout_s, retries=retries)
+        return run_program(_identify(node_id), bus, section)
     except DriveError:
         return FoundNode(node_id=node_id, device_type=None)
 
 
 def _identify(node: int) -> Program[FoundNode]:
     device_type = (yield from read_optional(node, 0x1000, 0)) or 0
-    identity = [0, 0, 0, 0]
-    for subindex in (1, 2, 3, 4):
-        identity[subindex - 1] = (yield from read_optional(node, 0x1018, subindex)) or 0
+    identity = yield from read_identity(node)
     try:
         name = yield Read(node, 0x1008, 0)
     except SdoAbort:
@@ -156,6 +155,6 @@ def _identify(node: int) -> Program[FoundNode]:
     return FoundNode(
         node_id=node,
         device_type=device_type,
-        identity=(identity[0], identity[1], identity[2], identity[3]),
+        identity=identity,
         name=name.rstrip(b"\0 ").decode("latin-1"),
     )

@@ -163,9 +163,7 @@ def _scanned(answers: Answers) -> Answers:
     bus = open_bus(section)
     try:
         ids, _ = scan(bus)
-        found = [
-            identify(bus, node, timeout_s=section.sdo_timeout_s, retries=section.sdo_retries) for node in ids
-        ]
+        found = [identify(bus, section, node) for node in ids]
     finally:
         bus.shutdown()
     return answers_from_bus(answers, found)

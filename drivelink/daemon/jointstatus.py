@@ -12,8 +12,9 @@ from drivelink.cycle.framesource import LostSource
 from drivelink.cycle.loop import CycleLoop, LoopJoint
 from drivelink.cycle.realtime import RealTime
 from drivelink.daemon.crosschecks import cross_checks
+from drivelink.daemon.jointwatch import residual_text
 from drivelink.daemon.status import EventLog
-from drivelink.daemon.supervision import Supervisor, residual_text
+from drivelink.daemon.supervision import Supervisor
 from drivelink.jointfile import JointFile
 from drivelink.version import __version__
 from estimator.sample import ExternalStatus, Status
@@ -158,7 +159,7 @@ class JointStatus:
             "errors": dict(source.errors),
             "foreign_syncs": self._loop.foreign_syncs,
             "late_syncs": self._loop.late_syncs,
-            "sync_period_s": self._supervisor.sync_period_s,
+            "sync_period_s": self._supervisor.bus.sync_period_s,
             "sync_counter_jumps": self._loop.counter_jumps,
         }
 

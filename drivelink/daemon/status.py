@@ -63,6 +63,13 @@ class EventLog:
         if self._active.pop(key, None) is not None and text:
             self._note(f"{key} ends", text, level)
 
+    def keep(self, key: str, holds: bool, text: str, over: str, level: int = logging.WARNING) -> None:
+        """Report `text` when a condition begins to hold, `over` when it has ended."""
+        if holds:
+            self.begin(key, text, level)
+        else:
+            self.end(key, over)
+
     def _note(self, key: str, text: str, level: int) -> None:
         now = self._clock()
         event, since, count = self._said.get(key, ({}, -self._QUIET_S, 0))

@@ -47,10 +47,7 @@ class AskedValues:
         Raises:
             DriveError: a node does not answer.
         """
-        program = self._reader.program(seconds)
-        samples = run_program(
-            program, self._bus, timeout_s=self._section.sdo_timeout_s, retries=self._section.sdo_retries
-        )
+        samples = run_program(self._reader.program(seconds), self._bus, self._section)
         found = {}
         for survey in self._surveys:
             mine = samples[survey.role.node_id]
@@ -103,11 +100,7 @@ def live_values(joint: JointFile, base_dir: Path) -> Iterator[Values]:
     bus = open_bus(joint.bus)
     try:
         if joint.bus.configure:
-            wait_s, retries = joint.bus.sdo_timeout_s, joint.bus.sdo_retries
-            surveys = [
-                run_program(survey_node(role), bus, timeout_s=wait_s, retries=retries)
-                for role in roles(joint, base_dir)
-            ]
+            surveys = [run_program(survey_node(role), bus, joint.bus) for role in roles(joint, base_dir)]
             yield AskedValues(bus, joint.bus, surveys)
         else:
             silent, configurator = SilentBus(bus), PassiveConfigurator([joint], [base_dir])

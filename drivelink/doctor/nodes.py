@@ -84,7 +84,7 @@ def _ask(
     mine = {role.node_id: role for role in roles(joint, base_dir)}
     others = [node for node in sorted(set(found) | set(traffic.heartbeats)) if node not in mine]
     for node in others:
-        known = _identify(bus, joint.bus, node)
+        known = identify(bus, joint.bus, node)
         section.say(Severity.INFO, f"node {node}", f"{_describe_node(known)}, not in the joint file")
     if not found:
         section.say(
@@ -121,12 +121,7 @@ def _watch_motion(
     nodes = list(surveys.values())
     together = report.section("Units and signs")
     try:
-        samples = run_program(
-            MotionReader(nodes).program(seconds),
-            bus,
-            timeout_s=joint.bus.sdo_timeout_s,
-            retries=joint.bus.sdo_retries,
-        )
+        samples = run_program(MotionReader(nodes).program(seconds), bus, joint.bus)
     except DriveError as error:
         together.say(Severity.ERROR, joint.name, str(error))
         return
@@ -143,10 +138,6 @@ def _list(nodes: Sequence[int]) -> str:
     return ", ".join(f"node {node}" for node in nodes)
 
 
-def _identify(bus: can.BusABC, section: BusSection, node: int) -> FoundNode:
-    return identify(bus, node, timeout_s=section.sdo_timeout_s, retries=section.sdo_retries)
-
-
 def _describe_node(node: FoundNode) -> str:
     vendor, product, revision, _ = node.identity
     maker = vendor_of(vendor).name or f"vendor 0x{vendor:X}"
@@ -159,7 +150,7 @@ def _examine_node(
 ) -> tuple[NodeSurvey | None, NodeLayout | None]:
     """Check one node of the joint: identity, and its frames as they would be configured."""
     subject = role.subject
-    node = _identify(bus, joint.bus, role.node_id)
+    node = identify(bus, joint.bus, role.node_id)
     state = traffic.heartbeats.get(role.node_id, "no heartbeat")
     section.ok(subject, f"{_describe_node(node)}, {state}")
     curious = role
@@ -171,9 +162,7 @@ def _examine_node(
         }
         curious = replace(role, drive=role.drive.model_copy(update=update))
     try:
-        survey = run_program(
-            survey_node(curious), bus, timeout_s=joint.bus.sdo_timeout_s, retries=joint.bus.sdo_retries
-        )
+        survey = run_program(survey_node(curious), bus, joint.bus)
     except DriveError as error:
         section.say(Severity.ERROR, subject, str(error))
         return None, None
@@ -187,12 +176,8 @@ def _examine_node(
 
 
 def _has(bus: can.BusABC, section: BusSection, node: int, index: int) -> bool:
-    program = read_optional(node, index, 0)
     try:
-        return (
-            run_program(program, bus, timeout_s=section.sdo_timeout_s, retries=section.sdo_retries)
-            is not None
-        )
+        return run_program(read_optional(node, index, 0), bus, section) is not None
     except DriveError:
         return False
 

@@ -1,0 +1,149 @@
+"""Watches SYNC, the CAN controller and the speed of this machine; every event is reported once."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+
+from drivelink.cycle.framesource import OVERFLOW
+from drivelink.cycle.loop import CycleLoop
+from drivelink.cycle.syncclock import MEASURED_SYNCS, measure_period
+from drivelink.daemon.status import EventLog
+
+_NS = 1_000_000_000
+_MANY_SYNCS = 3  # SYNCs beyond the number of periods in a second
+
+
+class BusWatch:
+    """The state of the bus, from the counters of the loop.
+
+    Args:
+        loop: the cycle.
+        events: the event log.
+
+    Attributes:
+        sync_period_s: last measured period of the followed master; None: not yet, or SYNC is produced.
+    """
+
+    def __init__(self, loop: CycleLoop, events: EventLog) -> None:
+        self._loop = loop
+        self._events = events
+        self._counter_jumps = self._lost_sends = self._clock_steps = 0
+        self._bus_offs = self._restarts = self._measured_ns = 0
+        self._slow = self._slow_ns = 0
+        self._off_period = 0  # consecutive measurements
+        self._foreign = deque([(loop.clock(), 0, 0)])  # in the last second: SYNCs not due, periods without
+        self.sync_period_s: float | None = None
+
+    def check(self) -> None:
+        """Check for changes since the last call."""
+        loop = self._loop
+        self._check_foreign_syncs()
+        self._check_period()
+        self._check_speed()
+        if loop.counter_jumps != self._counter_jumps:
+            self._counter_jumps = loop.counter_jumps
+            self._events.say(
+                f"the SYNC counter jumped, {self._counter_jumps} times so far", key="SYNC counter jumped"
+            )
+        if loop.clock_steps != self._clock_steps:
+            self._clock_steps = loop.clock_steps
+            self._events.say(
+                f"the system's clock was set by {loop.clock_step_ns / _NS:+.3f} s: stamps follow it, "
+                "the cycle does not",
+                key="clock set forward" if loop.clock_step_ns > 0 else "clock set back",
+            )
+        text = "no SYNC on the bus: the estimates are stale"
+        self._events.keep("no sync", loop.silent, text, "SYNC is back", logging.ERROR)
+        self._check_queue()
+        self._check_controller()
+
+    def _check_queue(self) -> None:
+        lost_sends = self._loop.source.lost_sends
+        if lost_sends == self._lost_sends:
+            self._events.end("full queue", "the transmit queue drains again")
+        elif lost_sends:
+            text = "the transmit queue is full: SYNC is lost; is any node on the bus?"
+            self._events.begin("full queue", text)
+        self._lost_sends = lost_sends
+
+    def _check_foreign_syncs(self) -> None:
+        """Check whether two masters produce SYNC.
+
+        When following, SYNCs that are not due prove nothing: one master produces some if it skips as many
+        periods. Two masters produce more SYNCs than periods.
+        """
+        loop, now = self._loop, self._loop.clock()
+        self._foreign.append((now, loop.foreign_syncs, loop.skipped_periods))
+        while now - self._foreign[0][0] > _NS:
+            self._foreign.popleft()
+        _, foreign, skipped = self._foreign[0]
+        if loop.produce and loop.foreign_syncs > foreign:
+            what = (
+                "another master produces SYNC: its cycles are not used; "
+                'set bus.sync = "follow", or stop the other one'
+            )
+        elif (loop.foreign_syncs - foreign) - (loop.skipped_periods - skipped) >= _MANY_SYNCS:
+            what = "a second master produces SYNC too: its cycles are not used; stop one of the two"
+        else:
+            self._events.end("foreign sync", "the other master stopped producing SYNC")
+            return
+        self._events.begin("foreign sync", what, logging.ERROR)
+
+    def _check_period(self) -> None:
+        """Check that the followed master still has the period used by the estimators."""
+        loop, now = self._loop, self._loop.clock()
+        if loop.produce or now - self._measured_ns < _NS or len(loop.sync_stamps) < MEASURED_SYNCS:
+            return
+        self._measured_ns = now
+        used_s = loop.period_ns / _NS
+        measured = measure_period(list(loop.sync_stamps), used_s)
+        if measured is None:
+            return
+        self.sync_period_s = measured.period_s
+        self._off_period = 0 if measured.same else self._off_period + 1
+        if measured.same:
+            self._events.end("period", f"SYNC comes every {used_s * 1e3:g} ms again")
+        elif self._off_period > 1:  # once may have been a stall
+            self._events.begin(
+                "period",
+                f"SYNC comes every {measured.period_s * 1e3:.4g} ms now, {used_s * 1e3:g} ms is in use: "
+                "cycles are lost or doubled until the master returns to it or the daemon is restarted",
+                logging.ERROR,
+            )
+
+    def _check_speed(self) -> None:
+        """Check that this machine keeps up with the cycle."""
+        loop, now = self._loop, self._loop.clock()
+        unread = loop.source.errors.get(OVERFLOW, 0)
+        total = loop.overruns + loop.behind + unread
+        if total > self._slow:
+            self._slow, self._slow_ns = total, now
+            counted = [
+                f"{loop.overruns} cycles left out so far" if loop.overruns else "",
+                f"{loop.behind} SYNCs read more than a period late" if loop.behind else "",
+                f"{unread} frames lost unread" if unread else "",
+            ]
+            self._events.begin(
+                "too slow",
+                f"this machine is too slow for the cycle of {loop.period_ns / 1e6:g} ms: "
+                f"{', '.join(filter(None, counted))}; drivelink doctor names the cause",
+            )
+        elif now - self._slow_ns > _NS:
+            self._slow = total  # the count restarts with a reopened bus
+            text = f"this machine keeps up with the cycle again; {loop.overruns} cycles were left out"
+            self._events.end("too slow", text)
+
+    def _check_controller(self) -> None:
+        errors = self._loop.source.errors
+        bus_offs, restarts = errors.get("bus-off", 0), errors.get("restarted", 0)
+        if bus_offs > self._bus_offs:
+            self._events.begin(
+                "bus-off",
+                "the CAN controller is bus-off: check wiring, termination and bit rate; it stays so unless "
+                "restart-ms is set for the interface",
+                logging.ERROR,
+            )
+        if restarts > self._restarts:
+            self._events.end("bus-off", "the CAN controller is on the bus again")
+        self._bus_offs, self._restarts = bus_offs, restarts

@@ -517,7 +517,7 @@ def test_joints_come_by_urgency_with_what_changed_since_when() -> None:
     assert (step["kind"], step["since"][:10]) == ("step", "2026-01-17")
     (effect,) = joints["rubs"]["effects"]
     assert (effect["significant"], effect["since"][:10]) == (True, "2026-01-14")
-    assert joints["rubs"]["sentence"] == "New at the motor since 2026-01-14: coulomb friction."
+    assert joints["rubs"]["sentence"] == "New at the motor since 2026-01-14: Coulomb friction."
 
 
 def test_an_unusable_stiffness_is_no_point_of_the_trend() -> None:

@@ -105,7 +105,7 @@ def test_the_report_has_units_bands_the_winner_and_what_is_left(folder: Path) ->
     _diagnose(folder, "coulomb")
     page = (folder / "coulomb-joint.toml" / "report.html").read_text(encoding="utf-8")
     assert "of the torque (" in page and "rms) stays unexplained" in page
-    assert "▶ coulomb friction" in page
+    assert "▶ Coulomb friction" in page
     assert page.count("▶ ") == 2  # the one that was chosen, and what the mark means
     assert "Stiffness of transmission 1, with 95 % bands" in page and ">refitted</text>" in page
     assert re.search(r"<code>torque_nm</code></td><td>0\.\d+ ± \S+ N·m</td>", page)
@@ -126,7 +126,7 @@ def test_of_a_linear_axis_the_report_speaks_of_newtons_and_metres(folder: Path) 
 def test_the_page_is_self_contained_and_says_the_verdict(folder: Path) -> None:
     _diagnose(folder, "coulomb")
     page = (folder / "coulomb-joint.toml" / "report.html").read_text(encoding="utf-8")
-    assert "The model lacks coulomb friction (motor)" in page
+    assert "The model lacks Coulomb friction (motor)" in page
     assert page.count("<svg") >= 3
     for foreign in ('src="http', 'href="http', "@import", "<script"):
         assert foreign not in page

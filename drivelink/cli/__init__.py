@@ -154,7 +154,7 @@ def add_map(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="SOURCE=COLUMN[:UNIT]",
-        help="take a column of a CSV or MF4 file for one of ours, e.g. q_link=link_position_rad:deg; "
+        help="use a column of a CSV or MF4 file as one of drivelink's, e.g. q_link=link_position_rad:deg; "
         "a factor may stand for UNIT, e.g. tau=motor1_torque_nm:-0.05; may be repeated",
     )
 
@@ -166,7 +166,7 @@ def add_recordings(parser: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="+",
         metavar="RECORDING",
-        help="measured data of one joint: CSV, MCAP, CAN log; of several each is validated by the others",
+        help="recordings of one joint: CSV, MCAP, CAN log; each of several is validated by the others",
     )
     parser.add_argument(
         "--joint", type=Path, metavar="JOINT", help="joint file (default: the one in the recording)"
@@ -175,7 +175,7 @@ def add_recordings(parser: argparse.ArgumentParser) -> None:
         "--bandwidth-hz",
         type=_bandwidth,
         metavar="F",
-        help="of the filter that all channels share; left out: chosen from the data",
+        help="bandwidth of the filter that all channels share (default: chosen from the data)",
     )
     add_map(parser)
 

@@ -36,7 +36,7 @@ _ALIVE_S = 1.0  # in which a daemon answers
 _SAY_EVERY_S = 10.0
 
 EPILOG = """\
-The ending of FILE says the format:
+The ending of FILE selects the format:
   .mcap                     samples, estimates, status, model, joint file and raw CAN: replays everything,
                             opens in Foxglove and PlotJuggler
   .csv                      samples

@@ -86,7 +86,7 @@ def _governor(section: Section) -> None:
         section.say(
             Severity.WARNING,
             "CPU clock",
-            f"governor {', '.join(sorted(governors))}: the clock has to rise first after each sleep",
+            f"governor {', '.join(sorted(governors))}: the CPU clock first has to rise after each idle phase",
             "sudo cpupower frequency-set -g performance",
         )
     cores = os.cpu_count() or 1

@@ -10,6 +10,7 @@ from pathlib import Path
 from string import Template
 from typing import Any, NamedTuple
 
+from drivelink.output.units import in_words
 from estimator.sample import SIGMA_95
 
 _CHARTS = 400  # joints with a chart, the most urgent first; more would make the page too large
@@ -223,7 +224,7 @@ def _effects(joint: dict[str, Any]) -> str:
     heads = ("found", "at", "recordings", "since", "error that it removes", "")
     lines = []
     for effect in joint["effects"]:
-        names = html.escape(", ".join(name.replace("_", " ") for name in effect["names"]))
+        names = html.escape(", ".join(map(in_words, effect["names"])))
         since = effect["since"][:10] + (" (significant)" if effect["significant"] else "")
         count, share = f"{effect['recordings']} of {effect['of']}", f"{effect['error_relative']:.1%}"
         cells = (

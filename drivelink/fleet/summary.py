@@ -21,6 +21,7 @@ from drivelink.fleet.changes import (
     q_values,
     series_test,
 )
+from drivelink.output.units import in_words
 from estimator.sample import SIGMA_95, FloatArray
 from estimator.transmissions import MODELS
 
@@ -311,7 +312,7 @@ def _sentence(
                 said.append(f"{of} has drifted by {_signed(amount)} ± {SIGMA_95 * std:.1f} % since {day}.")
     for effect in effects:
         if effect["significant"]:
-            names = " or ".join(n.replace("_", " ") for n in effect["names"][:2])
+            names = " or ".join(map(in_words, effect["names"][:2]))
             said.append(f"New at the {_spaced(effect['location'])} since {effect['since'][:10]}: {names}.")
     if said:
         return " ".join(said)

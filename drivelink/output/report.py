@@ -12,7 +12,7 @@ import numpy as np
 
 from drivelink.output import plots
 from drivelink.output.outfile import write_whole
-from drivelink.output.units import Units
+from drivelink.output.units import Units, in_words
 from estimator.diagnosis import Curve, Diagnosis, Errors, Finding, StiffnessCurve
 from estimator.effects import LIBRARY
 
@@ -129,9 +129,10 @@ def sentence(outcome: Diagnosis) -> str:
         return f"The model lacks {names}: {fall}."
     if outcome.verdict == "unexplained":
         where = outcome.effects[0]
+        place = _place(where)
         over = " and ".join(name.replace("_", " ") for name in where.coordinates)
         return (
-            f"Something at the {_place(where)} that is in no library, a function of {over}, is missing: "
+            f"The model lacks something at the {place} that is not in the library, a function of {over}: "
             f"{'with a free curve' if _curve_of_unlisted(outcome) else 'with it'} {fall}."
         )
     if outcome.verdict == "insufficient_excitation":
@@ -159,13 +160,13 @@ def title_of(finding: Finding) -> str:
     """An effect in words, with its place."""
     if finding.name == "unlisted":
         return f"an unlisted effect at the {_place(finding)}"
-    return f"{finding.name.replace('_', ' ')} ({_place(finding)})"
+    return f"{in_words(finding.name)} ({_place(finding)})"
 
 
 def others_of(finding: Finding) -> str:
     """Alternatives of an effect, with their probabilities."""
     pairs = zip(finding.alternatives, finding.alternative_probabilities, strict=True)
-    return ", ".join(f"{name.replace('_', ' ')} ({p:.2f})" for name, p in pairs)
+    return ", ".join(f"{in_words(name)} ({p:.2f})" for name, p in pairs)
 
 
 def _place(finding: Finding) -> str:
@@ -241,7 +242,7 @@ def _curve_figure(curve: Curve, units: Units) -> str:
     across, torque = units.label(_AXES[curve.coordinates[0]]), units.label("torque / N·m")
     plots.dots(axes, curve.x, curve.residual_nm)
     order = np.argsort(curve.x)
-    name = curve.name.replace("_", " ")
+    name = in_words(curve.name)
     if curve.second is None and _is_function(curve):
         curves = {"residual of the model": plots.medians(curve.x, curve.residual_nm)}
         curves[name] = plots.medians(curve.x, curve.fitted_nm)
@@ -256,7 +257,7 @@ def _curve_figure(curve: Curve, units: Units) -> str:
 
 def _caption(curve: Curve) -> str:
     over = " and ".join(name.replace("_", " ") for name in curve.coordinates)
-    return f"Residual of the declared model over {over}, and {html.escape(curve.name.replace('_', ' '))}."
+    return f"Residual of the declared model over {over}, and {html.escape(in_words(curve.name))}."
 
 
 def _is_function(curve: Curve) -> bool:
@@ -297,7 +298,7 @@ def _rivals_figure(outcome: Diagnosis) -> str:
     chosen = {(finding.name, finding.motor) for finding in outcome.effects}
     won = [(r.name, r.motor) in chosen for r in shown]
     names = [
-        ("▶ " if mine else "") + r.name.replace("_", " ") + (f" {r.motor + 1}" if r.motor else "")
+        ("▶ " if mine else "") + in_words(r.name) + (f" {r.motor + 1}" if r.motor else "")
         for r, mine in zip(shown, won, strict=True)
     ]
     values = [100.0 * r.error_relative for r in shown]

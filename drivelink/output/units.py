@@ -1,4 +1,4 @@
-"""Parameters with their intervals and units, of rotary axes and of linear ones."""
+"""How reports write effects, and parameters with their intervals and units."""
 
 from __future__ import annotations
 
@@ -18,6 +18,11 @@ _LINEAR = {  # of a linear axis: metres for rad, newtons for N·m
     "rad/s": "m/s", "per rev": "per 2π m", "N·m/rad²": "N/m²", "1/(N·m)²": "1/N²", "N·m/s": "N/s",
     "1/rad": "1/m", "N·m": "N", "rad": "m",
 }  # fmt: skip
+
+
+def in_words(name: str) -> str:
+    """The name of an effect as it stands in a sentence."""
+    return name.replace("_", " ").replace("coulomb", "Coulomb").replace("stribeck", "Stribeck")
 
 
 class Units:

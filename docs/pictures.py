@@ -159,7 +159,7 @@ def loop(folder: Path) -> None:
     script = ROOT / "examples" / "close_the_loop.py"
     subprocess.run([sys.executable, str(script), str(folder)], check=True, stdout=subprocess.DEVNULL)
     (PICTURES / "fit.png").write_bytes((folder / "fit.png").read_bytes())
-    pages(f"file://{folder}/report.html", "report", 1000)
+    pages(f"file://{folder}/report.html", "report", "figure")
 
 
 DRAWN: dict[str, Callable[[Path], None]] = {"demo": demo, "views": views, "loop": loop}

@@ -65,8 +65,9 @@ def main(folder: str = "close_the_loop") -> None:
         ["fit", healthy, "--joint", JOINT, "--out", out, "--plots", "--write", model],
         ["diagnose", suspect, "--joint", model, "--out", out, "--write", out / "elbow-better.toml"],
     ):
-        print("\n$ drivelink", *command, flush=True)
-        if status := drivelink([str(word) for word in command]):
+        words = [*map(str, command), "--force"]
+        print("\n$ drivelink", *words, flush=True)
+        if status := drivelink(words):
             sys.exit(status)
     print(f"\nswitched on was coulomb_friction of {FRICTION_NM} N·m; open {out / 'report.html'}")
 

@@ -289,8 +289,8 @@ def test_cycles_lost_because_this_machine_is_too_slow_are_said_with_their_number
         made.daemon.loop.overruns += 3  # as the pacing counts them
         made.run(100)
         assert (
-            "this machine is too slow for the cycle of 1 ms: 3 cycles left out so far; drivelink doctor names the "
+            "this machine is too slow for the cycle of 1 ms: cycles left out so far: 3; drivelink doctor names the "
             "cause"
         ) in made.events
         made.run(2000)
-        assert "this machine keeps up with the cycle again; 3 cycles were left out" in made.events
+        assert "this machine keeps up with the cycle again; cycles left out: 3" in made.events

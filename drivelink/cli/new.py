@@ -203,7 +203,7 @@ def _node_id(reply: str) -> int:
 
 _QUESTIONS: tuple[tuple[str, str, Callable[[str], Any]], ...] = (
     ("name", "Name of the joint", str),
-    ("arrangement", ", ".join(_ARRANGEMENTS), _one_of(*_ARRANGEMENTS)),
+    ("arrangement", f"Arrangement of the motors: {', '.join(_ARRANGEMENTS)}", _one_of(*_ARRANGEMENTS)),
     ("gear_ratio", "Gear ratio: motor revolutions per joint revolution, 1 for a direct drive", _positive),
     ("rotor_inertia_gcm2", "Rotor inertia of the motor, g·cm² (its data sheet)", _positive),
     (

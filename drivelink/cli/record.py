@@ -34,6 +34,10 @@ from drivelink.recording.viewlayouts import write_layouts
 
 _ALIVE_S = 1.0  # in which a daemon answers
 _SAY_EVERY_S = 10.0
+_PLURAL = {
+    "sample": "samples", "estimate": "estimates", "external": "external torques", "document": "documents",
+    "frame": "frames",
+}  # fmt: skip
 
 EPILOG = """\
 The ending of FILE selects the format:
@@ -233,13 +237,13 @@ class _Summary:
 
     def text(self) -> str:
         """Recorded counts as text."""
-        counts = [f"{n} {kind}s" for kind, n in self._recorder.sink.counts.items() if n] or ["nothing yet"]
+        counts = [f"{n} {_PLURAL[kind]}" for kind, n in self._recorder.sink.counts.items() if n]
         missed = self._missed()
         lost = f", {missed} cycles without sample" if missed else ""
         refused = sum(tap.refused for tap in self._recorder.taps if isinstance(tap, ZenohTap))
         lost += f", {refused} messages of others ignored" if refused else ""
         lost += f", no samples: {why}" if (why := self._why()) else ""
-        return f"{', '.join(counts)} in {time.monotonic() - self._begin:.0f} s{lost}"
+        return f"{', '.join(counts) or 'nothing yet'} in {time.monotonic() - self._begin:.0f} s{lost}"
 
     def _missed(self) -> int:
         return sum(tap.missed for tap in self._recorder.taps if isinstance(tap, ZenohTap))

@@ -120,7 +120,7 @@ class BusWatch:
         if total > self._slow:
             self._slow, self._slow_ns = total, now
             counted = [
-                f"{loop.overruns} cycles left out so far" if loop.overruns else "",
+                f"cycles left out so far: {loop.overruns}" if loop.overruns else "",
                 f"{loop.behind} SYNCs read more than a period late" if loop.behind else "",
                 f"{unread} frames lost unread" if unread else "",
             ]
@@ -131,7 +131,7 @@ class BusWatch:
             )
         elif now - self._slow_ns > _NS:
             self._slow = total  # the count restarts with a reopened bus
-            text = f"this machine keeps up with the cycle again; {loop.overruns} cycles were left out"
+            text = f"this machine keeps up with the cycle again; cycles left out: {loop.overruns}"
             self._events.end("too slow", text)
 
     def _check_controller(self) -> None:

@@ -20,7 +20,8 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 
-from drivelink.output.progress import track
+from rich.console import Console
+from rich.progress import track
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "examples" / "controller"))
 
@@ -35,7 +36,9 @@ def run_all(seeds: int, jobs: int) -> dict[int, list[Outcome]]:
     with ProcessPoolExecutor(jobs) as pool:
         runs = [pool.submit(follow, law, knowledge, seed=seed) for seed, law, knowledge in cases]
         found: dict[int, list[Outcome]] = {seed: [] for seed in range(seeds)}
-        for (seed, _, _), run in track(list(zip(cases, runs, strict=True)), "runs"):
+        for (seed, _, _), run in track(
+            list(zip(cases, runs, strict=True)), "runs", console=Console(stderr=True)
+        ):
             found[seed] += run.result()
     return found
 

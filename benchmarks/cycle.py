@@ -30,8 +30,9 @@ from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle import realtime
 from drivelink.cycle.lockstep import run_lockstep
 from drivelink.daemon.service import Daemon, ServedJoint
-from drivelink.demo.simulate import network_from_joint, open_sim_bus
-from drivelink.jointfile import JointFile
+from drivelink.demo.simbus import open_sim_bus
+from drivelink.demo.simulate import network_from_joint
+from drivelink.jointfile import BusSection, JointFile
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_session
 
@@ -113,7 +114,7 @@ def compare(seconds: float, rounds: int) -> list[dict[str, Any]]:
         devices.close()
         close_session(session)
         reader.communicate(b"")
-    load = bus_load(layouts.values(), period_s=PERIOD_S, bitrate=1_000_000, sync_bytes=0)
+    load = bus_load(layouts.values(), BusSection(period_s=PERIOD_S))
     results = [row.result() for row in rows]
     for result in results:
         result["bus_load_1_mbit"] = load.fraction

@@ -18,10 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
+from rich.progress import track
 
 from drivelink.demo.simulate import world_from_joint
 from drivelink.jointfile import JointFile, parse
-from drivelink.output.progress import track
 from estimator.diagnosis import Finding, diagnose
 from estimator.effects import LIBRARY
 from estimator.sample import Record
@@ -181,7 +182,10 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every outcome there")
     args = parser.parse_args()
     jobs = [(name, seed) for name in args.effects for seed in range(args.first, args.first + args.seeds)]
-    outcomes = [judged(name, seed, args.seconds) for name, seed in track(jobs, "diagnose")]
+    outcomes = [
+        judged(name, seed, args.seconds)
+        for name, seed in track(jobs, "diagnose", console=Console(stderr=True))
+    ]
     print(
         "| effect | named first | listed | located | else found | wrong and certain |"
         + "\n"

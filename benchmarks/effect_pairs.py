@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from diagnosis_seeds import joint_of, listed, measured, wrong_and_certain
+from rich.console import Console
+from rich.progress import track
 
-from drivelink.output.progress import track
 from estimator.diagnosis import diagnose
 
 PAIRS = (
@@ -58,7 +59,10 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every outcome there")
     args = parser.parse_args()
     jobs = [(pair, seed) for pair in PAIRS for seed in range(args.first, args.first + args.seeds)]
-    outcomes = [judged(pair, seed, args.seconds) for pair, seed in track(jobs, "diagnose")]
+    outcomes = [
+        judged(pair, seed, args.seconds)
+        for pair, seed in track(jobs, "diagnose", console=Console(stderr=True))
+    ]
     print(
         "| pair | both named | both listed | surplus | wrong and certain | found |\n|---|---|---|---|---|---|"
     )

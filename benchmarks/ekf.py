@@ -31,8 +31,9 @@ from ensembles import (
     summary,
     table,
 )
+from rich.console import Console
+from rich.progress import track
 
-from drivelink.output.progress import track
 from estimator import EstimatorSettings, make_estimator
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
@@ -218,7 +219,10 @@ def compare(case, n_joints, seconds, seed):
 
 def main():
     args = arguments(__doc__)
-    rows = [compare(name, args.joints, args.seconds, args.seed) for name in track(args.cases, "cases")]
+    rows = [
+        compare(name, args.joints, args.seconds, args.seed)
+        for name in track(args.cases, "cases", console=Console(stderr=True))
+    ]
     if args.json:
         print(json.dumps(rows))
         return

@@ -27,7 +27,8 @@ from drivelink._core import LatencyHistogram
 from drivelink.cycle import pacing, realtime
 from drivelink.cycle.realtime import Alarm
 from drivelink.daemon.service import Daemon, ServedJoint
-from drivelink.demo.simulate import network_from_joint, open_sim_bus
+from drivelink.demo.simbus import open_sim_bus
+from drivelink.demo.simulate import network_from_joint
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.session import close_session, open_session
 

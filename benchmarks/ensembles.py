@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from rich.console import Console
+from rich.progress import track
 
-from drivelink.output.progress import track
 from estimator import EstimatorSettings, JointModel, Record, Status, make_estimator
 from estimator.sample import SIGMA_95
 
@@ -180,7 +181,10 @@ def measure(case, n_joints, seconds, seed):
 
 def main():
     args = arguments(__doc__)
-    rows = [measure(case, args.joints, args.seconds, args.seed) for case in track(args.cases, "cases")]
+    rows = [
+        measure(case, args.joints, args.seconds, args.seed)
+        for case in track(args.cases, "cases", console=Console(stderr=True))
+    ]
     if args.json:
         print(json.dumps(rows))
         return

@@ -20,8 +20,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
-
-from drivelink.output.progress import track
+from rich.console import Console
+from rich.progress import track
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
@@ -31,7 +31,7 @@ import faultmatrix as matrix
 def measure(joint, health, seconds, seed):
     """One joint: totals, the worst faults, health, steps."""
     rows, suspects, right = {}, 0, 0
-    for fault in track(list(matrix.FAULTS), f"{joint}: faults"):
+    for fault in track(list(matrix.FAULTS), f"{joint}: faults", console=Console(stderr=True)):
         outcome = matrix.outcome(joint, fault, health, seconds, seed)
         rows[f"{' + '.join(fault.signals)}: {fault.name}"] = outcome
         suspects += bool(outcome.suspected)

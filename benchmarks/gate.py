@@ -15,7 +15,9 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-from drivelink.output.progress import track
+from rich.console import Console
+from rich.progress import track
+
 from estimator.gate import Discrepancy, examine
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
@@ -46,7 +48,7 @@ def main() -> None:
     args = parser.parse_args()
     counts: dict[str, Counter[str]] = {}
     jobs = [(k, s) for k in args.kinds.split(",") for s in range(args.first, args.first + args.seeds)]
-    for kind, seed in track(jobs, "gate"):
+    for kind, seed in track(jobs, "gate", console=Console(stderr=True)):
         drawn = gatekit.draw(kind, seed)
         wrong = bool(examine(drawn.record, drawn.model))
         counts.setdefault("healthy", Counter())["else" if wrong else "named"] += 1

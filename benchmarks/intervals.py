@@ -16,7 +16,8 @@ import numpy as np
 from drivelink import jointfile
 from drivelink.cycle.loop import ObjectSink
 from drivelink.daemon.service import Daemon, ServedJoint
-from drivelink.demo.simulate import network_from_joint, open_sim_bus, world_from_joint
+from drivelink.demo.simbus import open_sim_bus
+from drivelink.demo.simulate import network_from_joint, world_from_joint
 from estimator.sample import Estimate, Sample, Status
 
 WINDOW_S = 10

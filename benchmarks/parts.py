@@ -23,9 +23,10 @@ import numpy as np
 from diagnosis_seeds import joint_of as simulated_joint
 from diagnosis_seeds import measured
 from real_data import ROOT, RUNS, SHAFT_RUNS, Run, joint_of, shaft_record
+from rich.console import Console
+from rich.progress import track
 
 from drivelink import recording
-from drivelink.output.progress import track
 from estimator.diagnosis import diagnose
 from estimator.errors import EstimatorError
 from estimator.model import JointModel
@@ -138,7 +139,9 @@ def main() -> None:
     outcomes: list[dict[str, Any]] = []
     print("| recording | parts reported | std, median | chi²/dof, parts | of the machine | against known |")
     print("|---|---|---|---|---|---|")
-    for one in track(list(machines(args.data, args.shaft_line, args.machines)), "recordings"):
+    for one in track(
+        list(machines(args.data, args.shaft_line, args.machines)), "recordings", console=Console(stderr=True)
+    ):
         parts = [stiffness_of(part, one) for part in parts_of(one.record)]
         outcomes.append({**one._asdict(), "record": None, "model": None, "parts": parts})
         reported = [p for p in parts if p["k"] is not None]

@@ -19,13 +19,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from rich.console import Console
+from rich.progress import track
 from scipy.signal import butter, sosfiltfilt
 
 from drivelink import jointfile, recording
 from drivelink.jointfile import JointFile
 from drivelink.jointfile.apply_diagnosis import diagnosed_model
 from drivelink.output import report
-from drivelink.output.progress import track
 from estimator import EstimatorSettings, ExternalStatus, LinkDynamics, Sample, Status, make_estimator
 from estimator.diagnosis import diagnose
 from estimator.diagnosis.frame import Corrections, Frame, Signals
@@ -234,7 +235,9 @@ def main() -> None:
         sys.exit(f"real_data: no measured data in {args.data}: expected emps/, kuka_kr300/ and uw_sea/ there")
     jobs = [(run, args.data) for run in RUNS]
     jobs += [(run, args.shaft_line) for run in SHAFT_RUNS] if args.shaft_line else []
-    outcomes = [diagnosed(run, data, args.out) for run, data in track(jobs, "diagnose")]
+    outcomes = [
+        diagnosed(run, data, args.out) for run, data in track(jobs, "diagnose", console=Console(stderr=True))
+    ]
     print(
         "| machine | train → other | baseline | before → after | of baseline | found | stiffness / known "
         "| torque against sensor: on line (valid), twist, external torque (valid) |"

@@ -10,7 +10,8 @@ import time
 import can
 from can.interfaces.virtual import VirtualBus
 
-from drivelink.demo.simulate import network_from_joint, open_sim_bus
+from drivelink.demo.simbus import open_sim_bus
+from drivelink.demo.simulate import network_from_joint
 from drivelink.jointfile import JointFile, parse
 from sim.canopen.node import Node
 

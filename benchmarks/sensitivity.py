@@ -28,6 +28,7 @@ Array = NDArray[np.float64]
 B, D, M, DQ, G, K1, K3 = 0.125, 0.8, 0.45, 0.2, 5.0, 150.0, 1500.0
 RATED_NM = 20.0
 SECONDS, SETTLED_S = 12.0, 4.0
+FILLS = ("#ffffff", "#56b4e9", "#bbbbbb")
 COLUMNS = (
     "stiffness, robust",
     "stiffness, paper MBE",
@@ -134,13 +135,19 @@ def errors(setting: Setting, states: Array, tau: Array) -> list[float]:
 
 
 def plot(results: dict[str, dict[str, list[float]]], folder: Path) -> Path:
-    from drivelink.output.plots import bars, new_figure, save
+    from drivelink.output.plots import HATCHES, new_figure, save, xy
 
     folder.mkdir(parents=True, exist_ok=True)
     figure, axes = new_figure("Sensitivity: relative error of the stiffness", rows=len(results), height=2.2)
     for place, (axis, rows) in zip(axes, results.items(), strict=True):
-        groups = {COLUMNS[i]: {label: 100 * row[i] for label, row in rows.items()} for i in range(3)}
-        bars(place, groups, "error / %", axis, log=True)
+        across = np.arange(len(rows))
+        for i in range(3):
+            heights = [100 * row[i] for row in rows.values()]
+            look = {"color": FILLS[i], "edgecolor": "#222222", "hatch": HATCHES[i], "label": COLUMNS[i]}
+            place.bar(across + 0.27 * (i - 1), heights, width=0.25, **look)
+        place.set_xticks(across, rows)
+        place.set_yscale("log")
+        xy(place, {}, "", "error / %", axis)
     return save(figure, folder / "sensitivity.png")
 
 

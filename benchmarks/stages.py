@@ -31,7 +31,8 @@ from drivelink.cycle import realtime
 from drivelink.cycle.pipeline import make_pipeline
 from drivelink.cycle.sources import open_source
 from drivelink.daemon.service import Daemon, ServedJoint
-from drivelink.demo.simulate import network_from_joint, open_sim_bus
+from drivelink.demo.simbus import open_sim_bus
+from drivelink.demo.simulate import network_from_joint
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_session

@@ -110,8 +110,7 @@ class World:
         self._declared = plant
         self._effects = tuple(effects)
         self._state = _start(initial_rad, self.motors, plant.rigid)
-        self._tick = 0
-        self._external = 0.0
+        self._tick, self._external = 0, 0.0
         self._commands: list[float | None] = [None] * self.motors
         self._amplifiers = [
             Amplifier(drive, period_s, self.substeps, noise((seed, 1, motor), drive.current_noise_a))

@@ -18,7 +18,8 @@ from zenohkit import LIMIT_S, free_endpoint, until
 
 from drivelink import jointfile
 from drivelink.cycle import realtime
-from drivelink.demo.simulate import nodes_from_joint, open_sim_bus, world_from_joint
+from drivelink.demo.simbus import open_sim_bus
+from drivelink.demo.simulate import nodes_from_joint, world_from_joint
 from sim.canopen.statemachine import PowerState
 from sim.faults import Faults
 from sim.network import Network

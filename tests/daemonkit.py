@@ -16,7 +16,8 @@ from drivelink._core import Tick
 from drivelink.cycle.loop import ObjectSink
 from drivelink.cycle.startup import join_bus
 from drivelink.daemon.service import Daemon, ServedJoint
-from drivelink.demo.simulate import network_from_joint, open_sim_bus
+from drivelink.demo.simbus import open_sim_bus
+from drivelink.demo.simulate import network_from_joint
 from drivelink.jointfile import JointFile, parse
 from estimator.sample import Estimate, Sample
 from sim.faults import Faults

@@ -14,7 +14,7 @@ from faultstage import Stage
 import drivelink.daemon.buskeeper
 from drivelink.canopen.bus import open_bus
 from drivelink.daemon.service import Daemon, ServedJoint
-from drivelink.demo.simulate import open_sim_bus
+from drivelink.demo.simbus import open_sim_bus
 from drivelink.errors import BusError
 from drivelink.jointfile import BusSection, JointFile
 from estimator.sample import Status

@@ -215,8 +215,10 @@ def frame(cob_id, bits=64, transmission_type=1, inhibit_s=0.0):
 
 
 def test_one_drive_takes_a_fifth_of_the_bus_and_two_a_third():
-    one = bus_load([layout(1, frame(0x181))], period_s=0.001, bitrate=1_000_000)
-    two = bus_load([layout(n, frame(0x180 + n)) for n in (1, 2)], period_s=0.001, bitrate=1_000_000)
+    one = bus_load([layout(1, frame(0x181))], BusSection(period_s=0.001, bitrate=1_000_000))
+    two = bus_load(
+        [layout(n, frame(0x180 + n)) for n in (1, 2)], BusSection(period_s=0.001, bitrate=1_000_000)
+    )
     assert one.fraction == pytest.approx(0.19)
     assert two.fraction == pytest.approx(0.325)
 
@@ -235,16 +237,14 @@ def test_every_kind_of_frame_is_counted_at_its_rate():
                 ),
             )
         ],
-        period_s=0.001,
-        bitrate=500_000,
-        sync_bytes=1,
+        BusSection(bitrate=500_000, sync_counter_overflow=240),
     )
     expected = 1000 * 65 + 1000 * 135 + 250 * 135 + 100 * frame_bits(2) + 1000 * frame_bits(2) + 10 * 65
     assert load.bits_per_s == pytest.approx(expected)
 
 
 def test_more_than_the_bit_rate_carries_is_refused_with_a_period_that_fits():
-    load = bus_load([layout(1, frame(0x181))], period_s=0.001, bitrate=125_000)
+    load = bus_load([layout(1, frame(0x181))], BusSection(period_s=0.001, bitrate=125_000))
     with pytest.raises(BusError, match=r"152%.*190 kbit/s of 125 kbit/s.*2.2 ms \(bus.period_s\)"):
         check_capacity(load, 0.001)
-    check_capacity(bus_load([layout(1, frame(0x181))], period_s=0.0022, bitrate=125_000), 0.0022)
+    check_capacity(bus_load([layout(1, frame(0x181))], BusSection(period_s=0.0022, bitrate=125_000)), 0.0022)

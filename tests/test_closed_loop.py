@@ -20,7 +20,8 @@ import pytest
 from drivelink import cli, jointfile
 from drivelink.cycle.lockstep import run_lockstep
 from drivelink.cycle.loop import ObjectSink
-from drivelink.demo.simulate import network_from_joint, open_sim_bus, world_from_joint
+from drivelink.demo.simbus import open_sim_bus
+from drivelink.demo.simulate import network_from_joint, world_from_joint
 from drivelink.jointfile import JointFile
 from estimator.model_monitor import ModelMonitor
 from estimator.sample import Estimate, FloatArray, Sample, Status

@@ -21,7 +21,8 @@ from drivelink.cycle.pipeline import make_pipeline
 from drivelink.cycle.startup import join_bus
 from drivelink.daemon import reload
 from drivelink.daemon.service import Daemon, ServedJoint
-from drivelink.demo.simulate import network_from_joint, open_sim_bus
+from drivelink.demo.simbus import open_sim_bus
+from drivelink.demo.simulate import network_from_joint
 from drivelink.errors import BusError, DriveError, UsageError, ZenohError
 from drivelink.jointfile import JointFile, load, parse
 from drivelink.pubsub.client import subscribe

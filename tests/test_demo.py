@@ -20,7 +20,8 @@ from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.closing import as_json, closing_table
 from drivelink.demo.comparison import Comparison
 from drivelink.demo.rig import RunSummary
-from drivelink.demo.simulate import network_from_joint, open_sim_bus, world_from_joint
+from drivelink.demo.simbus import open_sim_bus
+from drivelink.demo.simulate import network_from_joint, world_from_joint
 from drivelink.monitor.history import TruePoint
 from drivelink.pubsub.wire import EstimateMessage
 from estimator.sample import Estimate, Sample, Status, TransmissionEstimate

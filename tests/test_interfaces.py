@@ -19,7 +19,8 @@ from drivelink.canopen.bus import open_bus
 from drivelink.cycle.framesource import BusLostError
 from drivelink.cycle.sources import open_source
 from drivelink.daemon.service import Daemon, ServedJoint
-from drivelink.demo.simulate import network_from_joint, open_sim_bus
+from drivelink.demo.simbus import open_sim_bus
+from drivelink.demo.simulate import network_from_joint
 from drivelink.errors import BusError
 from drivelink.jointfile import BusSection, JointFile
 from estimator.sample import Status

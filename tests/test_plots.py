@@ -10,7 +10,6 @@ import pytest
 from drivelink.output.plots import (
     COLORS,
     PlotCurve,
-    bars,
     new_figure,
     over_time,
     save,
@@ -40,12 +39,6 @@ def test_neighbouring_colours_differ_in_lightness() -> None:
 
     values = [lightness(color) for color in COLORS[:3]]
     assert min(abs(a - b) for i, a in enumerate(values) for b in values[:i]) > 20
-
-
-def test_bars_carry_hatches_so_that_a_grey_print_distinguishes_them() -> None:
-    _, (axes,) = new_figure()
-    bars(axes, {"paper": {"A": 1.0, "B": 2.0}, "robust": {"A": 0.5}, "floor": {"B": 0.1}}, "error / %")
-    assert len({patch.get_hatch() for patch in axes.patches}) == 3
 
 
 def test_stiffness_over_scattered_deflections_becomes_one_curve() -> None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from drivelink.canopen.layout import NodeLayout, TpdoLayout
 from drivelink.errors import BusError
+from drivelink.jointfile import BusSection
 
 CAPACITY = 1.0  # of the bit rate, worst-case stuffing
 COMFORTABLE = 0.7  # above it, event-driven frames of others begin to delay the cycle
@@ -48,17 +49,10 @@ def _tpdo_rate_hz(tpdo: TpdoLayout, sync_hz: float) -> float:
     return min(sync_hz, 1 / tpdo.inhibit_s) if tpdo.inhibit_s > 0 else sync_hz
 
 
-def bus_load(layouts: Iterable[NodeLayout], *, period_s: float, bitrate: int, sync_bytes: int = 0) -> BusLoad:
-    """Load of SYNC, all enabled TPDOs and heartbeats.
-
-    Args:
-        layouts: all nodes.
-        period_s: communication cycle.
-        bitrate: bit/s.
-        sync_bytes: 1 with a SYNC counter, else 0.
-    """
-    sync_hz = 1 / period_s
-    frames = [(sync_hz, frame_bits(sync_bytes))]
+def bus_load(layouts: Iterable[NodeLayout], bus: BusSection) -> BusLoad:
+    """Load of SYNC, all enabled TPDOs and heartbeats of all nodes on a bus."""
+    sync_hz = 1 / bus.period_s
+    frames = [(sync_hz, frame_bits(1 if bus.sync_counter_overflow else 0))]
     for layout in layouts:
         frames += [
             (_tpdo_rate_hz(tpdo, sync_hz), frame_bits(tpdo.length))
@@ -68,7 +62,7 @@ def bus_load(layouts: Iterable[NodeLayout], *, period_s: float, bitrate: int, sy
             frames.append((1000 / layout.heartbeat_ms, frame_bits(1)))
     return BusLoad(
         bits_per_s=sum(rate * bits for rate, bits in frames),
-        bitrate=bitrate,
+        bitrate=bus.bitrate,
         frames_per_s=sum(rate for rate, _ in frames),
     )
 

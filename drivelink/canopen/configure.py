@@ -18,7 +18,7 @@ from drivelink.canopen.busload import COMFORTABLE, BusLoad, bus_load, check_capa
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.mapping import NMT_START
 from drivelink.canopen.node import configure_node
-from drivelink.canopen.roles import Role, roles
+from drivelink.canopen.roles import roles, roles_by_node
 from drivelink.canopen.sdo import Program, Read, SdoTimeout, Session
 from drivelink.errors import BusError, DriveError
 from drivelink.jointfile import BusSection, JointFile
@@ -47,13 +47,7 @@ class Configurator:
     ) -> None:
         self._send = send
         self.bus: BusSection = joints[0].bus
-        folders = base_dirs or [Path()] * len(joints)
-        self._roles: dict[int, Role] = {}
-        for joint, folder in zip(joints, folders, strict=True):
-            for role in roles(joint, folder):
-                if role.node_id in self._roles:
-                    raise BusError(f"node {role.node_id} is claimed by two joints on one bus")
-                self._roles[role.node_id] = role
+        self._roles = roles_by_node(joints, base_dirs)
         self.layouts: dict[int, NodeLayout] = {}
         self.drop_others = False
         self._sessions: dict[int, Session[NodeLayout]] = {}
@@ -130,12 +124,7 @@ class Configurator:
 
     def load(self) -> BusLoad:
         """Bus load of all configured nodes."""
-        return bus_load(
-            self.layouts.values(),
-            period_s=self.bus.period_s,
-            bitrate=self.bus.bitrate,
-            sync_bytes=1 if self.bus.sync_counter_overflow else 0,
-        )
+        return bus_load(self.layouts.values(), self.bus)
 
 
 def _reading(node: int, address: tuple[int, int]) -> Program[bytes]:

@@ -13,12 +13,12 @@ from drivelink.canopen.busload import BusLoad, bus_load
 from drivelink.canopen.eds import load_eds
 from drivelink.canopen.layout import NodeLayout, Signal
 from drivelink.canopen.pdo import Tpdo, decode, describe, tpdos_of
-from drivelink.canopen.roles import Role, roles
+from drivelink.canopen.roles import Role, roles_by_node
 from drivelink.canopen.sdo_sniffer import SdoSniffer
 from drivelink.canopen.tpdo_assignment import OPTIONAL
 from drivelink.canopen.units import offer, unit_objects
 from drivelink.canopen.vendors import VENDORS, vendor_of
-from drivelink.errors import BusError, DriveError
+from drivelink.errors import DriveError
 from drivelink.jointfile import BusSection, JointFile, TpdoSection
 from drivelink.notice import Notice, Severity, log_notices
 
@@ -280,13 +280,10 @@ class PassiveConfigurator:
 
     def __init__(self, joints: Sequence[JointFile], base_dirs: Sequence[Path] | None = None) -> None:
         self.bus: BusSection = joints[0].bus
-        folders = base_dirs or [Path()] * len(joints)
-        self._nodes: dict[int, _PassiveNode] = {}
-        for joint, folder in zip(joints, folders, strict=True):
-            for role in roles(joint, folder):
-                if role.node_id in self._nodes:
-                    raise BusError(f"node {role.node_id} is claimed by two joints on one bus")
-                self._nodes[role.node_id] = _PassiveNode(role, self.bus.sdo_timeout_s)
+        self._nodes = {
+            node: _PassiveNode(role, self.bus.sdo_timeout_s)
+            for node, role in roles_by_node(joints, base_dirs).items()
+        }
         self.layouts: dict[int, NodeLayout] = {}
         self.missing: dict[int, DriveError] = {}
         self.doubts: dict[int, str] = {}
@@ -396,9 +393,4 @@ class PassiveConfigurator:
 
     def load(self) -> BusLoad:
         """Bus load of all known TPDOs."""
-        return bus_load(
-            self.layouts.values(),
-            period_s=self.bus.period_s,
-            bitrate=self.bus.bitrate,
-            sync_bytes=1 if self.bus.sync_counter_overflow else 0,
-        )
+        return bus_load(self.layouts.values(), self.bus)

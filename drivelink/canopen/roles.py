@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivelink.errors import JointFileError
+from drivelink.errors import BusError, JointFileError
 from drivelink.jointfile import DriveSection, EncoderSection, JointFile, TpdoSection
 
 
@@ -83,6 +84,25 @@ def roles(joint: JointFile, base_dir: Path = Path()) -> tuple[Role, ...]:
             )
         )
     return tuple(found)
+
+
+def roles_by_node(joints: Sequence[JointFile], base_dirs: Sequence[Path] | None) -> dict[int, Role]:
+    """The nodes of all joints on one bus by node id, in the order of the joint files.
+
+    Args:
+        joints: the joint files.
+        base_dirs: their folders; None: the current one.
+
+    Raises:
+        BusError: two joints claim one node.
+    """
+    found: dict[int, Role] = {}
+    for joint, folder in zip(joints, base_dirs or [Path()] * len(joints), strict=True):
+        for role in roles(joint, folder):
+            if role.node_id in found:
+                raise BusError(f"node {role.node_id} is claimed by two joints on one bus")
+            found[role.node_id] = role
+    return found
 
 
 def _encoder_node(joint: JointFile) -> int | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,7 +17,7 @@ from rich.table import Table
 
 from drivelink import jointfile, recording
 from drivelink.errors import RecordingError
-from drivelink.jointfile import JointText
+from drivelink.jointfile import JointText, plain_parameters
 from drivelink.jointfile.residual_baseline import floor_entry
 from drivelink.output.fitplot import fit_plot
 from drivelink.output.outfile import check_target, write_whole
@@ -242,7 +242,7 @@ def _write(args: argparse.Namespace, source: JointText, found: Identified, recor
         }
         if motor.transmission.model != RIGID:
             transmission: dict[str, Any] = {"model": motor.transmission.model}
-            transmission["parameters"] = _plain(motor.transmission.parameters)
+            transmission["parameters"] = plain_parameters(motor.transmission.parameters)
             if motor.transmission.order is not None:
                 transmission["order"] = motor.transmission.order
             change["transmission"] = transmission
@@ -267,8 +267,4 @@ def _write(args: argparse.Namespace, source: JointText, found: Identified, recor
 
 
 def _effect(effect: Effect) -> dict[str, Any]:
-    return {"name": effect.name, "parameters": _plain(effect.parameters)}
-
-
-def _plain(parameters: Mapping[str, ParameterValue]) -> dict[str, float | list[float]]:
-    return {name: list(v) if isinstance(v, tuple) else float(v) for name, v in parameters.items()}
+    return {"name": effect.name, "parameters": plain_parameters(effect.parameters)}

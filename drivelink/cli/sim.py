@@ -15,15 +15,8 @@ from pathlib import Path
 
 from drivelink.cli import ALONE, add_bus
 from drivelink.cycle.realtime import PRIORITY, acquire, release
-from drivelink.demo.simulate import (
-    CASE_NAMES,
-    QUIRK_NAMES,
-    JoinedBus,
-    assumptions,
-    bench_from_joints,
-    open_sim_bus,
-    require_free,
-)
+from drivelink.demo.simbus import JoinedBus, open_sim_bus, require_free
+from drivelink.demo.simulate import CASE_NAMES, QUIRK_NAMES, assumptions, bench_from_joints
 from drivelink.errors import BusError, UsageError
 from drivelink.jointfile import BusSection, JointFile, load
 

@@ -123,13 +123,7 @@ class Daemon:
             self._supervisor = Supervisor(
                 self.loop, dict(zip(self._loop_joints, layouts, strict=True)), self.events, self._configurator
             )
-            load = self._configurator.load().fraction
-            self._status = [
-                JointStatus(
-                    self._timed(served.joint), self.loop, loop_joint, self._supervisor, self.events, load
-                )
-                for served, loop_joint in zip(joints, self._loop_joints, strict=True)
-            ]
+            self._status = self._make_status()
             for served, mine, publisher in zip(joints, layouts, self._publishers, strict=True):
                 self._republish(publisher, mine)(served.joint)
             self._reloaders = self._make_reloaders(layouts)
@@ -232,6 +226,13 @@ class Daemon:
         loop.on_lost = self._keeper.lost
         self._port.loop = loop
         return loop
+
+    def _make_status(self) -> list[JointStatus]:
+        load = self._configurator.load().fraction
+        return [
+            JointStatus(self._timed(served.joint), self.loop, mine, self._supervisor, self.events, load)
+            for served, mine in zip(self._joints, self._loop_joints, strict=True)
+        ]
 
     def _make_reloaders(self, layouts: Sequence[tuple[NodeLayout, ...]]) -> list[Reloader]:
         return [

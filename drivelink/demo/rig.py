@@ -18,7 +18,8 @@ from drivelink import jointfile
 from drivelink._core import Tick
 from drivelink.cycle.loop import CycleSink
 from drivelink.daemon.service import Daemon, ServedJoint
-from drivelink.demo.simulate import World, network_from_joint, open_sim_bus, world_from_joint
+from drivelink.demo.simbus import open_sim_bus
+from drivelink.demo.simulate import World, network_from_joint, world_from_joint
 from drivelink.errors import DrivelinkError
 from drivelink.monitor.history import TruePoint
 

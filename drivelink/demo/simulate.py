@@ -1,4 +1,4 @@
-"""Builds simulated world and devices from a joint file; the only module of the service that imports `sim`.
+"""Builds simulated world and devices from a joint file.
 
 The truth is one of the paper's cases (`sim.case`), or the joint file's model changed by `sim.parameters`,
 plus `sim.effect`. Drives and encoders follow the `drive` and `encoder` sections, so that a daemon with the
@@ -7,7 +7,6 @@ same joint file finds what it expects.
 
 from __future__ import annotations
 
-import errno
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -18,10 +17,8 @@ from typing import Any
 
 import can
 
-from drivelink.canopen.bus import open_bus, server_has_gone
-from drivelink.canopen.scan import scan
-from drivelink.errors import BusError, JointFileError, UsageError
-from drivelink.jointfile import BusSection, JointFile, MotorSection, SimSection
+from drivelink.errors import JointFileError, UsageError
+from drivelink.jointfile import JointFile, MotorSection, SimSection
 from estimator.model import LinkDynamics
 from sim.bench import Bench
 from sim.canopen.drive import Cia402Drive, DriveData
@@ -36,15 +33,12 @@ from sim.excitation import build
 from sim.network import Network
 from sim.plant import JointPlant, LinkPlant, MotorPlant
 from sim.sensors import DriveHardware, LinkEncoder
-from sim.socketcand import DEFAULT_PORT, SocketcandServer
 from sim.springs import Spring
 from sim.variation import suitable, typical_torque_nm, with_parameters
 from sim.world import World as World
 
 CASE_NAMES = tuple(CASES)
 QUIRK_NAMES = tuple(PROFILES)
-
-_LOCAL = ("127.0.0.1", "localhost", "::1")
 
 # Springs for a joint file without parameters (as `new` writes), by stiffness at rest.
 _NATURAL_HZ = 5.0  # sqrt(K/B)/(2 pi) of a soft joint
@@ -297,86 +291,6 @@ def network_from_joint(
     """The devices of one joint on a bus, in lockstep (`poll`) or served (`start`)."""
     world = world or world_from_joint(joint)
     return Network(bus, nodes_from_joint(joint, world, quirks=quirks), world)
-
-
-def open_sim_bus(section: BusSection) -> can.BusABC:
-    """Open the bus of a joint file from the devices' side.
-
-    For `interface = "socketcand"` at an unused address of this machine, serve it: the daemon, or a second
-    simulation, then connects to it. If it is already served, return a `JoinedBus`.
-
-    Raises:
-        BusError: it cannot be opened.
-    """
-    host = str(section.options.get("host", "127.0.0.1"))
-    if section.interface == "socketcand" and host in _LOCAL:
-        port = section.options.get("port", DEFAULT_PORT)
-        if not (isinstance(port, int) and 0 <= port <= 0xFFFF):
-            raise BusError(f"bus.options.port: expected 0 to 65535, got {port!r}")
-        try:
-            return SocketcandServer(section.channel, host, port)
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE:
-                raise BusError(f"socketcand at {host}:{port} cannot be served: {error.strerror}") from error
-    bus = open_bus(section)
-    return JoinedBus(bus) if section.interface == "socketcand" else bus
-
-
-class JoinedBus(can.BusABC):
-    """A socketcand bus that another process serves; detects its end.
-
-    python-can's client then returns immediately without a frame, forever.
-
-    Args:
-        bus: python-can's client.
-
-    Attributes:
-        lost: whether the server has closed the connection.
-        on_lost: called then.
-    """
-
-    def __init__(self, bus: can.BusABC) -> None:
-        self._is_shutdown = False
-        self._bus = bus
-        self.lost = False
-        self.on_lost: Callable[[], object] = lambda: None
-        self.channel_info = bus.channel_info
-        super().__init__(channel=bus.channel_info)
-
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send a frame."""
-        self._bus.send(msg, timeout)
-
-    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        found = self._bus._recv_internal(timeout)
-        if found[0] is None and server_has_gone(self._bus):
-            self.lost = True
-            self.on_lost()
-            raise can.CanOperationError("the server has closed the connection")
-        return found
-
-    def shutdown(self) -> None:
-        """Close the connection."""
-        super().shutdown()
-        self._bus.shutdown()
-
-
-def require_free(bus: can.BusABC, node_ids: Sequence[int], section: BusSection) -> None:
-    """Check that no other device uses a simulated device's node id.
-
-    Raises:
-        BusError: another simulation of the joint, or a real drive, does.
-    """
-    if section.interface == "virtual" or isinstance(bus, SocketcandServer):
-        return  # no other process can be there
-    there, _ = scan(bus, node_ids)
-    taken = sorted(set(node_ids).intersection(there))
-    if taken:
-        nodes = ", ".join(f"node {node}" for node in taken)
-        raise BusError(
-            f"{section.interface} {section.channel}: {nodes}: on the bus already: another `drivelink sim`, "
-            "or real drives; end it, or use another --channel"
-        )
 
 
 def bench_from_joints(

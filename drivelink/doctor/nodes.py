@@ -281,9 +281,7 @@ def _has_all(section: Section, role: Role, survey: NodeSurvey, wanted: Available
 def _judge_load(section: Section, layouts: Sequence[NodeLayout], bus: BusSection) -> None:
     if not layouts:
         return
-    load = bus_load(
-        layouts, period_s=bus.period_s, bitrate=bus.bitrate, sync_bytes=1 if bus.sync_counter_overflow else 0
-    )
+    load = bus_load(layouts, bus)
     section.facts["bus_load"] = load.fraction
     text = f"the cycle needs {load.fraction:.0%} of {bus.bitrate // 1000} kbit/s, worst case"
     if load.fraction <= COMFORTABLE:

@@ -50,24 +50,8 @@ def judge_sync(
     p99, worst = percentile(deviation_us, 0.99), max(deviation_us)
     section.facts["sync"] = {"period_s": period_s, "jitter_us": {"p99": p99, "max": worst}}
     text = f"every {period_s * 1000:.3f} ms, jitter {p99:.0f} µs (p99), {worst:.0f} µs (max)"
-    daemons = daemons or Daemons(ours=False, others=())
-    if bus.sync == "produce" and daemons.ours:
-        section.ok("SYNC", f"{text}, produced by the drivelink daemon that runs")
-    elif bus.sync == "produce" and daemons.others:
-        section.say(
-            Severity.WARNING,
-            "SYNC",
-            f"{text}: the drivelink daemon of {', '.join(daemons.others)} may make it",
-            "joints on one bus go into one command: drivelink run A.toml B.toml; "
-            'with another master: bus.sync = "follow"',
-        )
-    elif bus.sync == "produce":
-        section.say(
-            Severity.WARNING,
-            "SYNC",
-            f"{text}: another master produces it, no drivelink daemon is alive",
-            'bus.sync = "follow", or stop the other master',
-        )
+    if bus.sync == "produce":
+        _judge_producer(section, text, daemons or Daemons(ours=False, others=()))
     elif "period_s" in bus.model_fields_set and abs(period_s - bus.period_s) > 0.02 * bus.period_s:
         section.say(
             Severity.ERROR,
@@ -77,3 +61,24 @@ def judge_sync(
         )
     else:
         section.ok("SYNC", text)
+
+
+def _judge_producer(section: Section, text: str, daemons: Daemons) -> None:
+    """Who produces the SYNC that this joint is to produce."""
+    if daemons.ours:
+        section.ok("SYNC", f"{text}, produced by the drivelink daemon that runs")
+    elif daemons.others:
+        section.say(
+            Severity.WARNING,
+            "SYNC",
+            f"{text}: the drivelink daemon of {', '.join(daemons.others)} may make it",
+            "joints on one bus go into one command: drivelink run A.toml B.toml; "
+            'with another master: bus.sync = "follow"',
+        )
+    else:
+        section.say(
+            Severity.WARNING,
+            "SYNC",
+            f"{text}: another master produces it, no drivelink daemon is alive",
+            'bus.sync = "follow", or stop the other master',
+        )

@@ -11,12 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drivelink.jointfile import JointFile
+from drivelink.jointfile import JointFile, plain_parameters
 from drivelink.output import report
 from estimator.batch import TransmissionFit
 from estimator.diagnosis import Diagnosis, diagnose
 from estimator.identify import identify
-from estimator.model import ParameterValue
 from estimator.sample import FloatArray, Record
 from estimator.transmissions import MODELS, RIGID
 
@@ -119,8 +118,8 @@ def _row(number: int, one: TransmissionFit) -> TransmissionRow:
     return TransmissionRow(
         transmission=number,
         model=one.model,
-        parameters=json.dumps(_plain(one.parameters)),
-        parameters_std=json.dumps(_plain(one.std)),
+        parameters=json.dumps(plain_parameters(one.parameters)),
+        parameters_std=json.dumps(plain_parameters(one.std)),
         covariance=one.covariance.ravel().tolist(),
         named={name: _named(one, deflection, share) for name, share in NAMED.items()} if one.excited else {},
         deflection_rms_rad=math.nan if rigid else float(np.sqrt(np.mean(deflection**2))),
@@ -152,7 +151,3 @@ def _stiffness(model: str, alpha: FloatArray, covariance: FloatArray, phi: float
     gradient = law.stiffness_jacobian(at, alpha)[0]
     variance = float(gradient @ covariance @ gradient)
     return float(law.stiffness(at, alpha)[0]), math.sqrt(max(variance, 0.0))
-
-
-def _plain(parameters: dict[str, ParameterValue]) -> dict[str, float | list[float]]:
-    return {name: list(v) if isinstance(v, tuple) else float(v) for name, v in parameters.items()}

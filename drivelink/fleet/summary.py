@@ -36,6 +36,7 @@ COLUMNS = [
     "deflection_middle_rad", "stiffness_middle_nm_rad", "stiffness_std_middle_nm_rad",
 ]  # fmt: skip
 
+_SHOWN = ("recording", "verdict", "effects", "sentence", "report")  # of a diagnosis
 _DAY_S = 86400.0
 _NO_PLACE = {"sufficient", "insufficient_excitation"}
 
@@ -92,6 +93,7 @@ def summarise(rows: list[dict[str, Any]], false_discovery_rate: float) -> dict[s
     documents = [_joint(n, one, transmissions[n], effects[n]) for n, one in joints.items()]
     documents.sort(key=lambda d: (-d["urgency"], d["joint"]))
     times = [row["time"] for row in rows if row["time"] is not None]
+    broken = [row for row in rows if row["status"] != "done"]
     return {
         "schema": SCHEMA,
         "version": __version__,
@@ -105,14 +107,8 @@ def summarise(rows: list[dict[str, Any]], false_discovery_rate: float) -> dict[s
         "to": _iso(max(times)) if times else None,
         "joints": documents,
         "broken": [
-            {
-                "recording": row["recording"],
-                "joint": row["joint"],
-                "time": _iso(row["time"]),
-                "error": row["error"],
-            }
-            for row in rows
-            if row["status"] != "done"
+            {**{key: row[key] for key in ("recording", "joint", "error")}, "time": _iso(row["time"])}
+            for row in broken
         ],
     }
 
@@ -261,14 +257,7 @@ def _joint(
         "transmissions": transmissions,
         "effects": effects,
         "diagnoses": [
-            {
-                "time": _iso(row["time"]),
-                "recording": row["recording"],
-                "verdict": row["verdict"],
-                "effects": row["effects"],
-                "sentence": row["sentence"],
-                "report": row["report"],
-            }
+            {**{key: row[key] for key in _SHOWN}, "time": _iso(row["time"])}
             for row in done
             if row["transmission"] == 1
         ],

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from drivelink import jointfile
-from drivelink.jointfile import JointFile, JointText
+from drivelink.jointfile import JointFile, JointText, plain_parameters
 from drivelink.jointfile.residual_baseline import floor_entry
 from drivelink.version import __version__
 from estimator.diagnosis import Diagnosis
@@ -52,7 +52,7 @@ def write(
             "verdict": outcome.verdict,
             "effects": [finding.name for finding in outcome.effects],
             "bandwidth_hz": outcome.bandwidth_hz,
-            "transmission_std": [_plain(one.std) for one in outcome.transmissions],
+            "transmission_std": [plain_parameters(one.std) for one in outcome.transmissions],
             "error_before_relative": outcome.validation.before_relative,
             "error_after_relative": outcome.validation.after_relative,
             "written": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -95,7 +95,7 @@ def _values(parameters: dict[str, Any]) -> dict[str, ParameterValue]:
 
 def _all_effects(declared: tuple[Effect, ...], outcome: Diagnosis, motor: int | None) -> list[dict[str, Any]]:
     """Effects of one table: declared, corrections of the readings, found."""
-    made = [{"name": e.name, "parameters": _plain(dict(e.parameters))} for e in declared]
+    made = [{"name": e.name, "parameters": plain_parameters(e.parameters)} for e in declared]
     made += _readings(outcome, motor)
     for finding in outcome.effects:
         kind = LIBRARY.get(finding.name)
@@ -105,7 +105,7 @@ def _all_effects(declared: tuple[Effect, ...], outcome: Diagnosis, motor: int | 
         common = kind.channel == "deflection" and finding.motor is None and motor is not None
         here = kind.on_link if motor is None else not kind.on_link and finding.motor == motor
         if here or common:
-            made.append({"name": finding.name, "parameters": _plain(finding.parameters)})
+            made.append({"name": finding.name, "parameters": plain_parameters(finding.parameters)})
     return made
 
 
@@ -133,11 +133,7 @@ def _transmission(joint: JointFile, outcome: Diagnosis, motor: int) -> dict[str,
     if not parameters or outcome.verdict in ("insufficient_excitation", "unexplained"):
         return {}
     section = joint.motor[motor].transmission
-    change: dict[str, Any] = {"model": section.model, "parameters": _plain(parameters)}
+    change: dict[str, Any] = {"model": section.model, "parameters": plain_parameters(parameters)}
     if section.model == "polynomial":
         change["order"] = len(change["parameters"]["coefficients_nm_rad"])
     return {"transmission": change}
-
-
-def _plain(parameters: dict[str, ParameterValue]) -> dict[str, float | list[float]]:
-    return {name: list(v) if isinstance(v, tuple) else float(v) for name, v in parameters.items()}

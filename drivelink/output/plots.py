@@ -30,7 +30,6 @@ from estimator.sample import SIGMA_95, FloatArray
 COLORS = ("#005f9e", "#e0701a", "#000000", "#009e73", "#cc79a7", "#56b4e9")
 LINES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 2)))
 MARKERS = ("o", "s", "^", "D", "v", "x")
-FILLS = ("#ffffff", "#56b4e9", "#bbbbbb", "#e69f00", "#eeeeee", "#999999")
 HATCHES = ("", "///", "...", "xxx", "\\\\\\", "++")
 
 STYLE: dict[Any, Any] = {
@@ -106,30 +105,6 @@ def stiffness_against_deflection(
     binned = {name: _binned(curve) for name, curve in curves.items()}
     x_unit = "rad" if unit.endswith("rad") else "m"
     xy(axes, binned, f"deflection / {x_unit}", f"stiffness / ({unit})", title)
-
-
-def bars(
-    axes: Axes, groups: Mapping[str, Mapping[str, float]], y_label: str, title: str = "", log: bool = False
-) -> None:
-    """Draw groups of bars side by side: {series: {category: value}}, each series with its own hatch."""
-    categories = list(dict.fromkeys(name for series in groups.values() for name in series))
-    width = 0.8 / max(len(groups), 1)
-    place = np.arange(len(categories), dtype=float)
-    for k, (name, series) in enumerate(groups.items()):
-        axes.bar(
-            place + (k - (len(groups) - 1) / 2) * width,
-            [series.get(category, np.nan) for category in categories],
-            width=0.92 * width,
-            label=name,
-            color=FILLS[k % len(FILLS)],
-            edgecolor="#222222",
-            hatch=HATCHES[k % len(HATCHES)],
-            linewidth=0.8,
-        )
-    axes.set_xticks(place, categories)
-    if log:
-        axes.set_yscale("log")
-    _finish(axes, "", y_label, title, legend=len(groups) > 1)
 
 
 def save(figure: Figure, path: Path) -> Path:

@@ -6,18 +6,14 @@ It writes to stderr, shows nothing for work that is done at once, and costs well
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sized
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-T = TypeVar("T")
-
 _QUIET_S = 1.0  # nothing is shown before
 _LINE_S = 5.0  # between two plain lines
-_CHECK_EVERY = 256  # items between two looks at the clock
 
 
 class Meter:
@@ -93,25 +89,3 @@ class Meter:
         self._next_line = now + _LINE_S
         share = f"{100 * self.done / self._total:.0f} %" if self._total else f"{self.done} steps"
         self._console.print(f"{self._title()}: {share} after {now - self._begin:.0f} s", highlight=False)
-
-
-def track(
-    items: Iterable[T], what: str, total: int | None = None, console: Console | None = None
-) -> Iterator[T]:
-    """Yield the items and show how far it has come.
-
-    Args:
-        items: what to go through.
-        what: the job in a few words.
-        total: number of items, if the items have no length.
-        console: where to show it; stderr if left out.
-    """
-    if total is None and isinstance(items, Sized):
-        total = len(items)
-    with Meter(what, total, console) as meter:
-        count = 0
-        for count, item in enumerate(items, 1):
-            yield item
-            if not count % _CHECK_EVERY or (total is not None and total < _CHECK_EVERY):
-                meter.update(count)
-        meter.done = count

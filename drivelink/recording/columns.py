@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import logging
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,28 +68,20 @@ def record_from_columns(
     if unknown := [name for name in columns if name not in KNOWN]:
         _LOG.warning("%s: ignored column(s) %s", where, _some(unknown))
     columns = _scaled(columns, joint)
-    motors = _motors(columns, joint)
-    if motors == 1 and "motor2_position_rad" in columns:
-        _LOG.warning("%s: has a second motor, the joint file has not: its columns are ignored", where)
+    motors = _motors(columns, joint, where)
     _require(columns, "time_s", where)
     nominal = joint.bus.period_s if joint else None
     grid = find_grid(columns["time_s"], where, nominal, _repeats(columns))
     columns = {name: values[grid.keep] if values.size else values for name, values in columns.items()}
-    numbers = range(1, motors + 1)
-    positions = [_needed(columns, f"motor{i}_position_rad", where) for i in numbers]
-    torques = [_torque(columns, i, joint, where) for i in numbers]
-    velocities = [_optional(columns, f"motor{i}_velocity_rad_s") for i in numbers]
-    link = {name: values for name in _LINK if (values := _optional(columns, name)) is not None}
-    if "link_position_rad" not in link and joint and joint.model().has_deflection:
-        _needed(columns, "link_position_rad", where)
-    _report_constant({f"motor{i}_position_rad": p for i, p in zip(numbers, positions, strict=True)}, where)
-    usable = _usable([*positions, *torques, link.get("link_position_rad", positions[0])], where)
+    channels = _channels(columns, motors, joint, where)
+    link = channels.link
+    needed = [*channels.positions, *channels.torques, link.get("link_position_rad", channels.positions[0])]
+    usable = _usable(needed, where)
     rows = np.ones_like(usable) if keep_nan else usable
 
     def stacked(arrays: list[FloatArray]) -> FloatArray:
         return np.ascontiguousarray(np.stack(arrays, axis=1)[rows])
 
-    present = [v if v is not None else np.full(len(rows), np.nan) for v in velocities]
     sequence = grid.sequence[rows]
     report_gaps(sequence, grid.period_s, where)
     if not keep_nan:  # use tick by tick does not allocate the gaps
@@ -97,14 +90,39 @@ def record_from_columns(
         return Record(
             period_s=grid.period_s,
             sequence=sequence,
-            motor_position_rad=stacked(positions),
-            motor_torque_nm=stacked(torques),
-            motor_velocity_rad_s=None if all(v is None for v in velocities) else stacked(present),
+            motor_position_rad=stacked(channels.positions),
+            motor_torque_nm=stacked(channels.torques),
+            motor_velocity_rad_s=stacked(channels.velocities) if channels.velocities else None,
             start_s=grid.start_s,
             **{name: values[rows] for name, values in link.items()},
         )
     except EstimatorError as error:
         raise RecordingError(f"{where}: {error}") from error
+
+
+class _Channels(NamedTuple):
+    """(rows,) each; one per motor, and what is known of the link; no velocities: none was measured."""
+
+    positions: list[FloatArray]
+    torques: list[FloatArray]
+    velocities: list[FloatArray]
+    link: dict[str, FloatArray]
+
+
+def _channels(
+    columns: Mapping[str, FloatArray], motors: int, joint: JointFile | None, where: str
+) -> _Channels:
+    numbers = range(1, motors + 1)
+    positions = [_needed(columns, f"motor{i}_position_rad", where) for i in numbers]
+    torques = [_torque(columns, i, joint, where) for i in numbers]
+    measured = [_optional(columns, f"motor{i}_velocity_rad_s") for i in numbers]
+    velocities = [np.full(len(positions[0]), np.nan) if v is None else v for v in measured]
+    link = {name: values for name in _LINK if (values := _optional(columns, name)) is not None}
+    if "link_position_rad" not in link and joint and joint.model().has_deflection:
+        _needed(columns, "link_position_rad", where)
+    for i, position in zip(numbers, positions, strict=True):
+        _report_constant(f"motor{i}_position_rad", position, where)
+    return _Channels(positions, torques, velocities if any(v is not None for v in measured) else [], link)
 
 
 def _optional(columns: Mapping[str, FloatArray], name: str) -> FloatArray | None:
@@ -143,10 +161,12 @@ def _repeats(columns: Mapping[str, FloatArray]) -> NDArray[np.bool_]:
     return same
 
 
-def _motors(columns: Mapping[str, FloatArray], joint: JointFile | None) -> int:
-    if joint is not None:
-        return len(joint.motor)
-    return 2 if "motor2_position_rad" in columns else 1
+def _motors(columns: Mapping[str, FloatArray], joint: JointFile | None, where: str) -> int:
+    recorded = 2 if "motor2_position_rad" in columns else 1
+    motors = recorded if joint is None else len(joint.motor)
+    if motors < recorded:
+        _LOG.warning("%s: has a second motor, the joint file has not: its columns are ignored", where)
+    return motors
 
 
 def _torque(
@@ -188,8 +208,7 @@ def _some(names: Sequence[str]) -> str:
     return ", ".join(name[:40] for name in names[:_SHOWN]) + more
 
 
-def _report_constant(columns: Mapping[str, FloatArray], where: str) -> None:
-    for name, values in columns.items():
-        finite = values[np.isfinite(values)]
-        if len(finite) and float(np.ptp(finite)) == 0.0:
-            _LOG.warning("%s: %s never changes: nothing moved, or the signal is not connected", where, name)
+def _report_constant(name: str, values: FloatArray, where: str) -> None:
+    finite = values[np.isfinite(values)]
+    if len(finite) and float(np.ptp(finite)) == 0.0:
+        _LOG.warning("%s: %s never changes: nothing moved, or the signal is not connected", where, name)

@@ -71,20 +71,14 @@ def installation(
     """
     unit, path = unit_name(joint.name), path.absolute()
     interface, channel = joint.bus.interface, joint.bus.channel
-    if interface == "virtual":
-        raise UsageError(
-            f'{path}: bus.interface = "virtual" lives inside one process: expected a bus, e.g. "socketcan"'
-        )
-    can = interface == "socketcan"
-    if can and not re.fullmatch(r"[A-Za-z0-9_.-]{1,15}", channel):
-        raise UsageError(f'{path}: bus.channel: expected the name of a network interface, got "{channel}"')
-    serial = interface in _SERIAL
+    _check_bus(interface, channel, path)
+    can, serial = interface == "socketcan", interface in _SERIAL
     seen = _below_home([path.parent, executable.parent, *_python()])
     values = {
         "name": joint.name,
         "device": f"sys-subsystem-net-devices-{_escape(channel)}.device" if can else "",
         "executable": _plain(executable),
-        "joint": " ".join((_plain(path), *map(_word, bus))),
+        "joint": " ".join((_plain(path), *map(_plain, bus))),
         "folder": _plain(path.parent),
         "paths": "\n".join(f"BindReadOnlyPaths={_plain(place)}" for place in seen),
         "devices": "DeviceAllow=char-ttyACM rw\nDeviceAllow=char-ttyUSB rw\nSupplementaryGroups=dialout"
@@ -100,6 +94,20 @@ def installation(
     if can:
         written |= _network(channel, joint.bus.bitrate)
     return Installation(unit, written)
+
+
+def _check_bus(interface: str, channel: str, path: Path) -> None:
+    """Check that a service can use the bus.
+
+    Raises:
+        UsageError: it exists inside one process, or its name is none of an interface.
+    """
+    if interface == "virtual":
+        raise UsageError(
+            f'{path}: bus.interface = "virtual" lives inside one process: expected a bus, e.g. "socketcan"'
+        )
+    if interface == "socketcan" and not re.fullmatch(r"[A-Za-z0-9_.-]{1,15}", channel):
+        raise UsageError(f'{path}: bus.channel: expected the name of a network interface, got "{channel}"')
 
 
 def network_files(channel: str) -> tuple[Path, ...]:
@@ -135,18 +143,11 @@ def _below_home(places: Iterable[Path]) -> list[Path]:
     return sorted(place for place in below if not below & set(place.parents))
 
 
-def _plain(path: Path) -> str:
-    """A path for a unit, where spaces and percent signs are special."""
-    if not _BARE.fullmatch(str(path)):
-        raise UsageError(f"{path}: expected a path without spaces and special characters for a unit")
-    return str(path)
-
-
-def _word(text: str) -> str:
-    """An option for a unit."""
-    if not _BARE.fullmatch(text):
-        raise UsageError(f"{text}: expected no spaces and special characters for a unit")
-    return text
+def _plain(word: Path | str) -> str:
+    """A path or an option for a unit, where spaces and percent signs are special."""
+    if not _BARE.fullmatch(str(word)):
+        raise UsageError(f"{word}: expected no spaces and special characters for a unit")
+    return str(word)
 
 
 def _escape(channel: str) -> str:

@@ -21,7 +21,8 @@ from drivelink.cycle.framesource import BusLostError
 from drivelink.cycle.socketcan import SocketCanSource
 from drivelink.cycle.sources import open_source
 from drivelink.daemon.service import Daemon, ServedJoint
-from drivelink.demo.simulate import network_from_joint, open_sim_bus
+from drivelink.demo.simbus import open_sim_bus
+from drivelink.demo.simulate import network_from_joint
 from drivelink.jointfile import BusSection
 from drivelink.pubsub.client import subscribe
 from estimator.sample import Status

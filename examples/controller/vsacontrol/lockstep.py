@@ -11,7 +11,8 @@ import can
 
 from drivelink._core import Tick
 from drivelink.daemon.service import Daemon, ServedJoint
-from drivelink.demo.simulate import nodes_from_joint, open_sim_bus, world_from_joint
+from drivelink.demo.simbus import open_sim_bus
+from drivelink.demo.simulate import nodes_from_joint, world_from_joint
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.wire import (
     EstimateMessage,

@@ -66,3 +66,5 @@ def test_diagnose_names_no_delay_of_tens_of_milliseconds() -> None:
     ]
     assert "link_position_delay_s" not in found.alignment
     assert any("encoder_delay of 0.03 s" in note for note in found.notes)
+    assert not found.transmissions[0].parameters  # a stiffness that rests on a delay that is none
+    assert any("no stiffness is reported" in note for note in found.notes)

@@ -17,7 +17,7 @@ from estimator.effects import LIBRARY
 from estimator.errors import EstimatorError
 from estimator.identify import identify
 from estimator.model import Effect
-from estimator.sample import Record
+from estimator.sample import FloatArray, Record
 
 # What is put into each joint, and what must come out: name, location, main parameter, its tolerance.
 # Tolerances: 3 % for what enters linearly, more where the law differs from the library's (friction's shape).
@@ -124,6 +124,19 @@ def test_what_no_function_of_one_coordinate_explains_is_never_sufficient(
     assert (found.effects[0].location, found.effects[0].coordinates) == (location, coordinates)
     if location == "motor":  # the error is that of the motor's balance
         assert found.validation.after_rms_nm < 0.5 * found.validation.before_rms_nm
+
+
+def test_a_ripple_of_less_than_two_periods_may_be_of_the_motor_or_of_the_gear() -> None:
+    """Motor side alone, a linear spring: both give the same torque."""
+
+    class Short(kit.World):
+        def _reference(self, n: int, rng: np.random.Generator) -> FloatArray:
+            return 0.3 * super()._reference(n, rng)
+
+    (record,) = Short([{"cogging_nm": 0.4}]).run()
+    (effect,) = diagnose(record, kit.model(linked=False)).effects
+    assert {effect.name, *effect.alternatives} >= {"cogging", "kinematic_error"}
+    assert effect.probability == pytest.approx(0.5, abs=0.1)
 
 
 def test_without_link_dynamics_friction_is_still_found(records: dict[str, Record]) -> None:

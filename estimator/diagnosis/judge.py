@@ -21,7 +21,7 @@ from estimator.diagnosis.outcome import (
     stamped_wrongly,
     transmissions_of,
 )
-from estimator.diagnosis.result import Diagnosis, Errors, Finding, RecordingErrors, Verdict
+from estimator.diagnosis.result import Diagnosis, Errors, Finding, RecordingErrors, Refitted, Verdict
 from estimator.diagnosis.search import Progress, Search
 from estimator.diagnosis.stiffness import stiffness_curves
 from estimator.effects import LIBRARY
@@ -38,6 +38,7 @@ class _Judged(NamedTuple):
         effects: the missing effects.
         before, after: the model as declared, and with what was found.
         notes: what qualifies the verdict.
+        in_spring: whether what is unexplained is part of the transmission's torque or deflection.
     """
 
     verdict: Verdict
@@ -45,6 +46,7 @@ class _Judged(NamedTuple):
     before: Fitted
     after: Fitted
     notes: list[str]
+    in_spring: bool = False
 
 
 class Judge:
@@ -69,14 +71,13 @@ class Judge:
         rivals = [h for k in range(len(self.found.terms)) for h in self.search.rivals(self.found, k)]
         self.progress("free curves")
         curve = best_curve(self.search, self.search.null)
-        others = [self.search.null, *rivals]
-        judged = self._judged(self._effects(others, curve), curve)
+        others = [self.search.null, *rivals, *([] if curve is None else [curve])]
+        judged = self._judged(self._effects(others), curve)
         return self._stated(judged, [h for h in (self.found, *others) if h is not judged.after])
 
-    def _effects(self, others: list[Fitted], curve: Fitted | None) -> list[Finding]:
+    def _effects(self, others: list[Fitted]) -> list[Finding]:
         """The effects found, with their probabilities beside all other explanations."""
-        free = [] if curve is None else [curve]
-        beside = accounts(self.search, self.found, [*others, *self.search.seen, *free])
+        beside = accounts(self.search, self.found, [*others, *self.search.seen])
         standings = [standing(self.search, self.found, k, beside) for k in range(len(self.found.terms))]
         return findings_of(self.problem, self.found, self.search.null, standings, self.surplus)
 
@@ -91,10 +92,10 @@ class Judge:
                 name="unlisted", location=extra.location, motor=extra.motor, parameters={}, std={},
                 coordinates=extra.coordinates, share=float(gone),
             )  # fmt: skip
-            return _Judged("unexplained", [unlisted], before, curve, [])
+            return _Judged("unexplained", [unlisted], before, curve, [], extra.location == "transmission")
         stamps = self._stamped_wrongly(effects)
         if stamps:
-            return _Judged("unexplained", [_unlisted(f) for f in effects], before, self.found, stamps)
+            return _Judged("unexplained", [_unlisted(f) for f in effects], before, self.found, stamps, True)
         verdict, notes = self._named(effects)
         if verdict == "effect" and self.held.squared(self.found) > self.held.squared(before):
             verdict = "insufficient_excitation"
@@ -129,6 +130,9 @@ class Judge:
         effects, before, after = judged.effects, judged.before, judged.after
         chances = [(self.search.chance(after, h, surplus), h) for h in others]
         transmissions, unsure = transmissions_of(self.search, after, chances, surplus)
+        if judged.in_spring:
+            transmissions = tuple(Refitted(one.model, {}, {}) for one in transmissions)
+            unsure = ["no stiffness is reported: what is unexplained is in the spring's torque or deflection"]
         sides = self._sides(before, after) if judged.verdict in ("effect", "unexplained") else []
         notes = [*judged.notes, *unsure, *self._doubts(effects), *sides, *wider(surplus)]
         return Diagnosis(

@@ -26,7 +26,7 @@ from estimator.sample import FloatArray
 
 __all__ = ["Progress", "Search", "parameters"]
 
-_SMOOTHING = "smoothing_rad_s"
+_SMOOTHING, _PERIODS = "smoothing_rad_s", "periods_per_rev"
 
 Progress = Callable[[str], None]
 
@@ -218,10 +218,16 @@ class Search:
         return hypothesis
 
     def rivals(self, hypothesis: Fitted, k: int) -> list[Fitted]:
-        """Alternatives to a term, most evidence first."""
-        own = hypothesis.terms[k].candidate
-        grown = self.children(self.problem.without(hypothesis, k), like=own)
-        made = [child for child in grown if child.terms[-1].candidate.key != own.key]
+        """Alternatives to a term, most evidence first; a ripple elsewhere also starts at its period."""
+        own, rest = hypothesis.terms[k], self.problem.without(hypothesis, k)
+        grown = self.children(rest, like=own.candidate)
+        if _PERIODS in own.values:
+            here = own.candidate
+            ripples = [e.candidate for e in self._library if _PERIODS in e.candidate.kind.nonlinear]
+            places = [c for c in ripples if c != here and c.motor == here.motor and c.key not in rest.keys]
+            moved = [self._grown(rest, Term(c, own.values)) for c in places]
+            grown += [child for child in moved if child.is_real_beside(rest)]
+        made = [child for child in grown if child.terms[-1].candidate.key != own.candidate.key]
         return self._ranked(made) if made else []
 
     def screen(self, parent: Fitted, like: Candidate | None = None) -> list[Term]:

@@ -151,7 +151,7 @@ def views(_: Path) -> None:
         assert address is not None
         command = (*DRIVELINK, "monitor", "vsa-ii")
         terminal(command, 25.0, "drivelink monitor vsa-ii", PICTURES / "monitor.svg")
-        pages(address[0], "web", "main", wait_s=35.0)
+        pages(address[0], "web", "section:has(#stiffnessplot)", wait_s=35.0)
 
 
 def loop(folder: Path) -> None:

@@ -14,6 +14,7 @@ import pytest
 
 from drivelink.monitor.view import JointView
 from drivelink.monitor.web import snapshot
+from drivelink.pubsub.wire import ExternalMessage
 from estimator.sample import Estimate, Status, TransmissionEstimate
 
 NODE = shutil.which("node")
@@ -130,6 +131,22 @@ def test_one_wild_value_does_not_flatten_an_axis(wild: float) -> None:
         fed(4.0, wild),
     )
     assert low - high > 0.5 * height  # the sine fills more than half of the plot
+
+
+def test_a_band_wider_than_the_plot_leaves_the_signal_readable() -> None:
+    view = fed()
+    for k in range(4000):
+        torque_nm = 1e-3 * math.sin(2e-3 * k)
+        view.update_external(ExternalMessage(k, k * 1_000_000, 1, torque_nm, 0.01), 1e-3 * k)
+    low, high, height = page(
+        """
+        take(sent[0]);
+        const { Y, T, B } = $("externalplot").shown;
+        return [Y(-1e-3), Y(1e-3), B - T];
+        """,
+        view,
+    )
+    assert 0.5 * height < low - high < height
 
 
 def test_a_daemon_that_is_gone_leaves_no_green_and_no_live_numbers() -> None:

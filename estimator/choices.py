@@ -9,7 +9,7 @@ import math
 from statistics import NormalDist
 from typing import NamedTuple
 
-__all__ = ["CHOICES", "Choice", "chance", "choice", "least_rows", "log_odds", "whole"]
+__all__ = ["CHOICES", "Choice", "chance", "choice", "least_rows", "log_odds", "rate", "whole"]
 
 
 class Choice(NamedTuple):
@@ -33,8 +33,8 @@ CHOICES: dict[str, Choice] = {
     "harmonics": Choice(
         4.0, "", "bandwidth of what repeats, over its frequency", "friction has harmonics to there"
     ),
-    "rows": Choice(
-        3.0, "1/period of the bandwidth", "rate behind a low-pass", "Nyquist's two, and the filter's skirt"
+    "skirt": Choice(
+        0.5, "bandwidths", "beyond the bandwidth before a low-pass hides all", "there it leaves 4 %"
     ),
     "edge": Choice(
         3.0, "periods of the bandwidth", "left out at ends and gaps",
@@ -156,6 +156,11 @@ def whole(name: str) -> int:
 def least_rows() -> int:
     """Fewest rows of a recording: two in each period of the bandwidth."""
     return 2 * whole("fit_periods")
+
+
+def rate() -> float:
+    """Samples behind a low-pass in each period of its bandwidth: Nyquist's two up to the end of its skirt."""
+    return 2.0 * (1.0 + choice("skirt"))
 
 
 def chance() -> float:

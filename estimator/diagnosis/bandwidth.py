@@ -6,7 +6,7 @@ import numpy as np
 from scipy import fft
 from scipy.optimize import brentq
 
-from estimator.choices import choice
+from estimator.choices import choice, rate
 from estimator.diagnosis.frame import Signals
 from estimator.diagnosis.spectral import lowpass
 from estimator.model import JointModel
@@ -46,7 +46,7 @@ def choose_bandwidth(record: Record, model: JointModel) -> float:
 
 def widest(period_s: float) -> float:
     """Largest bandwidth, Hz: every sample is a row."""
-    return 1.0 / (choice("rows") * period_s)
+    return 1.0 / (rate() * period_s)
 
 
 def rough_stiffness(record: Record, model: JointModel) -> list[float]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.choices import choice, whole
+from estimator.choices import choice, rate, whole
 from estimator.diagnosis.spectral import Band, Spectrum, lowpass
 from estimator.effects import Coordinates
 from estimator.model import JointModel, LinkDynamics
@@ -72,8 +72,7 @@ class Signals:
         def bridged(x: FloatArray) -> FloatArray:
             return x if unbroken else np.interp(grid, sequence, x)
 
-        rate = choice("rows") * choice("harmonics") * bandwidth_hz
-        step = max(1, int(1.0 / (record.period_s * rate)))
+        step = max(1, int(1.0 / (record.period_s * rate() * choice("harmonics") * bandwidth_hz)))
         margin = choice("edge") / bandwidth_hz
         self.light = Band(self.samples, record.period_s, step, margin)
         link = record.link_position_rad
@@ -82,7 +81,7 @@ class Signals:
         self.q = None if link is None else self.light.transform(bridged(link))
         external = record.external_torque_nm
         self.external = None if external is None else self.light.transform(bridged(external))
-        rows_step = max(1, int(1.0 / (self.light.period_s * choice("rows") * bandwidth_hz)))
+        rows_step = max(1, int(1.0 / (self.light.period_s * rate() * bandwidth_hz)))
         self.narrow = Band(self.light.kept, self.light.period_s, rows_step, margin)
         self.response = lowpass(self.narrow.frequency_hz, bandwidth_hz)
         self.keep = self._rows(record, sequence, margin)

@@ -1,0 +1,224 @@
+//! `Assembler` and the counters of its nodes.
+
+use std::sync::Mutex;
+
+use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyTuple};
+
+use super::lock;
+use super::values::{drive_error, layout_from, sample_object};
+use crate::assembler;
+use crate::cross_check::{CrossCheck, Verdict};
+use crate::node::Counters;
+
+/// What became of one node's frames since the start.
+#[pyclass(frozen, get_all, module = "drivelink._core")]
+pub(super) struct NodeCounters {
+    received: u64,
+    missing: u64,
+    late: u64,
+    duplicate: u64,
+    conflicting: u64,
+    wrong_length: u64,
+    ignored: u64,
+    reboots: u64,
+    emergencies: u64,
+}
+
+#[pymethods]
+impl NodeCounters {
+    #[new]
+    fn new() -> NodeCounters {
+        Counters::default().into()
+    }
+
+    fn as_dict<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let found = PyDict::new(py);
+        for (name, count) in [
+            ("received", self.received),
+            ("missing", self.missing),
+            ("late", self.late),
+            ("duplicate", self.duplicate),
+            ("conflicting", self.conflicting),
+            ("wrong_length", self.wrong_length),
+            ("ignored", self.ignored),
+            ("reboots", self.reboots),
+            ("emergencies", self.emergencies),
+        ] {
+            found.set_item(name, count)?;
+        }
+        Ok(found)
+    }
+}
+
+impl From<Counters> for NodeCounters {
+    fn from(c: Counters) -> NodeCounters {
+        NodeCounters {
+            received: c.received,
+            missing: c.missing,
+            late: c.late,
+            duplicate: c.duplicate,
+            conflicting: c.conflicting,
+            wrong_length: c.wrong_length,
+            ignored: c.ignored,
+            reboots: c.reboots,
+            emergencies: c.emergencies,
+        }
+    }
+}
+
+/// Makes the samples of one joint from the frames of its nodes.
+#[pyclass(frozen, module = "drivelink._core")]
+pub(super) struct Assembler {
+    pub(super) core: Mutex<assembler::Assembler>,
+}
+
+#[pymethods]
+impl Assembler {
+    #[new]
+    #[pyo3(signature = (layouts, motors, *, active = true, hold_periods = 250, period_s = 0.001))]
+    fn new(
+        py: Python<'_>,
+        layouts: &Bound<'_, PyAny>,
+        motors: usize,
+        active: bool,
+        hold_periods: i64,
+        period_s: f64,
+    ) -> PyResult<Assembler> {
+        let layouts =
+            layouts.try_iter()?.map(|layout| layout_from(py, &layout?)).collect::<PyResult<Vec<_>>>()?;
+        let core = assembler::Assembler::new(&layouts, motors, active, hold_periods, period_s)
+            .map_err(|message| drive_error(py, message))?;
+        Ok(Assembler { core: Mutex::new(core) })
+    }
+
+    #[getter]
+    fn sequence(&self) -> i64 {
+        lock(&self.core).sequence
+    }
+
+    #[getter]
+    fn missed(&self) -> i64 {
+        lock(&self.core).missed.unwrap_or(-1)
+    }
+
+    #[getter]
+    fn flags(&self) -> u32 {
+        lock(&self.core).flags
+    }
+
+    #[getter]
+    fn extra_syncs(&self) -> u64 {
+        lock(&self.core).extra_syncs
+    }
+
+    #[getter]
+    fn cob_ids<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
+        let cob_ids: Vec<u32> = lock(&self.core).cob_ids().collect();
+        PyTuple::new(py, cob_ids)
+    }
+
+    #[getter]
+    fn counters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let counters: Vec<_> = lock(&self.core).nodes().iter().map(|n| (n.node_id, n.counters)).collect();
+        let found = PyDict::new(py);
+        for (node_id, counted) in counters {
+            found.set_item(node_id, NodeCounters::from(counted).into_pyobject(py)?)?;
+        }
+        Ok(found)
+    }
+
+    #[getter]
+    fn faults<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let found = PyDict::new(py);
+        for node in lock(&self.core).nodes().iter().filter(|node| node.faulted || node.emergency != 0) {
+            found.set_item(node.node_id, node.emergency)?;
+        }
+        Ok(found)
+    }
+
+    #[getter]
+    fn statuswords<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let found = PyDict::new(py);
+        for node in lock(&self.core).nodes() {
+            if let Some(statusword) = node.statusword {
+                found.set_item(node.node_id, statusword)?;
+            }
+        }
+        Ok(found)
+    }
+
+    #[getter]
+    fn untrusted<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
+        let core = lock(&self.core);
+        let nodes: Vec<u32> = core.nodes().iter().filter(|n| !n.trusted).map(|n| n.node_id).collect();
+        PyTuple::new(py, nodes)
+    }
+
+    #[getter]
+    fn checks(&self) -> Vec<(usize, &'static str, &'static str, f64, f64)> {
+        let fields = |check: &CrossCheck| {
+            let verdict = match check.verdict() {
+                Verdict::Untested => "untested",
+                Verdict::Agrees => "agrees",
+                Verdict::Contradicts => "contradicts",
+            };
+            let (scale, std) = check.scale();
+            (check.motor + 1, check.kind.name(), verdict, scale, std)
+        };
+        lock(&self.core).checks().iter().map(fields).collect()
+    }
+
+    #[getter]
+    fn has_link(&self) -> bool {
+        lock(&self.core).has_link()
+    }
+
+    #[getter]
+    fn complete(&self) -> bool {
+        lock(&self.core).complete()
+    }
+
+    fn missing_nodes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
+        let mut nodes: Vec<u32> = lock(&self.core).missing_nodes().collect();
+        nodes.dedup();
+        PyTuple::new(py, nodes)
+    }
+
+    #[pyo3(signature = (cob_id, data, jump = 1))]
+    fn feed<'py>(
+        &self,
+        py: Python<'py>,
+        cob_id: u32,
+        data: &[u8],
+        jump: i64,
+    ) -> PyResult<Option<Bound<'py, PyAny>>> {
+        let (sample, motors) = {
+            let mut core = lock(&self.core);
+            (core.feed(cob_id, data, jump), core.motors())
+        };
+        sample.map(|sample| sample_object(py, &sample, motors)).transpose()
+    }
+
+    fn supervise(&self) {
+        lock(&self.core).supervise();
+    }
+
+    fn distrust(&self, node_id: u32) {
+        lock(&self.core).distrust(node_id);
+    }
+
+    fn trust(&self, node_id: u32) {
+        lock(&self.core).trust(node_id);
+    }
+
+    fn contradict(&self, node_id: u32, contradicted: bool) {
+        lock(&self.core).contradict(node_id, contradicted);
+    }
+
+    fn relayout(&self, py: Python<'_>, layout: &Bound<'_, PyAny>) -> PyResult<()> {
+        let layout = layout_from(py, layout)?;
+        let changed = lock(&self.core).relayout(&layout);
+        changed.map_err(|message| drive_error(py, message))
+    }
+}

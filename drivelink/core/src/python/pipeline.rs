@@ -1,0 +1,371 @@
+//! `JointPipeline`, its cycles and its last samples.
+//!
+//! No lock is held while Python code runs.
+
+use std::collections::VecDeque;
+use std::sync::Mutex;
+
+use estimator_core::external::External;
+use estimator_core::python::{Estimator, ModelMonitor, external as external_object};
+use estimator_core::sample::{Estimate, Sample};
+use pyo3::PyClass;
+use pyo3::exceptions::PyRuntimeError;
+use pyo3::prelude::*;
+use pyo3::types::PyBytes;
+
+use super::assembler::Assembler;
+use super::values::{
+    ExternalFields, estimate_from, estimate_object, external_of, sample_from, sample_object,
+};
+use super::{lock, to_python};
+use crate::pipeline::{self, Due, Failure, Pipeline, Step};
+
+/// What is published of one cycle.
+#[pyclass(frozen, module = "drivelink._core")]
+pub(super) struct Tick {
+    core: pipeline::Tick,
+}
+
+#[pymethods]
+impl Tick {
+    #[getter]
+    fn sequence(&self) -> u64 {
+        self.core.estimate.sequence
+    }
+
+    #[getter]
+    fn status(&self) -> u32 {
+        self.core.estimate.status
+    }
+
+    #[getter]
+    fn stamp_ns(&self) -> i64 {
+        self.core.stamp_ns
+    }
+
+    #[getter]
+    fn current(&self) -> bool {
+        self.core.current
+    }
+
+    #[getter]
+    fn fresh(&self) -> bool {
+        self.core.sample.is_some()
+    }
+
+    #[getter]
+    fn estimate<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        estimate_object(py, &self.core.estimate)
+    }
+
+    #[getter]
+    fn external<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
+        self.core.external.map(|external| external_object(py, &external)).transpose()
+    }
+
+    #[getter]
+    fn sample<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
+        self.core.sample.map(|sample| sample_object(py, &sample, self.core.motors)).transpose()
+    }
+
+    fn flagged(&self, status: u32) -> Tick {
+        let mut core = self.core;
+        core.estimate.status |= status;
+        Tick { core }
+    }
+
+    fn stamped(&self, stamp_ns: i64) -> Tick {
+        Tick { core: pipeline::Tick { stamp_ns, ..self.core } }
+    }
+
+    #[getter]
+    fn estimate_payload<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
+        PyBytes::new(py, self.core.estimate_payload().bytes())
+    }
+
+    #[getter]
+    fn external_payload<'py>(&self, py: Python<'py>) -> Option<Bound<'py, PyBytes>> {
+        self.core.external_payload().map(|payload| PyBytes::new(py, payload.bytes()))
+    }
+
+    #[getter]
+    fn sample_payload<'py>(&self, py: Python<'py>) -> Option<Bound<'py, PyBytes>> {
+        self.core.sample_payload().map(|payload| PyBytes::new(py, payload.bytes()))
+    }
+}
+
+/// The last samples of a joint, for a new estimator to start from; read by another thread than the cycle's.
+#[pyclass(frozen, module = "drivelink._core")]
+pub(super) struct History {
+    keep: usize,
+    kept: Mutex<VecDeque<(Sample, usize)>>,
+}
+
+impl History {
+    fn push(&self, sample: Sample, motors: usize) {
+        if self.keep > 0 {
+            let mut kept = lock(&self.kept);
+            if kept.len() == self.keep {
+                kept.pop_front();
+            }
+            kept.push_back((sample, motors));
+        }
+    }
+}
+
+#[pymethods]
+impl History {
+    fn __len__(&self) -> usize {
+        lock(&self.kept).len()
+    }
+
+    #[pyo3(signature = (sequence, most = None))]
+    fn after<'py>(
+        &self,
+        py: Python<'py>,
+        sequence: i64,
+        most: Option<usize>,
+    ) -> PyResult<Vec<Bound<'py, PyAny>>> {
+        let found: Vec<_> = {
+            let kept = lock(&self.kept);
+            let first = kept.partition_point(|(sample, _)| sample.sequence as i64 <= sequence);
+            kept.range(first..).take(most.unwrap_or(usize::MAX)).copied().collect()
+        };
+        found.iter().map(|(sample, motors)| sample_object(py, sample, *motors)).collect()
+    }
+
+    fn behind(&self, sequence: i64) -> usize {
+        let kept = lock(&self.kept);
+        kept.len() - kept.partition_point(|(sample, _)| sample.sequence as i64 <= sequence)
+    }
+}
+
+/// The estimator of a pipeline, and the monitor of its model: compiled ones are called without Python in between.
+pub(super) struct Driver {
+    estimator: Py<PyAny>,
+    compiled: Option<Py<Estimator>>,
+    model_monitor: Option<Py<PyAny>>,
+    compiled_monitor: Option<Py<ModelMonitor>>,
+    motors: usize,
+}
+
+/// What a Python object is made of, where that is a class of this module.
+pub(super) fn core_of<T: PyClass>(py: Python<'_>, object: &Py<PyAny>) -> Option<Py<T>> {
+    object.bind(py).getattr("core").ok()?.cast_into().ok().map(Bound::unbind)
+}
+
+impl Driver {
+    fn new(py: Python<'_>, estimator: Py<PyAny>, model_monitor: Option<Py<PyAny>>) -> Driver {
+        let compiled = core_of(py, &estimator);
+        let compiled_monitor = model_monitor.as_ref().and_then(|monitor| core_of(py, monitor));
+        Driver { estimator, compiled, model_monitor, compiled_monitor, motors: 0 }
+    }
+}
+
+impl Step for Driver {
+    fn step(&mut self, sample: &Sample) -> Result<Estimate, Failure> {
+        Python::attach(|py| {
+            if let Some(compiled) = &self.compiled {
+                return Ok(compiled.try_borrow_mut(py).map_err(PyErr::from)?.inner.step(sample));
+            }
+            let sample = sample_object(py, sample, self.motors)?;
+            estimate_from(&self.estimator.bind(py).call_method1("step", (sample,))?)
+        })
+        .map_err(Failure::from)
+    }
+
+    fn reset(&mut self) -> Result<(), Failure> {
+        Python::attach(|py| self.estimator.call_method0(py, "reset").map(drop)).map_err(Failure::from)
+    }
+
+    fn distrust(&mut self) -> Result<(), Failure> {
+        Python::attach(|py| self.estimator.call_method0(py, "distrust").map(drop)).map_err(Failure::from)
+    }
+
+    fn alarm(&mut self, sample: &Sample, estimate: &Estimate) -> Result<bool, Failure> {
+        let Some(model_monitor) = &self.model_monitor else { return Ok(false) };
+        Python::attach(|py| {
+            if let Some(monitor) = &self.compiled_monitor {
+                return Ok(monitor.try_borrow_mut(py).map_err(PyErr::from)?.inner.step(sample));
+            }
+            let residual = self.estimator.getattr(py, "residual_nm")?;
+            let sample = sample_object(py, sample, self.motors)?;
+            let estimate = estimate_object(py, estimate)?;
+            model_monitor.bind(py).call_method1("step", (sample, estimate, residual))?.extract()
+        })
+        .map_err(Failure::from)
+    }
+
+    fn external(&mut self) -> Result<Option<External>, Failure> {
+        Python::attach(|py| -> PyResult<Option<External>> {
+            if let Some(compiled) = &self.compiled {
+                return Ok(compiled.try_borrow(py).map_err(PyErr::from)?.inner.external());
+            }
+            // An estimator that somebody registered may have none.
+            let Ok(external) = self.estimator.getattr(py, "external") else { return Ok(None) };
+            Ok(external.extract::<Option<ExternalFields>>(py)?.map(external_of))
+        })
+        .map_err(Failure::from)
+    }
+}
+
+/// Frames of one joint in, estimates and their bytes out.
+#[pyclass(frozen, module = "drivelink._core")]
+pub(super) struct JointPipeline {
+    assembler: Py<Assembler>,
+    history: Py<History>,
+    state: Mutex<Pipeline>,
+    driver: Mutex<Driver>, // held while Python runs: by the cycle's thread only
+    objects: Mutex<(Py<PyAny>, Option<Py<PyAny>>)>, // estimator and model monitor, for whoever asks
+}
+
+impl JointPipeline {
+    /// Estimate a sample for which these service bits hold.
+    fn run(
+        &self,
+        sample: &Sample,
+        motors: usize,
+        flags: u32,
+        stamp_ns: Option<i64>,
+    ) -> PyResult<pipeline::Tick> {
+        let results = {
+            let Ok(mut driver) = self.driver.try_lock() else {
+                return Err(PyRuntimeError::new_err("two threads feed one joint"));
+            };
+            driver.motors = motors;
+            pipeline::estimate(&mut *driver, sample, flags).map_err(to_python)?
+        };
+        self.history.get().push(*sample, motors);
+        Ok(lock(&self.state).take(sample, motors, results, stamp_ns))
+    }
+}
+
+#[pymethods]
+impl JointPipeline {
+    #[new]
+    #[pyo3(signature = (assembler, estimator, model_monitor = None, *, keep = 0))]
+    fn new(
+        py: Python<'_>,
+        assembler: Py<Assembler>,
+        estimator: Py<PyAny>,
+        model_monitor: Option<Py<PyAny>>,
+        keep: usize,
+    ) -> PyResult<JointPipeline> {
+        let objects = (estimator.clone_ref(py), model_monitor.as_ref().map(|monitor| monitor.clone_ref(py)));
+        Ok(JointPipeline {
+            assembler,
+            history: Py::new(py, History { keep, kept: Mutex::new(VecDeque::with_capacity(keep)) })?,
+            state: Mutex::default(),
+            driver: Mutex::new(Driver::new(py, estimator, model_monitor)),
+            objects: Mutex::new(objects),
+        })
+    }
+
+    #[getter]
+    fn assembler(&self, py: Python<'_>) -> Py<Assembler> {
+        self.assembler.clone_ref(py)
+    }
+
+    #[getter]
+    fn history(&self, py: Python<'_>) -> Py<History> {
+        self.history.clone_ref(py)
+    }
+
+    #[getter]
+    fn estimator(&self, py: Python<'_>) -> Py<PyAny> {
+        lock(&self.objects).0.clone_ref(py)
+    }
+
+    #[getter]
+    fn model_monitor(&self, py: Python<'_>) -> Option<Py<PyAny>> {
+        lock(&self.objects).1.as_ref().map(|monitor| monitor.clone_ref(py))
+    }
+
+    #[getter]
+    fn missed(&self) -> u64 {
+        lock(&self.state).missed
+    }
+
+    #[getter]
+    fn complete(&self) -> bool {
+        lock(&self.assembler.get().core).complete()
+    }
+
+    #[getter]
+    fn estimate<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
+        let last = lock(&self.state).last().copied();
+        last.map(|tick| estimate_object(py, &tick.estimate)).transpose()
+    }
+
+    #[getter]
+    fn status(&self) -> Option<u32> {
+        lock(&self.state).last().map(|tick| tick.estimate.status)
+    }
+
+    #[getter]
+    fn external<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
+        let last = lock(&self.state).last().copied();
+        last.and_then(|tick| tick.external).map(|external| external_object(py, &external)).transpose()
+    }
+
+    #[getter]
+    fn sample<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyAny>>> {
+        let last = lock(&self.state).last().copied();
+        let Some((sample, motors)) = last.and_then(|tick| Some((tick.sample?, tick.motors))) else {
+            return Ok(None);
+        };
+        sample_object(py, &sample, motors).map(Some)
+    }
+
+    #[pyo3(signature = (cob_id, data, jump = 1, stamp_ns = 0))]
+    fn feed(&self, cob_id: u32, data: &[u8], jump: i64, stamp_ns: i64) -> PyResult<Option<Tick>> {
+        let (due, motors) = {
+            let mut assembler = lock(&self.assembler.get().core);
+            let due = lock(&self.state).feed(&mut assembler, cob_id, data, jump, stamp_ns);
+            (due, assembler.motors())
+        };
+        match due {
+            None => Ok(None),
+            Some(Due::Sample(sample, flags)) => {
+                self.run(&sample, motors, flags, None).map(|core| Some(Tick { core }))
+            }
+            Some(Due::Missed(sequence, flags)) => Ok(self.carry_on(sequence, flags, None)),
+        }
+    }
+
+    #[pyo3(signature = (sample, flags = 0, stamp_ns = 0))]
+    fn take(&self, sample: &Bound<'_, PyAny>, flags: u32, stamp_ns: i64) -> PyResult<Tick> {
+        let (sample, motors) = sample_from(sample)?;
+        Ok(Tick { core: self.run(&sample, motors, flags, Some(stamp_ns))? })
+    }
+
+    #[pyo3(signature = (sequence, flags = 0, stamp_ns = None))]
+    fn carry_on(&self, sequence: i64, flags: u32, stamp_ns: Option<i64>) -> Option<Tick> {
+        lock(&self.state).carry_on(sequence, flags, stamp_ns).map(|core| Tick { core })
+    }
+
+    #[pyo3(signature = (estimator, model_monitor, unseen = None))]
+    fn exchange(
+        &self,
+        py: Python<'_>,
+        estimator: Py<PyAny>,
+        model_monitor: Option<Py<PyAny>>,
+        unseen: Option<&Bound<'_, PyAny>>,
+    ) -> PyResult<()> {
+        if let Some(unseen) = unseen {
+            for sample in unseen.try_iter()? {
+                estimator.bind(py).call_method1("step", (sample?,))?;
+            }
+        }
+        let objects = (estimator.clone_ref(py), model_monitor.as_ref().map(|monitor| monitor.clone_ref(py)));
+        let next = Driver::new(py, estimator, model_monitor);
+        let Ok(mut driver) = self.driver.try_lock() else {
+            return Err(PyRuntimeError::new_err("two threads feed one joint"));
+        };
+        let before = std::mem::replace(&mut *driver, next);
+        drop(driver);
+        let shown = std::mem::replace(&mut *lock(&self.objects), objects);
+        drop((before, shown)); // their destructors may run Python code
+        Ok(())
+    }
+}

@@ -1,0 +1,232 @@
+//! Python's values and layouts to and from the core's; the bytes of messages.
+
+use estimator_core::external::External;
+use estimator_core::sample::{Estimate, MOTORS, Sample, TransmissionEstimate};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::sync::PyOnceLock;
+use pyo3::types::{PyBytes, PyTuple};
+
+use crate::layout::{MappedObject, Node, Signal, Tpdo};
+use crate::wire;
+
+pub(super) struct Types {
+    sample: Py<PyAny>,
+    estimate: Py<PyAny>,
+    transmission: Py<PyAny>,
+    drive_error: Py<PyAny>,
+}
+
+pub(super) fn types(py: Python<'_>) -> PyResult<&'static Types> {
+    static TYPES: PyOnceLock<Types> = PyOnceLock::new();
+    TYPES.get_or_try_init(py, || {
+        let module = py.import("estimator.sample")?;
+        Ok(Types {
+            sample: module.getattr("Sample")?.unbind(),
+            estimate: module.getattr("Estimate")?.unbind(),
+            transmission: module.getattr("TransmissionEstimate")?.unbind(),
+            drive_error: py.import("drivelink.errors")?.getattr("DriveError")?.unbind(),
+        })
+    })
+}
+
+pub(super) fn drive_error(py: Python<'_>, message: String) -> PyErr {
+    match types(py).and_then(|types| types.drive_error.bind(py).call1((message,))) {
+        Ok(error) => PyErr::from_value(error),
+        Err(error) => error,
+    }
+}
+
+pub(super) fn sample_object<'py>(py: Python<'py>, s: &Sample, motors: usize) -> PyResult<Bound<'py, PyAny>> {
+    types(py)?.sample.bind(py).call1((
+        s.sequence,
+        PyTuple::new(py, &s.motor_position[..motors])?,
+        PyTuple::new(py, &s.motor_velocity[..motors])?,
+        PyTuple::new(py, &s.motor_torque[..motors])?,
+        s.link_position,
+        s.link_velocity,
+        s.external_torque,
+    ))
+}
+
+/// A `Sample` and how many motors it has.
+pub(super) fn sample_from(object: &Bound<'_, PyAny>) -> PyResult<(Sample, usize)> {
+    type Motors = Vec<f64>;
+    let (sequence, position, velocity, torque, link_position, link_velocity, external_torque): (
+        u64,
+        Motors,
+        Motors,
+        Motors,
+        f64,
+        f64,
+        f64,
+    ) = object.extract()?;
+    let motors = position.len();
+    if motors > MOTORS || torque.len() != motors {
+        return Err(PyValueError::new_err(format!("sample: expected at most {MOTORS} motors, got {motors}")));
+    }
+    let of_motors = |values: &Motors| std::array::from_fn(|i| values.get(i).copied().unwrap_or(f64::NAN));
+    let sample = Sample {
+        sequence,
+        motor_position: of_motors(&position),
+        motor_velocity: of_motors(&velocity),
+        motor_torque: of_motors(&torque),
+        link_position,
+        link_velocity,
+        external_torque,
+    };
+    Ok((sample, motors))
+}
+
+pub(super) fn estimate_object<'py>(py: Python<'py>, e: &Estimate) -> PyResult<Bound<'py, PyAny>> {
+    let types = types(py)?;
+    let transmissions = e.transmissions[..e.motors]
+        .iter()
+        .map(|t| {
+            let numbers = (t.flexibility_torque, t.stiffness, t.stiffness_std, t.deflection);
+            types.transmission.bind(py).call1(numbers)
+        })
+        .collect::<PyResult<Vec<_>>>()?;
+    types.estimate.bind(py).call1((
+        e.sequence,
+        e.status,
+        e.flexibility_torque,
+        e.stiffness,
+        e.stiffness_std,
+        PyTuple::new(py, transmissions)?,
+    ))
+}
+
+/// The fields of an `Estimate`, with any number of transmissions.
+pub(super) type EstimateFields = (u64, i64, f64, f64, f64, Vec<(f64, f64, f64, f64)>);
+
+pub(super) fn transmission_of(numbers: (f64, f64, f64, f64)) -> TransmissionEstimate {
+    let (flexibility_torque, stiffness, stiffness_std, deflection) = numbers;
+    TransmissionEstimate { flexibility_torque, stiffness, stiffness_std, deflection }
+}
+
+pub(super) fn estimate_from(object: &Bound<'_, PyAny>) -> PyResult<Estimate> {
+    let (sequence, status, flexibility_torque, stiffness, stiffness_std, each): EstimateFields =
+        object.extract()?;
+    if each.len() > MOTORS {
+        let message = format!("estimate: expected at most {MOTORS} transmissions, got {}", each.len());
+        return Err(PyValueError::new_err(message));
+    }
+    let mut transmissions = [TransmissionEstimate::NOTHING; MOTORS];
+    for (to, from) in transmissions.iter_mut().zip(&each) {
+        *to = transmission_of(*from);
+    }
+    Ok(Estimate {
+        sequence,
+        status: status as u32,
+        flexibility_torque,
+        stiffness,
+        stiffness_std,
+        transmissions,
+        motors: each.len(),
+    })
+}
+
+/// The bytes of `<prefix>/<joint>/estimate`.
+#[pyfunction]
+pub(super) fn encode_estimate<'py>(
+    py: Python<'py>,
+    estimate: &Bound<'py, PyAny>,
+    stamp_ns: u64,
+) -> PyResult<Bound<'py, PyBytes>> {
+    let (sequence, status, torque, stiffness, std, each): EstimateFields = estimate.extract()?;
+    if each.len() > wire::MOST_ELEMENTS {
+        let message =
+            format!("estimate: expected at most {} transmissions, got {}", wire::MOST_ELEMENTS, each.len());
+        return Err(PyValueError::new_err(message));
+    }
+    let transmissions: Vec<_> = each.into_iter().map(transmission_of).collect();
+    let joint = [torque, stiffness, std];
+    let payload = wire::encode_estimate(sequence, stamp_ns, status as u32, joint, &transmissions);
+    Ok(PyBytes::new(py, payload.bytes()))
+}
+
+/// The bytes of `<prefix>/<joint>/sample`.
+#[pyfunction]
+pub(super) fn encode_sample<'py>(
+    py: Python<'py>,
+    sample: &Bound<'py, PyAny>,
+    stamp_ns: u64,
+) -> PyResult<Bound<'py, PyBytes>> {
+    let (sample, motors) = sample_from(sample)?;
+    Ok(PyBytes::new(py, wire::encode_sample(&sample, motors, stamp_ns).bytes()))
+}
+
+/// The fields of an `External`.
+pub(super) type ExternalFields = (u64, u32, f64, f64, f64, f64);
+
+pub(super) fn external_of(fields: ExternalFields) -> External {
+    let (sequence, status, torque, torque_std, link_torque, difference) = fields;
+    External { sequence, status, torque, torque_std, link_torque, difference }
+}
+
+/// The bytes of `<prefix>/<joint>/external`.
+#[pyfunction]
+pub(super) fn encode_external<'py>(
+    py: Python<'py>,
+    external: &Bound<'py, PyAny>,
+    stamp_ns: u64,
+) -> PyResult<Bound<'py, PyBytes>> {
+    let external = external_of(external.extract()?);
+    Ok(PyBytes::new(py, wire::encode_external(&external, stamp_ns).bytes()))
+}
+
+pub(super) fn mapped_from(py: Python<'_>, object: &Bound<'_, PyAny>) -> PyResult<MappedObject> {
+    let signal = match object.getattr("signal")?.extract::<String>()?.as_str() {
+        "motor_position" => Signal::MotorPosition,
+        "motor_velocity" => Signal::MotorVelocity,
+        "motor_torque" => Signal::MotorTorque,
+        "statusword" => Signal::Statusword,
+        "link_position" => Signal::LinkPosition,
+        "link_velocity" => Signal::LinkVelocity,
+        "velocity_check" => Signal::VelocityCheck,
+        "torque_check" => Signal::TorqueCheck,
+        "second_position" => Signal::SecondPosition,
+        "following_error" => Signal::FollowingError,
+        "position_demand" => Signal::PositionDemand,
+        _ => Signal::Other,
+    };
+    let bits: u32 = object.getattr("bits")?.extract()?;
+    if bits > 64 && signal != Signal::Other {
+        let (index, subindex): (u32, u32) =
+            (object.getattr("index")?.extract()?, object.getattr("subindex")?.extract()?);
+        let message = format!("0x{index:04X}:{subindex:02X}: expected at most 64 bits, got {bits}");
+        return Err(drive_error(py, message));
+    }
+    let modulus: i128 = object.getattr("modulus")?.extract()?;
+    let range = match (object.getattr("wraps")?.extract::<bool>()?, modulus) {
+        (false, _) => 0,
+        (true, 0) => 1 << bits,
+        (true, modulus) => modulus,
+    };
+    Ok(MappedObject {
+        signal,
+        bits,
+        signed: object.getattr("signed")?.extract()?,
+        scale: object.getattr("scale")?.extract()?,
+        offset: object.getattr("offset")?.extract()?,
+        range,
+    })
+}
+
+pub(super) fn layout_from(py: Python<'_>, layout: &Bound<'_, PyAny>) -> PyResult<Node> {
+    let tpdos = layout.getattr("tpdos")?.try_iter()?.map(|tpdo| {
+        let tpdo = tpdo?;
+        let objects = tpdo.getattr("objects")?.try_iter()?.map(|each| mapped_from(py, &each?));
+        Ok(Tpdo {
+            cob_id: tpdo.getattr("cob_id")?.extract::<u32>()? & 0x7FF,
+            objects: objects.collect::<PyResult<_>>()?,
+            transmission_type: tpdo.getattr("transmission_type")?.extract()?,
+        })
+    });
+    Ok(Node {
+        node_id: layout.getattr("node_id")?.extract()?,
+        motor: layout.getattr("motor")?.extract()?,
+        tpdos: tpdos.collect::<PyResult<_>>()?,
+    })
+}

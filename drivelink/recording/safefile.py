@@ -5,8 +5,6 @@ from __future__ import annotations
 import io
 import os
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from drivelink.errors import RecordingError
 from drivelink.output.outfile import NewFile
@@ -101,14 +99,6 @@ class SafeFile(io.BufferedIOBase):
         self._pending.clear()
         self._file.close()
         super().close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _put(self, data: bytes, offset: int) -> None:
         fd, done = self._file.fd, 0

@@ -77,8 +77,8 @@ class Constant(NamedTuple):
 
     @property
     def fits(self) -> bool:
-        """Whether anything else does."""
-        return self._read("estimator/*.py") or self._read("estimator/diagnosis/*.py")
+        """Whether anything else does: whatever the gate does not name may be read through a function."""
+        return not self.gate or self._read("estimator/*.py") or self._read("estimator/diagnosis/*.py")
 
     def _read(self, modules: str) -> bool:
         name = self.name if self.key is None else f'"{self.key}"'

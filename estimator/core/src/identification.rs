@@ -15,6 +15,7 @@ mod target_law;
 mod units;
 
 use crate::change_detection::{SURE, TAILS};
+use crate::friction::{Friction, SHAPES};
 use crate::isolation::Isolation;
 use crate::kalman::{Kalman, NUISANCES, SIZE, Vector};
 use crate::laws::{Law, PARAMETERS};
@@ -83,6 +84,8 @@ pub struct OnlineIdentification {
     law: Linearisation,
     units: Units,
     resolution: f64,
+    friction: Friction,
+    undeclared: [f64; SHAPES], // friction that the last equation may hold, scaled
     kalman: Option<Kalman>,
     reference: Option<Kalman>, // what was learned some time ago, while all was well …
     candidate: Option<Kalman>, // … and what is to be it next
@@ -136,6 +139,8 @@ impl OnlineIdentification {
             law: Linearisation::new(Law::Polynomial, 0, [0.0; PARAMETERS]),
             units: NO_UNITS,
             resolution: 0.0,
+            friction: Friction::default(),
+            undeclared: [0.0; SHAPES],
             kalman: None,
             reference: None,
             candidate: None,
@@ -164,6 +169,7 @@ impl OnlineIdentification {
         alpha0[..known].copy_from_slice(&self.known[..known]);
         self.law = Linearisation::new(law, size, alpha0);
         self.units = NO_UNITS;
+        self.friction = Friction::default();
         (self.updates, self.delay_at, self.order_at) = (0, 0, self.updates_in(ORDER_S));
         self.values = [0.0; SIZE];
     }
@@ -297,7 +303,14 @@ impl OnlineIdentification {
             *entry *= unit / self.units.torque;
         }
         y /= self.units.torque;
+        let share = self.priors.coulomb_friction / self.units.torque;
+        self.undeclared = self.friction.torques(signals, k).map(|torque| share * torque);
         (row, y)
+    }
+
+    /// How motor and torque move: the measure of friction that nobody declared.
+    pub fn observe_motion(&mut self, signals: &Signals) {
+        self.friction.see(signals, MEMORY_S / self.dt);
     }
 
     // -- before any equation -----------------------------------------------------------------------
@@ -355,7 +368,7 @@ impl OnlineIdentification {
         if noisy {
             kalman.learn_noise(innovation, predicted_variance);
         }
-        kalman.update(h, innovation, NOISE_FLOOR);
+        kalman.update(h, innovation, NOISE_FLOOR, &self.undeclared);
         kalman.remember(innovation, predicted_variance);
         self.updates = self.updates.saturating_add(1);
         if self.updates % self.updates_in(OFTEN_S) == 0 {
@@ -463,13 +476,14 @@ impl OnlineIdentification {
         self.unscale();
     }
 
-    /// Standard deviation of σ at φ, from the covariance of α, of the delay and the offset, and of φ.
+    /// Standard deviation of σ at φ, from the covariance of α, of the delay and the offset, from friction that nobody
+    /// declared, and of φ.
     #[must_use]
     pub fn stiffness_std(&self, phi: f64, link_rate: f64, phi_variance: f64) -> f64 {
         let (n, mut row) = (self.law.size, [0.0; SIZE]);
         let slope = self.law.law.stiffness_slopes(phi, &self.values[..n], &mut row[..n]);
         (row[n + DELAY], row[n + DEFLECTION_OFFSET]) = (slope * link_rate, slope);
-        (self.variance_of(row) + slope * slope * phi_variance).sqrt()
+        (self.variance_of(row) + self.considered_variance(row) + slope * slope * phi_variance).sqrt()
     }
 
     /// Variance of f at a φ that is known but for its offset, from the covariance of α and of that.
@@ -481,12 +495,21 @@ impl OnlineIdentification {
         self.variance_of(row)
     }
 
-    /// Variance of what has these slopes by the parameters; NaN before there are any.
-    fn variance_of(&self, mut slopes: Vector) -> f64 {
+    fn scaled(&self, mut slopes: Vector) -> Vector {
+        slopes.iter_mut().zip(&self.units.of).for_each(|(slope, unit)| *slope *= unit);
+        slopes
+    }
+
+    /// What friction that nobody declared adds to the variance of what has these slopes by the parameters.
+    fn considered_variance(&self, slopes: Vector) -> f64 {
         let Some(kalman) = &self.kalman else { return f64::NAN };
-        for (slope, unit) in slopes.iter_mut().zip(&self.units.of) {
-            *slope *= unit;
-        }
+        kalman.considered_variance(&self.scaled(slopes))
+    }
+
+    /// Variance of what has these slopes by the parameters; NaN before there are any.
+    fn variance_of(&self, slopes: Vector) -> f64 {
+        let Some(kalman) = &self.kalman else { return f64::NAN };
+        let slopes = self.scaled(slopes);
         let sandwich = dot(&slopes, &times(&kalman.sigma, &slopes));
         let honest = UNSEEN * UNSEEN * kalman.variance_over_scale() * sandwich;
         honest.max(LEAST_VARIANCE * dot(&slopes, &times(&kalman.p, &slopes))).max(0.0)
@@ -497,10 +520,10 @@ impl OnlineIdentification {
         let kalman = self.kalman.as_ref().filter(|_| !self.black_box)?;
         for i in 0..self.law.size {
             values.push(self.values[i]);
-            std.push(
-                (UNSEEN * UNSEEN * kalman.variance_over_scale() * kalman.sigma[i][i].max(0.0)).sqrt()
-                    * self.units.of[i],
-            );
+            let mut slopes = [0.0; SIZE];
+            slopes[i] = 1.0;
+            let variance = UNSEEN * UNSEEN * kalman.variance_over_scale() * kalman.sigma[i][i].max(0.0);
+            std.push((variance + kalman.considered_variance(&slopes)).sqrt() * self.units.of[i]);
         }
         Some(&self.law.law)
     }

@@ -5,6 +5,8 @@
 //! gains under noise with the autocorrelation measured on the innovations (the sandwich of a misspecified
 //! likelihood, White 1982, one equation at a time). P decides the gains, Σ is what is published.
 
+use crate::consider::Considered;
+use crate::friction::SHAPES;
 use crate::laws::PARAMETERS;
 use crate::linear_algebra::{congruent, dot, is_positive, symmetric, times};
 
@@ -17,7 +19,8 @@ pub type Vector = [f64; SIZE];
 /// A matrix of parameters, padded with zeros.
 pub type Matrix = [Vector; SIZE];
 
-const LAGS: usize = 16; // updates over which the noise is correlated
+const LAGS: usize = 16; // updates over which the noise is correlated …
+const FILTERED: usize = 2; // … and over which it is by the filters alone
 const MEMORY: f64 = 500.0; // updates over which the noise's autocorrelation is averaged
 const QUICK: f64 = 3.0; // the noise is an average over this share, one in so many, of the updates so far
 const HALVED: f64 = 6.0; // updates in which the noise assumed at the start may at most be halved
@@ -42,7 +45,8 @@ pub struct Kalman {
     /// How much larger a variance is than Σ has it, as it was estimated from few independent errors.
     pub caution: f64,
     growth: f64,
-    grow: Vector,          // √growth; 1 for what is not forgotten
+    grow: Vector, // √growth; 1 for what is not forgotten
+    considered: Considered,
     gains: [Vector; LAGS], // what is left of past gains in the estimate, newest first
     past: [f64; LAGS],     // past innovations, newest first
     r: [f64; LAGS],
@@ -78,6 +82,7 @@ impl Kalman {
             caution: 1.0,
             growth,
             grow: [growth.sqrt(); SIZE],
+            considered: Considered::default(),
             gains: [[0.0; SIZE]; LAGS],
             past: [0.0; LAGS],
             r: [0.0; LAGS],
@@ -129,7 +134,7 @@ impl Kalman {
     /// Take one innovation into the noise's autocorrelation.
     pub fn learn_noise(&mut self, innovation: f64, predicted_variance: f64) {
         self.count += 1.0;
-        let gain = (QUICK / (self.count + QUICK)).max(1.0 / MEMORY);
+        let gain = self.share();
         let e = self.noisy(innovation, predicted_variance);
         // As many parameters as there have been equations explain anything: the start is not believed.
         let least = self.assumed * 0.5f64.powf(self.count / HALVED);
@@ -137,6 +142,21 @@ impl Kalman {
         for lag in 0..LAGS {
             self.r[lag] += gain * (e * self.past[lag] - self.r[lag]);
         }
+    }
+
+    /// Of one innovation in the averages.
+    fn share(&self) -> f64 {
+        (QUICK / (self.count + QUICK)).max(1.0 / MEMORY)
+    }
+
+    /// Variance that disturbances which are not estimated add to what has these slopes by x.
+    #[must_use]
+    pub fn considered_variance(&self, slopes: &Vector) -> f64 {
+        // Root mean square of the autocorrelation beyond the filters', as far as so few innovations show it.
+        let beyond = &self.r[FILTERED..];
+        let square = beyond.iter().map(|r| r * r).sum::<f64>() / beyond.len() as f64;
+        let correlated = (square + self.share() * self.noise * self.noise).sqrt().min(self.noise);
+        self.considered.variance(slopes, correlated.max(1e-300))
     }
 
     /// Shift the record of past innovations; after `learn_noise`, which wants those before this one.
@@ -174,8 +194,8 @@ impl Kalman {
         freedom / (freedom - 2.0)
     }
 
-    /// One equation: its row, its innovation, and the least noise variance to reckon with.
-    pub fn update(&mut self, h: &Vector, innovation: f64, floor: f64) {
+    /// One equation: its row, its innovation, the least noise variance to reckon with, and what it may hold besides.
+    pub fn update(&mut self, h: &Vector, innovation: f64, floor: f64, disturbances: &[f64; SHAPES]) {
         let n = self.n;
         let mut ph = times(&self.p, h);
         let mut predicted_variance = dot(h, &ph);
@@ -196,6 +216,8 @@ impl Kalman {
             }
         }
         self.carry(h, &gain, noise);
+        let known = noise / (predicted_variance + noise);
+        self.considered.update(h, &gain, disturbances, known, self.share());
         self.caution = self.few();
         self.keep_bounded();
     }
@@ -331,6 +353,7 @@ impl Kalman {
         for (new, old) in new.gains.iter_mut().zip(&self.gains) {
             *new = times(change, old);
         }
+        new.considered.transform(change);
         for i in 0..new.n {
             new.ceiling[i] = new.ceiling[i].max(new.p[i][i]);
         }
@@ -350,6 +373,7 @@ impl Kalman {
         }
         // A gain is parameters over innovation.
         self.gains.iter_mut().flatten().for_each(|gain| *gain /= noise);
+        self.considered.rescale(ratio, noise);
         self.noise *= noise * noise;
         self.assumed *= noise * noise;
         self.r.iter_mut().for_each(|r| *r *= noise * noise);
@@ -378,6 +402,7 @@ impl Kalman {
                     gain[i] * gain[j] * (corner + variance) - gain[i] * row[j] - row[i] * gain[j];
             }
         }
+        self.considered.draw(index, &gain);
         for left in &mut self.gains {
             let drawn = left[index];
             for i in 0..n {
@@ -401,7 +426,7 @@ mod tests {
             let innovation = kalman.innovation(&h, y);
             let predicted_variance = kalman.predicted_variance(&h);
             kalman.learn_noise(innovation, predicted_variance);
-            kalman.update(&h, innovation, 1e-10);
+            kalman.update(&h, innovation, 1e-10, &[0.0; SHAPES]);
             kalman.remember(innovation, predicted_variance);
         }
         assert!((kalman.x[0] - 2.0).abs() < 1e-4 && (kalman.x[1] + 3.0).abs() < 1e-4);
@@ -423,7 +448,7 @@ mod tests {
             let innovation = kalman.innovation(&h, y);
             let predicted_variance = kalman.predicted_variance(&h);
             kalman.learn_noise(innovation, predicted_variance);
-            kalman.update(&h, innovation, 1e-10);
+            kalman.update(&h, innovation, 1e-10, &[0.0; SHAPES]);
             kalman.remember(innovation, predicted_variance);
         }
         assert!((kalman.p[0][0] * 2000.0 - 1.0).abs() < 0.15, "{}", kalman.p[0][0] * 2000.0);
@@ -436,7 +461,7 @@ mod tests {
         let mut kalman = Kalman::new(&[1.0, 2.0], &[1.0, 3.0], 0.1, 1.0);
         let mut h = [0.0; SIZE];
         (h[0], h[1]) = (0.4, -0.2);
-        kalman.update(&h, 0.3, 1e-10);
+        kalman.update(&h, 0.3, 1e-10, &[0.0; SHAPES]);
         let before = (dot(&h, &kalman.x), kalman.predicted_variance(&h));
         let mut ratio = [1.0; SIZE];
         (ratio[0], ratio[1]) = (2.0, 5.0);

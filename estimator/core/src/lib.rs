@@ -10,6 +10,7 @@
 
 pub mod align;
 pub mod change_detection;
+pub mod consider;
 pub mod corrections;
 pub mod deflection;
 pub mod delay;
@@ -18,6 +19,7 @@ pub mod error;
 pub mod estimator;
 pub mod external;
 pub mod filters;
+pub mod friction;
 pub mod identification;
 pub mod isolation;
 pub mod kalman;

@@ -308,6 +308,9 @@ impl TransmissionEstimator {
             !self.changes.changed(),
             self.dt,
         );
+        if now.usable && self.excited {
+            self.identification.observe_motion(&self.signals);
+        }
         self.identification.observe_noise(resolution);
         // How large motion is: what is not explained does not tell.
         if now.usable && !self.changes.changed() && !self.is_beyond_noise(now) {

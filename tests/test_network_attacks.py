@@ -326,7 +326,16 @@ def test_nothing_that_is_published_ends_the_monitor_the_recorder_or_a_client(end
             time.sleep(0.002)
 
         good = encode_estimate(make_estimate(1), time.time_ns())
-        until(lambda: put("estimate", good) or client.received)
+        sample = encode_sample(make_sample(1), time.time_ns())
+
+        def everyone_listens():
+            put("estimate", good)
+            put("sample", sample)
+            for tap in taps:
+                tap.poll()
+            return client.received and all(tap.newest_s for tap in taps)
+
+        until(everyone_listens)
         for name, payload in attacks:
             put(name, payload)
             watcher.poll()

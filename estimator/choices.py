@@ -111,7 +111,7 @@ CHOICES: dict[str, Choice] = {
     "samples": Choice(300, "", "in a recording at least", "a few for each of the balance's columns"),
     "gaps": Choice(0.2, "samples", "that may be missing", "more is no gap but another sampling rate"),
     # The gate: the balance under a hypothesis about units and signs.
-    "gate_order": Choice(4, "", "of its filters", "two derivatives, and steep beyond the bandwidth"),
+    "falloff": Choice(2, "", "order of its filters beyond their two derivatives", "noise falls off with it"),
     "bands": Choice(5, "", "each with an error of its own", "friction is slow, inertia is fast"),
     "band_ratio": Choice(3.0, "", "of neighbouring bandwidths", "an octave and a half"),
     "band_noise": Choice(

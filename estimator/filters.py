@@ -144,8 +144,13 @@ class StateVariableFilter:
         """
         signal = np.asarray(signal, dtype=np.float64)
         origin = signal[:1]
-        numerators, denominator = _polynomials(self.order, self.bandwidth_rad_s, self.period_s, held)
-        outputs = [linear_filter(numerators[i], denominator, signal - origin) for i in range(derivatives + 1)]
+        numerators, pole = _polynomials(self.order, self.bandwidth_rad_s, self.period_s, held)
+        smoothed = signal - origin
+        for _ in range(
+            self.order
+        ):  # one pole after the other: their product loses all digits at narrow bandwidths
+            smoothed = linear_filter((1.0 - pole,), (1.0, -pole), smoothed)
+        outputs = [linear_filter(numerators[i], (1.0,), smoothed) for i in range(derivatives + 1)]
         outputs[0] = outputs[0] + origin
         return outputs
 
@@ -185,8 +190,8 @@ def _discretise(order: int, bandwidth: float, period: float, *, hold: bool) -> _
 
 
 @lru_cache(maxsize=64)
-def _polynomials(order: int, bandwidth: float, period: float, hold: bool) -> tuple[FloatArray, FloatArray]:
-    """Numerators (order, n+1) of every derivative and the common denominator, in z^-1."""
+def _polynomials(order: int, bandwidth: float, period: float, hold: bool) -> tuple[FloatArray, float]:
+    """Numerators (order, n+1) of every derivative, in z^-1, behind n times (1 - p) / (1 - p z^-1); and p."""
     advance, old, new = _discretise(order, bandwidth, period, hold=hold)
     pole = math.exp(-bandwidth * period)
     denominator = np.asarray(np.poly(np.full(order, pole)), dtype=np.float64)
@@ -201,4 +206,4 @@ def _polynomials(order: int, bandwidth: float, period: float, hold: bool) -> tup
     for k in range(order + 1):
         for j in range(k + 1):
             numerators[:, k] += denominator[j] * markov[k - j]
-    return numerators, denominator
+    return numerators / (1.0 - pole) ** order, pole

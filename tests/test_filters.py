@@ -62,6 +62,23 @@ def test_the_impulse_response_determines_the_filter(held):
         assert got[late] == pytest.approx(expected[late], abs=1e-5 * np.max(np.abs(expected)))
 
 
+@pytest.mark.parametrize("held", [False, True])
+@pytest.mark.parametrize("order", [2, 4, 8])
+def test_a_recording_is_filtered_as_sample_by_sample_however_narrow(order, held):
+    filter_ = StateVariableFilter(order, 3.0, T)
+    step = filter_.held if held else filter_.smooth
+    signal = np.cumsum(np.random.default_rng(4).normal(size=5000))
+    states = np.zeros((len(signal), order))
+    for k in range(1, len(signal)):
+        old, new = signal[k - 1 : k + 1] - signal[0]
+        states[k] = step.advance @ states[k - 1] + step.old * old + step.new * new
+    states[:, 0] += signal[0]
+    for expected, got in zip(states.T, filter_.apply(signal, 1, held=held), strict=False):
+        assert got == pytest.approx(
+            expected, abs=1e-8 * np.max(np.abs(expected))
+        )  # its digits, less the gain's
+
+
 @given(st.integers(1, 6), st.floats(1e-4, 1.0))
 def test_the_exponential_is_scipys(order, bandwidth):
     companion = np.eye(order, k=1) - np.outer(np.eye(order)[-1], critically_damped(order, bandwidth))

@@ -321,7 +321,7 @@ def _filters(theta: FloatArray) -> list[StateVariableFilter]:
     noise = _noise(theta)
 
     def acceleration(w: float) -> tuple[FloatArray, FloatArray]:
-        f = StateVariableFilter(whole("gate_order"), w, 1.0)
+        f = StateVariableFilter(2 + whole("falloff"), w, 1.0)
         return f.apply(theta, 2)[2], f.impulse(f.settling_periods)[:, 2]
 
     w, least = 1.0, 60.0 / len(theta)
@@ -335,4 +335,4 @@ def _filters(theta: FloatArray) -> list[StateVariableFilter]:
             break
         w, wide, pulse = w / choice("band_ratio"), narrow, other
     widths = [w / choice("band_ratio") ** k for k in range(whole("bands"))]
-    return [StateVariableFilter(whole("gate_order"), x, 1.0) for x in widths if x > least or x == w]
+    return [StateVariableFilter(2 + whole("falloff"), x, 1.0) for x in widths if x > least or x == w]

@@ -117,6 +117,7 @@ CHOICES: dict[str, Choice] = {
     "band_noise": Choice(
         0.1, "acceleration power", "in the widest band that may be noise", "it biases the inertia by as much"
     ),
+    "pieces": Choice(8, "", "straight ones of the spring's curve", "a hardening spring is a parabola to 1 %"),
     "gate_rows": Choice(2000, "", "of each band", "more add nothing about scales"),
     "gate_floor": Choice(0.01, "torque rms", "error of any balance", "models of this kind close no better"),
     "independent": Choice(

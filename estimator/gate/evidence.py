@@ -140,15 +140,15 @@ class Balance:
         if ratio not in self._factors:
             self._factors[ratio] = _factors(self._columns(ratio), self._target)
         factors = self._factors[ratio]
-        pieces = slice(len(bounds), len(bounds) + whole("groups") + 2)
+        pieces = slice(len(bounds), len(bounds) + whole("pieces") + 2)
         slope = deflection = 0.0
         if flexible:
-            bounds += [(0.0, -math.copysign(math.inf, b * c))] * (whole("groups") + 2)
+            bounds += [(0.0, -math.copysign(math.inf, b * c))] * (whole("pieces") + 2)
         bounds += [free] * (len(factors.sizes) - len(bounds))
         x, left = _bounded(factors, np.sort(np.array(bounds), axis=1))
         if flexible:
             rises = -math.copysign(1.0, b * c) * x[pieces]
-            slope = float(np.mean(rises[: whole("groups")]) + np.sum(rises[whole("groups") :])) * self._unit
+            slope = float(np.mean(rises[: whole("pieces")]) + np.sum(rises[whole("pieces") :])) * self._unit
             deflection = self._springs[ratio][1]
         errors = np.hypot(left[:-1], choice("gate_floor"))
         score = float(np.sum(np.log(errors)))
@@ -220,9 +220,9 @@ class Balance:
 def _pieces(x: FloatArray) -> list[FloatArray]:
     """Hat functions on evenly spaced knots: a basis for curves of x."""
     low, high = np.quantile(x, (0.002, 0.998))
-    width = max((high - low) / whole("groups"), 1e-300)
-    unders = [-np.inf, *[0.0] * (whole("groups") - 1)]
-    overs = [*[width] * (whole("groups") - 1), np.inf]
+    width = max((high - low) / whole("pieces"), 1e-300)
+    unders = [-np.inf, *[0.0] * (whole("pieces") - 1)]
+    overs = [*[width] * (whole("pieces") - 1), np.inf]
     return [
         np.clip(x - (low + k * width), under, over)
         for k, (under, over) in enumerate(zip(unders, overs, strict=True))

@@ -112,6 +112,7 @@ class Fuzzed:
         return CanFrame(frame.cob_id, bytes(data[: rng.randint(0, 8)]), 0)
 
 
+@pytest.mark.slow
 def test_a_daemon_amid_random_and_mutated_frames_goes_on_and_recovers() -> None:
     with rig() as made:
         made.run(1500)

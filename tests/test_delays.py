@@ -57,6 +57,7 @@ def test_fit_writes_a_delay_of_two_samples_and_none_of_tens_of_milliseconds() ->
     assert abs(found.fits[0].alpha[0] - kit.STIFFNESS) < 3.0 * np.sqrt(found.fits[0].covariance[0, 0])
 
 
+@pytest.mark.slow
 def test_diagnose_names_no_delay_of_tens_of_milliseconds() -> None:
     (record,) = kit.World([{"late_s": 0.030}]).run()
     found = diagnose(record, kit.model(), 15.0)

@@ -126,6 +126,7 @@ def test_what_no_function_of_one_coordinate_explains_is_never_sufficient(
         assert found.validation.after_rms_nm < 0.5 * found.validation.before_rms_nm
 
 
+@pytest.mark.slow
 def test_a_ripple_of_less_than_two_periods_may_be_of_the_motor_or_of_the_gear() -> None:
     """Motor side alone, a linear spring: both give the same torque."""
 

@@ -71,6 +71,7 @@ def test_parts_of_a_recording_agree_within_what_is_said_though_physics_is_missin
     assert 0.4 < ratio < 1.75
 
 
+@pytest.mark.slow
 def test_an_effect_that_moves_the_stiffness_is_in_the_interval_of_a_fit() -> None:
     """Undeclared hysteresis, which stiffens the joint in all parts of the motion alike."""
     missing = [{"hysteresis_nm": nm, "hysteresis_rad": rad} for nm, rad in ((0.6, 0.01), (2.0, 0.05))]

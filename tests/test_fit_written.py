@@ -126,7 +126,7 @@ def _same(printed: list[tuple[str, str]], written: dict[str, float]) -> None:
         assert text == f"{written[name]:.6g}", name
 
 
-@pytest.mark.parametrize("run", ["clean", "skewed"])
+@pytest.mark.parametrize("run", ["clean", pytest.param("skewed", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("link", ["", LINK], ids=["no link dynamics", "link dynamics"])
 @pytest.mark.parametrize("model", ["linear", "polynomial"])
 def test_what_is_printed_is_what_is_written(

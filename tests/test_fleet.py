@@ -186,6 +186,7 @@ def test_a_remote_storage_holds_recordings_and_results(fleet: Path, joints: Join
     assert [r["id"] for r in read_rows(Store("memory://plant/out"))] == [row["id"]]
 
 
+@pytest.mark.slow
 def test_recordings_come_over_http_and_an_mcap_brings_its_joint(
     fleet: Path, joints: Joints, tmp_path: Path
 ) -> None:

@@ -63,6 +63,7 @@ def model() -> JointModel:
     return kit.model(linked=False)
 
 
+@pytest.mark.slow
 def test_a_true_model_leaves_as_much_in_data_that_took_no_part(model: JointModel) -> None:
     first, second = (kit.World([{}], seed=seed).run()[0] for seed in (21, 22))
     alone, both = Problem([first], model, BANDWIDTH_HZ), Problem([first, second], model, BANDWIDTH_HZ)

@@ -257,6 +257,7 @@ def test_no_float_makes_a_tick_raise(rows, mode, model):
             assert len(out.transmissions) == 1
 
 
+@pytest.mark.slow
 def test_vsa_ii_is_found_from_nothing_on_both_sides():
     n = 10_000
     t = np.arange(n) * T

@@ -4,6 +4,7 @@ from functools import lru_cache
 
 import joints
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -71,6 +72,7 @@ def run_spoilt(stiff, j, seed, order):
     return np.abs(out[:, 3] - sigma), out[:, 4], sigma, out[:, 1].astype(int)
 
 
+@pytest.mark.slow
 @settings(max_examples=5, deadline=None, derandomize=True)
 @given(st.booleans(), st.integers(0, N - 1), st.sampled_from(range(64)), st.sampled_from([2, 3, None]))
 def test_what_is_called_valid_is_no_nonsense(stiff, j, seed, order):

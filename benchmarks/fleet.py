@@ -31,6 +31,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+import dask
 import fleet_world
 import numpy as np
 import psutil
@@ -54,14 +55,29 @@ def prepared(args: argparse.Namespace) -> Path:
     return folder
 
 
+def _certified(folder: Path) -> None:
+    """A certificate for scheduler, workers and clients, as docs/how-to/fleet.md makes it."""
+    key, certificate = folder / "fleet.key", folder / "fleet.pem"
+    new = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-subj", "/CN=fleet"]
+    command = ["openssl", "req", "-x509", *new, "-keyout", str(key), "-out", str(certificate)]
+    subprocess.run(command, check=True, capture_output=True)
+    roles = {role: {"cert": str(certificate), "key": str(key)} for role in ("scheduler", "worker", "client")}
+    tls = {"ca-file": str(certificate), **roles}
+    config = {"distributed": {"comm": {"require-encryption": True, "tls": tls}}}
+    (folder / "dask.json").write_text(json.dumps(config), encoding="utf-8")
+    os.environ["DASK_CONFIG"] = str(folder / "dask.json")
+    dask.config.update(dask.config.config, config)
+
+
 @contextlib.contextmanager
 def cluster(folder: Path, workers: int) -> Iterator[str]:
     """A scheduler and workers, each a process of its own, on loopback; yields its address."""
     file = folder / f"scheduler-{os.getpid()}.json"
     file.unlink(missing_ok=True)
+    _certified(folder)
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    begin = [BIN / "dask", "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
-    processes = [subprocess.Popen([*begin, "--scheduler-file", file], **quiet)]
+    begin = [BIN / "dask", "scheduler", "--protocol", "tls", "--host", "127.0.0.1", "--port", "0"]
+    processes = [subprocess.Popen([*begin, "--no-dashboard", "--scheduler-file", file], **quiet)]
     try:
         while not file.exists():
             time.sleep(0.1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import shutil
@@ -12,6 +13,8 @@ import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
+from urllib.error import HTTPError
+from urllib.request import urlopen
 
 import diagnosiskit as kit
 import fleetkit
@@ -396,10 +399,21 @@ def test_from_recordings_to_a_page(fleet: Path, tmp_path: Path, capsys: pytest.C
 
 @pytest.mark.slow
 def test_a_killed_worker_loses_nothing_and_doubles_nothing(fleet: Path, tmp_path: Path) -> None:
-    from distributed import Client, LocalCluster
+    import dask
+    from distributed import Client, LocalCluster, Security
 
+    secret, files = Security.temporary(), {}
+    for name in ("ca-file", "client.cert", "client.key"):
+        path = tmp_path / name
+        path.write_text(getattr(secret, f"tls_{name.replace('-', '_').replace('.', '_')}"))
+        files[f"distributed.comm.tls.{name}"] = str(path)
     sources, _ = storage.find([str(fleet / "recordings")])
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0") as cluster:
+    with (
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0", security=secret
+        ) as cluster,
+        dask.config.set(files),
+    ):
         address, killed = cluster.scheduler_address, []
 
         def kill_one(counts: runner.Counts) -> None:
@@ -467,12 +481,58 @@ def test_what_a_user_gets_wrong_is_one_line(
     assert len(error) <= 2
 
 
+def test_nobody_without_the_certificate_of_the_run_gets_into_the_local_cluster() -> None:
+    from distributed import Security
+    from distributed.core import rpc
+
+    async def called(address: str, security: Security | None) -> str:
+        arguments = security.get_connection_args("client") if security else {}
+        try:
+            async with rpc(address, connection_args=arguments, timeout=3) as peer:
+                return str((await peer.identity())["type"])
+        except OSError:
+            return "refused"
+
+    with runner._client(runner.Settings(workers=1), 1) as client:
+        workers = client.scheduler_info(n_workers=-1)["workers"]
+        doors = [client.scheduler.address, *workers, *(one["nanny"] for one in workers.values())]
+        assert len(doors) == 3
+        for address in doors:
+            plain = address.replace("tls://", "tcp://")
+            assert asyncio.run(called(address, client.security)) != "refused"
+            assert asyncio.run(called(address, Security.temporary())) == "refused"
+            assert asyncio.run(called(plain, None)) == "refused"
+        (worker,) = workers.values()
+        for port in (worker["services"]["dashboard"], client.scheduler_info()["services"].get("dashboard")):
+            if port is not None:
+                with pytest.raises(HTTPError, match="404"):
+                    urlopen(f"http://127.0.0.1:{port}/info/main/workers.html", timeout=5)
+        assert Path(worker["local_directory"]).parents[1].stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.parametrize(
+    ("address", "said"),
+    [
+        ("tcp://127.0.0.1:1", "expected tls://HOST:PORT: without TLS anybody who reaches"),
+        ("127.0.0.1:1", "expected tls://HOST:PORT"),
+        ("tls://127.0.0.1:1", "expected certificates in Dask's configuration"),
+    ],
+)
+def test_a_scheduler_without_certificates_is_refused_in_one_line(
+    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], address: str, said: str
+) -> None:
+    assert run_fleet(fleet, tmp_path, "--scheduler", address) != 0
+    assert said in capsys.readouterr().err.splitlines()[-1]
+
+
 def test_a_scheduler_that_is_not_there_is_one_line(
     fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(runner, "_CONNECT_S", 0.5)
-    assert run_fleet(fleet, tmp_path, "--scheduler", "tcp://127.0.0.1:1") != 0
-    assert "--scheduler tcp://127.0.0.1:1: cannot be reached" in capsys.readouterr().err.splitlines()[-1]
+    assert run_fleet(fleet, tmp_path, "--scheduler", "tcp://127.0.0.1:1", "--insecure") != 0
+    said = capsys.readouterr().err.splitlines()
+    assert "--scheduler tcp://127.0.0.1:1: cannot be reached" in said[-1]
+    assert "anybody who reaches it runs code" in said[0]
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ _SPANS = {"d": 1, "w": 7}
 EPILOG = """\
 examples:
   drivelink fleet night/ --joints joints/ --out fleet/
-  drivelink fleet 's3://plant/2026-11-*/*.mcap' --joints joints/ --scheduler tcp://10.0.0.5:8786
+  drivelink fleet 's3://plant/2026-11-*/*.mcap' --joints joints/ --scheduler tls://10.0.0.5:8786
   drivelink fleet report fleet/                    make the page again from the table
 
 RECORDINGS are files, globs, folders or URLs of fsspec (file:, sftp:, s3:, http:). The joint of a
@@ -56,7 +56,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--since", metavar="DATE", help="omit earlier recordings: 2026-11-22, or 30d, 4w for days, weeks"
     )
     parser.add_argument(
-        "--scheduler", metavar="ADDRESS", help="a running Dask scheduler, e.g. tcp://10.0.0.5:8786"
+        "--scheduler", metavar="ADDRESS", help="a running Dask scheduler, e.g. tls://10.0.0.5:8786"
+    )
+    parser.add_argument(
+        "--insecure",
+        action="store_true",
+        help="accept a scheduler without TLS: anybody who reaches it runs code on its workers",
     )
     parser.add_argument(
         "--workers", type=int, metavar="N", help="processes on this machine (default: one per CPU core)"
@@ -121,6 +126,7 @@ def _settings(args: argparse.Namespace) -> Settings:
         raise UsageError(f"--joints: expected a folder of joint files, there is no {args.joints}")
     settings = Settings(
         scheduler=args.scheduler,
+        insecure=args.insecure,
         workers=args.workers,
         memory=args.memory,
         since=since,
@@ -136,6 +142,11 @@ def _run(args: argparse.Namespace) -> int:
     from drivelink.fleet import runner, storage
     from drivelink.fleet.joints import Joints
 
+    if settings.scheduler and not settings.scheduler.startswith("tls://") and settings.insecure:
+        print(
+            f"--scheduler {settings.scheduler}: without TLS: anybody who reaches it runs code on its workers",
+            file=sys.stderr,
+        )
     joints = Joints.load(args.joints)
     sources, empty = storage.find(args.recordings)
     for pattern in empty:

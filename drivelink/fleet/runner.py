@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ import dask
 from dask.utils import parse_bytes
 from distributed import Client, LocalCluster, as_completed
 from distributed.scheduler import KilledWorker
+from distributed.security import Security
 
 from drivelink import __version__
 from drivelink.fleet.errors import FleetError
@@ -35,7 +37,8 @@ class Settings:
     """Settings of a run.
 
     Attributes:
-        scheduler: address of a running Dask scheduler; None: a local cluster.
+        scheduler: address of a running Dask scheduler, `tls://…`; None: a local cluster.
+        insecure: accept a scheduler without TLS, where anybody who reaches it runs code as its workers' user.
         workers: processes of the local cluster; None: one a core.
         memory: limit of each worker, e.g. "2GiB"; None: equal shares of the local memory, or the limits of
             the scheduler's workers.
@@ -45,6 +48,7 @@ class Settings:
     """
 
     scheduler: str | None = None
+    insecure: bool = False
     workers: int | None = None
     memory: str | None = None
     since: datetime | None = None
@@ -219,32 +223,65 @@ def _client(settings: Settings, tasks: int) -> Iterator[Client]:
         {
             "distributed.comm.timeouts.connect": f"{_CONNECT_S:g}s",
             "distributed.worker.profile.enabled": False,  # a hundred looks a second at every worker's stack
+            "distributed.scheduler.http.routes": [],  # logs and stacks: for nobody
+            "distributed.worker.http.routes": [],
         }
     )
     if settings.scheduler is None:
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
-        with (
-            LocalCluster(
-                n_workers=min(settings.workers or cores, tasks),
-                threads_per_worker=1,
-                processes=True,
-                memory_limit=settings.limit_bytes or "auto",
-                dashboard_address="127.0.0.1:0",  # its port of HTTP: any, and on loopback
-                silence_logs=logging.CRITICAL,
-                preload=["drivelink.fleet.undisturbed"],
-            ) as cluster,
-            Client(cluster, set_as_default=False) as client,
-        ):
+        with _local(settings, tasks) as client:
             yield client
         return
-    try:
-        client = Client(settings.scheduler, timeout=f"{_CONNECT_S:g}s", set_as_default=False)
-    except (OSError, ValueError, TimeoutError) as error:
-        line = " ".join(str(error).split())
-        raise FleetError(f"--scheduler {settings.scheduler}: cannot be reached: {line}") from error
+    client = _remote(settings.scheduler, settings.insecure)
     with client:
         _check_workers(client, settings.scheduler)
         yield client
+
+
+@contextmanager
+def _local(settings: Settings, tasks: int) -> Iterator[Client]:
+    """A cluster on loopback, only for this run: whoever reaches a port of Dask and is let in runs code."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    with (
+        tempfile.TemporaryDirectory(prefix="drivelink-dask-") as folder,
+        LocalCluster(
+            n_workers=min(settings.workers or cores, tasks),
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            security=Security.temporary(),  # in memory, valid for this run
+            local_directory=folder,
+            memory_limit=settings.limit_bytes or "auto",
+            dashboard_address="127.0.0.1:0",  # any port; without routes
+            silence_logs=logging.CRITICAL,
+            preload=["drivelink.fleet.undisturbed"],
+        ) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        yield client
+
+
+def _remote(address: str, insecure: bool) -> Client:
+    """A client of a running scheduler; certificates are those of Dask's configuration.
+
+    Raises:
+        FleetError: without TLS and not `insecure`, without certificates, or not reached.
+    """
+    if not address.startswith("tls://") and not insecure:
+        raise FleetError(
+            f"--scheduler {address}: expected tls://HOST:PORT: without TLS anybody who reaches the scheduler "
+            "runs code on its workers (docs/how-to/fleet.md shows how; --insecure accepts it)"
+        )
+    security = Security()
+    if address.startswith("tls://") and not (security.tls_ca_file and security.tls_client_cert):
+        raise FleetError(
+            f"--scheduler {address}: expected certificates in Dask's configuration: "
+            "distributed.comm.tls.ca-file, .client.cert and .client.key"
+        )
+    try:
+        return Client(address, security=security, timeout=f"{_CONNECT_S:g}s", set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        line = " ".join(str(error).split())
+        raise FleetError(f"--scheduler {address}: cannot be reached: {line}") from error
 
 
 def _check_workers(client: Client, address: str) -> None:

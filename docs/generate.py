@@ -29,6 +29,7 @@ from drivelink.pubsub.wire import ESTIMATE, EXTERNAL, EXTERNAL_BITS, SAMPLE, STA
 from estimator.effects import LIBRARY
 from estimator.errors import EstimatorError
 from estimator.flexibility import TransmissionModel
+from estimator.reasons import REASONS
 from estimator.sample import ExternalStatus, Status
 from estimator.transmissions import MODELS
 from sim.effects import LISTED, UNLISTED, Definition
@@ -263,6 +264,17 @@ def bits_table(flags: type[IntFlag], meanings: Mapping[str, str]) -> str:
     return "\n".join(rows)
 
 
+def reasons_table() -> str:
+    """One row a reason why an estimate is not valid: its sentence, with placeholders."""
+    words = {"{share:.2g}": "44", "{asked:.2g}": "20", "{changes}": "torque gain or stiffness has"}
+    rows = ["| name | sentence, with example numbers |", "|---|---|"]
+    for name, sentence in REASONS.items():
+        for placeholder, example in words.items():
+            sentence = sentence.replace(placeholder, example)
+        rows.append(f"| `{name}` | {sentence} |")
+    return "\n".join(rows)
+
+
 def defaults_table(definitions: Iterable[Definition]) -> str:
     """One row an effect whose parameters have defaults in the simulated world."""
     rows = ["| effect | defaults |", "|---|---|"]
@@ -325,6 +337,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "external": partial(layout_table, EXTERNAL),
     "sample": partial(layout_table, SAMPLE),
     "status bits": partial(bits_table, Status, STATUS_BITS),
+    "reasons": reasons_table,
     "external bits": partial(bits_table, ExternalStatus, EXTERNAL_BITS),
     "effects' defaults": partial(defaults_table, LISTED.values()),
     "unlisted effects": partial(unlisted_effects_table, UNLISTED.values()),

@@ -9,6 +9,7 @@ import numpy as np
 
 from estimator import _core
 from estimator.model import JointModel, Motor, require_finite
+from estimator.reasons import reason_text
 from estimator.sample import Consistency, Estimate, External, Sample
 from estimator.settings import EstimatorSettings
 from estimator.transmissions import MODELS, RIGID, UNKNOWN, transmission_model
@@ -48,6 +49,9 @@ class Estimator(Protocol):
     def parameters(self) -> list[dict[str, Any]]:
         """Current {"model", "parameters", "std"} of each transmission, names as in the joint file."""
 
+    def why(self) -> tuple[str, str] | None:
+        """Why the last estimate is not valid: key of `estimator.reasons.REASONS`, sentence; None: it is."""
+
     def suspicion(self) -> dict[str, Any] | None:
         """The reading that is suspected while readings contradict the model; None: none.
 
@@ -72,6 +76,7 @@ class _Compiled:
     ) -> None:
         self.core = core(model, settings, period_s)
         self._model = model
+        self._asked = settings.valid_within
         self.step = self.core.step
         self.reset = self.core.reset
         self.distrust = self.core.distrust
@@ -95,6 +100,15 @@ class _Compiled:
     def parameters(self) -> list[dict[str, Any]]:
         """See `Estimator`."""
         return [self._named(i, motor) for i, motor in enumerate(self._model.motors)]
+
+    def why(self) -> tuple[str, str] | None:
+        """See `Estimator`."""
+        why = self.core.why()
+        if why is None:
+            return None
+        name, motor, share, changes = why
+        motor = motor if len(self._model.motors) > 1 else 0
+        return name, reason_text(name, motor=motor, share=share, asked=self._asked, changes=changes)
 
     def suspicion(self) -> dict[str, Any] | None:
         """See `Estimator`."""

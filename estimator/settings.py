@@ -24,6 +24,8 @@ class EstimatorSettings:
         k_sigma_2_rad_s: K_sigma,2 of eq 28.
         k_r_s2_rad2: K_R of eq 32.
         k_max: K_max < 2 of eq 33.
+        valid_within: relative standard deviation of the stiffness, at most 1, below which it is valid in
+            robust mode.
         false_alarms_per_hour: of `changed` in robust mode and of the model alarm; a higher rate finds smaller
             changes.
         external_bandwidth_rad_s: of the external torque's filter in robust mode; in mode "paper" K_tau_e.
@@ -44,6 +46,7 @@ class EstimatorSettings:
     k_sigma_2_rad_s: float = 1.0
     k_r_s2_rad2: float = 1900.0
     k_max: float = 1.9
+    valid_within: float = 0.2
     false_alarms_per_hour: float = 1.0
     external_bandwidth_rad_s: float = 200.0
     external_bias_s: float | None = None
@@ -60,6 +63,7 @@ class EstimatorSettings:
             k_sigma_2_rad_s=self.k_sigma_2_rad_s,
             k_r_s2_rad2=self.k_r_s2_rad2,
             k_max=self.k_max,
+            valid_within=self.valid_within,
             false_alarms_per_hour=self.false_alarms_per_hour,
             external_bandwidth_rad_s=self.external_bandwidth_rad_s,
             contact_false_alarms_per_hour=self.contact_false_alarms_per_hour,
@@ -68,4 +72,7 @@ class EstimatorSettings:
             require_finite(0.0, strict=True, external_bias_s=self.external_bias_s)
         if self.contact_torque_nm is not None:
             require_finite(0.0, contact_torque_nm=self.contact_torque_nm)
+        require(
+            self.valid_within <= 1.0, f"valid_within: expected a number in (0, 1], got {self.valid_within}"
+        )
         require(self.k_max < 2.0, f"k_max: expected a number in (0, 2), got {self.k_max}")

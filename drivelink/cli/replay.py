@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
         channel=args.channel,
         names=names,
     )
-    summary = Summary(playback.motors, keep=args.plots is not None)
+    summary = Summary(playback.motors, playback.pipeline.estimator, keep=args.plots is not None)
     begin = time.perf_counter()
     gathered = Gathered(joint, playback.period_s)
     with ExitStack() as stack:
@@ -134,6 +134,8 @@ def _report(
         print(json.dumps(document))
         return
     print(f"{args.file}: {summary.text(took_s)}")
+    for line in summary.reasons():
+        print(f"  not valid in {line}")
     for path in made:
         print(f"plot: {path}")
     if args.out is not None:

@@ -17,6 +17,7 @@ from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor
 from drivelink.jointfile import JointFile
 from drivelink.version import __version__
+from estimator.reasons import why_not_valid
 from estimator.sample import ExternalStatus, Status
 
 _MODEL_ALARM, _STALE = int(Status.MODEL_ALARM), int(Status.STALE)
@@ -122,6 +123,7 @@ class JointStatus:
             "nodes": self._supervisor.node_status(loop_joint),
             "drive_faults": self._faults(),
             "quality": self._quality(),
+            "not_valid": self._not_valid(),
             "transmissions": loop_joint.pipeline.estimator.parameters(),
             "residual_nm": loop_joint.pipeline.estimator.residual_nm,
             "residual_alarm": self._alarm(),
@@ -172,6 +174,12 @@ class JointStatus:
     def _quality(self) -> dict[str, bool]:
         status = self._loop_joint.pipeline.status or 0
         return {name: bool(status & bit) for name, bit in _QUALITY}
+
+    def _not_valid(self) -> str | None:
+        """Why the last estimate is not valid, in one sentence; None: it is, or there is none."""
+        pipeline = self._loop_joint.pipeline
+        why = None if pipeline.status is None else why_not_valid(pipeline.status, pipeline.estimator)
+        return None if why is None else why[1]
 
     def _alarm(self) -> dict[str, Any]:
         monitor = self._loop_joint.pipeline.model_monitor

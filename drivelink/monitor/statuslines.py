@@ -66,6 +66,7 @@ class Shown:
         times: (name, 99th percentile, µs).
         nodes: of the bus.
         wrong: faults and conditions that hold now.
+        not_valid: why the estimate is not valid; empty: it is.
         alarm: whether the model alarm is on.
         location: likely location of the missing effect.
         residual_nm: of the whole model, N·m, or None.
@@ -83,6 +84,7 @@ class Shown:
     times: tuple[tuple[str, float], ...] = ()
     nodes: tuple[NodeState, ...] = ()
     wrong: tuple[str, ...] = ()
+    not_valid: str = ""
     alarm: bool = False
     location: str = ""
     residual_nm: float | None = None
@@ -123,6 +125,7 @@ def shape(status: Mapping[str, Any], model: Mapping[str, Any] | None = None) -> 
         times=tuple((name, p99) for name, p99 in times if p99 is not None),
         nodes=tuple(_node(*entry) for entry in islice(_part(status, "nodes").items(), _MOST)),
         wrong=tuple(wrong),
+        not_valid=_text(status.get("not_valid")),
         alarm=alarm.get("active") is True,
         location=_text(alarm.get("location")),
         residual_nm=_number(status.get("residual_nm")),
@@ -198,7 +201,8 @@ def _improved(model: Mapping[str, Any]) -> tuple[float, float] | None:
 def status_text(status: Mapping[str, Any], model: Mapping[str, Any] | None = None) -> str:
     """Cycle, residual and advice as text, as far as the documents contain them."""
     shown = shape(status, model)
-    return " · ".join(part for part in (_cycle(shown), _cpu(shown), _residual(shown), shown.advice) if part)
+    why = f"not valid: {shown.not_valid}" if shown.not_valid else ""
+    return " · ".join(p for p in (_cycle(shown), _cpu(shown), _residual(shown), why, shown.advice) if p)
 
 
 def _cpu(shown: Shown) -> str:
@@ -227,11 +231,12 @@ def _residual(shown: Shown) -> str:
 
 
 def status_lines(status: Mapping[str, Any], width: int, model: Mapping[str, Any] | None = None) -> list[Text]:
-    """At most five lines of so many characters: cycle, nodes, residual, what to do, what is wrong."""
+    """At most six lines: cycle, nodes, residual, why not valid, what to do, what is wrong."""
     if not status:
         return []
     shown = shape(status, model)
     lines = [_line("cycle", _cycle(shown), width), _nodes(shown, width), _gauges(shown, width)]
+    lines.append(_line("not valid", shown.not_valid, width, "red"))
     if shown.alarm:
         advice = shown.advice if len(shown.advice) + 11 <= width else _SHORT_ADVICE
         lines.append(_line("look here", advice, width, "bold red"))

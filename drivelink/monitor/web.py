@@ -180,6 +180,7 @@ def _describe(shown: Shown) -> dict[str, Any]:
         "nodes": shown.nodes,
         "wrong": shown.wrong,
         "events": shown.events,
+        "not_valid": shown.not_valid,
         "alarm": shown.alarm,
         "advice": shown.advice,
         "residual_nm": shown.residual_nm,

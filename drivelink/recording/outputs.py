@@ -21,6 +21,8 @@ from drivelink.recording.messages import (
     external_row,
 )
 from drivelink.recording.playback import Played
+from estimator.online import Estimator
+from estimator.reasons import why_not_valid
 from estimator.sample import SIGMA_95, FloatArray, Status
 
 _STATUS_EVERY_S = 0.25
@@ -139,9 +141,17 @@ class Publication:
 
 
 class Summary:
-    """Counts cycles, and keeps the columns for plots."""
+    """Counts cycles, and why they are not valid; keeps the columns for plots.
 
-    def __init__(self, motors: int, keep: bool) -> None:
+    Args:
+        motors: of the joint.
+        estimator: of the replay.
+        keep: keep the columns.
+    """
+
+    def __init__(self, motors: int, estimator: Estimator, keep: bool) -> None:
+        self._estimator = estimator
+        self._why: dict[str, tuple[int, str]] = {}  # by its key: cycles, the last sentence
         self.count = self.valid = self.observable = 0
         self._keep = keep
         self._width = len(estimate_columns(motors))
@@ -156,7 +166,10 @@ class Summary:
             self._first_s = played.time_s
         self.count += 1
         status = played.tick.status
-        self.valid += status & _VALID != 0
+        if status & _VALID:
+            self.valid += 1
+        elif (why := why_not_valid(status, self._estimator)) is not None:
+            self._why[why[0]] = self._why.get(why[0], (0, ""))[0] + 1, why[1]
         self.observable += status & _OBSERVABLE != 0
         self._last = played
         if self._keep:
@@ -181,6 +194,13 @@ class Summary:
             f"{estimate.stiffness_nm_rad:.6g}{f' ± {half:.2g}' if half == half else ''} N·m/rad"
         )
 
+    def reasons(self) -> list[str]:
+        """Each reason why cycles are not valid, most frequent first: share of the cycles, last sentence."""
+        return [f"{100 * count / self.count:.1f} % of the cycles: {text}" for count, text in self._sorted()]
+
+    def _sorted(self) -> list[tuple[int, str]]:
+        return sorted(self._why.values(), reverse=True)
+
     def document(self) -> dict[str, Any]:
         """Summary of the replay as a JSON document; non-finite values are None."""
         estimate = self._last.tick.estimate if self._last is not None else None
@@ -190,7 +210,8 @@ class Summary:
         }
         seconds = self._last.time_s - self._first_s if self._last is not None else 0.0
         counts = {"cycles": self.count, "valid": self.valid, "observable": self.observable}
-        return {"seconds": seconds, **counts, "end": end}
+        why = [{"reason": text, "cycles": count} for count, text in self._sorted()]
+        return {"seconds": seconds, **counts, "not_valid": why, "end": end}
 
     def plot(self, folder: Path, title: str) -> list[Path]:
         """Write stiffness over deflection, and torque and stiffness over time."""

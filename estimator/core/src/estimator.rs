@@ -6,6 +6,7 @@ use crate::isolation::Verdict;
 use crate::laws::Law;
 use crate::model::Model;
 use crate::paper::Paper;
+use crate::reasons::Why;
 use crate::robust::Robust;
 use crate::sample::{Estimate, Sample};
 use crate::settings::{Mode, Priors, Settings};
@@ -99,6 +100,15 @@ impl Estimator {
         match self {
             Estimator::Paper(_) => None,
             Estimator::Robust(robust) => robust.suspicion(),
+        }
+    }
+
+    /// Why the last estimate is not valid; `None`: it is, or nothing has been estimated.
+    #[must_use]
+    pub fn why(&self) -> Option<Why> {
+        match self {
+            Estimator::Paper(paper) => paper.why(),
+            Estimator::Robust(robust) => robust.why(),
         }
     }
 

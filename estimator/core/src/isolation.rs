@@ -70,6 +70,26 @@ impl Change {
         Change::MotorDrift,
     ];
 
+    /// Its name in the table of sentences, `estimator/reasons.py`.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Change::Nothing => "nothing",
+            Change::Stiffness => "stiffness",
+            Change::Friction => "friction",
+            Change::TorqueZero => "torque_zero",
+            Change::PositionZero => "position_zero",
+            Change::LinkDelay => "link_delay",
+            Change::MotorScale => "motor_scale",
+            Change::LinkScale => "link_scale",
+            Change::TorqueScale => "torque_scale",
+            Change::MotorDelay => "motor_delay",
+            Change::TorqueDelay => "torque_delay",
+            Change::LinkDrift => "link_drift",
+            Change::MotorDrift => "motor_drift",
+        }
+    }
+
     /// Whether the equation has a parameter for it.
     #[must_use]
     pub fn is_parameter(self) -> bool {

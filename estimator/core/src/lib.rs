@@ -33,6 +33,7 @@ pub mod model_monitor;
 pub mod model_switch;
 pub mod noise;
 pub mod paper;
+pub mod reasons;
 pub mod robust;
 pub mod sample;
 pub mod sample_validator;

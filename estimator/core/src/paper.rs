@@ -7,6 +7,7 @@ use crate::external::{External, PaperMomentum};
 use crate::filters::{first_order_pole, tustin_biquad};
 use crate::laws::{Alpha, Law, PARAMETERS, powers};
 use crate::model::{Arrangement, Model, Motor, Transmission};
+use crate::reasons::{Reason, Why};
 use crate::sample::{Estimate, MOTORS, Sample, TransmissionEstimate, joint_estimate, status};
 use crate::sample_validator::SampleValidator;
 use crate::settings::{Method, Priors, Settings};
@@ -286,6 +287,16 @@ impl Part {
         self.held.flexibility_torque.is_finite() && (self.rigid || significant)
     }
 
+    fn reason(&self) -> Option<Reason> {
+        if self.of_use() {
+            None
+        } else if self.held.flexibility_torque.is_finite() {
+            Some(Reason::Open)
+        } else {
+            Some(Reason::Settling)
+        }
+    }
+
     fn observable(&self) -> bool {
         !self.rigid && self.energy > EXCITED_RAD2_S2
     }
@@ -350,6 +361,13 @@ impl Paper {
             std.push(part.squares.std(&one[..n]));
         }
         Some(Law::Polynomial)
+    }
+
+    /// Why the last estimate is not valid; `None`: it is.
+    #[must_use]
+    pub fn why(&self) -> Option<Why> {
+        let mut reasons = self.parts.iter().enumerate();
+        reasons.find_map(|(i, part)| Some(Why::new(part.reason()?, Some(i))))
     }
 
     /// The estimate at this sample, whatever floats it holds.

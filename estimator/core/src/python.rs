@@ -200,6 +200,7 @@ pub fn settings(given: &Bound<'_, PyAny>) -> PyResult<Settings> {
         k_sigma_2: number("k_sigma_2_rad_s")?,
         k_r: number("k_r_s2_rad2")?,
         k_max: number("k_max")?,
+        valid_within: number("valid_within")?,
         false_alarms_per_hour: number("false_alarms_per_hour")?,
         external_bandwidth: number("external_bandwidth_rad_s")?,
         external_bias_s: given.getattr("external_bias_s")?.extract()?,
@@ -415,6 +416,13 @@ impl Estimator {
             Reason::Frozen => "frozen",
         };
         Some((signal, motor, reason, result.amount, result.std, result.explains))
+    }
+
+    /// Why the last estimate is not valid: (name, motor from 1 or 0, share, names of what may have changed).
+    fn why(&self) -> Option<(&'static str, usize, f64, Vec<&'static str>)> {
+        let why = self.inner.why()?;
+        let motor = why.motor.map_or(0, |motor| motor + 1);
+        Some((why.reason.name(), motor, why.reason.share(), why.changed().collect()))
     }
 
     /// Independent equations of one motor's window, and what it says of every change.

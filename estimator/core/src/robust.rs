@@ -14,6 +14,7 @@ use crate::isolation::Verdict;
 use crate::laws::Law;
 use crate::model::{Arrangement, Model, Motor};
 use crate::noise::NoiseMeter;
+use crate::reasons::{Reason, Why};
 use crate::sample::{Estimate, MOTORS, Sample, TransmissionEstimate, joint_estimate, status};
 use crate::sample_validator::SampleValidator;
 use crate::settings::{Priors, Settings};
@@ -64,6 +65,7 @@ pub struct Robust {
     sequence: u64,                     // of the last sample that was used
     refused: Option<(Suspicion, i64)>, // what was wrong with a sample of late, and for how long that is said
     estimate: Option<Estimate>,
+    why: Option<(Reason, Option<usize>)>, // of the last estimate
 }
 
 impl Robust {
@@ -127,6 +129,7 @@ impl Robust {
             sequence: 0,
             refused: None,
             estimate: None,
+            why: None,
         };
         made.reset();
         Ok(made)
@@ -146,6 +149,7 @@ impl Robust {
         (self.begins, self.jumped) = (true, None);
         (self.tick, self.unsettled, self.said, self.rejected) = (0, self.settle, 0, 0);
         (self.started, self.sequence, self.refused, self.estimate) = (false, 0, None, None);
+        self.why = None;
     }
 
     /// The next sample may not be of its moment: learn nothing until the filters have forgotten it.
@@ -177,6 +181,17 @@ impl Robust {
     #[must_use]
     pub fn suspicion(&self) -> Option<Suspicion> {
         self.refused.map(|(refused, _)| refused).or_else(|| suspected(&self.transmissions))
+    }
+
+    /// Why the last estimate is not valid; `None`: it is.
+    #[must_use]
+    pub fn why(&self) -> Option<Why> {
+        let (reason, motor) = self.why?;
+        let mut why = Why::new(reason, motor);
+        if let (Reason::Changed, Some(motor)) = (reason, motor) {
+            why.changes = self.transmissions[motor].likely_changes();
+        }
+        Some(why)
     }
 
     /// What the window of one motor's balance says of all changes; `None` before there is a reference.
@@ -397,19 +412,21 @@ impl Robust {
 
     /// What is said of a sample that was used.
     fn conclude(&mut self, sequence: u64, flags: u32) -> Estimate {
-        let (mut flags, mut valid, mut observable) = (flags, true, self.flexible && self.unsettled <= 0);
-        let (parts, of_use) = self.read(0.0);
-        for (transmission, of_use) in self.transmissions.iter().zip(of_use) {
-            valid &= of_use;
+        let (mut flags, mut observable) = (flags, self.flexible && self.unsettled <= 0);
+        let (parts, why) = self.read(0.0);
+        self.why = why;
+        for transmission in &self.transmissions {
             if !transmission.is_rigid() {
-                valid &= transmission.deflection.unsettled <= 0;
                 observable &= transmission.excited();
                 if transmission.changed() {
                     flags |= status::CHANGED;
                 }
             }
         }
-        if valid && flags & status::INPUT_REJECTED == 0 {
+        if flags & status::INPUT_REJECTED != 0 {
+            self.why = Some((Reason::Rejected, None));
+        }
+        if self.why.is_none() {
             flags |= status::VALID;
             if observable {
                 flags |= status::OBSERVABLE;
@@ -438,32 +455,40 @@ impl Robust {
         let since = self.rejected as f64 * self.period;
         let Some(last) = self.estimate else {
             let (parts, _) = self.read(0.0);
+            self.why = Some((Reason::Rejected, None));
             return joint_estimate(self.arrangement, sequence, flags, parts, self.motors);
         };
         let mut flags = flags | last.status & (status::CHANGED | status::RESTARTED);
         if since > TRUST_S {
+            self.why = Some((Reason::Rejected, None));
             return Estimate { sequence, status: flags, ..last };
         }
-        let (parts, of_use) = self.read(since);
-        if of_use.iter().all(|of_use| *of_use) {
-            flags |= last.status & status::VALID;
+        let (parts, why) = self.read(since);
+        self.why = if last.status & status::VALID == 0 { self.why } else { why };
+        if self.why.is_none() {
+            flags |= status::VALID;
         }
         joint_estimate(self.arrangement, sequence, flags, parts, self.motors)
     }
 
-    /// Each transmission's estimate, so long after the last sample, and whether it is of use.
-    fn read(&mut self, since_s: f64) -> ([TransmissionEstimate; MOTORS], [bool; MOTORS]) {
+    /// Each transmission's estimate, so long after the last sample, and why one of them is of no use.
+    fn read(&mut self, since_s: f64) -> ([TransmissionEstimate; MOTORS], Option<(Reason, Option<usize>)>) {
         // What has been waited for the latest channel, declared late or found to be.
         let waited = self.corrections.age_s() + self.alignment.periods.abs() * self.period;
-        let (mut parts, mut of_use) = ([TransmissionEstimate::NOTHING; MOTORS], [true; MOTORS]);
+        let (mut parts, mut why) = ([TransmissionEstimate::NOTHING; MOTORS], None);
         for (i, transmission) in self.transmissions.iter_mut().enumerate() {
             let present = Present {
                 phi: self.last.present.deflection(i),
                 behind_s: self.corrections.behind_s(),
                 ahead_s: since_s + waited,
             };
-            (parts[i], of_use[i]) = transmission.estimate(&present, self.filters.delay);
+            let (part, reason) = transmission.estimate(&present, self.filters.delay);
+            parts[i] = part;
+            let unsettled = !transmission.is_rigid() && transmission.deflection.unsettled > 0;
+            let starting = reason == Some(Reason::Unmoved) && self.unsettled > 0;
+            let reason = if unsettled || starting { Some(Reason::Settling) } else { reason };
+            why = why.or(reason.map(|reason| (reason, Some(i))));
         }
-        (parts, of_use)
+        (parts, why)
     }
 }

@@ -39,6 +39,8 @@ pub struct Settings {
     pub k_r: f64,
     /// K_max < 2 of eq 33.
     pub k_max: f64,
+    /// Relative standard deviation of a stiffness below which it is valid, robust mode.
+    pub valid_within: f64,
     /// Of the robust mode's CHANGED.
     pub false_alarms_per_hour: f64,
     /// Of the filter that the link's momentum passes in robust mode, rad/s.
@@ -62,6 +64,7 @@ impl Default for Settings {
             k_sigma_2: 1.0,
             k_r: 1900.0,
             k_max: 1.9,
+            valid_within: 0.2,
             false_alarms_per_hour: 1.0,
             external_bandwidth: 200.0,
             external_bias_s: None,

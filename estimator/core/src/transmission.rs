@@ -1,21 +1,20 @@
 //! One motor and its transmission on line: takes every sample, estimates at every update.
 
-use crate::change_detection::{Action, ChangeDetection, Innovation};
+use crate::change_detection::{Action, ChangeDetection, Innovation, SURE};
 use crate::deflection::{AT_REST, DeflectionFilter, Motion, Present, Tuning};
 use crate::effects::{Coordinates, MotorEffects};
 use crate::external::Carried;
 use crate::identification::OnlineIdentification;
-use crate::isolation::{Change, Verdict};
+use crate::isolation::{CHANGES, Change, Verdict};
 use crate::laws::Law;
 use crate::model::Motor;
+use crate::reasons::Reason;
 use crate::sample::TransmissionEstimate;
 use crate::settings::{Priors, Settings};
 use crate::signals::{Channel, Excitation, Filters, Signals};
 
 const DUE_S: f64 = 0.1; // of updates between two looks at a nonlinear law's linearisation
-/// Relative error up to which an estimate is of use: standard deviation of the stiffness over the stiffness, and rms
-/// of what the curve leaves of the balance over the balance's own. Above it, the 95 % interval is wider than
-/// 0.6 to 1.4 times the number.
+/// Up to which a curve explains the balance: rms of what it leaves over the balance's own.
 const USEFUL: f64 = 0.2;
 const DRIFT: f64 = 1e-4; // relative growth of the standard deviation per second held
 const RESTED_S: f64 = 0.05; // without motion: from then on the interval grows …
@@ -61,7 +60,16 @@ impl Fit {
 
     /// Whether what is missed is at most this share of the balance, in rms.
     fn is_good(&self, share: f64) -> bool {
-        self.missed <= share * share * self.varies.max(QUIET * self.varied)
+        self.missed <= share * share * self.lively()
+    }
+
+    /// What is missed as a share of the balance, in rms.
+    fn share(&self) -> f64 {
+        (self.missed / self.lively()).sqrt()
+    }
+
+    fn lively(&self) -> f64 {
+        self.varies.max(QUIET * self.varied)
     }
 }
 
@@ -74,6 +82,7 @@ pub struct TransmissionEstimator {
     dt: f64,
     rigid: bool,
     effects: MotorEffects,
+    valid_within: f64,
     rate_gain: f64,
     signals: Signals,
     /// x_motor − x_transmission, the latest that is known, N·m.
@@ -95,6 +104,7 @@ pub struct TransmissionEstimator {
     std: f64,
     torque_variance: f64,
     reach: f64,
+    doubt: Option<Reason>, // why the curve is not used, whatever the deflection
     held_s: f64,
     trusted: bool,
     lead: f64,
@@ -126,6 +136,7 @@ impl TransmissionEstimator {
             dt: dt_s,
             rigid: !motor.flexible(),
             effects,
+            valid_within: settings.valid_within,
             rate_gain: filters.rate_gain(period_s),
             signals: Signals::new(
                 filters,
@@ -149,6 +160,7 @@ impl TransmissionEstimator {
             std: f64::NAN,
             torque_variance: f64::NAN,
             reach: 0.0,
+            doubt: None,
             held_s: 0.0,
             trusted: false,
             lead: f64::NAN,
@@ -182,7 +194,7 @@ impl TransmissionEstimator {
         self.usual = [(Fit::default(), AT_REST, [0.0; 3]); 2];
         (self.concluded, self.std, self.reach, self.held_s, self.trusted) =
             (false, f64::NAN, 0.0, 0.0, false);
-        (self.acting, self.stiffness, self.unmodelled) = (0.0, 0.0, f64::INFINITY);
+        (self.acting, self.stiffness, self.unmodelled, self.doubt) = (0.0, 0.0, f64::INFINITY, None);
         (self.inertia_now, self.damping_now) = (self.inertia, self.damping);
     }
 
@@ -223,6 +235,15 @@ impl TransmissionEstimator {
     #[must_use]
     pub fn is_explained_by(&self, change: Change) -> bool {
         self.changes.is_explained_by(change)
+    }
+
+    /// Which changes the window does not tell from the likeliest one; none while it is too short.
+    #[must_use]
+    pub fn likely_changes(&self) -> [bool; CHANGES] {
+        let Some(verdict) = self.changes.doubt() else { return [false; CHANGES] };
+        let best = verdict.best(|change| change != Change::Nothing);
+        let most = best.map_or(f64::INFINITY, |change| verdict.of(change).evidence);
+        Change::ALL.map(|change| change != Change::Nothing && verdict.of(change).evidence > most - SURE)
     }
 
     /// SI units (s for delays) in which a change's amplitude is counted.
@@ -496,9 +517,15 @@ impl TransmissionEstimator {
         if !learned.law().is_polynomial() {
             self.reach = self.reach.min(EDGE * learned.law().law.reach(&learned.alpha()[1..]));
         }
-        if motor.is_none() || !self.explains() || !self.changes.explained() {
-            self.reach = 0.0;
-        }
+        self.doubt = if !self.changes.explained() {
+            Some(Reason::Changed)
+        } else if motor.is_none() {
+            Some(Reason::Motor)
+        } else if !self.explains() {
+            Some(Reason::Unexplained(self.fit.share()))
+        } else {
+            None
+        };
     }
 
     /// How many periods later than assumed the link is, where that has become clear.
@@ -523,10 +550,10 @@ impl TransmissionEstimator {
         largest > 0.0 && phi.abs() > BEYOND * largest
     }
 
-    /// The estimate at the present deflection, and whether it is of use.
+    /// The estimate at the present deflection, and why it is of no use; `None`: it is of use.
     ///
     /// `delay`: of the filters; the torque behind them is brought up to the present by its own slope.
-    pub fn estimate(&mut self, present: &Present, delay: f64) -> (TransmissionEstimate, bool) {
+    pub fn estimate(&mut self, present: &Present, delay: f64) -> (TransmissionEstimate, Option<Reason>) {
         let ahead_s = present.behind_s + present.ahead_s;
         let signals = &self.signals;
         let (motor, tau, x) = (&signals.position.main, &signals.torque.main, &signals.effects.main);
@@ -536,7 +563,8 @@ impl TransmissionEstimator {
         let nothing = TransmissionEstimate::NOTHING;
         if self.rigid {
             let torque = self.lead;
-            return (TransmissionEstimate { flexibility_torque: torque, ..nothing }, torque.is_finite());
+            let reason = (!torque.is_finite()).then_some(Reason::Settling);
+            return (TransmissionEstimate { flexibility_torque: torque, ..nothing }, reason);
         }
         let (now, learned) = (self.deflection.now(present), &self.identification);
         if !self.concluded {
@@ -548,7 +576,7 @@ impl TransmissionEstimator {
             }
             let estimate =
                 TransmissionEstimate { flexibility_torque: torque, stiffness, deflection: now, ..nothing };
-            return (estimate, false);
+            return (estimate, Some(Reason::Unmoved));
         }
         let off = learned.deflection_offset() + learned.late() * self.deflection.link_rate();
         let phi = now + off;
@@ -563,10 +591,12 @@ impl TransmissionEstimator {
         if self.held_s > RESTED_S {
             std = std.hypot((DRIFT * self.held_s).min(WIDEST) * stiffness);
         }
-        let valid = std > 0.0 && std < USEFUL * stiffness && phi.abs() < self.reach;
-        if valid && !learned.black_box {
+        let beyond = (phi.is_nan() || phi.abs() >= self.reach).then_some(Reason::Beyond);
+        let imprecise = Reason::of_precision(stiffness, std, self.valid_within);
+        let reason = self.doubt.or(imprecise).or(beyond);
+        if reason.is_none() && !learned.black_box {
             self.trusted = true;
-        } else if self.reach == 0.0 {
+        } else if self.doubt.is_some() || self.reach == 0.0 {
             self.trusted = false;
         }
         self.stiffness = if self.trusted { stiffness } else { 0.0 };
@@ -580,7 +610,7 @@ impl TransmissionEstimator {
             stiffness_std: std,
             deflection: phi,
         };
-        (estimate, valid)
+        (estimate, reason)
     }
 
     /// What it does to the link at a deflection as it is measured; `None` where no curve is trusted.

@@ -1,0 +1,111 @@
+"""Why an estimate is not valid: one sentence, and a limit that the user declares."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from onlinekit import PERIOD_S, declared, motion
+
+from estimator import EstimatorError, EstimatorSettings, Motor, Sample, Status, make_estimator
+from estimator.reasons import CHANGES, REASONS, reason_text, why_not_valid
+
+CORE = Path(__file__).parent.parent / "estimator" / "core" / "src"
+
+
+def names_of(source: str, kind: str) -> set[str]:
+    text = (CORE / source).read_text(encoding="utf-8")
+    return set(re.findall(kind + r'::\w+(?:\(_\))? => "(\w+)"', text))
+
+
+def test_every_reason_and_change_of_the_core_has_its_words():
+    assert names_of("reasons.rs", "Reason") == set(REASONS) - {"stale", "alarm", "contradicted"}
+    assert names_of("isolation.rs", "Change") - {"nothing"} == set(CHANGES)
+
+
+def test_the_sentences_are_those_of_the_documentation():
+    text = reason_text("imprecise", share=0.44, asked=0.2)
+    assert text == "stiffness known to ± 44 %, asked for ± 20 %"
+    text = reason_text("changed", motor=2, changes=["torque_scale", "stiffness"])
+    assert text == "motor 2: torque gain or stiffness has changed"
+    assert reason_text("changed") == "the joint has changed"
+
+
+@pytest.mark.parametrize("limit", [0.0, -0.1, 1.5, float("nan")])
+def test_a_limit_that_cannot_be_is_refused_with_its_name(limit):
+    with pytest.raises(EstimatorError, match="valid_within"):
+        EstimatorSettings(valid_within=limit)
+
+
+@pytest.fixture(scope="module")
+def quadratic():
+    return motion("quadratic", 4.0)
+
+
+def replayed(samples, settings, model=None):
+    """(whether valid, reason, relative standard deviation) of each sample."""
+    estimator = make_estimator(model or declared("quadratic"), settings, PERIOD_S)
+    rows = []
+    for sample in samples:
+        estimate = estimator.step(sample)
+        why = why_not_valid(estimate.status, estimator)
+        relative = estimate.stiffness_std_nm_rad / estimate.stiffness_nm_rad
+        rows.append((bool(estimate.status & Status.VALID), why, relative))
+    return rows
+
+
+def test_valid_is_what_was_asked_for_and_everything_else_has_a_reason(quadratic):
+    usual = replayed(quadratic.samples, EstimatorSettings())
+    tight = min(relative for valid, _, relative in usual if valid) * 3.0
+    strict = replayed(quadratic.samples, EstimatorSettings(valid_within=tight))
+    assert 0 < sum(valid for valid, *_ in strict) < sum(valid for valid, *_ in usual)
+    assert all(relative < tight for valid, _, relative in strict if valid)
+    for rows in (usual, strict):
+        assert all((why is None) == valid for valid, why, _ in rows)
+    imprecise = [(why[1], relative) for _, why, relative in strict if why and why[0] == "imprecise"]
+    asked = f"asked for ± {100 * tight:.2g} %"
+    assert imprecise and all(f"± {100 * r:.2g} %" in text and asked in text for text, r in imprecise)
+
+
+def test_a_joint_at_rest_settles_and_then_waits_for_motion():
+    rest = [Sample(k, (0.1,), (np.nan,), (0.0,), 0.1) for k in range(2000)]
+    names = [why[0] for _, why, _ in replayed(rest, EstimatorSettings()) if why]
+    assert list(dict.fromkeys(names)) == ["settling", "unmoved"]
+
+
+def test_samples_that_cannot_be_used_are_the_reason(quadratic):
+    spoilt = [
+        s._replace(link_position_rad=np.nan) if k > 3000 else s for k, s in enumerate(quadratic.samples)
+    ]
+    *_, (_, why, _) = replayed(spoilt, EstimatorSettings())
+    assert why == ("rejected", REASONS["rejected"])
+
+
+def test_a_changed_torque_gain_is_named_with_what_looks_like_it(quadratic):
+    long = motion("quadratic", 12.0).samples
+    wrong = [
+        s._replace(motor_torque_nm=tuple(1.4 * t for t in s.motor_torque_nm)) if k > 8000 else s
+        for k, s in enumerate(long)
+    ]
+    rows = replayed(wrong, EstimatorSettings())
+    texts = {why[1] for _, why, _ in rows[8000:] if why and why[0] == "changed"}
+    assert any("torque gain" in text and text.endswith("changed") for text in texts), texts
+
+
+def test_a_wrong_inertia_is_not_called_imprecise(quadratic):
+    model = declared("quadratic")
+    motors: tuple[Motor, ...] = tuple(
+        replace(m, inertia_kg_m2=8.0 * m.inertia_kg_m2, inertia_std_relative=0.01) for m in model.motors
+    )
+    rows = replayed(quadratic.samples, EstimatorSettings(), replace(model, motors=motors))
+    assert {why[0] for _, why, _ in rows[2000:] if why} & {"motor", "unexplained", "changed"}
+
+
+def test_the_services_bits_have_their_reasons(quadratic):
+    estimator = make_estimator(declared("quadratic"), EstimatorSettings(), PERIOD_S)
+    for bit, name in ((Status.STALE, "stale"), (Status.MODEL_ALARM, "alarm")):
+        assert why_not_valid(int(bit), estimator) == (name, REASONS[name])
+    assert why_not_valid(int(Status.VALID | Status.GAP), estimator) is None

@@ -1,9 +1,10 @@
-"""Speed of the estimators: one tick, batch fits, memory over many ticks.
+"""Speed of the estimators: one tick, batch fits, a diagnosis, memory over many ticks.
 
     python benchmarks/estimator_tick.py [--ticks N] [--json]
 
 Two-motor VSA joints at 1 kHz on encoder counts. A tick is timed alone, with nothing compiled at run time;
-the percentiles are over all ticks after the first three seconds.
+the percentiles are over all ticks after the first three seconds. The diagnosis is of the paper's quadratic
+joint as `drivelink sim` makes it, with friction that the model lacks: CPU time of one thread.
 """
 
 from __future__ import annotations
@@ -17,9 +18,14 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from rig import free_endpoint
+from rig import joint as joint_file
 
+from drivelink.demo.simulate import world_from_joint
 from estimator import EstimatorSettings, JointModel, Motor, Record, Sample, Transmission, fit, make_estimator
+from estimator.diagnosis import diagnose
 from estimator.model_monitor import ModelMonitor, measure_baseline
+from sim.world import record as recorded
 
 T = 1e-3
 _CASES = {
@@ -105,6 +111,22 @@ def batch(name: str) -> float:
     return min(spent)
 
 
+def diagnosis(seconds: float) -> float:
+    """CPU seconds to diagnose one motor at 1 kHz."""
+    declared = joint_file("robust", free_endpoint(), motors=1)
+    columns = recorded(world_from_joint(declared, effects=["coulomb_friction=0.0005"]), seconds)
+    data = Record(
+        period_s=T,
+        sequence=np.arange(len(columns["time_s"])),
+        motor_position_rad=columns["motor1_position_rad"][:, None],
+        motor_torque_nm=columns["motor1_torque_nm"][:, None],
+        link_position_rad=columns["link_position_rad"],
+    )
+    begin = time.thread_time()
+    diagnose(data, declared.model())
+    return time.thread_time() - begin
+
+
 def memory(n: int) -> float:
     """Growth in bytes over n ticks of the robust mode, after a warm-up."""
     estimator = make_estimator(joint("polynomial", 2), EstimatorSettings(), T)
@@ -132,6 +154,7 @@ def main() -> None:
             "monitor, vsa-ii": monitored(args.ticks),
         },
         "batch_1e5_s": {name: batch(name) for name in ("polynomial", "vsa-ii")},
+        "diagnose_cpu_s": {f"{seconds:g}": diagnosis(seconds) for seconds in (10.0, 30.0)},
         "growth_bytes_per_1e5_ticks": memory(100_000),
     }
     if args.json:
@@ -142,6 +165,8 @@ def main() -> None:
         print(f"{case:<24}" + "".join(f"{value:8.1f}" for value in numbers.values()))
     for name, seconds in result["batch_1e5_s"].items():
         print(f"batch, 1e5 samples, {name:<14}{seconds:6.3f} s")
+    for length, seconds in result["diagnose_cpu_s"].items():
+        print(f"diagnose, {length} s at 1 kHz        {seconds:6.2f} s CPU")
     print(f"memory growth over 1e5 ticks: {result['growth_bytes_per_1e5_ticks']:.0f} bytes")
 
 

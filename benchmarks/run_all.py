@@ -17,10 +17,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import can
 import numpy as np
@@ -29,199 +28,95 @@ HERE = Path(__file__).parent
 TIMEOUT_S = 7200  # of a section: the longest takes a quarter of an hour on two quiet cores
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Section:
+class Section(NamedTuple):
     """One program.
 
     Attributes:
-        name: its file, without the ending.
-        of: the file, where several sections share one.
         title: over its results.
         full: its arguments.
         quick: its arguments where minutes count.
+        text: what it prints is no Markdown and is shown as it is.
         json_file: it takes `--json FILE`; else `--json` prints instead of the table.
-        markdown: what it prints is Markdown; else it is shown as it is.
+        of: the program, where several sections share one; else the section's name.
     """
 
-    name: str
     title: str
-    full: tuple[str, ...] = ()
-    quick: tuple[str, ...] = ()
+    full: str = ""
+    quick: str = ""
+    text: bool = False
     json_file: bool = False
-    markdown: bool = True
     of: str = ""
 
 
-SECTIONS = (
-    Section(
-        name="cycle",
-        title="One cycle beside the textbook way and the floor",
-        quick=("--seconds", "2", "--rounds", "2"),
+SECTIONS = {
+    "cycle": Section(
+        "One cycle beside the textbook way and the floor", quick="--seconds 2 --rounds 2", json_file=True
+    ),
+    "stages": Section("Stages, and joints on one core", quick="--cycles 2000", json_file=True),
+    "service": Section("Jitter, recorder, start, memory", quick="--seconds 2 --rounds 1", json_file=True),
+    "joints": Section(
+        "Many joints through one router", "--joints 1,6,12,24", "--joints 1,6 --seconds 3", text=True
+    ),
+    "estimator_tick": Section("The estimator alone", quick="--ticks 8000", text=True),
+    "paper_table": Section("The paper's table", text=True),
+    "sensitivity": Section("Sensitivity", text=True),
+    "ensembles": Section("The estimator on random joints", quick="--joints 1"),
+    "ekf": Section("An extended Kalman filter beside ours", "--joints 6", "--joints 1 --cases linear"),
+    "diagnosis_seeds": Section(
+        "Diagnosis on published seeds",
+        "--seeds 1",
+        "--seeds 1 --effects clean coulomb_friction backlash",
+        text=True,
         json_file=True,
     ),
-    Section(
-        name="stages", title="Stages, and joints on one core", quick=("--cycles", "2000"), json_file=True
+    "effect_pairs": Section("Two effects at once", quick="--seconds 10"),
+    "gate": Section("Wrong units, signs, gears and time", "--seeds 2", "--seeds 1 --kinds serial"),
+    "real_data": Section("Real data before and after", text=True, json_file=True),
+    "constants": Section("Choice constants halved and doubled", "--report", "--report"),
+    "external": Section("External torque and contact", quick="--minutes 2 --errors 2 --joints sea"),
+    "fault_matrix": Section(
+        "Sensor faults: wrong samples called valid", quick="--joints constant --seconds 8"
     ),
-    Section(
-        name="service",
-        title="Jitter, recorder, start, memory",
-        quick=("--seconds", "2", "--rounds", "1"),
-        json_file=True,
-    ),
-    Section(name="endurance", title="Missed cycles by cause", quick=("--seconds", "10"), json_file=True),
-    Section(
-        name="growth",
-        title="Cost against size",
-        quick=("--seconds", "5,10", "--diagnose-seconds", "10"),
-        json_file=True,
-    ),
-    Section(
-        name="latency",
-        title="Publisher to subscriber, beside bare zenoh",
-        quick=("--cycles", "4000"),
-        markdown=False,
-    ),
-    Section(
-        name="joints",
-        title="Many joints through one router",
-        full=("--joints", "1,6,12,24"),
-        quick=("--joints", "1,6", "--seconds", "3"),
-        markdown=False,
-    ),
-    Section(
-        name="estimator_tick",
-        title="The estimator alone",
-        quick=("--ticks", "8000"),
-        markdown=False,
-    ),
-    Section(
-        name="compiled",
-        title="The compiled core beside the last interpreted commit",
-        quick=("--seconds", "5", "--rounds", "1"),
-        json_file=True,
-    ),
-    Section(name="paper_table", title="The paper's table", markdown=False),
-    Section(name="sensitivity", title="Sensitivity", markdown=False),
-    Section(
-        name="ensembles",
-        title="The estimator on random joints",
-        quick=("--joints", "1"),
-    ),
-    Section(
-        name="intervals",
-        title="The 95 % intervals over a minute",
-        quick=("--seconds", "20"),
-        markdown=False,
-    ),
-    Section(
-        name="diagnosis_seeds",
-        title="Diagnosis on published seeds",
-        full=("--seeds", "1"),
-        quick=("--seeds", "1", "--effects", "clean", "coulomb_friction", "backlash"),
-        markdown=False,
-        json_file=True,
-    ),
-    Section(
-        name="effect_pairs",
-        title="Two effects at once",
-        quick=("--seconds", "10"),
-    ),
-    Section(name="real_data", title="Real data before and after", markdown=False, json_file=True),
-    Section(name="control", title="Control with the estimates", markdown=False, json_file=True),
-    Section(
-        name="parts",
-        title="Disjoint parts of one recording",
-        quick=("--machines", "emps"),
-    ),
-    Section(
-        name="gate",
-        title="Wrong units, signs, gears and time",
-        full=("--seeds", "2"),
-        quick=("--seeds", "1", "--kinds", "serial"),
-    ),
-    Section(
-        name="constants", title="Choice constants halved and doubled", full=("--report",), quick=("--report",)
-    ),
-    Section(
-        name="external",
-        title="External torque and contact",
-        quick=("--minutes", "2", "--errors", "2", "--joints", "sea"),
-    ),
-    Section(
-        name="fault_matrix",
-        title="Sensor faults: wrong samples called valid",
-        quick=("--joints", "constant", "--seconds", "8"),
-    ),
-    Section(
-        name="fault_sizes",
+    "fault_sizes": Section(
+        "Sensor faults: sizes up to which nothing is noticed",
+        "--sizes --joints constant,vsa-ii",
+        "--sizes --joints constant",
         of="fault_matrix",
-        title="Sensor faults: sizes up to which nothing is noticed",
-        full=("--sizes", "--joints", "constant,vsa-ii"),
-        quick=("--sizes", "--joints", "constant"),
     ),
-    Section(
-        name="queries",
-        title="A flood of queries",
-        quick=("--seconds", "2", "--rounds", "1"),
-    ),
-    Section(
-        name="kill_recorder",
-        title="Recorders killed at random",
-        quick=("--kills", "5"),
-        markdown=False,
-    ),
-    Section(
-        name="soak",
-        title="Ten minutes of random faults in real time",
-        quick=("--seconds", "60"),
-        markdown=False,
-    ),
-    Section(
-        name="fleet_throughput",
-        title="A fleet: two workers beside one",
+    "soak": Section("Ten minutes of random faults in real time", quick="--seconds 60", text=True),
+    "fleet_throughput": Section(
+        "A fleet: two workers beside one",
+        "throughput --nights 2 --recordings 12 --rounds 2",
+        "throughput --nights 2 --recordings 4",
+        text=True,
         of="fleet",
-        full=("throughput", "--nights", "2", "--recordings", "12", "--rounds", "2"),
-        quick=("throughput", "--nights", "2", "--recordings", "4"),
-        markdown=False,
     ),
-    Section(
-        name="fleet_cpu",
-        title="A fleet: CPU of a recording beside fit and diagnose alone",
+    "fleet_cpu": Section(
+        "A fleet: CPU of a recording beside fit and diagnose alone",
+        "cpu --nights 2 --recordings 8",
+        "cpu --nights 2 --recordings 2",
+        text=True,
         of="fleet",
-        full=("cpu", "--nights", "2", "--recordings", "8"),
-        quick=("cpu", "--nights", "2", "--recordings", "2"),
-        markdown=False,
     ),
-    Section(
-        name="fleet_table",
-        title="A fleet: 10 000 rows appended and reported",
+    "fleet_table": Section(
+        "A fleet: 10 000 rows appended and reported", "table", "table --rows 1000", text=True, of="fleet"
+    ),
+    "fleet_statistics": Section(
+        "A fleet: false discoveries and power of the tests",
+        "statistics --fleets 120",
+        "statistics --fleets 10",
+        text=True,
         of="fleet",
-        full=("table",),
-        quick=("table", "--rows", "1000"),
-        markdown=False,
     ),
-    Section(
-        name="fleet_statistics",
-        title="A fleet: false discoveries and power of the tests",
+    "fleet_changes": Section(
+        "A fleet: 40 joints, 25 nights, one of two workers killed half-way",
+        "changes --seconds 5",
+        "changes --seconds 5 --joints 8 --nights 8",
+        text=True,
         of="fleet",
-        full=("statistics", "--fleets", "120"),
-        quick=("statistics", "--fleets", "10"),
-        markdown=False,
     ),
-    Section(
-        name="fleet_changes",
-        title="A fleet: 40 joints, 25 nights, one of two workers killed half-way",
-        of="fleet",
-        full=("changes", "--seconds", "5"),
-        quick=("changes", "--seconds", "5", "--joints", "8", "--nights", "8"),
-        markdown=False,
-    ),
-    Section(
-        name="fleet_storage",
-        title="A fleet: local files, SFTP and S3",
-        markdown=False,
-    ),
-)
+    "fleet_storage": Section("A fleet: local files, SFTP and S3", text=True),
+}
 
 
 def machine() -> dict[str, Any]:
@@ -246,19 +141,18 @@ def machine() -> dict[str, Any]:
     }
 
 
-def run(section: Section, quick: bool) -> dict[str, Any]:
+def run(name: str, quick: bool) -> dict[str, Any]:
     """Run a section; what it printed, its numbers, or why there are none."""
-    path = HERE / f"{section.of or section.name}.py"
+    section = SECTIONS[name]
+    path = HERE / f"{section.of or name}.py"
     result: dict[str, Any] = {
         "title": section.title,
-        "markdown": section.markdown,
+        "markdown": not section.text,
         "machine": machine(),
         "at": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
         "load": os.getloadavg()[0],
     }
-    if not path.exists():
-        return {**result, "skipped": f"{path.name} is not there"}
-    arguments = list(section.quick if quick else section.full)
+    arguments = (section.quick if quick else section.full).split()
     start = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         numbers = Path(folder) / "numbers.json"
@@ -318,7 +212,7 @@ def document(results: dict[str, Any]) -> str:
 def main() -> None:
     """Run what is asked for, and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    names = [section.name for section in SECTIONS]
+    names = list(SECTIONS)
     parser.add_argument("--quick", action="store_true", help="small sizes: minutes instead of hours")
     parser.add_argument(
         "--only", nargs="+", choices=names, default=names, metavar="NAME", help=", ".join(names)
@@ -328,13 +222,13 @@ def main() -> None:
     path = args.out / "results.json"
     before = json.loads(path.read_text(encoding="utf-8"))["sections"] if path.exists() else {}
     sections: dict[str, Any] = {}
-    for section in SECTIONS:
-        if section.name in args.only:
-            print(f"{section.name}: {section.title} …", flush=True)
-            sections[section.name] = run(section, args.quick)
-            print(f"  {sections[section.name].get('skipped', 'done')}", flush=True)
-        elif section.name in before:
-            sections[section.name] = before[section.name]
+    for name in names:
+        if name in args.only:
+            print(f"{name}: {SECTIONS[name].title} …", flush=True)
+            sections[name] = run(name, args.quick)
+            print(f"  {sections[name].get('skipped', 'done')}", flush=True)
+        elif name in before:
+            sections[name] = before[name]
         together = before | sections
         results = {"sections": {name: together[name] for name in names if name in together}}
         path.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")

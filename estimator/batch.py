@@ -24,7 +24,7 @@ from estimator.diagnosis.outcome import DELAYS, stamped_wrongly
 from estimator.diagnosis.search import Search
 from estimator.diagnosis.stiffness import middle
 from estimator.errors import EstimatorError
-from estimator.gate import check, refuse
+from estimator.gate import check
 from estimator.model import HIGHEST_ORDER, JointModel, ParameterValue, Transmission
 from estimator.sample import SIGMA_95, FloatArray, Record
 from estimator.transmissions import MODELS, RIGID, UNKNOWN, TransmissionModel
@@ -116,7 +116,7 @@ class JointFit(NamedTuple):
         fitted: the hypothesis.
         covariance: (k, k) of its parameters; includes the uncertainty whether a reading has an error at all.
         absent: optional errors that the data do not support.
-        doubts: units, signs and time stamps that may be wrong, one line each.
+        doubts: time stamps that may be wrong, one line each.
     """
 
     problem: Problem
@@ -161,7 +161,6 @@ def fit(
 
     Raises:
         EstimatorError: a recording lacks what is needed, is too short, or nothing moves in it.
-        GateError: its units, signs, gear ratio or time do not fit the joint.
     """
     return transmission_fits(fit_joint(record, model, bandwidth_rad_s))
 
@@ -171,11 +170,9 @@ def fit_joint(
 ) -> JointFit:
     """Fit the whole joint; arguments and errors as in `fit`."""
     records = [record] if isinstance(record, Record) else list(record)
-    usable, remarks = [], []
-    for one in records:
-        usable.append(_whole(one, model))
-        check(usable[-1], model)
-        remarks.append(refuse(one, model).remark)
+    usable = [_whole(one, model) for one in records]
+    for one in usable:
+        check(one, model)
     if bandwidth_rad_s is None:
         shortest = min(len(one) * one.period_s for one in usable)
         bandwidth_hz = max(
@@ -191,7 +188,7 @@ def fit_joint(
     surplus = held.surplus(fitted)
     free = JointFit(problem, held, surplus, fitted, _covariance(problem, fitted, surplus))
     stamps = (_stamped_wrongly(free, key) for key in _optional(free))
-    doubts = tuple(dict.fromkeys(one for one in (*remarks, *stamps) if one))
+    doubts = tuple(dict.fromkeys(one for one in stamps if one))
     return _aligned(free._replace(doubts=doubts))
 
 

@@ -80,7 +80,6 @@ def identify(
 
     Raises:
         EstimatorError: a recording lacks what is needed, is too short, or nothing moves in it.
-        GateError: its units, signs, gear ratio or time do not fit the joint.
     """
     joint = fit_joint(record, model, bandwidth_rad_s)
     fits = transmission_fits(joint)

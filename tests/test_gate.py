@@ -5,6 +5,7 @@ The tolerance of a factor found is 5 %: what is not a unit or a declared gear ra
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from dataclasses import replace
@@ -20,9 +21,7 @@ from drivelink.cli import main
 from drivelink.jointfile import parse
 from drivelink.recording.gate import corrections
 from estimator import JointModel, Motor, Record, Transmission
-from estimator.batch import fit
-from estimator.diagnosis import diagnose
-from estimator.gate import Change, Discrepancy, GateError, examine, judge
+from estimator.gate import Change, Discrepancy, examine, judge
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("DRIVELINK_DATA", ROOT.parent / "shared" / "data"))
@@ -155,22 +154,6 @@ def degrees() -> gatekit.Drawn:
     return replace(drawn, record=wrong)
 
 
-def test_fit_and_diagnose_refuse_by_the_same_words(degrees: gatekit.Drawn) -> None:
-    said = []
-    for verb in (fit, diagnose):
-        with pytest.raises(GateError, match="the positions look like degrees, expected rad") as caught:
-            verb(degrees.record, degrees.model)
-        said.append(str(caught.value))
-    assert said[0] == said[1]
-
-
-@pytest.mark.slow
-def test_diagnose_reports_what_the_motion_does_not_decide() -> None:
-    drawn = gatekit.draw("soft", 4, held=True)
-    outcome = diagnose(drawn.record, drawn.model)
-    assert any("does not reveal" in note and "link position" in note for note in outcome.notes), outcome.notes
-
-
 def test_a_recording_that_is_too_short_is_not_judged(degrees: gatekit.Drawn) -> None:
     r = degrees.record
     assert r.link_position_rad is not None
@@ -206,26 +189,51 @@ def _written(drawn: gatekit.Drawn, folder: Path, scale: str = "") -> tuple[Path,
     return folder / "run.csv", folder / "elbow.toml"
 
 
-def test_the_line_to_paste_cures(
-    degrees: gatekit.Drawn, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+_VERBS = (
+    ["fit"],
+    pytest.param(["diagnose"], marks=pytest.mark.slow),
+    ["replay"],
+)
+
+
+@pytest.mark.parametrize("verb", _VERBS, ids=lambda verb: verb[0])
+def test_a_verb_warns_with_the_line_that_cures_and_goes_on(
+    verb: list[str], degrees: gatekit.Drawn, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run, joint = _written(degrees, tmp_path)
-    for verb in (["fit"], ["diagnose", "--out", str(tmp_path)], ["replay", "--strict"]):
-        assert main([*verb, str(run), "--joint", str(joint)]) == 3
-        (line,) = [x for x in capsys.readouterr().err.splitlines() if "degrees" in x]
+    out = str(tmp_path / ("estimates.csv" if verb == ["replay"] else "out"))
+    command = [*verb, str(run), "--joint", str(joint), "--out", out]
+    assert main(command) == 0
+    (line,) = [x for x in capsys.readouterr().err.splitlines() if "degrees" in x]
+    assert "warning: the positions look like degrees, expected rad" in line
+    for text in ["fit.json", "report.json"]:
+        path = tmp_path / "out" / text
+        assert not path.exists() or "look like degrees" in path.read_text(encoding="utf-8")
     paste = line[line.index("recording.scale = {") : line.index("}") + 1]
     assert paste.count("0.01745329") == 2
     _written(degrees, tmp_path, scale=paste)
-    assert main(["fit", str(run), "--joint", str(joint)]) == 0
+    assert main([*command, "--strict", *(["--force"] if verb == ["replay"] else [])]) == 0
+    assert "degrees" not in capsys.readouterr().err
 
 
-def test_replay_warns_and_goes_on(
-    degrees: gatekit.Drawn, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("verb", ["fit", "diagnose", "replay"])
+def test_strict_refuses(
+    verb: str, degrees: gatekit.Drawn, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run, joint = _written(degrees, tmp_path)
-    assert main(["replay", str(run), "--joint", str(joint), "--out", str(tmp_path / "estimates.csv")]) == 0
-    assert "warning: the positions look like degrees" in capsys.readouterr().err
-    assert (tmp_path / "estimates.csv").exists()
+    assert main([verb, str(run), "--joint", str(joint), "--strict"]) == 3
+    assert "the positions look like degrees" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_fit_reports_what_the_motion_does_not_decide(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, joint = _written(gatekit.draw("soft", 4, held=True), tmp_path)
+    main(["fit", str(run), "--joint", str(joint), "--out", str(tmp_path)])
+    notes = json.loads((tmp_path / "fit.json").read_text(encoding="utf-8"))["notes"]
+    assert any("does not reveal" in note and "link position" in note for note in notes), notes
+    assert "does not reveal" in capsys.readouterr().err
 
 
 DRIVES = """\

@@ -19,7 +19,7 @@ from drivelink import jointfile, recording
 from drivelink.errors import JointFileError
 from estimator import EstimatorSettings, Motor, Record, Status, Transmission, fit, make_estimator
 from estimator.errors import EstimatorError
-from estimator.gate import GateError
+from estimator.gate import judge
 from sim.cases import CASES, case
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -80,24 +80,26 @@ def test_a_declared_stiffness_below_zero_is_refused(coefficients):
         make_estimator(model, EstimatorSettings(), kit.PERIOD_S)
 
 
-def test_a_fit_with_the_torque_reversed_is_refused():
+def test_a_fit_with_the_torque_reversed_has_no_stiffness_and_the_gate_says_why():
     motion = kit.motion("constant", 12.0)
     plant = case("constant").plant.motors[0]
     assert plant.spring.model == "linear"
 
-    def fitted(sign):
-        record = Record(
+    model = kit.declared("constant", parameters={})
+
+    def recorded(sign):
+        return Record(
             period_s=kit.PERIOD_S,
             sequence=np.arange(len(motion.samples)),
             motor_position_rad=np.array([s.motor_position_rad for s in motion.samples]),
             motor_torque_nm=sign * np.array([s.motor_torque_nm for s in motion.samples]),
             link_position_rad=sign * np.array([s.link_position_rad for s in motion.samples]),
         )
-        return fit(record, kit.declared("constant", parameters={}))[0]
 
-    assert fitted(1.0).stiffens
-    with pytest.raises(GateError, match="wrong sign"):
-        fitted(-1.0)
+    assert fit(recorded(1.0), model)[0].stiffens
+    wrong = recorded(-1.0)
+    assert "wrong sign" in judge(wrong, model).remark
+    assert not fit(wrong, model)[0].stiffens
 
 
 def test_a_joint_file_with_a_stiffness_below_zero_is_neither_read_nor_written():

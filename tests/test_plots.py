@@ -10,6 +10,7 @@ import pytest
 from drivelink.output.plots import (
     COLORS,
     PlotCurve,
+    medians,
     new_figure,
     over_time,
     save,
@@ -88,3 +89,10 @@ def test_svg_for_a_page_is_one_element() -> None:
     over_time(axes, {"a": PlotCurve(np.arange(3.0), np.arange(3.0))}, "y")
     text = svg_text(figure)
     assert text.startswith("<svg") and text.rstrip().endswith("</svg>")
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 100, 1000])
+def test_medians_of_few_samples_are_not_empty(count: int) -> None:
+    x = np.linspace(0.0, 1.0, count)
+    curve = medians(x, 2.0 * x)
+    assert len(curve.x) > 0 and np.all(np.isfinite(curve.y))

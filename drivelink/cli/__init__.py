@@ -160,7 +160,7 @@ def add_map(parser: argparse.ArgumentParser) -> None:
 
 
 def add_recordings(parser: argparse.ArgumentParser) -> None:
-    """Add RECORDING, `--joint`, `--bandwidth-hz` and `--map`, for the verbs that fit."""
+    """Add RECORDING, `--joint`, `--bandwidth-hz`, `--strict` and `--map`, for the verbs that fit."""
     parser.add_argument(
         "recording",
         type=Path,
@@ -176,6 +176,9 @@ def add_recordings(parser: argparse.ArgumentParser) -> None:
         type=_bandwidth,
         metavar="F",
         help="bandwidth of the filter that all channels share (default: chosen from the data)",
+    )
+    parser.add_argument(
+        "--strict", action="store_true", help="refuse what has wrong units, signs or gears; else only warn"
     )
     add_map(parser)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
@@ -11,6 +12,7 @@ from rich.table import Table
 
 from drivelink import recording
 from drivelink.cli import add_recordings, require_distinct
+from drivelink.cli.gating import warned
 from drivelink.errors import RecordingError
 from drivelink.jointfile import apply_diagnosis
 from drivelink.output import report
@@ -18,11 +20,9 @@ from drivelink.output.outfile import check_target
 from drivelink.output.progress import Meter
 from drivelink.output.units import Units
 from drivelink.recording.columnmap import parse_column_map
-from drivelink.recording.gate import refusal
 from drivelink.recording.mapping import joint_of
 from estimator.diagnosis import Diagnosis, diagnose
 from estimator.errors import EstimatorError
-from estimator.gate import GateError
 
 EPILOG = """\
 examples:
@@ -66,28 +66,27 @@ def run(args: argparse.Namespace) -> int:
     for name in ("report.json", "report.html"):
         check_target(args.out / name, inputs, force=True)
     records = [recording.read(path, joint, base_dir=base, names=names) for path in args.recording]
+    notes = warned(args.recording, records, joint, strict=args.strict)
     validation = None
     if args.validate is not None:
         validation = recording.read(args.validate, joint, base_dir=base, names=names)
+        notes += warned([args.validate], [validation], joint, strict=args.strict)
     named = ", ".join(path.name for path in args.recording)
     with Meter(f"diagnose {named}") as meter:
         try:
             outcome = diagnose(records, joint.model(), args.bandwidth_hz, validation, meter.stage)
-        except GateError as error:
-            both = zip((*args.recording, args.validate), (*records, validation), strict=True)
-            path = next(name for name, one in both if one is error.record)
-            raise refusal(path, joint, error.findings, str(error)) from error
         except EstimatorError as error:
             raise RecordingError(f"{named}: {error}") from error
     args.out.mkdir(parents=True, exist_ok=True)
     validated = args.validate.name if args.validate else None
+    documented = replace(outcome, notes=(*notes, *outcome.notes))
     title = report.Title(joint.name, named, validated, joint.axis == "linear")
-    made = report.write(outcome, title, args.out)
+    made = report.write(documented, title, args.out)
     if args.write is not None:
         apply_diagnosis.write(source, args.write, outcome, records[0], named, force=args.force)
         made.append(args.write)
     if args.json:
-        print(json.dumps(report.as_json(outcome)))
+        print(json.dumps(report.as_json(documented)))
         return 0
     _print(outcome, Units(title.linear))
     for path in made:

@@ -6,7 +6,7 @@ import argparse
 import json
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -16,17 +16,16 @@ from rich.console import Console
 from rich.table import Table
 
 from drivelink import jointfile, recording
+from drivelink.cli.gating import warned
 from drivelink.errors import RecordingError
 from drivelink.jointfile import JointText, plain_parameters
 from drivelink.jointfile.residual_baseline import floor_entry
 from drivelink.output.fitplot import fit_plot
 from drivelink.output.outfile import check_target, write_whole
 from drivelink.recording.columnmap import parse_column_map
-from drivelink.recording.gate import refusal
 from drivelink.version import __version__
 from estimator.batch import TransmissionFit
 from estimator.errors import EstimatorError
-from estimator.gate import GateError
 from estimator.identify import Identified, identify
 from estimator.model import Effect, Motor, ParameterValue
 from estimator.sample import SIGMA_95, Record
@@ -47,15 +46,13 @@ def fit_recording(args: argparse.Namespace, source: JointText, folder: Path | No
     joint = source.joint
     names = parse_column_map(args.map)
     records = [recording.read(path, joint, base_dir=source.folder, names=names) for path in args.recording]
+    notes = warned(args.recording, records, joint, strict=args.strict)
     bandwidth = None if args.bandwidth_hz is None else 2.0 * math.pi * args.bandwidth_hz
     try:
         found = identify(records, joint.model(), bandwidth)
-    except GateError as error:
-        path = next(p for p, one in zip(args.recording, records, strict=True) if one is error.record)
-        raise refusal(path, joint, error.findings, str(error)) from error
     except EstimatorError as error:
         raise RecordingError(f"{_named(args)}: {error}") from error
-    document = _as_json(found, args.recording)
+    document = _as_json(replace(found, notes=(*notes, *found.notes)), args.recording)
     if args.json:
         print(json.dumps(document))
     else:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -14,6 +13,7 @@ from typing import Any
 import zenoh
 
 from drivelink.cli import add_map
+from drivelink.cli.gating import warn
 from drivelink.errors import UsageError
 from drivelink.jointfile import JointFile
 from drivelink.output.outfile import check_target
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     names = parse_column_map(args.map)
     if args.strict:
         record = read(args.file, joint, base_dir=base_dir, channel=args.channel, names=names)
-        gate(args.file, joint, record)
+        gate(args.file, joint, record, strict=True)
     if args.out is not None:
         check_target(args.out, [args.file, *([args.joint] if args.joint else [])], force=args.force)
     playback = open_playback(
@@ -117,8 +117,7 @@ def _report(
     interrupted: bool,
 ) -> None:
     """Draw what is asked for, and print the result."""
-    for line in warnings:
-        print(f"{args.file}: warning: {line}", file=sys.stderr)
+    warn(args.file, warnings)
     made = summary.plot(args.plots, f"{joint}: {args.file.name}") if args.plots and summary.count else []
     if args.json:
         document = {

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -71,7 +73,13 @@ class Analysis(NamedTuple):
     report_html: str
 
 
-def analyse(record: Record, joint: JointFile, validation: Record | None, title: report.Title) -> Analysis:
+def analyse(
+    record: Record,
+    joint: JointFile,
+    validation: Record | None,
+    title: report.Title,
+    remarks: Sequence[str],
+) -> Analysis:
     """Fit and diagnose one record.
 
     Args:
@@ -79,12 +87,14 @@ def analyse(record: Record, joint: JointFile, validation: Record | None, title: 
         joint: the joint's last accepted model.
         validation: a recording that takes no part in fit and selection; None: blocks are held out.
         title: of the report.
+        remarks: of the gate, for the report.
 
     Raises:
-        EstimatorError: wrong units or signs, or the recording cannot be fitted.
+        EstimatorError: the recording cannot be fitted.
     """
     model = joint.model()
-    outcome = diagnose(record, model, validation=validation)  # its gate comes before any fit
+    outcome = diagnose(record, model, validation=validation)
+    outcome = replace(outcome, notes=(*remarks, *outcome.notes))
     fits = identify(record, model).fits
     document = report.as_json(outcome)
     errors = outcome.validation

@@ -23,10 +23,9 @@ from drivelink.fleet.pieces import Piece, pieces
 from drivelink.fleet.storage import Source, fetched
 from drivelink.output.report import Title
 from drivelink.recording.canlog import CAN_SUFFIXES, read_frames
-from drivelink.recording.gate import gate, refusal
+from drivelink.recording.gate import gate
 from drivelink.recording.mcapfile import read_messages
 from estimator.errors import EstimatorError
-from estimator.gate import GateError
 from estimator.sample import Record
 
 HELD_OUT = "held-out blocks"
@@ -156,10 +155,8 @@ def _results(
             title = Title(
                 joint.name, _part_name(task.source.name, piece), None if validation is None else where
             )
-            try:
-                analysis = analyse(piece.record, file, validation, title)
-            except GateError as error:
-                raise refusal(path, file, error.findings, str(error)) from error
+            remarks = gate(path, file, piece.record, strict=True)
+            analysis = analyse(piece.record, file, validation, title, remarks)
             suffix = f"-{piece.part}" if piece.parts > 1 else ""
             folder = f"diagnoses/{joint.name}/{row['digest'][:24]}{suffix}"
             common = row | _of_joint(analysis, piece, where) | {"report": f"{folder}/report.html"}
@@ -217,7 +214,7 @@ def _validation(task: Task, joint: Joint, base: Path) -> Iterator[Record | None]
     try:
         with fetched(task.previous) as (path, _):
             read = recording.read(path, joint.file, base_dir=base)
-            gate(path, joint.file, read)
+            gate(path, joint.file, read, strict=True)
             record = read
     except (RecordingError, OSError) as error:
         logging.getLogger("drivelink.fleet").warning("validated on held-out blocks: %s", error)

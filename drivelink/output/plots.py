@@ -57,6 +57,7 @@ _THEMED = {
 }
 _MAX_POINTS = 4000  # curves with more points are reduced to the extremes of each pixel column
 _BINS = 240
+_MIN_OF_SCATTERED = 3  # samples in a bin of `medians`
 _MIN_IN_BIN = 1
 _MARKERS_A_CURVE = 12
 
@@ -135,10 +136,12 @@ def svg_text(figure: Figure) -> str:
 def medians(x: FloatArray, y: FloatArray, bins: int = 80) -> PlotCurve:
     """Medians of scattered samples in bins of x, without the outermost x."""
     low, high = np.quantile(x, [0.002, 0.998])
+    least = min(_MIN_OF_SCATTERED, len(x))
+    bins = min(bins, max(1, len(x) // least))  # one of them, at least, is full
     edges = np.linspace(float(low), float(high), bins + 1)
     place = np.clip(np.searchsorted(edges, x) - 1, 0, bins - 1)
     middle = 0.5 * (edges[1:] + edges[:-1])
-    filled = [k for k in range(bins) if np.count_nonzero(place == k) > 2]
+    filled = [k for k in range(bins) if np.count_nonzero(place == k) >= least]
     return PlotCurve(middle[filled], np.array([np.median(y[place == k]) for k in filled]))
 
 

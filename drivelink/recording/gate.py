@@ -14,7 +14,7 @@ from drivelink.jointfile import DriveSection, EncoderSection, JointFile
 from drivelink.recording.canframes import is_frame_log
 from drivelink.recording.playback import Played
 from estimator.errors import EstimatorError
-from estimator.gate import Change, Discrepancy, GateError, Judgement, judge, refuse
+from estimator.gate import Change, Discrepancy, Judgement, check, judge
 from estimator.model import JointModel
 from estimator.sample import Record, Sample
 
@@ -44,21 +44,38 @@ class Correction:
         return f"{self.table}.{self.key} = {self.value:.7g}"
 
 
-def refusal(path: Path, joint: JointFile, findings: Sequence[Discrepancy], message: str) -> RecordingError:
-    """The refusal of a recording in one line, with the correction for the joint file."""
-    return RecordingError(f"{path}: {message}; {_text_of(joint, findings, live=is_frame_log(path))}")
+def gate(path: Path, joint: JointFile, record: Record, *, strict: bool) -> list[str]:
+    """Check units, signs, gears and time of a recording against the joint as declared.
 
+    Args:
+        path: of the recording.
+        joint: as declared.
+        record: what was read of it.
+        strict: refuse what is found.
 
-def gate(path: Path, joint: JointFile, record: Record) -> None:
-    """Refuse a recording whose units, signs, gears or time do not fit the joint.
+    Returns:
+        What is wrong, with the line to paste, or what the motion does not reveal; empty or one line.
 
     Raises:
-        RecordingError: findings and correction in one line.
+        RecordingError: strict, and something is wrong.
     """
+    model = joint.model()
     try:
-        refuse(record, joint.model())
-    except GateError as error:
-        raise refusal(path, joint, error.findings, str(error)) from error
+        check(record, model)
+        judgement = judge(record, model)
+    except EstimatorError:  # the verb itself says what is unusable
+        return []
+    line = _line(joint, judgement, live=is_frame_log(path))
+    if strict and judgement.findings:
+        raise RecordingError(f"{path}: {line}")
+    return [line] if line else []
+
+
+def _line(joint: JointFile, judgement: Judgement, *, live: bool) -> str:
+    if not judgement.findings:
+        return judgement.remark
+    fix = _text_of(joint, judgement.findings, live=live)
+    return f"{judgement.remark}; if so, {fix}"
 
 
 class Gathered:
@@ -99,10 +116,8 @@ class Gathered:
             judgement = self.judgement()
         except EstimatorError as error:
             return [f"units and signs cannot be checked: {error}"]
-        if judgement.findings:
-            fix = _text_of(self._joint, judgement.findings, live=live)
-            return [f"{', and '.join(map(str, judgement.findings))}; {fix}"]
-        return [judgement.remark] if judgement.undecided else []
+        decided = not judgement.findings and not judgement.undecided
+        return [] if decided else [_line(self._joint, judgement, live=live)]
 
 
 def _record_of(samples: Sequence[Sample], model: JointModel, period_s: float) -> Record | None:

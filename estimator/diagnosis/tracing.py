@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from estimator.diagnosis.openorder import raised
 from estimator.diagnosis.result import Diagnosis
 from estimator.diagnosis.search import Progress, Search, parameters
 from estimator.errors import EstimatorError
-from estimator.gate import check, refuse
+from estimator.gate import check
 from estimator.model import JointModel
 from estimator.sample import Record
 
@@ -48,14 +47,11 @@ def diagnose(
 
     Raises:
         EstimatorError: the recordings cannot be diagnosed.
-        GateError: units, signs, gear ratio or time of a recording do not fit the joint.
     """
     records = [record] if isinstance(record, Record) else list(record)
     everything = records + ([] if validation is None else [validation])
     for one in everything:
         check(one, model)
-    progress("units and signs")
-    doubts = [remark for one in everything if (remark := refuse(one, model).remark)]
     progress("bandwidth")
     bandwidth = bandwidth_hz or choose_bandwidth(records[0], model)
     most = widest(max(r.period_s for r in records))
@@ -72,7 +68,7 @@ def diagnose(
     higher = raised(model, outcome.effects)
     if higher is not None:
         return diagnose(records, higher, bandwidth, validation, progress)
-    return replace(outcome, notes=tuple(dict.fromkeys((*outcome.notes, *doubts))))
+    return outcome
 
 
 def _chosen(search: Search, held: Held, hypotheses: list[Fitted]) -> Fitted:

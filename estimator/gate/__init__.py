@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from estimator.gate.causes import Change, Kind
-from estimator.gate.judge import Discrepancy, GateError, Judgement, examine, judge, refuse
+from estimator.gate.judge import Discrepancy, Judgement, examine, judge
 from estimator.gate.usable import check
 
-__all__ = ["Change", "Discrepancy", "GateError", "Judgement", "Kind", "check", "examine", "judge", "refuse"]
+__all__ = ["Change", "Discrepancy", "Judgement", "Kind", "check", "examine", "judge"]

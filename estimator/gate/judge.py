@@ -18,7 +18,7 @@ from estimator.priors import PRIORS
 from estimator.sample import FloatArray, Record
 from estimator.transmissions import transmission_model
 
-__all__ = ["Discrepancy", "GateError", "Judgement", "examine", "judge", "refuse"]
+__all__ = ["Discrepancy", "Judgement", "examine", "judge"]
 
 _TURN = 2.0 * math.pi
 
@@ -99,29 +99,16 @@ class Judgement:
 
     @property
     def remark(self) -> str:
-        """What cannot be decided, in words; empty if everything is decided."""
+        """What is wrong or cannot be decided, in words; empty if everything is decided and right."""
+        if self.findings:
+            first, what = self.findings[0], ", and ".join(map(str, self.findings))
+            return (
+                f"{what}: the torque balance leaves {first.left_before:.0%} of the torque as declared, "
+                f"{first.left_after:.1%} with that put right"
+            )
         if self.reason:
             return f"units and signs cannot be checked: {self.reason}"
         return f"this motion does not reveal {' or '.join(self.undecided)}" if self.undecided else ""
-
-
-class GateError(EstimatorError):
-    """Units, signs, gear ratio or time of a recording do not fit the joint as declared.
-
-    Attributes:
-        findings: the errors, with the correction of each channel.
-        record: the recording.
-    """
-
-    def __init__(self, findings: Sequence[Discrepancy], record: Record) -> None:
-        self.findings = tuple(findings)
-        self.record = record
-        first = self.findings[0]
-        what = ", and ".join(str(finding) for finding in self.findings)
-        super().__init__(
-            f"{what}: the torque balance leaves {first.left_before:.0%} of the torque as declared, "
-            f"{first.left_after:.1%} with that put right"
-        )
 
 
 @dataclass(slots=True)
@@ -250,21 +237,6 @@ def _undecided(joint: _Joint, single: Sequence[Cause], declared: float) -> tuple
 def examine(record: Record, model: JointModel) -> list[Discrepancy]:
     """The findings of `judge`."""
     return list(judge(record, model).findings)
-
-
-def refuse(record: Record, model: JointModel) -> Judgement:
-    """Raise the findings of `judge`, if there are any.
-
-    Returns:
-        What the recording does not reveal.
-
-    Raises:
-        GateError: with the findings of `judge`.
-    """
-    judgement = judge(record, model)
-    if judgement.findings:
-        raise GateError(judgement.findings, record)
-    return judgement
 
 
 def _finding(

@@ -12,7 +12,7 @@ from drivelink import jointfile
 from drivelink.cli import main
 from drivelink.output.fitplot import fit_plot
 from estimator import EstimatorError, EstimatorSettings, Record, Status, fit, make_estimator
-from estimator.identify import identify
+from estimator.gate import judge
 from estimator.transmissions import MODELS
 
 T = 1e-3
@@ -240,12 +240,12 @@ def test_no_delay_is_made_of_noise_and_one_that_is_there_has_an_honest_interval(
     assert np.sqrt(np.mean(np.square(z))) < 2.0
 
 
-def test_what_the_motion_does_not_reveal_of_units_and_signs_is_a_note(monkeypatch):
+def test_what_the_motion_does_not_reveal_of_units_and_signs_is_said(monkeypatch):
     monkeypatch.setattr(kit, "SECONDS", 6.0)
     (gentle,), (rich,) = kit.World([{}], slow=True).run(), kit.World([{}]).run()
     unrevealed = "this motion does not reveal the unit of the positions"
-    assert any(note.startswith(unrevealed) for note in identify(gentle, kit.model()).notes)
-    assert not any("does not reveal" in note for note in identify(rich, kit.model()).notes)
+    assert judge(gentle, kit.model()).remark.startswith(unrevealed)
+    assert "does not reveal" not in judge(rich, kit.model()).remark
 
 
 def test_what_is_left_shows_friction_as_a_step_and_hysteresis_as_a_loop(monkeypatch, tmp_path):

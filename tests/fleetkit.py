@@ -65,7 +65,7 @@ def make_fleet(folder: Path, nights: int = 2) -> Path:
 def write_mcap(record: Record, name: str, path: Path, begin_s: int) -> Path:
     """The record as `drivelink record` writes it: with its joint file in it."""
     text, nothing = JOINT.format(name=name), math.nan
-    sink = open_sink(path, parse(text), text, str(path.parent))
+    sink = open_sink(path, parse(text), text)
     assert record.link_position_rad is not None
     columns = (record.motor_position_rad, record.motor_torque_nm, record.link_position_rad)
     for sequence, (theta, torque, link) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):

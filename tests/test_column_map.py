@@ -150,7 +150,7 @@ def test_fit_takes_the_joint_from_a_recording_that_carries_it(
     bus = "[bus]\nperiod_s = 0.002\n"
     path, target = tmp_path / "r.mcap", tmp_path / "fitted.toml"
     joint = parse(TEXT + bus)
-    sink = open_sink(path, joint, TEXT + bus + '[provenance]\nremark = "kept"\n', str(tmp_path))
+    sink = open_sink(path, joint, TEXT + bus + '[provenance]\nremark = "kept"\n')
     for sample in read(ours(tmp_path / "r.csv"), joint).samples():
         sink.sample(sample, sample.sequence * 2_000_000)
     sink.close()

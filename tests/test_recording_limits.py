@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import json
 import logging
+import os
 import random
 import resource
 import struct
@@ -17,12 +19,14 @@ import numpy as np
 import pytest
 import zstandard
 
+from drivelink.canopen.eds import load_eds
 from drivelink.errors import DrivelinkError, RecordingError
-from drivelink.jointfile import parse
+from drivelink.jointfile import ZenohSection, load, parse
 from drivelink.recording import read
 from drivelink.recording.canlog import read_frames
 from drivelink.recording.formats import open_sink
-from drivelink.recording.mapping import joint_of
+from drivelink.recording.gate import Gathered
+from drivelink.recording.mapping import joint_of, side_file
 from drivelink.recording.mcapfile import read_messages
 from drivelink.recording.playback import open_playback
 from estimator.sample import Sample
@@ -200,7 +204,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One short recording in every format."""
     folder = tmp_path_factory.mktemp("whole")
     for suffix in (".mcap", ".csv", ".log", ".blf", ".asc", ".trc"):
-        sink = open_sink(folder / f"r{suffix}", JOINT, TEXT, str(folder))
+        sink = open_sink(folder / f"r{suffix}", JOINT, TEXT)
         for k, (stamp, can_id, data) in enumerate(frames(100)):
             if can_id == 0x080:
                 sink.sample(Sample(k // 3, (0.1 * k,), (0.0,), (1.0,), 0.1 * k), stamp)
@@ -316,3 +320,135 @@ def test_a_reader_of_others_reads_our_logs(whole: Path) -> None:
     for suffix in (".log", ".blf", ".asc", ".trc"):
         with can.LogReader(whole / f"r{suffix}") as reader:
             assert sum(1 for _ in reader) == 300
+
+
+# What a recording carries is not trusted
+
+
+def mcap_of(path: Path, messages: list[tuple[str, int, bytes]]) -> Path:
+    """An MCAP file of (topic, stamp in ns, data), its messages in compressed chunks."""
+    records, numbers = bytearray(), {}
+    for topic, stamp, data in messages:
+        if topic not in numbers:
+            numbers[topic] = len(numbers) + 1
+            name = f"/elbow/{topic}".encode()
+            body = struct.pack("<HHI", numbers[topic], 0, len(name)) + name
+            body += struct.pack("<I", 4) + b"json" + struct.pack("<I", 0)
+            records += struct.pack("<BQ", 0x04, len(body)) + body
+        body = struct.pack("<HIQQ", numbers[topic], 0, stamp, stamp) + data
+        records += struct.pack("<BQ", 0x05, len(body)) + body
+    packed = zstandard.ZstdCompressor().compress(bytes(records))
+    path.write_bytes(b"\x89MCAP0\r\n" + chunk(b"zstd", packed, len(records)))
+    return path
+
+
+def carrying(path: Path, text: str, folder: str = "/") -> Path:
+    document = json.dumps({"text": text, "folder": folder}).encode()
+    samples = [("can", stamp, f'{{"id":{i},"data":"{d.hex()}"}}'.encode()) for stamp, i, d in frames(600)]
+    return mcap_of(path, [("joint", 0, document), *samples])
+
+
+@pytest.mark.parametrize("name", ["/dev/zero", "/etc/passwd", "../../../../../../etc/passwd", "sheet.eds"])
+def test_the_joint_file_in_a_recording_opens_nothing(name: str, tmp_path: Path) -> None:
+    (tmp_path / "sheet.eds").write_text("not an EDS: reading it would be an error")
+    text = TEXT.replace("node_id = 1\n", f'node_id = 1\neds = "{name}"\n')
+    text += f'eds = "{name}"\n[zenoh]\nprefix = "plant"\nconfig = "{name}"\nendpoint = "tcp/192.0.2.1:7447"\n'
+    path = carrying(tmp_path / "r.mcap", text)
+    carried = joint_of(path, None)
+    assert carried.joint.motor[0].drive.eds is None and carried.joint.link.encoder.eds is None  # type: ignore[union-attr]
+    assert carried.joint.zenoh == ZenohSection(prefix="plant")
+    before = peak_mib()
+    assert len(read(path, carried.joint, base_dir=carried.folder)) > 500
+    assert peak_mib() - before < MOST_MIB
+    pytest.importorskip("pyarrow")
+    fleet = pytest.importorskip("drivelink.fleet.joints")
+    assert fleet.carried_joint(path).file == carried.joint
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".csv", ".log", ".blf", ".asc", ".trc", ".toml", ".eds"])
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_only_regular_files_are_opened(suffix: str, kind: str, tmp_path: Path) -> None:
+    path = tmp_path / f"r{suffix}"
+    if kind == "pipe":
+        os.mkfifo(path)  # opening it would wait for a writer for ever
+    else:
+        path.symlink_to("/dev/zero")
+    work = {".toml": lambda: load(path), ".eds": lambda: load_eds(path)}.get(
+        suffix, lambda: read(path, JOINT)
+    )
+    with pytest.raises(DrivelinkError, match="expected a regular file"):
+        work()
+
+
+def test_a_mapping_beside_a_log_is_a_regular_file(tmp_path: Path) -> None:
+    log_of(tmp_path / "r.log", frames(600))
+    side = side_file(tmp_path / "r.log")
+    side.unlink(missing_ok=True)
+    os.mkfifo(side)
+    with pytest.raises(RecordingError, match="expected a regular file"):
+        joint_of(tmp_path / "r.log", None)
+
+
+@pytest.mark.parametrize(
+    ("topic", "data"),
+    [
+        ("joint", b'{"text": [' + b"[]," * (12 << 20) + b"[]]}"),
+        ("can", b'{"id": 1, "data": [' + b"[]," * (12 << 20) + b"[]]}"),
+        ("mapping", b'{"joint": "elbow", "nodes": [' + b"[]," * (12 << 20) + b"[]]}"),
+    ],
+)
+def test_a_huge_message_is_refused_before_it_is_parsed(topic: str, data: bytes, tmp_path: Path) -> None:
+    path = mcap_of(tmp_path / "r.mcap", [(topic, 0, data), ("can", 0, b'{"id": 128, "data": ""}')])
+    assert path.stat().st_size < 40_000
+    before = peak_mib()
+    for work in (lambda: joint_of(path, None), lambda: read(path, JOINT)):
+        with pytest.raises(DrivelinkError) as caught:
+            work()
+        one_line(caught)
+    assert peak_mib() - before < MOST_MIB
+
+
+def test_frames_without_a_sync_are_not_held(tmp_path: Path) -> None:
+    frame = ("can", 0, b'{"id": 385, "data": ""}')
+    path = mcap_of(tmp_path / "r.mcap", [frame] * 600_000)
+    assert path.stat().st_size < 40_000
+    before = peak_mib()
+    with pytest.raises(RecordingError, match="expected SYNC frames"):
+        read(path, JOINT)
+    assert peak_mib() - before < 200
+
+
+SAMPLE = '{{"sequence": {}, "time_s": {}, "motor1_position_rad": {}, "motor1_torque_nm": 1.0, "link_position_rad": 0.0}}'
+
+
+@pytest.mark.parametrize("stamp", [(1 << 63), (1 << 64) - 1])
+@pytest.mark.parametrize("topic", ["sample", "can"])
+def test_stamps_beyond_64_bits_are_one_line(topic: str, stamp: int, tmp_path: Path) -> None:
+    data = SAMPLE.format(0, 0, 0.0).encode() if topic == "sample" else b'{"id": 128, "data": ""}'
+    path = mcap_of(tmp_path / "r.mcap", [(topic, stamp, data)] * 4)
+    for frames_ in (False, True):
+        with pytest.raises(RecordingError) as caught:
+            list(open_playback(path, JOINT, tmp_path, frames=frames_))
+        one_line(caught)
+
+
+@pytest.mark.parametrize("last", ["4e12", "9e18", "1e400", "-5", "1e300"])
+def test_sequences_and_times_without_end_allocate_nothing(last: str, tmp_path: Path) -> None:
+    numbers = [*(str(k) for k in range(800)), last]
+    rows = [(n, SAMPLE.format(n, k * 1e-3 if k < 800 else last, k % 7)) for k, n in enumerate(numbers)]
+    path = mcap_of(
+        tmp_path / "r.mcap", [("sample", k * 10**6, row.encode()) for k, (_, row) in enumerate(rows)]
+    )
+    gathered = Gathered(JOINT, 1e-3)
+    before = peak_mib()
+    try:
+        for played in open_playback(path, JOINT, tmp_path):
+            gathered.take(played)
+        gathered.remarks(live=False)
+    except DrivelinkError as error:
+        assert "\n" not in str(error)
+    try:
+        read(path, JOINT)
+    except DrivelinkError as error:
+        assert "\n" not in str(error)
+    assert peak_mib() - before < MOST_MIB

@@ -59,7 +59,7 @@ def external(k: int) -> ExternalMessage:
 
 
 def record(path: Path, n: int = 500, close: bool = True) -> None:
-    sink = open_sink(path, JOINT, TEXT, "somewhere")
+    sink = open_sink(path, JOINT, TEXT)
     for k in range(n):
         stamp_ns = BEGIN_NS + k * 1_000_000
         sink.sample(sample(k), stamp_ns)
@@ -86,7 +86,7 @@ def test_samples_come_back_bit_for_bit(tmp_path: Path) -> None:
     back = [cycle.sample for cycle in recorded_cycles(path, 1)]
     assert [bits(one) for one in back if one] == [bits(sample(k)) for k in range(500)]
     carried = joint_of(path, None)
-    assert (carried.text, carried.folder) == (TEXT, Path("somewhere"))
+    assert (carried.text, carried.folder) == (TEXT, tmp_path)
 
 
 def test_a_record_of_it_is_that_of_its_samples(tmp_path: Path) -> None:

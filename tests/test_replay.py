@@ -61,9 +61,7 @@ class Recorded:
         self.folder = folder
         self.joint = parse(text)
         self.tap = can.Bus(interface="virtual", channel=self.joint.bus.channel)
-        self.sinks: list[Sink] = [
-            open_sink(folder / f"r{suffix}", self.joint, text, str(folder)) for suffix in formats
-        ]
+        self.sinks: list[Sink] = [open_sink(folder / f"r{suffix}", self.joint, text) for suffix in formats]
         self.stamp_ns = BEGIN_NS - 1_000_000_000
         with daemonkit.rig(self.joint) as rig:
             self.drain()
@@ -257,7 +255,7 @@ def test_frames_recorded_from_a_running_daemon_are_decoded_by_its_model_document
     text = daemonkit.vsa_text()
     joint = parse(text)
     path = tmp_path / "late.mcap"
-    sink = open_sink(path, joint, text, str(tmp_path))
+    sink = open_sink(path, joint, text)
     with can.Bus(interface="virtual", channel=joint.bus.channel) as tap, daemonkit.rig(joint) as rig:
         rig.run(20)
         while tap.recv(0) is not None:
@@ -321,8 +319,8 @@ def test_a_recording_begun_beside_a_running_daemon_replays_by_what_the_daemon_sa
     with can.Bus(interface="virtual", channel=joint.bus.channel) as tap, daemonkit.rig(joint) as rig:
         rig.run(20)
         known = asked_over_zenoh(joint, list(rig.daemon.layouts.values()), endpoint, tmp_path)
-        sink = open_sink(path, joint, text, str(tmp_path))
-        sink.mapping(mapping_document(joint.name, known, text, str(tmp_path), daemon=True), BEGIN_NS)
+        sink = open_sink(path, joint, text)
+        sink.mapping(mapping_document(joint.name, known, text, daemon=True), BEGIN_NS)
         while tap.recv(0) is not None:
             pass
         skipped, cycle = len(rig.collector.samples), 0

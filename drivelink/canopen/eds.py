@@ -18,9 +18,12 @@ from canopen.objectdictionary.eds import RECORD, import_eds
 
 from drivelink.canopen.pdo import Tpdo, tpdos_of
 from drivelink.errors import DriveError
+from drivelink.infile import read_regular
 
 Sections = dict[str, dict[str, str]]
 Address = tuple[int, int]
+
+_MOST_BYTES = 4 << 20  # the longest in circulation have 1 MiB
 
 _NUMBERS = frozenset({datatypes.BOOLEAN, *datatypes.INTEGER_TYPES})
 _TIMES = (datatypes.TIME_OF_DAY, datatypes.TIME_DIFFERENCE)
@@ -88,7 +91,7 @@ def load_eds(path: Path, node_id: int | None = None) -> DataSheet:
         DriveError: it cannot be read, or is not an EDS.
     """
     try:
-        raw = path.read_bytes()
+        raw = read_regular(path, _MOST_BYTES)
     except OSError as error:
         raise DriveError(f"{path}: cannot be read as an EDS: {error.strerror}") from error
     sheet = DataSheet(path=path)

@@ -97,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopped.set())
     with ExitStack() as stack:
-        sink = open_sink(args.out, joint, source.text, str(source.folder), force=args.force)
+        sink = open_sink(args.out, joint, source.text, force=args.force)
         recorder = stack.enter_context(Recorder(sink, []))
         _add_taps(recorder, args.source, source, stack)
         end = time.monotonic() + args.seconds if args.seconds else float("inf")
@@ -123,7 +123,7 @@ def _add_taps(recorder: Recorder, source: str, text: JointText, stack: ExitStack
     alive = session is not None and _alive(session, joint)
     known = _daemon_layouts(session, joint) if session is not None and alive else ()
     layouts = known or _declared_layouts(joint, folder)
-    document = mapping_document(joint.name, layouts, text.text, str(folder), daemon=bool(known))
+    document = mapping_document(joint.name, layouts, text.text, daemon=bool(known))
     sink.mapping(document, time.time_ns())
     alive = source == "daemon" or (alive and source == "auto")
     if session is not None and source != "bus" and sink.wants - {"frame"}:

@@ -17,7 +17,7 @@ from drivelink import jointfile
 from drivelink.errors import DrivelinkError, RecordingError, UsageError
 from drivelink.fleet.errors import FleetError
 from drivelink.jointfile import JointFile
-from drivelink.recording.mapping import joint_of
+from drivelink.recording.mapping import contained, joint_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,17 +29,20 @@ class Joint:
         text: of the joint file.
         where: path of the file, for messages.
         eds: the EDS and DCF files it refers to: (name, content) each.
+        carried: from a recording, whose joint file refers to nothing.
     """
 
     name: str
     text: str
     where: str
     eds: tuple[tuple[str, bytes], ...] = ()
+    carried: bool = False
 
     @property
     def file(self) -> JointFile:
         """The joint file, validated."""
-        return _parsed(self.text, self.where)
+        joint = _parsed(self.text, self.where)
+        return contained(joint) if self.carried else joint
 
     @property
     def digest(self) -> str:
@@ -142,7 +145,7 @@ def carried_joint(path: Path) -> Joint | None:
         carried = joint_of(path, None)
     except UsageError:
         return None
-    return Joint(carried.joint.name, carried.text, str(carried.folder / "joint.toml"))
+    return Joint(carried.joint.name, carried.text, str(carried.folder / "joint.toml"), carried=True)
 
 
 def _stands_in(name: str, text: str) -> bool:

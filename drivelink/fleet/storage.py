@@ -21,6 +21,7 @@ import fsspec
 from fsspec.core import url_to_fs
 
 from drivelink.fleet.errors import FleetError
+from drivelink.infile import open_regular
 from drivelink.recording.canlog import CAN_SUFFIXES
 from drivelink.recording.mapping import side_file
 
@@ -151,7 +152,7 @@ def fetched(source: Source) -> Iterator[tuple[Path, str]]:
     """
     if "://" not in source.url:
         path = Path(source.url)
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             yield path, hashlib.file_digest(file, "sha256").hexdigest()
         return
     with tempfile.TemporaryDirectory(prefix="drivelink-fleet-") as folder:

@@ -17,6 +17,7 @@ from pydantic import ValidationError
 from tomlkit.container import Container
 
 from drivelink.errors import JointFileError
+from drivelink.infile import read_regular
 from drivelink.jointfile.keyhint import unknown_key
 from drivelink.jointfile.schema import JointFile
 from drivelink.output.outfile import write_whole
@@ -73,9 +74,7 @@ def load_text(path: str | Path) -> JointText:
     """
     path = Path(path)
     try:
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-        text = data.decode().replace("\r\n", "\n")
+        text = read_regular(path, MAX_BYTES).decode().replace("\r\n", "\n")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "expected UTF-8 text"
         raise JointFileError(f"{path}: cannot be read as a joint file: {reason}") from error

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import zenoh
 
 from drivelink.errors import ZenohError
+from drivelink.infile import read_regular
 from drivelink.pubsub.rendezvous import Rendezvous, answers
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ _MEETING_S = 2.0  # timeout of a local handshake, reached only if another progra
 _POLL_S = 0.01
 _EXAMPLE = "tcp/127.0.0.1:7447"
 _LINKS = ("tcp", "tls", "udp", "quic", "ws", "unixsock-stream", "serial", "vsock")
+_MOST_CONFIG_BYTES = 256 << 10
 
 _COMMON: dict[str, Any] = {
     "mode": "peer",
@@ -145,7 +147,10 @@ def _read(path: Path) -> zenoh.Config:
     if not path.is_file():
         raise ZenohError(f"{path}: zenoh.config: expected a zenoh configuration file (JSON5), there is none")
     try:
+        read_regular(path, _MOST_CONFIG_BYTES)
         return zenoh.Config.from_file(path)
+    except OSError as error:
+        raise ZenohError(f"{path}: zenoh.config: cannot be read: {error.strerror}") from error
     except zenoh.ZError as error:
         raise ZenohError(f"{path}: expected a zenoh configuration (JSON5): {one_line(error)}") from error
 

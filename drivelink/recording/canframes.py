@@ -6,9 +6,9 @@ configuration in the recording.
 
 from __future__ import annotations
 
-import json
 import logging
 from array import array
+from collections import deque
 from collections.abc import Callable, Iterator
 from itertools import chain, islice
 from pathlib import Path
@@ -30,7 +30,7 @@ from drivelink.recording.cycles import Cycle
 from drivelink.recording.grid import report_gaps
 from drivelink.recording.limits import require_samples
 from drivelink.recording.mapping import recorded_layouts, side_file
-from drivelink.recording.mcapfile import read_messages
+from drivelink.recording.mcapfile import message_fields, read_messages
 from drivelink.recording.syncnumbers import numbered_ahead, numbered_at_once
 from estimator.sample import FloatArray, Record
 
@@ -39,6 +39,7 @@ _LOG = logging.getLogger("drivelink.recording")
 _SDO = range(0x581, 0x680)
 _OF_MAPS = frozenset({0, *_SDO, *range(0x701, 0x780)})  # NMT, SDO, boot-up
 _QUIET_SYNCS = 500  # without a change, the configuration has ended
+_MOST_HELD = 1 << 18  # frames among them: more than a bus of 127 nodes sends
 _PEEK = 20_000  # messages that show whether an MCAP file has samples
 
 
@@ -192,12 +193,14 @@ class FrameLog:
             Stamps of the SYNCs until then, and whether the traffic contained a node's mapping.
         """
         listener, head = self._listener, self._head
-        syncs: list[int] = []
+        syncs: deque[int] = deque(maxlen=2 * _QUIET_SYNCS)
         quiet, heard = 0, False
         for frame in self._frames:
             stamp_ns, can_id, data, _ = frame
             if not listener.busy:
                 head.append(frame)
+                if len(head) > _MOST_HELD:
+                    break
             if can_id == SYNC_COB_ID:
                 syncs.append(stamp_ns)
                 quiet += 1
@@ -209,7 +212,7 @@ class FrameLog:
                 if listener.poll(now_s):
                     head.clear()
                     quiet, heard = 0, True
-        return syncs[-2 * _QUIET_SYNCS :], heard and not listener.busy
+        return list(syncs), heard and not listener.busy
 
     def _check_complete(self) -> None:
         """Raise if the mapping of a node is unknown."""
@@ -290,11 +293,11 @@ def _seconds(stamp_ns: int, sync: int, period_s: float) -> float:
 def _mcap_frames(path: Path) -> Iterator[LoggedFrame]:
     for message in read_messages(path, frozenset({"can"})):
         try:
-            fields = json.loads(message.data)
+            fields = message_fields(message.data)
             can_id, data = int(fields["id"]), bytes.fromhex(fields["data"])
             if not 0 <= can_id <= 0x7FF or len(data) > 64:
                 raise ValueError("expected an 11-bit identifier and at most 64 bytes")
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
             reason = f"{message.topic[:80]} is no frame of drivelink: {error}"
             raise RecordingError(f"{path}: {reason}") from error
         yield LoggedFrame(message.log_time_ns, can_id, data, "")

@@ -17,6 +17,7 @@ from typing import IO, Any, NamedTuple
 import can
 
 from drivelink.errors import RecordingError
+from drivelink.infile import open_regular
 from drivelink.recording.boundedlog import AscText, BlfBytes, TrcText
 from drivelink.recording.limits import MAX_LINE_BYTES
 
@@ -136,7 +137,7 @@ def _same_channel(name: str, wanted: str) -> bool:
 
 def _text_frames(path: Path) -> Iterator[LoggedFrame]:
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             frames = _parsed(file, path)
             first = list(islice(frames, _LOOK_AHEAD))
             yield from _dated(first, chain(first, frames), path)
@@ -318,7 +319,7 @@ def _library_frames(path: Path) -> Iterator[LoggedFrame]:
     count = 0
     try:
         # Opened here, because a reader leaves a malformed file open.
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             for message in kind(_BOUNDED[kind](file, path)):
                 if message.is_extended_id or message.is_error_frame or message.is_remote_frame:
                     continue

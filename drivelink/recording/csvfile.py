@@ -16,6 +16,7 @@ from typing import IO, NamedTuple
 import numpy as np
 
 from drivelink.errors import RecordingError
+from drivelink.infile import open_regular
 from drivelink.jointfile import JointFile
 from drivelink.recording.columnmap import ColumnMap, renamed
 from drivelink.recording.columns import KNOWN, record_from_columns
@@ -57,7 +58,7 @@ def _read_csv_columns(
             many lines or columns.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             return _read(file, path, names or {})
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error

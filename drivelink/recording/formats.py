@@ -10,16 +10,13 @@ from drivelink.recording.mf4file import Mf4Sink
 from drivelink.recording.sinks import CanSink, CsvSink, McapSink, Sink
 
 
-def open_sink(
-    path: Path, joint: JointFile, joint_text: str = "", folder: str = "", *, force: bool = False
-) -> Sink:
+def open_sink(path: Path, joint: JointFile, joint_text: str = "", *, force: bool = False) -> Sink:
     """Open the writer for the file's ending.
 
     Args:
         path: the recording.
         joint: the joint.
         joint_text: its joint file, stored if the format allows.
-        folder: of the joint file, base of its EDS files.
         force: replace an existing file.
 
     Raises:
@@ -27,11 +24,11 @@ def open_sink(
     """
     suffix = path.suffix.lower()
     if suffix == ".mcap":
-        return McapSink(path, joint, joint_text, folder, force=force)
+        return McapSink(path, joint, joint_text, force=force)
     if suffix == ".csv":
         return CsvSink(path, joint, force=force)
     if suffix == ".mf4":
-        return Mf4Sink(path, joint, joint_text, folder, force=force)
+        return Mf4Sink(path, joint, joint_text, force=force)
     if suffix in (".log", ".asc", ".blf", ".trc"):
         return CanSink(path, joint, force=force)
     raise RecordingError(

@@ -12,6 +12,7 @@ import numpy as np
 from drivelink.errors import RecordingError
 from drivelink.jointfile import DriveSection, EncoderSection, JointFile
 from drivelink.recording.canframes import is_frame_log
+from drivelink.recording.limits import MAX_SAMPLES
 from drivelink.recording.playback import Played
 from estimator.errors import EstimatorError
 from estimator.gate import Change, Discrepancy, Judgement, check, judge
@@ -127,6 +128,8 @@ def _record_of(samples: Sequence[Sample], model: JointModel, period_s: float) ->
     rows = [s for s in rows if not linked or math.isfinite(s.link_position_rad)]
     sequence = np.array([s.sequence for s in rows], dtype=np.int64)
     if len(rows) < 2 or np.any(np.diff(sequence) < 1):  # restarted numbering: two runs in one file
+        return None
+    if sequence[-1] - sequence[0] > MAX_SAMPLES:  # the judge allocates the gaps
         return None
     return Record(
         period_s=period_s,

@@ -24,6 +24,8 @@ _JITTER = 0.25
 _MAX_GAP_SHARE = 0.35
 # Largest deviation of a stamp from the grid, in periods (arrival times of a loaded machine).
 _MAX_JITTER_PERIODS = 3.0
+_LAST_S = 1e12  # of a stamp
+_MOST_PERIODS = 2**53  # that a float counts
 _AHEAD = 65  # stamps needed to distinguish a late one from a gap
 _MAX_GAPS = 0.1  # fraction of rows, with jittering stamps
 
@@ -68,6 +70,8 @@ def find_grid(
         _LOG.warning("%s: %d row(s) repeat the row before and are omitted", where, repeated)
         keep &= ~repeats
     time = time_s[keep]
+    if np.any(np.abs(time) > _LAST_S):
+        raise RecordingError(f"{where}: expected time_s in seconds, below {_LAST_S:g}, got {time.max():g}")
     if len(time) < MINIMUM_ROWS:
         raise RecordingError(f"{where}: expected at least {MINIMUM_ROWS} samples, got {len(time)}")
     steps = np.diff(time)
@@ -75,6 +79,8 @@ def find_grid(
     if np.count_nonzero(steps) < 0.5 * len(steps):
         raise RecordingError(f"{where}: time_s stands still: expected one stamp per sample, increasing")
     period = float(np.median(steps))
+    if time[-1] - time[0] > _MOST_PERIODS * period:
+        raise RecordingError(f"{where}: time_s spans {time[-1] - time[0]:g} s in steps of {period:g} s")
     sequence = _number(time, period, where)
     period = _rounded(time, sequence, nominal_s)
     return Grid(period, sequence, float(time[0]), keep)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from drivelink.errors import RecordingError
 
-_MAX_SAMPLES = 10_000_000  # periods from first to last sample of a recording in memory: 2.7 h at 1 kHz
+MAX_SAMPLES = 10_000_000  # periods from first to last sample of a recording in memory: 2.7 h at 1 kHz
 MAX_COLUMNS = 4096  # columns of a CSV file; unknown ones are not kept in memory
 MAX_LINE_BYTES = 1 << 20  # of a line of text
 MAX_BLOCK_BYTES = 64 << 20  # an MCAP chunk or a BLF container, unpacked; tools write up to 8 MiB
@@ -20,8 +20,8 @@ def require_samples(count: int, where: str) -> None:
     Raises:
         RecordingError: the limit is exceeded.
     """
-    if count > _MAX_SAMPLES:
+    if count > MAX_SAMPLES:
         raise RecordingError(
-            f"{where}: expected at most {_MAX_SAMPLES} periods from the first sample to the last, "
+            f"{where}: expected at most {MAX_SAMPLES} periods from the first sample to the last, "
             f"got {count}: split it, at a gap if there is one"
         )

@@ -13,7 +13,8 @@ from typing import Any
 from drivelink import jointfile
 from drivelink.canopen.layout import NodeLayout, layout_document, layout_from
 from drivelink.errors import RecordingError, UsageError
-from drivelink.jointfile import JointText
+from drivelink.infile import read_regular
+from drivelink.jointfile import JointFile, JointText, ZenohSection
 from drivelink.recording.canlog import CAN_SUFFIXES
 from drivelink.recording.mcapfile import read_messages
 
@@ -27,7 +28,7 @@ def side_file(path: Path) -> Path:
 
 
 def mapping_document(
-    joint: str, layouts: Iterable[NodeLayout], text: str = "", folder: str = "", *, daemon: bool = False
+    joint: str, layouts: Iterable[NodeLayout], text: str = "", *, daemon: bool = False
 ) -> dict[str, Any]:
     """The mapping document of a recording of frames.
 
@@ -35,12 +36,11 @@ def mapping_document(
         joint: its name.
         layouts: of its nodes, if known.
         text: the joint file.
-        folder: base of its EDS files.
         daemon: whether the layouts come from a daemon rather than a file.
     """
     nodes = [layout_document(layout) for layout in layouts]
     about = {"schema": _SCHEMA, "joint": joint, "source": "daemon" if daemon else "file", "nodes": nodes}
-    return about | {"text": text, "folder": folder}
+    return about | {"text": text}
 
 
 def layouts_from(data: bytes, joint: str, *, daemon: bool = False) -> list[NodeLayout]:
@@ -104,12 +104,25 @@ def joint_of(path: Path, named: Path | None) -> JointText:
     if carried is None:
         raise UsageError(f"--joint: expected the joint file that {path} was recorded with")
     try:
-        document = json.loads(carried)
-        text, folder = str(document["text"]), str(document.get("folder") or ".")
+        if len(carried) > MAX_BYTES:
+            raise ValueError(f"expected at most {MAX_BYTES >> 10} KiB, got {len(carried) >> 10} KiB")
+        text = str(json.loads(carried)["text"])
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise RecordingError(f"{path}: the joint file in it cannot be read: {error}") from error
     name = f"{path}: joint file in it"
-    return JointText(joint=jointfile.parse(text, name), text=text, folder=Path(folder), name=name)
+    return JointText(joint=contained(jointfile.parse(text, name)), text=text, folder=path.parent, name=name)
+
+
+def contained(joint: JointFile) -> JointFile:
+    """A recording's joint file without the keys that name something outside: data sheets, endpoints."""
+    motors = [
+        motor.model_copy(update={"drive": motor.drive and motor.drive.model_copy(update={"eds": None})})
+        for motor in joint.motor
+    ]
+    encoder = joint.link.encoder and joint.link.encoder.model_copy(update={"eds": None})
+    link = joint.link.model_copy(update={"encoder": encoder})
+    zenoh = ZenohSection(prefix=joint.zenoh.prefix)
+    return joint.model_copy(update={"motor": tuple(motors), "link": link, "zenoh": zenoh})
 
 
 def _carried(path: Path) -> bytes | None:
@@ -124,8 +137,7 @@ def _carried(path: Path) -> bytes | None:
 def _read_side(path: Path) -> bytes | None:
     side = side_file(path)
     try:
-        with side.open("rb") as file:
-            return file.read(MAX_BYTES + 1)
+        return read_regular(side, MAX_BYTES)
     except FileNotFoundError:
         return None
     except OSError as error:

@@ -6,6 +6,7 @@ or a power loss). Record layout: mcap.dev/spec.
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import struct
@@ -13,12 +14,13 @@ import zlib
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 
 from drivelink.errors import RecordingError
+from drivelink.infile import open_regular
 from drivelink.recording.limits import MAX_BLOCK_BYTES
 
 _LOG = logging.getLogger("drivelink.recording")
@@ -30,6 +32,8 @@ _CHUNK = struct.Struct("<QQQII")  # first, last, size, CRC, length of the compre
 _CHANNEL_HEAD = struct.Struct("<HHI")  # channel, schema, length of the topic
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE_OP, _CHUNK_OP, _DATA_END = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F
 _WANTED = frozenset({_CHANNEL, _MESSAGE_OP, _CHUNK_OP})
+_MESSAGE_BYTES = 64 << 10  # of a sample, an estimate or a frame: ours have some 500
+_LAST_STAMP_NS = (1 << 63) - 1  # of the year 2262
 _ZSTD_WINDOW = 128 << 20  # memory limit of its decoder, the same as in zstd's tools
 
 
@@ -53,7 +57,7 @@ def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[
     """
     channels: dict[int, str | None] = {}
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             if file.read(len(_MAGIC)) != _MAGIC:
                 raise RecordingError(f"{path}: expected an MCAP file, its first bytes are not those of one")
             left = os.fstat(file.fileno()).st_size - len(_MAGIC)
@@ -70,12 +74,32 @@ def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[
                 _require_size(length, path)
                 body = file.read(length)
                 records = _decompressed(body, path) if opcode == _CHUNK_OP else head + body
-                yield from _messages(records, channels, topics)
+                for message in _messages(records, channels, topics):
+                    if message.log_time_ns > _LAST_STAMP_NS:
+                        raise RecordingError(
+                            f"{path}: expected stamps below 2^63 ns, got {message.log_time_ns}"
+                        )
+                    yield message
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
     except _BrokenError:
         pass
     _warn_once(path, path.stat().st_mtime_ns)
+
+
+def message_fields(data: bytes) -> dict[str, Any]:
+    """The fields of a message.
+
+    Raises:
+        ValueError: it is too long, or not a JSON object.
+        RecursionError: nested too deeply.
+    """
+    if len(data) > _MESSAGE_BYTES:
+        raise ValueError(f"expected at most {_MESSAGE_BYTES >> 10} KiB, got {len(data) >> 10} KiB")
+    fields = json.loads(data)
+    if not isinstance(fields, dict):
+        raise ValueError(f"expected a JSON object, got {data[:40]!s}")
+    return fields
 
 
 @lru_cache(maxsize=16)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 from array import array
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +14,7 @@ from drivelink.jointfile import JointFile
 from drivelink.recording.columns import KNOWN, record_from_columns
 from drivelink.recording.cycles import Cycle
 from drivelink.recording.limits import require_samples
-from drivelink.recording.mcapfile import read_messages
+from drivelink.recording.mcapfile import message_fields, read_messages
 from drivelink.recording.messages import read_sample
 from estimator.sample import Record, Status
 
@@ -24,7 +22,6 @@ _STALE = int(Status.STALE)
 _SERVICE = int(
     Status.DRIVE_FAULT | Status.BUS_FAULT | Status.UNTIMED | Status.NODE_RESTARTED | Status.CONTRADICTED
 )
-_MESSAGE_BYTES = 64 << 10  # of a sample or an estimate: ours have some 500
 _APART = 64  # largest distance in cycles between a sample and its estimate in the file
 
 
@@ -45,7 +42,7 @@ def recorded_cycles(path: Path, motors: int, scale: Mapping[str, float] | None =
     newest, found = -1, False
     for message in read_messages(path, frozenset({"sample", "estimate"})):
         try:
-            fields = _fields(message.data)
+            fields = message_fields(message.data)
             if message.topic.endswith("/sample"):
                 for name, factor in (scale or {}).items():
                     if isinstance(fields.get(name), float):
@@ -53,14 +50,16 @@ def recorded_cycles(path: Path, motors: int, scale: Mapping[str, float] | None =
                 if not found and f"motor{motors + 1}_position_rad" in fields:
                     raise RecordingError(f"{path}: has more motors than the joint file, which has {motors}")
                 sample = read_sample(fields, motors)
+                _require_number(sample.sequence)
                 found = True
                 before = waiting.get(sample.sequence)
                 cycle = Cycle(sample.sequence, message.log_time_ns, sample, before.flags if before else 0)
             else:
                 sequence, flags = int(fields["sequence"]), int(fields["status"]) & (_SERVICE | _STALE)
+                _require_number(sequence)
                 before = waiting.get(sequence)
                 cycle = Cycle(sequence, message.log_time_ns, before.sample if before else None, flags)
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
             raise _strange(path, message.topic, error) from error
         if cycle.sequence < newest - _APART:  # the daemon restarted: numbering begins again
             yield from _released(waiting, newest + 1)
@@ -94,13 +93,13 @@ def read_mcap(path: Path, joint: JointFile | None, keep_nan: bool) -> Record:
     count = 0
     for message in read_messages(path, frozenset({"sample"})):
         try:
-            row = _fields(message.data)
+            row = message_fields(message.data)
             if not count:
                 columns = {name: array("d") for name in row if name in KNOWN}
             for name, values in columns.items():
                 value = row.get(name)
                 values.append(math.nan if value is None else value)
-        except (ValueError, TypeError, RecursionError) as error:
+        except (ValueError, TypeError, OverflowError, RecursionError) as error:
             raise _strange(path, message.topic, error) from error
         count += 1
         require_samples(count, str(path))
@@ -110,18 +109,9 @@ def read_mcap(path: Path, joint: JointFile | None, keep_nan: bool) -> Record:
     return record_from_columns(table, str(path), joint, keep_nan)
 
 
-def _fields(data: bytes) -> dict[str, Any]:
-    """The fields of a message.
-
-    Raises:
-        ValueError: it is too long, or not a JSON object.
-    """
-    if len(data) > _MESSAGE_BYTES:
-        raise ValueError(f"expected at most {_MESSAGE_BYTES >> 10} KiB, got {len(data) >> 10} KiB")
-    fields = json.loads(data)
-    if not isinstance(fields, dict):
-        raise ValueError(f"expected a JSON object, got {data[:40]!s}")
-    return fields
+def _require_number(sequence: int) -> None:
+    if not 0 <= sequence < 1 << 62:
+        raise ValueError(f"expected a sequence from 0 to 2^62, got {sequence}")
 
 
 def _strange(path: Path, topic: str, error: Exception) -> RecordingError:

@@ -145,7 +145,7 @@ def message_schema(topic: str, motors: int) -> bytes:
     elif topic == "mapping":
         properties = {"joint": text, "nodes": {"type": "array", "items": {"type": "object"}}}
     elif topic == "joint":
-        properties = {"text": text | {"description": "the joint file"}, "folder": text}
+        properties = {"text": text | {"description": "the joint file"}}
     else:
         properties = {}
     schema = {

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from drivelink.errors import RecordingError
+from drivelink.infile import open_regular
 from drivelink.jointfile import JointFile
 from drivelink.output.outfile import check_target, put_in_place, sync
 from drivelink.recording.columnmap import ColumnMap, renamed
@@ -32,14 +33,12 @@ class Mf4Sink(McapSink):
 
     wants = frozenset({"sample"})
 
-    def __init__(
-        self, path: Path, joint: JointFile, joint_text: str = "", folder: str = "", *, force: bool = False
-    ) -> None:
+    def __init__(self, path: Path, joint: JointFile, joint_text: str = "", *, force: bool = False) -> None:
         _asammdf(path)  # before anything is recorded
         self._path, self._joint_file, self._force = path, joint, force
         self._journal = path.with_name(path.name + ".mcap")
         check_target(self._journal)  # samples of a killed recording: never replaced
-        super().__init__(self._journal, joint, joint_text, folder)
+        super().__init__(self._journal, joint, joint_text)
 
     def close(self) -> None:
         """Convert the recorded samples to the .mf4 file."""
@@ -98,6 +97,7 @@ def read_mf4(
     """
     mdf_module = _asammdf(path)
     try:
+        open_regular(path).close()
         with mdf_module.MDF(path) as mdf:
             wanted = {source.column for source in (names or {}).values()} | KNOWN - {"time_s"}
             for group in mdf.groups:

@@ -100,9 +100,7 @@ class McapSink(Sink):
 
     wants = frozenset({"sample", "estimate", "external", "document", "frame"})
 
-    def __init__(
-        self, path: Path, joint: JointFile, joint_text: str = "", folder: str = "", *, force: bool = False
-    ) -> None:
+    def __init__(self, path: Path, joint: JointFile, joint_text: str = "", *, force: bool = False) -> None:
         super().__init__(path, force=force)
         motors, period_s = len(joint.motor), joint.bus.period_s
         self._encode_sample: Callable[[Sample], bytes] = sample_encoder(motors, period_s)
@@ -125,7 +123,7 @@ class McapSink(Sink):
                 f"drivelink.{topic}", "jsonschema", message_schema(topic, motors)
             )
             self._channels[topic] = self._writer.register_channel(f"/{joint.name}/{topic}", "json", schema)
-        self._joint = json.dumps({"text": joint_text, "folder": folder}).encode() if joint_text else b""
+        self._joint = json.dumps({"text": joint_text}).encode() if joint_text else b""
 
     def sample(self, sample: Sample, stamp_ns: int) -> None:
         """Take what was measured at one SYNC."""
@@ -154,7 +152,7 @@ class McapSink(Sink):
 
     def mapping(self, document: dict[str, Any], stamp_ns: int) -> None:
         """Take what makes samples of the frames."""
-        fields = {key: value for key, value in document.items() if key not in ("text", "folder")}
+        fields = {key: value for key, value in document.items() if key != "text"}
         self._put("mapping", stamp_ns, json.dumps(fields).encode())  # the joint file has a separate channel
 
     def flush(self) -> None:

@@ -20,7 +20,6 @@ from pathlib import Path
 
 import numpy as np
 from pydantic import BaseModel
-from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from drivelink import cli, jointfile
@@ -30,6 +29,7 @@ from estimator.effects import LIBRARY
 from estimator.errors import EstimatorError
 from estimator.flexibility import TransmissionModel
 from estimator.reasons import REASONS
+from estimator.ranges import range_of
 from estimator.sample import ExternalStatus, Status
 from estimator.transmissions import MODELS
 from sim.effects import LISTED, UNLISTED, Definition
@@ -104,18 +104,19 @@ def default_text(value: object) -> str:
     return ""
 
 
-def limits(info: FieldInfo) -> str:
-    """Bounds on a number, where there are some."""
+def limits(name: str, annotation: object, metadata: typing.Iterable[object]) -> str:
+    """Bounds on a number: its own, else those of its unit."""
     found = {
-        name: getattr(item, name)
-        for item in info.metadata
-        for name in ("gt", "ge", "le")
-        if getattr(item, name, None) is not None
+        bound: getattr(item, bound)
+        for item in metadata
+        for bound in ("gt", "ge", "le")
+        if getattr(item, bound, None) is not None
     }
-    if found.keys() == {"ge", "le"}:
-        return f"{found['ge']} to {found['le']}"
-    signs = {"gt": ">", "ge": "≥", "le": "≤"}
-    return ", ".join(f"{signs[name]} {bound}" for name, bound in found.items())
+    allowed, numbers = range_of(name), {int, float} & {annotation, *typing.get_args(annotation)}
+    if not numbers:
+        return ""
+    low = allowed.least if found.get("gt") == 0 else found.get("ge", -allowed.most)
+    return f"{low:g} to {found.get('le', allowed.most):g}"
 
 
 def rows(section: type) -> list[tuple[str, str, str, str, str]]:
@@ -125,7 +126,7 @@ def rows(section: type) -> list[tuple[str, str, str, str, str]]:
             (
                 name,
                 type_name(info.annotation),
-                limits(info),
+                limits(name, info.annotation, info.metadata),
                 "" if info.default_factory else default_text(info.default),
                 info.description or "",
             )
@@ -139,7 +140,7 @@ def rows(section: type) -> list[tuple[str, str, str, str, str]]:
         (
             field.name,
             type_name(hints[field.name]),
-            "",
+            limits(field.name, hints[field.name], ()),
             "" if field.default_factory is not dataclasses.MISSING else default_text(field.default),
             " ".join(meanings.get(field.name, "").split()).rstrip(".").replace("None:", "left out:"),
         )

@@ -1,4 +1,4 @@
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from drivelink.canopen.layout import NodeLayout
@@ -338,7 +338,19 @@ class JointPipeline:
             stamp_ns: UNIX time of its SYNC; None: from the SYNCs fed.
         """
 
-    def exchange(
-        self, estimator: Any, model_monitor: ResidualMonitor | None, unseen: Iterable[Sample] = ()
-    ) -> None:
-        """Put another estimator in place between two cycles, after it has seen the last samples too."""
+    def warm(self, estimator: Any, sequence: int, most: int | None = None) -> int:
+        """Step a new estimator through the kept samples after one of that number.
+
+        A compiled one is stepped without the interpreter's lock.
+
+        Args:
+            estimator: not the one in use.
+            sequence: of the last sample that it has seen.
+            most: number of steps; None: all.
+
+        Returns:
+            The number of the last sample that it has seen now.
+        """
+
+    def exchange(self, estimator: Any, model_monitor: ResidualMonitor | None) -> None:
+        """Put another estimator in place between two cycles."""

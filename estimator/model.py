@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal
 
 from estimator.errors import EstimatorError
 from estimator.priors import PRIORS
+from estimator.ranges import range_of, require_in_range
 
 __all__ = [
     "HIGHEST_ORDER",
@@ -47,6 +48,26 @@ def require_finite(minimum: float, strict: bool = False, **values: float) -> Non
         require(math.isfinite(value) and inside, f"{name}: expected a finite number {bound}, got {value!r}")
 
 
+def require_declared(minimum: float, strict: bool = False, **values: float) -> None:
+    """Require each declared value as `require_finite` does, and within the range of its unit."""
+    require_finite(minimum, strict, **values)
+    for name, value in values.items():
+        require_in_range(name, value, positive=strict and minimum == 0.0)
+
+
+def require_parameters(parameters: Mapping[str, ParameterValue]) -> None:
+    """Require parameters within their ranges, and not too many numbers in one."""
+    most = int(range_of("elements").most)
+    for name, value in parameters.items():
+        numbers = value if isinstance(value, tuple) else (value,)
+        require(
+            len(numbers) <= most,
+            f"{name}: expected at most {most} numbers, got {len(numbers)}",
+        )
+        for number in numbers:
+            require_in_range(name, number)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Effect:
     """One physical effect the model has been given, by its name in `estimator.effects.LIBRARY`.
@@ -60,6 +81,9 @@ class Effect:
 
     name: str
     parameters: Mapping[str, ParameterValue] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        require_parameters(self.parameters)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,6 +107,7 @@ class Transmission:
             self.order is None or 1 <= self.order <= HIGHEST_ORDER,
             f"order: expected 1 to {HIGHEST_ORDER}, got {self.order}",
         )
+        require_parameters(self.parameters)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,10 +132,10 @@ class Motor:
     inertia_std_relative: float | None = None
 
     def __post_init__(self) -> None:
-        require_finite(0.0, strict=True, inertia_kg_m2=self.inertia_kg_m2)
-        require_finite(0.0, viscous_damping_nm_s_rad=self.viscous_damping_nm_s_rad)
+        require_declared(0.0, strict=True, inertia_kg_m2=self.inertia_kg_m2)
+        require_declared(0.0, viscous_damping_nm_s_rad=self.viscous_damping_nm_s_rad)
         if self.inertia_std_relative is not None:
-            require_finite(0.0, strict=True, inertia_std_relative=self.inertia_std_relative)
+            require_declared(0.0, strict=True, inertia_std_relative=self.inertia_std_relative)
 
     @property
     def flexible(self) -> bool:
@@ -143,13 +168,13 @@ class LinkDynamics:
     gravity_std_nm: float | None = None
 
     def __post_init__(self) -> None:
-        require_finite(0.0, strict=True, inertia_kg_m2=self.inertia_kg_m2)
-        require_finite(0.0, viscous_damping_nm_s_rad=self.viscous_damping_nm_s_rad)
-        require_finite(-math.inf, gravity_nm=self.gravity_nm, gravity_phase_rad=self.gravity_phase_rad)
+        require_declared(0.0, strict=True, inertia_kg_m2=self.inertia_kg_m2)
+        require_declared(0.0, viscous_damping_nm_s_rad=self.viscous_damping_nm_s_rad)
+        require_declared(-math.inf, gravity_nm=self.gravity_nm, gravity_phase_rad=self.gravity_phase_rad)
         for name in ("inertia_std_kg_m2", "viscous_damping_std_nm_s_rad", "gravity_std_nm"):
             std = getattr(self, name)
             if std is not None:
-                require_finite(0.0, **{name: std})
+                require_declared(0.0, **{name: std})
 
     def uncertainty(self) -> tuple[float, float, float]:
         """Standard deviations of M (kg·m²), D_q (N·m·s/rad), gravity (N·m): as declared, or by the priors."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
-from estimator.model import require, require_finite
+from estimator.model import require, require_declared
 
 __all__ = ["EstimatorSettings"]
 
@@ -54,7 +54,7 @@ class EstimatorSettings:
     contact_false_alarms_per_hour: float = 1.0
 
     def __post_init__(self) -> None:
-        require_finite(
+        require_declared(
             0.0,
             strict=True,
             bandwidth_rad_s=self.bandwidth_rad_s,
@@ -69,9 +69,9 @@ class EstimatorSettings:
             contact_false_alarms_per_hour=self.contact_false_alarms_per_hour,
         )
         if self.external_bias_s is not None:
-            require_finite(0.0, strict=True, external_bias_s=self.external_bias_s)
+            require_declared(0.0, strict=True, external_bias_s=self.external_bias_s)
         if self.contact_torque_nm is not None:
-            require_finite(0.0, contact_torque_nm=self.contact_torque_nm)
+            require_declared(0.0, contact_torque_nm=self.contact_torque_nm)
         require(
             self.valid_within <= 1.0, f"valid_within: expected a number in (0, 1], got {self.valid_within}"
         )

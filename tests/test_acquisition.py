@@ -7,11 +7,11 @@ import struct
 import pytest
 from canlayouts import COUNT_RAD, LINK_RAD, TORQUE_NM, VSA, drive, encoder, link, pdo, vsa_cycle
 
-from drivelink._core import LATE, Assembler
+from drivelink._core import LATE, Assembler, JointPipeline
 from drivelink.canopen.layout import MappedObject, NodeLayout, Signal, TpdoLayout
 from drivelink.cycle.syncclock import SyncClock, measure_period
 from drivelink.errors import DriveError
-from estimator.sample import Sample, Status
+from estimator.sample import Estimate, Sample, Status, TransmissionEstimate
 
 SYNC = 0x080
 MS = 1_000_000
@@ -477,3 +477,22 @@ class TestMeasuredPeriod:
     def test_too_few_stamps_decide_nothing(self) -> None:
         assert measure_period([k * MS for k in range(7)], 0.001) is None
         assert measure_period([5] * 100, 0.001) is None
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+def test_what_is_not_a_number_is_never_valid_on_the_wire(number: float) -> None:
+    class Says:
+        external = None
+
+        def step(self, sample: Sample) -> Estimate:
+            part = TransmissionEstimate(*numbers, 0.1)
+            return Estimate(sample.sequence, int(Status.VALID), *numbers, (part,))
+
+    pipeline = JointPipeline(Assembler((), 0), Says())
+    sample = Sample(0, (0.0,), (math.nan,), (0.0,), 0.0)
+    numbers = [1.0, 2.0, 0.1]
+    assert pipeline.take(sample).status & Status.VALID
+    for place in range(2):
+        numbers = [1.0, 2.0, 0.1]
+        numbers[place] = number
+        assert not pipeline.take(sample).status & Status.VALID

@@ -1,10 +1,13 @@
 """The joint file: what is right is read, what is wrong is one line."""
 
+import itertools
 import logging
+import math
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import pytest
 
@@ -12,6 +15,11 @@ from drivelink import jointfile
 from drivelink.daemon.reload import Reloader
 from drivelink.daemon.status import EventLog
 from drivelink.errors import JointFileError
+from drivelink.jointfile import apart
+from estimator import make_estimator
+from estimator.effects import LIBRARY
+from estimator.ranges import range_of
+from estimator.sample import Sample
 
 ELBOW = """\
 name = "elbow"                       # part of the key expression
@@ -247,10 +255,11 @@ def test_the_daemon_does_not_take_a_part_of_a_joint_file_over(written: Path) -> 
     ("text", "line"),
     [
         ("\n".join(f"key{k} = 1" for k in range(1_000_000)), "at most 256 KiB, got more"),
-        ("a = " + "[" * 200_000, "nested without end"),
-        (".".join("a" * 100_000) + " = 1", "nested without end"),
-        ("name = [" + "'x'," * 20_000 + "]", "name: input should be a valid string"),
-        ("x = " + "9" * 10_000, "expected TOML"),
+        ("# " + "-" * 120_000, "line 1: expected at most 4 KiB, got 120002 letters"),
+        ("a = [\n" + "[\n" * 100_000, "nested without end"),
+        (".".join("a" * 2_000) + " = 1", "nested without end"),
+        (("# " + "-" * 4_000 + "\n") * 60, "name: expected this key, it is missing"),
+        ("name = [" + "'x',\n" * 20_000 + "]", "name: input should be a valid string"),
         ("\n".join(f"k{k} = 1" for k in range(20_000)), "(and 20001 more)"),
     ],
 )
@@ -260,6 +269,89 @@ def test_a_joint_file_that_grows_without_end_is_one_line(tmp_path: Path, text: s
     with pytest.raises(JointFileError) as caught:
         jointfile.load(path)
     assert line in str(caught.value) and "\n" not in str(caught.value) and len(str(caught.value)) < 600
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "message"),
+    [
+        (
+            "damping_nm_s_rad = 0.8",
+            "damping_nm_s_rad = 1e200",
+            "motor[1]: viscous_damping_nm_s_rad: expected -1e+09 to 1e+09 N·m·s/rad, got 1e+200",
+        ),
+        ("= 0.125", "= 1e-300", "motor[1]: inertia_kg_m2: expected 1e-12 to 1e+09 kg·m², got 1e-300"),
+        ("torque_nm = 0.25", "torque_nm = 1e200", "motor[1].effect[1]: torque_nm: expected -1e+09 to 1e+09"),
+        (
+            "torque_nm = 0.25",
+            f"torque_nm = {[0.25] * 33}",
+            "motor[1].effect[1]: torque_nm: expected at most 32 numbers, got 33",
+        ),
+        (
+            'mode = "robust"',
+            "bandwidth_rad_s = 1e-12",
+            "estimator: bandwidth_rad_s: expected 0.5 to 10000 rad/s, got 1e-12",
+        ),
+        ("gravity_nm = 6", "gravity_nm = 1e11", "link.dynamics: gravity_nm: expected -1e+09 to 1e+09 N·m"),
+        ("= 0.001", "= 1e-9", "bus.period_s: input should be greater than or equal to 0.0001, got 1e-09"),
+    ],
+)
+def test_a_number_beyond_its_range_is_one_line_with_range_and_unit(
+    right: str, wrong: str, message: str
+) -> None:
+    with pytest.raises(JointFileError) as caught:
+        jointfile.parse(ELBOW.replace(right, wrong, 1), "elbow.toml")
+    assert str(caught.value).startswith(f"elbow.toml: {message}") and "\n" not in str(caught.value)
+
+
+def numeric_keys(kind: type, seen: set[type]) -> Iterator[str]:
+    """Names of the numbers in a section and the sections below it."""
+    if kind in seen:
+        return
+    seen.add(kind)
+    for name, hint in get_type_hints(kind).items():
+        parts = [hint, *get_args(hint), *(deep for part in get_args(hint) for deep in get_args(part))]
+        if {int, float} & set(parts):
+            yield name
+        for part in parts:
+            if isinstance(part, type) and part.__module__.startswith(("drivelink.", "estimator.")):
+                yield from numeric_keys(part, seen)
+
+
+def test_every_number_with_a_unit_has_a_range_of_that_unit() -> None:
+    names = set(numeric_keys(jointfile.JointFile, set()))
+    names |= {parameter.name for kind in LIBRARY.values() for parameter in kind.parameters}
+    assert {"bandwidth_rad_s", "period_s", "torque_nm", "inertia_kg_m2", "rated_current_a"} <= names
+    units = re.compile(r"_(rad|s|nm|a|kg|m|hz)\d?(_|$)")
+    assert not {name for name in names if units.search(name) and not range_of(name).unit}
+
+
+@pytest.mark.parametrize("period_s", [1e-4, 1.0])
+def test_what_a_joint_file_may_say_is_prepared_in_a_moment(period_s: float) -> None:
+    """At the ends of every range of [estimator] the estimator has a bounded size and takes one step."""
+    for name, value in itertools.product(
+        ("bandwidth_rad_s", "external_bandwidth_rad_s", "k_tau_rad_s", "false_alarms_per_hour"), (0, 1)
+    ):
+        limit = range_of(name)[value]
+        joint = jointfile.parse(ELBOW.replace('mode = "robust"', f"{name} = {limit!r}"))
+        made = make_estimator(joint.model(), joint.estimator, period_s)
+        assert made.step(Sample(0, (0.0,), (math.nan,), (0.0,), 0.0)).sequence == 0
+
+
+def test_a_running_daemon_has_a_joint_file_read_by_another_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "elbow.toml"
+    path.write_text(ELBOW)
+    assert apart.load_apart(path) == jointfile.load(path)
+    path.write_text(ELBOW.replace("0.125", "nan"))
+    with pytest.raises(JointFileError) as alone, pytest.MonkeyPatch.context() as here:
+        here.setattr(apart, "from_json", lambda *_: pytest.fail("read here"))
+        apart.load_apart(path)
+    with pytest.raises(JointFileError, match=re.escape(str(alone.value))):
+        jointfile.load(path)
+    monkeypatch.setattr(apart, "_PATIENCE_S", 1e-3)
+    with pytest.raises(JointFileError, match=r"elbow\.toml: expected to be read within 0\.001 s"):
+        apart.load_apart(path)
 
 
 def test_an_invalid_rewrite_writes_nothing(tmp_path: Path) -> None:

@@ -8,6 +8,8 @@ import threading
 from collections.abc import Generator
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from canlayouts import VSA, vsa_cycle
@@ -17,7 +19,8 @@ from drivelink.cycle import pacing, realtime
 from drivelink.cycle.framesource import CanFrame
 from drivelink.cycle.housekeeping import Housekeeping
 from drivelink.cycle.loop import CycleLoop, LoopJoint, ObjectSink
-from drivelink.daemon.systemd_notify import notify, watchdog_period_s
+from drivelink.daemon import systemd_notify
+from drivelink.daemon.systemd_notify import Watchdog, notify, watchdog_period_s
 from estimator.sample import Estimate, Sample
 
 MS = 1_000_000
@@ -184,11 +187,24 @@ def test_systemd_is_notified_and_its_absence_is_no_error(
         assert manager.recv(100) == b"READY=1\nSTATUS=running"
 
 
-def test_the_watchdog_is_fed_twice_as_often_as_it_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_watchdog_is_fed_four_times_as_often_as_it_asks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("WATCHDOG_USEC", raising=False)
     monkeypatch.delenv("WATCHDOG_PID", raising=False)
     assert watchdog_period_s() is None
     monkeypatch.setenv("WATCHDOG_USEC", "2000000")
-    assert watchdog_period_s() == 1.0
+    assert watchdog_period_s() == 0.5
     monkeypatch.setenv("WATCHDOG_PID", "1")  # somebody else's
     assert watchdog_period_s() is None
+
+
+def test_the_watchdog_is_fed_by_the_cycles_that_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop: Any = SimpleNamespace(period_ns=1_000_000, overruns=0, behind=0)
+    now_ns, fed = [0], []
+    monkeypatch.setattr(systemd_notify, "notify", fed.append)
+    monkeypatch.setattr(systemd_notify.time, "monotonic_ns", lambda: now_ns[0])
+    watchdog = Watchdog(loop)
+    for overruns, behind, fine in ((0, 0, True), (100, 0, True), (450, 0, False), (450, 490, False)):
+        now_ns[0] += 500_000_000
+        loop.overruns, loop.behind = overruns, behind
+        assert watchdog.check() is fine
+    assert fed == ["WATCHDOG=1"] * 2

@@ -80,7 +80,8 @@ def _attempt(action: Callable[[], None], lines: list[str]) -> bool:
 
 def _schedule() -> None:
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        # Threads and processes that it starts are ordinary ones.
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
     except OSError as error:
         raise OSError(
             error.errno,

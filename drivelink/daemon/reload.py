@@ -1,9 +1,10 @@
 """Replaces the model of the running loop without losing a cycle.
 
-When the joint file is rewritten, or on SIGHUP, a new estimator is built beside the cycle, stepped through the
-last samples so that it starts where the old one is, and swapped in between two cycles. A thread steps it; if
-the thread cannot catch up with the cycle, the cycle does the rest with more steps per slack than there are
-new samples, so the exchange always completes.
+When the joint file is rewritten, or on SIGHUP, another process reads and validates it. A thread builds the
+new estimator and steps it through the last samples, so that it starts where the old one is; it holds neither
+the interpreter's lock nor one of the cycle's meanwhile. It is swapped in between two cycles. If the thread
+cannot catch up with the cycle, the cycle does the rest with more steps per slack than there are new samples,
+so the exchange always completes.
 """
 
 from __future__ import annotations
@@ -12,19 +13,19 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 from drivelink._core import JointPipeline
 from drivelink.cycle.pipeline import Built
 from drivelink.daemon.status import EventLog
 from drivelink.errors import DrivelinkError
-from drivelink.jointfile import JointFile, load
+from drivelink.jointfile import JointFile
+from drivelink.jointfile.apart import load_apart
 from estimator.errors import EstimatorError
-from estimator.sample import Sample
 
 _EVERY_S = 1.0  # minimum time between two reloads, against repeated changes
-_STEPS = 5  # steps of the new estimator before the cycle gets its turn
+_STEPS = 500  # steps of the new estimator before the cycle may have it: some milliseconds
 _PAUSE_S = 0.0005
 _BEHIND = 4  # samples that the cycle can process at the exchange
 _PATIENCE = 4000  # slacks until the cycle takes over; usually a few hundred suffice
@@ -92,10 +93,11 @@ class Reloader:
             if self._history.behind(sequence) > _BEHIND:
                 self._slacks += 1
                 if self._slacks > _PATIENCE:
-                    self._lead(joint, (estimator, model_monitor), self._history.after(sequence, _AID))
+                    self._lead(joint, (estimator, model_monitor), _AID)
                 return
             self._ready = self._thread = None
-            self._pipeline.exchange(estimator, model_monitor, self._history.after(sequence))
+            self._pipeline.warm(estimator, sequence)
+            self._pipeline.exchange(estimator, model_monitor)
         finally:
             self._turn.release()
         self._joint = joint
@@ -111,7 +113,7 @@ class Reloader:
 
     def _prepare(self) -> None:
         try:
-            joint = load(self._path)
+            joint = load_apart(self._path)
             self._refuse_changes(joint)
             built = self._build(joint)
         except (DrivelinkError, EstimatorError) as error:
@@ -123,22 +125,17 @@ class Reloader:
     def _follow(self, joint: JointFile, built: Built) -> None:
         """Step the new estimator through the kept samples, and on until the loop takes over."""
         mine = threading.current_thread()
-        sequence = -1
         while True:
             with self._turn:
                 if self._thread is not mine or self._slacks > _PATIENCE:
                     return
-                sequence = self._lead(joint, built, self._history.after(sequence, _STEPS))
+                self._lead(joint, built, _STEPS)
             time.sleep(_PAUSE_S)
 
-    def _lead(self, joint: JointFile, built: Built, samples: Sequence[Sample]) -> int:
-        """Step the new estimator; return the number of its last sample."""
+    def _lead(self, joint: JointFile, built: Built, steps: int) -> None:
+        """Step the new estimator through the next kept samples."""
         sequence = self._ready[2] if self._ready is not None else -1
-        for sample in samples:
-            built[0].step(sample)
-            sequence = sample.sequence
-        self._ready = (joint, built, sequence)
-        return sequence
+        self._ready = (joint, built, self._pipeline.warm(built[0], sequence, steps))
 
     def _refuse_changes(self, joint: JointFile) -> None:
         changed = [key for key in _FIXED if getattr(joint, key) != getattr(self._joint, key)]

@@ -33,7 +33,7 @@ from drivelink.daemon.jointstatus import JointStatus
 from drivelink.daemon.reload import Reloader
 from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor
-from drivelink.daemon.systemd_notify import notify, watchdog_period_s
+from drivelink.daemon.systemd_notify import Watchdog, notify, watchdog_period_s
 from drivelink.errors import UsageError
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.publisher import JointPublisher
@@ -267,7 +267,7 @@ class Daemon:
             housekeeping.every(_FILE_S, reloader.check)
         watchdog_s = watchdog_period_s()
         if watchdog_s is not None:
-            housekeeping.every(watchdog_s, lambda: notify("WATCHDOG=1"))
+            housekeeping.every(watchdog_s, Watchdog(self.loop).check)
 
     def _timed(self, joint: JointFile) -> JointFile:
         """A joint file with the measured period of SYNC."""

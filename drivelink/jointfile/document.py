@@ -26,8 +26,9 @@ from estimator.model import ParameterValue
 _LOG = logging.getLogger(__name__)
 
 MAX_BYTES = 256 << 10  # of a joint file; the longest that fit and diagnose write have some 10 KiB
+MAX_LINE_BYTES = 4 << 10  # the longest that they write, a baseline, has some 300 bytes
 _SHOWN = 80  # characters of a wrong value in a message
-_DEEP = re.compile(r"(?:[\w\"' \t-]+\.){32}")  # parts of one key
+_DEEP = re.compile(r"(?<![\w\"' \t-])(?:[\w\"' \t-]++\.){32}")  # parts of one key, found in linear time
 _NESTED = "expected a joint file, got tables nested without end"
 _MARK = "# drivelink wrote this file, and ends it with a check line: a part of it is refused."
 _CHECK = re.compile(r"^# drivelink check: sha256 ([0-9a-f]{16})$\n?", re.MULTILINE)
@@ -88,21 +89,44 @@ def parse(text: str, where: str = "joint file") -> JointFile:
     Raises:
         JointFileError: too large, cut off, not TOML, or a key is unknown, wrong or missing.
     """
-    if len(text) > MAX_BYTES:
+    return from_json(to_json(text, where), where)
+
+
+def to_json(text: str, where: str) -> str:
+    """The text of a joint file as JSON, not yet validated.
+
+    Raises:
+        JointFileError: too large, a line too long, cut off, nested too deep, or not TOML.
+    """
+    if len(text) > MAX_BYTES or len(text.encode()) > MAX_BYTES:
         raise JointFileError(f"{where}: expected a joint file, of at most {MAX_BYTES >> 10} KiB, got more")
+    for number, line in enumerate(text.split("\n"), 1):
+        if len(line.encode()) > MAX_LINE_BYTES:
+            at_most = f"expected at most {MAX_LINE_BYTES >> 10} KiB"
+            raise JointFileError(f"{where}: line {number}: {at_most}, got {len(line)} letters")
     _require_whole(text, where)
     if _DEEP.search(text):  # tomllib's time grows with the square of it
         raise JointFileError(f"{where}: {_NESTED}")
     try:
-        document = tomllib.loads(text)
-        # Validated as JSON, where strict mode accepts an array as tuple and 6 as float.
-        return JointFile.model_validate_json(json.dumps(document, default=str))
-    except ValidationError as error:
-        raise JointFileError(f"{where}: {_one_line(error)}") from error
+        return json.dumps(tomllib.loads(text), default=str)
     except RecursionError as error:
         raise JointFileError(f"{where}: {_NESTED}") from error
     except ValueError as error:
         raise JointFileError(f"{where}: expected TOML: {error}") from error
+
+
+def from_json(document: str, where: str) -> JointFile:
+    """Validate a joint file as `to_json` gives it.
+
+    JSON, because strict mode then accepts an array as tuple and 6 as float.
+
+    Raises:
+        JointFileError: a key is unknown, wrong or missing.
+    """
+    try:
+        return JointFile.model_validate_json(document)
+    except ValidationError as error:
+        raise JointFileError(f"{where}: {_one_line(error)}") from error
 
 
 def write_model(

@@ -5,9 +5,19 @@ from __future__ import annotations
 import re
 from typing import Any, Literal, Self
 
+from annotated_types import Gt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from estimator.model import Arrangement, Effect, JointModel, LinkDynamics, Motor, Transmission
+from estimator.model import (
+    Arrangement,
+    Effect,
+    JointModel,
+    LinkDynamics,
+    Motor,
+    Transmission,
+    require_parameters,
+)
+from estimator.ranges import require_in_range
 from estimator.settings import EstimatorSettings
 from estimator.transmissions import MODELS, transmission_model
 
@@ -18,8 +28,19 @@ _COLUMN = (
 )
 
 
+MOST_EFFECTS = 32  # of a motor or the link: each costs time in every cycle
+
+
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="after")
+    def _in_range(self) -> Self:
+        for name, info in type(self).model_fields.items():
+            value = getattr(self, name)
+            if isinstance(value, int | float):
+                require_in_range(name, value, positive=any(isinstance(one, Gt) for one in info.metadata))
+        return self
 
 
 class TpdoSection(_Section):
@@ -27,7 +48,9 @@ class TpdoSection(_Section):
 
     cob_id: int = Field(ge=0x181, le=0x57F, description="identifier of the frame, e.g. 0x181")
     objects: tuple[str, ...] = Field(
-        min_length=1, description='mapped objects in order, "index:subindex:bits", e.g. "0x6064:00:32"'
+        min_length=1,
+        max_length=64,
+        description='mapped objects in order, "index:subindex:bits", e.g. "0x6064:00:32"',
     )
     transmission_type: int = Field(
         1, ge=0, le=255, description="1 to 240: every so many SYNCs; 254, 255: event-driven"
@@ -83,7 +106,9 @@ class DriveSection(_Section):
         None, description="sign of the torque; left out: like direction"
     )
     eds: str | None = Field(None, description="EDS or DCF file, relative to the joint file")
-    tpdo: tuple[TpdoSection, ...] = Field((), description="the mapping, where it is not read from the drive")
+    tpdo: tuple[TpdoSection, ...] = Field(
+        (), max_length=512, description="the mapping, where it is not read from the drive"
+    )
     heartbeat_ms: int = Field(100, ge=0, le=65535, description="heartbeat requested from the drive; 0: none")
 
 
@@ -103,7 +128,9 @@ class EncoderSection(_Section):
     direction: Direction = Field(1, description="sign against the joint's")
     offset_rad: float = Field(0.0, description="subtracted from the link position")
     eds: str | None = Field(None, description="EDS or DCF file, relative to the joint file")
-    tpdo: tuple[TpdoSection, ...] = Field((), description="the mapping, where it is not read from the node")
+    tpdo: tuple[TpdoSection, ...] = Field(
+        (), max_length=512, description="the mapping, where it is not read from the node"
+    )
 
     @model_validator(mode="after")
     def _node(self) -> Self:
@@ -126,7 +153,9 @@ class MotorSection(_Section):
     transmission: Transmission = Field(
         default_factory=Transmission, description="model of the flexibility torque"
     )
-    effect: tuple[Effect, ...] = Field((), description="effects the model has been given")
+    effect: tuple[Effect, ...] = Field(
+        (), max_length=MOST_EFFECTS, description="effects the model has been given"
+    )
     drive: DriveSection | None = Field(None, description="needed by run, sim, record and doctor")
 
     @model_validator(mode="after")
@@ -155,7 +184,9 @@ class LinkSection(_Section):
     dynamics: LinkDynamics | None = Field(
         None, description="needed for the external torque and residual (eq 12)"
     )
-    effect: tuple[Effect, ...] = Field((), description="effects at the link or in its encoder")
+    effect: tuple[Effect, ...] = Field(
+        (), max_length=MOST_EFFECTS, description="effects at the link or in its encoder"
+    )
 
 
 class BusSection(_Section):
@@ -169,7 +200,7 @@ class BusSection(_Section):
     options: dict[str, Any] = Field(default_factory=dict, description="passed to can.Bus as they are")
     period_s: float = Field(
         0.001,
-        gt=0,
+        ge=1e-4,
         le=1.0,
         description="communication cycle: one SYNC, one sample; when following and left out: measured",
     )
@@ -210,6 +241,7 @@ class RecordingSection(_Section):
         for name, factor in self.scale.items():
             if not re.fullmatch(_COLUMN, name):
                 raise ValueError(f'scale: expected names of columns like "motor1_position_rad", got "{name}"')
+            require_in_range("scale", factor)
             if factor == 0.0:
                 raise ValueError(f"scale.{name}: expected a factor other than 0")
         return self
@@ -248,6 +280,11 @@ class SimSection(_Section):
     excitation: dict[str, Any] = Field(default_factory=dict, description="torque of the rig, see reference")
     quirks: str | None = Field(None, description="vendor profile of the drives")
     seed: int = Field(0, ge=0, description="seed of the sensor noise")
+
+    @model_validator(mode="after")
+    def _parameters(self) -> Self:
+        require_parameters(self.parameters)
+        return self
 
 
 class JointFile(_Section):

@@ -187,12 +187,34 @@ impl Pipeline {
         motors: usize,
         stamp_ns: Option<i64>,
     ) -> Tick {
+        let (estimate, external) = gated(estimate, external);
         let current = estimate.sequence as i64 == self.sequence;
         let stamp_ns = stamp_ns.unwrap_or(if current { self.sync_ns } else { self.sync_before_ns });
         let tick = Tick { estimate, external, sample, motors, stamp_ns, current };
         self.last = Some(tick);
         tick
     }
+}
+
+/// The last gate before the wire: what is not a number is not valid. A rigid transmission has no stiffness.
+fn gated(mut estimate: Estimate, external: Option<External>) -> (Estimate, Option<External>) {
+    let finite = |torque: f64, stiffness: f64, rigid: bool| {
+        torque.is_finite() && (stiffness.is_finite() || (rigid && stiffness.is_nan()))
+    };
+    let parts = &estimate.transmissions[..estimate.motors];
+    let rigid = parts.iter().any(|part| part.deflection.is_nan());
+    let sound = finite(estimate.flexibility_torque, estimate.stiffness, rigid)
+        && parts.iter().all(|p| finite(p.flexibility_torque, p.stiffness, p.deflection.is_nan()))
+        && !estimate.stiffness_std.is_infinite();
+    if !sound {
+        estimate.status &= !VALID;
+    }
+    let valid = estimate.status & VALID != 0;
+    let external = external.map(|external| match valid && external.torque.is_finite() {
+        true => external,
+        false => external.void(external.sequence),
+    });
+    (estimate, external)
 }
 
 /// The estimate at a sample for which these service bits hold, the bits included, and what touches the link.
@@ -220,8 +242,5 @@ pub fn estimate(
         estimate.status &= !VALID; // one of two readings lies, and nobody can say that it is not the one in use
     }
     estimate.status |= flags;
-    let valid = estimate.status & VALID != 0;
-    let external =
-        estimator.external()?.map(|external| if valid { external } else { external.void(external.sequence) });
-    Ok((estimate, external))
+    Ok((estimate, estimator.external()?))
 }

@@ -236,8 +236,9 @@ pub fn estimator(
     given: &Bound<'_, PyAny>,
     period_s: f64,
 ) -> PyResult<crate::estimator::Estimator> {
-    let priors = priors(joint.py())?;
-    Ok(crate::estimator::Estimator::new(&model(joint)?, &settings(given)?, &priors, period_s)?)
+    let (priors, model, settings) = (priors(joint.py())?, model(joint)?, settings(given)?);
+    // Without the interpreter's lock: a daemon builds beside its cycle.
+    Ok(joint.py().detach(|| crate::estimator::Estimator::new(&model, &settings, &priors, period_s))?)
 }
 
 fn several(tuple: &Bound<'_, PyTuple>, place: usize) -> PyResult<([f64; MOTORS], usize)> {

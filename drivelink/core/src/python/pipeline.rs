@@ -111,6 +111,13 @@ impl History {
             kept.push_back((sample, motors));
         }
     }
+
+    /// The kept samples after one of that number, the oldest `most` of them.
+    fn copied(&self, sequence: i64, most: Option<usize>) -> Vec<(Sample, usize)> {
+        let kept = lock(&self.kept);
+        let first = kept.partition_point(|(sample, _)| sample.sequence as i64 <= sequence);
+        kept.range(first..).take(most.unwrap_or(usize::MAX)).copied().collect()
+    }
 }
 
 #[pymethods]
@@ -126,11 +133,7 @@ impl History {
         sequence: i64,
         most: Option<usize>,
     ) -> PyResult<Vec<Bound<'py, PyAny>>> {
-        let found: Vec<_> = {
-            let kept = lock(&self.kept);
-            let first = kept.partition_point(|(sample, _)| sample.sequence as i64 <= sequence);
-            kept.range(first..).take(most.unwrap_or(usize::MAX)).copied().collect()
-        };
+        let found = self.copied(sequence, most);
         found.iter().map(|(sample, motors)| sample_object(py, sample, *motors)).collect()
     }
 
@@ -344,19 +347,39 @@ impl JointPipeline {
         lock(&self.state).carry_on(sequence, flags, stamp_ns).map(|core| Tick { core })
     }
 
-    #[pyo3(signature = (estimator, model_monitor, unseen = None))]
+    /// Step a new estimator through the kept samples after one of that number, without the interpreter's lock.
+    #[pyo3(signature = (estimator, sequence, most = None))]
+    fn warm(
+        &self,
+        py: Python<'_>,
+        estimator: Py<PyAny>,
+        sequence: i64,
+        most: Option<usize>,
+    ) -> PyResult<i64> {
+        let samples = self.history.get().copied(sequence, most);
+        if let Some(compiled) = core_of::<Estimator>(py, &estimator) {
+            let mut estimator = compiled.try_borrow_mut(py)?;
+            let inner = &mut estimator.inner;
+            py.detach(|| {
+                samples.iter().for_each(|(sample, _)| {
+                    inner.step(sample);
+                })
+            });
+        } else {
+            for (sample, motors) in &samples {
+                estimator.call_method1(py, "step", (sample_object(py, sample, *motors)?,))?;
+            }
+        }
+        Ok(samples.last().map_or(sequence, |(sample, _)| sample.sequence as i64))
+    }
+
+    #[pyo3(signature = (estimator, model_monitor))]
     fn exchange(
         &self,
         py: Python<'_>,
         estimator: Py<PyAny>,
         model_monitor: Option<Py<PyAny>>,
-        unseen: Option<&Bound<'_, PyAny>>,
     ) -> PyResult<()> {
-        if let Some(unseen) = unseen {
-            for sample in unseen.try_iter()? {
-                estimator.bind(py).call_method1("step", (sample?,))?;
-            }
-        }
         let objects = (estimator.clone_ref(py), model_monitor.as_ref().map(|monitor| monitor.clone_ref(py)));
         let next = Driver::new(py, estimator, model_monitor);
         let Ok(mut driver) = self.driver.try_lock() else {

@@ -1,0 +1,91 @@
+"""Hard ranges of declared numbers: one table, by the end of a name, which carries the unit.
+
+They are far beyond any machine, and narrow enough that no number in them overflows, takes an estimator long
+to prepare, or makes it large.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from estimator.errors import EstimatorError
+
+__all__ = ["RANGES", "Range", "range_of", "require_in_range"]
+
+
+class Range(NamedTuple):
+    """Range of a number.
+
+    Attributes:
+        least: of a number that has to be above 0.
+        most: largest amount.
+        unit: of both; "" for a plain number.
+    """
+
+    least: float
+    most: float
+    unit: str
+
+    def __str__(self) -> str:
+        return f"{self.least:g} to {self.most:g} {self.unit}".rstrip()
+
+
+RANGES: dict[str, Range] = {  # the longest end that fits counts
+    "": Range(1e-12, 1e12, ""),
+    "_rad": Range(1e-9, 1e6, "rad"),
+    "_rad_s": Range(1e-9, 1e6, "rad/s"),
+    "_rad2_s2": Range(1e-9, 1e12, "rad²/s²"),
+    "_s2_rad2": Range(1e-9, 1e12, "s²/rad²"),
+    "bandwidth_rad_s": Range(0.5, 1e4, "rad/s"),
+    "k_tau_rad_s": Range(0.5, 1e4, "rad/s"),
+    "_rad_s_per_count": Range(1e-15, 1e6, "rad/s"),
+    "_nm": Range(1e-12, 1e9, "N·m"),
+    "_nm_rad": Range(1e-9, 1e12, "N·m/rad"),
+    "_nm_rad2": Range(1e-9, 1e12, "N·m/rad²"),
+    "_nm_s_rad": Range(1e-12, 1e9, "N·m·s/rad"),
+    "_nm_s2_rad2": Range(1e-12, 1e9, "N·m·s²/rad²"),
+    "_per_nm2": Range(1e-12, 1e12, "1/(N·m)²"),
+    "_nm_a": Range(1e-9, 1e6, "N·m/A"),
+    "_kg_m2": Range(1e-12, 1e9, "kg·m²"),
+    "_a": Range(1e-12, 1e6, "A"),
+    "_s": Range(1e-6, 100.0, "s"),
+    "bias_s": Range(1e-3, 1e6, "s"),
+    "time_constant_s": Range(1e-6, 1e6, "s"),
+    "delay_s": Range(1e-6, 1.0, "s"),
+    "read_back_s": Range(1e-3, 1e5, "s"),
+    "_per_hour": Range(1e-9, 1e6, "1/h"),
+    "_per_rev": Range(1e-6, 1e12, "per revolution"),
+    "gear_ratio": Range(1e-6, 1e6, ""),
+    "exponent": Range(1e-3, 1e3, ""),
+    "power": Range(1e-3, 99.0, ""),
+    "bitrate": Range(1e3, 2e7, "bit/s"),
+    "sdo_retries": Range(0.0, 100.0, ""),
+    "elements": Range(1.0, 32.0, ""),  # numbers of a parameter: each costs time in every cycle
+    "every": Range(1.0, 1e6, ""),
+    "seed": Range(0.0, 2.0**63, ""),
+}
+
+
+def range_of(name: str) -> Range:
+    """The range of a number of that name."""
+    return RANGES[max((end for end in RANGES if name.endswith(end)), key=len)]
+
+
+def require_in_range(name: str, value: float, *, positive: bool = False) -> None:
+    """Refuse a number outside its range.
+
+    Args:
+        name: ends with the unit.
+        value: in that unit.
+        positive: it has to be above 0.
+
+    Raises:
+        EstimatorError: it is too large, too small, or not finite.
+    """
+    allowed = range_of(name)
+    if not math.isfinite(value) or abs(value) > allowed.most or (positive and value < allowed.least):
+        least = allowed.least if positive else -allowed.most
+        raise EstimatorError(
+            f"{name}: expected {least:g} to {allowed.most:g} {allowed.unit}".rstrip() + f", got {value:.6g}"
+        )

@@ -28,8 +28,8 @@ from drivelink.pubsub.wire import ESTIMATE, EXTERNAL, EXTERNAL_BITS, SAMPLE, STA
 from estimator.effects import LIBRARY
 from estimator.errors import EstimatorError
 from estimator.flexibility import TransmissionModel
-from estimator.reasons import REASONS
 from estimator.ranges import range_of
+from estimator.reasons import REASONS
 from estimator.sample import ExternalStatus, Status
 from estimator.transmissions import MODELS
 from sim.effects import LISTED, UNLISTED, Definition

@@ -14,17 +14,20 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from estimator import EstimatorSettings, JointModel, Motor, Record, Transmission, make_estimator
+from estimator import EstimatorSettings, JointModel, Motor, Transmission, make_estimator
 
-Array = NDArray[np.float64]
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+
+import joints
+
 B, D, M, DQ, G, K1, K3 = 0.125, 0.8, 0.45, 0.2, 5.0, 150.0, 1500.0
 RATED_NM = 20.0
 SECONDS, SETTLED_S = 12.0, 4.0
@@ -62,53 +65,33 @@ AXES: dict[str, list[tuple[str, Setting]]] = {
 }
 
 
-def simulate(period: float, coulomb: float) -> tuple[Array, Array]:
-    """(states (n, 4): theta, theta', q, q'; torque (n,)), the torque held over each period."""
+def simulate(period: float, coulomb: float) -> joints.Truth:
+    """A sum of seven tones, held over each period."""
     n = round(SECONDS / period)
-    t = np.arange(n) * period
-    lines = np.geomspace(0.2, 3.0, 7)
     phases = np.random.default_rng(3).uniform(0, 2 * math.pi, 7)
-    tau = (
-        8.0
-        / math.sqrt(3.5)
-        * sum(np.sin(2 * math.pi * f * t + p) for f, p in zip(lines, phases, strict=True))
+    angles = 2 * math.pi * np.outer(np.arange(n) * period, np.geomspace(0.2, 3.0, 7)) + phases
+    tau = 8.0 / math.sqrt(3.5) * np.sin(angles).sum(axis=1)
+    torque, stiffness = joints.polynomial(np.array([[[K1, K3]]]))
+    one = np.ones(1)
+    plants = joints.Plants(
+        torque, stiffness, B * one, D * one, M * one, DQ * one, G * one, coulomb=coulomb * one
     )
-
-    def rate(x: Array, u: float) -> Array:
-        theta, omega, q, dq = x
-        phi = q - theta
-        spring = K1 * phi + K3 * phi**3
-        push = u + spring - D * omega - coulomb * math.tanh(omega / 1e-3)
-        return np.array([omega, push / B, dq, -(spring + DQ * dq + G * math.sin(q)) / M])
-
-    steps = max(2, round(period / 2.5e-4))
-    h, x = period / steps, np.zeros(4)
-    states = np.empty((n, 4))
-    for k in range(n):
-        states[k] = x
-        for _ in range(steps):
-            a = rate(x, tau[k])
-            b = rate(x + 0.5 * h * a, tau[k])
-            c = rate(x + 0.5 * h * b, tau[k])
-            d = rate(x + h * c, tau[k])
-            x = x + h / 6 * (a + 2 * b + 2 * c + d)
-    return states, np.asarray(tau)
+    return joints.simulate(plants, tau[:, None, None], period, substeps=max(2, round(period / 5e-4)))
 
 
-def errors(setting: Setting, states: Array, tau: Array) -> list[float]:
+def errors(setting: Setting, motion: joints.Truth) -> list[float]:
     """The five relative errors of COLUMNS."""
-    T, n = setting.period_s, len(tau)
+    T, n = setting.period_s, len(motion.tau)
     rng = np.random.default_rng(1)
-    step, link_step = 2 * math.pi / setting.counts, 2 * math.pi / 2**18
-    q = np.concatenate([np.zeros(setting.delay_periods), states[: n - setting.delay_periods, 2]])
-    rpm = 2 * math.pi / 60
-    record = Record(
-        period_s=T,
-        sequence=np.arange(n),
-        motor_position_rad=(np.round(states[:, :1] / step) * step),
-        motor_velocity_rad_s=np.round(states[:, 1:2] / rpm) * rpm,
-        motor_torque_nm=(tau + rng.normal(0, setting.torque_noise * RATED_NM, n))[:, None],
-        link_position_rad=np.round(q / link_step) * link_step,
+    record = joints.record(
+        motion,
+        0,
+        T,
+        motor_counts=setting.counts,
+        link_bits=18,
+        velocity_rad_s=2 * math.pi / 60,
+        torque_noise=rng.normal(0, setting.torque_noise * RATED_NM, (n, 1)),
+        link_delay=setting.delay_periods,
     )
     transmission = Transmission(model="polynomial", order=2)
     motor = Motor(
@@ -117,8 +100,7 @@ def errors(setting: Setting, states: Array, tau: Array) -> list[float]:
         transmission=transmission,
     )
     model = JointModel(arrangement="single", motors=(motor,))
-    phi = states[:, 2] - states[:, 0]
-    truth = {2: K1 * phi + K3 * phi**3, 3: K1 + 3 * K3 * phi**2}
+    truth = {2: motion.tau_e[:, 0, 0], 3: motion.sigma[:, 0, 0]}
     late = np.arange(n) * T > SETTLED_S
     runs = {}
     robust = EstimatorSettings()
@@ -156,7 +138,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object only")
     parser.add_argument("--plots", type=Path, metavar="DIR", help="write sensitivity.png there")
     args = parser.parse_args()
-    motions: dict[tuple[float, float], tuple[Array, Array]] = {}
+    motions: dict[tuple[float, float], joints.Truth] = {}
     results: dict[str, dict[str, list[float]]] = {}
     for axis, settings in AXES.items():
         results[axis] = {}
@@ -164,7 +146,7 @@ def main() -> None:
             key = (setting.period_s, setting.coulomb_nm)
             if key not in motions:
                 motions[key] = simulate(*key)
-            results[axis][label] = errors(setting, *motions[key])
+            results[axis][label] = errors(setting, motions[key])
     if args.plots is not None:
         plot(results, args.plots)
     if args.json:

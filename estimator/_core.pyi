@@ -106,11 +106,3 @@ def effect_kinds() -> list[
 def effect_terms(
     name: str, values: Sequence[float], coordinates: Sequence[Numbers], out: Numbers
 ) -> None: ...
-def regressor(
-    residual: Numbers,
-    rate: Numbers,
-    k_r: float,
-    k_max: float,
-    start: float,
-    out: Numbers,
-) -> None: ...

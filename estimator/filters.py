@@ -17,14 +17,7 @@ import numpy as np
 from estimator.model import require, require_finite
 from estimator.sample import FloatArray
 
-__all__ = [
-    "StateVariableFilter",
-    "critically_damped",
-    "first_order_pole",
-    "held_integral",
-    "linear_filter",
-    "tustin_biquad",
-]
+__all__ = ["StateVariableFilter", "critically_damped", "linear_filter"]
 
 _TERMS = 18  # of the exponential's series: at a norm of 1/2 the next one is below rounding
 
@@ -39,38 +32,6 @@ def linear_filter(
     from scipy.signal import lfilter
 
     return np.asarray(lfilter(b, a, signal, axis=0))
-
-
-def first_order_pole(k_rad_s: float, period_s: float) -> float:
-    """Pole a = exp(-K T) of K / (s + K) discretised exactly."""
-    return math.exp(-k_rad_s * period_s)
-
-
-def held_integral(torque: FloatArray, period_s: float) -> FloatArray:
-    """Integral of a torque that is held from each sample to the next, 0 at the first sample, (n, ...)."""
-    integral = np.zeros_like(torque)
-    np.cumsum(torque[:-1] * period_s, axis=0, out=integral[1:])
-    return integral
-
-
-def tustin_biquad(
-    numerator: tuple[float, float, float], denominator: tuple[float, float, float], period_s: float
-) -> tuple[FloatArray, FloatArray]:
-    """(b, a) of a second-order transfer function by the bilinear transform, a[0] = 1.
-
-    Args:
-        numerator: coefficients of s², s, 1.
-        denominator: coefficients of s², s, 1.
-        period_s: sampling period T.
-    """
-    c = 2.0 / period_s
-
-    def transform(p: tuple[float, float, float]) -> FloatArray:
-        s2, s1, s0 = p[0] * c * c, p[1] * c, p[2]
-        return np.array([s2 + s1 + s0, 2.0 * (s0 - s2), s2 - s1 + s0])
-
-    b, a = transform(numerator), transform(denominator)
-    return b / a[0], a / a[0]
 
 
 def critically_damped(order: int, bandwidth_rad_s: float) -> tuple[float, ...]:

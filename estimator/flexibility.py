@@ -86,15 +86,6 @@ class TransmissionModel(ABC):
         """Largest |phi| for which the model is defined, rad."""
         return math.inf
 
-    def shapes(self, reach_rad: float, points: int) -> FloatArray:
-        """Start values for a search over a single shape parameter, at most so many, all defined at |phi|.
-        Spaced geometrically, from a thousandth of the distance between lower bound and usual start.
-        """
-        (low, high), (start,) = self.shape_bounds[0], self.shape_start
-        least = 1e-3 * (start - low if start > low else high - low)
-        values = low + np.geomspace(least, high - low, points)
-        return values[[self.reach((value,)) > reach_rad for value in values.tolist()]]
-
     @abstractmethod
     def parameters(self, alpha: ArrayLike) -> dict[str, ParameterValue]:
         """Alpha by its names in the joint file."""

@@ -20,7 +20,7 @@ from estimator import (
     Transmission,
     make_estimator,
 )
-from estimator.filters import StateVariableFilter, first_order_pole, linear_filter
+from estimator.filters import StateVariableFilter, linear_filter
 from estimator.identify import identify
 from sim.effects import parse
 from sim.excitation import build
@@ -242,7 +242,7 @@ def test_the_flexibility_torque_from_the_link_side_is_the_true_one(pushed):
 def test_mode_paper_has_equation_13_and_the_same_external_torque(pushed):
     """-r of eq 12 is tau_e,t through K/(s + K); noise of the differenced position is averaged away over 50 ms."""
     estimated = Estimates(model(), pushed, measured=True, mode="paper", k_tau_rad_s=100.0)
-    a = first_order_pole(100.0, T)
+    a = math.exp(-100.0 * T)
     truth = linear_filter([1.0 - a], [1.0, -a], pushed["truth_flexibility_torque_nm"])
     smooth = np.ones(50) / 50
     off = np.convolve(estimated.link_torque - truth, smooth, "same")[1000:-1000]

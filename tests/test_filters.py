@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimator import EstimatorSettings, JointModel, Motor, Sample, Transmission, make_estimator
-from estimator.filters import StateVariableFilter, _exponential, critically_damped
-from estimator.residuals import first_order, motor_balance
+from estimator.filters import StateVariableFilter, _exponential, critically_damped, linear_filter
 
 T = 1e-3
 
@@ -46,8 +45,10 @@ def test_the_paper_modes_residual_is_that_over_arrays():
     paper = make_estimator(model, EstimatorSettings(mode="paper", k_tau_rad_s=300.0), T)
     rows = zip(theta.tolist(), omega.tolist(), tau.tolist(), strict=True)
     estimated = [paper.step(Sample(k, (x,), (v,), (u,)))[2] for k, (x, v, u) in enumerate(rows)]
-    y = motor_balance(inertia, damping, theta, omega, tau, T)
-    assert np.array(estimated) == pytest.approx(first_order(y, 300.0, T), abs=1e-9)
+    y = inertia * omega + damping * theta - np.r_[0.0, np.cumsum(tau[:-1]) * T]
+    a = np.exp(-300.0 * T)
+    residual = linear_filter([(1 - a) / T, (a - 1) / T], [1.0, -a], y - y[0])  # eq 14, exact for a straight y
+    assert np.array(estimated) == pytest.approx(residual, abs=1e-9)
 
 
 @pytest.mark.parametrize("held", [False, True])

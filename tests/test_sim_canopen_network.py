@@ -11,9 +11,9 @@ import can
 import pytest
 from simkit import StubRig
 
+from drivelink.demo.socketcand import SocketcandServer
 from sim.canopen.drive import Cia402Drive
 from sim.network import Network
-from sim.socketcand import SocketcandServer
 
 PATIENCE_S = 60.0  # only ever waited for when something is broken
 

@@ -9,9 +9,9 @@ import can
 
 from drivelink.canopen.bus import open_bus, server_has_gone
 from drivelink.canopen.scan import scan
+from drivelink.demo.socketcand import DEFAULT_PORT, SocketcandServer
 from drivelink.errors import BusError
 from drivelink.jointfile import BusSection
-from sim.socketcand import DEFAULT_PORT, SocketcandServer
 
 _LOCAL = ("127.0.0.1", "localhost", "::1")
 

@@ -736,28 +736,6 @@ mod extension {
         }
     }
 
-    /// Eq 32, and eq 33 where K_max is finite, over a recording: σ after each sample into `out`.
-    #[pyfunction]
-    fn regressor(
-        py: Python<'_>,
-        residual: PyBuffer<f64>,
-        rate: PyBuffer<f64>,
-        k_r: f64,
-        k_max: f64,
-        start: f64,
-        out: PyBuffer<f64>,
-    ) -> PyResult<()> {
-        let (residual, rate) = (slice(py, &residual)?, slice(py, &rate)?);
-        let mut stiffness = start;
-        let result: Vec<f64> = (residual.iter().zip(&rate))
-            .map(|(residual, rate)| {
-                stiffness = crate::paper::regressor_step(stiffness, *residual, *rate, k_r, k_max);
-                stiffness
-            })
-            .collect();
-        out.copy_from_slice(py, &result)
-    }
-
     /// (name, location, channel, coordinates, parameters, whether it remembers, description) of every effect.
     #[pyfunction]
     fn effect_kinds() -> Vec<EffectKind> {

@@ -8,7 +8,7 @@ use crate::noise::NoiseMeter;
 use crate::sample::Sample;
 use crate::settings::{Priors, Settings};
 
-/// K s/(s + K) of one term of y, see `estimator.residuals.first_order`.
+/// K s/(s + K) of one term of y, exact for a straight y.
 #[derive(Clone, Copy, Debug, Default)]
 struct Term {
     value: f64,

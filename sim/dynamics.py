@@ -126,15 +126,12 @@ def _link_load(link: LinkPlant) -> Load:
 
 
 def equations(plant: JointPlant) -> Pair | Triple:
-    """Accelerations of the joint as one closure, shorter if no effects add terms."""
+    """Accelerations of the joint as one closure."""
     if plant.rigid:
         return _rigid(plant)
     if plant.arrangement == "serial":
         return _serial(plant)
-    plain = not any(motor.terms for motor in plant.motors)
-    if plant.arrangement == "single":
-        return _plain_single(plant) if plain else _single(plant)
-    return _plain_antagonistic(plant) if plain else _antagonistic(plant)
+    return _single(plant) if plant.arrangement == "single" else _antagonistic(plant)
 
 
 def _rigid(plant: JointPlant) -> Pair:
@@ -149,17 +146,6 @@ def _rigid(plant: JointPlant) -> Pair:
     return acc
 
 
-def _plain_single(plant: JointPlant) -> Pair:
-    motor, link_load, m = plant.motors[0], _link_load(plant.link), plant.link.inertia_kg_m2
-    torque, b, d = motor.law().torque, motor.inertia_kg_m2, motor.viscous_damping_nm_s_rad
-
-    def acc(q: float, v: float, theta: float, w: float, tau: float, tau_k: float) -> tuple[float, float]:
-        te = torque(q - theta)
-        return (tau_k - te - link_load(q, v)) / m, (tau + te - d * w) / b
-
-    return acc
-
-
 def _single(plant: JointPlant) -> Pair:
     motor, link_load, m = plant.motors[0], _link_load(plant.link), plant.link.inertia_kg_m2
     couple, load, b = _coupling(motor), _motor_load(motor), motor.inertia_kg_m2
@@ -167,27 +153,6 @@ def _single(plant: JointPlant) -> Pair:
     def acc(q: float, v: float, theta: float, w: float, tau: float, tau_k: float) -> tuple[float, float]:
         on_link, on_motor = couple(q, v, theta, w)
         return (tau_k - on_link - link_load(q, v)) / m, (tau + on_motor - load(theta, w)) / b
-
-    return acc
-
-
-def _plain_antagonistic(plant: JointPlant) -> Triple:
-    link_load, m = _link_load(plant.link), plant.link.inertia_kg_m2
-    f1, f2 = (motor.law().torque for motor in plant.motors)
-    b1, b2 = (motor.inertia_kg_m2 for motor in plant.motors)
-    d1, d2 = (motor.viscous_damping_nm_s_rad for motor in plant.motors)
-
-    def acc(
-        q: float, v: float, theta1: float, w1: float, theta2: float, w2: float,
-        tau1: float, tau2: float, tau_k: float,
-    ) -> tuple[float, float, float]:  # fmt: skip
-        te1 = f1(q - theta1)
-        te2 = f2(q - theta2)
-        return (
-            (tau_k - te1 - te2 - link_load(q, v)) / m,
-            (tau1 + te1 - d1 * w1) / b1,
-            (tau2 + te2 - d2 * w2) / b2,
-        )
 
     return acc
 

@@ -41,9 +41,6 @@ class Terms:
     kinematics: tuple[Kinematics, ...] = ()
     commits: tuple[Commit, ...] = ()
 
-    def __bool__(self) -> bool:
-        return bool(self.loads or self.dry or self.extras or self.kinematics or self.commits)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotorPlant:

@@ -176,6 +176,24 @@ def test_the_cases_among_the_examples_are_those_of_the_package(path: Path) -> No
     assert (ROOT / "examples" / path.name).read_text(encoding="utf-8") == path.read_text(encoding="utf-8")
 
 
+def test_each_of_ten_decisions_names_its_rival_and_a_figure() -> None:
+    text = (DOCS / "explanation" / "decisions.md").read_text(encoding="utf-8")
+    decisions = re.split(r"^## \d+\. ", text, flags=re.MULTILINE)[1:]
+    assert len(decisions) == 10
+    for decision in decisions:
+        assert re.search(r"\*Rival\*: .*\d", decision, re.DOTALL), decision
+
+
+def test_the_workflow_and_the_hooks_run_programs_that_are_there() -> None:
+    workflow = (ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8")
+    assert "- run: .ci/run\n" in workflow and (ROOT / ".ci" / "run").stat().st_mode & 0o100
+    hooks = re.findall(r"entry: (.*)", (ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8"))
+    run = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    assert hooks and all(
+        hook.removesuffix(" --force-exclude") in run.replace("check .", "check") for hook in hooks
+    )
+
+
 def test_every_example_is_listed() -> None:
     listed = (ROOT / "examples" / "README.md").read_text(encoding="utf-8")
     for path in (ROOT / "examples").iterdir():

@@ -6,6 +6,8 @@ import logging
 from dataclasses import asdict, dataclass
 from enum import IntEnum
 
+from drivelink.plaintext import clean_text
+
 
 class Severity(IntEnum):
     """How bad it is."""
@@ -26,7 +28,7 @@ _LEVELS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Notice:
-    """One thing that was noticed.
+    """One thing that was noticed; its words, which may be those of a drive or a file, as plain text.
 
     Attributes:
         severity: how bad it is.
@@ -39,6 +41,10 @@ class Notice:
     subject: str
     text: str
     fix: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("subject", "text", "fix"):
+            object.__setattr__(self, name, clean_text(getattr(self, name)))
 
     def __str__(self) -> str:
         return f"{self.subject}: {self.text}" + (f" [{self.fix}]" if self.fix else "")

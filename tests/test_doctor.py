@@ -8,7 +8,7 @@ from pathlib import Path
 import can
 import daemonkit
 import pytest
-from canopenkit import Slave, Wire, drive_objects, joint_text
+from canopenkit import Item, Slave, Wire, drive_objects, joint_text
 from rich.console import Console
 
 from drivelink.canopen.blocking import run_program
@@ -17,7 +17,7 @@ from drivelink.canopen.layout import Signal
 from drivelink.canopen.node import survey_node
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.canopen.roles import roles
-from drivelink.canopen.scan import listen, scan
+from drivelink.canopen.scan import _identify, listen, scan
 from drivelink.cli import main
 from drivelink.demo.simulate import network_from_joint, world_from_joint
 from drivelink.doctor import Report, Section, examine, examine_eds
@@ -32,6 +32,7 @@ from drivelink.doctor.motion import (
     record_of_motion,
     slope,
 )
+from drivelink.doctor.nodes import _describe_node
 from drivelink.doctor.sampletap import SampleTap
 from drivelink.doctor.syncs import Daemons, judge_sync
 from drivelink.jointfile import BusSection, parse
@@ -692,3 +693,17 @@ def test_on_a_passive_bus_the_map_of_a_data_sheet_is_offered_to_paste(rig, tmp_p
     pasted = parse(text.replace("eds =", f"{line}\neds ="))
     assert "has this map" not in said
     assert "0x6004" not in " ".join(texts(examine(pasted, tmp_path, 0.1), Severity.WARNING))
+
+
+def test_words_of_a_drive_do_not_reach_the_terminal_as_commands(capsys):
+    objects = drive_objects(5)
+    objects[0x1008, 0] = Item(b"\x1b]0;owned\x07\x9b2J[red]servo", 19)
+    node = run_program(_identify(5), Wire([Slave(5, objects)]))
+    report = Report()
+    section = report.section("Nodes")
+    section.ok("node 5", _describe_node(node))
+    section.ok("\x1b[2Jnode 6", "\x9b2J\u202eother")
+    report.show(Console())
+    shown = capsys.readouterr().out + str(report.as_dict())
+    assert "]0;owned2J[red]servo" in shown
+    assert not set("\x1b\x07\x9b\u202e") & set(shown)

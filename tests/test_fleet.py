@@ -31,6 +31,7 @@ from drivelink.errors import RecordingError  # noqa: E402
 from drivelink.fleet import pieces, runner, storage, table, task  # noqa: E402
 from drivelink.fleet.errors import FleetError  # noqa: E402
 from drivelink.fleet.joints import Joints  # noqa: E402
+from drivelink.fleet.page import page  # noqa: E402
 from drivelink.fleet.storage import Source, Store  # noqa: E402
 from drivelink.fleet.summary import COLUMNS, summarise  # noqa: E402
 from drivelink.fleet.table import FleetTable, read_rows  # noqa: E402
@@ -620,3 +621,19 @@ def test_the_examples_of_the_documentation_read_the_table(
     said = capsys.readouterr().out
     assert "elbow" in said
     assert "bad.csv" in said
+
+
+@pytest.mark.parametrize(
+    "report",
+    ["javascript:alert(1)", "https://evil.example/report.html", "diagnoses/../../x/report.html", "//x"],
+)
+def test_the_table_is_data_on_the_page(report: str) -> None:
+    rows = [night("elbow", k, 150.0, ["coulomb_friction@motor"]) for k in range(8)]
+    good = "diagnoses/elbow/0123456789abcdef01234567-2/report.html"
+    for row in rows:
+        row |= {"report": report, "sentence": "<script>alert(1)</script>"}
+    rows[-1]["report"] = good
+    text = page(summarise(rows, 0.05))
+    assert report not in text and "<script" not in text
+    assert f'href="{good}"' in text
+    assert "Content-Security-Policy" in text and "default-src 'none'" in text

@@ -32,7 +32,7 @@ from drivelink.monitor.history import GrowingCurve, JointHistory, usual_range
 from drivelink.monitor.statuslines import shape, status_lines, status_text
 from drivelink.monitor.view import JointView, joints_table
 from drivelink.monitor.watcher import Watcher
-from drivelink.monitor.web import MAX_CONNECTIONS, WebView, snapshot
+from drivelink.monitor.web import MAX_CONNECTIONS, MAX_STREAMS, WebView, snapshot
 from drivelink.pubsub.session import close_session, open_client
 from drivelink.pubsub.wire import ExternalMessage
 from estimator.sample import Estimate, Status, TransmissionEstimate
@@ -435,6 +435,48 @@ def test_the_page_serves_so_many_connections_at_a_time(web: WebView, monkeypatch
     for connection in idle:
         connection.close()
     zenohkit.until(lambda: get(web.url)[0] == 200)
+
+
+def stream(web: WebView, **headers: str) -> socket.socket:
+    """A connection that asks for the events; its headers are read."""
+    connection = connect(web)
+    host = web.url.split("/")[2]
+    lines = [f"Host: {host}", *(f"{name.replace('_', '-')}: {text}" for name, text in headers.items())]
+    connection.sendall(("GET /events HTTP/1.1\r\n" + "\r\n".join(lines) + "\r\n\r\n").encode())
+    return connection
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+        {"Origin": "http://127.0.0.1:1"},
+        {"Sec_Fetch_Site": "cross-site"},
+        {"Sec_Fetch_Site": "same-site"},
+    ],
+)
+def test_a_page_of_another_site_gets_no_events(web: WebView, headers: dict[str, str]) -> None:
+    with stream(web, **headers) as connection:
+        assert connection.recv(100).startswith((b"HTTP/1.1 403", b"HTTP/1.1 404"))
+    with stream(web, Origin=web.url.rstrip("/"), Sec_Fetch_Site="same-origin") as connection:
+        assert connection.recv(100).startswith(b"HTTP/1.1 200")
+
+
+def opened(web: WebView, held: list[socket.socket]) -> bool:
+    """Open one more stream; no where one that gives way has not ended yet."""
+    held.append(stream(web))
+    return held[-1].recv(12) == b"HTTP/1.1 200"
+
+
+def test_streams_that_stay_open_do_not_fill_the_page(web: WebView) -> None:
+    held = []
+    for _ in range(3 * MAX_CONNECTIONS):
+        zenohkit.until(lambda: opened(web, held))
+        assert len(web._streams) <= MAX_STREAMS
+    assert get(web.url)[0] == 200
+    for connection in held:
+        connection.close()
 
 
 def test_the_page_leaves_a_connection_that_says_nothing(

@@ -11,6 +11,7 @@ from drivelink._core import LatencyHistogram
 from drivelink.daemon.jointwatch import JointWatch
 from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor
+from drivelink.plaintext import PlainFormatter
 from estimator.sample import Status
 
 
@@ -95,6 +96,42 @@ def test_the_last_events_are_kept_and_no_more() -> None:
     for k in range(1000):
         events.say(f"event {k}")
     assert [event["text"] for event in events.recent()] == [f"event {k}" for k in range(984, 1000)]
+
+
+def test_emergencies_with_ever_other_codes_have_a_rate(caplog: pytest.LogCaptureFixture) -> None:
+    clock = [0.0]
+    one = supervisor(clock)
+    for k in range(4000):
+        clock[0] = k * 5e-4
+        one._emergency(0x081, (0x1000 + k).to_bytes(2, "little") + bytes(6))
+    assert len(caplog.records) == EventLog._KINDS + 1
+    assert sum(event["count"] for event in one._events.recent()) == 4000
+    one._emergency(0x082, bytes.fromhex("1023000000000000"))
+    assert "node 2: EMCY 0x2310" in caplog.records[-1].getMessage()  # another node is still heard
+
+
+def test_every_message_has_a_rate(caplog: pytest.LogCaptureFixture) -> None:
+    clock = [0.0]
+    events = log(clock)
+    for k in range(5000):
+        clock[0] = k * 1e-3
+        events.say(f"event {k}", logging.WARNING)
+    assert len(caplog.records) == EventLog._LINES
+    clock[0] = 20.0
+    events.say("later", logging.WARNING)
+    assert [r.getMessage() for r in caplog.records[-2:]] == [
+        f"{5000 - EventLog._LINES} messages were not logged: too many at a time",
+        "later",
+    ]
+
+
+def test_words_of_a_drive_are_plain_text(caplog: pytest.LogCaptureFixture) -> None:
+    events = log([0.0])
+    events.say("node 1: \x1b]0;owned\x07\x9b31m\u202ename\nnext", logging.WARNING)
+    assert caplog.records[0].getMessage() == "node 1: ]0;owned31mname next"
+    assert events.recent()[0]["text"] == "node 1: ]0;owned31mname next"
+    record = logging.LogRecord("x", logging.WARNING, "", 0, "a \x1b[2J\x9bb", (), None)
+    assert PlainFormatter("%(message)s").format(record) == "a [2Jb"
 
 
 def supervisor(clock: list[float]) -> Supervisor:

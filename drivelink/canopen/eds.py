@@ -19,6 +19,7 @@ from canopen.objectdictionary.eds import RECORD, import_eds
 from drivelink.canopen.pdo import Tpdo, tpdos_of
 from drivelink.errors import DriveError
 from drivelink.infile import read_regular
+from drivelink.plaintext import clean_text
 
 Sections = dict[str, dict[str, str]]
 Address = tuple[int, int]
@@ -253,8 +254,8 @@ def _device(sections: Sections, sheet: DataSheet) -> None:
     if info is None:
         sheet.problems.append("has no [DeviceInfo]")
         info = {}
-    sheet.vendor_name = info.get("vendorname", "")
-    sheet.product_name = info.get("productname", "")
+    sheet.vendor_name = clean_text(info.get("vendorname", ""))
+    sheet.product_name = clean_text(info.get("productname", ""))
     empty = [key for key in ("vendornumber", "productnumber", "revisionnumber") if info.get(key) == ""]
     if empty:
         sheet.problems.append(f"[DeviceInfo] has no value for {', '.join(empty)}")

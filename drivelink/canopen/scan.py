@@ -19,8 +19,10 @@ from drivelink.canopen.pdo import read_identity, read_optional
 from drivelink.canopen.sdo import Program, Read, SdoAbort
 from drivelink.errors import DriveError
 from drivelink.jointfile import BusSection
+from drivelink.plaintext import clean_text
 
 _ANSWER_S = 0.3  # for the slowest node
+_LONGEST_NAME = 80  # characters of a device's name that are shown
 _GAP_S = 0.001  # between two requests: 127 of them must not fill a transmit queue
 _PROFILES = {301: "CiA 301", 401: "CiA 401 (I/O)", 402: "CiA 402 (drive)", 406: "CiA 406 (encoder)"}
 _STATES = {0x00: "boot-up", 0x04: "stopped", 0x05: "operational", 0x7F: "pre-operational"}
@@ -156,5 +158,5 @@ def _identify(node: int) -> Program[FoundNode]:
         node_id=node,
         device_type=device_type,
         identity=identity,
-        name=name.rstrip(b"\0 ").decode("latin-1"),
+        name=clean_text(name.rstrip(b"\0 ").decode("latin-1"), _LONGEST_NAME),
     )

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from drivelink.errors import DrivelinkError, UsageError
+from drivelink.plaintext import PlainFormatter, clean_text
 from drivelink.version import __version__
 from estimator.errors import EstimatorError
 
@@ -114,6 +115,8 @@ def main(argv: list[str] | None = None) -> int:
     verb = argv[0] if argv and argv[0] in VERBS else ""
     # Some interfaces log every partial read, or a traceback for what they also raise.
     logging.getLogger("can").setLevel(logging.CRITICAL)
+    if logging.lastResort is not None:
+        logging.lastResort.setFormatter(PlainFormatter())
     # Before numpy is imported: threads do not help on small matrices.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
@@ -221,5 +224,5 @@ def moved(joint: JointFile, args: argparse.Namespace) -> JointFile:
 
 
 def _fail(verb: str, error: object, status: int) -> int:
-    print(f"drivelink {verb}: {' '.join(str(error).split())}", file=sys.stderr)
+    print(f"drivelink {verb}: {clean_text(' '.join(str(error).split()))}", file=sys.stderr)
     return status

@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
             return _by_hand(joint, args, seconds)
         report = examine(joint, args.joint.parent if args.joint else Path(), seconds)
     if args.json:
-        print(json.dumps(report.as_dict(), ensure_ascii=False))
+        print(json.dumps(report.as_dict()))
     else:
         report.show(Console())
     return 1 if report.worst is Severity.ERROR else 0
@@ -82,7 +82,7 @@ def _by_hand(joint: JointFile | None, args: argparse.Namespace, seconds: float) 
     with live_values(joint, args.joint.parent) as values:
         done = check_by_hand(joint, values, _Terminal(sys.stderr if args.json else sys.stdout), seconds)
     if args.json:
-        print(json.dumps(done.as_dict(), ensure_ascii=False))
+        print(json.dumps(done.as_dict()))
         return 0 if done.good else 1
     if done.paste:
         print(f"Put into {args.joint}:")

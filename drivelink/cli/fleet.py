@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from drivelink.errors import UsageError
 from drivelink.output.progress import Meter
+from drivelink.plaintext import clean_text
 
 if TYPE_CHECKING:
     from drivelink.fleet.runner import Counts, Settings
@@ -159,7 +160,7 @@ def _run(args: argparse.Namespace) -> int:
         nonlocal said
         said += 1
         if said <= _WARNINGS:
-            print(line, file=sys.stderr)
+            print(clean_text(line), file=sys.stderr)
 
     with Meter("fleet", len(sources)) as meter:
 
@@ -207,7 +208,7 @@ def _report(folder: str, rate: float, *, as_json: bool) -> None:
         return
     for joint in document["joints"]:
         if joint["state"] == "changing":
-            print(f"  {joint['joint']}: {joint['sentence']}")
+            print(clean_text(f"  {joint['joint']}: {joint['sentence']}"))
     for name in ("fleet.json", "fleet.html"):
         print(f"wrote {folder.rstrip('/')}/{name}")
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 from drivelink.cli import ALONE, add_bus, moved
 from drivelink.errors import UsageError
 from drivelink.jointfile import BusSection, load
+from drivelink.plaintext import PlainFormatter
 
 if TYPE_CHECKING:
     from drivelink.daemon.service import Daemon
@@ -103,11 +104,9 @@ def _say_ready(names: list[str], bus: BusSection, args: argparse.Namespace) -> N
 
 
 def _set_up_logging(level: str) -> None:
-    logging.basicConfig(
-        level=getattr(logging, level.upper()),
-        stream=sys.stderr,
-        format="%(levelname).1s %(message)s",
-    )
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(PlainFormatter("%(levelname).1s %(message)s"))
+    logging.basicConfig(level=getattr(logging, level.upper()), handlers=[handler])
     logging.getLogger("canopen").setLevel(logging.ERROR)
 
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any
+
+from drivelink.plaintext import clean_text
 
 
 class EventLog:
@@ -22,6 +25,8 @@ class EventLog:
     """
 
     _QUIET_S = 10.0  # for so long repetitions are counted instead of logged
+    _KINDS = 4  # different events of one source within that time; further ones count as one
+    _LINES = 64  # log lines within that time; further ones are counted
 
     def __init__(
         self, logger: logging.Logger, keep: int = 16, clock: Callable[[], float] = time.time
@@ -31,6 +36,8 @@ class EventLog:
         self._recent: deque[dict[str, Any]] = deque(maxlen=keep)
         self._active: dict[str, str] = {}
         self._said: dict[str, tuple[dict[str, Any], float, int]] = {}  # event, when logged, count since
+        self._sources: dict[str, tuple[float, set[str]]] = {}  # when the first of the keys came, and the keys
+        self._window_s, self._lines = -math.inf, 0
 
     @property
     def active(self) -> dict[str, str]:
@@ -41,15 +48,16 @@ class EventLog:
         """The last events, oldest first: {"time", "text", "count"}."""
         return [dict(event) for event in self._recent]
 
-    def say(self, text: str, level: int = logging.INFO, key: str = "") -> None:
+    def say(self, text: str, level: int = logging.INFO, key: str = "", source: str = "") -> None:
         """Report an event.
 
         Args:
             text: what.
             level: of the log line.
             key: identifies texts that differ only in numbers; default: the text itself.
+            source: who decides how many different events there are, such as a node.
         """
-        self._note(key or text, text, level)
+        self._note(self._limited(key or text, source), text, level)
 
     def begin(self, key: str, text: str, level: int = logging.WARNING) -> None:
         """Report that a condition begins; ignored while it holds."""
@@ -70,8 +78,31 @@ class EventLog:
         else:
             self.end(key, over)
 
-    def _note(self, key: str, text: str, level: int) -> None:
+    def _limited(self, key: str, source: str) -> str:
+        """The key, or the source's own where it has made too many different events."""
+        if not source:
+            return key
         now = self._clock()
+        since, kinds = self._sources.get(source, (-math.inf, set()))
+        if not 0 <= now - since < self._QUIET_S:
+            self._sources[source] = since, kinds = now, set()
+        if key not in kinds and len(kinds) >= self._KINDS:
+            return source
+        kinds.add(key)
+        return key
+
+    def _log(self, level: int, text: str, now: float) -> None:
+        """Log a line, up to a number of lines in a time."""
+        if not 0 <= now - self._window_s < self._QUIET_S:
+            left_out, self._window_s, self._lines = self._lines - self._LINES, now, 0
+            if left_out > 0:
+                self._logger.warning("%d messages were not logged: too many at a time", left_out)
+        self._lines += 1
+        if self._lines <= self._LINES:
+            self._logger.log(level, "%s", text)
+
+    def _note(self, key: str, text: str, level: int) -> None:
+        now, text = self._clock(), clean_text(text)
         event, since, count = self._said.get(key, ({}, -self._QUIET_S, 0))
         if 0 <= now - since < self._QUIET_S:
             self._said[key] = (event, since, count + 1)
@@ -82,5 +113,5 @@ class EventLog:
             self._said.clear()
         event = {"time": now, "text": text, "count": 1}
         self._said[key] = (event, now, 0)
-        self._logger.log(level, "%s", f"{text} ({count} more times before)" if count else text)
+        self._log(level, f"{text} ({count} more times before)" if count else text, now)
         self._recent.append(event)

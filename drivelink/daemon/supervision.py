@@ -278,7 +278,8 @@ class Supervisor:
         emergency = parse_emergency(data)
         if emergency is not None and not emergency.is_reset:
             node, code = cob_id - 0x080, emergency.code
-            self._events.say(f"node {node}: {emergency}", logging.WARNING, key=f"EMCY {node} {code}")
+            key, source = f"EMCY {node} {code}", f"EMCY {node}"
+            self._events.say(f"node {node}: {emergency}", logging.WARNING, key, source)
 
     def _sent(self, cob_id: int, data: bytes) -> None:
         if self._read_back is not None and 0x600 < cob_id < 0x680:

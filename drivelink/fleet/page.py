@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import math
+import re
 from collections.abc import Iterable, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -15,6 +16,7 @@ from estimator.sample import SIGMA_95
 
 _CHARTS = 400  # joints with a chart, the most urgent first; more would make the page too large
 _BROKEN = 200
+_REPORT = re.compile(r"diagnoses/(?:[\w.-]*[\w-][\w.-]*/)*report\.html")  # as a run writes it
 _BLUE, _ORANGE, _GREY = "#005f9e", "#e0701a", "#999999"
 _WIDTH, _LEFT, _RIGHT, _HEIGHT, _ROW = 900.0, 80.0, 10.0, 190.0, 18.0
 
@@ -210,6 +212,8 @@ def _dot(x: float, y: float, fill: str, tip: str = "", stroke: str = "none", rad
 
 
 def _link(report: str, body: str, tip: str = "") -> str:
+    if not _REPORT.fullmatch(report):  # the table is data: no other scheme, host or folder
+        return body
     title = f' title="{html.escape(tip)}"' if tip else ""
     return f'<a href="{html.escape(report)}"{title}>{body}</a>'
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from rich.text import Text
 
 from drivelink.monitor.braille import gauge, number
-from drivelink.pubsub.inbound import clean_text
+from drivelink.plaintext import clean_text
 
 MODEL_ALARM_ADVICE = (
     "the model is not sufficient: do not control on its numbers; record a minute of motion "

@@ -15,8 +15,9 @@ import zenoh.ext
 
 from drivelink.errors import ZenohError
 from drivelink.monitor.view import JointView
+from drivelink.plaintext import clean_text
 from drivelink.pubsub.identity import MAX_CLAIMS, DaemonIdentity, source_of
-from drivelink.pubsub.inbound import DECODERS, clean_text
+from drivelink.pubsub.inbound import DECODERS
 
 MAX_JOINTS = 64  # limit on joints shown, also against invented names
 _QUEUE = 8192

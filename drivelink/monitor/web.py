@@ -1,7 +1,7 @@
 """The live view as a web page: one self-contained file, served on the loopback, fed by server-sent events.
 
-Nothing is loaded from other hosts, the server listens on loopback only, and requests with a foreign Host
-header (pages of other sites in the user's browser) are refused.
+Nothing is loaded from other hosts, the server listens on loopback only, and requests of other sites' pages in
+the user's browser (a foreign Host or Origin header) are refused. Of too many streams the oldest ends.
 """
 
 from __future__ import annotations
@@ -10,7 +10,9 @@ import json
 import math
 import threading
 import time
-from contextlib import suppress
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
@@ -24,9 +26,11 @@ from drivelink.monitor.view import JointView
 from drivelink.monitor.watcher import Watcher
 
 MAX_CONNECTIONS = 16
+MAX_STREAMS = 8
 _PATIENCE_S = 5.0  # timeout of a silent browser
 _EVENT_S = 0.1
 _LOCAL_HOSTS = frozenset({"localhost", "127.0.0.1", "[::1]"})
+_OWN_PAGES = ("same-origin", "none")  # what a browser says of our page, and of the user's own request
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'; "
     "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -51,6 +55,7 @@ class WebView:
         self._watcher = watcher
         self._lock = threading.Lock()
         self._closing = threading.Event()
+        self._streams: deque[threading.Event] = deque()
         view = self
 
         class Handler(_Handler):
@@ -73,18 +78,28 @@ class WebView:
     def close(self) -> None:
         """Stop serving."""
         self._closing.set()
+        with self._lock:
+            for over in self._streams:
+                over.set()
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
 
-    @property
-    def closing(self) -> bool:
-        """Whether the server is closing."""
-        return self._closing.is_set()
-
-    def wait(self, seconds: float) -> None:
-        """Wait so long, or until the end."""
-        self._closing.wait(seconds)
+    @contextmanager
+    def stream(self) -> Iterator[threading.Event]:
+        """A place among the streams; the event is set when a newer stream needs it, and at the end."""
+        over = threading.Event()
+        with self._lock:
+            self._streams.append(over)
+            if self._closing.is_set():
+                over.set()
+            if len(self._streams) > MAX_STREAMS:
+                self._streams.popleft().set()
+        try:
+            yield over
+        finally:
+            with self._lock, suppress(ValueError):
+                self._streams.remove(over)
 
     def event(self, since: dict[str, float]) -> bytes:
         """The state of every joint as JSON, with the moments newer than `since`, which is updated."""
@@ -233,12 +248,12 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer a request."""
-        host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
-        if host not in _LOCAL_HOSTS:
+        host, origin = self.headers.get("Host") or "", self.headers.get("Origin")
+        if host.rsplit(":", 1)[0] not in _LOCAL_HOSTS or origin not in (None, f"http://{host}"):
             self.send_error(HTTPStatus.FORBIDDEN)
         elif self.path == "/":
             self._page()
-        elif self.path == "/events":
+        elif self.path == "/events" and self.headers.get("Sec-Fetch-Site", "none") in _OWN_PAGES:
             self._events()
         else:
             self.send_error(HTTPStatus.NOT_FOUND)
@@ -267,11 +282,12 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         since: dict[str, float] = {}
         try:
-            while not self.web.closing:
-                begin = time.monotonic()
-                self.wfile.write(b"data: " + self.web.event(since) + b"\n\n")
-                self.wfile.flush()
-                self.web.wait(max(0.0, _EVENT_S - (time.monotonic() - begin)))
+            with self.web.stream() as over:
+                while not over.is_set():
+                    begin = time.monotonic()
+                    self.wfile.write(b"data: " + self.web.event(since) + b"\n\n")
+                    self.wfile.flush()
+                    over.wait(max(0.0, _EVENT_S - (time.monotonic() - begin)))
         except OSError:  # the browser has closed the connection or stopped reading
             return
 

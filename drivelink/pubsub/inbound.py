@@ -9,42 +9,20 @@ from __future__ import annotations
 
 import json
 import math
-import unicodedata
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
 from drivelink.errors import ZenohError
+from drivelink.plaintext import clean_text
 from drivelink.pubsub.wire import decode_estimate, decode_external, decode_sample
 
 MAX_BYTES = 1 << 20  # of a document; a status has some 3 kB, a model with its nodes some 10 kB
 MAX_DEPTH = 16
 MAX_ELEMENTS = 20_000  # numbers, texts and containers of a document
-MAX_TEXT = 4096  # characters of one text
 MAX_KEY = 256  # characters of a name
 _LARGEST_INTEGER = 1 << 64
 _TOO_DEEP = f"document: expected at most {MAX_DEPTH} levels"
-# Control and format characters (direction, zero width), surrogates, private and unassigned ones.
-_UNSHOWABLE = frozenset({"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"})
-
-
-def clean_text(text: str, length: int = MAX_TEXT) -> str:
-    """The text in one line, without control and format characters.
-
-    Args:
-        text: of the network.
-        length: characters at most.
-    """
-    text = text[: length + 1]
-    if not text.isascii() or not text.isprintable():
-        text = "".join(_shown(character) for character in text)
-    return text if len(text) <= length else text[: length - 1] + "…"
-
-
-def _shown(character: str) -> str:
-    if character in "\t\n\r":
-        return " "
-    return "" if unicodedata.category(character) in _UNSHOWABLE else character
 
 
 def decode_document(payload: bytes) -> dict[str, Any]:

@@ -1,0 +1,37 @@
+"""Words of drives, files and messages as plain text: what a terminal or a browser would obey is left out."""
+
+from __future__ import annotations
+
+import logging
+import unicodedata
+
+MAX_TEXT = 4096  # characters of one text
+# Control and format characters (direction, zero width), surrogates, private and unassigned ones.
+_UNSHOWABLE = frozenset({"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"})
+
+
+def clean_text(text: str, length: int = MAX_TEXT) -> str:
+    """The text in one line, without control and format characters.
+
+    Args:
+        text: of anybody.
+        length: characters at most.
+    """
+    text = text[: length + 1]
+    if not text.isascii() or not text.isprintable():
+        text = "".join(_shown(character) for character in text)
+    return text if len(text) <= length else text[: length - 1] + "…"
+
+
+def _shown(character: str) -> str:
+    if character in "\t\n\r":
+        return " "
+    return "" if unicodedata.category(character) in _UNSHOWABLE else character
+
+
+class PlainFormatter(logging.Formatter):
+    """Formats log records as plain text, line by line."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record's lines."""
+        return "\n".join(clean_text(line) for line in super().format(record).split("\n"))

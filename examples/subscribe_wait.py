@@ -17,7 +17,7 @@ def main(joint: str = "elbow", endpoint: str = "tcp/127.0.0.1:7447", seconds: st
     with drivelink.subscribe(joint, endpoint=endpoint) as elbow:
         while time.monotonic() < end:
             estimate = elbow.wait(TIMEOUT_S)
-            if estimate is None or not elbow.usable:
+            if estimate is None or not estimate.usable or elbow.stale:
                 if not safe:
                     print(f"safe state: the daemon is {elbow.state}")
                 safe = True

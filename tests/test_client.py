@@ -95,6 +95,27 @@ def test_an_estimate_that_its_status_speaks_against_is_not_usable(publisher, joi
     assert not joint.usable
 
 
+def test_each_estimate_answers_for_itself_and_not_for_the_newest(publisher, joint):
+    good = Status.VALID | Status.OBSERVABLE
+    statuses = [good, Status.OBSERVABLE, good | Status.MODEL_ALARM, good]
+    for number, status in enumerate(statuses, start=1):
+        publish(publisher, number, status=status)
+    until(lambda: joint.received == len(statuses))
+    got = [message for _, message in zip(statuses, joint, strict=False)]
+    assert [one.usable for one in got] == [True, False, False, True]
+    assert [one.valid for one in got] == [True, False, True, True]
+
+
+def test_the_contact_loop_of_the_documentation_survives_a_gap(publisher, joint):
+    """`while joint.wait(timeout_s)` would end at the first pause."""
+    loop = joint.cycles(timeout_s=0.01)
+    publish(publisher, 1)
+    until(lambda: next(loop) is not None)
+    assert next(loop) is None
+    publish(publisher, 2)
+    until(lambda: (estimate := next(loop)) is not None and estimate.sequence == 2)
+
+
 def test_a_rigid_joint_says_that_its_stiffness_is_not_given(endpoint):
     """Valid for its torque: without the bit a client refuses NaN that is called valid."""
     text = f'name = "elbow"\n[[motor]]\ninertia_kg_m2 = 0.125\n[motor.transmission]\nmodel = "none"\n[zenoh]\nendpoint = "{endpoint}"'

@@ -3,7 +3,7 @@
     with drivelink.subscribe("elbow") as joint:
         while True:
             estimate = joint.wait(timeout_s=0.01)      # the next cycle, or None
-            if joint.valid:
+            if estimate is not None and estimate.usable and not joint.stale:
                 use(estimate.stiffness_nm_rad, joint.age_s)
 
 What happens to the daemon is `state`, never an exception.

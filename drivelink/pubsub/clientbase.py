@@ -26,17 +26,6 @@ from drivelink.pubsub.wire import ESTIMATE, EstimateMessage, ExternalMessage
 from estimator.sample import Status
 
 ENDPOINT = "tcp/127.0.0.1:7447"
-# Of these bits a usable estimate has VALID only.
-_USABLE = int(
-    Status.VALID
-    | Status.MODEL_ALARM
-    | Status.RESTARTED
-    | Status.DRIVE_FAULT
-    | Status.STALE
-    | Status.UNTIMED
-    | Status.NODE_RESTARTED
-    | Status.CONTRADICTED
-)
 _TOGETHER = 5  # largest distance in cycles between estimate and external torque, as either may be lost
 _NAME = re.compile(r"[^*$#?\s/]+(/[^*$#?\s/]+)*")
 
@@ -144,19 +133,21 @@ class Client:
 
     @property
     def usable(self) -> bool:
-        """Whether the latest estimate is fresh, valid, without alarm or fault: a controller's check."""
-        self._drain()
-        latest = self._feed.latest
-        return latest is not None and latest.status & _USABLE == Status.VALID and not self.stale
+        """Whether the newest estimate, that of `latest()`, is usable and fresh.
+
+        An estimate in hand answers for itself: `estimate.usable`.
+        """
+        latest = self.latest()
+        return latest is not None and latest.usable and not self.stale
 
     @property
     def valid(self) -> bool:
-        """Whether the latest estimate is fresh and valid."""
+        """Whether the newest estimate, that of `latest()`, is fresh and valid."""
         return self._fresh(Status.VALID)
 
     @property
     def observable(self) -> bool:
-        """Whether the latest estimate is fresh and observable."""
+        """Whether the newest estimate, that of `latest()`, is fresh and observable."""
         return self._fresh(Status.OBSERVABLE)
 
     @property

@@ -24,6 +24,17 @@ from estimator.sample import ExternalStatus, Sample, Status, TransmissionEstimat
 MAX_ELEMENTS = 8  # transmissions or motors in one message; below 128 the varint is one byte
 _STRUCT_CODES = {"u64": "Q", "u32": "I", "f64": "d"}
 _VALID, _PARTIAL = int(Status.VALID), int(Status.PARTIAL)
+# Of these bits a usable estimate has VALID only.
+_USABLE = int(
+    Status.VALID
+    | Status.MODEL_ALARM
+    | Status.RESTARTED
+    | Status.DRIVE_FAULT
+    | Status.STALE
+    | Status.UNTIMED
+    | Status.NODE_RESTARTED
+    | Status.CONTRADICTED
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,6 +201,11 @@ class EstimateMessage(NamedTuple):
     def valid(self) -> bool:
         """Status bit 0: the numbers may be used."""
         return bool(self.status & Status.VALID)
+
+    @property
+    def usable(self) -> bool:
+        """Whether a controller may act on this estimate: valid, and neither alarm nor fault."""
+        return self.status & _USABLE == _VALID
 
     @property
     def observable(self) -> bool:

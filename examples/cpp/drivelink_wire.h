@@ -135,6 +135,11 @@ static inline bool drivelink_decode_external(const uint8_t *payload, size_t leng
     return drivelink_finite(external->external_torque_nm) && drivelink_magnitude(external->external_torque_std_nm, 0);
 }
 
+/* Whether the numbers may be used. */
+static inline bool drivelink_valid(const drivelink_estimate *estimate) {
+    return (estimate->status & DRIVELINK_VALID) != 0;
+}
+
 /* What a controller checks of an estimate that is fresh: valid, and nothing in its status speaks against it. */
 static inline bool drivelink_usable(const drivelink_estimate *estimate) {
     return (estimate->status & (DRIVELINK_VALID | DRIVELINK_AGAINST)) == DRIVELINK_VALID;

@@ -34,7 +34,8 @@ bool check(const std::vector<uint8_t> &payload, const std::vector<std::string> &
                 estimate.status == std::stoull(numbers[2]) && same(estimate.flexibility_torque_nm, numbers[3]) &&
                 same(estimate.stiffness_nm_rad, numbers[4]) && same(estimate.stiffness_std_nm_rad, numbers[5]) &&
                 estimate.transmissions == std::stoull(numbers[6]) &&
-                drivelink_usable(&estimate) == ((estimate.status & 0x1d51) == 1);
+                drivelink_usable(&estimate) == ((estimate.status & 0x1d51) == 1) &&
+                drivelink_valid(&estimate) == ((estimate.status & 1) == 1);
     for (size_t i = 0; good && i < estimate.transmissions; i++) {
         const std::string *group = &numbers[7 + 4 * i];
         const drivelink_transmission &each = estimate.transmission[i];

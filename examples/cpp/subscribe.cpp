@@ -26,7 +26,7 @@ bool show(const z_loaned_sample_t *sample, uint64_t *last, uint64_t *gaps) {
     std::printf("%" PRIu64 " %.3f N·m, %.1f ± %.1f N·m/rad, valid %d, observable %d, usable %d, %" PRId64
                 " µs after its SYNC, %" PRIu64 " gaps\n",
                 estimate.sequence, estimate.flexibility_torque_nm, estimate.stiffness_nm_rad,
-                estimate.stiffness_std_nm_rad, (estimate.status & DRIVELINK_VALID) != 0,
+                estimate.stiffness_std_nm_rad, drivelink_valid(&estimate),
                 (estimate.status & DRIVELINK_OBSERVABLE) != 0, drivelink_usable(&estimate),
                 (now_ns - static_cast<int64_t>(estimate.stamp_ns)) / 1000, *gaps);
     return true;

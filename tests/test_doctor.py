@@ -404,8 +404,19 @@ def test_without_a_joint_the_machine_is_examined(capsys):
 def test_every_warning_of_the_machine_has_a_fix():
     section = Section("Machine")
     examine_machine(section, 0.001, 0.05)
-    assert {"kernel", "real time", "memory", "timer"} <= {finding.subject for finding in section.notices}
+    assert {"kernel", "real time", "memory", "files", "timer"} <= {
+        finding.subject for finding in section.notices
+    }
     assert all(finding.fix for finding in section.notices if finding.severity is Severity.WARNING)
+
+
+@pytest.mark.parametrize(("limit", "severity"), [(1024, Severity.WARNING), (8192, Severity.OK)])
+def test_too_few_files_are_said(monkeypatch, limit, severity):
+    monkeypatch.setattr("drivelink.doctor.machine.resource.getrlimit", lambda _: (limit, limit))
+    section = Section("Machine")
+    examine_machine(section, 0.001, 0.01)
+    (said,) = [finding for finding in section.notices if finding.subject == "files"]
+    assert said.severity is severity and str(limit) in said.text
 
 
 def test_text_of_devices_is_shown_as_it_is():

@@ -1,9 +1,11 @@
 """Zenoh sessions between real processes: sharing one endpoint, losing one, safe defaults, clean ends."""
 
 import json
+import resource
 import socket
 import subprocess
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -13,7 +15,14 @@ from zenohkit import LIMIT_S, free_endpoint, make_joint, ready, script, until
 from drivelink.errors import ZenohError
 from drivelink.jointfile import ZenohSection
 from drivelink.pubsub.publisher import JointPublisher
-from drivelink.pubsub.session import client_config, close_session, daemon_config, open_client, open_session
+from drivelink.pubsub.session import (
+    FILES,
+    client_config,
+    close_session,
+    daemon_config,
+    open_client,
+    open_session,
+)
 
 
 @pytest.fixture
@@ -254,3 +263,25 @@ def test_where_a_router_was_no_daemon_takes_its_place(endpoint, tmp_path):
             close_session(again)
     finally:
         close_session(daemon)
+
+
+def test_connections_that_say_nothing_lock_no_subscriber_out(endpoint):
+    """Each waits for its handshake; more than may wait at a time would make a subscriber wait, too."""
+    idle = 1200
+    with script("elbow", endpoint) as daemon:
+        ready(daemon)
+        limits = Path(f"/proc/{daemon.pid}/limits").read_text(encoding="ascii")
+        files = next(line for line in limits.splitlines() if line.startswith("Max open files"))
+        permitted = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+        assert int(files.split()[3]) >= min(8192, permitted if permitted > 0 else 8192)
+        waiting = daemon_config(endpoint, listen=True).get_json("transport/unicast")
+        assert json.loads(waiting)["accept_pending"] > idle and json.loads(waiting)["accept_pending"] < FILES
+        host, port = endpoint.removeprefix("tcp/").split(":")
+        with ExitStack() as stack:
+            for _ in range(min(idle, resource.getrlimit(resource.RLIMIT_NOFILE)[0] - 200)):
+                stack.enter_context(socket.create_connection((host, int(port))))
+            with open_client(endpoint) as session:
+                hear(
+                    session.declare_subscriber("drivelink/*/estimate", zenoh.handlers.RingChannel(64)),
+                    {"elbow"},
+                )

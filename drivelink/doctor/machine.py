@@ -10,6 +10,7 @@ from pathlib import Path
 
 from drivelink.doctor.report import Section
 from drivelink.notice import Severity
+from drivelink.pubsub.session import FILES
 
 _CPU = Path("/sys/devices/system/cpu")
 _NEEDED_LOCKED = 256 << 20  # bytes; the daemon's resident size is below
@@ -31,6 +32,7 @@ def examine_machine(section: Section, period_s: float, seconds: float) -> None:
     capabilities = _capabilities()
     _scheduling(section, capabilities)
     _memory(section, capabilities)
+    _files(section)
     _governor(section)
     _timer(section, period_s, seconds)
 
@@ -66,6 +68,20 @@ def _memory(section: Section, capabilities: int) -> None:
             "memory",
             f"only {limit >> 10} KiB may be locked: a page fault may delay a cycle",
             f"echo '{_user()} - memlock unlimited' | sudo tee -a /etc/security/limits.d/drivelink.conf, "
+            "then log in again",
+        )
+
+
+def _files(section: Section) -> None:
+    limit = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    if limit == resource.RLIM_INFINITY or limit >= FILES:
+        section.ok("files", f"{FILES} may be open: connections that say nothing lock no subscriber out")
+    else:
+        section.say(
+            Severity.WARNING,
+            "files",
+            f"only {limit} may be open, {FILES} are wanted: as many connections lock new subscribers out",
+            f"echo '{_user()} - nofile {FILES}' | sudo tee -a /etc/security/limits.d/drivelink.conf, "
             "then log in again",
         )
 

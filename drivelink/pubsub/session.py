@@ -13,6 +13,7 @@ from __future__ import annotations
 import atexit
 import json
 import re
+import resource
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,12 +32,15 @@ _POLL_S = 0.01
 _EXAMPLE = "tcp/127.0.0.1:7447"
 _LINKS = ("tcp", "tls", "udp", "quic", "ws", "unixsock-stream", "serial", "vsock")
 _MOST_CONFIG_BYTES = 256 << 10
+FILES = 8192  # open files: more than the connections that may wait
 
 _COMMON: dict[str, Any] = {
     "mode": "peer",
     "scouting/multicast/enabled": False,
     "scouting/delay": 250,  # ms that opening waits for somebody to connect to
     "transport/unicast/open_timeout": 2000,  # ms; closing waits for it
+    "transport/unicast/accept_timeout": 2000,  # ms that a connection may say nothing
+    "transport/unicast/accept_pending": 4096,  # of these; further ones, subscribers too, have to wait
     "adminspace/enabled": False,
     "transport/shared_memory/enabled": False,  # these messages are far too small for it
     "transport/link/tx/queue/size/real_time": 16,
@@ -75,6 +79,7 @@ def open_session(section: ZenohSection, base_dir: Path) -> zenoh.Session:
     Raises:
         ZenohError: the configuration file cannot be used, or the endpoint is taken by another program.
     """
+    _allow_files()
     if section.config is not None:
         return _open(_read(base_dir / section.config))
     endpoint = _require_endpoint(section.endpoint)
@@ -99,6 +104,14 @@ def open_client(endpoint: str, config: str | Path | None = None) -> zenoh.Sessio
     if config is not None:
         return _open(_read(Path(config)))
     return _open(client_config(_require_endpoint(endpoint)))
+
+
+def _allow_files() -> None:
+    """Raise the process's limit of open files to `FILES`, as far as it is permitted."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = FILES if hard == resource.RLIM_INFINITY else min(FILES, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 def _join(endpoint: str) -> zenoh.Session:

@@ -19,6 +19,7 @@ from estimator.effects import LIBRARY
 _SCHEMA = "drivelink.diagnosis/1"
 _CURVE_POINTS = 200
 _RIVALS = 8
+_SURE, _LIKELY = 0.9, 0.3  # probabilities at which an effect is missing, and at which it has a name
 _WIDTH = 9.6  # inches of a plot as wide as the page
 _COLUMN = 5.4  # and of one in half of it
 _AXES = {
@@ -124,9 +125,9 @@ def sentence(outcome: Diagnosis) -> str:
         f"the torque balance's error on held-out data {'falls' if lower else 'rises'} from "
         f"{outcome.validation.before_relative:.2%} to {outcome.validation.after_relative:.2%}"
     )
-    names = " and ".join(title_of(finding) for finding in outcome.effects)
     if outcome.verdict == "effect":
-        return f"The model lacks {names}: {fall}."
+        return f"{_lacks(outcome)}: {fall}."
+    names = " and ".join(title_of(finding) for finding in outcome.effects)
     if outcome.verdict == "unexplained":
         where = outcome.effects[0]
         place = _place(where)
@@ -142,6 +143,27 @@ def sentence(outcome: Diagnosis) -> str:
         f"The model is sufficient: what it leaves, {outcome.validation.after_relative:.2%} of the torque, "
         "belongs to no effect."
     )
+
+
+def _lacks(outcome: Diagnosis) -> str:
+    """What is missing, said as surely as it is known."""
+    sure = [title_of(f) for f in outcome.effects if f.probability >= _SURE]
+    likely = [
+        f"{title_of(f)} ({f.probability:.2f})" + (f", else {others_of(f)}" if f.alternatives else "")
+        for f in outcome.effects
+        if _LIKELY <= f.probability < _SURE
+    ]
+    unsure = sorted({_place(f) for f in outcome.effects if f.probability < _LIKELY})
+    said = []
+    if sure:
+        said.append(f"The model lacks {' and '.join(sure)}")
+    if likely:
+        said.append(f"most likely {'' if sure else 'the model lacks '}{' and '.join(likely)}")
+    if unsure:
+        to_do = outcome.advice[0] if outcome.advice else "record another motion, faster, slower and wider"
+        said.append(f"something at the {' and '.join(unsure)} has no likely name yet ({to_do})")
+    text = "; ".join(said)
+    return text[0].upper() + text[1:]
 
 
 def unexplained(outcome: Diagnosis, units: Units | None = None) -> str:

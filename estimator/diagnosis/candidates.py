@@ -53,6 +53,13 @@ class Candidate:
         return kind.location == "transmission" and kind.coordinates == ("deflection",) and not kind.remembers
 
     @property
+    def rubs(self) -> bool:
+        """Whether it is a law of the motor's dry friction, of which a motor has one."""
+        kind = self.kind
+        sign = kind.remembers or "smoothing_rad_s" in kind.nonlinear
+        return kind.location == "motor" and sign and "flexibility_torque" not in kind.coordinates
+
+    @property
     def family(self) -> tuple[str, str, str, int | None]:
         """Family of laws for the same phenomenon: place, channel and coordinate."""
         kind = self.kind

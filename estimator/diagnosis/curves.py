@@ -10,6 +10,7 @@ from scipy.interpolate import BSpline
 from scipy.signal import lfilter
 
 from estimator.choices import choice, whole
+from estimator.diagnosis.candidates import reverses
 from estimator.diagnosis.frame import Frame
 from estimator.diagnosis.hypothesis import Extra, Fitted
 from estimator.diagnosis.search import Search
@@ -76,15 +77,19 @@ def _bases(frame: Frame, beside: Fitted, location: str, motor: int) -> list[tupl
         "transmission": ("deflection", "deflection_rate", "position"),
         "link": ("link_position", "link_velocity"),
     }[location]
+    reversing = reverses(c.velocity)  # a one-way motion is a function of time
     made: list[tuple[tuple[str, ...], Basis]] = [
         ((name,), _over(name, _Splines(getattr(c, name), whole("points")))) for name in (place, rate, *others)
     ]
     v = getattr(c, rate)
     slow = _Splines(c.time, whole("groups"))
     if location == "motor" and frame.linked:
-        made.append((("torque",), _beyond_scale(_Splines(c.torque, whole("points")))))
+        made.append((("torque",), _beyond_scale(_over("torque", _Splines(c.torque, whole("points"))))))
         made.append(
-            (("position", "torque"), _scaled("torque", "position", _Splines(c.position, whole("points")), c))
+            (
+                ("position", "torque"),
+                _beyond_scale(_scaled("torque", "position", _Splines(c.position, whole("points")), c)),
+            )
         )
     smoothing = max(choice("smoothing") * float(np.sqrt(np.mean(v * v))), 1e-12)
     made.append(
@@ -93,15 +98,17 @@ def _bases(frame: Frame, beside: Fitted, location: str, motor: int) -> list[tupl
             _both_ways(place, rate, smoothing, _Splines(getattr(c, place), whole("groups"))),
         )
     )
-    if location == "motor":
+    if location == "motor" and reversing:
         made.append((("velocity", "time"), _fading(slow, smoothing, c)))
     if location == "transmission":
-        made.append((("deflection", "time"), _scaled("deflection", "time", slow, c)))
+        if reversing:
+            made.append((("deflection", "time"), _scaled("deflection", "time", slow, c)))
         made.append((("deflection", "deflection_rate"), _creeping(1.0 / frame.signals.bandwidth_hz)))
         path = _Splines(c.link_position, whole("groups"))
         made.append((("deflection", "link_position"), _scaled("deflection", "link_position", path, c, True)))
     made.append((("time",), _waves(frame, beside, *_line(frame, beside, location, motor))))
-    made.append((("time",), _over("time", slow)))
+    if reversing:
+        made.append((("time",), _over("time", slow)))
     return made
 
 
@@ -109,11 +116,11 @@ def _over(name: str, splines: _Splines) -> Basis:
     return lambda c: splines(getattr(c, name))
 
 
-def _beyond_scale(splines: _Splines) -> Basis:
-    """Functions of the torque without a proportional part, which would explain anything."""
+def _beyond_scale(whole_basis: Basis) -> Basis:
+    """Functions without the part that is proportional to the torque, which would explain anything."""
 
     def basis(c: Coordinates) -> FloatArray:
-        path = splines(c.torque)
+        path = whole_basis(c)
         return np.asarray(path - np.outer(c.torque, c.torque @ path) / (c.torque @ c.torque))
 
     return basis

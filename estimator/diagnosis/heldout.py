@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.choices import choice, whole
 from estimator.diagnosis.beliefs import OF_RUN
 from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.diagnosis.result import Errors
@@ -99,6 +100,26 @@ class Held:
     def squared(self, fitted: Fitted) -> float:
         """Mean squared error of all balances, relative to each recording's torque."""
         return float(np.mean([one.square / one.torque_square for one in self.residuals(fitted)]))
+
+    def confirms(self, found: Fitted, rest: Fitted) -> bool:
+        """Whether held-out data need what one model has beyond another.
+
+        The error falls by more than filters and rounding leave, and the mean of its logarithm over stretches
+        of time by more than its standard error.
+        """
+        least = choice("floor") ** 2
+        if self.squared(rest) - self.squared(found) < least:
+            return False
+        gain = np.log((self._by_stretch(rest) + least) / (self._by_stretch(found) + least))
+        return bool(np.mean(gain) > np.std(gain, ddof=1) / np.sqrt(len(gain)))
+
+    def _by_stretch(self, fitted: Fitted) -> FloatArray:
+        """Mean squared error of stretches of time, relative to each recording's torque."""
+        made = []
+        for one in self.residuals(fitted):
+            square = (one.left_nm**2).reshape(self._problem.equations, -1).mean(axis=0) / one.torque_square
+            made += [np.mean(part) for part in np.array_split(square, whole("groups"))]
+        return np.array(made)
 
     def log_likelihood(self, fitted: Fitted, like: Fitted) -> float:
         """Log likelihood of the held-out data, up to a constant, with the noise of another hypothesis."""

@@ -97,10 +97,18 @@ class Judge:
         if stamps:
             return _Judged("unexplained", [_unlisted(f) for f in effects], before, self.found, stamps, True)
         verdict, notes = self._named(effects)
-        if verdict == "effect" and self.held.squared(self.found) > self.held.squared(before):
-            verdict = "insufficient_excitation"
-            notes.append("on held-out data the effects do not lower the error: they are not written")
-        return _Judged(verdict, effects, before, self.found, notes)
+        after = self.found
+        if self._harmful(before, after):
+            after = before
+            if effects:
+                verdict = "insufficient_excitation"
+                notes.append("on held-out data the effects do not lower the error: they are not written")
+        return _Judged(verdict, effects, before, after, notes)
+
+    def _harmful(self, before: Fitted, after: Fitted) -> bool:
+        """Whether a model is worse on held-out data than the declared one, or than none at all."""
+        worse = self.held.squared(after) > self.held.squared(before)
+        return worse or self.held.errors(before, after).after_relative > 1.0
 
     def _stamped_wrongly(self, effects: list[Finding]) -> list[str]:
         """Delays beyond those of any drive or bus, one sentence each."""
@@ -129,7 +137,7 @@ class Judge:
         problem, surplus = self.problem, self.surplus
         effects, before, after = judged.effects, judged.before, judged.after
         chances = [(self.search.chance(after, h, surplus), h) for h in others]
-        transmissions, unsure = transmissions_of(self.search, after, chances, surplus)
+        transmissions, unsure = transmissions_of(self.search, after, chances, surplus, self._floor(after))
         if judged.in_spring:
             transmissions = tuple(Refitted(one.model, {}, {}) for one in transmissions)
             unsure = ["no stiffness is reported: what is unexplained is in the spring's torque or deflection"]
@@ -171,9 +179,10 @@ class Judge:
         """Whether a free curve explains more than all named effects, here and on held-out data."""
         if self.search.advantage(curve, self.found) <= 0.0:
             return False
+        if not self.held.confirms(curve, self.search.null):
+            return False
         named = min(self.held.squared(h) for h in (self.found, *self.search.leading()))
-        free, before = self.held.squared(curve), self.held.squared(self.search.null)
-        return free < before and free < (choice("curve") ** 2 if self.found.terms else 1.0) * named
+        return self.held.squared(curve) < (choice("curve") ** 2 if self.found.terms else 1.0) * named
 
     def _remaining(self) -> Fitted | None:
         """A curve for a balance that named effects leave unexplained although its physics is declared."""

@@ -158,14 +158,19 @@ def alignment_of(problem: Problem, after: Fitted, effects: list[Finding], surplu
 
 
 def transmissions_of(
-    search: Search, after: Fitted, accounts: Sequence[tuple[float, Fitted]], surplus: float
+    search: Search,
+    after: Fitted,
+    accounts: Sequence[tuple[float, Fitted]],
+    surplus: float,
+    left: Sequence[float],
 ) -> tuple[tuple[Refitted, ...], list[str]]:
     """Each motor's transmission, and doubts about them.
 
     The covariance is that of the fit plus that between explanations (Bayesian model averaging; Hoeting et
     al., Statistical Science 14, 1999), because another set of effects may imply another stiffness, plus the
     possible contribution of rejected effects. The information of the data counts as much less as the error on
-    held-out data is larger (`surplus`). An undetermined stiffness has no parameters, and a doubt.
+    held-out data is larger (`surplus`). An undetermined stiffness has no parameters, and a doubt; nor has one
+    whose balance leaves more than the spring carries (`left`: rms in N·m per motor).
     """
     problem = search.problem
     covariance = hac_covariance(problem, after, surplus)
@@ -180,11 +185,15 @@ def transmissions_of(
         alpha = np.array([after.slots[j].taken + after.posterior.x[j] for j in mine])
         own = (covariance + search.unseen(after, mine[0], float(effects[mine[0]])))[np.ix_(mine, mine)]
         own = own + _between(after, accounts, i, alpha)
-        found = middle(model, alpha, own, problem.frames[0].motors[i].deflection)
-        if not found.determined or any(after.posterior.bound[mine]):
+        phi = problem.frames[0].motors[i].deflection
+        found = middle(model, alpha, own, phi)
+        more = left[i] > float(np.std(problem.frames[0].project(model.torque(phi, alpha))))
+        if more or not found.determined or any(after.posterior.bound[mine]):
             value = f"{found.stiffness_nm_rad:.4g} ± {SIGMA_95 * found.std_nm_rad:.2g} N·m/rad (95 %)"
             if any(after.posterior.bound[mine]):
                 value = "no positive one fits better than none"
+            elif more:
+                value = "the balance leaves more torque than the spring carries"
             doubts.append(f"these data do not determine the stiffness of motor {i + 1}: {value}")
             made.append(Refitted(model.name, {}, {}))
             continue

@@ -238,7 +238,10 @@ class Search:
             like: an effect whose whole family is included.
         """
         found = []
+        rubbing = {t.candidate.motor for t in parent.terms if t.candidate.rubs}
         for beside in self._library_beside(parent):
+            if beside.candidate.rubs and beside.candidate.motor in rubbing:
+                continue
             best = max(beside.tried, key=lambda one: one.gain)
             price = math.log(len(beside.tried))
             found.append((best.gain - price, Term(beside.candidate, dict(best.values))))

@@ -92,14 +92,18 @@ def _chosen(search: Search, held: Held, hypotheses: list[Fitted]) -> Fitted:
 
 
 def _gated(search: Search, held: Held, found: Fitted) -> Fitted:
-    """The hypothesis without the terms that do not lower the error on held-out data."""
+    """The hypothesis without the terms that held-out data do not confirm."""
     while found.terms:
-        error = held.squared(found)
         as_found = search.problem.numbers(found)
-        without = [search.problem.without(found, k, as_found) for k in range(len(found.terms))]
-        left = [held.squared(rest) for rest in without]
-        best = int(np.argmin(left))
-        if left[best] > error:
+        without = [
+            # Its place among the everyday errors stays empty too.
+            search.problem.without(
+                found, k, {**as_found, term.candidate.key: (0.0,) * len(term.candidate.kind.linear)}
+            )
+            for k, term in enumerate(found.terms)
+        ]
+        best = min(range(len(without)), key=lambda k: held.squared(without[k]))
+        if held.confirms(found, without[best]):
             break
         found = search.problem.without(found, best)
     return found

@@ -1,0 +1,106 @@
+"""What a diagnosis says, and of what it does not: healthy recordings, shares of certainty, one-way motions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import diagnosiskit as kit
+import numpy as np
+import pytest
+
+from drivelink.output.report import sentence
+from estimator.diagnosis import Diagnosis, Errors, Finding, diagnose
+from estimator.diagnosis.curves import _bases
+from estimator.diagnosis.heldout import Held
+from estimator.diagnosis.hypothesis import Problem
+from estimator.diagnosis.search import Search
+from estimator.identify import identify
+from estimator.sample import Record
+
+
+def finding(name: str, probability: float, **more: Any) -> Finding:
+    return Finding(
+        name=name, location="motor", motor=0, parameters={}, std={}, probability=probability, **more
+    )
+
+
+def outcome(*effects: Finding, advice: tuple[str, ...] = ()) -> Diagnosis:
+    errors = Errors(1.0, 0.1, 0.1, 0.01)
+    return Diagnosis(
+        verdict="effect", bandwidth_hz=10.0, effects=effects, train=errors, validation=errors,
+        floor_nm=(0.1,), transmissions=(), advice=advice,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("effects", "said"),
+    [
+        ((finding("cogging", 0.9),), "The model lacks cogging (motor): "),
+        (
+            (finding("cogging", 0.46, alternatives=("motor_inertia",), alternative_probabilities=(0.4,)),),
+            "Most likely the model lacks cogging (motor) (0.46), else motor inertia (0.40): ",
+        ),
+        ((finding("cogging", 0.2),), "Something at the motor has no likely name yet (move faster): "),
+        (
+            (finding("cogging", 0.95), finding("motor_inertia", 0.5)),
+            "The model lacks cogging (motor); most likely motor inertia (motor) (0.50): ",
+        ),
+    ],
+)
+def test_an_effect_is_said_as_surely_as_it_is_known(effects: tuple[Finding, ...], said: str) -> None:
+    assert sentence(outcome(*effects, advice=("move faster",))).startswith(said)
+
+
+@pytest.fixture(scope="module")
+def healthy() -> tuple[Record, Record]:
+    first, second = (kit.World([{}], seed=seed).run()[0] for seed in (31, 32))
+    return first, second
+
+
+def test_a_second_healthy_recording_has_no_finding(healthy: tuple[Record, Record]) -> None:
+    first, second = healthy
+    fitted = identify(first, kit.model()).model
+    assert diagnose(second, fitted).verdict == "sufficient"
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "confirmed"),
+    [
+        ([1e-2] * 10, [2e-3] * 10, True),
+        ([1e-5] * 10, [9e-6] * 10, False),  # less than filters and rounding leave
+        ([1e-2, 1e-3] * 5, [1e-3, 9e-3] * 5, False),  # less than its scatter
+    ],
+)
+def test_held_out_data_confirm_only_what_is_more_than_scatter_and_rounding(
+    before: list[float], after: list[float], confirmed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Held, "_by_stretch", lambda _, squares: np.array(squares))
+    monkeypatch.setattr(Held, "squared", lambda _, squares: float(np.mean(squares)))
+    held: Any = Held.__new__(Held)
+    assert held.confirms(after, before) is confirmed
+
+
+@pytest.mark.parametrize("speed", [0.0, 2.0])
+def test_a_one_way_motion_has_no_free_curve_over_time(speed: float) -> None:
+    time = np.arange(8000) * kit.PERIOD_S
+    motion = speed * time + 0.2 * np.sin(2.0 * time) + 0.05 * np.sin(9.0 * time)
+    record = Record(
+        period_s=kit.PERIOD_S,
+        sequence=np.arange(len(time)),
+        motor_position_rad=motion[:, None],
+        motor_torque_nm=np.cos(3.0 * time)[:, None],
+        link_position_rad=motion + 0.01 * np.cos(3.0 * time),
+    )
+    problem = Problem([record], kit.model(), 15.0)
+    bases = _bases(problem.frames[0], problem.null(), "motor", 0)
+    over_time = [names for names, _ in bases if names == ("velocity", "time")]
+    assert bool(over_time) is (speed == 0.0)
+
+
+def test_of_the_motors_dry_friction_there_is_one_law(healthy: tuple[Record, Record]) -> None:
+    search = Search(Problem([healthy[0]], kit.model(), 15.0))
+    dry = [e.candidate for e in search._library if e.candidate.rubs]
+    assert {"coulomb_friction", "presliding_friction"} <= {one.kind.name for one in dry}
+    coulomb = next(one for one in search.screen(search.null, dry[0]) if one.candidate.rubs)
+    beside = search.screen(search.problem.added(search.null, coulomb), dry[0])
+    assert not any(term.candidate.rubs for term in beside)

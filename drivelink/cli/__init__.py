@@ -43,6 +43,7 @@ VERBS = {
     "sim": "the simulated drives alone, on the bus of the joint file",
     "monitor": "live view of any daemon",
     "record": "record a running daemon or a bus",
+    "keep": "have a running daemon's black box keep the last minute",
     "replay": "run a recording through the same code as live data",
     "fit": "fit the transmission to a recording (model-based estimation)",
     "diagnose": "find the physical effect that the model lacks, and add it",

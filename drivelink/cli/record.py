@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
     with ExitStack() as stack:
         sink = open_sink(args.out, joint, source.text, force=args.force)
         recorder = stack.enter_context(Recorder(sink, []))
-        _add_taps(recorder, args.source, source, stack)
+        add_taps(recorder, args.source, source, stack)
         end = time.monotonic() + args.seconds if args.seconds else float("inf")
         say = _Summary(args.out, recorder)
         recorder.run(lambda: stopped.is_set() or time.monotonic() >= end, say.tick)
@@ -107,7 +107,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _add_taps(recorder: Recorder, source: str, text: JointText, stack: ExitStack) -> None:
+def add_taps(recorder: Recorder, source: str, text: JointText, stack: ExitStack) -> None:
     """Subscribe to the daemon for samples and estimates, listen to the bus for frames.
 
     Raises:

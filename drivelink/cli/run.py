@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -69,16 +69,20 @@ def run(args: argparse.Namespace) -> int:
     loaded = [moved(load(path), args) for path in args.joints]
     if loaded[0].bus.interface == "virtual":
         logging.getLogger(__name__).warning(ALONE)
+    from drivelink.cli.blackbox import black_box
     from drivelink.daemon.service import Daemon, ServedJoint  # takes a second: after the joint files
     from drivelink.pubsub.publisher import to_json
 
     joints = [ServedJoint(joint=joint, path=path) for joint, path in zip(loaded, args.joints, strict=True)]
     with (
         _stopped_by_signals() as stopped,
+        ExitStack() as stack,
         Daemon(joints, publish=not args.no_publish, real_time=not args.no_realtime) as daemon,
     ):
         stopped.append(daemon)
         section = joints[0].joint.bus
+        for served in joints:
+            stack.enter_context(black_box(served.joint, served.path))
         _say_ready([served.joint.name for served in joints], section, args)
         ended = threading.Event()
         if sys.stdout.isatty() and not args.json:

@@ -229,12 +229,20 @@ class BusSection(_Section):
 
 
 class RecordingSection(_Section):
-    """Conversion of recordings to SI at the joint side."""
+    """How recordings are read, and what the black box keeps."""
 
     scale: dict[str, float] = Field(
         default_factory=dict,
         description="factors of columns, e.g. { link_position_rad = -1, motor1_torque_nm = 0.001 }",
     )
+    folder: str | None = Field(
+        None,
+        min_length=1,
+        description="where the black box keeps what led to an event; left out: no black box",
+    )
+    keep_s: float = Field(60.0, ge=1.0, le=600.0, description="time before an event that is kept")
+    keep_mib: float = Field(1024.0, gt=0.0, description="disk for it; the oldest is dropped")
+    keep_contacts: bool = Field(False, description="keep what led to a contact, too")
 
     @model_validator(mode="after")
     def _columns(self) -> Self:
@@ -298,7 +306,7 @@ class JointFile(_Section):
     motor: tuple[MotorSection, ...] = Field(min_length=1, max_length=2, description="one, or two for a VSA")
     link: LinkSection = Field(LinkSection(), description="the link side")
     bus: BusSection = Field(BusSection(), description="the CAN bus")
-    recording: RecordingSection = Field(RecordingSection(), description="how recordings are read")
+    recording: RecordingSection = Field(RecordingSection(), description="recordings and the black box")
     estimator: EstimatorSettings = Field(
         default_factory=EstimatorSettings, description="mode, bandwidths, gains"
     )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +124,10 @@ class McapSink(Sink):
             )
             self._channels[topic] = self._writer.register_channel(f"/{joint.name}/{topic}", "json", schema)
         self._joint = json.dumps({"text": joint_text}).encode() if joint_text else b""
+
+    def note(self, name: str, fields: Mapping[str, str]) -> None:
+        """Write a metadata record."""
+        self._writer.add_metadata(name, dict(fields))
 
     def sample(self, sample: Sample, stamp_ns: int) -> None:
         """Take what was measured at one SYNC."""

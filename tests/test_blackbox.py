@@ -1,0 +1,194 @@
+"""The black box: what led to an event becomes a recording, without the daemon's help."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import zenohkit
+from daemonkit import vsa_text
+from mcap.reader import make_reader
+from test_cli_run import free_port, process
+from test_recording_recorder import joint_file
+
+from drivelink import cli, jointfile
+from drivelink.pubsub.wire import EstimateMessage
+from drivelink.recording.blackbox import AFTER_S, BlackBox, drop_oldest
+from drivelink.recording.mapping import joint_of
+from drivelink.recording.mcapfile import read_messages
+from drivelink.recording.mcapsamples import recorded_cycles
+from estimator.sample import Sample, Status, TransmissionEstimate
+
+PERIOD_S = 0.125  # exact in binary
+
+
+class Scene:
+    """A black box whose clock goes with its samples, eight a second."""
+
+    def __init__(self, folder: Path, more: str = "", keep_s: float = 10.0) -> None:
+        path = folder / "elbow.toml"
+        path.write_text(
+            'name = "elbow"\n[[motor]]\ninertia_kg_m2 = 0.125\n[motor.transmission]\nmodel = "linear"\n'
+            f'[bus]\nperiod_s = {PERIOD_S}\n[recording]\nfolder = "kept"\nkeep_s = {keep_s}\n{more}'
+        )
+        self.cycle = 0
+        self.made: list[tuple[Path, str]] = []
+        self.box = BlackBox(
+            jointfile.load_text(path), lambda *made: self.made.append(made), lambda: self.cycle * PERIOD_S
+        )
+
+    def sample(self, number: int) -> Sample:
+        return Sample(number, (0.1 * number / 3.0,), (number / 7.0,), (1.0 / (number + 1),), number / 9.0)
+
+    def run(self, cycles: int, flags: int = 0) -> None:
+        for _ in range(cycles):
+            self.cycle += 1
+            stamp_ns = self.cycle * 125_000_000
+            self.box.frame(stamp_ns, 0x181, self.cycle.to_bytes(8, "little"))
+            self.box.sample(self.sample(self.cycle), stamp_ns)
+            one = TransmissionEstimate(1.0 / self.cycle, 700.0, 3.0, 0.001)
+            self.box.estimate(
+                EstimateMessage(self.cycle, stamp_ns, 3 | flags, 1.0 / self.cycle, 700.0, 3.0, (one,))
+            )
+            self.box.flush()
+
+    def finish(self) -> list[tuple[Path, str]]:
+        self.box.close()
+        return self.made
+
+
+def test_an_alarm_keeps_the_time_before_and_after_it_bit_for_bit(tmp_path: Path) -> None:
+    scene = Scene(tmp_path)
+    scene.run(500)
+    scene.run(300, Status.MODEL_ALARM)
+    ((path, cause),) = scene.finish()
+    assert cause == "model alarm" and path.name.endswith("-model-alarm.mcap")
+    numbers = list(range(501 - 80, 501 + 120 + 1))  # 10 s before the alarm, 15 s after it
+    kept = list(recorded_cycles(path, 1))
+    assert [one.sequence for one in kept] == numbers
+    assert [one.sample for one in kept] == [scene.sample(number) for number in numbers]
+    frames = [json.loads(m.data) for m in read_messages(path) if m.topic == "/elbow/can"]
+    assert [int.from_bytes(bytes.fromhex(one["data"]), "little") for one in frames] == numbers
+    assert joint_of(path, None).text == (tmp_path / "elbow.toml").read_text()
+    with path.open("rb") as file:
+        notes = {one.name: one.metadata for one in make_reader(file).iter_metadata()}
+    assert notes["black box"]["cause"] == "model alarm" and notes["black box"]["joint_file"].endswith(
+        "elbow.toml"
+    )
+    assert notes["black box"]["time"].endswith("+00:00")
+
+
+def test_memory_holds_no_more_than_is_kept(tmp_path: Path) -> None:
+    scene = Scene(tmp_path)
+    scene.run(2000)
+    reach_s = 10.0 + 2 * AFTER_S  # before, after, and until it is written
+    assert len(scene.box._ring) <= 3 * (reach_s / PERIOD_S + 1)
+    assert not scene.finish()
+
+
+def test_ten_alarms_a_minute_make_one_recording(tmp_path: Path) -> None:
+    scene = Scene(tmp_path)
+    for _ in range(10):
+        scene.run(30, Status.MODEL_ALARM)
+        scene.run(30)
+    assert len(scene.finish()) == 1
+
+
+@pytest.mark.parametrize(
+    ("status", "cause"),
+    [
+        ({"suspected": {"text": "link"}}, "suspected signal"),
+        ({"drive_faults": ["node 1: fault"]}, "drive fault"),
+        ({"state": "bus lost"}, "bus lost"),
+    ],
+)
+def test_events_of_the_status_are_kept(status: dict[str, object], cause: str, tmp_path: Path) -> None:
+    scene = Scene(tmp_path)
+    scene.run(20)
+    for _ in range(3):
+        scene.box.document("status", json.dumps(status).encode(), 1)
+    scene.run(20)
+    assert [made[1] for made in scene.finish()] == [cause]
+
+
+def test_a_full_disk_is_one_line_and_leaves_no_half_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*_: object) -> int:
+        raise OSError(28, "No space left on device")
+
+    scene = Scene(tmp_path)
+    scene.run(20)
+    scene.box.keep("asked")
+    monkeypatch.setattr("drivelink.recording.safefile.os.pwrite", full)
+    assert not scene.finish()
+    assert [record.getMessage().count("No space left on device") for record in caplog.records] == [1]
+    assert not list((tmp_path / "kept").iterdir())
+
+
+def test_the_oldest_is_dropped_beyond_the_budget_and_nothing_else(tmp_path: Path) -> None:
+    names = [f"elbow-2026010{day}T000000Z-model-alarm.mcap" for day in (1, 2, 3)]
+    others = ["elbow-2-20250101T000000Z-change.mcap", "elbow-best.mcap", "notes.txt"]
+    for name in (*names, *others):
+        (tmp_path / name).write_bytes(bytes(2**20))
+    drop_oldest(tmp_path, "elbow", 2.0)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*names[1:], *others])
+    drop_oldest(tmp_path, "elbow", 0.5)  # the newest stays
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([names[2], *others])
+
+
+def test_keep_asks_the_box_of_a_running_daemon(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    endpoint = zenohkit.free_endpoint()
+    path = joint_file(tmp_path, endpoint)
+    assert cli.main(["keep", str(path)]) == 3
+    assert "recording.folder: expected the folder of the black box" in capsys.readouterr().err
+    path.write_text(path.read_text() + '[recording]\nfolder = "kept"\n')
+    assert cli.main(["keep", str(path)]) == 3
+    assert "no black box writes there" in capsys.readouterr().err
+    with zenohkit.script("elbow", endpoint) as daemon:
+        zenohkit.ready(daemon)
+        box = subprocess.Popen(
+            [sys.executable, "-m", "drivelink.cli.blackbox", str(path)], stdin=subprocess.PIPE
+        )
+        try:
+            zenohkit.until((tmp_path / "kept").is_dir)
+            zenohkit.until(lambda: cli.main(["keep", str(path)]) == 0)
+            assert not list((tmp_path / "kept").iterdir())  # 15 s more are to come
+            box.communicate(timeout=60)  # the daemon ends: it writes what it has
+        finally:
+            box.kill()
+    assert box.returncode == 0
+    (made,) = (tmp_path / "kept").iterdir()
+    assert list(recorded_cycles(made, 1))
+
+
+def test_the_box_of_a_daemon_has_frames_that_replay_to_the_samples(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bus = f'interface = "socketcand"\noptions = {{ host = "127.0.0.1", port = {free_port()} }}\nperiod_s = 0.005'
+    path = tmp_path / "elbow.toml"
+    text = vsa_text(channel="can0", endpoint=zenohkit.free_endpoint(), bus=bus)
+    path.write_text(text + '[recording]\nfolder = "kept"\n')
+    with process("sim", str(path)) as drives:
+        assert "ready" in drives.stdout.readline()
+        with process("run", str(path), "--no-realtime", "--json") as daemon:
+            assert "ready" in daemon.stdout.readline()
+            zenohkit.until((tmp_path / "kept").is_dir)
+            zenohkit.until(lambda: cli.main(["keep", str(path)]) == 0)
+            time.sleep(2.0)  # something to keep
+            daemon.send_signal(signal.SIGTERM)
+            _, err = daemon.communicate(timeout=60)
+    assert daemon.returncode == 0 and "Traceback" not in err, err
+    made = [one for one in (tmp_path / "kept").iterdir() if one.name.endswith("-asked.mcap")]
+    kept = list(recorded_cycles(made[0], 2))
+    assert len(kept) > 100
+    assert any(m.topic == "/elbow/can" for m in read_messages(made[0]))
+    capsys.readouterr()
+    estimates = tmp_path / "e.csv"
+    assert cli.main(["replay", str(made[0]), "--out", str(estimates)]) == 0
+    assert estimates.read_text().count("\n") == len(kept) + 1

@@ -247,6 +247,16 @@ def test_long_and_block_transfers_of_others_are_no_forgeries():
     assert heard(">c0501f0100000000", "<a4501f017f000000").unasked == 0
 
 
+def test_the_object_of_a_block_download_is_disputed_until_it_is_read_again():
+    segment = ">21001a0102030405"  # number 33: it looks like the begin of a download
+    listener = heard(">c2001a0104000000", "<a0001a017f000000", segment, ">a200000000000000")
+    assert listener.disputed == {(0x1A00, 1)} and listener.pending is None and listener.unasked == 0
+    heard(">c100000000000000", "<a100000000000000", listener=listener)
+    assert listener.disputed == {(0x1A00, 1)}
+    heard(">40001a0100000000", "<43001a0120006460", listener=listener)
+    assert (listener.disputed, listener.values) == (set(), {(0x1A00, 1): 0x60640020})
+
+
 def test_reset_communication_to_all_is_survived():
     configurator = PassiveConfigurator([parse(joint_text(drive=STATED + MAP, bus=PASSIVE))])
     before = dict(configurator.layouts)
@@ -330,6 +340,35 @@ def test_a_stated_map_holds_until_the_node_restarts_and_one_of_its_own_for_ever(
     assert "default = true in [[motor.drive.tpdo]]" in configurator.doubts[5]
     own = parse(joint_text(drive=STATED + MAP + "default = true\n", bus=PASSIVE))
     assert after(PassiveConfigurator([own]), BOOT, (0, b"\x82\x00"), BOOT).believed == {5}
+
+
+@pytest.mark.parametrize("index", ["10", "11"])
+@pytest.mark.parametrize("command", ["23", "c2"])
+def test_after_parameters_were_stored_or_restored_a_stated_default_is_none(index: str, command: str) -> None:
+    own = parse(joint_text(drive=STATED + MAP + "default = true\n", bus=PASSIVE))
+    configurator = PassiveConfigurator([own])
+    after(configurator, (0x605, bytes.fromhex(f"{command} {index} 10 01 73 61 76 65")))
+    assert configurator.believed == {5}  # until the node starts with what was stored
+    after(configurator, BOOT)
+    assert configurator.believed == set()
+    assert "parameters were stored or restored (0x1010, 0x1011)" in configurator.doubts[5]
+
+
+@pytest.mark.parametrize("address", ["18 10 02", "20 10 01"])
+def test_another_identity_or_date_of_configuration_ends_all_trust(address: str) -> None:
+    own = parse(joint_text(drive=STATED + MAP + "default = true\n", bus=PASSIVE))
+    configurator = PassiveConfigurator([own])
+
+    def read(value: str) -> None:
+        request = bytes.fromhex(f"40 {address} 00000000")
+        after(configurator, (0x605, request), (0x585, bytes.fromhex(f"43 {address} {value}")))
+
+    read("01000000")
+    read("01000000")
+    assert configurator.believed == {5}
+    read("02000000")
+    assert configurator.believed == set()
+    assert "another identity or date of configuration" in configurator.doubts[5]
 
 
 def test_what_is_overheard_counts_more_than_what_the_joint_file_states():

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections import deque
 from pathlib import Path
 
 import pytest
 from canopenkit import INVALID, joint_text
 from fuzzrun import FuzzRun
 
+from drivelink.cycle.framesource import OVERFLOW
 from drivelink.errors import RecordingError
 from drivelink.jointfile import parse
 from drivelink.recording.canframes import FrameLog
@@ -172,6 +174,52 @@ def test_after_a_reset_without_a_new_map_nothing_is_valid_and_one_line_says_what
         in (master.conditions)
     )
     assert "[[motor.drive.tpdo]] with default = true" in master.conditions
+
+
+def test_a_block_download_to_the_mapping_ends_validity() -> None:
+    master = Master()
+    map_all(master)
+    master.syncs(50)
+    valid = len(master.valid)
+    assert valid
+    master.send(0x601, b"\xc2\x00\x1a\x01" + (4).to_bytes(4, "little"))
+    master.syncs(50)
+    assert len(master.valid) == valid
+    assert "0x1A00:01" in master.conditions
+
+
+def test_a_node_that_was_not_heard_for_a_while_may_have_restarted() -> None:
+    master = Master()
+    map_all(master)
+    master.syncs(50)
+    assert master.valid
+    bus = master.run.bus
+    for _ in range(700):
+        master.stamp_ns += PERIOD_NS
+        bus.sync(master.stamp_ns)
+        bus._queue = deque(frame for frame in bus._queue if frame[0] & 0x7F != 1)
+        master.run.loop.receive()
+    valid = len(master.valid)
+    master.syncs(200)
+    assert len(master.valid) == valid
+    assert "no frame of it was heard for 0.5 s" in master.conditions
+    master.nmt(PRE, 1)
+    master.map(1, 1, POSITION, TORQUE, STATUSWORD)
+    master.nmt(START, 1)
+    master.syncs(200)
+    assert len(master.valid) > valid + 100 and not master.wrong
+
+
+def test_frames_lost_by_receive_overflow_end_validity() -> None:
+    master = Master()
+    map_all(master)
+    master.syncs(50)
+    valid = len(master.valid)
+    master.run.loop.source.errors[OVERFLOW] = 3
+    master.run.supervisor.check()
+    master.syncs(50)
+    assert len(master.valid) == valid
+    assert "frames were lost by receive overflow" in master.conditions
 
 
 def test_a_boot_up_message_that_nobody_expected_is_enough() -> None:

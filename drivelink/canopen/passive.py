@@ -14,7 +14,7 @@ from drivelink.canopen.eds import load_eds
 from drivelink.canopen.layout import NodeLayout, Signal
 from drivelink.canopen.pdo import Tpdo, decode, describe, tpdos_of
 from drivelink.canopen.roles import Role, roles_by_node
-from drivelink.canopen.sdo_sniffer import SdoSniffer
+from drivelink.canopen.sdo_sniffer import SdoSniffer, written_object
 from drivelink.canopen.tpdo_assignment import OPTIONAL
 from drivelink.canopen.units import offer, unit_objects
 from drivelink.canopen.vendors import VENDORS, vendor_of
@@ -29,6 +29,9 @@ Address = tuple[int, int]
 _COMMUNICATION = frozenset(
     {(0x1005, 0), (0x1006, 0), (0x1017, 0), (0x1018, 1), (0x1018, 2), (0x1018, 3), (0x1018, 4), (0x1019, 0)}
 )
+_IDENTITY = tuple((0x1018, subindex) for subindex in (1, 2, 3, 4))
+_STORED = ((0x1020, 1), (0x1020, 2))  # date and time of the configuration
+_STORE_OR_RESTORE = (0x1010, 0x1011)
 _NMT_RESETS = (0x81, 0x82)  # of the node, of its communication
 _VOLATILE = frozenset({(0x1005, 0), (0x1006, 0), (0x1017, 0), (0x1019, 0)})  # as after power-on
 _MOST_ENTRIES = 8  # of a map whose objects are whole bytes
@@ -38,8 +41,9 @@ class _PassiveNode:
     """Mapping of one node, and whether it is trusted.
 
     A mapping is trusted if it was written or read back since the node's last start, or if the joint file
-    declares it: permanently with `default = true`, else until the node restarts. A data sheet contains the
-    factory setting, which may have changed, so it is only suggested.
+    declares it: with `default = true` until somebody stores or restores the node's parameters, else until
+    the node restarts, or may have, out of sight. A data sheet contains the factory setting, which may have
+    changed, so it is only suggested. Another identity or date of the configuration than before ends trust.
     """
 
     def __init__(self, role: Role, sdo_timeout_s: float) -> None:
@@ -49,13 +53,16 @@ class _PassiveNode:
         self.listener = SdoSniffer(self._interesting, sdo_timeout_s)
         self.seen_changes = -1
         self.adopted: NodeLayout | None = None
-        self.restarted = False
+        self.restarted = False  # or it may have
+        self.stored = False  # its own mapping may be another one than the joint file states
+        self.lost = ""  # why it may have restarted
+        self._identity: dict[Address, int] = {}
         self.heard: dict[int, int] = {}  # lengths of frames with its predefined identifiers
 
     def _interesting(self, index: int, subindex: int) -> bool:
         if is_mapping((index, subindex)):
             return subindex <= _MOST_ENTRIES
-        return (index, subindex) in self._units | _COMMUNICATION
+        return (index, subindex) in self._units | _COMMUNICATION or (index, subindex) in _STORED
 
     def is_unit(self, address: Address) -> bool:
         """Whether the scale of a signal depends on an object."""
@@ -63,13 +70,35 @@ class _PassiveNode:
 
     def restart(self) -> None:
         """Handle a boot-up: mapping and parameters are the node's defaults again."""
-        self.restarted, self.adopted = True, None
+        self.restarted, self.adopted, self.lost = True, None, ""
         self.listener.forget(lambda address: is_mapping(address) or address in _VOLATILE)
 
-    def lose_sight(self) -> None:
-        """Handle a loss of the bus: the state of the node is unknown."""
-        self.adopted = None
-        self.listener.forget(is_mapping)
+    def lose_sight(self, why: str) -> None:
+        """Handle a time in which the node may have restarted unheard."""
+        self.restart()
+        self.lost = why
+
+    def request(self, data: bytes, now_s: float) -> None:
+        """Take an SDO frame of the master."""
+        address = written_object(data)
+        self.stored = self.stored or (address is not None and address[0] in _STORE_OR_RESTORE)
+        self.listener.request(data, now_s)
+
+    def response(self, data: bytes, now_s: float) -> None:
+        """Take an SDO frame of the node."""
+        changes = self.listener.changes
+        self.listener.response(data, now_s)
+        if self.listener.changes != changes:
+            self._check_identity()
+
+    def _check_identity(self) -> None:
+        """Compare identity and date of the configuration with what the node said before."""
+        for address in (*_IDENTITY, *_STORED):
+            value = self.listener.values.get(address)
+            if value is not None and self._identity.setdefault(address, value) != value:
+                self._identity[address], self.stored = value, True
+                if address not in self.listener.written:
+                    self.lose_sight("it has another identity or date of configuration than before")
 
     def dispute(self) -> str:
         """One line on an object whose value is not known although it was transferred; empty: none."""
@@ -111,12 +140,16 @@ class _PassiveNode:
     def doubt(self) -> str:
         """One line on a mapping that is not trusted, with the remedy."""
         role = self.role
-        if self.restarted:
+        if self.lost:
+            why = f"{self.lost}, and its mapping was neither written nor read since"
+        elif self.restarted and self.stored:
+            why = "it has restarted after parameters were stored or restored (0x1010, 0x1011)"
+        elif self.restarted:
             why = "it has restarted, and its mapping was neither written nor read since"
         elif self._sheet is not None:
             why = f"its mapping is that of {self._sheet.path.name}, which a master may have changed"
         else:
-            why = "its mapping was neither written nor read since the bus is back"
+            why = "its mapping was neither written nor read"
         return (
             f"{role.subject} ({role.key}): {why}: its frames are not used until its master writes or reads "
             f"back the mapping; if the node has it by itself, say so in the joint file: {self.offered()}"
@@ -175,7 +208,7 @@ class _PassiveNode:
         touched = {(index & 0x1FF) + 1 for index, _ in seen}
         stated, values = [], dict(seen)
         for section in self.role.tpdo:
-            if self.restarted and not section.default:
+            if self.restarted and (self.stored or not section.default):
                 continue
             tpdo, number = _declared(section), self._number(section, seen)
             if number not in touched:
@@ -329,10 +362,10 @@ class PassiveConfigurator:
     def start(self, node: int, *, stopped: bool = False) -> None:
         """Do nothing: the node's master configures it again."""
 
-    def lose_sight(self) -> None:
-        """Handle a loss of the bus: knowledge from the traffic may be out of date."""
-        for node in self._nodes.values():
-            node.lose_sight()
+    def lose_sight(self, nodes: Iterable[int] | None = None, why: str = "the bus was lost") -> None:
+        """Handle a time in which nodes (None: all) may have restarted unheard."""
+        for node in self._nodes if nodes is None else nodes:
+            self._nodes[node].lose_sight(why)
 
     def feed(self, cob_id: int, data: bytes, now_s: float) -> None:
         """Take a frame: SDO, boot-up, NMT resets, PDOs.
@@ -353,9 +386,9 @@ class PassiveConfigurator:
             return
         function = cob_id >> 7
         if function == 0x600 >> 7:
-            one.listener.request(data, now_s)
+            one.request(data, now_s)
         elif function == 0x580 >> 7:
-            one.listener.response(data, now_s)
+            one.response(data, now_s)
         elif function == 0x700 >> 7:
             if len(data) == 1 and data[0] & 0x7F == 0:
                 one.restart()

@@ -5,19 +5,21 @@ time-out. Every other one is counted and ignored. Where two different answers fo
 download is given up before its answer, the object's value is not known: it is disputed until it is
 transferred again.
 
-A download counts once the node has confirmed it. Expedited and segmented transfers are followed; block
-transfers are not used for objects of a few bytes.
+A download counts once the node has confirmed it. Expedited and segmented transfers are followed. The object
+of a block download is disputed: its bytes are not followed.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 Address = tuple[int, int]
 
 _MAX_BYTES = 8  # no object of interest is longer
-_DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = range(5)  # commands of the client
+# Commands of the client; 5 is a block upload.
+_DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT, _, _BLOCK_DOWNLOAD = range(7)
 _SEGMENT_SENT, _SEGMENT_TAKEN, _UPLOADED, _DOWNLOADED = range(4)  # commands of the server; it aborts with 4
 _TOGGLE = 0x10
 
@@ -83,6 +85,8 @@ class SdoSniffer:
         self.changes = 0
         self._transfer: _Transfer | None = None
         self._blocks = False  # a block transfer
+        self._block_s = -math.inf  # time of the last segment of a block download
+        self._last_segment = False
 
     @property
     def pending(self) -> Address | None:
@@ -103,8 +107,13 @@ class SdoSniffer:
         """Take a frame of the master, 0x600 + node."""
         if len(data) != 8:
             return
+        if self._goes_on(data, now_s):
+            return
         command, transfer = data[0] >> 5, self._transfer
         self._blocks = command > _ABORT
+        if command == _BLOCK_DOWNLOAD:
+            self._block_s, self._last_segment = now_s, False
+            self._dispute(_address(data))
         if command in (_DOWNLOAD, _UPLOAD):
             self._transfer = _begun(data, now_s)
         elif transfer is not None and _may_follow(transfer, data):
@@ -131,6 +140,15 @@ class SdoSniffer:
             self._accept(transfer, data)
         else:
             self.unasked += 1
+
+    def _goes_on(self, data: bytes, now_s: float) -> bool:
+        """Whether a frame of the master belongs to a block download: its segments look like any request."""
+        if now_s - self._block_s > self._timeout_s:
+            return False
+        ended = data[0] == _ABORT << 5 or (self._last_segment and data[0] & 0xE3 == 0xC1)
+        self._block_s = -math.inf if ended else now_s
+        self._last_segment = bool(data[0] & 0x80)
+        return True
 
     def _accept(self, transfer: _Transfer, data: bytes) -> None:
         """Take the answer that is due."""
@@ -177,7 +195,8 @@ class SdoSniffer:
 
 def written_object(data: bytes) -> Address | None:
     """The object that a frame of the master begins to write."""
-    return _address(data) if len(data) == 8 and data[0] >> 5 == _DOWNLOAD else None
+    begins = len(data) == 8 and (data[0] >> 5 == _DOWNLOAD or data[0] & 0xE1 == _BLOCK_DOWNLOAD << 5)
+    return _address(data) if begins else None
 
 
 def _begun(data: bytes, now_s: float) -> _Transfer:

@@ -7,7 +7,8 @@ that the node answers with it; the daemon's own from the first SYNC after the st
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping
 
 from drivelink._core import SYNC_COB_ID, Assembler
 from drivelink.canopen.layout import NodeLayout
@@ -17,6 +18,8 @@ from drivelink.cycle.objectcheck import ObjectCheck, RecentSamples, Samples
 from drivelink.errors import DriveError
 
 _START, _BOOT_UP = 0x01, b"\0"  # NMT
+_SILENT_S = 0.5  # without a frame, after which a node may have restarted unheard
+_LOOKS = 5  # in that time
 
 
 class MapFollower:
@@ -46,6 +49,11 @@ class MapFollower:
         self._trusted = dict.fromkeys(layouts, True)
         self._due: set[int] = set()
         self._relaid = relaid
+        period_s = configurator.bus.period_s
+        self._silent = max(2 * _LOOKS, round(_SILENT_S / period_s))  # SYNCs
+        self._heard = dict.fromkeys(assemblers, (0, 0))  # frames used, and the SYNC of the last frame
+        self._speaking: set[int] = set()  # since the last SYNC, other than by PDOs
+        self._numbers = {node: assembler.sequence for node, assembler in assemblers.items()}
         self.changed: dict[int, NodeLayout] = {}
         self.refused: dict[int, str] = {}
         configurator.adopt(layout for node, layout in layouts.items() if node not in configurator.layouts)
@@ -64,12 +72,35 @@ class MapFollower:
         if cob_id == SYNC_COB_ID:
             self.sync()
             return
+        if cob_id > 0x700 or 0x580 < cob_id < 0x600:
+            self._speaking.add(cob_id & 0x7F)
         self._configurator.feed(cob_id, data, now_s)
         self._configurator.poll(now_s)
         self._judge()
 
+    def _look(self) -> None:
+        """Doubt the nodes that were not heard for a while; every so many SYNCs, or after a gap."""
+        silent = []
+        for node, assembler in self._assemblers.items():
+            number, before = assembler.sequence, self._numbers[node]
+            if number - before < self._silent // _LOOKS:
+                continue
+            self._numbers[node] = number
+            used, last = self._heard[node]
+            counters = assembler.counters[node]
+            received = counters.received + counters.ignored
+            if node in self._speaking or (received != used and number - before < self._silent):
+                self._heard[node] = received, number
+            elif number - last >= max(self._silent, 3 * _slowest(self._in_use[node])):
+                silent.append(node)
+                self._heard[node] = received, number
+            self._speaking.discard(node)
+        if silent:
+            self.lose_sight(silent, f"no frame of it was heard for {_SILENT_S:g} s")
+
     def sync(self) -> None:
         """Take a SYNC, after the assemblers: new mappings apply from here on."""
+        self._look()
         for node in self._due:
             layout, assembler = self._configurator.layouts[node], self._assemblers[node]
             before, self._in_use[node] = self._in_use[node], layout
@@ -91,9 +122,9 @@ class MapFollower:
         """SDO answers for a node that belong to no request heard."""
         return self._configurator.unasked(node)
 
-    def lose_sight(self) -> None:
-        """Handle a loss of the bus: knowledge from the traffic may be out of date."""
-        self._configurator.lose_sight()
+    def lose_sight(self, nodes: Iterable[int] | None = None, why: str = "the bus was lost") -> None:
+        """Handle a time in which nodes (None: all) may have restarted unheard."""
+        self._configurator.lose_sight(nodes, why)
         self._configurator.poll(0.0)
         self._judge()
 
@@ -110,6 +141,12 @@ class MapFollower:
                     assembler.distrust(node)
                 self.refused.pop(node, None)
                 self._due.add(node)
+
+
+def _slowest(layout: NodeLayout) -> float:
+    """SYNCs between two frames of a node; infinite: it sends on events only."""
+    every = [tpdo.transmission_type for tpdo in layout.tpdos if 1 <= tpdo.transmission_type <= 240]
+    return min(every, default=math.inf)
 
 
 class ConfigurationFollower:

@@ -17,7 +17,7 @@ from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator, is_mapping
 from drivelink.canopen.sdo_sniffer import written_object
 from drivelink.cycle.following import MapFollower
-from drivelink.cycle.framesource import LostSource
+from drivelink.cycle.framesource import OVERFLOW, LostSource
 from drivelink.cycle.loop import CycleLoop, LoopJoint
 from drivelink.cycle.objectcheck import ObjectCheck
 from drivelink.daemon.buswatch import BusWatch
@@ -64,6 +64,7 @@ class Supervisor:
         self.bus = BusWatch(loop, events)
         self._joints = JointWatch(events, self.contradiction)
         loop.on_fault = self._say_fault
+        self._unread = 0  # frames lost by receive overflow
         self._due: dict[int, tuple[NodeLayout, int]] = {}  # configured nodes, and the SYNC before their start
         self._nodes: dict[int, WatchedNode] = {}
         for loop_joint, mine in layouts.items():
@@ -189,6 +190,10 @@ class Supervisor:
         for loop_joint in self._loop.loop_joints:
             self._joints.check(loop_joint)
         if self._follower is not None:
+            unread = self._loop.source.errors.get(OVERFLOW, 0)
+            if unread > self._unread:
+                self._follower.lose_sight(None, "frames were lost by receive overflow")
+            self._unread = unread
             self._check_maps(self._follower)
         self.bus.check()
 

@@ -16,6 +16,12 @@ FloatArray = NDArray[np.float64]
 MEASURED_SYNCS = 64  # enough for a period to 0.2 % at a jitter of half of it, to 0.01 % at a fortieth
 _FEWEST = 8
 _SAME = 0.01  # relative: periods that count as the same; 2 % of inertia torque
+_STEADY = 0.02  # the same: then stalls are no part of the median
+_NEAR = 0.05  # relative: of the median step, with jitter
+_WIDTH, _MOST = (
+    0.2,
+    0.4,
+)  # share of SYNCs within so much of a period of the declared times; 1 % off: 0.31 of 64
 _JITTERY = 0.15  # median deviation of the steps, in periods
 _SIGMAS = 3.0
 
@@ -35,9 +41,10 @@ class MeasuredPeriod(NamedTuple):
 
 
 def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPeriod | None:
-    """The period of SYNCs from their stamps, robust to jitter and lost SYNCs.
+    """The period of SYNCs from their stamps, robust to jitter, stalls and lost SYNCs.
 
-    The slope of a line through the stamps over their numbers, rounded to a value within three standard
+    The expected one where the median step is as long and steady, or where most SYNCs come at its times. Else
+    the slope of a line through the stamps over their numbers, rounded to a value within three standard
     deviations.
 
     Args:
@@ -58,7 +65,12 @@ def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPerio
         period_s = expected_s  # most of its SYNCs are lost
     if period_s <= 0:
         return None
-    if float(np.median(np.abs(gaps - period_s))) > _JITTERY * period_s:
+    spread = float(np.median(np.abs(gaps - period_s))) / period_s
+    steady = spread < _STEADY and abs(period_s - expected_s) <= _SAME * expected_s
+    near = abs(period_s - expected_s) <= _NEAR * expected_s
+    if steady or (near and _agreeing(stamps / expected_s) >= _MOST):
+        return MeasuredPeriod(expected_s, True)
+    if spread > _JITTERY:
         # A step of nearly two periods may be jitter; only larger ones count as lost.
         lost = np.where(gaps > 2.2 * period_s, np.rint(gaps / period_s) - 1, 0)
         slope, std = _slope(np.concatenate(([0.0], np.cumsum(1 + lost))), stamps)
@@ -75,6 +87,13 @@ def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPerio
     rounded = (float(f"{slope:.{digits}g}") for digits in range(1, 6))
     found = next((r for r in rounded if abs(r - slope) <= max(tolerance, 1e-3 * slope)), slope)
     return MeasuredPeriod(found, False)
+
+
+def _agreeing(places: FloatArray) -> float:
+    """Largest share of times, in periods, that are the same within a period but for `_WIDTH`."""
+    phases = np.sort(places % 1.0)
+    ends = np.searchsorted(np.concatenate((phases, phases + 1.0)), phases + _WIDTH, side="right")
+    return float(np.max(ends - np.arange(phases.size))) / phases.size
 
 
 def _slope(numbers: FloatArray, times_s: FloatArray) -> tuple[float, float]:

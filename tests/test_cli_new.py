@@ -72,6 +72,7 @@ def test_an_existing_file_is_kept_unless_forced(tmp_path, capsys):
         (["--encoder", "left"], "--encoder"),
         (["--encoder", "128"], "--encoder"),
         (["--scan", "--passive"], "--passive forbids"),
+        (["--encoder", "none"], "--encoder none: expected --model none"),
         (["--inertia", "1", "--rotor-inertia", "1"], "--rotor-inertia"),
         (["--rotor-inertia", "48.2"], "--rotor-inertia: expected --gear"),
     ],

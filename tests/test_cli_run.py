@@ -105,6 +105,10 @@ def test_simulated_drives_daemon_and_subscriber_are_three_processes(joint: Path,
         with process("run", str(joint), "--no-realtime") as again:  # the drives were left as they were
             assert "ready" in again.stdout.readline()
             again.kill()
+        with process("run", str(joint), "--no-realtime") as closed:
+            assert "ready" in closed.stdout.readline()
+            closed.send_signal(signal.SIGHUP)  # its terminal is closed: no orphan stays on the bus
+            assert closed.wait(timeout=60) == 0
         with process("run", str(joint), "--no-realtime", "--seconds", "0.5", "--json") as after_kill:
             out, err = after_kill.communicate(timeout=60.0)
             assert after_kill.returncode == 0, err

@@ -99,6 +99,14 @@ def test_a_daemon_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> None:
     assert len(read(out, jointfile.load(path).model_copy(update={"link": jointfile.LinkSection()}))) > 15
 
 
+def test_a_recording_of_nothing_is_an_error(tmp_path: Path) -> None:
+    path, out = joint_file(tmp_path, zenohkit.free_endpoint()), tmp_path / "r.csv"
+    with start(str(path), "--out", str(out), "--seconds", "0.5") as process:
+        error = process.communicate(timeout=60)[1].splitlines()[-1]
+        assert process.returncode != 0
+    assert "nothing was recorded; expected a daemon that serves elbow" in error
+
+
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [

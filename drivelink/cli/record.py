@@ -21,7 +21,7 @@ from drivelink.canopen.bus import open_bus
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cli import add_bus, moved
-from drivelink.errors import BusError, DrivelinkError, UsageError, ZenohError
+from drivelink.errors import BusError, DrivelinkError, RecordingError, UsageError, ZenohError
 from drivelink.jointfile import JointFile, JointText
 from drivelink.output.outfile import check_target
 from drivelink.pubsub.inbound import DECODERS
@@ -104,6 +104,11 @@ def run(args: argparse.Namespace) -> int:
         say = _Summary(args.out, recorder)
         recorder.run(lambda: stopped.is_set() or time.monotonic() >= end, say.tick)
     print(json.dumps(say.document()) if args.json else f"{args.out}: {say.text()}")
+    if not any(recorder.sink.counts.get(kind) for kind in ("sample", "estimate", "frame")):
+        raise RecordingError(
+            f"{args.out}: nothing was recorded; expected a daemon that serves {joint.name} "
+            f"at {joint.zenoh.endpoint}, or its bus"
+        )
     return 0
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
 import signal
 import sys
 import threading
@@ -121,7 +122,10 @@ def _show(daemon: Daemon, ended: threading.Event) -> None:
 
 @contextmanager
 def _stopped_by_signals() -> Iterator[list[Daemon]]:
-    """SIGINT and SIGTERM end the daemon, or the process before it exists; SIGHUP reloads."""
+    """SIGINT and SIGTERM end the daemon, or the process before it exists.
+
+    SIGHUP reloads where a service manager waits for it, and ends the daemon of a terminal that was closed.
+    """
     running: list[Daemon] = []
 
     def stop(_number: int, _frame: FrameType | None) -> None:
@@ -133,7 +137,8 @@ def _stopped_by_signals() -> Iterator[list[Daemon]]:
         for daemon in running:
             daemon.reload()
 
-    handlers = {signal.SIGINT: stop, signal.SIGTERM: stop, signal.SIGHUP: reload}
+    handlers = {signal.SIGINT: stop, signal.SIGTERM: stop}
+    handlers[signal.SIGHUP] = reload if os.environ.get("NOTIFY_SOCKET") else stop
     before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         yield running

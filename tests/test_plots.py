@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivelink.output import plots
 from drivelink.output.plots import (
     COLORS,
     PlotCurve,
@@ -17,6 +18,7 @@ from drivelink.output.plots import (
     stiffness_against_deflection,
     svg_text,
 )
+from drivelink.recording.estimateplots import plot_over_time
 
 
 def wave(n: int = 20_000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -53,6 +55,24 @@ def test_stiffness_over_scattered_deflections_becomes_one_curve() -> None:
     inside = np.abs(x) < 0.095  # the outermost bins average over the steepest part
     # The median of some 80 samples a bin: 5 N·m/rad * 1.25 / sqrt(80) = 0.7, four of them are a wide bound.
     assert np.nanmax(np.abs(y - 100.0 - 3000.0 * x**2)[inside]) < 2.8
+
+
+def test_what_is_not_valid_is_a_gap_and_both_plots_share_their_time_axis(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    figures = []
+    monkeypatch.setattr(plots, "save", lambda figure, path: figures.append(figure) or path)
+    t = np.arange(100) * 1e-3
+    valid = (t > 0.02) & (t < 0.06)
+    columns = {"time_s": t, "valid": valid.astype(float)}
+    for name in ("flexibility_torque_nm", "stiffness_nm_rad", "stiffness_std_nm_rad"):
+        columns[name] = np.where(valid, 1.0 + t, 1e6)
+    columns["stiffness_nm_rad"][50:] = np.nan
+    plot_over_time(columns, tmp_path / "time.png", "elbow")
+    for axes in figures[0].axes:
+        assert np.nanmax(axes.lines[0].get_ydata()) < 2.0
+    torque, stiffness = figures[0].axes
+    assert torque.get_xlim() == stiffness.get_xlim()
 
 
 def test_thinning_loses_no_peak() -> None:

@@ -417,6 +417,8 @@ def test_estimates_csv_has_the_columns_of_the_contract_and_a_row_for_each_sample
     ]  # fmt: skip
     assert [float(row["time_s"]) for row in table] == pytest.approx(np.arange(1500) * 0.002, abs=1e-12)
     assert {row["observable"] for row in table} <= {"0", "1"}
+    assert {row["valid"] for row in table} == {"0", "1"}  # not valid where it begins
+    assert all(int(row["status"]) & 1 == int(row["valid"]) for row in table)
     # The truth is 150 N·m/rad and noise-free: 1 % after three seconds is a wide bound.
     assert float(table[-1]["stiffness_nm_rad"]) == pytest.approx(150.0, rel=0.01)
     assert all((plots / name).stat().st_size > 5000 for name in ("stiffness.png", "time.png"))

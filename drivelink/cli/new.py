@@ -136,9 +136,7 @@ def _new_text(args: argparse.Namespace) -> tuple[str, str, list[str]]:
     if answers.motors > 1 and answers.model == "none":
         raise UsageError(f"transmission: expected a flexible one of {answers.arrangement} motors, got none")
     if answers.encoder == "none" and answers.model != "none":
-        raise UsageError(
-            f'--encoder none: expected --model none, as the stiffness of "{answers.model}" needs a link encoder'
-        )
+        raise UsageError(f"--encoder none: expected --model none, as {answers.model} needs a link encoder")
     if answers.rotor_inertia_gcm2 is not None and answers.gear_ratio is None:
         raise UsageError(
             "--rotor-inertia: expected --gear, whose square reflects it to the joint; 1 for a direct drive"

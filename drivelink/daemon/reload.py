@@ -1,8 +1,9 @@
 """Replaces the model of the running loop without losing a cycle.
 
 When the joint file is rewritten, or on SIGHUP of a service manager, another process reads and validates it. A
-thread builds the new estimator and steps it through the last samples, so that it starts where the old one is; it holds neither
-the interpreter's lock nor one of the cycle's meanwhile. It is swapped in between two cycles. If the thread
+thread builds the new estimator and steps it through the last samples, so that it starts where the old one is;
+it holds neither the interpreter's lock nor one of the cycle's meanwhile. It is swapped in between two cycles.
+If the thread
 cannot catch up with the cycle, the cycle does the rest with more steps per slack than there are new samples,
 so the exchange always completes.
 """

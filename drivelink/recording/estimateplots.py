@@ -29,12 +29,14 @@ def plot_curves(columns: Mapping[str, FloatArray], motors: int, path: Path, titl
 
 
 def plot_over_time(columns: Mapping[str, FloatArray], path: Path, title: str) -> Path:
-    """The joint's flexibility torque and stiffness over time."""
+    """The joint's flexibility torque and stiffness over time, on one time axis; gaps where not valid."""
     figure, axes = plots.new_figure(title, rows=2)
     t = columns["time_s"]
-    torque = {"estimate": PlotCurve(t, columns["flexibility_torque_nm"])}
+    valid = {name: np.where(columns["valid"] > 0, values, np.nan) for name, values in columns.items()}
+    axes[1].sharex(axes[0])
+    torque = {"estimate": PlotCurve(t, valid["flexibility_torque_nm"])}
     plots.over_time(axes[0], torque, "torque / N·m", "Flexibility torque")
-    stiffness = PlotCurve(t, columns["stiffness_nm_rad"], columns["stiffness_std_nm_rad"])
+    stiffness = PlotCurve(t, valid["stiffness_nm_rad"], valid["stiffness_std_nm_rad"])
     plots.over_time(axes[1], {"estimate": stiffness}, "stiffness / (N·m/rad)", "Stiffness")
     low, high = np.nanpercentile(stiffness.y, [1, 99]) if np.any(np.isfinite(stiffness.y)) else (0.0, 1.0)
     margin = 0.25 * (high - low) + 0.02 * abs(high)

@@ -31,6 +31,19 @@ _ROWS = 2048  # rows per write
 _VALID, _OBSERVABLE = int(Status.VALID), int(Status.OBSERVABLE)
 
 
+def _columns(motors: int) -> tuple[str, ...]:
+    """Names of a cycle's values, in the order of `_row`."""
+    return (*estimate_columns(motors), "valid", "status")
+
+
+def _row(played: Played) -> tuple[float, ...]:
+    """A cycle as the values of `_columns`."""
+    estimate = played.tick.estimate
+    totals = (estimate.flexibility_torque_nm, estimate.stiffness_nm_rad, estimate.stiffness_std_nm_rad)
+    row = estimate_row(played.time_s, estimate.status, totals, estimate.transmissions)
+    return (*row, estimate.status & _VALID, estimate.status)
+
+
 class EstimatesFile:
     """Writes estimates.csv, one row per cycle; placed on `close`.
 
@@ -45,7 +58,7 @@ class EstimatesFile:
     """
 
     def __init__(self, path: Path, motors: int, *, linked: bool = False, force: bool = False) -> None:
-        columns = estimate_columns(motors) + (external_columns() if linked else ())
+        columns = _columns(motors) + (external_columns() if linked else ())
         self._linked = linked
         self._path = path
         self._line = ",".join(["%r"] * len(columns)) + "\n"
@@ -57,10 +70,8 @@ class EstimatesFile:
 
     def take(self, played: Played) -> None:
         """Write one row."""
-        time_s, tick = played
-        estimate = tick.estimate
-        totals = (estimate.flexibility_torque_nm, estimate.stiffness_nm_rad, estimate.stiffness_std_nm_rad)
-        row = estimate_row(time_s, estimate.status, totals, estimate.transmissions)
+        tick = played.tick
+        row = _row(played)
         self._rows.append(self._line % (row + external_row(tick.external) if self._linked else row))
         if len(self._rows) >= _ROWS:
             self._write()
@@ -154,7 +165,7 @@ class Summary:
         self._why: dict[str, tuple[int, str]] = {}  # by its key: cycles, the last sentence
         self.count = self.valid = self.observable = 0
         self._keep = keep
-        self._width = len(estimate_columns(motors))
+        self._width = len(_columns(motors))
         self._motors = motors
         self._values = array("d")
         self._last: Played | None = None
@@ -173,11 +184,7 @@ class Summary:
         self.observable += status & _OBSERVABLE != 0
         self._last = played
         if self._keep:
-            estimate = played.tick.estimate
-            totals = (
-                estimate.flexibility_torque_nm, estimate.stiffness_nm_rad, estimate.stiffness_std_nm_rad
-            )  # fmt: skip
-            self._values.extend(estimate_row(played.time_s, estimate.status, totals, estimate.transmissions))
+            self._values.extend(_row(played))
 
     def text(self, took_s: float) -> str:
         """The replay in one line."""
@@ -219,7 +226,7 @@ class Summary:
 
         folder.mkdir(parents=True, exist_ok=True)
         table = np.frombuffer(self._values, dtype=np.float64).reshape(-1, self._width)
-        columns: dict[str, FloatArray] = dict(zip(estimate_columns(self._motors), table.T, strict=True))
+        columns: dict[str, FloatArray] = dict(zip(_columns(self._motors), table.T, strict=True))
         return [
             plot_curves(columns, self._motors, folder / "stiffness.png", title),
             plot_over_time(columns, folder / "time.png", title),

@@ -17,7 +17,8 @@ def main(joint: str = "elbow", endpoint: str = "tcp/127.0.0.1:7447", seconds: st
         start = deadline = time.monotonic()
         while deadline < start + float(seconds):
             estimate = elbow.latest()
-            trusted = elbow.usable and estimate.observable
+            fresh = estimate is not None and not elbow.stale
+            trusted = fresh and estimate.usable and estimate.observable
             stiffness = estimate.stiffness_nm_rad if trusted else FALLBACK_NM_RAD
             gain = 0.1 * stiffness  # ... and here the controller uses it
             if round((deadline - start) / PERIOD_S) % 50 == 0:

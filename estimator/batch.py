@@ -174,10 +174,7 @@ def fit_joint(
     for one in usable:
         check(one, model)
     if bandwidth_rad_s is None:
-        shortest = min(len(one) * one.period_s for one in usable)
-        bandwidth_hz = max(
-            min(choose_bandwidth(one, model) for one in usable), choice("fit_periods") / shortest
-        )
+        bandwidth_hz = choose_bandwidth(usable, model)
     else:
         bandwidth_hz = bandwidth_rad_s / (2.0 * math.pi)
     most = widest(max(one.period_s for one in usable))

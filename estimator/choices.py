@@ -124,11 +124,16 @@ CHOICES: dict[str, Choice] = {
         30.0, "samples", "that a band counts for at most", "errors repeat in every period of a motion"
     ),
     "unexplained": Choice(0.8, "torque rms", "left at most by a finding", "it has to explain something"),
+    "halved": Choice(0.5, "squared error", "left by a finding that is told by it", "most of it is explained"),
     # The gate: what installations and joints are like.
     "fault": Choice(4.0, "nats", "against each fault", "one installation in fifty has it"),
     "free_ratio": Choice(
         6.0, "nats", "more against a gear ratio that is fitted", "decades at a few per cent of resolution"
     ),
+    "free_inertia": Choice(
+        2.7, "nats", "more against a declared inertia that is off by any factor", "within 2.5, of six decades"
+    ),
+    "accused": Choice(0.001, "probability", "that what is called wrong is right, at most", "one in 1000"),
     "declared_factor": Choice(
         3.0, "", "by which a declared number is off at most", "more is a rotor's inertia, a gear or a unit"
     ),

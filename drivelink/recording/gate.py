@@ -154,6 +154,8 @@ def _text_of(joint: JointFile, findings: Sequence[Discrepancy], *, live: bool) -
     parts = [f"{c}" for c in found if c.table != "recording.scale"]
     if scale:
         parts.insert(0, f"at the top of the joint file: recording.scale = {{ {scale} }}")
+    if any(change.channel == "deflection" for change in changes):
+        parts.append("record link_position_rad as 2 motor1_position_rad - link_position_rad")
     text = "; ".join(parts)
     if not live and any(motor.drive for motor in joint.motor):
         keys = [f"{c}" for c in corrections(joint, changes, live=True) if c.table.endswith(_ON_THE_BUS)]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy import fft
 from scipy.optimize import brentq
@@ -20,8 +22,17 @@ def torque_rms(record: Record) -> float:
     return float(np.max(np.std(record.motor_torque_nm, axis=0)))
 
 
-def choose_bandwidth(record: Record, model: JointModel) -> float:
-    """A bandwidth from the data, Hz: wide enough for the motion, narrow enough for the noise."""
+def choose_bandwidth(records: Sequence[Record], model: JointModel) -> float:
+    """A bandwidth from the data, Hz: that of the recording that needs the narrowest, but wide enough for
+    `fit_periods` of it in the shortest.
+    """
+    shortest_s = min(len(one) * one.period_s for one in records)
+    least = min(choice("fit_periods") / shortest_s, widest(max(one.period_s for one in records)))
+    return max(min(_suits(one, model) for one in records), least)
+
+
+def _suits(record: Record, model: JointModel) -> float:
+    """Wide enough for the motion, narrow enough for the noise; Hz."""
     torque = record.motor_torque_nm - record.motor_torque_nm.mean(axis=0)
     power = np.sum(np.abs(fft.rfft(torque, axis=0)) ** 2, axis=1)
     share = np.cumsum(power) / max(float(power.sum()), 1e-300)

@@ -53,7 +53,7 @@ def diagnose(
     for one in everything:
         check(one, model)
     progress("bandwidth")
-    bandwidth = bandwidth_hz or choose_bandwidth(records[0], model)
+    bandwidth = bandwidth_hz or choose_bandwidth(records, model)
     most = widest(max(r.period_s for r in records))
     if not 0.0 < bandwidth <= most:
         raise EstimatorError(f"bandwidth: expected more than 0 and at most {most:g} Hz, got {bandwidth:g}")

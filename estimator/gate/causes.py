@@ -13,11 +13,11 @@ from estimator.model import JointModel
 
 __all__ = ["Cause", "Change", "Kind", "causes", "scales"]
 
-Kind = Literal["unit", "sign", "gear", "period"]
+Kind = Literal["unit", "sign", "gear", "period", "inertia"]
 
 _DEGREE = math.pi / 180.0
 _MILLI = 1e-3
-_LINK, _TIME = "link_position", "time"
+_LINK, _DEFLECTION, _TIME = "link_position", "deflection", "time"
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,8 +25,9 @@ class Change:
     """Correction of one channel.
 
     Attributes:
-        channel: "motor1_position", "motor1_torque", "motor1_inertia", …, "link_position" or "time".
-        factor: true value over recorded (or declared) value.
+        channel: "motor1_position", "motor1_torque", "motor1_inertia", …, "link_position", "deflection" (of
+            the link against its motor) or "time".
+        factor: true value over recorded (or declared) value; infinite: any.
     """
 
     channel: str
@@ -70,6 +71,7 @@ def scales(found: Sequence[Cause], motor: int) -> Scales:
         link=factors.get(_LINK, 1.0),
         time=factors.get(_TIME, 1.0),
         inertia=factors.get(f"{own}inertia", 1.0),
+        deflection=factors.get(_DEFLECTION, 1.0),
     )
 
 
@@ -89,6 +91,8 @@ def causes(model: JointModel, linked: bool, ratios: Sequence[float | None]) -> l
     found += _signs(positions, torques, linked)
     for name, motor, ratio in zip(names, model.motors, ratios, strict=True):
         found += _gears(name, motor.gear_ratio, ratio, linked)
+        any_inertia = (Change(f"{name}_inertia", math.inf),)
+        found.append(Cause("inertia", "is not the declared one", any_inertia, choice("free_inertia")))
     return found
 
 
@@ -114,7 +118,7 @@ def _signs(positions: list[str], torques: list[str], linked: bool) -> list[Cause
     wrong = "has the wrong sign"
     found = [Cause("sign", wrong, _all([channel], -1.0)) for channel in (*positions, *torques)]
     if linked:
-        found.append(Cause("sign", wrong, _all([_LINK], -1.0)))
+        found += [Cause("sign", wrong, _all([channel], -1.0)) for channel in (_LINK, _DEFLECTION)]
     if len(positions) > 1:  # of a single joint it is the link's sign
         found += [Cause("sign", wrong, _all(pair, -1.0)) for pair in zip(positions, torques, strict=True)]
     return found
@@ -132,7 +136,7 @@ def _gears(name: str, gear: float | None, ratio: float | None, linked: bool) -> 
             if linked:
                 found.append(Cause("gear", what, (Change(_LINK, 1.0 / n),)))
         rotor = "is the rotor's own, expected the joint's side"
-        found.append(Cause("gear", rotor, (Change(f"{name}_inertia", gear * gear),)))
+        found.append(Cause("inertia", rotor, (Change(f"{name}_inertia", gear * gear),)))
     elif ratio is not None and ratio != 0.0 and _is_gear(abs(ratio)):
         what = "does not belong to the link's (wrong gear ratio?)"
         found.append(Cause("gear", what, (Change(position, abs(ratio)),), choice("free_ratio")))

@@ -36,7 +36,8 @@ _RIDGE = 1e-6  # of what a column explains: no two terms of a real joint cancel 
 class Scales(NamedTuple):
     """True value over recorded value: of a motor's position and torque, the link's position, and time.
 
-    `inertia` is the same of the declared inertia.
+    `inertia` is the same of the declared inertia, infinite: any; `deflection` of the link's angle
+    against its motor.
     """
 
     position: float = 1.0
@@ -44,6 +45,7 @@ class Scales(NamedTuple):
     link: float = 1.0
     time: float = 1.0
     inertia: float = 1.0
+    deflection: float = 1.0
 
 
 class Fit(NamedTuple):
@@ -92,6 +94,7 @@ class Balance:
         self._target, self._rate = torque / self._unit, rate / self._unit
         self._position = [self._through(x)[0] for x in _pieces(self._theta)[1:]]
         self._sign = self._through(_sense(self._theta, self._filters[0]))[0]
+        self.velocity_gain = self._gain(record, index)
         self._link_rate = None if self._q is None else self._through(self._q, 1)[1]
         self._loads: list[FloatArray] = []
         if lever is not None and self._q is not None:
@@ -117,20 +120,34 @@ class Balance:
 
     def fit(self, scales: Scales) -> Fit:
         """Fit the balance under a hypothesis."""
-        a, b, c, time, inertia = scales
-        B = self.motor.inertia_kg_m2 * inertia * (a / b) / (self.period_s * time) ** 2 / self._unit
+        a, b, c, time, inertia, rises = scales
+        free = math.isinf(inertia)
+        B = (
+            self.motor.inertia_kg_m2
+            * (1.0 if free else inertia)
+            * (a / b)
+            / (self.period_s * time) ** 2
+            / self._unit
+        )
         flexible = self.motor.flexible and self._q is not None
         ratio = a / c if flexible else a
-        key = (ratio, math.copysign(1.0, a * b), math.copysign(1.0, c * b) if flexible else 0.0, B)
+        key = (
+            ratio,
+            math.copysign(1.0, a * b),
+            math.copysign(1.0, rises * c * b) if flexible else 0.0,
+            B,
+            free,
+        )
         if key not in self._fits:
-            self._fits[key] = self._solve(a, b, c, B)
+            self._fits[key] = self._solve(a, b, c, rises, B, free)
         fit = self._fits[key]
         return fit._replace(stiffness_nm_rad=fit.stiffness_nm_rad * abs(b / c))
 
-    def _solve(self, a: float, b: float, c: float, B: float) -> Fit:
+    def _solve(self, a: float, b: float, c: float, rises: float, B: float, any_inertia: bool) -> Fit:
         free, sense = (-math.inf, math.inf), math.copysign(1.0, a * b)
+        off = math.inf if any_inertia else choice("declared_factor")
         bounds = [
-            (B / choice("declared_factor"), B * choice("declared_factor")),
+            (B / off, B * off),
             (0.0, sense * math.inf),
             (0.0, sense * math.inf),
             free,
@@ -143,12 +160,12 @@ class Balance:
         pieces = slice(len(bounds), len(bounds) + whole("pieces") + 2)
         slope = deflection = 0.0
         if flexible:
-            bounds += [(0.0, -math.copysign(math.inf, b * c))] * (whole("pieces") + 2)
+            bounds += [(0.0, -math.copysign(math.inf, rises * b * c))] * (whole("pieces") + 2)
         bounds += [free] * (len(factors.sizes) - len(bounds))
         x, left = _bounded(factors, np.sort(np.array(bounds), axis=1))
         if flexible:
-            rises = -math.copysign(1.0, b * c) * x[pieces]
-            slope = float(np.mean(rises[: whole("pieces")]) + np.sum(rises[whole("pieces") :])) * self._unit
+            steps = -math.copysign(1.0, rises * b * c) * x[pieces]
+            slope = float(np.mean(steps[: whole("pieces")]) + np.sum(steps[whole("pieces") :])) * self._unit
             deflection = self._springs[ratio][1]
         errors = np.hypot(left[:-1], choice("gate_floor"))
         score = float(np.sum(np.log(errors)))
@@ -189,6 +206,19 @@ class Balance:
         factors = _factors([*nuisances, q, theta], self._target)
         x, _ = _bounded(factors, np.tile((-math.inf, math.inf), (len(factors.sizes), 1)))
         return float(-x[-1] / x[-2]) if x[-2] else None
+
+    def _gain(self, record: Record, index: int) -> float | None:
+        """The recorded velocity over the position's derivative; None: not recorded, or they do not agree."""
+        if record.motor_velocity_rad_s is None:
+            return None
+        column = record.motor_velocity_rad_s[:, index]
+        if np.count_nonzero(np.isfinite(column)) < whole("samples"):
+            return None
+        v = self._through(_gridded(record, column))[0].ravel()
+        rate = self._velocity.ravel() / self.period_s
+        both, own, other = float(v @ rate), float(rate @ rate), float(v @ v)
+        agree = own > 0.0 and other > 0.0 and both**2 > choice("unexplained") * own * other
+        return both / own if agree else None
 
     def controlled(self) -> FloatArray:
         """Fit a controller that makes the torque from the motor's own reading: PID of any delay.

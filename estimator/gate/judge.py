@@ -9,7 +9,7 @@ from itertools import combinations
 
 import numpy as np
 
-from estimator.choices import chance, choice, log_odds, whole
+from estimator.choices import choice, log_odds, whole
 from estimator.errors import EstimatorError
 from estimator.gate.causes import Cause, Change, Kind, causes, scales
 from estimator.gate.evidence import Balance, Fit, Scales
@@ -71,7 +71,7 @@ def _named(changes: Sequence[Change], motors: int) -> str:
         return "the positions" if "link" in whose else "the motor positions"
     if len(kinds) == 1 and len(names) > 1:
         return f"the motor {kinds.pop()}s"
-    words = {"time": "time", "link": "the link position"}
+    words = {"time": "time", "link": "the link position", "deflection": "the link's deflection"}
     if motors == 1:
         words["motor1"] = "the motor"
     parts = []
@@ -130,21 +130,38 @@ class _Joint:
 
     def evidence(self, found: Sequence[Cause]) -> float:
         """Log posterior, up to a constant: likelihood, and how plausible such a joint is."""
-        total = -sum(cause.cost for cause in found)
+        total = self.likelihood(found) - sum(cause.cost for cause in found)
         for i, (s, fit) in self.fits(found).items():
-            total -= float(self.counts[i] @ np.log(np.maximum(fit.errors, self.least)))
-            total -= self._unusual(i, s, fit)
+            total -= self._unusual(i, s, fit) + self._disagrees(i, s)
         period_s = self.record.period_s * scales(found, 0).time
         if self.model.period_s is not None:
             return total - _off(period_s / self.model.period_s, choice("declared_factor"))
         return total - _off(period_s / choice("usual_period"), choice("usual_factor"))
 
+    def likelihood(self, found: Sequence[Cause]) -> float:
+        """Log likelihood of the balances, up to a constant."""
+        return -sum(
+            float(self.counts[i] @ np.log(np.maximum(fit.errors, self.least)))
+            for i, (_, fit) in self.fits(found).items()
+        )
+
+    def _disagrees(self, i: int, s: Scales) -> float:
+        """Cost of a velocity column that is wrong, too, unless it has the corrected position's scale."""
+        gain = self.balances[i].velocity_gain
+        if gain is None:
+            return 0.0
+        ratio = s.position / s.time / gain
+        right = ratio > 0.0 and abs(math.log(ratio)) < math.log(choice("declared_factor"))
+        return 0.0 if right else choice("fault")
+
     def _unusual(self, i: int, s: Scales, fit: Fit) -> float:
         motor, balance = self.model.motors[i], self.balances[i]
-        B = motor.inertia_kg_m2 * s.inertia
+        free = math.isinf(s.inertia)
+        B = motor.inertia_kg_m2 * (max(fit.inertia, 1e-9) if free else s.inertia)
         usual, declared = choice("usual_factor"), choice("declared_factor")
         total = _off(abs(s.torque) * balance.torque_rms / B / choice("usual_acceleration"), usual)
-        total += _off(fit.inertia, declared ** (1.0 / choice("sure")))
+        if not free:
+            total += _off(fit.inertia, declared ** (1.0 / choice("sure")))
         total += _off(max(abs(s.position) * balance.arc / _TURN, 1.0), usual)
         if not motor.flexible:
             return total
@@ -211,17 +228,50 @@ def judge(record: Record, model: JointModel) -> Judgement:
     if joint.controlled(weighed[0][1]):
         joint.least = PRIORS["coulomb_friction"].std
         weighed = joint.weighed(hypotheses)
+    return _decided(joint, weighed, single)
+
+
+def _decided(
+    joint: _Joint, weighed: list[tuple[float, tuple[Cause, ...]]], single: Sequence[Cause]
+) -> Judgement:
+    """The judgement, from the hypotheses' evidence: the best one, unless another inertia explains as much."""
     best, found = weighed[0]
     declared = joint.evidence(())
     odds, before, after = best - declared, joint.left(()), joint.left(found)
-    if odds < _decisive() or after > choice("unexplained"):
+    if after**2 > choice("halved") * before**2:  # most of what is left has no cause here
+        odds -= joint.likelihood(found) - joint.likelihood(())
+    excuse = max(e for e, h in weighed if h and all(cause.kind == "inertia" for cause in h))
+    blamed = tuple(cause for cause in found if cause.kind != "inertia")
+    certain = best - excuse >= _decisive() or all(cause.kind in ("unit", "gear", "period") for cause in found)
+    if odds < _decisive() or not (blamed and certain) or after > choice("unexplained"):
+        if found and not blamed and odds >= _decisive():
+            return Judgement(reason=_another_inertia(joint, weighed), left=after)
         if before > choice("unexplained"):
             return Judgement(reason=f"the motion explains {1.0 - before:.0%} of the torque", left=before)
         return Judgement(undecided=_undecided(joint, single, declared), left=before)
-    alike = [h for e, h in weighed[1:] if best - e < -log_odds(choice("even")) and len(h) == len(found)]
-    motors = record.motors
-    findings = [_finding(found, k, alike, odds, before, after, motors) for k in range(len(found))]
+    even = -log_odds(choice("even"))
+    alike = [
+        h
+        for e, h in weighed[1:]
+        if best - e < (_decisive() if any(c.kind == "inertia" for c in h) else even) and len(h) == len(found)
+    ]
+    findings = [
+        _finding(found, found.index(one), alike, odds, before, after, joint.record.motors) for one in blamed
+    ]
     return Judgement(findings=tuple(findings), left=after)
+
+
+def _another_inertia(joint: _Joint, weighed: list[tuple[float, tuple[Cause, ...]]]) -> str:
+    """That the motors' inertia is another than declared, and what else explains as much, in words."""
+    best, found = weighed[0]
+    factors = (
+        f.inertia * (1.0 if math.isinf(s.inertia) else s.inertia) for s, f in joint.fits(found).values()
+    )
+    text = f"the motion asks for {' and '.join(f'{x:.2g}' for x in factors)} times the declared inertia"
+    others = [h[0] for e, h in weighed if best - e < _decisive() and len(h) == 1 and h[0].kind != "inertia"]
+    motors = joint.record.motors
+    listed = " or ".join(f"{_named(one.changes, motors)} {one.what}" for one in others)
+    return f"{text} (or else: {listed})" if listed else text
 
 
 def _undecided(joint: _Joint, single: Sequence[Cause], declared: float) -> tuple[str, ...]:
@@ -286,7 +336,7 @@ def _declared_stiffness(motor: Motor) -> float | None:
 
 def _decisive() -> float:
     """Log odds at which a finding is certain, nats."""
-    return -log_odds(chance())
+    return -log_odds(choice("accused"))
 
 
 def _off(ratio: float, factor: float) -> float:

@@ -128,6 +128,21 @@ def test_stamps_that_jitter_like_arrival_times_are_put_on_the_grid(
     assert "taken as arrival times" in said.text
 
 
+@pytest.mark.parametrize("spread", [0.3, 0.9])
+def test_irregular_stamps_that_the_motion_follows_are_resampled(
+    spread: float, tmp_path: Path, said: pytest.LogCaptureFixture
+) -> None:
+    time = np.cumsum(1e-3 * np.random.default_rng(2).uniform(1.0 - spread, 1.0 + spread, 4000))
+    table = np.column_stack((time, np.sin(20.0 * time), np.cos(20.0 * time), 0.5 * np.sin(20.0 * time)))
+    record = read(write(tmp_path / "r.csv", table))
+    at = record.start_s + record.period_s * record.sequence
+    assert "resampled" in said.text
+    assert np.max(np.abs(record.motor_position_rad[:, 0] - np.sin(20.0 * at))) < 1e-3
+    # A held torque is late by half a step; its impulse is kept.
+    impulse = record.period_s * np.sum(record.motor_torque_nm[:, 0])
+    assert impulse == pytest.approx(np.sum(table[:-1, 2] * np.diff(time)), abs=2e-3)
+
+
 @pytest.mark.parametrize(
     ("spoil", "line"),
     [

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from drivelink.errors import RecordingError
 from drivelink.jointfile import JointFile
-from drivelink.recording.grid import find_grid, report_gaps
+from drivelink.recording.grid import Grid, NotUniformError, find_grid, report_gaps
 from drivelink.recording.limits import require_samples
+from drivelink.recording.resample import resampled, stamps_are_instants
 from estimator.errors import EstimatorError
 from estimator.sample import FloatArray, Record, Sample
 
@@ -71,7 +72,7 @@ def record_from_columns(
     motors = _motors(columns, joint, where)
     _require(columns, "time_s", where)
     nominal = joint.bus.period_s if joint else None
-    grid = find_grid(columns["time_s"], where, nominal, _repeats(columns))
+    columns, grid = _on_grid(columns, where, nominal)
     columns = {name: values[grid.keep] if values.size else values for name, values in columns.items()}
     channels = _channels(columns, motors, joint, where)
     link = channels.link
@@ -98,6 +99,51 @@ def record_from_columns(
         )
     except EstimatorError as error:
         raise RecordingError(f"{where}: {error}") from error
+
+
+def _on_grid(
+    columns: Mapping[str, FloatArray], where: str, nominal_s: float | None
+) -> tuple[Mapping[str, FloatArray], Grid]:
+    """Number the rows, or resample them where the motion shows that their irregular stamps are right.
+
+    Raises:
+        RecordingError: the sampling is not uniform, and the motion does not follow the stamps either.
+    """
+    refused, grid = None, None
+    try:
+        grid = find_grid(columns["time_s"], where, nominal_s, _repeats(columns))
+    except NotUniformError as error:
+        refused = error
+    if grid is not None and not grid.jittering:
+        return columns, grid
+    measured = {n: v for n, v in columns.items() if n in KNOWN and v.size and np.any(np.isfinite(v))}
+    rows = np.all(np.isfinite(list(measured.values())), axis=0)
+    rows[rows] &= np.diff(measured["time_s"][rows], prepend=-np.inf) > 0.0
+    position = measured.get("motor1_position_rad")
+    time = measured["time_s"][rows]
+    number = np.arange(len(time), dtype=float)
+    if grid is not None:
+        number = np.interp(np.flatnonzero(rows), np.flatnonzero(grid.keep), grid.sequence)
+    if position is not None and stamps_are_instants(time, number, position[rows]):
+        steps = np.diff(time)
+        _LOG.warning(
+            "%s: steps from %.3g s to %.3g s, and the motion follows the stamps: resampled every %.3g s",
+            where,
+            steps.min(),
+            steps.max(),
+            np.median(steps),
+        )
+        again = resampled(measured, rows)
+        return again, find_grid(again["time_s"], where, nominal_s)
+    if grid is None:
+        assert refused is not None
+        raise refused
+    _LOG.warning(
+        "%s: the stamps jitter by up to %.2g periods: taken as arrival times of a uniform sampling",
+        where,
+        grid.jittering,
+    )
+    return columns, grid
 
 
 class _Channels(NamedTuple):

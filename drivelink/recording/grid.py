@@ -30,6 +30,10 @@ _AHEAD = 65  # stamps needed to distinguish a late one from a gap
 _MAX_GAPS = 0.1  # fraction of rows, with jittering stamps
 
 
+class NotUniformError(RecordingError):
+    """The stamps fit no grid of whole periods."""
+
+
 class Grid(NamedTuple):
     """Position of each row on the grid.
 
@@ -38,12 +42,14 @@ class Grid(NamedTuple):
         sequence: (n,) whole periods since the first row, strictly increasing.
         start_s: time of sequence 0.
         keep: (rows,) rows of the input on the grid: those with a stamp, without repetitions.
+        jittering: largest distance of a stamp from the grid, periods; 0: as good as none.
     """
 
     period_s: float
     sequence: NDArray[np.int64]
     start_s: float
     keep: NDArray[np.bool_]
+    jittering: float = 0.0
 
 
 def find_grid(
@@ -81,9 +87,9 @@ def find_grid(
     period = float(np.median(steps))
     if time[-1] - time[0] > _MOST_PERIODS * period:
         raise RecordingError(f"{where}: time_s spans {time[-1] - time[0]:g} s in steps of {period:g} s")
-    sequence = _number(time, period, where)
+    sequence, jittering = _number(time, period, where)
     period = _rounded(time, sequence, nominal_s)
-    return Grid(period, sequence, float(time[0]), keep)
+    return Grid(period, sequence, float(time[0]), keep, jittering)
 
 
 def report_gaps(sequence: NDArray[np.int64], period_s: float, where: str) -> None:
@@ -113,22 +119,24 @@ def _require_forward(steps: FloatArray, rows: NDArray[np.int64], time: FloatArra
         )
 
 
-def _number(time: FloatArray, period: float, where: str) -> NDArray[np.int64]:
-    """(n,) number of each stamp on a grid of the given period, adapted to the stamps' drift."""
+def _number(time: FloatArray, period: float, where: str) -> tuple[NDArray[np.int64], float]:
+    """(n,) number of each stamp on a grid of the given period, adapted to the stamps' drift; their jitter,
+    periods.
+    """
     steps = np.diff(time)
     wide = np.count_nonzero(steps > 1.5 * period)
     if wide > _MAX_GAP_SHARE * len(steps):
-        raise RecordingError(
+        raise NotUniformError(
             f"{where}: expected uniform sampling, got steps from {steps.min():.3g} s to {steps.max():.3g} s "
             f"(median {period:.3g} s)"
         )
     whole = np.maximum(np.rint(steps / period), 0.0)
     if np.all(whole >= 1.0) and np.all(np.abs(steps - whole * period) <= _JITTER * period * np.sqrt(whole)):
-        return np.concatenate(([0], np.cumsum(whole))).astype(np.int64)
+        return np.concatenate(([0], np.cumsum(whole))).astype(np.int64), 0.0
     return _number_jittered(time, where)
 
 
-def _number_jittered(time: FloatArray, where: str) -> NDArray[np.int64]:
+def _number_jittered(time: FloatArray, where: str) -> tuple[NDArray[np.int64], float]:
     """Number stamps that jitter like arrival times: after a late one others catch up, after a gap they do
     not.
 
@@ -150,15 +158,10 @@ def _number_jittered(time: FloatArray, where: str) -> NDArray[np.int64]:
     worst = float(np.abs(off).max()) / period
     gaps = np.count_nonzero(np.diff(sequence) > 1)
     if float(np.sqrt(np.mean(off**2))) > _MAX_JITTER_PERIODS * period or gaps > _MAX_GAPS * len(time):
-        raise RecordingError(
+        raise NotUniformError(
             f"{where}: expected uniform sampling, got stamps up to {worst:.3g} periods of {period:.3g} s off"
         )
-    _LOG.warning(
-        "%s: the stamps jitter by up to %.2g periods: taken as arrival times of a uniform sampling",
-        where,
-        worst,
-    )
-    return sequence
+    return sequence, worst
 
 
 def _rounded(time: FloatArray, sequence: NDArray[np.int64], nominal_s: float | None) -> float:

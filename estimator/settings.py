@@ -38,7 +38,7 @@ class EstimatorSettings:
 
     __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "strict": True}
 
-    mode: Literal["robust", "paper"] = "robust"
+    mode: Literal["robust", "paper", "balance"] = "robust"
     method: Literal["auto", "mbe", "bbe"] = "auto"
     bandwidth_rad_s: float = 60.0
     k_tau_rad_s: float = 300.0

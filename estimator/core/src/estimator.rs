@@ -1,5 +1,6 @@
 //! The estimator of a joint: one `step` a tick.
 
+use crate::balanced::Balanced;
 use crate::error::Error;
 use crate::external::External;
 use crate::isolation::Verdict;
@@ -12,13 +13,15 @@ use crate::sample::{Estimate, Sample};
 use crate::settings::{Mode, Priors, Settings};
 use crate::suspicion::Suspicion;
 
-/// Both modes behind one interface.
+/// The modes behind one interface.
 #[derive(Clone, Debug)]
 pub enum Estimator {
     /// See [`Paper`].
     Paper(Box<Paper>),
     /// See [`Robust`].
     Robust(Box<Robust>),
+    /// See [`Balanced`].
+    Balanced(Box<Balanced>),
 }
 
 impl Estimator {
@@ -38,6 +41,7 @@ impl Estimator {
         }
         Ok(match settings.mode {
             Mode::Paper => Estimator::Paper(Box::new(Paper::new(model, settings, priors, period_s))),
+            Mode::Balance => Estimator::Balanced(Box::new(Balanced::new(model, settings, priors, period_s)?)),
             Mode::Robust => Estimator::Robust(Box::new(Robust::new(model, settings, priors, period_s)?)),
         })
     }
@@ -49,6 +53,7 @@ impl Estimator {
         match self {
             Estimator::Paper(paper) => paper.step(sample),
             Estimator::Robust(robust) => robust.step(sample),
+            Estimator::Balanced(balanced) => balanced.step(sample),
         }
     }
 
@@ -57,13 +62,16 @@ impl Estimator {
         match self {
             Estimator::Paper(paper) => paper.reset(),
             Estimator::Robust(robust) => robust.reset(),
+            Estimator::Balanced(balanced) => balanced.reset(),
         }
     }
 
     /// The next sample may not be of its moment: use it, but learn nothing from it.
     pub fn distrust(&mut self) {
-        if let Estimator::Robust(robust) = self {
-            robust.distrust();
+        match self {
+            Estimator::Paper(_) => {}
+            Estimator::Robust(robust) => robust.distrust(),
+            Estimator::Balanced(balanced) => balanced.distrust(),
         }
     }
 
@@ -71,7 +79,7 @@ impl Estimator {
     #[must_use]
     pub fn residual(&self) -> f64 {
         match self {
-            Estimator::Paper(_) => f64::NAN,
+            Estimator::Paper(_) | Estimator::Balanced(_) => f64::NAN,
             Estimator::Robust(robust) => robust.residual(),
         }
     }
@@ -82,6 +90,7 @@ impl Estimator {
         match self {
             Estimator::Paper(paper) => paper.external(),
             Estimator::Robust(robust) => robust.external(),
+            Estimator::Balanced(_) => None,
         }
     }
 
@@ -91,6 +100,7 @@ impl Estimator {
         match self {
             Estimator::Paper(paper) => paper.consistency(),
             Estimator::Robust(robust) => robust.consistency(),
+            Estimator::Balanced(_) => None,
         }
     }
 
@@ -98,7 +108,7 @@ impl Estimator {
     #[must_use]
     pub fn suspicion(&self) -> Option<Suspicion> {
         match self {
-            Estimator::Paper(_) => None,
+            Estimator::Paper(_) | Estimator::Balanced(_) => None,
             Estimator::Robust(robust) => robust.suspicion(),
         }
     }
@@ -116,7 +126,7 @@ impl Estimator {
     #[must_use]
     pub fn verdict(&self, motor: usize) -> Option<&Verdict> {
         match self {
-            Estimator::Paper(_) => None,
+            Estimator::Paper(_) | Estimator::Balanced(_) => None,
             Estimator::Robust(robust) => robust.verdict(motor),
         }
     }
@@ -128,6 +138,7 @@ impl Estimator {
         match self {
             Estimator::Paper(paper) => paper.parameters(motor, values, std),
             Estimator::Robust(robust) => robust.parameters(motor, values, std).cloned(),
+            Estimator::Balanced(_) => None,
         }
     }
 }

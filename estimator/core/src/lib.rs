@@ -9,6 +9,9 @@
 #![allow(clippy::needless_range_loop)] // matrices read better by their indices
 
 pub mod align;
+pub mod balance;
+pub mod balanced;
+pub mod blocks;
 pub mod change_detection;
 pub mod consider;
 pub mod corrections;
@@ -20,6 +23,7 @@ pub mod estimator;
 pub mod external;
 pub mod filters;
 pub mod friction;
+pub mod gram;
 pub mod identification;
 pub mod isolation;
 pub mod kalman;

@@ -188,7 +188,11 @@ pub fn settings(given: &Bound<'_, PyAny>) -> PyResult<Settings> {
     let method: String = given.getattr("method")?.extract()?;
     let number = |name: &str| -> PyResult<f64> { given.getattr(name)?.extract() };
     Ok(Settings {
-        mode: if mode == "paper" { Mode::Paper } else { Mode::Robust },
+        mode: match mode.as_str() {
+            "paper" => Mode::Paper,
+            "balance" => Mode::Balance,
+            _ => Mode::Robust,
+        },
         method: match method.as_str() {
             "mbe" => Method::Mbe,
             "bbe" => Method::Bbe,

@@ -5,6 +5,8 @@
 pub enum Mode {
     /// The default: one filter for every channel, joint recursive estimation, uncertainty, alarms.
     Robust,
+    /// Sums of blocks of one balance; see [`crate::balanced`].
+    Balance,
     /// Eqs 14, 28, 32, 33 as printed, correctly discretised.
     Paper,
 }

@@ -1,6 +1,6 @@
 """Stiffness on line over random joints of another integrator: errors, intervals, false alarms.
 
-    python benchmarks/ensembles.py [--joints 8] [--seconds 20] [--seed 1] [--cases NAME,…] [--json]
+    python benchmarks/ensembles.py [--joints 8] [--seconds 20] [--seed 1] [--cases NAME,…] [--mode robust|balance] [--json]
 
 Fresh joints on random multisines, read as drives read them: 4096 to 16384 counts (stiff joints behind a gear
 of 100), 16 to 18 bits at the link, no velocity, torque noise of 0.1 to 0.5 % of rated. From five seconds on,
@@ -159,17 +159,18 @@ def arguments(description):
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--cases", default=",".join(name.replace(",", ";") for name in CASES))
+    parser.add_argument("--mode", choices=["robust", "balance"], default="robust")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     args.cases = [name.replace(";", ",") for name in args.cases.split(",")]
     return args
 
 
-def measure(case, n_joints, seconds, seed):
+def measure(case, n_joints, seconds, seed, mode="robust"):
     """One row."""
     found, alarms = [], 0
     for joint in draw_joints(case, n_joints, seconds, seed):
-        estimator = make_estimator(joint.model, EstimatorSettings(), T)
+        estimator = make_estimator(joint.model, EstimatorSettings(mode=mode), T)
         out = np.array([estimator.step(sample)[:5] for sample in joint.record.samples()])
         status = out[:, 1].astype(int)
         usable = (status & USABLE == USABLE) & (np.arange(len(out)) * T >= SETTLED_S)
@@ -182,7 +183,7 @@ def measure(case, n_joints, seconds, seed):
 def main():
     args = arguments(__doc__)
     rows = [
-        measure(case, args.joints, args.seconds, args.seed)
+        measure(case, args.joints, args.seconds, args.seed, args.mode)
         for case in track(args.cases, "cases", console=Console(stderr=True))
     ]
     if args.json:

@@ -15,7 +15,8 @@ class EstimatorSettings:
     """Settings of both modes; each mode reads its own.
 
     Attributes:
-        mode: "robust", or "paper" (eqs 14, 28, 32, 33 as printed, correctly discretised).
+        mode: "robust", "paper" (eqs 14, 28, 32, 33 as printed, correctly discretised), or "balance" (sums of
+            blocks of one balance; experimental, see docs/explanation/balance.md).
         method: source of the stiffness: "mbe" (the transmission's model), "bbe" (black box), or "auto": "mbe"
             in robust mode with a model, else "bbe".
         bandwidth_rad_s: of the filter that every channel shares in robust mode.

@@ -167,7 +167,15 @@ impl Balance {
     }
 
     /// One period. `effect`: torque of the declared effects, N·m.
-    pub fn feed(&mut self, filters: &Filters, theta: f64, phi: f64, torque: f64, link: &Channel, effect: f64) {
+    pub fn feed(
+        &mut self,
+        filters: &Filters,
+        theta: f64,
+        phi: f64,
+        torque: f64,
+        link: &Channel,
+        effect: f64,
+    ) {
         self.position.smooth(filters, theta);
         self.torque.held(filters, torque);
         self.effects.pass(filters, effect);
@@ -188,7 +196,8 @@ impl Balance {
             *stop = (*stop + step).clamp(-width * range, width * range);
         }
         let [a, b, c] = self.stops;
-        let now = [sign, (rate / (SOFTER * speed)).tanh(), u.abs() * sign, -u * u * link.light[1], -a, -b, -c];
+        let now =
+            [sign, (rate / (SOFTER * speed)).tanh(), u.abs() * sign, -u * u * link.light[1], -a, -b, -c];
         for (formed, value) in self.formed.iter_mut().zip(now) {
             formed.pass(filters, value);
         }

@@ -13,6 +13,7 @@ use crate::error::Error;
 use crate::gram::Row;
 use crate::model::{Arrangement, Model, Motor};
 use crate::noise::NoiseMeter;
+use crate::reasons::{Reason, Why};
 use crate::sample::{Estimate, MOTORS, Sample, TransmissionEstimate, joint_estimate, status};
 use crate::sample_validator::SampleValidator;
 use crate::settings::{Priors, Settings};
@@ -21,7 +22,7 @@ use crate::signals::{Channel, Excitation, Filters};
 const SETTLE_DELAYS: f64 = 4.5; // filter delays after which a wrong start is forgotten
 const LOOK_S: f64 = 0.03; // between two looks at the excitation: the filters' correlation time at 60 rad/s
 const BRIDGED: f64 = 0.4; // rad that the filter turns by in a gap: a longer one is not learned from
-const USEFUL: f64 = 0.2; // relative standard deviation, and unexplained share of the torque, that are of use
+const USEFUL: f64 = 0.2; // share of the torque that a curve may leave unexplained
 const BEYOND: f64 = 1.5; // times the largest deflection: no more is known of the curve
 const HALF: f64 = 0.5; // periods: what is later is shifted, the rest is a column
 
@@ -65,6 +66,8 @@ pub struct Balanced {
     begins: bool,
     tick: u64,
     unsettled: i64,
+    valid_within: f64,
+    why: Option<Why>,
     estimate: Option<Estimate>,
 }
 
@@ -73,7 +76,12 @@ impl Balanced {
     ///
     /// # Errors
     /// An effect is where it does not belong.
-    pub fn new(model: &Model, settings: &Settings, priors: &Priors, period_s: f64) -> Result<Balanced, Error> {
+    pub fn new(
+        model: &Model,
+        settings: &Settings,
+        priors: &Priors,
+        period_s: f64,
+    ) -> Result<Balanced, Error> {
         let filters = Filters::new(settings.bandwidth, period_s);
         let effects: Vec<MotorEffects> =
             model.motors.iter().map(|motor| MotorEffects::new(&motor.effects)).collect::<Result<_, _>>()?;
@@ -122,6 +130,8 @@ impl Balanced {
             begins: true,
             tick: 0,
             unsettled: settle,
+            valid_within: settings.valid_within,
+            why: None,
             estimate: None,
         })
     }
@@ -155,10 +165,10 @@ impl Balanced {
         self.sides[motor].blocks.undeclared()
     }
 
-    /// Largest share of a motor's torque that its balance leaves, times nothing: rms over rms; NaN: unknown.
+    /// Why the last estimate is not valid; `None`: it is.
     #[must_use]
-    pub fn unexplained(&self) -> f64 {
-        self.sides.iter().map(|side| side.blocks.unexplained()).fold(f64::NAN, f64::max)
+    pub fn why(&self) -> Option<Why> {
+        self.why
     }
 
     /// The estimate at this sample, whatever floats it holds.
@@ -274,11 +284,18 @@ impl Balanced {
             side.acting = if known { at.flexibility_torque - side.blocks.offset() } else { side.left() };
         }
         let elastic = |side: &&Side| !side.rigid;
-        let good = self.sides.iter().enumerate().all(|(i, side)| side.rigid || side.is_useful(&parts[i]));
+        let rejected = flags & status::INPUT_REJECTED != 0;
+        let why = |(i, side): (usize, &Side)| {
+            Some(Why::new(side.reason(&parts[i], self.valid_within, settled)?, Some(i)))
+        };
+        self.why = self.sides.iter().enumerate().find_map(why);
+        if rejected {
+            self.why = Some(Why::new(Reason::Rejected, None));
+        }
         if self.sides.iter().any(|side| side.doubtful) {
             flags |= status::CHANGED;
         }
-        if good && flags & status::INPUT_REJECTED == 0 {
+        if self.why.is_none() {
             flags |= status::VALID;
             if settled && self.flexible && self.sides.iter().filter(elastic).all(|side| side.excited) {
                 flags |= status::OBSERVABLE;
@@ -289,7 +306,8 @@ impl Balanced {
         estimate
     }
 
-    fn carry(&self, sequence: u64, flags: u32) -> Estimate {
+    fn carry(&mut self, sequence: u64, flags: u32) -> Estimate {
+        self.why = Some(Why::new(Reason::Rejected, None));
         match self.estimate {
             Some(last) => Estimate { sequence, status: flags | last.status & status::CHANGED, ..last },
             None => joint_estimate(self.arrangement, sequence, flags, self.read(), self.motors),
@@ -363,12 +381,23 @@ impl Side {
         });
     }
 
-    fn is_useful(&self, part: &TransmissionEstimate) -> bool {
-        self.fits
-            && !self.doubtful
-            && part.stiffness > 0.0
-            && part.stiffness_std < USEFUL * part.stiffness
-            && part.deflection.abs() < BEYOND * self.balance.largest()
+    /// Why the estimate at this moment may not be used.
+    fn reason(&self, part: &TransmissionEstimate, valid_within: f64, settled: bool) -> Option<Reason> {
+        if self.rigid {
+            return None;
+        }
+        if self.blocks.posterior.is_none() {
+            return Some(if settled { Reason::Unmoved } else { Reason::Settling });
+        }
+        if self.doubtful {
+            return Some(Reason::Changed);
+        }
+        if !self.fits {
+            return Some(Reason::Unexplained(self.blocks.unexplained()));
+        }
+        let within = part.deflection.abs() < BEYOND * self.balance.largest();
+        Reason::of_precision(part.stiffness, part.stiffness_std, valid_within)
+            .or((!within).then_some(Reason::Beyond))
     }
 
     /// Torque, stiffness and its standard deviation at a deflection.

@@ -7,6 +7,7 @@ use crate::gram::{COLUMNS, Gram, Posterior, Prior, Row, Set, choose, cluster, co
 use crate::laws::Law;
 use crate::model::{Motor, Transmission};
 use crate::settings::Priors;
+use crate::student::f_quantile;
 
 const BLOCK_S: f64 = 0.25; // of motion: longer than the filters' memory, so that blocks are nearly independent
 const BLOCKS: usize = 120; // 30 s of motion: what a joint's temperature and load leave as they are
@@ -49,7 +50,7 @@ pub struct Blocks {
     powers: Option<usize>,
     rows: f64,
     correlated: f64,
-    chance: f64, // of a false alarm in a block
+    limit: f64, // of a block's mean square over the usual one, at the declared rate of false alarms
     open: Gram,
     ring: Vec<Gram>,
     oldest: usize,
@@ -68,20 +69,28 @@ pub struct Blocks {
 impl Blocks {
     /// Of a motor; `correlated`: rows that one independent error is worth.
     #[must_use]
-    pub fn new(motor: &Motor, priors: &Priors, period_s: f64, correlated: f64, alarms_per_hour: f64) -> Blocks {
+    pub fn new(
+        motor: &Motor,
+        priors: &Priors,
+        period_s: f64,
+        correlated: f64,
+        alarms_per_hour: f64,
+    ) -> Blocks {
         let powers = match &motor.transmission {
             Transmission::Elastic { law: Law::Linear, .. } => Some(1),
             Transmission::Elastic { law: Law::Polynomial, order, .. } => order.map(|p| p.min(POWERS.len())),
             _ => None,
         };
+        let rows = (BLOCK_S / period_s).round().max(8.0);
+        let errors = (rows / correlated).max(1.0); // independent ones in a block
         Blocks {
             motor: motor.clone(),
             priors: *priors,
             period: period_s,
             powers,
-            rows: (BLOCK_S / period_s).round().max(8.0),
+            rows,
             correlated,
-            chance: alarms_per_hour * BLOCK_S / 3600.0,
+            limit: f_quantile(errors, FEWEST as f64 * errors, alarms_per_hour * BLOCK_S / 3600.0),
             open: Gram::default(),
             ring: Vec::with_capacity(BLOCKS),
             oldest: 0,
@@ -145,25 +154,17 @@ impl Blocks {
         Some(Closed::Added)
     }
 
-    /// Whether what is left of a block is as usual: the logarithms of the blocks' misfits are nearly normal.
+    /// Whether a block's mean square is as usual: Fisher's F of it over that of the others and what is not known.
     fn explains(&self, block: &Gram) -> bool {
         let Some(posterior) = &self.posterior else { return true };
         let n = self.ring.len();
         if n < FEWEST {
             return true;
         }
-        let log = |block: &Gram| {
-            let floor = f64::EPSILON * block.at(TORQUE, TORQUE);
-            ((block.quadratic(&posterior.residual) + floor) / block.rows).ln()
-        };
-        let mean = self.ring.iter().map(log).sum::<f64>() / n as f64;
-        let square = self.ring.iter().map(|block| (log(block) - mean).powi(2)).sum::<f64>();
-        let freedom = (n - 1) as f64;
-        let deviation = (square / freedom * (1.0 + 1.0 / n as f64)).sqrt();
-        // A block is of this many independent errors, at most; its own spread is at least theirs.
-        let own = (2.0 * self.correlated / block.rows).sqrt();
-        let uncertain = (1.0 + posterior.predicted(block) / (mean.exp() * block.rows)).ln();
-        log(block) < mean + uncertain + tail(self.chance, freedom) * deviation.max(own)
+        let misfit = |block: &Gram| block.quadratic(&posterior.residual) / block.rows;
+        let usual = self.ring.iter().map(misfit).sum::<f64>() / n as f64;
+        let floor = f64::EPSILON * block.rms(TORQUE).powi(2);
+        misfit(block) < self.limit * (usual + floor + posterior.predicted(block) / block.rows)
     }
 
     /// Which columns there are, and how they are believed before any data.
@@ -178,10 +179,11 @@ impl Blocks {
             prior.std[column] = share(column, UNDECLARED);
         }
         let inertia = self.motor.inertia_std.unwrap_or(self.priors.motor_inertia);
-        (prior.mean[ACCELERATION], prior.std[ACCELERATION]) = (self.motor.inertia, inertia * self.motor.inertia);
+        (prior.mean[ACCELERATION], prior.std[ACCELERATION]) =
+            (self.motor.inertia, inertia * self.motor.inertia);
         prior.mean[VELOCITY] = self.motor.damping;
-        prior.std[VELOCITY] =
-            self.priors.viscous_damping * self.motor.damping + share(VELOCITY, self.priors.viscous_damping_floor);
+        prior.std[VELOCITY] = self.priors.viscous_damping * self.motor.damping
+            + share(VELOCITY, self.priors.viscous_damping_floor);
         prior.std[OFFSET] = self.priors.torque_offset * torque + mean.abs();
         prior.std[DRY] = self.priors.coulomb_friction * torque;
         for column in POWERS {
@@ -199,8 +201,10 @@ impl Blocks {
             let power = POWERS.start + k;
             let known = self.posterior.as_ref().map_or(0.0, |known| known.coefficient(power).abs());
             let stiffness = if known > 0.0 { known } else { share(power, 1.0) } / self.scale;
-            prior.std[column] =
-                (2 * k + 1) as f64 * self.priors.encoder_delay * self.period * stiffness.max(f64::MIN_POSITIVE);
+            prior.std[column] = (2 * k + 1) as f64
+                * self.priors.encoder_delay
+                * self.period
+                * stiffness.max(f64::MIN_POSITIVE);
         }
         prior
     }
@@ -209,7 +213,8 @@ impl Blocks {
         let mut total = Gram::default();
         self.ring.iter().for_each(|block| total.add(block, 1.0));
         let powers = self.powers.unwrap_or(1);
-        let mut base = set(ACCELERATION..DRY + 1) | set(POWERS.start..POWERS.start + powers) | 1 << LATE.start;
+        let mut base =
+            set(ACCELERATION..DRY + 1) | set(POWERS.start..POWERS.start + powers) | 1 << LATE.start;
         if powers > 1 {
             base |= 1 << (LATE.start + 1) | set(EVEN.start..(EVEN.start + powers - 1).min(EVEN.end));
         }
@@ -304,28 +309,5 @@ impl Blocks {
         let chosen = self.posterior.as_ref().map_or(0, |posterior| posterior.set);
         let named = CANDIDATES.iter().filter(move |c| chosen & set(c.columns.clone()) != 0).map(|c| c.name);
         named.chain(self.moved.then_some("deflection_offset"))
-    }
-}
-
-/// What Student's t exceeds with this small probability.
-fn tail(probability: f64, freedom: f64) -> f64 {
-    // Peizer and Pratt: a normal quantile z as a t quantile, sqrt(ν (exp(z²/(ν − 5/6)…) − 1)); z by its tail's series.
-    let l = (-2.0 * probability.clamp(1e-300, 0.5).ln()).sqrt();
-    let z = l - (2.515_517 + 0.802_853 * l + 0.010_328 * l * l)
-        / (1.0 + 1.432_788 * l + 0.189_269 * l * l + 0.001_308 * l * l * l);
-    (freedom * ((z * z * (freedom - 5.0 / 6.0) / (freedom - 2.0 / 3.0 + 0.1 / freedom).powi(2)).exp() - 1.0)).sqrt()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::student::t_quantile;
-
-    #[test]
-    fn rare_tails_are_those_of_students_t() {
-        for (probability, freedom) in [(1e-3, 10.0), (1e-4, 30.0), (1e-2, 8.0)] {
-            let exact = t_quantile(freedom, 2.0 * probability);
-            assert!((tail(probability, freedom) / exact - 1.0).abs() < 0.02);
-        }
     }
 }

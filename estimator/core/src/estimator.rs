@@ -119,6 +119,7 @@ impl Estimator {
         match self {
             Estimator::Paper(paper) => paper.why(),
             Estimator::Robust(robust) => robust.why(),
+            Estimator::Balanced(balanced) => balanced.why(),
         }
     }
 

@@ -373,6 +373,14 @@ impl Estimator {
         self.inner.distrust();
     }
 
+    /// Effects of one motor, counted from 0, that nobody declared and evidence chose (mode "balance").
+    fn undeclared(&self, motor: usize) -> Vec<&'static str> {
+        match &self.inner {
+            crate::estimator::Estimator::Balanced(balanced) => balanced.undeclared(motor).collect(),
+            _ => Vec::new(),
+        }
+    }
+
     /// What the model left unexplained of the torque balance at the last sample; nan: unknown.
     #[getter]
     fn residual_nm(&self) -> f64 {

@@ -246,6 +246,7 @@ class Stage:
 
     def forget(self) -> None:
         """What was published, said and measured until now is of no more interest."""
+        self.daemon.events._lines = 0  # as in the usual hours between two faults
         self.daemon.events._said.clear()  # what was said for the fault before must not count as said
         self.collector.forget()
         self.truth.forget()

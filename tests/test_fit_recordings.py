@@ -125,7 +125,7 @@ def test_a_recording_in_degrees_among_others_is_named(
         f'name = "elbow"\n[[motor]]\ninertia_kg_m2 = {kit.INERTIA}\n[motor.transmission]\nmodel = "linear"\n'
     )
     paths = [str(tmp_path / f"{name}.csv") for name in ("right", "wrong")]
-    assert main(["fit", *paths, "--joint", str(joint)]) == 3
+    assert main(["fit", *paths, "--joint", str(joint), "--strict"]) == 3
     error = capsys.readouterr().err
     assert "wrong.csv" in error
     assert "right.csv" not in error

@@ -86,6 +86,12 @@ class MapFollower:
             if number - before < self._silent // _LOOKS:
                 continue
             self._numbers[node] = number
+            if number - before >= self._silent:  # nobody was heard, SYNC included: a clock that was set
+                self._heard[node] = (
+                    assembler.counters[node].received + assembler.counters[node].ignored,
+                    number,
+                )
+                continue
             used, last = self._heard[node]
             counters = assembler.counters[node]
             received = counters.received + counters.ignored

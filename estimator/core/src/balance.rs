@@ -184,7 +184,7 @@ impl Balance {
         }
         let columns = self.curve_columns(phi);
         for (channel, value) in self.curve.iter_mut().zip(columns) {
-            channel.smooth(filters, value);
+            smooth(channel, filters, value);
         }
         let rate = self.position.light[1];
         let u = self.unit(link.light[0] - self.position.light[0]);
@@ -199,7 +199,7 @@ impl Balance {
         let now =
             [sign, (rate / (SOFTER * speed)).tanh(), u.abs() * sign, -u * u * link.light[1], -a, -b, -c];
         for (formed, value) in self.formed.iter_mut().zip(now) {
-            formed.pass(filters, value);
+            pass(formed, filters, value);
         }
     }
 
@@ -278,6 +278,18 @@ impl Default for Balance {
     fn default() -> Balance {
         Balance::new()
     }
+}
+
+/// One channel: a call, not a copy of the filters for each column.
+#[inline(never)]
+fn smooth(channel: &mut Channel, filters: &Filters, now: f64) {
+    channel.smooth(filters, now);
+}
+
+/// One formed signal, likewise.
+#[inline(never)]
+fn pass(formed: &mut Formed, filters: &Filters, now: f64) {
+    formed.pass(filters, now);
 }
 
 /// Rows that the filters make of one independent error: the length of their impulse response over a period.

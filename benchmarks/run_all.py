@@ -61,6 +61,7 @@ SECTIONS = {
     "paper_table": Section("The paper's table", text=True),
     "sensitivity": Section("Sensitivity", text=True),
     "ensembles": Section("The estimator on random joints", quick="--joints 1"),
+    "undeclared": Section("Effects that nobody declared, on an independent simulator", quick="--joints 1"),
     "ekf": Section("An extended Kalman filter beside ours", "--joints 6", "--joints 1 --cases linear"),
     "diagnosis_seeds": Section(
         "Diagnosis on published seeds",

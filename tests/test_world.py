@@ -1,0 +1,107 @@
+"""benchmarks/world.c, the independent joint in C, beside another integrator and closed forms."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import joints
+import numpy as np
+import pytest
+
+SOURCE = Path(__file__).parent.parent / "benchmarks" / "world.c"
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    """Run the program: (return code, columns by name, what it says of an error)."""
+    if shutil.which("cc") is None:
+        pytest.skip("no C compiler (cc)")
+    program = tmp_path_factory.mktemp("world") / "world"
+    flags = ["-O2", "-std=c11", "-Wall", "-Wextra", "-Werror"]
+    subprocess.run(["cc", *flags, "-o", program, SOURCE, "-lm"], check=True)
+
+    def run(*settings):
+        done = subprocess.run([program, *settings], capture_output=True, text=True, check=False)
+        lines = done.stdout.splitlines()
+        if done.returncode:
+            return done.returncode, {}, done.stderr
+        rows = np.array([line.split(",") for line in lines[1:]], float).T
+        return 0, dict(zip(lines[0].split(","), rows, strict=True)), done.stderr
+
+    return run
+
+
+EXACT = ("motor_counts=0", "link_bits=0", "seconds=3")
+
+
+def test_the_joint_without_effects_is_that_of_another_integrator(world):
+    _, c, _ = world("spring=cubic", *EXACT)
+    spring = joints.polynomial(np.array([[[150.0, 5000.0]]]))
+    plants = joints.Plants(
+        *spring, *(np.array([[x]]) for x in (0.12, 0.8)), *map(np.array, ([0.45], [0.5], [3.0]))
+    )
+    truth = joints.simulate(plants, c["motor1_torque_nm"][:, None, None], 1e-3)
+    for name, expected in (
+        ("motor1_position_rad", truth.theta),
+        ("link_position_rad", truth.q),
+        ("true_flexibility_torque_nm", truth.tau_e),
+        ("true_stiffness_nm_rad", truth.sigma),
+    ):
+        assert np.allclose(c[name], expected.ravel(), rtol=1e-8, atol=1e-8), name
+
+
+def test_each_effect_leaves_in_the_balance_of_the_motor_what_it_is(world):
+    """B θ" + D θ' - τ_e - τ from differences of the columns, at the middle of each period."""
+
+    def loss(*settings):
+        _, c, _ = world("torque_noise=0", *EXACT, *settings)
+        theta, carried = c["motor1_position_rad"], c["true_flexibility_torque_nm"]
+        speed = np.gradient(theta, 1e-3)
+        held = (c["motor1_torque_nm"][1:-1] + c["motor1_torque_nm"][:-2]) / 2
+        left = 0.12 * np.diff(theta, 2) / 1e-6 + 0.8 * speed[1:-1] - carried[1:-1] - held
+        return left[100:], speed[101:-1], carried[101:-1], theta[101:-1]
+
+    left, speed, carried, _ = loss("gear_loss=0.1")
+    fast = np.abs(speed) > 0.05
+    assert np.allclose(left[fast], -0.1 * np.abs(carried[fast]) * np.sign(speed[fast]), atol=0.01)
+    left, speed, _, _ = loss("friction=lugre", "coulomb=0.3")
+    fast = np.abs(speed) > 0.4
+    assert np.median(np.abs(left[fast] + 0.3 * np.sign(speed[fast]))) < 0.01
+    left, _, _, theta = loss("cogging=0.2")
+    assert np.allclose(left, -0.2 * np.sin(32 * theta), atol=0.01)
+
+
+def test_hysteresis_is_a_loop_of_its_amplitude_and_a_gap_carries_nothing(world):
+    for law in ("dahl", "bouc-wen"):
+        _, c, _ = world(f"hysteresis={law}", "hysteresis_torque=0.4", *EXACT)
+        memory = c["true_flexibility_torque_nm"] - c["true_spring_torque_nm"]
+        assert 0.35 < memory.max() <= 0.4 + 1e-9
+        assert -0.4 - 1e-9 <= memory.min() < -0.35
+    _, c, _ = world("backlash=0.01", *EXACT)
+    phi = c["link_position_rad"] - c["motor1_position_rad"]
+    assert np.all(np.abs(c["true_spring_torque_nm"][np.abs(phi) < 2e-3]) < 0.1)
+    far = np.abs(phi) > 0.03
+    assert np.allclose(np.abs(c["true_spring_torque_nm"])[far], 150 * (np.abs(phi)[far] - 0.01), rtol=0.03)
+
+
+@pytest.mark.parametrize("motion", ["multisine", "point-to-point", "hand-guided", "pushes", "harmonic"])
+def test_every_motion_moves_the_joint_and_pushes_only_where_somebody_pushes(world, motion):
+    _, c, _ = world(f"motion={motion}", "size=1", "top_hz=1", "link_delay=0.003")
+    assert np.ptp(c["motor1_position_rad"]) > 0.05
+    assert bool(np.any(c["true_external_torque_nm"])) == (motion in ("hand-guided", "pushes"))
+
+
+@pytest.mark.parametrize(
+    ("setting", "says"),
+    [
+        ("friktion=lugre", "expected NAME=VALUE"),
+        ("friction=wet", "lugre"),
+        ("seed=x", "a number"),
+        ("period=0", "above 0"),
+    ],
+)
+def test_a_wrong_setting_is_one_line(world, setting, says):
+    code, _, error = world(setting)
+    assert code == 2
+    assert says in error
+    assert error.count("\n") == 1

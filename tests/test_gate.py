@@ -77,8 +77,14 @@ def test_a_healthy_joint_passes(kind: str, seeds: range) -> None:
 def test_each_fault_is_named(kind: str) -> None:
     drawn = gatekit.draw(kind, 0, effects=False, seconds=6.0)
     for name, factors in gatekit.faults(drawn).items():
-        findings = examine(gatekit.faulty(drawn.record, factors), drawn.model)
-        assert named(findings, factors), (kind, name, findings)
+        judgement = judge(gatekit.faulty(drawn.record, factors), drawn.model)
+        if (kind, name) == (
+            "serial",
+            "link in degrees",
+        ):  # curves of motor and link explain as much: odds of 200
+            assert judgement.findings == () and "the unit of the link position" in judgement.remark
+        else:
+            assert named(list(judgement.findings), factors), (kind, name, judgement)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +97,9 @@ def test_a_rich_motion_decides_every_sign_and_the_unit_of_the_link(kind: str) ->
     ]
     for judgement in judgements:
         assert judgement.reason == "" and judgement.left < 0.3
-        assert not any("sign" in text and "link" in text for text in judgement.undecided), judgement.undecided
+        open_ = " ".join(judgement.undecided)
+        assert "link position" not in open_, judgement
+        assert "deflection" not in open_ or kind == "stiff", judgement  # it deflects too little to tell
 
 
 def test_the_sign_of_a_link_that_is_held_is_reported_as_undecided() -> None:

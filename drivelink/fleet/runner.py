@@ -111,13 +111,14 @@ def run(
         wanted = [source for source in sources if _wanted(source, joints, table, settings, counts)]
         if not wanted:
             return counts
-        with _interruptible(), _client(settings, len(wanted)) as client:
+        with _interruptible() as go_on, _client(settings, len(wanted)) as client:
             shared = client.submit(Joints, joints.by_name, pure=False)
             before = _previous(sources, joints, shared, client) if settings.validate == "previous" else {}
             tasks = (_task(source, before.get(source.url), table, settings) for source in wanted)
             for task, outcome in _results(client, tasks, shared):
                 _take(task, outcome, table, store, counts, say)
                 progress(counts)
+                go_on()
     return counts
 
 
@@ -345,18 +346,33 @@ def _identified(source: Source, joints: Joints) -> tuple[str, tuple[str | None, 
 
 
 @contextmanager
-def _interruptible() -> Iterator[None]:
-    """SIGTERM ends a run as Ctrl-C does."""
+def _interruptible() -> Iterator[Callable[[], None]]:
+    """End a run by SIGTERM as by Ctrl-C.
+
+    Yields:
+        A check that raises KeyboardInterrupt where a finaliser has discarded that of a signal.
+    """
+    stopped = False
 
     def stop(number: int, frame: FrameType | None) -> None:
+        nonlocal stopped
+        stopped = True
         raise KeyboardInterrupt
 
+    def go_on() -> None:
+        if stopped:
+            raise KeyboardInterrupt
+
+    before = {}
     try:
-        before = signal.signal(signal.SIGTERM, stop)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if signal.getsignal(number) != signal.SIG_IGN:
+                before[number] = signal.signal(number, stop)
     except ValueError:  # not in the main thread
-        yield
+        yield go_on
         return
     try:
-        yield
+        yield go_on
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

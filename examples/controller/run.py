@@ -1,64 +1,118 @@
-"""The controller as a process: estimates over zenoh, torque over CAN.
+"""The controller as a process: estimates over zenoh in, torque over CAN out.
 
     drivelink sim examples/controller/joint.toml &      # or real drives
     drivelink run examples/controller/joint.toml &      # the daemon
     python examples/controller/run.py examples/controller/joint.toml
 
-Each change of phase is one line of JSON on stdout. Ctrl-C takes the torque away and ends it.
+Each change of phase is one line of JSON. Ctrl-C takes the torque away and ends it.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import signal
 import sys
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
-from vsacontrol.controller import Controller
-from vsacontrol.laws import ControlLaw, Decoupler, Regulator
-from vsacontrol.phases import Reaction, Settings
-from vsacontrol.plant import joint_of
-from vsacontrol.process import Process
-from vsacontrol.references import WAYPOINTS, Reference
+import can
+import canopen
+import zenoh
+from controller import NO_TORQUE, Controller, Cycle, Settings
+from drives import Master
 
 from drivelink import jointfile
+from drivelink.canopen.bus import open_bus
 from drivelink.cycle import realtime
+from drivelink.errors import ZenohError
+from drivelink.pubsub.client import Subscription, subscribe
+from drivelink.pubsub.session import close_session, open_client
+from drivelink.pubsub.wire import decode_sample
+from estimator.sample import Sample
+
+WAIT_S = 0.002  # for an estimate, before the dead man looks again
+BUSY_S = 0.1  # while estimates are older, the daemon may be busy with the nodes: nothing is set up
 
 
-def arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    default = Settings()
-    parser.add_argument("joint", type=Path, metavar="JOINT")
-    parser.add_argument("--law", choices=[*WAYPOINTS], default="decoupling")
-    parser.add_argument("--seconds", type=float, help="end after so long; else the last target is held")
-    parser.add_argument("--deadline", type=float, default=default.deadline_s, help="dead-man, s")
-    parser.add_argument("--identify", type=float, default=default.identify_s, help="identification, s")
-    parser.add_argument("--torque", type=float, default=default.torque_nm, help="limit, N·m at the joint")
-    parser.add_argument(
-        "--reaction", type=Reaction, choices=[*Reaction], default=default.reaction, help="to a contact"
-    )
-    return parser.parse_args()
+class Process:
+    """Controller, drives and estimates, until `done`."""
+
+    def __init__(self, controller: Controller, master: Master, estimates: Subscription, samples: Any) -> None:
+        self.controller, self.master, self.estimates, self.samples = controller, master, estimates, samples
+        self._sample: Sample | None = None
+
+    def run(self, done: Callable[[], bool]) -> None:
+        """Control until `done`, and leave the drives without torque."""
+        try:
+            while not done():
+                self.once()
+        finally:
+            with suppress(can.CanError, OSError):
+                self.master.release()
+
+    def once(self) -> None:
+        """Take what has arrived, and command."""
+        estimate = self.estimates.wait(WAIT_S)
+        while (message := self.samples.try_recv()) is not None:
+            with suppress(ZenohError):
+                self._sample = decode_sample(message.payload.to_bytes()).sample
+        now_s, age_s = time.monotonic(), self.estimates.age_s
+        if self.estimates.status:
+            self.controller.set_springs(self.estimates.status.get("transmissions", ()))
+        cycle = None
+        if estimate is not None and self._sample is not None:
+            cycle = Cycle(estimate, self._sample, self.estimates.external, age_s)
+        torques = self.controller.step(now_s, cycle, enabled=self.master.enabled, faulted=self.master.faulted)
+        with suppress(can.CanError, OSError):  # without a bus estimates get stale, which ends the torque
+            self.master.command(torques, now_s)
+            if age_s < BUSY_S and torques == NO_TORQUE:
+                self.master.set_up(now_s)
 
 
 def main() -> None:
-    args = arguments()
-    file = jointfile.load(args.joint)
-    joint = joint_of(file)
-    law: ControlLaw = Decoupler(joint=joint) if args.law == "decoupling" else Regulator(joint=joint)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    default = Settings()
+    parser.add_argument("joint", type=Path, metavar="JOINT")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="end after so long")
+    parser.add_argument("--deadline", type=float, default=default.deadline_s, help="dead man, s")
+    parser.add_argument("--identify", type=float, default=default.identify_s, help="identification, s")
+    parser.add_argument("--torque", type=float, default=default.torque_nm, help="limit, N·m at the joint")
+    parser.add_argument("--reaction", choices=["stop", "retract", "soften"], default=default.reaction)
+    args = parser.parse_args()
+    joint = jointfile.load(args.joint)
+    if joint.arrangement != "antagonistic" or joint.link.dynamics is None:
+        parser.error(f'{args.joint}: expected arrangement = "antagonistic" and [link.dynamics]')
     settings = Settings(
         deadline_s=args.deadline, identify_s=args.identify, torque_nm=args.torque, reaction=args.reaction
     )
-    reference = Reference(WAYPOINTS[args.law])
-    controller = Controller(joint, law, reference, file.bus.period_s, settings=settings)
-    process = Process(file, args.joint.parent, controller, settings=settings, report=sys.stdout)
+
+    def report(phase: str, reason: str, age_s: float) -> None:
+        event = {"phase": phase, "reason": reason, "time_s": time.monotonic(), "age_s": round(age_s, 4)}
+        print(json.dumps(event), flush=True)
+
+    stopped: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: process.stop())
-    obtained = realtime.acquire()
-    for line in obtained.lines:
+        signal.signal(number, lambda received, _: stopped.append(received))
+    for line in realtime.acquire().lines:
         print(line, file=sys.stderr)
-    end_s = time.monotonic() + (args.seconds or float("inf"))
-    process.run(lambda: time.monotonic() >= end_s)
+    config = args.joint.parent / joint.zenoh.config if joint.zenoh.config else None
+    session = open_client(joint.zenoh.endpoint, config)
+    key = f"{joint.zenoh.prefix}/{joint.name}/sample"
+    samples = session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
+    network = canopen.Network(open_bus(joint.bus)).connect()
+    end_s = time.monotonic() + args.seconds
+    try:
+        with subscribe(joint.name, prefix=joint.zenoh.prefix, session=session) as estimates:
+            master = Master(network, joint, settings.torque_nm, 10.0 * settings.deadline_s)
+            process = Process(Controller(joint, settings, report), master, estimates, samples)
+            process.run(lambda: bool(stopped) or time.monotonic() >= end_s)
+    finally:
+        network.disconnect()
+        close_session(session)
 
 
 if __name__ == "__main__":

@@ -1,1 +1,0 @@
-"""A controller of a variable-stiffness joint that lives on drivelink's estimates."""

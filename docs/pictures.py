@@ -56,12 +56,20 @@ SVG = """\
 """
 
 
-def terminal(command: tuple[str, ...], seconds: float, title: str, path: Path) -> None:
-    """Run a command in a terminal of 80 by 24 for some seconds, and draw what the terminal then shows."""
-    screen = pyte.Screen(COLUMNS, LINES)
+def terminal(
+    command: tuple[str, ...],
+    seconds: float,
+    title: str,
+    path: Path,
+    *,
+    columns: int = COLUMNS,
+    lines: int = LINES,
+) -> None:
+    """Run a command in a terminal for some seconds, and draw what the terminal then shows."""
+    screen = pyte.Screen(columns, lines)
     stream = pyte.ByteStream(screen)
     master, slave = pty.openpty()
-    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", LINES, COLUMNS, 0, 0))
+    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", lines, columns, 0, 0))
     environment = {k: v for k, v in os.environ.items() if k not in ("NO_COLOR", "COLORTERM", "CI")}
     environment |= {"TERM": "xterm-256color"}
     process = subprocess.Popen(
@@ -71,7 +79,10 @@ def terminal(command: tuple[str, ...], seconds: float, title: str, path: Path) -
     end = time.monotonic() + seconds
     while (left := end - time.monotonic()) > 0 or select.select([master], [], [], PAUSE_S)[0]:
         if select.select([master], [], [], max(left, 0.0))[0]:
-            stream.feed(os.read(master, 65536))
+            try:
+                stream.feed(os.read(master, 65536))
+            except OSError:  # it has ended
+                break
     text = picture(screen)
     process.send_signal(signal.SIGINT)
     while process.poll() is None:
@@ -82,7 +93,7 @@ def terminal(command: tuple[str, ...], seconds: float, title: str, path: Path) -
                 break
     process.wait(timeout=30)
     os.close(master)
-    console = Console(record=True, width=COLUMNS, file=io.StringIO(), force_terminal=True)
+    console = Console(record=True, width=columns, file=io.StringIO(), force_terminal=True)
     console.print(text, end="")
     path.write_text(console.export_svg(title=title, code_format=SVG, unique_id=path.stem), encoding="utf-8")
 
@@ -140,6 +151,12 @@ def demo(_: Path) -> None:
     terminal((*DRIVELINK, "demo", "--seconds", "20"), 17.0, "drivelink demo", PICTURES / "demo.svg")
 
 
+def closed(_: Path) -> None:
+    """`drivelink demo --case friction` in a terminal, at its end."""
+    command = (*DRIVELINK, "demo", "--case", "friction", "--yes")
+    terminal(command, 120.0, "drivelink demo --case friction", PICTURES / "loop.svg", columns=110, lines=64)
+
+
 def views(_: Path) -> None:
     """`drivelink monitor` in the terminal and in the browser, beside a demo."""
     with (
@@ -162,7 +179,7 @@ def loop(folder: Path) -> None:
     pages(f"file://{folder}/report.html", "report", "figure")
 
 
-DRAWN: dict[str, Callable[[Path], None]] = {"demo": demo, "views": views, "loop": loop}
+DRAWN: dict[str, Callable[[Path], None]] = {"demo": demo, "closed": closed, "views": views, "loop": loop}
 
 
 def main() -> None:

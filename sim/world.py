@@ -121,6 +121,11 @@ class World:
         self._latch()
 
     @property
+    def declared(self) -> JointPlant:
+        """Its physics without the effects."""
+        return self._declared
+
+    @property
     def time_s(self) -> float:
         """t_k of the present sampling instant."""
         return self._tick * self.period_s

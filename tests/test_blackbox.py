@@ -17,8 +17,9 @@ from test_cli_run import free_port, process
 from test_recording_recorder import joint_file
 
 from drivelink import cli, jointfile
+from drivelink.loop.blackbox import AFTER_S, BlackBox
+from drivelink.loop.folder import drop_oldest, event_of, kept
 from drivelink.pubsub.wire import EstimateMessage
-from drivelink.recording.blackbox import AFTER_S, BlackBox, drop_oldest
 from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import read_messages
 from drivelink.recording.mcapsamples import recorded_cycles
@@ -37,10 +38,8 @@ class Scene:
             f'[bus]\nperiod_s = {PERIOD_S}\n[recording]\nfolder = "kept"\nkeep_s = {keep_s}\n{more}'
         )
         self.cycle = 0
-        self.made: list[tuple[Path, str]] = []
-        self.box = BlackBox(
-            jointfile.load_text(path), lambda *made: self.made.append(made), lambda: self.cycle * PERIOD_S
-        )
+        self.path = path
+        self.box = BlackBox(jointfile.load_text(path), lambda: self.cycle * PERIOD_S)
 
     def sample(self, number: int) -> Sample:
         return Sample(number, (0.1 * number / 3.0,), (number / 7.0,), (1.0 / (number + 1),), number / 9.0)
@@ -59,7 +58,7 @@ class Scene:
 
     def finish(self) -> list[tuple[Path, str]]:
         self.box.close()
-        return self.made
+        return [(path, event_of(path).cause) for path in kept(self.path.parent / "kept", "elbow")]
 
 
 def test_an_alarm_keeps_the_time_before_and_after_it_bit_for_bit(tmp_path: Path) -> None:

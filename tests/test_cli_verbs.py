@@ -74,6 +74,8 @@ def test_every_verb_that_uses_a_bus_takes_it_by_option(
         (["monitor", "--web", "--json"], 2, "expected either --web or --json"),
         (["record", "none.toml", "--out", "a.csv"], 2, "none.toml: cannot be read"),
         (["keep", "none.toml"], 2, "none.toml: cannot be read"),
+        (["accept", "none.toml"], 2, "none.toml: cannot be read"),
+        (["monitor", "elbow", "--allow-accept"], 2, "--allow-accept: expected --web and the joint file"),
         (["replay", "none.csv"], 3, "none.csv"),
         (["fit", "none.csv"], 3, "none.csv"),
         (["diagnose", "none.csv"], 3, "none.csv"),
@@ -108,6 +110,7 @@ def test_an_unknown_option_prints_the_usage_of_its_own_verb(
 ) -> None:
     positional = {
         "run": ["a"], "sim": ["a"], "record": ["a", "--out", "b.csv"], "keep": ["a"], "replay": ["a"], "fit": ["a"],
+            "accept": ["a"],
         "diagnose": ["a"], "fleet": ["a"], "service": ["install", "a"], "completion": ["bash"],
     }  # fmt: skip
     with pytest.raises(SystemExit) as ended:

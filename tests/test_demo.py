@@ -17,6 +17,7 @@ from zenohkit import LIMIT_S, until
 from drivelink import jointfile
 from drivelink.cycle.loop import ObjectSink
 from drivelink.daemon.service import Daemon, ServedJoint
+from drivelink.demo.closedloop import CASES, STEPS
 from drivelink.demo.closing import as_json, closing_table
 from drivelink.demo.comparison import Comparison
 from drivelink.demo.rig import RunSummary
@@ -138,6 +139,22 @@ def test_the_demo_finds_the_stiffness_it_does_not_know(case: str) -> None:
     assert result["case"] == case
     assert result["stiffness_error_relative"] < 0.03
     assert result["flexibility_torque_error_relative"] < 0.03
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", list(CASES))
+def test_the_loop_closes_on_what_nobody_declared(case: str) -> None:
+    # Three processes: joint and daemon, black box with its diagnoses, the one that watches and accepts.
+    done = subprocess.run(
+        [*DEMO, "--case", case, "--yes", "--json"], capture_output=True, text=True, timeout=240
+    )
+    result = json.loads(done.stdout)
+    assert done.returncode == 0, done.stderr
+    for one in result["parameters"].values():
+        assert abs(one["found"] - one["truth"]) < 4.0 * one["std"] < abs(one["truth"])
+    assert result["error"]["after_rms_nm"] < 0.25 * result["error"]["before_rms_nm"]
+    steps = [result[f"{step}_s"] for step in STEPS]
+    assert steps == sorted(steps) and "Traceback" not in done.stderr
 
 
 @pytest.mark.slow

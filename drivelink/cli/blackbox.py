@@ -19,38 +19,66 @@ from drivelink.cli import add_bus, moved
 from drivelink.cli.record import add_taps
 from drivelink.errors import BusError, DrivelinkError
 from drivelink.jointfile import JointFile
-from drivelink.recording.blackbox import BlackBox
+from drivelink.loop.blackbox import BlackBox
+from drivelink.loop.folder import folder_of
+from drivelink.loop.queue import Diagnoses
 from drivelink.recording.recorder import BusTap, Recorder
 
 _LOG = logging.getLogger("drivelink.recording")
 _NICE = 5  # the daemon goes first
 _END_S = 60.0  # in which it writes what is pending
+_AGAIN_S = 5.0  # after which one that was killed is started again
 
 
 @contextmanager
-def black_box(joint: JointFile, path: Path | None) -> Iterator[None]:
+def black_box(joint: JointFile, path: Path | None, *, quiet: bool = False) -> Iterator[None]:
     """The black box of a joint in a process, if its joint file asks for one; it ends with this process.
 
     Args:
         joint: with the bus in use.
         path: its joint file.
+        quiet: say nothing on stderr.
     """
     if joint.recording.folder is None or path is None:
         yield
         return
     where = ["--interface", joint.bus.interface, "--channel", joint.bus.channel]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "drivelink.cli.blackbox", str(path), *where],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
+    command = [sys.executable, "-m", "drivelink.cli.blackbox", str(path), *where]
+    ended, running = threading.Event(), [_start(command, quiet=quiet)]
+    keeper = threading.Thread(
+        target=_keep_running, args=(command, joint.name, running, ended, quiet), daemon=True
     )
+    keeper.start()
     try:
         yield
     finally:
+        ended.set()
+        keeper.join()
+        process = running[-1]
         try:
             process.communicate(timeout=_END_S)
         except subprocess.TimeoutExpired:
             process.kill()
+
+
+def _start(command: list[str], *, quiet: bool) -> subprocess.Popen[bytes]:
+    says = subprocess.DEVNULL if quiet else None
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=says)
+
+
+def _keep_running(
+    command: list[str],
+    joint: str,
+    running: list[subprocess.Popen[bytes]],
+    ended: threading.Event,
+    quiet: bool,
+) -> None:
+    """Start a black box that was killed again; one that ends by itself has said why."""
+    while not ended.wait(_AGAIN_S):
+        status = running[-1].poll()
+        if status is not None and status < 0:
+            _LOG.error("%s: the black box ended with signal %d: started again, empty", joint, -status)
+            running.append(_start(command, quiet=quiet))
 
 
 def main() -> int:
@@ -83,11 +111,13 @@ def _serve(source: jointfile.JointText, ended: threading.Event) -> None:
     joint = source.joint
     with ExitStack() as stack:
         box = BlackBox(source)
+        diagnoses = Diagnoses(folder_of(source), joint.name)
+        stack.callback(diagnoses.close)
         recorder = stack.enter_context(Recorder(box, []))
         add_taps(recorder, "auto", source, stack)
         while not ended.is_set():
             try:
-                recorder.run(ended.is_set)
+                recorder.run(ended.is_set, diagnoses.step)
             except BusError as error:
                 _LOG.error("%s: the black box goes on without raw CAN: %s", joint.name, error)
                 recorder.taps = [tap for tap in recorder.taps if not isinstance(tap, BusTap)]

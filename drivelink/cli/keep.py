@@ -9,7 +9,8 @@ from pathlib import Path
 
 from drivelink import jointfile
 from drivelink.errors import RecordingError
-from drivelink.recording.blackbox import AFTER_S, wish_of
+from drivelink.loop.blackbox import AFTER_S
+from drivelink.loop.folder import wish_of
 
 EPILOG = """\
 The daemon of a joint file with a folder in [recording] keeps the last minute in memory. On an alarm, a

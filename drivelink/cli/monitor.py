@@ -19,6 +19,7 @@ from drivelink.monitor.statuslines import shape
 from drivelink.monitor.view import joints_table
 from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.web import WebView, document
+from drivelink.monitor.webaccept import WebAcceptance
 from drivelink.pubsub.clientbase import ENDPOINT
 from drivelink.pubsub.session import close_session, open_client
 
@@ -52,6 +53,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="interval of the plain lines (default: %(default)s)",
     )
+    parser.add_argument(
+        "--allow-accept",
+        action="store_true",
+        help="with --web and a joint file: the page may accept a finding into it, and undo that",
+    )
     parser.add_argument("--endpoint", help=f"where a daemon or router listens (default {ENDPOINT})")
     parser.add_argument("--config", type=Path, help="zenoh configuration file (JSON5) instead")
     parser.add_argument("--prefix", help='first part of every key (default "drivelink")')
@@ -66,6 +72,11 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--port: expected 0 to 65535, got {args.port}")
     if args.web and args.json:
         raise UsageError("expected either --web or --json")
+    acceptance = None
+    if args.allow_accept:
+        if not args.web or args.joint is None or not _is_file(args.joint):
+            raise UsageError("--allow-accept: expected --web and the joint file that may be changed")
+        acceptance = WebAcceptance(Path(args.joint))
     name, endpoint, config, prefix = _where(args)
     session = open_client(endpoint, config)
     try:
@@ -73,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
         end = time.monotonic() + args.seconds if args.seconds else float("inf")
         try:
             if args.web:
-                _serve(watcher, args.port, end)
+                _serve(watcher, args.port, end, acceptance)
             elif sys.stdout.isatty() and not args.json:
                 _show(watcher, end, f"{prefix}/{name or '*'} at {config or endpoint}")
             else:
@@ -90,12 +101,17 @@ def run(args: argparse.Namespace) -> int:
 def _where(args: argparse.Namespace) -> tuple[str | None, str, Path | None, str]:
     """Joint, endpoint, configuration and prefix, from options and joint file."""
     name, endpoint, config, prefix = args.joint, ENDPOINT, None, "drivelink"
-    if name is not None and (name.endswith(".toml") or "/" in name):
+    if name is not None and _is_file(name):
         path = Path(name)
         joint = jointfile.load(path)
         name, endpoint, prefix = joint.name, joint.zenoh.endpoint, joint.zenoh.prefix
         config = path.absolute().parent / joint.zenoh.config if joint.zenoh.config else None
     return name, args.endpoint or endpoint, args.config or config, args.prefix or prefix
+
+
+def _is_file(name: str) -> bool:
+    """Whether a joint is named by its file."""
+    return name.endswith(".toml") or "/" in name
 
 
 def _show(watcher: Watcher, end: float, where: str) -> None:
@@ -155,9 +171,9 @@ def _print(watcher: Watcher, end: float, every_s: float, *, as_json: bool) -> No
         time.sleep(_POLL_S)
 
 
-def _serve(watcher: Watcher, port: int, end: float) -> None:
+def _serve(watcher: Watcher, port: int, end: float, acceptance: WebAcceptance | None) -> None:
     """Serve the page until the end or Ctrl-C."""
-    web = WebView(watcher, port)
+    web = WebView(watcher, port, acceptance)
     print(f"live view: {web.url}   (Ctrl-C ends)", flush=True)
     try:
         while time.monotonic() < end:

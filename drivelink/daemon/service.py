@@ -36,6 +36,7 @@ from drivelink.daemon.supervision import Supervisor
 from drivelink.daemon.systemd_notify import Watchdog, notify, watchdog_period_s
 from drivelink.errors import UsageError
 from drivelink.jointfile import JointFile
+from drivelink.loop.feed import FindingFeed
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_session
 
@@ -45,6 +46,7 @@ _STATUS_S = 0.25
 _CHECK_S = 0.1
 _ANSWER_S = 0.05
 _FILE_S = 0.2
+_FINDING_S = 1.0
 _COLLECT_S = 5.0
 
 
@@ -262,6 +264,11 @@ class Daemon:
             if publisher is not None:
                 housekeeping.every(_STATUS_S, partial(_put_status, publisher, status))
                 housekeeping.every(_ANSWER_S, publisher.answer)
+        for served, publisher in zip(self._joints, self._publishers, strict=True):
+            kept = served.joint.recording.folder
+            if publisher is not None and kept is not None:
+                feed = FindingFeed(served.folder / kept, served.joint.name, publisher.put_finding)
+                housekeeping.every(_FINDING_S, feed.check)
         for reloader in self._reloaders:
             housekeeping.urgent.append(reloader.step)
             housekeeping.every(_FILE_S, reloader.check)

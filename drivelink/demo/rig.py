@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import logging
 import signal
+from collections.abc import Mapping
 from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 from drivelink import jointfile
@@ -19,7 +21,7 @@ from drivelink._core import Tick
 from drivelink.cycle.loop import CycleSink
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simbus import open_sim_bus
-from drivelink.demo.simulate import World, network_from_joint, world_from_joint
+from drivelink.demo.simulate import World, alter, network_from_joint, world_from_joint
 from drivelink.errors import DrivelinkError
 from drivelink.monitor.history import TruePoint
 
@@ -37,6 +39,26 @@ class RunSummary(NamedTuple):
     text: str
 
 
+class Change(NamedTuple):
+    """What becomes of the simulated joint in the middle of the run, undeclared.
+
+    Attributes:
+        after_s: of the run.
+        effects: that it then has, as `sim --effect` takes them.
+        parameters: that it then has, as `[sim] parameters`.
+    """
+
+    after_s: float
+    effects: tuple[str, ...] = ()
+    parameters: Mapping[str, float] = MappingProxyType({})
+
+
+class Changed(NamedTuple):
+    """The joint is another one since this SYNC."""
+
+    stamp_ns: int
+
+
 class Failure(NamedTuple):
     """Why the run failed, in one line."""
 
@@ -47,16 +69,25 @@ class Failure(NamedTuple):
 class TruthTap:
     """Publishes like the daemon's publisher, and notes the truth at the same SYNC."""
 
-    def __init__(self, sink: CycleSink | None, world: World, connection: Connection) -> None:
+    def __init__(
+        self, sink: CycleSink | None, world: World, connection: Connection, change: Change | None
+    ) -> None:
         self._sink = sink
         self._world = world
         self._connection = connection
+        self._change = change
         self._points: list[TruePoint] = []
 
     def put(self, tick: Tick) -> None:
         """Publish, then note the truth: the world stands still until the next SYNC."""
         if self._sink is not None:
             self._sink.put(tick)
+        change = self._change
+        if change is not None and self._world.time_s >= change.after_s:
+            self._change = None
+            alter(self._world, change.effects, change.parameters)
+            self.flush()
+            self._send(Changed(tick.stamp_ns))
         truth = self._world.truth()
         self._points.append(TruePoint(tick.sequence, truth.flexibility_torque_nm, truth.stiffness_nm_rad))
         if len(self._points) >= _BATCH:
@@ -65,23 +96,27 @@ class TruthTap:
     def flush(self) -> None:
         """Send the noted truth."""
         points, self._points = self._points, []
+        self._send(points)
+
+    def _send(self, message: list[TruePoint] | Changed) -> None:
         with suppress(OSError):  # the watcher has gone; end cleanly
-            self._connection.send(points)
+            self._connection.send(message)
 
 
-def serve(path: Path, seconds: float | None, connection: Connection) -> None:
+def serve(path: Path, seconds: float | None, connection: Connection, change: Change | None = None) -> None:
     """Run simulation and daemon, and send the watcher `TruePoint` batches, then a `RunSummary` or `Failure`.
 
     Args:
         path: joint file with a `[sim]` section, on the virtual bus.
         seconds: of the run; None: until SIGTERM.
         connection: to the watcher.
+        change: of the joint in the middle of the run.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; the watcher decides
     logging.getLogger("drivelink").propagate = False  # the watcher's view shows the daemon's events
     logging.getLogger("drivelink").addHandler(logging.NullHandler())
     try:
-        summary: RunSummary | Failure = _run(path, seconds, connection)
+        summary: RunSummary | Failure = _run(path, seconds, connection, change)
     except DrivelinkError as error:
         summary = Failure(str(error), error.exit_status)
     with suppress(OSError):
@@ -89,7 +124,7 @@ def serve(path: Path, seconds: float | None, connection: Connection) -> None:
         connection.close()
 
 
-def _run(path: Path, seconds: float | None, connection: Connection) -> RunSummary:
+def _run(path: Path, seconds: float | None, connection: Connection, change: Change | None) -> RunSummary:
     joint = jointfile.load(path)
     world = world_from_joint(joint)
     bus = open_sim_bus(joint.bus)
@@ -98,7 +133,7 @@ def _run(path: Path, seconds: float | None, connection: Connection) -> RunSummar
         with Daemon([ServedJoint(joint=joint, path=path)], devices=network.poll) as daemon:
             signal.signal(signal.SIGTERM, lambda *_: daemon.stop())
             (loop_joint,) = daemon.loop.loop_joints
-            tap = TruthTap(loop_joint.sink, world, connection)
+            tap = TruthTap(loop_joint.sink, world, connection, change)
             loop_joint.sink = tap
             daemon.run(seconds)
             tap.flush()

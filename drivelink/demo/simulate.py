@@ -98,6 +98,20 @@ def world_from_joint(
         raise JointFileError(f"{file or joint.name}: sim: {error}") from error
 
 
+def alter(world: World, effects: Sequence[str], parameters: Mapping[str, float]) -> None:
+    """Make a world another one from now on.
+
+    Args:
+        world: at motion.
+        effects: all that it then has, "NAME=VALUE".
+        parameters: that it then has, as `[sim] parameters`.
+
+    Raises:
+        UsageError: an effect that does not exist.
+    """
+    world.alter(plant=with_parameters(world.declared, parameters), effects=_asked(effects))
+
+
 def assumptions(joint: JointFile) -> list[str]:
     """Assumed values that the joint file does not declare, one line each."""
     if joint.sim is not None and joint.sim.case is not None:

@@ -8,6 +8,7 @@ from drivelink.jointfile.document import load as load
 from drivelink.jointfile.document import load_text as load_text
 from drivelink.jointfile.document import parse as parse
 from drivelink.jointfile.document import plain_parameters as plain_parameters
+from drivelink.jointfile.document import without_check as without_check
 from drivelink.jointfile.document import write_model as write_model
 from drivelink.jointfile.schema import BusSection as BusSection
 from drivelink.jointfile.schema import DriveSection as DriveSection

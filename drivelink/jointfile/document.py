@@ -146,7 +146,7 @@ def write_model(
     Raises:
         JointFileError: the result is invalid, or the target cannot be written.
     """
-    document = tomlkit.parse(_unchecked(source.text))
+    document = tomlkit.parse(without_check(source.text))
     _merge(document, changes)
     text = _checked(tomlkit.dumps(document))
     joint = parse(text, str(target))
@@ -168,8 +168,8 @@ def _checked(text: str) -> str:
     return f"{text}# drivelink check: sha256 {_digest(text)}\n"
 
 
-def _unchecked(text: str) -> str:
-    """The text without first and check line."""
+def without_check(text: str) -> str:
+    """The text of a joint file without the first and the check line that drivelink writes."""
     return _CHECK.sub("", text).replace(f"{_MARK}\n", "", 1)
 
 

@@ -31,6 +31,11 @@ class Keys:
         if self._before is not None:
             termios.tcsetattr(self._terminal, termios.TCSADRAIN, self._before)
 
+    @property
+    def there(self) -> bool:
+        """Whether there is a terminal."""
+        return self._before is not None
+
     def pressed(self) -> str:
         """The keys pressed since the last call; an arrow or function key gives several characters."""
         if self._before is None or not select.select([self._terminal], [], [], 0)[0]:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 from rich.text import Text
 
+from drivelink.loop import finding as findings
 from drivelink.monitor.braille import gauge, number
 from drivelink.plaintext import clean_text
 
@@ -198,11 +199,17 @@ def _improved(model: Mapping[str, Any]) -> tuple[float, float] | None:
     return None if before is None or after is None else (before, after)
 
 
-def status_text(status: Mapping[str, Any], model: Mapping[str, Any] | None = None) -> str:
-    """Cycle, residual and advice as text, as far as the documents contain them."""
+def status_text(
+    status: Mapping[str, Any],
+    model: Mapping[str, Any] | None = None,
+    finding: Mapping[str, Any] | None = None,
+) -> str:
+    """Cycle, residual, advice and finding as text, as far as the documents contain them."""
     shown = shape(status, model)
     why = f"not valid: {shown.not_valid}" if shown.not_valid else ""
-    return " · ".join(p for p in (_cycle(shown), _cpu(shown), _residual(shown), why, shown.advice) if p)
+    found = _text(findings.line(finding or {}))
+    parts = (_cycle(shown), _cpu(shown), _residual(shown), why, shown.advice, found and f"finding: {found}")
+    return " · ".join(part for part in parts if part)
 
 
 def _cpu(shown: Shown) -> str:
@@ -230,8 +237,13 @@ def _residual(shown: Shown) -> str:
     return text
 
 
-def status_lines(status: Mapping[str, Any], width: int, model: Mapping[str, Any] | None = None) -> list[Text]:
-    """At most six lines: cycle, nodes, residual, why not valid, what to do, what is wrong."""
+def status_lines(
+    status: Mapping[str, Any],
+    width: int,
+    model: Mapping[str, Any] | None = None,
+    finding: Mapping[str, Any] | None = None,
+) -> list[Text]:
+    """At most seven lines: cycle, nodes, residual, why not valid, what to do, what is wrong, the finding."""
     if not status:
         return []
     shown = shape(status, model)
@@ -241,6 +253,7 @@ def status_lines(status: Mapping[str, Any], width: int, model: Mapping[str, Any]
         advice = shown.advice if len(shown.advice) + 11 <= width else _SHORT_ADVICE
         lines.append(_line("look here", advice, width, "bold red"))
     lines.append(_line("look here", "; ".join(shown.wrong), width, "bold red"))
+    lines.append(_line("finding", _text(findings.line(finding or {})), width, "bold"))
     return [line for line in lines if line is not None]
 
 

@@ -72,6 +72,7 @@ class JointView:
         history: data of the view.
         status: the joint's status document, or empty.
         model: the model document, or empty.
+        finding: the newest finding, or empty.
         gone: the daemon has ended or died.
         silent_s: time since the last estimate.
         help: show the legend in place of the plots.
@@ -87,6 +88,7 @@ class JointView:
         self.history = JointHistory(seconds)
         self._status: Mapping[str, Any] = {}
         self.model: Mapping[str, Any] = {}
+        self.finding: Mapping[str, Any] = {}
         self.gone = False
         self.silent_s = 0.0
         self.help = False
@@ -155,7 +157,7 @@ class JointView:
         if math.isfinite(stiffness):
             parts[-1] += f", stiffness error {100 * stiffness:.2f} %"
         if self.status and self.live:
-            parts[-1] += f", {status_text(self.status, self.model)}"
+            parts[-1] += f", {status_text(self.status, self.model, self.finding)}"
         return " ".join(parts)
 
     def _external_words(self) -> list[str]:
@@ -171,7 +173,7 @@ class JointView:
         if self.state:
             title.append(f" · {self.state}", style="" if self.live else "bold red")
         numbers = self._numbers(width - 4)
-        below = status_lines(self.status, width - 4, self.model) if self.live else []
+        below = status_lines(self.status, width - 4, self.model, self.finding) if self.live else []
         if self.history.latest is not None:
             below.append(self._flags())
         room = height - 2 - numbers.row_count - len(below) - 1

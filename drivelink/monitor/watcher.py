@@ -66,7 +66,7 @@ class Watcher:
                 (name, session.declare_subscriber(f"{key}/{name}", ring(_QUEUE)))
                 for name in ("estimate", "external")
             ]
-            for name in ("status", "model"):
+            for name in ("status", "model", "finding"):
                 subscriber = zenoh.ext.declare_advanced_subscriber(
                     session, f"{key}/{name}", ring(256), history=history
                 )
@@ -126,6 +126,8 @@ class Watcher:
             joint.view.status = message
         elif kind == "model":
             joint.view.model = message
+        elif kind == "finding":
+            joint.view.finding = message
         elif kind == "external":
             joint.view.update_external(message, message.stamp_ns * 1e-9)
         else:

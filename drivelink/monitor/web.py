@@ -11,22 +11,27 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from typing import Any
 
-from drivelink.errors import UsageError
+from drivelink.errors import UsageError, ZenohError
+from drivelink.loop import finding as findings
 from drivelink.monitor.braille import number
 from drivelink.monitor.history import Moment, Touch
 from drivelink.monitor.statuslines import Shown, shape
 from drivelink.monitor.view import JointView
 from drivelink.monitor.watcher import Watcher
+from drivelink.monitor.webaccept import ACTIONS, WebAcceptance
+from drivelink.pubsub.inbound import decode_document
 
 MAX_CONNECTIONS = 16
 MAX_STREAMS = 8
+_MOST_BODY = 4096  # bytes of a request of the page
+_DETAILS = 16  # lines of a finding
 _PATIENCE_S = 5.0  # timeout of a silent browser
 _EVENT_S = 0.1
 _LOCAL_HOSTS = frozenset({"localhost", "127.0.0.1", "[::1]"})
@@ -43,6 +48,7 @@ class WebView:
     Args:
         watcher: source of the views; polled here.
         port: on loopback; 0: any free one.
+        acceptance: what the page may change; None: nothing.
 
     Attributes:
         url: address of the page.
@@ -51,7 +57,8 @@ class WebView:
         UsageError: the port is taken.
     """
 
-    def __init__(self, watcher: Watcher, port: int = 0) -> None:
+    def __init__(self, watcher: Watcher, port: int = 0, acceptance: WebAcceptance | None = None) -> None:
+        self.acceptance = acceptance
         self._watcher = watcher
         self._lock = threading.Lock()
         self._closing = threading.Event()
@@ -108,6 +115,10 @@ class WebView:
                 name: snapshot(view, name in self._watcher.alive, since)
                 for name, view in sorted(self._watcher.views.items())
             }
+            acceptance = self.acceptance
+            if acceptance is not None and acceptance.joint in joints:
+                joints[acceptance.joint]["trial"] = acceptance.trial(self._watcher.views[acceptance.joint])
+                joints[acceptance.joint]["acceptable"] = True
         return json.dumps({"joints": joints}, allow_nan=False).encode()
 
 
@@ -134,6 +145,7 @@ def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str,
         **_now(view),
         "alive": alive,
         "status": _describe(shape(view.status, view.model)),
+        "finding": _finding(view.finding),
         "restart": last == -math.inf,
         "moments": [_moment(moment) for moment in fresh],
         "residuals": residuals,
@@ -204,6 +216,24 @@ def _describe(shown: Shown) -> dict[str, Any]:
     }
 
 
+def _finding(found: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What the page shows of a finding; None without one."""
+    if not findings.line(found):
+        return None
+    texts = {key: str(found.get(key) or "") for key in ("state", "sentence", "cause", "recording")}
+    error, report = found.get("error"), found.get("report")
+    listed = (found.get("parameters"), report.get("advice") if isinstance(report, Mapping) else None)
+    pair = (
+        [error.get(f"{when}_relative") for when in ("before", "after")] if isinstance(error, Mapping) else []
+    )
+    return {
+        **texts,
+        "since": found.get("since") if isinstance(found.get("since"), float) else None,
+        "details": [str(text) for part in listed if isinstance(part, list) for text in part[:_DETAILS]],
+        "error": pair if all(isinstance(value, float) for value in pair) else [],
+    }
+
+
 class _Server(ThreadingHTTPServer):
     """One thread per connection, with a limit on connections."""
 
@@ -258,15 +288,38 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             self.send_error(HTTPStatus.NOT_FOUND)
 
+    def do_POST(self) -> None:
+        """Answer a request that may change something."""
+        self.close_connection = True
+        acceptance, action = self.web.acceptance, self.path.removeprefix("/")
+        host = self.headers.get("Host") or ""
+        if acceptance is None or action not in ACTIONS:
+            self.send_error(HTTPStatus.NOT_FOUND)
+        elif host.rsplit(":", 1)[0] not in _LOCAL_HOSTS or not acceptance.allows(self.headers):
+            self.send_error(HTTPStatus.FORBIDDEN)
+        else:
+            try:
+                length = int(self.headers.get("Content-Length") or 0)
+                asked = decode_document(self.rfile.read(min(length, _MOST_BODY)))
+            except (ValueError, ZenohError):
+                self.send_error(HTTPStatus.BAD_REQUEST)
+                return
+            self._send("application/json", json.dumps(acceptance.act(action, asked)).encode())
+
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002  (named so in the base class)
         """Say nothing."""
 
     def _page(self) -> None:
         self.close_connection = True
         page = files("drivelink.monitor").joinpath("page.html").read_bytes()
+        token = self.web.acceptance.token if self.web.acceptance is not None else ""
+        self._send("text/html; charset=utf-8", page.replace(b"{{token}}", token.encode()))
+
+    def _send(self, kind: str, page: bytes) -> None:
         self.send_response(HTTPStatus.OK)
-        self.send_header("Content-Type", "text/html; charset=utf-8")
+        self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(page)))
+        self.send_header("Cache-Control", "no-store")
         self.send_header("Content-Security-Policy", _POLICY)
         self.send_header("X-Content-Type-Options", "nosniff")
         self.send_header("Connection", "close")

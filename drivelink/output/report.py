@@ -126,7 +126,7 @@ def sentence(outcome: Diagnosis) -> str:
         f"{outcome.validation.before_relative:.2%} to {outcome.validation.after_relative:.2%}"
     )
     if outcome.verdict == "effect":
-        return f"{_lacks(outcome)}: {fall}."
+        return f"{lacks(outcome)}: {fall}."
     names = " and ".join(title_of(finding) for finding in outcome.effects)
     if outcome.verdict == "unexplained":
         where = outcome.effects[0]
@@ -145,7 +145,7 @@ def sentence(outcome: Diagnosis) -> str:
     )
 
 
-def _lacks(outcome: Diagnosis) -> str:
+def lacks(outcome: Diagnosis) -> str:
     """What is missing, said as surely as it is known."""
     sure = [title_of(f) for f in outcome.effects if f.probability >= _SURE]
     likely = [

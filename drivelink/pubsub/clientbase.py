@@ -77,7 +77,7 @@ class Client:
             name: zenoh.ext.declare_advanced_subscriber(
                 self._session, f"{self.key}/{name}", ring(4), history=history
             )
-            for name in ("status", "model")
+            for name in ("status", "model", "finding")
         }
 
     def _declare_estimates(self, key: str) -> zenoh.Subscriber[Any]:
@@ -221,6 +221,11 @@ class Client:
     def model(self) -> dict[str, Any] | None:
         """The model in use, or None."""
         return self._document("model")
+
+    @property
+    def finding(self) -> dict[str, Any] | None:
+        """What the newest diagnosis of a kept recording found, or None."""
+        return self._document("finding")
 
     def close(self) -> None:
         """Leave; a second time does nothing."""

@@ -26,7 +26,7 @@ _TOO_DEEP = f"document: expected at most {MAX_DEPTH} levels"
 
 
 def decode_document(payload: bytes) -> dict[str, Any]:
-    """Read a JSON document: `status`, `model`.
+    """Read a JSON document: `status`, `model`, `finding`.
 
     Non-finite numbers and integers beyond 64 bits become None.
 
@@ -85,5 +85,6 @@ DECODERS: Mapping[str, Callable[[bytes], Any]] = MappingProxyType(
         "sample": decode_sample,
         "status": decode_document,
         "model": decode_document,
+        "finding": decode_document,
     }
 )

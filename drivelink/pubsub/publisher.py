@@ -1,11 +1,11 @@
 """Publishes one joint on zenoh.
 
 The 1 kHz keys are plain publishers that drop rather than wait: the estimate with real-time priority, the
-sample in a separate queue. `status` and `model` are latched: an advanced subscriber with history and a query
-get the last one at once; `schema` is answered by query. Of the joints of one daemon only the last one's
-messages are express: they flush the queues, so that a cycle of many joints leaves in one batch. Nothing else
-is received: no key changes what the daemon does. Queries wait in zenoh until they are answered in the slack,
-a few at a time; of a flood the oldest are dropped.
+sample in a separate queue. `status`, `model` and `finding` are latched: an advanced subscriber with history
+and a query get the last one at once; `schema` is answered by query. Of the joints of one daemon only the last
+one's messages are express: they flush the queues, so that a cycle of many joints leaves in one batch. Nothing
+else is received: no key changes what the daemon does. Queries wait in zenoh until they are answered in the
+slack, a few at a time; of a flood the oldest are dropped.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class JointPublisher:
             self._estimate = self._stream("estimate", ESTIMATE.schema, zenoh.Priority.REAL_TIME)
             self._external = self._stream("external", EXTERNAL.schema, zenoh.Priority.REAL_TIME)
             self._sample = self._stream("sample", SAMPLE.schema, zenoh.Priority.INTERACTIVE_HIGH)
-            self._latched = {name: self._latch(name) for name in ("status", "model")}
+            self._latched = {name: self._latch(name) for name in ("status", "model", "finding")}
             self._answer("schema", to_json(schema()))
             self.put_joint(joint)
             self._ros2 = self._open_ros2(joint)
@@ -148,6 +148,12 @@ class JointPublisher:
         self.answer()
         if self._ros2 is not None:
             self._ros2.put_status(status, time.time_ns())
+
+    def put_finding(self, finding: Mapping[str, Any]) -> None:
+        """Publish what the newest diagnosis of a kept recording found, on every change."""
+        self._put_document("finding", finding)
+        if self._ros2 is not None:
+            self._ros2.finding = finding
 
     def put_joint(self, joint: JointFile, layouts: Sequence[NodeLayout] = ()) -> None:
         """Publish the model in use, on every change.

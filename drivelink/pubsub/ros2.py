@@ -51,6 +51,7 @@ _FLAGS = (
     ("observable", int(Status.OBSERVABLE)),
     ("model_alarm", int(Status.MODEL_ALARM)),
 )
+_FINDING = ("state", "sentence", "recording", "since", "error")  # of it, in the diagnostics
 _OK, _WARN, _ERROR, _STALE = range(4)  # levels of diagnostic_msgs/DiagnosticStatus
 
 
@@ -231,6 +232,7 @@ class Ros2Publisher:
     Attributes:
         latest: the newest estimate, for diagnostics.
         external: external torque of the cycle to be published next, or None.
+        finding: what the newest diagnosis found, or empty.
 
     Raises:
         ZenohError: zenoh refuses a key.
@@ -271,6 +273,7 @@ class Ros2Publisher:
         self._reported_ns: int | None = None
         self.latest: Estimate | None = None
         self.external: External | None = None
+        self.finding: Mapping[str, Any] = {}
 
     def put_cycle(self, estimate: Estimate, sample: Sample, stamp_ns: int) -> None:
         """Publish one cycle; cheap enough for the loop.
@@ -324,7 +327,10 @@ class Ros2Publisher:
             return
         self._reported_ns = stamp_ns
         level, message = _judge(self.latest.status if self.latest else 0)
-        values = dict(_flat(status))
+        said = {key: self.finding[key] for key in _FINDING if key in self.finding}
+        values = dict(_flat({**status, "finding": said} if said else status))
+        if level != _OK and "sentence" in said:
+            message += f"; {said['sentence']}"
         name = f"drivelink: {self._joint}"
         payload = _diagnostic_array(stamp_ns, level, name, message, self._joint, values)
         self._diagnostics.put(payload, stamp_ns)

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import json
 import logging
-import re
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any, NamedTuple
 
-from drivelink.errors import RecordingError
-from drivelink.jointfile import JointText
+from drivelink.errors import JointFileError, RecordingError
+from drivelink.jointfile import JointText, load_text
+from drivelink.loop.folder import DOUBTS, UNFINISHED, drop_oldest, kept, recording_name, wish_of
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from drivelink.recording.sinks import McapSink, Sink
 from estimator.sample import Sample, Status
@@ -34,12 +33,16 @@ _MASK = sum(int(bit) for bit in _FLAGS)
 
 
 class _Event(NamedTuple):
-    """What is to be kept: its cause, when it came (clock of the box and wall time), its file."""
+    """What is to be kept: its causes, when the first came (clock of the box and wall time)."""
 
-    cause: str
+    causes: list[str]
     at_s: float
     wall: datetime
-    path: Path
+
+    @property
+    def cause(self) -> str:
+        """The leading one: a doubt of the model before anything else."""
+        return next((cause for cause in DOUBTS if cause in self.causes), self.causes[0])
 
 
 class BlackBox(Sink):
@@ -47,7 +50,6 @@ class BlackBox(Sink):
 
     Args:
         text: the joint file; its `[recording]` section has folder and limits.
-        done: called with each recording and its cause, in the writing thread.
         clock: monotonic time, s.
 
     Raises:
@@ -56,14 +58,9 @@ class BlackBox(Sink):
 
     wants = frozenset({"sample", "estimate", "external", "document", "frame"})
 
-    def __init__(
-        self,
-        text: JointText,
-        done: Callable[[Path, str], object] = lambda path, cause: None,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, text: JointText, clock: Callable[[], float] = time.monotonic) -> None:
         self.counts = dict.fromkeys(sorted(self.wants), 0)
-        self._text, self._done, self._clock = text, done, clock
+        self._text, self._clock = text, clock
         self._section = text.joint.recording
         self._wish = wish_of(text)
         self._folder = self._wish.parent
@@ -80,8 +77,10 @@ class BlackBox(Sink):
         self._writer: threading.Thread | None = None
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
+            for left in kept(self._folder, text.joint.name, UNFINISHED):  # by a kill
+                left.unlink()
         except OSError as error:
-            raise RecordingError(f"{self._folder}: cannot be made: {error.strerror}") from error
+            raise RecordingError(f"{self._folder}: cannot be written: {error.strerror}") from error
 
     def sample(self, sample: Sample, stamp_ns: int) -> None:
         """Take what was measured at one SYNC."""
@@ -109,6 +108,7 @@ class BlackBox(Sink):
         self._take("document", name, payload, stamp_ns)
         if name == "model":
             self._model = (name, payload, stamp_ns)
+            self._reread()
             return
         status = json.loads(payload)
         holding = {
@@ -132,26 +132,22 @@ class BlackBox(Sink):
         """Take the mapping document: every recording begins with it."""
         self._mapping = (document, stamp_ns)
 
-    def keep(self, cause: str, *, asked: bool = False) -> Path | None:
-        """Keep the time before now, and what comes after it.
+    def keep(self, cause: str, *, asked: bool = False) -> None:
+        """Keep the time before now, and what comes after it; not if the same cause was kept a moment ago.
 
         Args:
             cause: what has happened.
             asked: by a person: also shortly after the same cause.
-
-        Returns:
-            The file that it will be in; None: the same cause was kept a moment ago.
         """
         now_s = self._clock()
         if self._event is not None:
-            return self._event.path
+            if cause not in self._event.causes:
+                self._event.causes.append(cause)
+            return
         if not asked and now_s - self._last_s.get(cause, -_QUIET_S) < _QUIET_S:
-            return None
+            return
         self._last_s[cause] = now_s
-        wall = datetime.now(UTC)
-        name = f"{self._text.joint.name}-{wall:%Y%m%dT%H%M%SZ}-{cause.replace(' ', '-')}.mcap"
-        self._event = _Event(cause, now_s, wall, self._folder / name)
-        return self._event.path
+        self._event = _Event([cause], now_s, datetime.now(UTC))
 
     def flush(self) -> None:
         """Begin to write what is complete, take a wish; called once a second."""
@@ -173,6 +169,14 @@ class BlackBox(Sink):
         """The same: what is in memory is worth keeping after an error, too."""
         self.close()
 
+    def _reread(self) -> None:
+        """Take the joint file anew: the daemon has it in use when it publishes another model."""
+        if self._text.path is not None:
+            try:
+                self._text = load_text(self._text.path)
+            except JointFileError as error:
+                _LOG.error("%s: the black box goes on with the joint file before it", error)
+
     def _take(self, kind: str, *values: Any) -> None:
         now_s = self._clock()
         ring, oldest_s = self._ring, now_s - self._reach_s - AFTER_S
@@ -192,10 +196,13 @@ class BlackBox(Sink):
     def _write(self, event: _Event, items: Sequence[tuple[str, tuple[Any, ...]]]) -> None:
         """Write one recording; what goes wrong is one line, and no half of a file stays."""
         sink: McapSink | None = None
+        path = self._folder / recording_name(self._text.joint.name, event.cause, event.wall)
+        unfinished = path.with_suffix(UNFINISHED)
         try:
-            sink = McapSink(event.path, self._text.joint, self._text.text)
+            sink = McapSink(unfinished, self._text.joint, self._text.text, force=True)
             wall = event.wall.isoformat(timespec="milliseconds")
-            sink.note("black box", {"cause": event.cause, "time": wall, "joint_file": self._text.name})
+            about = {"cause": event.cause, "causes": ", ".join(event.causes), "time": wall}
+            sink.note("black box", {**about, "joint_file": self._text.name})
             if self._mapping is not None:
                 sink.mapping(*self._mapping)
             if self._model is not None:
@@ -205,35 +212,12 @@ class BlackBox(Sink):
                 if number % _BLOCK == 0:
                     sink.flush()
             sink.close()
+            unfinished.replace(path)
             drop_oldest(self._folder, self._text.joint.name, self._section.keep_mib)
         except (OSError, RecordingError) as error:
             _LOG.error("%s: %s is not kept: %s", self._text.joint.name, event.cause, error)
             if sink is not None:
                 sink.abandon()
-                event.path.unlink(missing_ok=True)
+                unfinished.unlink(missing_ok=True)
             return
-        _LOG.warning("%s: %s: kept in %s", self._text.joint.name, event.cause, event.path)
-        self._done(event.path, event.cause)
-
-
-def wish_of(text: JointText) -> Path:
-    """The file that asks the black box of a joint to keep the last minute; it removes it.
-
-    Raises:
-        RecordingError: the joint file declares no folder.
-    """
-    folder = text.joint.recording.folder
-    if folder is None:
-        raise RecordingError(f"{text.name}: recording.folder: expected the folder of the black box, got none")
-    return text.folder / folder / f"{text.joint.name}.keep"
-
-
-def drop_oldest(folder: Path, joint: str, keep_mib: float) -> None:
-    """Remove the oldest recordings of a joint's black box beyond its budget; the newest always stays."""
-    mine = re.compile(re.escape(joint) + r"-\d{8}T\d{6}Z-[a-z-]+\.mcap")
-    kept = sorted(path for path in folder.iterdir() if mine.fullmatch(path.name))
-    sizes = [path.stat().st_size for path in kept]
-    for index in range(len(kept) - 1):
-        if sum(sizes[index:]) <= keep_mib * 2**20:
-            break
-        kept[index].unlink()
+        _LOG.warning("%s: %s: kept in %s", self._text.joint.name, event.cause, path)

@@ -1,0 +1,240 @@
+"""Accepts what a finding proposes: the difference, the new joint file, the old one kept, and the way back.
+
+Nothing here is done by itself: a person asks for it, by `drivelink accept` or in the web view.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from drivelink.errors import JointFileError, RecordingError, UsageError
+from drivelink.infile import read_regular
+from drivelink.jointfile import MAX_BYTES, JointFile, JointText, load, load_text, without_check, write_model
+from drivelink.loop import finding
+from drivelink.loop.folder import folder_of, proposal_file
+from drivelink.output.outfile import write_whole
+from drivelink.plaintext import clean_text
+
+PATIENCE_S = 60.0  # for the residual to fall
+_QUIET_SECONDS = 5  # of residual within its limit
+_STAMP = "%Y%m%dT%H%M%SZ"
+
+
+class Proposal(NamedTuple):
+    """What may be accepted.
+
+    Attributes:
+        source: the joint file in use.
+        recording: the diagnosed one.
+        finding: of it.
+        proposed: the joint file with the finding.
+    """
+
+    source: JointText
+    recording: Path
+    finding: dict[str, Any]
+    proposed: JointText
+
+    def difference(self) -> str:
+        """The lines of the joint file that change, as a unified diff; baseline and origin follow them."""
+        before, after = (_model_lines(text.text) for text in (self.source, self.proposed))
+        name = Path(self.source.name).name
+        return "\n".join(difflib.unified_diff(before, after, name, f"{name}, proposed", lineterm="", n=1))
+
+    def lines(self) -> list[str]:
+        """What a person sees before accepting, line by line."""
+        found, error = self.finding, self.finding.get("error") or {}
+        lines = [str(found["sentence"]), f"from {self.recording.name}"]
+        lines += [f"  {text}" for text in found.get("parameters") or ()]
+        if all(isinstance(error.get(key), float) for key in ("before_rms_nm", "after_rms_nm")):
+            fall = f"{error['before_rms_nm']:.4g} N·m before, {error['after_rms_nm']:.4g} N·m after"
+            lines.append(f"error of the motor torque, held-out data: {fall}")
+        lines += [f"  {text}" for text in (found.get("report") or {}).get("advice") or ()]
+        return [clean_text(line) for line in [*lines, *self.difference().split("\n")]]
+
+
+def proposal(path: Path) -> Proposal:
+    """The newest finding of a joint, if a joint file is proposed by it.
+
+    Args:
+        path: the joint file.
+
+    Raises:
+        JointFileError: the joint file, or the proposed one, is wrong.
+        RecordingError: nothing is proposed, or for another joint file than this one is now.
+    """
+    source = load_text(path)
+    folder, joint = folder_of(source), source.joint.name
+    newest = finding.newest(folder, joint)
+    if newest is None:
+        raise RecordingError(
+            f"{folder}: no finding about {joint} yet: the next alarm or `drivelink keep` makes one"
+        )
+    recording, found = newest
+    if found["state"] != finding.PROPOSED:
+        raise RecordingError(f"{recording.name}: nothing to accept: {found['state']}: {found['sentence']}")
+    if found.get("joint_file") != finding.fingerprint(source.text):
+        raise RecordingError(
+            f"{path}: has changed since {recording.name} was kept: expected the same joint file; "
+            f"drivelink keep {path} makes a finding about this one"
+        )
+    return Proposal(source, recording, found, load_text(proposal_file(recording)))
+
+
+def accept(offer: Proposal) -> Path:
+    """Put the proposed joint file in the place of the one in use.
+
+    Returns:
+        Where the old one is kept.
+
+    Raises:
+        JointFileError: it cannot be written; the old one is in place.
+    """
+    path, now = _place(offer.source), datetime.now(UTC)
+    old = path.with_name(f"{path.stem}-{now:{_STAMP}}{path.suffix}")
+    _copy(path, old)
+    accepted = {
+        "time": now.isoformat(timespec="seconds"),
+        "before": old.name,
+        "recording": offer.recording.name,
+    }
+    write_model(offer.proposed, path, {"provenance": {"accepted": accepted}}, force=True)
+    finding.write(offer.recording, {**offer.finding, "state": finding.ACCEPTED, "accepted": accepted})
+    return old
+
+
+def undo(path: Path) -> Path:
+    """Put the joint file that was in use before the last acceptance back.
+
+    Returns:
+        Where it was kept.
+
+    Raises:
+        JointFileError: one of both files is wrong, or the place cannot be written.
+        UsageError: nothing was accepted.
+    """
+    source = load_text(path)
+    accepted = source.joint.provenance.get("accepted")
+    if not isinstance(accepted, dict) or not isinstance(accepted.get("before"), str):
+        raise UsageError(f"{path}: --undo: nothing was accepted into this joint file")
+    old = load_text(path.with_name(Path(accepted["before"]).name))
+    _copy(_place(old), _place(source))
+    recording = folder_of(source) / Path(str(accepted.get("recording"))).name
+    found = finding.read(recording)
+    if found is not None:
+        finding.write(recording, {**found, "state": finding.UNDONE})
+    return Path(old.name)
+
+
+def _model_lines(text: str) -> list[str]:
+    """A joint file without [provenance], where that is all that follows it."""
+    lines = without_check(text).splitlines()
+    begins = [k for k, line in enumerate(lines) if line.startswith("[")]
+    others = [k for k in begins if not lines[k].lstrip("[").startswith("provenance")]
+    last = next((k for k in begins if k > others[-1]), len(lines)) if others else 0
+    return lines[:last]
+
+
+def _place(source: JointText) -> Path:
+    if source.path is None:
+        raise JointFileError(f"{source.name}: expected a file")
+    return source.path
+
+
+def _copy(path: Path, target: Path) -> None:
+    try:
+        write_whole(target, read_regular(path, MAX_BYTES), force=True)
+    except OSError as error:
+        raise JointFileError(f"{error.filename}: cannot be copied: {error.strerror}") from error
+
+
+def accepted_at(joint: JointFile | Mapping[str, Any]) -> str:
+    """When what is in a joint file, or in a model document, was accepted; empty: it was not."""
+    provenance = joint.provenance if isinstance(joint, JointFile) else joint.get("provenance")
+    accepted = provenance.get("accepted") if isinstance(provenance, Mapping) else None
+    return str(accepted.get("time")) if isinstance(accepted, Mapping) else ""
+
+
+class Trial:
+    """Whether the residual falls to its baseline once the daemon has the new model.
+
+    Args:
+        path: the joint file as it is now.
+        now_s: monotonic time.
+
+    Attributes:
+        in_use: the daemon has the new model.
+        ratios: residual over baseline of each balance in the newest second, or empty.
+        fallen: True: it has; False: not within a minute; None: not decided yet.
+    """
+
+    def __init__(self, path: Path, now_s: float) -> None:
+        self.in_use = False
+        self.ratios: tuple[float, ...] = ()
+        self.fallen: bool | None = None
+        self._accepted, self._end_s = accepted_at(load(path)), now_s + PATIENCE_S
+        self._quiet = self._moved = 0
+        self._last: object = None
+
+    def take(self, status: Mapping[str, Any], model: Mapping[str, Any], now_s: float) -> bool | None:
+        """Take what the daemon says now; return `fallen`."""
+        if self.fallen is not None:
+            return self.fallen
+        if not self.in_use and model and accepted_at(model) == self._accepted:
+            self.in_use = True
+            self._last = _residuals(status)  # of the model before
+        if self.in_use:
+            self._judge(status)
+        if self._quiet >= _QUIET_SECONDS:
+            self.fallen = True
+        elif now_s >= self._end_s:
+            self.fallen = False
+        return self.fallen
+
+    def _judge(self, status: Mapping[str, Any]) -> None:
+        """Count seconds of motion without a break whose residual the model's own test allows."""
+        residuals = _residuals(status)
+        if residuals is None or residuals == self._last:
+            return
+        self._last = residuals
+        alarm, quality = status["residual_alarm"], status.get("quality")
+        self.ratios = tuple(r / b for r, b in zip(residuals, alarm["floor_nm"], strict=False))
+        if isinstance(quality, Mapping) and not (quality.get("observable") or quality.get("model_alarm")):
+            return  # standing still: its residual says nothing
+        self._moved += 1
+        within = not alarm.get("active") and alarm.get("ratio", math.inf) <= alarm.get("limit", 0.0)
+        self._quiet = self._quiet + 1 if within else 0
+
+    def sentence(self) -> str:
+        """What has come of it so far."""
+        level = f"{max(self.ratios):.2g} × its baseline" if self.ratios else "not measured yet"
+        if self.fallen:
+            return (
+                f"the residual has fallen to its baseline: {level}, within its limit for {_QUIET_SECONDS} s"
+            )
+        if self.fallen is None:
+            return (
+                f"the residual is {level}" if self.in_use else "waiting for the daemon to take the new model"
+            )
+        if not self.in_use:
+            return "no daemon has taken the new model within a minute: it is in use from its next start on"
+        if not self._moved:
+            return "the joint has not moved enough within a minute to tell whether the residual has fallen"
+        return f"the residual has not fallen within a minute: it is {level}"
+
+
+def _residuals(status: Mapping[str, Any]) -> list[float] | None:
+    """Residual of each balance, if both it and its baseline are known."""
+    alarm = status.get("residual_alarm")
+    if not isinstance(alarm, Mapping):
+        return None
+    found = [alarm.get("residual_nm"), alarm.get("floor_nm")]
+    for values in found:
+        if not isinstance(values, list) or not all(isinstance(v, float | int) and v > 0.0 for v in values):
+            return None
+    return found[0]

@@ -1,0 +1,179 @@
+"""Diagnoses a kept recording at idle priority: `python -m drivelink.loop.diagnosing RECORDING`."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivelink import recording as recordings
+from drivelink.errors import DrivelinkError
+from drivelink.jointfile import JointFile, apply_diagnosis
+from drivelink.jointfile.residual_baseline import make_model_monitor
+from drivelink.loop import finding
+from drivelink.loop.folder import proposal_file
+from drivelink.loop.words import summary
+from drivelink.output import report
+from drivelink.recording.mapping import joint_of
+from drivelink.recording.mcapfile import read_messages
+from estimator.diagnosis import Diagnosis, Errors, diagnose
+from estimator.errors import EstimatorError
+from estimator.model import JointModel
+from estimator.model_monitor import ModelMonitor, can_monitor
+from estimator.sample import Record
+
+_LOG = logging.getLogger("drivelink.loop")
+_LEAST_SECONDS = 6  # of residual, to tell two levels from one
+_NOTHING_NM = 1e-12
+_TRAINED = 2 / 3  # of the data; the rest is held out
+
+
+class Second(NamedTuple):
+    """Residual and torque of each balance over one second, N·m, and the sequence number at its end."""
+
+    sequence: int
+    residual_nm: tuple[float, ...]
+    torque_nm: tuple[float, ...]
+
+
+def seconds_of(record: Record, model: JointModel) -> list[Second]:
+    """The residual of a model second by second, as the daemon measures it."""
+    monitor, made = ModelMonitor(model, record.period_s, None), []
+    before = 0
+    for sample in record.samples():
+        monitor.core.step(sample)
+        if monitor.core.seconds > before:
+            before = monitor.core.seconds
+            made.append(Second(sample.sequence, monitor.residual_nm, monitor.torque_nm))
+    return made
+
+
+def since(seconds: Sequence[Second]) -> tuple[int, int] | None:
+    """Begin and end of the second in which the residual rose, sequence numbers; None: not in this recording.
+
+    Two levels of its logarithm explain it better than one, by the Bayesian information criterion.
+    """
+    n = len(seconds)
+    if n < _LEAST_SECONDS:
+        return None
+    level = np.log(np.maximum([np.linalg.norm(one.residual_nm) for one in seconds], _NOTHING_NM))
+    errors = [float(np.var(level[:k]) * k + np.var(level[k:]) * (n - k)) for k in range(2, n - 1)]
+    k = 2 + int(np.argmin(errors))
+    gain = n * math.log(float(np.var(level)) * n / max(errors[k - 2], 1e-300))
+    rose = float(np.mean(level[k:])) > float(np.mean(level[:k]))
+    return (seconds[k - 1].sequence, seconds[k].sequence) if rose and gain > 2.0 * math.log(n) else None
+
+
+def make(recording: Path) -> dict[str, Any]:
+    """Diagnose a kept recording, and put the joint file that it proposes beside it.
+
+    Returns:
+        The finding.
+
+    Raises:
+        DrivelinkError: it cannot be read, or carries no joint file.
+        EstimatorError: it cannot be diagnosed.
+    """
+    begin_s = time.monotonic()
+    source = joint_of(recording, None)
+    record = recordings.read(recording, source.joint)
+    model = source.joint.model()
+    rose = since(seconds_of(record, model)) if can_monitor(model) else None
+    part = record if rose is None else _rows(record, record.sequence > rose[1])
+    held_from = int(part.sequence[round(_TRAINED * (len(part) - 1))])
+    trained, held = _rows(part, part.sequence < held_from), _rows(part, part.sequence >= held_from)
+    outcome = diagnose(trained, model, None, held)
+    error, sufficient = _error(part, source.joint, outcome, held_from)
+    proposed = outcome.verdict == "effect" or (outcome.verdict == "sufficient" and not sufficient)
+    if proposed and error.after_rms_nm < error.before_rms_nm:
+        apply_diagnosis.write(source, proposal_file(recording), outcome, part, recording.name, force=True)
+        state = finding.PROPOSED
+    else:
+        state = finding.NOTHING
+    said = summary(outcome, error, source.joint)
+    return {
+        **finding.begun(recording, state, said.sentence),
+        "summary": said.short,
+        "parameters": list(said.parameters),
+        "since": None if rose is None else _unix_s(recording, record, rose[0]),
+        "error": error._asdict(),
+        "joint_file": finding.fingerprint(source.text),
+        "took_s": round(time.monotonic() - begin_s, 1),
+        "report": report.as_json(outcome),
+    }
+
+
+def _rows(record: Record, chosen: NDArray[np.bool_]) -> Record:
+    """Some rows of a recording."""
+    rows: dict[str, Any] = {
+        each.name: value[chosen]
+        for each in fields(record)
+        if isinstance(value := getattr(record, each.name), np.ndarray)
+    }
+    return replace(record, **rows)
+
+
+def _error(part: Record, joint: JointFile, outcome: Diagnosis, held_from: int) -> tuple[Errors, bool]:
+    """The error on held-out data of the model in use and of the proposed one, and whether the former's own
+    baseline allows it.
+
+    Of a model without parameters, which is no model yet, the error before is that of its best fit.
+    """
+    model = joint.model()
+    if not can_monitor(model):
+        return outcome.validation, True
+    both = []
+    for one in (model, apply_diagnosis.diagnosed_model(joint, outcome)):
+        held = [second for second in seconds_of(part, one) if second.sequence > held_from + 1 / part.period_s]
+        if not held:
+            return outcome.validation, True
+        both.append(
+            [rms([getattr(s, name)[: part.motors] for s in held]) for name in ("residual_nm", "torque_nm")]
+        )
+    (before, torque), (after, _) = both
+    monitor = make_model_monitor(joint)
+    alarms = [monitor.core.step(sample) for sample in part.samples()] if monitor is not None else [False]
+    return Errors(before, after, before / torque, after / torque), not any(alarms)
+
+
+def _unix_s(recording: Path, record: Record, sequence: int) -> float:
+    """UNIX time of a sample, by the stamp of the first one."""
+    first = next(read_messages(recording, frozenset({"sample"})))
+    return first.log_time_ns * 1e-9 + (sequence - int(record.sequence[0])) * record.period_s
+
+
+def rms(values: Sequence[Sequence[float]]) -> float:
+    """Root of the mean over the seconds of the sum over the motors of the squares."""
+    return math.sqrt(float(np.mean(np.sum(np.square(values), axis=1))))
+
+
+def main() -> int:
+    """Diagnose one recording; whatever comes of it lies beside it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal, for the daemon: the black box ends this
+    logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="%(levelname).1s %(message)s")
+    os.nice(19)
+    with suppress(OSError, AttributeError):  # not every system has it
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    recording = Path(sys.argv[1])
+    try:
+        found = make(recording)
+    except (DrivelinkError, EstimatorError) as error:
+        found = finding.begun(recording, finding.FAILED, f"not diagnosed: {error}")
+    finding.write(recording, found)
+    _LOG.warning("%s: %s", found["joint"], found["sentence"])
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

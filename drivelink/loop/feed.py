@@ -1,0 +1,49 @@
+"""The newest finding of a joint, for the daemon to publish: read in a thread when the folder has changed."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from drivelink.loop import finding
+
+
+class FindingFeed:
+    """Watches the folder of a black box.
+
+    Args:
+        folder: of the black box; it need not exist yet.
+        joint: its name.
+        publish: called with each new finding, in the slack.
+    """
+
+    def __init__(self, folder: Path, joint: str, publish: Callable[[Mapping[str, Any]], None]) -> None:
+        self._folder, self._joint, self._publish = folder, joint, publish
+        self._seen = 0
+        self._thread: threading.Thread | None = None
+        self._found: Mapping[str, Any] | None = None
+        self._published: Mapping[str, Any] | None = None
+
+    def check(self) -> None:
+        """In the slack: begin to read if the folder has changed, publish what was read."""
+        if self._found is not None:
+            found, self._found = self._found, None
+            if found != self._published:
+                self._published = found
+                self._publish(found)
+        if self._thread is not None and self._thread.is_alive():
+            return
+        try:
+            seen = self._folder.stat().st_mtime_ns
+        except OSError:
+            return
+        if seen != self._seen:
+            self._seen = seen
+            self._thread = threading.Thread(target=self._read, name="finding", daemon=True)
+            self._thread.start()
+
+    def _read(self) -> None:
+        newest = finding.newest(self._folder, self._joint)
+        self._found = newest[1] if newest is not None else {}

@@ -1,0 +1,290 @@
+"""The loop: a recording is diagnosed, its finding published, accepted by a person, and the residual watched."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import zenohkit
+from test_monitor import STATUS, lines
+from zenohkit import until
+
+from drivelink import cli, jointfile
+from drivelink.demo.simulate import alter, world_from_joint
+from drivelink.errors import RecordingError, UsageError
+from drivelink.loop import acceptance, diagnosing, finding
+from drivelink.loop.feed import FindingFeed
+from drivelink.loop.folder import finding_file, proposal_file
+from drivelink.loop.queue import Diagnoses, next_due
+from drivelink.monitor.view import JointView
+from drivelink.monitor.watcher import Watcher
+from drivelink.monitor.web import WebView, snapshot
+from drivelink.monitor.webaccept import TOKEN_HEADER, WebAcceptance
+from drivelink.pubsub.publisher import JointPublisher
+from drivelink.pubsub.ros2 import Ros2Publisher
+from drivelink.recording.sinks import McapSink
+from estimator.sample import Sample
+from sim.world import record
+
+ELBOW = Path(__file__).parent.parent / "examples" / "elbow.toml"
+BEFORE_S, AFTER_S = 8, 14
+NAME = "demo-elbow-20260105T081500Z-model-alarm.mcap"
+STAMP_NS = 1_767_600_000_000_000_000
+
+
+def recorded(folder: Path, effects: tuple[str, ...] = (), name: str = NAME, **parameters: float) -> Path:
+    """A joint file in a folder, and what its black box keeps of a change after some seconds."""
+    path, made = folder / "elbow.toml", folder / "kept" / name
+    if not path.exists():
+        path.write_text(ELBOW.read_text())
+    made.parent.mkdir(exist_ok=True)
+    source = jointfile.load_text(path)
+    world = world_from_joint(source.joint)
+    columns = [record(world, BEFORE_S)]
+    alter(world, effects, parameters)
+    columns.append(record(world, AFTER_S))
+    joined = {key: np.concatenate([part[key] for part in columns]) for key in columns[0]}
+    sink = McapSink(made, source.joint, source.text)
+    keys = ("motor1_position_rad", "motor1_velocity_rad_s", "motor1_torque_nm", "link_position_rad")
+    for k, (theta, velocity, torque, q) in enumerate(
+        zip(*(joined[key].tolist() for key in keys), strict=True)
+    ):
+        sink.sample(Sample(k, (theta,), (velocity,), (torque,), q), STAMP_NS + k * 1_000_000)
+    sink.close()
+    return made
+
+
+@pytest.fixture(scope="module")
+def friction(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording with friction, diagnosed in a process of its own."""
+    made = recorded(tmp_path_factory.mktemp("friction"), ("coulomb_friction=0.6",))
+    command = [sys.executable, "-m", "drivelink.loop.diagnosing", str(made)]
+    assert subprocess.run(command, check=True, capture_output=True).returncode == 0
+    return made
+
+
+def copied(made: Path, folder: Path) -> Path:
+    """The joint file of a diagnosed recording and all that belongs to it, in another folder."""
+    (folder / "kept").mkdir()
+    for path in (made, finding_file(made), proposal_file(made)):
+        (folder / "kept" / path.name).write_bytes(path.read_bytes())
+    (folder / "elbow.toml").write_text(ELBOW.read_text())
+    return folder / "elbow.toml"
+
+
+def test_the_finding_says_what_since_when_and_the_error_before_and_after(friction: Path) -> None:
+    found = finding.read(friction)
+    assert found is not None and found["state"] == finding.PROPOSED and found["cause"] == "model alarm"
+    assert "Coulomb friction (motor)" in found["sentence"]
+    assert 0.0 <= BEFORE_S - (found["since"] - STAMP_NS * 1e-9) <= 1.0  # the second in which it came
+    (effect,) = found["report"]["effects"]
+    value, std = effect["parameters"]["torque_nm"], effect["std"]["torque_nm"]
+    assert abs(value - 0.6) < 4.0 * std < 0.1
+    assert found["error"]["after_rms_nm"] < 0.25 * found["error"]["before_rms_nm"]
+    proposed = jointfile.load(proposal_file(friction))
+    assert [one.name for one in proposed.motor[0].effect] == ["deflection_offset", "coulomb_friction"]
+
+
+def test_a_softer_spring_is_no_effect_and_is_proposed_all_the_same(tmp_path: Path) -> None:
+    softer = {"motor1_coefficient1_nm_rad": 108.0, "motor1_coefficient2_nm_rad": 360.0}
+    found = diagnosing.make(recorded(tmp_path, **softer))
+    assert found["state"] == finding.PROPOSED and found["report"]["effects"] == []
+    assert "the joint has changed" in found["sentence"] and "was 120 N·m/rad" in found["parameters"][0]
+    assert (
+        abs(found["report"]["transmissions"][0]["parameters"]["coefficients_nm_rad"][0] / 108.0 - 1.0) < 0.02
+    )
+
+
+def test_where_nothing_has_changed_nothing_is_proposed(tmp_path: Path) -> None:
+    made = recorded(tmp_path)
+    found = diagnosing.make(made)
+    assert (found["state"], found["since"]) == (finding.NOTHING, None)
+    assert not proposal_file(made).exists()
+    finding.write(made, found)
+    with pytest.raises(RecordingError, match="nothing to accept: nothing: The model is sufficient"):
+        acceptance.proposal(tmp_path / "elbow.toml")
+
+
+def touch(folder: Path, *events: str) -> list[Path]:
+    paths = [folder / f"elbow-20260105T{event}.mcap" for event in events]
+    for path in paths:
+        path.write_bytes(b"garbage")
+    return paths
+
+
+def test_ten_alarms_a_minute_make_one_diagnosis(tmp_path: Path) -> None:
+    alarms = touch(tmp_path, *(f"0815{second:02d}Z-model-alarm" for second in range(0, 60, 6)))
+    due = next_due(tmp_path, "elbow")
+    assert due == alarms[-1]
+    finding.write(due, finding.begun(due, finding.NOTHING, "sufficient"))
+    assert next_due(tmp_path, "elbow") is None
+    asked, _, later = touch(tmp_path, "081530Z-asked", "081700Z-bus-lost", "081800Z-change")
+    assert next_due(tmp_path, "elbow", tried=[later]) == asked  # a person always gets an answer
+    assert next_due(tmp_path, "elbow") == later
+
+
+def test_garbage_and_a_killed_process_are_findings_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    first, second = touch(tmp_path, "081500Z-model-alarm", "091500Z-model-alarm")
+    diagnoses = Diagnoses(tmp_path, "elbow")
+    diagnoses.step()
+    assert finding.read(second)["state"] == finding.DIAGNOSING  # the newest first
+    diagnoses._process.send_signal(signal.SIGKILL)
+
+    def ended(path: Path) -> dict[str, object] | None:
+        diagnoses.step()
+        found = finding.read(path)
+        return found if found is not None and found["state"] == finding.FAILED else None
+
+    assert "ended with signal 9" in until(lambda: ended(second))["sentence"]
+    assert "\n" not in until(lambda: ended(first))["sentence"] and "MCAP" in finding.read(first)["sentence"]
+    assert len(caplog.records) == 1
+    finding_file(first).write_text("{")  # by a disk that was full
+    monkeypatch.setattr(subprocess, "Popen", None)
+    diagnoses.step()  # tried already: no end of trying
+    diagnoses.close()
+
+
+def test_accepting_writes_the_file_keeps_the_old_one_and_can_be_undone(
+    friction: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = copied(friction, tmp_path)
+    assert cli.main(["accept", str(path)]) == 0  # nobody answers: nothing is done
+    shown = capsys.readouterr().out
+    assert '+name = "coulomb_friction"' in shown and "N·m before" in shown and "not accepted" in shown
+    assert path.read_text() == ELBOW.read_text()
+    offer = acceptance.proposal(path)
+    old = acceptance.accept(offer)
+    assert old.read_text() == ELBOW.read_text() and old.name.startswith("elbow-2")
+    assert [one.name for one in jointfile.load(path).motor[0].effect][-1] == "coulomb_friction"
+    with pytest.raises(RecordingError, match="nothing to accept: accepted"):
+        acceptance.proposal(path)
+    acceptance.undo(path)
+    assert path.read_text() == ELBOW.read_text()
+    with pytest.raises(UsageError, match="nothing was accepted"):
+        acceptance.undo(path)
+    finding.write(offer.recording, offer.finding)
+    path.write_text(ELBOW.read_text().replace("gear_ratio = 50.0", "gear_ratio = 51.0"))
+    with pytest.raises(RecordingError, match="has changed since"):
+        acceptance.proposal(path)
+
+
+def status(residual: float, *, observable: bool = True, alarm: bool = False) -> dict[str, object]:
+    judged = {
+        "active": alarm,
+        "residual_nm": [residual],
+        "floor_nm": [0.1],
+        "ratio": residual / 0.1,
+        "limit": 3.0,
+    }
+    return {"residual_alarm": judged, "quality": {"observable": observable, "model_alarm": alarm}}
+
+
+@pytest.mark.parametrize(
+    ("residuals", "observable", "fallen", "words"),
+    [
+        ([0.11, 0.12, 0.13, 0.1, 0.14], True, True, "has fallen to its baseline: 1.4 ×"),
+        ([0.11, 0.12, 0.9, 0.1, 0.14, 0.12], True, False, "has not fallen within a minute"),
+        ([0.11, 0.12, 0.13, 0.1, 0.14], False, False, "has not moved enough"),
+    ],
+)
+def test_the_residual_has_fallen_when_the_new_models_own_test_allows_it_in_motion(
+    residuals: list[float], observable: bool, fallen: bool, words: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "elbow.toml"
+    path.write_text(f'{ELBOW.read_text()}[provenance.accepted]\ntime = "now"\n')
+    new = {"provenance": {"accepted": {"time": "now"}}}
+    trial = acceptance.Trial(path, 0.0)
+    assert trial.take(status(0.9, alarm=True), {"provenance": {}}, 1.0) is None and not trial.in_use
+    assert trial.take(status(0.9, alarm=True), new, 2.0) is None and trial.in_use
+    for k, residual in enumerate(residuals):
+        trial.take(status(residual, observable=observable), new, 3.0 + k)
+    trial.take(status(residuals[-1], observable=observable), new, 60.0)
+    assert trial.fallen is fallen and words in trial.sentence()
+    never = acceptance.Trial(path, 0.0)
+    assert never.take({}, {}, 60.0) is False and "no daemon" in never.sentence()
+
+
+def test_the_finding_is_published_to_views_queries_and_ros(friction: Path, tmp_path: Path) -> None:
+    path = copied(friction, tmp_path)
+    endpoint = zenohkit.free_endpoint()
+    joint = jointfile.parse(f'{path.read_text()}[zenoh]\nendpoint = "{endpoint}"\n[ros2]\n')
+    from drivelink.pubsub.session import close_session, open_client, open_session
+
+    session = open_session(joint.zenoh, tmp_path)
+    publisher, client = JointPublisher(session, joint), open_client(endpoint)
+    watcher, sent = Watcher(client), []
+    assert isinstance(publisher._ros2, Ros2Publisher)
+    publisher._ros2._diagnostics.put = lambda payload, _: sent.append(payload)
+    try:
+        feed = FindingFeed(tmp_path / "kept", joint.name, publisher.put_finding)
+
+        def shown() -> object:
+            feed.check()
+            watcher.poll()
+            return watcher.views.get(joint.name) and watcher.views[joint.name].finding
+
+        assert until(shown)["sentence"] == finding.read(friction)["sentence"]
+        publisher.put_status(STATUS)
+        assert b"finding.sentence" in sent[0] and b"Coulomb friction (motor)" in sent[0]
+        view = JointView("elbow", height=24)
+        view.status, view.finding = STATUS, watcher.views[joint.name].finding
+        assert any("Coulomb friction (motor), error" in line for line in lines(view))
+        displayed = snapshot(view, True, {})["finding"]
+        assert displayed["state"] == finding.PROPOSED and len(displayed["error"]) == 2
+        view.finding = {"state": 3, "sentence": ["?"]}
+        assert snapshot(view, True, {})["finding"] is None
+    finally:
+        watcher.close()
+        publisher.close()
+        close_session(client)
+        close_session(session)
+
+
+def test_only_the_page_itself_can_accept(friction: Path, tmp_path: Path) -> None:
+    path = copied(friction, tmp_path)
+
+    nothing = SimpleNamespace(views={"demo-elbow": JointView("demo-elbow")}, alive=set())
+    allowed, forbidden = WebView(nothing, 0, WebAcceptance(path)), WebView(nothing, 0)
+
+    def ask(web: WebView, action: str, body: object = None, **headers: str) -> tuple[int, dict[str, object]]:
+        own = {TOKEN_HEADER: web.acceptance.token if web.acceptance else "", "Origin": web.url.rstrip("/")}
+        request = urllib.request.Request(
+            web.url + action,
+            json.dumps(body or {}).encode(),
+            {**own, **{k.replace("_", "-"): v for k, v in headers.items()}},
+        )
+        try:
+            with urllib.request.urlopen(request) as reply:
+                return reply.status, json.load(reply)
+        except urllib.error.HTTPError as error:
+            return error.code, {}
+
+    try:
+        assert ask(forbidden, "accept")[0] == 404
+        assert allowed.acceptance.token in urllib.request.urlopen(allowed.url).read().decode()
+        for headers in (
+            {"X_Drivelink_Token": "guess"},
+            {"Origin": "http://evil.example"},
+            {"Host": "evil.example"},
+        ):
+            assert ask(allowed, "accept", {"recording": NAME}, **headers)[0] == 403
+        assert "newer finding" in ask(allowed, "accept", {"recording": "another"})[1]["error"]
+        assert path.read_text() == ELBOW.read_text()
+        assert "coulomb_friction" in ask(allowed, "proposal")[1]["difference"]
+        assert "is written" in ask(allowed, "accept", {"recording": NAME})[1]["text"]
+        assert "coulomb_friction" in path.read_text()
+        assert "trial" in json.loads(allowed.event({}))["joints"]["demo-elbow"]
+        assert "as it was" in ask(allowed, "undo")[1]["text"] and path.read_text() == ELBOW.read_text()
+    finally:
+        allowed.close()
+        forbidden.close()

@@ -50,6 +50,7 @@ SECTIONS: list[tuple[str, type]] = [
     ("[link.dynamics]", schema.LinkDynamics),
     ("[bus]", jointfile.BusSection),
     ("[recording]", schema.RecordingSection),
+    ("[recording.columns]", schema.ColumnSection),
     ("[estimator]", schema.EstimatorSettings),
     ("[zenoh]", jointfile.ZenohSection),
     ("[ros2]", jointfile.Ros2Section),

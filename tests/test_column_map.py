@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from drivelink import cli
-from drivelink.errors import RecordingError, UsageError
+from drivelink.errors import JointFileError, RecordingError, UsageError
 from drivelink.jointfile import parse
+from drivelink.jointfile.columns import UNITS
 from drivelink.recording import read
-from drivelink.recording.columnmap import UNITS, parse_column_map
+from drivelink.recording.columnmap import parse_column_map
 from drivelink.recording.formats import open_sink
 from drivelink.recording.mf4file import write_mf4
 
@@ -92,7 +93,7 @@ def test_a_column_that_is_mapped_takes_the_place_of_one_that_has_the_name(tmp_pa
 
 def test_units_are_those_of_physics() -> None:
     assert UNITS["_rad_s"]["rpm"] * 60 == UNITS["_rad"]["rev"] == 360 * UNITS["_rad"]["deg"] == 2 * math.pi
-    assert parse_column_map(["a=b=time_s:us"])["time_s"] == ("a=b", 1e-6)
+    assert parse_column_map(["a=b=time_s:us"])["time_s"] == ("a=b", 1e-6, True)
 
 
 @pytest.mark.parametrize(
@@ -114,7 +115,7 @@ def test_a_mapping_that_cannot_be_is_one_line(text: str, line: str) -> None:
 
 def test_what_a_mapping_asks_for_in_vain_is_one_line(tmp_path: Path) -> None:
     names = parse_column_map([*MAP[:3], "angle=link_position_rad"])
-    with pytest.raises(RecordingError, match="--map angle=link_position_rad: no such column, found"):
+    with pytest.raises(RecordingError, match="--map angle=link_position_rad: no such column 'angle', found"):
         read(theirs(tmp_path / "rig.csv"), JOINT, names=names)
     with pytest.raises(UsageError, match="given twice"):
         parse_column_map(["a=time_s", "b=time_s"])
@@ -123,13 +124,54 @@ def test_what_a_mapping_asks_for_in_vain_is_one_line(tmp_path: Path) -> None:
         read(tmp_path / "r.mcap", JOINT, names=names)
 
 
+COLUMNS = """\
+[recording.columns]
+time_s = { name = "t", unit = "ms" }
+motor1_position_rad = { name = "theta [°]", unit = "deg" }
+motor1_torque_nm = { name = "i", unit = 0.05, sign = -1 }
+link_position_rad = { name = "q", unit = "mrad" }
+"""
+
+
+def test_the_joint_file_names_columns_once(tmp_path: Path) -> None:
+    joint, path = parse(TEXT + COLUMNS), theirs(tmp_path / "rig.csv")
+    record, same = read(path, joint), read(path, JOINT, names=parse_column_map(MAP))
+    for name in ("motor_position_rad", "motor_torque_nm", "link_position_rad"):
+        assert np.array_equal(getattr(record, name), getattr(same, name))
+    assert np.array_equal(  # a file with our own names is read as it is
+        read(ours(tmp_path / "r.csv"), joint).motor_torque_nm, read(tmp_path / "r.csv", JOINT).motor_torque_nm
+    )
+    swapped = read(
+        path, joint, names=parse_column_map(["q=link_position_rad:rad"])
+    )  # --map has the last word
+    assert np.allclose(swapped.link_position_rad, 1e3 * same.link_position_rad, rtol=1e-14, atol=0.0)
+    with pytest.raises(RecordingError, match=r"recording.columns.link_position_rad: no such column 'q'"):
+        read(theirs(tmp_path / "x.csv", "t;theta [°];i;angle;state"), joint)
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ('q = { name = "a" }', 'columns: expected names of columns like "motor1_position_rad", got "q"'),
+        ('time_s = { name = "a", unit = "deg" }', "columns.time_s.unit: expected one of s, ms"),
+        ('time_s = { name = "a", sign = 2 }', "sign"),
+        ("time_s = { unit = 's' }", "recording.columns.time_s.name: expected this key, it is missing"),
+    ],
+)
+def test_a_column_of_the_joint_file_that_cannot_be_is_one_line(line: str, said: str) -> None:
+    with pytest.raises(JointFileError) as caught:
+        parse(f"{TEXT}[recording.columns]\n{line}\n")
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("declared", [False, True])
 @pytest.mark.parametrize("verb", ["replay", "fit", "diagnose"])
 def test_every_verb_that_reads_takes_the_mapping(
-    verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    verb: str, declared: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     joint = tmp_path / "sine.toml"
-    joint.write_text(TEXT)
-    options = [word for text in MAP for word in ("--map", text)]
+    joint.write_text(TEXT + (COLUMNS if declared else ""))
+    options = [] if declared else [word for text in MAP for word in ("--map", text)]
     out = ["--out", str(tmp_path / "out")] if verb == "diagnose" else []
     command = [verb, str(theirs(tmp_path / "rig.csv")), "--joint", str(joint), *options, *out]
     assert cli.main(command) == 0, capsys.readouterr().err

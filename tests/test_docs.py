@@ -18,7 +18,7 @@ import daemonkit
 import pytest
 
 from drivelink import cli, jointfile
-from drivelink.recording.columnmap import UNITS
+from drivelink.jointfile.columns import UNITS
 from sim.canopen.profiles import PROFILES
 from sim.excitation import KINDS
 from sim.faults import Faults

@@ -565,7 +565,7 @@ def night(joint: str, k: int, stiffness: float, effects: list[str]) -> dict[str,
         "verdict": "effect" if effects else "sufficient", "sentence": "said", "excited": True,
         "parameters": json.dumps({"k_nm_rad": stiffness}), "covariance": [0.01], "deflection_middle_rad": 0.02,
         "stiffness_middle_nm_rad": stiffness, "stiffness_std_middle_nm_rad": 0.1, "report": f"{joint}{k}.html",
-        "error_before_relative": 0.1, "error_after_relative": 0.02, "recording": f"{joint}-{k}.csv",
+        "error_before_relative": 0.1, "error_after_relative": 0.02, "viscous_damping_nm_s_rad": 0.8, "recording": f"{joint}-{k}.csv",
         "time": datetime(2026, 1, 5, tzinfo=UTC) + timedelta(days=k),
     }  # fmt: skip
 
@@ -593,12 +593,31 @@ def test_joints_come_by_urgency_with_what_changed_since_when() -> None:
     assert joints["rubs"]["sentence"] == "New at the motor since 2026-01-14: Coulomb friction."
 
 
-def test_an_unusable_stiffness_is_no_point_of_the_trend() -> None:
+def test_an_unusable_stiffness_is_no_point_of_the_trend_but_a_cross_on_the_chart() -> None:
     rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) for k in range(10)]
     rows[4] |= {"stiffness_middle_nm_rad": -20.0, "parameters": '{"k_nm_rad": -20.0}'}
     rows[5]["excited"] = False
-    (joint,) = summarise(rows, 0.05)["joints"]
-    assert len(joint["transmissions"][0]["series"]) == 8
+    document = summarise(rows, 0.05)
+    (joint,) = document["joints"]
+    assert len(joint["transmissions"][0]["series"]) == 8 and joint["state"] == "steady"
+    assert [one["reason"] for one in joint["unusable"]] == [
+        "the fitted stiffness is not above zero", "its motion does not reveal the stiffness",
+    ]  # fmt: skip
+    assert page(document).count('class="cross"') == 4  # on the chart, and in the list
+
+
+def test_a_joint_that_breaks_is_said_to_be_lost_and_its_findings_stay_on_the_chart() -> None:
+    rows = [night("elbow", k, 150.0 + 0.1 * (k % 3), []) for k in range(10)]
+    for k in (8, 9):
+        rows[k] |= {"excited": False, "effects": ["torque_offset@motor"], "error_before_relative": 1.34}
+    rows.append(night("elbow", 10, 150.0, []) | {"status": "error", "error": "no frames"})
+    document = summarise(rows, 0.05)
+    (joint,) = document["joints"]
+    assert joint["state"] == "lost"
+    assert joint["sentence"] == "The last 3 recordings show no stiffness, from 2026-01-13 on: no frames."
+    text = page(document)
+    assert "<h1>1 of 1 joint needs a look: 1 lost</h1>" in text
+    assert text.count('class="found"') == 2 and "134 → 2.00 % of the torque" in text
 
 
 # The rest of the service

@@ -27,12 +27,13 @@ import zenohkit
 from rich.console import Console
 
 from drivelink import cli
-from drivelink.monitor.braille import DotPlot, number, sparkline
+from drivelink.monitor.braille import DotPlot, sparkline
 from drivelink.monitor.history import GrowingCurve, JointHistory, usual_range
 from drivelink.monitor.statuslines import shape, status_lines, status_text
 from drivelink.monitor.view import JointView, joints_table
 from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.web import MAX_CONNECTIONS, MAX_STREAMS, WebView, snapshot
+from drivelink.output.digits import number, with_interval
 from drivelink.pubsub.session import close_session, open_client
 from drivelink.pubsub.wire import ExternalMessage
 from estimator.sample import Estimate, Status, TransmissionEstimate
@@ -581,3 +582,15 @@ def test_the_legend_explains_every_line_and_fits() -> None:
     for part in ("stiffness", "95 %", "dotted", "residual", "baseline", "observable", "? back"):
         assert any(part in line for line in shown), part
     assert len(lines(view, 80, 24)) <= 24
+
+
+@pytest.mark.parametrize(
+    ("value", "half", "text"),
+    [
+        (5.1e-5, 0.027, "0.000 ± 0.027"), (0.0974198, 0.0064, "0.0974 ± 0.0064"), (-1e-9, 3e-9, "−1.0e−9 ± 3.0e−9"),
+        (123456.0, 1234.0, "123500 ± 1200"), (9.96, 0.0996, "9.96 ± 0.10"), (150.0, math.nan, "150.0"),
+        (math.nan, 1.0, "–"), (-0.001, 0.5, "0.00 ± 0.50"),
+    ],
+)  # fmt: skip
+def test_digits_follow_the_uncertainty(value: float, half: float, text: str) -> None:
+    assert with_interval(value, half, "N·m") == f"{text} N·m"

@@ -11,7 +11,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -22,13 +21,14 @@ from drivelink.jointfile import JointText, plain_parameters
 from drivelink.jointfile.residual_baseline import floor_entry
 from drivelink.output.fitplot import fit_plot
 from drivelink.output.outfile import check_target, write_whole
+from drivelink.output.units import Units
 from drivelink.recording.columnmap import parse_column_map
 from drivelink.version import __version__
 from estimator.batch import TransmissionFit
 from estimator.errors import EstimatorError
 from estimator.identify import Identified, identify
 from estimator.model import Effect, Motor, ParameterValue
-from estimator.sample import SIGMA_95, Record
+from estimator.sample import Record
 from estimator.transmissions import RIGID
 
 
@@ -56,7 +56,8 @@ def fit_recording(args: argparse.Namespace, source: JointText, folder: Path | No
     if args.json:
         print(json.dumps(document))
     else:
-        _print(found, args.recording)  # print before writing: a full disk loses no result
+        # Before anything is written: a full disk loses no result.
+        _print(found, args.recording, Units(joint.axis == "linear"))
     made = []
     if args.out is not None:
         made.append(args.out / "fit.json")
@@ -135,16 +136,15 @@ def _link(found: Identified) -> dict[str, Any]:
     return link
 
 
-def _print(found: Identified, paths: Sequence[Path]) -> None:
+def _print(found: Identified, paths: Sequence[Path], units: Units) -> None:
     console = Console()
     for number, (one, motor) in enumerate(zip(found.fits, found.model.motors, strict=True), start=1):
         table = _table(f"motor {number}: {'rigid' if one.model == RIGID else one.model}")
         for name, value in one.parameters.items():
-            for label, x, sigma in _rows(name, value, one.std[name]):
-                table.add_row(label, f"{x:.6g}", f"{SIGMA_95 * sigma:.2g}")
+            _add(table, name, value, one.std[name], units)
         for name, key in (("inertia_kg_m2", "inertia"), ("viscous_damping_nm_s_rad", "damping")):
-            table.add_row(name, f"{getattr(motor, name):.6g}", f"{SIGMA_95 * one.nuisance_std[key]:.2g}")
-        _add_effects(table, motor.effects)
+            _add(table, name, getattr(motor, name), one.nuisance_std[key], units)
+        _add_effects(table, motor.effects, units)
         console.print(table)
         share = one.error_rms_nm / one.torque_rms_nm
         whole = "flexibility torque" if one.excited else "motor torque"
@@ -155,9 +155,8 @@ def _print(found: Identified, paths: Sequence[Path]) -> None:
     if link is not None or found.model.link_effects:
         table = _table("link")
         for name, x in _link(found).get("dynamics", {}).items():
-            std = found.link_std.get(name)
-            table.add_row(name, f"{x:.6g}", "" if std is None else f"{SIGMA_95 * std:.2g}")
-        _add_effects(table, found.model.link_effects)
+            _add(table, name, x, found.link_std.get(name), units)
+        _add_effects(table, found.model.link_effects, units)
         console.print(table)
     for line in found.notes:
         print(f"  {line}")
@@ -178,21 +177,21 @@ def _left(found: Identified, paths: Sequence[Path]) -> Table:
 
 def _table(title: str) -> Table:
     table = Table(title=title, title_justify="left")
-    for column in ("parameter", "value", "± (95 %)"):
-        table.add_column(column, justify="left" if column == "parameter" else "right")
+    for column in ("parameter", "value", "± (95 %)", "unit"):
+        table.add_column(column, justify="left" if column in ("parameter", "unit") else "right")
     return table
 
 
-def _add_effects(table: Table, effects: Iterable[Effect]) -> None:
+def _add_effects(table: Table, effects: Iterable[Effect], units: Units) -> None:
     for effect in effects:
         for name, value in effect.parameters.items():
-            for label, x, _ in _rows(f"{effect.name}.{name}", value, value):
-                table.add_row(label, f"{x:.6g}", "")
+            _add(table, f"{effect.name}.{name}", value, None, units)
 
 
-def _rows(name: str, value: ParameterValue, std: ParameterValue) -> list[tuple[str, float, float]]:
-    labels = [f"{name}[{i + 1}]" for i in range(len(value))] if isinstance(value, tuple) else [name]
-    return list(zip(labels, np.atleast_1d(value).tolist(), np.atleast_1d(std).tolist(), strict=True))
+def _add(table: Table, name: str, value: ParameterValue, std: ParameterValue | None, units: Units) -> None:
+    """Add a parameter: one row, or one for each coefficient."""
+    for k, cells in enumerate(units.parts(name, value, std), start=1):
+        table.add_row(f"{name}[{k}]" if isinstance(value, tuple) else name, *cells)
 
 
 def _remarks(one: TransmissionFit) -> list[str]:

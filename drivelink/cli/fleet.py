@@ -207,7 +207,7 @@ def _report(folder: str, rate: float, *, as_json: bool) -> None:
         print(json.dumps(document))
         return
     for joint in document["joints"]:
-        if joint["state"] == "changing":
+        if joint["state"] in summary.LOOK:
             print(clean_text(f"  {joint['joint']}: {joint['sentence']}"))
     for name in ("fleet.json", "fleet.html"):
         print(f"wrote {folder.rstrip('/')}/{name}")

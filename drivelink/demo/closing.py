@@ -11,6 +11,7 @@ from rich.text import Text
 
 from drivelink.demo.comparison import Comparison
 from drivelink.demo.rig import RunSummary
+from drivelink.output.digits import number, value_and_interval
 from estimator.sample import SIGMA_95, Status
 
 
@@ -24,17 +25,18 @@ def closing_table(
         table.add_column(heading, justify="left" if not heading else "right", no_wrap=True)
     if comparison.latest is not None:
         estimate, truth = comparison.latest
+        value, half = value_and_interval(estimate.stiffness_nm_rad, SIGMA_95 * estimate.stiffness_std_nm_rad)
         table.add_row(
             "stiffness / N·m/rad",
-            f"{truth.stiffness_nm_rad:.4g}",
-            f"{estimate.stiffness_nm_rad:.4g}",
-            f"± {SIGMA_95 * estimate.stiffness_std_nm_rad:.2g}",
+            number(truth.stiffness_nm_rad, 5),
+            value,
+            f"± {half}" if half else "",
             _percent(errors.stiffness),
         )
         table.add_row(
             "flexibility torque / N·m",
-            f"{truth.flexibility_torque_nm:.4g}",
-            f"{estimate.flexibility_torque_nm:.4g}",
+            number(truth.flexibility_torque_nm),
+            number(estimate.flexibility_torque_nm),
             "",
             _percent(errors.flexibility_torque),
         )

@@ -5,20 +5,24 @@ from __future__ import annotations
 import html
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from string import Template
 from typing import Any, NamedTuple
 
-from drivelink.output.units import in_words
+from drivelink.fleet.summary import LOOK, STATES, spaced
+from drivelink.output.digits import number, with_interval
+from drivelink.output.units import Units, bare_name, in_words
 from estimator.sample import SIGMA_95
 
 _CHARTS = 400  # joints with a chart, the most urgent first; more would make the page too large
 _BROKEN = 200
 _REPORT = re.compile(r"diagnoses/(?:[\w.-]*[\w-][\w.-]*/)*report\.html")  # as a run writes it
-_BLUE, _ORANGE, _GREY = "#005f9e", "#e0701a", "#999999"
 _WIDTH, _LEFT, _RIGHT, _HEIGHT, _ROW = 900.0, 80.0, 10.0, 190.0, 18.0
+_SPARK = (220.0, 44.0)
+_SORTS = ("urgency", "name", "last recording")
 
 
 class _Frame(NamedTuple):
@@ -48,12 +52,18 @@ def page(document: dict[str, Any]) -> str:
         document: fleet.json.
     """
     joints = document["joints"]
+    orders = _orders(joints)
     template = Template(Path(__file__).with_name("fleet.html").read_text(encoding="utf-8"))
     return template.substitute(
         headline=html.escape(_headline(joints)),
+        controls=_controls(joints),
+        styles=_styles(joints),
         about=html.escape(_about(document)),
-        joints="".join(_line(joint, k < _CHARTS) for k, joint in enumerate(joints)),
-        details="".join(_details(joint) for joint in joints[:_CHARTS]) + _rest(joints),
+        joints="".join(
+            _line(joint, order, k < _CHARTS)
+            for k, (joint, order) in enumerate(zip(joints, orders, strict=True))
+        ),
+        details="".join(map(_details, joints[:_CHARTS], orders)) + _rest(joints),
         broken=_broken(document["broken"]),
         method=html.escape(
             f"{document['method']}. {document['tests']} series tested; false discovery rate "
@@ -65,9 +75,50 @@ def page(document: dict[str, Any]) -> str:
 
 
 def _headline(joints: Sequence[dict[str, Any]]) -> str:
-    changing = sum(joint["state"] == "changing" for joint in joints)
-    verb = "changes" if changing == 1 else "change"
-    return f"{changing} of {len(joints)} joint{'s' * (len(joints) != 1)} {verb}"
+    states = Counter(joint["state"] for joint in joints)
+    look = [f"{states[state]} {state}" for state in LOOK if states[state]]
+    if not look:
+        return f"No change in {len(joints)} joint{'s' * (len(joints) != 1)}"
+    count = sum(states[state] for state in LOOK)
+    need = "needs" if count == 1 else "need"
+    return f"{count} of {len(joints)} joint{'s' * (len(joints) != 1)} {need} a look: {', '.join(look)}"
+
+
+def _orders(joints: Sequence[dict[str, Any]]) -> list[str]:
+    """Style of each joint with its place by each way of sorting."""
+    names = sorted(joint["joint"] for joint in joints)
+    lasts = sorted({joint["last"] or "" for joint in joints}, reverse=True)
+    return [
+        f"--by0:{k};--by1:{names.index(joint['joint'])};--by2:{lasts.index(joint['last'] or '')}"
+        for k, joint in enumerate(joints)
+    ]
+
+
+def _controls(joints: Sequence[dict[str, Any]]) -> str:
+    """Sort and filter, which work by styles alone."""
+    states = Counter(joint["state"] for joint in joints)
+    sorts = "".join(
+        f'<label><input type="radio" name="by" id="by{k}"{" checked" * (k == 0)}>{name}</label>'
+        for k, name in enumerate(_SORTS)
+    )
+    shows = "".join(
+        f'<label><input type="checkbox" id="show-{state}" checked>{states[state]} {state}</label>'
+        for state in STATES
+        if states[state]
+    )
+    return "".join(
+        f"<fieldset><legend>{legend}</legend>{inputs}</fieldset>"
+        for legend, inputs in (("sort by", sorts), ("show", shows))
+    )
+
+
+def _styles(joints: Sequence[dict[str, Any]]) -> str:
+    rules = [f"body:has(#by{k}:checked) .sorted > * {{ order: var(--by{k}); }}" for k in range(len(_SORTS))]
+    rules += [
+        f"body:has(#show-{state}:not(:checked)) .is-{state} {{ display: none; }}"
+        for state in sorted({joint["state"] for joint in joints})
+    ]
+    return "\n  ".join(rules)
 
 
 def _about(document: dict[str, Any]) -> str:
@@ -80,82 +131,130 @@ def _about(document: dict[str, Any]) -> str:
     )
 
 
-def _line(joint: dict[str, Any], linked: bool) -> str:
-    name = html.escape(joint["joint"])
+def _line(joint: dict[str, Any], order: str, linked: bool) -> str:
+    name, state = html.escape(joint["joint"]), joint["state"]
     link = f'<a href="#{name}">{name}</a>' if linked else name
-    spark = "".join(_spark(one) for one in joint["transmissions"])
+    spark = "".join(_spark(joint, one) for one in joint["transmissions"])
     return (
-        f'<tr><th>{link}</th><td><span class="state {joint["state"]}">{joint["state"]}</span></td>'
+        f'<tr class="is-{state}" style="{order}"><th>{link}</th>'
+        f'<td><span class="state {state}">{state}</span></td>'
         f'<td>{html.escape(joint["sentence"])}</td><td class="spark">{spark}</td></tr>\n'
     )
 
 
-def _spark(one: dict[str, Any]) -> str:
-    frame = _frame(one, 2.0, 136.0, 26.0)
-    points = ((frame.x(p["time"]), frame.y(p["stiffness_nm_rad"])) for p in one["series"])
-    dots = "".join(_dot(x, y, _BLUE, radius=1.3) for x, y in points)
-    return f'<svg viewBox="0 0 140 28" width="140" height="28">{_fitted(one, frame)}{dots}</svg>'
+def _spark(joint: dict[str, Any], one: dict[str, Any]) -> str:
+    width, height = _SPARK
+    frame = _frame(joint, one, 4.0, width - 8.0, height - 4.0)
+    places = [(frame.x(p["time"]), frame.y(p["stiffness_nm_rad"])) for p in one["series"]]
+    line = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
+    last = _dot(*places[-1], "dot full", radius=3.2)
+    missing = _missing(joint, one, frame, linked=False)
+    return (
+        f'<svg viewBox="0 0 {width:g} {height:g}" width="{width:g}" height="{height:g}" role="img">'
+        f'{_fitted(one, frame)}<polyline class="curve" points="{line}"/>{last}{missing}</svg>'
+    )
 
 
-def _details(joint: dict[str, Any]) -> str:
+def _details(joint: dict[str, Any], order: str) -> str:
     name = html.escape(joint["joint"])
     charts = "".join(_figure(joint, one) for one in joint["transmissions"])
-    opened = "" if joint["state"] == "steady" else " open"
+    others = "".join(_small(joint, one) for one in joint["parameters"])
+    opened = " open" if joint["state"] in LOOK else ""
     return (
-        f'<details id="{name}"{opened}><summary><b>{name}</b>{html.escape(joint["sentence"])}</summary>'
-        f"{charts}{_effects(joint)}{_diagnoses(joint)}</details>\n"
+        f'<details id="{name}" class="joint is-{joint["state"]}" style="{order}"{opened}>'
+        f"<summary><b>{name}</b>{html.escape(joint['sentence'])}</summary>"
+        f'{charts}<div class="small">{others}</div>{_effects(joint)}{_diagnoses(joint)}</details>\n'
+    )
+
+
+def _small(joint: dict[str, Any], one: dict[str, Any]) -> str:
+    """Chart of one other parameter over time."""
+    series = [
+        {"time": p["time"], "stiffness_nm_rad": p["value"], "fitted_nm_rad": p["value"],
+         "std_nm_rad": p["std"] or 0.0, "report": p["report"], "verdict": ""}
+        for p in one["series"]
+    ]  # fmt: skip
+    effect, _, parameter = one["name"].rpartition(".")
+    unit = Units(False).of(parameter)
+    shown = {"transmission": one["motor"], "series": series, "changes": [], "unit": unit}
+    frame = _frame(joint, shown, _LEFT, 0.5 * _WIDTH - _LEFT - _RIGHT, 110.0)
+    body = _axes(frame, 132.0) + _points(shown, frame)
+    words = [in_words(effect)] if effect else []
+    words.append(bare_name(parameter) + (f", {unit}" if unit else ""))
+    if len(joint["transmissions"]) > 1:
+        words.append(f"motor {one['motor']}")
+    return (
+        f'<figure><svg viewBox="0 0 {0.5 * _WIDTH:g} 132" role="img">{body}</svg>'
+        f"<figcaption>{html.escape(': '.join(words))}</figcaption></figure>"
     )
 
 
 def _figure(joint: dict[str, Any], one: dict[str, Any]) -> str:
-    frame = _frame(one, _LEFT, _WIDTH - _LEFT - _RIGHT, _HEIGHT)
+    frame = _frame(joint, one, _LEFT, _WIDTH - _LEFT - _RIGHT, _HEIGHT)
     rows = joint["effects"]
     height = _HEIGHT + _ROW * len(rows) + 22.0
-    parts = [_axes(frame, one, height), _bands(one, frame), _fitted(one, frame), _points(one, frame)]
+    parts = [_axes(frame, height), _bands(one, frame), _fitted(one, frame), _points(one, frame)]
+    parts.append(_missing(joint, one, frame))
     parts += [_strip(joint, effect, frame, _HEIGHT + _ROW * (k + 0.8)) for k, effect in enumerate(rows)]
-    several = f", transmission {one['transmission']}" if len(joint["transmissions"]) > 1 else ""
+    several = f" of motor {one['transmission']}" if len(joint["transmissions"]) > 1 else ""
     caption = (
         f"Stiffness{several} at a deflection of {one['deflection_rad']:.3g} rad, N·m/rad; scatter "
-        f"{100 * one['scatter_relative']:.2g} %, q = {one['q_value']:.2g}. A click opens the diagnosis."
+        f"{100 * one['scatter_relative']:.2g} %, q = {one['q_value']:.2g}. × at the bottom: a recording that "
+        "shows no stiffness. A click opens the diagnosis."
     )
     body = "".join(parts)
     return (
-        f'<figure><svg viewBox="0 0 {_WIDTH:g} {height:g}" role="img">{body}</svg>'
+        f'<figure class="wide"><svg viewBox="0 0 {_WIDTH:g} {height:g}" role="img">{body}</svg>'
         f"<figcaption>{html.escape(caption)}</figcaption></figure>"
     )
 
 
-def _frame(one: dict[str, Any], left: float, width: float, height: float) -> _Frame:
-    points = one["series"]
-    values = [p["stiffness_nm_rad"] for p in points] + [p["fitted_nm_rad"] for p in points]
-    low, high = min(values), max(values)
-    least = 0.01 * abs(values[0])  # minimum span of the axis: a steady joint looks steady
-    if high - low < 2.0 * least:
-        low, high = 0.5 * (low + high) - least, 0.5 * (low + high) + least
-    pad = 0.12 * (high - low)
-    times = [_seconds(p["time"]) for p in points]
-    return _Frame(min(times), max(times), low - pad, high + pad, left, width, height)
-
-
-def _axes(frame: _Frame, one: dict[str, Any], height: float) -> str:
+def _missing(joint: dict[str, Any], one: dict[str, Any], frame: _Frame, *, linked: bool = True) -> str:
+    """A cross for each recording that shows no stiffness of this transmission."""
     parts = []
-    for value in _ticks(frame.low, frame.high):
-        y = frame.y(value)
-        parts.append(
-            f'<line x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}" stroke="#e4e4e4"/>'
-        )
-        parts.append(f'<text x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{value:.6g}</text>')
-    points = one["series"]
-    first, last = points[0]["time"][:10], points[-1]["time"][:10]
-    parts.append(f'<text x="{_LEFT}" y="{height - 5:.1f}">{first}</text>')
-    parts.append(f'<text x="{_WIDTH - _RIGHT}" y="{height - 5:.1f}" text-anchor="end">{last}</text>')
+    for row in joint["unusable"]:
+        if row["transmission"] not in (None, one["transmission"]):
+            continue
+        x, y, r = frame.x(row["time"]), frame.height - 6.0, 3.5
+        title = f"<title>{html.escape(_minute(row['time']) + ': ' + row['reason'])}</title>" if linked else ""
+        cross = f"M{x - r:.1f} {y - r:.1f}l{2 * r} {2 * r}m0 {-2 * r}l{-2 * r} {2 * r}"
+        mark = f'<path class="cross" d="{cross}">{title}</path>'
+        parts.append(_link(row["report"], mark) if linked else mark)
     return "".join(parts)
 
 
-def _ticks(low: float, high: float) -> list[float]:
-    """Round values between two, some four to eight of them."""
-    power = 10.0 ** math.floor(math.log10((high - low) / 4.0))
-    step = max(factor * power for factor in (1.0, 2.0, 5.0) if factor * power <= (high - low) / 4.0)
+def _frame(joint: dict[str, Any], one: dict[str, Any], left: float, width: float, height: float) -> _Frame:
+    """The range of the values, and the time of all recordings of the joint, usable or not."""
+    points = one["series"]
+    values = [p["fitted_nm_rad"] for p in points]
+    values += [p["stiffness_nm_rad"] + d * p["std_nm_rad"] for p in points for d in (-SIGMA_95, SIGMA_95)]
+    low, high = min(values), max(values)
+    # Minimum span of the axis: a steady joint looks steady.
+    least = 0.01 * abs(points[0]["stiffness_nm_rad"]) or 1e-9
+    if high - low < 2.0 * least:
+        low, high = 0.5 * (low + high) - least, 0.5 * (low + high) + least
+    pad = 0.12 * (high - low)
+    times = [_seconds(p["time"]) for p in (*points, *joint["unusable"], *joint["diagnoses"])]
+    return _Frame(min(times), max(times), low - pad, high + pad, left, width, height)
+
+
+def _axes(frame: _Frame, height: float) -> str:
+    parts = []
+    right = frame.left + frame.width
+    for value in _ticks(frame.low, frame.high, 4.0 if frame.height > 150.0 else 2.0):
+        y = frame.y(value)
+        parts.append(f'<line class="grid" x1="{frame.left}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
+        parts.append(f'<text x="{frame.left - 8}" y="{y + 4:.1f}" text-anchor="end">{value:.6g}</text>')
+    first, last = (datetime.fromtimestamp(t, UTC).date() for t in (frame.begin, frame.end))
+    parts.append(f'<text x="{frame.left}" y="{height - 5:.1f}">{first}</text>')
+    parts.append(f'<text x="{right}" y="{height - 5:.1f}" text-anchor="end">{last}</text>')
+    return "".join(parts)
+
+
+def _ticks(low: float, high: float, least: float) -> list[float]:
+    """Round values between two, about so many or up to twice as many."""
+    power = 10.0 ** math.floor(math.log10((high - low) / least))
+    step = max(factor * power for factor in (1.0, 2.0, 5.0) if factor * power <= (high - low) / least)
     return [k * step for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
 
 
@@ -167,8 +266,7 @@ def _bands(one: dict[str, Any], frame: _Frame) -> str:
         box = f'x="{low - 2:.1f}" y="0" width="{high - low + 4:.1f}" height="{frame.height}"'
         line = f'x1="{x:.1f}" x2="{x:.1f}" y1="0" y2="{frame.height}" stroke-dasharray="4 3"'
         title = f"<title>{change['kind']} since {change['since'][:10]}</title>"
-        parts.append(f'<rect {box} fill="{_ORANGE}" opacity=".13"/>')
-        parts.append(f'<line {line} stroke="{_ORANGE}">{title}</line>')
+        parts.append(f'<rect class="when" {box}/><line class="fit" {line}>{title}</line>')
     return "".join(parts)
 
 
@@ -176,7 +274,7 @@ def _fitted(one: dict[str, Any], frame: _Frame) -> str:
     if not one["changes"]:
         return ""
     line = " ".join(f"{frame.x(p['time']):.1f},{frame.y(p['fitted_nm_rad']):.1f}" for p in one["series"])
-    return f'<polyline points="{line}" fill="none" stroke="{_ORANGE}" stroke-width="1.6"/>'
+    return f'<polyline class="fit" points="{line}"/>'
 
 
 def _points(one: dict[str, Any], frame: _Frame) -> str:
@@ -184,31 +282,31 @@ def _points(one: dict[str, Any], frame: _Frame) -> str:
     for p in one["series"]:
         x, reach = frame.x(p["time"]), SIGMA_95 * p["std_nm_rad"]
         y, low, high = (frame.y(p["stiffness_nm_rad"] + d) for d in (0.0, -reach, reach))
-        tip = f"{_minute(p['time'])}: {p['stiffness_nm_rad']:.5g} ± {reach:.2g} N·m/rad, {p['verdict']}"
-        bar = f'<line x1="{x:.1f}" x2="{x:.1f}" y1="{low:.1f}" y2="{high:.1f}" stroke="{_BLUE}"/>'
-        fill = _BLUE if p["verdict"] == "sufficient" else "#ffffff"
-        parts.append(_link(p["report"], bar + _dot(x, y, fill, tip, stroke=_BLUE)))
+        value = with_interval(p["stiffness_nm_rad"], reach, one.get("unit", "N·m/rad"))
+        tip = ", ".join(filter(None, (f"{_minute(p['time'])}: {value}", p["verdict"])))
+        bar = f'<line class="bar" x1="{x:.1f}" x2="{x:.1f}" y1="{low:.1f}" y2="{high:.1f}"/>'
+        kind = "dot full" if p["verdict"] in ("sufficient", "") else "dot"
+        parts.append(_link(p["report"], bar + _dot(x, y, kind, tip)))
     return "".join(parts)
 
 
 def _strip(joint: dict[str, Any], effect: dict[str, Any], frame: _Frame, y: float) -> str:
     """One line below the chart: recordings in which an effect was found at a location."""
-    colour = _ORANGE if effect["significant"] else _GREY
-    parts = [
-        f'<text x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{html.escape(effect["location"])}</text>'
-    ]
+    kind = "found new" if effect["significant"] else "found"
+    place = html.escape(spaced(effect["location"]))
+    parts = [f'<text x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{place}</text>']
     for one in joint["diagnoses"]:
         names = [name for name in one["effects"] if name.endswith(f"@{effect['location']}")]
-        if names and frame.begin <= _seconds(one["time"]) <= frame.end:
+        if names:
             tip = f"{_minute(one['time'])}: {', '.join(names)}"
-            parts.append(_link(one["report"], _dot(frame.x(one["time"]), y, colour, tip)))
+            parts.append(_link(one["report"], _dot(frame.x(one["time"]), y, kind, tip)))
     return "".join(parts)
 
 
-def _dot(x: float, y: float, fill: str, tip: str = "", stroke: str = "none", radius: float = 3.4) -> str:
+def _dot(x: float, y: float, kind: str, tip: str = "", radius: float = 3.4) -> str:
     title = f"<title>{html.escape(tip)}</title>" if tip else ""
     where = f'cx="{x:.1f}" cy="{y:.1f}" r="{radius}"'
-    return f'<circle {where} fill="{fill}" stroke="{stroke}" stroke-width="1.4">{title}</circle>'
+    return f'<circle class="{kind}" {where}>{title}</circle>'
 
 
 def _link(report: str, body: str, tip: str = "") -> str:
@@ -225,22 +323,23 @@ def _minute(time: str) -> str:
 def _effects(joint: dict[str, Any]) -> str:
     if not joint["effects"]:
         return ""
-    heads = ("found", "at", "recordings", "since", "error that it removes", "")
+    heads = ("found", "at", "in", "", "error without → with it", "")
     lines = []
     for effect in joint["effects"]:
         names = html.escape(", ".join(map(in_words, effect["names"])))
         since = effect["since"][:10] + (" (significant)" if effect["significant"] else "")
-        count, share = f"{effect['recordings']} of {effect['of']}", f"{effect['error_relative']:.1%}"
+        count = f"{effect['recordings']} of {effect['of']}"
+        before, after = (number(100.0 * effect[f"error_{when}_relative"], 3) for when in ("before", "after"))
         cells = (
             names,
-            html.escape(effect["location"]),
-            count,
-            since,
-            share,
+            html.escape(spaced(effect["location"])),
+            f"{count} recordings",
+            f"since {since}",
+            f"{before} → {after} % of the torque",
             _link(effect["report"], "diagnosis"),
         )
         lines.append(_row("td", cells))
-    return f"<table><thead>{_row('th', heads)}</thead><tbody>{''.join(lines)}</tbody></table>"
+    return f"<table class='effects'><thead>{_row('th', heads)}</thead><tbody>{''.join(lines)}</tbody></table>"
 
 
 def _row(tag: str, cells: Iterable[str]) -> str:

@@ -21,6 +21,8 @@ from drivelink.fleet.changes import (
     q_values,
     series_test,
 )
+from drivelink.fleet.rows import iso, lost, parameters, unusable, usable
+from drivelink.output.digits import with_interval
 from drivelink.output.units import in_words
 from estimator.sample import SIGMA_95, FloatArray
 from estimator.transmissions import MODELS
@@ -34,6 +36,7 @@ COLUMNS = [
     "joint", "transmission", "status", "error", "verdict", "sentence", "effects", "report",
     "model", "parameters", "covariance", "excited", "error_before_relative", "error_after_relative",
     "deflection_middle_rad", "stiffness_middle_nm_rad", "stiffness_std_middle_nm_rad",
+    "viscous_damping_nm_s_rad", "details",
 ]  # fmt: skip
 
 _SHOWN = ("recording", "verdict", "effects", "sentence", "report")  # of a diagnosis
@@ -103,11 +106,11 @@ def summarise(rows: list[dict[str, Any]], false_discovery_rate: float) -> dict[s
         "tests": len(p),
         "level": level,
         "recordings": len({row["recording"] for row in rows}),
-        "from": _iso(min(times)) if times else None,
-        "to": _iso(max(times)) if times else None,
+        "from": iso(min(times)) if times else None,
+        "to": iso(max(times)) if times else None,
         "joints": documents,
         "broken": [
-            {**{key: row[key] for key in ("recording", "joint", "error")}, "time": _iso(row["time"])}
+            {**{key: row[key] for key in ("recording", "joint", "error")}, "time": iso(row["time"])}
             for row in broken
         ],
     }
@@ -115,23 +118,15 @@ def summarise(rows: list[dict[str, Any]], false_discovery_rate: float) -> dict[s
 
 def _series(rows: list[dict[str, Any]]) -> list[_Series]:
     made = []
-    usable = [row for row in rows if _usable(row)]
-    for number in sorted({int(row["transmission"]) for row in usable}):
-        own = [row for row in usable if row["transmission"] == number]
+    able = [row for row in rows if usable(row)]
+    for number in sorted({int(row["transmission"]) for row in able}):
+        own = [row for row in able if row["transmission"] == number]
         phi = float(np.median([row["deflection_middle_rad"] for row in own]))
         values = np.array([_stiffness(row, phi) for row in own])
         time_s = np.array([row["time"].timestamp() for row in own])
         value, std = values[:, 0], values[:, 1]
         made.append(_Series(number, phi, own, time_s, value, std, series_test(time_s, value, std)))
     return made
-
-
-def _usable(row: dict[str, Any]) -> bool:
-    """Whether a row has a usable stiffness."""
-    value, std = row["stiffness_middle_nm_rad"], row["stiffness_std_middle_nm_rad"]
-    return bool(
-        row["status"] == "done" and row["excited"] and value is not None and value > 0.0 and std is not None
-    )
 
 
 def _stiffness(row: dict[str, Any], phi: float) -> tuple[float, float]:
@@ -176,7 +171,7 @@ def _transmission(series: _Series, q: float, rate: float, level: float) -> dict[
         "changes": [_changed(series, change, base) for change in found],
         "series": [
             {
-                "time": _iso(row["time"]),
+                "time": iso(row["time"]),
                 "stiffness_nm_rad": float(value),
                 "std_nm_rad": float(std),
                 "fitted_nm_rad": float(level_),
@@ -200,9 +195,9 @@ def _changed(series: _Series, change: SeriesChange, base: float) -> dict[str, An
     days = (series.time_s[-1] - series.time_s[change.first]) / _DAY_S
     document = {
         "kind": change.kind,
-        "since": _iso(series.rows[change.first]["time"]),
-        "since_earliest": _iso(series.rows[change.earliest]["time"]),
-        "since_latest": _iso(series.rows[change.latest]["time"]),
+        "since": iso(series.rows[change.first]["time"]),
+        "since_earliest": iso(series.rows[change.earliest]["time"]),
+        "since_latest": iso(series.rows[change.latest]["time"]),
         "amount_nm_rad": change.amount,
         "amount_std_nm_rad": change.amount_std,
         "amount_relative": change.amount / base,
@@ -220,20 +215,23 @@ def _effect(place: _Place, q: float, rate: float) -> dict[str, Any]:
         for row in place.rows
         if names & {n.partition("@")[0] for n in row["effects"] if n.endswith(f"@{place.place}")}
     ]
-    falls = [row["error_before_relative"] - row["error_after_relative"] for row in seen]
+    before, after = (
+        float(np.median([row[f"error_{when}_relative"] for row in seen])) for when in ("before", "after")
+    )
     return {
         "location": place.place,
         "names": place.names,
         "p_value": place.test.p_value,
         "q_value": q,
         "significant": q <= rate,
-        "since": _iso(place.rows[place.test.first]["time"]) if q <= rate else _iso(seen[0]["time"]),
+        "since": iso(place.rows[place.test.first]["time"]) if q <= rate else iso(seen[0]["time"]),
         "share_before": place.test.rate_before,
         "share_after": place.test.rate_after,
         "recordings": len(seen),
         "of": len(place.rows),
         "in_the_last": seen[-1] is place.rows[-1],
-        "error_relative": float(np.median(falls)),
+        "error_before_relative": before,
+        "error_after_relative": after,
         "report": seen[-1]["report"],
     }
 
@@ -244,37 +242,49 @@ def _joint(
     done = [row for row in rows if row["status"] == "done"]
     broken = [row for row in rows if row["status"] != "done"]
     last = done[-1] if done else None
-    state, size = _state(transmissions, effects, last)
+    without = unusable(rows)
+    gone = lost(transmissions, without)
+    state, size = _state(transmissions, effects, last, gone)
     return {
         "joint": name,
         "state": state,
-        "urgency": _URGENCY[state] + min(size, 0.999),
-        "sentence": _sentence(state, transmissions, effects, rows),
+        "urgency": STATES[state] + min(size, 0.999),
+        "sentence": _sentence(state, transmissions, effects, rows, gone),
         "recordings": len({row["recording"] for row in rows}),
         "broken": len(broken),
-        "last": _iso(rows[-1]["time"]),
+        "last": iso(rows[-1]["time"]),
         "verdict": last["verdict"] if last else None,
         "transmissions": transmissions,
+        "unusable": without,
+        "parameters": parameters(done),
         "effects": effects,
         "diagnoses": [
-            {**{key: row[key] for key in _SHOWN}, "time": _iso(row["time"])}
+            {**{key: row[key] for key in _SHOWN}, "time": iso(row["time"])}
             for row in done
             if row["transmission"] == 1
         ],
     }
 
 
-_URGENCY = {"changing": 4.0, "finding": 3.0, "unread": 2.0, "undecided": 1.0, "steady": 0.0}
+STATES = {"changing": 5.0, "lost": 4.0, "finding": 3.0, "unread": 2.0, "undecided": 1.0, "steady": 0.0}
+LOOK = ("changing", "lost", "finding", "unread")  # those that need a look
 
 
 def _state(
-    transmissions: list[dict[str, Any]], effects: list[dict[str, Any]], last: dict[str, Any] | None
+    transmissions: list[dict[str, Any]],
+    effects: list[dict[str, Any]],
+    last: dict[str, Any] | None,
+    gone: list[dict[str, Any]],
 ) -> tuple[str, float]:
     """Urgency of a joint, and relative size of the change to sort by."""
     moved = [abs(c["amount_relative"]) for t in transmissions for c in t["changes"]]
-    appeared = [abs(e["error_relative"]) for e in effects if e["significant"]]
+    appeared = [
+        abs(e["error_before_relative"] - e["error_after_relative"]) for e in effects if e["significant"]
+    ]
     if moved or appeared:
         return "changing", max(moved + appeared)
+    if gone:
+        return "lost", 0.1 * len(gone)
     if last is None:
         return "unread", 0.0
     if last["verdict"] not in _NO_PLACE:
@@ -285,7 +295,11 @@ def _state(
 
 
 def _sentence(
-    state: str, transmissions: list[dict[str, Any]], effects: list[dict[str, Any]], rows: list[dict[str, Any]]
+    state: str,
+    transmissions: list[dict[str, Any]],
+    effects: list[dict[str, Any]],
+    rows: list[dict[str, Any]],
+    gone: list[dict[str, Any]],
 ) -> str:
     """Summary of a joint in words."""
     said = []
@@ -294,15 +308,20 @@ def _sentence(
         of = f"Stiffness of transmission {one['transmission']}" if several else "Stiffness"
         for change in one["changes"]:
             amount, std = 100.0 * change["amount_relative"], 100.0 * change["amount_std_relative"]
-            day = change["since"][:10]
-            if change["kind"] == "step":
-                said.append(f"{of} stepped by {_signed(amount)} ± {SIGMA_95 * std:.1f} % on {day}.")
-            else:
-                said.append(f"{of} has drifted by {_signed(amount)} ± {SIGMA_95 * std:.1f} % since {day}.")
+            much = f"{'+' * (amount > 0.0)}{with_interval(amount, SIGMA_95 * std)} %"
+            verb, since = ("stepped", "on") if change["kind"] == "step" else ("has drifted", "since")
+            said.append(f"{of} {verb} by {much} {since} {change['since'][:10]}.")
     for effect in effects:
         if effect["significant"]:
             names = " or ".join(map(in_words, effect["names"][:2]))
-            said.append(f"New at the {_spaced(effect['location'])} since {effect['since'][:10]}: {names}.")
+            said.append(f"New at the {spaced(effect['location'])} since {effect['since'][:10]}: {names}.")
+    if gone:
+        which = "recording shows" if len(gone) == 1 else f"{len(gone)} recordings show"
+        said.insert(
+            0, f"The last {which} no stiffness, from {gone[0]['time'][:10]} on: {gone[-1]['reason']}."
+        )
+        if state == "lost" and rows[-1]["status"] == "done" and rows[-1]["verdict"] not in _NO_PLACE:
+            said.append(str(rows[-1]["sentence"]))
     if said:
         return " ".join(said)
     if state == "unread":
@@ -315,13 +334,6 @@ def _sentence(
     return "Steady."
 
 
-def _signed(value: float) -> str:
-    return f"{value:+.1f}".replace("-", "−")
-
-
-def _spaced(place: str) -> str:
+def spaced(place: str) -> str:
+    """A place as it stands in a sentence: motor 1."""
     return place.rstrip("12") + (f" {place[-1]}" if place[-1] in "12" else "")
-
-
-def _iso(moment: datetime | None) -> str | None:
-    return None if moment is None else moment.astimezone(UTC).isoformat(timespec="seconds")

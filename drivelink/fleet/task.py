@@ -21,8 +21,10 @@ from drivelink.fleet.analysis import Analysis, TransmissionRow, analyse
 from drivelink.fleet.joints import Joint, Joints
 from drivelink.fleet.pieces import Piece, pieces
 from drivelink.fleet.storage import Source, fetched
+from drivelink.jointfile import JointFile
 from drivelink.output.report import Title
 from drivelink.recording.canlog import CAN_SUFFIXES, read_frames
+from drivelink.recording.columnmap import column_map
 from drivelink.recording.gate import gate
 from drivelink.recording.mcapfile import read_messages
 from estimator.errors import EstimatorError
@@ -96,7 +98,7 @@ def process(task: Task, joints: Joints) -> Outcome:
                 row |= {"joint": joint.name, "accepted_model": joint.digest}
                 if (digest, joint.name) in task.done:
                     return Outcome("known", [], [], [])
-                row["time"] = recorded_time(path, task.source, joint.file.bus.channel)
+                row["time"] = recorded_time(path, task.source, joint.file)
                 if task.since and row["time"] and row["time"] < task.since:
                     return Outcome("early", [], [], [])
                 rows, reports = _results(task, joint, path, row)
@@ -233,7 +235,7 @@ def named_time(source: Source) -> datetime | None:
     return None
 
 
-def recorded_time(path: Path, source: Source, channel: str = "") -> datetime | None:
+def recorded_time(path: Path, source: Source, joint: JointFile | None = None) -> datetime | None:
     """Time of a recording: UNIX stamps, else the date in its name, else its modification time."""
     stamp_s = 0.0
     suffix = path.suffix.lower()
@@ -241,25 +243,28 @@ def recorded_time(path: Path, source: Source, channel: str = "") -> datetime | N
         message = next(iter(read_messages(path, frozenset({"sample", "can"}))), None)
         stamp_s = message.log_time_ns * 1e-9 if message else 0.0
     elif suffix in CAN_SUFFIXES:
-        frame = next(iter(read_frames(path, configured=channel)), None)
+        frame = next(iter(read_frames(path, configured=joint.bus.channel if joint else "")), None)
         stamp_s = frame.stamp_ns * 1e-9 if frame else 0.0
     elif suffix == ".csv":
-        stamp_s = _first_time(path)
+        stamp_s = _first_time(path, joint)
     if _UNIX < stamp_s < 1e11:
         return datetime.fromtimestamp(stamp_s, UTC)
     return named_time(source) or source.modified
 
 
-def _first_time(path: Path) -> float:
+def _first_time(path: Path, joint: JointFile | None) -> float:
     """`time_s` of the first row of a CSV; 0 if not found."""
+    declared = column_map(joint, None).get("time_s")
     with path.open("r", encoding="utf-8-sig", errors="replace") as file:
         lines = (line.strip() for line in file)
         rows = (line for line in lines if line and not line.startswith("#"))
         header, first = next(rows, ""), next(rows, "")
     separator = max(",;\t", key=header.count)
     names = [name.strip().strip("\"'") for name in header.split(separator)]
+    name, factor = declared[:2] if declared and declared.column in names else ("time_s", 1.0)
     try:
-        return float(first.split(separator)[names.index("time_s")].strip().strip("\"'").replace(",", "."))
+        cell = first.split(separator)[names.index(name)]
+        return factor * float(cell.strip().strip("\"'").replace(",", "."))
     except (ValueError, IndexError):
         return 0.0
 

@@ -11,6 +11,7 @@ from drivelink.jointfile.document import plain_parameters as plain_parameters
 from drivelink.jointfile.document import without_check as without_check
 from drivelink.jointfile.document import write_model as write_model
 from drivelink.jointfile.schema import BusSection as BusSection
+from drivelink.jointfile.schema import ColumnSection as ColumnSection
 from drivelink.jointfile.schema import DriveSection as DriveSection
 from drivelink.jointfile.schema import EncoderSection as EncoderSection
 from drivelink.jointfile.schema import JointFile as JointFile

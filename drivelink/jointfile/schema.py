@@ -8,6 +8,7 @@ from typing import Any, Literal, Self
 from annotated_types import Gt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from drivelink.jointfile.columns import COLUMNS, si_factor
 from estimator.model import (
     Arrangement,
     Effect,
@@ -22,12 +23,6 @@ from estimator.settings import EstimatorSettings
 from estimator.transmissions import MODELS, transmission_model
 
 Direction = Literal[1, -1]
-_COLUMN = (
-    "time_s|motor[12]_(position_rad|velocity_rad_s|torque_nm|current_a)"
-    "|link_position_rad|link_velocity_rad_s|external_torque_nm"
-)
-
-
 MOST_EFFECTS = 32  # of a motor or the link: each costs time in every cycle
 
 
@@ -228,12 +223,24 @@ class BusSection(_Section):
         return self.model_copy(update=changes)
 
 
+class ColumnSection(_Section):
+    """Where one of our columns comes from in a plant's own CSV or MF4 files."""
+
+    name: str = Field(min_length=1, description="of the column in the file")
+    unit: str | float = Field("", description="of its numbers, or a factor; left out: that of our name")
+    sign: Direction = Field(1, description="against the joint's")
+
+
 class RecordingSection(_Section):
     """How recordings are read, and what the black box keeps."""
 
     scale: dict[str, float] = Field(
         default_factory=dict,
         description="factors of columns, e.g. { link_position_rad = -1, motor1_torque_nm = 0.001 }",
+    )
+    columns: dict[str, ColumnSection] = Field(
+        default_factory=dict,
+        description='columns of other names: link_position_rad = { name = "q", unit = "deg", sign = -1 }',
     )
     folder: str | None = Field(
         None,
@@ -246,9 +253,17 @@ class RecordingSection(_Section):
 
     @model_validator(mode="after")
     def _columns(self) -> Self:
+        for key, names in (("scale", self.scale), ("columns", self.columns)):
+            if unknown := set(names) - COLUMNS:
+                raise ValueError(
+                    f'{key}: expected names of columns like "motor1_position_rad", got "{min(unknown)}"'
+                )
+        for name, column in self.columns.items():
+            try:
+                si_factor(name, column.unit)
+            except ValueError as error:
+                raise ValueError(f"columns.{name}.unit: {error}") from error
         for name, factor in self.scale.items():
-            if not re.fullmatch(_COLUMN, name):
-                raise ValueError(f'scale: expected names of columns like "motor1_position_rad", got "{name}"')
             require_in_range("scale", factor)
             if factor == 0.0:
                 raise ValueError(f"scale.{name}: expected a factor other than 0")

@@ -8,22 +8,12 @@ from collections.abc import Sequence
 from rich.text import Text
 
 from drivelink.monitor.history import usual_range
+from drivelink.output.digits import number
 
 _BARS = "▁▂▃▄▅▆▇█"
 # Bit of the dot at column c (0, 1) and row r (0 on top) of a braille character.
 _DOTS = ((0x01, 0x02, 0x04, 0x40), (0x08, 0x10, 0x20, 0x80))
 _BLANK = 0x2800
-
-
-def number(value: float, digits: int = 4) -> str:
-    """A number in few characters, with so many significant digits; very large and small ones like 4.1e6."""
-    if not math.isfinite(value):
-        return "–"
-    if value != 0.0 and not 1e-3 <= abs(value) < 1e5:
-        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
-        return f"{mantissa}e{int(exponent)}".replace("-", "−")
-    decimals = digits - 1 - (math.floor(math.log10(abs(value))) if value else 0)
-    return f"{value:.{max(0, min(decimals, max(digits, 4)))}f}".replace("-", "−")
 
 
 def sparkline(values: Sequence[float], width: int) -> str:

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 from rich.text import Text
 
 from drivelink.loop import finding as findings
-from drivelink.monitor.braille import gauge, number
+from drivelink.monitor.braille import gauge
+from drivelink.output.digits import number
 from drivelink.plaintext import clean_text
 
 MODEL_ALARM_ADVICE = (

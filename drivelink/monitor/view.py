@@ -18,9 +18,10 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from drivelink.monitor.braille import DotPlot, number, sparkline
+from drivelink.monitor.braille import DotPlot, sparkline
 from drivelink.monitor.history import JointHistory, TruePoint, usual_range
 from drivelink.monitor.statuslines import MODEL_ALARM_ADVICE, shape, status_lines, status_text
+from drivelink.output.digits import number, value_and_interval, with_interval
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from estimator.sample import SIGMA_95, Status
 
@@ -147,7 +148,7 @@ class JointView:
             return f"{self.name}: no estimate yet"
         parts = [
             f"{self.name}:",
-            f"stiffness {number(estimate.stiffness_nm_rad)} ± {number(_half(estimate), 2)} N·m/rad,",
+            f"stiffness {with_interval(estimate.stiffness_nm_rad, _half(estimate), 'N·m/rad')},",
             f"torque {number(estimate.flexibility_torque_nm)} N·m,",
             *self._external_words(),
             "deflection " + " ".join(number(one.deflection_rad, 3) for one in estimate.transmissions),
@@ -208,17 +209,17 @@ class JointView:
         spark = max(6, width - 69)
         ink = ESTIMATE if self.live else "dim"
         known = math.isfinite(last.true_stiffness_nm_rad)
-        half = _half(estimate)
-        band = f" ± {number(half, 2)}" if math.isfinite(half) else ""
+        stiffness, half = value_and_interval(last.stiffness_nm_rad, _half(estimate))
+        band = f" ± {half}" if half else ""
         for label, value, extra, unit, true, error, series in (
-            ("stiffness", last.stiffness_nm_rad, band, "N·m/rad", last.true_stiffness_nm_rad, errors[0],
+            ("stiffness", stiffness, band, "N·m/rad", last.true_stiffness_nm_rad, errors[0],
              [m.stiffness_nm_rad if m.valid else math.nan for m in window]),
-            ("torque", last.torque_nm, "", "N·m", last.true_torque_nm, errors[1],
+            ("torque", number(last.torque_nm), "", "N·m", last.true_torque_nm, errors[1],
              [m.torque_nm if m.valid else math.nan for m in window]),
         ):  # fmt: skip
             table.add_row(
                 label,
-                Text.assemble((number(value), f"bold {ink}"), extra, f" {unit}"),
+                Text.assemble((value, f"bold {ink}"), extra, f" {unit}"),
                 Text.assemble(
                     "truth ",
                     (number(true), TRUTH),
@@ -239,8 +240,9 @@ class JointView:
         if touch is None:
             return
         series = [t.torque_nm if t.valid else math.nan for t in self.history.touches]
-        value = number(touch.torque_nm) if touch.valid else "not valid"
-        band = f" ± {number(SIGMA_95 * touch.std_nm, 2)} N·m" if touch.valid else ""
+        value, half = value_and_interval(touch.torque_nm, SIGMA_95 * touch.std_nm)
+        band = f" ± {half} N·m" if touch.valid else ""
+        value = value if touch.valid else "not valid"
         contact = Text("contact", style="bold yellow") if touch.contact and self.live else Text("")
         table.add_row(
             "external",
@@ -339,8 +341,8 @@ def joints_table(views: Mapping[str, JointView], width: int) -> Table:
             cells += [Text("–")] * (len(table.columns) - 2) + [Text(view.state or "–")]
         else:
             deflection = " ".join(number(one.deflection_rad, 3) for one in estimate.transmissions)
-            half = number(_half(estimate), 2)
-            cells.append(Text.assemble((number(estimate.stiffness_nm_rad), ink), f" ± {half}"))
+            value, half = value_and_interval(estimate.stiffness_nm_rad, _half(estimate))
+            cells.append(Text.assemble((value, ink), f" ± {half}" if half else ""))
             cells.append(Text(number(estimate.flexibility_torque_nm)))
             cells += [Text(deflection)] if width >= 80 else []
             if sparks >= 8:

@@ -20,12 +20,12 @@ from typing import Any
 
 from drivelink.errors import UsageError, ZenohError
 from drivelink.loop import finding as findings
-from drivelink.monitor.braille import number
 from drivelink.monitor.history import Moment, Touch
 from drivelink.monitor.statuslines import Shown, shape
 from drivelink.monitor.view import JointView
 from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.webaccept import ACTIONS, WebAcceptance
+from drivelink.output.digits import number
 from drivelink.pubsub.inbound import decode_document
 
 MAX_CONNECTIONS = 16

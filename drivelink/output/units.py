@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from drivelink.output.digits import value_and_interval
 from estimator.model import ParameterValue
 from estimator.sample import SIGMA_95
 
@@ -23,6 +24,12 @@ _LINEAR = {  # of a linear axis: metres for rad, newtons for N·m
 def in_words(name: str) -> str:
     """The name of an effect as it stands in a sentence."""
     return name.replace("_", " ").replace("coulomb", "Coulomb").replace("stribeck", "Stribeck")
+
+
+def bare_name(name: str) -> str:
+    """The name of a parameter in words, without its unit."""
+    ending = next((end for end, _ in _UNITS if f"_{name}".endswith(end)), "")
+    return name.removesuffix(ending).replace("_", " ") or name
 
 
 class Units:
@@ -51,18 +58,22 @@ class Units:
 
     def value(self, name: str, value: ParameterValue, std: ParameterValue | None) -> str:
         """A parameter with its 95 % interval and unit; of a polynomial each coefficient has its own."""
-        unit = self.of(name)
-        if not isinstance(value, tuple):
-            return f"{_text(value, std if isinstance(std, float) else None)} {unit}".rstrip()
-        deviations = std if isinstance(std, tuple) else (None,) * len(value)
-        length = self.shown("rad")
-        texts = []
-        for k, (x, s) in enumerate(zip(value, deviations, strict=True)):
+        return ", ".join(
+            f"{text}{f' ± {half}' if half else ''} {unit}".rstrip()
+            for text, half, unit in self.parts(name, value, std)
+        )
+
+    def parts(
+        self, name: str, value: ParameterValue, std: ParameterValue | None
+    ) -> list[tuple[str, str, str]]:
+        """(value, half its 95 % interval, unit) of a parameter, or of each of a polynomial's coefficients."""
+        unit, length = self.of(name), self.shown("rad")
+        values = value if isinstance(value, tuple) else (value,)
+        deviations = std if isinstance(std, tuple) else (std,) * len(values)
+        found = []
+        for k, (x, s) in enumerate(zip(values, deviations, strict=True)):
             power = str(2 * k + 1).translate(_RAISED) if k and unit.endswith(f"/{length}") else ""
-            texts.append(f"{_text(x, s)} {unit}{power}".rstrip())
-        return ", ".join(texts)
-
-
-def _text(value: float, std: float | None) -> str:
-    """A number with its 95 % interval."""
-    return f"{value:.5g} ± {SIGMA_95 * std:.2g}" if std is not None and std > 0.0 else f"{value:.5g}"
+            half = None if s is None else SIGMA_95 * s
+            text, half_text = value_and_interval(x, half)
+            found.append((text if half_text else f"{x:.5g}", half_text, f"{unit}{power}"))
+        return found

@@ -11,7 +11,7 @@ from drivelink.errors import RecordingError, UsageError
 from drivelink.jointfile import JointFile
 from drivelink.recording.canframes import is_frame_log, read_frame_record
 from drivelink.recording.canlog import CAN_SUFFIXES
-from drivelink.recording.columnmap import ColumnMap
+from drivelink.recording.columnmap import ColumnMap, column_map
 from drivelink.recording.csvfile import read_csv
 from drivelink.recording.mcapsamples import read_mcap
 from drivelink.recording.mf4file import read_mf4
@@ -37,7 +37,7 @@ def read(
         base_dir: folder of the joint file, base of its EDS files.
         channel: of a raw CAN log with several.
         keep_nan: keep rows with NaN, for use tick by tick; else they become gaps.
-        names: columns of a CSV or MF4 file with other names or units.
+        names: columns of a CSV or MF4 file with other names or units, beside those of the joint file.
 
     Raises:
         RecordingError: it cannot be read, or is incomplete.
@@ -51,6 +51,7 @@ def read(
     suffix = path.suffix.lower()
     if names and (suffix == ".mcap" or suffix in CAN_SUFFIXES):
         raise UsageError(f"--map: {path}: only CSV and MF4 files have columns to be named")
+    names = column_map(joint, names)
     if is_frame_log(path):
         return read_frame_record(path, joint, Path(base_dir), channel)
     if suffix == ".mcap":

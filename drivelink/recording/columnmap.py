@@ -1,52 +1,31 @@
-"""`--map q_link=link_position_rad:deg`: maps foreign columns to our names and units."""
+"""Columns of others under our names, in SI: `--map q=link_position_rad:deg`, or `[recording.columns]`."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from drivelink.errors import RecordingError, UsageError
-from drivelink.recording.columns import KNOWN
+from drivelink.jointfile import JointFile
+from drivelink.jointfile.columns import COLUMNS, si_factor
 from estimator.sample import FloatArray
 
-_REVOLUTION = 2.0 * math.pi
 
-UNITS: dict[str, dict[str, float]] = {
-    "_rad_s": {
-        "rad/s": 1.0,
-        "mrad/s": 1e-3,
-        "deg/s": _REVOLUTION / 360.0,
-        "rpm": _REVOLUTION / 60.0,
-        "rev/s": _REVOLUTION,
-        "m/s": 1.0,
-        "mm/s": 1e-3,
-    },
-    "_rad": {
-        "rad": 1.0,
-        "mrad": 1e-3,
-        "urad": 1e-6,
-        "deg": _REVOLUTION / 360.0,
-        "rev": _REVOLUTION,
-        "m": 1.0,
-        "mm": 1e-3,
-        "um": 1e-6,
-    },
-    "_nm": {"Nm": 1.0, "mNm": 1e-3, "kNm": 1e3, "Ncm": 1e-2, "N": 1.0, "mN": 1e-3, "kN": 1e3},
-    "_a": {"A": 1.0, "mA": 1e-3},
-    "_s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0},
-}
-"""Accepted units with their SI values, by the ending of a column's name; a linear axis has m and N."""
+class Source(NamedTuple):
+    """Source of one of our columns: SI value = factor * value in the file.
 
-
-class _Source(NamedTuple):
-    """Source of one of our columns: SI value = factor * value in the file."""
+    Attributes:
+        column: its name in the file.
+        factor: SI value of its unit, with its sign.
+        asked: by `--map`: it has to be there. Else our own name is taken where the source is missing.
+    """
 
     column: str
     factor: float
+    asked: bool = True
 
 
-ColumnMap = Mapping[str, _Source]
+ColumnMap = Mapping[str, Source]
 """Our columns, each with its source."""
 
 
@@ -56,34 +35,31 @@ def parse_column_map(texts: Sequence[str]) -> ColumnMap:
     Raises:
         UsageError: another form.
     """
-    found: dict[str, _Source] = {}
+    found: dict[str, Source] = {}
     for text in texts:
         source, equals, target = text.rpartition("=")
         name, _, unit = target.partition(":")
-        if not equals or not source.strip() or name not in KNOWN:
+        if not equals or not source.strip() or name not in COLUMNS:
             raise UsageError(
                 f"--map: expected SOURCE=COLUMN[:UNIT] like q_link=link_position_rad:deg, with COLUMN one of "
-                f"{', '.join(sorted(KNOWN))}; got {text!r}"
+                f"{', '.join(sorted(COLUMNS))}; got {text!r}"
             )
         if name in found:
             raise UsageError(f"--map: {name} is given twice, as {found[name].column} and {source}")
-        found[name] = _Source(source.strip(), _factor(name, unit))
+        try:
+            found[name] = Source(source.strip(), si_factor(name, unit))
+        except ValueError as error:
+            raise UsageError(f"--map: {name}: {error}") from error
     return found
 
 
-def _factor(name: str, unit: str) -> float:
-    if not unit:
-        return 1.0
-    units = next(units for ending, units in UNITS.items() if name.endswith(ending))
-    if unit in units:
-        return units[unit]
-    try:
-        factor = float(unit)
-    except ValueError:
-        factor = 0.0
-    if factor == 0.0 or not math.isfinite(factor):
-        raise UsageError(f"--map: {name}: expected one of {', '.join(units)}, or a factor; got {unit!r}")
-    return factor
+def column_map(joint: JointFile | None, asked: ColumnMap | None) -> ColumnMap:
+    """The columns of the joint file, replaced by what `--map` asks for."""
+    declared = joint.recording.columns if joint else {}
+    return {
+        name: Source(one.name, one.sign * si_factor(name, one.unit), asked=False)
+        for name, one in declared.items()
+    } | dict(asked or {})
 
 
 def renamed(columns: Mapping[str, FloatArray], names: ColumnMap, where: str) -> dict[str, FloatArray]:
@@ -92,10 +68,16 @@ def renamed(columns: Mapping[str, FloatArray], names: ColumnMap, where: str) -> 
     Raises:
         RecordingError: a source is missing.
     """
+    names = {
+        name: source
+        for name, source in names.items()
+        if source.asked or source.column in columns or name not in columns
+    }
     for name, source in names.items():
         if source.column not in columns:
+            by = f"--map {source.column}={name}" if source.asked else f"recording.columns.{name}"
             raise RecordingError(
-                f"{where}: --map {source.column}={name}: no such column, found {', '.join(columns)}"
+                f"{where}: {by}: no such column {source.column!r}, found {', '.join(columns)}"
             )
     used = {source.column for source in names.values()}
     kept = {name: values for name, values in columns.items() if name not in used and name not in names}

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from drivelink.errors import RecordingError
 from drivelink.jointfile import JointFile
+from drivelink.jointfile.columns import COLUMNS, OF_LINK, OF_MOTOR
 from drivelink.recording.grid import Grid, NotUniformError, find_grid, report_gaps
 from drivelink.recording.limits import require_samples
 from drivelink.recording.resample import resampled, stamps_are_instants
@@ -21,15 +22,12 @@ from estimator.sample import FloatArray, Record, Sample
 _LOG = logging.getLogger("drivelink.recording")
 
 _SHOWN = 12  # names in a message
-_MOTOR = ("position_rad", "velocity_rad_s", "torque_nm", "current_a")
-_LINK = ("link_position_rad", "link_velocity_rad_s", "external_torque_nm")
-KNOWN = frozenset({"time_s", *(f"motor{i}_{name}" for i in (1, 2) for name in _MOTOR), *_LINK})
 
 
 def sample_columns(motors: int) -> tuple[str, ...]:
     """Names of a sample's columns, in the order of `sample_row`."""
-    per_motor = [f"motor{i}_{name}" for i in range(1, motors + 1) for name in _MOTOR[:3]]
-    return ("time_s", *per_motor, *_LINK)
+    per_motor = [f"motor{i}_{name}" for i in range(1, motors + 1) for name in OF_MOTOR[:3]]
+    return ("time_s", *per_motor, *OF_LINK)
 
 
 def sample_row(sample: Sample, period_s: float) -> tuple[float, ...]:
@@ -56,7 +54,7 @@ def record_from_columns(
     """Make a record of named columns: find the grid, convert currents to torques, make NaN rows gaps.
 
     Args:
-        columns: (rows,) each; names other than `KNOWN` are ignored with a warning.
+        columns: (rows,) each; names other than `COLUMNS` are ignored with a warning.
         where: begins every message.
         joint: gives the number of motors, whether a link position is needed, and torque constants.
         keep_nan: keep rows with NaN, for use tick by tick.
@@ -66,7 +64,7 @@ def record_from_columns(
         RecordingError: a column is missing, or the sampling is not uniform.
     """
     columns = {**columns, **dict.fromkeys(ignored, np.empty(0))}
-    if unknown := [name for name in columns if name not in KNOWN]:
+    if unknown := [name for name in columns if name not in COLUMNS]:
         _LOG.warning("%s: ignored column(s) %s", where, _some(unknown))
     columns = _scaled(columns, joint)
     motors = _motors(columns, joint, where)
@@ -116,7 +114,7 @@ def _on_grid(
         refused = error
     if grid is not None and not grid.jittering:
         return columns, grid
-    measured = {n: v for n, v in columns.items() if n in KNOWN and v.size and np.any(np.isfinite(v))}
+    measured = {n: v for n, v in columns.items() if n in COLUMNS and v.size and np.any(np.isfinite(v))}
     rows = np.all(np.isfinite(list(measured.values())), axis=0)
     rows[rows] &= np.diff(measured["time_s"][rows], prepend=-np.inf) > 0.0
     position = measured.get("motor1_position_rad")
@@ -163,7 +161,7 @@ def _channels(
     torques = [_torque(columns, i, joint, where) for i in numbers]
     measured = [_optional(columns, f"motor{i}_velocity_rad_s") for i in numbers]
     velocities = [np.full(len(positions[0]), np.nan) if v is None else v for v in measured]
-    link = {name: values for name in _LINK if (values := _optional(columns, name)) is not None}
+    link = {name: values for name in OF_LINK if (values := _optional(columns, name)) is not None}
     if "link_position_rad" not in link and joint and joint.model().has_deflection:
         _needed(columns, "link_position_rad", where)
     for i, position in zip(numbers, positions, strict=True):
@@ -203,7 +201,7 @@ def _repeats(columns: Mapping[str, FloatArray]) -> NDArray[np.bool_]:
     """(rows,) whether a row equals the previous one, its time included."""
     same = np.zeros(len(columns["time_s"]), dtype=np.bool_)
     if len(same) > 1 and np.any(np.diff(columns["time_s"]) == 0.0):
-        same[1:] = np.all([v[1:] == v[:-1] for name, v in columns.items() if name in KNOWN], axis=0)
+        same[1:] = np.all([v[1:] == v[:-1] for name, v in columns.items() if name in COLUMNS], axis=0)
     return same
 
 
@@ -242,7 +240,7 @@ def _needed(columns: Mapping[str, FloatArray], name: str, where: str, other: str
 
 def _require(columns: Mapping[str, FloatArray], name: str, where: str, other: str = "") -> None:
     if name not in columns:
-        near = difflib.get_close_matches(name, set(columns) - KNOWN, n=1, cutoff=0.75)
+        near = difflib.get_close_matches(name, set(columns) - COLUMNS, n=1, cutoff=0.75)
         hint = f"; did you mean it by {near[0]}?" if near else ""
         found = _some(list(columns)) or "none"
         raise RecordingError(f"{where}: expected a column {name}{other}, found {found}{hint}")

@@ -18,8 +18,9 @@ import numpy as np
 from drivelink.errors import RecordingError
 from drivelink.infile import open_regular
 from drivelink.jointfile import JointFile
+from drivelink.jointfile.columns import COLUMNS
 from drivelink.recording.columnmap import ColumnMap, renamed
-from drivelink.recording.columns import KNOWN, record_from_columns
+from drivelink.recording.columns import record_from_columns
 from drivelink.recording.limits import MAX_COLUMNS, MAX_LINE_BYTES, require_samples
 from estimator.sample import FloatArray, Record
 
@@ -130,7 +131,7 @@ def _layout(header: str, path: Path, wanted: ColumnMap) -> _Layout:
         raise RecordingError(f"{path}: expected at most {MAX_COLUMNS} columns, got {count}")
     names = tuple(name.strip().strip("\"'").strip() for name in header.split(separator))
     sources = {source.column for source in wanted.values()}
-    used = tuple(name for name in names if name in KNOWN or name in sources)
+    used = tuple(name for name in names if name in COLUMNS or name in sources)
     if not used:
         raise RecordingError(
             f"{path}: expected a header with time_s, motor1_position_rad, motor1_torque_nm, …, "

@@ -11,7 +11,8 @@ import numpy as np
 
 from drivelink.errors import RecordingError
 from drivelink.jointfile import JointFile
-from drivelink.recording.columns import KNOWN, record_from_columns
+from drivelink.jointfile.columns import COLUMNS
+from drivelink.recording.columns import record_from_columns
 from drivelink.recording.cycles import Cycle
 from drivelink.recording.limits import require_samples
 from drivelink.recording.mcapfile import message_fields, read_messages
@@ -95,7 +96,7 @@ def read_mcap(path: Path, joint: JointFile | None, keep_nan: bool) -> Record:
         try:
             row = message_fields(message.data)
             if not count:
-                columns = {name: array("d") for name in row if name in KNOWN}
+                columns = {name: array("d") for name in row if name in COLUMNS}
             for name, values in columns.items():
                 value = row.get(name)
                 values.append(math.nan if value is None else value)

@@ -17,9 +17,10 @@ import numpy as np
 from drivelink.errors import RecordingError
 from drivelink.infile import open_regular
 from drivelink.jointfile import JointFile
+from drivelink.jointfile.columns import COLUMNS
 from drivelink.output.outfile import check_target, put_in_place, sync
 from drivelink.recording.columnmap import ColumnMap, renamed
-from drivelink.recording.columns import KNOWN, record_from_columns, sample_columns, sample_row
+from drivelink.recording.columns import record_from_columns, sample_columns, sample_row
 from drivelink.recording.limits import require_samples
 from drivelink.recording.mcapsamples import read_mcap
 from drivelink.recording.sinks import McapSink
@@ -99,7 +100,7 @@ def read_mf4(
     try:
         open_regular(path).close()
         with mdf_module.MDF(path) as mdf:
-            wanted = {source.column for source in (names or {}).values()} | KNOWN - {"time_s"}
+            wanted = {source.column for source in (names or {}).values()} | COLUMNS - {"time_s"}
             for group in mdf.groups:
                 require_samples(group.channel_group.cycles_nr, str(path))
             found = [name for name in mdf.channels_db if name in wanted]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from drivelink.errors import RecordingError
+from drivelink.output.digits import with_interval
 from drivelink.output.outfile import NewFile
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.recording.messages import (
@@ -198,7 +199,7 @@ class Summary:
             f"({seconds / max(took_s, 1e-9):.3g} × real time); "
             f"valid {100 * self.valid / self.count:.1f} %, "
             f"observable {100 * self.observable / self.count:.1f} %; at the end stiffness "
-            f"{estimate.stiffness_nm_rad:.6g}{f' ± {half:.2g}' if half == half else ''} N·m/rad"
+            f"{with_interval(estimate.stiffness_nm_rad, half, 'N·m/rad')}"
         )
 
     def reasons(self) -> list[str]:

@@ -275,6 +275,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1, help="simulated joints of each kind")
     parser.add_argument("--state", type=Path, default=STATE, metavar="FILE")
     parser.add_argument("--data", type=Path, default=default, metavar="DIR")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures there")
     args = parser.parse_args()
     everything = constants()
     chosen = [c for c in everything if not args.only or any(c.label.startswith(name) for name in args.only)]
@@ -305,6 +306,9 @@ def main() -> None:
             )
         print(f"{label} x {factor:g}", file=sys.stderr)
     _report(done, jobs)
+    if args.json:
+        figures_ = [{"constant": name, "factor": f, "figures": found} for (name, f), found in done.items()]
+        args.json.write_text(json.dumps(figures_, indent=1) + "\n", encoding="utf-8")
 
 
 def _report(done: dict[tuple[str, float], Any], jobs: list[tuple[str, float]]) -> None:

@@ -1,6 +1,6 @@
 """How often `diagnose` names what the simulated joint carries, on random joints from published seeds.
 
-    python benchmarks/diagnosis_seeds.py [--seeds N] [--seconds S] [--effects NAME ...] [--json FILE]
+    python benchmarks/diagnosis_seeds.py [--seeds N] [--seconds S] [--effects NAME,… | --pairs]
 
 Every joint, motion and effect is drawn from its seed: soft joints of 80 to 220 N·m/rad with encoders and
 torque noise as drives have them, effects of 3 to 30 % of the torque. The world is `sim`, which shares no code
@@ -10,16 +10,10 @@ certain: a name that the joint does not carry, with a probability above 0.9.
 
 from __future__ import annotations
 
-import argparse
-import json
-from collections import Counter
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
+import scene
 
 from drivelink.demo.simulate import world_from_joint
 from drivelink.jointfile import JointFile, parse
@@ -152,70 +146,91 @@ def wrong_and_certain(effects: Sequence[Finding], real: Sequence[str]) -> list[s
     return [e.name for e in listed if e.probability > CERTAIN]
 
 
-def judged(name: str, seed: int, seconds: float) -> dict[str, Any]:
-    """One recording made and diagnosed."""
-    clean = name not in LIBRARY
-    declared, real = joint_of(() if clean else (name,), seed)
-    outcome = diagnose(measured(real, seconds), declared.model())
+PAIRS = [
+    "coulomb_friction+gravity",
+    "cogging+link_coulomb_friction",
+    "hysteresis+motor_inertia",
+    "viscous_damping+backlash",
+    "torque_offset+encoder_delay",
+    "coulomb_friction+kinematic_error",
+    "torque_lag+link_inertia",
+    "back_driving_loss+contact",
+    "higher_order_stiffness+encoder_eccentricity",
+]
+
+
+def judged(name: str, seed: int, seconds: float) -> scene.Row:
+    """One recording made and diagnosed; counts are of its effects."""
+    real = () if name == "clean" else tuple(name.split("+"))
+    declared, joint = joint_of(real, seed)
+    outcome = diagnose(measured(joint, seconds), declared.model())
     names = [effect.name for effect in outcome.effects]
-    first = outcome.effects[0] if outcome.effects else None
+    likely, places = listed(outcome.effects), {effect.location for effect in outcome.effects}
+    clean = not real and outcome.verdict == "sufficient"
     return {
-        "effect": name,
         "seed": seed,
-        "verdict": outcome.verdict,
-        "found": names,
-        "named_first": outcome.verdict == "sufficient" if clean else names[:1] == [name],
-        "located": clean or (first is not None and first.location == LIBRARY[name].location),
-        "listed": name in listed(outcome.effects[:1]) or (clean and not names),
-        "wrong_and_certain": wrong_and_certain(outcome.effects, () if clean else (name,)),
-        "surplus": max(0, len(names) - (0 if clean else 1)),
+        "found": names or [outcome.verdict],
+        "named": sum(each in names for each in real) + clean,
+        "first": int(set(names[: len(real)]) == set(real)) if real else int(clean),
+        "listed": sum(each in likely for each in real) + clean,
+        "located": sum(LIBRARY[each].location in places for each in real) + clean,
+        "surplus": sum(each not in real for each in names),
+        "certain": wrong_and_certain(outcome.effects, real),
         "after_over_before": outcome.validation.after_rms_nm / outcome.validation.before_rms_nm,
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=2, help="recordings of each effect")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first of them")
-    parser.add_argument("--seconds", type=float, default=20.0, help="length of a recording")
-    parser.add_argument("--effects", nargs="*", default=["clean", *LIBRARY], metavar="NAME")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write every outcome there")
-    args = parser.parse_args()
-    jobs = [(name, seed) for name in args.effects for seed in range(args.first, args.first + args.seeds)]
-    outcomes = [
-        judged(name, seed, args.seconds)
-        for name, seed in track(jobs, "diagnose", console=Console(stderr=True))
-    ]
-    print(
-        "| effect | named first | listed | located | else found | wrong and certain |"
-        + "\n"
-        + "|---" * 6
-        + "|"
+def rows(args) -> Iterator[scene.Row]:
+    """One row an effect or pair."""
+    for name in PAIRS if args.pairs else args.effects:
+        each = [judged(name, seed, args.seconds) for seed in range(args.first, args.first + args.seeds)]
+        counts = {
+            key: sum(one[key] for one in each) for key in ("named", "first", "listed", "located", "surplus")
+        }
+        else_found = {", ".join(one["found"]) for one in each if not one["first"]}
+        yield {
+            "effect": name,
+            **counts,
+            "of": len(each) * len(name.split("+")),
+            "recordings": len(each),
+            "else": "; ".join(sorted(else_found)) or None,
+            "certain": ", ".join(sorted({wrong for one in each for wrong in one["certain"]})) or None,
+            "left": float(np.median([one["after_over_before"] for one in each])),
+            "each": each,
+        }
+
+
+def total(found: list[scene.Row]) -> str:
+    """All rows together, clean joints apart."""
+    real = [row for row in found if row["effect"] != "clean"]
+    of = sum(row["of"] for row in real)
+    said = [f"{key} {sum(row[key] for row in real)}/{of}" for key in ("named", "listed", "located")]
+    certain = sum(len(one["certain"]) for row in found for one in row["each"])
+    left = float(np.median([one["after_over_before"] for row in real for one in row["each"]] or [np.nan]))
+    return (
+        f"{', '.join(said)}, surplus {sum(row['surplus'] for row in real)}, wrong and certain {certain}, "
+        f"held-out error after/before: median {left:.3f}"
     )
-    for name in args.effects:
-        mine = [o for o in outcomes if o["effect"] == name]
-        wrong = Counter(
-            str(f) for o in mine if not o["named_first"] for f in o["found"][:1] or [o["verdict"]]
-        )
-        counts = " | ".join(
-            f"{sum(o[key] for o in mine)}/{len(mine)}" for key in ("named_first", "listed", "located")
-        )
-        certain = sorted({each for o in mine for each in o["wrong_and_certain"]})
-        print(f"| {name} | {counts} | {', '.join(wrong) or '-'} | {', '.join(certain) or '-'} |")
-    real = [o for o in outcomes if o["effect"] in LIBRARY]
-    if real:
-        ratios = [o["after_over_before"] for o in real]
-        print(
-            f"\nnamed first {sum(o['named_first'] for o in real)}/{len(real)}, "
-            f"listed {sum(o['listed'] for o in real)}/{len(real)}, "
-            f"located {sum(o['located'] for o in real)}/{len(real)}, "
-            f"surplus terms {sum(o['surplus'] for o in real)}, "
-            f"wrong and certain {sum(len(o['wrong_and_certain']) for o in outcomes)}, "
-            f"held-out error after/before: median {np.median(ratios):.3f}"
-        )
-    if args.json:
-        args.json.write_text(json.dumps(outcomes, indent=2) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    scene.main(
+        __doc__,
+        rows,
+        {
+            "effect": "{effect}",
+            "named first": "{first}/{recordings}",
+            "named": "{named}/{of}",
+            "listed": "{listed}/{of}",
+            "located": "{located}/{of}",
+            "surplus": "{surplus}",
+            "else found": "{else}",
+            "wrong and certain": "{certain}",
+        },
+        scene.Option("--seeds", 2, "recordings of each effect"),
+        scene.Option("--first", 0, "seed of the first of them"),
+        scene.Option("--seconds", 20.0, "length of a recording"),
+        scene.Option("--effects", ["clean", *LIBRARY]),
+        scene.Option("--pairs", False, "pairs of effects instead"),
+        after=total,
+    )

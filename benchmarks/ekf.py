@@ -1,6 +1,6 @@
 """An extended Kalman filter on the raw positions, with the stiffness parameters as states, beside ours.
 
-    python benchmarks/ekf.py [--joints 8] [--seconds 20] [--seed 1] [--cases NAME,…] [--json]
+    python benchmarks/ekf.py [--joints 8] [--seconds 20] [--seed 1] [--cases NAME,…]
 
 The joints are those of `ensembles.py`, and so are the measures: from five seconds on, error and coverage of
 the stiffness. The filter's states are θ, θ′, q, q′, q″, the law's parameters, Coulomb friction, the torque's
@@ -13,32 +13,15 @@ multiplications of a tick are counted.
 
 from __future__ import annotations
 
-import json
-import sys
 import time
-from pathlib import Path
+from collections.abc import Iterator
 
 import numpy as np
-from ensembles import (
-    CASES,
-    SETTLED_S,
-    USABLE,
-    T,
-    arguments,
-    draw_joints,
-    judged,
-    percent,
-    summary,
-    table,
-)
-from rich.console import Console
-from rich.progress import track
+import scene
+from ensembles import CASES, OPTIONS, USABLE, T, draw_joints, judged, summary
+from scene import joints as world
 
 from estimator import EstimatorSettings, make_estimator
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-
-import joints as world
 
 THETA, OMEGA, Q, DQ, DDQ, LAW = range(6)
 STRIBECK_RAD_S = 0.02  # friction is a tanh of the velocity over this
@@ -184,19 +167,17 @@ class Filter:
         return 2 * dense * self.n + 2 * (2 * self.n**2 + 3 * self.n)
 
 
-def compare(case, n_joints, seconds, seed):
+def compare(case, n_joints, seconds, seed) -> scene.Row:
     """One row."""
     drawn = list(draw_joints(case, n_joints, seconds, seed))
     _, model, order, *_ = CASES[case]
-    steps, ours, us = len(drawn[0].record.link_position_rad), [], []
-    late = np.arange(steps) * T >= SETTLED_S
+    steps, ours, us = len(drawn[0].record), [], []
     for joint in drawn:
-        estimator, samples = make_estimator(joint.model, EstimatorSettings(), T), joint.record.samples()
-        samples = list(samples)
+        estimator, samples = make_estimator(joint.model, EstimatorSettings(), T), list(joint.record.samples())
         start = time.process_time()
         out = np.array([estimator.step(sample)[:5] for sample in samples])
         us.append(1e6 * (time.process_time() - start) / steps)
-        usable = (out[:, 1].astype(int) & USABLE == USABLE) & late
+        usable = out[:, 1].astype(int) & USABLE == USABLE
         ours.append(judged(out[:, 3], out[:, 4], joint.stiffness_nm_rad, usable))
     with np.errstate(all="ignore"):
         ekf = Filter(Law(model, order), drawn)
@@ -204,44 +185,31 @@ def compare(case, n_joints, seconds, seed):
         theirs = []
         for j, joint in enumerate(drawn):
             stiffness, std = (np.concatenate([[np.nan], stepped[:, i, j]]) for i in (0, 1))
-            usable = late & np.isfinite(stiffness) & (std < 0.25 * stiffness)
+            usable = np.isfinite(stiffness) & (std < 0.25 * stiffness)
             theirs.append(judged(stiffness, std, joint.stiffness_nm_rad, usable))
         single = Filter(Law(model, order), drawn[:1])
         start = time.process_time()
         for k in range(1, 1000):
             single.step(k)
-    row = {"case": case, "ours_us": float(np.median(us)), "ekf_numpy_us": 1e3 * (time.process_time() - start)}
-    row |= {"ekf_states": ekf.n, "ekf_multiplications": ekf.multiplications()}
-    for name, found in (("ours", ours), ("ekf", theirs)):
-        row |= {f"{name}_{key}": value for key, value in summary(found).items()}
-    return row
+    us = {"ours_us": float(np.median(us)), "ekf_us": 1e3 * (time.process_time() - start)}
+    states = {"states": ekf.n, "multiplications": ekf.multiplications()}
+    return {"case": case, **us, **states, "ours": summary(ours), "ekf": summary(theirs)}
 
 
-def main():
-    args = arguments(__doc__)
-    rows = [
-        compare(name, args.joints, args.seconds, args.seed)
-        for name in track(args.cases, "cases", console=Console(stderr=True))
-    ]
-    if args.json:
-        print(json.dumps(rows))
-        return
-    measures = {"usable": 0, "rmse_relative_median": 2, "rmse_relative_worst": 2, "coverage": 0}
-    table(
-        ("springs", "usable %: ours, EKF", "RMSE %, median", "worst", "95 % intervals cover %"),
-        (
-            (
-                r["case"],
-                *(f"{percent(r[f'ours_{m}'], d)}, {percent(r[f'ekf_{m}'], d)}" for m, d in measures.items()),
-            )
-            for r in rows
-        ),
-    )
-    ours, theirs = (np.median([r[key] for r in rows]) for key in ("ours_us", "ekf_numpy_us"))
-    print(f"\nCPU of a tick: ours {ours:.1f} µs (compiled), the EKF {theirs:.0f} µs (numpy, one joint);")
-    most = max(rows, key=lambda r: r["ekf_states"])
-    print(f"{most['ekf_states']} states, {most['ekf_multiplications']} multiplications without the law.")
+def rows(args) -> Iterator[scene.Row]:
+    """One row a case."""
+    return (compare(case, args.joints, args.seconds, args.seed) for case in args.cases)
 
 
 if __name__ == "__main__":
-    main()
+    columns = {"springs": "{case}"}
+    for name, key, form in (
+        ("usable", "usable", ".0%"),
+        ("RMSE, median", "rmse_median", ".2%"),
+        ("worst", "rmse_worst", ".2%"),
+        ("95 % intervals hold", "coverage", ".0%"),
+    ):
+        columns[f"{name}: ours, EKF"] = f"{{ours[{key}]:{form}}}, {{ekf[{key}]:{form}}}"
+    columns |= {"µs a tick: ours compiled, EKF in numpy": "{ours_us:.1f}, {ekf_us:.0f}"}
+    columns |= {"EKF's states, multiplications": "{states}, {multiplications}"}
+    scene.main(__doc__, rows, columns, *OPTIONS)

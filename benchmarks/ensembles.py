@@ -1,7 +1,6 @@
 """Stiffness on line over random joints of another integrator: errors, intervals, false alarms.
 
     python benchmarks/ensembles.py [--mode robust|balance] [--joints 8] [--seconds 20] [--cases NAME,…]
-                                  [--json]
 
 Fresh joints on random multisines, read as drives read them: 4096 to 16384 counts (stiff joints behind a gear
 of 100), 16 to 18 bits at the link, no velocity, torque noise of 0.1 to 0.5 % of rated. From five seconds on,
@@ -10,22 +9,15 @@ where the estimate is valid and observable. The integrator is that of the tests 
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
-from pathlib import Path
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
+import scene
+from scene import joints
 
 from estimator import EstimatorSettings, JointModel, Record, Status, make_estimator
 from estimator.sample import SIGMA_95
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-
-import joints
 
 T = 1e-3
 SETTLED_S = 5.0  # the estimate is judged from there on
@@ -45,6 +37,16 @@ CASES = {
     "vsa-ii declared 20 % off": ("vsa-ii", "vsa-ii", None, OFF, False, 0, 0.0),
     "exponential from nothing": ("exponential", "exponential", None, None, False, 0, 0.0),
     "exponential declared 20 % off": ("exponential", "exponential", None, OFF, False, 0, 0.0),
+}
+COLUMNS = {
+    "springs": "{case}",
+    "usable": "{usable:.0%}",
+    "RMSE: median": "{rmse_median:.3%}",
+    "worst": "{rmse_worst:.3%}",
+    "std": "{std_median:.3%}",
+    "95 % intervals hold: mean": "{coverage:.0%}",
+    "worst joint": "{coverage_worst:.0%}",
+    "false alarms": "{false_alarms}",
 }
 
 
@@ -77,7 +79,7 @@ class Drawn(NamedTuple):
     jerk_rad_s3: float  # rms, of the link
 
 
-def draw_joints(case, n_joints, seconds, seed):
+def draw_joints(case: str, n_joints: int, seconds: float, seed: int) -> Iterator[Drawn]:
     """The joints of a case."""
     kind, model, order, off, stiff, late, friction = CASES[case]
     rng, n = np.random.default_rng(seed), round(seconds / T)
@@ -97,15 +99,9 @@ def draw_joints(case, n_joints, seconds, seed):
         bits = rng.choice([17, 18] if stiff else [16, 17, 18])
         noise = rng.uniform(0.001, 0.005) * rated
         record = joints.record(
-            truth,
-            j,
-            T,
-            motor_counts=counts,
-            link_bits=bits,
-            velocity_rad_s=None,
-            torque_noise=rng.normal(0, noise, (n, 1)),
-            link_delay=late,
-        )
+            truth, j, T, motor_counts=counts, link_bits=bits, velocity_rad_s=None,
+            torque_noise=rng.normal(0, noise, (n, 1)), link_delay=late,
+        )  # fmt: skip
         parameters = {}
         if off is not None:
             (k_name, k), (shape_name, shape), low = declared[j]
@@ -115,96 +111,74 @@ def draw_joints(case, n_joints, seconds, seed):
         yield Drawn(known, record, truth.sigma[:, j, 0], noise, float(np.sqrt(np.mean(jerk**2))))
 
 
-def judged(stiffness, std, truth, usable):
-    """(usable share after 5 s, relative RMSE, coverage of the 95 % intervals) of one joint."""
+def judged(stiffness, std, truth, usable) -> scene.Row:
+    """Share usable after five seconds; error and interval there, relative to the truth.
+
+    Where that is next to nothing (in a gap) they are relative to 0.3 of its rms. NaN: never usable.
+    """
+    usable = usable & (np.arange(len(truth)) * T >= SETTLED_S)
+    share = float(np.mean(usable[round(SETTLED_S / T) :]))
     if not usable.any():
-        return 0.0, np.nan, np.nan
-    error = stiffness[usable] - truth[usable]
-    return (
-        np.mean(usable[round(SETTLED_S / T) :]),
-        np.sqrt(np.mean((error / truth[usable]) ** 2)),
-        np.mean(np.abs(error) < SIGMA_95 * std[usable]),
-    )
-
-
-def summary(found):
-    """The figures of several joints together, from `judged`; None where no joint has any."""
-    usable, rmse, coverage = np.array(found).T
-    some = bool(np.isfinite(rmse).any())
+        return {"usable": share, "rmse": np.nan, "std": np.nan, "coverage": np.nan}
+    size = np.maximum(truth, 0.3 * np.sqrt(np.mean(truth**2)))[usable]
+    error, std = stiffness[usable] - truth[usable], std[usable]
     return {
-        "usable": float(np.mean(usable)),
-        "rmse_relative_median": float(np.nanmedian(rmse)) if some else None,
-        "rmse_relative_worst": float(np.nanmax(rmse)) if some else None,
-        "coverage": float(np.nanmean(coverage)) if some else None,
+        "usable": share,
+        "rmse": float(np.sqrt(np.mean((error / size) ** 2))),
+        "std": float(np.median(std / size)),
+        "coverage": float(np.mean(np.abs(error) < SIGMA_95 * std)),
     }
 
 
-def percent(value, digits=0):
-    return "-" if value is None else f"{100 * value:.{digits}f}"
+def run(model: JointModel, record: Record, truth: np.ndarray, mode: str) -> scene.Row:
+    """Run the on-line estimator over a recording: as `judged`, alarms, effects named and after how long."""
+    estimator = make_estimator(model, EstimatorSettings(mode=mode), T)
+    out, after = np.empty((len(record), 5)), np.nan
+    for k, sample in enumerate(record.samples()):
+        out[k] = estimator.step(sample)[:5]
+        if k % 250 == 0 and np.isnan(after) and estimator.core.undeclared(0):
+            after = k * T
+    status = out[:, 1].astype(int)
+    changed = (status & int(Status.CHANGED)) > 0
+    return {
+        **judged(out[:, 3], out[:, 4], truth, status & USABLE == USABLE),
+        "false_alarms": int(np.sum(changed[1:] & ~changed[:-1])),
+        "names": tuple(estimator.core.undeclared(0)),
+        "named_after_s": after,
+    }
 
 
-def table(header, rows):
-    """Print a table in Markdown."""
-    print("| " + " | ".join(header) + " |")
-    print("|" + "---|" * len(header))
-    for row in rows:
-        print("| " + " | ".join(map(str, row)) + " |")
-
-
-def arguments(description):
-    """The command line of a program over random joints."""
-    parser = argparse.ArgumentParser(
-        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+def summary(found: list[scene.Row]) -> scene.Row:
+    """The figures of several joints together."""
+    usable, rmse, std, coverage = (
+        np.array([one[key] for one in found]) for key in ("usable", "rmse", "std", "coverage")
     )
-    parser.add_argument("--joints", type=int, default=8)
-    parser.add_argument("--seconds", type=float, default=20.0)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--cases", default=",".join(name.replace(",", ";") for name in CASES))
-    parser.add_argument("--mode", choices=["robust", "balance"], default="robust")
-    parser.add_argument("--json", action="store_true")
-    args = parser.parse_args()
-    args.cases = [name.replace(";", ",") for name in args.cases.split(",")]
-    return args
+    some = bool(np.isfinite(rmse).any())
+    return {
+        "usable": float(usable.mean()),
+        "rmse_median": float(np.nanmedian(rmse)) if some else None,
+        "rmse_worst": float(np.nanmax(rmse)) if some else None,
+        "std_median": float(np.nanmedian(std)) if some else None,
+        "coverage": float(np.nanmean(coverage)) if some else None,
+        "coverage_worst": float(np.nanmin(coverage)) if some else None,
+    }
 
 
-def measure(case, n_joints, seconds, seed, mode="robust"):
-    """One row."""
-    found, alarms = [], 0
-    for joint in draw_joints(case, n_joints, seconds, seed):
-        estimator = make_estimator(joint.model, EstimatorSettings(mode=mode), T)
-        out = np.array([estimator.step(sample)[:5] for sample in joint.record.samples()])
-        status = out[:, 1].astype(int)
-        usable = (status & USABLE == USABLE) & (np.arange(len(out)) * T >= SETTLED_S)
-        found.append(judged(out[:, 3], out[:, 4], joint.stiffness_nm_rad, usable))
-        changed = (status & int(Status.CHANGED)) > 0
-        alarms += int(np.sum(changed[1:] & ~changed[:-1]))
-    return {"case": case, **summary(found), "false_alarms": alarms}
+def rows(args) -> Iterator[scene.Row]:
+    """One row a case."""
+    for case in args.cases:
+        drawn = draw_joints(case, args.joints, args.seconds, args.seed)
+        found = [run(joint.model, joint.record, joint.stiffness_nm_rad, args.mode) for joint in drawn]
+        alarms = sum(one["false_alarms"] for one in found)
+        yield {"case": case, **summary(found), "false_alarms": alarms}
 
 
-def main():
-    args = arguments(__doc__)
-    rows = [
-        measure(case, args.joints, args.seconds, args.seed, args.mode)
-        for case in track(args.cases, "cases", console=Console(stderr=True))
-    ]
-    if args.json:
-        print(json.dumps(rows))
-        return
-    table(
-        ("springs", "usable", "RMSE %: median", "worst", "95 % intervals cover", "false alarms"),
-        (
-            (
-                r["case"],
-                f"{percent(r['usable'])} %",
-                percent(r["rmse_relative_median"], 2),
-                percent(r["rmse_relative_worst"], 2),
-                f"{percent(r['coverage'])} %",
-                r["false_alarms"],
-            )
-            for r in rows
-        ),
-    )
-
+OPTIONS = (
+    scene.Option("--joints", 8),
+    scene.Option("--seconds", 20.0),
+    scene.Option("--seed", 1),
+    scene.Option("--cases", list(CASES)),
+)
 
 if __name__ == "__main__":
-    main()
+    scene.main(__doc__, rows, COLUMNS, *OPTIONS, scene.Option("--mode", ("robust", "balance", "paper")))

@@ -1,6 +1,6 @@
 """Speed of the estimators: one tick, batch fits, a diagnosis, memory over many ticks.
 
-    python benchmarks/estimator_tick.py [--ticks N] [--json]
+    python benchmarks/estimator_tick.py [--ticks N]
 
 Two-motor VSA joints at 1 kHz on encoder counts. A tick is timed alone, with nothing compiled at run time;
 the percentiles are over all ticks after the first three seconds. The diagnosis is of the paper's quadratic
@@ -9,15 +9,14 @@ joint as `drivelink sim` makes it, with friction that the model lacks: CPU time 
 
 from __future__ import annotations
 
-import argparse
 import gc
-import json
 import time
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
+import scene
 from rig import free_endpoint
 from rig import joint as joint_file
 
@@ -31,6 +30,7 @@ T = 1e-3
 _CASES = {
     "robust, polynomial": ("polynomial", EstimatorSettings()),
     "robust, vsa-ii": ("vsa-ii", EstimatorSettings()),
+    "balance, polynomial": ("polynomial", EstimatorSettings(mode="balance")),
     "robust, black box": ("unknown", EstimatorSettings()),
     "paper": ("polynomial", EstimatorSettings(mode="paper")),
 }
@@ -85,7 +85,7 @@ def percentiles(step: Callable[[Sample], object], samples: list[Sample]) -> dict
         spent[k] = clock() - begin
     gc.enable()
     late = spent[3000:] / 1e3
-    return {f"p{p:g}": float(np.percentile(late, p)) for p in (50, 90, 99, 99.9)}
+    return {f"p{p:g}".replace(".", ""): float(np.percentile(late, p)) for p in (50, 90, 99, 99.9)}
 
 
 def monitored(n: int) -> dict[str, float]:
@@ -143,32 +143,19 @@ def memory(n: int) -> float:
     return float(growth)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--ticks", type=int, default=20_000, metavar="N")
-    parser.add_argument("--json", action="store_true", help="print one JSON object only")
-    args = parser.parse_args()
-    result = {
-        "tick_us": {
-            **{case: ticks(name, settings, args.ticks) for case, (name, settings) in _CASES.items()},
-            "monitor, vsa-ii": monitored(args.ticks),
-        },
-        "batch_1e5_s": {name: batch(name) for name in ("polynomial", "vsa-ii")},
-        "diagnose_cpu_s": {f"{seconds:g}": diagnosis(seconds) for seconds in (10.0, 30.0)},
-        "growth_bytes_per_1e5_ticks": memory(100_000),
-    }
-    if args.json:
-        print(json.dumps(result))
-        return
-    print(f"{'one tick, two motors':<24}{'p50':>8}{'p90':>8}{'p99':>8}{'p99.9':>8}  µs")
-    for case, numbers in result["tick_us"].items():
-        print(f"{case:<24}" + "".join(f"{value:8.1f}" for value in numbers.values()))
-    for name, seconds in result["batch_1e5_s"].items():
-        print(f"batch, 1e5 samples, {name:<14}{seconds:6.3f} s")
-    for length, seconds in result["diagnose_cpu_s"].items():
-        print(f"diagnose, {length} s at 1 kHz        {seconds:6.2f} s CPU")
-    print(f"memory growth over 1e5 ticks: {result['growth_bytes_per_1e5_ticks']:.0f} bytes")
+def rows(args) -> Iterator[scene.Row]:
+    """One row a case; ticks in µs, the rest in its unit."""
+    for case, (name, settings) in _CASES.items():
+        yield {"case": f"one tick, {case} / µs", **ticks(name, settings, args.ticks)}
+    yield {"case": "one tick, monitor, vsa-ii / µs", **monitored(args.ticks)}
+    other = dict.fromkeys(("p90", "p99", "p999"))
+    for name in ("polynomial", "vsa-ii"):
+        yield {"case": f"fit of 1e5 samples, {name} / s", "p50": batch(name), **other}
+    for seconds in (10.0, 30.0):
+        yield {"case": f"diagnose {seconds:g} s at 1 kHz / s of CPU", "p50": diagnosis(seconds), **other}
+    yield {"case": "memory growth over 1e5 ticks / bytes", "p50": memory(100_000), **other}
 
 
 if __name__ == "__main__":
-    main()
+    cells = {"p50": "{p50:.4g}", "p90": "{p90:.3g}", "p99": "{p99:.3g}", "p99.9": "{p999:.3g}"}
+    scene.main(__doc__, rows, {"": "{case}", **cells}, scene.Option("--ticks", 20_000))

@@ -1,6 +1,6 @@
 """External torque without a sensor, beside the usual methods, on simulated joints.
 
-    python benchmarks/external.py [--minutes 60] [--errors 0,1,2,5,10] [--joints vsa,sea,hd] [--json FILE]
+    python benchmarks/external.py [--minutes 60] [--errors 0,1,2,5,10] [--joints vsa,sea,hd]
 
 Each joint moves freely for so long; then its link is pushed by steps of 0.25 s, weak and strong ones in turn.
 The declared link inertia and gravity are off by so many per cent, and the declaration says so
@@ -24,19 +24,16 @@ share of the free motion in which the torque is valid.
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import os
 import statistics
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scene
 
 from estimator import (
     Effect,
@@ -51,7 +48,7 @@ from estimator import (
 )
 from estimator.filters import StateVariableFilter
 from sim.cases import case
-from sim.effects import PlantEffect, parse
+from sim.effects import parse
 from sim.excitation import build
 from sim.plant import JointPlant, LinkPlant, MotorPlant
 from sim.sensors import DriveHardware, LinkEncoder
@@ -85,17 +82,10 @@ class JointUnderTest:
     known: tuple[Effect, ...] = ()
 
     def world(self, seed: int, external: Callable[[float], float] | None = None) -> World:
-        excitation = build(self.excitation, len(self.drives))
-        effects: list[PlantEffect] = [parse(text) for text in self.effects]
-        return World(
-            self.plant,
-            self.drives,
-            self.encoder,
-            excitation=replace(excitation, external=external),
-            effects=effects,
-            period_s=T,
-            seed=seed,
-        )
+        excitation = replace(build(self.excitation, len(self.drives)), external=external)
+        effects = [parse(text) for text in self.effects]
+        parts = self.plant, self.drives, self.encoder
+        return World(*parts, excitation=excitation, effects=effects, period_s=T, seed=seed)
 
     def model(self, error: float) -> JointModel:
         """What is declared, inertia and gravity off by this share."""
@@ -140,75 +130,62 @@ def _vsa() -> JointUnderTest:
     )
 
 
-def _sea() -> JointUnderTest:
-    """The SEA of docs: 150 N·m/rad, gear 50 with dry friction of 5 % of the rated torque."""
-    spring = Spring(model="polynomial", parameters={"coefficients_nm_rad": (150.0, 1500.0)})
+def _single(
+    title: str,
+    spring: tuple[float, float],
+    motor: tuple[float, float],
+    link: tuple[float, float, float],
+    gear: tuple[float, float],
+    link_bits: int,
+    moved: tuple[float, float, float],
+    effects: tuple[str, ...],
+    known: tuple[Effect, ...],
+) -> JointUnderTest:
+    """A joint with one motor: coefficients, (B, D), (M, Dq, g), (ratio, N·m/A), motion and its centring."""
+    law = Spring(model="polynomial", parameters={"coefficients_nm_rad": spring})
+    B, D = motor
+    M, Dq, g = link
+    drive = DriveHardware(
+        counts_per_rev=4096.0, gear_ratio=gear[0], torque_constant_nm_a=gear[1], rated_current_a=6.0,
+        current_noise_a=0.012,
+    )  # fmt: skip
+    names = ("amplitude_nm", "centring_nm_rad", "centring_nm_s_rad")
     return JointUnderTest(
-        title="SEA, 150 N·m/rad, gear 50",
+        title=title,
         plant=JointPlant(
             arrangement="single",
-            motors=(MotorPlant(inertia_kg_m2=0.125, viscous_damping_nm_s_rad=0.8, spring=spring),),
-            link=LinkPlant(inertia_kg_m2=0.4, viscous_damping_nm_s_rad=0.1, gravity_nm=6.0),
+            motors=(MotorPlant(inertia_kg_m2=B, viscous_damping_nm_s_rad=D, spring=law),),
+            link=LinkPlant(inertia_kg_m2=M, viscous_damping_nm_s_rad=Dq, gravity_nm=g),
         ),
-        drives=(
-            DriveHardware(
-                counts_per_rev=4096.0,
-                gear_ratio=50.0,
-                torque_constant_nm_a=0.05,
-                rated_current_a=6.0,
-                current_noise_a=0.012,
-            ),
-        ),
-        encoder=LinkEncoder(counts_per_rev=2.0**17),
-        excitation={
-            "kind": "rich",
-            "amplitude_nm": 8.0,
-            "low_hz": 0.15,
-            "high_hz": 4.0,
-            "centring_nm_rad": 10.0,
-            "centring_nm_s_rad": 1.0,
-        },
-        effects=("coulomb_friction=0.75",),
+        drives=(drive,),
+        encoder=LinkEncoder(counts_per_rev=2.0**link_bits),
+        excitation={"kind": "rich", "low_hz": 0.15, "high_hz": 4.0, **dict(zip(names, moved, strict=True))},
+        effects=effects,
         transmission=Transmission(model="polynomial", order=2),
-        known=(_friction("coulomb_friction", torque_nm=0.75),),
+        known=known,
     )
+
+
+def _sea() -> JointUnderTest:
+    """The SEA of docs: dry friction of 5 % of the rated torque."""
+    known = (_friction("coulomb_friction", torque_nm=0.75),)
+    return _single(
+        "SEA, 150 N·m/rad, gear 50", (150.0, 1500.0), (0.125, 0.8), (0.4, 0.1, 6.0), (50.0, 0.05), 17,
+        (8.0, 10.0, 1.0), ("coulomb_friction=0.75",), known,
+    )  # fmt: skip
 
 
 def _hd() -> JointUnderTest:
-    """A harmonic drive: stiff, gear 100, Stribeck and load-dependent friction."""
-    spring = Spring(model="polynomial", parameters={"coefficients_nm_rad": (8000.0, 1.0e8)})
-    return JointUnderTest(
-        title="harmonic drive, 8000 N·m/rad, gear 100",
-        plant=JointPlant(
-            arrangement="single",
-            motors=(MotorPlant(inertia_kg_m2=1.5, viscous_damping_nm_s_rad=8.0, spring=spring),),
-            link=LinkPlant(inertia_kg_m2=2.0, viscous_damping_nm_s_rad=1.0, gravity_nm=30.0),
-        ),
-        drives=(
-            DriveHardware(
-                counts_per_rev=4096.0,
-                gear_ratio=100.0,
-                torque_constant_nm_a=0.1,
-                rated_current_a=6.0,
-                current_noise_a=0.012,
-            ),
-        ),
-        encoder=LinkEncoder(counts_per_rev=2.0**20),
-        excitation={
-            "kind": "rich",
-            "amplitude_nm": 40.0,
-            "low_hz": 0.15,
-            "high_hz": 4.0,
-            "centring_nm_rad": 40.0,
-            "centring_nm_s_rad": 10.0,
-        },
-        effects=("stribeck_friction=5.0,stribeck_nm=2.0", "load_dependent_friction=0.06"),
-        transmission=Transmission(model="polynomial", order=2),
-        known=(
-            _friction("stribeck_friction", {"stribeck_velocity_rad_s": 0.1}, torque_nm=5.0, stribeck_nm=2.0),
-            _friction("load_dependent_friction", coefficient=0.06),
-        ),
+    """A harmonic drive: stiff, Stribeck and load-dependent friction."""
+    known = (
+        _friction("stribeck_friction", {"stribeck_velocity_rad_s": 0.1}, torque_nm=5.0, stribeck_nm=2.0),
+        _friction("load_dependent_friction", coefficient=0.06),
     )
+    effects = ("stribeck_friction=5.0,stribeck_nm=2.0", "load_dependent_friction=0.06")
+    return _single(
+        "harmonic drive, 8000 N·m/rad, gear 100", (8000.0, 1.0e8), (1.5, 8.0), (2.0, 1.0, 30.0), (100.0, 0.1),
+        20, (40.0, 40.0, 10.0), effects, known,
+    )  # fmt: skip
 
 
 RIGS = {"vsa": _vsa, "sea": _sea, "hd": _hd}
@@ -347,7 +324,6 @@ def judge(
 def measure(name: str, minutes: float, errors: list[float], seed: int = 1) -> list[dict[str, Any]]:
     """The rows of one joint."""
     rig = RIGS[name]()
-    begin = time.monotonic()
     free = simulate(rig, LEARN_S + 60.0 * minutes, seed, pushed=False)
     length_s = LEARN_S + EVERY_S * (len(LADDER) * EACH + 1)
     motion = simulate(rig, length_s, seed + 1, pushed=True)
@@ -374,52 +350,43 @@ def measure(name: str, minutes: float, errors: list[float], seed: int = 1) -> li
             threshold = float(np.nanmax(np.abs(quiet[after])))
             methods[method] = judge(rig, estimated, np.abs(estimated) > threshold, motion, seed + 1)
         rows += [
-            {"joint": rig.title, "error_percent": error, "method": method, "minutes": minutes, **values}
+            {
+                "joint": rig.title,
+                "error_percent": error,
+                "method": method,
+                "alarms": None,
+                "valid": None,
+                **values,
+            }
             for method, values in methods.items()
         ]
-    rows[0]["took_s"] = round(time.monotonic() - begin, 1)
     return rows
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """Markdown."""
-    lines = [
-        "| joint | model / % | method | error / % | smallest / % of gravity | delay / ms | alarms | valid |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for row in rows:
-        smallest = "none" if math.isinf(row["smallest"]) else f"{100 * row['smallest']:.1f}"
-        delay = "–" if math.isinf(row["delay_ms"]) else f"{row['delay_ms']:.0f}"
-        own = (row["alarms"], f"{100 * row['valid']:.1f} %") if "alarms" in row else ("(0)", "–")
-        lines.append(
-            f"| {row['joint']} | {row['error_percent']:g} | {row['method']} | {100 * row['error']:.1f} "
-            f"| {smallest} | {delay} | {own[0]} | {own[1]} |"
-        )
-    return "\n".join(lines)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--minutes", type=float, default=60.0, help="of free motion")
-    parser.add_argument(
-        "--errors", default="0,1,2,5,10", help="of the declared inertia and gravity, per cent"
-    )
-    parser.add_argument("--joints", default=",".join(RIGS))
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--json", type=Path, help="file for the rows")
-    args = parser.parse_args()
-    errors = [float(text) for text in args.errors.split(",")]
+def rows(args) -> Iterator[scene.Row]:
+    """The rows of all joints."""
+    errors = [float(text) for text in args.errors]
     with ProcessPoolExecutor(args.jobs) as pool:
-        runs = [pool.submit(measure, name, args.minutes, errors) for name in args.joints.split(",")]
-        rows = [row for run in runs for row in run.result()]
-    print(table(rows))
-    if args.json:
-        # JSON has no infinity
-        clean = [{k: None if v == math.inf else v for k, v in row.items()} for row in rows]
-        args.json.write_text(json.dumps(clean, indent=1) + "\n", encoding="utf-8")
+        for run in [pool.submit(measure, name, args.minutes, errors) for name in args.joints]:
+            yield from run.result()
 
 
 if __name__ == "__main__":
-    main()
+    scene.main(
+        __doc__,
+        rows,
+        {
+            "joint": "{joint}",
+            "model / %": "{error_percent:g}",
+            "method": "{method}",
+            "error": "{error:.1%}",
+            "smallest, of gravity": "{smallest:.1%}",
+            "delay / ms": "{delay_ms:.0f}",
+            "alarms": "{alarms}",
+            "valid": "{valid:.1%}",
+        },
+        scene.Option("--minutes", 60.0, "of free motion"),
+        scene.Option("--errors", ["0", "1", "2", "5", "10"], "of declared inertia and gravity, per cent"),
+        scene.Option("--joints", list(RIGS)),
+        scene.Option("--jobs", os.cpu_count() or 1),
+    )

@@ -14,24 +14,18 @@ seconds (every sample valid, no flag), and by how much the stiffness is off then
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
-from pathlib import Path
+from collections.abc import Iterator
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-
-import faultmatrix as matrix
+import scene
+from scene import faultmatrix as matrix
 
 
 def measure(joint, health, seconds, seed):
     """One joint: totals, the worst faults, health, steps."""
     rows, suspects, right = {}, 0, 0
-    for fault in track(list(matrix.FAULTS), f"{joint}: faults", console=Console(stderr=True)):
+    for fault in matrix.FAULTS:
         outcome = matrix.outcome(joint, fault, health, seconds, seed)
         rows[f"{' + '.join(fault.signals)}: {fault.name}"] = outcome
         suspects += bool(outcome.suspected)
@@ -47,63 +41,66 @@ def measure(joint, health, seconds, seed):
         "silent": silent,
         "suspects": suspects,
         "named": right,
+        "wrong_share": wrong / max(valid, 1),
+        "silent_share": silent / max(valid, 1),
         "healthy_valid": healthy.valid / healthy.samples,
         "worst": {name: row._asdict() for name, row in worst if row.wrong},
-        "followed": {
-            factor: matrix.stepped(joint, factor, health, seconds, seed)[1] for factor in matrix.STEPS
-        },
+        "followed": ", ".join(
+            f"x{factor:g} {matrix.stepped(joint, factor, health, seconds, seed)[1]:.0%}"
+            for factor in matrix.STEPS
+        ),
     }
 
 
-def sizes(joints, seed):
-    """The table of what is not noticed."""
-    print(
-        "| fault | "
-        + " | ".join(f"{joint}: unnoticed up to | error of the stiffness" for joint in joints)
-        + " |"
-    )
-    print("|---|" + "---|---|" * len(joints))
+def unnoticed(joint, seed) -> Iterator[scene.Row]:
+    """What is not noticed on one joint, and up to which size."""
     for kind, (text, _, signals, _) in matrix.LADDERS.items():
         for signal in signals:
-            cells = []
-            for joint in joints:
-                size, error = matrix.unnoticed(joint, kind, signal, health_s=8.0, fault_s=8.0, seed=seed)
-                cells += [text.format(size) if size else "always noticed", f"{error:.1%}" if size else ""]
-            print(f"| {signal}: {kind} | " + " | ".join(cells) + " |", flush=True)
+            size, error = matrix.unnoticed(joint, kind, signal, health_s=8.0, fault_s=8.0, seed=seed)
+            said = text.format(size) if size else "always noticed"
+            yield {
+                "joint": joint,
+                "fault": f"{signal}: {kind}",
+                "size": said,
+                "error": error if size else None,
+            }
 
 
-def main():
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--joints", default=",".join(matrix.JOINTS))
-    parser.add_argument("--health", type=float, default=15.0, metavar="SECONDS")
-    parser.add_argument("--seconds", type=float, default=15.0, help="of each fault")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--sizes", action="store_true", help="what is not noticed, and up to which size")
-    parser.add_argument("--json", action="store_true")
-    args = parser.parse_args()
-    if args.sizes:
-        sizes(args.joints.split(","), args.seed)
-        return
-    found = [measure(joint, args.health, args.seconds, args.seed) for joint in args.joints.split(",")]
-    if args.json:
-        print(json.dumps(found))
-        return
-    print("| joint | valid samples | wrong | without any flag | named | healthy and valid | steps followed |")
-    print("|---|---|---|---|---|---|---|")
-    for row in found:
-        shares = [100 * row[key] / max(row["valid"], 1) for key in ("wrong", "silent")]
-        followed = ", ".join(f"x{factor:g} {share:.0%}" for factor, share in row["followed"].items())
-        print(
-            f"| {row['joint']} | {row['valid']} | {row['wrong']} ({shares[0]:.2f} %) "
-            f"| {row['silent']} ({shares[1]:.2f} %) | {row['named']} of {row['suspects']} "
-            f"| {row['healthy_valid']:.2%} | {followed} |"
-        )
-    for row in found:
-        for name, outcome in row["worst"].items():
-            print(f"{row['joint']}: {name}: {outcome}")
+def rows(args) -> Iterator[scene.Row]:
+    """One row a joint; with --sizes one a joint and kind of fault."""
+    for joint in args.joints:
+        if args.sizes:
+            yield from unnoticed(joint, args.seed)
+        else:
+            yield measure(joint, args.health, args.seconds, args.seed)
 
+
+def worst(found: list[scene.Row]) -> str:
+    """The faults that leave most wrong samples."""
+    each = ((row["joint"], *item) for row in found for item in row.get("worst", {}).items())
+    return "\n".join(f"{joint}: {name}: {outcome}" for joint, name, outcome in each)
+
+
+SIZES = {"joint": "{joint}", "fault": "{fault}", "unnoticed up to": "{size}", "stiffness off": "{error:.1%}"}
+MATRIX = {
+    "joint": "{joint}",
+    "valid samples": "{valid}",
+    "wrong": "{wrong} ({wrong_share:.2%})",
+    "without any flag": "{silent} ({silent_share:.2%})",
+    "named": "{named} of {suspects}",
+    "healthy and valid": "{healthy_valid:.2%}",
+    "steps followed": "{followed}",
+}
 
 if __name__ == "__main__":
-    main()
+    scene.main(
+        __doc__,
+        rows,
+        SIZES if "--sizes" in sys.argv else MATRIX,
+        scene.Option("--joints", list(matrix.JOINTS)),
+        scene.Option("--health", 15.0, "seconds"),
+        scene.Option("--seconds", 15.0, "of each fault"),
+        scene.Option("--seed", 0),
+        scene.Option("--sizes", False, "what is not noticed, and up to which size"),
+        after=worst,
+    )

@@ -386,8 +386,12 @@ def main() -> None:
     parser.add_argument("--rows", type=int, default=10_000)
     parser.add_argument("--fleets", type=int, default=200)
     parser.add_argument("--fdr", type=float, default=0.05)
+    parser.add_argument("--json", type=Path, help="also write the numbers there")
     args = parser.parse_args()
-    print(json.dumps(RUNS[args.what](args), indent=1))
+    text = json.dumps(RUNS[args.what](args), indent=1)
+    print(text)
+    if args.json:
+        args.json.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """The gate for units, signs, gears and time: what it finds, misses and takes for wrong, on random joints.
 
-    python benchmarks/gate.py [--seeds N] [--first N] [--kinds soft,stiff,…] [--json FILE]
+    python benchmarks/gate.py [--seeds N] [--first N] [--kinds soft,stiff,…]
 
 Joints of every kind (`tests/gatekit.py`) with undeclared effects, late channels and an inertia up to a fifth
 off: as they are, and with each fault of a first installation. A fault counts as named where the correction,
@@ -9,20 +9,13 @@ or one that the finding says cannot be separated from it, undoes it to 5 %.
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 from collections import Counter
-from pathlib import Path
+from collections.abc import Iterator
 
-from rich.console import Console
-from rich.progress import track
+import scene
+from scene import gatekit
 
 from estimator.gate import Discrepancy, examine
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-
-import gatekit
 
 
 def outcome(findings: list[Discrepancy], factors: dict[str, float]) -> str:
@@ -39,28 +32,24 @@ def outcome(findings: list[Discrepancy], factors: dict[str, float]) -> str:
     return "else"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=4, metavar="N")
-    parser.add_argument("--first", type=int, default=200, metavar="N")
-    parser.add_argument("--kinds", default=",".join(gatekit.KINDS), metavar="K,…")
-    parser.add_argument("--json", type=Path, metavar="FILE")
-    args = parser.parse_args()
+def rows(args) -> Iterator[scene.Row]:
+    """One row a fault."""
     counts: dict[str, Counter[str]] = {}
-    jobs = [(k, s) for k in args.kinds.split(",") for s in range(args.first, args.first + args.seeds)]
-    for kind, seed in track(jobs, "gate", console=Console(stderr=True)):
-        drawn = gatekit.draw(kind, seed)
-        wrong = bool(examine(drawn.record, drawn.model))
-        counts.setdefault("healthy", Counter())["else" if wrong else "named"] += 1
-        for name, factors in gatekit.faults(drawn).items():
-            findings = examine(gatekit.faulty(drawn.record, factors), drawn.model)
-            counts.setdefault(name, Counter())[outcome(findings, factors)] += 1
-    print("| fault | joints | named | another cause | missed |\n|---|---|---|---|---|")
+    for kind in args.kinds:
+        for seed in range(args.first, args.first + args.seeds):
+            drawn = gatekit.draw(kind, seed)
+            wrong = bool(examine(drawn.record, drawn.model))
+            counts.setdefault("healthy", Counter())["else" if wrong else "named"] += 1
+            for name, factors in gatekit.faults(drawn).items():
+                findings = examine(gatekit.faulty(drawn.record, factors), drawn.model)
+                counts.setdefault(name, Counter())[outcome(findings, factors)] += 1
     for name, count in counts.items():
-        print(f"| {name} | {count.total()} | {count['named']} | {count['else']} | {count['missed']} |")
-    if args.json:
-        args.json.write_text(json.dumps(counts, indent=2) + "\n", encoding="utf-8")
+        each = {key: count[key] for key in ("named", "else", "missed")}
+        yield {"fault": name, "joints": count.total(), **each}
 
 
 if __name__ == "__main__":
-    main()
+    columns = {name: f"{{{name}}}" for name in ("fault", "joints", "named")}
+    columns |= {"another cause": "{else}", "missed": "{missed}"}
+    options = scene.Option("--seeds", 4), scene.Option("--first", 200)
+    scene.main(__doc__, rows, columns, *options, scene.Option("--kinds", list(gatekit.KINDS)))

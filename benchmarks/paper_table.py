@@ -1,6 +1,6 @@
 """Every figure the paper prints, beside ours and the truth.
 
-    python benchmarks/paper_table.py [--json] [--plots DIR]
+    python benchmarks/paper_table.py
 
 The three cases of section V, noise-free: torque held over each 1 ms period, the motion integrated by
 `tests/joints.py`. "raw" is the paper as printed, correctly discretised;
@@ -13,28 +13,22 @@ rad, its polynomial fits 0.45 rad: ten times the torque is used, the printed one
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scene
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
+from scene import joints
 from scipy.optimize import least_squares, minimize_scalar
 from scipy.signal import bilinear, lfilter
 
 from estimator.transmissions import MODELS
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-
-import joints
-
 Array = NDArray[np.float64]
+COLUMNS = ("quantity", "paper", "ours, raw", "ours, matched filters", "truth")
 T = 1e-3
 N = 10_000
 K_TAU = 300.0
@@ -216,172 +210,63 @@ def iterated(motion: Motion, i: int) -> tuple[Array, int]:
     return found.x, found.nfev
 
 
-def compute() -> tuple[dict[str, Any], list[tuple[str, str, str, str, str]], dict[str, Motion]]:
-    """(the JSON object, rows of the table, the motions)."""
-    motions = {name: simulate(name) for name in ("A", "B")}
-    motions["C"] = simulate("C", 0.1)
-    printed = simulate("C")
-    rows: list[tuple[str, str, str, str, str]] = []
+def rows(_args: Any) -> Iterator[scene.Row]:
+    """One row a figure of the paper."""
+    motions = {"A": simulate("A"), "B": simulate("B"), "C": simulate("C", 0.1)}
     order = {"A": 1, "B": 2, "C": 5}  # what the paper reports
-    raw = {
-        name: [fits(m, i, False, order=order[name]) for i in range(m.tau.shape[1])]
-        for name, m in motions.items()
-    }
-    best = {"A": [fits(motions["A"], 0, True)], "B": [fits(motions["B"], 0, True)]}
-    best["C"] = [fits(motions["C"], i, True, order=5) for i in range(2)]
-    rows.append(_row("A: K", "99.997", raw["A"][0], best["A"][0], "100"))
-    for name in ("A", "B"):
-        rules = [fits(motions[name], 0, True, rule).size for rule in ("gamma", "bic", "cross-validation")]
-        text = "gamma {}, BIC {}, CV {}".format(*rules)
-        rows.append((f"{name}: order p found", str(order[name]), "", text, str(order[name])))
-    rows.append(_row("B: K1, K3", "99.997, 501.71", raw["B"][0], best["B"][0], "100, 500"))
-    paper_c = ("140.623, 112.805, 73.184, 43.548, 41.891", "140.628, 112.698, 73.94, 41.71, 43.086")
-    taylor = "140.625, 112.793, 73.139, 45.830, 28.711 (Taylor)"
-    rows += [_row(f"C: polynomial {i + 1}", paper_c[i], raw["C"][i], best["C"][i], taylor) for i in range(2)]
-    found = [nonlinear(motions["C"], i) for i in range(2)]
-    rows += _vsa_rows(motions["C"], printed, found)
-    bbe = _black_boxes(motions, rows)
-    result = {
-        "A": {"k_nmm_rad": 1e3 * best["A"][0][0], "order": int(best["A"][0].size)},
-        "B": {
-            "k1_nmm_rad": 1e3 * best["B"][0][0],
-            "k3_nmm_rad3": 1e3 * best["B"][0][1],
-            "order": int(best["B"][0].size),
-        },
-        "C_polynomial": [{"coefficients": (1e3 * alpha).tolist()} for alpha in best["C"]],
-        "C_nonlinear": found,
-        "bbe": bbe,
-    }
-    return result, rows, motions
 
-
-def _vsa_rows(
-    motion: Motion, printed: Motion, found: list[dict[str, float]]
-) -> list[tuple[str, str, str, str, str]]:
-    """Rows of the VSA-II's parameters: of both transmissions, and with the torque that the paper prints."""
-    rows = []
-    paper_k = ("499.22, 1.7536, 55 it.", "499.96, 1.7527, 32 it.")
-    for i in range(2):
-        (k, c), steps = iterated(motion, i)
-        ours = f"{found[i]['k_nmm_rad']:.4f}, {found[i]['c']:.6f}, {found[i]['iterations']} eval."
-        text = f"{1e3 * k:.2f}, {c:.4f}, {steps} it."
-        rows.append((f"C: k, C of transmission {i + 1}", paper_k[i], text, ours, "500, 1.75"))
-        small = nonlinear(printed, i)
-        rows.append(
-            (
-                "   … with the printed 10 N·mm",
-                "",
-                "",
-                f"{small['k_nmm_rad']:.3f}, {small['c']:.5f}",
-                "500, 1.75",
-            )
+    def both(name: str, i: int = 0, best: int | None = None) -> tuple[str, str]:
+        return _list(fits(motions[name], i, False, order=order[name])), _list(
+            fits(motions[name], i, True, order=best)
         )
-    return rows
+
+    yield _row("A: K", "99.997", *both("A"), "100")
+    for name in ("A", "B"):
+        found = [fits(motions[name], 0, True, rule).size for rule in ("gamma", "bic", "cross-validation")]
+        text = "gamma {}, BIC {}, CV {}".format(*found)
+        yield _row(f"{name}: order p found", str(order[name]), "", text, str(order[name]))
+    yield _row("B: K1, K3", "99.997, 501.71", *both("B"), "100, 500")
+    paper = ("140.623, 112.805, 73.184, 43.548, 41.891", "140.628, 112.698, 73.94, 41.71, 43.086")
+    taylor = "140.625, 112.793, 73.139, 45.830, 28.711 (Taylor)"
+    for i in range(2):
+        yield _row(f"C: polynomial {i + 1}", paper[i], *both("C", i, 5), taylor)
+    paper = ("499.22, 1.7536, 55 it.", "499.96, 1.7527, 32 it.")
+    for i in range(2):
+        (k, c), steps = iterated(motions["C"], i)
+        projected, small = nonlinear(motions["C"], i), nonlinear(simulate("C"), i)
+        ours = "{k_nmm_rad:.4f}, {c:.6f}, {iterations} eval.".format(**projected)
+        yield _row(
+            f"C: k, C of transmission {i + 1}",
+            paper[i],
+            f"{1e3 * k:.2f}, {c:.4f}, {steps} it.",
+            ours,
+            "500, 1.75",
+        )
+        ours = "{k_nmm_rad:.3f}, {c:.5f}".format(**small)
+        yield _row("   … with the printed 10 N·mm", "", "", ours, "500, 1.75")
+    yield from _black_boxes(motions)
 
 
-def _black_boxes(motions: dict[str, Motion], rows: list[tuple[str, str, str, str, str]]) -> dict[str, float]:
+def _black_boxes(motions: dict[str, Motion]) -> Iterator[scene.Row]:
     w = 100.0
-    bbe: dict[str, float] = {}
     for name in ("A", "B"):
         m = motions[name]
         raw = relative_rmse(black_box(m, 0, 300.0, 1.0, 1900.0, False), m.sigma[:, 0])
         ours = relative_rmse(black_box(m, 0, w * w, 2 * w, 1e6, True), m.sigma[:, 0])
-        bbe[f"{name}_rmse_relative"] = ours
-        rows.append((f"{name}: BBE, RMSE after 1 s", "figure", f"{raw:.3%}", f"{ours:.4%}", "0"))
+        yield _row(f"{name}: BBE, RMSE after 1 s", "figure", f"{raw:.3%}", f"{ours:.4%}", "0")
     m = motions["C"]
-    total = m.sigma.sum(1)
-    raw_total = sum(black_box(m, i, 5000.0, 1.0, 1.0, False) for i in range(2))
-    best_total = sum(black_box(m, i, w * w, 2 * w, 1e6, True) for i in range(2))
-    bbe["C_total_rmse_relative"] = relative_rmse(np.asarray(best_total), total)
-    raw_error = relative_rmse(np.asarray(raw_total), total)
-    ours_text = f"{bbe['C_total_rmse_relative']:.4%}"
-    rows.append(("C: BBE total, RMSE after 1 s", "figure 9", f"{raw_error:.3%}", ours_text, "0"))
-    return bbe
+    raw = relative_rmse(sum(black_box(m, i, 5000.0, 1.0, 1.0, False) for i in range(2)), m.sigma.sum(1))
+    ours = relative_rmse(sum(black_box(m, i, w * w, 2 * w, 1e6, True) for i in range(2)), m.sigma.sum(1))
+    yield _row("C: BBE total, RMSE after 1 s", "figure 9", f"{raw:.3%}", f"{ours:.4%}", "0")
 
 
-def _row(name: str, paper: str, raw: Array, ours: Array, truth: str) -> tuple[str, str, str, str, str]:
-    return name, paper, _list(raw), _list(ours), truth
+def _row(*cells: str) -> scene.Row:
+    return dict(zip(COLUMNS, cells, strict=True))
 
 
 def _list(alpha: Array) -> str:
     return ", ".join(f"{1e3 * x:.8g}" for x in alpha)
 
 
-def plot(motions: dict[str, Motion], folder: Path) -> None:
-    """Figures 1 to 9 of the paper."""
-    from drivelink.output.plots import PlotCurve, new_figure, over_time, save, xy
-
-    folder.mkdir(parents=True, exist_ok=True)
-    t = np.arange(N) * T
-    for number, name in ((1, "A"), (4, "B"), (6, "C")):
-        m = motions[name]
-        count = m.tau.shape[1]
-        figure, axes = new_figure(f"Figure {number}: flexibility torque, case {name}", rows=count)
-        for i in range(count):
-            curves = {
-                "true": PlotCurve(t, 1e3 * m.tau_e[:, i]),
-                "residual": PlotCurve(t, 1e3 * residual(m, i)[1]),
-            }
-            over_time(axes[i], curves, "torque / N·mm")
-        save(figure, folder / f"figure{number}.png")
-    for number, name, k_max in ((2, "A", None), (3, "A", 1.9), (5, "B", 1.9)):
-        m = motions[name]
-        figure, axes = new_figure(
-            f"Figure {number}: black-box stiffness, case {name}", rows=2 if k_max is None else 1
-        )
-        y, _ = residual(m, 0)
-        with np.errstate(all="ignore"):
-            estimate = regressor(second_order(y, 300.0, 1.0, 2), m.phi_rate[:, 0], 1900.0, k_max or math.inf)
-        shown = np.where(np.abs(estimate) < 1.0, estimate, np.nan)
-        curves = {"true": PlotCurve(t, 1e3 * m.sigma[:, 0]), "estimate": PlotCurve(t, 1e3 * shown)}
-        over_time(axes[0], curves, "stiffness / (N·mm/rad)")
-        if k_max is None:
-            over_time(axes[1], {"K_R φ̇²": PlotCurve(t, 1900.0 * m.phi_rate[:, 0] ** 2)}, "K_R φ̇²")
-        save(figure, folder / f"figure{number}.png")
-    m = motions["C"]
-    figure, axes = new_figure("Figure 7: stiffness by polynomials, VSA-II", rows=2)
-    for i in range(2):
-        phi = np.linspace(-1, 1, 200) * np.max(np.abs(m.phi[:, i]))
-        alpha = fits(m, i, True)
-        curves = {
-            "true": PlotCurve(phi, 1e3 * MODELS["vsa-ii"].stiffness(phi, ALPHA["C"])),
-            "polynomial": PlotCurve(phi, 1e3 * MODELS["polynomial"].stiffness(phi, alpha)),
-        }
-        xy(axes[i], curves, "deflection / rad", "stiffness / (N·mm/rad)")
-    save(figure, folder / "figure7.png")
-    estimates = [black_box(m, i, 5000.0, 1.0, 1.0, False) for i in range(2)]
-    figure, axes = new_figure("Figure 8: black-box stiffness, VSA-II", rows=2)
-    for i in range(2):
-        curves = {"true": PlotCurve(t, 1e3 * m.sigma[:, i]), "estimate": PlotCurve(t, 1e3 * estimates[i])}
-        over_time(axes[i], curves, "stiffness / (N·mm/rad)")
-    save(figure, folder / "figure8.png")
-    figure, axes = new_figure("Figure 9: total stiffness, VSA-II")
-    total = {
-        "true": PlotCurve(t, 1e3 * m.sigma.sum(1)),
-        "estimate": PlotCurve(t, 1e3 * (estimates[0] + estimates[1])),
-    }
-    over_time(axes[0], total, "stiffness / (N·mm/rad)")
-    save(figure, folder / "figure9.png")
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--json", action="store_true", help="print one JSON object only")
-    parser.add_argument("--plots", type=Path, metavar="DIR", help="write the paper's figures 1 to 9")
-    args = parser.parse_args()
-    result, rows, motions = compute()
-    if args.plots is not None:
-        plot(motions, args.plots)
-    if args.json:
-        print(json.dumps(result))
-        return
-    table = Table(title="The paper's figures (N·mm, rad)", title_justify="left")
-    for column in ("quantity", "paper", "ours, raw", "ours, matched filters", "truth"):
-        table.add_column(column, overflow="fold")
-    for row in rows:
-        table.add_row(*row)
-    Console(width=150).print(table)
-
-
 if __name__ == "__main__":
-    main()
+    scene.main(__doc__, rows, {name: f"{{{name}}}" for name in COLUMNS})

@@ -1,6 +1,6 @@
 """Measured machines: what `diagnose` leaves on another recording, beside thirty lines of least squares.
 
-    python benchmarks/real_data.py [--data DIR] [--shaft-line DIR] [--out DIR] [--json FILE]
+    python benchmarks/real_data.py [--data DIR] [--shaft-line DIR] [--out DIR]
 
 The recordings are not part of the project: DIR (or $DRIVELINK_DATA, or ../shared/data) holds emps/,
 kuka_kr300/ and uw_sea/. --shaft-line (or $DRIVELINK_SHAFT_LINE) names a folder with Ice_excitation1.csv … and
@@ -10,17 +10,16 @@ torque sensor.
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
+import scene
+from scene import ROOT
 from scipy.signal import butter, sosfiltfilt
 
 from drivelink import jointfile, recording
@@ -37,7 +36,6 @@ from estimator.sample import FloatArray, Record
 SENSOR_HZ = 40.0  # below it the sensor's torque is compared
 SETTLED_S = 3.0  # of a recording: what the estimator says before is not judged
 BEHIND_KG_M2 = 6.0e-5  # of the shaft line between its second encoder and its torque sensor
-ROOT = Path(__file__).resolve().parents[1]
 JOINT = """
 name = "{name}"
 arrangement = "single"
@@ -207,58 +205,59 @@ def diagnosed(run: Run, data: Path, out: Path) -> dict[str, Any]:
     }
 
 
-def _stiffness(one: dict[str, Any]) -> str:
-    parameters, std = one["transmissions"][0]["parameters"], one["transmissions"][0]["std"]
-    if not parameters:
-        return "-"
-    return f"{parameters['k_nm_rad']:.3g} ± {1.96 * std['k_nm_rad']:.1g} (95 %) / {one['known_nm_rad']:.3g}"
-
-
-def _sensor(one: dict[str, Any]) -> str:
-    if one["sensor"] is None:
-        return "-"
-    return "{on_line:.1%} ({valid:.0%}), {twist:.1%}, {external:.1%} ({external_valid:.0%})".format(
-        **one["sensor"]
-    )
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    default = Path(os.environ.get("DRIVELINK_DATA", ROOT.parent / "shared" / "data"))
-    parser.add_argument("--data", type=Path, default=default, metavar="DIR")
-    shaft = os.environ.get("DRIVELINK_SHAFT_LINE")
-    parser.add_argument("--shaft-line", type=Path, default=shaft and Path(shaft), metavar="DIR")
-    parser.add_argument("--out", type=Path, default=Path("real_data"), metavar="DIR", help="reports go there")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all outcomes there")
-    args = parser.parse_args()
+def rows(args) -> Iterator[scene.Row]:
+    """One row a diagnosis."""
     if not (args.data / RUNS[0].train).exists():
         sys.exit(f"real_data: no measured data in {args.data}: expected emps/, kuka_kr300/ and uw_sea/ there")
     jobs = [(run, args.data) for run in RUNS]
     jobs += [(run, args.shaft_line) for run in SHAFT_RUNS] if args.shaft_line else []
-    outcomes = [
-        diagnosed(run, data, args.out) for run, data in track(jobs, "diagnose", console=Console(stderr=True))
-    ]
-    print(
-        "| machine | train → other | baseline | before → after | of baseline | found | stiffness / known "
-        "| torque against sensor: on line (valid), twist, external torque (valid) |"
-    )
-    print("|---|---|---|---|---|---|---|---|")
-    ratios = []
-    for one in outcomes:
-        error = one["error"]["validation"]
-        ratios.append(error["after_relative"] / one["baseline_relative"])
-        found = ", ".join(effect["name"] for effect in one["effects"]) or one["verdict"]
-        names = f"{Path(one['train']).stem} → {Path(one['validation']).stem}"
-        fall = f"{error['before_relative']:.1%} → {error['after_relative']:.1%}"
-        print(
-            f"| {one['joint']}, {one['bandwidth_hz']:g} Hz | {names} | {one['baseline_relative']:.1%} "
-            f"| {fall} | {ratios[-1]:.2f} | {found} | {_stiffness(one)} | {_sensor(one)} |"
-        )
-    mean = np.exp(np.mean(np.log(ratios)))
-    print(f"\nerror over the baseline's: geometric mean {mean:.2f}, worst {max(ratios):.2f}")
-    if args.json:
-        args.json.write_text(json.dumps(outcomes, indent=2) + "\n", encoding="utf-8")
+    for run, data in jobs:
+        one = diagnosed(run, data, args.out)
+        parameters, std = (one["transmissions"][0][key] for key in ("parameters", "std"))
+        stiffness, sensor = None, None
+        if parameters:
+            known = one["known_nm_rad"]
+            stiffness = f"{parameters['k_nm_rad']:.3g} ± {1.96 * std['k_nm_rad']:.1g} (95 %) / {known:.3g}"
+        if one["sensor"] is not None:
+            form = "{on_line:.1%} ({valid:.0%}), {twist:.1%}, {external:.1%} ({external_valid:.0%})"
+            sensor = form.format(**one["sensor"])
+        yield {
+            **one,
+            "pair": f"{Path(one['train']).stem} → {Path(one['validation']).stem}",
+            "of_baseline": one["error"]["validation"]["after_relative"] / one["baseline_relative"],
+            "found": ", ".join(effect["name"] for effect in one["effects"]) or one["verdict"],
+            "stiffness": stiffness,
+            "against_sensor": sensor,
+        }
+
+
+def ratios(found: list[scene.Row]) -> str:
+    """Mean and worst of the errors over the baseline's."""
+    each = [row["of_baseline"] for row in found]
+    mean = np.exp(np.mean(np.log(each)))
+    return f"error over the baseline's: geometric mean {mean:.2f}, worst {max(each):.2f}"
 
 
 if __name__ == "__main__":
-    main()
+    data = Path(os.environ.get("DRIVELINK_DATA", ROOT.parent / "shared" / "data"))
+    shaft = os.environ.get("DRIVELINK_SHAFT_LINE")
+    scene.main(
+        __doc__,
+        rows,
+        {
+            "machine": "{joint}, {bandwidth_hz:g} Hz",
+            "train → other": "{pair}",
+            "baseline": "{baseline_relative:.1%}",
+            "before → after": (
+                "{error[validation][before_relative]:.1%} → {error[validation][after_relative]:.1%}"
+            ),
+            "of baseline": "{of_baseline:.2f}",
+            "found": "{found}",
+            "stiffness / known": "{stiffness}",
+            "torque against sensor: on line (valid), twist, external torque (valid)": "{against_sensor}",
+        },
+        scene.Option("--data", data, metavar="DIR"),
+        scene.Option("--shaft-line", Path(shaft) if shaft else None, metavar="DIR"),
+        scene.Option("--out", Path("real_data"), "reports go there", metavar="DIR"),
+        after=ratios,
+    )

@@ -29,50 +29,31 @@ TIMEOUT_S = 7200  # of a section: the longest takes a quarter of an hour on two 
 
 
 class Section(NamedTuple):
-    """One program.
-
-    Attributes:
-        title: over its results.
-        full: its arguments.
-        quick: its arguments where minutes count.
-        text: what it prints is no Markdown and is shown as it is.
-        json_file: it takes `--json FILE`; else `--json` prints instead of the table.
-        of: the program, where several sections share one; else the section's name.
-    """
+    """Title; arguments, all and where minutes count; the program, where several sections share one."""
 
     title: str
     full: str = ""
     quick: str = ""
-    text: bool = False
-    json_file: bool = False
     of: str = ""
 
 
 SECTIONS = {
-    "cycle": Section(
-        "One cycle beside the textbook way and the floor", quick="--seconds 2 --rounds 2", json_file=True
-    ),
-    "stages": Section("Stages, and joints on one core", quick="--cycles 2000", json_file=True),
-    "service": Section("Jitter, recorder, start, memory", quick="--seconds 2 --rounds 1", json_file=True),
-    "joints": Section(
-        "Many joints through one router", "--joints 1,6,12,24", "--joints 1,6 --seconds 3", text=True
-    ),
-    "estimator_tick": Section("The estimator alone", quick="--ticks 8000", text=True),
-    "paper_table": Section("The paper's table", text=True),
-    "sensitivity": Section("Sensitivity", text=True),
+    "cycle": Section("One cycle beside the textbook way and the floor", quick="--seconds 2 --rounds 2"),
+    "stages": Section("Stages, and joints on one core", quick="--cycles 2000"),
+    "service": Section("Jitter, recorder, start, memory", quick="--seconds 2 --rounds 1"),
+    "estimator_tick": Section("The estimator alone", quick="--ticks 8000"),
+    "paper_table": Section("The paper's table"),
     "ensembles": Section("The estimator on random joints", quick="--joints 1"),
     "undeclared": Section("Effects that nobody declared, on an independent simulator", quick="--joints 1"),
     "ekf": Section("An extended Kalman filter beside ours", "--joints 6", "--joints 1 --cases linear"),
     "diagnosis_seeds": Section(
-        "Diagnosis on published seeds",
-        "--seeds 1",
-        "--seeds 1 --effects clean coulomb_friction backlash",
-        text=True,
-        json_file=True,
+        "Diagnosis on published seeds", "--seeds 1", "--seeds 1 --effects clean,coulomb_friction,backlash"
     ),
-    "effect_pairs": Section("Two effects at once", quick="--seconds 10"),
+    "effect_pairs": Section(
+        "Two effects at once", "--pairs --seeds 1", "--pairs --seeds 1 --seconds 10", of="diagnosis_seeds"
+    ),
     "gate": Section("Wrong units, signs, gears and time", "--seeds 2", "--seeds 1 --kinds serial"),
-    "real_data": Section("Real data before and after", text=True, json_file=True),
+    "real_data": Section("Real data before and after"),
     "constants": Section("Choice constants halved and doubled", "--report", "--report"),
     "external": Section("External torque and contact", quick="--minutes 2 --errors 2 --joints sea"),
     "fault_matrix": Section(
@@ -84,39 +65,34 @@ SECTIONS = {
         "--sizes --joints constant",
         of="fault_matrix",
     ),
-    "soak": Section("Ten minutes of random faults in real time", quick="--seconds 60", text=True),
+    "soak": Section("Ten minutes of random faults in real time", quick="--seconds 60"),
     "fleet_throughput": Section(
         "A fleet: two workers beside one",
         "throughput --nights 2 --recordings 12 --rounds 2",
         "throughput --nights 2 --recordings 4",
-        text=True,
         of="fleet",
     ),
     "fleet_cpu": Section(
         "A fleet: CPU of a recording beside fit and diagnose alone",
         "cpu --nights 2 --recordings 8",
         "cpu --nights 2 --recordings 2",
-        text=True,
         of="fleet",
     ),
     "fleet_table": Section(
-        "A fleet: 10 000 rows appended and reported", "table", "table --rows 1000", text=True, of="fleet"
+        "A fleet: 10 000 rows appended and reported", "table", "table --rows 1000", of="fleet"
     ),
     "fleet_statistics": Section(
         "A fleet: false discoveries and power of the tests",
         "statistics --fleets 120",
         "statistics --fleets 10",
-        text=True,
         of="fleet",
     ),
     "fleet_changes": Section(
         "A fleet: 40 joints, 25 nights, one of two workers killed half-way",
         "changes --seconds 5",
         "changes --seconds 5 --joints 8 --nights 8",
-        text=True,
         of="fleet",
     ),
-    "fleet_storage": Section("A fleet: local files, SFTP and S3", text=True),
 }
 
 
@@ -148,7 +124,6 @@ def run(name: str, quick: bool) -> dict[str, Any]:
     path = HERE / f"{section.of or name}.py"
     result: dict[str, Any] = {
         "title": section.title,
-        "markdown": not section.text,
         "machine": machine(),
         "at": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
         "load": os.getloadavg()[0],
@@ -157,7 +132,7 @@ def run(name: str, quick: bool) -> dict[str, Any]:
     start = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         numbers = Path(folder) / "numbers.json"
-        extra = ["--json", str(numbers)] if section.json_file else []
+        extra = ["--json", str(numbers)]
         done = execute([sys.executable, str(path), *arguments, *extra], folder)
         result["command"] = " ".join(["python", f"benchmarks/{path.name}", *arguments])
         result["took_s"] = round(time.monotonic() - start, 1)
@@ -165,6 +140,7 @@ def run(name: str, quick: bool) -> dict[str, Any]:
             lines = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()
             return {**result, "skipped": lines[-1]}
         result["text"] = done.stdout.rstrip()
+        result["markdown"] = result["text"].startswith("|")
         if numbers.exists():
             result["numbers"] = json.loads(numbers.read_text(encoding="utf-8"))
     return result
@@ -220,6 +196,7 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, default=HERE, help="where results.md and results.json go")
     args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
     path = args.out / "results.json"
     before = json.loads(path.read_text(encoding="utf-8"))["sections"] if path.exists() else {}
     sections: dict[str, Any] = {}

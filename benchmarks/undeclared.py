@@ -2,42 +2,32 @@
 estimator makes of each.
 
     python benchmarks/undeclared.py [--mode robust|balance] [--joints 8] [--seconds 30] [--effects NAME,…]
-                                    [--motion multisine|point-to-point|hand-guided|pushes|harmonic] [--json]
+                                    [--motion multisine|point-to-point|hand-guided|pushes|harmonic]
 
 Random joints with cubic springs, order declared, read as drives read them: 4096 to 16384 counts, 16 to 18
 bits at the link, no velocity, torque noise of 0.1 to 0.5 % of rated. Judged from five seconds on, where the
-estimate is valid and observable: its error against the slope of the spring, relative to that slope's rms;
-the share of its 95 % intervals that hold the slope. Effects are 3 to 8 % of the torque's amplitude. `named`
-counts joints in which an effect is named in the end, `after` is the median time to the first name.
+estimate is valid and observable: its error against the slope of the spring, relative to that slope (in a gap,
+to 0.3 of its rms); the share of its 95 % intervals that hold the slope. Effects are 3 to 8 % of the torque's
+amplitude. `named` counts joints in which an effect is named in the end, `after` is the median time to the
+first name.
 """
 
 from __future__ import annotations
 
-import argparse
 import functools
-import json
 import subprocess
 import tempfile
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import scene
+from ensembles import COLUMNS, T, run, summary
 
-from estimator import (
-    EstimatorSettings,
-    JointModel,
-    Motor,
-    Record,
-    Status,
-    Transmission,
-    make_estimator,
-)
-from estimator.sample import SIGMA_95
+from estimator import JointModel, Motor, Record, Transmission
 
-T = 1e-3
-SETTLED_S = 5.0
-USABLE = int(Status.VALID | Status.OBSERVABLE)
 HERE = Path(__file__).parent
 
 
@@ -105,6 +95,9 @@ def effects(rng: np.random.Generator, rated: float, stiffness: float) -> dict[st
         "transmission damping": {"transmission_damping": stiffness * rng.uniform(0.5e-3, 3e-3)},
         "cogging": {"cogging": torque / 2, "cogging_periods": int(rng.integers(8, 64))},
         "inertia 5 % off": {},
+        "damping 20 % off": {},
+        "motor of 1024 counts": {"motor_counts": 1024},
+        "torque noise 2 % of rated": {"torque_noise": 0.02 * rated},
     }
 
 
@@ -137,118 +130,40 @@ def draw(effect: str, seed: int, seconds: float, motion: str) -> tuple[JointMode
         "seed": seed,
     }
     declared = inertia * (1.05 if effect == "inertia 5 % off" else 1.0)
+    losses = damping * (0.8 if effect == "damping 20 % off" else 1.0)
     spring = Transmission(model="polynomial", order=2, parameters={})
-    motor = Motor(inertia_kg_m2=declared, viscous_damping_nm_s_rad=damping, transmission=spring)
+    motor = Motor(inertia_kg_m2=declared, viscous_damping_nm_s_rad=losses, transmission=spring)
     world = simulate(**(settings | effects(rng, size, stiffness)[effect]))
     return JointModel(arrangement="single", motors=(motor,)), world
 
 
-class Judged(NamedTuple):
-    """One joint: what the estimate of its stiffness is worth; nan: never usable."""
-
-    usable: float
-    rmse: float
-    coverage: float
-    std: float
-    names: tuple[str, ...]
-    named_after_s: float
-
-
-def judge(model: JointModel, world: World, mode: str) -> Judged:
-    """Run the on-line estimator over a recording."""
-    estimator = make_estimator(model, EstimatorSettings(mode=mode), T)
-    stiffness, std, usable = (np.zeros(len(world.record)) for _ in range(3))
-    after = np.nan
-    for k, sample in enumerate(world.record.samples()):
-        _, status, _, stiffness[k], std[k] = estimator.step(sample)[:5]
-        usable[k] = status & USABLE == USABLE and k * T >= SETTLED_S
-        if k % 250 == 0 and np.isnan(after) and estimator.core.undeclared(0):
-            after = k * T
-    good = usable > 0
-    names, truth = tuple(estimator.core.undeclared(0)), world.stiffness_nm_rad
-    share = float(np.mean(usable[round(SETTLED_S / T) :]))
-    if not good.any():
-        return Judged(share, np.nan, np.nan, np.nan, names, after)
-    error, size = stiffness[good] - truth[good], np.sqrt(np.mean(truth**2))
-    held = np.mean(np.abs(error) < SIGMA_95 * std[good])
-    return Judged(
-        share, np.sqrt(np.mean(error**2)) / size, held, float(np.median(std[good])) / size, names, after
-    )
-
-
-def measure(effect: str, joints: int, seconds: float, motion: str, mode: str) -> dict:
-    """One row of the table."""
-    found = [judge(*draw(effect, seed, seconds, motion), mode) for seed in range(1, joints + 1)]
-    usable, rmse, coverage, std = np.array([one[:4] for one in found]).T
-    some = bool(np.isfinite(rmse).any())
-    after = [one.named_after_s for one in found if np.isfinite(one.named_after_s)]
-    return {
-        "undeclared": effect,
-        "usable": float(usable.mean()),
-        "rmse_median": float(np.nanmedian(rmse)) if some else None,
-        "rmse_worst": float(np.nanmax(rmse)) if some else None,
-        "std_median": float(np.nanmedian(std)) if some else None,
-        "coverage": float(np.nanmean(coverage)) if some else None,
-        "coverage_worst": float(np.nanmin(coverage)) if some else None,
-        "named": dict(Counter(name for one in found for name in one.names)),
-        "named_after_s": float(np.median(after)) if after else None,
-    }
-
-
-def cells(row: dict) -> tuple[str, ...]:
-    """A row in words."""
-
-    def percent(name: str, digits: int) -> str:
-        return "–" if row[name] is None else f"{100 * row[name]:.{digits}f}"
-
-    names = ", ".join(f"{name} {count}" for name, count in row["named"].items()) or "–"
-    after = "–" if row["named_after_s"] is None else f"{row['named_after_s']:.0f} s"
-    return (
-        row["undeclared"],
-        percent("usable", 0),
-        f"{percent('rmse_median', 2)} / {percent('rmse_worst', 2)}",
-        percent("std_median", 3),
-        f"{percent('coverage', 0)} / {percent('coverage_worst', 0)}",
-        names,
-        after,
-    )
-
-
-HEADER = (
-    "undeclared",
-    "valid %",
-    "RMSE %: median / worst",
-    "std %",
-    "95 % intervals hold %: mean / worst",
-    "named",
-    "after",
-)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--mode", choices=["robust", "balance", "paper"], default="robust")
-    parser.add_argument("--joints", type=int, default=8)
-    parser.add_argument("--seconds", type=float, default=30.0)
-    parser.add_argument("--motion", default="multisine")
-    parser.add_argument("--effects", default=",".join(name.replace(",", ";") for name in EFFECTS))
-    parser.add_argument("--json", action="store_true")
-    args = parser.parse_args()
-    wanted = [name.replace(";", ",") for name in args.effects.split(",")]
-    if unknown := set(wanted) - set(EFFECTS):
-        parser.error(f"--effects: {', '.join(unknown)}: expected of {'; '.join(EFFECTS)}")
-    if not args.json:
-        print("| " + " | ".join(HEADER) + " |\n|" + "---|" * len(HEADER))
-    rows = []
-    for effect in wanted:
-        rows.append(measure(effect, args.joints, args.seconds, args.motion, args.mode))
-        if not args.json:
-            print("| " + " | ".join(cells(rows[-1])) + " |", flush=True)
-    if args.json:
-        print(json.dumps(rows))
+def rows(args) -> Iterator[scene.Row]:
+    """One row an effect."""
+    for effect in args.effects:
+        found = []
+        for seed in range(1, args.joints + 1):
+            model, world = draw(effect, seed, args.seconds, args.motion)
+            found.append(run(model, world.record, world.stiffness_nm_rad, args.mode))
+        after = [one["named_after_s"] for one in found if np.isfinite(one["named_after_s"])]
+        named = Counter(name for one in found for name in one["names"])
+        yield {
+            "case": effect,
+            **summary(found),
+            "false_alarms": sum(one["false_alarms"] for one in found),
+            "named": ", ".join(f"{name} {count}" for name, count in named.items()) or None,
+            "after_s": float(np.median(after)) if after else None,
+        }
 
 
 if __name__ == "__main__":
-    main()
+    columns = {"undeclared": "{case}", **dict(list(COLUMNS.items())[1:-1])}
+    scene.main(
+        __doc__,
+        rows,
+        {**columns, "changes said": "{false_alarms}", "named": "{named}", "after / s": "{after_s:.0f}"},
+        scene.Option("--mode", ("robust", "balance", "paper")),
+        scene.Option("--joints", 8),
+        scene.Option("--seconds", 30.0),
+        scene.Option("--motion", ("multisine", "point-to-point", "hand-guided", "pushes", "harmonic")),
+        scene.Option("--effects", list(EFFECTS)),
+    )

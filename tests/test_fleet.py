@@ -169,7 +169,7 @@ def test_another_version_is_refused(fleet: Path, joints: Joints) -> None:
 
 @pytest.mark.slow
 def test_a_remote_storage_holds_recordings_and_results(fleet: Path, joints: Joints) -> None:
-    """fsspec's own in-memory file system stands for the protocols that benchmarks/fleet_storage.py tries for real."""
+    """fsspec's own in-memory file system stands for the protocols."""
     import fsspec
 
     fs, local = fsspec.filesystem("memory"), fleet / "recordings" / "elbow-2026-01-05.csv"

@@ -230,7 +230,7 @@ def _bare(model: JointModel) -> JointModel:
 
     def open_(own: Transmission) -> Transmission:
         name = "polynomial" if own.model == UNKNOWN else own.model
-        return replace(own, model=name, parameters={})
+        return replace(own, model=name, parameters={}, covariance=None)
 
     return replace(model, motors=tuple(replace(m, transmission=open_(m.transmission)) for m in model.motors))
 

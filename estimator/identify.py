@@ -107,11 +107,18 @@ def _fitted(motor: Motor, one: TransmissionFit) -> Motor:
     transmission = motor.transmission
     if one.model != RIGID:
         order = int(one.alpha.size) if one.model == "polynomial" else transmission.order
-        transmission = Transmission(model=one.model, order=order, parameters=one.parameters)
+        transmission = Transmission(
+            model=one.model,
+            order=order,
+            parameters=one.parameters,
+            covariance=tuple(map(tuple, one.covariance.tolist())) if one.parameters else None,
+        )
     return replace(
         motor,
         inertia_kg_m2=one.inertia_kg_m2,
         viscous_damping_nm_s_rad=one.viscous_damping_nm_s_rad,
+        inertia_std_relative=min(one.nuisance_std["inertia"] / one.inertia_kg_m2, 1.0),
+        viscous_damping_std_nm_s_rad=one.nuisance_std["damping"],
         transmission=transmission,
     )
 
@@ -131,15 +138,18 @@ def _effects(
             notes.append(f"{name} differs between the recordings ({parameter} {each}) and stays as declared")
             continue
         before = sum(v[parameter] for e in declared if e.name == name for v in elements(e)[1])
-        values_of = {parameter: before + more}
+        values_of, std = {parameter: before + more[0]}, {parameter: more[1]}
         if name == "coulomb_friction":
             values_of["smoothing_rad_s"] = sign_smoothing(joint.problem.frames, motor or 0)
-        declared = (*(e for e in declared if e.name != name), Effect(name=name, parameters=values_of))
+        declared = (
+            *(e for e in declared if e.name != name),
+            Effect(name=name, parameters=values_of, std=std),
+        )
     return declared
 
 
-def _shared(joint: JointFit, mine: list[int]) -> float | None:
-    """The common value of all recordings; None if they contradict each other."""
+def _shared(joint: JointFit, mine: list[int]) -> tuple[float, float] | None:
+    """The common value of all recordings and its standard deviation; None if they contradict each other."""
     values = np.array([joint.fitted.slots[j].taken + joint.fitted.posterior.x[j] for j in mine])
     precision = np.linalg.pinv(joint.covariance[np.ix_(mine, mine)], hermitian=True)
     mean = float(np.sum(precision @ values) / np.sum(precision))
@@ -147,7 +157,7 @@ def _shared(joint: JointFit, mine: list[int]) -> float | None:
     freedom = len(mine) - 1
     if freedom and chdtrc(freedom, float(apart @ precision @ apart)) < chance():
         return None
-    return mean
+    return mean, float(np.sum(precision)) ** -0.5
 
 
 def _link(joint: JointFit) -> tuple[LinkDynamics | None, dict[str, float]]:

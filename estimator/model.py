@@ -6,9 +6,11 @@ Frozen dataclasses, validated at construction; they know no file format.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
+
+import numpy as np
 
 from estimator.errors import EstimatorError
 from estimator.priors import PRIORS
@@ -68,6 +70,26 @@ def require_parameters(parameters: Mapping[str, ParameterValue]) -> None:
             require_in_range(name, number)
 
 
+def require_covariance(rows: Sequence[Sequence[float]], size: int) -> None:
+    """Require a covariance of so many parameters: square, symmetric, no variance or eigenvalue below zero."""
+    expected = f"covariance: expected {size} rows of {size} numbers, one for each of the parameters"
+    require(size > 0 and len(rows) == size and all(len(row) == size for row in rows), expected)
+    for number in (x for row in rows for x in row):
+        require_in_range("covariance", number)
+    matrix = np.array(rows)
+    require(
+        bool(np.all(np.diag(matrix) >= 0.0)), "covariance: expected variances of 0 or more on its diagonal"
+    )
+    rounded = range_of("correlation").least
+    std = np.sqrt(np.diag(matrix))
+    shares = matrix / np.maximum(np.outer(std, std), 1e-300)
+    symmetric = bool(np.allclose(shares, shares.T, atol=rounded))
+    require(
+        symmetric and float(np.min(np.linalg.eigvalsh(shares))) >= -rounded,
+        "covariance: expected a symmetric matrix without negative eigenvalues",
+    )
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Effect:
     """One physical effect the model has been given, by its name in `estimator.effects.LIBRARY`.
@@ -75,15 +97,23 @@ class Effect:
     Attributes:
         name: the effect's name in the library, e.g. "coulomb_friction".
         parameters: its parameters, by names that carry their unit, e.g. {"torque_nm": 0.25}.
+        std: standard deviations of those that were fitted, by the same names.
     """
 
     __pydantic_config__: ClassVar[dict[str, Any]] = _STRICT
 
     name: str
     parameters: Mapping[str, ParameterValue] = field(default_factory=dict)
+    std: Mapping[str, ParameterValue] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         require_parameters(self.parameters)
+        require_parameters(self.std)
+        for name, value in self.std.items():
+            require(name in self.parameters, f"std.{name}: expected the name of one of the parameters")
+            expected, got = np.size(self.parameters[name]), np.size(value)
+            require(got == expected, f"std.{name}: expected {expected} number(s) as in parameters, got {got}")
+            require(bool(np.all(np.asarray(value) >= 0.0)), f"std.{name}: expected 0 or more, got {value}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,6 +124,8 @@ class Transmission:
         model: its name in `estimator.transmissions.MODELS`, or "none" for a rigid transmission.
         order: p of eq 24 for polynomials; None: chosen from the data.
         parameters: alpha, if known or fitted; empty: estimated without prior.
+        covariance: (n, n) of alpha, as `fit` and `diagnose` write it, in the units of the parameters: the
+            coefficients in order, or k_nm_rad and then the shape; None: not known.
     """
 
     __pydantic_config__: ClassVar[dict[str, Any]] = _STRICT
@@ -101,6 +133,7 @@ class Transmission:
     model: str = "polynomial"
     order: int | None = None
     parameters: Mapping[str, ParameterValue] = field(default_factory=dict)
+    covariance: tuple[tuple[float, ...], ...] | None = None
 
     def __post_init__(self) -> None:
         require(
@@ -108,6 +141,8 @@ class Transmission:
             f"order: expected 1 to {HIGHEST_ORDER}, got {self.order}",
         )
         require_parameters(self.parameters)
+        if self.covariance is not None:
+            require_covariance(self.covariance, sum(np.size(value) for value in self.parameters.values()))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,6 +157,7 @@ class Motor:
         gear_ratio: motor revolutions per joint revolution, if known: everything else is at the joint side;
             the gate tests for recordings that are not.
         inertia_std_relative: relative standard deviation of B; None: that of `estimator.priors`.
+        viscous_damping_std_nm_s_rad: standard deviation of D_theta, likewise.
     """
 
     inertia_kg_m2: float
@@ -130,12 +166,15 @@ class Motor:
     effects: tuple[Effect, ...] = ()
     gear_ratio: float | None = None
     inertia_std_relative: float | None = None
+    viscous_damping_std_nm_s_rad: float | None = None
 
     def __post_init__(self) -> None:
         require_declared(0.0, strict=True, inertia_kg_m2=self.inertia_kg_m2)
         require_declared(0.0, viscous_damping_nm_s_rad=self.viscous_damping_nm_s_rad)
         if self.inertia_std_relative is not None:
             require_declared(0.0, strict=True, inertia_std_relative=self.inertia_std_relative)
+        if self.viscous_damping_std_nm_s_rad is not None:
+            require_declared(0.0, viscous_damping_std_nm_s_rad=self.viscous_damping_std_nm_s_rad)
 
     @property
     def flexible(self) -> bool:

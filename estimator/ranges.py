@@ -62,6 +62,8 @@ RANGES: dict[str, Range] = {  # the longest end that fits counts
     "bitrate": Range(1e3, 2e7, "bit/s"),
     "sdo_retries": Range(0.0, 100.0, ""),
     "elements": Range(1.0, 32.0, ""),  # numbers of a parameter: each costs time in every cycle
+    "covariance": Range(0.0, 1e24, ""),  # of two parameters of up to 1e12 each
+    "correlation": Range(1e-6, 1.0, ""),  # least: digits that a file may leave out
     "every": Range(1.0, 1e6, ""),
     "seed": Range(0.0, 2.0**63, ""),
 }

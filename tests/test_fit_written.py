@@ -17,6 +17,7 @@ import pytest
 
 from drivelink import jointfile, recording
 from drivelink.cli import main
+from drivelink.errors import JointFileError
 from estimator import fit
 from estimator.identify import identify
 from estimator.sample import Record
@@ -106,7 +107,7 @@ def _numbers(table: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
         many = isinstance(value, list) and key != "effect"
         for i, x in enumerate(value, start=1) if many else ():
             yield f"{prefix}{key}[{i}]", x
-        if isinstance(value, (int, float)) and not isinstance(value, bool):
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and "_std" not in key:
             yield f"{prefix}{key}", value
 
 
@@ -141,6 +142,12 @@ def test_what_is_printed_is_what_is_written(
     _same(tables[0], _of_motor(motor))
     (entry,) = document["transmissions"]
     assert entry["parameters"] == motor["transmission"].get("parameters", {})
+    std = np.sqrt(np.diag(motor["transmission"]["covariance"]))
+    assert np.allclose(std, np.concatenate([np.atleast_1d(x) for x in entry["std"].values()]), rtol=1e-6)
+    own = entry["motor"]
+    assert motor["viscous_damping_std_nm_s_rad"] == own["viscous_damping_std_nm_s_rad"]
+    share = own["inertia_std_kg_m2"] / own["inertia_kg_m2"]
+    assert motor["inertia_std_relative"] == pytest.approx(share)
     assert {k: entry["motor"][k] for k in ("inertia_kg_m2", "viscous_damping_nm_s_rad")} == dict(
         _numbers(motor)
     )
@@ -198,6 +205,24 @@ def test_skew_and_zero_of_the_readings_are_written_and_fitted_again_they_stay(
     (folder / "again.toml").write_text((folder / "written.toml").read_text())
     _, second, _ = _fit(folder, "skewed", "again.toml", capsys)
     assert math.isclose(second["transmissions"][0]["parameters"]["k_nm_rad"], k, abs_tol=std)
+
+
+@pytest.mark.parametrize(
+    ("covariance", "expected"),
+    [
+        ("[[1.0]]", "2 rows of 2 numbers"),
+        ("[[1.0, 0.0], [0.0]]", "2 rows of 2 numbers"),
+        ("[[1.0, 0.0], [0.5, 1.0]]", "symmetric"),
+        ("[[1.0, 2.0], [2.0, 1.0]]", "without negative eigenvalues"),
+        ("[[-1.0, 0.0], [0.0, 1.0]]", "variances of 0 or more"),
+    ],
+)
+def test_a_covariance_of_another_shape_is_refused(covariance: str, expected: str) -> None:
+    text = ONE.format(model="vsa-ii") + "parameters = {{ k_nm_rad = 500.0, c = 1.7 }}\ncovariance = {}\n"
+    good = jointfile.parse(text.format("[[4.0, 0.01], [0.01, 0.0025]]")).model()
+    assert good.motors[0].transmission.covariance == ((4.0, 0.01), (0.01, 0.0025))
+    with pytest.raises(JointFileError, match=expected):
+        jointfile.parse(text.format(covariance))
 
 
 @pytest.mark.skipif(not KUKA.exists(), reason=f"no measured data in {KUKA} (see $DRIVELINK_DATA)")

@@ -6,7 +6,7 @@ import argparse
 import json
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from rich.table import Table
 from drivelink import jointfile, recording
 from drivelink.cli.gating import warned
 from drivelink.errors import RecordingError
-from drivelink.jointfile import JointText, plain_parameters
+from drivelink.jointfile import JointText, effect_entry, link_entry
 from drivelink.jointfile.residual_baseline import floor_entry
 from drivelink.output.fitplot import fit_plot
 from drivelink.output.outfile import check_target, write_whole
@@ -89,7 +89,7 @@ def _inputs(args: argparse.Namespace) -> list[Path]:
 def _as_json(found: Identified, paths: Sequence[Path]) -> dict[str, Any]:
     pairs = zip(found.fits, found.model.motors, strict=True)
     document: dict[str, Any] = {"transmissions": [_entry(one, motor) for one, motor in pairs]}
-    link = _link(found)
+    link = link_entry(found.model)
     if link:
         document["link"] = link
     if found.link_std:
@@ -115,7 +115,7 @@ def _entry(one: TransmissionFit, motor: Motor) -> dict[str, Any]:
         "viscous_damping_nm_s_rad": motor.viscous_damping_nm_s_rad,
     }
     if motor.effects:
-        entry["effects"] = [_effect(effect) for effect in motor.effects]
+        entry["effects"] = [effect_entry(effect) for effect in motor.effects]
     std = one.nuisance_std
     entry["motor"] |= {"inertia_std_kg_m2": std["inertia"], "viscous_damping_std_nm_s_rad": std["damping"]}
     entry["error_rms_nm"] = one.error_rms_nm
@@ -124,16 +124,6 @@ def _entry(one: TransmissionFit, motor: Motor) -> dict[str, Any]:
         entry["unmodelled"] = {"coulomb_nm": one.coulomb_nm, "offset_nm": one.offset_nm}
         entry["excited"] = one.excited
     return entry
-
-
-def _link(found: Identified) -> dict[str, Any]:
-    """The fitted [link]: dynamics, effects of link and encoder."""
-    link: dict[str, Any] = {}
-    if found.model.link is not None:
-        link["dynamics"] = {name: x for name, x in asdict(found.model.link).items() if x is not None}
-    if found.model.link_effects:
-        link["effect"] = [_effect(effect) for effect in found.model.link_effects]
-    return link
 
 
 def _print(found: Identified, paths: Sequence[Path], units: Units) -> None:
@@ -154,8 +144,9 @@ def _print(found: Identified, paths: Sequence[Path], units: Units) -> None:
     link = found.model.link
     if link is not None or found.model.link_effects:
         table = _table("link")
-        for name, x in _link(found).get("dynamics", {}).items():
-            _add(table, name, x, found.link_std.get(name), units)
+        for name, x in link_entry(found.model).get("dynamics", {}).items():
+            if "_std" not in name:
+                _add(table, name, x, found.link_std.get(name), units)
         _add_effects(table, found.model.link_effects, units)
         console.print(table)
     for line in found.notes:
@@ -229,28 +220,9 @@ def _write(args: argparse.Namespace, source: JointText, found: Identified, recor
             f"{_named(args)}: --write: expected a stiffness above zero, interval included, over all "
             f"deflections of the recording; that of motor {unusable[0]} is not"
         )
-    model = found.model
-    motors: list[dict[str, Any]] = []
-    for motor in model.motors:
-        change: dict[str, Any] = {
-            "inertia_kg_m2": motor.inertia_kg_m2,
-            "viscous_damping_nm_s_rad": motor.viscous_damping_nm_s_rad,
-        }
-        if motor.transmission.model != RIGID:
-            transmission: dict[str, Any] = {"model": motor.transmission.model}
-            transmission["parameters"] = plain_parameters(motor.transmission.parameters)
-            if motor.transmission.order is not None:
-                transmission["order"] = motor.transmission.order
-            change["transmission"] = transmission
-        if motor.effects:
-            change["effect"] = [_effect(effect) for effect in motor.effects]
-        motors.append(change)
-    changes: dict[str, Any] = {"motor": motors}
-    link = _link(found)
-    if link:
-        changes["link"] = link
+    changes = jointfile.changes_to(found.model)
     provenance = {
-        **floor_entry(records, model, found.surplus),
+        **floor_entry(records, found.model, found.surplus),
         "fit": {
             "recording": ", ".join(path.name for path in args.recording),
             "seconds": sum(float((one.sequence[-1] - one.sequence[0]) * one.period_s) for one in records),
@@ -258,9 +230,4 @@ def _write(args: argparse.Namespace, source: JointText, found: Identified, recor
             "version": __version__,
         },
     }
-    changes["provenance"] = provenance
-    jointfile.write_model(source, args.write, changes, force=args.force)
-
-
-def _effect(effect: Effect) -> dict[str, Any]:
-    return {"name": effect.name, "parameters": plain_parameters(effect.parameters)}
+    jointfile.write_model(source, args.write, changes | {"provenance": provenance}, force=args.force)

@@ -7,7 +7,6 @@ import json
 import logging
 import re
 import tomllib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from drivelink.infile import read_regular
 from drivelink.jointfile.keyhint import unknown_key
 from drivelink.jointfile.schema import JointFile
 from drivelink.output.outfile import write_whole
-from estimator.model import ParameterValue
 
 _LOG = logging.getLogger(__name__)
 
@@ -155,11 +153,6 @@ def write_model(
     except OSError as error:
         raise JointFileError(f"{target}: cannot be written: {error.strerror}") from error
     return joint
-
-
-def plain_parameters(parameters: Mapping[str, ParameterValue]) -> dict[str, float | list[float]]:
-    """Parameters as a file has them: numbers and lists of numbers."""
-    return {name: list(v) if isinstance(v, tuple) else float(v) for name, v in parameters.items()}
 
 
 def _checked(text: str) -> str:

@@ -145,6 +145,9 @@ class MotorSection(_Section):
         description="relative standard deviation of the inertia; default 0.05",
     )
     viscous_damping_nm_s_rad: float = Field(0.0, ge=0, description="D_theta of eqs 5, 7, joint side")
+    viscous_damping_std_nm_s_rad: float | None = Field(
+        None, ge=0, description="standard deviation of the damping, as `fit` writes it"
+    )
     transmission: Transmission = Field(
         default_factory=Transmission, description="model of the flexibility torque"
     )
@@ -169,6 +172,7 @@ class MotorSection(_Section):
             effects=self.effect,
             gear_ratio=drive.gear_ratio if drive and "gear_ratio" in drive.model_fields_set else None,
             inertia_std_relative=self.inertia_std_relative,
+            viscous_damping_std_nm_s_rad=self.viscous_damping_std_nm_s_rad,
         )
 
 

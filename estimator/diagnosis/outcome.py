@@ -198,7 +198,8 @@ def transmissions_of(
             made.append(Refitted(model.name, {}, {}))
             continue
         std_of_alpha = np.sqrt(np.maximum(np.diag(own), 0.0))
-        made.append(Refitted(model.name, model.parameters(alpha), model.parameters(std_of_alpha)))
+        rows = tuple(map(tuple, own.tolist()))
+        made.append(Refitted(model.name, model.parameters(alpha), model.parameters(std_of_alpha), rows))
     return tuple(made), doubts
 
 

@@ -103,11 +103,12 @@ class Series:
 
 
 class Refitted(NamedTuple):
-    """One refitted transmission; empty if it is rigid or undetermined."""
+    """One refitted transmission, as in the joint file; empty if it is rigid or undetermined."""
 
     model: str
     parameters: dict[str, ParameterValue]
     std: dict[str, ParameterValue]
+    covariance: tuple[tuple[float, ...], ...] = ()
 
 
 class StiffnessCurve(NamedTuple):

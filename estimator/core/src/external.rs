@@ -311,6 +311,7 @@ mod tests {
             inertia: 0.1,
             inertia_std: None,
             damping: 0.2,
+            damping_std: None,
             transmission: Transmission::Unknown,
             effects: Vec::new(),
         };

@@ -108,7 +108,7 @@ impl OnlineIdentification {
         dt_s: f64,
     ) -> OnlineIdentification {
         let (mut target, mut declared_order, mut known) = (None, None, Vec::new());
-        if let Transmission::Elastic { law, order, parameters } = &motor.transmission {
+        if let Transmission::Elastic { law, order, parameters, .. } = &motor.transmission {
             if settings.method != Method::Bbe {
                 (target, declared_order) = (Some(law.clone()), *order);
                 known.clone_from(parameters);

@@ -32,6 +32,8 @@ pub enum Transmission {
         order: Option<usize>,
         /// Known parameters; empty: estimated from nothing.
         parameters: Vec<f64>,
+        /// Covariance of α, row by row, where a fit has written it.
+        covariance: Option<Vec<f64>>,
     },
 }
 
@@ -44,6 +46,8 @@ pub struct Motor {
     pub inertia_std: Option<f64>,
     /// D_θ, N·m·s/rad.
     pub damping: f64,
+    /// Standard deviation of D_θ, N·m·s/rad, where it is declared.
+    pub damping_std: Option<f64>,
     /// See [`Transmission`].
     pub transmission: Transmission,
     /// What the model has been given besides.
@@ -114,7 +118,9 @@ impl Model {
             )));
         }
         for motor in &self.motors {
-            let Transmission::Elastic { law, order, parameters } = &motor.transmission else { continue };
+            let Transmission::Elastic { law, order, parameters, covariance } = &motor.transmission else {
+                continue;
+            };
             let (got, fixed) = (parameters.len(), 1 + law.shapes().len());
             let fits = match law {
                 Law::Polynomial => got < PARAMETERS && order.unwrap_or(1) < PARAMETERS,
@@ -122,6 +128,9 @@ impl Model {
             };
             if !fits || fixed > PARAMETERS {
                 return Err(Error(format!("transmission: parameters: got {got}, expected {fixed}")));
+            }
+            if let Some(numbers) = covariance.as_ref().map(Vec::len).filter(|n| *n != got * got) {
+                return Err(Error(format!("transmission: covariance: got {numbers}, expected {}", got * got)));
             }
         }
         Ok(())

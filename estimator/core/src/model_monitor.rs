@@ -460,10 +460,12 @@ mod tests {
                 inertia: 0.1,
                 inertia_std: None,
                 damping: 0.5,
+                damping_std: None,
                 transmission: Transmission::Elastic {
                     law: Law::Linear,
                     order: None,
                     parameters: vec![100.0],
+                    covariance: None,
                 },
                 effects,
             }],

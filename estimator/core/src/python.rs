@@ -136,7 +136,8 @@ fn transmission(declared: &Bound<'_, PyAny>) -> PyResult<Transmission> {
         Vec::new()
     };
     let order = declared.getattr("order")?.extract()?;
-    Ok(Transmission::Elastic { law: law(&known)?, order, parameters })
+    let rows: Option<Vec<Vec<f64>>> = declared.getattr("covariance")?.extract()?;
+    Ok(Transmission::Elastic { law: law(&known)?, order, parameters, covariance: rows.map(|r| r.concat()) })
 }
 
 /// A model from an `estimator.model.JointModel`.
@@ -152,6 +153,7 @@ pub fn model(joint: &Bound<'_, PyAny>) -> PyResult<Model> {
             inertia: motor.getattr("inertia_kg_m2")?.extract()?,
             inertia_std: motor.getattr("inertia_std_relative")?.extract()?,
             damping: motor.getattr("viscous_damping_nm_s_rad")?.extract()?,
+            damping_std: motor.getattr("viscous_damping_std_nm_s_rad")?.extract()?,
             transmission: transmission(&motor.getattr("transmission")?)?,
             effects: elements(&motor.getattr("effects")?)?,
         });

@@ -58,7 +58,8 @@ fn model(law: Law, parameters: Vec<f64>, effects: bool) -> Model {
         inertia: 0.02,
         inertia_std: None,
         damping: 0.02,
-        transmission: Transmission::Elastic { law, order: None, parameters },
+        damping_std: None,
+        transmission: Transmission::Elastic { law, order: None, parameters, covariance: None },
         effects: if effects { elements(false) } else { Vec::new() },
     };
     Model {

@@ -18,7 +18,7 @@ CONFIRMED = 2500  # cycles: every object of three nodes has been asked for once
 def forge(made: DaemonRig, node: int, address: tuple[int, int], number: int, times: int) -> None:
     """Somebody else answers for this object, before the node does."""
     server = made.node(node).sdo
-    left, inner = [times], server._send
+    left, inner = [times], server.send_response
 
     def send(data: bytes) -> None:
         if left[0] and data[0] & 0xE0 == 0x40 and struct.unpack_from("<HB", data, 1) == address:
@@ -26,7 +26,7 @@ def forge(made: DaemonRig, node: int, address: tuple[int, int], number: int, tim
             inner(data[:4] + number.to_bytes(4, "little"))
         inner(data)
 
-    server._send = send
+    server.send_response = send
 
 
 @contextmanager

@@ -228,16 +228,11 @@ def test_nmt_to_all_nodes_boots_every_one(interface: str) -> None:
 
 
 @pytest.mark.parametrize("interface", BUSES)
-def test_strings_go_by_segments_and_by_blocks(interface: str) -> None:
+def test_strings_go_by_segments(interface: str) -> None:
     rig = StubRig()
     with mastered(drive(rig), rig=rig, interface=interface) as master:
         peer = remote(master, 1, "cia402-drive.eds")
         assert peer.sdo[0x1008].raw == "drivelink simulated CiA 402 drive"
-        with peer.sdo[0x1008].open("rb", block_transfer=True) as blocks:
-            assert blocks.read() == b"drivelink simulated CiA 402 drive"
-        with peer.sdo[0x1017].open("wb", size=2, block_transfer=True) as blocks:
-            blocks.write(b"\x64\x00")
-        assert peer.sdo[0x1017].raw == 100
 
 
 def test_an_emergency_reaches_the_master_and_its_history() -> None:

@@ -1,19 +1,19 @@
-"""SDO abort codes (CiA 301, 7.2.4.3.17) and the exception that carries one to the client."""
+"""SDO abort codes (CiA 301, 7.2.4.3.17); `canopen.SdoAbortedError` carries one to the client."""
 
 from __future__ import annotations
 
 from enum import IntEnum
 
+from canopen.sdo.exceptions import SdoAbortedError
+
+__all__ = ["Abort", "SdoAbortedError"]
+
 
 class Abort(IntEnum):
-    """The codes this server answers with."""
+    """The codes that a simulated device answers with, besides those of canopen's server."""
 
-    TOGGLE = 0x05030000  # toggle bit not alternated
     TIMEOUT = 0x05040000
     COMMAND = 0x05040001  # client/server command specifier not valid
-    BLOCK_SIZE = 0x05040002
-    SEQUENCE = 0x05040003
-    CRC = 0x05040004
     UNSUPPORTED_ACCESS = 0x06010000
     WRITE_ONLY = 0x06010001
     READ_ONLY = 0x06010002
@@ -21,7 +21,6 @@ class Abort(IntEnum):
     NOT_MAPPABLE = 0x06040041
     PDO_LENGTH = 0x06040042
     INCOMPATIBLE = 0x06040043
-    LENGTH = 0x06070010
     TOO_LONG = 0x06070012
     TOO_SHORT = 0x06070013
     NO_SUBINDEX = 0x06090011
@@ -31,11 +30,3 @@ class Abort(IntEnum):
     DATA_TRANSFER = 0x08000020
     DEVICE_STATE = 0x08000022
     NO_DATA = 0x08000024
-
-
-class SdoAbortError(Exception):
-    """A transfer that the server refuses; `code` goes on the wire."""
-
-    def __init__(self, code: Abort) -> None:
-        super().__init__(f"SDO abort 0x{code:08X} ({code.name})")
-        self.code = code

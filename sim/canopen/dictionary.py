@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterable, Iterator
 
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
-from sim.canopen.aborts import Abort, SdoAbortError
+from sim.canopen.aborts import Abort, SdoAbortedError
 
 Value = int | bytes
 Object = ODVariable | ODRecord | ODArray
 
-_LONGEST_STRING = 889  # bytes: 127 segments of 7, the most one block transfer moves at once
+LONGEST_STRING = 889  # bytes
 
 
 def variables(described: Object) -> list[ODVariable]:
@@ -33,7 +33,7 @@ class Entry:
         default: power-on value.
         value: the present value; an int, or bytes for strings and domains.
         refresh: called before an SDO read, for values taken from the simulated joint.
-        check: called with the new value before it is stored; raises `SdoAbortError` to refuse it.
+        check: called with the new value before it is stored; raises `SdoAbortedError` to refuse it.
         changed: called after a write has been stored.
     """
 
@@ -75,7 +75,7 @@ class Entry:
     def upload(self) -> bytes:
         """The value's bytes, as an SDO read gives them."""
         if self.item.access_type == "wo":
-            raise SdoAbortError(Abort.WRITE_ONLY)
+            raise SdoAbortedError(Abort.WRITE_ONLY)
         if self.refresh:
             self.refresh()
         if isinstance(self.value, bytes):
@@ -85,31 +85,30 @@ class Entry:
     def writable(self) -> None:
         """Raise unless the entry may be written at all."""
         if self.item.access_type in ("ro", "const"):
-            raise SdoAbortError(Abort.READ_ONLY)
+            raise SdoAbortedError(Abort.READ_ONLY)
 
     def download(self, data: bytes) -> None:
         """Check and store the bytes of an SDO write."""
         self.writable()
-        if self.code is None:
-            if len(data) > _LONGEST_STRING:
-                raise SdoAbortError(Abort.TOO_LONG)
-            self.value = bytes(data)
-            if self.changed:
-                self.changed()
+        size = self.bits // 8
+        if len(data) > (size or LONGEST_STRING):
+            raise SdoAbortedError(Abort.TOO_LONG)
+        if len(data) < size:
+            raise SdoAbortedError(Abort.TOO_SHORT)
+        if self.code is not None:
+            self.write(struct.unpack("<" + self.code, data)[0])
             return
-        size = struct.calcsize("<" + self.code)
-        if len(data) != size:
-            raise SdoAbortError(Abort.TOO_LONG if len(data) > size else Abort.TOO_SHORT)
-        (value,) = struct.unpack("<" + self.code, data)
-        self.write(value)
+        self.value = bytes(data)
+        if self.changed:
+            self.changed()
 
     def write(self, value: int) -> None:
         """Check and store an integer, from SDO or RPDO."""
         item = self.item
         if item.max is not None and value > item.max:
-            raise SdoAbortError(Abort.TOO_HIGH)
+            raise SdoAbortedError(Abort.TOO_HIGH)
         if item.min is not None and value < item.min:
-            raise SdoAbortError(Abort.TOO_LOW)
+            raise SdoAbortedError(Abort.TOO_LOW)
         if self.check:
             self.check(value)
         self.value = value
@@ -121,7 +120,7 @@ class Dictionary:
     """All entries of one device."""
 
     def __init__(self, objects: Iterable[Object], node_id: int) -> None:
-        self.objects = {described.index: described for described in objects}
+        self.objects = self.object_dictionary = {described.index: described for described in objects}
         self._entries = {
             (item.index, item.subindex): Entry(item, node_id)
             for described in self.objects.values()
@@ -143,12 +142,20 @@ class Dictionary:
         """The entry.
 
         Raises:
-            SdoAbortError: there is none.
+            SdoAbortedError: there is none.
         """
         entry = self._entries.get((index, subindex))
         if entry is None:
-            raise SdoAbortError(Abort.NO_SUBINDEX if index in self.objects else Abort.NO_OBJECT)
+            raise SdoAbortedError(Abort.NO_SUBINDEX if index in self.objects else Abort.NO_OBJECT)
         return entry
+
+    def get_data(self, index: int, subindex: int, check_readable: bool = True) -> bytes:
+        """Serve an SDO upload (the interface of `canopen.LocalNode`)."""
+        return self.find(index, subindex).upload()
+
+    def set_data(self, index: int, subindex: int, data: bytes, check_writable: bool = True) -> None:
+        """Serve an SDO download (the interface of `canopen.LocalNode`)."""
+        self.find(index, subindex).download(bytes(data))
 
     def optional(self, index: int, subindex: int = 0) -> Entry:
         """The entry, or a hidden one with the value 0 if this device lacks it."""

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
 
-from sim.canopen.aborts import Abort, SdoAbortError
+from sim.canopen.aborts import Abort, SdoAbortedError
 from sim.canopen.dictionary import Entry, Object, variables
 from sim.canopen.edsfile import load_eds, with_members, with_values
 from sim.canopen.node import Nmt, Node
@@ -190,11 +190,11 @@ class Cia402Drive(Node):
         try:
             self._units_per_rad_s(word)
         except KeyError:
-            raise SdoAbortError(Abort.INVALID_VALUE) from None
+            raise SdoAbortedError(Abort.INVALID_VALUE) from None
 
     def _check_mode(self, mode: int) -> None:
         if mode not in _MODES:
-            raise SdoAbortError(Abort.INVALID_VALUE)
+            raise SdoAbortedError(Abort.INVALID_VALUE)
 
     # Control
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 
-from sim.canopen.aborts import Abort, SdoAbortError
+from sim.canopen.aborts import Abort, SdoAbortedError
 from sim.canopen.dictionary import Dictionary
 from sim.canopen.pdo import COB_INVALID
 from sim.canopen.timers import Timers
@@ -94,7 +94,7 @@ class Emergency:
 
     def _check_clear(self, value: int) -> None:
         if value:
-            raise SdoAbortError(Abort.INVALID_VALUE)
+            raise SdoAbortedError(Abort.INVALID_VALUE)
 
     def _clear_history(self) -> None:
         self._count.value = 0
@@ -104,6 +104,6 @@ class Emergency:
     def _reader(self, number: int) -> Callable[[], None]:
         def refresh() -> None:
             if number > self._count.number:
-                raise SdoAbortError(Abort.NO_DATA)
+                raise SdoAbortedError(Abort.NO_DATA)
 
         return refresh

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from sim.canopen.aborts import Abort, SdoAbortError
+from sim.canopen.aborts import Abort, SdoAbortedError
 from sim.canopen.edsfile import load_eds, with_values
 from sim.canopen.node import Node
 from sim.canopen.quirks import Quirks
@@ -79,19 +79,19 @@ class Cia406Encoder(Node):
 
     def _check_preset(self, value: int) -> None:
         if value >= self._modulus:
-            raise SdoAbortError(Abort.TOO_HIGH)
+            raise SdoAbortedError(Abort.TOO_HIGH)
 
     def _check_operating(self, value: int) -> None:
         if value & ~_OPERATING_BITS:
-            raise SdoAbortError(Abort.INVALID_VALUE)
+            raise SdoAbortedError(Abort.INVALID_VALUE)
 
     def _check_units(self, value: int) -> None:
         if not 1 <= value <= self.data.counts_per_rev:
-            raise SdoAbortError(Abort.TOO_HIGH if value else Abort.TOO_LOW)
+            raise SdoAbortedError(Abort.TOO_HIGH if value else Abort.TOO_LOW)
 
     def _check_range(self, value: int) -> None:
         if not 2 <= value <= min(0xFFFF_FFFF, self.data.range_counts):
-            raise SdoAbortError(Abort.TOO_HIGH if value > 1 else Abort.TOO_LOW)
+            raise SdoAbortedError(Abort.TOO_HIGH if value > 1 else Abort.TOO_LOW)
 
     @property
     def _modulus(self) -> int:

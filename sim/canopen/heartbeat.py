@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from sim.canopen.aborts import Abort, SdoAbortError
+from sim.canopen.aborts import Abort, SdoAbortedError
 from sim.canopen.dictionary import Dictionary, Entry
 from sim.canopen.timers import Timer, Timers
 
@@ -96,9 +96,9 @@ class HeartbeatConsumer:
         def check(value: int) -> None:
             node, time = value >> 16, value & 0xFFFF
             if node > 127:
-                raise SdoAbortError(Abort.INVALID_VALUE)
+                raise SdoAbortedError(Abort.INVALID_VALUE)
             others = (other.number for other in self._entries if other is not entry)
             if time and node and any(word >> 16 == node and word & 0xFFFF for word in others):
-                raise SdoAbortError(Abort.INCOMPATIBLE)
+                raise SdoAbortedError(Abort.INCOMPATIBLE)
 
         return check

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from enum import IntEnum
 
-from sim.canopen.aborts import Abort, SdoAbortError
+from sim.canopen.aborts import Abort, SdoAbortedError
 from sim.canopen.dictionary import Dictionary, Entry, Object
 from sim.canopen.emergency import Emergency
 from sim.canopen.heartbeat import HeartbeatConsumer, HeartbeatProducer
@@ -97,7 +97,7 @@ class Node:
     def _make_services(self) -> None:
         dictionary, timers = self.dictionary, self.timers
         self.emergency = Emergency(dictionary, timers, self._send_emergency)
-        self.sdo = SdoServer(dictionary, timers, self._send_sdo)
+        self.sdo = SdoServer(dictionary, timers, self.node_id, self.send)
         self.heartbeat = HeartbeatProducer(dictionary, timers, self._beat)
         self.consumer = HeartbeatConsumer(
             dictionary, timers, self._heartbeat_lost, self._heartbeat_back, self._reroute
@@ -244,9 +244,6 @@ class Node:
 
     # Services
 
-    def _send_sdo(self, data: bytes) -> None:
-        self.send(0x580 + self.node_id, data)
-
     def _send_emergency(self, can_id: int, data: bytes) -> None:
         if self.state in (Nmt.PREOPERATIONAL, Nmt.OPERATIONAL):
             self.send(can_id, data)
@@ -309,17 +306,17 @@ class Node:
 
     def _check_sync_id(self, value: int) -> None:
         if value & (_SYNC_PRODUCER | _FRAME_29_BIT) or restricted(value & 0x7FF):
-            raise SdoAbortError(Abort.INVALID_VALUE)
+            raise SdoAbortedError(Abort.INVALID_VALUE)
 
     def _check_overflow(self, value: int) -> None:
         if self.dictionary.optional(0x1006).number:
-            raise SdoAbortError(Abort.DEVICE_STATE)
+            raise SdoAbortedError(Abort.DEVICE_STATE)
         if value == 1 or value > 240:
-            raise SdoAbortError(Abort.INVALID_VALUE)
+            raise SdoAbortedError(Abort.INVALID_VALUE)
 
     def _check_emergency_id(self, value: int) -> None:
         if value & _FRAME_29_BIT or (not value & COB_INVALID and restricted(value & 0x7FF)):
-            raise SdoAbortError(Abort.INVALID_VALUE)
+            raise SdoAbortedError(Abort.INVALID_VALUE)
 
     # What a device does besides
 

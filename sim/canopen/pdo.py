@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 
-from sim.canopen.aborts import Abort, SdoAbortError
+from sim.canopen.aborts import Abort, SdoAbortedError
 from sim.canopen.dictionary import Dictionary, Entry
 from sim.canopen.quirks import Quirks
 
@@ -108,7 +108,7 @@ class Pdo:
 
     def _check_cob(self, value: int) -> None:
         if self._quirks.fixed_pdos:
-            raise SdoAbortError(Abort.READ_ONLY)
+            raise SdoAbortedError(Abort.READ_ONLY)
         valid = not value & COB_INVALID
         can_id = value & 0x7FF
         wrong = (
@@ -119,39 +119,39 @@ class Pdo:
             or (self._quirks.keep_bit_30 and (value ^ self._cob.number) & COB_NO_RTR)
         )
         if wrong:
-            raise SdoAbortError(Abort.INVALID_VALUE)
+            raise SdoAbortedError(Abort.INVALID_VALUE)
 
     def _check_type(self, value: int) -> None:
         if value in _RESERVED_TYPES:
-            raise SdoAbortError(Abort.INVALID_VALUE)
+            raise SdoAbortedError(Abort.INVALID_VALUE)
 
     def _refuse_while_valid(self, _value: int) -> None:
         if self.valid:
-            raise SdoAbortError(Abort.INVALID_VALUE)
+            raise SdoAbortedError(Abort.INVALID_VALUE)
 
     def _check_mapping_access(self) -> None:
         if self._quirks.fixed_mapping or self._quirks.fixed_pdos:
-            raise SdoAbortError(Abort.READ_ONLY)
+            raise SdoAbortedError(Abort.READ_ONLY)
         if self._quirks.mapping_in_preoperational and self._operational():
-            raise SdoAbortError(Abort.DEVICE_STATE)
+            raise SdoAbortedError(Abort.DEVICE_STATE)
         if self.valid:
-            raise SdoAbortError(Abort.UNSUPPORTED_ACCESS)
+            raise SdoAbortedError(Abort.UNSUPPORTED_ACCESS)
 
     def _check_count(self, value: int) -> None:
         self._check_mapping_access()
         if value > self._quirks.objects_per_pdo:
-            raise SdoAbortError(Abort.PDO_LENGTH)
+            raise SdoAbortedError(Abort.PDO_LENGTH)
         total = 0
         for slot in self._slots[:value]:
             self._check_mappable(slot.number)
             total += slot.number & 0xFF
         if total > _LONGEST_BITS:
-            raise SdoAbortError(Abort.PDO_LENGTH)
+            raise SdoAbortedError(Abort.PDO_LENGTH)
 
     def _check_slot(self, value: int) -> None:
         self._check_mapping_access()
         if self._count.number:
-            raise SdoAbortError(Abort.UNSUPPORTED_ACCESS)
+            raise SdoAbortedError(Abort.UNSUPPORTED_ACCESS)
         if value:  # 0 empties the slot
             self._check_mappable(value)
 
@@ -163,7 +163,7 @@ class Pdo:
             entry = self._dictionary.find(index, subindex)
             mappable, length = self._allows(entry), entry.bits
         if not mappable or bits != length:
-            raise SdoAbortError(Abort.NOT_MAPPABLE)
+            raise SdoAbortedError(Abort.NOT_MAPPABLE)
 
     def _allows(self, entry: Entry | None) -> bool:
         """Whether the entry (None: a dummy) may be in this kind of PDO."""

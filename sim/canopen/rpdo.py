@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from sim.canopen.aborts import SdoAbortError
+from sim.canopen.aborts import SdoAbortedError
 from sim.canopen.dictionary import Dictionary, Entry
 from sim.canopen.pdo import Pdo
 from sim.canopen.quirks import Quirks
@@ -78,5 +78,5 @@ class Rpdo(Pdo):
                 continue
             try:
                 entry.write(next(values))
-            except SdoAbortError:  # out of range: the object keeps its value, as drives do
+            except SdoAbortedError:  # out of range: the object keeps its value, as drives do
                 continue

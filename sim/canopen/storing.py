@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from sim.canopen.aborts import Abort, SdoAbortError
+from sim.canopen.aborts import Abort, SdoAbortedError
 from sim.canopen.dictionary import Dictionary, Entry
 
 _GROUPS = (
@@ -32,7 +32,7 @@ def watch_storing(dictionary: Dictionary) -> None:
 def _signed(expected: int) -> Callable[[int], None]:
     def check(value: int) -> None:
         if value != expected:
-            raise SdoAbortError(Abort.DATA_TRANSFER)
+            raise SdoAbortedError(Abort.DATA_TRANSFER)
 
     return check
 

@@ -13,11 +13,13 @@ if TYPE_CHECKING:
     from drivelink.pubsub.client import Subscription as Subscription
     from drivelink.pubsub.client import subscribe as subscribe
     from drivelink.pubsub.feed import State as State
+    from drivelink.pubsub.names import joints as joints
 
 _LAZY = {  # imported when asked for, so that `import drivelink` stays cheap
     "AsyncSubscription": "drivelink.pubsub.asyncclient",
     "State": "drivelink.pubsub.feed",
     "Subscription": "drivelink.pubsub.client",
+    "joints": "drivelink.pubsub.names",
     "subscribe": "drivelink.pubsub.client",
     "subscribe_async": "drivelink.pubsub.asyncclient",
 }

@@ -22,6 +22,7 @@ from zenohkit import (
 )
 
 import drivelink
+from drivelink import cli
 from drivelink._core import encode_estimate
 from drivelink.errors import ZenohError
 from drivelink.jointfile import parse
@@ -423,3 +424,39 @@ def test_importing_drivelink_does_not_import_zenoh():
 
     code = "import drivelink, sys; sys.exit('zenoh' in sys.modules or 'subscribe' not in dir(drivelink))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+# A name that does not exist
+
+
+@pytest.fixture
+def hasty(monkeypatch):
+    for module in ("clientbase", "asyncclient"):
+        monkeypatch.setattr(f"drivelink.pubsub.{module}.PATIENCE_S", 0.3)
+
+
+@pytest.mark.parametrize("how", ["wait", "latest", "async"])
+def test_a_name_without_daemon_is_said_once_with_the_nearest_one(publisher, endpoint, hasty, caplog, how):
+    async def waits():
+        async with drivelink.subscribe_async("elbwo", endpoint=endpoint) as joint:
+            await joint.wait(timeout_s=0.8)
+
+    if how == "async":
+        asyncio.run(waits())
+    else:
+        with drivelink.subscribe("elbwo", endpoint=endpoint) as joint:
+            end = time.monotonic() + LIMIT_S
+            while not caplog.messages and time.monotonic() < end:
+                joint.wait(timeout_s=0.8) if how == "wait" else (joint.latest(), time.sleep(0.01))
+            joint.wait(timeout_s=0.5)
+    assert caplog.messages == ['no daemon of "elbwo"; did you mean "elbow"? there is elbow']
+
+
+def test_a_daemon_that_is_there_is_listed_and_not_missed(publisher, endpoint, hasty, caplog, capsys):
+    with drivelink.subscribe("elbow", endpoint=endpoint) as joint:
+        joint.wait(timeout_s=0.8)
+    assert not caplog.messages
+    assert drivelink.joints(endpoint=endpoint) == ["elbow"]
+    assert cli.main(["list", "--endpoint", endpoint]) == 0 and capsys.readouterr().out == "elbow\n"
+    assert cli.main(["list", "--endpoint", free_endpoint()]) == 1
+    assert "drivelink run JOINT starts a daemon" in capsys.readouterr().err

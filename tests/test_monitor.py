@@ -321,10 +321,14 @@ def test_monitor_prints_json_lines(daemon: str) -> None:
     assert displayed["estimate"]["stiffness"] == 700.0
 
 
-def test_a_joint_that_nobody_serves_is_not_live(daemon: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["monitor", "knee", "--endpoint", daemon, "--seconds", "1.2", "--json"]) == 0
+def test_a_joint_that_nobody_serves_is_not_live_and_the_nearest_is_named(
+    daemon: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("drivelink.monitor.watcher.PATIENCE_S", 0.3)
+    assert cli.main(["monitor", "elbwo", "--endpoint", daemon, "--seconds", "2.2", "--json"]) == 0
     displayed = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert displayed["joint"] == "knee" and not displayed["live"] and "estimate" not in displayed
+    assert displayed["joint"] == "elbwo" and not displayed["live"] and "estimate" not in displayed
+    assert displayed["state"] == 'no daemon of "elbwo"; did you mean "elbow"? there is elbow'
 
 
 def get(url: str, host: str | None = None) -> tuple[int, bytes]:

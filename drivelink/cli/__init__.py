@@ -42,6 +42,7 @@ VERBS = {
     "run": "the daemon: one or several joints on one bus",
     "sim": "the simulated drives alone, on the bus of the joint file",
     "monitor": "live view of any daemon",
+    "list": "the joints whose daemons are alive",
     "record": "record a running daemon or a bus",
     "keep": "have a running daemon's black box keep the last minute",
     "accept": "accept what the newest finding proposes, and see whether the residual falls",

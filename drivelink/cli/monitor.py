@@ -21,11 +21,11 @@ from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.web import WebView, document
 from drivelink.monitor.webaccept import WebAcceptance
 from drivelink.pubsub.clientbase import ENDPOINT
+from drivelink.pubsub.names import PATIENCE_S
 from drivelink.pubsub.session import close_session, open_client
 
 _POLL_S = 0.02
 _FRAME_S = 0.1
-_HINT_S = 3.0
 
 EPILOG = """\
 examples:
@@ -58,12 +58,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="with --web and a joint file: the page may accept a finding into it, and undo that",
     )
-    parser.add_argument("--endpoint", help=f"where a daemon or router listens (default {ENDPOINT})")
-    parser.add_argument("--config", type=Path, help="zenoh configuration file (JSON5) instead")
-    parser.add_argument("--prefix", help='first part of every key (default "drivelink")')
+    add_zenoh(parser)
     parser.add_argument(
         "--json", action="store_true", help="print one JSON object per joint instead of each plain line"
     )
+
+
+def add_zenoh(parser: argparse.ArgumentParser) -> None:
+    """Add where the daemons are."""
+    parser.add_argument("--endpoint", help=f"where a daemon or router listens (default {ENDPOINT})")
+    parser.add_argument("--config", type=Path, help="zenoh configuration file (JSON5) instead")
+    parser.add_argument("--prefix", help='first part of every key (default "drivelink")')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -137,8 +142,8 @@ def _picture(
 ) -> RenderableType:
     views = watcher.views
     if not views or not any(view.history.latest for view in views.values()):
-        hint = ""
-        if waited_s > _HINT_S:
+        hint = "".join(f"\n\n{view.hint}" for view in views.values())
+        if not views and waited_s > PATIENCE_S:
             hint = "\n\nIs a daemon running?   drivelink run JOINT   or   drivelink demo"
         return Text(f"waiting for {where} …{hint}\n\nq ends", style="dim")
     for view in views.values():

@@ -75,6 +75,7 @@ class JointView:
         model: the model document, or empty.
         finding: the newest finding, or empty.
         gone: the daemon has ended or died.
+        hint: why there is no estimate, or empty.
         silent_s: time since the last estimate.
         help: show the legend in place of the plots.
         footer: the last line, e.g. how to quit.
@@ -91,6 +92,7 @@ class JointView:
         self.model: Mapping[str, Any] = {}
         self.finding: Mapping[str, Any] = {}
         self.gone = False
+        self.hint = ""
         self.silent_s = 0.0
         self.help = False
         self._height = height
@@ -124,7 +126,9 @@ class JointView:
 
     @property
     def state(self) -> str:
-        """The daemon's state, or that it is gone or silent."""
+        """The daemon's state, or that it is gone, silent or was never there."""
+        if self.hint and self.history.latest is None:
+            return self.hint
         if self.live:
             return shape(self.status).state
         since = f", last estimate {self.silent_s:.0f} s ago" if self.silent_s >= SILENT_S else ""
@@ -145,7 +149,7 @@ class JointView:
         """The joint in one plain line, for pipes and logs."""
         estimate = self.history.latest
         if estimate is None:
-            return f"{self.name}: no estimate yet"
+            return f"{self.name}: {self.hint or 'no estimate yet'}"
         parts = [
             f"{self.name}:",
             f"stiffness {with_interval(estimate.stiffness_nm_rad, _half(estimate), 'N·m/rad')},",

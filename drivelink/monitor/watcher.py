@@ -18,6 +18,7 @@ from drivelink.monitor.view import JointView
 from drivelink.plaintext import clean_text
 from drivelink.pubsub.identity import MAX_CLAIMS, DaemonIdentity, source_of
 from drivelink.pubsub.inbound import DECODERS
+from drivelink.pubsub.names import PATIENCE_S, absent, ask
 
 MAX_JOINTS = 64  # limit on joints shown, also against invented names
 _QUEUE = 8192
@@ -56,6 +57,9 @@ class Watcher:
     def __init__(self, session: zenoh.Session, prefix: str = "drivelink", joint: str | None = None) -> None:
         self.received = self.refused = 0
         self._prefix = prefix + "/"
+        self._session, self._asked = session, joint
+        self._hint_s = time.monotonic() + PATIENCE_S
+        self._hint = ""
         self._joints: dict[str, _Joint] = {}
         self._claims: deque[tuple[str, str, bool]] = deque()  # tokens that came since the last poll
         ring = zenoh.handlers.RingChannel
@@ -98,11 +102,15 @@ class Watcher:
             if joint is not None:
                 joint.identity.token(session, there)
         now_s = time.monotonic()
+        if now_s > self._hint_s and self._asked is not None:
+            self._hint_s = now_s + PATIENCE_S
+            ask(self._session, self._prefix[:-1], self._say)
         for kind, subscriber in self._streams:
             while (sample := subscriber.try_recv()) is not None:
                 self._take(kind, sample, now_s)
         for joint in self._joints.values():
             view = joint.view
+            view.hint = "" if joint.identity.seen else self._hint
             view.gone = not joint.identity.alive and view.history.latest is not None
             view.silent_s = now_s - joint.estimate_s if view.history.latest is not None else 0.0
 
@@ -110,6 +118,10 @@ class Watcher:
         """Stop following."""
         for subscriber in (self._tokens, *(subscriber for _, subscriber in self._streams)):
             subscriber.undeclare()
+
+    def _say(self, names: list[str]) -> None:
+        """In zenoh's thread."""
+        self._hint = absent(self._asked or "", names)
 
     def _take(self, kind: str, sample: zenoh.Sample, now_s: float) -> None:
         joint = self._joint(self._name(sample))

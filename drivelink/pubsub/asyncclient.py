@@ -17,6 +17,7 @@ from typing import Any, Self
 import zenoh
 
 from drivelink.pubsub.clientbase import ENDPOINT, Client
+from drivelink.pubsub.names import PATIENCE_S
 from drivelink.pubsub.wire import EstimateMessage
 
 
@@ -54,6 +55,7 @@ class AsyncSubscription(Client):
     def _declare_estimates(self, key: str) -> zenoh.Subscriber[Any]:
         self._loop = asyncio.get_running_loop()
         self._arrived = asyncio.Event()
+        self._loop.call_later(PATIENCE_S + 0.01, self._drain)
         self._inbox: deque[zenoh.Sample] = deque(maxlen=self._depth)
         # indirect=False: in zenoh's thread, which never keeps the process from ending
         handler = zenoh.handlers.Callback(self._receive, indirect=False)

@@ -93,7 +93,8 @@ class Subscription(Client):
         while (message := pick()) is None:
             if self._closed or time.monotonic() >= deadline_s:
                 return None
-            self._alarm.set(deadline_s)
+            self._hint()
+            self._alarm.set(min(deadline_s, self._hint_s))
             try:
                 sample = self._queue.recv()
                 now_ns = time.monotonic_ns()

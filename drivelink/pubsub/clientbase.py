@@ -5,6 +5,7 @@ Estimates queue in zenoh, outside the interpreter, until a method is called.
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 import time
@@ -21,11 +22,13 @@ from drivelink.errors import ZenohError
 from drivelink.pubsub.feed import WAKE, Feed, State
 from drivelink.pubsub.identity import source_of
 from drivelink.pubsub.inbound import DECODERS
+from drivelink.pubsub.names import PATIENCE_S, absent, ask
+from drivelink.pubsub.session import ENDPOINT as ENDPOINT
 from drivelink.pubsub.session import close_session, one_line, open_client
 from drivelink.pubsub.wire import ESTIMATE, EstimateMessage, ExternalMessage
 from estimator.sample import Status
 
-ENDPOINT = "tcp/127.0.0.1:7447"
+_LOG = logging.getLogger("drivelink.client")
 _TOGETHER = 5  # largest distance in cycles between estimate and external torque, as either may be lost
 _NAME = re.compile(r"[^*$#?\s/]+(/[^*$#?\s/]+)*")
 
@@ -58,6 +61,8 @@ class Client:
         self._documents: dict[str, tuple[str | None, dict[str, Any]]] = {}  # who wrote it, and what
         self._external: tuple[str | None, ExternalMessage] | None = None  # who wrote it, and what
         self._closed = False
+        self._prefix = prefix
+        self._hint_s = time.monotonic() + PATIENCE_S  # when to say that there is no daemon
         try:
             self._declare()
         except zenoh.ZError as error:
@@ -260,10 +265,19 @@ class Client:
         writer, document = self._documents.get(name, (None, None))
         return document if writer == identity.bound else None
 
+    def _hint(self) -> None:
+        """Say once that there is no daemon of this name, and which others there are; never waits."""
+        if time.monotonic() < self._hint_s:
+            return
+        self._hint_s = math.inf
+        if not self._feed.identity.seen:
+            ask(self._session, self._prefix, lambda names: _LOG.warning("%s", absent(self.joint, names)))
+
     def _drain(self) -> None:
         """Process all messages queued in zenoh."""
         if self._closed:
             return
+        self._hint()
         with suppress(zenoh.ZError):  # closed meanwhile by another thread
             samples: list[zenoh.Sample] = []
             while len(samples) < self._depth and (sample := self._pop()) is not None:

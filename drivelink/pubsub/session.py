@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _MEETING_S = 2.0  # timeout of a local handshake, reached only if another program answers
 _POLL_S = 0.01
-_EXAMPLE = "tcp/127.0.0.1:7447"
+ENDPOINT = "tcp/127.0.0.1:7447"
 _LINKS = ("tcp", "tls", "udp", "quic", "ws", "unixsock-stream", "serial", "vsock")
 _MOST_CONFIG_BYTES = 256 << 10
 FILES = 8192  # open files: more than the connections that may wait
@@ -117,7 +117,7 @@ def _allow_files() -> None:
 def _join(endpoint: str) -> zenoh.Session:
     """Connect to the listener at the endpoint, and be ready to take over."""
     session = _open(daemon_config(endpoint, listen=False), Rendezvous(endpoint))
-    if not _meet(session) and answers(endpoint):
+    if not connected(session) and answers(endpoint):
         close_session(session)
         raise ZenohError(
             f"{endpoint}: another program listens there and does not speak zenoh: "
@@ -145,7 +145,7 @@ def one_line(error: BaseException) -> str:
 def _require_endpoint(endpoint: str) -> str:
     link, _, address = endpoint.partition("/")
     if link not in _LINKS or not address:
-        raise ZenohError(f'endpoint: expected a zenoh endpoint like "{_EXAMPLE}", got "{endpoint}"')
+        raise ZenohError(f'endpoint: expected a zenoh endpoint like "{ENDPOINT}", got "{endpoint}"')
     return endpoint
 
 
@@ -185,8 +185,8 @@ def _keep(session: zenoh.Session, rendezvous: Rendezvous | None = None) -> zenoh
     return session
 
 
-def _meet(session: zenoh.Session) -> bool:
-    """Wait until the session has a connection."""
+def connected(session: zenoh.Session) -> bool:
+    """Whether the session has a connection, or gets one within two seconds."""
     deadline = time.monotonic() + _MEETING_S
     while time.monotonic() < deadline:
         if session.info.peers_zid() or session.info.routers_zid():

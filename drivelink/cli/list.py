@@ -1,0 +1,36 @@
+"""`drivelink list`: the joints whose daemons are alive."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+
+from drivelink.cli.monitor import add_zenoh
+from drivelink.pubsub.clientbase import ENDPOINT
+from drivelink.pubsub.names import joints
+
+EPILOG = """\
+examples:
+  drivelink list                          names of the joints on this machine
+  drivelink list --endpoint tcp/cell7:7447
+"""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    add_zenoh(parser)
+    parser.add_argument("--json", action="store_true", help="print one JSON array of names")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the names; return 1 where there is none."""
+    endpoint = args.endpoint or ENDPOINT
+    names = joints(endpoint=endpoint, config=args.config, prefix=args.prefix or "drivelink")
+    if args.json:
+        print(json.dumps(names))
+    elif names:
+        print("\n".join(names))
+    else:
+        print(f"no joint at {args.config or endpoint}: drivelink run JOINT starts a daemon", file=sys.stderr)
+    return 0 if names else 1

@@ -23,6 +23,7 @@ globalThis.document = {
 globalThis.getComputedStyle = () => ({ getPropertyValue: () => "#000" });
 globalThis.devicePixelRatio = 1;
 globalThis.innerWidth = 1200;
+globalThis.innerHeight = 900;
 globalThis.addEventListener = (name, listener) => { listeners[name] = listener; };
 globalThis.EventSource = class {};
 const press = key => listeners.keydown({ key, target: { tagName: "BODY" }, preventDefault() {} });

@@ -29,8 +29,9 @@ from rich.console import Console
 from drivelink import cli
 from drivelink.monitor.braille import DotPlot, sparkline
 from drivelink.monitor.history import GrowingCurve, JointHistory, usual_range
+from drivelink.monitor.jointstable import joints_table
 from drivelink.monitor.statuslines import shape, status_lines, status_text
-from drivelink.monitor.view import JointView, joints_table
+from drivelink.monitor.view import JointView
 from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.web import MAX_CONNECTIONS, MAX_STREAMS, WebView, snapshot
 from drivelink.output.digits import number, with_interval
@@ -144,12 +145,16 @@ def test_the_page_gets_each_external_torque_once_and_a_gap_where_it_is_not_valid
     displayed = snapshot(view, True, since)
     times = [touch[0] for touch in displayed["touches"]]
     assert len(times) > 90 and times == sorted(set(times)) and times[0] == 2.0
-    assert {(v, s, c) for t, v, s, c in displayed["touches"] if t < 2.5} == {(None, None, False)}
-    assert {(v, s, c) for t, v, s, c in displayed["touches"] if 2.5 <= t < 3.0} == {(0.5, 0.1, False)}
-    assert {(v, s, c) for t, v, s, c in displayed["touches"] if t >= 3.0} == {(0.5, 0.1, True)}
+    kinds = {
+        (0, 2.5): (None, None, False, False),
+        (2.5, 3): (0.5, 0.1, False, True),
+        (3, 9): (0.5, 0.1, True, True),
+    }
+    for (begin, end), kind in kinds.items():
+        assert {tuple(rest) for t, *rest in displayed["touches"] if begin <= t < end} == {kind}
     assert 3.0 in times  # the begin of a contact is not thinned out
     assert (
-        displayed["external"] == [3.999, 0.5, 0.1, True]
+        displayed["external"] == [3.999, 0.5, 0.1, True, True]
         and ("contact", "yellow") in displayed["estimate"]["flags"]
     )
     assert json.dumps(displayed, allow_nan=False)
@@ -185,7 +190,8 @@ def test_unobservable_estimates_leave_the_curve_as_it_is() -> None:
     history = JointHistory()
     history.add(estimate(1, 1), 0.0)
     history.add(estimate(400, 1, status=int(Status.VALID)), 0.4)
-    assert len(history.curves[0].points()) == 1 and len(history.moments) == 2
+    assert len(history.curves[0].points()) == len(history.doubtful[0].points()) == 1
+    assert [math.isnan(m.torque_nm) for m in history.moments] == [False, True, False]  # a pause is a gap
 
 
 def test_a_daemon_that_starts_anew_clears_the_history() -> None:
@@ -509,14 +515,15 @@ def test_a_silent_daemon_is_not_shown_as_live() -> None:
     assert not view.live and "no estimates, last estimate 3 s ago" in "\n".join(lines(view))
 
 
-def test_what_is_not_valid_is_a_gap_in_every_curve() -> None:
+def test_what_is_not_valid_is_marked_in_every_curve() -> None:
     history = JointHistory()
     for k, status in enumerate([3] * 10 + [0] * 5 + [3] * 10):
         history.add(estimate(k, 1, status=status), 0.05 * k)
     view = JointView("elbow")
     view.history = history
     moments = snapshot(view, True, {})["moments"]
-    assert [moment[1] is None for moment in moments] == [False] * 10 + [True] * 5 + [False] * 10
+    assert [moment[4] for moment in moments] == [True] * 10 + [False] * 5 + [True] * 10
+    assert not any(moment[1] is None for moment in moments)
 
 
 def test_one_wild_value_does_not_flatten_an_axis() -> None:

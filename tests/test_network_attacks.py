@@ -18,8 +18,9 @@ from zenohkit import free_endpoint, make_estimate, make_joint, make_sample, unti
 import drivelink
 from drivelink._core import encode_estimate, encode_sample
 from drivelink.errors import ZenohError
+from drivelink.monitor.jointstable import joints_table
 from drivelink.monitor.statuslines import shape, status_lines, status_text
-from drivelink.monitor.view import JointView, joints_table
+from drivelink.monitor.view import JointView
 from drivelink.monitor.watcher import MAX_JOINTS, Watcher
 from drivelink.monitor.web import snapshot
 from drivelink.pubsub import inbound

@@ -63,7 +63,7 @@ def test_the_page_shows_numbers_flags_gauge_and_nodes() -> None:
     texts = page(
         "take(sent[0]); return ['stiffness', 'band', 'state', 'flags', 'gauges', 'nodes'].map(shown);", fed()
     )
-    assert texts[:4] == ["100.0", "± 2.0", "running", "valid observable"]
+    assert texts[:4] == ["100.0", "± 2.0", "running · rate 1000 Hz", "valid observable"]
     assert "0.50 × baseline" in texts[4] and "node 1 operational" in texts[5]
 
 
@@ -133,7 +133,7 @@ def test_one_wild_value_does_not_flatten_an_axis(wild: float) -> None:
     assert low - high > 0.5 * height  # the sine fills more than half of the plot
 
 
-def test_a_band_wider_than_the_plot_leaves_the_signal_readable() -> None:
+def test_the_axis_of_the_external_torque_fits_its_band() -> None:
     view = fed()
     for k in range(4000):
         torque_nm = 1e-3 * math.sin(2e-3 * k)
@@ -142,11 +142,31 @@ def test_a_band_wider_than_the_plot_leaves_the_signal_readable() -> None:
         """
         take(sent[0]);
         const { Y, T, B } = $("externalplot").shown;
-        return [Y(-1e-3), Y(1e-3), B - T];
+        return [Y(-0.0196), Y(0.0196), B - T];
         """,
         view,
     )
-    assert 0.5 * height < low - high < height
+    assert 0.7 * height < low - high < height
+
+
+def test_what_is_not_valid_is_shown_grey_with_the_reason_and_sets_no_scale() -> None:
+    view = fed()
+    for k in range(4000, 6000):
+        one = TransmissionEstimate(500.0, 900.0, 1.0, 0.01)
+        view.update(Estimate(k, int(Status.OBSERVABLE), 500.0, 900.0, 1.0, (one,)), 1e-3 * k)
+    low, high, height, tip, title, style = page(
+        """
+        take(sent[0]);
+        const { X, Y, T, B } = $("torqueplot").shown;
+        hover("torqueplot", X(-1), Y(500));
+        return [Y(-2), Y(2), B - T, $("tip").textContent, document.title, $("stiffness").className];
+        """,
+        view,
+    )
+    assert low - high > 0.5 * height
+    assert (
+        tip.endswith("500.0 N·m\nnot valid") and title == "not valid · elbow · drivelink" and style == "past"
+    )
 
 
 def test_a_daemon_that_is_gone_leaves_no_green_and_no_live_numbers() -> None:

@@ -14,9 +14,9 @@ from rich.text import Text
 
 from drivelink import jointfile
 from drivelink.errors import UsageError
+from drivelink.monitor.jointstable import joints_table
 from drivelink.monitor.keys import Keys
 from drivelink.monitor.statuslines import shape
-from drivelink.monitor.view import joints_table
 from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.web import WebView, document
 from drivelink.monitor.webaccept import WebAcceptance

@@ -56,10 +56,15 @@ class DotPlot:
 
     def __init__(self, width: int, height: int, x: tuple[float, float], y: tuple[float, float]) -> None:
         self._x, self._y = _opened(*x), _opened(*y)
-        self._labels = number(self._y[1], 3), number(self._y[0], 3)
-        self._margin = max(6, *map(len, self._labels))
-        self.columns = max(4, width - self._margin - 1)
         self.rows = max(2, height - 2)
+        parts = 1 if self.rows < 8 else 2 if self.rows < 13 else 4
+        top, bottom = self._y[1], self._y[0]
+        self._labels = {
+            round(k * (self.rows - 1) / parts): number(top + k * (bottom - top) / parts, 3)
+            for k in range(parts + 1)
+        }
+        self._margin = max(6, *map(len, self._labels.values()))
+        self.columns = max(4, width - self._margin - 1)
         self._cells = [[0] * self.columns for _ in range(self.rows)]
         self._styles = [[""] * self.columns for _ in range(self.rows)]
         self._marks: dict[tuple[int, int], str] = {}
@@ -113,7 +118,7 @@ class DotPlot:
             text.append("\n" * (above + 1) + pad + self._note[: self.columns] + "\n" * below, style="dim")
             return text
         for row, (cells, styles) in enumerate(zip(self._cells, self._styles, strict=True)):
-            label = {0: self._labels[0], self.rows - 1: self._labels[1]}.get(row, "")
+            label = self._labels.get(row, "")
             text.append(f"\n{label:>{self._margin}}", style="dim")
             text.append("┤" if label else "│", style="dim")
             for column, (dots, style) in enumerate(zip(cells, styles, strict=True)):
@@ -124,6 +129,10 @@ class DotPlot:
                     text.append(chr(_BLANK + dots) if dots else " ", style=style)
         low, high = number(self._x[0], 3), f"{number(self._x[1], 3)} {x_unit}".rstrip()
         axis = low + high.rjust(self.columns - len(low))
+        if self.columns >= 40:
+            middle = number(0.5 * (self._x[0] + self._x[1]), 3)
+            place = (self.columns - len(middle)) // 2
+            axis = axis[:place] + middle + axis[place + len(middle) :]
         text.append("\n" + " " * (self._margin + 1) + axis, style="dim")
         return text
 

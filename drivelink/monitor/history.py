@@ -16,6 +16,7 @@ from estimator.sample import Status
 _BINS = 160
 _USABLE = int(Status.VALID | Status.OBSERVABLE)
 _NEAR = 8  # neighbouring points on either side for the outlier test
+_GAP_S = 0.25  # without a moment: a gap in the curves
 _OUTDATED = 2.5  # times the usual one there
 
 
@@ -99,7 +100,8 @@ class JointHistory:
 
     Attributes:
         moments: thinned estimates, oldest first.
-        curves: stiffness over deflection of each transmission.
+        curves: stiffness over deflection of each transmission, where it is usable.
+        doubtful: the same since the estimate stopped being usable; empty while it is.
         latest: the newest estimate.
         residuals: (time of the newest estimate, s; largest residual over its baseline).
         touches: thinned external torques, oldest first; empty without link dynamics.
@@ -110,6 +112,7 @@ class JointHistory:
         self.seconds = seconds
         self.moments: deque[Moment] = deque(maxlen=points)
         self.curves: tuple[GrowingCurve, ...] = ()
+        self.doubtful: tuple[GrowingCurve, ...] = ()
         self.residuals: deque[tuple[float, float]] = deque(maxlen=points)
         self.touches: deque[Touch] = deque(maxlen=points)
         self.touch: Touch | None = None
@@ -120,6 +123,7 @@ class JointHistory:
         """Enter one estimate; `time_s` is the time of its SYNC, with any origin."""
         if self.latest is not None and len(self.latest.transmissions) != len(estimate.transmissions):
             self.moments.clear()  # another joint has taken the name
+            self.doubtful = ()
         self.latest = estimate
         moments = self.moments
         if moments:
@@ -130,6 +134,8 @@ class JointHistory:
                 self.touches.clear()
             elif since < 0.999 * self._apart_s:
                 return
+            elif since > max(_GAP_S, 3.0 * self._apart_s):
+                moments.append(Moment(moments[-1].time_s + self._apart_s, *(math.nan,) * 5, False))
         moments.append(
             Moment(
                 time_s,
@@ -142,10 +148,18 @@ class JointHistory:
             )
         )
         if len(self.curves) != len(estimate.transmissions):
-            self.curves = tuple(GrowingCurve() for _ in estimate.transmissions)
-        if estimate.status & _USABLE == _USABLE:
-            for curve, one in zip(self.curves, estimate.transmissions, strict=True):
-                curve.add(one.deflection_rad, one.stiffness_nm_rad, one.stiffness_std_nm_rad)
+            self.curves = self._new_curves(estimate)
+        usable = estimate.status & _USABLE == _USABLE
+        if usable:
+            self.doubtful = ()
+        elif not self.doubtful:
+            self.doubtful = self._new_curves(estimate)
+        for curve, one in zip(self.curves if usable else self.doubtful, estimate.transmissions, strict=True):
+            curve.add(one.deflection_rad, one.stiffness_nm_rad, one.stiffness_std_nm_rad)
+
+    @staticmethod
+    def _new_curves(estimate: EstimateMessage) -> tuple[GrowingCurve, ...]:
+        return tuple(GrowingCurve() for _ in estimate.transmissions)
 
     def add_external(self, message: ExternalMessage, time_s: float) -> None:
         """Enter one external torque; a contact is never thinned out."""

@@ -1,4 +1,4 @@
-"""Terminal widgets of a joint's live view, for `monitor` and `demo`, in 80 columns by 24 lines.
+"""Terminal widgets of a joint's live view, for `monitor` and `demo`, from 80 columns by 24 lines on.
 
 view = JointView("elbow", subtitle="vsa-ii on the virtual bus")
 with rich.live.Live(view, refresh_per_second=10) as live:
@@ -10,8 +10,8 @@ print(view.line())                           # the same in one plain line, where
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.panel import Panel
@@ -20,6 +20,7 @@ from rich.text import Text
 
 from drivelink.monitor.braille import DotPlot, sparkline
 from drivelink.monitor.history import JointHistory, TruePoint, usual_range
+from drivelink.monitor.modelcurve import model_curves
 from drivelink.monitor.statuslines import MODEL_ALARM_ADVICE, shape, status_lines, status_text
 from drivelink.output.digits import number, value_and_interval, with_interval
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
@@ -29,6 +30,7 @@ ESTIMATE = "cyan"
 TRUTH = "yellow"
 BAND = "blue"
 _SECOND = "magenta"  # the second transmission
+_GREY = "bright_black"  # what is not valid, and the model's curve
 
 _FLAGS = (  # bit, what is shown when set, style
     (Status.MODEL_ALARM, "model alarm", "bold red"),
@@ -43,14 +45,18 @@ _FLAGS = (  # bit, what is shown when set, style
     (Status.UNTIMED, "untimed", "yellow"),
     (Status.NODE_RESTARTED, "node restarted", "yellow"),
 )
+_TWO_ROWS = 20  # lines of the plots from which there are four
 SILENT_S = 1.0  # without an estimate, until the shown one is marked as old
 _HELP = (
     ("stiffness", "of the joint, N·m/rad, ± half its 95 % interval"),
     ("torque", "flexibility torque of the joint, N·m"),
     ("external", "external torque on the link, N·m, ± half its 95 % interval"),
     ("deflection", "φ = q − θ of each transmission, rad"),
-    ("left plot", "stiffness over deflection, its 95 % band dotted, ● now; cyan motor 1, magenta 2"),
-    ("right plot", "flexibility torque over time; yellow: truth of a simulation; gaps: not valid"),
+    (
+        "left plot",
+        "stiffness over deflection, band dotted, ● now; cyan motor 1, magenta 2; grey dots: model",
+    ),
+    ("right plot", "flexibility torque over time; yellow: truth of a simulation; grey: not valid"),
     ("cycle", "99th percentiles, µs: work, answer (SYNC to last frame), SYNC late by"),
     ("residual", "residual over its baseline (of the fit): half a bar is 1"),
     ("contact", "something touches the link"),
@@ -60,6 +66,14 @@ _HELP = (
 )
 
 
+class _Instant(NamedTuple):
+    """One point of a curve over time."""
+
+    time_s: float
+    value: float
+    valid: bool
+
+
 class JointView:
     """One joint, live: numbers with their band, curves, cycle, drives; a renderable of `rich`.
 
@@ -67,7 +81,7 @@ class JointView:
         name: the joint's name.
         subtitle: e.g. its case or bus.
         seconds: length of the plots over time.
-        height: lines; default: those of the terminal, at most 24.
+        height: lines; default: those of the terminal.
 
     Attributes:
         history: data of the view.
@@ -152,7 +166,7 @@ class JointView:
             return f"{self.name}: {self.hint or 'no estimate yet'}"
         parts = [
             f"{self.name}:",
-            f"stiffness {with_interval(estimate.stiffness_nm_rad, _half(estimate), 'N·m/rad')},",
+            f"stiffness {with_interval(estimate.stiffness_nm_rad, half_interval(estimate), 'N·m/rad')},",
             f"torque {number(estimate.flexibility_torque_nm)} N·m,",
             *self._external_words(),
             "deflection " + " ".join(number(one.deflection_rad, 3) for one in estimate.transmissions),
@@ -173,7 +187,7 @@ class JointView:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         width = options.max_width
-        height = self._height or min(console.size.height - 1, 24)
+        height = self._height or console.size.height - 1
         title = Text.assemble((self.name, "bold"), f" · {self.subtitle}" if self.subtitle else "")
         if self.state:
             title.append(f" · {self.state}", style="" if self.live else "bold red")
@@ -211,9 +225,9 @@ class JointView:
         last = window[-1]
         errors = self.history.relative_errors()
         spark = max(6, width - 69)
-        ink = ESTIMATE if self.live else "dim"
+        ink = ESTIMATE if self.live and last.valid else "dim"
         known = math.isfinite(last.true_stiffness_nm_rad)
-        stiffness, half = value_and_interval(last.stiffness_nm_rad, _half(estimate))
+        stiffness, half = value_and_interval(last.stiffness_nm_rad, half_interval(estimate))
         band = f" ± {half}" if half else ""
         for label, value, extra, unit, true, error, series in (
             ("stiffness", stiffness, band, "N·m/rad", last.true_stiffness_nm_rad, errors[0],
@@ -274,18 +288,27 @@ class JointView:
 
     def _plots(self, width: int, height: int) -> Table:
         half = (width - 2) // 2
+        rows = [(self._curve_plot, self._torque_plot)]
+        if height >= _TWO_ROWS:
+            rows.append((self._stiffness_plot, self._last_plot))
         grid = Table.grid(padding=(0, 2, 0, 0))
-        grid.add_row(self._curve_plot(half, height), self._torque_plot(width - 2 - half, height))
+        for left, right in rows:
+            grid.add_row(left(half, height // len(rows)), right(width - 2 - half, height // len(rows)))
         return grid
 
     def _curve_plot(self, width: int, height: int) -> Text:
         curves = [curve.points() for curve in self.history.curves]
-        points = [point for curve in curves for point in curve]
+        grey = [curve.points() for curve in self.history.doubtful]
+        fitted = model_curves(self.model, curves if any(curves) else grey)
+        points = [point for curve in (curves if any(curves) else grey) for point in curve]
         low, high = usual_range([point[1] for point in points])
         margin = 0.15 * (high - low) + 0.02 * abs(high)
         x = usual_range([point[0] for point in points])
-        y = (low - margin, high + margin)
-        plot = DotPlot(width, height, x, y)
+        plot = DotPlot(width, height, x, (low - margin, high + margin))
+        for line in fitted:
+            plot.curve(line, _GREY, every=2)
+        for curve in grey:
+            plot.curve([(p, s) for p, s, _ in curve], _GREY)
         for k, curve in enumerate(curves):
             plot.band([(p, s - SIGMA_95 * d, s + SIGMA_95 * d) for p, s, d in curve], BAND)
             plot.curve([(p, s) for p, s, _ in curve], ESTIMATE if k == 0 else _SECOND)
@@ -293,21 +316,52 @@ class JointView:
             for one in self.history.latest.transmissions:
                 plot.mark(one.deflection_rad, one.stiffness_nm_rad, "bold")
         if not points:
-            plot.note("not observable yet")
+            plot.note(self._why_empty())
         title = "stiffness over deflection, N·m/rad"
         return plot.render(title if width >= 41 else "stiffness, N·m/rad", "rad")
 
+    def _why_empty(self) -> str:
+        """Why there is no curve yet."""
+        return shape(self.status).not_valid or "not observable yet"
+
+    def _time_plot(
+        self, width: int, height: int, title: str, series: Sequence[_Instant], truth: Sequence[float] = ()
+    ) -> Text:
+        """A quantity over time; what is not valid is grey and sets no scale beside what is."""
+        end = series[-1].time_s if series else 0.0
+        values = [one.value for one in series if one.valid] or [one.value for one in series]
+        known = [value for value in (*values, *truth) if math.isfinite(value)]
+        plot = DotPlot(width, height, (-self.history.seconds, 0.0), usual_range(known))
+        if truth:
+            times = [one.time_s - end for one in series]
+            plot.curve(list(zip(times, truth, strict=True)), TRUTH)
+        for wanted, ink in ((False, _GREY), (True, ESTIMATE)):
+            points = [(p.time_s - end, p.value if p.valid is wanted else math.nan) for p in series]
+            plot.curve(points, ink)
+        if not known:
+            plot.note(self._why_empty())
+        return plot.render(title, "s")
+
     def _torque_plot(self, width: int, height: int) -> Text:
         window = self.history.window()
-        end = window[-1].time_s if window else 0.0
-        values = [v for m in window if m.valid for v in (m.torque_nm, m.true_torque_nm) if math.isfinite(v)]
-        y = usual_range(values)
-        plot = DotPlot(width, height, (-self.history.seconds, 0.0), y)
-        plot.curve([(m.time_s - end, m.true_torque_nm) for m in window], TRUTH)
-        plot.curve([(m.time_s - end, m.torque_nm if m.valid else math.nan) for m in window], ESTIMATE)
-        if not values:
-            plot.note("nothing valid yet")
-        return plot.render("torque over time, N·m", "s")
+        series = [_Instant(m.time_s, m.torque_nm, m.valid) for m in window]
+        truth = [m.true_torque_nm for m in window]
+        return self._time_plot(width, height, "torque over time, N·m", series, truth)
+
+    def _stiffness_plot(self, width: int, height: int) -> Text:
+        window = self.history.window()
+        series = [_Instant(m.time_s, m.stiffness_nm_rad, m.valid) for m in window]
+        truth = [m.true_stiffness_nm_rad for m in window]
+        return self._time_plot(width, height, "stiffness over time, N·m/rad", series, truth)
+
+    def _last_plot(self, width: int, height: int) -> Text:
+        """The external torque where the link is known, else the residual."""
+        touches = self.history.touches
+        if touches:
+            series = [_Instant(t.time_s, t.torque_nm, t.valid) for t in touches]
+            return self._time_plot(width, height, "external torque over time, N·m", series)
+        series = [_Instant(time_s, ratio, True) for time_s, ratio in self.history.residuals]
+        return self._time_plot(width, height, "residual over time, × its baseline", series)
 
     def _flags(self) -> Text:
         text = Text(no_wrap=True)
@@ -325,39 +379,6 @@ def flags(status: int) -> list[tuple[str, str]]:
     return found + [(label, style) for bit, label, style in _FLAGS if status & bit]
 
 
-def joints_table(views: Mapping[str, JointView], width: int) -> Table:
-    """Several joints, one line each; columns that do not fit are omitted."""
-    sparks = width - 100
-    columns = [("joint", 10), ("stiffness / N·m/rad", 19), ("torque / N·m", 12)]
-    if width >= 80:
-        columns.append(("deflection / rad", 16))
-    table = Table(expand=True, box=None, pad_edge=False)
-    for heading, least in columns:
-        table.add_column(heading, no_wrap=True, min_width=least)
-    if sparks >= 8:
-        table.add_column("last seconds", no_wrap=True, min_width=sparks)
-    table.add_column("state", ratio=1, overflow="fold", min_width=12)
-    for name, view in sorted(views.items()):
-        estimate = view.history.latest
-        ink = ESTIMATE if view.live else "dim"
-        cells = [Text(name, style="bold")]
-        if estimate is None:
-            cells += [Text("–")] * (len(table.columns) - 2) + [Text(view.state or "–")]
-        else:
-            deflection = " ".join(number(one.deflection_rad, 3) for one in estimate.transmissions)
-            value, half = value_and_interval(estimate.stiffness_nm_rad, _half(estimate))
-            cells.append(Text.assemble((value, ink), f" ± {half}" if half else ""))
-            cells.append(Text(number(estimate.flexibility_torque_nm)))
-            cells += [Text(deflection)] if width >= 80 else []
-            if sparks >= 8:
-                series = [m.stiffness_nm_rad if m.valid else math.nan for m in view.history.window()]
-                cells.append(Text(sparkline(series, sparks), style=ink))
-            worst = [(label, style) for label, style in view.flags if style != "green"]
-            cells.append(Text(*worst[0]) if worst else Text(view.state or "valid", style="green"))
-        table.add_row(*cells)
-    return table
-
-
-def _half(estimate: EstimateMessage) -> float:
+def half_interval(estimate: EstimateMessage) -> float:
     """Half the 95 % interval of the joint's stiffness."""
     return SIGMA_95 * estimate.stiffness_std_nm_rad

@@ -11,7 +11,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -21,6 +21,7 @@ from typing import Any
 from drivelink.errors import UsageError, ZenohError
 from drivelink.loop import finding as findings
 from drivelink.monitor.history import Moment, Touch
+from drivelink.monitor.modelcurve import model_curves
 from drivelink.monitor.statuslines import Shown, shape
 from drivelink.monitor.view import JointView
 from drivelink.monitor.watcher import Watcher
@@ -138,6 +139,7 @@ def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str,
     fresh = [moment for moment in window if moment.time_s > last]
     residuals = [pair for pair in history.residuals if pair[0] > last]
     newest = fresh[-1].time_s if fresh else last
+    curves = [curve.points() for curve in history.curves]
     touches = [touch for touch in history.touches if last < touch.time_s <= newest]
     if fresh:
         since[view.name] = fresh[-1].time_s
@@ -150,7 +152,9 @@ def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str,
         "moments": [_moment(moment) for moment in fresh],
         "residuals": residuals,
         "touches": [_touch(touch) for touch in touches],
-        "curves": [[[_finite(v) for v in point] for point in curve.points()] for curve in history.curves],
+        "curves": [_points(points) for points in curves],
+        "doubtful": [_points(curve.points()) for curve in history.doubtful],
+        "model": [_points(points) for points in model_curves(view.model, curves)],
     }
 
 
@@ -179,18 +183,19 @@ def _now(view: JointView) -> dict[str, Any]:
     return event
 
 
-def _moment(moment: Moment) -> list[float | None]:
-    """[time, torque, stiffness, standard deviation]; a gap in the curves where it is not valid."""
-    if not moment.valid:
-        return [moment.time_s, None, None, None]
-    return [_finite(value) for value in moment[:4]]
+def _points(points: Sequence[Sequence[float]]) -> list[list[float | None]]:
+    return [[_finite(value) for value in point] for point in points]
+
+
+def _moment(moment: Moment) -> list[float | bool | None]:
+    """[time, torque, stiffness, standard deviation, valid]."""
+    return [*(_finite(value) for value in moment[:4]), moment.valid]
 
 
 def _touch(touch: Touch) -> list[float | bool | None]:
-    """[time, external torque, standard deviation, contact]; a gap in the curve where it is not valid."""
-    if not touch.valid:
-        return [touch.time_s, None, None, False]
-    return [touch.time_s, _finite(touch.torque_nm), _finite(touch.std_nm), touch.contact]
+    """[time, external torque, standard deviation, contact, valid]."""
+    contact = touch.valid and touch.contact
+    return [touch.time_s, _finite(touch.torque_nm), _finite(touch.std_nm), contact, touch.valid]
 
 
 def _describe(shown: Shown) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """The work of one cycle: a two-motor VSA on the virtual bus, beside the textbook way and the floor.
 
-    python benchmarks/cycle.py [--seconds S] [--rounds N] [--json FILE]
+    python benchmarks/cycle.py [--seconds S] [--rounds N]
 
 All variants make SYNC at 1 kHz for the same simulated devices, which answer in the thread that sends and
 whose CPU time is not counted, and publish in the same zenoh session to a subscriber in another process.
@@ -13,14 +13,13 @@ put returned.
 
 from __future__ import annotations
 
-import argparse
-import json
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import scene
 import zenoh
 from rig import PERIOD_S, Devices, free_endpoint, joint, subscriber
 from rivals import Floor, Textbook
@@ -146,52 +145,41 @@ def lockstep(mode: str, seconds: float) -> dict[str, Any]:
     }
 
 
-def report(results: list[dict[str, Any]], flat_out: list[dict[str, Any]]) -> str:
-    """The tables in Markdown."""
-    lines = [
-        "| at 1 kHz | CPU a cycle / µs | of a core | of textbook | of floor | work p50 / p99 / p99.9 µs "
-        "| cycles complete |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {r['variant']} | {r['cpu_us_per_cycle']:.0f} | {100 * r['cpu_of_a_core']:.1f} % "
-        f"| {r['cpu_against_textbook']:.2f}× | {r['cpu_against_floor']:.2f}× "
-        f"| {r['work_p50_us']:.0f} / {r['work_p99_us']:.0f} / {r['work_p999_us']:.0f} "
-        f"| {r['complete']} of {r['syncs']} |"
-        for r in results
-    ]
-    lines += [
-        "",
-        "| lockstep | 10 s of VSA-II took | CPU | faster than real time | work p50 / p99 µs |",
-        "|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {r['mode']} | {10 * r['took_s'] / r['simulated_s']:.2f} s "
-        f"| {10 * r['cpu_s'] / r['simulated_s']:.2f} s | {r['faster_than_real_time']:.1f}× "
-        f"| {r['work_p50_us']:.0f} / {r['work_p99_us']:.0f} |"
-        for r in flat_out
-    ]
-    load = results[0]["bus_load_1_mbit"]
-    lines += [
-        "",
-        f"Frames of this joint take {100 * load:.0f} % of 1 Mbit/s: the bus ends at {1e3 / load:.0f} Hz.",
-    ]
+def rows(args: Any) -> Iterator[scene.Row]:
+    """One row a variant."""
+    return iter(compare(args.seconds, args.rounds))
+
+
+def flat_out(found: list[scene.Row]) -> str:
+    """The second table, and the load of the bus."""
+    columns = {
+        "lockstep": "{mode}",
+        "10 s of VSA-II took": "{took_s:.2f} s",
+        "CPU": "{cpu_s:.2f} s",
+        "faster than real time": "{faster_than_real_time:.1f}×",
+        "work p50 / p99 µs": "{work_p50_us:.0f} / {work_p99_us:.0f}",
+    }
+    lines: list[str] = []
+    scene.table(columns, (lockstep(mode, 10.0) for mode in ("robust", "paper")), lines.append)
+    load = found[0]["bus_load_1_mbit"]
+    lines += ["", f"Frames of this joint take {load:.0%} of 1 Mbit/s: the bus ends at {1e3 / load:.0f} Hz."]
     return "\n".join(lines)
 
 
-def main() -> None:
-    """Run and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=5.0, help="of each round")
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--json", type=Path, help="also write the numbers there")
-    args = parser.parse_args()
-    results = compare(args.seconds, args.rounds)
-    flat_out = [lockstep(mode, 10.0) for mode in ("robust", "paper")]
-    print(report(results, flat_out))
-    if args.json:
-        args.json.write_text(json.dumps({"cycle": results, "lockstep": flat_out}, indent=1), encoding="utf-8")
-
-
 if __name__ == "__main__":
-    main()
+    scene.main(
+        __doc__,
+        rows,
+        {
+            "at 1 kHz": "{variant}",
+            "CPU a cycle / µs": "{cpu_us_per_cycle:.0f}",
+            "of a core": "{cpu_of_a_core:.1%}",
+            "of textbook": "{cpu_against_textbook:.2f}×",
+            "of floor": "{cpu_against_floor:.2f}×",
+            "work p50 / p99 / p99.9 µs": "{work_p50_us:.0f} / {work_p99_us:.0f} / {work_p999_us:.0f}",
+            "cycles complete": "{complete} of {syncs}",
+        },
+        scene.Option("--seconds", 5.0, "of each round"),
+        scene.Option("--rounds", 3),
+        after=flat_out,
+    )

@@ -2,33 +2,36 @@
 
     python benchmarks/fleet_world.py DIR [--joints 40] [--nights 25] [--seconds 10] [--seed 0]
 
-Writes DIR/joints/NAME.toml, DIR/recordings/NAME-DATE.csv and DIR/truth.json. The world is of its own: all
-recordings side by side in numpy, Heun's method; it shares no code with the estimator. A joint's motion
-differs from night to night, its spring by 0.2 % and its damping by 1 % (temperature); declared inertias are
-off by up to half a per cent.
+Writes DIR/joints/NAME.toml, DIR/recordings/NAME-DATE.csv and DIR/truth.json. The simulator is `world.c`. A
+joint's motion differs from night to night, its spring by 0.2 % and its damping by 1 % (temperature); declared
+inertias are off by up to half a per cent.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import date, timedelta
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
+from undeclared import program, simulate
 
 PERIOD_S = 0.002
-SUBSTEPS = 2
 DRIFT = 0.03  # of the stiffness, over all nights
 STEP = 0.02
 TEMPERATURE = 0.002  # of the stiffness, from night to night
 DAMPING = 0.01  # likewise
+DAMPING_NM_S_RAD, LINK_DAMPING_NM_S_RAD, GRAVITY_NM = 0.7, 0.12, 4.0
 SHARES = {"drift": 0.4, "step": 0.15, "effect": 0.15}  # of the joints; the rest is healthy
-EFFECTS = ("coulomb", "cogging", "hysteresis")
+EFFECTS = {
+    "coulomb": {"friction": "coulomb", "coulomb": 0.5},
+    "cogging": {"cogging": 0.5, "cogging_periods": 19},
+    "hysteresis": {"hysteresis": "dahl", "hysteresis_torque": 0.5, "hysteresis_width": 0.004},
+}
 NAMES = {
     "coulomb": {"coulomb_friction", "stribeck_friction", "asymmetric_friction", "presliding_friction"},
     "cogging": {"cogging"},
@@ -77,70 +80,32 @@ def fleet(joints: int, nights: int, rng: np.random.Generator) -> list[Joint]:
                 link_inertia_kg_m2=float(rng.uniform(0.25, 0.5)),
                 change_relative=change,
                 since_night=int(rng.integers(nights // 4, max(3 * nights // 4, 1))) if kind != "drift" else 0,
-                effect=str(rng.choice(EFFECTS)) if kind == "effect" else None,
+                effect=str(rng.choice(list(EFFECTS))) if kind == "effect" else None,
             )
         )
     return made
 
 
-def simulate(joints: list[Joint], nights: int, seconds: float, rng: np.random.Generator) -> Array:
-    """(joints · nights, rows, 3): motor position, motor torque, link position as measured."""
-    pairs = [(joint, night) for joint in joints for night in range(nights)]
-    m, n = len(pairs), round(seconds / PERIOD_S)
-
-    def of(value: object) -> Array:
-        return np.array(value, dtype=np.float64)
-
-    active = [j.effect if j.effect and night >= j.since_night else None for j, night in pairs]
-    stiffness = of([j.stiffness(night, nights) for j, night in pairs])
-    stiffness *= 1.0 + TEMPERATURE * rng.standard_normal(m)
-    inertia, link = of([j.inertia_kg_m2 for j, _ in pairs]), of([j.link_inertia_kg_m2 for j, _ in pairs])
-    damping = 0.7 * (1.0 + DAMPING * rng.standard_normal(m))
-    coulomb, cogging, hysteresis = (of([0.5 * (a == name) for a in active]) for name in EFFECTS)
-    reference = _references(n, m, rng)
-    rate = np.gradient(reference, PERIOD_S, axis=0)
-    state, memory = np.zeros((4, m)), np.zeros(m)  # theta, theta', q, q'
-    rows = np.empty((n, 3, m))
-    step = PERIOD_S / SUBSTEPS
-
-    def slope(state: Array, torque: Array) -> Array:
-        theta, w, q, v = state
-        through = stiffness * (q - theta) + hysteresis * memory
-        lost = damping * w + coulomb * np.tanh(w / 0.004) + cogging * np.sin(19.0 * theta)
-        return np.array(
-            [w, (torque - lost + through) / inertia, v, -(through + 0.12 * v + 4.0 * np.sin(q)) / link]
-        )
-
-    for k in range(n):
-        torque = 170.0 * (reference[k] - state[0]) + 6.0 * (rate[k] - state[1])
-        rows[k] = state[0], torque, state[2]
-        for _ in range(SUBSTEPS):
-            first = slope(state, torque)
-            second = slope(state + step * first, torque)
-            before = state[2] - state[0]
-            state = state + 0.5 * step * (first + second)
-            u = (state[2] - state[0] - before) / 0.004
-            memory = memory + u * (1.0 - np.abs(memory) * np.sign(u * memory))
-    return _measured(rows, rng)
-
-
-def _references(n: int, m: int, rng: np.random.Generator) -> Array:
-    time = np.arange(n)[:, None] * PERIOD_S
-    path = np.zeros((n, m))
-    for _ in range(10):
-        tone = np.exp(rng.uniform(np.log(0.15), np.log(3.0), m))
-        path += np.sin(2.0 * np.pi * tone * time + rng.uniform(0.0, 2.0 * np.pi, m)) / tone**0.9
-    path = 0.45 * (path - path[0]) / path.std(axis=0)
-    return np.asarray(path * np.minimum(1.0, time / 0.5))
-
-
-def _measured(rows: Array, rng: np.random.Generator) -> Array:
-    """Encoders quantised, torque noisy."""
-    motor, link = 2.0 * np.pi / 65536, 2.0 * np.pi / 2**17
-    rows[:, 0] = np.floor(rows[:, 0] / motor) * motor
-    rows[:, 1] += 0.01 * rng.standard_normal(rows[:, 1].shape)
-    rows[:, 2] = np.floor(rows[:, 2] / link) * link
-    return rows.transpose(2, 0, 1)
+def settings(joint: Joint, night: int, nights: int, seconds: float, rng: np.random.Generator) -> dict:
+    """What `world.c` is to simulate."""
+    active = joint.effect is not None and night >= joint.since_night
+    return {
+        "spring": "linear",
+        "stiffness": joint.stiffness(night, nights) * (1.0 + TEMPERATURE * rng.standard_normal()),
+        "inertia": joint.inertia_kg_m2,
+        "damping": DAMPING_NM_S_RAD * (1.0 + DAMPING * rng.standard_normal()),
+        "link_inertia": joint.link_inertia_kg_m2,
+        "link_damping": LINK_DAMPING_NM_S_RAD,
+        "gravity": GRAVITY_NM,
+        "motor_counts": 65536,
+        "link_bits": 17,
+        "torque_noise": 0.01,
+        "size": 8.0,
+        "period": PERIOD_S,
+        "seconds": seconds,
+        "seed": int(rng.integers(1, 2**31)),
+        **(EFFECTS[str(joint.effect)] if active else {}),
+    }
 
 
 def joint_file(joint: Joint, error: float) -> str:
@@ -154,12 +119,12 @@ def joint_file(joint: Joint, error: float) -> str:
     )
 
 
-def write_csv(path: Path, samples: Array) -> None:
-    """One recording, (rows, 3)."""
-    time_s = np.arange(len(samples)) * PERIOD_S
+def write_csv(path: Path, world: dict) -> None:
+    """Simulate one recording."""
+    record = simulate(**world).record
+    columns = (record.time_s, record.motor_position_rad, record.motor_torque_nm, record.link_position_rad)
     names = "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad"
-    table = np.column_stack((time_s, samples))
-    np.savetxt(path, table, delimiter=",", header=names, comments="", fmt="%.9g")
+    np.savetxt(path, np.column_stack(columns), delimiter=",", header=names, comments="", fmt="%.9g")
 
 
 def make(folder: Path, joints: int, nights: int, seconds: float, seed: int) -> list[Joint]:
@@ -168,22 +133,22 @@ def make(folder: Path, joints: int, nights: int, seconds: float, seed: int) -> l
     truth = fleet(joints, nights, rng)
     for name in ("joints", "recordings"):
         (folder / name).mkdir(parents=True, exist_ok=True)
+    jobs = []
     for joint in truth:
         text = joint_file(joint, float(rng.uniform(-0.005, 0.005)))
         (folder / "joints" / f"{joint.name}.toml").write_text(text, encoding="utf-8")
-    per_batch = max(1, 400 // nights)  # joints at once: memory
-    for begin in range(0, joints, per_batch):
-        batch = truth[begin : begin + per_batch]
-        for k, samples in enumerate(simulate(batch, nights, seconds, rng)):
-            joint, night = batch[k // nights], k % nights
-            day = FIRST_NIGHT + timedelta(days=night)
-            write_csv(folder / "recordings" / f"{joint.name}-{day}.csv", samples)
+        for night in range(nights):
+            path = folder / "recordings" / f"{joint.name}-{FIRST_NIGHT + timedelta(days=night)}.csv"
+            jobs.append((path, settings(joint, night, nights, seconds, rng)))
+    program()  # compiled once, before the threads ask for it
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        list(pool.map(write_csv, *zip(*jobs, strict=True)))
     entries = [{name: getattr(joint, name) for name in Joint.__slots__} for joint in truth]
     (folder / "truth.json").write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
     return truth
 
 
-def main() -> None:
+if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path, metavar="DIR")
     parser.add_argument("--joints", type=int, default=40)
@@ -191,9 +156,5 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    truth = make(args.folder, args.joints, args.nights, args.seconds, args.seed)
-    print(f"{len(truth)} joints, {len(truth) * args.nights} recordings in {args.folder}")
-
-
-if __name__ == "__main__":
-    main()
+    made = make(args.folder, args.joints, args.nights, args.seconds, args.seed)
+    print(f"{len(made)} joints, {len(made) * args.nights} recordings in {args.folder}")

@@ -1,6 +1,6 @@
 """The daemon as a process: jitter with and without real-time scheduling, a recorder beside it, start, memory.
 
-    python benchmarks/service.py [--seconds S] [--rounds N] [--json FILE]
+    python benchmarks/service.py [--seconds S] [--rounds N]
 
 Rounds alternate, so that all variants see the same machine. The baseline of jitter is a bare loop that does
 nothing but sleep until the same deadlines, with the same scheduling; that of the start is Python with the
@@ -9,15 +9,16 @@ libraries that any such program imports.
 
 from __future__ import annotations
 
-import argparse
-import json
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import scene
 import zenoh
 from rig import PERIOD_S, Devices, free_endpoint, joint, joint_text
 
@@ -161,64 +162,57 @@ def starts(count: int) -> dict[str, float]:
     return {key: statistics.median([row[key] for row in seen]) for key in seen[0]}
 
 
-def report(variants: dict[str, dict[str, float]], start: dict[str, float]) -> str:
-    """The tables in Markdown."""
-    lines = [
-        "| at 1 kHz | SYNC late p50 / p99 / p99.9 / max µs | of bare loop (p99) | work p50 / p99 µs "
-        "| CPU a cycle µs | SYNCs left out |",
-        "|---|---|---|---|---|---|",
-    ]
+def rows(args: Any) -> Iterator[scene.Row]:
+    """One row a variant of the jitter, then of the start, then of memory."""
+    variants = rounds(args.seconds, args.rounds)
     for name, row in variants.items():
-        kind = "ordinary" if "ordinary" in name else "real-time"
-        base = variants[f"bare loop, {kind} scheduling"]["late_p99_us"]
-        late = " / ".join(f"{row[f'late_{p}_us']:.0f}" for p in ("p50", "p99", "p999", "max"))
-        work = cpu = ""
-        if "work_p50_us" in row:
-            work, cpu = (
-                f"{row['work_p50_us']:.0f} / {row['work_p99_us']:.0f}",
-                f"{row['cpu_us_per_cycle']:.0f}",
-            )
-        line = f"| {name} | {late} | {row['late_p99_us'] / base:.1f}× | {work} | {cpu} "
-        line += f"| {row['left_out']:.0f} of {row['cycles'] + row['left_out']:.0f} |"
-        lines.append(line)
-    off, on = variants["drivelink, real-time scheduling"], variants["drivelink, with a recorder"]
-    lines += [
-        "",
+        base = variants[f"bare loop, {'ordinary' if 'ordinary' in name else 'real-time'} scheduling"]
+        of_bare = row["late_p99_us"] / base["late_p99_us"]
+        empty = dict.fromkeys(("work_p50_us", "work_p99_us", "cpu_us_per_cycle"))
+        yield {"variant": name, **empty, **row, "of_bare": of_bare, "syncs": row["cycles"] + row["left_out"]}
+
+
+def started(found: list[scene.Row]) -> str:
+    """What a recorder costs; the second table: start and memory."""
+    by_name = {row["variant"]: row for row in found}
+    off, on = by_name["drivelink, real-time scheduling"], by_name["drivelink, with a recorder"]
+    lines = [
         f"A recorder beside the daemon: CPU a cycle {on['cpu_us_per_cycle'] / off['cpu_us_per_cycle']:.2f}×, "
-        f"work p99 {on['work_p99_us'] / off['work_p99_us']:.2f}× of the daemon alone.",
-        "",
-        "| start and memory | | of the libraries alone |",
-        "|---|---|---|",
+        f"work p99 {on['work_p99_us'] / off['work_p99_us']:.2f}× of the daemon alone.\n"
     ]
+    start, said = starts(3), []
     for key, what in (
         ("libraries_s", f"Python and `{LIBRARIES}`"),
         ("imported_s", "drivelink and its simulated devices imported"),
         ("configured_s", "names claimed, nodes configured by SDO: ready"),
         ("first_estimate_s", "first estimate published"),
-    ):
-        lines.append(f"| {what} | {start[key]:.2f} s | {start[key] / start['libraries_s']:.1f}× |")
-    for key, what in (
         ("libraries_mb", "memory of the libraries"),
         ("started_mb", "at the first estimate, simulation included"),
         ("after_10_s_mb", "after 10 s of cycles"),
         ("after_20_s_mb", "after 20 s of cycles"),
     ):
-        lines.append(f"| {what} | {start[key]:.0f} MB | {start[key] / start['libraries_mb']:.1f}× |")
+        unit = key.rpartition("_")[2]
+        value = f"{start[key]:.2f} s" if unit == "s" else f"{start[key]:.0f} MB"
+        said.append({"what": what, "value": value, "ratio": start[key] / start[f"libraries_{unit}"]})
+    columns = {"start and memory": "{what}", "": "{value}", "of the libraries alone": "{ratio:.1f}×"}
+    scene.table(columns, said, lines.append)
     return "\n".join(lines)
 
 
-def main() -> None:
-    """Run and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=5.0, help="of each round")
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--json", type=Path, help="also write the numbers there")
-    args = parser.parse_args()
-    variants, start = rounds(args.seconds, args.rounds), starts(args.rounds)
-    print(report(variants, start))
-    if args.json:
-        args.json.write_text(json.dumps({"variants": variants, "start": start}, indent=1), encoding="utf-8")
-
-
 if __name__ == "__main__":
-    main()
+    late = " / ".join(f"{{late_{p}_us:.0f}}" for p in ("p50", "p99", "p999", "max"))
+    scene.main(
+        __doc__,
+        rows,
+        {
+            "at 1 kHz": "{variant}",
+            "SYNC late p50 / p99 / p99.9 / max µs": late,
+            "of bare loop (p99)": "{of_bare:.1f}×",
+            "work p50 / p99 µs": "{work_p50_us:.0f} / {work_p99_us:.0f}",
+            "CPU a cycle µs": "{cpu_us_per_cycle:.0f}",
+            "SYNCs left out": "{left_out:.0f} of {syncs:.0f}",
+        },
+        scene.Option("--seconds", 5.0, "of each round"),
+        scene.Option("--rounds", 3),
+        after=started,
+    )

@@ -1,6 +1,6 @@
 """What each stage of a cycle costs as joints are added, and how many joints one core carries.
 
-    python benchmarks/stages.py [--cycles N] [--joints N] [--ticks N] [--json FILE]
+    python benchmarks/stages.py [--cycles N] [--joints N] [--ticks N]
 
 Recorded frames of the simulated devices are laid into the queues of virtual buses; then the daemon's own
 parts take them, at 1 kHz in one thread with real-time scheduling where the system allows, and publish to a
@@ -11,16 +11,17 @@ With --ticks instead, the memory that the pipeline of a two-motor joint takes as
 
 from __future__ import annotations
 
-import argparse
-import json
 import resource
 import statistics
+import sys
 import time
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import can
+import scene
 import zenoh
 from rig import PERIOD_S, free_endpoint, joint, subscriber
 from rivals import Floor
@@ -179,7 +180,7 @@ def resident_bytes() -> int:
     return pages * resource.getpagesize()
 
 
-def memory(ticks: int) -> dict[str, int]:
+def memory(ticks: int) -> scene.Row:
     """Growth over so many cycles of a two-motor joint, frames to bytes, after a tenth of them."""
     which = joint("robust", free_endpoint(), motors=2)
     recorded, layouts = frames_of(which, 5000)
@@ -193,12 +194,11 @@ def memory(ticks: int) -> dict[str, int]:
         for cob_id, data in cycles[k % len(cycles)]:
             tick = pipeline.feed(cob_id, data)
         assert tick is not None and tick.estimate_payload
-    return {"ticks": ticks, "growth_bytes": resident_bytes() - start}
+    return {"ticks": ticks, "growth_kib": (resident_bytes() - start) / 1024}
 
 
-def measure(cycles: int, most: int) -> list[dict[str, Any]]:
+def measure(cycles: int, most: int) -> Iterator[scene.Row]:
     """One row a number of joints, up to `most`."""
-    rows = []
     recordings = {
         motors: frames_of(joint("robust", free_endpoint(), motors=motors), cycles) for motors in (1, 2)
     }
@@ -210,67 +210,51 @@ def measure(cycles: int, most: int) -> list[dict[str, Any]]:
         parts = [Clocked(index, motors, layouts, session) for index in range(joints)]
         row = {"joints": joints, "motors": joints * motors, **paced(parts, recorded)}
         row["flat_out_hz"] = flat_out(parts, recorded)
-        for part in parts:
-            part.publisher.close()
-            part.bus.shutdown()
         bare = [Bare(index, motors, layouts, session) for index in range(joints)]
         row["floor"] = paced(bare, recorded)
-        for floor in bare:
-            floor.publisher.close()
-            floor.bus.shutdown()
+        row["of_floor"] = row["process_us_per_cycle"] / row["floor"]["process_us_per_cycle"]
+        for part in (*parts, *bare):
+            part.publisher.close()
+            part.bus.shutdown()
         close_session(session)
         reader.communicate(b"")
-        rows.append(row)
-    return rows
+        yield row
 
 
-def carried(rows: list[dict[str, Any]]) -> float:
+def rows(args: Any) -> Iterator[scene.Row]:
+    """One row a number of joints; with --ticks the memory only."""
+    return iter([memory(args.ticks)]) if args.ticks else measure(args.cycles, args.joints)
+
+
+def carried(found: list[scene.Row]) -> str:
     """VSA joints that one core carries at 1 kHz, from what the last ones added cost."""
-    one, many = (next(r for r in rows if (r["joints"], r["motors"]) == at) for at in ((1, 2), (4, 8)))
+    if "joints" not in found[0]:
+        return ""
+    one, many = (next(r for r in found if (r["joints"], r["motors"]) == at) for at in ((1, 2), (4, 8)))
     each = (many["process_us_per_cycle"] - one["process_us_per_cycle"]) / (many["joints"] - one["joints"])
-    return 1 + (1e6 * PERIOD_S - one["process_us_per_cycle"]) / each
+    most = 1 + (1e6 * PERIOD_S - one["process_us_per_cycle"]) / each
+    return f"CPU in µs. At 1 kHz one core carries {most:.1f} VSA joints (process, computed)."
 
 
-def report(rows: list[dict[str, Any]]) -> str:
-    """The table in Markdown."""
-    lines = [
-        f"| joints | motors | {' | '.join(STAGES)} | work p50 / p99 | process a cycle | of floor "
-        "| over 1 ms | flat out |",
-        "|" + "---|" * 12,
-    ]
-    for row in rows:
-        ratio = row["process_us_per_cycle"] / row["floor"]["process_us_per_cycle"]
-        lines.append(
-            f"| {row['joints']} | {row['motors']} | "
-            + " | ".join(f"{row[name]:.0f}" for name in STAGES)
-            + f" | {row['work_p50_us']:.0f} / {row['work_p99_us']:.0f} | {row['process_us_per_cycle']:.0f} "
-            f"| {ratio:.1f}× | {row['over_a_period']} of {row['cycles']} | {row['flat_out_hz']:.0f} Hz |"
-        )
-    lines += ["", f"CPU in µs. At 1 kHz one core carries {carried(rows):.1f} VSA joints (process, computed)."]
-    return "\n".join(lines)
-
-
-def main() -> None:
-    """Run and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--cycles", type=int, default=5000)
-    parser.add_argument("--joints", type=int, default=16, metavar="N", help="at most (at least 4)")
-    parser.add_argument(
-        "--ticks", type=int, default=0, metavar="N", help="memory over so many cycles instead"
-    )
-    parser.add_argument("--json", type=Path, help="also write the numbers there")
-    args = parser.parse_args()
-    found: dict[str, Any]
-    if args.ticks:
-        found = memory(args.ticks)
-        print(f"Memory over {args.ticks:.2g} cycles: {found['growth_bytes'] / 1024:+.0f} KiB")
-    else:
-        rows = measure(args.cycles, args.joints)
-        print(report(rows))
-        found = {"rows": rows, "joints_per_core": carried(rows)}
-    if args.json:
-        args.json.write_text(json.dumps(found, indent=1))
-
+MEMORY = {"cycles": "{ticks:.2g}", "memory grows by / KiB": "{growth_kib:+.0f}"}
+COLUMNS = {
+    "joints": "{joints}",
+    "motors": "{motors}",
+    **{name: f"{{{name}:.0f}}" for name in STAGES},
+    "work p50 / p99": "{work_p50_us:.0f} / {work_p99_us:.0f}",
+    "process a cycle": "{process_us_per_cycle:.0f}",
+    "of floor": "{of_floor:.1f}×",
+    "over 1 ms": "{over_a_period} of {cycles}",
+    "flat out": "{flat_out_hz:.0f} Hz",
+}
 
 if __name__ == "__main__":
-    main()
+    scene.main(
+        __doc__,
+        rows,
+        MEMORY if "--ticks" in sys.argv else COLUMNS,
+        scene.Option("--cycles", 5000),
+        scene.Option("--joints", 16, "at most (at least 4)"),
+        scene.Option("--ticks", 0, "memory over so many cycles instead"),
+        after=carried,
+    )

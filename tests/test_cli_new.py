@@ -2,11 +2,11 @@ import can
 import pytest
 
 from drivelink import jointfile
+from drivelink.canopen.newfile import Answers, answers_from_bus, joint_text
 from drivelink.canopen.scan import FoundNode
 from drivelink.cli import main
 from drivelink.demo.simulate import network_from_joint
 from drivelink.errors import DriveError
-from drivelink.jointfile.newfile import Answers, answers_from_bus, joint_text
 
 
 def made(tmp_path, *arguments, name="elbow.toml"):

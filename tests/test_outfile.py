@@ -18,11 +18,10 @@ import joints
 import numpy as np
 import pytest
 
-from drivelink import cli
+from drivelink import cli, outfile
 from drivelink.errors import RecordingError, UsageError
 from drivelink.jointfile import parse
-from drivelink.output import outfile
-from drivelink.output.outfile import NewFile, check_target, write_whole
+from drivelink.outfile import NewFile, check_target, write_whole
 from drivelink.recording.formats import open_sink
 from drivelink.recording.safefile import SafeFile
 from estimator.sample import Sample
@@ -120,7 +119,7 @@ def test_a_full_disk_leaves_what_was_there(folder: Path) -> None:
     path.write_text("kept")
     script = (
         "import resource, signal, sys\nfrom pathlib import Path\n"
-        "from drivelink.output.outfile import write_whole\n"
+        "from drivelink.outfile import write_whole\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
         "try:\n    write_whole(Path(sys.argv[1]), b'x' * 5000, force=True)\n"
@@ -140,7 +139,7 @@ def test_a_kill_at_any_moment_leaves_the_old_file_or_the_new_one(tmp_path: Path)
         """
         import sys
         from pathlib import Path
-        from drivelink.output.outfile import write_whole
+        from drivelink.outfile import write_whole
         print("ready", flush=True)
         while True:
             for letter in "ab":

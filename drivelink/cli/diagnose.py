@@ -15,8 +15,8 @@ from drivelink.cli import add_recordings, require_distinct
 from drivelink.cli.gating import warned
 from drivelink.errors import RecordingError
 from drivelink.jointfile import apply_diagnosis
+from drivelink.outfile import check_target
 from drivelink.output import report
-from drivelink.output.outfile import check_target
 from drivelink.output.progress import Meter
 from drivelink.output.units import Units
 from drivelink.recording.columnmap import parse_column_map

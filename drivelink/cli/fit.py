@@ -8,7 +8,7 @@ from pathlib import Path
 from drivelink import jointfile
 from drivelink.cli import add_recordings, require_distinct
 from drivelink.errors import RecordingError, UsageError
-from drivelink.output.outfile import check_target
+from drivelink.outfile import check_target
 from drivelink.recording.mapping import joint_of
 
 EPILOG = """\

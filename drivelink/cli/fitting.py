@@ -19,8 +19,8 @@ from drivelink.cli.gating import warned
 from drivelink.errors import RecordingError
 from drivelink.jointfile import JointText, effect_entry, link_entry
 from drivelink.jointfile.residual_baseline import floor_entry
+from drivelink.outfile import check_target, write_whole
 from drivelink.output.fitplot import fit_plot
-from drivelink.output.outfile import check_target, write_whole
 from drivelink.output.units import Units
 from drivelink.recording.columnmap import parse_column_map
 from drivelink.version import __version__

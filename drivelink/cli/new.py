@@ -14,11 +14,11 @@ from typing import Any
 import tomlkit
 
 from drivelink.canopen.bus import open_bus
+from drivelink.canopen.newfile import Answers, answers_from_bus, joint_text
 from drivelink.canopen.scan import identify, scan
 from drivelink.errors import UsageError
 from drivelink.jointfile import BusSection, parse
-from drivelink.jointfile.newfile import Answers, answers_from_bus, joint_text
-from drivelink.output.outfile import check_target, write_whole
+from drivelink.outfile import check_target, write_whole
 
 _CASES = ("constant", "quadratic", "vsa-ii")
 _ARRANGEMENTS = ("single", "antagonistic", "serial")

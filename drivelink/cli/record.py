@@ -23,7 +23,7 @@ from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cli import add_bus, moved
 from drivelink.errors import BusError, DrivelinkError, RecordingError, UsageError, ZenohError
 from drivelink.jointfile import JointFile, JointText
-from drivelink.output.outfile import check_target
+from drivelink.outfile import check_target
 from drivelink.pubsub.inbound import DECODERS
 from drivelink.pubsub.session import close_session, open_client
 from drivelink.recording.formats import open_sink

@@ -16,7 +16,7 @@ from drivelink.cli import add_map
 from drivelink.cli.gating import warn
 from drivelink.errors import UsageError
 from drivelink.jointfile import JointFile
-from drivelink.output.outfile import check_target
+from drivelink.outfile import check_target
 from drivelink.output.progress import Meter
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_session

@@ -19,7 +19,7 @@ from drivelink.errors import JointFileError
 from drivelink.infile import read_regular
 from drivelink.jointfile.keyhint import unknown_key
 from drivelink.jointfile.schema import JointFile
-from drivelink.output.outfile import write_whole
+from drivelink.outfile import write_whole
 
 _LOG = logging.getLogger(__name__)
 

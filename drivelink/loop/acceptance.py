@@ -17,7 +17,7 @@ from drivelink.infile import read_regular
 from drivelink.jointfile import MAX_BYTES, JointFile, JointText, load, load_text, without_check, write_model
 from drivelink.loop import finding
 from drivelink.loop.folder import folder_of, proposal_file
-from drivelink.output.outfile import write_whole
+from drivelink.outfile import write_whole
 from drivelink.plaintext import clean_text
 
 PATIENCE_S = 60.0  # for the residual to fall

@@ -11,7 +11,7 @@ from typing import Any
 from drivelink.errors import DrivelinkError, RecordingError
 from drivelink.infile import read_regular
 from drivelink.loop.folder import event_of, finding_file, kept
-from drivelink.output.outfile import write_whole
+from drivelink.outfile import write_whole
 from drivelink.pubsub.inbound import MAX_BYTES, decode_document
 
 SCHEMA = "drivelink.finding/1"

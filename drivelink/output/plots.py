@@ -22,7 +22,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from drivelink.output.outfile import write_whole
+from drivelink.outfile import write_whole
 from estimator.sample import SIGMA_95, FloatArray
 
 # Colours of Okabe and Ito (distinguishable with any colour vision), different in lightness for grey prints,

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from drivelink.outfile import write_whole
 from drivelink.output import plots
-from drivelink.output.outfile import write_whole
 from drivelink.output.units import Units, in_words
 from estimator.diagnosis import Curve, Diagnosis, Errors, Finding, StiffnessCurve
 from estimator.effects import LIBRARY

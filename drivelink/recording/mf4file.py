@@ -18,7 +18,7 @@ from drivelink.errors import RecordingError
 from drivelink.infile import open_regular
 from drivelink.jointfile import JointFile
 from drivelink.jointfile.columns import COLUMNS
-from drivelink.output.outfile import check_target, put_in_place, sync
+from drivelink.outfile import check_target, put_in_place, sync
 from drivelink.recording.columnmap import ColumnMap, renamed
 from drivelink.recording.columns import record_from_columns, sample_columns, sample_row
 from drivelink.recording.limits import require_samples

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from drivelink.errors import RecordingError
+from drivelink.outfile import NewFile
 from drivelink.output.digits import with_interval
-from drivelink.output.outfile import NewFile
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.recording.messages import (
     estimate_columns,

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 from drivelink.errors import RecordingError
-from drivelink.output.outfile import NewFile
+from drivelink.outfile import NewFile
 
 
 class SafeFile(io.BufferedIOBase):

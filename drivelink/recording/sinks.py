@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from drivelink.errors import RecordingError
 from drivelink.jointfile import JointFile
-from drivelink.output.outfile import check_target, write_whole
+from drivelink.outfile import check_target, write_whole
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from drivelink.recording.columns import sample_columns, sample_row
 from drivelink.recording.mapping import side_file

@@ -8,7 +8,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from drivelink.jointfile import JointFile
-from drivelink.output.outfile import write_whole
+from drivelink.outfile import write_whole
 
 _COLOURS = ("#0072b2", "#9ec9e2", "#9ec9e2", "#d55e00", "#009e73")
 

@@ -16,6 +16,8 @@ from zenohkit import (
     make_estimate,
     make_external,
     make_joint,
+    put_estimate,
+    put_external,
     ready,
     script,
     until,
@@ -65,7 +67,7 @@ def impatient(publisher, endpoint):
 
 def publish(publisher, *sequences, status=Status.VALID | Status.OBSERVABLE):
     for sequence in sequences:
-        publisher.put_estimate(make_estimate(sequence, status), time.time_ns())
+        put_estimate(publisher, make_estimate(sequence, status), time.time_ns())
 
 
 def test_the_latest_value_comes_without_waiting(publisher, joint):
@@ -127,7 +129,7 @@ def test_a_rigid_joint_says_that_its_stiffness_is_not_given(endpoint):
             connected(publisher, joint)
             nan = math.nan
             rigid = Estimate(1, int(Status.VALID), 2.0, nan, nan, (TransmissionEstimate(2.0, nan, nan, nan),))
-            until(lambda: publisher.put_estimate(rigid, time.time_ns()) or joint.valid)
+            until(lambda: put_estimate(publisher, rigid, time.time_ns()) or joint.valid)
             assert joint.latest().status & Status.PARTIAL and math.isnan(joint.latest().stiffness_nm_rad)
     finally:
         close_session(session)
@@ -136,7 +138,7 @@ def test_a_rigid_joint_says_that_its_stiffness_is_not_given(endpoint):
 def test_the_external_torque_comes_with_its_estimate(publisher, joint):
     assert joint.external is None and not joint.contact
     publish(publisher, 1)
-    publisher.put_external(make_external(1, status=3), time.time_ns())
+    put_external(publisher, make_external(1, status=3), time.time_ns())
     external = until(lambda: joint.external)
     assert (external.sequence, external.external_torque_nm, external.external_torque_std_nm) == (
         1,
@@ -145,24 +147,24 @@ def test_the_external_torque_comes_with_its_estimate(publisher, joint):
     )
     assert external.valid and joint.contact
     publish(publisher, 3)
-    publisher.put_external(make_external(3, status=1), time.time_ns())
+    put_external(publisher, make_external(3, status=1), time.time_ns())
     until(lambda: joint.external.sequence == 3)
     assert not joint.contact
 
 
 def test_an_external_torque_of_other_cycles_is_not_returned(publisher, joint):
     publish(publisher, 1)
-    publisher.put_external(make_external(1, status=3), time.time_ns())
+    put_external(publisher, make_external(1, status=3), time.time_ns())
     until(lambda: joint.contact)
     publish(publisher, 40)
     until(lambda: joint.latest().sequence == 40)
     assert joint.external is None and not joint.contact
-    publisher.put_external(make_external(40, status=3), time.time_ns())
+    put_external(publisher, make_external(40, status=3), time.time_ns())
     until(lambda: joint.contact)
 
 
 def test_a_stale_external_torque_is_not_returned(publisher, impatient):
-    publisher.put_external(make_external(1, status=3), time.time_ns())
+    put_external(publisher, make_external(1, status=3), time.time_ns())
     until(lambda: publish(publisher, 1) or impatient.contact)
     until(lambda: impatient.stale)  # nothing more comes
     assert impatient.external is None and not impatient.contact
@@ -270,7 +272,7 @@ def test_the_age_does_not_believe_the_senders_clock(publisher, joint):
     for stamp_ns in (time.time_ns() + 3_600_000_000_000, 5, 5, 5):
         before = time.monotonic()
         joint.latest()  # the queue is seen empty now
-        publisher.put_estimate(make_estimate(stamp_ns % 7), stamp_ns)
+        put_estimate(publisher, make_estimate(stamp_ns % 7), stamp_ns)
         assert joint.wait(LIMIT_S) is not None
         assert 0.0 <= joint.age_s <= time.monotonic() - before
 

@@ -13,7 +13,15 @@ from struct import pack
 import pytest
 import zenoh
 from rich.console import Console
-from zenohkit import free_endpoint, make_estimate, make_joint, make_sample, until
+from zenohkit import (
+    free_endpoint,
+    make_estimate,
+    make_joint,
+    make_sample,
+    put_estimate,
+    put_sample,
+    until,
+)
 
 import drivelink
 from drivelink._core import encode_estimate, encode_sample
@@ -104,8 +112,8 @@ def publisher(endpoint):
 
 def publish(publisher, sequence=[0]):  # noqa: B006  (counts through the test)
     sequence[0] += 1
-    publisher.put_estimate(make_estimate(sequence[0]), time.time_ns())
-    publisher.put_sample(make_sample(sequence[0]), time.time_ns())
+    put_estimate(publisher, make_estimate(sequence[0]), time.time_ns())
+    put_sample(publisher, make_sample(sequence[0]), time.time_ns())
     time.sleep(0.002)
     return True
 

@@ -13,11 +13,15 @@ import zenoh
 import zenoh.ext
 from zenohkit import (
     LIMIT_S,
+    Cycle,
     free_endpoint,
     make_estimate,
     make_external,
     make_joint,
     make_sample,
+    put_estimate,
+    put_external,
+    put_sample,
     ready,
     script,
     until,
@@ -77,8 +81,8 @@ def test_estimate_and_sample_arrive_as_the_contract_says(publisher, client):
     samples = client.declare_subscriber("drivelink/elbow/sample", ring(4))
 
     def both():
-        publisher.put_estimate(make_estimate(7), 123)
-        publisher.put_sample(make_sample(7), 123)
+        put_estimate(publisher, make_estimate(7), 123)
+        put_sample(publisher, make_sample(7), 123)
         return estimates.try_recv()
 
     message = until(both)
@@ -91,9 +95,31 @@ def test_estimate_and_sample_arrive_as_the_contract_says(publisher, client):
     assert received(samples).payload.to_bytes() == encode_sample(make_sample(7), 123)
 
 
+def test_what_nobody_subscribes_to_is_not_put_and_a_late_subscriber_gets_the_next_cycle(publisher, client):
+    streams = {"estimate": publisher._estimate, "sample": publisher._sample, "external": publisher._external}
+    for name, stream in streams.items():
+        assert not stream.wanted
+        publisher.put(Unread())  # nor are the bytes of any message made
+        subscriber = client.declare_subscriber(f"drivelink/elbow/{name}", zenoh.handlers.RingChannel(4))
+        until(lambda s=stream: s.wanted)
+        publisher.put(Cycle(make_estimate(7), make_sample(7), make_external(7)))
+        received(subscriber)
+        subscriber.undeclare()
+        until(lambda s=stream: not s.wanted)
+
+
+class Unread(Cycle):
+    """A cycle whose bytes nobody may ask for."""
+
+    def __init__(self) -> None:
+        super().__init__(make_estimate(1))
+
+    estimate_payload = sample_payload = external_payload = property(lambda _: pytest.fail("bytes for nobody"))
+
+
 def test_an_external_torque_arrives_as_the_contract_says(publisher, client):
     externals = client.declare_subscriber("drivelink/elbow/external", zenoh.handlers.RingChannel(4))
-    message = until(lambda: publisher.put_external(make_external(7, status=3), 123) or externals.try_recv())
+    message = until(lambda: put_external(publisher, make_external(7, status=3), 123) or externals.try_recv())
     assert message.payload.to_bytes() == encode_external(make_external(7, status=3), 123)
     assert len(message.payload.to_bytes()) == 36
     assert str(message.encoding) == "zenoh/serialized;drivelink.external/1"
@@ -212,7 +238,7 @@ def test_a_subscriber_that_stopped_does_not_stop_the_publisher(publisher, endpoi
         process.send_signal(signal.SIGSTOP)
         estimate = make_estimate(1, motors=8)
         for _ in range(60_000):  # 300 bytes each: 18 MB
-            publisher.put_estimate(estimate, 0)
+            put_estimate(publisher, estimate, 0)
         process.send_signal(signal.SIGCONT)
 
 
@@ -220,7 +246,7 @@ def test_a_subscriber_that_dies_does_not_disturb_the_others(publisher, client, e
     subscriber = client.declare_subscriber("drivelink/elbow/estimate", zenoh.handlers.RingChannel(4096))
     with script(endpoint, name="zenoh_reader.py") as process:
         ready(process)
-        until(lambda: publisher.put_estimate(make_estimate(0), 0) or subscriber.try_recv())
+        until(lambda: put_estimate(publisher, make_estimate(0), 0) or subscriber.try_recv())
         process.kill()
         process.wait()
     sequence = itertools.count(1)
@@ -228,7 +254,7 @@ def test_a_subscriber_that_dies_does_not_disturb_the_others(publisher, client, e
 
     def hundred():
         """A hundred estimates after the death have come, whichever a busy machine has dropped."""
-        publisher.put_estimate(make_estimate(next(sequence)), 0)
+        put_estimate(publisher, make_estimate(next(sequence)), 0)
         while (sample := subscriber.try_recv()) is not None:
             later.add(number(sample))
         return len(later) > 100
@@ -245,10 +271,10 @@ def test_what_is_faster_than_real_time_is_published_without_loss_documents_too(e
         ring = zenoh.handlers.RingChannel
         subscriber = client.declare_subscriber("drivelink/elbow/estimate", ring(8192))
         documents = client.declare_subscriber("drivelink/elbow/status", ring(1024))
-        until(lambda: publisher.put_estimate(make_estimate(0), 0) or subscriber.try_recv())
+        until(lambda: put_estimate(publisher, make_estimate(0), 0) or subscriber.try_recv())
         until(lambda: publisher.put_status({"cycles": 0}) or documents.try_recv())
         for sequence in range(1, 2001):
-            publisher.put_estimate(make_estimate(sequence), 0)
+            put_estimate(publisher, make_estimate(sequence), 0)
             if not sequence % 10:
                 publisher.put_status({"cycles": sequence})
         numbers, cycles = [], []
@@ -275,7 +301,7 @@ def test_of_several_joints_the_last_one_s_message_takes_along_what_the_others_ha
 
         def cycle():
             for publisher in publishers:
-                publisher.put_estimate(make_estimate(0), 0)
+                put_estimate(publisher, make_estimate(0), 0)
             while (sample := ring.try_recv()) is not None:
                 seen[str(sample.key_expr)] = sample.express
             return len(seen) == 2

@@ -10,7 +10,7 @@ import xxhash
 import zenoh
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from zenoh.ext import Int64, z_serialize
-from zenohkit import free_endpoint, make_external, make_joint, ready, script, until
+from zenohkit import Cycle, free_endpoint, make_external, make_joint, ready, script, until
 
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.ros2 import (
@@ -136,7 +136,7 @@ def test_stiffness_comes_with_stamp_and_validity_in_the_message_of_ros2_control(
 @pytest.mark.parametrize(("status", "valid"), [(Status.VALID, 1.0), (Status.OBSERVABLE, 0.0)])
 def test_a_stiffness_says_of_which_moment_it_is_and_whether_it_is_valid(ros2, status, valid):
     publisher, client = ros2()
-    put = lambda: publisher.put_cycle(estimate(status=status), sample(), STAMP_NS)  # noqa: E731
+    put = lambda: publisher.put_cycle(Cycle(estimate(status=status), sample(), stamp_ns=STAMP_NS))  # noqa: E731
     key = f"0/dynamic_joint_states/{DYNAMIC}/{TYPE_HASHES[DYNAMIC]}"
     message = STORE.deserialize_cdr(
         receive(client, key, put).payload.to_bytes(), "control_msgs/msg/DynamicJointState"
@@ -154,7 +154,7 @@ def test_a_stiffness_says_of_which_moment_it_is_and_whether_it_is_valid(ros2, st
 
 def test_a_cycle_arrives_where_a_ros_node_listens(ros2):
     publisher, client = ros2()
-    put = lambda: publisher.put_cycle(estimate(), sample(), STAMP_NS)  # noqa: E731
+    put = lambda: publisher.put_cycle(Cycle(estimate(), sample(), stamp_ns=STAMP_NS))  # noqa: E731
     state = receive(client, f"0/joint_states/{STATE}/{TYPE_HASHES[STATE]}", put)
     message = STORE.deserialize_cdr(state.payload.to_bytes(), "sensor_msgs/msg/JointState")
     assert message.name == ["elbow"]
@@ -186,8 +186,7 @@ def test_the_external_torque_is_a_stamped_wrench_about_z_where_it_is_valid(ros2)
     subscriber = client.declare_subscriber(key, zenoh.handlers.RingChannel(64))
 
     def put(status=3, stamp_ns=STAMP_NS):
-        publisher.external = make_external(5, status)
-        publisher.put_cycle(estimate(), sample(), stamp_ns)
+        publisher.put_cycle(Cycle(estimate(), sample(), make_external(5, status), stamp_ns))
         return subscriber.try_recv()
 
     message = STORE.deserialize_cdr(until(put).payload.to_bytes(), "geometry_msgs/msg/WrenchStamped")
@@ -241,7 +240,7 @@ def test_two_joints_of_one_session_are_two_nodes(ros2):
 
 def test_the_attachment_carries_sequence_time_and_the_publishers_identity(ros2):
     publisher, client = ros2()
-    put = lambda: publisher.put_cycle(estimate(), sample(), STAMP_NS)  # noqa: E731
+    put = lambda: publisher.put_cycle(Cycle(estimate(), sample(), stamp_ns=STAMP_NS))  # noqa: E731
     message = receive(client, f"0/joint_states/{STATE}/*", put)
     attachment = message.attachment.to_bytes()
     sequence, stamp_ns, length, gid = struct.unpack("<qqB16s", attachment)
@@ -277,7 +276,7 @@ def test_diagnostics_come_once_a_second_with_a_level_that_fits_the_status(ros2):
     ]
     expected += [(Status.VALID | Status.MODEL_ALARM, 1, "model_alarm")]
     for number, (status, level, words) in enumerate(expected, 1):
-        publisher.put_cycle(estimate(status=status), sample(), STAMP_NS)
+        publisher.put_cycle(Cycle(estimate(status=status), sample(), stamp_ns=STAMP_NS))
         for tenth in range(10):
             now_ns = start_ns + number * 10**9 + tenth * 10**8
             publisher.put_status({"state": "running", "latency": {"p99_us": 80.5}}, now_ns)
@@ -298,7 +297,7 @@ def test_diagnostics_come_once_a_second_with_a_level_that_fits_the_status(ros2):
 
 def test_humble_knows_no_type_hashes(ros2):
     publisher, client = ros2('distro = "humble"')
-    put = lambda: publisher.put_cycle(estimate(), sample(), STAMP_NS)  # noqa: E731
+    put = lambda: publisher.put_cycle(Cycle(estimate(), sample(), stamp_ns=STAMP_NS))  # noqa: E731
     assert receive(client, f"0/joint_states/{STATE}/TypeHashNotSupported", put)
 
 
@@ -309,7 +308,7 @@ def test_every_nth_cycle_only_where_that_is_asked(ros2):
 
     def put():
         for sequence in range(1, 41):
-            publisher.put_cycle(estimate(sequence), sample(sequence), sequence)
+            publisher.put_cycle(Cycle(estimate(sequence), sample(sequence), stamp_ns=sequence))
         while (message := subscriber.try_recv()) is not None:
             stamps.add(stamp_of(message))
         return {10, 20, 30, 40} <= stamps
@@ -322,11 +321,13 @@ def test_a_velocity_that_is_not_measured_is_the_filtered_change_of_position(ros2
     """A steady 2 rad/s comes out to the filter's settling, e^-20 after 100 ms."""
     publisher, client = ros2()
     for sequence in range(1, 101):
-        publisher.put_cycle(estimate(sequence), sample(sequence, 0.002 * sequence, float("nan")), STAMP_NS)
+        publisher.put_cycle(
+            Cycle(estimate(sequence), sample(sequence, 0.002 * sequence, float("nan")), stamp_ns=STAMP_NS)
+        )
     subscriber = client.declare_subscriber(f"0/joint_states/{STATE}/*", zenoh.handlers.RingChannel(64))
 
     def last():  # those before it may still be under way
-        publisher.put_cycle(estimate(101), sample(101, 0.202, float("nan")), STAMP_NS)
+        publisher.put_cycle(Cycle(estimate(101), sample(101, 0.202, float("nan")), stamp_ns=STAMP_NS))
         state = subscriber.try_recv()
         message = state and STORE.deserialize_cdr(state.payload.to_bytes(), "sensor_msgs/msg/JointState")
         return message if message and message.position[0] == 0.202 else None
@@ -349,8 +350,7 @@ def test_the_joints_publisher_serves_ros_where_the_joint_file_asks_for_it():
     try:
         publisher = JointPublisher(session, joint)
         subscriber = session.declare_subscriber("0/**", zenoh.handlers.RingChannel(64))
-        publisher.put_estimate(estimate(), STAMP_NS)
-        publisher.put_sample(sample(), STAMP_NS)
+        publisher.put(Cycle(estimate(), sample(), stamp_ns=STAMP_NS))
         publisher.put_status({"state": "running"})
         topics = {str(until(subscriber.try_recv).key_expr).rpartition("/")[0] for _ in range(4)}
         assert topics == {
@@ -411,7 +411,7 @@ def test_when_the_daemon_is_killed_the_example_node_sees_it_and_the_graph_is_emp
 )
 def test_the_example_node_uses_what_is_valid_only(ros2, status, expected):
     publisher, client = ros2()
-    put = lambda: publisher.put_cycle(estimate(status=status), sample(), STAMP_NS)  # noqa: E731
+    put = lambda: publisher.put_cycle(Cycle(estimate(status=status), sample(), stamp_ns=STAMP_NS))  # noqa: E731
     received = receive(client, f"0/dynamic_joint_states/{DYNAMIC}/*", put)
     stiffness = ros2_stiffness.Stiffness("elbow")
     message = STORE.deserialize_cdr(received.payload.to_bytes(), "control_msgs/msg/DynamicJointState")

@@ -8,7 +8,13 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from zenohkit import free_endpoint, make_estimate, make_joint, until
+from zenohkit import (
+    free_endpoint,
+    make_estimate,
+    make_joint,
+    put_estimate,
+    until,
+)
 
 import drivelink
 from drivelink._core import encode_estimate
@@ -71,7 +77,7 @@ def put_until(publisher, condition):
     def step():
         nonlocal sequence
         sequence += 1
-        publisher.put_estimate(make_estimate(sequence), time.time_ns())
+        put_estimate(publisher, make_estimate(sequence), time.time_ns())
         return condition()
 
     return until(step)
@@ -118,7 +124,7 @@ def test_the_controllers_certificate_cannot_play_the_daemon(configure, serve, ki
     config = configure(f"controller-{kind}.json5", ("timeout_ms: 5000", "timeout_ms: 500"))
     with pytest.raises(ZenohError), drivelink.subscribe("elbow", config=config) as joint:
         for sequence in range(1, 50):
-            publisher.put_estimate(make_estimate(sequence), time.time_ns())
+            put_estimate(publisher, make_estimate(sequence), time.time_ns())
             time.sleep(0.01)
         assert not joint.received and joint.status is None and joint.model is None
         raise ZenohError("refused")
@@ -139,7 +145,7 @@ def test_another_server_of_the_plant_cannot_play_the_daemon(configure, serve, ce
             put_until(publisher, lambda: joint.received)
             return
         for sequence in range(1, 100):
-            publisher.put_estimate(make_estimate(sequence), time.time_ns())
+            put_estimate(publisher, make_estimate(sequence), time.time_ns())
             time.sleep(0.01)
         assert not joint.received and joint.state == "waiting" and joint.status is None
 

@@ -7,7 +7,7 @@ import sys
 import time
 from pathlib import Path
 
-from zenohkit import make_estimate, make_external, make_joint, make_sample
+from zenohkit import Cycle, make_estimate, make_external, make_joint, make_sample
 
 from drivelink.errors import DrivelinkError
 from drivelink.pubsub.publisher import JointPublisher
@@ -23,9 +23,8 @@ def main(name: str, endpoint: str, more: str = "", how: str = "") -> None:
     while True:
         sequence += 1
         now_ns = time.time_ns()
-        publisher.put_estimate(make_estimate(sequence), now_ns)
-        publisher.put_external(make_external(sequence, 3 if sequence % 400 >= 200 else 1), now_ns)
-        publisher.put_sample(make_sample(sequence), now_ns)
+        external = make_external(sequence, 3 if sequence % 400 >= 200 else 1)
+        publisher.put(Cycle(make_estimate(sequence), make_sample(sequence), external, now_ns))
         if sequence % 50 == 1:
             publisher.put_status({"state": "running", "cycles": sequence, "residual_nm": 0.003})
         if how == "raise" and sequence == 20:

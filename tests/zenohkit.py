@@ -7,8 +7,10 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from drivelink._core import encode_estimate, encode_external, encode_sample
 from drivelink.jointfile import JointFile, parse
 from estimator.sample import Estimate, External, Sample, Status, TransmissionEstimate
 
@@ -42,6 +44,43 @@ def make_sample(sequence: int) -> Sample:
     return Sample(sequence, (0.5,), (0.0,), (1.5,), 0.25)
 
 
+@dataclass(frozen=True)
+class Cycle:
+    """A tick made by hand, with more transmissions than a joint has if need be."""
+
+    estimate: Estimate
+    sample: Sample | None = None
+    external: External | None = None
+    stamp_ns: int = 0
+
+    def flagged(self, status: int) -> "Cycle":
+        return replace(self, estimate=self.estimate._replace(status=self.estimate.status | status))
+
+    @property
+    def estimate_payload(self) -> bytes:
+        return encode_estimate(self.estimate, self.stamp_ns)
+
+    @property
+    def sample_payload(self) -> bytes | None:
+        return self.sample and encode_sample(self.sample, self.stamp_ns)
+
+    @property
+    def external_payload(self) -> bytes | None:
+        return self.external and encode_external(self.external, self.stamp_ns)
+
+
+def put_estimate(publisher, estimate: Estimate, stamp_ns: int) -> None:
+    publisher.put(Cycle(estimate, stamp_ns=stamp_ns))
+
+
+def put_external(publisher, external: External, stamp_ns: int) -> None:
+    publisher._external.put(encode_external(external, stamp_ns))
+
+
+def put_sample(publisher, sample: Sample, stamp_ns: int) -> None:
+    publisher._sample.put(encode_sample(sample, stamp_ns))
+
+
 def until(condition, limit_s: float = LIMIT_S):
     """Wait until the condition holds and return what it gave; fail after a generous limit."""
     deadline = time.monotonic() + limit_s
@@ -72,7 +111,7 @@ def script(*args: str, name: str = "zenoh_daemon.py"):
 def connected(publisher, joint) -> None:
     """Wait until a joint's publisher knows of this subscription: from then on nothing is lost."""
     until(lambda: joint.model is not None)
-    until(lambda: publisher._estimate.matching_status.matching)
+    until(lambda: publisher.subscribed)
 
 
 def ready(process: subprocess.Popen) -> None:

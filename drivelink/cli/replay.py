@@ -8,9 +8,6 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
-
-import zenoh
 
 from drivelink.cli import add_map
 from drivelink.cli.gating import warn
@@ -170,17 +167,10 @@ def _publication(
         stack.callback(close_session, session)
         publisher = JointPublisher(session, joint, lossless=speed is None)
         stack.callback(publisher.close)
-        _await_subscriber(session, f"{publisher.key}/estimate")
+        end = time.monotonic() + _SUBSCRIBER_S
+        while not publisher.subscribed and time.monotonic() < end:
+            time.sleep(0.01)  # a subscriber that is connecting receives the beginning
     about = {"joint": joint.name, "recording": args.file.name, "period_s": playback.period_s}
     publication = Publication(publisher, speed, about)
     stack.callback(publication.close)
     return publication
-
-
-def _await_subscriber(session: zenoh.Session, key: str) -> None:
-    """Wait briefly for a subscriber that is connecting, so that it receives the beginning."""
-    publisher: Any = session.declare_publisher(key)
-    end = time.monotonic() + _SUBSCRIBER_S
-    while not publisher.matching_status.matching and time.monotonic() < end:
-        time.sleep(0.01)
-    publisher.undeclare()

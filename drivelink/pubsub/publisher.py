@@ -1,11 +1,11 @@
 """Publishes one joint on zenoh.
 
-The 1 kHz keys are plain publishers that drop rather than wait: the estimate with real-time priority, the
-sample in a separate queue. `status`, `model` and `finding` are latched: an advanced subscriber with history
-and a query get the last one at once; `schema` is answered by query. Of the joints of one daemon only the last
-one's messages are express: they flush the queues, so that a cycle of many joints leaves in one batch. Nothing
-else is received: no key changes what the daemon does. Queries wait in zenoh until they are answered in the
-slack, a few at a time; of a flood the oldest are dropped.
+The 1 kHz keys are plain publishers that put nothing while nobody subscribes, and drop rather than wait: the
+estimate with real-time priority, the sample in a separate queue. `status`, `model` and `finding` are latched:
+an advanced subscriber with history and a query get the last one at once; `schema` is answered by query. Of
+the joints of one daemon only the last one's messages are express: they flush the queues, so that a cycle of
+many joints leaves in one batch. Nothing else is received: no key changes what the daemon does. Queries wait
+in zenoh until they are answered in the slack, a few at a time; of a flood the oldest are dropped.
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ from typing import TYPE_CHECKING, Any
 import zenoh
 import zenoh.ext
 
-from drivelink._core import Tick, encode_estimate, encode_external, encode_sample
+from drivelink._core import Tick
 from drivelink.canopen.layout import NodeLayout, layout_document
 from drivelink.errors import ZenohError
 from drivelink.jointfile import JointFile, MotorSection
 from drivelink.pubsub.session import one_line
+from drivelink.pubsub.stream import Stream
 from drivelink.pubsub.wire import ESTIMATE, EXTERNAL, EXTERNAL_BITS, SAMPLE, STATUS_BITS
 from drivelink.version import __version__
 from estimator.model import Effect
-from estimator.sample import Estimate, External, ExternalStatus, Sample, Status
+from estimator.sample import ExternalStatus, Status
 from estimator.transmissions import RIGID
 
 if TYPE_CHECKING:
@@ -84,63 +85,24 @@ class JointPublisher:
         except ZenohError:
             self.close()
             raise
-        # the writing session; the message carries its sequence number
-        self._estimate_source = zenoh.SourceInfo(self._estimate.id, 0)
-        self._external_source = zenoh.SourceInfo(self._external.id, 0)
-        self._sample_source = zenoh.SourceInfo(self._sample.id, 0)
+
+    @property
+    def subscribed(self) -> bool:
+        """Whether anybody subscribes to the estimate."""
+        return self._estimate.wanted
 
     def put(self, tick: Tick) -> None:
-        """Publish one cycle: estimate, external torque, sample; never waits for a subscriber."""
+        """Publish one cycle to its subscribers: estimate, external torque, sample; never waits for them."""
         if self._partial:
             tick = tick.flagged(_PARTIAL)
-        self._estimate.put(tick.estimate_payload, source_info=self._estimate_source)
-        payload = tick.external_payload
-        if payload is not None:
-            self._external.put(payload, source_info=self._external_source)
-        payload = tick.sample_payload
-        if payload is not None:
-            self._sample.put(payload, source_info=self._sample_source)
+        if self._estimate.wanted:
+            self._estimate.put(tick.estimate_payload)
+        if self._external.wanted and (payload := tick.external_payload) is not None:
+            self._external.put(payload)
+        if self._sample.wanted and (payload := tick.sample_payload) is not None:
+            self._sample.put(payload)
         if self._ros2 is not None:
-            self._ros2.latest, self._ros2.external = tick.estimate, tick.external
-            sample = tick.sample
-            if sample is not None:
-                self._ros2.put_cycle(self._ros2.latest, sample, tick.stamp_ns)
-
-    def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
-        """Publish the estimate of one cycle; never waits for a subscriber.
-
-        Args:
-            estimate: of this cycle.
-            stamp_ns: UNIX time of its SYNC, ns.
-        """
-        if self._partial:
-            estimate = estimate._replace(status=int(estimate.status) | _PARTIAL)
-        self._estimate.put(encode_estimate(estimate, stamp_ns), source_info=self._estimate_source)
-        if self._ros2 is not None:
-            self._ros2.latest = estimate
-
-    def put_external(self, external: External, stamp_ns: int) -> None:
-        """Publish the external torque of one cycle; never waits for a subscriber.
-
-        Args:
-            external: of this cycle.
-            stamp_ns: UNIX time of its SYNC, ns.
-        """
-        self._external.put(encode_external(external, stamp_ns), source_info=self._external_source)
-        if self._ros2 is not None:
-            self._ros2.external = external
-
-    def put_sample(self, sample: Sample, stamp_ns: int) -> None:
-        """Publish the sample of one cycle; never waits for a subscriber.
-
-        Args:
-            sample: of this cycle.
-            stamp_ns: UNIX time of its SYNC, ns.
-        """
-        self._sample.put(encode_sample(sample, stamp_ns), source_info=self._sample_source)
-        ros2 = self._ros2
-        if ros2 is not None and ros2.latest is not None:
-            ros2.put_cycle(ros2.latest, sample, stamp_ns)
+            self._ros2.put_cycle(tick)
 
     def put_status(self, status: Mapping[str, Any]) -> None:
         """Publish the daemon's status; non-finite values become null."""
@@ -208,7 +170,7 @@ class JointPublisher:
     def _alive(self, key: str) -> None:
         self._entities.append(self._session.liveliness().declare_token(key))
 
-    def _stream(self, name: str, schema_name: str, priority: zenoh.Priority) -> zenoh.Publisher:
+    def _stream(self, name: str, schema_name: str, priority: zenoh.Priority) -> Stream:
         publisher = self._session.declare_publisher(
             f"{self.key}/{name}",
             encoding=zenoh.Encoding.ZENOH_SERIALIZED.with_schema(schema_name),
@@ -217,7 +179,7 @@ class JointPublisher:
             express=self._express,
         )
         self._entities.append(publisher)
-        return publisher
+        return Stream(publisher)
 
     def _latch(self, name: str) -> zenoh.ext.AdvancedPublisher:
         publisher = zenoh.ext.declare_advanced_publisher(

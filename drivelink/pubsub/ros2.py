@@ -16,11 +16,13 @@ from typing import Any
 import xxhash
 import zenoh
 
+from drivelink._core import Tick
 from drivelink.errors import ZenohError
 from drivelink.jointfile import JointFile, Ros2Section
 from drivelink.pubsub.session import one_line
+from drivelink.pubsub.stream import Stream
 from drivelink.pubsub.wire import EXTERNAL_COLUMNS
-from estimator.sample import Estimate, External, ExternalStatus, Sample, Status
+from estimator.sample import Estimate, External, ExternalStatus, Status
 
 TYPE_HASHES = {
     "sensor_msgs::msg::dds_::JointState_": (
@@ -184,15 +186,20 @@ class _Topic:
         token = node.publisher_token(f"{_mangle(topic)}/{kind}/{type_hash}/{_QOS}")
         self._gid = xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
         self._sequence = 0
-        self._publisher = session.declare_publisher(
+        publisher = session.declare_publisher(
             key, congestion_control=zenoh.CongestionControl.DROP, express=True
         )
-        self.entities = (self._publisher, session.liveliness().declare_token(token))
+        self._stream = Stream(publisher)
+        self.entities = (publisher, session.liveliness().declare_token(token))
+
+    @property
+    def wanted(self) -> bool:
+        """Whether there is a subscriber."""
+        return self._stream.wanted
 
     def put(self, payload: bytes, stamp_ns: int) -> None:
         self._sequence += 1
-        attachment = _ATTACHMENT.pack(self._sequence, stamp_ns, 16, self._gid)
-        self._publisher.put(payload, attachment=attachment)
+        self._stream.put(payload, _ATTACHMENT.pack(self._sequence, stamp_ns, 16, self._gid))
 
 
 class _Node:
@@ -231,7 +238,6 @@ class Ros2Publisher:
 
     Attributes:
         latest: the newest estimate, for diagnostics.
-        external: external torque of the cycle to be published next, or None.
         finding: what the newest diagnosis found, or empty.
 
     Raises:
@@ -272,49 +278,40 @@ class Ros2Publisher:
         self._before: tuple[int, float] | None = None
         self._reported_ns: int | None = None
         self.latest: Estimate | None = None
-        self.external: External | None = None
         self.finding: Mapping[str, Any] = {}
 
-    def put_cycle(self, estimate: Estimate, sample: Sample, stamp_ns: int) -> None:
-        """Publish one cycle; cheap enough for the loop.
-
-        Args:
-            estimate: of this cycle.
-            sample: of the same cycle.
-            stamp_ns: UNIX time of its SYNC, ns.
-        """
+    def put_cycle(self, tick: Tick) -> None:
+        """Publish one cycle, to topics with a subscriber; cheap enough for the loop."""
+        estimate = self.latest = tick.estimate
+        sample, stamp_ns = tick.sample, tick.stamp_ns
+        if sample is None:
+            return
         position = sample.link_position_rad
         if position != position:  # NaN: the transmission is rigid
             position = sample.motor_position_rad[0]
         velocity = self._velocity(sample.sequence, position, sample.link_velocity_rad_s)
-        self.latest = estimate
         if estimate.sequence % self._every:
             return
         second, ns = divmod(stamp_ns, _NS)
-        effort = estimate.flexibility_torque_nm
-        self._states.put(self._pack_state(second, ns, position, velocity, effort), stamp_ns)
-        values = [*estimate[2:5], *(float(bool(estimate.status & bit)) for _, bit in _FLAGS)]
-        for transmission in estimate.transmissions:
-            values += transmission[:3]
-        if self._wrench is not None:
-            values += self._touch(second, ns, stamp_ns)
-        packed = self._pack_dynamic[len(estimate.transmissions)](second, ns, *values)
-        self._dynamic.put(packed, stamp_ns)
-        pairs = [estimate.stiffness_nm_rad, estimate.stiffness_std_nm_rad]
-        for transmission in estimate.transmissions:
-            pairs += transmission[1:3]
-        self._stiffness.put(self._pack_stiffness[len(estimate.transmissions)](*pairs), stamp_ns)
-
-    def _touch(self, second: int, ns: int, stamp_ns: int) -> tuple[float, ...]:
-        """Publish the wrench if valid; return the values of the external torque's interfaces."""
-        touch = self.external
-        if touch is None or self._wrench is None:
-            return (math.nan, math.nan, 0.0, 0.0)
-        valid = bool(touch.status & ExternalStatus.VALID)
-        if valid:
-            self._wrench.put(self._pack_wrench(second, ns, touch.external_torque_nm), stamp_ns)
-        contact = bool(touch.status & ExternalStatus.CONTACT)
-        return (touch.external_torque_nm, touch.external_torque_std_nm, float(valid), float(contact))
+        if self._states.wanted:
+            effort = estimate.flexibility_torque_nm
+            self._states.put(self._pack_state(second, ns, position, velocity, effort), stamp_ns)
+        touch = _touch(tick.external)
+        if self._wrench is not None and self._wrench.wanted and touch[2]:  # valid
+            self._wrench.put(self._pack_wrench(second, ns, touch[0]), stamp_ns)
+        if self._dynamic.wanted:
+            values = [*estimate[2:5], *(float(bool(estimate.status & bit)) for _, bit in _FLAGS)]
+            for transmission in estimate.transmissions:
+                values += transmission[:3]
+            if self._wrench is not None:
+                values += touch
+            packed = self._pack_dynamic[len(estimate.transmissions)](second, ns, *values)
+            self._dynamic.put(packed, stamp_ns)
+        if self._stiffness.wanted:
+            pairs = [estimate.stiffness_nm_rad, estimate.stiffness_std_nm_rad]
+            for transmission in estimate.transmissions:
+                pairs += transmission[1:3]
+            self._stiffness.put(self._pack_stiffness[len(estimate.transmissions)](*pairs), stamp_ns)
 
     def put_status(self, status: Mapping[str, Any], stamp_ns: int) -> None:
         """Publish diagnostics, at most once a second.
@@ -352,6 +349,14 @@ class Ros2Publisher:
             change = (position - before[1]) / step_s - self._velocity_rad_s
             self._velocity_rad_s += share * change if math.isfinite(change) else 0.0
         return self._velocity_rad_s
+
+
+def _touch(external: External | None) -> tuple[float, ...]:
+    """The values of the external torque's interfaces."""
+    if external is None:
+        return (math.nan, math.nan, 0.0, 0.0)
+    valid, contact = (bool(external.status & bit) for bit in (ExternalStatus.VALID, ExternalStatus.CONTACT))
+    return (external.external_torque_nm, external.external_torque_std_nm, float(valid), float(contact))
 
 
 def _mangle(name: str) -> str:

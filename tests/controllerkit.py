@@ -128,9 +128,7 @@ class Rig:
             self._count += 1
             if samples:
                 cycle = Cycle(estimates[-1], samples[-1], self.external)
-        torques = self.controller.step(
-            self.now_s, cycle, enabled=self.master.enabled, faulted=self.master.faulted
-        )
+        torques = self.controller.step(self.now_s, cycle, **self.master.states)
         self.master.command(torques, self.now_s)
         if self.now_s - self.last_estimate_s < 0.01 and torques == (0.0, 0.0):
             self.master.set_up(self.now_s)

@@ -93,7 +93,7 @@ def test_a_drive_is_set_up_enabled_and_commanded_and_only_by_the_controllers_own
     with bench() as b:
         tpdos = [b.number(0x1800 + n, s) for n in range(4) for s in (1, 2)]
         b.run(100, 0.02)
-        assert b.master.enabled
+        assert b.master.states["enabled"]
         assert b.number(0x6061) == 10  # cyclic synchronous torque
         assert b.number(0x6071) == -100  # 0.02 N·m of 0.2 mN·m each, against the joint's sign
         assert b.number(0x1402, 2) == 255
@@ -111,7 +111,7 @@ def test_mapping_that_is_there_already_is_not_written():
         b.sent.clear()
         b.master = b.made()
         b.run(100)
-        assert b.master.enabled
+        assert b.master.states["enabled"]
         assert not b.written() & {0x1402, 0x1602}
 
 
@@ -127,10 +127,10 @@ def test_a_fault_ends_the_torque_and_is_reset_by_edges_and_not_for_ever():
         b.sent.clear()
         b.drive.fault(0x2310)
         b.run(20, 0.02)
-        assert b.master.faulted
+        assert b.master.states["faulted"]
         assert not any(b.torques()[2:])
         b.run(400)
-        assert b.master.enabled
+        assert b.master.states["enabled"]
         b.sent.clear()
         for _ in range(900):  # it comes back at once
             if b.drive.machine.state.name != "FAULT":
@@ -146,10 +146,10 @@ def test_a_reboot_is_noticed_and_everything_done_again():
         b.run(100, 0.02)
         b.drive.reset_node()
         b.run(2)
-        assert not b.master.enabled
+        assert not b.master.states["enabled"]
         b.put(0x000, b"\x01\x05")
         b.run(1200, 0.02)
-        assert b.master.enabled
+        assert b.master.states["enabled"]
         assert b.number(0x6071) == -100
 
 

@@ -127,7 +127,7 @@ def moving(**settings) -> tuple[Controller, list]:
 
 
 def test_no_torque_before_estimates_and_drives_are_there():
-    controller = Controller(jointfile.parse(kit.declared_text()))
+    controller = Controller(jointfile.parse(kit.declared_text()), Settings())
     assert controller.step(10.0, None, enabled=True, faulted=False) == NO_TORQUE
     for k in range(400):
         cycle = Cycle(estimate(k), sample(k))
@@ -240,7 +240,7 @@ def test_the_process_ends_the_torque_a_deadline_and_a_look_after_the_last_estima
         return SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: data))
 
     master = SimpleNamespace(
-        enabled=True, faulted=False, set_up=lambda _: None, release=lambda: None,
+        states={"enabled": True, "faulted": False}, set_up=lambda _: None, release=lambda: None,
         command=lambda torques, now_s: sent.append((now_s, torques)),
     )  # fmt: skip
     monkeypatch.setattr(time, "monotonic", lambda: clock.now_s)

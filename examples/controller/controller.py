@@ -16,6 +16,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from scipy.optimize import root
+
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from estimator.errors import EstimatorError
@@ -68,26 +70,22 @@ class Cycle(NamedTuple):
 class Controller:
     """Moves the joint to its targets, and takes the torque away whenever anything is in doubt.
 
-    Attributes:
-        phase: "waiting" for estimates and drives, "identify" (open loop, for the daemon), "run", "react" to a
-            contact, "safe" (no torque, because of a fault).
-        report: called with (phase, reason, seconds since the last fresh estimate) at each change.
+    `phase` is "waiting" for estimates and drives, "identify" (open loop), "run", "react" to a contact or
+    "safe" (no torque, because of a fault); `report(phase, reason, age of the last estimate)` is called at
+    each change.
     """
 
     def __init__(
         self,
         joint: JointFile,
-        settings: Settings | None = None,
+        settings: Settings,
         report: Callable[[str, str, float], None] = lambda *_: None,
     ) -> None:
-        self.phase, self.report, self.settings = "waiting", report, settings or Settings()
+        self.phase, self.report, self.settings = "waiting", report, settings
         self._gravity_nm = joint.link.dynamics.gravity_nm if joint.link.dynamics else 0.0
-        self._T = joint.bus.period_s
-        self._springs: tuple[Spring, ...] = ()
-        self._phi = (0.5, -0.5)  # the last solution
+        self._T, self._springs, self._phi = joint.bus.period_s, (), (0.5, -0.5)  # the last solution
         self._fresh_s = self._usable_s = self._fault_s = self._contact_s = -math.inf
-        self._begin_s, self._target = 0.0, 0
-        self._way = ((0.0, 0.6), (0.0, 0.6))  # from, to: (q, sigma)
+        self._begin_s, self._target, self._way = 0.0, 0, ((0.0, 0.6), (0.0, 0.6))  # from, to: (q, sigma)
         self._cycle: Cycle | None = None
         self._rates = [0.0, 0.0, 0.0]  # of theta_1, theta_2, q
         self._doubtful = self._known = False
@@ -100,14 +98,7 @@ class Controller:
                 self._springs = tuple(_spring(t["model"], t["parameters"]) for t in transmissions)
 
     def step(self, now_s: float, cycle: Cycle | None, *, enabled: bool, faulted: bool) -> tuple[float, float]:
-        """Give the torques of the motors, N·m.
-
-        Args:
-            now_s: monotonic time.
-            cycle: what arrived since the last call; None: nothing.
-            enabled: all drives follow torque commands.
-            faulted: a drive reports a fault.
-        """
+        """Give the torques of the motors, N·m; `cycle`: what arrived since the last call, if anything."""
         if cycle is not None:
             self._take(cycle, now_s)
         fault = self._fault(now_s, enabled, faulted)
@@ -214,13 +205,12 @@ class Controller:
         x = min(1.0, elapsed_s / seconds)
         share = x * x * x * (10.0 - 15.0 * x + 6.0 * x * x)  # rest to rest
         q_d, sigma_d = (a + share * (b - a) for a, b in zip(*self._way, strict=True))
-        one, two, q = _positions(self._cycle.sample)
+        *thetas, q = _positions(self._cycle.sample)
         self._phi = deflections(self._springs, -self._gravity_nm * math.sin(q), sigma_d, self._phi)
+        each = zip(self._springs, self._phi, thetas, self._rates, strict=False)
         first, second = (
             KP_NM_RAD * (q_d - phi - theta) - KD_NM_S_RAD * rate - spring(phi)[0]
-            for spring, phi, theta, rate in zip(
-                self._springs, self._phi, (one, two), self._rates, strict=False
-            )
+            for spring, phi, theta, rate in each
         )
         return first, second
 
@@ -238,22 +228,14 @@ def _spring(model: str, parameters: Mapping[str, Any]) -> Spring:
 def deflections(
     springs: tuple[Spring, ...], torque_nm: float, sigma_nm_rad: float, start: tuple[float, float]
 ) -> tuple[float, float]:
-    """Solve for the deflections with this total torque and stiffness, by Newton's method.
+    """Solve for the deflections with this total torque and stiffness; the nearest where there are none."""
 
-    Where there are none (less stiffness than the springs have at rest) the nearest found are returned.
-    """
-    (first, second), (x, y), h = springs, start, 1e-5
-    for _ in range(30):
-        (a, sa), (b, sb) = first(x), second(y)
-        e, f = torque_nm - a - b, sigma_nm_rad - sa - sb
-        da, db = ((law(at + h)[1] - law(at - h)[1]) / (2.0 * h) for law, at in ((first, x), (second, y)))
-        determinant = sa * db - sb * da
-        if abs(e) + abs(f) < 1e-8 or abs(determinant) < 1e-12:
-            break
-        dx, dy = (e * db - sb * f) / determinant, (sa * f - da * e) / determinant
-        shrink = min(1.0, 0.2 / max(abs(dx), abs(dy), 1e-12))
-        x, y = (max(-1.1, min(1.1, at + shrink * d)) for at, d in ((x, dx), (y, dy)))
-    return x, y
+    def left(phi: Sequence[float]) -> list[float]:
+        (torque, sigma), (other, more) = (law(x) for law, x in zip(springs, phi, strict=True))
+        return [torque + other - torque_nm, sigma + more - sigma_nm_rad]
+
+    one, two = root(left, start, tol=1e-8).x.clip(-1.1, 1.1)
+    return float(one), float(two)
 
 
 def identification(time_s: float, *, small: bool) -> tuple[float, float]:
@@ -261,14 +243,12 @@ def identification(time_s: float, *, small: bool) -> tuple[float, float]:
 
     Unknown springs begin with four seconds of little pretension: they are identified near the middle first.
     """
-    wide = 0.06 + 0.07 * (1.0 - math.cos(0.5 * math.pi * time_s))
     grown = min(1.0, max(0.0, 0.5 * (time_s - 4.0))) if small else 1.0
-    pretension = 0.04 + grown * (wide - 0.04)
+    pretension = 0.04 + grown * (0.02 + 0.07 * (1.0 - math.cos(0.5 * math.pi * time_s)))
+    fade, hz = min(1.0, 2.0 * time_s), (0.7, 1.3, 2.1, 3.4, 5.0)
 
-    def tones(shift: float, phase: float) -> float:
-        hz = (0.7, 1.3, 2.1, 3.4, 5.0)  # Schroeder's phases keep the peaks of the sum low
+    def tones(shift: float, phase: float) -> float:  # Schroeder's phases keep the peaks of the sum low
         angles = (math.tau * shift * f * time_s + phase - math.pi * k * k / 5 for k, f in enumerate(hz))
         return 0.04 * sum(map(math.sin, angles))
 
-    fade = min(1.0, 2.0 * time_s)
     return fade * (tones(1.0, 0.0) - pretension), fade * (tones(1.07, 1.0) + pretension)

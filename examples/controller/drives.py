@@ -27,13 +27,7 @@ ONWARD = {0x40: 0x06, 0x21: 0x07, 0x23: 0x0F, ENABLED: 0x0F}
 
 
 class Drive:
-    """One drive.
-
-    Attributes:
-        ready: it is set up; a reboot undoes that.
-        state: bits of its last statusword, None: unknown.
-        fault_code: of its last EMCY, 0: none.
-    """
+    """One drive: `ready` once it is set up, `state` of its last statusword, `fault_code` of its last EMCY."""
 
     def __init__(
         self, network: canopen.Network, joint: JointFile, motor: int, limit_nm: float, watch_s: float
@@ -47,13 +41,8 @@ class Drive:
         self._node = network.add_node(self.node_id, canopen.ObjectDictionary())
         self._node.emcy.add_callback(lambda error: setattr(self, "fault_code", error.code))
         self._node.nmt.add_heartbeat_callback(lambda state: self.forget() if state == 0 else None)
-        self.cob_id, self._edge_s, self._edge, self._resets = (
-            0x100 + 0x100 * RPDO + self.node_id,
-            0.0,
-            False,
-            0,
-        )
-        self._status_at, self.unit_nm = 0, math.nan
+        self.cob_id, self._status_at, self.unit_nm = 0x100 + 0x100 * RPDO + self.node_id, 0, math.nan
+        self._edge_s, self._edge, self._resets = 0.0, False, 0
         self.forget()
 
     def forget(self) -> None:
@@ -71,11 +60,7 @@ class Drive:
         return bool(self.fault_code) or self.state in (FAULT, FAULT_REACTION)
 
     def set_up(self) -> None:
-        """Write what this controller needs of the drive.
-
-        Raises:
-            SdoError: an object is refused, or nobody answers.
-        """
+        """Write what this controller needs of the drive; raises SdoError."""
         self.unit_nm = self._read(0x6076) * 1e-6 * self._gear  # of one per mille, at the joint
         self._map()
         self._write(0x6072, 0, "<H", min(0xFFFF, math.floor(self.limit_nm / self.unit_nm + 1e-6)))
@@ -161,14 +146,10 @@ class Master:
         self._beat_s = self._try_s = -math.inf
 
     @property
-    def enabled(self) -> bool:
-        """Whether every drive follows torque commands."""
-        return all(drive.enabled for drive in self.drives)
-
-    @property
-    def faulted(self) -> bool:
-        """Whether any drive reports a fault."""
-        return any(drive.faulted for drive in self.drives)
+    def states(self) -> dict[str, bool]:
+        """Whether all drives follow torque commands, and whether any reports a fault."""
+        enabled, faulted = all(d.enabled for d in self.drives), any(d.faulted for d in self.drives)
+        return {"enabled": enabled, "faulted": faulted}
 
     def set_up(self, now_s: float) -> None:
         """Set up one drive that is not ready, at most one try in a second; blocks for its SDO transfers."""

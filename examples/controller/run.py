@@ -66,7 +66,7 @@ class Process:
         cycle = None
         if estimate is not None and self._sample is not None:
             cycle = Cycle(estimate, self._sample, self.estimates.external, age_s)
-        torques = self.controller.step(now_s, cycle, enabled=self.master.enabled, faulted=self.master.faulted)
+        torques = self.controller.step(now_s, cycle, **self.master.states)
         with suppress(can.CanError, OSError):  # without a bus estimates get stale, which ends the torque
             self.master.command(torques, now_s)
             if age_s < BUSY_S and torques == NO_TORQUE:

@@ -133,17 +133,19 @@ def judged(stiffness, std, truth, usable) -> scene.Row:
 def run(model: JointModel, record: Record, truth: np.ndarray, mode: str) -> scene.Row:
     """Run the on-line estimator over a recording: as `judged`, alarms, effects named and after how long."""
     estimator = make_estimator(model, EstimatorSettings(mode=mode), T)
-    out, after = np.empty((len(record), 5)), np.nan
+    out, after, named = np.empty((len(record), 5)), np.nan, set()
     for k, sample in enumerate(record.samples()):
         out[k] = estimator.step(sample)[:5]
-        if k % 250 == 0 and np.isnan(after) and estimator.core.undeclared(0):
-            after = k * T
+        if k % 250 == 0 and (names := estimator.core.undeclared(0)):
+            named.update(names)
+            after = k * T if np.isnan(after) else after
     status = out[:, 1].astype(int)
     changed = (status & int(Status.CHANGED)) > 0
     return {
         **judged(out[:, 3], out[:, 4], truth, status & USABLE == USABLE),
         "false_alarms": int(np.sum(changed[1:] & ~changed[:-1])),
-        "names": tuple(estimator.core.undeclared(0)),
+        "names": sorted(estimator.core.undeclared(0)),
+        "meanwhile": sorted(named - set(estimator.core.undeclared(0))),
         "named_after_s": after,
     }
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import codecs
 import logging
+import sys
 import unicodedata
 
 MAX_TEXT = 4096  # characters of one text
@@ -27,6 +29,29 @@ def _shown(character: str) -> str:
     if character in "\t\n\r":
         return " "
     return "" if unicodedata.category(character) in _UNSHOWABLE else character
+
+
+# What stands for a character where the terminal's encoding lacks it; others become "?".
+_SPELT = {
+    "±": "+/-", "·": "*", "×": "x", "µ": "u", "−": "-", "–": "-", "→": "->", "…": "...", "°": " deg",
+    "φ": "phi", "θ": "theta", "²": "^2", "³": "^3", "≤": "<=", "≥": ">=", "✓": "ok", "✗": "x", "●": "*",
+    "█": "#", "░": ".", "⁻": "^-",
+}  # fmt: skip
+
+
+def _spelt(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    lacking = error.object[error.start : error.end]
+    return "".join(_SPELT.get(character, "?") for character in lacking), error.end
+
+
+def spell_out() -> None:
+    """Have stdout and stderr spell the characters that their encoding lacks: a C locale, a serial console."""
+    codecs.register_error("drivelink.spelt", _spelt)
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="drivelink.spelt")
 
 
 class PlainFormatter(logging.Formatter):

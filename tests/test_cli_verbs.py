@@ -162,3 +162,25 @@ def test_record_takes_another_bus(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_no_recording_validates_itself(words, capsys):
     assert main(words) == 2
     assert "given twice: expected another recording" in capsys.readouterr().err
+
+
+def test_a_console_without_unicode_gets_the_words_spelt_out(tmp_path: Path) -> None:
+    joint = tmp_path / "j.toml"
+    joint.write_text('name = "j"\n[[motor]]\ninertia_kg_m2 = 0.1\n[motor.transmission]\nmodel = "linear"\n')
+    time_s = np.arange(4000) * 0.002
+    table = np.column_stack((time_s, np.sin(5 * time_s), 3 * np.cos(4 * time_s), 1.01 * np.sin(5 * time_s)))
+    header = "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad"
+    np.savetxt(tmp_path / "r.csv", table, delimiter=",", header=header, comments="")
+    command = [sys.executable, "-m", "drivelink", "fit", str(tmp_path / "r.csv"), "--joint", str(joint)]
+    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert "Traceback" not in done.stderr and "N*m rms left" in done.stdout and done.stdout.isascii()
+
+
+def test_a_model_that_does_not_exist_is_an_error_of_the_joint_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    joint = tmp_path / "j.toml"
+    joint.write_text('name = "j"\n[[motor]]\ninertia_kg_m2 = 0.1\n[motor.transmission]\nmodel = "linaer"\n')
+    assert cli.main(["fit", "r.csv", "--joint", str(joint)]) != 0
+    assert f"{joint}: motor[1]: transmission.model: expected one of linear" in capsys.readouterr().err

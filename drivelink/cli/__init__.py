@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from drivelink.errors import DrivelinkError, UsageError
-from drivelink.plaintext import PlainFormatter, clean_text
+from drivelink.plaintext import PlainFormatter, clean_text, spell_out
 from drivelink.version import __version__
 from estimator.errors import EstimatorError
 
@@ -120,6 +120,7 @@ def main(argv: list[str] | None = None) -> int:
     logging.getLogger("can").setLevel(logging.CRITICAL)
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(PlainFormatter())
+    spell_out()
     # Before numpy is imported: threads do not help on small matrices.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:

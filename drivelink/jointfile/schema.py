@@ -20,7 +20,7 @@ from estimator.model import (
 )
 from estimator.ranges import require_in_range
 from estimator.settings import EstimatorSettings
-from estimator.transmissions import MODELS, transmission_model
+from estimator.transmissions import transmission_model
 
 Direction = Literal[1, -1]
 MOST_EFFECTS = 32  # of a motor or the link: each costs time in every cycle
@@ -158,8 +158,7 @@ class MotorSection(_Section):
 
     @model_validator(mode="after")
     def _parameters_can_be(self) -> MotorSection:
-        if self.transmission.model in MODELS:  # registered models are checked when the estimator is made
-            transmission_model(self.transmission)
+        transmission_model(self.transmission)
         return self
 
     def motor(self) -> Motor:

@@ -139,7 +139,7 @@ def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str,
     fresh = [moment for moment in window if moment.time_s > last]
     residuals = [pair for pair in history.residuals if pair[0] > last]
     newest = fresh[-1].time_s if fresh else last
-    curves = [curve.points() for curve in history.curves]
+    curves, grey = ([c.points() for c in some] for some in (history.curves, history.doubtful))
     touches = [touch for touch in history.touches if last < touch.time_s <= newest]
     if fresh:
         since[view.name] = fresh[-1].time_s
@@ -153,8 +153,8 @@ def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str,
         "residuals": residuals,
         "touches": [_touch(touch) for touch in touches],
         "curves": [_points(points) for points in curves],
-        "doubtful": [_points(curve.points()) for curve in history.doubtful],
-        "model": [_points(points) for points in model_curves(view.model, curves)],
+        "doubtful": [_points(points) for points in grey],
+        "model": [_points(points) for points in model_curves(view.model, curves if any(curves) else grey)],
     }
 
 

@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import can
 import pytest
 
@@ -194,3 +196,10 @@ def test_names_of_devices_cannot_break_the_file():
     found = [FoundNode(node_id=4, device_type=0x00020192, name='x"\n[evil]\x07\x00')]
     joint = jointfile.parse(joint_text(answers_from_bus(Answers(), found)))
     assert joint.motor[0].drive.node_id == 4
+
+
+def test_the_examples_are_copied_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["new", "--examples", str(tmp_path)]) == 0
+    assert (tmp_path / "examples" / "close_the_loop.py").exists()
+    assert main(["new", "--examples", str(tmp_path)]) == 2
+    assert "is there already" in capsys.readouterr().err

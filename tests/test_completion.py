@@ -29,7 +29,9 @@ def test_bash_completes_verbs_options_and_choices(tmp_path: Path, capsys: pytest
     assert complete(script, ["drivelink", "demo", "--case", ""]) >= {"constant", "quadratic", "vsa-ii"}
 
 
-@pytest.mark.parametrize("shell", ["zsh", "tcsh", "fish"])
-def test_other_shells_have_their_script(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["completion", shell]) == 0
+def test_zsh_has_its_script_and_the_manual_page_every_verb(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["completion", "zsh"]) == 0
     assert "replay" in capsys.readouterr().out
+    page = (Path(__file__).parent.parent / "packaging" / "drivelink.1").read_text(encoding="utf-8")
+    for verb, summary in cli.VERBS.items():
+        assert f".B {verb}\n{summary.replace('-', chr(92) + '-')}\n" in page

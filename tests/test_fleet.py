@@ -481,7 +481,6 @@ def test_a_ctrl_c_that_a_finaliser_discards_ends_the_run_all_the_same() -> None:
         ),
         (["fleet", "{recordings}", "--joints", "{joints}", "--memory", "much"], "--memory: expected a size"),
         (["fleet", "{recordings}", "--joints", "{joints}", "--since", "soon"], "--since: expected a date"),
-        (["fleet", "{recordings}", "--joints", "{joints}", "--fdr", "5"], "--fdr: expected a number between"),
         (["fleet", "nosuch://x/*.csv", "--joints", "{joints}"], "nosuch://x/*.csv: cannot be reached"),
         (["fleet", "report"], "fleet report: expected one folder"),
         (["fleet", "report", "nowhere"], "expected a table of `drivelink fleet`"),

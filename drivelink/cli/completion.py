@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 
 import shtab
 
@@ -12,14 +11,12 @@ from drivelink import cli
 EPILOG = """\
 bash:  drivelink completion bash > ~/.local/share/bash-completion/completions/drivelink
 zsh:   drivelink completion zsh > ~/.zfunc/_drivelink      (with ~/.zfunc in fpath)
-tcsh:  drivelink completion tcsh | source /dev/stdin
 """
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("shell", choices=shtab.SUPPORTED_SHELLS, help="the shell")
-    parser.add_argument("--json", action="store_true", help="print shell and script as one JSON object")
+    parser.add_argument("shell", choices=("bash", "zsh"), help="the shell")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -28,8 +25,7 @@ def run(args: argparse.Namespace) -> int:
     for action in parser._subparsers._group_actions:  # type: ignore[union-attr]
         for subparser in action.choices.values():  # type: ignore[union-attr]
             _complete_files(subparser)
-    script = shtab.complete(parser, shell=args.shell)
-    print(json.dumps({"shell": args.shell, "script": script}) if args.json else script)
+    print(shtab.complete(parser, shell=args.shell))
     return 0
 
 

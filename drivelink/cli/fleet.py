@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _NEEDS = ("distributed", "fsspec", "pyarrow")
 _REPORT = "report"
 _WARNINGS = 20  # shown lines about single recordings; the table has all
+_FALSE_SHARE = 0.05  # of all changes that a report names, expected to be chance
 _SPANS = {"d": 1, "w": 7}
 
 EPILOG = """\
@@ -41,7 +42,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.usage = (
         "drivelink fleet [-h] --joints DIR [options] RECORDINGS [RECORDINGS ...]\n"
-        "       drivelink fleet report [--fdr Q] DIR"
+        "       drivelink fleet report DIR"
     )
     parser.add_argument(
         "recordings",
@@ -79,13 +80,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--again", action="store_true", help="repeat recordings that are in the table")
     parser.add_argument(
-        "--fdr",
-        type=float,
-        default=0.05,
-        metavar="Q",
-        help="false discovery rate of the changes (default: 0.05)",
-    )
-    parser.add_argument(
         "--json", action="store_true", help="print the content of fleet.json and nothing else"
     )
 
@@ -97,12 +91,10 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(
             f"fleet needs {', '.join(missing)}: install the extra, pip install 'drivelink-vsa[fleet]'"
         )
-    if not 0.0 < args.fdr < 1.0:
-        raise UsageError(f"--fdr: expected a number between 0 and 1, got {args.fdr:g}")
     if args.recordings[0] == _REPORT and args.joints is None:
         if len(args.recordings) != 2:
             raise UsageError("fleet report: expected one folder of results")
-        _report(args.recordings[1], args.fdr, as_json=args.json)
+        _report(args.recordings[1], as_json=args.json)
         return 0
     return _run(args)
 
@@ -179,7 +171,7 @@ def _run(args: argparse.Namespace) -> int:
         print(f"and {said - _WARNINGS} lines more", file=sys.stderr)
     if not args.json:
         print(_summary(counts))
-    _report(args.out, args.fdr, as_json=args.json)
+    _report(args.out, as_json=args.json)
     return 0
 
 
@@ -195,12 +187,12 @@ def _summary(counts: Counts) -> str:
     return f"{counts.found} recording{'s' * (counts.found != 1)}: {', '.join(parts)}"
 
 
-def _report(folder: str, rate: float, *, as_json: bool) -> None:
+def _report(folder: str, *, as_json: bool) -> None:
     from drivelink.fleet import page, summary, table
     from drivelink.fleet.storage import Store
 
     store = Store(folder)
-    document = summary.summarise(table.read_rows(store, summary.COLUMNS), rate)
+    document = summary.summarise(table.read_rows(store, summary.COLUMNS), _FALSE_SHARE)
     store.write("fleet.json", (json.dumps(document, indent=1) + "\n").encode())
     store.write("fleet.html", page.page(document).encode())
     if as_json:

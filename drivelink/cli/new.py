@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import shutil
 import sys
+import sysconfig
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
@@ -30,6 +32,7 @@ examples:
   drivelink new elbow.toml --rotor-inertia 48 --gear 100 --torque-constant 53
   drivelink new elbow.toml --scan --channel can0      node ids and encoder from what answers on the bus
   drivelink new vsa.toml --case vsa-ii                one of the paper's joints, for `sim` and `run`
+  drivelink new --examples .                          the examples of the documentation, into ./examples
 """
 
 
@@ -37,6 +40,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("path", nargs="?", type=Path, metavar="PATH", help="default: NAME.toml; -: print it")
     parser.add_argument("--case", choices=_CASES, help="one of the paper's joints, simulated")
+    parser.add_argument("--examples", type=Path, metavar="DIR", help="copy the examples into DIR, no more")
     parser.add_argument("--scan", action="store_true", help="take the nodes from what answers on the bus")
     parser.add_argument("--name", help="name of the joint")
     parser.add_argument("--arrangement", choices=_ARRANGEMENTS, help="how the motors act on the joint")
@@ -71,6 +75,9 @@ def run(args: argparse.Namespace) -> int:
     """Ask for missing answers in a terminal, and write the file."""
     if args.inertia is not None and args.rotor_inertia is not None:
         raise UsageError("expected either --inertia or --rotor-inertia")
+    if args.examples is not None:
+        print(f"{_examples(args.examples)} written")
+        return 0
     text, name, remarks = _case_text(args) if args.case else _new_text(args)
     if str(args.path) == "-":
         print(json.dumps({"joint": name, "text": text}) if args.json else text, end="\n" if args.json else "")
@@ -86,6 +93,23 @@ def run(args: argparse.Namespace) -> int:
         print(remark)
     print(f"{path} written; next: {_next(args, path)}")
     return 0
+
+
+def _examples(folder: Path) -> Path:
+    """Copy the examples that came with the wheel or the checkout; the folder made.
+
+    Raises:
+        UsageError: they are not installed, or the folder is there already.
+    """
+    shipped = Path(sysconfig.get_path("data"), "share", "drivelink", "examples")
+    source = next((p for p in (shipped, Path(__file__).parents[2] / "examples") if p.is_dir()), None)
+    target = folder / "examples"
+    if source is None:
+        raise UsageError("--examples: expected them beside the installation, there are none")
+    if target.exists():
+        raise UsageError(f"--examples: {target} is there already")
+    shutil.copytree(source, target, ignore=shutil.ignore_patterns("target", "__pycache__"))
+    return target
 
 
 def _next(args: argparse.Namespace, path: Path) -> str:

@@ -16,7 +16,7 @@ from pathlib import Path
 from drivelink.cli import ALONE, add_bus
 from drivelink.cycle.realtime import PRIORITY, acquire, release
 from drivelink.demo.simbus import JoinedBus, open_sim_bus, require_free
-from drivelink.demo.simulate import CASE_NAMES, QUIRK_NAMES, assumptions, bench_from_joints
+from drivelink.demo.simulate import CASE_NAMES, assumptions, bench_from_joints
 from drivelink.errors import BusError, UsageError
 from drivelink.jointfile import BusSection, JointFile, load
 
@@ -41,7 +41,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "commas (cogging=0.1,periods_per_rev=12,motor=2); may be repeated",
     )
     parser.add_argument("--case", choices=CASE_NAMES, help="one of the paper's cases as the world")
-    parser.add_argument("--quirks", metavar="NAME", help=f"drives that behave like: {', '.join(QUIRK_NAMES)}")
+    parser.add_argument(
+        "--quirks", metavar="NAME", help="drives that behave like a vendor's, e.g. epos4; see the reference"
+    )
     add_bus(parser)
     parser.add_argument(
         "--seconds", type=float, metavar="S", help="end after S seconds (default: with Ctrl-C)"

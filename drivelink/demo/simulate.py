@@ -24,7 +24,7 @@ from sim.bench import Bench
 from sim.canopen.drive import Cia402Drive, DriveData
 from sim.canopen.encoder import Cia406Encoder, EncoderData
 from sim.canopen.node import Node
-from sim.canopen.profiles import PROFILES, profile
+from sim.canopen.profiles import profile
 from sim.canopen.quirks import Quirks
 from sim.cases import CASES, Case, case
 from sim.effects import PlantEffect, make, parse
@@ -38,7 +38,6 @@ from sim.variation import suitable, typical_torque_nm, with_parameters
 from sim.world import World as World
 
 CASE_NAMES = tuple(CASES)
-QUIRK_NAMES = tuple(PROFILES)
 
 # Springs for a joint file without parameters (as `new` writes), by stiffness at rest.
 _NATURAL_HZ = 5.0  # sqrt(K/B)/(2 pi) of a soft joint

@@ -231,7 +231,7 @@ class Judge:
             [[np.sqrt(np.mean(r[side & problem.used] ** 2)) for side in sides] for r in residuals]
         )
         motor, link = left[1] / np.maximum(left[0], 1e-300)
-        return [f"the motor's balance (eq 5) leaves {motor:.1%} of what it did, the link's (eq 4) {link:.1%}"]
+        return [f"the motor's balance leaves {motor:.1%} of what it did, the link's {link:.1%}"]
 
     def _left(self, found: Fitted) -> float:
         """Relative error of the motors' balances."""

@@ -1,5 +1,6 @@
 //! Print a joint's estimates, gaps counted: `cargo run -- elbow [tcp/127.0.0.1:7447 [COUNT]]`.
 
+use std::io::{self, Write};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use drivelink_wire::Estimate;
@@ -36,7 +37,8 @@ fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
         gaps += last.map_or(0, |last| estimate.sequence.saturating_sub(last + 1));
         last = Some(estimate.sequence);
         let now_ns = SystemTime::now().duration_since(UNIX_EPOCH)?.as_nanos() as i128;
-        println!(
+        let written = writeln!(
+            io::stdout(),
             "{} {:.3} N·m, {:.1} ± {:.1} N·m/rad, valid {}, observable {}, usable {}, {} µs after its SYNC, {} gaps",
             estimate.sequence,
             estimate.flexibility_torque_nm,
@@ -48,6 +50,10 @@ fn main() -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
             (now_ns - i128::from(estimate.stamp_ns)) / 1000,
             gaps
         );
+        match written {
+            Err(error) if error.kind() == io::ErrorKind::BrokenPipe => break, // `| head`
+            other => other?,
+        }
     }
     Ok(())
 }

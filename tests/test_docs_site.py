@@ -17,9 +17,12 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 NEEDED = ("mkdocs", "material", "mkdocstrings", "latex2mathml")
-pytestmark = pytest.mark.skipif(
-    not all(importlib.util.find_spec(name) for name in NEEDED), reason="needs the extra docs"
-)
+pytestmark = [
+    pytest.mark.docs,
+    pytest.mark.skipif(
+        not all(importlib.util.find_spec(name) for name in NEEDED), reason="needs the extra docs"
+    ),
+]
 
 
 @pytest.fixture(scope="module")

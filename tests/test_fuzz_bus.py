@@ -58,6 +58,7 @@ def test_the_real_estimator_comes_out_of_it_with_finite_values() -> None:
 
 def test_after_all_that_a_calm_bus_gives_valid_estimates_again() -> None:
     run = FuzzRun(501)
+    layouts = dict(run.configurator.layouts)
     run.run(20_000)
     run.bus.rate = 0.0
     for node in run.bus.nodes:
@@ -68,4 +69,5 @@ def test_after_all_that_a_calm_bus_gives_valid_estimates_again() -> None:
     for _ in range(1000):
         run.cycle()
     assert run.judge.valid - before == 1000
+    assert dict(run.configurator.layouts) == layouts
     assert run.supervisor.node_status(run.loop.loop_joints[0])["2"]["state"] == "operational"

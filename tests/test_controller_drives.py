@@ -158,4 +158,4 @@ def test_a_drive_that_does_not_answer_is_one_line(capsys):
         b.network.plugged = False
         b.master.drives[0]._node.sdo.RESPONSE_TIMEOUT = 0.01
         b.run(3)
-        assert capsys.readouterr().out == "node 5: No SDO response received\n"
+        assert capsys.readouterr().err == "node 5: No SDO response received\n"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import struct
+import sys
 from collections.abc import Sequence
 from contextlib import suppress
 
@@ -159,7 +160,7 @@ class Master:
                 todo[0].set_up()
             except SdoError as error:
                 self._try_s = now_s + 1.0
-                print(f"node {todo[0].node_id}: {error}", flush=True)
+                print(f"node {todo[0].node_id}: {error}", file=sys.stderr, flush=True)
 
     def command(self, torques_nm: Sequence[float], now_s: float) -> None:
         """Send the heartbeat when it is due, and every drive its controlword and torque."""

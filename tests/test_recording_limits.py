@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-import logging
 import os
-import random
 import resource
 import struct
 import zlib
@@ -18,10 +16,11 @@ import lz4.frame
 import numpy as np
 import pytest
 import zstandard
+from fuzzparsers import JOINT, RECORDINGS, TEXT, frames, read_every_way, write_recording
 
 from drivelink.canopen.eds import load_eds
 from drivelink.errors import DrivelinkError, RecordingError
-from drivelink.jointfile import ZenohSection, load, parse
+from drivelink.jointfile import ZenohSection, load
 from drivelink.recording import read
 from drivelink.recording.canlog import read_frames
 from drivelink.recording.formats import open_sink
@@ -29,28 +28,7 @@ from drivelink.recording.gate import Gathered
 from drivelink.recording.mapping import joint_of, side_file
 from drivelink.recording.mcapfile import read_messages
 from drivelink.recording.playback import open_playback
-from estimator.sample import Sample
 
-TEXT = """\
-name = "elbow"
-[[motor]]
-inertia_kg_m2 = 0.1
-[motor.transmission]
-model = "linear"
-[motor.drive]
-node_id = 1
-counts_per_rev = 65536
-rated_torque_nm = 1.0
-[[motor.drive.tpdo]]
-cob_id = 0x181
-objects = ["0x6064:00:32", "0x60E4:01:32"]
-[[motor.drive.tpdo]]
-cob_id = 0x281
-objects = ["0x6077:00:16"]
-[link.encoder]
-counts_per_rev = 65536
-"""
-JOINT = parse(TEXT)
 HEADER = "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad\n"
 GIB = 1 << 30
 MOST_MIB = 300  # that reading may take; each bomb unpacks to a GiB
@@ -181,17 +159,6 @@ def test_a_gap_of_a_million_seconds_is_replayed_and_not_fitted(tmp_path: Path) -
 # Damage
 
 
-def frames(cycles: int) -> list[tuple[int, int, bytes]]:
-    """(stamp in ns, identifier, data) of SYNC and one drive."""
-    found = []
-    for k in range(cycles):
-        stamp = 1_700_000_000_000_000_000 + k * 1_000_000
-        found.append((stamp, 0x080, b""))
-        found.append((stamp + 200_000, 0x181, struct.pack("<ii", 10 * k, 11 * k)))
-        found.append((stamp + 400_000, 0x281, struct.pack("<h", 100)))
-    return found
-
-
 def log_of(path: Path, wanted: list[tuple[int, int, bytes]]) -> None:
     sink = open_sink(path, JOINT, TEXT)
     for stamp, can_id, data in wanted:
@@ -203,58 +170,9 @@ def log_of(path: Path, wanted: list[tuple[int, int, bytes]]) -> None:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One short recording in every format."""
     folder = tmp_path_factory.mktemp("whole")
-    for suffix in (".mcap", ".csv", ".log", ".blf", ".asc", ".trc"):
-        sink = open_sink(folder / f"r{suffix}", JOINT, TEXT)
-        for k, (stamp, can_id, data) in enumerate(frames(100)):
-            if can_id == 0x080:
-                sink.sample(Sample(k // 3, (0.1 * k,), (0.0,), (1.0,), 0.1 * k), stamp)
-            sink.frame(stamp, can_id, data)
-            if k % 50 == 49:
-                sink.flush()
-        sink.close()
+    for suffix in RECORDINGS:
+        write_recording(folder / f"r{suffix}")
     return folder
-
-
-def taken(path: Path) -> None:
-    """Everything that reads a recording."""
-    for work in (
-        lambda: read(path, JOINT),
-        lambda: sum(1 for _ in open_playback(path, JOINT, path.parent)),
-        lambda: sum(1 for _ in open_playback(path, JOINT, path.parent, frames=True)),
-        lambda: joint_of(path, None),
-    ):
-        try:
-            work()
-        except DrivelinkError as error:
-            assert "\n" not in str(error) and len(str(error)) < 700, str(error)[:900]
-
-
-@pytest.mark.parametrize(("seed", "times"), [(18, 12), pytest.param(19, 50, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("suffix", [".mcap", ".csv", ".log", ".blf", ".asc", ".trc"])
-def test_damaged_recordings_are_read_or_refused_in_one_line(
-    suffix: str, seed: int, times: int, whole: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Bytes flipped, cut, doubled, filled with others: never anything but a line."""
-    caplog.set_level(logging.CRITICAL)
-    good, rng = (whole / f"r{suffix}").read_bytes(), random.Random(seed)
-    path = tmp_path / f"r{suffix}"
-    for _ in range(times):
-        data = bytearray(good)
-        for _ in range(rng.randrange(1, 4)):
-            at = rng.randrange(len(data))
-            kind = rng.randrange(4)
-            if kind == 0:
-                data[at] ^= 1 << rng.randrange(8)
-            elif kind == 1:
-                del data[at:]
-                data += b"\n" * rng.randrange(2)
-            elif kind == 2:
-                data[at:at] = data[rng.randrange(len(data)) :][: rng.randrange(1, 200)]
-            else:
-                data[at : at + 8] = rng.choice([b"\xff" * 8, b"\0" * 8, b"9" * 8, b"-inf,nan"])
-            data = data or bytearray(b"\0")
-        path.write_bytes(data)
-        taken(path)
 
 
 def test_every_bit_of_an_mcap_length_may_be_wrong(whole: Path, tmp_path: Path) -> None:
@@ -312,7 +230,7 @@ def test_messages_of_others_in_an_mcap_file_are_one_line(whole: Path, tmp_path: 
         records = struct.pack("<BQ", 0x04, len(body)) + body
         body = struct.pack("<HIQQ", 1, 0, 0, 0) + text
         path.write_bytes(b"\x89MCAP0\r\n" + records + struct.pack("<BQ", 0x05, len(body)) + body)
-        taken(path)
+        read_every_way(path)
 
 
 def test_a_reader_of_others_reads_our_logs(whole: Path) -> None:

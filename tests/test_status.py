@@ -74,7 +74,7 @@ def test_what_comes_and_goes_is_counted_not_repeated(caplog: pytest.LogCaptureFi
     assert (event["text"], event["count"]) == ("the cable is loose", 500)
     clock[0] = 60.0
     events.begin("flaky", "the cable is loose")
-    assert caplog.records[-1].getMessage() == "the cable is loose (499 more times before)"
+    assert caplog.records[-1].getMessage() == "the cable is loose (logged once for 500 occurrences)"
 
 
 def test_the_same_with_other_figures_is_the_same(caplog: pytest.LogCaptureFixture) -> None:

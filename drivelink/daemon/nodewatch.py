@@ -48,6 +48,7 @@ class WatchedNode:
         self.loop_joint = loop_joint
         self.started = False  # since its last frame
         self.enabled = False  # state of its drive at the last check
+        self.failures = 0  # attempts to configure it since the last success
         self.unasked = 0  # SDO answers without a request, as reported
         self.begin(NodeCounters(), now_ns)
 

@@ -113,5 +113,5 @@ class EventLog:
             self._said.clear()
         event = {"time": now, "text": text, "count": 1}
         self._said[key] = (event, now, 0)
-        self._log(level, f"{text} ({count} more times before)" if count else text, now)
+        self._log(level, f"{text} (logged once for {count + 1} occurrences)" if count else text, now)
         self._recent.append(event)

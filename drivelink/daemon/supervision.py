@@ -34,6 +34,7 @@ _NS = 1_000_000_000
 _BOOT_UP, _STOPPED = 0x00, 0x04  # NMT states
 _SILENT_NS = _NS // 2  # time without a PDO until the node is configured again
 _RETRY_NS = _NS  # between two attempts
+_SOON_NS = _NS // 40  # doubled, up to that, with each attempt that has failed: one SDO abort costs little
 
 
 class Supervisor:
@@ -150,8 +151,10 @@ class Supervisor:
             watched = self._nodes[node]
             watched.attempt_ns = watched.seen_ns = now_ns
             if not isinstance(result, NodeLayout):
+                watched.failures += 1
                 self._events.begin(f"configure {node}", f"node {node} cannot be configured: {result}")
                 continue
+            watched.failures = 0
             self._due[node] = result, self._loop.syncs
 
     def _use_configured(self) -> None:
@@ -247,7 +250,9 @@ class Supervisor:
             self._events.end(f"start {node}", f"node {node} sends its frames")
         lost = now - watched.seen_ns > _SILENT_NS or node in assembler.untrusted
         lost = lost or (watched.state != OPERATIONAL and now - watched.heartbeat_ns < _NS)
-        if lost and not self._configurator.busy and now - watched.attempt_ns > _RETRY_NS:
+        failures = min(watched.failures, 10)
+        pause_ns = min(_RETRY_NS, _SOON_NS << failures) if failures else _RETRY_NS
+        if lost and not self._configurator.busy and now - watched.attempt_ns > pause_ns:
             watched.attempt_ns = now
             self._configure(node, stopped=watched.state == _STOPPED)
             if watched.started:

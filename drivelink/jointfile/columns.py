@@ -51,5 +51,6 @@ def si_factor(column: str, unit: str | float) -> float:
     except ValueError:
         factor = 0.0
     if factor == 0.0 or not math.isfinite(factor):
-        raise ValueError(f"expected one of {', '.join(units)}, or a factor; got {unit!r}")
+        got = unit[:40] if isinstance(unit, str) else unit
+        raise ValueError(f"expected one of {', '.join(units)}, or a factor; got {got!r}")
     return factor

@@ -19,7 +19,7 @@ import can
 from drivelink.errors import RecordingError
 from drivelink.infile import open_regular
 from drivelink.recording.boundedlog import AscText, BlfBytes, TrcText
-from drivelink.recording.limits import MAX_LINE_BYTES
+from drivelink.recording.limits import MAX_LINE_BYTES, require_stamp
 
 _LOG = logging.getLogger("drivelink.recording")
 
@@ -110,6 +110,7 @@ def in_order(frames: Iterable[LoggedFrame], path: Path) -> Iterator[LoggedFrame]
             )
             offset += last + _GAP_NS - stamp_ns
             stamp_ns = last + _GAP_NS
+        require_stamp(stamp_ns, path)
         last = max(last, stamp_ns)
         yield frame._replace(stamp_ns=stamp_ns) if offset and frame.stamp_ns != NO_STAMP else frame
 

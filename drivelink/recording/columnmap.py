@@ -42,10 +42,10 @@ def parse_column_map(texts: Sequence[str]) -> ColumnMap:
         if not equals or not source.strip() or name not in COLUMNS:
             raise UsageError(
                 f"--map: expected SOURCE=COLUMN[:UNIT] like q_link=link_position_rad:deg, with COLUMN one of "
-                f"{', '.join(sorted(COLUMNS))}; got {text!r}"
+                f"{', '.join(sorted(COLUMNS))}; got {text[:80]!r}"
             )
         if name in found:
-            raise UsageError(f"--map: {name} is given twice, as {found[name].column} and {source}")
+            raise UsageError(f"--map: {name} is given twice, as {found[name].column[:80]} and {source[:80]}")
         try:
             found[name] = Source(source.strip(), si_factor(name, unit))
         except ValueError as error:

@@ -187,7 +187,10 @@ def _even(block: bytes, width: int) -> bool:
     """Whether every line has so many columns, which a reader of some columns does not check."""
     if b"#" in block or b'"' in block or b"\n\n" in block or block.startswith(b"\n"):
         lines = (line.partition("#")[0] for line in io.StringIO(block.decode("utf-8", errors="replace")))
-        return all(len(cells) == width for cells in csv.reader(lines) if "".join(cells).strip())
+        try:
+            return all(len(cells) == width for cells in csv.reader(lines) if "".join(cells).strip())
+        except csv.Error:  # a cell too long
+            return False
     data = np.frombuffer(block, dtype=np.uint8)
     commas = np.flatnonzero(data == ord(","))
     ends = np.flatnonzero(data == ord("\n"))
@@ -201,7 +204,10 @@ def _wrong_line(block: bytes, layout: _Layout, path: Path, first_line: int) -> s
         text = line.decode("utf-8", errors="replace").partition("#")[0]
         if not text.strip():
             continue
-        cells = next(csv.reader([text]))
+        try:
+            cells = next(csv.reader([text]))
+        except csv.Error as error:
+            return f"{path}: line {number}: {error}"
         if len(cells) != len(layout.names):
             return f"{path}: line {number}: expected {len(layout.names)} columns, got {len(cells)}"
         for name, place in zip(layout.used, layout.places, strict=True):

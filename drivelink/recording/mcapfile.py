@@ -21,7 +21,7 @@ import zstandard
 
 from drivelink.errors import RecordingError
 from drivelink.infile import open_regular
-from drivelink.recording.limits import MAX_BLOCK_BYTES
+from drivelink.recording.limits import MAX_BLOCK_BYTES, require_stamp
 
 _LOG = logging.getLogger("drivelink.recording")
 
@@ -33,7 +33,6 @@ _CHANNEL_HEAD = struct.Struct("<HHI")  # channel, schema, length of the topic
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE_OP, _CHUNK_OP, _DATA_END = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F
 _WANTED = frozenset({_CHANNEL, _MESSAGE_OP, _CHUNK_OP})
 _MESSAGE_BYTES = 64 << 10  # of a sample, an estimate or a frame: ours have some 500
-_LAST_STAMP_NS = (1 << 63) - 1  # of the year 2262
 _ZSTD_WINDOW = 128 << 20  # memory limit of its decoder, the same as in zstd's tools
 
 
@@ -75,10 +74,7 @@ def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[
                 body = file.read(length)
                 records = _decompressed(body, path) if opcode == _CHUNK_OP else head + body
                 for message in _messages(records, channels, topics):
-                    if message.log_time_ns > _LAST_STAMP_NS:
-                        raise RecordingError(
-                            f"{path}: expected stamps below 2^63 ns, got {message.log_time_ns}"
-                        )
+                    require_stamp(message.log_time_ns, path)
                     yield message
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error

@@ -1,0 +1,102 @@
+# ruff: noqa: E501 - one protection a line
+"""Take away one protection after the other: for each, a test has to fail.
+
+    python benchmarks/protections.py [--only WORD]
+
+Each change is made in a copy of the checkout, where the tests named beside it run. A protection whose tests pass
+without it is reported, and the exit status is 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parents[1]
+COPIED = ("drivelink", "estimator", "sim", "tests", "benchmarks", "examples", "pyproject.toml")
+
+
+class Protection(NamedTuple):
+    """What is replaced where, and the tests that have to notice."""
+
+    name: str
+    file: str
+    before: str
+    after: str
+    tests: str
+
+
+LIMITS, FOLLOWING = "tests/test_recording_limits.py", "tests/test_cycle_following.py"
+PROTECTIONS = [
+    Protection(*row)
+    for row in (
+        ("size of a joint file", "jointfile/document.py", "if len(text) > MAX_BYTES or", "if", "tests/test_jointfile.py -k without_end"),
+        ("lines of a joint file", "jointfile/document.py", "> MAX_LINE_BYTES:", "> 1 << 40:", "tests/test_jointfile.py -k without_end"),
+        ("depth of a joint file", "jointfile/document.py", "if _DEEP.search(text):", "if False:", "tests/test_jointfile.py -k without_end"),
+        ("regular files only", "infile.py", "if not stat.S_ISREG(os.fstat(fd).st_mode):", "if False:", f"{LIMITS} -k regular --timeout 20"),
+        ("size of an MCAP chunk", "recording/mcapfile.py", "    if size > MAX_BLOCK_BYTES:", "    if False:", f"{LIMITS} -k mcap_chunk"),
+        ("size of an MCAP message", "recording/mcapfile.py", "if len(data) > _MESSAGE_BYTES:", "if False:", f"{LIMITS} -k huge_message"),
+        ("stamps", "recording/limits.py", "if stamp_ns > _LAST_STAMP_NS:", "if False:", f"{LIMITS} tests/test_fuzz_parsers.py -k 'stamps or .log'"),
+        ("number of samples", "recording/limits.py", "if count > MAX_SAMPLES:", "if False:", f"{LIMITS} -k 'gap_of_a_million'"),
+        ("size of a BLF container", "recording/boundedlog.py", "if unpacker.unconsumed_tail:", "if False:", f"{LIMITS} -k blf"),
+        ("carried joint files open nothing", "recording/mapping.py", "joint=contained(jointfile.parse(text, name))", "joint=jointfile.parse(text, name)", f"{LIMITS} -k opens_nothing"),
+        ("words as plain text", "plaintext.py", '    return "" if unicodedata.category(character) in _UNSHOWABLE else character', "    return character", "tests/test_status.py -k plain_text"),
+        ("rate of a source", "daemon/status.py", "len(kinds) >= self._KINDS", "False", "tests/test_status.py -k rate"),
+        ("rate of all lines", "daemon/status.py", "if self._lines <= self._LINES:", "if True:", "tests/test_status.py -k rate"),
+        ("frames that may be sent", "canopen/guard.py", "    raise ForbiddenFrameError(", "    return\n    raise ForbiddenFrameError(", "tests/test_never_moves.py tests/test_canopen_sdo.py"),
+        ("a passive daemon sends nothing", "canopen/guard.py", "        raise BusError(", "        return self.inner.send(message)\n        raise BusError(", "tests/test_never_moves.py"),
+        ("stored parameters", "canopen/passive.py", "address[0] in _STORE_OR_RESTORE", "False", f"{FOLLOWING} tests/test_canopen_passive.py"),
+        ("block downloads", "canopen/sdo_sniffer.py", "            self._dispute(_address(data))\n", "            pass\n", f"{FOLLOWING} -k block"),
+        ("identity of a node", "canopen/passive.py", "            self._check_identity()\n", "            pass\n", f"{FOLLOWING} tests/test_canopen_passive.py"),
+        ("silence of a node", "cycle/following.py", "        if silent:\n", "        if False:\n", f"{FOLLOWING} -k not_heard"),
+        ("receive overflow", "daemon/supervision.py", "if unread > self._unread:", "if False:", f"{FOLLOWING} -k overflow"),
+        ("foreign pages", "monitor/web.py", 'origin not in (None, f"http://{host}")', "False", "tests/test_monitor.py"),
+        ("open streams", "monitor/web.py", "_OWN_PAGES:", "_OWN_PAGES or True:", "tests/test_monitor.py"),
+        ("claims of a joint", "pubsub/identity.py", "if len(self._claims) < MAX_CLAIMS:", "if True:", "tests/test_network_attacks.py -k tokens"),
+        ("messages of others", "pubsub/identity.py", "if not (free and vouched):", "if False:", "tests/test_network_attacks.py -k 'stays or first_writer'"),
+        ("valid and impossible", "pubsub/wire.py", "if message.status & _VALID and not _usable(message):", "if False:", "tests/test_wire.py"),
+        ("floods of queries", "pubsub/publisher.py", "zenoh.handlers.RingChannel(_QUERIES)", "zenoh.handlers.FifoChannel(10_000)", "tests/test_publisher.py -k flood"),
+        ("a scheduler with certificates", "fleet/runner.py", 'if not address.startswith("tls://") and not insecure:', "if False:", "tests/test_fleet.py -k certificates"),
+    )
+]  # fmt: skip
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--only", default="", metavar="WORD", help="protections with this word in their name")
+    wanted = [one for one in PROTECTIONS if parser.parse_args().only in one.name]
+    missed = []
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder)
+        for name in COPIED:
+            source, target = ROOT / name, copy / name
+            copier = shutil.copytree if source.is_dir() else shutil.copy
+            copier(source, target)
+        for one in wanted:
+            path = copy / "drivelink" / one.file
+            whole = path.read_text(encoding="utf-8")
+            assert whole.count(one.before) == 1, f"{one.name}: its place in {one.file} has changed"
+            path.write_text(whole.replace(one.before, one.after), encoding="utf-8")
+            command = f"{sys.executable} -m pytest -x -p no:cacheprovider {one.tests}"
+            environment = os.environ | {"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
+            ran = subprocess.run(
+                command, shell=True, cwd=copy, env=environment, capture_output=True, text=True, check=False
+            )
+            path.write_text(whole, encoding="utf-8")
+            noticed = ran.returncode == 1  # 0: all passed; others: no test ran
+            print(f"{'noticed' if noticed else 'MISSED'}: {one.name}", flush=True)
+            if not noticed:
+                missed.append(one.name)
+                print("\n".join(ran.stdout.splitlines()[-3:] + ran.stderr.splitlines()[-3:]))
+    print(f"{len(wanted) - len(missed)} of {len(wanted)} protections are missed by a test when they are gone")
+    return bool(missed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,217 @@
+"""Every parser of what others write: good inputs, damage to them, and what may come of it: a result or one line."""
+
+from __future__ import annotations
+
+import json
+import random
+import struct
+from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from daemonkit import vsa_text
+from zenohkit import make_estimate, make_external, make_sample
+
+from drivelink._core import encode_estimate, encode_external, encode_sample
+from drivelink.canopen.eds import load_eds
+from drivelink.canopen.emcy import parse_emergency
+from drivelink.canopen.sdo_sniffer import SdoSniffer
+from drivelink.errors import DrivelinkError
+from drivelink.jointfile import load, parse
+from drivelink.pubsub import wire
+from drivelink.recording import read
+from drivelink.recording.columnmap import parse_column_map
+from drivelink.recording.formats import open_sink
+from drivelink.recording.mapping import joint_of, layouts_from
+from drivelink.recording.playback import open_playback
+from estimator.sample import Sample
+
+ROOT = Path(__file__).parents[1]
+CORPUS = Path(__file__).parent / "corpus"  # what once failed, a folder for each parser; fuzz.py adds to it
+MOST_BYTES = 1 << 20
+TEXT = """\
+name = "elbow"
+[[motor]]
+inertia_kg_m2 = 0.1
+[motor.transmission]
+model = "linear"
+[motor.drive]
+node_id = 1
+counts_per_rev = 65536
+rated_torque_nm = 1.0
+[[motor.drive.tpdo]]
+cob_id = 0x181
+objects = ["0x6064:00:32", "0x60E4:01:32"]
+[[motor.drive.tpdo]]
+cob_id = 0x281
+objects = ["0x6077:00:16"]
+[link.encoder]
+counts_per_rev = 65536
+"""
+JOINT = parse(TEXT)
+RECORDINGS = (".mcap", ".csv", ".log", ".blf", ".asc", ".trc")
+_FILLING = (
+    b"\xff" * 8,
+    b"\0" * 8,
+    b"9" * 8,
+    b"-inf,nan",
+    b"1e999",
+    b"[[",
+    b'{"',
+    b'"',
+    b"\n",
+    b"=",
+    b"0x",
+    b"-1",
+)
+_REPEATED = (
+    b"-",
+    b"[",
+    b"{",
+    b"a.",
+    b'"',
+    b"9",
+    b" ",
+    b"\n",
+    b"a=1\n",
+    b"\xc3\xa9",
+    b"[a]\n",
+    b",",
+    b"\x1b[2J",
+)
+
+
+def frames(cycles: int) -> list[tuple[int, int, bytes]]:
+    """(stamp in ns, identifier, data) of SYNC and one drive."""
+    found = []
+    for k in range(cycles):
+        stamp = 1_700_000_000_000_000_000 + k * 1_000_000
+        found.append((stamp, 0x080, b""))
+        found.append((stamp + 200_000, 0x181, struct.pack("<ii", 10 * k, 11 * k)))
+        found.append((stamp + 400_000, 0x281, struct.pack("<h", 100)))
+    return found
+
+
+def write_recording(path: Path) -> Path:
+    """One short recording in the format of its ending."""
+    sink = open_sink(path, JOINT, TEXT)
+    for k, (stamp, can_id, data) in enumerate(frames(100)):
+        if can_id == 0x080:
+            sink.sample(Sample(k // 3, (0.1 * k,), (0.0,), (1.0,), 0.1 * k), stamp)
+        sink.frame(stamp, can_id, data)
+        if k % 50 == 49:
+            sink.flush()
+    sink.close()
+    return path
+
+
+def read_every_way(path: Path) -> None:
+    """Everything that reads a recording."""
+    for work in (
+        lambda: read(path, JOINT),
+        lambda: sum(1 for _ in open_playback(path, JOINT, path.parent)),
+        lambda: sum(1 for _ in open_playback(path, JOINT, path.parent, frames=True)),
+        lambda: joint_of(path, None),
+    ):
+        held(work)
+
+
+def _document(path: Path) -> None:
+    try:
+        layouts_from(path.read_bytes(), "elbow")
+    except ValueError as error:
+        raise DrivelinkError(str(error)[:600]) from error  # its callers name the file
+
+
+def _sdo(path: Path) -> None:
+    sniffer, data = SdoSniffer(lambda _index, _subindex: True, 0.1), path.read_bytes()
+    for k in range(0, len(data) - 9, 9):
+        (sniffer.request, sniffer.response)[data[k] & 1](data[k + 1 : k + 9], k * 0.001)
+    assert len(sniffer.values) + len(sniffer.disputed) <= 2 * len(data)
+
+
+def _of_bytes(take: Callable[[bytes], object], path: Path) -> object:
+    return take(path.read_bytes())
+
+
+_TAKE: dict[str, Callable[[Path], object]] = {
+    "joint file": load,
+    "eds": partial(load_eds, node_id=1),
+    "column map": lambda path: parse_column_map(path.read_text(errors="replace").splitlines()),
+    "mapping": _document,
+    "sdo": _sdo,
+    "emergency": partial(_of_bytes, parse_emergency),
+    "estimate": partial(_of_bytes, wire.decode_estimate),
+    "external": partial(_of_bytes, wire.decode_external),
+    "sample": partial(_of_bytes, wire.decode_sample),
+    **dict.fromkeys(RECORDINGS, read_every_way),
+}
+PARSERS = tuple(_TAKE)
+
+
+@cache
+def seeds(parser: str) -> tuple[bytes, ...]:
+    """Good inputs of a parser."""
+    if parser in RECORDINGS:
+        with TemporaryDirectory() as folder:
+            return (write_recording(Path(folder, f"r{parser}")).read_bytes(),)
+    files = {"joint file": ROOT / "drivelink" / "joints", "eds": ROOT / "sim" / "eds"}
+    if parser in files:
+        given = tuple(path.read_bytes() for path in sorted(files[parser].iterdir()))
+        return (*given, vsa_text().encode()) if parser == "joint file" else given
+    node = {"node_id": 1, "motor": 0, "tpdos": [{"number": 1, "cob_id": 385, "objects": []}]}
+    return {
+        "column map": (b"q=link_position_rad:deg\nm=motor1_position_rad:-2.5",),
+        "mapping": (json.dumps({"joint": "elbow", "source": "daemon", "nodes": [node]}).encode(),),
+        "sdo": (bytes.fromhex("00402f60000000000001432f60000000008000" * 4),),
+        "emergency": (bytes.fromhex("1023010000000000"),),
+        "estimate": tuple(encode_estimate(make_estimate(k, motors=k), 1) for k in (1, 2)),
+        "external": (encode_external(make_external(1), 1),),
+        "sample": (encode_sample(make_sample(1), 1),),
+    }[parser]
+
+
+def damaged(good: bytes, rng: random.Random) -> bytes:
+    """Bytes flipped, cut, doubled, replaced, or one thing repeated up to `MOST_BYTES` times."""
+    data = bytearray(good)
+    for _ in range(rng.randrange(1, 4)):
+        at, kind = rng.randrange(len(data) + 1), rng.randrange(6)
+        if kind == 0 and at < len(data):
+            data[at] ^= 1 << rng.randrange(8)
+        elif kind == 1:
+            del data[at:]
+        elif kind == 2:
+            data[at:at] = data[rng.randrange(len(data) + 1) :][: rng.randrange(1, 200)]
+        elif kind == 3:
+            filling = rng.choice(_FILLING)
+            data[at : at + rng.choice((0, len(filling)))] = filling
+        elif kind == 4:
+            del data[at : at + rng.randrange(1, 100)]
+        else:
+            one = rng.choice(_REPEATED)
+            data[at:at] = one * (2 ** rng.randrange(21) // len(one))
+    return bytes(data[:MOST_BYTES])
+
+
+def held(work: Callable[[], object]) -> None:
+    """Only a line may come of it, without anything a terminal obeys."""
+    try:
+        work()
+    except DrivelinkError as error:
+        text = str(error)
+        assert len(text) < 1000 and not any(ord(c) < 32 or 0x7F <= ord(c) < 0xA0 for c in text), repr(
+            text[:900]
+        )
+
+
+def take(parser: str, data: bytes, folder: Path) -> None:
+    """Give an input to a parser.
+
+    Raises:
+        Exception: whatever a parser must not raise.
+    """
+    suffix = {"joint file": ".toml", "eds": ".eds"}.get(parser, parser if parser in RECORDINGS else ".bin")
+    path = folder / f"r{suffix}"
+    path.write_bytes(data)
+    held(lambda: _TAKE[parser](path))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import pytest
 
 from sim.canopen.statemachine import PowerState as P
@@ -49,12 +47,13 @@ def test_a_controlword_leads_where_the_standard_says(state: P, word: int) -> Non
     assert machine.state is TABLE[state, word]
 
 
-@pytest.mark.parametrize(("state", "word"), list(itertools.product((P.FAULT, P.FAULT_REACTION), range(0x80))))
-def test_no_controlword_without_bit_7_leads_out_of_a_fault(state: P, word: int) -> None:
+@pytest.mark.parametrize("state", [P.FAULT, P.FAULT_REACTION])
+def test_no_controlword_without_bit_7_leads_out_of_a_fault(state: P) -> None:
     machine = StateMachine()
     machine.state = state
-    machine.control(word)
-    assert machine.state is state
+    for word in range(0x80):
+        machine.control(word)
+        assert machine.state is state, word
 
 
 @pytest.mark.parametrize("state", [s for s in P if s not in (P.FAULT, P.FAULT_REACTION, P.NOT_READY)])
@@ -73,10 +72,10 @@ def test_a_fault_runs_through_its_reaction_and_is_reset_by_an_edge(state: P) -> 
     assert machine.state is P.SWITCH_ON_DISABLED
 
 
-@pytest.mark.parametrize("option", range(9))
-def test_quick_stop_ends_disabled_or_stays_as_its_option_says(option: int) -> None:
-    machine = StateMachine()
-    machine.quick_stop_option = option
-    machine.state = P.QUICK_STOP_ACTIVE
-    machine.step()
-    assert machine.state is (P.QUICK_STOP_ACTIVE if option >= 5 else P.SWITCH_ON_DISABLED)
+def test_quick_stop_ends_disabled_or_stays_as_its_option_says() -> None:
+    for option in range(9):
+        machine = StateMachine()
+        machine.quick_stop_option = option
+        machine.state = P.QUICK_STOP_ACTIVE
+        machine.step()
+        assert machine.state is (P.QUICK_STOP_ACTIVE if option >= 5 else P.SWITCH_ON_DISABLED), option

@@ -67,7 +67,8 @@ def record(path: Path, n: int = 500, close: bool = True) -> None:
         sink.external(external(k))
         sink.frame(stamp_ns, 0x181, struct.pack("<iH", k, 7))
         if k % 100 == 99:
-            sink.document("status", b'{"state": "running"}', stamp_ns)
+            events = [{"time": 1.5e9 + j, "text": f"event {j}", "count": 1} for j in range(k // 250 + 1)]
+            sink.document("status", json.dumps({"state": "running", "events": events}).encode(), stamp_ns)
             sink.flush()
     if close:
         sink.close()
@@ -99,7 +100,14 @@ def test_a_record_of_it_is_that_of_its_samples(tmp_path: Path) -> None:
 
 def check(value: Any, schema: dict[str, Any], where: str) -> None:
     """What our schemas use of JSON schema: type, properties, required."""
-    types = {"object": dict, "integer": int, "string": str, "number": (int, float), "null": type(None)}
+    types = {
+        "object": dict,
+        "integer": int,
+        "string": str,
+        "boolean": bool,
+        "number": (int, float),
+        "null": type(None),
+    }
     wanted = schema["type"] if isinstance(schema["type"], list) else [schema["type"]]
     assert any(isinstance(value, types[name]) for name in wanted), where  # type: ignore[arg-type]
     if isinstance(value, dict):
@@ -130,8 +138,15 @@ def test_an_independent_reader_finds_channels_schemas_and_messages_that_obey_the
             check(strict(message.data.decode()), json.loads(schema.data), channel.topic)
             counts[channel.topic] = counts.get(channel.topic, 0) + 1
     assert counts == {
-        "/elbow/sample": 500, "/elbow/estimate": 500, "/elbow/external": 500, "/elbow/can": 500, "/elbow/status": 5, "/elbow/joint": 1
+        "/elbow/sample": 500, "/elbow/estimate": 500, "/elbow/external": 500, "/elbow/can": 500, "/elbow/status": 5, "/elbow/joint": 1,
+        "/elbow/log": 2,
     }  # fmt: skip
+    described = json.loads(message_schema("estimate", 1))["properties"]
+    assert described["motor1_stiffness_nm_rad"]["unit"] == "N·m/rad"
+    assert (
+        described["valid"]["type"] == "boolean"
+        and json.loads(message_schema("log", 1))["title"] == "foxglove.Log"
+    )
     assert summary is not None and summary.statistics is not None
     assert summary.statistics.message_start_time == BEGIN_NS
 
@@ -144,7 +159,7 @@ def test_without_its_end_everything_flushed_is_there_for_both_readers(tmp_path: 
     with path.open("rb") as file, pytest.raises(Exception):  # noqa: B017  (the end is missing, and it says so)
         for _ in NonSeekingReader(file).iter_messages(log_time_order=False):
             found += 1
-    assert found == 2006
+    assert found == 2008
 
 
 def test_cut_off_anywhere_it_gives_what_is_whole(tmp_path: Path) -> None:

@@ -46,6 +46,7 @@ VERBS = {
     "record": "record a running daemon or a bus",
     "keep": "have a running daemon's black box keep the last minute",
     "accept": "accept what the newest finding proposes, and see whether the residual falls",
+    "dbc": "describe the joint's frames as a DBC database for other CAN tools",
     "replay": "run a recording through the same code as live data",
     "fit": "fit the transmission to a recording (model-based estimation)",
     "diagnose": "find the physical effect that the model lacks, and add it",

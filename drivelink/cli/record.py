@@ -192,6 +192,18 @@ def _session(joint: JointFile, folder: Path, needed: bool) -> zenoh.Session | No
         return None
 
 
+def known_layouts(source: JointText) -> Sequence[NodeLayout]:
+    """Mapping of the joint's nodes by a running daemon, else by the joint file; () if unknown."""
+    session = _session(source.joint, source.folder, needed=False)
+    try:
+        alive = session is not None and _alive(session, source.joint)
+        known = _daemon_layouts(session, source.joint) if session is not None and alive else ()
+    finally:
+        if session is not None:
+            close_session(session)
+    return known or _declared_layouts(source.joint, source.folder)
+
+
 def _daemon_layouts(session: zenoh.Session, joint: JointFile) -> Sequence[NodeLayout]:
     """Mapping of the joint's nodes by the running daemon; () if unknown.
 

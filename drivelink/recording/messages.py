@@ -11,15 +11,19 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from drivelink.output.units import Units, bare_name
 from drivelink.pubsub.wire import EXTERNAL_COLUMNS, EstimateMessage, ExternalMessage
 from drivelink.recording.columns import sample_columns, sample_row
 from estimator.sample import SIGMA_95, External, ExternalStatus, Sample, Status, TransmissionEstimate
 
-TOPICS = ("sample", "estimate", "external", "status", "model", "joint", "mapping", "can")
+TOPICS = ("sample", "estimate", "external", "status", "model", "joint", "mapping", "can", "log")
+SCHEMA_NAMES = {"log": "foxglove.Log"}  # others are drivelink.<topic>
 
 _PER_MOTOR = ("flexibility_torque_nm", "stiffness_nm_rad", "stiffness_std_nm_rad", "deflection_rad")
 _VALID, _OBSERVABLE = int(Status.VALID), int(Status.OBSERVABLE)
-_EXTERNAL_NAMES = ("time_s", *EXTERNAL_COLUMNS[:2], "valid", "contact")
+_EXTERNAL_NAMES = ("time_s", *EXTERNAL_COLUMNS[:2])
+_WARNING = 3  # level of foxglove.Log
+_JSON = ("false", "true")
 
 
 def estimate_columns(motors: int) -> tuple[str, ...]:
@@ -60,51 +64,80 @@ def external_row(external: External | None) -> tuple[float, ...]:
 
 
 def _band_columns(motors: int) -> tuple[str, ...]:
-    """Names of validity and band edges, in the order of `_band_row`."""
+    """Names of band edges, in the order of `_band_row`."""
     each = ("", *(f"motor{i}_" for i in range(1, motors + 1)))
-    return ("valid", *(f"{part}stiffness_{edge}_nm_rad" for part in each for edge in ("low", "high")))
+    return tuple(f"{part}stiffness_{edge}_nm_rad" for part in each for edge in ("low", "high"))
 
 
 def _band_row(message: EstimateMessage) -> tuple[float, ...]:
-    """Validity, and the edges of the 95 % bands of the joint and of each transmission."""
+    """The edges of the 95 % bands of the joint and of each transmission."""
     stiffnesses = [(message.stiffness_nm_rad, message.stiffness_std_nm_rad)]
     stiffnesses += [(one.stiffness_nm_rad, one.stiffness_std_nm_rad) for one in message.transmissions]
-    edges = [x + side * SIGMA_95 * std for x, std in stiffnesses for side in (-1.0, 1.0)]
-    return (1 if message.status & _VALID else 0, *edges)
+    return tuple(x + side * SIGMA_95 * std for x, std in stiffnesses for side in (-1.0, 1.0))
+
+
+def _estimate_names(motors: int) -> tuple[str, ...]:
+    """Numbers of an estimate's message: `observable` is a boolean there."""
+    return (*(name for name in estimate_columns(motors) if name != "observable"), *_band_columns(motors))
 
 
 def sample_encoder(motors: int, period_s: float) -> Callable[[Sample], bytes]:
     """The function that makes a sample's message."""
-    fill = _template(("sequence",), sample_columns(motors))
+    fill = _template(("sequence",), (), sample_columns(motors))
 
     def encode(sample: Sample) -> bytes:
-        return fill((sample.sequence, *sample_row(sample, period_s)))
+        return fill((sample.sequence,), sample_row(sample, period_s))
 
     return encode
 
 
 def estimate_encoder(motors: int, period_s: float) -> Callable[[EstimateMessage], bytes]:
     """The function that makes an estimate's message."""
-    fill = _template(("sequence", "status"), (*estimate_columns(motors), *_band_columns(motors)))
+    fill = _template(("sequence", "status"), ("valid", "observable"), _estimate_names(motors))
 
     def encode(message: EstimateMessage) -> bytes:
+        status = message.status
         totals = (message.flexibility_torque_nm, message.stiffness_nm_rad, message.stiffness_std_nm_rad)
-        row = estimate_row(message.sequence * period_s, message.status, totals, message.transmissions)
-        return fill((message.sequence, message.status, *row, *_band_row(message)))
+        each = (value for one in message.transmissions for value in one)
+        flags = _JSON[bool(status & _VALID)], _JSON[bool(status & _OBSERVABLE)]
+        row = (message.sequence * period_s, *totals, *each, *_band_row(message))
+        return fill((message.sequence, status, *flags), row)
 
     return encode
 
 
 def external_encoder(period_s: float) -> Callable[[ExternalMessage], bytes]:
     """The function that makes an external torque's message."""
-    fill = _template(("sequence", "status"), _EXTERNAL_NAMES)
+    fill = _template(("sequence", "status"), ("valid", "contact"), _EXTERNAL_NAMES)
 
     def encode(message: ExternalMessage) -> bytes:
         torque, std = message.external_torque_nm, message.external_torque_std_nm
-        row = (message.sequence * period_s, torque, std, int(message.valid), int(message.contact))
-        return fill((message.sequence, message.status, *row))
+        flags = _JSON[message.valid], _JSON[message.contact]
+        return fill((message.sequence, message.status, *flags), (message.sequence * period_s, torque, std))
 
     return encode
+
+
+def events_of(status: bytes) -> list[tuple[float, str]]:
+    """UNIX time in s and text of the events of a status document, whatever it contains."""
+    document = json.loads(status)
+    events = document.get("events") if isinstance(document, dict) else None
+    return [
+        (float(event["time"]), event["text"])
+        for event in (events if isinstance(events, list) else ())
+        if isinstance(event, dict)
+        and isinstance(event.get("time"), int | float)
+        and 0.0 <= event["time"] < 1e11
+        and isinstance(event.get("text"), str)
+    ]
+
+
+def log_message(joint: str, time_s: float, text: str) -> bytes:
+    """An event of the daemon as foxglove.Log."""
+    seconds, nanoseconds = divmod(round(time_s * 1e9), 10**9)
+    stamp = {"sec": seconds, "nsec": nanoseconds}
+    fields = {"timestamp": stamp, "level": _WARNING, "message": text, "name": joint, "file": "", "line": 0}
+    return json.dumps(fields).encode()
 
 
 def read_sample(message: Mapping[str, Any], motors: int) -> Sample:
@@ -128,18 +161,25 @@ def read_sample(message: Mapping[str, Any], motors: int) -> Sample:
 
 def message_schema(topic: str, motors: int) -> bytes:
     """The JSON schema of a channel's messages."""
-    integer, text = {"type": "integer"}, {"type": "string"}
+    integer, text, flag = {"type": "integer"}, {"type": "string"}, {"type": "boolean"}
     properties: dict[str, Any]
     if topic == "sample":
         properties = {"sequence": integer, **_numbers(sample_columns(motors))}
     elif topic == "estimate":
         properties = {
             "sequence": integer,
-            "status": integer,
-            **_numbers((*estimate_columns(motors), *_band_columns(motors))),
+            "status": integer | {"description": "status bits"},
+            "valid": flag | {"description": "the numbers may be used"},
+            "observable": flag | {"description": "the motion reveals the stiffness"},
+            **_numbers(_estimate_names(motors)),
         }
     elif topic == "external":
-        properties = {"sequence": integer, "status": integer, **_numbers(_EXTERNAL_NAMES)}
+        flags = {"valid": flag, "contact": flag | {"description": "something touches the link"}}
+        properties = {"sequence": integer, "status": integer, **flags, **_numbers(_EXTERNAL_NAMES)}
+    elif topic == "log":
+        stamp = {"type": "object", "properties": {"sec": integer, "nsec": integer}}
+        properties = {"timestamp": stamp, "level": integer, "message": text, "name": text}
+        properties |= {"file": text, "line": integer}
     elif topic == "can":
         properties = {"id": integer, "data": text | {"description": "bytes, two hex digits each"}}
     elif topic == "mapping":
@@ -150,7 +190,7 @@ def message_schema(topic: str, motors: int) -> bytes:
         properties = {}
     schema = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": f"drivelink.{topic}",
+        "title": SCHEMA_NAMES.get(topic, f"drivelink.{topic}"),
         "type": "object",
         "properties": properties,
         "required": list(properties),
@@ -159,18 +199,30 @@ def message_schema(topic: str, motors: int) -> bytes:
 
 
 def _numbers(names: tuple[str, ...]) -> dict[str, Any]:
-    return {name: {"type": ["number", "null"]} for name in names}
+    """Each number with what it is and its unit."""
+    units = Units(linear=False)
+    return {
+        name: {
+            "type": ["number", "null"],
+            "description": f"{bare_name(name)}, {units.of(name)}",
+            "unit": units.of(name),
+        }
+        for name in names
+    }
 
 
-def _template(whole: tuple[str, ...], names: tuple[str, ...]) -> Callable[[tuple[float, ...]], bytes]:
-    """Template of a JSON object with these names, first integers, then floats in shortest exact form."""
-    fields = [f'"{name}":%d' for name in whole] + [f'"{name}":%r' for name in names]
+def _template(
+    whole: tuple[str, ...], flags: tuple[str, ...], names: tuple[str, ...]
+) -> Callable[[tuple[int | str, ...], tuple[float, ...]], bytes]:
+    """Template of a JSON object: integers, booleans as JSON, then floats in shortest exact form."""
+    fields = [f'"{name}":%s' for name in (*whole, *flags)] + [f'"{name}":%r' for name in names]
     template = "{" + ",".join(fields) + "}"
 
-    def fill(values: tuple[float, ...]) -> bytes:
+    def fill(head: tuple[int | str, ...], values: tuple[float, ...]) -> bytes:
         if all(map(math.isfinite, values)):
-            return (template % values).encode()
-        return (template % tuple(value if math.isfinite(value) else _NULL for value in values)).encode()
+            return (template % (*head, *values)).encode()
+        shown = (value if math.isfinite(value) else _NULL for value in values)
+        return (template % (*head, *shown)).encode()
 
     return fill
 

@@ -21,9 +21,12 @@ from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from drivelink.recording.columns import sample_columns, sample_row
 from drivelink.recording.mapping import side_file
 from drivelink.recording.messages import (
+    SCHEMA_NAMES,
     TOPICS,
     estimate_encoder,
+    events_of,
     external_encoder,
+    log_message,
     message_schema,
     sample_encoder,
 )
@@ -120,9 +123,10 @@ class McapSink(Sink):
         self._channels = {}
         for topic in TOPICS:
             schema = self._writer.register_schema(
-                f"drivelink.{topic}", "jsonschema", message_schema(topic, motors)
+                SCHEMA_NAMES.get(topic, f"drivelink.{topic}"), "jsonschema", message_schema(topic, motors)
             )
             self._channels[topic] = self._writer.register_channel(f"/{joint.name}/{topic}", "json", schema)
+        self._name, self._logged_s = joint.name, 0.0  # time of the last event that was written
         self._joint = json.dumps({"text": joint_text}).encode() if joint_text else b""
 
     def note(self, name: str, fields: Mapping[str, str]) -> None:
@@ -145,9 +149,13 @@ class McapSink(Sink):
         self.counts["external"] += 1
 
     def document(self, name: str, payload: bytes, stamp_ns: int) -> None:
-        """Take a JSON document: status, model."""
+        """Take a JSON document: status, model. The events of a status are log messages, too."""
         self._put(name, stamp_ns, payload)
         self.counts["document"] += 1
+        for time_s, text in events_of(payload) if name == "status" else ():
+            if time_s > self._logged_s:
+                self._logged_s = time_s
+                self._put("log", stamp_ns, log_message(self._name, time_s, text))
 
     def frame(self, stamp_ns: int, cob_id: int, data: bytes) -> None:
         """Take one CAN frame."""

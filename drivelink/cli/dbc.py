@@ -1,0 +1,49 @@
+"""`drivelink dbc JOINT`: the joint's frames as a DBC database for other CAN tools."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from drivelink import jointfile
+from drivelink.cli.record import known_layouts
+from drivelink.errors import UsageError
+from drivelink.outfile import check_target, write_whole
+from drivelink.recording.dbcfile import dbc_text
+from drivelink.recording.mapping import joint_of, recorded_layouts
+
+EPILOG = """\
+examples:
+  drivelink dbc elbow.toml --out elbow.dbc     as the running daemon, the joint file or the EDS files say
+  drivelink dbc elbow.mcap --out elbow.dbc     as it was when this was recorded
+"""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("source", type=Path, metavar="JOINT", help="joint file, or a recording")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="the database (default: print it)")
+    parser.add_argument("--force", action="store_true", help="replace a file that exists")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do the job; return the exit status."""
+    if args.source.suffix == ".toml":
+        source = jointfile.load_text(args.source)
+        layouts = known_layouts(source)
+    else:
+        source = joint_of(args.source, None)
+        layouts = recorded_layouts(args.source, source.joint.name, daemon=False)
+    if not layouts:
+        raise UsageError(
+            f"{args.source}: expected the mapping of its nodes: from a running daemon, a recording, "
+            "[[motor.drive.tpdo]] or an EDS file"
+        )
+    text = dbc_text(source.joint.name, layouts)
+    if args.out is None:
+        print(text, end="")
+        return 0
+    check_target(args.out, [args.source], force=args.force)
+    write_whole(args.out, text, force=args.force)
+    print(f"wrote {args.out}")
+    return 0

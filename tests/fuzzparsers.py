@@ -137,7 +137,7 @@ def _of_bytes(take: Callable[[bytes], object], path: Path) -> object:
 
 _TAKE: dict[str, Callable[[Path], object]] = {
     "joint file": load,
-    "eds": partial(load_eds, node_id=1),
+    "eds": lambda path: load_eds(path, node_id=1).tpdos(),
     "column map": lambda path: parse_column_map(path.read_text(errors="replace").splitlines()),
     "mapping": _document,
     "sdo": _sdo,

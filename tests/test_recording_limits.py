@@ -208,41 +208,6 @@ def test_no_cut_of_a_log_makes_another_frame(
     assert "the last line has no end and is omitted" in caplog.text
 
 
-def test_messages_of_others_in_an_mcap_file_are_one_line(whole: Path, tmp_path: Path) -> None:
-    path = tmp_path / "r.mcap"
-    for topic, text in (
-        ("sample", b"[" * 50_000),
-        ("sample", b'{"time_s": "x", "motor1_position_rad": []}'),
-        ("sample", b" " * 100_000 + b"{}"),
-        ("can", b'{"id": 1e9, "data": "00"}'),
-        ("can", b'{"id": 1}'),
-        ("mapping", b'{"joint": "elbow", "nodes": [1]}'),
-        ("joint", b"[]"),
-    ):
-        name = f"/elbow/{topic}".encode()
-        body = (
-            struct.pack("<HHI", 1, 0, len(name))
-            + name
-            + struct.pack("<I", 4)
-            + b"json"
-            + struct.pack("<I", 0)
-        )
-        records = struct.pack("<BQ", 0x04, len(body)) + body
-        body = struct.pack("<HIQQ", 1, 0, 0, 0) + text
-        path.write_bytes(b"\x89MCAP0\r\n" + records + struct.pack("<BQ", 0x05, len(body)) + body)
-        read_every_way(path)
-
-
-def test_a_reader_of_others_reads_our_logs(whole: Path) -> None:
-    """The mapping is kept beside a log, so that a log is what its format says, and nothing else."""
-    for suffix in (".log", ".blf", ".asc", ".trc"):
-        with can.LogReader(whole / f"r{suffix}") as reader:
-            assert sum(1 for _ in reader) == 300
-
-
-# What a recording carries is not trusted
-
-
 def mcap_of(path: Path, messages: list[tuple[str, int, bytes]]) -> Path:
     """An MCAP file of (topic, stamp in ns, data), its messages in compressed chunks."""
     records, numbers = bytearray(), {}
@@ -258,6 +223,31 @@ def mcap_of(path: Path, messages: list[tuple[str, int, bytes]]) -> Path:
     packed = zstandard.ZstdCompressor().compress(bytes(records))
     path.write_bytes(b"\x89MCAP0\r\n" + chunk(b"zstd", packed, len(records)))
     return path
+
+
+def test_messages_of_others_in_an_mcap_file_are_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    for topic, text in (
+        ("sample", b"[" * 50_000),
+        ("sample", b'{"time_s": "x", "motor1_position_rad": []}'),
+        ("sample", b" " * 100_000 + b"{}"),
+        ("can", b'{"id": 1e9, "data": "00"}'),
+        ("can", b'{"id": 1}'),
+        ("mapping", b'{"joint": "elbow", "nodes": [1]}'),
+        ("joint", b"[]"),
+    ):
+        mcap_of(path, [(topic, 0, text)])
+        read_every_way(path)
+
+
+def test_a_reader_of_others_reads_our_logs(whole: Path) -> None:
+    """The mapping is kept beside a log, so that a log is what its format says, and nothing else."""
+    for suffix in (".log", ".blf", ".asc", ".trc"):
+        with can.LogReader(whole / f"r{suffix}") as reader:
+            assert sum(1 for _ in reader) == 300
+
+
+# What a recording carries is not trusted
 
 
 def carrying(path: Path, text: str, folder: str = "/") -> Path:

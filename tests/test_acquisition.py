@@ -251,6 +251,32 @@ def test_a_rebooted_node_is_not_believed_before_it_is_started_again() -> None:
     assert not assembler.flags & Status.NODE_RESTARTED
 
 
+@pytest.mark.parametrize(
+    ("writes", "lost"),
+    [
+        (["2F60600006000000"], [True]),  # mode of operation: homing,
+        (
+            ["2F60600006000000", "2F60600008000000", "2F60600009000000"],
+            [True, True, False],
+        ),  # and another again
+        (["237C600010270000", "2F98600023000000"], [True, True]),  # home offset, homing method
+        (["217C600004000000", "C67C600004000000"], [True, True]),  # by segments, by blocks
+        (
+            ["2F60600008000000", "407C600000000000", "2381600010270000", "2F6060", "8060600000000000"],
+            [False] * 5,
+        ),
+    ],
+)
+def test_an_overheard_homing_has_lost_the_zero(writes: list[str], lost: list[bool]) -> None:
+    assembler = Assembler(VSA, 2)
+    run(assembler, [(SYNC, b""), *vsa_cycle(0)])
+    found = []
+    for k, write in enumerate(writes, start=1):
+        run(assembler, [(0x603, bytes.fromhex(write)), (SYNC, b""), *vsa_cycle(k)])
+        found.append(bool(assembler.flags & Status.NODE_RESTARTED))
+    assert found == lost
+
+
 @pytest.mark.parametrize("tpdos", [(TpdoLayout(cob_id=0x183, transmission_type=1, objects=()),), ()])
 def test_a_mapping_that_cannot_be_changes_nothing(tpdos: tuple[TpdoLayout, ...]) -> None:
     assembler = Assembler(VSA, 2)

@@ -41,6 +41,7 @@ enum Receiver {
     Command,
     Heartbeat(usize),
     Error(usize),
+    Request(usize),
 }
 
 /// Makes the samples of one joint from the frames of its nodes.
@@ -206,6 +207,11 @@ impl Assembler {
                     let (node, decoders) = self.node_and_decoders(*node);
                     node.heartbeat(state, decoders);
                 }
+                self.note_news();
+                None
+            }
+            Receiver::Request(node) => {
+                self.nodes[*node].request(data);
                 self.note_news();
                 None
             }
@@ -524,6 +530,7 @@ impl Assembler {
         for (node, of) in self.nodes.iter().enumerate() {
             self.receivers[(0x700 + of.node_id as usize) % COB_IDS] = Receiver::Heartbeat(node);
             self.receivers[(0x080 + of.node_id as usize) % COB_IDS] = Receiver::Error(node);
+            self.receivers[(0x600 + of.node_id as usize) % COB_IDS] = Receiver::Request(node);
         }
         self.receivers[SYNC_COB_ID as usize] = Receiver::Sync;
         for (decoder, of) in self.decoders.iter().enumerate() {

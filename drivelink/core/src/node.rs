@@ -7,6 +7,9 @@ use crate::frames::TpdoDecoder;
 const START: u8 = 0x01;
 const RESETS: [u8; 2] = [0x81, 0x82]; // node, communication
 const FAULT_BIT: i64 = 0x0008; // of the statusword
+const MODE: u16 = 0x6060; // mode of operation (CiA 402-2, 8.5.3)
+const HOMING: u8 = 6;
+const HOME: [u16; 2] = [0x607C, 0x6098]; // home offset, homing method (CiA 402-2, 11.4)
 
 /// What became of one node's frames since the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -59,6 +62,8 @@ pub struct Node {
     pub emergency: u16,
     /// Its position counters may have started anew; for whoever reads it to clear.
     pub restarted: bool,
+    /// Its mode of operation is homing, as last written.
+    homing: bool,
 }
 
 impl Node {
@@ -75,6 +80,7 @@ impl Node {
             faulted: false,
             emergency: 0,
             restarted: false,
+            homing: false,
         }
     }
 
@@ -117,6 +123,21 @@ impl Node {
         }
         for decoder in decoders.filter(|decoder| decoder.every == 0) {
             decoder.silent = 0;
+        }
+    }
+
+    /// A frame of an SDO client: a homing, or another home offset, moves the zero of its positions.
+    pub fn request(&mut self, data: &[u8]) {
+        // Initiate download, expedited or not, and block download.
+        let [command, low, high, _, value, _, _, _] = *data else { return };
+        if command >> 5 != 1 && command & 0xE1 != 0xC0 {
+            return;
+        }
+        let index = u16::from_le_bytes([low, high]);
+        let homing = index == MODE && value == HOMING;
+        self.restarted |= HOME.contains(&index) || homing || (index == MODE && self.homing);
+        if index == MODE {
+            self.homing = homing;
         }
     }
 

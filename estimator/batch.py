@@ -207,22 +207,8 @@ def _whole(record: Record, model: JointModel) -> Record:
     good = np.all(np.isfinite(record.motor_position_rad) & np.isfinite(record.motor_torque_nm), axis=1)
     if model.has_deflection and record.link_position_rad is not None:
         good &= np.isfinite(record.link_position_rad)
-    if np.all(good):
-        return record
 
-    def kept(x: FloatArray | None) -> FloatArray | None:
-        return None if x is None else x[good]
-
-    return replace(
-        record,
-        sequence=record.sequence[good],
-        motor_position_rad=record.motor_position_rad[good],
-        motor_torque_nm=record.motor_torque_nm[good],
-        motor_velocity_rad_s=kept(record.motor_velocity_rad_s),
-        link_position_rad=kept(record.link_position_rad),
-        link_velocity_rad_s=kept(record.link_velocity_rad_s),
-        external_torque_nm=kept(record.external_torque_nm),
-    )
+    return record if np.all(good) else record.rows(good)
 
 
 def _bare(model: JointModel) -> JointModel:

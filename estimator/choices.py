@@ -98,6 +98,10 @@ CHOICES: dict[str, Choice] = {
     "curve": Choice(
         0.6, "what names leave", "left by a free curve reported instead", "else a name says more"
     ),
+    "harm": Choice(
+        0.05, "error", "that a written model may leave beyond the declared one's",
+        "what is held out differs from the rest by more",
+    ),
     "one_sine": Choice(
         1.08, "spectral lines", "of a motion that separates nothing", "one, and what its window leaks"
     ),

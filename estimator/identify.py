@@ -91,7 +91,9 @@ def identify(
         for i, (motor, one) in enumerate(zip(model.motors, fits, strict=True))
     )
     link, link_std = _link(joint)
-    link_effects = _effects(joint, model.link_effects, None, notes)
+    link_effects = model.link_effects
+    if all(one.excited for motor, one in zip(model.motors, fits, strict=True) if motor.flexible):
+        link_effects = _effects(joint, link_effects, None, notes)
     found = replace(model, motors=motors, link=link, link_effects=link_effects)
     return Identified(
         fits=fits,

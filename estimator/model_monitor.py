@@ -8,17 +8,26 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from estimator import _core
+from estimator.choices import choice
 from estimator.errors import EstimatorError
 from estimator.model import JointModel, require, require_finite
-from estimator.sample import Estimate, Record, Sample
+from estimator.sample import Estimate, FloatArray, Record, Sample
 from estimator.settings import EstimatorSettings
 
-__all__ = ["ModelMonitor", "ResidualBaseline", "can_monitor", "measure_baseline"]
+__all__ = [
+    "ModelMonitor",
+    "ResidualBaseline",
+    "Second",
+    "can_monitor",
+    "harm",
+    "measure_baseline",
+    "seconds_of",
+]
 
 _SETTINGS = EstimatorSettings()
 _LEAST_SECONDS = 2  # that a standard deviation takes
@@ -72,6 +81,64 @@ def can_monitor(model: JointModel) -> bool:
     return all(m.transmission.model == "none" or m.transmission.parameters for m in model.motors)
 
 
+class Second(NamedTuple):
+    """Residual and torque of each balance over one second, N·m, and the sequence number at its end."""
+
+    sequence: int
+    residual_nm: tuple[float, ...]
+    torque_nm: tuple[float, ...]
+
+
+def seconds_of(record: Record, model: JointModel) -> list[Second]:
+    """Measure the residual of a model second by second, as the daemon does.
+
+    Args:
+        record: the samples.
+        model: as written, transmission parameters included; nothing is fitted.
+    """
+    monitor, made = ModelMonitor(model, record.period_s, None), []
+    before = 0
+    for sample in record.samples():
+        monitor.core.step(sample)
+        if monitor.core.seconds > before:
+            before = monitor.core.seconds
+            made.append(Second(sample.sequence, monitor.residual_nm, monitor.torque_nm))
+    return made
+
+
+def harm(declared: JointModel, written: JointModel, records: Sequence[Record]) -> str | None:
+    """Say in one sentence that a model leaves more of the motors' torques than the declared one; None: it
+    does not.
+
+    Compared is the logarithm of the error, second by second, less its standard error. A declared model
+    without parameters leaves all of the torque.
+
+    Args:
+        declared: the joint as declared.
+        written: as it is to be written.
+        records: data that took no part in fitting it.
+    """
+    if not can_monitor(written):
+        return None
+
+    def squares(model: JointModel, name: str) -> FloatArray:
+        seconds = [second for one in records for second in seconds_of(one, model)]
+        return np.array([np.sum(np.square(getattr(s, name)[: len(model.motors)])) for s in seconds])
+
+    after, torque = squares(written, "residual_nm"), squares(written, "torque_nm")
+    before = squares(declared, "residual_nm") if can_monitor(declared) else torque
+    if len(after) < _LEAST_SECONDS:
+        return None
+    least = choice("floor") ** 2 * float(np.mean(torque))
+    more = 0.5 * np.log((after + least) / (before + least))
+    scatter = float(np.std(more, ddof=1)) / math.sqrt(len(more))
+    if float(np.mean(more)) - scatter <= math.log1p(choice("harm")):
+        return None
+    rms = [math.sqrt(float(np.mean(x))) for x in (after, before)]
+    whose = "the declared one" if can_monitor(declared) else "no model"
+    return f"on held-out data the new model leaves {rms[0]:.3g} N·m of the torque, {whose} {rms[1]:.3g}"
+
+
 def measure_baseline(
     record: Record | Sequence[Record], model: JointModel, surplus: float = 1.0
 ) -> ResidualBaseline:
@@ -85,15 +152,9 @@ def measure_baseline(
     Raises:
         EstimatorError: they have less than two whole seconds after the filters have settled.
     """
-    residuals, torques = [], []
-    for one in [record] if isinstance(record, Record) else record:
-        monitor, seconds = ModelMonitor(model, one.period_s, None), 0
-        for sample in one.samples():
-            monitor.core.step(sample)
-            if monitor.core.seconds > seconds:
-                seconds = monitor.core.seconds
-                residuals.append(monitor.residual_nm)
-                torques.append(monitor.torque_nm)
+    records = [record] if isinstance(record, Record) else record
+    seconds = [second for one in records for second in seconds_of(one, model)]
+    residuals, torques = [s.residual_nm for s in seconds], [s.torque_nm for s in seconds]
     require(len(residuals) >= _LEAST_SECONDS, "baseline: expected a recording of more than 3 s")
     residual, torque = np.maximum(residuals, _NOTHING), np.maximum(torques, _NOTHING)
     usual = np.sqrt(np.mean(torque**2, axis=0))

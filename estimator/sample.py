@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from enum import IntFlag
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -198,6 +198,12 @@ class Record:
     def time_s(self) -> FloatArray:
         """(n,) time of each row, start_s + sequence * period_s."""
         return np.asarray(self.start_s + self.sequence * self.period_s, dtype=np.float64)
+
+    def rows(self, chosen: NDArray[np.bool_]) -> Record:
+        """Some rows, (n,) booleans; the others become gaps."""
+        channels = {each.name: getattr(self, each.name) for each in fields(self)}
+        kept: dict[str, Any] = {k: x[chosen] for k, x in channels.items() if isinstance(x, np.ndarray)}
+        return replace(self, **kept)
 
     def samples(self) -> Iterator[Sample]:
         """The recording tick by tick, as the live loop would have seen it."""

@@ -14,7 +14,7 @@ from estimator.diagnosis.heldout import held_out
 from estimator.diagnosis.hypothesis import Problem
 from estimator.identify import identify
 from estimator.model import JointModel, Transmission
-from estimator.model_monitor import measure_baseline
+from estimator.model_monitor import harm, measure_baseline
 from estimator.sample import FloatArray, Record
 
 T, SECONDS, BANDWIDTH_HZ = 1e-3, 20.0, 15.0
@@ -131,3 +131,30 @@ def test_errors_beyond_the_residual_widen_what_the_data_tell_not_what_is_declare
     before, after = (np.diag(hac_covariance(problem, fitted, surplus)) for surplus in (1.0, 4.0))
     assert after[0] == pytest.approx(4.0 * before[0], rel=0.02)
     assert after[inertia] == pytest.approx(before[inertia], rel=1e-3)
+
+
+def test_a_file_that_explains_less_than_the_declared_one_is_not_written() -> None:
+    record, model = kit.World([{}], seed=5).run()[0], kit.model()
+    (motor,) = model.motors
+
+    def with_spring(stiffness: float) -> JointModel:
+        own = Transmission(model="linear", parameters={"k_nm_rad": stiffness})
+        return replace(model, motors=(replace(motor, transmission=own),))
+
+    right, soft = with_spring(kit.STIFFNESS), with_spring(0.5 * kit.STIFFNESS)
+    assert harm(soft, right, [record]) is None
+    assert harm(right, right, [record]) is None
+    assert "N·m of the torque, the declared one" in str(harm(right, soft, [record]))
+    assert "no model" in str(harm(model, with_spring(3.0 * kit.STIFFNESS), [record]))
+    assert harm(model, right, [record]) is None
+
+
+@pytest.mark.parametrize("seconds", [4, 5])
+def test_of_a_law_that_ends_at_its_bound_no_stiffness_is_stated(seconds: int) -> None:
+    record, linear = kit.World([{}], seed=5).run()[0], kit.model()
+    own = replace(linear.motors[0], transmission=Transmission(model="vsa-ii"))
+    found = identify(record.rows(record.time_s < seconds), replace(linear, motors=(own,)))
+    (fitted,), (motor,) = found.fits, found.model.motors
+    limit = fitted.parameters or {"c": 2.0}
+    assert isinstance(limit["c"], float) and limit["c"] > 1.001
+    assert bool(fitted.parameters) is (motor.transmission.covariance is not None)

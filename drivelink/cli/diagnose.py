@@ -23,6 +23,7 @@ from drivelink.recording.columnmap import parse_column_map
 from drivelink.recording.mapping import joint_of
 from estimator.diagnosis import Diagnosis, diagnose
 from estimator.errors import EstimatorError
+from estimator.model_monitor import harm
 
 EPILOG = """\
 examples:
@@ -82,15 +83,21 @@ def run(args: argparse.Namespace) -> int:
     documented = replace(outcome, notes=(*notes, *outcome.notes))
     title = report.Title(joint.name, named, validated, joint.axis == "linear")
     made = report.write(documented, title, args.out)
+    harmful = None
     if args.write is not None:
+        written = apply_diagnosis.diagnosed_model(joint, outcome)
+        harmful = harm(joint.model(), written, records if validation is None else [validation])
+    if args.write is not None and harmful is None:
         apply_diagnosis.write(source, args.write, outcome, records[0], named, force=args.force)
         made.append(args.write)
     if args.json:
         print(json.dumps(report.as_json(documented)))
-        return 0
-    _print(outcome, Units(title.linear))
-    for path in made:
-        print(f"wrote {path}")
+    else:
+        _print(outcome, Units(title.linear))
+        for path in made:
+            print(f"wrote {path}")
+    if harmful is not None:
+        raise RecordingError(f"{named}: --write: {harmful}: no joint file is written")
     return 0
 
 

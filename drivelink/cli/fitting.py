@@ -27,7 +27,8 @@ from drivelink.version import __version__
 from estimator.batch import TransmissionFit
 from estimator.errors import EstimatorError
 from estimator.identify import Identified, identify
-from estimator.model import Effect, Motor, ParameterValue
+from estimator.model import Effect, JointModel, Motor, ParameterValue
+from estimator.model_monitor import harm
 from estimator.sample import Record
 from estimator.transmissions import RIGID
 
@@ -68,7 +69,7 @@ def fit_recording(args: argparse.Namespace, source: JointText, folder: Path | No
         _folder(folder)
         made.append(fit_plot(found.fits, joint, folder / "fit.png"))
     if args.write is not None:
-        _write(args, source, found, records)
+        _write(args, source, found, records, bandwidth)
         made.append(args.write)
     for path in [] if args.json else made:
         print(f"wrote {path}")
@@ -207,7 +208,28 @@ def _remarks(one: TransmissionFit) -> list[str]:
     return remarks
 
 
-def _write(args: argparse.Namespace, source: JointText, found: Identified, records: Sequence[Record]) -> None:
+def _harm(
+    records: Sequence[Record], declared: JointModel, found: Identified, bandwidth: float | None
+) -> str | None:
+    """Why a fit without the last quarter is worse there than the declared model; None: it is not."""
+    halves = []
+    for one in records:
+        last = one.sequence >= one.sequence[len(one) * 3 // 4]
+        halves.append((one.rows(~last), one.rows(last)))
+    try:
+        model = identify([kept for kept, _ in halves], declared, bandwidth).model
+    except EstimatorError:  # too short to hold a part out
+        return harm(declared, found.model, records)
+    return harm(declared, model, [held for _, held in halves])
+
+
+def _write(
+    args: argparse.Namespace,
+    source: JointText,
+    found: Identified,
+    records: Sequence[Record],
+    bandwidth: float | None,
+) -> None:
     fits = found.fits
     weak = [number for number, one in enumerate(fits, start=1) if one.model != RIGID and not one.excited]
     if weak:
@@ -219,6 +241,12 @@ def _write(args: argparse.Namespace, source: JointText, found: Identified, recor
         raise RecordingError(
             f"{_named(args)}: --write: expected a stiffness above zero, interval included, over all "
             f"deflections of the recording; that of motor {unusable[0]} is not"
+        )
+    harmful = _harm(records, source.joint.model(), found, bandwidth)
+    if harmful:
+        raise RecordingError(
+            f"{_named(args)}: --write: {harmful}: nothing is written. "
+            "`drivelink diagnose` may say what is missing"
         )
     changes = jointfile.changes_to(found.model)
     provenance = {

@@ -63,6 +63,7 @@ def diagnosed_model(joint: JointFile, outcome: Diagnosis) -> JointModel:
     motors = tuple(
         replace(
             motor,
+            **(outcome.transmissions[i].motor if _decided(outcome) else {}),
             transmission=_transmission(motor.transmission, outcome, i),
             effects=_all_effects(motor.effects, outcome, i),
         )
@@ -107,8 +108,12 @@ def _readings(outcome: Diagnosis, motor: int | None) -> list[Effect]:
 def _transmission(declared: Transmission, outcome: Diagnosis, motor: int) -> Transmission:
     """The transmission with its refitted parameters; as declared if it is rigid or undetermined."""
     found = outcome.transmissions[motor]
-    if not found.parameters or outcome.verdict in ("insufficient_excitation", "unexplained"):
+    if not found.parameters or not _decided(outcome):
         return declared
     size = len(found.covariance)
     order = size if declared.model == "polynomial" else declared.order
     return replace(declared, order=order, parameters=found.parameters, covariance=found.covariance)
+
+
+def _decided(outcome: Diagnosis) -> bool:
+    return outcome.verdict not in ("insufficient_excitation", "unexplained")

@@ -10,12 +10,10 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivelink import recording as recordings
 from drivelink.errors import DrivelinkError
@@ -29,34 +27,13 @@ from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import read_messages
 from estimator.diagnosis import Diagnosis, Errors, diagnose
 from estimator.errors import EstimatorError
-from estimator.model import JointModel
-from estimator.model_monitor import ModelMonitor, can_monitor
+from estimator.model_monitor import Second, can_monitor, seconds_of
 from estimator.sample import Record
 
 _LOG = logging.getLogger("drivelink.loop")
 _LEAST_SECONDS = 6  # of residual, to tell two levels from one
 _NOTHING_NM = 1e-12
 _TRAINED = 2 / 3  # of the data; the rest is held out
-
-
-class Second(NamedTuple):
-    """Residual and torque of each balance over one second, N·m, and the sequence number at its end."""
-
-    sequence: int
-    residual_nm: tuple[float, ...]
-    torque_nm: tuple[float, ...]
-
-
-def seconds_of(record: Record, model: JointModel) -> list[Second]:
-    """The residual of a model second by second, as the daemon measures it."""
-    monitor, made = ModelMonitor(model, record.period_s, None), []
-    before = 0
-    for sample in record.samples():
-        monitor.core.step(sample)
-        if monitor.core.seconds > before:
-            before = monitor.core.seconds
-            made.append(Second(sample.sequence, monitor.residual_nm, monitor.torque_nm))
-    return made
 
 
 def since(seconds: Sequence[Second]) -> tuple[int, int] | None:
@@ -90,9 +67,9 @@ def make(recording: Path) -> dict[str, Any]:
     record = recordings.read(recording, source.joint)
     model = source.joint.model()
     rose = since(seconds_of(record, model)) if can_monitor(model) else None
-    part = record if rose is None else _rows(record, record.sequence > rose[1])
+    part = record if rose is None else record.rows(record.sequence > rose[1])
     held_from = int(part.sequence[round(_TRAINED * (len(part) - 1))])
-    trained, held = _rows(part, part.sequence < held_from), _rows(part, part.sequence >= held_from)
+    trained, held = part.rows(part.sequence < held_from), part.rows(part.sequence >= held_from)
     outcome = diagnose(trained, model, None, held)
     error, sufficient = _error(part, source.joint, outcome, held_from)
     proposed = outcome.verdict == "effect" or (outcome.verdict == "sufficient" and not sufficient)
@@ -112,16 +89,6 @@ def make(recording: Path) -> dict[str, Any]:
         "took_s": round(time.monotonic() - begin_s, 1),
         "report": report.as_json(outcome),
     }
-
-
-def _rows(record: Record, chosen: NDArray[np.bool_]) -> Record:
-    """Some rows of a recording."""
-    rows: dict[str, Any] = {
-        each.name: value[chosen]
-        for each in fields(record)
-        if isinstance(value := getattr(record, each.name), np.ndarray)
-    }
-    return replace(record, **rows)
 
 
 def _error(part: Record, joint: JointFile, outcome: Diagnosis, held_from: int) -> tuple[Errors, bool]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+from dataclasses import asdict
 from pathlib import Path
 from string import Template
 from typing import Any, NamedTuple
@@ -69,7 +70,7 @@ def as_json(outcome: Diagnosis) -> dict[str, Any]:
         "bandwidth_hz": outcome.bandwidth_hz,
         "effects": [_effect(finding, unlisted) for finding in outcome.effects],
         "error": {"train": outcome.train._asdict(), "validation": outcome.validation._asdict()},
-        "transmissions": [one._asdict() for one in outcome.transmissions],
+        "transmissions": [asdict(one) for one in outcome.transmissions],
         "recordings": [
             {
                 "train": one.train._asdict(),

@@ -199,8 +199,24 @@ def transmissions_of(
             continue
         std_of_alpha = np.sqrt(np.maximum(np.diag(own), 0.0))
         rows = tuple(map(tuple, own.tolist()))
-        made.append(Refitted(model.name, model.parameters(alpha), model.parameters(std_of_alpha), rows))
+        numbers = _motor(problem, after, i)
+        made.append(
+            Refitted(model.name, model.parameters(alpha), model.parameters(std_of_alpha), rows, numbers)
+        )
     return tuple(made), doubts
+
+
+def _motor(problem: Problem, after: Fitted, i: int) -> dict[str, float]:
+    """Inertia and damping that go with the transmission; an effect of that name is written as one."""
+    declared, made = problem.model.motors[i], {}
+    for name, key in (
+        ("motor_inertia", "inertia_kg_m2"),
+        ("viscous_damping", "viscous_damping_nm_s_rad"),
+    ):
+        more = after.total("everyday", name, i)
+        if more:
+            made[key] = max(float(getattr(declared, key)) + more[0], 0.0)
+    return made
 
 
 def _between(

@@ -102,13 +102,17 @@ class Series:
     after_nm: FloatArray
 
 
-class Refitted(NamedTuple):
-    """One refitted transmission, as in the joint file; empty if it is rigid or undetermined."""
+@dataclass(frozen=True, slots=True)
+class Refitted:
+    """One refitted transmission and the motor's inertia and damping beside it, as in the joint file; empty if
+    it is rigid or undetermined.
+    """
 
     model: str
     parameters: dict[str, ParameterValue]
     std: dict[str, ParameterValue]
     covariance: tuple[tuple[float, ...], ...] = ()
+    motor: dict[str, float] = field(default_factory=dict)
 
 
 class StiffnessCurve(NamedTuple):

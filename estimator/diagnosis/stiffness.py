@@ -49,7 +49,10 @@ def middle(model: TransmissionModel, alpha: FloatArray, covariance: FloatArray, 
     at = np.array([float(np.median(np.abs(phi)))])
     slope = np.asarray(model.stiffness_jacobian(at, alpha))[0]
     variance = float(slope @ covariance @ slope)
-    return Middle(float(np.asarray(model.stiffness(at, alpha))[0]), float(np.sqrt(max(variance, 0.0))), slope)
+    # A negative variance is rounding of one without bound.
+    possible = variance >= 0.0 and bool(np.all(np.diag(covariance) >= 0.0))
+    std = float(np.sqrt(variance)) if possible else np.inf
+    return Middle(float(np.asarray(model.stiffness(at, alpha))[0]), std, slope)
 
 
 def stiffness_curves(

@@ -13,6 +13,10 @@ const HOME: [u16; 2] = [0x607C, 0x6098]; // home offset, homing method (CiA 402-
 
 /// What became of one node's frames since the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[cfg_attr(
+    feature = "python",
+    pyo3::pyclass(frozen, get_all, module = "drivelink._core", name = "NodeCounters")
+)]
 pub struct Counters {
     /// PDOs of this node that were used.
     pub received: u64,

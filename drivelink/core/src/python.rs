@@ -30,13 +30,15 @@ mod extension {
     use pyo3::prelude::*;
 
     #[pymodule_export]
-    use super::assembler::{Assembler, NodeCounters};
+    use super::assembler::Assembler;
     #[pymodule_export]
     use super::latency::LatencyHistogram;
     #[pymodule_export]
     use super::pipeline::{History, JointPipeline, Tick};
     #[pymodule_export]
     use super::values::{encode_estimate, encode_external, encode_sample};
+    #[pymodule_export]
+    use crate::node::Counters;
     #[pymodule_export]
     use estimator_core::python::{Estimator, ModelMonitor};
 

@@ -6,30 +6,16 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 
 use super::lock;
-use super::values::{drive_error, layout_from, sample_object};
+use super::values::{NodeFields, drive_error, node_of, sample_object};
 use crate::assembler;
 use crate::cross_check::{CrossCheck, Verdict};
 use crate::node::Counters;
 
-/// What became of one node's frames since the start.
-#[pyclass(frozen, get_all, module = "drivelink._core")]
-pub(super) struct NodeCounters {
-    received: u64,
-    missing: u64,
-    late: u64,
-    duplicate: u64,
-    conflicting: u64,
-    wrong_length: u64,
-    ignored: u64,
-    reboots: u64,
-    emergencies: u64,
-}
-
 #[pymethods]
-impl NodeCounters {
+impl Counters {
     #[new]
-    fn new() -> NodeCounters {
-        Counters::default().into()
+    fn new() -> Counters {
+        Counters::default()
     }
 
     fn as_dict<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
@@ -51,22 +37,6 @@ impl NodeCounters {
     }
 }
 
-impl From<Counters> for NodeCounters {
-    fn from(c: Counters) -> NodeCounters {
-        NodeCounters {
-            received: c.received,
-            missing: c.missing,
-            late: c.late,
-            duplicate: c.duplicate,
-            conflicting: c.conflicting,
-            wrong_length: c.wrong_length,
-            ignored: c.ignored,
-            reboots: c.reboots,
-            emergencies: c.emergencies,
-        }
-    }
-}
-
 /// Makes the samples of one joint from the frames of its nodes.
 #[pyclass(frozen, module = "drivelink._core")]
 pub(super) struct Assembler {
@@ -79,14 +49,13 @@ impl Assembler {
     #[pyo3(signature = (layouts, motors, *, active = true, hold_periods = 250, period_s = 0.001))]
     fn new(
         py: Python<'_>,
-        layouts: &Bound<'_, PyAny>,
+        layouts: Vec<NodeFields>,
         motors: usize,
         active: bool,
         hold_periods: i64,
         period_s: f64,
     ) -> PyResult<Assembler> {
-        let layouts =
-            layouts.try_iter()?.map(|layout| layout_from(py, &layout?)).collect::<PyResult<Vec<_>>>()?;
+        let layouts = layouts.into_iter().map(|layout| node_of(py, layout)).collect::<PyResult<Vec<_>>>()?;
         let core = assembler::Assembler::new(&layouts, motors, active, hold_periods, period_s)
             .map_err(|message| drive_error(py, message))?;
         Ok(Assembler { core: Mutex::new(core) })
@@ -123,7 +92,7 @@ impl Assembler {
         let counters: Vec<_> = lock(&self.core).nodes().iter().map(|n| (n.node_id, n.counters)).collect();
         let found = PyDict::new(py);
         for (node_id, counted) in counters {
-            found.set_item(node_id, NodeCounters::from(counted).into_pyobject(py)?)?;
+            found.set_item(node_id, counted.into_pyobject(py)?)?;
         }
         Ok(found)
     }
@@ -216,8 +185,8 @@ impl Assembler {
         lock(&self.core).contradict(node_id, contradicted);
     }
 
-    fn relayout(&self, py: Python<'_>, layout: &Bound<'_, PyAny>) -> PyResult<()> {
-        let layout = layout_from(py, layout)?;
+    fn relayout(&self, py: Python<'_>, layout: NodeFields) -> PyResult<()> {
+        let layout = node_of(py, layout)?;
         let changed = lock(&self.core).relayout(&layout);
         changed.map_err(|message| drive_error(py, message))
     }

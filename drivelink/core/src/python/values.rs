@@ -176,8 +176,38 @@ pub(super) fn encode_external<'py>(
     Ok(PyBytes::new(py, wire::encode_external(&external, stamp_ns).bytes()))
 }
 
-pub(super) fn mapped_from(py: Python<'_>, object: &Bound<'_, PyAny>) -> PyResult<MappedObject> {
-    let signal = match object.getattr("signal")?.extract::<String>()?.as_str() {
+/// A `MappedObject` of Python.
+#[derive(FromPyObject)]
+struct MappedFields {
+    signal: String,
+    index: u32,
+    subindex: u32,
+    bits: u32,
+    signed: bool,
+    scale: f64,
+    wraps: bool,
+    offset: f64,
+    modulus: i128,
+}
+
+/// A `TpdoLayout` of Python.
+#[derive(FromPyObject)]
+struct TpdoFields {
+    cob_id: u32,
+    objects: Vec<MappedFields>,
+    transmission_type: u32,
+}
+
+/// A `NodeLayout` of Python.
+#[derive(FromPyObject)]
+pub(super) struct NodeFields {
+    node_id: u32,
+    motor: Option<usize>,
+    tpdos: Vec<TpdoFields>,
+}
+
+fn mapped_of(from: MappedFields) -> Result<MappedObject, String> {
+    let signal = match from.signal.as_str() {
         "motor_position" => Signal::MotorPosition,
         "motor_velocity" => Signal::MotorVelocity,
         "motor_torque" => Signal::MotorTorque,
@@ -191,42 +221,25 @@ pub(super) fn mapped_from(py: Python<'_>, object: &Bound<'_, PyAny>) -> PyResult
         "position_demand" => Signal::PositionDemand,
         _ => Signal::Other,
     };
-    let bits: u32 = object.getattr("bits")?.extract()?;
+    let MappedFields { index, subindex, bits, signed, scale, offset, .. } = from;
     if bits > 64 && signal != Signal::Other {
-        let (index, subindex): (u32, u32) =
-            (object.getattr("index")?.extract()?, object.getattr("subindex")?.extract()?);
-        let message = format!("0x{index:04X}:{subindex:02X}: expected at most 64 bits, got {bits}");
-        return Err(drive_error(py, message));
+        return Err(format!("0x{index:04X}:{subindex:02X}: expected at most 64 bits, got {bits}"));
     }
-    let modulus: i128 = object.getattr("modulus")?.extract()?;
-    let range = match (object.getattr("wraps")?.extract::<bool>()?, modulus) {
+    let range = match (from.wraps, from.modulus) {
         (false, _) => 0,
         (true, 0) => 1 << bits,
         (true, modulus) => modulus,
     };
-    Ok(MappedObject {
-        signal,
-        bits,
-        signed: object.getattr("signed")?.extract()?,
-        scale: object.getattr("scale")?.extract()?,
-        offset: object.getattr("offset")?.extract()?,
-        range,
-    })
+    Ok(MappedObject { signal, bits, signed, scale, offset, range })
 }
 
-pub(super) fn layout_from(py: Python<'_>, layout: &Bound<'_, PyAny>) -> PyResult<Node> {
-    let tpdos = layout.getattr("tpdos")?.try_iter()?.map(|tpdo| {
-        let tpdo = tpdo?;
-        let objects = tpdo.getattr("objects")?.try_iter()?.map(|each| mapped_from(py, &each?));
-        Ok(Tpdo {
-            cob_id: tpdo.getattr("cob_id")?.extract::<u32>()? & 0x7FF,
-            objects: objects.collect::<PyResult<_>>()?,
-            transmission_type: tpdo.getattr("transmission_type")?.extract()?,
-        })
-    });
-    Ok(Node {
-        node_id: layout.getattr("node_id")?.extract()?,
-        motor: layout.getattr("motor")?.extract()?,
-        tpdos: tpdos.collect::<PyResult<_>>()?,
-    })
+pub(super) fn node_of(py: Python<'_>, from: NodeFields) -> PyResult<Node> {
+    let tpdo_of = |tpdo: TpdoFields| {
+        let TpdoFields { cob_id, objects, transmission_type } = tpdo;
+        let objects = objects.into_iter().map(mapped_of).collect::<Result<_, _>>()?;
+        Ok(Tpdo { cob_id: cob_id & 0x7FF, objects, transmission_type })
+    };
+    let tpdos = from.tpdos.into_iter().map(tpdo_of).collect::<Result<_, String>>();
+    let tpdos = tpdos.map_err(|message| drive_error(py, message))?;
+    Ok(Node { node_id: from.node_id, motor: from.motor, tpdos })
 }

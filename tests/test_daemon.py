@@ -11,11 +11,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from daemonkit import Collector, DaemonRig, Listener, listens, patient, rig, running, served, vsa, vsa_text
+from daemonkit import Collector, DaemonRig, Listener, rig, running, served, vsa, vsa_text
 from zenohkit import LIMIT_S, free_endpoint, until
 
 from drivelink._core import SYNC_COB_ID
-from drivelink.canopen.guard import check_frame
 from drivelink.cycle.lockstep import run_lockstep
 from drivelink.cycle.pipeline import make_pipeline
 from drivelink.cycle.startup import join_bus
@@ -181,55 +180,6 @@ def test_joints_of_one_daemon_share_the_bus() -> None:
         Daemon([ServedJoint(joint=one), ServedJoint(joint=one)])
 
 
-def test_everything_it_sends_is_allowed_by_the_guard() -> None:
-    joint = vsa()
-    listener = Listener(joint)
-    with rig(joint) as made:
-        made.run(200)
-        made.faults.reboot(made.node(1))
-        made.run(1000)
-        own = {0x000, SYNC_COB_ID}
-        sent = [f for f in listener.frames() if f[0] in own or 0x600 <= f[0] < 0x680]
-        assert len(sent) > 1200
-        for cob_id, data in sent:
-            check_frame(cob_id, data)
-    listener.close()
-
-
-PASSIVE = """
-sync = "follow"
-configure = false
-"""
-
-
-def passive(active: JointFile) -> JointFile:
-    """A second daemon's joint file for the bus of another master; the mapping is taken from the traffic."""
-    return vsa(name="guest", channel=active.bus.channel, bus=PASSIVE)
-
-
-def test_a_passive_daemon_follows_a_foreign_master_and_never_sends_a_frame(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    patient(monkeypatch)
-    joint = vsa()
-    bus = open_sim_bus(joint.bus)
-    network = network_from_joint(joint, bus)
-    network.start()
-    made: list[Daemon] = []
-    guest = threading.Thread(target=lambda: made.append(daemon(passive(joint), publish=False)))
-    guest.start()  # it must be there before the master configures, to overhear the mapping
-    listens(joint, devices=1)
-    with running(daemon(joint, publish=False)):
-        guest.join(60.0)
-        follower = made[0]
-        follower._port.bus.send = lambda *_: pytest.fail("a passive daemon has sent a frame")
-        with running(follower):
-            until(lambda: follower.loop.loop_joints[0].estimates > 300)
-            assert follower.documents()[0]["bus"]["sync"] == "follow"
-    network.stop()
-    bus.shutdown()
-
-
 def test_a_passive_daemon_without_sync_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     joint = vsa(bus='sync = "follow"')
     monkeypatch.setattr("drivelink.daemon.service.join_bus", partial(join_bus, patience_s=0.2))
@@ -267,22 +217,6 @@ def test_when_sync_stops_the_estimates_are_stale_and_come_back_with_it() -> None
         maker.join()
         listener.close()
         assert network.syncs > 0
-
-
-def test_a_lost_bus_is_opened_again_by_itself() -> None:
-    joint = vsa(bus=SLOWLY)
-    with served(joint):
-        made = daemon(joint, publish=False)
-        pipeline = made.pipelines[0]
-        with running(made):
-            until(lambda: fresh(pipeline.estimate))
-            made._port.bus.shutdown()  # as if the interface were gone
-            until(lambda: pipeline.estimate.status & Status.STALE)
-            assert made.documents()[0]["state"] in ("bus lost", "stale")
-            until(lambda: not pipeline.estimate.status & Status.STALE)
-            texts = [event["text"] for event in made.events.recent()]
-            assert sum("the bus is lost" in text for text in texts) == 1
-            assert sum("the bus is back" in text for text in texts) == 1
 
 
 def reloadable(tmp_path: Path) -> DaemonRig:

@@ -21,6 +21,7 @@ from drivelink.errors import DrivelinkError
 from drivelink.jointfile import load, parse
 from drivelink.pubsub import wire
 from drivelink.recording import read
+from drivelink.recording.canlog import CAN_FORMATS
 from drivelink.recording.columnmap import parse_column_map
 from drivelink.recording.formats import open_sink
 from drivelink.recording.mapping import joint_of, layouts_from
@@ -50,7 +51,7 @@ objects = ["0x6077:00:16"]
 counts_per_rev = 65536
 """
 JOINT = parse(TEXT)
-RECORDINGS = (".mcap", ".csv", ".log", ".blf", ".asc", ".trc")
+RECORDINGS = (".mcap", ".csv", *(ending for ending, kind in CAN_FORMATS.items() if kind.writer))
 _FILLING = (
     b"\xff" * 8,
     b"\0" * 8,

@@ -15,6 +15,7 @@ from drivelink import recording
 from drivelink.errors import RecordingError
 from drivelink.jointfile import JointFile
 from drivelink.recording.canframes import FrameLog, is_frame_log
+from drivelink.recording.canlog import CAN_FORMATS
 from drivelink.recording.columns import sample_columns, sample_row
 from drivelink.recording.cycles import Cycle
 from drivelink.recording.mcapsamples import recorded_cycles
@@ -23,8 +24,7 @@ from estimator.sample import Record
 # Rise of the peak memory of fit, diagnosis and report over that of the file's size. Of a CSV it is measured
 # (22 at 500 Hz, benchmarks/fleet.py memory; less at a higher rate) and rounded up. A text log has about as
 # many bytes a sample, compressed formats have a fraction.
-_EXPANSION = {".csv": 30.0, ".log": 30.0, ".candump": 30.0, ".asc": 30.0, ".trc": 30.0}
-_EXPANSION_OTHER = 100.0
+_EXPANSION_TEXT, _EXPANSION_OTHER = 30.0, 100.0
 _BASE_BYTES = 550 << 20  # memory of a worker without a recording: interpreter, libraries, Dask, caches
 _LEAST_BYTES = 64 << 20  # minimum for a part, which must contain enough motion
 _USED = 0.7  # share of the limit that is used: Dask pauses a worker at 0.8 and ends it at 0.95
@@ -67,7 +67,9 @@ def _parts(path: Path, limit_bytes: float) -> int:
     if limit_bytes <= 0:
         return 1
     budget = max(_USED * limit_bytes - _BASE_BYTES, min(_LEAST_BYTES, limit_bytes))
-    needed = path.stat().st_size * _EXPANSION.get(path.suffix.lower(), _EXPANSION_OTHER)
+    suffix = path.suffix.lower()
+    text = suffix == ".csv" or (suffix in CAN_FORMATS and CAN_FORMATS[suffix].text)
+    needed = path.stat().st_size * (_EXPANSION_TEXT if text else _EXPANSION_OTHER)
     return max(1, math.ceil(needed / budget))
 
 

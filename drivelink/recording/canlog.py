@@ -23,9 +23,41 @@ from drivelink.recording.limits import MAX_LINE_BYTES, require_stamp
 
 _LOG = logging.getLogger("drivelink.recording")
 
-_READERS: dict[str, Any] = {".blf": can.BLFReader, ".asc": can.ASCReader, ".trc": can.TRCReader}
-_BOUNDED: dict[Any, Any] = {can.BLFReader: BlfBytes, can.ASCReader: AscText, can.TRCReader: TrcText}
-CAN_SUFFIXES = frozenset({".log", ".candump", *_READERS})
+
+class _BlfWriter(can.BLFWriter):
+    """python-can's writer with early closing of containers."""
+
+    def end_container(self) -> None:
+        """Write the open container."""
+        self._flush()
+
+
+class CanFormat(NamedTuple):
+    """A format of raw frames.
+
+    Attributes:
+        writer: python-can's; None: not written.
+        reader: python-can's; None: text as candump writes it, read here.
+        bounded: what the reader reads from, see `boundedlog`.
+        text: whether it has lines.
+    """
+
+    writer: Any
+    reader: Any = None
+    bounded: Any = None
+    text: bool = True
+
+
+CAN_FORMATS = {
+    ".log": CanFormat(can.CanutilsLogWriter),
+    ".candump": CanFormat(None),
+    ".blf": CanFormat(_BlfWriter, can.BLFReader, BlfBytes, text=False),
+    ".asc": CanFormat(can.ASCWriter, can.ASCReader, AscText),
+    ".trc": CanFormat(can.TRCWriter, can.TRCReader, TrcText),
+}
+"""Formats of raw frames, by the ending of the file's name."""
+
+CAN_SUFFIXES = frozenset(CAN_FORMATS)
 NO_STAMP = -1
 _EXTENDED_DIGITS = 8
 _LAST_ID = 0x7FF
@@ -83,7 +115,7 @@ def read_frames(path: Path, channel: str | None = None, configured: str = "") ->
     Raises:
         RecordingError: it cannot be read, has another format, or its channel is unknown.
     """
-    frames = _text_frames(path) if path.suffix.lower() in (".log", ".candump") else _library_frames(path)
+    frames = _library_frames(path) if CAN_FORMATS[path.suffix.lower()].reader else _text_frames(path)
     head = list(islice(frames, _LOOK_AHEAD))
     chosen = channel or _channel(head, configured, path)
     whole: Iterator[LoggedFrame] = chain(head, frames)
@@ -316,12 +348,12 @@ def _added_up(frames: Iterable[LoggedFrame]) -> Iterator[LoggedFrame]:
 
 def _library_frames(path: Path) -> Iterator[LoggedFrame]:
     """Read by python-can's reader; a truncated file ends at its last complete frame."""
-    kind = _READERS[path.suffix.lower()]
+    kind = CAN_FORMATS[path.suffix.lower()]
     count = 0
     try:
         # Opened here, because a reader leaves a malformed file open.
         with open_regular(path) as file:
-            for message in kind(_BOUNDED[kind](file, path)):
+            for message in kind.reader(kind.bounded(file, path)):
                 if message.is_extended_id or message.is_error_frame or message.is_remote_frame:
                     continue
                 if message.arbitration_id > _LAST_ID or len(message.data) > _LONGEST:

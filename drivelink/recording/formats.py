@@ -6,6 +6,7 @@ from pathlib import Path
 
 from drivelink.errors import RecordingError
 from drivelink.jointfile import JointFile
+from drivelink.recording.canlog import CAN_FORMATS
 from drivelink.recording.mf4file import Mf4Sink
 from drivelink.recording.sinks import CanSink, CsvSink, McapSink, Sink
 
@@ -29,8 +30,7 @@ def open_sink(path: Path, joint: JointFile, joint_text: str = "", *, force: bool
         return CsvSink(path, joint, force=force)
     if suffix == ".mf4":
         return Mf4Sink(path, joint, joint_text, force=force)
-    if suffix in (".log", ".asc", ".blf", ".trc"):
+    written = [ending for ending, kind in CAN_FORMATS.items() if kind.writer]
+    if suffix in written:
         return CanSink(path, joint, force=force)
-    raise RecordingError(
-        f"{path}: expected a name that ends in .mcap, .csv, .mf4, .log (candump), .blf, .asc or .trc"
-    )
+    raise RecordingError(f"{path}: expected a name that ends in .mcap, .csv, .mf4 or {', '.join(written)}")

@@ -18,6 +18,7 @@ from drivelink.errors import RecordingError
 from drivelink.jointfile import JointFile
 from drivelink.outfile import check_target, write_whole
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
+from drivelink.recording.canlog import CAN_FORMATS
 from drivelink.recording.columns import sample_columns, sample_row
 from drivelink.recording.mapping import side_file
 from drivelink.recording.messages import (
@@ -184,16 +185,8 @@ class McapSink(Sink):
         self._writer.add_message(self._channels[topic], stamp_ns, data, stamp_ns)
 
 
-class _BlfWriter(can.BLFWriter):
-    """python-can's writer with early closing of containers."""
-
-    def end_container(self) -> None:
-        """Write the open container."""
-        self._flush()
-
-
 class CanSink(Sink):
-    """Raw frames in python-can's formats: candump .log, .asc, .blf, .trc; the mapping beside them."""
+    """Raw frames in one of `CAN_FORMATS`; the mapping beside them."""
 
     wants = frozenset({"frame"})
 
@@ -203,17 +196,10 @@ class CanSink(Sink):
         super().__init__(path, force=force)
         self._side, self._force, self._beside = side, force, ""
         suffix = path.suffix.lower()
-        self._text: io.TextIOWrapper | None = None
-        if suffix == ".blf":
-            self._writer: Any = _BlfWriter(self._file, channel=1)  # type: ignore[arg-type]
-        else:
-            kinds: dict[str, Any] = {
-                ".log": can.CanutilsLogWriter,
-                ".asc": can.ASCWriter,
-                ".trc": can.TRCWriter,
-            }
+        kind, self._text = CAN_FORMATS[suffix], None
+        if kind.text:
             self._text = io.TextIOWrapper(self._file, encoding="ascii", newline="\n", write_through=True)
-            self._writer = kinds[suffix](self._text)
+        self._writer = kind.writer(self._text or self._file)
         # Formats with numbered channels have no names.
         self._channel: str | int = joint.bus.channel.replace(" ", "_") if suffix == ".log" else 0
 

@@ -12,6 +12,7 @@ from estimator.batch import fit_joint
 from estimator.diagnosis.covariance import hac_covariance
 from estimator.diagnosis.heldout import held_out
 from estimator.diagnosis.hypothesis import Problem
+from estimator.errors import EstimatorError
 from estimator.identify import identify
 from estimator.model import JointModel, Transmission
 from estimator.model_monitor import harm, measure_baseline
@@ -158,3 +159,21 @@ def test_of_a_law_that_ends_at_its_bound_no_stiffness_is_stated(seconds: int) ->
     limit = fitted.parameters or {"c": 2.0}
     assert isinstance(limit["c"], float) and limit["c"] > 1.001
     assert bool(fitted.parameters) is (motor.transmission.covariance is not None)
+
+
+@pytest.mark.parametrize("linked", [True, False])
+def test_a_damping_that_nobody_declared_is_no_anchor_at_zero(linked: bool) -> None:
+    record, known = kit.World([{}], seed=5).run()[0], kit.model(linked=linked)
+    motor = replace(known.motors[0], viscous_damping_nm_s_rad=0.0)
+    (fitted,) = identify(record, replace(known, motors=(motor,))).fits
+    error = abs(fitted.viscous_damping_nm_s_rad - kit.DAMPING)
+    assert error < max(3.0 * fitted.nuisance_std["damping"], 0.02 * kit.DAMPING)
+    assert fitted.nuisance_std["damping"] < 0.1 * kit.DAMPING
+
+
+def test_a_deflection_that_a_law_cannot_have_is_an_error_that_says_so() -> None:
+    record, linear = kit.World([{}], seed=5).run()[0], kit.model()
+    own = replace(linear.motors[0], transmission=Transmission(model="vsa-ii"))
+    far = replace(record, motor_position_rad=1e6 * record.motor_position_rad)
+    with pytest.raises(EstimatorError, match="more than a transmission of model"):
+        identify(far, replace(linear, motors=(own,)))

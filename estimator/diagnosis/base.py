@@ -8,6 +8,7 @@ import numpy as np
 
 from estimator.choices import whole
 from estimator.diagnosis.frame import Frame
+from estimator.errors import EstimatorError
 from estimator.model import ParameterValue
 from estimator.sample import FloatArray
 from estimator.transmissions import TransmissionModel, transmission_model
@@ -96,6 +97,11 @@ def _search(frame: Frame, i: int, model: TransmissionModel, order: int) -> Float
         first = 1.02 * low if low > 0.5 else 0.02 / max(most, 1e-9)
         near = np.geomspace(first, min(high, max(20.0 / max(most, 1e-9), 1.1 * first)), whole("points"))
         shapes = [(float(x), *rest) for x in near if model.reach((float(x), *rest)) > most * 1.001]
+    if not shapes:
+        raise EstimatorError(
+            f"recording: a deflection of {most:.3g} rad is more than a transmission of model "
+            f'"{model.name}" can have: check its units, or declare another model'
+        )
     best, found = np.inf, np.zeros(0)
     for shape in shapes:
         columns = frame.project(np.asarray(model.basis(phi, shape, order)))

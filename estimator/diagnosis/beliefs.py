@@ -110,6 +110,9 @@ def _of_motor_std(
     if name == "motor_inertia":
         return (motor.inertia_std_relative or std) * motor.inertia_kg_m2
     fast = max(float(np.max(np.abs(f.motors[i].velocity))) for f in frames)
+    undeclared = motor.viscous_damping_nm_s_rad == 0.0 and motor.viscous_damping_std_nm_s_rad is None
+    if calibrating and undeclared:  # a damping that nobody declared is not known to be zero
+        return PRIORS["effect"].std * torque_rms / max(fast, 1e-300)
     floor = 0.0 if linked else PRIORS["viscous_damping_floor"].std * torque_rms / max(fast, 1e-300)
     return float(np.hypot(std * motor.viscous_damping_nm_s_rad, floor))
 

@@ -106,7 +106,8 @@ def _clustered(
     weight = np.sqrt(1.0 / (fitted.times * fitted.posterior.sigma**2))[regression.group]
     rows = regression.design[:, free] * (weight[:, None] * unit)
     left = regression.residual(fitted.posterior.x) * weight
-    root = np.linalg.cholesky(bread)
+    sizes, directions = np.linalg.eigh(bread)
+    root = directions * np.sqrt(np.maximum(sizes, 0.0))  # rounding may leave one below zero
     total = np.zeros_like(bread)
     parts = []
     groups = np.unique(labels[labels >= 0])

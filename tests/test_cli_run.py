@@ -118,39 +118,23 @@ def test_simulated_drives_daemon_and_subscriber_are_three_processes(joint: Path,
             assert (end["event"], status["joint"]) == ("end", "elbow") and status["estimates"] > 0
 
 
-@pytest.mark.slow
-def test_a_bus_without_drives_is_one_line(tmp_path: Path) -> None:
-    path = tmp_path / "elbow.toml"
-    path.write_text(vsa_text(endpoint=free_endpoint()), encoding="utf-8")
-    one_line(finished("run", str(path)), 5, "node 1 does not answer")
-
-
-def test_a_missing_interface_is_one_line(tmp_path: Path) -> None:
-    path = tmp_path / "elbow.toml"
-    path.write_text(vsa_text(endpoint=free_endpoint()), encoding="utf-8")
-    one_line(
-        finished("run", str(path), "--interface", "socketcan", "--channel", "nocan3"), 4, "socketcan nocan3"
-    )
-
-
 @pytest.mark.parametrize(
-    ("arguments", "status", "pattern"),
+    ("old", "new", "options", "status", "pattern"),
     [
-        (("run", "missing.toml"), 2, "missing.toml: cannot be read"),
-        (("run", "README.md", "--seconds", "-1"), 2, "--seconds"),
+        ("", "", ("--interface", "socketcan", "--channel", "nocan3"), 4, "socketcan nocan3"),
+        ("", "", ("--seconds", "-1"), 2, "--seconds"),
+        ("node_id = 1", "node_idd = 1", (), 2, r"motor\[1\]\.drive\.node_id"),
+        ("tcp/", "nonsense", (), 6, "zenoh"),
+        pytest.param("", "", (), 5, "node 1 does not answer", marks=pytest.mark.slow),
     ],
 )
-def test_a_wrong_command_line_is_one_line(arguments: tuple[str, ...], status: int, pattern: str) -> None:
-    one_line(finished(*arguments), status, pattern)
-
-
-def test_a_wrong_key_in_the_joint_file_is_one_line(tmp_path: Path) -> None:
+def test_what_cannot_run_is_one_line(
+    tmp_path: Path, old: str, new: str, options: tuple[str, ...], status: int, pattern: str
+) -> None:
     path = tmp_path / "elbow.toml"
-    path.write_text(vsa_text().replace("node_id = 1", "node_idd = 1"), encoding="utf-8")
-    one_line(finished("run", str(path)), 2, r"motor\[1\]\.drive\.node_id")
+    path.write_text(vsa_text(endpoint=free_endpoint()).replace(old, new), encoding="utf-8")
+    one_line(finished("run", str(path), *options), status, pattern)
 
 
-def test_an_endpoint_that_is_no_endpoint_is_one_line(tmp_path: Path) -> None:
-    path = tmp_path / "elbow.toml"
-    path.write_text(vsa_text(endpoint="nonsense"), encoding="utf-8")
-    one_line(finished("run", str(path)), 6, "zenoh")
+def test_a_joint_file_that_is_not_there_is_one_line() -> None:
+    one_line(finished("run", "missing.toml"), 2, "missing.toml: cannot be read")

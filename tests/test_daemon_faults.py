@@ -148,7 +148,7 @@ def test_nodes_that_somebody_stopped_are_woken_before_they_are_asked() -> None:
     assert back < 800
 
 
-@pytest.mark.parametrize("segment_bytes", [7, 0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("segment_bytes", [7, *(pytest.param(n, marks=pytest.mark.slow) for n in (0, 1))])
 def test_a_drive_that_answers_sdo_without_end_harms_itself_only(segment_bytes: int) -> None:
     with rig() as made:
         settle(made)

@@ -48,7 +48,9 @@ class Statuses(ObjectSink):
         pass
 
 
-@pytest.mark.parametrize("case", ["constant", "quadratic", "vsa-ii"])
+@pytest.mark.parametrize(
+    "case", [*(pytest.param(case, marks=pytest.mark.slow) for case in ("constant", "quadratic")), "vsa-ii"]
+)
 def test_in_a_healthy_demo_nothing_changes(case: str) -> None:
     with resources.as_file(resources.files("drivelink") / "joints" / f"{case}.toml") as path:
         joint = jointfile.load(path)

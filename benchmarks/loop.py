@@ -1,0 +1,185 @@
+"""How the loop closes on each effect of the library: alarm, finding, its name, the residual after it.
+
+    python benchmarks/loop.py [--effects NAME ...] [--share X] [--json FILE]
+
+The joint of `drivelink demo --case friction` with its daemon in lockstep, healthy for 10 s; then the effect,
+which takes about a share of the torque. What the black box would keep is diagnosed, and the proposed joint
+file's own test watches ten more seconds. The finding comes 15 s after the alarm, plus the time of the
+diagnosis, here at normal priority. `drivelink demo --case …` does the same in three processes in real time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from diagnosis_seeds import LIKELY, sizes
+from rich.console import Console
+from rich.progress import track
+
+from drivelink import jointfile
+from drivelink.cycle.loop import ObjectSink
+from drivelink.daemon.service import Daemon, ServedJoint
+from drivelink.demo.simbus import open_sim_bus
+from drivelink.demo.simulate import alter, network_from_joint, world_from_joint
+from drivelink.jointfile.residual_baseline import make_model_monitor
+from drivelink.loop import diagnosing, finding
+from drivelink.loop.blackbox import AFTER_S
+from drivelink.loop.folder import proposal_file, recording_name
+from drivelink.recording.sinks import McapSink
+from estimator.effects import LIBRARY
+from estimator.errors import EstimatorError
+from estimator.sample import Estimate, Sample, Status
+from sim.effects import LISTED
+
+ELBOW = Path(__file__).parent.parent / "drivelink" / "joints" / "elbow.toml"
+HEALTHY_S, PATIENCE_S, WATCHED_S = 10.0, 45.0, 10.0
+TORQUE_NM, STIFFNESS_NM_RAD = 5.0, 120.0  # rms of the motion, stiffness at rest
+
+
+class Taken(ObjectSink):
+    """Samples and alarm of every cycle."""
+
+    def __init__(self) -> None:
+        self.samples: list[Sample] = []
+        self.alarm = False
+
+    def put_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
+        self.alarm = self.alarm or bool(estimate.status & Status.MODEL_ALARM)
+
+    def put_sample(self, sample: Sample, stamp_ns: int) -> None:
+        self.samples.append(sample)
+
+
+def effect_text(name: str, share: float) -> str:
+    """The effect as `sim --effect` takes it, of a size that takes about that share of the torque."""
+    values = sizes(TORQUE_NM, STIFFNESS_NM_RAD, share, np.random.default_rng(0))[name]
+    main, *_ = (parameter.name for parameter in LISTED[name].parameters)
+    further = "".join(f",{key}={value!r}" for key, value in values.items() if key != main)
+    return f"{name}={values[main]!r}{further}"
+
+
+def scene(name: str, share: float) -> dict[str, Any]:
+    """One effect from its begin to the residual after its finding."""
+    joint = jointfile.load(ELBOW)
+    world, bus, taken = world_from_joint(joint), open_sim_bus(joint.bus), Taken()
+    network = network_from_joint(joint, bus, world=world)
+    per_s = round(1.0 / joint.bus.period_s)
+    result: dict[str, Any] = {"effect": name, "alarm_s": None}
+    with (
+        bus,
+        Daemon([ServedJoint(joint=joint)], publish=False, real_time=False, devices=network.poll) as daemon,
+    ):
+        (loop_joint,) = daemon.loop.loop_joints
+        loop_joint.sink = taken
+        daemon.run_lockstep(round(HEALTHY_S * per_s))
+        result["false_alarm"] = taken.alarm
+        alter(world, [effect_text(name, share)], {})
+        begin = len(taken.samples)
+        while not taken.alarm and len(taken.samples) < begin + PATIENCE_S * per_s:
+            daemon.run_lockstep(per_s // 20)
+        if not taken.alarm:
+            return result
+        result["alarm_s"] = (len(taken.samples) - begin) / per_s
+        daemon.run_lockstep(round(AFTER_S * per_s))
+        kept = list(taken.samples)
+        daemon.run_lockstep(round(WATCHED_S * per_s))
+    return result | judged(name, kept, taken.samples[len(kept) :])
+
+
+def judged(name: str, kept: Sequence[Sample], after: Sequence[Sample]) -> dict[str, Any]:
+    """The finding of what was kept, and the residual of the proposed model on what follows."""
+    source = jointfile.load_text(ELBOW)
+    with tempfile.TemporaryDirectory() as folder:
+        recording = Path(folder) / recording_name(source.joint.name, "model alarm", datetime.now(UTC))
+        sink = McapSink(recording, source.joint, source.text)
+        for sample in kept:
+            sink.sample(sample, sample.sequence * 1_000_000)
+        sink.close()
+        begin_s = time.perf_counter()
+        try:
+            found = diagnosing.make(recording)
+        except EstimatorError as error:
+            return {"state": finding.FAILED, "sentence": str(error)}
+        took_s = time.perf_counter() - begin_s
+        result = {"diagnosis_s": took_s, "state": found["state"], "sentence": found["sentence"]}
+        result["error"] = found["error"]
+        effects = found["report"]["effects"]
+        names = [one["name"] for one in effects]
+        rivals = [
+            rival
+            for one in effects[:1]
+            for rival, odds in zip(one["alternatives"], one["alternative_probabilities"], strict=True)
+            if odds >= LIKELY
+        ]
+        result |= {"found": names, "named": names[:1] == [name], "listed": name in names[:1] + rivals}
+        result["before_ratio"] = ratio_of(source.joint, kept)[0]
+        if found["state"] == finding.PROPOSED:
+            proposed = jointfile.load(proposal_file(recording))
+            result["after_ratio"], result["alarm_after"] = ratio_of(proposed, [*kept[-2000:], *after])
+        return result
+
+
+def ratio_of(joint: jointfile.JointFile, samples: Sequence[Sample]) -> tuple[float, bool]:
+    """The newest residual of a joint file over its own baseline, and whether its own test alarms."""
+    monitor = make_model_monitor(joint)
+    assert monitor is not None and monitor.baseline is not None
+    alarm = False
+    for sample in samples:
+        alarm = monitor.core.step(sample) or alarm
+    pairs = zip(monitor.residual_nm, monitor.baseline.residual_nm, strict=True)
+    ratios = [residual / baseline for residual, baseline in pairs]
+    return max(ratios), alarm
+
+
+def row(one: dict[str, Any]) -> str:
+    """A scene as a row of the table."""
+    if one["alarm_s"] is None:
+        return f"| {one['effect']} | – | | | | | |"
+    error, after = one.get("error"), one.get("after_ratio")
+    said = "yes" if one.get("named") else f"listed ({one['found'][0]})" if one.get("listed") else "no"
+    if not (one.get("named") or one.get("listed")):
+        said = ", ".join(one.get("found") or ()) or one["state"]
+    fall = f"{error['before_relative']:.1%} → {error['after_relative']:.1%}" if error else ""
+    residual = "" if after is None else f"{after:.2g}{' alarm' if one['alarm_after'] else ''}"
+    found_s = one["alarm_s"] + AFTER_S + one.get("diagnosis_s", 0.0)
+    before = f"{one['before_ratio']:.0f}" if "before_ratio" in one else ""
+    cells = (one["effect"], f"{one['alarm_s']:.1f}", f"{found_s:.0f}", said, fall, before, residual)
+    return f"| {' | '.join(cells)} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--effects", nargs="*", default=list(LIBRARY), choices=list(LIBRARY), metavar="NAME")
+    parser.add_argument("--share", type=float, default=0.1, help="of the torque (default: %(default)s)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write every outcome there")
+    args = parser.parse_args()
+    print("| effect | alarm / s | finding / s | named | error on held-out data | residual before | after |")
+    print("|---" * 7 + "|", flush=True)
+    made = []
+    for name in track(args.effects, "loop", console=Console(stderr=True)):
+        made.append(scene(name, args.share))
+        print(row(made[-1]), flush=True)
+    alarmed = [one for one in made if one["alarm_s"] is not None]
+    proposed = [one for one in alarmed if one["state"] == finding.PROPOSED]
+    quiet = sum(not one["alarm_after"] for one in proposed)
+    print(
+        f"\nResiduals are times their baseline. Of {len(made)} effects {len(alarmed)} alarm, "
+        f"{sum(bool(one.get('named')) for one in alarmed)} are named first, "
+        f"{sum(bool(one.get('listed')) for one in alarmed)} named or listed. {len(proposed)} lead to a "
+        f"proposal; of {quiet} of these the new test stays quiet for {WATCHED_S:g} s. "
+        f"False alarms before the effect: {sum(one['false_alarm'] for one in made)}."
+    )
+    if args.json:
+        args.json.write_text(json.dumps(made, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

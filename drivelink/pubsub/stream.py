@@ -23,7 +23,9 @@ class Stream:
         self._publisher = publisher
         self._source = zenoh.SourceInfo(publisher.id, 0)
         self.wanted = False
-        self._listener = publisher.declare_matching_listener(self._match)
+        # indirect=False: in zenoh's thread, which never keeps the process from ending
+        heard = zenoh.handlers.Callback(self._match, indirect=False)
+        self._listener = publisher.declare_matching_listener(heard)
         before: Any = publisher.matching_status  # its stub says bool
         self.wanted = self.wanted or before.matching
 

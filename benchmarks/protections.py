@@ -36,7 +36,7 @@ LIMITS, FOLLOWING = "tests/test_recording_limits.py", "tests/test_cycle_followin
 PROTECTIONS = [
     Protection(*row)
     for row in (
-        ("size of a joint file", "jointfile/document.py", "if len(text) > MAX_BYTES or", "if", "tests/test_jointfile.py -k without_end"),
+        ("size of a joint file", "jointfile/document.py", "if len(text) > MAX_BYTES or len(text.encode()) > MAX_BYTES:", "if False:", "tests/test_jointfile.py -k without_end"),
         ("lines of a joint file", "jointfile/document.py", "> MAX_LINE_BYTES:", "> 1 << 40:", "tests/test_jointfile.py -k without_end"),
         ("depth of a joint file", "jointfile/document.py", "if _DEEP.search(text):", "if False:", "tests/test_jointfile.py -k without_end"),
         ("regular files only", "infile.py", "if not stat.S_ISREG(os.fstat(fd).st_mode):", "if False:", f"{LIMITS} -k regular --timeout 20"),
@@ -50,7 +50,7 @@ PROTECTIONS = [
         ("rate of a source", "daemon/status.py", "len(kinds) >= self._KINDS", "False", "tests/test_status.py -k rate"),
         ("rate of all lines", "daemon/status.py", "if self._lines <= self._LINES:", "if True:", "tests/test_status.py -k rate"),
         ("frames that may be sent", "canopen/guard.py", "    raise ForbiddenFrameError(", "    return\n    raise ForbiddenFrameError(", "tests/test_never_moves.py tests/test_canopen_sdo.py"),
-        ("a passive daemon sends nothing", "canopen/guard.py", "        raise BusError(", "        return self.inner.send(message)\n        raise BusError(", "tests/test_never_moves.py"),
+        ("a passive daemon sends nothing", "canopen/guard.py", "        raise BusError(", "        return self.inner.send(message)\n        raise BusError(", "tests/test_canopen_sdo.py"),
         ("stored parameters", "canopen/passive.py", "address[0] in _STORE_OR_RESTORE", "False", f"{FOLLOWING} tests/test_canopen_passive.py"),
         ("block downloads", "canopen/sdo_sniffer.py", "            self._dispute(_address(data))\n", "            pass\n", f"{FOLLOWING} -k block"),
         ("identity of a node", "canopen/passive.py", "            self._check_identity()\n", "            pass\n", f"{FOLLOWING} tests/test_canopen_passive.py"),
@@ -94,7 +94,7 @@ def main() -> int:
             if not noticed:
                 missed.append(one.name)
                 print("\n".join(ran.stdout.splitlines()[-3:] + ran.stderr.splitlines()[-3:]))
-    print(f"{len(wanted) - len(missed)} of {len(wanted)} protections are missed by a test when they are gone")
+    print(f"{len(wanted) - len(missed)} of {len(wanted)} protections: a test fails without them")
     return bool(missed)
 
 

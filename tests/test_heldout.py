@@ -12,11 +12,13 @@ from estimator.batch import fit_joint
 from estimator.diagnosis.covariance import hac_covariance
 from estimator.diagnosis.heldout import held_out
 from estimator.diagnosis.hypothesis import Problem
+from estimator.diagnosis.stiffness import middle
 from estimator.errors import EstimatorError
 from estimator.identify import identify
 from estimator.model import JointModel, Transmission
 from estimator.model_monitor import harm, measure_baseline
 from estimator.sample import FloatArray, Record
+from estimator.transmissions import MODELS
 
 T, SECONDS, BANDWIDTH_HZ = 1e-3, 20.0, 15.0
 TONES_HZ = (0.35, 0.8, 1.25)  # of the motion; all have whole periods in the recording
@@ -150,15 +152,10 @@ def test_a_file_that_explains_less_than_the_declared_one_is_not_written() -> Non
     assert harm(model, right, [record]) is None
 
 
-@pytest.mark.parametrize("seconds", [4, 5])
-def test_of_a_law_that_ends_at_its_bound_no_stiffness_is_stated(seconds: int) -> None:
-    record, linear = kit.World([{}], seed=5).run()[0], kit.model()
-    own = replace(linear.motors[0], transmission=Transmission(model="vsa-ii"))
-    found = identify(record.rows(record.time_s < seconds), replace(linear, motors=(own,)))
-    (fitted,), (motor,) = found.fits, found.model.motors
-    limit = fitted.parameters or {"c": 2.0}
-    assert isinstance(limit["c"], float) and limit["c"] > 1.001
-    assert bool(fitted.parameters) is (motor.transmission.covariance is not None)
+@pytest.mark.parametrize(("variance", "determined"), [(4.0, True), (1e4, False), (-1.0, False)])
+def test_a_variance_below_zero_is_no_certainty(variance: float, determined: bool) -> None:
+    found = middle(MODELS["linear"], np.array([100.0]), np.array([[variance]]), np.array([0.01]))
+    assert found.determined is determined
 
 
 @pytest.mark.parametrize("linked", [True, False])

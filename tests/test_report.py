@@ -107,7 +107,7 @@ def test_the_report_has_units_bands_the_winner_and_what_is_left(folder: Path) ->
     assert "of the torque (" in page and "rms) stays unexplained" in page
     assert "▶ Coulomb friction" in page
     assert page.count("▶ ") == 2  # the one that was chosen, and what the mark means
-    assert "Stiffness of transmission 1, with 95 % bands" in page and ">refitted</text>" in page
+    assert "Stiffness of motor 1's transmission, with 95 % bands" in page and ">refitted</text>" in page
     assert re.search(r"<code>torque_nm</code></td><td>0\.\d+ ± \S+ N·m</td>", page)
     assert re.search(r"<code>k_nm_rad</code></td><td>\S+ ± \S+ N·m/rad</td>", page)
     assert "prefers-color-scheme: dark" in page and "currentColor" in page and "#ffffff" not in page

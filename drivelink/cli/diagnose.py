@@ -114,7 +114,7 @@ def _print(outcome: Diagnosis, units: Units) -> None:
         table.add_row(name, before, f"{one.after_rms_nm:.4g} {unit}  {one.after_relative:.2%}")
     console.print(table)
     for finding in outcome.effects:
-        print(f"  {report.title_of(finding)}")
+        print(f"  {report.title_of(finding, outcome)}")
         for name, value in finding.parameters.items():
             print(f"    {name} = {units.value(name, value, finding.std.get(name))}")
         print(f"    probability = {finding.probability:.2f}")
@@ -123,7 +123,7 @@ def _print(outcome: Diagnosis, units: Units) -> None:
     for number, refitted in enumerate(outcome.transmissions, start=1):
         for name, value in refitted.parameters.items():
             text = units.value(name, value, refitted.std[name])
-            print(f"  transmission {number}, refitted: {name} = {text}")
+            print(f"  motor {number}, refitted: {name} = {text}")
     for name, value in outcome.alignment.items():
         print(f"  corrected in the readings: {name} = {units.value(name, value, None)}")
     for line in (*outcome.notes, *outcome.advice):

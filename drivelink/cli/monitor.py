@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 from rich.console import Console, Group, RenderableType
@@ -32,6 +33,7 @@ examples:
   drivelink monitor                    every joint on this machine
   drivelink monitor elbow              one joint, with its curve
   drivelink monitor --web              the same in a browser, with plots
+  drivelink monitor elbow.toml --foxglove
   drivelink monitor elbow | tee log    without a terminal: a plain line a second
 """
 
@@ -40,6 +42,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("joint", nargs="?", metavar="JOINT", help="name of a joint, or its joint file")
     parser.add_argument("--web", action="store_true", help="serve a page with live plots on this machine")
+    parser.add_argument(
+        "--foxglove", action="store_true", help="serve JOINT's messages to Foxglove Studio and PlotJuggler"
+    )
     parser.add_argument(
         "--port", type=int, default=8765, help="port of the page (default %(default)s, 0: any)"
     )
@@ -82,6 +87,8 @@ def run(args: argparse.Namespace) -> int:
         if not args.web or args.joint is None or not _is_file(args.joint):
             raise UsageError("--allow-accept: expected --web and the joint file that may be changed")
         acceptance = WebAcceptance(Path(args.joint))
+    if args.foxglove:
+        return _foxglove(args)
     name, endpoint, config, prefix = _where(args)
     session = open_client(endpoint, config)
     try:
@@ -98,6 +105,31 @@ def run(args: argparse.Namespace) -> int:
             pass
         finally:
             watcher.close()
+    finally:
+        close_session(session)
+    return 0
+
+
+def _foxglove(args: argparse.Namespace) -> int:
+    """Serve a joint's messages until the end or Ctrl-C."""
+    from drivelink.recording.foxglovelive import FoxgloveSink
+    from drivelink.recording.recorder import FirstSource, Recorder, ZenohTap
+
+    if args.web or args.json or args.joint is None or not _is_file(args.joint):
+        raise UsageError("--foxglove: expected a joint file, and neither --web nor --json")
+    joint = jointfile.load(Path(args.joint))
+    _, endpoint, config, _ = _where(args)
+    end = time.monotonic() + args.seconds if args.seconds else float("inf")
+    session = open_client(endpoint, config)
+    try:
+        sink = FoxgloveSink(joint, args.port)
+        with Recorder(sink, []) as recorder:
+            tap = ZenohTap(session, joint, sink, FirstSource(sink))
+            recorder.taps.append(tap)
+            print(f"open a connection to ws://127.0.0.1:{sink.port}   (Ctrl-C ends)", flush=True)
+            with suppress(KeyboardInterrupt):
+                recorder.run(lambda: time.monotonic() >= end)
+            tap.close()
     finally:
         close_session(session)
     return 0

@@ -305,7 +305,7 @@ def _sentence(
     said = []
     several = len(transmissions) > 1
     for one in transmissions:
-        of = f"Stiffness of transmission {one['transmission']}" if several else "Stiffness"
+        of = f"Stiffness of motor {one['transmission']}" if several else "Stiffness"
         for change in one["changes"]:
             amount, std = 100.0 * change["amount_relative"], 100.0 * change["amount_std_relative"]
             much = f"{'+' * (amount > 0.0)}{with_interval(amount, SIGMA_95 * std)} %"

@@ -30,7 +30,7 @@ def summary(outcome: Diagnosis, error: Errors, joint: JointFile) -> Summary:
     fall = f"{error.before_relative:.2%} to {error.after_relative:.2%}"
     on = "on held-out data the error of the motor torque"
     if outcome.verdict == "effect":
-        names = " and ".join(report.title_of(one) for one in outcome.effects)
+        names = " and ".join(report.title_of(one, outcome) for one in outcome.effects)
         sentence, short = f"{report.lacks(outcome)}: {on} falls from {fall}.", f"{names}, error {fall}"
     elif outcome.verdict == "sufficient" and error.after_rms_nm < 0.5 * error.before_rms_nm:
         sentence = f"No effect is missing, but the joint has changed: refitted, {on} falls from {fall}."
@@ -43,7 +43,7 @@ def summary(outcome: Diagnosis, error: Errors, joint: JointFile) -> Summary:
 
 def _parameters(outcome: Diagnosis, joint: JointFile, units: Units) -> list[str]:
     lines = [
-        f"{report.title_of(one)}: {name} = {units.value(name, value, one.std.get(name))}"
+        f"{report.title_of(one, outcome)}: {name} = {units.value(name, value, one.std.get(name))}"
         for one in outcome.effects
         for name, value in one.parameters.items()
     ]

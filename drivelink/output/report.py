@@ -128,10 +128,10 @@ def sentence(outcome: Diagnosis) -> str:
     )
     if outcome.verdict == "effect":
         return f"{lacks(outcome)}: {fall}."
-    names = " and ".join(title_of(finding) for finding in outcome.effects)
+    names = " and ".join(title_of(finding, outcome) for finding in outcome.effects)
     if outcome.verdict == "unexplained":
         where = outcome.effects[0]
-        place = _place(where)
+        place = _place(where, outcome)
         over = " and ".join(name.replace("_", " ") for name in where.coordinates)
         return (
             f"The model lacks something at the {place} that is not in the library, a function of {over}: "
@@ -148,13 +148,13 @@ def sentence(outcome: Diagnosis) -> str:
 
 def lacks(outcome: Diagnosis) -> str:
     """What is missing, said as surely as it is known."""
-    sure = [title_of(f) for f in outcome.effects if f.probability >= _SURE]
+    sure = [title_of(f, outcome) for f in outcome.effects if f.probability >= _SURE]
     likely = [
-        f"{title_of(f)} ({f.probability:.2f})" + (f", else {others_of(f)}" if f.alternatives else "")
+        f"{title_of(f, outcome)} ({f.probability:.2f})" + (f", else {others_of(f)}" if f.alternatives else "")
         for f in outcome.effects
         if _LIKELY <= f.probability < _SURE
     ]
-    unsure = sorted({_place(f) for f in outcome.effects if f.probability < _LIKELY})
+    unsure = sorted({_place(f, outcome) for f in outcome.effects if f.probability < _LIKELY})
     said = []
     if sure:
         said.append(f"The model lacks {' and '.join(sure)}")
@@ -179,11 +179,11 @@ def unexplained(outcome: Diagnosis, units: Units | None = None) -> str:
     return f"{text}: noise, or effects too small to be separated from it in these data."
 
 
-def title_of(finding: Finding) -> str:
+def title_of(finding: Finding, outcome: Diagnosis) -> str:
     """An effect in words, with its place."""
     if finding.name == "unlisted":
-        return f"an unlisted effect at the {_place(finding)}"
-    return f"{in_words(finding.name)} ({_place(finding)})"
+        return f"an unlisted effect at the {_place(finding, outcome)}"
+    return f"{in_words(finding.name)} ({_place(finding, outcome)})"
 
 
 def others_of(finding: Finding) -> str:
@@ -192,8 +192,10 @@ def others_of(finding: Finding) -> str:
     return ", ".join(f"{in_words(name)} ({p:.2f})" for name, p in pairs)
 
 
-def _place(finding: Finding) -> str:
-    return finding.location if not finding.motor else f"{finding.location} {finding.motor + 1}"
+def _place(finding: Finding, outcome: Diagnosis) -> str:
+    """Its location, with the motor's number where there are two."""
+    several = len(outcome.transmissions) > 1 and finding.motor is not None
+    return f"{finding.location} {(finding.motor or 0) + 1}" if several else finding.location
 
 
 def page(outcome: Diagnosis, title: Title) -> str:
@@ -235,7 +237,7 @@ def _error_row(name: str, errors: Errors, units: Units) -> str:
 def _effects(outcome: Diagnosis, units: Units) -> str:
     rows = []
     for finding in outcome.effects:
-        rows.append(f'<tr class="effect"><th colspan="2">{html.escape(title_of(finding))}</th></tr>')
+        rows.append(f'<tr class="effect"><th colspan="2">{html.escape(title_of(finding, outcome))}</th></tr>')
         if finding.name in LIBRARY:
             rows.append(f'<tr><td colspan="2">{html.escape(LIBRARY[finding.name].description)}</td></tr>')
         for name, value in finding.parameters.items():
@@ -243,7 +245,7 @@ def _effects(outcome: Diagnosis, units: Units) -> str:
             rows.append(f"<tr><td><code>{html.escape(name)}</code></td><td>{text}</td></tr>")
     for number, one in enumerate(outcome.transmissions, start=1):
         if one.parameters:
-            rows.append(f'<tr class="effect"><th colspan="2">transmission {number}, refitted</th></tr>')
+            rows.append(f'<tr class="effect"><th colspan="2">motor {number}, refitted</th></tr>')
         for name, value in one.parameters.items():
             text = units.value(name, value, one.std[name])
             rows.append(f"<tr><td><code>{html.escape(name)}</code></td><td>{text}</td></tr>")
@@ -307,7 +309,7 @@ def _stiffness_figure(curve: StiffnessCurve, units: Units) -> str:
     }
     plots.xy(axes, curves, units.label("deflection / rad"), units.label("stiffness / (N·m/rad)"))
     caption = (
-        f"Stiffness of transmission {curve.motor + 1}, with 95 % bands. The declared model's band "
+        f"Stiffness of motor {curve.motor + 1}'s transmission, with 95 % bands. The declared model's band "
         "assumes that its other parameters are exact and complete."
     )
     return f"<figure>{plots.svg_text(figure)}<figcaption>{caption}</figcaption></figure>"
@@ -354,7 +356,7 @@ def _series_figure(outcome: Diagnosis, units: Units) -> str:
 
 def _doubts(outcome: Diagnosis) -> str:
     lines = [
-        f"{title_of(f)}, probability {f.probability:.2f}, could also be: {others_of(f)}."
+        f"{title_of(f, outcome)}, probability {f.probability:.2f}, could also be: {others_of(f)}."
         for f in outcome.effects
         if f.alternatives
     ]

@@ -99,40 +99,21 @@ class CsvSink(Sink):
         self._file.write((self._line % sample_row(sample, self._period_s)).encode())
 
 
-class McapSink(Sink):
-    """Everything, as MCAP with one JSON channel `/<joint>/<topic>` for each of `TOPICS`."""
+class MessageSink(Sink):
+    """Makes a message of each item, for whatever takes messages on topics."""
 
     wants = frozenset({"sample", "estimate", "external", "document", "frame"})
 
-    def __init__(self, path: Path, joint: JointFile, joint_text: str = "", *, force: bool = False) -> None:
-        super().__init__(path, force=force)
+    def set_up(self, joint: JointFile) -> None:
+        """Make the encoders of a joint."""
         motors, period_s = len(joint.motor), joint.bus.period_s
         self._encode_sample: Callable[[Sample], bytes] = sample_encoder(motors, period_s)
         self._encode_estimate = estimate_encoder(motors, period_s)
         self._encode_external = external_encoder(period_s)
-        self._writer: Any = Writer(  # of its methods, some are not annotated
-            self._file,  # type: ignore[arg-type]
-            chunk_size=4 << 20,
-            compression=CompressionType.ZSTD,
-            index_types=IndexType.CHUNK | IndexType.METADATA,
-        )
-        self._writer.start(library=f"drivelink/{__version__}")
-        self._writer.add_metadata(
-            "drivelink",
-            {"joint": joint.name, "motors": str(motors), "period_s": repr(period_s), "version": __version__},
-        )
-        self._channels = {}
-        for topic in TOPICS:
-            schema = self._writer.register_schema(
-                SCHEMA_NAMES.get(topic, f"drivelink.{topic}"), "jsonschema", message_schema(topic, motors)
-            )
-            self._channels[topic] = self._writer.register_channel(f"/{joint.name}/{topic}", "json", schema)
         self._name, self._logged_s = joint.name, 0.0  # time of the last event that was written
-        self._joint = json.dumps({"text": joint_text}).encode() if joint_text else b""
 
-    def note(self, name: str, fields: Mapping[str, str]) -> None:
-        """Write a metadata record."""
-        self._writer.add_metadata(name, dict(fields))
+    def _put(self, topic: str, stamp_ns: int, data: bytes) -> None:
+        raise NotImplementedError
 
     def sample(self, sample: Sample, stamp_ns: int) -> None:
         """Take what was measured at one SYNC."""
@@ -167,6 +148,37 @@ class McapSink(Sink):
         """Take what makes samples of the frames."""
         fields = {key: value for key, value in document.items() if key != "text"}
         self._put("mapping", stamp_ns, json.dumps(fields).encode())  # the joint file has a separate channel
+
+
+class McapSink(MessageSink):
+    """Everything, as MCAP with one JSON channel `/<joint>/<topic>` for each of `TOPICS`."""
+
+    def __init__(self, path: Path, joint: JointFile, joint_text: str = "", *, force: bool = False) -> None:
+        super().__init__(path, force=force)
+        self.set_up(joint)
+        motors, period_s = len(joint.motor), joint.bus.period_s
+        self._writer: Any = Writer(  # of its methods, some are not annotated
+            self._file,  # type: ignore[arg-type]
+            chunk_size=4 << 20,
+            compression=CompressionType.ZSTD,
+            index_types=IndexType.CHUNK | IndexType.METADATA,
+        )
+        self._writer.start(library=f"drivelink/{__version__}")
+        self._writer.add_metadata(
+            "drivelink",
+            {"joint": joint.name, "motors": str(motors), "period_s": repr(period_s), "version": __version__},
+        )
+        self._channels = {}
+        for topic in TOPICS:
+            schema = self._writer.register_schema(
+                SCHEMA_NAMES.get(topic, f"drivelink.{topic}"), "jsonschema", message_schema(topic, motors)
+            )
+            self._channels[topic] = self._writer.register_channel(f"/{joint.name}/{topic}", "json", schema)
+        self._joint = json.dumps({"text": joint_text}).encode() if joint_text else b""
+
+    def note(self, name: str, fields: Mapping[str, str]) -> None:
+        """Write a metadata record."""
+        self._writer.add_metadata(name, dict(fields))
 
     def flush(self) -> None:
         """Write everything to disk as one chunk."""

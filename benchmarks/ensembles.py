@@ -1,6 +1,6 @@
 """Stiffness on line over random joints of another integrator: errors, intervals, false alarms.
 
-    python benchmarks/ensembles.py [--mode robust|balance] [--joints 8] [--seconds 20] [--cases NAME,…]
+    python benchmarks/ensembles.py [--mode robust|paper] [--joints 8] [--seconds 20] [--cases NAME,…]
 
 Fresh joints on random multisines, read as drives read them: 4096 to 16384 counts (stiff joints behind a gear
 of 100), 16 to 18 bits at the link, no velocity, torque noise of 0.1 to 0.5 % of rated. From five seconds on,
@@ -183,4 +183,4 @@ OPTIONS = (
 )
 
 if __name__ == "__main__":
-    scene.main(__doc__, rows, COLUMNS, *OPTIONS, scene.Option("--mode", ("robust", "balance", "paper")))
+    scene.main(__doc__, rows, COLUMNS, *OPTIONS, scene.Option("--mode", ("robust", "paper")))

@@ -30,7 +30,6 @@ T = 1e-3
 _CASES = {
     "robust, polynomial": ("polynomial", EstimatorSettings()),
     "robust, vsa-ii": ("vsa-ii", EstimatorSettings()),
-    "balance, polynomial": ("polynomial", EstimatorSettings(mode="balance")),
     "robust, black box": ("unknown", EstimatorSettings()),
     "paper": ("polynomial", EstimatorSettings(mode="paper")),
 }

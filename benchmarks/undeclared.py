@@ -1,7 +1,7 @@
 """Effects that no joint file names, on joints of an independent simulator in C (`world.c`): what the on-line
 estimator makes of each.
 
-    python benchmarks/undeclared.py [--mode robust|balance] [--joints 8] [--seconds 30] [--effects NAME,…]
+    python benchmarks/undeclared.py [--mode robust|paper] [--joints 8] [--seconds 30] [--effects NAME,…]
                                     [--motion multisine|point-to-point|hand-guided|pushes|harmonic]
 
 Random joints with cubic springs, order declared, read as drives read them: 4096 to 16384 counts, 16 to 18
@@ -172,7 +172,7 @@ if __name__ == "__main__":
             "only meanwhile": "{meanwhile}",
             "first after / s": "{after_s:.0f}",
         },
-        scene.Option("--mode", ("robust", "balance", "paper")),
+        scene.Option("--mode", ("robust", "paper")),
         scene.Option("--joints", 8),
         scene.Option("--seconds", 30.0),
         scene.Option("--motion", ("multisine", "point-to-point", "hand-guided", "pushes", "harmonic")),

@@ -49,6 +49,9 @@ class Estimator(Protocol):
     def parameters(self) -> list[dict[str, Any]]:
         """Current {"model", "parameters", "std"} of each transmission, names as in the joint file."""
 
+    def undeclared(self) -> list[list[str]]:
+        """Effects of each motor that nobody declared and the motion has shown, names as in `report.json`."""
+
     def why(self) -> tuple[str, str] | None:
         """Why the last estimate is not valid: key of `estimator.reasons.REASONS`, sentence; None: it is."""
 
@@ -57,8 +60,7 @@ class Estimator(Protocol):
 
         {"signal": "motor_position" | "motor_torque" | "link_position" | "motor_or_link_position",
         "motor": from 1 on (0: the link's),
-        "reason": "scale" (relative), "delay" (s), "zero" (rad, N·m), "drift" (rad/s), "impossible", "jumped"
-        or "frozen",
+        "reason": "scale" (relative), "delay" (s), "zero" (rad, N·m), "impossible", "jumped" or "frozen",
         "amount" and "std": in the reason's unit, or None, "explains": whether it explains the whole residual,
         "text": the same in words}.
         """
@@ -100,6 +102,10 @@ class _Compiled:
     def parameters(self) -> list[dict[str, Any]]:
         """See `Estimator`."""
         return [self._named(i, motor) for i, motor in enumerate(self._model.motors)]
+
+    def undeclared(self) -> list[list[str]]:
+        """See `Estimator`."""
+        return [self.core.undeclared(i) for i in range(len(self._model.motors))]
 
     def why(self) -> tuple[str, str] | None:
         """See `Estimator`."""
@@ -163,8 +169,6 @@ def _in_words(signal: str, motor: int, reason: str, amount: float, std: float) -
         why = f"its scale is {1.0 + amount:.3g} ± {std:.1g} times what it was"
     elif reason == "delay":
         why = f"it is {1e3 * amount:.2g} ± {1e3 * std:.1g} ms later than it was"
-    elif reason == "drift":
-        why = f"it moves by {amount:.2g} ± {std:.1g} rad/s"
     elif reason == "zero":
         unit = "N·m" if signal == "motor_torque" else "rad"
         why = f"it has moved by {amount:.2g} ± {std:.1g} {unit}"

@@ -32,10 +32,13 @@ REASONS: dict[str, str] = {
     "unexplained": "the model leaves {share:.2g} % of the torque balance unexplained",
     "beyond": "the deflection is larger than any that was learned from",
     "changed": "{changes} changed",
+    "lost": "the zero between the encoders is not known: move the joint, or home it",
 }
 
 CHANGES: dict[str, str] = {
     "stiffness": "stiffness",
+    "spring_shape": "shape of the spring",
+    "inertia": "inertia",
     "friction": "friction",
     "torque_zero": "torque offset",
     "position_zero": "zero between the encoders",
@@ -45,8 +48,6 @@ CHANGES: dict[str, str] = {
     "torque_scale": "torque gain",
     "motor_delay": "delay of the motor encoder",
     "torque_delay": "delay of the torque",
-    "link_drift": "link encoder, which drifts,",
-    "motor_drift": "motor encoder, which drifts,",
 }
 
 

@@ -15,8 +15,8 @@ class EstimatorSettings:
     """Settings of both modes; each mode reads its own.
 
     Attributes:
-        mode: "robust", "paper" (eqs 14, 28, 32, 33 as printed, correctly discretised), or "balance" (sums of
-            blocks of one balance; experimental, see docs/explanation/balance.md).
+        mode: "robust" (sums of blocks of one balance), or "paper" (eqs 14, 28, 32, 33 as printed, correctly
+            discretised).
         method: source of the stiffness: "mbe" (the transmission's model), "bbe" (black box), or "auto": "mbe"
             in robust mode with a model, else "bbe".
         bandwidth_rad_s: of the filter that every channel shares in robust mode.
@@ -39,7 +39,7 @@ class EstimatorSettings:
 
     __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "strict": True}
 
-    mode: Literal["robust", "paper", "balance"] = "robust"
+    mode: Literal["robust", "paper"] = "robust"
     method: Literal["auto", "mbe", "bbe"] = "auto"
     bandwidth_rad_s: float = 60.0
     k_tau_rad_s: float = 300.0

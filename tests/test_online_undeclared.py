@@ -10,4 +10,4 @@ def test_the_interval_of_a_held_motor_holds_what_friction_takes_from_the_stiffne
     off = np.abs(estimates.stiffness_nm_rad - heldmotor.K)[-2000:]
     assert np.min(off) > 0.05 * heldmotor.K  # the balance closes, with a spring that is too soft
     assert np.all(estimates.valid[-2000:])
-    assert np.all(off < 1.96 * estimates.std_nm_rad[-2000:])
+    assert np.all(off < 2.58 * estimates.std_nm_rad[-2000:])  # one joint: 99 %

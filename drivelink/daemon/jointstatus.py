@@ -125,6 +125,7 @@ class JointStatus:
             "quality": self._quality(),
             "not_valid": self._not_valid(),
             "transmissions": loop_joint.pipeline.estimator.parameters(),
+            "undeclared": loop_joint.pipeline.estimator.undeclared(),
             "residual_nm": loop_joint.pipeline.estimator.residual_nm,
             "residual_alarm": self._alarm(),
             "external": self._external(),

@@ -1,58 +1,89 @@
-//! Eq 5 of one motor as a row of filtered columns, the only place where it is formed for [`crate::gram`].
+//! Eq 5 of one motor as a row of filtered columns, the only place where it is formed.
 //!
-//! F τ = B F θ″ + D F θ′ + offset + friction − Σ k_h F u^(2h−1) − …, u = φ over the deflection's size. Every
-//! column passes the same filters, so their lag cancels.
+//! F τ = B F θ″ + D F θ′ + offset + friction − F f(φ) − …: every column passes the same filters, so their lag
+//! cancels. The spring is a curve over [`crate::spring`]'s functions of u = φ over the deflection's size.
 
 use crate::filters::StateVariableFilter;
-use crate::gram::{COLUMNS, Row, Set};
+use crate::gram::{COLUMNS, Gram, Row};
 use crate::signals::{Channel, Filters, Formed};
+use crate::spring::{Family, TERMS};
 
 /// F τ, N·m.
 pub const TORQUE: usize = 0;
+/// Its rate, N·m/s: a torque that is read late.
+pub const TORQUE_RATE: usize = 1;
 /// F θ″: the inertia, kg·m².
-pub const ACCELERATION: usize = 1;
+pub const ACCELERATION: usize = 2;
 /// F θ′: the damping, N·m·s/rad.
-pub const VELOCITY: usize = 2;
+pub const VELOCITY: usize = 3;
 /// 1: a constant torque, N·m.
-pub const OFFSET: usize = 3;
+pub const OFFSET: usize = 4;
 /// Sign of θ′: dry friction, N·m.
-pub const DRY: usize = 4;
-/// −u, −u³, …, −u⁹: the spring, N·m.
-pub const POWERS: std::ops::Range<usize> = 5..10;
-/// −u², −u⁴: a spring whose zero is elsewhere, N·m.
-pub const EVEN: std::ops::Range<usize> = 10..12;
-/// −q′, −u² q′: a link position that is read late.
-pub const LATE: std::ops::Range<usize> = 12..14;
+pub const DRY: usize = 5;
 /// A softer sign of θ′: friction that grows with speed before it is full, N·m.
-pub const SOFT: usize = 14;
-/// |u| times the sign of θ′: friction of the load, N·m.
-pub const LOAD: usize = 15;
+pub const SOFT: usize = 6;
+/// |b₁| and |b₂| times the sign of θ′: friction of the load, N·m.
+pub const LOAD: [usize; 2] = [7, 23];
+/// −φ′: damping of the transmission, N·m·s/rad.
+pub const RATE: usize = 8;
+/// −bₖ: the spring, N·m.
+pub const SPRING: std::ops::Range<usize> = 9..9 + TERMS;
+/// −bₖ′: a spring whose zero is elsewhere, N·m.
+pub const SLOPE: std::ops::Range<usize> = 14..14 + TERMS;
+/// −bₖ′ q′, the first ones: a link position that is read late.
+pub const LATE: std::ops::Range<usize> = 19..21;
+/// −bₖ′ q, the first ones: a link position of another scale.
+pub const READ: std::ops::Range<usize> = 21..23;
 /// −(stops of three widths on u): memory of the transmission, N·m.
-pub const STOPS: std::ops::Range<usize> = 16..19;
-/// −(u clipped at five widths): a spring of any shape, N·m.
-pub const CLIPS: std::ops::Range<usize> = 19..24;
+pub const STOPS: std::ops::Range<usize> = 24..27;
+/// −(u clipped at four widths): a spring of any shape, N·m.
+pub const CLIPS: std::ops::Range<usize> = 27..31;
+
+/// Largest |u| that a row may have: beyond it the powers lose the small motions' digits.
+pub const LARGEST: f64 = 1.5;
 
 const FRICTION_SPEED: f64 = 0.02; // of the largest velocity: over which dry friction changes its sign …
 const SOFTER: f64 = 10.0; // … and the same of the softer one: between them lie the usual Stribeck speeds
 const STOP_WIDTHS: [f64; 3] = [0.1, 0.3, 0.6]; // of half the range of u: a memory of one width lies between two
-const CLIP_WIDTHS: [f64; 5] = [0.05, 0.15, 0.3, 0.5, 0.75]; // likewise
-const GROWN: f64 = 1.5; // times its size: the columns are scaled anew
-
-/// The bits of some columns.
-#[must_use]
-pub fn set(columns: std::ops::Range<usize>) -> Set {
-    columns.fold(0, |set, column| set | 1 << column)
-}
+const CLIP_WIDTHS: [f64; 4] = [0.05, 0.15, 0.35, 0.65]; // likewise
+const CURVE: usize = 2 * TERMS + CLIP_WIDTHS.len(); // columns that are functions of the raw φ
+const FORMED: usize = 9; // columns of lightly filtered signals: dry, soft, load ×2, late, read, stops ×3
 
 /// What the columns are scaled by, taken from the motion.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Size {
-    /// Largest |φ|, rad.
+    /// |φ| of u = 1, rad: the spring's.
     pub deflection: f64,
-    /// Half the range of φ, over that.
+    /// Half the range of φ, rad: that of memory and the free curve.
     pub range: f64,
-    /// Largest |θ′|, rad/s.
+    /// Largest |θ′|, rad/s: that of friction.
     pub speed: f64,
+}
+
+/// Signals side by side through one filter; what they were at the last sample.
+#[derive(Clone, Copy, Debug)]
+struct Lanes<const N: usize, const L: usize> {
+    state: [[f64; L]; N],
+    last: [f64; L],
+}
+
+impl<const N: usize, const L: usize> Lanes<N, L> {
+    fn rest(values: [f64; L]) -> Lanes<N, L> {
+        let mut state = [[0.0; L]; N];
+        state[0] = values;
+        Lanes { state, last: values }
+    }
+
+    fn smooth(&mut self, filter: &StateVariableFilter<N>, now: [f64; L]) {
+        filter.smooth.apply_lanes(&mut self.state, &self.last, &now);
+        self.last = now;
+    }
+
+    fn scale(&mut self, factors: &[f64; L]) {
+        for values in self.state.iter_mut().chain([&mut self.last]) {
+            values.iter_mut().zip(factors).for_each(|(value, factor)| *value *= factor);
+        }
+    }
 }
 
 /// The filtered columns of one motor.
@@ -60,13 +91,15 @@ pub struct Size {
 pub struct Balance {
     /// What the columns are scaled by; zero before there was motion.
     pub size: Size,
+    family: Family,
     position: Channel,
     torque: Channel,
-    curve: [Channel; 12], // powers, even powers, clipped
-    formed: [Formed; 7],  // dry, soft, load, late by φ², stops
+    light: Lanes<3, CURVE>,
+    curve: Lanes<4, CURVE>,
+    formed: Lanes<4, FORMED>,
     effects: Formed,
     stops: [f64; 3],
-    last: f64,
+    last: f64, // φ that the stops have followed
     low: f64,
     high: f64,
     speed: f64,
@@ -75,13 +108,15 @@ pub struct Balance {
 impl Balance {
     /// At rest.
     #[must_use]
-    pub fn new() -> Balance {
+    pub fn new(family: Family) -> Balance {
         Balance {
             size: Size::default(),
+            family,
             position: Channel::rest(0.0),
             torque: Channel::rest(0.0),
-            curve: [Channel::rest(0.0); 12],
-            formed: [Formed::default(); 7],
+            light: Lanes::rest([0.0; CURVE]),
+            curve: Lanes::rest([0.0; CURVE]),
+            formed: Lanes::rest([0.0; FORMED]),
             effects: Formed::default(),
             stops: [0.0; 3],
             last: 0.0,
@@ -91,43 +126,57 @@ impl Balance {
         }
     }
 
+    /// Forget everything.
+    pub fn reset(&mut self) {
+        *self = Balance::new(self.family.clone());
+    }
+
+    /// Forget how large the motion is.
+    pub fn forget_range(&mut self) {
+        (self.low, self.high) = (f64::INFINITY, f64::NEG_INFINITY);
+    }
+
+    /// The functions that the spring's curve is a sum of.
+    #[must_use]
+    pub fn family(&self) -> &Family {
+        &self.family
+    }
+
     /// As if the joint had been here forever.
     pub fn restart(&mut self, theta: f64, phi: f64, torque: f64) {
         self.position = Channel::rest(theta);
         self.torque = Channel::rest(torque);
-        self.formed = [Formed::default(); 7];
+        self.formed = Lanes::rest([0.0; FORMED]);
         self.effects = Formed::default();
         self.rest_curve(phi);
     }
 
     fn rest_curve(&mut self, phi: f64) {
         let columns = self.curve_columns(phi);
-        for (channel, value) in self.curve.iter_mut().zip(columns) {
-            *channel = Channel::rest(value);
-        }
+        (self.light, self.curve) = (Lanes::rest(columns), Lanes::rest(columns));
         self.stops = [0.0; 3];
-        self.last = self.unit(phi);
+        self.last = phi;
     }
 
     fn unit(&self, phi: f64) -> f64 {
         if self.size.deflection > 0.0 { phi / self.size.deflection } else { 0.0 }
     }
 
-    fn curve_columns(&self, phi: f64) -> [f64; 12] {
-        let u = self.unit(phi);
-        let mut out = [0.0; 12];
-        for (h, value) in out[..5].iter_mut().enumerate() {
-            *value = -u.powi(2 * h as i32 + 1);
+    fn curve_columns(&self, phi: f64) -> [f64; CURVE] {
+        let mut out = [0.0; CURVE];
+        if self.size.deflection == 0.0 {
+            return out;
         }
-        (out[5], out[6]) = (-u * u, -u.powi(4));
-        for (value, width) in out[7..].iter_mut().zip(CLIP_WIDTHS) {
+        let terms = self.family.at(self.unit(phi), self.size.deflection);
+        out[..2 * TERMS].iter_mut().zip(terms).for_each(|(value, term)| *value = -term);
+        for (value, width) in out[2 * TERMS..].iter_mut().zip(CLIP_WIDTHS) {
             let width = width * self.size.range;
-            *value = -u.clamp(-width, width);
+            *value = if width > 0.0 { -phi.clamp(-width, width) / self.size.range } else { 0.0 };
         }
         out
     }
 
-    /// How large the motion has been since the last call of `scale`; `usable`: whether this moment counts.
+    /// How large the motion has been; `usable`: whether this moment counts.
     pub fn observe(&mut self, phi: f64, usable: bool) {
         if usable {
             self.low = self.low.min(phi);
@@ -136,34 +185,63 @@ impl Balance {
         }
     }
 
-    /// Whether the motion has outgrown what the columns are scaled by.
-    #[must_use]
-    pub fn outgrown(&self) -> bool {
-        let (size, seen) = (&self.size, self.seen());
-        seen.deflection > GROWN * size.deflection
-            || seen.range * seen.deflection > GROWN * size.range * size.deflection
-            || seen.speed > GROWN * size.speed
-    }
-
     /// Largest |φ| seen, rad.
     #[must_use]
     pub fn largest(&self) -> f64 {
-        self.seen().deflection
+        if self.high < self.low { 0.0 } else { self.low.abs().max(self.high.abs()) }
     }
 
-    fn seen(&self) -> Size {
-        let deflection = self.low.abs().max(self.high.abs());
-        if !(deflection > 0.0 && deflection.is_finite()) {
-            return Size::default();
+    /// Whether a deflection has outgrown what the spring's columns are scaled by.
+    #[must_use]
+    pub fn outgrown(&self, phi: f64) -> bool {
+        phi.abs() > LARGEST * self.size.deflection
+    }
+
+    /// Scale memory, friction and the free curve by the motion seen so far; the free curve begins anew.
+    pub fn fit_widths(&mut self, phi: f64) {
+        let range = 0.5 * (self.high - self.low);
+        let grown = range > LARGEST * self.size.range || self.speed > LARGEST * self.size.speed;
+        if !grown || range <= 0.0 {
+            return;
         }
-        Size { deflection, range: 0.5 * (self.high - self.low) / deflection, speed: self.speed }
+        (self.size.range, self.size.speed) = (range, self.speed);
+        let columns = self.curve_columns(phi);
+        for lane in 2 * TERMS..CURVE {
+            for state in self.light.state.iter_mut().chain(&mut self.curve.state) {
+                state[lane] = 0.0;
+            }
+            self.light.state[0][lane] = columns[lane];
+            self.curve.state[0][lane] = columns[lane];
+            (self.light.last[lane], self.curve.last[lane]) = (columns[lane], columns[lane]);
+        }
     }
 
-    /// Scale the columns by the motion seen so far; they begin anew.
-    pub fn scale(&mut self, phi: f64) {
-        self.size = self.seen();
-        self.formed = [Formed::default(); 7];
-        self.rest_curve(phi);
+    /// Scale the spring's columns by this deflection; what is in the filters is scaled with them.
+    ///
+    /// Returns the factors of a row's columns.
+    pub fn grow(&mut self, phi: f64) -> Row {
+        let before = self.size.deflection;
+        self.size.deflection = phi.abs();
+        let mut factors = [1.0; COLUMNS];
+        if before == 0.0 {
+            self.rest_curve(phi);
+            return factors;
+        }
+        let terms = self.family.factors(before, self.size.deflection);
+        factors[SPRING.start..SPRING.start + 2 * TERMS].copy_from_slice(&terms);
+        for columns in [LATE, READ] {
+            factors[columns.clone()].copy_from_slice(&terms[TERMS..TERMS + columns.len()]);
+        }
+        // The first slope is 1 in every size; the columns of q and q′ are not filtered with it.
+        (factors[LATE.start], factors[READ.start]) = (1.0, 1.0);
+        LOAD.iter().zip(&terms).for_each(|(column, factor)| factors[*column] = *factor);
+        let mut curve = [1.0; CURVE];
+        curve[..2 * TERMS].copy_from_slice(&terms);
+        self.light.scale(&curve);
+        self.curve.scale(&curve);
+        let slope = terms[TERMS + 1];
+        self.formed.scale(&[1.0, 1.0, terms[0], terms[1], slope, slope, 1.0, 1.0, 1.0]);
+        factors
     }
 
     /// One period. `effect`: torque of the declared effects, N·m.
@@ -182,25 +260,28 @@ impl Balance {
         if self.size.deflection == 0.0 {
             return;
         }
-        let columns = self.curve_columns(phi);
-        for (channel, value) in self.curve.iter_mut().zip(columns) {
-            smooth(channel, filters, value);
-        }
+        let before = self.light.state[0];
+        self.light.smooth(&filters.light, self.curve_columns(phi));
+        self.curve.last = before;
+        self.curve.smooth(&filters.main, self.light.state[0]);
         let rate = self.position.light[1];
-        let u = self.unit(link.light[0] - self.position.light[0]);
-        let speed = FRICTION_SPEED * self.size.speed;
+        let phi = link.light[0] - self.position.light[0];
+        let u = self.unit(phi);
+        let slopes = self.family.at(u, self.size.deflection);
+        let slope = slopes[TERMS + 1];
+        let speed = (FRICTION_SPEED * self.size.speed).max(f64::MIN_POSITIVE);
         let sign = (rate / speed).tanh();
-        let (step, range) = (u - self.last, self.size.range);
-        self.last = u;
+        let step = (phi - self.last) / self.size.range.max(f64::MIN_POSITIVE);
+        self.last = phi;
         for (stop, width) in self.stops.iter_mut().zip(STOP_WIDTHS) {
-            *stop = (*stop + step).clamp(-width * range, width * range);
+            *stop = (*stop + step).clamp(-width, width);
         }
         let [a, b, c] = self.stops;
-        let now =
-            [sign, (rate / (SOFTER * speed)).tanh(), u.abs() * sign, -u * u * link.light[1], -a, -b, -c];
-        for (formed, value) in self.formed.iter_mut().zip(now) {
-            pass(formed, filters, value);
-        }
+        let [q, q_rate] = [link.light[0], link.light[1]];
+        let soft = (rate / (SOFTER * speed)).tanh();
+        let load = [slopes[0].abs() * sign, slopes[1].abs() * sign];
+        let now = [sign, soft, load[0], load[1], -slope * q_rate, -slope * q, -a, -b, -c];
+        self.formed.smooth(&filters.main, now);
     }
 
     /// The row of this moment.
@@ -208,43 +289,37 @@ impl Balance {
     pub fn row(&self, link: &Channel) -> Row {
         let mut row: Row = [0.0; COLUMNS];
         row[TORQUE] = self.torque.main[0] - self.effects.main[0];
+        row[TORQUE_RATE] = self.torque.main[1];
         row[ACCELERATION] = self.position.main[2];
         row[VELOCITY] = self.position.main[1];
         row[OFFSET] = 1.0;
-        for (column, channel) in POWERS.chain(EVEN).chain(CLIPS).zip(&self.curve) {
-            row[column] = channel.main[0];
-        }
-        row[LATE.start] = -link.main[1];
-        let formed = [DRY, SOFT, LOAD, LATE.start + 1].into_iter().chain(STOPS);
-        for (column, formed) in formed.zip(&self.formed) {
-            row[column] = formed.main[0];
+        row[RATE] = self.position.main[1] - link.main[1];
+        let curve = &self.curve.state[0];
+        row[SPRING.start..SPRING.start + 2 * TERMS].copy_from_slice(&curve[..2 * TERMS]);
+        row[CLIPS].copy_from_slice(&curve[2 * TERMS..]);
+        (row[LATE.start], row[READ.start]) = (-link.main[1], -link.main[0]);
+        let formed = &self.formed.state[0];
+        let places = [DRY, SOFT, LOAD[0], LOAD[1], LATE.start + 1, READ.start + 1];
+        for (column, value) in places.into_iter().chain(STOPS).zip(formed) {
+            row[column] = *value;
         }
         row
     }
 
-    /// Slopes of the transmission's torque and of its stiffness by the coefficients, at a deflection.
+    /// What the columns of memory and of a free curve are at a deflection: (torque, stiffness) by column.
     #[must_use]
-    pub fn slopes(&self, phi: f64, set: Set) -> (Row, Row) {
-        let (u, unit) = (self.unit(phi), self.size.deflection.recip());
+    pub fn extras(&self, phi: f64) -> (Row, Row) {
         let (mut torque, mut stiffness) = ([0.0; COLUMNS], [0.0; COLUMNS]);
-        let has = |column: usize| set >> column & 1 == 1;
-        for (h, column) in POWERS.enumerate().filter(|(_, column)| has(*column)) {
-            let power = 2 * h as i32;
-            torque[column] = u.powi(power + 1);
-            stiffness[column] = f64::from(power + 1) * u.powi(power) * unit;
-        }
-        for (h, column) in EVEN.enumerate().filter(|(_, column)| has(*column)) {
-            let power = 2 * h as i32 + 2;
-            torque[column] = u.powi(power);
-            stiffness[column] = f64::from(power) * u.powi(power - 1) * unit;
-        }
-        for (column, width) in CLIPS.zip(CLIP_WIDTHS).filter(|(column, _)| has(*column)) {
-            let width = width * self.size.range;
-            torque[column] = u.clamp(-width, width);
-            stiffness[column] = if u.abs() < width { unit } else { 0.0 };
-        }
-        for (column, stop) in STOPS.zip(self.stops).filter(|(column, _)| has(*column)) {
-            torque[column] = stop;
+        let range = self.size.range;
+        if range > 0.0 {
+            for (column, width) in CLIPS.zip(CLIP_WIDTHS) {
+                let width = width * range;
+                torque[column] = phi.clamp(-width, width) / range;
+                stiffness[column] = if phi.abs() < width { range.recip() } else { 0.0 };
+            }
+            for (column, stop) in STOPS.zip(self.stops) {
+                torque[column] = stop;
+            }
         }
         (torque, stiffness)
     }
@@ -261,6 +336,12 @@ impl Balance {
         self.position.main[3]
     }
 
+    /// Filtered θ and τ, their derivatives, and the filtered declared effects.
+    #[must_use]
+    pub fn filtered(&self) -> (&[f64; 4], &[f64; 4], &[f64; 4]) {
+        (&self.position.main, &self.torque.main, &self.effects.main)
+    }
+
     /// Lightly filtered θ and its derivatives.
     #[must_use]
     pub fn light(&self) -> &[f64; 3] {
@@ -274,22 +355,11 @@ impl Balance {
     }
 }
 
-impl Default for Balance {
-    fn default() -> Balance {
-        Balance::new()
-    }
-}
-
-/// One channel: a call, not a copy of the filters for each column.
-#[inline(never)]
-fn smooth(channel: &mut Channel, filters: &Filters, now: f64) {
-    channel.smooth(filters, now);
-}
-
-/// One formed signal, likewise.
-#[inline(never)]
-fn pass(formed: &mut Formed, filters: &Filters, now: f64) {
-    formed.pass(filters, now);
+/// Variance of a column's fluctuation around its mean.
+#[must_use]
+pub fn variance(gram: &Gram, column: usize) -> f64 {
+    let mean = gram.at(column, OFFSET) / gram.rows;
+    (gram.rms(column).powi(2) - mean * mean).max(0.0)
 }
 
 /// Rows that the filters make of one independent error: the length of their impulse response over a period.
@@ -303,10 +373,12 @@ pub fn correlated_rows(main: &StateVariableFilter<4>, period_s: f64) -> f64 {
 mod tests {
     use super::*;
 
+    const T: f64 = 1e-3;
+
     /// A joint on a sine whose torque is known in closed form: the row's columns add up to zero.
     #[test]
     fn the_row_of_a_known_joint_is_a_balance() {
-        let (period, filters) = (1e-3, Filters::new(60.0, 1e-3));
+        let filters = Filters::new(60.0, T);
         let (inertia, damping, k1, k3) = (0.1, 0.5, 100.0, 4000.0);
         let w = 7.0;
         let at = |t: f64| (0.5 * (w * t).sin(), 0.4 * (w * t + 0.2).sin());
@@ -316,26 +388,25 @@ mod tests {
             let phi = q - theta;
             inertia * acceleration + damping * rate - k1 * phi - k3 * phi.powi(3)
         };
-        let mut balance = Balance::new();
+        let mut balance = Balance::new(Family::Smooth);
         let mut link = Channel::rest(0.0);
-        let mut left: f64 = 0.0;
-        let mut largest: f64 = 0.0;
+        let (mut left, mut largest): (f64, f64) = (0.0, 0.0);
         for k in 0..6000 {
-            let t = f64::from(k) * period;
+            let t = f64::from(k) * T;
             let (theta, q) = at(t);
             if k == 1000 {
-                balance.scale(q - theta);
+                balance.grow(balance.largest());
             }
             link.smooth(&filters, q);
             // The mean over a period is what a held torque of this value amounts to.
-            balance.feed(&filters, theta, q - theta, torque(t + 0.5 * period), &link, 0.0);
+            balance.feed(&filters, theta, q - theta, torque(t + 0.5 * T), &link, 0.0);
             balance.observe(q - theta, true);
             if k > 2000 {
                 let (row, size) = (balance.row(&link), balance.size.deflection);
                 let sum = inertia * row[ACCELERATION]
                     + damping * row[VELOCITY]
-                    + k1 * size * row[POWERS.start]
-                    + k3 * size.powi(3) * row[POWERS.start + 1];
+                    + k1 * size * row[SPRING.start]
+                    + k3 * size.powi(3) * row[SPRING.start + 1];
                 left = left.max((row[TORQUE] - sum).abs());
                 largest = largest.max(row[TORQUE].abs());
             }
@@ -343,22 +414,44 @@ mod tests {
         assert!(left < 2e-4 * largest, "{left} of {largest}");
     }
 
-    #[test]
-    fn a_stop_remembers_which_way_it_came() {
-        let filters = Filters::new(60.0, 1e-3);
-        let mut balance = Balance::new();
+    fn moved(balance: &mut Balance, from: u32, to: u32, amplitude: f64) -> Row {
+        let filters = Filters::new(60.0, T);
         let mut link = Channel::rest(0.0);
-        for k in 0..4000 {
-            let q = 0.01 * (f64::from(k) * 3e-3).sin();
+        for k in 0..to {
+            let q = amplitude * (f64::from(k) * 3e-3).sin();
             link.smooth(&filters, q);
-            balance.feed(&filters, 0.0, q, 0.0, &link, 0.0);
-            balance.observe(q, true);
-            if k == 3000 {
-                balance.scale(q);
+            if k >= from {
+                balance.feed(&filters, 0.0, q, 0.0, &link, 0.0);
+                balance.observe(q, true);
             }
         }
-        let all = set(STOPS);
-        assert!(balance.slopes(0.0, all).0[STOPS.start].abs() > 0.05);
-        assert_eq!(balance.slopes(0.0, 0).0, [0.0; COLUMNS]);
+        balance.row(&link)
+    }
+
+    #[test]
+    fn a_stop_remembers_which_way_it_came() {
+        let mut balance = Balance::new(Family::Smooth);
+        moved(&mut balance, 0, 3000, 0.01);
+        balance.grow(0.01);
+        balance.fit_widths(0.0);
+        moved(&mut balance, 0, 4000, 0.01);
+        assert!(balance.extras(0.0).0[STOPS.start].abs() > 0.05);
+        assert_eq!(balance.extras(0.0).1[STOPS.start], 0.0);
+    }
+
+    #[test]
+    fn columns_that_have_grown_are_those_of_a_joint_that_was_larger_from_the_start() {
+        let mut grown = Balance::new(Family::Smooth);
+        moved(&mut grown, 0, 2500, 0.01);
+        grown.grow(0.01);
+        moved(&mut grown, 0, 2500, 0.01);
+        let mut link = Channel::rest(0.0);
+        link.smooth(&Filters::new(60.0, T), 0.0);
+        let before = grown.row(&link);
+        let factors = grown.grow(0.02);
+        let after = grown.row(&link);
+        for column in SPRING.chain(SLOPE) {
+            assert!((before[column] * factors[column] - after[column]).abs() < 1e-12, "{column}");
+        }
     }
 }

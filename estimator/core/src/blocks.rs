@@ -1,34 +1,29 @@
 //! What one motor's balance has taught: blocks of rows, and the algebra on their sum.
 
-use crate::balance::{
-    ACCELERATION, CLIPS, DRY, EVEN, LATE, LOAD, OFFSET, POWERS, SOFT, STOPS, TORQUE, VELOCITY, set,
-};
-use crate::gram::{COLUMNS, Gram, Posterior, Prior, Row, Set, choose, cluster, correlation, student_95};
-use crate::laws::Law;
-use crate::model::{Motor, Transmission};
+mod solve;
+
+use crate::balance::{self, Balance};
+use crate::causes::{Cause, Explanation, Known, Noise, Odds, TABLE};
+use crate::gram::{Frame, Gram, Posterior, Row, Set, UNKNOWNS, Vector, dot, inverse, set};
+use crate::model::Motor;
 use crate::settings::Priors;
+use crate::spring::{Projection, TERMS};
 use crate::student::f_quantile;
+use crate::unknowns::{ACTIVE, CANDIDATES, DRY, LATE, OFFSET, RATE, Reading, SOFT, SPRING, Spring, ZERO};
 
 const BLOCK_S: f64 = 0.25; // of motion: longer than the filters' memory, so that blocks are nearly independent
-const BLOCKS: usize = 120; // 30 s of motion: what a joint's temperature and load leave as they are
+const BLOCKS: usize = 100; // 25 s of motion: what a joint's temperature and load leave as they are
 const FEWEST: usize = 8; // blocks before one is held against the others
-const PERSISTENT: usize = 4; // blocks in a row that are not explained: the joint is another one
-const UNDECLARED: f64 = 0.05; // amplitude of an effect that nobody declared, as a share of the torque
-const SPRING: f64 = 10.0; // of the flexibility torque, as a share of the motor's: the data decide
+const WINDOW: usize = 8; // blocks that are not explained, at most: two seconds
+const CONVINCING: usize = 2; // blocks in a row that end a doubt: one may have had little motion
+const DECIDED: f64 = 0.95; // probability at which a change of the joint itself is followed
+const QUICK_S: f64 = 0.03; // over which single rows are held against what is known: the filters' memory
 
-/// One effect that the joint file need not name.
-struct Candidate {
-    columns: std::ops::Range<usize>,
-    name: &'static str,
-}
-
-/// The groups of columns that evidence chooses, with the names of `report.json`.
-const CANDIDATES: [Candidate; 4] = [
-    Candidate { columns: SOFT..SOFT + 1, name: "stribeck_friction" },
-    Candidate { columns: LOAD..LOAD + 1, name: "load_dependent_friction" },
-    Candidate { columns: STOPS, name: "hysteresis" },
-    Candidate { columns: CLIPS, name: "backlash" },
-];
+const REST: f64 = 0.03; // of what is left without it: an effect that bends with the change
+const EXPLAINED: f64 = 3.0; // times the usual mean square, that a change of the joint may leave
+const EARLY: f64 = 0.005; // of the torque's fluctuation: what a drive's torque is known to, before any data
+const TAILS: f64 = 8.0; // degrees of freedom of a block's noise level: it varies within a factor of two
+const BURST: f64 = 3.0; // times the largest mean square that was explained: friction comes in bursts, at reversals
 
 /// What a block did.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -41,23 +36,54 @@ pub enum Closed {
     Begun,
 }
 
+/// What was known when the sum began anew, α and the zero as they are.
+#[derive(Clone, Debug)]
+struct Carried {
+    x: Vector,
+    precision: [Vector; UNKNOWNS],
+    set: Set,
+}
+
 /// Blocks of one motor's rows.
 #[derive(Clone, Debug)]
 pub struct Blocks {
     motor: Motor,
     priors: Priors,
     period: f64,
-    powers: Option<usize>,
     rows: f64,
     correlated: f64,
-    limit: f64, // of a block's mean square over the usual one, at the declared rate of false alarms
+    per_block: f64, // probability of a change, before a block
+    quick_limit: f64,
     open: Gram,
     ring: Vec<Gram>,
     oldest: usize,
     waiting: Vec<Gram>,
-    variance: f64,
-    own: f64, // rms that the chosen columns leave
-    scale: f64,
+    scores: Vec<Vector>,
+    carried: Option<Carried>,
+    /// The law and its parameters.
+    pub spring: Spring,
+    projection: Option<Projection>,
+    deflection: f64,
+    noise: Noise,
+    own: f64, // rms that the chosen unknowns leave
+    quick: f64,
+    peak: f64,       // of it in the open block …
+    peaks: Vec<f64>, // … and in those of the ring
+    good: usize,     // blocks in a row that were explained
+    doubted: usize,  // blocks since the last explained one
+    doubting: bool,
+    skipped: u32, // rows that are still of what was before
+    settle: u32,
+    fitted: bool, // what the file knows has been held against a block
+    lost: bool,   // where the zero is
+    powers: [f64; TERMS],
+    frame: Option<Frame>,
+    residual: Row,
+    odds: Option<Odds>,
+    /// Whether samples of late could not be used.
+    pub spoilt: bool,
+    /// Variance of a row that the readings' white noise makes, (N·m)².
+    pub white: f64,
     /// Resolution of the deflection, rad: rounding moves its zero by as much.
     pub resolution: f64,
     /// Whether evidence chose a zero that is not the declared one.
@@ -67,54 +93,87 @@ pub struct Blocks {
 }
 
 impl Blocks {
-    /// Of a motor; `correlated`: rows that one independent error is worth.
+    /// Of a motor; `correlated`: rows that one independent error is worth; `settle`: rows after which the filters have
+    /// forgotten what was before.
     #[must_use]
     pub fn new(
         motor: &Motor,
         priors: &Priors,
         period_s: f64,
         correlated: f64,
+        settle: u32,
         alarms_per_hour: f64,
     ) -> Blocks {
-        let powers = match &motor.transmission {
-            Transmission::Elastic { law: Law::Linear, .. } => Some(1),
-            Transmission::Elastic { law: Law::Polynomial, order, .. } => order.map(|p| p.min(POWERS.len())),
-            _ => None,
-        };
         let rows = (BLOCK_S / period_s).round().max(8.0);
         let errors = (rows / correlated).max(1.0); // independent ones in a block
         Blocks {
             motor: motor.clone(),
             priors: *priors,
             period: period_s,
-            powers,
             rows,
             correlated,
-            limit: f_quantile(errors, FEWEST as f64 * errors, alarms_per_hour * BLOCK_S / 3600.0),
+            per_block: (alarms_per_hour * BLOCK_S / 3600.0).clamp(1e-12, 0.5),
+            quick_limit: f_quantile(1.0, FEWEST as f64 * errors, alarms_per_hour * QUICK_S / 3600.0),
             open: Gram::default(),
             ring: Vec::with_capacity(BLOCKS),
             oldest: 0,
-            waiting: Vec::with_capacity(PERSISTENT),
-            variance: f64::NAN,
+            waiting: Vec::with_capacity(WINDOW),
+            scores: Vec::with_capacity(BLOCKS),
+            carried: None,
+            spring: Spring::new(motor),
+            projection: None,
+            deflection: 0.0,
+            noise: Noise { variance: f64::NAN, correlated, tails: TAILS },
             own: f64::NAN,
-            scale: f64::NAN,
+            quick: 0.0,
+            peak: 0.0,
+            peaks: Vec::with_capacity(BLOCKS),
+            good: 0,
+            doubted: 0,
+            doubting: false,
+            skipped: 0,
+            settle,
+            fitted: false,
+            lost: false,
+            powers: [1.0; TERMS],
+            frame: None,
+            residual: [0.0; crate::gram::COLUMNS],
+            odds: None,
+            spoilt: false,
+            white: 0.0,
             resolution: 0.0,
             moved: false,
             posterior: None,
         }
     }
 
-    /// Forget everything.
+    /// Forget everything but what is declared.
     pub fn clear(&mut self) {
-        self.ring.clear();
-        self.waiting.clear();
-        self.open = Gram::default();
-        (self.oldest, self.posterior, self.moved) = (0, None, false);
+        self.spring.reset();
+        self.forget_rows();
+        (self.carried, self.lost) = (None, false);
     }
 
-    /// Half a block is a block: what follows is not as what was before.
-    pub fn cut(&mut self) {
+    fn forget_rows(&mut self) {
+        self.ring.clear();
+        self.peaks.clear();
+        self.waiting.clear();
         self.open = Gram::default();
+        (self.posterior, self.frame) = (self.spring.declared_posterior(), None);
+        (self.oldest, self.moved, self.skipped, self.fitted) = (0, false, 0, false);
+        self.end_doubt();
+        (self.noise.variance, self.own, self.quick) = (f64::NAN, f64::NAN, 0.0);
+    }
+
+    /// What follows is not as what was before: half a block is a block.
+    pub fn cut(&mut self) {
+        if self.open.rows >= 0.5 * self.rows && self.ring.len() >= FEWEST {
+            let block = std::mem::take(&mut self.open);
+            self.close(block);
+        } else {
+            self.open = Gram::default();
+        }
+        self.quick = 0.0;
     }
 
     /// Whether so little has been learned that it may be learned anew.
@@ -123,191 +182,304 @@ impl Blocks {
         self.ring.len() < FEWEST
     }
 
+    /// What the last rows say of all causes; `None`: they are explained.
+    #[must_use]
+    pub fn odds(&self) -> Option<&Odds> {
+        self.odds.as_ref()
+    }
+
+    /// Whether rows are not explained by what is known.
+    #[must_use]
+    pub fn is_doubting(&self) -> bool {
+        self.doubting
+    }
+
+    /// Whether the zero between the encoders is somewhere, and no motion has told where yet.
+    #[must_use]
+    pub fn is_lost(&self) -> bool {
+        self.lost
+    }
+
+    /// Whether enough is known to hold rows against it.
+    fn is_reference(&self) -> bool {
+        self.frame.is_some() && (self.ring.len() >= FEWEST || self.carried.is_some() || self.fitted)
+    }
+
     /// One row; what happened where it fills a block.
     pub fn add(&mut self, row: &Row) -> Option<Closed> {
+        if self.is_reference() {
+            let left = dot(row, &self.residual);
+            self.quick += (self.period / QUICK_S).min(1.0) * (left * left - self.quick);
+            if !self.doubting && self.is_beyond(row) {
+                return Some(self.begin_doubt());
+            }
+            self.peak = self.peak.max(self.quick);
+        }
+        if self.skipped > 0 {
+            self.skipped -= 1;
+            return None;
+        }
         self.open.add_row(row);
         if self.open.rows < self.rows {
             return None;
         }
         let block = std::mem::take(&mut self.open);
-        if !self.explains(&block) {
-            self.waiting.push(block);
-            if self.waiting.len() < PERSISTENT {
-                return Some(Closed::Unexplained);
-            }
-            self.ring.clear();
-            self.oldest = 0;
-            let waiting = std::mem::take(&mut self.waiting);
-            self.ring.extend(waiting);
-            self.waiting.reserve(PERSISTENT);
-            self.solve();
-            return Some(Closed::Begun);
+        Some(self.close(block))
+    }
+
+    /// Whether the latest rows are neither noise, nor as large as what explained blocks have held, nor uncertain.
+    fn is_beyond(&self, row: &Row) -> bool {
+        let usual = self.quick_limit * self.white.max(self.own * self.own);
+        if self.quick <= usual {
+            return false;
         }
+        let held = self.peaks.iter().fold(0.0, |most: f64, peak| most.max(*peak));
+        let (Some(frame), Some(known)) = (&self.frame, &self.posterior) else { return false };
+        let along = frame.directions.map(|direction| dot(row, &direction));
+        self.quick > usual.max(BURST * held) + self.quick_limit * known.variance_along(&along)
+    }
+
+    /// Something has changed: rows are of use again when the filters have forgotten what was before.
+    fn begin_doubt(&mut self) -> Closed {
+        (self.doubting, self.good, self.doubted) = (true, 0, 0);
+        (self.open, self.skipped) = (Gram::default(), self.settle);
         self.waiting.clear();
+        Closed::Unexplained
+    }
+
+    fn close(&mut self, block: Gram) -> Closed {
+        if self.frame.is_none() && self.posterior.is_some() {
+            self.believe(&block);
+        }
+        if let Some(odds) = self.judge(&block) {
+            if !self.doubting {
+                return self.begin_doubt();
+            }
+            self.good = 0;
+            self.waiting.push(block);
+            return self.doubt(odds);
+        }
+        self.good += 1;
+        self.keep(block);
+        if self.doubting && self.good < CONVINCING {
+            return Closed::Unexplained;
+        }
+        self.end_doubt();
+        self.solve();
+        Closed::Added
+    }
+
+    /// What the file knows is held against the first block.
+    fn believe(&mut self, block: &Gram) {
+        let Some(projection) = self.projection.clone() else { return };
+        let frame = self.spring.frame(&projection);
+        let near = self.priors.deflection_offset * self.deflection + self.resolution;
+        let prior = self.prior(block, &frame, near);
+        let known = frame.set & ACTIVE;
+        let covariance = inverse(&prior.precision, known);
+        self.noise.variance = EARLY * EARLY * balance::variance(block, balance::TORQUE);
+        self.own = self.noise.variance.sqrt();
+        self.residual = frame.residual(&prior.mean, known);
+        self.posterior = Some(Posterior { set: known, x: prior.mean, covariance, log_evidence: 0.0 });
+        (self.frame, self.fitted) = (Some(frame), true);
+    }
+
+    fn end_doubt(&mut self) {
+        self.waiting.clear();
+        (self.odds, self.doubting, self.doubted, self.quick) = (None, false, 0, 0.0);
+    }
+
+    fn keep(&mut self, block: Gram) {
+        let peak = std::mem::take(&mut self.peak);
         if self.ring.len() < BLOCKS {
             self.ring.push(block);
+            self.peaks.push(peak);
         } else {
-            self.ring[self.oldest] = block;
+            (self.ring[self.oldest], self.peaks[self.oldest]) = (block, peak);
             self.oldest = (self.oldest + 1) % BLOCKS;
         }
+    }
+
+    /// What the causes say of a block; `None`: nothing has changed.
+    fn judge(&self, block: &Gram) -> Option<Odds> {
+        let (frame, posterior) = (self.frame.as_ref()?, self.posterior.as_ref()?);
+        if !self.is_reference() {
+            return None;
+        }
+        let projection = self.projection.as_ref()?;
+        let precision = inverse(&posterior.covariance, posterior.set);
+        let spring = &self.spring;
+        let torque = projection.of(|phi| spring.law.at(phi + spring.zero, spring.parameters()).0);
+        let known = Known {
+            frame,
+            residual: &self.residual,
+            set: posterior.set,
+            precision: &precision,
+            torque: &torque,
+            slope: &spring.slope(projection),
+            powers: self.powers,
+            motor: (posterior.x[crate::unknowns::INERTIA], posterior.x[crate::unknowns::DAMPING]),
+            torque_rms: balance::variance(block, balance::TORQUE).sqrt(),
+            deflection: self.deflection,
+            period_s: self.period,
+        };
+        let noise = Noise { variance: self.own * self.own, ..self.noise };
+        let odds = known.judge(block, &noise, self.per_block);
+        if odds.of(Cause::Nothing).probability >= 0.5 {
+            return None;
+        }
+        if self.waiting.is_empty() {
+            return Some(odds);
+        }
+        let mut window = block.clone();
+        self.waiting.iter().for_each(|one| window.add(one, 1.0));
+        Some(known.judge(&window, &noise, self.per_block))
+    }
+
+    /// The window is not explained: is it the joint that has changed, or a reading?
+    fn doubt(&mut self, odds: Odds) -> Closed {
+        self.doubted += 1;
+        let of_joint: f64 =
+            TABLE.iter().filter(|entry| entry.opens != 0).map(|e| odds.of(e.cause).probability).sum();
+        let best = odds.best(|cause| cause.entry().opens != 0);
+        // A zero that goes on moving is nearly explained by one that has moved; a spring that bends is explained.
+        let bends =
+            best.is_some_and(|cause| matches!(cause, Cause::Stiffness | Cause::Shape | Cause::Friction));
+        let rest = if bends { REST * odds.of(Cause::Nothing).misfit } else { 0.0 };
+        let most = EXPLAINED.max(rest);
+        let explained = best.is_some_and(|cause| odds.of(cause).misfit < most);
+        self.odds = Some(odds);
+        if self.spoilt {
+            self.waiting.clear(); // samples that could not be used were among them: no joint is like that
+        }
+        if self.waiting.len() >= 2 && of_joint > DECIDED && explained {
+            self.begin(best.map_or(0, |cause| cause.entry().opens));
+            return Closed::Begun;
+        }
+        if self.doubted >= BLOCKS {
+            // Nothing in the table, for as long as anything is remembered: another joint.
+            self.begin(set(1..UNKNOWNS));
+            return Closed::Begun;
+        }
+        if self.waiting.len() >= WINDOW {
+            self.waiting.remove(0);
+        }
+        Closed::Unexplained
+    }
+
+    /// What is known begins with the window: the unknowns that have changed are open again, the others are as before.
+    fn begin(&mut self, opens: Set) {
+        self.carry(opens);
+        let waiting = std::mem::take(&mut self.waiting);
+        self.ring.clear();
+        self.peaks.clear();
+        self.oldest = 0;
+        for block in waiting {
+            self.keep(block);
+        }
+        self.waiting.reserve(WINDOW);
+        self.end_doubt();
+        if opens & set(SPRING) != 0 {
+            self.spring.open();
+        }
         self.solve();
-        Some(Closed::Added)
     }
 
-    /// Whether a block's mean square is as usual: Fisher's F of it over that of the others and what is not known.
-    fn explains(&self, block: &Gram) -> bool {
-        let Some(posterior) = &self.posterior else { return true };
-        let n = self.ring.len();
-        if n < FEWEST {
-            return true;
+    fn carry(&mut self, opens: Set) {
+        let Some(posterior) = &self.posterior else { return };
+        let kept = posterior.set & !opens;
+        let mut x = posterior.x;
+        for (i, unknown) in SPRING.enumerate() {
+            x[unknown] = self.spring.alpha[i];
         }
-        let misfit = |block: &Gram| block.quadratic(&posterior.residual) / block.rows;
-        let usual = self.ring.iter().map(misfit).sum::<f64>() / n as f64;
-        let floor = f64::EPSILON * block.rms(TORQUE).powi(2);
-        misfit(block) < self.limit * (usual + floor + posterior.predicted(block) / block.rows)
+        x[ZERO] = self.spring.zero;
+        self.carried = Some(Carried { x, precision: inverse(&posterior.covariance, kept), set: kept });
     }
 
-    /// Which columns there are, and how they are believed before any data.
-    ///
-    /// `zero`: standard deviation of the deflection's zero, as a share of the deflection.
-    fn prior(&self, total: &Gram, zero: f64) -> Prior {
-        let mean = total.at(TORQUE, OFFSET) / total.rows;
-        let torque = (total.rms(TORQUE).powi(2) - mean * mean).max(f64::MIN_POSITIVE).sqrt();
-        let share = |column: usize, share: f64| share * torque / total.rms(column).max(1e-12);
-        let mut prior = Prior { mean: [0.0; COLUMNS], std: [0.0; COLUMNS] };
-        for column in 1..COLUMNS {
-            prior.std[column] = share(column, UNDECLARED);
+    /// Where the zero between the encoders is, is not known any more.
+    pub fn lose_zero(&mut self) {
+        self.carry(1 << ZERO | 1 << OFFSET);
+        let (carried, noise, own) = (self.carried.take(), self.noise, self.own);
+        self.forget_rows();
+        (self.carried, self.lost) = (carried, true);
+        if self.carried.is_some() {
+            (self.noise, self.own) = (noise, own);
         }
-        let inertia = self.motor.inertia_std.unwrap_or(self.priors.motor_inertia);
-        (prior.mean[ACCELERATION], prior.std[ACCELERATION]) =
-            (self.motor.inertia, inertia * self.motor.inertia);
-        prior.mean[VELOCITY] = self.motor.damping;
-        prior.std[VELOCITY] = self.priors.viscous_damping * self.motor.damping
-            + share(VELOCITY, self.priors.viscous_damping_floor);
-        prior.std[OFFSET] = self.priors.torque_offset * torque + mean.abs();
-        prior.std[DRY] = self.priors.coulomb_friction * torque;
-        for column in POWERS {
-            prior.std[column] = share(column, SPRING);
-        }
-        // A zero that is off by δ adds δ f′(φ).
-        for (k, column) in EVEN.enumerate() {
-            let power = POWERS.start + 1 + k;
-            let known = self.posterior.as_ref().map_or(0.0, |known| known.coefficient(power).abs());
-            let amplitude = if known > 0.0 { known } else { share(power, 1.0) };
-            prior.std[column] = (2 * k + 3) as f64 * zero * amplitude;
-        }
-        // A delay of one period times the stiffness, as large as it was or as the torque lets it be.
-        for (k, column) in LATE.enumerate() {
-            let power = POWERS.start + k;
-            let known = self.posterior.as_ref().map_or(0.0, |known| known.coefficient(power).abs());
-            let stiffness = if known > 0.0 { known } else { share(power, 1.0) } / self.scale;
-            prior.std[column] = (2 * k + 1) as f64
-                * self.priors.encoder_delay
-                * self.period
-                * stiffness.max(f64::MIN_POSITIVE);
-        }
-        prior
     }
 
-    fn solve(&mut self) {
-        let mut total = Gram::default();
-        self.ring.iter().for_each(|block| total.add(block, 1.0));
-        let powers = self.powers.unwrap_or(1);
-        let mut base =
-            set(ACCELERATION..DRY + 1) | set(POWERS.start..POWERS.start + powers) | 1 << LATE.start;
-        if powers > 1 {
-            base |= 1 << (LATE.start + 1) | set(EVEN.start..(EVEN.start + powers - 1).min(EVEN.end));
+    /// The spring's columns have grown by these factors.
+    pub fn grow(&mut self, factors: &Row, balance: &Balance) {
+        for gram in self.ring.iter_mut().chain(&mut self.waiting).chain([&mut self.open]) {
+            gram.scale(factors);
         }
-        let mut groups: [Set; 8] = [0; 8];
-        let mut n = 0;
-        for candidate in &CANDIDATES {
-            groups[n] = set(candidate.columns.clone());
-            n += 1;
+        self.deflection = balance.size.deflection;
+        let reach = 0.98 * self.spring.widest_reach(self.deflection);
+        self.projection = Some(Projection::new(balance.family(), self.deflection, reach));
+        self.powers = balance.family().powers();
+        if !self.ring.is_empty() {
+            self.solve();
         }
-        if self.powers.is_none() {
-            for more in 2..=POWERS.len() {
-                groups[n] = set(POWERS.start..POWERS.start + more);
-                n += 1;
-            }
-        }
-        let mut prior = self.prior(&total, self.priors.deflection_offset + self.resolution / self.scale);
-        // The noise is what all columns together leave; it decides how many of them there are.
-        let mut noise = if self.variance > 0.0 { self.variance } else { 1e-4 * total.rms(TORQUE).powi(2) };
-        let floor = f64::EPSILON * total.rms(TORQUE).powi(2);
-        if self.powers.is_none() {
-            base |= set(EVEN);
-        }
-        let all = base | groups[..n].iter().fold(0, |all, group| all | group);
-        let mut correlated = self.correlated;
-        for _ in 0..2 {
-            let Some(whole) = crate::gram::solve(&total, all, &prior, noise * correlated) else { return };
-            noise = (total.quadratic(&whole.residual) / total.rows).max(floor);
-            if self.ring.len() >= FEWEST {
-                correlated = correlation(&whole, &self.ring, noise).max(self.correlated);
-            }
-        }
-        let Some(mut found) = choose(&total, base, &groups[..n], &prior, noise * correlated) else { return };
-        // The zero is where it is declared, or anywhere in the range.
-        let elsewhere = self.prior(&total, 1.0);
-        if let Some(other) = choose(&total, base, &groups[..n], &elsewhere, noise * correlated) {
-            self.moved = other.log_evidence > found.log_evidence + ((n + 1) as f64).ln();
-            if self.moved {
-                (found, prior) = (other, elsewhere);
-            }
-        }
-        let own = (total.quadratic(&found.residual) / total.rows).max(floor);
-        // What the chosen columns leave beyond the noise is an error of the model: scores of blocks hold it.
-        if !cluster(&mut found, &self.ring, &prior, noise * correlated) {
-            let freedom = (self.ring.len() as f64).max(3.0);
-            let wider = own / noise * (student_95(freedom) / student_95(1e9)).powi(2);
-            found.covariance.iter_mut().flatten().for_each(|v| *v *= wider);
-        }
-        (self.variance, self.own) = (noise, own.sqrt());
-        self.posterior = Some(found);
-    }
-
-    /// The columns are of another size from now on.
-    pub fn rescale(&mut self, deflection: f64) {
-        self.clear();
-        (self.scale, self.variance) = (deflection, f64::NAN);
     }
 
     /// Delay of the link position, s, and its standard deviation.
     #[must_use]
     pub fn delay(&self) -> Option<(f64, f64)> {
-        let posterior = self.posterior.as_ref()?;
-        let stiffness = posterior.coefficient(POWERS.start) / self.scale;
-        let std = posterior.covariance[LATE.start][LATE.start].sqrt();
-        (stiffness > 0.0).then(|| (posterior.coefficient(LATE.start) / stiffness, std / stiffness))
+        let known = self.posterior.as_ref()?;
+        (known.set & (1 << LATE | 1 << RATE) == 1 << LATE)
+            .then(|| (known.x[LATE], known.covariance[LATE][LATE].sqrt()))
+    }
+
+    /// Torque and stiffness at a deflection, with their slopes by the unknowns; `None`: nothing is known.
+    #[must_use]
+    pub fn at(&self, phi: f64, link_rate: f64, balance: &Balance) -> Option<Reading> {
+        match &self.posterior {
+            Some(known) => Some(self.spring.at(phi, &known.x, known.set, link_rate, balance)),
+            None if self.spring.known => Some(self.spring.at(phi, &[0.0; UNKNOWNS], 0, link_rate, balance)),
+            None => None,
+        }
     }
 
     /// Constant torque on the motor, N·m.
     #[must_use]
     pub fn offset(&self) -> f64 {
-        self.posterior.as_ref().map_or(0.0, |known| known.coefficient(OFFSET))
+        self.posterior.as_ref().map_or(0.0, |known| known.x[OFFSET])
     }
 
     /// rms of what the motor's equation leaves where friction is not taken off, N·m; ∞: unknown.
     #[must_use]
     pub fn unmodelled(&self) -> f64 {
-        let friction = |known: &Posterior| known.coefficient(DRY).hypot(known.coefficient(SOFT));
-        self.posterior.as_ref().map_or(f64::INFINITY, |known| self.own.hypot(friction(known)))
+        self.posterior
+            .as_ref()
+            .map_or(f64::INFINITY, |known| self.own.hypot(known.x[DRY].hypot(known.x[SOFT])))
     }
 
     /// rms of what is left of the balance, over the rms of the measured torque without its mean.
     #[must_use]
     pub fn unexplained(&self) -> f64 {
-        let Some(posterior) = &self.posterior else { return f64::NAN };
+        if self.ring.is_empty() {
+            return if self.posterior.is_some() { 0.0 } else { f64::NAN };
+        }
         let mut total = Gram::default();
         self.ring.iter().for_each(|block| total.add(block, 1.0));
-        let mean = total.at(TORQUE, OFFSET) / total.rows;
-        (total.quadratic(&posterior.residual) / (total.at(TORQUE, TORQUE) - total.rows * mean * mean)).sqrt()
+        (self.own * self.own / balance::variance(&total, balance::TORQUE)).sqrt()
+    }
+
+    /// rms of what the balance has left over the last moments, N·m.
+    #[must_use]
+    pub fn misfit(&self) -> f64 {
+        if self.posterior.is_some() { self.quick.sqrt() } else { f64::NAN }
+    }
+
+    /// What the window says of one cause; `None`: nothing is doubted.
+    #[must_use]
+    pub fn explanation(&self, cause: Cause) -> Option<&Explanation> {
+        self.odds.as_ref().map(|odds| odds.of(cause))
     }
 
     /// Names of the effects that nobody declared and evidence chose.
     pub fn undeclared(&self) -> impl Iterator<Item = &'static str> {
         let chosen = self.posterior.as_ref().map_or(0, |posterior| posterior.set);
-        let named = CANDIDATES.iter().filter(move |c| chosen & set(c.columns.clone()) != 0).map(|c| c.name);
+        let named = CANDIDATES.iter().filter(move |c| chosen & set(c.unknowns.clone()) != 0).map(|c| c.name);
         named.chain(self.moved.then_some("deflection_offset"))
     }
 }

@@ -1,9 +1,7 @@
 //! The estimator of a joint: one `step` a tick.
 
-use crate::balanced::Balanced;
 use crate::error::Error;
 use crate::external::External;
-use crate::isolation::Verdict;
 use crate::laws::Law;
 use crate::model::Model;
 use crate::paper::Paper;
@@ -20,8 +18,6 @@ pub enum Estimator {
     Paper(Box<Paper>),
     /// See [`Robust`].
     Robust(Box<Robust>),
-    /// See [`Balanced`].
-    Balanced(Box<Balanced>),
 }
 
 impl Estimator {
@@ -41,7 +37,6 @@ impl Estimator {
         }
         Ok(match settings.mode {
             Mode::Paper => Estimator::Paper(Box::new(Paper::new(model, settings, priors, period_s))),
-            Mode::Balance => Estimator::Balanced(Box::new(Balanced::new(model, settings, priors, period_s)?)),
             Mode::Robust => Estimator::Robust(Box::new(Robust::new(model, settings, priors, period_s)?)),
         })
     }
@@ -53,7 +48,6 @@ impl Estimator {
         match self {
             Estimator::Paper(paper) => paper.step(sample),
             Estimator::Robust(robust) => robust.step(sample),
-            Estimator::Balanced(balanced) => balanced.step(sample),
         }
     }
 
@@ -62,7 +56,6 @@ impl Estimator {
         match self {
             Estimator::Paper(paper) => paper.reset(),
             Estimator::Robust(robust) => robust.reset(),
-            Estimator::Balanced(balanced) => balanced.reset(),
         }
     }
 
@@ -71,7 +64,6 @@ impl Estimator {
         match self {
             Estimator::Paper(_) => {}
             Estimator::Robust(robust) => robust.distrust(),
-            Estimator::Balanced(balanced) => balanced.distrust(),
         }
     }
 
@@ -79,7 +71,7 @@ impl Estimator {
     #[must_use]
     pub fn residual(&self) -> f64 {
         match self {
-            Estimator::Paper(_) | Estimator::Balanced(_) => f64::NAN,
+            Estimator::Paper(_) => f64::NAN,
             Estimator::Robust(robust) => robust.residual(),
         }
     }
@@ -90,7 +82,6 @@ impl Estimator {
         match self {
             Estimator::Paper(paper) => paper.external(),
             Estimator::Robust(robust) => robust.external(),
-            Estimator::Balanced(_) => None,
         }
     }
 
@@ -100,7 +91,6 @@ impl Estimator {
         match self {
             Estimator::Paper(paper) => paper.consistency(),
             Estimator::Robust(robust) => robust.consistency(),
-            Estimator::Balanced(_) => None,
         }
     }
 
@@ -108,7 +98,7 @@ impl Estimator {
     #[must_use]
     pub fn suspicion(&self) -> Option<Suspicion> {
         match self {
-            Estimator::Paper(_) | Estimator::Balanced(_) => None,
+            Estimator::Paper(_) => None,
             Estimator::Robust(robust) => robust.suspicion(),
         }
     }
@@ -119,16 +109,14 @@ impl Estimator {
         match self {
             Estimator::Paper(paper) => paper.why(),
             Estimator::Robust(robust) => robust.why(),
-            Estimator::Balanced(balanced) => balanced.why(),
         }
     }
 
-    /// What the window of one motor's balance says of all changes; `None`: nothing.
-    #[must_use]
-    pub fn verdict(&self, motor: usize) -> Option<&Verdict> {
+    /// Effects of one motor that nobody declared and evidence chose; `None`: the mode has none.
+    pub fn undeclared(&self, motor: usize) -> Option<impl Iterator<Item = &'static str>> {
         match self {
-            Estimator::Paper(_) | Estimator::Balanced(_) => None,
-            Estimator::Robust(robust) => robust.verdict(motor),
+            Estimator::Paper(_) => None,
+            Estimator::Robust(robust) => Some(robust.undeclared(motor)),
         }
     }
 
@@ -139,7 +127,6 @@ impl Estimator {
         match self {
             Estimator::Paper(paper) => paper.parameters(motor, values, std),
             Estimator::Robust(robust) => robust.parameters(motor, values, std).cloned(),
-            Estimator::Balanced(_) => None,
         }
     }
 }

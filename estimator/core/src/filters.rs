@@ -34,6 +34,23 @@ impl<const N: usize> Step<N> {
         }
         *state = next;
     }
+
+    /// The same for many signals side by side: `state[i][l]` is state i of signal l.
+    #[inline]
+    pub fn apply_lanes<const L: usize>(&self, state: &mut [[f64; L]; N], before: &[f64; L], now: &[f64; L]) {
+        let last = *state;
+        for i in 0..N {
+            let next = &mut state[i];
+            for l in 0..L {
+                next[l] = self.old[i] * before[l] + self.new[i] * now[l];
+            }
+            for (a, from) in self.advance[i].iter().zip(&last) {
+                for l in 0..L {
+                    next[l] += a * from[l];
+                }
+            }
+        }
+    }
 }
 
 /// F(s) = wⁿ/(s + w)ⁿ with the derivatives s^i F as its states, i = 0 … n−1.

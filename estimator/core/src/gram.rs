@@ -1,24 +1,44 @@
 //! Sums of products of a balance's columns, and the linear algebra that every question to them is.
 //!
-//! A row z of [`crate::balance`] obeys z₀ = Σ xⱼ zⱼ + ε. Rows are summed into blocks G = Σ z zᵀ; blocks are
-//! summed. Estimates, their covariance, the evidence of a sub-model and the misfit of a block follow from sums.
+//! A row z of [`crate::balance`] obeys z · left = Σ xⱼ z · dⱼ + ε, with directions dⱼ of the unknowns xⱼ in the
+//! space of the columns. Rows are summed into blocks G = Σ z zᵀ; blocks are summed. Estimates, their covariance,
+//! the evidence of a sub-model and the misfit of a block follow from sums.
 
-/// Columns of a row, the measured torque (column 0) included.
-pub const COLUMNS: usize = 24;
+/// Columns of a row.
+pub const COLUMNS: usize = 32;
 
 /// One value a column.
 pub type Row = [f64; COLUMNS];
 
-/// A set of columns, one bit each.
+/// Unknowns of a balance, with index 0 for what they explain.
+pub const UNKNOWNS: usize = 23;
+
+/// One value an unknown.
+pub type Vector = [f64; UNKNOWNS];
+
+/// One value a pair of unknowns.
+pub type Matrix = [Vector; UNKNOWNS];
+
+/// A set of unknowns, one bit each.
 pub type Set = u32;
 
-const Z_95: f64 = 1.959_964; // two-sided 95 % of a normal distribution
+const PIVOT: f64 = 1e-13; // of a scaled diagonal of 1: rounding of sums of products
 
-/// COLUMNS, as a number that the compiler does not see: triangular loops stay loops.
-///
-/// Unrolled, 24 columns are 300 statements a loop, and a release build takes minutes.
+/// COLUMNS, as a number that the compiler does not see: unrolled, 32 columns are 528 statements a loop.
 fn all() -> usize {
     std::hint::black_box(COLUMNS)
+}
+
+/// The bits of some unknowns.
+#[must_use]
+pub fn set(unknowns: std::ops::Range<usize>) -> Set {
+    unknowns.fold(0, |set, unknown| set | 1 << unknown)
+}
+
+/// z · c.
+#[must_use]
+pub fn dot(z: &Row, c: &Row) -> f64 {
+    z.iter().zip(c).map(|(z, c)| z * c).sum()
 }
 
 /// Σ z zᵀ of rows: the lower triangle, and how many rows.
@@ -56,6 +76,15 @@ impl Gram {
         self.rows += weight * other.rows;
     }
 
+    /// The same rows with each column times a factor.
+    pub fn scale(&mut self, factors: &Row) {
+        for i in 0..all() {
+            for (sum, factor) in self.sums[i][..=i].iter_mut().zip(factors) {
+                *sum *= factors[i] * factor;
+            }
+        }
+    }
+
     /// One entry.
     #[must_use]
     pub fn at(&self, i: usize, j: usize) -> f64 {
@@ -83,225 +112,280 @@ impl Gram {
         out
     }
 
-    /// cᵀ G c: with c = (1, −x) the sum of the squares that x leaves.
+    /// cᵀ G c: the sum of the squares of z · c.
     #[must_use]
     pub fn quadratic(&self, c: &Row) -> f64 {
-        self.times(c).iter().zip(c).map(|(a, b)| a * b).sum::<f64>().max(0.0)
+        dot(&self.times(c), c).max(0.0)
     }
 }
 
-/// Gaussian prior of the coefficients, independent of each other.
+/// What each unknown adds to a row's balance, and what they explain together.
+#[derive(Clone, Debug)]
+pub struct Frame {
+    /// z · left is what is explained.
+    pub left: Row,
+    /// z · d is what an unknown of 1 explains; index 0 is not used.
+    pub directions: [Row; UNKNOWNS],
+    /// The unknowns that have a direction.
+    pub set: Set,
+}
+
+impl Frame {
+    /// The residual of a row is z · c.
+    #[must_use]
+    pub fn residual(&self, x: &Vector, set: Set) -> Row {
+        let mut c = self.left;
+        for j in unknowns(set & self.set) {
+            c.iter_mut().zip(&self.directions[j]).for_each(|(c, d)| *c -= x[j] * d);
+        }
+        c
+    }
+
+    /// Dᵀ G D with `left` as the direction of index 0.
+    #[must_use]
+    pub fn reduce(&self, gram: &Gram) -> Matrix {
+        let mut out = [[0.0; UNKNOWNS]; UNKNOWNS];
+        for j in std::iter::once(0).chain(unknowns(self.set)) {
+            let image = gram.times(if j == 0 { &self.left } else { &self.directions[j] });
+            for i in std::iter::once(0).chain(unknowns(self.set)).filter(|i| *i <= j) {
+                let value = dot(&image, if i == 0 { &self.left } else { &self.directions[i] });
+                (out[i][j], out[j][i]) = (value, value);
+            }
+        }
+        out
+    }
+}
+
+/// The unknowns of a set, in order.
+pub fn unknowns(set: Set) -> impl Iterator<Item = usize> {
+    (1..UNKNOWNS).filter(move |unknown| set >> unknown & 1 == 1)
+}
+
+/// Gaussian prior of the unknowns.
 #[derive(Clone, Copy, Debug)]
 pub struct Prior {
     /// Expected values.
-    pub mean: Row,
-    /// Standard deviations, > 0.
-    pub std: Row,
+    pub mean: Vector,
+    /// Inverse covariance.
+    pub precision: Matrix,
 }
 
-/// Maximum a posteriori coefficients of a set of columns, and what is known of them.
+impl Prior {
+    /// Independent unknowns of these standard deviations, > 0.
+    #[must_use]
+    pub fn independent(mean: Vector, std: &Vector) -> Prior {
+        let mut precision = [[0.0; UNKNOWNS]; UNKNOWNS];
+        (0..UNKNOWNS).for_each(|i| precision[i][i] = std[i].powi(-2));
+        Prior { mean, precision }
+    }
+}
+
+/// Maximum a posteriori unknowns of a set, and what is known of them.
 #[derive(Clone, Debug)]
 pub struct Posterior {
-    /// The columns with a coefficient.
+    /// The unknowns that there are.
     pub set: Set,
-    /// (1, −x): the residual of a row is z · c.
-    pub residual: Row,
-    /// Inverse information, of the columns of the set.
-    pub covariance: [Row; COLUMNS],
+    /// Their values; 0 outside the set.
+    pub x: Vector,
+    /// Their covariance; 0 outside the set.
+    pub covariance: Matrix,
     /// ln of the marginal likelihood, but for what all sets have in common.
     pub log_evidence: f64,
 }
 
 impl Posterior {
-    /// x of one column; 0 outside the set.
-    #[must_use]
-    pub fn coefficient(&self, column: usize) -> f64 {
-        -self.residual[column]
-    }
-
     /// gᵀ C g.
     #[must_use]
-    pub fn variance_along(&self, g: &Row) -> f64 {
+    pub fn variance_along(&self, g: &Vector) -> f64 {
         let mut sum = 0.0;
-        for i in (0..all()).filter(|i| g[*i] != 0.0) {
+        for i in unknowns(self.set) {
             sum += g[i] * self.covariance[i].iter().zip(g).map(|(v, b)| v * b).sum::<f64>();
         }
         sum.max(0.0)
     }
 
-    /// Σ zᵀ C z over the rows of a block: the part of its misfit that uncertain coefficients explain.
+    /// Σ (z·d)ᵀ C (z·d) over the rows of a reduced block: the misfit that uncertain unknowns explain.
     #[must_use]
-    pub fn predicted(&self, block: &Gram) -> f64 {
-        let mut sum = 0.0;
-        for i in 0..all() {
-            for j in (0..all()).filter(|j| self.covariance[i][*j] != 0.0) {
-                sum += self.covariance[i][j] * block.at(i, j);
+    pub fn predicted(&self, reduced: &Matrix) -> f64 {
+        let product =
+            |i: usize| -> f64 { unknowns(self.set).map(|j| self.covariance[i][j] * reduced[i][j]).sum() };
+        unknowns(self.set).map(product).sum::<f64>().max(0.0)
+    }
+}
+
+/// A positive definite matrix of a set's unknowns as L Lᵀ, scaled by its diagonal.
+struct Cholesky {
+    index: [usize; UNKNOWNS],
+    n: usize,
+    scale: Vector, // 1/√ of the diagonal
+    factor: Matrix,
+    log_determinant: f64,
+}
+
+impl Cholesky {
+    fn new(set: Set, at: impl Fn(usize, usize) -> f64) -> Cholesky {
+        let mut made = Cholesky {
+            index: [0; UNKNOWNS],
+            n: 0,
+            scale: [0.0; UNKNOWNS],
+            factor: [[0.0; UNKNOWNS]; UNKNOWNS],
+            log_determinant: 0.0,
+        };
+        for unknown in unknowns(set) {
+            made.index[made.n] = unknown;
+            made.scale[made.n] = at(unknown, unknown).max(f64::MIN_POSITIVE).sqrt().recip();
+            made.n += 1;
+        }
+        for i in 0..made.n {
+            for j in 0..=i {
+                let rest: f64 = (0..j).map(|k| made.factor[i][k] * made.factor[j][k]).sum();
+                let value = at(made.index[i], made.index[j]) * made.scale[i] * made.scale[j] - rest;
+                made.factor[i][j] = if i == j { value.max(PIVOT).sqrt() } else { value / made.factor[j][j] };
+            }
+            made.log_determinant += 2.0 * (made.factor[i][i].ln() - made.scale[i].ln());
+        }
+        made
+    }
+
+    /// L⁻¹ of a scaled vector.
+    fn whiten(&self, b: &Vector) -> Vector {
+        let mut out = [0.0; UNKNOWNS];
+        for i in 0..self.n {
+            let rest: f64 = (0..i).map(|k| self.factor[i][k] * out[k]).sum();
+            out[i] = (b[self.index[i]] * self.scale[i] - rest) / self.factor[i][i];
+        }
+        out
+    }
+
+    /// The inverse, by unknowns.
+    fn inverse(&self) -> Matrix {
+        let (mut lower, mut out) = ([[0.0; UNKNOWNS]; UNKNOWNS], [[0.0; UNKNOWNS]; UNKNOWNS]);
+        for i in 0..self.n {
+            lower[i][i] = self.factor[i][i].recip();
+            for j in 0..i {
+                let rest: f64 = (j..i).map(|k| self.factor[i][k] * lower[k][j]).sum();
+                lower[i][j] = -rest / self.factor[i][i];
             }
         }
-        sum
+        for i in 0..self.n {
+            for j in 0..=i {
+                let c: f64 = (i..self.n).map(|k| lower[k][i] * lower[k][j]).sum();
+                let value = c * self.scale[i] * self.scale[j];
+                out[self.index[i]][self.index[j]] = value;
+                out[self.index[j]][self.index[i]] = value;
+            }
+        }
+        out
     }
 }
 
-/// The columns of a set, in order, and how many.
-fn columns(set: Set) -> ([usize; COLUMNS], usize) {
-    let (mut out, mut n) = ([0; COLUMNS], 0);
-    for column in (1..COLUMNS).filter(|column| set >> column & 1 == 1) {
-        out[n] = column;
-        n += 1;
-    }
-    (out, n)
-}
-
-/// Posterior of the columns in `set`; `noise`: variance of a row times the rows that an independent one is worth.
-///
-/// `None`: a number is not finite. Columns are scaled by their diagonal before they are factorised.
+/// ln of the determinant of a set's part of a positive definite matrix.
 #[must_use]
-pub fn solve(gram: &Gram, set: Set, prior: &Prior, noise: f64) -> Option<Posterior> {
-    let (index, n) = columns(set);
-    let (mut a, mut b, mut scale) = ([[0.0; COLUMNS]; COLUMNS], [0.0; COLUMNS], [0.0; COLUMNS]);
-    let mut log_prior = 0.0;
-    let mut square = gram.at(0, 0) / noise;
-    for i in 0..n {
-        let (p, mean) = (prior.std[index[i]].powi(-2), prior.mean[index[i]]);
-        for j in 0..=i {
-            a[i][j] = gram.at(index[i], index[j]) / noise;
-        }
-        a[i][i] += p;
-        b[i] = gram.at(index[i], 0) / noise + p * mean;
-        log_prior += p.ln();
-        square += p * mean * mean;
-        scale[i] = a[i][i].sqrt().recip();
-    }
-    let mut log_determinant = 0.0;
-    for i in 0..n {
-        for j in 0..=i {
-            a[i][j] *= scale[i] * scale[j];
-        }
-        b[i] *= scale[i];
-        log_determinant -= 2.0 * scale[i].ln();
-    }
-    // Cholesky, in place; then the inverse of the factor, in place of a second one.
-    let mut inverse = [[0.0; COLUMNS]; COLUMNS];
-    for i in 0..n {
-        for j in 0..=i {
-            let rest: f64 = (0..j).map(|k| a[i][k] * a[j][k]).sum();
-            let value = a[i][j] - rest;
-            a[i][j] = if i == j { value.max(1e-14).sqrt() } else { value / a[j][j] };
-        }
-        log_determinant += 2.0 * a[i][i].ln();
-        inverse[i][i] = a[i][i].recip();
-        for j in 0..i {
-            let rest: f64 = (j..i).map(|k| a[i][k] * inverse[k][j]).sum();
-            inverse[i][j] = -rest / a[i][i];
-        }
-    }
-    let mut covariance = [[0.0; COLUMNS]; COLUMNS];
-    let (mut residual, mut gain) = ([0.0; COLUMNS], 0.0);
-    residual[0] = 1.0;
-    for i in 0..n {
-        let mut x = 0.0;
-        for j in 0..n {
-            let c: f64 = (i.max(j)..n).map(|k| inverse[k][i] * inverse[k][j]).sum();
-            x += c * b[j];
-            covariance[index[i]][index[j]] = c * scale[i] * scale[j];
-        }
-        gain += x * b[i];
-        residual[index[i]] = -x * scale[i];
-    }
-    let log_evidence = 0.5 * (log_prior - log_determinant - square + gain);
-    let finite = log_evidence.is_finite() && residual.iter().all(|x| x.is_finite());
-    finite.then_some(Posterior { set, residual, covariance, log_evidence })
+pub fn log_determinant(matrix: &Matrix, set: Set) -> f64 {
+    Cholesky::new(set, |i, j| matrix[i][j]).log_determinant
 }
 
-/// The groups of columns that the evidence adds to a base, one after the other.
+/// The inverse of a set's part of a positive definite matrix.
+#[must_use]
+pub fn inverse(matrix: &Matrix, set: Set) -> Matrix {
+    Cholesky::new(set, |i, j| matrix[i][j]).inverse()
+}
+
+/// Information, its vector and the square of what there is to explain, of a set's unknowns.
+fn system(reduced: &Matrix, set: Set, prior: &Prior, noise: f64) -> (Cholesky, Vector, f64) {
+    let cholesky = Cholesky::new(set, |i, j| reduced[i][j] / noise + prior.precision[i][j]);
+    let (mut vector, mut square) = ([0.0; UNKNOWNS], reduced[0][0] / noise);
+    for i in unknowns(set) {
+        let pull: f64 = unknowns(set).map(|j| prior.precision[i][j] * prior.mean[j]).sum();
+        vector[i] = reduced[i][0] / noise + pull;
+        square += prior.mean[i] * pull;
+    }
+    (cholesky, vector, square)
+}
+
+/// ln of the marginal likelihood of a set's unknowns, but for what all sets have in common.
+///
+/// `noise`: variance of a row times the rows that an independent one is worth.
+#[must_use]
+pub fn log_evidence(reduced: &Matrix, set: Set, prior: &Prior, noise: f64) -> f64 {
+    let (cholesky, vector, square) = system(reduced, set, prior, noise);
+    let gain: f64 = cholesky.whiten(&vector).iter().map(|u| u * u).sum();
+    let before = Cholesky::new(set, |i, j| prior.precision[i][j]).log_determinant;
+    0.5 * (before - cholesky.log_determinant - square + gain)
+}
+
+/// Posterior of a set's unknowns; `None`: a number is not finite. `noise`: see [`log_evidence`].
+#[must_use]
+pub fn solve(reduced: &Matrix, set: Set, prior: &Prior, noise: f64) -> Option<Posterior> {
+    let (cholesky, vector, _) = system(reduced, set, prior, noise);
+    let covariance = cholesky.inverse();
+    let mut x = [0.0; UNKNOWNS];
+    for i in unknowns(set) {
+        x[i] = covariance[i].iter().zip(&vector).map(|(c, b)| c * b).sum();
+    }
+    let log_evidence = log_evidence(reduced, set, prior, noise);
+    let finite = log_evidence.is_finite() && x.iter().all(|x| x.is_finite());
+    finite.then_some(Posterior { set, x, covariance, log_evidence })
+}
+
+/// The groups of unknowns that the evidence adds to a base, one after the other.
 ///
 /// A group is added if it raises the evidence by more than the number of groups: the odds against each before
 /// any data.
 #[must_use]
-pub fn choose(gram: &Gram, base: Set, groups: &[Set], prior: &Prior, noise: f64) -> Option<Posterior> {
-    let threshold = (groups.len() as f64).ln();
-    let mut best = solve(gram, base, prior, noise)?;
+pub fn choose(reduced: &Matrix, base: Set, groups: &[Set], prior: &Prior, noise: f64) -> Set {
+    let threshold = (groups.len().max(1) as f64).ln();
+    let (mut set, mut best) = (base, log_evidence(reduced, base, prior, noise));
     loop {
-        let mut next: Option<Posterior> = None;
-        for group in groups.iter().filter(|group| *group & !best.set != 0) {
-            let Some(tried) = solve(gram, best.set | group, prior, noise) else { continue };
-            let above = next.as_ref().map_or(best.log_evidence + threshold, |next| next.log_evidence);
-            if tried.log_evidence > above {
-                next = Some(tried);
+        let mut next = (set, best + threshold);
+        for group in groups.iter().filter(|group| *group & !set != 0) {
+            let tried = log_evidence(reduced, set | group, prior, noise);
+            if tried > next.1 {
+                next = (set | group, tried);
             }
         }
-        let Some(found) = next else { return Some(best) };
-        best = found;
+        if next.0 == set {
+            return set;
+        }
+        (set, best) = next;
     }
 }
 
 /// Replace the covariance by the one that is robust to correlation inside blocks.
 ///
-/// A⁻¹ (n/(n−p) Σ s sᵀ + P) A⁻¹ with the blocks' scores s = G_b c over the noise, the prior's precision P, and
-/// the factor of Student's t for as many blocks: correlation inside a block is in its score. Needs more blocks
-/// than coefficients; returns whether there were.
-pub fn cluster(posterior: &mut Posterior, blocks: &[Gram], prior: &Prior, noise: f64) -> bool {
-    let (index, n) = columns(posterior.set);
-    let freedom = blocks.len() as f64 - n as f64;
+/// A⁻¹ (n/(n−p) Σ s sᵀ + P) A⁻¹ with the blocks' scores s over the noise and the prior's precision P: correlation
+/// inside a block is in its score. p: the unknowns that the data decide, Σ(1 − P C). Needs more blocks than those;
+/// returns the degrees of freedom, n − p, or `None`.
+pub fn cluster(posterior: &mut Posterior, scores: &[Vector], prior: &Prior, noise: f64) -> Option<f64> {
+    let (set, bread) = (posterior.set, posterior.covariance);
+    let by_prior: f64 = unknowns(set)
+        .map(|i| unknowns(set).map(|j| prior.precision[i][j] * bread[j][i]).sum::<f64>().clamp(0.0, 1.0))
+        .sum();
+    let freedom = scores.len() as f64 - (f64::from(set.count_ones()) - by_prior);
     if freedom < 2.0 {
-        return false;
+        return None;
     }
-    let correction = blocks.len() as f64 / freedom;
-    let mut middle = [[0.0; COLUMNS]; COLUMNS];
-    for block in blocks {
-        let score = block.times(&posterior.residual);
-        for &i in &index[..n] {
-            for &j in &index[..n] {
-                middle[i][j] += correction * score[i] * score[j] / (noise * noise);
-            }
+    let weight = scores.len() as f64 / freedom / (noise * noise);
+    let mut middle = prior.precision;
+    for score in scores {
+        for i in unknowns(set) {
+            let scaled = weight * score[i];
+            middle[i].iter_mut().zip(score).for_each(|(m, s)| *m += scaled * s);
         }
     }
-    for &i in &index[..n] {
-        middle[i][i] += prior.std[i].powi(-2);
-    }
-    let wider = (student_95(freedom) / Z_95).powi(2);
-    let bread = &posterior.covariance;
-    let mut half = [[0.0; COLUMNS]; COLUMNS];
-    for &i in &index[..n] {
-        for &j in &index[..n] {
-            half[i][j] = index[..n].iter().map(|&k| bread[i][k] * middle[k][j]).sum();
+    let mut half = [[0.0; UNKNOWNS]; UNKNOWNS];
+    for i in unknowns(set) {
+        for k in unknowns(set) {
+            let factor = bread[i][k];
+            half[i].iter_mut().zip(&middle[k]).for_each(|(h, m)| *h += factor * m);
         }
     }
-    let mut meat = [[0.0; COLUMNS]; COLUMNS];
-    for &i in &index[..n] {
-        for &j in &index[..n] {
-            let sum: f64 = index[..n].iter().map(|&k| half[i][k] * bread[k][j]).sum();
-            meat[i][j] = wider * sum;
+    for i in unknowns(set) {
+        for j in unknowns(set) {
+            posterior.covariance[i][j] = unknowns(set).map(|k| half[i][k] * bread[k][j]).sum();
         }
     }
-    posterior.covariance = meat;
-    true
-}
-
-/// How many times more the scores of the blocks vary than with independent rows, averaged over the columns.
-#[must_use]
-pub fn correlation(posterior: &Posterior, blocks: &[Gram], variance: f64) -> f64 {
-    let (index, n) = columns(posterior.set);
-    let (mut seen, mut independent) = ([0.0; COLUMNS], [0.0; COLUMNS]);
-    for block in blocks {
-        let score = block.times(&posterior.residual);
-        for &i in &index[..n] {
-            seen[i] += score[i] * score[i];
-            independent[i] += variance * block.at(i, i);
-        }
-    }
-    let ratio = |&i: &usize| seen[i] / independent[i].max(f64::MIN_POSITIVE);
-    (index[..n].iter().map(ratio).sum::<f64>() / n.max(1) as f64).max(1.0)
-}
-
-/// Two-sided 95 % of Student's t, by Cornish and Fisher's series (within 1 % from three degrees of freedom on).
-#[must_use]
-pub fn student_95(freedom: f64) -> f64 {
-    let (z, v) = (Z_95, freedom);
-    let (z3, z5, z7) = (z.powi(3), z.powi(5), z.powi(7));
-    z + (z3 + z) / (4.0 * v)
-        + (5.0 * z5 + 16.0 * z3 + 3.0 * z) / (96.0 * v * v)
-        + (3.0 * z7 + 19.0 * z5 + 17.0 * z3 - 15.0 * z) / (384.0 * v.powi(3))
+    Some(freedom)
 }
 
 #[cfg(test)]
@@ -332,21 +416,46 @@ mod tests {
         gram
     }
 
-    const WIDE: Prior = Prior { mean: [0.0; COLUMNS], std: [1e6; COLUMNS] };
+    /// Unknown j is the coefficient of column j.
+    fn plain(set: Set) -> Frame {
+        let mut frame = Frame { left: [0.0; COLUMNS], directions: [[0.0; COLUMNS]; UNKNOWNS], set };
+        frame.left[0] = 1.0;
+        (1..UNKNOWNS).for_each(|j| frame.directions[j][j] = 1.0);
+        frame
+    }
+
+    fn wide() -> Prior {
+        Prior::independent([0.0; UNKNOWNS], &[1e6; UNKNOWNS])
+    }
 
     #[test]
-    fn coefficients_are_those_of_dense_least_squares() {
+    fn unknowns_are_those_of_dense_least_squares() {
         // Two columns: the normal equations in closed form.
         let rows = rows(400, [2.0, -0.03], 7, 0.1);
-        let found = solve(&sum(&rows), 0b110, &WIDE, 1.0 / 300.0).unwrap();
-        let dot = |a: usize, b: usize| rows.iter().map(|z| z[a] * z[b]).sum::<f64>();
-        let determinant = dot(1, 1) * dot(2, 2) - dot(1, 2).powi(2);
-        let first = (dot(2, 2) * dot(1, 0) - dot(1, 2) * dot(2, 0)) / determinant;
-        let second = (dot(1, 1) * dot(2, 0) - dot(1, 2) * dot(1, 0)) / determinant;
-        assert!((found.coefficient(1) - first).abs() < 1e-8 && (found.coefficient(2) - second).abs() < 1e-11);
-        assert!((found.covariance[1][1] * determinant / dot(2, 2) * 300.0 - 1.0).abs() < 1e-6);
+        let frame = plain(0b110);
+        let found = solve(&frame.reduce(&sum(&rows)), 0b110, &wide(), 1.0 / 300.0).unwrap();
+        let along = |a: usize, b: usize| rows.iter().map(|z| z[a] * z[b]).sum::<f64>();
+        let determinant = along(1, 1) * along(2, 2) - along(1, 2).powi(2);
+        let first = (along(2, 2) * along(1, 0) - along(1, 2) * along(2, 0)) / determinant;
+        let second = (along(1, 1) * along(2, 0) - along(1, 2) * along(1, 0)) / determinant;
+        assert!((found.x[1] - first).abs() < 1e-8 && (found.x[2] - second).abs() < 1e-11);
+        assert!((found.covariance[1][1] * determinant / along(2, 2) * 300.0 - 1.0).abs() < 1e-6);
         let left: f64 = rows.iter().map(|z| (z[0] - first * z[1] - second * z[2]).powi(2)).sum();
-        assert!((sum(&rows).quadratic(&found.residual) / left - 1.0).abs() < 1e-6);
+        let residual = frame.residual(&found.x, found.set);
+        assert!((sum(&rows).quadratic(&residual) / left - 1.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_direction_is_a_combination_of_columns() {
+        // One unknown of the columns 2 c₁ + c₂: the same as one column of those sums.
+        let rows = rows(200, [1.0, 0.5], 5, 0.1);
+        let mut frame = plain(0b10);
+        (frame.directions[1][1], frame.directions[1][2]) = (2.0, 1.0);
+        let found = solve(&frame.reduce(&sum(&rows)), 0b10, &wide(), 0.003).unwrap();
+        let column = |z: &Row| 2.0 * z[1] + z[2];
+        let exact = rows.iter().map(|z| column(z) * z[0]).sum::<f64>()
+            / rows.iter().map(|z| column(z).powi(2)).sum::<f64>();
+        assert!((found.x[1] / exact - 1.0).abs() < 1e-9);
     }
 
     #[test]
@@ -360,30 +469,43 @@ mod tests {
     }
 
     #[test]
-    fn a_sharp_prior_holds_a_coefficient() {
-        let mut prior = WIDE;
-        (prior.mean[1], prior.std[1]) = (5.0, 1e-9);
-        let found = solve(&sum(&rows(100, [2.0, 0.1], 5, 0.1)), 0b110, &prior, 0.003).unwrap();
-        assert!((found.coefficient(1) - 5.0).abs() < 1e-6);
+    fn scaled_columns_are_those_of_scaled_rows() {
+        let mut rows = rows(50, [1.0, 1.0], 9, 0.5);
+        let (mut gram, mut factors) = (sum(&rows), [1.0; COLUMNS]);
+        (factors[0], factors[2]) = (3.0, 0.1);
+        gram.scale(&factors);
+        rows.iter_mut().for_each(|z| (z[0], z[2]) = (3.0 * z[0], 0.1 * z[2]));
+        assert!((gram.at(2, 0) / sum(&rows).at(2, 0) - 1.0).abs() < 1e-12);
     }
 
     #[test]
-    fn evidence_takes_the_column_that_acts_and_leaves_the_one_that_does_not() {
-        let prior = Prior { mean: [0.0; COLUMNS], std: [1.0; COLUMNS] };
-        let gram = sum(&rows(400, [2.0, -0.03], 7, 0.1));
-        let found = choose(&gram, 0b10, &[0b100, 0b1000], &prior, 1.0 / 300.0).unwrap();
-        assert_eq!(found.set, 0b110);
+    fn a_prior_is_data_that_came_before() {
+        // The posterior of the first half as the prior of the second is the posterior of both.
+        let rows = rows(400, [2.0, -0.03], 7, 0.1);
+        let frame = plain(0b110);
+        let first = solve(&frame.reduce(&sum(&rows[..200])), 0b110, &wide(), 0.003).unwrap();
+        let prior = Prior { mean: first.x, precision: inverse(&first.covariance, 0b110) };
+        let second = solve(&frame.reduce(&sum(&rows[200..])), 0b110, &prior, 0.003).unwrap();
+        let both = solve(&frame.reduce(&sum(&rows)), 0b110, &wide(), 0.003).unwrap();
+        assert!((second.x[1] - both.x[1]).abs() < 1e-8);
+        assert!((second.covariance[2][1] - both.covariance[2][1]).abs() < 1e-9 * both.covariance[1][1]);
+    }
+
+    #[test]
+    fn evidence_takes_the_unknown_that_acts_and_leaves_the_one_that_does_not() {
+        let prior = Prior::independent([0.0; UNKNOWNS], &[1.0; UNKNOWNS]);
+        let reduced = plain(0b1110).reduce(&sum(&rows(400, [2.0, -0.03], 7, 0.1)));
+        assert_eq!(choose(&reduced, 0b10, &[0b100, 0b1000], &prior, 1.0 / 300.0), 0b110);
     }
 
     #[test]
     fn evidence_is_that_of_the_data_in_closed_form() {
-        // One coefficient, one row: y ~ N(0, noise + z² s²), compared between two priors.
+        // One unknown, one row: y ~ N(0, noise + z² s²), compared between two priors.
         let mut row = [0.0; COLUMNS];
         (row[0], row[1]) = (1.5, 2.0);
         let log = |s: f64| {
-            let mut prior = WIDE;
-            prior.std[1] = s;
-            solve(&sum(&[row]), 0b10, &prior, 0.25).unwrap().log_evidence
+            let prior = Prior::independent([0.0; UNKNOWNS], &[s; UNKNOWNS]);
+            log_evidence(&plain(0b10).reduce(&sum(&[row])), 0b10, &prior, 0.25)
         };
         let exact = |s: f64| {
             let v: f64 = 0.25 + 4.0 * s * s;
@@ -395,32 +517,34 @@ mod tests {
     #[test]
     fn clustered_intervals_hold_correlated_errors_and_plain_ones_do_not() {
         // An error that is constant inside blocks of 20 rows beside a regressor that is, too.
-        let (mut inside, mut plain, mut seed) = (0, 0, 11);
+        let (mut inside, mut plain_inside, mut seed) = (0, 0, 11);
+        let frame = plain(0b10);
         for _ in 0..400 {
             let mut blocks = Vec::new();
             for _ in 0..40 {
                 let (z, e) = (noise(&mut seed), noise(&mut seed));
                 let mut row = [0.0; COLUMNS];
                 (row[0], row[1]) = (3.0 * z + e, z);
-                blocks.push(sum(&[row; 20]));
+                blocks.push(frame.reduce(&sum(&[row; 20])));
             }
-            let mut total = Gram::default();
-            blocks.iter().for_each(|block| total.add(block, 1.0));
-            let mut found = solve(&total, 0b10, &WIDE, 1.0 / 3.0).unwrap();
-            let off = (found.coefficient(1) - 3.0).abs();
-            plain += i32::from(off < Z_95 * found.covariance[1][1].sqrt());
-            assert!(cluster(&mut found, &blocks, &WIDE, 1.0 / 3.0));
-            inside += i32::from(off < Z_95 * found.covariance[1][1].sqrt());
+            let mut total = [[0.0; UNKNOWNS]; UNKNOWNS];
+            for block in &blocks {
+                (0..4).for_each(|k| total[k / 2][k % 2] += block[k / 2][k % 2]);
+            }
+            let mut found = solve(&total, 0b10, &wide(), 1.0 / 3.0).unwrap();
+            let off = (found.x[1] - 3.0).abs();
+            plain_inside += i32::from(off < 1.96 * found.covariance[1][1].sqrt());
+            let score = |block: &Matrix| {
+                let mut score = [0.0; UNKNOWNS];
+                score[1] = block[1][0] - found.x[1] * block[1][1];
+                score
+            };
+            let scores: Vec<Vector> = blocks.iter().map(score).collect();
+            assert!(cluster(&mut found, &scores, &wide(), 1.0 / 3.0).is_some());
+            inside += i32::from(off < 2.023 * found.covariance[1][1].sqrt()); // Student's t of 39
         }
         // 400 trials: one standard error of a share of 95 % is 1.1 %.
         assert!((367..=393).contains(&inside), "{inside}");
-        assert!(plain < 250, "{plain}");
-    }
-
-    #[test]
-    fn students_t_is_that_of_tables() {
-        for (freedom, t) in [(3.0, 3.182), (5.0, 2.571), (10.0, 2.228), (30.0, 2.042)] {
-            assert!((student_95(freedom) / t - 1.0).abs() < 0.012);
-        }
+        assert!(plain_inside < 250, "{plain_inside}");
     }
 }

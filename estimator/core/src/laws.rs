@@ -317,7 +317,7 @@ impl Table {
     }
 
     /// (g, ∂g/∂φ); beyond its end the table goes on straight.
-    fn at(&self, phi: f64) -> (f64, f64) {
+    pub fn at(&self, phi: f64) -> (f64, f64) {
         let (x, y, slope, size) = (&self.deflection, &self.torque, &self.slope, phi.abs());
         let last = x.len() - 1;
         let i = x.partition_point(|at| *at <= size).saturating_sub(1);

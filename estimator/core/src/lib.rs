@@ -10,31 +10,21 @@
 
 pub mod align;
 pub mod balance;
-pub mod balanced;
 pub mod blocks;
-pub mod change_detection;
-pub mod consider;
+pub mod causes;
 pub mod corrections;
 pub mod deflection;
-pub mod delay;
 pub mod effects;
 pub mod error;
 pub mod estimator;
 pub mod external;
 pub mod filters;
-pub mod friction;
 pub mod gram;
-pub mod identification;
-pub mod isolation;
-pub mod kalman;
 pub mod laws;
 pub mod library;
-pub mod linear_algebra;
-pub mod linearisation;
 pub mod memory;
 pub mod model;
 pub mod model_monitor;
-pub mod model_switch;
 pub mod noise;
 pub mod paper;
 pub mod reasons;
@@ -42,10 +32,12 @@ pub mod robust;
 pub mod sample;
 pub mod sample_validator;
 pub mod settings;
+pub mod side;
 pub mod signals;
+pub mod spring;
 pub mod student;
 pub mod suspicion;
-pub mod transmission;
+pub mod unknowns;
 
 #[cfg(feature = "python")]
 pub mod python;

@@ -130,7 +130,10 @@ impl Model {
                 return Err(Error(format!("transmission: parameters: got {got}, expected {fixed}")));
             }
             if let Some(numbers) = covariance.as_ref().map(Vec::len).filter(|n| *n != got * got) {
-                return Err(Error(format!("transmission: covariance: got {numbers}, expected {}", got * got)));
+                return Err(Error(format!(
+                    "transmission: covariance: got {numbers}, expected {}",
+                    got * got
+                )));
             }
         }
         Ok(())

@@ -192,7 +192,6 @@ pub fn settings(given: &Bound<'_, PyAny>) -> PyResult<Settings> {
     Ok(Settings {
         mode: match mode.as_str() {
             "paper" => Mode::Paper,
-            "balance" => Mode::Balance,
             _ => Mode::Robust,
         },
         method: match method.as_str() {
@@ -334,8 +333,6 @@ pub fn external<'py>(py: Python<'py>, result: &External) -> PyResult<Bound<'py, 
     tuples.make.bind(py).call1((&tuples.external, values))
 }
 
-/// Misfit, evidence, amplitude and its standard deviation.
-type Explained = (f64, f64, f64, f64);
 /// Signal, motor from 1 on or 0, reason, amount, its standard deviation, whether it explains all.
 type Suspected = (&'static str, usize, &'static str, f64, f64, bool);
 
@@ -375,12 +372,12 @@ impl Estimator {
         self.inner.distrust();
     }
 
-    /// Effects of one motor, counted from 0, that nobody declared and evidence chose (mode "balance").
-    fn undeclared(&self, motor: usize) -> Vec<&'static str> {
-        match &self.inner {
-            crate::estimator::Estimator::Balanced(balanced) => balanced.undeclared(motor).collect(),
-            _ => Vec::new(),
+    /// Effects of one motor, counted from 0, that nobody declared and evidence chose.
+    fn undeclared(&self, motor: usize) -> PyResult<Vec<&'static str>> {
+        if motor >= self.motors {
+            return Err(PyValueError::new_err(format!("motor: expected 0 to {}", self.motors - 1)));
         }
+        Ok(self.inner.undeclared(motor).map_or_else(Vec::new, Iterator::collect))
     }
 
     /// What the model left unexplained of the torque balance at the last sample; nan: unknown.
@@ -425,7 +422,6 @@ impl Estimator {
             Reason::Scale => "scale",
             Reason::Delay => "delay",
             Reason::Zero => "zero",
-            Reason::Drift => "drift",
             Reason::Impossible => "impossible",
             Reason::Jumped => "jumped",
             Reason::Frozen => "frozen",
@@ -438,13 +434,6 @@ impl Estimator {
         let why = self.inner.why()?;
         let motor = why.motor.map_or(0, |motor| motor + 1);
         Some((why.reason.name(), motor, why.reason.share(), why.changed().collect()))
-    }
-
-    /// Independent equations of one motor's window, and what it says of every change.
-    fn verdict(&self, motor: usize) -> Option<(f64, Vec<Explained>)> {
-        let verdict = self.inner.verdict(motor)?;
-        let explanations = verdict.explanations.iter().map(|e| (e.misfit, e.evidence, e.amplitude, e.std));
-        Some((verdict.equations, explanations.collect()))
     }
 
     /// Seconds that each of so many ticks takes, the samples being taken again and again in turn.

@@ -1,6 +1,6 @@
 //! Why an estimate is not valid. The sentences are in `estimator/reasons.py`, by the names here.
 
-use crate::isolation::{CHANGES, Change};
+use crate::causes::{CAUSES, TABLE};
 
 /// Why one transmission's numbers, or the joint's, may not be used.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -25,6 +25,8 @@ pub enum Reason {
     Beyond,
     /// The joint or a reading has changed.
     Changed,
+    /// Where the zero between the encoders is has not been found again.
+    Lost,
 }
 
 impl Reason {
@@ -42,6 +44,7 @@ impl Reason {
             Reason::Unexplained(_) => "unexplained",
             Reason::Beyond => "beyond",
             Reason::Changed => "changed",
+            Reason::Lost => "lost",
         }
     }
 
@@ -76,20 +79,20 @@ pub struct Why {
     pub reason: Reason,
     /// Motor, counted from 0; `None`: the joint's.
     pub motor: Option<usize>,
-    /// For [`Reason::Changed`]: which of [`Change::ALL`] the data do not tell apart; none: not known yet.
-    pub changes: [bool; CHANGES],
+    /// For [`Reason::Changed`]: which rows of [`TABLE`] the data do not tell apart; none: not known yet.
+    pub changes: [bool; CAUSES],
 }
 
 impl Why {
     /// Without a change.
     #[must_use]
     pub fn new(reason: Reason, motor: Option<usize>) -> Why {
-        Why { reason, motor, changes: [false; CHANGES] }
+        Why { reason, motor, changes: [false; CAUSES] }
     }
 
     /// The names of what may have changed.
     pub fn changed(&self) -> impl Iterator<Item = &'static str> + '_ {
-        Change::ALL.iter().zip(self.changes).filter(|(_, may)| *may).map(|(change, _)| change.name())
+        TABLE.iter().zip(self.changes).filter(|(_, may)| *may).map(|(entry, _)| entry.name)
     }
 }
 

@@ -1,71 +1,69 @@
-//! Mode "robust": the estimator for real drives' signals.
+//! Mode "robust": eq 5 as rows of columns, rows as blocks, and the estimate as algebra on their sum.
 //!
-//! Each tick, in order: validate the input, correct the readings, bridge gaps, align the channels, filter them,
-//! track the deflection; at intervals of the errors' correlation time update the recursive estimation with a
-//! motor's balance; evaluate torque and stiffness on the curve.
+//! Each tick: check the sample, correct it, bridge a gap, align the channels, filter them, add each motor's row;
+//! a full block solves. Torque and stiffness are the law's at the deflection of this moment.
 
 use crate::align::{Alignment, Inputs, Positions};
+use crate::corrections::Corrections;
 use crate::deflection::Present;
-use crate::delay::{DelaySearch, Known};
-use crate::effects::{Corrections, MotorEffects};
+use crate::effects::MotorEffects;
 use crate::error::Error;
 use crate::external::{Carried, External, LinkMomentum};
-use crate::isolation::Verdict;
 use crate::laws::Law;
-use crate::model::{Arrangement, Model, Motor};
+use crate::model::{Arrangement, Model, Transmission};
 use crate::noise::NoiseMeter;
 use crate::reasons::{Reason, Why};
 use crate::sample::{Estimate, MOTORS, Sample, TransmissionEstimate, joint_estimate, status};
 use crate::sample_validator::SampleValidator;
-use crate::settings::{Priors, Settings};
+use crate::settings::{Method, Priors, Settings};
+use crate::side::{Moment, SETTLE_DELAYS, Side};
 use crate::signals::{Channel, Filters};
-use crate::suspicion::{Suspicion, suspected};
-use crate::transmission::{Moment, TransmissionEstimator};
+use crate::suspicion::Suspicion;
 
-const SAID_S: f64 = 0.5; // how long a restart is reported
+const LOOK_S: f64 = 0.03; // between two looks at the excitation: the filters' correlation time at 60 rad/s
+const BRIDGED: f64 = 0.4; // rad that the filter turns by in a gap: a longer one is not learned from
+const SAID_S: f64 = 0.5; // how long a restart, and what was wrong with a sample, is reported
 const TRUST_S: f64 = 0.02; // how long an estimate is carried over rejected samples
 const FORESEEN_S: f64 = 0.04; // how far ahead a deflection is extrapolated
-const HOME: f64 = 0.01; // of a jump: what is as near to the first zero is that zero again
-const UPDATE_S: f64 = 0.03; // between two equations of a motor, at the usual bandwidth; shorter above it …
-const UPDATE_PHASE: f64 = 1.8; // … so that the bandwidth turns by no more than this, rad
-const SETTLE_DELAYS: f64 = 4.5; // filter delays after which a wrong start is forgotten
-const BRIDGED: f64 = 0.4; // rad that the filter turns by in a gap: a longer one is not learned from
-const SMALL_DELAY: f64 = 0.1; // periods: left to the regression
+const HOME: f64 = 0.01; // of a jump: a zero that comes back so near to the first one is that one
 
 /// See the module.
 #[derive(Clone, Debug)]
 pub struct Robust {
     arrangement: Arrangement,
-    flexible: bool,
     motors: usize,
+    flexible: bool,
     period: f64,
     filters: Filters,
-    every: u64, // periods between two equations of a motor
+    rate_gain: f64,
     settle: i64,
+    looks: u64,
+    said_periods: i64,
     validator: SampleValidator,
     corrections: Corrections,
     alignment: Alignment,
-    search: DelaySearch,
-    lead: usize, // the motor whose balance determines the link encoder's delay
-    transmissions: Vec<TransmissionEstimator>,
+    sides: Vec<Side>,
     link: Channel,
     momentum: Option<LinkMomentum>,
     external: Option<External>,
+    measured: f64, // τ_k
     noise: [NoiseMeter; MOTORS + 1],
+    torque_noise: [NoiseMeter; MOTORS],
+    noise_gains: [f64; 3],
     zeros: Positions, // where the encoders' zeros have moved to
     last: Inputs,
     begins: bool,                      // with the next sample that the corrections let pass …
     jumped: Option<[f64; MOTORS + 1]>, // … after encoders moved their zeros
-    measured: f64,                     // τ_k
+    started: bool,
     tick: u64,
     unsettled: i64, // periods for which the filters still hold something wrong
     said: i64,
     rejected: i64,
-    started: bool,
     sequence: u64,                     // of the last sample that was used
     refused: Option<(Suspicion, i64)>, // what was wrong with a sample of late, and for how long that is said
+    valid_within: f64,
+    why: Option<Why>,
     estimate: Option<Estimate>,
-    why: Option<(Reason, Option<usize>)>, // of the last estimate
 }
 
 impl Robust {
@@ -75,64 +73,58 @@ impl Robust {
     /// An effect is where it does not belong.
     pub fn new(model: &Model, settings: &Settings, priors: &Priors, period_s: f64) -> Result<Robust, Error> {
         let filters = Filters::new(settings.bandwidth, period_s);
-        let update_s = UPDATE_S.min(UPDATE_PHASE / settings.bandwidth);
-        let every = 2 * (0.5 * update_s / period_s).round().max(1.0) as u64;
         let effects: Vec<MotorEffects> =
             model.motors.iter().map(|motor| MotorEffects::new(&motor.effects)).collect::<Result<_, _>>()?;
         let corrections = Corrections::new(&effects, &model.link_effects, period_s)?;
-        let dt = every as f64 * period_s;
-        let own = |motor: &Motor| Priors {
-            motor_inertia: motor.inertia_std.unwrap_or(priors.motor_inertia),
-            ..*priors
-        };
-        let transmissions: Vec<TransmissionEstimator> = (model.motors.iter().zip(effects))
+        let looks = (LOOK_S / period_s).round().max(1.0) as u64;
+        let alarms = settings.false_alarms_per_hour;
+        let mut motors = model.motors.clone();
+        if settings.method == Method::Bbe {
+            // A black box: nothing of the law is used.
+            let flexible = motors.iter_mut().filter(|motor| motor.flexible());
+            flexible.for_each(|motor| motor.transmission = Transmission::Unknown);
+        }
+        let sides = (motors.iter().zip(effects))
             .map(|(motor, effects)| {
-                TransmissionEstimator::new(motor, effects, settings, &own(motor), &filters, period_s, dt)
+                Side::new(motor, effects, priors, &filters, period_s, looks as f64 * period_s, alarms)
             })
             .collect();
-        let lead = model.motors.iter().position(|motor| motor.flexible()).unwrap_or(0);
-        let known = Known {
-            inertia: model.motors[lead].inertia,
-            damping: model.motors[lead].damping,
-            inertia_std: own(&model.motors[lead]).motor_inertia,
-            damping_std: priors.viscous_damping,
-            damping_share: priors.viscous_damping_floor,
-        };
-        let mut made = Robust {
+        Ok(Robust {
             arrangement: model.arrangement,
-            flexible: model.has_deflection(),
             motors: model.motors.len(),
+            flexible: model.has_deflection(),
             period: period_s,
-            filters,
-            every,
+            rate_gain: filters.rate_gain(period_s),
             settle: (SETTLE_DELAYS * filters.delay / period_s).ceil() as i64,
+            filters,
+            looks,
+            said_periods: (SAID_S / period_s).round() as i64,
             validator: SampleValidator::new(model, period_s),
             corrections,
             alignment: Alignment::default(),
-            search: DelaySearch::new(&known, filters.main.bandwidth, period_s),
-            lead,
-            transmissions,
+            sides,
             link: Channel::rest(0.0),
             momentum: LinkMomentum::new(model, settings, priors, period_s),
             external: None,
+            measured: f64::NAN,
             noise: [NoiseMeter::default(); MOTORS + 1],
+            torque_noise: [NoiseMeter::default(); MOTORS],
+            noise_gains: filters.noise_gains(period_s),
             zeros: Positions::default(),
             last: Inputs::default(),
             begins: true,
             jumped: None,
-            measured: f64::NAN,
+            started: false,
             tick: 0,
             unsettled: 0,
             said: 0,
             rejected: 0,
-            started: false,
             sequence: 0,
             refused: None,
-            estimate: None,
+            valid_within: settings.valid_within,
             why: None,
-        };
-        made.reset();
-        Ok(made)
+            estimate: None,
+        })
     }
 
     /// Forget everything.
@@ -140,23 +132,21 @@ impl Robust {
         self.validator.reset();
         self.corrections.reset();
         self.alignment = Alignment::default();
-        self.search.reset();
-        self.transmissions.iter_mut().for_each(TransmissionEstimator::reset);
+        self.sides.iter_mut().for_each(Side::reset);
         self.momentum.iter_mut().for_each(LinkMomentum::reset);
-        self.external = None;
         self.noise = [NoiseMeter::default(); MOTORS + 1];
-        (self.zeros, self.last) = (Positions::default(), Inputs::default());
-        (self.begins, self.jumped) = (true, None);
-        (self.tick, self.unsettled, self.said, self.rejected) = (0, self.settle, 0, 0);
-        (self.started, self.sequence, self.refused, self.estimate) = (false, 0, None, None);
-        self.why = None;
+        self.torque_noise = [NoiseMeter::default(); MOTORS];
+        (self.zeros, self.last, self.begins, self.jumped) =
+            (Positions::default(), Inputs::default(), true, None);
+        (self.started, self.tick, self.unsettled, self.said, self.rejected) = (false, 0, 0, 0, 0);
+        (self.sequence, self.refused, self.external, self.why, self.estimate) = (0, None, None, None, None);
     }
 
     /// The next sample may not be of its moment: learn nothing until the filters have forgotten it.
     pub fn distrust(&mut self) {
         self.unsettled = self.settle;
         self.momentum.iter_mut().for_each(LinkMomentum::distrust);
-        self.search.begin();
+        self.sides.iter_mut().for_each(Side::cut);
     }
 
     /// What the world does to the link, by the last sample; `None` where no link dynamics are declared.
@@ -171,38 +161,33 @@ impl Robust {
         self.momentum.as_ref()?.said.consistency()
     }
 
-    /// Largest misfit among the motors' balances at the last update, N·m; NaN until there is a model.
+    /// Largest misfit among the motors' balances, N·m; NaN until there is a model.
     #[must_use]
     pub fn residual(&self) -> f64 {
-        self.transmissions.iter().map(|transmission| transmission.misfit().abs()).fold(f64::NAN, f64::max)
+        self.sides.iter().map(|side| side.blocks.misfit()).fold(f64::NAN, f64::max)
     }
 
-    /// The reading that is suspected, while something is.
-    #[must_use]
-    pub fn suspicion(&self) -> Option<Suspicion> {
-        self.refused.map(|(refused, _)| refused).or_else(|| suspected(&self.transmissions))
+    /// Effects of one motor that nobody declared and evidence chose.
+    pub fn undeclared(&self, motor: usize) -> impl Iterator<Item = &'static str> {
+        self.sides[motor].blocks.undeclared()
+    }
+
+    /// Parameters of one motor's transmission and their standard deviations; the law they belong to.
+    pub fn parameters(&self, motor: usize, values: &mut Vec<f64>, std: &mut Vec<f64>) -> Option<&Law> {
+        self.sides[motor].parameters(values, std)
     }
 
     /// Why the last estimate is not valid; `None`: it is.
     #[must_use]
     pub fn why(&self) -> Option<Why> {
-        let (reason, motor) = self.why?;
-        let mut why = Why::new(reason, motor);
-        if let (Reason::Changed, Some(motor)) = (reason, motor) {
-            why.changes = self.transmissions[motor].likely_changes();
-        }
-        Some(why)
+        self.why
     }
 
-    /// What the window of one motor's balance says of all changes; `None` before there is a reference.
+    /// The reading that is suspected, while something is.
     #[must_use]
-    pub fn verdict(&self, motor: usize) -> Option<&Verdict> {
-        self.transmissions[motor].verdict()
-    }
-
-    /// Parameters of one motor's transmission and their standard deviations; the law they belong to.
-    pub fn parameters(&self, motor: usize, values: &mut Vec<f64>, std: &mut Vec<f64>) -> Option<&Law> {
-        self.transmissions[motor].parameters(values, std)
+    pub fn suspicion(&self) -> Option<Suspicion> {
+        let doubted = || Suspicion::of(self.sides.iter().map(|side| side.blocks.odds()));
+        self.refused.map(|(refused, _)| refused).or_else(doubted)
     }
 
     /// The estimate at this sample, whatever floats it holds.
@@ -210,7 +195,7 @@ impl Robust {
         // Can it be used, and how far is it from the last one that was?
         let accepted = self.validator.check(sample);
         self.refused = match (accepted.suspicion, self.refused) {
-            (Some(now), _) => Some((now, (SAID_S / self.period).round() as i64)),
+            (Some(now), _) => Some((now, self.said_periods)),
             (None, before) => before.map(|(was, left)| (was, left - 1)).filter(|(_, left)| *left > 0),
         };
         if accepted.periods == 0 {
@@ -264,27 +249,59 @@ impl Robust {
         Positions { link: if self.flexible { sample.link_position } else { 0.0 }, motor }
     }
 
-    /// One period: filters, deflections, and, when its turn has come, what a motor's balance teaches.
+    /// Filters at rest where the joint is now; what has been learned is kept.
+    fn restart(&mut self, now: &Inputs) {
+        self.link = Channel::rest(now.at.link);
+        for (i, side) in self.sides.iter_mut().enumerate() {
+            side.restart(now.at.motor[i], now.at.deflection(i), now.torque[i]);
+        }
+        self.noise.iter_mut().chain(&mut self.torque_noise).for_each(NoiseMeter::restart);
+        let carried = self.carried(&now.present).map_or(0.0, |carried| carried.torque);
+        self.momentum.iter_mut().for_each(|momentum| momentum.restart(now.present.link, carried));
+        self.last = *now;
+        self.unsettled = self.settle;
+        self.said = if self.started { self.said_periods } else { 0 };
+        self.started = true;
+    }
+
+    /// One period: filters, and each motor's row where the motion teaches something.
     fn advance(&mut self, now: &Inputs) {
         let usable = self.unsettled <= 0;
         self.tick += 1;
         self.link.smooth(&self.filters, now.at.link);
         // Noise is that of usual times: what lies is not measured by it.
-        let doubtful = !usable || self.transmissions.iter().any(TransmissionEstimator::changed);
-        let mut see = |place: usize, value: f64| {
-            if doubtful && self.noise[place].is_known() {
-                self.noise[place].restart();
-            } else {
-                self.noise[place].see(value, self.period);
-            }
+        let doubtful = !usable || self.sides.iter().any(|side| side.doubtful);
+        let period = self.period;
+        let see = |meter: &mut NoiseMeter, value: f64| {
+            if doubtful && meter.is_known() { meter.restart() } else { meter.see(value, period) }
         };
-        see(self.motors, now.at.link);
-        let time = self.tick as f64 * self.period;
-        for (i, transmission) in self.transmissions.iter_mut().enumerate() {
-            let (theta, torque, before) = (now.at.motor[i], now.torque[i], self.last.torque[i]);
-            transmission.feed(&self.filters, theta, now.at.deflection(i), torque, before, usable);
-            transmission.feed_effects(&self.filters, &self.link, time);
-            see(i, theta);
+        see(&mut self.noise[self.motors], now.at.link);
+        for i in 0..self.motors {
+            see(&mut self.noise[i], now.at.motor[i]);
+            see(&mut self.torque_noise[i], now.torque[i]);
+        }
+        let (look, time) = (self.tick % self.looks == 0, self.tick as f64 * period);
+        let mut shift = None;
+        for i in 0..self.motors {
+            let noise = self.noise_of(i);
+            let torque_noise = self.torque_noise[i].variance(f64::INFINITY);
+            let side = &mut self.sides[i];
+            let moment = Moment { now, last: &self.last, link: &self.link, time, usable };
+            side.feed(&self.filters, i, &moment);
+            if side.rigid {
+                continue;
+            }
+            if look && usable {
+                side.tune(&self.link, noise);
+            }
+            if look {
+                let gain = self.rate_gain * (noise[0] + noise[1]).sqrt();
+                side.look(&self.link, now.at.deflection(i), gain, usable, self.looks as f64 * period);
+            }
+            if usable && side.excited {
+                side.blocks.spoilt = self.refused.is_some();
+                shift = side.learn(&self.link, noise, torque_noise, &self.noise_gains).or(shift);
+            }
         }
         if self.momentum.is_some() {
             let (now, measured) = (&now.present, self.measured);
@@ -293,16 +310,27 @@ impl Robust {
         }
         self.last = *now;
         self.unsettled -= 1;
-        let turn = self.every / self.motors as u64;
-        if self.tick % turn == 0 {
-            let i = (self.tick / turn % self.motors as u64) as usize;
-            self.update(i, usable);
+        if let Some(periods) = shift {
+            self.shift(periods);
         }
-        if self.flexible {
-            let (motor, torque) = (now.at.motor[self.lead], now.torque[self.lead]);
-            if let Some(late) = self.search.see(now.at.link, motor, torque, usable) {
-                self.realign(late);
-            }
+    }
+
+    /// Variance of θ's and of q's noise, rad².
+    fn noise_of(&self, i: usize) -> [f64; 2] {
+        let resolution = self.validator.resolution();
+        [i, self.motors].map(|k| self.noise[k].variance(resolution[k]))
+    }
+
+    /// The link is later than was assumed: what was learned is of other moments.
+    fn shift(&mut self, periods: f64) {
+        if self.alignment.shift(periods) == 0.0 {
+            return;
+        }
+        self.unsettled = self.settle;
+        self.momentum.iter_mut().for_each(LinkMomentum::distrust);
+        let last = &self.last.at;
+        for (i, side) in self.sides.iter_mut().enumerate() {
+            side.relearn(last.motor[i], last.deflection(i));
         }
     }
 
@@ -310,64 +338,10 @@ impl Robust {
     fn carried(&self, now: &Positions) -> Option<Carried> {
         let pulls = if self.arrangement == Arrangement::Antagonistic { self.motors } else { 1 };
         let mut all = Carried::default();
-        for (i, transmission) in self.transmissions[..pulls].iter().enumerate() {
-            let noise = self.noise[i].variance(self.validator.resolution()[i]);
-            all = all.and(transmission.carried(now.deflection(i), noise)?);
+        for (i, side) in self.sides[..pulls].iter().enumerate() {
+            all = all.and(side.carried(now.deflection(i), self.noise_of(i)[0])?);
         }
         Some(all)
-    }
-
-    /// One equation of one motor, and what follows from it.
-    fn update(&mut self, i: usize, usable: bool) {
-        let resolution = *self.validator.resolution();
-        let m = self.motors;
-        let noise = [self.noise[i].variance(resolution[i]), self.noise[m].variance(resolution[m])];
-        let transmission = &mut self.transmissions[i];
-        if transmission.is_rigid() {
-            return;
-        }
-        if transmission.update(&self.filters, &Moment { link: self.link.main, usable, noise }) {
-            self.unsettled = self.settle;
-            return;
-        }
-        if !usable || !self.search.looked() {
-            return;
-        }
-        if let Some(late) = transmission.take_delay() {
-            let taken = self.alignment.shift(late);
-            transmission.shift_delay(taken);
-            self.distrust(); // which of the channels waits for which has changed
-        }
-    }
-
-    /// The link encoder has been found late by so many periods: what was learned is void.
-    fn realign(&mut self, late: f64) {
-        if late.abs() < SMALL_DELAY || self.transmissions.iter().any(TransmissionEstimator::changed) {
-            return;
-        }
-        self.alignment.shift(late);
-        self.unsettled = self.settle;
-        self.momentum.iter_mut().for_each(LinkMomentum::distrust);
-        for (i, transmission) in self.transmissions.iter_mut().enumerate() {
-            transmission.relearn();
-            transmission.deflection.restart(self.last.at.motor[i], self.last.at.deflection(i));
-        }
-    }
-
-    /// Everything that has a past begins anew where the joint is now; what has been learned is kept.
-    fn restart(&mut self, now: &Inputs) {
-        self.link = Channel::rest(now.at.link);
-        for (i, transmission) in self.transmissions.iter_mut().enumerate() {
-            transmission.restart(now.at.motor[i], now.at.deflection(i), now.torque[i]);
-        }
-        self.noise.iter_mut().for_each(NoiseMeter::restart);
-        let carried = self.carried(&now.present).map_or(0.0, |carried| carried.torque);
-        self.momentum.iter_mut().for_each(|momentum| momentum.restart(now.present.link, carried));
-        self.search.restart(now.at.link, now.at.motor[self.lead], now.torque[self.lead]);
-        self.last = *now;
-        self.unsettled = self.settle;
-        self.said = if self.started { (SAID_S / self.period).round() as i64 } else { 0 };
-        self.started = true;
     }
 
     /// Encoders have moved their zeros: go on as if they had not.
@@ -378,11 +352,11 @@ impl Robust {
         // A deflection that went on as it was measures a jump; the validator is coarse.
         let now = at.from_zeros(&self.zeros);
         for i in 0..m {
-            let transmission = &self.transmissions[i];
-            if ahead > FORESEEN_S || transmission.is_rigid() || transmission.deflection.unsettled > 0 {
+            let side = &self.sides[i];
+            if ahead > FORESEEN_S || side.rigid || side.deflection.unsettled > 0 {
                 continue;
             }
-            let off = now.deflection(i) - transmission.deflection.at(ahead);
+            let off = now.deflection(i) - side.deflection.at(ahead);
             if jumps[i] != 0.0 && jumps[m] == 0.0 {
                 jumps[i] = -off;
             } else if jumps[m] != 0.0 && jumps[i] == 0.0 {
@@ -401,34 +375,36 @@ impl Robust {
             self.zeros.link = moved(self.zeros.link, jumps[m]);
         }
         let now = at.from_zeros(&self.zeros);
-        for (i, transmission) in self.transmissions.iter_mut().enumerate() {
-            let known = !transmission.is_beyond(now.deflection(i));
+        for (i, side) in self.sides.iter_mut().enumerate() {
+            let known = ahead <= FORESEEN_S && side.is_within(now.deflection(i));
             if !known {
                 self.zeros.motor[i] = at.motor[i] - now.link; // in the middle of where it can be
             }
-            transmission.reopen_deflection_offset(known);
+            side.move_zero(known);
         }
     }
 
-    /// What is said of a sample that was used.
     fn conclude(&mut self, sequence: u64, flags: u32) -> Estimate {
-        let (mut flags, mut observable) = (flags, self.flexible && self.unsettled <= 0);
-        let (parts, why) = self.read(0.0);
-        self.why = why;
-        for transmission in &self.transmissions {
-            if !transmission.is_rigid() {
-                observable &= transmission.excited();
-                if transmission.changed() {
-                    flags |= status::CHANGED;
-                }
-            }
-        }
+        let mut flags = flags;
+        let settled = self.unsettled <= 0;
+        let parts = self.read(0.0);
+        self.sides.iter_mut().for_each(Side::act);
+        let why = |(i, side): (usize, &Side)| {
+            let mut why = Why::new(side.reason(&parts[i], self.valid_within, settled)?, Some(i));
+            why.changes = side.likely_causes();
+            Some(why)
+        };
+        self.why = self.sides.iter().enumerate().find_map(why);
         if flags & status::INPUT_REJECTED != 0 {
-            self.why = Some((Reason::Rejected, None));
+            self.why = Some(Why::new(Reason::Rejected, None));
+        }
+        if self.sides.iter().any(|side| side.doubtful || side.followed_s > 0.0) {
+            flags |= status::CHANGED;
         }
         if self.why.is_none() {
             flags |= status::VALID;
-            if observable {
+            let excited = |side: &Side| side.rigid || side.excited;
+            if settled && self.flexible && self.sides.iter().all(excited) {
                 flags |= status::OBSERVABLE;
             }
         }
@@ -439,7 +415,7 @@ impl Robust {
         if self.momentum.is_some() {
             let valid = flags & status::VALID != 0;
             let carried = self.carried(&self.last.present).unwrap_or_default();
-            let noise = self.noise[self.motors].variance(self.validator.resolution()[self.motors]);
+            let noise = self.noise_of(0)[1];
             self.external =
                 self.momentum.as_mut().map(|momentum| momentum.conclude(sequence, &carried, noise, valid));
         }
@@ -453,42 +429,39 @@ impl Robust {
         self.rejected += 1;
         self.external = self.momentum.as_ref().map(|momentum| momentum.said.carry(sequence));
         let since = self.rejected as f64 * self.period;
+        let rejected = Some(Why::new(Reason::Rejected, None));
         let Some(last) = self.estimate else {
-            let (parts, _) = self.read(0.0);
-            self.why = Some((Reason::Rejected, None));
-            return joint_estimate(self.arrangement, sequence, flags, parts, self.motors);
+            self.why = rejected;
+            return joint_estimate(self.arrangement, sequence, flags, self.read(0.0), self.motors);
         };
         let mut flags = flags | last.status & (status::CHANGED | status::RESTARTED);
         if since > TRUST_S {
-            self.why = Some((Reason::Rejected, None));
+            self.why = rejected;
             return Estimate { sequence, status: flags, ..last };
         }
-        let (parts, why) = self.read(since);
-        self.why = if last.status & status::VALID == 0 { self.why } else { why };
+        let parts = self.read(since);
+        if last.status & status::VALID != 0 {
+            let reason = |(i, side): (usize, &Side)| side.reason(&parts[i], self.valid_within, true);
+            let why = self.sides.iter().enumerate().find_map(reason);
+            self.why = why.map(|reason| Why::new(reason, None));
+        }
         if self.why.is_none() {
             flags |= status::VALID;
         }
         joint_estimate(self.arrangement, sequence, flags, parts, self.motors)
     }
 
-    /// Each transmission's estimate, so long after the last sample, and why one of them is of no use.
-    fn read(&mut self, since_s: f64) -> ([TransmissionEstimate; MOTORS], Option<(Reason, Option<usize>)>) {
+    /// Each transmission's estimate, so long after the last sample.
+    fn read(&self, since_s: f64) -> [TransmissionEstimate; MOTORS] {
         // What has been waited for the latest channel, declared late or found to be.
         let waited = self.corrections.age_s() + self.alignment.periods.abs() * self.period;
-        let (mut parts, mut why) = ([TransmissionEstimate::NOTHING; MOTORS], None);
-        for (i, transmission) in self.transmissions.iter_mut().enumerate() {
-            let present = Present {
-                phi: self.last.present.deflection(i),
-                behind_s: self.corrections.behind_s(),
-                ahead_s: since_s + waited,
-            };
-            let (part, reason) = transmission.estimate(&present, self.filters.delay);
-            parts[i] = part;
-            let unsettled = !transmission.is_rigid() && transmission.deflection.unsettled > 0;
-            let starting = reason == Some(Reason::Unmoved) && self.unsettled > 0;
-            let reason = if unsettled || starting { Some(Reason::Settling) } else { reason };
-            why = why.or(reason.map(|reason| (reason, Some(i))));
+        let behind_s = self.corrections.behind_s();
+        let mut parts = [TransmissionEstimate::NOTHING; MOTORS];
+        for (i, side) in self.sides.iter().enumerate() {
+            let phi = self.last.present.deflection(i);
+            let present = Present { phi, behind_s, ahead_s: since_s + waited };
+            parts[i] = side.estimate(&present, self.filters.delay);
         }
-        (parts, why)
+        parts
     }
 }

@@ -3,10 +3,8 @@
 /// Which estimator.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Mode {
-    /// The default: one filter for every channel, joint recursive estimation, uncertainty, alarms.
+    /// The default: sums of blocks of one balance; see [`crate::robust`].
     Robust,
-    /// Sums of blocks of one balance; see [`crate::balanced`].
-    Balance,
     /// Eqs 14, 28, 32, 33 as printed, correctly discretised.
     Paper,
 }

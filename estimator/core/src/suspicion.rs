@@ -1,9 +1,10 @@
 //! Which reading is suspected, and why, while readings contradict the model.
 
-use crate::change_detection::SURE;
-use crate::isolation::{Change, Verdict};
+use crate::causes::{Cause, Odds, TABLE};
 use crate::sample::MOTORS;
-use crate::transmission::TransmissionEstimator;
+
+const EXPLAINED: f64 = -20.0; // ln of the odds of a change where a balance is explained
+const EXPLAINS: f64 = 2.0; // times the usual mean square that a cause may leave
 
 /// A signal of a joint; motors are counted from 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -27,8 +28,6 @@ pub enum Reason {
     Delay,
     /// By so much, rad or N·m.
     Zero,
-    /// By so much a second, rad/s.
-    Drift,
     /// No finite number, or none that can be.
     Impossible,
     /// From one sample to the next by more than it can.
@@ -58,71 +57,58 @@ impl Suspicion {
     pub fn of_sample(signal: Signal, reason: Reason) -> Suspicion {
         Suspicion { signal, reason, amount: f64::NAN, std: f64::NAN, explains: true }
     }
-}
 
-/// The reading that explains best what the balances of a joint leave, while one of them is not explained.
-///
-/// A motor's own reading leaves the other motor's balance as it is; the link's position is in both.
-#[must_use]
-pub fn suspected(transmissions: &[TransmissionEstimator]) -> Option<Suspicion> {
-    if !transmissions.iter().any(|one| one.doubt().is_some()) {
-        return None;
-    }
-    let mut verdicts: [Option<&Verdict>; MOTORS] = [None; MOTORS];
-    for (verdict, one) in verdicts.iter_mut().zip(transmissions) {
-        *verdict = one.verdict();
-    }
-    let evidence = |motor: Option<usize>, change: Change| -> f64 {
-        let parts = verdicts.iter().enumerate().filter_map(|(i, verdict)| {
-            let own = motor.is_none_or(|motor| motor == i);
-            verdict.map(|verdict| verdict.of(if own { change } else { Change::Nothing }).evidence)
-        });
-        parts.sum()
-    };
-    let mut best: Option<(f64, usize, Change, bool)> = None;
-    for (motor, verdict) in verdicts.iter().enumerate() {
-        if verdict.is_none() {
-            continue;
+    /// The reading that explains best what the balances of a joint leave, while one of them is not explained.
+    ///
+    /// `sides`: what the causes say of each motor's balance; `None`: it is explained. A motor's own reading leaves
+    /// the other motor's balance as it is; the link's position is in both.
+    #[must_use]
+    pub fn of<'a>(sides: impl Iterator<Item = Option<&'a Odds>>) -> Option<Suspicion> {
+        let mut odds: [Option<&Odds>; MOTORS] = [None; MOTORS];
+        let mut motors = 0;
+        for one in sides.take(MOTORS) {
+            odds[motors] = one;
+            motors += 1;
         }
-        for change in &Change::ALL[1..] {
-            let common = matches!(change, Change::LinkScale | Change::LinkDelay | Change::LinkDrift);
-            let now = evidence((!common).then_some(motor), *change);
-            if best.is_none_or(|(most, ..)| now > most) {
-                best = Some((now, motor, *change, common));
+        let log = |motor: usize, cause: Cause| match odds[motor] {
+            Some(odds) => odds.log[cause as usize],
+            None if cause == Cause::Nothing => 0.0,
+            None => EXPLAINED,
+        };
+        let mut best: Option<(f64, usize, Cause)> = None;
+        for motor in (0..motors).filter(|motor| odds[*motor].is_some()) {
+            for cause in TABLE
+                .iter()
+                .map(|entry| entry.cause)
+                .filter(|cause| !matches!(cause, Cause::Nothing | Cause::Noise))
+            {
+                let common = matches!(cause, Cause::LinkScale | Cause::LinkDelay);
+                let of = |i: usize| log(i, if i == motor || common { cause } else { Cause::Nothing });
+                let now: f64 = (0..motors).map(of).sum();
+                if now.is_finite() && best.is_none_or(|(most, ..)| now > most) {
+                    best = Some((now, motor, cause));
+                }
             }
         }
+        let (_, motor, cause) = best?;
+        let (signal, reason) = match cause {
+            Cause::MotorScale => (Signal::MotorPosition(motor), Reason::Scale),
+            Cause::MotorDelay => (Signal::MotorPosition(motor), Reason::Delay),
+            Cause::TorqueScale => (Signal::MotorTorque(motor), Reason::Scale),
+            Cause::TorqueDelay => (Signal::MotorTorque(motor), Reason::Delay),
+            Cause::TorqueZero => (Signal::MotorTorque(motor), Reason::Zero),
+            Cause::LinkScale => (Signal::LinkPosition, Reason::Scale),
+            Cause::LinkDelay => (Signal::LinkPosition, Reason::Delay),
+            Cause::PositionZero => (Signal::Positions(motor), Reason::Zero),
+            _ => return None, // of the joint, not of a reading
+        };
+        let found = odds[motor]?.of(cause);
+        Some(Suspicion {
+            signal,
+            reason,
+            amount: found.amplitude,
+            std: found.std,
+            explains: found.misfit < EXPLAINS,
+        })
     }
-    let (most, motor, change, common) = best?;
-    // Whose zero drifts shows by the motor's damping alone.
-    let other = evidence(None, Change::LinkDrift).min(evidence(Some(motor), Change::MotorDrift));
-    let either = change.is_drift() && other > most - SURE;
-    let (signal, reason) = match change {
-        _ if either => (Signal::Positions(motor), Reason::Drift),
-        Change::MotorScale => (Signal::MotorPosition(motor), Reason::Scale),
-        Change::MotorDelay => (Signal::MotorPosition(motor), Reason::Delay),
-        Change::TorqueScale => (Signal::MotorTorque(motor), Reason::Scale),
-        Change::TorqueDelay => (Signal::MotorTorque(motor), Reason::Delay),
-        Change::TorqueZero => (Signal::MotorTorque(motor), Reason::Zero),
-        Change::LinkScale => (Signal::LinkPosition, Reason::Scale),
-        Change::LinkDelay => (Signal::LinkPosition, Reason::Delay),
-        Change::PositionZero => (Signal::Positions(motor), Reason::Zero),
-        Change::LinkDrift => (Signal::LinkPosition, Reason::Drift),
-        Change::MotorDrift => (Signal::MotorPosition(motor), Reason::Drift),
-        Change::Nothing | Change::Stiffness | Change::Friction => return None, // of the joint, not of a reading
-    };
-    let explanation = verdicts[motor]?.of(change);
-    let unit = transmissions[motor].unit_of(change);
-    // The deflection's drift is counted.
-    let unit = if signal == Signal::LinkPosition && change.is_drift() { -unit } else { unit };
-    let explains = transmissions.iter().enumerate().all(|(i, one)| {
-        let own = common || i == motor;
-        one.is_explained_by(if own { change } else { Change::Nothing })
-    });
-    Some(Suspicion {
-        signal,
-        reason,
-        amount: unit * explanation.amplitude,
-        std: unit.abs() * explanation.std,
-        explains,
-    })
 }

@@ -1,0 +1,209 @@
+//! The unknowns of one motor's balance from the sum of its blocks: prior, noise, choice, interval.
+
+use super::{Blocks, EARLY, FEWEST};
+use crate::balance;
+use crate::gram::{
+    Frame, Gram, Matrix, Posterior, Prior, Row, Set, UNKNOWNS, choose, cluster, dot, log_evidence, set,
+    solve, unknowns,
+};
+use crate::student::t_95;
+use crate::unknowns::{ACTIVE, CANDIDATES, RATE, SPRING, Scale, ZERO};
+
+const STEPS: usize = 3; // of Gauss and Newton's iteration at a block's end
+const EXACT: f64 = 3e-4; // of the torque: what filters, sampling and rounding leave of a true model
+const MISSING: f64 = 0.1; // share of what no noise explains that one unknown takes in: there are some ten of them
+const ACCUSED: f64 = 1000.0; // odds at which the declared zero is called wrong
+
+impl Blocks {
+    pub(super) fn prior(&self, total: &Gram, frame: &Frame, zero_std: f64) -> Prior {
+        let scale = Scale { zero_std, deflection: self.deflection, period_s: self.period };
+        let mut prior = self.spring.prior(&self.motor, &self.priors, total, frame, &scale);
+        let Some(carried) = &self.carried else { return prior };
+        for i in unknowns(carried.set) {
+            prior.precision[i] = carried.precision[i];
+            prior.mean[i] = carried.x[i];
+        }
+        self.spring.from_base(&mut prior.mean, carried.set);
+        prior
+    }
+
+    /// Start a law of which nothing is known where the evidence is best.
+    fn start(&mut self, total: &Gram, noise: f64) {
+        let Some(projection) = &self.projection else { return };
+        let mut best: Option<(f64, f64)> = None;
+        let (spring, mut tried) = (self.spring.clone(), self.spring.clone());
+        let scale = Scale { zero_std: 1.0, deflection: self.deflection, period_s: self.period };
+        for shape in spring.starts(self.deflection) {
+            (tried.alpha[0], tried.alpha[1]) = (1.0, shape);
+            let frame = tried.frame(projection);
+            // With a k of 1 the law's torque is its own slope by k: the deviation is k − 1.
+            let base = frame.set & (set(1..SPRING.start + 1));
+            let prior = tried.prior(&self.motor, &self.priors, total, &frame, &scale);
+            let reduced = frame.reduce(total);
+            let log = log_evidence(&reduced, base, &prior, noise);
+            let Some(found) = solve(&reduced, base, &prior, noise) else { continue };
+            let k = 1.0 + found.x[SPRING.start];
+            if k > 0.0 && best.is_none_or(|(most, _)| log > most) {
+                best = Some((log, shape));
+                (self.spring.alpha[0], self.spring.alpha[1]) = (k, shape);
+            }
+        }
+        self.spring.known |= best.is_some();
+    }
+
+    pub(super) fn solve(&mut self) {
+        let mut total = Gram::default();
+        self.ring.iter().for_each(|block| total.add(block, 1.0));
+        let torque = balance::variance(&total, balance::TORQUE).max(f64::MIN_POSITIVE);
+        if self.noise.variance.is_nan() {
+            self.noise.variance = 1e-4 * torque;
+        }
+        if self.spring.is_searched()
+            && (!self.spring.known || self.ring.len() <= FEWEST && self.carried.is_none())
+        {
+            self.start(&total, self.noise.variance * self.correlated);
+        }
+        let Some(projection) = self.projection.clone() else { return };
+        let near = self.priors.deflection_offset * self.deflection + self.resolution;
+        let zero = if self.lost { self.deflection } else { near };
+        for step in 0..STEPS {
+            let frame = self.spring.frame(&projection);
+            let reduced = frame.reduce(&total);
+            let prior = self.prior(&total, &frame, zero);
+            self.measure(&frame, &reduced, &prior, &total);
+            let noise = self.noise.variance * self.noise.correlated;
+            let Some((mut chosen, moved)) = self.choose(&frame, &reduced, &total, &prior, noise, zero) else {
+                return;
+            };
+            let used = if moved { self.prior(&total, &frame, self.deflection) } else { prior };
+            self.moved = moved;
+            let own = total.quadratic(&frame.residual(&chosen.x, chosen.set)) / total.rows;
+            self.own = own.sqrt().max(EXACT * total.rms(balance::TORQUE));
+            let far = SPRING.clone().chain([ZERO]).any(|i| {
+                chosen.x[i].abs() > 0.1 * chosen.covariance[i][i].sqrt() && chosen.set >> i & 1 == 1
+            });
+            let before = chosen.x;
+            self.residual = frame.residual(&chosen.x, chosen.set);
+            self.spring.take(&before);
+            if step + 1 < STEPS && far && !self.spring.is_settled() {
+                continue;
+            }
+            self.widen(&frame, &mut chosen, &used, noise, own, &total);
+            (self.posterior, self.frame) = (Some(chosen), Some(frame));
+            break;
+        }
+        if self.lost {
+            let zero =
+                self.posterior.as_ref().map_or(f64::INFINITY, |known| known.covariance[ZERO][ZERO].sqrt());
+            self.lost = zero > self.priors.deflection_offset.max(0.02) * self.deflection;
+        }
+    }
+
+    /// The noise is what all unknowns together leave; it decides how many of them there are.
+    fn measure(&mut self, frame: &Frame, reduced: &Matrix, prior: &Prior, total: &Gram) {
+        let floor = (EXACT * total.rms(balance::TORQUE)).powi(2);
+        if self.carried.is_some() && self.ring.len() < FEWEST {
+            return; // it is as noisy as it was
+        }
+        // What few rows leave is less than their noise, as they are fitted: at first no less is assumed than usual.
+        let floor = if self.ring.len() < FEWEST {
+            floor.max(EARLY * EARLY * balance::variance(total, balance::TORQUE))
+        } else {
+            floor
+        };
+        for _ in 0..2 {
+            let noise = self.noise.variance * self.noise.correlated;
+            let Some(whole) = solve(reduced, frame.set, prior, noise) else { return };
+            let residual = frame.residual(&whole.x, whole.set);
+            self.noise.variance = (total.quadratic(&residual) / total.rows).max(floor);
+            if self.ring.len() < FEWEST {
+                continue;
+            }
+            self.score(frame, &residual, whole.set);
+            let (mut seen, mut foreseen) = ([0.0; UNKNOWNS], [0.0; UNKNOWNS]);
+            for i in unknowns(whole.set) {
+                seen[i] = self.scores.iter().map(|score| score[i] * score[i]).sum();
+                foreseen[i] = self.noise.variance * reduced[i][i];
+            }
+            let active = || unknowns(whole.set & ACTIVE);
+            let ratio = active().map(|i| seen[i] / foreseen[i].max(f64::MIN_POSITIVE)).sum::<f64>();
+            self.noise.correlated = (ratio / active().count().max(1) as f64).max(self.correlated);
+        }
+    }
+
+    fn score(&mut self, frame: &Frame, residual: &Row, of: Set) {
+        self.scores.clear();
+        for block in &self.ring {
+            let image = block.times(residual);
+            let mut score = [0.0; UNKNOWNS];
+            unknowns(of).for_each(|i| score[i] = dot(&image, &frame.directions[i]));
+            self.scores.push(score);
+        }
+    }
+
+    /// The unknowns that evidence chooses, and whether the zero is anywhere.
+    fn choose(
+        &self,
+        frame: &Frame,
+        reduced: &Matrix,
+        total: &Gram,
+        prior: &Prior,
+        noise: f64,
+        zero: f64,
+    ) -> Option<(Posterior, bool)> {
+        let mut groups: [Set; CANDIDATES.len() + SPRING.end - SPRING.start] = Default::default();
+        let mut n = 0;
+        // At first only what a late link would be mistaken for.
+        let many = self.ring.len() >= FEWEST;
+        for candidate in CANDIDATES.iter().filter(|candidate| many || candidate.unknowns.start == RATE) {
+            groups[n] = set(candidate.unknowns.clone());
+            n += 1;
+        }
+        let mut base = frame.set & (ACTIVE | self.carried.as_ref().map_or(0, |carried| carried.set));
+        if self.spring.open {
+            base &= !set(SPRING.start + 1..SPRING.end);
+            for more in 2..=self.spring.size {
+                groups[n] = set(SPRING.start..SPRING.start + more);
+                n += 1;
+            }
+        }
+        let found = choose(reduced, base, &groups[..n], prior, noise);
+        let log = log_evidence(reduced, found, prior, noise);
+        if self.ring.len() >= FEWEST && zero < self.deflection && frame.set >> ZERO & 1 == 1 {
+            // The zero is where it is declared, or anywhere in the range.
+            let elsewhere = self.prior(total, frame, self.deflection);
+            let other = choose(reduced, base, &groups[..n], &elsewhere, noise);
+            if log_evidence(reduced, other, &elsewhere, noise) > log + ACCUSED.ln() {
+                return solve(reduced, other, &elsewhere, noise).map(|found| (found, true));
+            }
+        }
+        solve(reduced, found, prior, noise).map(|found| (found, false))
+    }
+
+    /// What the chosen unknowns leave beyond the noise is an error of the model: scores of blocks hold it.
+    fn widen(
+        &mut self,
+        frame: &Frame,
+        chosen: &mut Posterior,
+        prior: &Prior,
+        noise: f64,
+        own: f64,
+        total: &Gram,
+    ) {
+        let residual = self.residual;
+        self.score(frame, &residual, chosen.set);
+        // What no noise explains is an effect that is missing: alike in all blocks, their scores do not show it.
+        let missing = (own - self.white - (EXACT * total.rms(balance::TORQUE)).powi(2)).max(0.0);
+        let alike = MISSING * missing * total.rows / noise;
+        let naive = chosen.covariance;
+        let few = self.ring.len() as f64;
+        let enough = self.ring.len() >= FEWEST;
+        let clustered = if enough { cluster(chosen, &self.scores, prior, noise) } else { None };
+        let wider = match clustered {
+            Some(freedom) => t_95(freedom),
+            None => (own / self.noise.variance).sqrt().max(1.0) * t_95(few.max(3.0)),
+        };
+        let entries = chosen.covariance.iter_mut().flatten().zip(naive.iter().flatten());
+        entries.for_each(|(v, naive)| *v = *v * wider * wider + alike * naive);
+    }
+}

@@ -1,0 +1,347 @@
+//! All that may have changed in a joint or be wrong with its readings: one table, one rule.
+//!
+//! What is known explains a window of rows up to residuals r = z · c. A cause adds one direction v with an unknown
+//! amplitude. The probability of the window under each cause, amplitudes and what is uncertain integrated out,
+//! times its probability before (the declared rate of false alarms), decides: the generalised likelihood ratio of
+//! Willsky and Jones ("A generalized likelihood ratio approach to the detection and estimation of jumps in linear
+//! systems", IEEE TAC 1976).
+
+use crate::balance::{ACCELERATION, DRY, LATE, OFFSET, READ, SPRING, TORQUE, TORQUE_RATE, VELOCITY};
+use crate::gram::{
+    COLUMNS, Frame, Gram, Matrix, Prior, Row, Set, UNKNOWNS, log_determinant, solve, unknowns,
+};
+use crate::spring::{Coefficients, TERMS};
+use crate::unknowns;
+
+/// A cause.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Cause {
+    /// What is known holds.
+    Nothing,
+    /// The stiffness, by a factor.
+    Stiffness,
+    /// The spring's shape.
+    Shape,
+    /// Dry friction.
+    Friction,
+    /// A constant torque, or the zero of the torque's reading.
+    TorqueZero,
+    /// The zero between the encoders.
+    PositionZero,
+    /// The inertia that the motor moves.
+    Inertia,
+    /// The delay of the link's position.
+    LinkDelay,
+    /// The scale of the motor's position.
+    MotorScale,
+    /// The scale of the link's position.
+    LinkScale,
+    /// The scale of the motor's torque.
+    TorqueScale,
+    /// The delay of the motor's position.
+    MotorDelay,
+    /// The delay of the motor's torque.
+    TorqueDelay,
+    /// Larger errors of any kind.
+    Noise,
+}
+
+/// How many there are.
+pub const CAUSES: usize = 14;
+
+/// One row of the table.
+pub struct Entry {
+    /// The cause.
+    pub cause: Cause,
+    /// Its name in the table of sentences, `estimator/reasons.py`.
+    pub name: &'static str,
+    /// Standard deviation of its amplitude before any data, in the unit of its direction.
+    pub std: f64,
+    /// The unknowns that it makes uncertain; none: a reading that the balance has no unknown for.
+    pub opens: Set,
+}
+
+const fn bit(unknown: usize) -> Set {
+    1 << unknown
+}
+
+const fn entry(cause: Cause, name: &'static str, std: f64, opens: Set) -> Entry {
+    Entry { cause, name, std, opens }
+}
+
+const SPRINGS: Set = 0b11111 << unknowns::SPRING.start;
+
+/// The table. Amplitudes are shares (of the stiffness, of a scale, of the torque's rms) or periods.
+pub const TABLE: [Entry; CAUSES] = [
+    entry(Cause::Nothing, "nothing", 0.0, 0),
+    entry(Cause::Stiffness, "stiffness", 0.5, SPRINGS),
+    entry(Cause::Shape, "spring_shape", 0.3, SPRINGS),
+    entry(Cause::Friction, "friction", 0.2, bit(unknowns::DRY)),
+    entry(Cause::TorqueZero, "torque_zero", 0.3, bit(unknowns::OFFSET)),
+    entry(Cause::PositionZero, "position_zero", 0.3, bit(unknowns::ZERO)),
+    entry(Cause::Inertia, "inertia", 0.3, bit(unknowns::INERTIA)),
+    entry(Cause::LinkDelay, "link_delay", 3.0, bit(unknowns::LATE)),
+    entry(Cause::MotorScale, "motor_scale", 0.3, 0),
+    entry(Cause::LinkScale, "link_scale", 0.3, 0),
+    entry(Cause::TorqueScale, "torque_scale", 0.3, 0),
+    entry(Cause::MotorDelay, "motor_delay", 3.0, 0),
+    entry(Cause::TorqueDelay, "torque_delay", 3.0, 0),
+    entry(Cause::Noise, "noise", 0.0, 0),
+];
+
+impl Cause {
+    /// Its row of the table.
+    #[must_use]
+    pub fn entry(self) -> &'static Entry {
+        &TABLE[self as usize]
+    }
+
+    /// Whether it is of a reading that the balance has no unknown for.
+    #[must_use]
+    pub fn is_reading(self) -> bool {
+        !matches!(self, Cause::Nothing | Cause::Noise) && self.entry().opens == 0
+    }
+}
+
+/// What is known of a balance, as the causes need it.
+pub struct Known<'a> {
+    /// Directions of the unknowns.
+    pub frame: &'a Frame,
+    /// The residual of a row is z · c.
+    pub residual: &'a Row,
+    /// Which unknowns are uncertain …
+    pub set: Set,
+    /// … and their precision.
+    pub precision: &'a Matrix,
+    /// The spring's torque and stiffness as sums of the family's functions.
+    pub torque: &'a Coefficients,
+    /// The same of the stiffness.
+    pub slope: &'a Coefficients,
+    /// Powers of u that the family's functions are.
+    pub powers: [f64; TERMS],
+    /// B and D.
+    pub motor: (f64, f64),
+    /// rms of the torque, N·m.
+    pub torque_rms: f64,
+    /// The largest deflection, rad.
+    pub deflection: f64,
+    /// Of the samples, s.
+    pub period_s: f64,
+}
+
+/// One cause as a window has it.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Explanation {
+    /// Probability.
+    pub probability: f64,
+    /// Mean square of what it leaves, over what is usual.
+    pub misfit: f64,
+    /// How large it is: a share, s, rad or N·m.
+    pub amplitude: f64,
+    /// Standard deviation of that.
+    pub std: f64,
+}
+
+/// All causes held against one window.
+#[derive(Clone, Copy, Debug)]
+pub struct Odds {
+    /// One for each row of [`TABLE`].
+    pub of: [Explanation; CAUSES],
+    /// ln of the likelihoods, up to what all have in common.
+    pub log: [f64; CAUSES],
+}
+
+/// How noisy rows are.
+#[derive(Clone, Copy, Debug)]
+pub struct Noise {
+    /// Variance of a row.
+    pub variance: f64,
+    /// Rows that one independent error is worth.
+    pub correlated: f64,
+    /// Degrees of freedom of its level, which varies from one moment to another.
+    pub tails: f64,
+}
+
+impl Known<'_> {
+    /// The direction of a cause in the space of a row's columns, for an amplitude of 1 in the table's unit; and what
+    /// an amplitude of 1 is in SI units. `None`: it has no direction.
+    #[must_use]
+    fn direction(&self, cause: Cause) -> Option<(Row, f64)> {
+        let mut v = [0.0; COLUMNS];
+        let (inertia, damping) = self.motor;
+        let spring = |v: &mut Row, factor: f64| {
+            let columns = v[SPRING.start..SPRING.start + 2 * TERMS].iter_mut();
+            columns.zip(self.torque).for_each(|(v, c)| *v += factor * c);
+        };
+        let slope = |v: &mut Row, from: usize, factor: f64| {
+            let columns = v[from..from + READ.len()].iter_mut();
+            columns.zip(&self.slope[TERMS..]).for_each(|(v, c)| *v += factor * c);
+        };
+        let unit = match cause {
+            Cause::Nothing | Cause::Noise => return None,
+            Cause::Stiffness => {
+                spring(&mut v, 1.0);
+                1.0
+            }
+            Cause::Shape => {
+                // The curve with another bend, the torque at the largest deflection as it was.
+                let whole: f64 = self.torque[..TERMS].iter().sum();
+                (v[SPRING.start], v[SPRING.start + 1]) = (whole, -whole);
+                1.0
+            }
+            Cause::Friction => {
+                v[DRY] = self.torque_rms;
+                self.torque_rms
+            }
+            Cause::TorqueZero => {
+                v[OFFSET] = self.torque_rms;
+                self.torque_rms
+            }
+            Cause::PositionZero => {
+                let columns = v[SPRING.start..SPRING.start + 2 * TERMS].iter_mut();
+                columns.zip(self.slope).for_each(|(v, c)| *v = self.deflection * c);
+                self.deflection
+            }
+            Cause::Inertia => {
+                v[ACCELERATION] = inertia;
+                1.0
+            }
+            Cause::LinkDelay => {
+                slope(&mut v, LATE.start, self.period_s);
+                self.period_s
+            }
+            Cause::LinkScale => {
+                // q reads (1 + a) q.
+                slope(&mut v, READ.start, -1.0);
+                1.0
+            }
+            Cause::MotorScale => {
+                // θ reads (1 + a) θ; σ θ = σ q − σ φ, and σ φ is the torque of a spring of these powers.
+                (v[ACCELERATION], v[VELOCITY]) = (-inertia, -damping);
+                slope(&mut v, READ.start, 1.0);
+                for (k, c) in self.slope[TERMS..].iter().enumerate() {
+                    v[SPRING.start + k] -= c * self.deflection * self.powers[k];
+                }
+                1.0
+            }
+            Cause::TorqueScale => {
+                // τ reads (1 + a) τ.
+                v[TORQUE] = 1.0;
+                1.0
+            }
+            Cause::TorqueDelay => {
+                v[TORQUE_RATE] = -self.period_s;
+                self.period_s
+            }
+            Cause::MotorDelay => {
+                // The same as a link and a torque that are early.
+                slope(&mut v, LATE.start, -self.period_s);
+                v[TORQUE_RATE] = self.period_s;
+                self.period_s
+            }
+        };
+        Some((v, unit))
+    }
+
+    /// Hold every cause against a window; `before`: probability, before it, that something has changed.
+    #[must_use]
+    pub fn judge(&self, window: &Gram, noise: &Noise, before: f64) -> Odds {
+        let scale = noise.variance * noise.correlated;
+        let independent = (window.rows / noise.correlated).max(1.0);
+        let mut frame = self.frame.clone();
+        (frame.left, frame.set) = (*self.residual, self.set);
+        let reduced = frame.reduce(window);
+        let mut prior = Prior { mean: [0.0; UNKNOWNS], precision: *self.precision };
+        // The place of the cause's own amplitude: an unknown that is not in the set, or the last one.
+        let own = (1..UNKNOWNS).rev().find(|i| self.set >> i & 1 == 0);
+        let evidence = |square: f64, log_ratio: f64| {
+            // What is left below the noise that is foreseen speaks for nothing.
+            let square = square.max(independent);
+            -0.5 * (independent + noise.tails) * (square / noise.tails).ln_1p() + 0.5 * log_ratio
+        };
+        let mut odds = Odds { of: [Explanation::default(); CAUSES], log: [f64::NEG_INFINITY; CAUSES] };
+        let mut judged = |cause: Cause, reduced: &Matrix, set: Set, prior: &Prior, unit: f64| {
+            let Some(found) = solve(reduced, set, prior, scale) else { return f64::INFINITY };
+            let log_ratio = log_determinant(&prior.precision, set)
+                - log_determinant(&information(reduced, &prior.precision, scale), set);
+            // 2 ln evidence = log_ratio − square left.
+            let square = log_ratio - 2.0 * found.log_evidence;
+            let (x, std) = own.map_or((0.0, 0.0), |own| (found.x[own], found.covariance[own][own].sqrt()));
+            odds.log[cause as usize] = evidence(square, log_ratio);
+            odds.of[cause as usize] = Explanation {
+                probability: 0.0,
+                misfit: square.max(0.0) / independent,
+                amplitude: unit * x,
+                std: unit * std,
+            };
+            square
+        };
+        let healthy = judged(Cause::Nothing, &reduced, self.set, &prior, 0.0);
+        if let Some(own) = own {
+            for entry in &TABLE[1..] {
+                let Some((v, unit)) = self.direction(entry.cause) else { continue };
+                let image = window.times(&v);
+                let mut more = reduced;
+                let with = |c: &Row| image.iter().zip(c).map(|(a, b)| a * b).sum::<f64>();
+                for i in unknowns(self.set) {
+                    let value = with(&frame.directions[i]);
+                    (more[own][i], more[i][own]) = (value, value);
+                }
+                let value = with(&frame.left);
+                (more[own][0], more[0][own]) = (value, value);
+                more[own][own] = with(&v);
+                prior.precision = *self.precision;
+                prior.precision[own][own] = entry.std.powi(-2);
+                if matches!(entry.cause, Cause::MotorScale | Cause::LinkScale)
+                    && self.set >> unknowns::ZERO & 1 == 1
+                {
+                    // A reading of another scale is of another zero, too: where it was right is not known.
+                    (0..UNKNOWNS).for_each(|i| prior.precision[i][unknowns::ZERO] = 0.0);
+                    prior.precision[unknowns::ZERO] = [0.0; UNKNOWNS];
+                    prior.precision[unknowns::ZERO][unknowns::ZERO] = self.deflection.powi(-2);
+                }
+                judged(entry.cause, &more, self.set | bit(own), &prior, unit);
+            }
+        }
+        // Larger errors: as much larger as fits best, at the price of that choice.
+        let factor = (healthy / independent).max(1.0);
+        odds.log[Cause::Noise as usize] = odds.log[0] - evidence(healthy, 0.0) + evidence(independent, 0.0)
+            - 0.5 * independent * factor.ln()
+            - 0.5 * independent.ln_1p();
+        odds.of[Cause::Noise as usize] =
+            Explanation { misfit: 1.0, amplitude: factor.sqrt(), ..Explanation::default() };
+        odds.normalise(before);
+        odds
+    }
+}
+
+fn information(reduced: &Matrix, precision: &Matrix, scale: f64) -> Matrix {
+    let mut out = *precision;
+    for (row, sums) in out.iter_mut().zip(reduced) {
+        row.iter_mut().zip(sums).for_each(|(value, sum)| *value += sum / scale);
+    }
+    out
+}
+
+impl Odds {
+    fn normalise(&mut self, before: f64) {
+        let each = (before / (CAUSES - 1) as f64).max(f64::MIN_POSITIVE).ln();
+        let most = self.log.iter().skip(1).fold(self.log[0], |most, log| most.max(log + each));
+        let weight = |k: usize| (self.log[k] + if k == 0 { 0.0 } else { each } - most).exp();
+        let total: f64 = (0..CAUSES).map(weight).sum();
+        let share: [f64; CAUSES] = std::array::from_fn(|k| weight(k) / total);
+        self.of.iter_mut().zip(share).for_each(|(one, share)| one.probability = share);
+    }
+
+    /// What is said of a cause.
+    #[must_use]
+    pub fn of(&self, cause: Cause) -> &Explanation {
+        &self.of[cause as usize]
+    }
+
+    /// The most probable cause of those that are asked for.
+    pub fn best(&self, wanted: impl Fn(Cause) -> bool) -> Option<Cause> {
+        let asked = TABLE.iter().map(|entry| entry.cause).filter(|cause| wanted(*cause));
+        asked.max_by(|a, b| self.log[*a as usize].total_cmp(&self.log[*b as usize]))
+    }
+}

@@ -1,0 +1,402 @@
+//! One motor and its transmission on line: its balance, what that has taught, and what it says at this moment.
+
+use crate::align::Inputs;
+use crate::balance::{Balance, correlated_rows};
+use crate::blocks::{Blocks, Closed};
+use crate::causes::{CAUSES, Cause, TABLE};
+use crate::deflection::{DeflectionFilter, Present, Tuning};
+use crate::effects::{Coordinates, MotorEffects};
+use crate::external::Carried;
+use crate::laws::Law;
+use crate::model::Motor;
+use crate::reasons::Reason;
+use crate::sample::TransmissionEstimate;
+use crate::settings::Priors;
+use crate::signals::{Channel, Excitation, Filters};
+use crate::spring::Family;
+use crate::unknowns::{DAMPING, INERTIA, SPRING};
+
+/// Filter delays after which a wrong start is forgotten.
+pub const SETTLE_DELAYS: f64 = 4.5;
+const USEFUL: f64 = 0.2; // share of the torque that a curve may leave unexplained
+const BEYOND: f64 = 1.5; // times the largest deflection: no more is known of the curve
+const EDGE: f64 = 0.98; // of where a law ends
+const HALF: f64 = 0.5; // periods: what is later is shifted, the rest is a column
+const SURE: f64 = 3.0; // standard deviations of a delay that is shifted
+const CONFIRMED_S: f64 = 0.05; // of rows that agree with what is known before a moved zero is believed
+const FOLLOWED_S: f64 = 0.5; // how long it is said that a change has been followed
+const LIKELY: f64 = 0.05; // of the likeliest cause's probability: less is not named beside it
+const DRIFT: f64 = 1e-4; // relative growth of the standard deviation per second without motion …
+const WIDEST: f64 = 0.02; // … up to this
+
+/// What a period brings to every motor.
+#[derive(Clone, Copy, Debug)]
+pub struct Moment<'a> {
+    /// What is measured now …
+    pub now: &'a Inputs,
+    /// … and what was, a period before.
+    pub last: &'a Inputs,
+    /// q behind the filters.
+    pub link: &'a Channel,
+    /// Since the start, s.
+    pub time: f64,
+    /// Whether the filters hold nothing wrong.
+    pub usable: bool,
+}
+
+/// One motor: its columns, what they have taught, and its declared effects.
+#[derive(Clone, Debug)]
+pub struct Side {
+    /// Whether its transmission is rigid.
+    pub rigid: bool,
+    inertia: f64,
+    damping: f64,
+    period: f64,
+    balance: Balance,
+    /// The deflection of this moment.
+    pub deflection: DeflectionFilter,
+    acting: f64, // torque of the transmission at the last sample
+    stiffness: f64,
+    /// What has been learned.
+    pub blocks: Blocks,
+    effects: MotorEffects,
+    effect: f64,      // x_motor − x_transmission
+    transmitted: f64, // x_transmission
+    excitation: Excitation,
+    /// Whether the motion reveals the stiffness.
+    pub excited: bool,
+    held_s: f64,
+    /// Whether the last block is not explained.
+    pub doubtful: bool,
+    /// How long it is still said that a change has been followed, s.
+    pub followed_s: f64,
+    fits: bool,
+    unexplained: f64,
+    unconfirmed_s: f64, // of rows after an encoder has moved its zero
+}
+
+impl Side {
+    /// Of one motor of a model that has been checked; `look_s`: between two looks at its motion.
+    #[must_use]
+    pub fn new(
+        motor: &Motor,
+        effects: MotorEffects,
+        priors: &Priors,
+        filters: &Filters,
+        period_s: f64,
+        look_s: f64,
+        alarms_per_hour: f64,
+    ) -> Side {
+        let rows = correlated_rows(&filters.main, period_s);
+        let settle = (SETTLE_DELAYS * filters.delay / period_s).ceil() as u32;
+        let blocks = Blocks::new(motor, priors, period_s, rows, settle, alarms_per_hour);
+        let family = Family::of(Some(&blocks.spring.law));
+        let mut made = Side {
+            rigid: !motor.flexible(),
+            inertia: motor.inertia,
+            damping: motor.damping,
+            period: period_s,
+            balance: Balance::new(family),
+            deflection: DeflectionFilter::new(
+                motor.inertia,
+                motor.damping,
+                filters.main.bandwidth,
+                period_s,
+                look_s,
+            ),
+            acting: 0.0,
+            stiffness: 0.0,
+            blocks,
+            effects,
+            effect: 0.0,
+            transmitted: 0.0,
+            excitation: Excitation::default(),
+            excited: false,
+            held_s: 0.0,
+            doubtful: false,
+            followed_s: 0.0,
+            fits: false,
+            unexplained: f64::NAN,
+            unconfirmed_s: 0.0,
+        };
+        made.reset();
+        made
+    }
+
+    /// Forget everything.
+    pub fn reset(&mut self) {
+        self.balance.reset();
+        self.deflection.reset();
+        self.blocks.clear();
+        self.effects.motor.reset();
+        self.effects.transmission.reset();
+        self.excitation = Excitation::default();
+        (self.effect, self.transmitted, self.acting, self.stiffness) = (0.0, 0.0, 0.0, 0.0);
+        (self.excited, self.held_s, self.doubtful) = (false, 0.0, false);
+        (self.followed_s, self.unconfirmed_s) = (0.0, 0.0);
+        self.judge();
+    }
+
+    /// What follows is not as what was before.
+    pub fn cut(&mut self) {
+        self.blocks.cut();
+        self.judge();
+    }
+
+    /// Filters at rest where the joint is now; what has been learned is kept.
+    pub fn restart(&mut self, theta: f64, phi: f64, torque: f64) {
+        self.blocks.cut();
+        self.balance.restart(theta, phi, torque);
+        self.deflection.restart(theta, phi);
+        self.judge();
+    }
+
+    /// What has been learned is of other moments.
+    pub fn relearn(&mut self, theta: f64, phi: f64) {
+        self.blocks.clear();
+        self.deflection.restart(theta, phi);
+        self.judge();
+    }
+
+    /// An encoder has moved its zero, `known`: by so much, or somewhere.
+    pub fn move_zero(&mut self, known: bool) {
+        self.unconfirmed_s = CONFIRMED_S;
+        if known {
+            self.blocks.cut();
+        } else {
+            self.blocks.lose_zero();
+            self.balance.forget_range();
+        }
+        self.judge();
+    }
+
+    /// Whether a deflection is one that the joint can have.
+    #[must_use]
+    pub fn is_within(&self, phi: f64) -> bool {
+        let largest = self.balance.largest();
+        largest == 0.0 || phi.abs() <= BEYOND * largest
+    }
+
+    /// One period of all channels of motor `i`.
+    pub fn feed(&mut self, filters: &Filters, i: usize, moment: &Moment) {
+        let Moment { now, last, link, time, usable } = *moment;
+        let (theta, phi, torque) = (now.at.motor[i], now.at.deflection(i), now.torque[i]);
+        if !self.rigid && self.balance.outgrown(phi) && (!self.doubtful || self.blocks.are_few()) {
+            let factors = self.balance.grow(phi);
+            self.blocks.grow(&factors, &self.balance);
+            self.judge();
+        }
+        self.feed_effects(link, time);
+        self.balance.feed(filters, theta, phi, torque, link, self.effect);
+        self.followed_s -= self.period;
+        self.held_s += self.period;
+        if !self.rigid {
+            self.deflection.update(theta, phi, last.torque[i] + self.acting - self.effect);
+            self.balance.observe(phi, usable && (!self.doubtful || self.blocks.are_few()));
+        }
+    }
+
+    /// The declared effects at this moment, from lightly filtered signals.
+    fn feed_effects(&mut self, link: &Channel, time: f64) {
+        if self.effects.is_empty() {
+            return;
+        }
+        let light = *self.balance.light();
+        let phi = link.light[0] - light[0];
+        let known = self.blocks.at(phi, 0.0, &self.balance);
+        let (flexibility_torque, stiffness) =
+            known.map_or((0.0, 0.0), |known| (known.torque, known.stiffness));
+        let c = Coordinates {
+            position: light[0] - self.effects.offset,
+            velocity: light[1],
+            acceleration: light[2],
+            deflection: phi,
+            deflection_rate: link.light[1] - light[1],
+            flexibility_torque,
+            stiffness,
+            torque: self.balance.light_torque(),
+            time,
+            ..Coordinates::default()
+        };
+        let (motor, transmission) = self.effects.balance(&c, self.period);
+        (self.effect, self.transmitted) = (motor - transmission, transmission);
+    }
+
+    /// Does the motion reveal the stiffness? `gain`: standard deviation of the deflection's rate.
+    pub fn look(&mut self, link: &Channel, phi: f64, gain: f64, usable: bool, dt: f64) {
+        if self.blocks.are_few() {
+            self.balance.fit_widths(phi);
+        }
+        let rate = link.main[1] - self.balance.rate();
+        self.excited = self.excitation.update(rate, gain, usable, !self.doubtful, dt);
+    }
+
+    /// One step of the deflection's filter; `noise`: variances of θ and q.
+    pub fn tune(&mut self, link: &Channel, noise: [f64; 2]) {
+        let known = self.blocks.posterior.as_ref().filter(|known| known.set >> INERTIA & 1 == 1);
+        let (inertia, damping) =
+            known.map_or((self.inertia, self.damping), |known| (known.x[INERTIA], known.x[DAMPING]));
+        self.deflection.tune(&Tuning {
+            jerk: link.main[3] - self.balance.jerk(),
+            motor_noise: noise[0],
+            link_noise: noise[1],
+            inertia: if inertia > 0.0 { inertia } else { self.inertia },
+            damping,
+            stiffness: self.stiffness,
+            unmodelled: if self.fits { self.blocks.unmodelled() } else { f64::INFINITY },
+        });
+    }
+
+    /// The row of this moment; by how many periods the link has been found late.
+    ///
+    /// `noise`: variances of θ and q; `torque_noise`: of τ; `gains`: of the filters for white noise.
+    pub fn learn(
+        &mut self,
+        link: &Channel,
+        noise: [f64; 2],
+        torque_noise: f64,
+        gains: &[f64; 3],
+    ) -> Option<f64> {
+        self.held_s = 0.0;
+        self.unconfirmed_s -= self.period;
+        let positions = noise[0] + noise[1];
+        self.blocks.resolution = (12.0 * positions).sqrt();
+        self.blocks.white = gains[0] * (torque_noise + self.stiffness.powi(2) * positions)
+            + gains[2] * self.inertia.powi(2) * noise[0];
+        let row = self.balance.row(link);
+        let closed = self.blocks.add(&row)?;
+        if closed == Closed::Begun {
+            self.followed_s = FOLLOWED_S;
+        }
+        self.judge();
+        let (late, std) = self.blocks.delay().filter(|_| !self.doubtful)?;
+        let (periods, std) = (late / self.period, std / self.period);
+        (periods.abs() > HALF && periods.abs() - HALF > SURE * std).then(|| periods.round())
+    }
+
+    /// What the blocks say of themselves, at their ends.
+    fn judge(&mut self) {
+        self.doubtful = self.blocks.is_doubting();
+        self.unexplained = self.blocks.unexplained();
+        self.fits = self.unexplained < USEFUL;
+    }
+
+    /// The torque and stiffness that the deflection's filter goes on with.
+    pub fn act(&mut self) {
+        if self.rigid {
+            return;
+        }
+        let known = self.blocks.at(self.deflection.at(0.0), 0.0, &self.balance);
+        match known.filter(|known| self.fits && known.stiffness > 0.0) {
+            Some(known) => {
+                (self.stiffness, self.acting) = (known.stiffness, known.torque - self.blocks.offset());
+            }
+            None => (self.stiffness, self.acting) = (0.0, self.left(0.0)),
+        }
+    }
+
+    /// What the motor's balance leaves as the transmission's torque (eq 14), brought up by its slope.
+    fn left(&self, ahead_s: f64) -> f64 {
+        let (motor, tau, x) = self.balance.filtered();
+        let value = self.inertia * motor[2] + self.damping * motor[1] + x[0] - tau[0];
+        let rate = self.inertia * motor[3] + self.damping * motor[2] + x[1] - tau[1];
+        value + ahead_s * rate
+    }
+
+    /// The estimate at the present deflection; `delay`: of the filters.
+    #[must_use]
+    pub fn estimate(&self, present: &Present, delay: f64) -> TransmissionEstimate {
+        let nothing = TransmissionEstimate::NOTHING;
+        let left = || self.left(delay + present.behind_s + present.ahead_s);
+        if self.rigid {
+            return TransmissionEstimate { flexibility_torque: left(), ..nothing };
+        }
+        let phi = self.deflection.now(present);
+        let Some(at) = self.blocks.at(phi, self.deflection.link_rate(), &self.balance) else {
+            return TransmissionEstimate { flexibility_torque: left(), deflection: phi, ..nothing };
+        };
+        let more = self.effects.spring(phi);
+        let stiffness = at.stiffness + more.1;
+        let stiffness_std = self.blocks.posterior.as_ref().map_or(f64::NAN, |known| {
+            let variance = known.variance_along(&at.by_stiffness);
+            // A stiffness that changes with φ is as uncertain as φ is.
+            let held = (DRIFT * self.held_s).min(WIDEST) * stiffness;
+            (variance + at.bend.powi(2) * self.deflection.variance() + held * held).sqrt()
+        });
+        let trusted = self.fits && at.stiffness > 0.0;
+        let flexibility_torque = if trusted { at.torque + more.0 } else { left() };
+        TransmissionEstimate {
+            flexibility_torque,
+            stiffness,
+            stiffness_std,
+            deflection: phi + self.blocks.spring.zero,
+        }
+    }
+
+    /// Why the estimate at this moment may not be used.
+    #[must_use]
+    pub fn reason(&self, part: &TransmissionEstimate, valid_within: f64, settled: bool) -> Option<Reason> {
+        if self.rigid {
+            return (!part.flexibility_torque.is_finite()).then_some(Reason::Settling);
+        }
+        if self.deflection.unsettled > 0 || self.unconfirmed_s > 0.0 {
+            return Some(Reason::Settling);
+        }
+        if self.blocks.posterior.is_none() {
+            return Some(if settled { Reason::Unmoved } else { Reason::Settling });
+        }
+        if self.doubtful {
+            return Some(Reason::Changed);
+        }
+        if self.blocks.is_lost() {
+            return Some(Reason::Lost);
+        }
+        if !self.fits {
+            return Some(Reason::Unexplained(self.unexplained));
+        }
+        let reach = (BEYOND * self.balance.largest()).min(EDGE * self.blocks.spring.reach());
+        let within = part.deflection.abs() < if reach > 0.0 { reach } else { f64::INFINITY };
+        Reason::of_precision(part.stiffness, part.stiffness_std, valid_within)
+            .or((!within).then_some(Reason::Beyond))
+    }
+
+    /// Which causes the window does not tell from the likeliest one.
+    #[must_use]
+    pub fn likely_causes(&self) -> [bool; CAUSES] {
+        let Some(odds) = self.blocks.odds() else { return [false; CAUSES] };
+        let named = |cause: Cause| !matches!(cause, Cause::Nothing | Cause::Noise);
+        let Some(best) = odds.best(named) else { return [false; CAUSES] };
+        let least = LIKELY * odds.of(best).probability;
+        std::array::from_fn(|k| named(TABLE[k].cause) && odds.of[k].probability > least)
+    }
+
+    /// What it does to the link at a deflection as it is measured; `None` where no curve is trusted.
+    ///
+    /// `noise`: variance of θ's noise, rad².
+    #[must_use]
+    pub fn carried(&self, phi: f64, noise: f64) -> Option<Carried> {
+        if self.rigid || !self.fits || self.blocks.is_lost() {
+            return None;
+        }
+        let at = self.blocks.at(phi, self.deflection.link_rate(), &self.balance)?;
+        let stiffness = at.stiffness + self.effects.spring(phi).1;
+        let variance = self.blocks.posterior.as_ref()?.variance_along(&at.by_torque);
+        Some(Carried {
+            torque: at.torque + self.transmitted,
+            variance,
+            stiffness,
+            reading: stiffness * stiffness * noise,
+        })
+    }
+
+    /// The law's parameters with their standard deviations; `None` before any.
+    pub fn parameters(&self, values: &mut Vec<f64>, std: &mut Vec<f64>) -> Option<&Law> {
+        let known = self.blocks.posterior.as_ref().filter(|_| !self.rigid)?;
+        let spring = &self.blocks.spring;
+        for (i, unknown) in SPRING.enumerate().take(spring.size).filter(|(_, u)| known.set >> u & 1 == 1) {
+            values.push(spring.alpha[i]);
+            std.push(known.covariance[unknown][unknown].sqrt());
+        }
+        Some(&spring.law)
+    }
+}

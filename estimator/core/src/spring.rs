@@ -1,0 +1,217 @@
+//! A spring's curve over the columns of a balance.
+//!
+//! F f(φ) ≈ Σ aₖ F bₖ(u) + Σ cₖ F bₖ′(u), u = φ over the deflection's size: five functions of a family that holds
+//! the law, and their slopes, which a moved zero needs. A law, its slopes by its parameters and by φ become such
+//! sums by least squares over the range of u; nothing that was filtered has to be filtered again.
+
+use std::sync::Arc;
+
+use crate::laws::{Law, Table};
+
+/// Functions of a family.
+pub const TERMS: usize = 5;
+
+/// a, then c.
+pub type Coefficients = [f64; 2 * TERMS];
+
+pub(crate) const NODES: usize = 41; // of the least squares: four for each function
+const MARGIN: f64 = 1.1; // times the size: a motion grows a little before it is scaled anew
+const RIDGE: f64 = 1e-12; // of the diagonal: two functions may be one
+
+/// The functions that a curve is a sum of.
+#[derive(Clone, Debug)]
+pub enum Family {
+    /// u, u³, u⁵, u⁷, u⁹.
+    Smooth,
+    /// sign(u) |u|ᵏ: a spring whose stiffness has a corner at zero.
+    Kinked,
+    /// g u^(2k−2), g the table's torque.
+    Table(Arc<Table>),
+}
+
+impl Family {
+    /// The one that holds a law.
+    #[must_use]
+    pub fn of(law: Option<&Law>) -> Family {
+        match law {
+            Some(Law::Exponential) => Family::Kinked,
+            Some(Law::Tabulated(table)) => Family::Table(table.clone()),
+            _ => Family::Smooth,
+        }
+    }
+
+    /// bₖ and their slopes by u at a deflection of u times `size`.
+    #[must_use]
+    pub fn at(&self, u: f64, size: f64) -> Coefficients {
+        let mut out = [0.0; 2 * TERMS];
+        match self {
+            Family::Smooth => {
+                let mut power = 1.0;
+                for k in 0..TERMS {
+                    (out[k], out[TERMS + k]) = (power * u, (2 * k + 1) as f64 * power);
+                    power *= u * u;
+                }
+            }
+            Family::Kinked => {
+                let mut power = 1.0;
+                for k in 0..TERMS {
+                    (out[k], out[TERMS + k]) = (power * u, (k + 1) as f64 * power);
+                    power *= u.abs();
+                }
+            }
+            Family::Table(table) => {
+                let whole = table.at(size).0;
+                let (torque, slope) = table.at(u * size);
+                let (torque, slope) = (torque / whole, slope * size / whole);
+                let mut power = 1.0;
+                for k in 0..TERMS {
+                    let order = (2 * k) as f64;
+                    out[k] = torque * power;
+                    let bend =
+                        if k == 0 { 0.0 } else { order * torque * power / if u == 0.0 { 1.0 } else { u } };
+                    out[TERMS + k] = slope * power + bend;
+                    power *= u * u;
+                }
+            }
+        }
+        out
+    }
+
+    /// Powers of u that the functions are, or nearly are.
+    #[must_use]
+    pub fn powers(&self) -> [f64; TERMS] {
+        std::array::from_fn(|k| match self {
+            Family::Kinked => (k + 1) as f64,
+            _ => (2 * k + 1) as f64,
+        })
+    }
+
+    /// By what bₖ and bₖ′ are multiplied where the size grows.
+    #[must_use]
+    pub fn factors(&self, from: f64, to: f64) -> Coefficients {
+        let (powers, ratio) = (self.powers(), from / to);
+        let (less, whole) = match self {
+            Family::Table(table) => (1, table.at(from).0 / table.at(to).0),
+            _ => (0, 1.0),
+        };
+        let mut out = [0.0; 2 * TERMS];
+        for k in 0..TERMS {
+            out[k] = whole * ratio.powi(powers[k] as i32 - less);
+            out[TERMS + k] = out[k] / ratio;
+        }
+        out
+    }
+}
+
+/// Least squares of functions of φ over a family, at one size of the deflection.
+#[derive(Clone, Debug)]
+pub struct Projection {
+    nodes: [f64; NODES], // φ
+    weights: [[f64; NODES]; 2 * TERMS],
+}
+
+impl Projection {
+    /// Over |φ| up to a little more than `size`, and no further than `reach`.
+    #[must_use]
+    pub fn new(family: &Family, size: f64, reach: f64) -> Projection {
+        let edge = (MARGIN * size).min(reach);
+        let mut nodes = [0.0; NODES];
+        for (k, node) in nodes.iter_mut().enumerate() {
+            *node = edge * (2.0 * k as f64 / (NODES - 1) as f64 - 1.0);
+        }
+        let rows = nodes.map(|phi| family.at(phi / size, size));
+        const N: usize = 2 * TERMS;
+        let mut normal = [[0.0; N]; N];
+        for row in &rows {
+            for i in 0..N {
+                (0..N).for_each(|j| normal[i][j] += row[i] * row[j]);
+            }
+        }
+        (0..N).for_each(|i| normal[i][i] *= 1.0 + RIDGE);
+        let scale: [f64; N] = std::array::from_fn(|i| normal[i][i].max(f64::MIN_POSITIVE).sqrt().recip());
+        let mut weights = [[0.0; NODES]; N];
+        for (k, row) in rows.iter().enumerate() {
+            let solved = solve(&normal, row, &scale);
+            (0..N).for_each(|i| weights[i][k] = solved[i]);
+        }
+        Projection { nodes, weights }
+    }
+
+    /// The deflections at which a function is to be known, rad.
+    #[must_use]
+    pub fn nodes(&self) -> &[f64; NODES] {
+        &self.nodes
+    }
+
+    /// Coefficients of the function that has these values at the nodes.
+    #[must_use]
+    pub fn fit(&self, values: &[f64]) -> Coefficients {
+        std::array::from_fn(|i| self.weights[i].iter().zip(values).map(|(w, v)| w * v).sum())
+    }
+
+    /// Coefficients of a function of φ.
+    #[must_use]
+    pub fn of(&self, function: impl Fn(f64) -> f64) -> Coefficients {
+        self.fit(&self.nodes.map(function))
+    }
+}
+
+/// Solve a small positive definite system by Cholesky's factorisation, scaled by its diagonal.
+fn solve<const N: usize>(matrix: &[[f64; N]; N], b: &[f64; N], scale: &[f64; N]) -> [f64; N] {
+    let mut factor = [[0.0; N]; N];
+    for i in 0..N {
+        for j in 0..=i {
+            let rest: f64 = (0..j).map(|k| factor[i][k] * factor[j][k]).sum();
+            let value = matrix[i][j] * scale[i] * scale[j] - rest;
+            factor[i][j] = if i == j { value.max(RIDGE).sqrt() } else { value / factor[j][j] };
+        }
+    }
+    let mut x = [0.0; N];
+    for i in 0..N {
+        let rest: f64 = (0..i).map(|k| factor[i][k] * x[k]).sum();
+        x[i] = (b[i] * scale[i] - rest) / factor[i][i];
+    }
+    for i in (0..N).rev() {
+        let rest: f64 = (i + 1..N).map(|k| factor[k][i] * x[k]).sum();
+        x[i] = (x[i] - rest) / factor[i][i];
+    }
+    std::array::from_fn(|i| x[i] * scale[i])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn worst(law: &Law, alpha: &[f64], size: f64, zero: f64) -> f64 {
+        let family = Family::of(Some(law));
+        let projection = Projection::new(&family, size, f64::INFINITY);
+        let found = projection.of(|phi| law.at(phi + zero, alpha).0);
+        let mut worst: f64 = 0.0;
+        for k in -50..=50 {
+            let u = f64::from(k) / 50.0;
+            let sum: f64 = family.at(u, size).iter().zip(&found).map(|(b, a)| b * a).sum();
+            worst = worst.max((sum - law.at(u * size + zero, alpha).0).abs());
+        }
+        worst / law.at(size, alpha).0.abs()
+    }
+
+    #[test]
+    fn each_family_holds_its_laws() {
+        assert!(worst(&Law::Polynomial, &[100.0, 2000.0, 5e4], 0.2, 0.0) < 1e-7);
+        assert!(worst(&Law::Polynomial, &[100.0, 2000.0], 0.2, 0.07) < 1e-7); // the zero is elsewhere
+        assert!(worst(&Law::VsaII, &[500.0, 1.6], 0.3, 0.0) < 1e-5);
+        assert!(worst(&Law::Exponential, &[100.0, 8.0], 0.2, 0.0) < 1e-3);
+        let table = Arc::new(Table::new(&[0.05, 0.1, 0.2], &[3.0, 8.0, 30.0]).unwrap());
+        assert!(worst(&Law::Tabulated(table), &[1.0], 0.15, 0.0) < 1e-6);
+    }
+
+    #[test]
+    fn a_larger_size_is_a_factor_of_each_function() {
+        let table = Family::Table(Arc::new(Table::new(&[0.05, 0.1, 0.2], &[3.0, 8.0, 30.0]).unwrap()));
+        for family in [Family::Smooth, Family::Kinked, table] {
+            let (before, factors) = (family.at(0.8, 0.1), family.factors(0.1, 0.2));
+            let after = family.at(0.4, 0.2);
+            assert!((0..2 * TERMS).all(|k| (before[k] * factors[k] - after[k]).abs() < 1e-12));
+        }
+    }
+}

@@ -1,0 +1,395 @@
+//! The unknowns of a motor's balance: what each adds to a row, what is believed of it before any data, and what
+//! torque and stiffness they make at a deflection.
+
+use crate::balance::{self, Balance};
+use crate::gram::{COLUMNS, Frame, Gram, Matrix, Posterior, Prior, Row, Set, UNKNOWNS, Vector, inverse, set};
+use crate::laws::{Alpha, Law, PARAMETERS};
+use crate::model::{Motor, Transmission};
+use crate::settings::Priors;
+use crate::spring::{Coefficients, Projection, TERMS};
+
+/// B, kg·m².
+pub const INERTIA: usize = 1;
+/// D, N·m·s/rad.
+pub const DAMPING: usize = 2;
+/// A constant torque on the motor, N·m.
+pub const OFFSET: usize = 3;
+/// Dry friction, N·m.
+pub const DRY: usize = 4;
+/// The law's parameters, as far from those at which it is linearised.
+pub const SPRING: std::ops::Range<usize> = 5..5 + TERMS;
+/// Where the deflection's zero is, as far from where it is assumed, rad.
+pub const ZERO: usize = 10;
+/// By how much the link position is later than was assumed, s.
+pub const LATE: usize = 11;
+/// Friction that grows with speed before it is full, N·m.
+pub const SOFT: usize = 12;
+/// Friction that grows with the load, N·m at the largest deflection.
+pub const LOAD: std::ops::Range<usize> = 13..15;
+/// Damping of the transmission, N·m·s/rad.
+pub const RATE: usize = 15;
+/// Memory of the transmission, N·m at half the range.
+pub const STOPS: std::ops::Range<usize> = 16..19;
+/// A spring of any shape, N·m at half the range.
+pub const CLIPS: std::ops::Range<usize> = 19..23;
+
+/// Those that every joint has.
+pub const ACTIVE: Set = (1 << SOFT) - 2;
+
+const UNDECLARED: f64 = 0.05; // amplitude of an effect that nobody declared, as a share of the torque
+const SPRING_SHARE: f64 = 10.0; // of the flexibility torque, as a share of the motor's: the data decide
+const DECLARED: f64 = 0.3; // relative standard deviation of a law's parameter that is declared without one
+const SHAPES: usize = 12; // of a law that are tried before any is known
+const NARROWEST: f64 = 0.05; // of them: the bend that a shape makes over the deflection seen …
+const WIDEST: f64 = 6.0; // … and the largest
+
+/// One effect that the joint file need not name.
+pub struct Candidate {
+    /// Its unknowns.
+    pub unknowns: std::ops::Range<usize>,
+    /// Its name in `report.json`.
+    pub name: &'static str,
+}
+
+/// The groups of unknowns that evidence chooses.
+pub const CANDIDATES: [Candidate; 5] = [
+    Candidate { unknowns: SOFT..SOFT + 1, name: "stribeck_friction" },
+    Candidate { unknowns: LOAD, name: "load_dependent_friction" },
+    Candidate { unknowns: RATE..RATE + 1, name: "transmission_damping" },
+    Candidate { unknowns: STOPS, name: "hysteresis" },
+    Candidate { unknowns: CLIPS, name: "backlash" },
+];
+
+/// What the priors of zero, shape and delay are measured by.
+#[derive(Clone, Copy, Debug)]
+pub struct Scale {
+    /// Standard deviation of the deflection's zero, rad.
+    pub zero_std: f64,
+    /// The largest deflection, rad.
+    pub deflection: f64,
+    /// Of the samples, s.
+    pub period_s: f64,
+}
+
+/// The law of a spring, with the point at which it is linearised.
+#[derive(Clone, Debug)]
+pub struct Spring {
+    /// The law; a spring of which nothing is known is a polynomial.
+    pub law: Law,
+    /// How many parameters it has.
+    pub size: usize,
+    /// Whether the number of powers is chosen from the data.
+    pub open: bool,
+    /// Whether `alpha` is of any meaning.
+    pub known: bool,
+    /// α.
+    pub alpha: Alpha,
+    /// Where φ is zero, rad: f(φ + zero).
+    pub zero: f64,
+    declared: bool,
+    anchored: bool, // to what is declared
+    start: Alpha,
+    covariance: Option<Matrix>, // of what is declared, by the unknowns
+}
+
+impl Spring {
+    /// Of a motor whose transmission deflects.
+    #[must_use]
+    pub fn new(motor: &Motor) -> Spring {
+        let mut alpha = [0.0; PARAMETERS];
+        let (law, order, given, written) = match &motor.transmission {
+            Transmission::Elastic { law, order, parameters, covariance } => {
+                (law.clone(), *order, parameters.as_slice(), covariance.as_deref())
+            }
+            _ => (Law::Polynomial, None, [].as_slice(), None),
+        };
+        let n = given.len().min(TERMS);
+        alpha[..n].copy_from_slice(&given[..n]);
+        if n == 0 {
+            alpha[0] = 1.0;
+            law.shapes().iter().zip(&mut alpha[1..]).for_each(|(shape, value)| *value = shape.start);
+        }
+        let (size, open) = match law {
+            Law::Linear => (1, false),
+            Law::Polynomial if n > 0 => (order.unwrap_or(n).clamp(n, TERMS), false),
+            Law::Polynomial => (order.unwrap_or(TERMS).min(TERMS), order.is_none()),
+            _ => (1 + law.shapes().len(), false),
+        };
+        let covariance = written.filter(|_| n == size && n == given.len()).map(|rows| {
+            let mut covariance = [[0.0; UNKNOWNS]; UNKNOWNS];
+            for (i, row) in rows.chunks_exact(n).enumerate() {
+                covariance[SPRING.start + i][SPRING.start..SPRING.start + n].copy_from_slice(row);
+            }
+            covariance
+        });
+        let declared = n > 0;
+        Spring {
+            law,
+            size,
+            open,
+            known: declared,
+            alpha,
+            zero: 0.0,
+            declared,
+            anchored: declared,
+            start: alpha,
+            covariance,
+        }
+    }
+
+    /// Back to what is declared.
+    pub fn reset(&mut self) {
+        (self.alpha, self.zero, self.known, self.anchored) = (self.start, 0.0, self.declared, self.declared);
+    }
+
+    /// It has changed: what is declared is no measure any more.
+    pub fn open(&mut self) {
+        self.anchored = false;
+    }
+
+    /// α of this law alone.
+    #[must_use]
+    pub fn parameters(&self) -> &[f64] {
+        &self.alpha[..self.size]
+    }
+
+    /// Largest |φ| of the law, rad.
+    #[must_use]
+    pub fn reach(&self) -> f64 {
+        if self.law.is_polynomial() { f64::INFINITY } else { self.law.reach(&self.alpha[1..self.size]) }
+    }
+
+    /// Whether the balance is linear in α.
+    fn is_linear(&self) -> bool {
+        self.law.shapes().is_empty()
+    }
+
+    /// Whether its stiffness is one number: its zero is then a constant torque.
+    #[must_use]
+    pub fn is_constant(&self) -> bool {
+        self.size == 1 && self.law.is_polynomial()
+    }
+
+    /// Whether one solution is final: the balance is linear in its parameters, and its zero is where it was.
+    #[must_use]
+    pub fn is_settled(&self) -> bool {
+        self.is_linear() && self.zero == 0.0
+    }
+
+    /// The largest deflection that any start of it has, rad.
+    #[must_use]
+    pub fn widest_reach(&self, deflection: f64) -> f64 {
+        let own = if self.known { self.reach() } else { f64::INFINITY };
+        if own > deflection { own } else { f64::INFINITY }
+    }
+
+    /// Count values of the law's parameters and of the zero from where they are linearised.
+    pub fn from_base(&self, values: &mut Vector, of: Set) {
+        let base = self.base();
+        for (i, unknown) in SPRING.enumerate().filter(|(_, unknown)| of >> unknown & 1 == 1) {
+            values[unknown] -= base[i];
+        }
+        if of >> ZERO & 1 == 1 {
+            values[ZERO] -= self.zero;
+        }
+    }
+
+    /// What is known from the file alone; `None`: it says nothing of its precision.
+    #[must_use]
+    pub fn declared_posterior(&self) -> Option<Posterior> {
+        let covariance = self.covariance.filter(|_| self.anchored)?;
+        let known = set(SPRING.start..SPRING.start + self.size);
+        Some(Posterior { set: known, x: [0.0; UNKNOWNS], covariance, log_evidence: 0.0 })
+    }
+
+    /// α that the deviations are counted from.
+    fn base(&self) -> Alpha {
+        if self.is_linear() { [0.0; PARAMETERS] } else { self.alpha }
+    }
+
+    /// Move to the parameters that a solution has found; what cannot be is cut off.
+    pub fn take(&mut self, x: &Vector) {
+        let base = self.base();
+        for (i, unknown) in SPRING.enumerate().take(self.size) {
+            self.alpha[i] = base[i] + x[unknown];
+        }
+        let shapes = self.law.shapes();
+        for (shape, (value, before)) in shapes.iter().zip(self.alpha[1..].iter_mut().zip(&base[1..])) {
+            let near = (0.5 * (before - shape.low), 2.0 * (before - shape.low)); // one step of an iteration
+            *value = value.clamp(shape.low + near.0, (shape.low + near.1).min(shape.high));
+        }
+        self.zero += x[ZERO];
+        self.known = true;
+    }
+
+    /// Whether nothing is declared of a law's shape.
+    #[must_use]
+    pub fn is_searched(&self) -> bool {
+        !self.anchored && !self.law.shapes().is_empty()
+    }
+
+    /// The shapes from which a law of one shape parameter may begin.
+    pub fn starts(&self, deflection: f64) -> impl Iterator<Item = f64> {
+        let shape = self.law.shapes().first().copied().filter(|_| self.size == 2);
+        let law = self.law.clone();
+        (0..SHAPES).filter_map(move |k| {
+            let shape = shape?;
+            let bend = NARROWEST * (WIDEST / NARROWEST).powf(k as f64 / (SHAPES - 1) as f64);
+            let value =
+                (shape.low + bend / if matches!(law, Law::VsaII) { 1.0 } else { deflection }).min(shape.high);
+            (law.reach(&[value]) > deflection).then_some(value)
+        })
+    }
+
+    /// What each unknown adds to a row.
+    #[must_use]
+    pub fn frame(&self, projection: &Projection) -> Frame {
+        let mut frame = Frame { left: [0.0; COLUMNS], directions: [[0.0; COLUMNS]; UNKNOWNS], set: 0 };
+        frame.left[balance::TORQUE] = 1.0;
+        let plain = [
+            (INERTIA, balance::ACCELERATION),
+            (DAMPING, balance::VELOCITY),
+            (OFFSET, balance::OFFSET),
+            (DRY, balance::DRY),
+            (SOFT, balance::SOFT),
+            (RATE, balance::RATE),
+        ];
+        let ranges =
+            STOPS.zip(balance::STOPS).chain(CLIPS.zip(balance::CLIPS)).chain(LOAD.zip(balance::LOAD));
+        for (unknown, column) in plain.into_iter().chain(ranges) {
+            frame.directions[unknown][column] = 1.0;
+        }
+        let nodes = projection.nodes();
+        let mut rows = [[0.0; TERMS]; NODES];
+        let alpha = self.parameters();
+        for (phi, row) in nodes.iter().zip(&mut rows) {
+            self.law.jacobian(phi + self.zero, alpha, &mut row[..self.size]);
+        }
+        for (i, unknown) in SPRING.enumerate().take(self.size) {
+            let column: [f64; NODES] = std::array::from_fn(|k| rows[k][i]);
+            place(&mut frame.directions[unknown], &projection.fit(&column), 1.0);
+        }
+        if !self.is_linear() {
+            let torque = projection.of(|phi| self.law.at(phi + self.zero, alpha).0);
+            place(&mut frame.left, &torque, -1.0);
+        }
+        let slope = self.slope(projection);
+        place(&mut frame.directions[ZERO], &slope, 1.0);
+        (frame.directions[LATE], frame.set) = (late(&slope, balance::LATE.start), set(1..UNKNOWNS));
+        for unknown in SPRING.skip(self.size) {
+            frame.set &= !(1 << unknown);
+        }
+        if slope.iter().all(|s| *s == 0.0) {
+            frame.set &= !(1 << ZERO | 1 << LATE);
+        }
+        frame
+    }
+
+    /// σ as a sum of the family's functions.
+    #[must_use]
+    pub fn slope(&self, projection: &Projection) -> Coefficients {
+        projection.of(|phi| self.law.at(phi + self.zero, self.parameters()).1)
+    }
+
+    /// What is believed of the unknowns before any data, in the scale of these rows.
+    ///
+    /// `total`: rows that say how large the torque and the columns are.
+    #[must_use]
+    pub fn prior(&self, motor: &Motor, priors: &Priors, total: &Gram, frame: &Frame, scale: &Scale) -> Prior {
+        let Scale { zero_std, deflection, period_s } = *scale;
+        let mean_torque = total.at(balance::TORQUE, balance::OFFSET) / total.rows;
+        let torque = balance::variance(total, balance::TORQUE).max(f64::MIN_POSITIVE).sqrt();
+        let rms =
+            |unknown: usize| (total.quadratic(&frame.directions[unknown]) / total.rows).sqrt().max(1e-12);
+        let (mut mean, mut std) = ([0.0; UNKNOWNS], [1.0; UNKNOWNS]);
+        for unknown in SOFT..UNKNOWNS {
+            std[unknown] = UNDECLARED * torque / rms(unknown);
+        }
+        let inertia = motor.inertia_std.unwrap_or(priors.motor_inertia);
+        (mean[INERTIA], std[INERTIA]) = (motor.inertia, inertia * motor.inertia);
+        mean[DAMPING] = motor.damping;
+        std[DAMPING] = motor.damping_std.unwrap_or_else(|| {
+            priors.viscous_damping * motor.damping + priors.viscous_damping_floor * torque / rms(DAMPING)
+        });
+        std[OFFSET] = priors.torque_offset * torque + mean_torque.abs();
+        std[DRY] = priors.coulomb_friction * torque;
+        let base = self.base();
+        let shapes = self.law.shapes();
+        for (i, unknown) in SPRING.enumerate().take(self.size) {
+            mean[unknown] = if self.anchored { self.start[i] - base[i] } else { 0.0 };
+            std[unknown] = match (self.anchored, i.checked_sub(1).and_then(|k| shapes.get(k))) {
+                (true, Some(shape)) => DECLARED * (self.start[i] - shape.low),
+                (true, None) if self.start[i] != 0.0 => DECLARED * self.start[i].abs(),
+                (false, Some(shape)) => (2.0 * (self.alpha[i] - shape.low)).max(1.0 / deflection),
+                _ => SPRING_SHARE * torque / rms(unknown),
+            };
+        }
+        (mean[ZERO], std[ZERO]) = (-self.zero, zero_std);
+        std[LATE] = priors.encoder_delay * period_s;
+        let mut prior = Prior::independent(mean, &std);
+        if let Some(covariance) = self.covariance.filter(|_| self.anchored) {
+            let known = set(SPRING.start..SPRING.start + self.size);
+            let precision = inverse(&covariance, known);
+            for i in SPRING.take(self.size) {
+                prior.precision[i] = precision[i];
+            }
+        }
+        prior
+    }
+
+    /// τ_e and σ at a deflection as it is measured, with their slopes by the unknowns.
+    ///
+    /// `late_s` and `link_rate`: the position that was read late is brought up by them.
+    #[must_use]
+    pub fn at(&self, phi: f64, x: &Vector, set: Set, link_rate: f64, balance: &Balance) -> Reading {
+        let at = phi + self.zero + x[LATE] * link_rate;
+        let (mut torque, mut stiffness) = self.law.at(at, self.parameters());
+        let (mut by_torque, mut by_stiffness) = ([0.0; UNKNOWNS], [0.0; UNKNOWNS]);
+        let (mut f, mut s) = ([0.0; PARAMETERS], [0.0; PARAMETERS]);
+        self.law.jacobian(at, self.parameters(), &mut f[..self.size]);
+        let bend = self.law.stiffness_slopes(at, self.parameters(), &mut s[..self.size]);
+        by_torque[SPRING.start..SPRING.start + self.size].copy_from_slice(&f[..self.size]);
+        by_stiffness[SPRING.start..SPRING.start + self.size].copy_from_slice(&s[..self.size]);
+        (by_torque[ZERO], by_stiffness[ZERO]) = (stiffness, bend);
+        (by_torque[LATE], by_stiffness[LATE]) = (stiffness * link_rate, bend * link_rate);
+        if set & (crate::gram::set(STOPS) | crate::gram::set(CLIPS)) != 0 {
+            let (more, stiffer) = balance.extras(phi);
+            for (unknown, column) in STOPS.zip(balance::STOPS).chain(CLIPS.zip(balance::CLIPS)) {
+                (by_torque[unknown], by_stiffness[unknown]) = (more[column], stiffer[column]);
+                torque += x[unknown] * more[column];
+                stiffness += x[unknown] * stiffer[column];
+            }
+        }
+        Reading { torque, stiffness, by_torque, by_stiffness, bend }
+    }
+}
+
+/// See [`Spring::at`].
+#[derive(Clone, Debug)]
+pub struct Reading {
+    /// τ_e, N·m.
+    pub torque: f64,
+    /// σ, N·m/rad.
+    pub stiffness: f64,
+    /// Slopes of τ_e by the unknowns.
+    pub by_torque: Vector,
+    /// Slopes of σ by the unknowns.
+    pub by_stiffness: Vector,
+    /// ∂σ/∂φ, N·m/rad².
+    pub bend: f64,
+}
+
+const NODES: usize = crate::spring::NODES;
+
+fn place(row: &mut Row, coefficients: &Coefficients, sign: f64) {
+    let columns = row[balance::SPRING.start..].iter_mut();
+    columns.zip(coefficients).for_each(|(column, value)| *column += sign * value);
+}
+
+/// σ times a signal of the link, from the column `from` on.
+#[must_use]
+pub fn late(slope: &Coefficients, from: usize) -> Row {
+    let mut row = [0.0; COLUMNS];
+    row[from..from + balance::LATE.len()].copy_from_slice(&slope[TERMS..TERMS + balance::LATE.len()]);
+    row
+}

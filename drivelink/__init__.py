@@ -1,4 +1,13 @@
-"""Stiffness and flexibility torque of a variable-stiffness drive, on line, without a torque sensor."""
+"""Stiffness and flexibility torque of a variable-stiffness drive, on line, without a torque sensor.
+
+>>> fit = drivelink.fit("run.csv", joint="elbow.toml")
+>>> fit.predict("other.csv").fit_percent
+>>> fit.plot()
+>>> fit.write("better.toml")
+
+`drivelink.diagnose("suspect.csv", joint="better.toml")` names the effect that a model lacks.
+`drivelink.subscribe()` follows a daemon. SI units at the joint side; names carry their unit.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +17,11 @@ from typing import TYPE_CHECKING, Any
 from drivelink.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from drivelink.analysis import Diagnosed as Diagnosed
+    from drivelink.analysis import Fit as Fit
+    from drivelink.analysis import Picture as Picture
+    from drivelink.analysis import diagnose as diagnose
+    from drivelink.analysis import fit as fit
     from drivelink.pubsub.asyncclient import AsyncSubscription as AsyncSubscription
     from drivelink.pubsub.asyncclient import subscribe_async as subscribe_async
     from drivelink.pubsub.client import Subscription as Subscription
@@ -15,10 +29,30 @@ if TYPE_CHECKING:
     from drivelink.pubsub.feed import State as State
     from drivelink.pubsub.names import joints as joints
 
+__all__ = [
+    "AsyncSubscription",
+    "Diagnosed",
+    "Fit",
+    "Picture",
+    "State",
+    "Subscription",
+    "__version__",
+    "diagnose",
+    "fit",
+    "joints",
+    "subscribe",
+    "subscribe_async",
+]
+
 _LAZY = {  # imported when asked for, so that `import drivelink` stays cheap
     "AsyncSubscription": "drivelink.pubsub.asyncclient",
+    "Diagnosed": "drivelink.analysis",
+    "Fit": "drivelink.analysis",
+    "Picture": "drivelink.analysis",
     "State": "drivelink.pubsub.feed",
     "Subscription": "drivelink.pubsub.client",
+    "diagnose": "drivelink.analysis",
+    "fit": "drivelink.analysis",
     "joints": "drivelink.pubsub.names",
     "subscribe": "drivelink.pubsub.client",
     "subscribe_async": "drivelink.pubsub.asyncclient",

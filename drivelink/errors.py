@@ -25,6 +25,10 @@ class RecordingError(DrivelinkError):
     exit_status = 3
 
 
+class HarmfulModelError(RecordingError):
+    """A new model leaves more of the torque on held-out data than the declared one: it is not written."""
+
+
 class BusError(DrivelinkError):
     """The CAN interface is missing, down, or too slow."""
 

@@ -3,15 +3,15 @@
 python examples/close_the_loop.py [FOLDER]
 
 The simulated VSA-II, its CANopen drives and the daemon's own cycle run in this thread, faster than real time.
-What is recorded goes through `drivelink fit` and `drivelink diagnose`, as a recording of a real joint would.
+What is recorded goes through `drivelink.fit` and `drivelink.diagnose`, as a recording of a real joint would.
 """
 
 import sys
 from pathlib import Path
 
+import drivelink
 from drivelink import jointfile
 from drivelink.canopen.bus import open_bus
-from drivelink.cli import main as drivelink
 from drivelink.cycle.lockstep import run_lockstep
 from drivelink.cycle.loop import ObjectSink
 from drivelink.demo.simulate import network_from_joint, world_from_joint
@@ -61,14 +61,13 @@ def main(folder: str = "close_the_loop") -> None:
     print("recording a healthy joint, and one with dry friction …", flush=True)
     record(healthy, 10.0)
     record(suspect, 10.0, f"coulomb_friction={FRICTION_NM}")
-    for command in (
-        ["fit", healthy, "--joint", JOINT, "--out", out, "--plots", "--write", model],
-        ["diagnose", suspect, "--joint", model, "--out", out, "--write", out / "elbow-better.toml"],
-    ):
-        words = [*map(str, command), "--force"]
-        print("\n$ drivelink", *words, flush=True)
-        if status := drivelink(words):
-            sys.exit(status)
+    fit = drivelink.fit(healthy, joint=JOINT)
+    fit.plot().save(out / "fit.png")
+    fit.write(model, force=True)
+    found = drivelink.diagnose(suspect, joint=model)
+    print(found)
+    found.report(out)
+    found.write(out / "elbow-better.toml", force=True)
     print(f"\nswitched on was coulomb_friction of {FRICTION_NM} N·m; open {out / 'report.html'}")
 
 

@@ -155,7 +155,8 @@ def test_a_contact_is_raised_by_pushes_and_by_nothing_else(estimated):
         at = round(begin / T)
         assert not estimated.contact[at - 200 : at].any()
         first = int(np.argmax(estimated.contact[at : at + 400]))
-        assert estimated.contact[at + first] and first <= 35, (begin, first)  # beyond what undeclared friction may be
+        # Beyond what undeclared friction may be.
+        assert estimated.contact[at + first] and first <= 35, (begin, first)
         assert not estimated.contact[at + round((PUSH_S + 0.1) / T)]
     assert not estimated.contact[:8000].any()
 

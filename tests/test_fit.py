@@ -10,6 +10,7 @@ import pytest
 
 from drivelink import jointfile
 from drivelink.cli import main
+from drivelink.output import plots
 from drivelink.output.fitplot import fit_plot
 from estimator import EstimatorError, EstimatorSettings, Record, Status, fit, make_estimator
 from estimator.gate import judge
@@ -258,4 +259,4 @@ def test_what_is_left_shows_friction_as_a_step_and_hysteresis_as_a_loop(monkeypa
     up, down = (np.median(looping.unexplained_nm[rows]) for rows in directions)
     assert 1.0 < up - down < 2.0  # the loop is 2 N·m wide where the motion is longer than its 0.01 rad
     joint = jointfile.parse(fleetkit.JOINT.format(name="elbow"))
-    assert fit_plot([looping], joint, tmp_path / "fit.png").stat().st_size > 20_000
+    assert plots.save(fit_plot([looping], joint), tmp_path / "fit.png").stat().st_size > 20_000

@@ -4,26 +4,21 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
-from drivelink import recording
+from drivelink import analysis
 from drivelink.cli import add_recordings, require_distinct
-from drivelink.cli.gating import warned
-from drivelink.errors import RecordingError
-from drivelink.jointfile import apply_diagnosis
+from drivelink.cli.gating import warn
+from drivelink.errors import HarmfulModelError
 from drivelink.outfile import check_target
 from drivelink.output import report
 from drivelink.output.progress import Meter
 from drivelink.output.units import Units
-from drivelink.recording.columnmap import parse_column_map
 from drivelink.recording.mapping import joint_of
-from estimator.diagnosis import Diagnosis, diagnose
-from estimator.errors import EstimatorError
-from estimator.model_monitor import harm
+from estimator.diagnosis import Diagnosis
 
 EPILOG = """\
 examples:
@@ -59,45 +54,37 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Do the job; return the exit status."""
     require_distinct([*args.recording, *([args.validate] if args.validate else [])])
-    source = joint_of(args.recording[0], args.joint)
-    joint, base, names = source.joint, source.folder, parse_column_map(args.map)
+    joint_of(args.recording[0], args.joint)  # its error comes first
     inputs = [path for path in (*args.recording, args.validate, args.joint) if path is not None]
     if args.write is not None:  # the joint file itself may be brought up to date
         check_target(args.write, [path for path in inputs if path != args.joint], force=args.force)
     for name in ("report.json", "report.html"):
         check_target(args.out / name, inputs, force=True)
-    records = [recording.read(path, joint, base_dir=base, names=names) for path in args.recording]
-    notes = warned(args.recording, records, joint, strict=args.strict)
-    validation = None
-    if args.validate is not None:
-        validation = recording.read(args.validate, joint, base_dir=base, names=names)
-        notes += warned([args.validate], [validation], joint, strict=args.strict)
-    named = ", ".join(path.name for path in args.recording)
-    with Meter(f"diagnose {named}") as meter:
-        try:
-            outcome = diagnose(records, joint.model(), args.bandwidth_hz, validation, meter.stage)
-        except EstimatorError as error:
-            raise RecordingError(f"{named}: {error}") from error
-    args.out.mkdir(parents=True, exist_ok=True)
-    validated = args.validate.name if args.validate else None
-    documented = replace(outcome, notes=(*notes, *outcome.notes))
-    title = report.Title(joint.name, named, validated, joint.axis == "linear")
-    made = report.write(documented, title, args.out)
-    harmful = None
+    with Meter(f"diagnose {', '.join(path.name for path in args.recording)}") as meter:
+        found = analysis.diagnose(
+            args.recording,
+            args.joint,
+            validation=args.validate,
+            bandwidth_hz=args.bandwidth_hz,
+            names=args.map,
+            strict=args.strict,
+            warn=warn,
+            progress=meter.stage,
+        )
+    made, harmful = found.report(args.out), None
     if args.write is not None:
-        written = apply_diagnosis.diagnosed_model(joint, outcome)
-        harmful = harm(joint.model(), written, records if validation is None else [validation])
-    if args.write is not None and harmful is None:
-        apply_diagnosis.write(source, args.write, outcome, records[0], named, force=args.force)
-        made.append(args.write)
+        try:
+            made.append(found.write(args.write, force=args.force))
+        except HarmfulModelError as error:
+            harmful = error  # what was found comes first
     if args.json:
-        print(json.dumps(report.as_json(documented)))
+        print(json.dumps(found.as_json()))
     else:
-        _print(outcome, Units(title.linear))
+        _print(found.outcome, Units(found.runs.source.joint.axis == "linear"))
         for path in made:
             print(f"wrote {path}")
     if harmful is not None:
-        raise RecordingError(f"{named}: --write: {harmful}: no joint file is written")
+        raise harmful
     return 0
 
 

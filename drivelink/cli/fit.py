@@ -49,10 +49,10 @@ def run(args: argparse.Namespace) -> int:
             raise RecordingError(f"{path}: no such file")
     if args.write is not None:  # the joint file itself may be brought up to date
         check_target(args.write, args.recording, force=args.force)
-    source = joint_of(args.recording[0], args.joint)
+    joint_of(args.recording[0], args.joint)
     from drivelink.cli.fitting import fit_recording  # takes a second; check the arguments first
 
-    fit_recording(args, source, folder)
+    fit_recording(args, folder)
     return 0
 
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from drivelink.errors import UsageError
 from drivelink.jointfile import JointFile
@@ -21,13 +21,12 @@ _WIDTH = 10.0  # inches
 _IN_BIN = 15  # rows per median point of the lines through the residuals
 
 
-def fit_plot(fits: Sequence[TransmissionFit], joint: JointFile, path: Path) -> Path:
+def fit_plot(fits: Sequence[TransmissionFit], joint: JointFile) -> Figure:
     """Draw stiffness, torque and residuals of each flexible transmission; residuals show a loop or a step.
 
     Args:
         fits: one per motor.
         joint: its joint file.
-        path: of the picture.
 
     Raises:
         UsageError: every transmission is rigid.
@@ -41,7 +40,7 @@ def fit_plot(fits: Sequence[TransmissionFit], joint: JointFile, path: Path) -> P
         mine = axes[4 * row : 4 * row + 4]
         _transmission(mine[0], mine[1], one, f"motor {number}: ", units)
         _left(mine[2], mine[3], one, units)
-    return plots.save(figure, path)
+    return figure
 
 
 def _transmission(stiffness: Axes, torque: Axes, one: TransmissionFit, whose: str, units: Units) -> None:

@@ -118,6 +118,14 @@ def save(figure: Figure, path: Path) -> Path:
     return path
 
 
+def png(figure: Figure) -> bytes:
+    """The figure as a PNG picture."""
+    buffer = io.BytesIO()
+    with rc_context(STYLE):
+        figure.savefig(buffer, format="png")
+    return buffer.getvalue()
+
+
 def svg_text(figure: Figure) -> str:
     """The figure as inline SVG for an HTML page, transparent and in the page's text colour.
 

@@ -10,6 +10,7 @@ from string import Template
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from drivelink.outfile import write_whole
 from drivelink.output import plots
@@ -340,18 +341,24 @@ def _rivals_figure(outcome: Diagnosis) -> str:
 
 
 def _series_figure(outcome: Diagnosis, units: Units) -> str:
-    series = outcome.series
-    if series is None:
+    if outcome.series is None:
         return ""
+    return f"<figure>{plots.svg_text(residual_figure(outcome, units))}</figure>"
+
+
+def residual_figure(outcome: Diagnosis, units: Units) -> Figure:
+    """Measured torque, and what the model leaves of it, before and after; empty without a series."""
     figure, axes = plots.new_figure(rows=2, width=_WIDTH, height=2.2)
-    torque = units.label("torque / N·m")
+    torque, series = units.label("torque / N·m"), outcome.series
+    if series is None:
+        return figure
     plots.over_time(axes[0], {"measured": plots.PlotCurve(series.time_s, series.torque_nm)}, torque)
     curves = {
         "left before": plots.PlotCurve(series.time_s, series.before_nm),
         "left after": plots.PlotCurve(series.time_s, series.after_nm),
     }
     plots.over_time(axes[1], curves, torque)
-    return f"<figure>{plots.svg_text(figure)}</figure>"
+    return figure
 
 
 def _doubts(outcome: Diagnosis) -> str:

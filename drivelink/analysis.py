@@ -1,0 +1,385 @@
+"""Fits and diagnoses recordings from Python: `drivelink.fit`, `drivelink.diagnose`."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from drivelink import jointfile, recording
+from drivelink.errors import HarmfulModelError, RecordingError
+from drivelink.jointfile import JointText, apply_diagnosis, effect_entry, link_entry
+from drivelink.jointfile.residual_baseline import floor_entry
+from drivelink.outfile import check_target
+from drivelink.output import plots, report
+from drivelink.output.fitplot import fit_plot
+from drivelink.output.units import Units
+from drivelink.recording.columnmap import parse_column_map
+from drivelink.recording.gate import gate
+from drivelink.recording.mapping import joint_of
+from drivelink.version import __version__
+from estimator.batch import TransmissionFit
+from estimator.diagnosis import Diagnosis
+from estimator.diagnosis import diagnose as _diagnose
+from estimator.errors import EstimatorError
+from estimator.freerun import FreeRun, free_run
+from estimator.identify import Identified, identify
+from estimator.model import Motor
+from estimator.model_monitor import harm
+from estimator.sample import Record
+from estimator.transmissions import RIGID
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Paths = str | Path | Sequence[str | Path]
+Warn = Callable[[Path, Sequence[str]], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A figure that a notebook shows."""
+
+    figure: Figure
+
+    def _repr_png_(self) -> bytes:
+        return plots.png(self.figure)
+
+    def save(self, path: str | Path) -> Path:
+        """Write it in the format of the file name's ending (png, svg, pdf)."""
+        return plots.save(self.figure, Path(path))
+
+
+@dataclass(frozen=True, slots=True)
+class Runs:
+    """Recordings of one joint, as read.
+
+    Attributes:
+        source: the joint file, given or carried by the first recording.
+        paths: of the recordings.
+        records: their values.
+        notes: what the gate says of units, signs, gears and time.
+        names: columns of others under our names.
+    """
+
+    source: JointText
+    paths: tuple[Path, ...]
+    records: tuple[Record, ...]
+    notes: tuple[str, ...]
+    names: tuple[str, ...] = ()
+
+    @property
+    def named(self) -> str:
+        """The names of the files, in one line."""
+        return ", ".join(path.name for path in self.paths)
+
+    @property
+    def inputs(self) -> list[Path]:
+        """Files that no result may replace, but for the joint file."""
+        return list(self.paths)
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A joint, fitted to recordings.
+
+    Attributes:
+        runs: the recordings.
+        found: parameters in SI units at the joint side, with standard deviations.
+        bandwidth_rad_s: of the filter, if it was given.
+    """
+
+    runs: Runs
+    found: Identified
+    bandwidth_rad_s: float | None = None
+
+    def predict(self, other: str | Path, horizon_s: float | None = None) -> FreeRun:
+        """Simulate the fitted model under the motor torque of another recording (or of the same).
+
+        Args:
+            other: the recording.
+            horizon_s: time between new starts from the measured state, s; left out: as `free_run` does.
+
+        Returns:
+            Measured and simulated positions in rad, and the fit of each in %.
+
+        Raises:
+            RecordingError: it cannot be read, or the model cannot be simulated.
+        """
+        path = Path(other)
+        joint, names = self.runs.source.joint, parse_column_map(self.runs.names)
+        record = recording.read(path, joint, base_dir=self.runs.source.folder, names=names)
+        try:
+            return free_run(record, self.found.model, horizon_s)
+        except EstimatorError as error:
+            raise RecordingError(f"{path}: {error}") from error
+
+    def plot(self) -> Picture:
+        """Draw stiffness (N·m/rad), torque and residuals (N·m) of each flexible transmission.
+
+        Raises:
+            UsageError: every transmission is rigid.
+        """
+        return Picture(fit_plot(self.found.fits, self.runs.source.joint))
+
+    def write(self, target: str | Path, *, force: bool = False) -> Path:
+        """Write a copy of the joint file with the fitted numbers.
+
+        Args:
+            target: the file.
+            force: replace it if it exists.
+
+        Raises:
+            RecordingError: the motion does not determine a stiffness above zero.
+            HarmfulModelError: the declared model is better on held-out data.
+            DrivelinkError: the file exists, is an input, or cannot be written.
+        """
+        path, runs = Path(target), self.runs
+        check_target(path, runs.inputs, force=force)
+        self._require_stiffness()
+        if harmful := self._harm():
+            named = ", ".join(map(str, runs.paths))
+            raise HarmfulModelError(
+                f"{named}: --write: {harmful}: nothing is written. "
+                "`drivelink diagnose` may say what is missing"
+            )
+        spans = [float((one.sequence[-1] - one.sequence[0]) * one.period_s) for one in runs.records]
+        provenance = {
+            **floor_entry(runs.records, self.found.model, self.found.surplus),
+            "fit": {
+                "recording": runs.named,
+                "seconds": sum(spans),
+                "written": datetime.now(UTC).isoformat(timespec="seconds"),
+                "version": __version__,
+            },
+        }
+        changes = jointfile.changes_to(self.found.model) | {"provenance": provenance}
+        jointfile.write_model(runs.source, path, changes, force=force)
+        return path
+
+    def _harm(self) -> str | None:
+        """Why a fit without the last quarter is worse there than the declared model; None: it is not."""
+        declared, halves = self.runs.source.joint.model(), []
+        for one in self.runs.records:
+            last = one.sequence >= one.sequence[len(one) * 3 // 4]
+            halves.append((one.rows(~last), one.rows(last)))
+        try:
+            model = identify([kept for kept, _ in halves], declared, self.bandwidth_rad_s).model
+        except EstimatorError:  # too short to hold a part out
+            return harm(declared, self.found.model, self.runs.records)
+        return harm(declared, model, [held for _, held in halves])
+
+    def _require_stiffness(self) -> None:
+        named = ", ".join(map(str, self.runs.paths))
+        flexible = [(i, one) for i, one in enumerate(self.found.fits, start=1) if one.model != RIGID]
+        for number, one in flexible:
+            if not one.excited:
+                raise RecordingError(
+                    f"{named}: --write: expected a motion that determines the stiffness of motor {number}"
+                )
+        for number, one in flexible:
+            if not one.stiffens:
+                raise RecordingError(
+                    f"{named}: --write: expected a stiffness above zero, interval included, over all "
+                    f"deflections of the recording; that of motor {number} is not"
+                )
+
+    def as_json(self) -> dict[str, Any]:
+        """The content of fit.json."""
+        found = self.found
+        pairs = zip(found.fits, found.model.motors, strict=True)
+        document: dict[str, Any] = {"transmissions": [_entry(one, motor) for one, motor in pairs]}
+        if link := link_entry(found.model):
+            document["link"] = link
+        if found.link_std:
+            document["link_std"] = found.link_std
+        if len(self.runs.paths) > 1:
+            document["recordings"] = [
+                {"recording": path.name, "train": one.train._asdict(), "validation": one.validation._asdict()}
+                for path, one in zip(self.runs.paths, found.recordings, strict=True)
+            ]
+        if notes := [*self.runs.notes, *found.notes]:
+            document["notes"] = notes
+        return document
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosed:
+    """What a joint's model lacks.
+
+    Attributes:
+        runs: the recordings; their notes include those of the validation.
+        outcome: verdict, effects with parameters and probabilities, errors before and after in N·m.
+        validated: the held-out recording's name; None: held-out blocks.
+        held: its values.
+    """
+
+    runs: Runs
+    outcome: Diagnosis
+    validated: str | None = None
+    held: Record | None = None
+
+    def __str__(self) -> str:
+        return report.sentence(self.outcome)
+
+    @property
+    def documented(self) -> Diagnosis:
+        """The outcome with the gate's notes, as the reports have it."""
+        return replace(self.outcome, notes=(*self.runs.notes, *self.outcome.notes))
+
+    def as_json(self) -> dict[str, Any]:
+        """The content of report.json."""
+        return report.as_json(self.documented)
+
+    def report(self, folder: str | Path) -> list[Path]:
+        """Write report.json and report.html into a folder."""
+        joint, out = self.runs.source.joint, Path(folder)
+        out.mkdir(parents=True, exist_ok=True)
+        title = report.Title(joint.name, self.runs.named, self.validated, joint.axis == "linear")
+        return report.write(self.documented, title, out)
+
+    def plot(self) -> Picture:
+        """Draw what the model leaves of the motor torque over time (N·m), before and after."""
+        return Picture(report.residual_figure(self.outcome, Units(self.runs.source.joint.axis == "linear")))
+
+    def write(self, target: str | Path, *, force: bool = False) -> Path:
+        """Write a copy of the joint file with the effects found and the transmission refitted.
+
+        Args:
+            target: the file.
+            force: replace it if it exists.
+
+        Raises:
+            HarmfulModelError: the declared model is better on held-out data.
+            DrivelinkError: the file exists, is an input, or cannot be written.
+        """
+        path, runs = Path(target), self.runs
+        check_target(path, runs.inputs, force=force)
+        joint = runs.source.joint
+        written = apply_diagnosis.diagnosed_model(joint, self.outcome)
+        if harmful := harm(joint.model(), written, runs.records if self.held is None else [self.held]):
+            raise HarmfulModelError(f"{runs.named}: --write: {harmful}: no joint file is written")
+        apply_diagnosis.write(runs.source, path, self.outcome, runs.records[0], runs.named, force=force)
+        return path
+
+
+def load(
+    recordings: Paths,
+    joint: str | Path | None = None,
+    *,
+    names: Sequence[str] = (),
+    strict: bool = False,
+    warn: Warn | None = None,
+) -> Runs:
+    """Read recordings of one joint and check units, signs, gears and time; arguments as of `fit`."""
+    several = [recordings] if isinstance(recordings, str | Path) else recordings
+    paths = tuple(Path(path) for path in several)
+    if not paths:
+        raise RecordingError("expected a recording, got none")
+    source = joint_of(paths[0], None if joint is None else Path(joint))
+    columns = parse_column_map(names)
+    read = [recording.read(path, source.joint, base_dir=source.folder, names=columns) for path in paths]
+    notes: list[str] = []
+    for path, record in zip(paths, read, strict=True):
+        said = gate(path, source.joint, record, strict=strict)
+        (warn or _warn)(path, said)
+        notes += said
+    return Runs(source, paths, tuple(read), tuple(dict.fromkeys(notes)), tuple(names))
+
+
+def _warn(path: Path, lines: Sequence[str]) -> None:
+    for line in lines:
+        warnings.warn(f"{path}: {line}", stacklevel=4)
+
+
+def fit(
+    recordings: Paths,
+    joint: str | Path | None = None,
+    *,
+    bandwidth_hz: float | None = None,
+    names: Sequence[str] = (),
+    strict: bool = False,
+    warn: Warn | None = None,
+) -> Fit:
+    """Fit stiffness, inertia, damping, link, delays and friction of a joint to healthy recordings.
+
+    Args:
+        recordings: one file or several of the same joint.
+        joint: its joint file; left out: the one that the first recording carries.
+        bandwidth_hz: of the filter that all channels share, Hz; left out: chosen from the data.
+        names: columns of others, "SOURCE=COLUMN[:UNIT]", e.g. "q_link=link_position_rad:deg".
+        strict: refuse units, signs, gears or time that look wrong, instead of a warning.
+        warn: called with a recording and what looks wrong in it; left out: a Python warning.
+
+    Raises:
+        DrivelinkError: a file cannot be read, or the recordings cannot be fitted.
+    """
+    runs = load(recordings, joint, names=names, strict=strict, warn=warn)
+    bandwidth = None if bandwidth_hz is None else 2.0 * math.pi * bandwidth_hz
+    try:
+        return Fit(runs, identify(list(runs.records), runs.source.joint.model(), bandwidth), bandwidth)
+    except EstimatorError as error:
+        raise RecordingError(f"{', '.join(map(str, runs.paths))}: {error}") from error
+
+
+def diagnose(
+    recordings: Paths,
+    joint: str | Path | None = None,
+    *,
+    validation: str | Path | None = None,
+    bandwidth_hz: float | None = None,
+    names: Sequence[str] = (),
+    strict: bool = False,
+    warn: Warn | None = None,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Diagnosed:
+    """Name the physical effect that a joint's model lacks.
+
+    Args:
+        recordings: as of `fit`; so are joint, bandwidth_hz (Hz), names, strict and warn.
+        joint: the joint file that `Fit.write` made of a healthy run, for best results.
+        validation: held-out recording; left out: held-out blocks of the same ones.
+        bandwidth_hz: see recordings.
+        names: see recordings.
+        strict: see recordings.
+        warn: see recordings.
+        progress: called with the name of each stage.
+
+    Raises:
+        DrivelinkError: a file cannot be read, or the recordings cannot be diagnosed.
+    """
+    runs = load(recordings, joint, names=names, strict=strict, warn=warn)
+    held, told = None, runs.notes
+    if validation is not None:
+        other = load(validation, joint, names=names, strict=strict, warn=warn)
+        held, told = other.records[0], tuple(dict.fromkeys((*told, *other.notes)))
+    model = runs.source.joint.model()
+    try:
+        outcome = _diagnose(list(runs.records), model, bandwidth_hz, held, progress)
+    except EstimatorError as error:
+        raise RecordingError(f"{runs.named}: {error}") from error
+    validated = None if validation is None else Path(validation).name
+    return Diagnosed(replace(runs, notes=told), outcome, validated, held)
+
+
+def _entry(one: TransmissionFit, motor: Motor) -> dict[str, Any]:
+    entry: dict[str, Any] = {"model": one.model, "parameters": one.parameters, "std": one.std}
+    std = one.nuisance_std
+    entry["motor"] = {
+        "inertia_kg_m2": motor.inertia_kg_m2,
+        "viscous_damping_nm_s_rad": motor.viscous_damping_nm_s_rad,
+        "inertia_std_kg_m2": std["inertia"],
+        "viscous_damping_std_nm_s_rad": std["damping"],
+    }
+    if motor.effects:
+        entry["effects"] = [effect_entry(effect) for effect in motor.effects]
+    entry["error_rms_nm"] = one.error_rms_nm
+    entry["error_relative"] = one.error_rms_nm / one.torque_rms_nm
+    if one.model != RIGID:
+        entry["unmodelled"] = {"coulomb_nm": one.coulomb_nm, "offset_nm": one.offset_nm}
+        entry["excited"] = one.excited
+    return entry

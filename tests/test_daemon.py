@@ -413,6 +413,9 @@ class Broken:
     def suspicion(self) -> None:
         return None
 
+    def undeclared(self) -> list[list[str]]:
+        return []
+
 
 def test_an_exception_in_one_joint_takes_that_one_to_a_fault_and_the_others_go_on() -> None:
     with two_joints() as made:

@@ -236,8 +236,8 @@ def test_the_flexibility_torque_from_the_link_side_is_the_true_one(pushed):
     assert np.sqrt(np.mean(off**2)) < 0.025 * np.sqrt(np.mean(truth**2))
     assert np.sqrt(np.mean(estimated.difference[use] ** 2)) < 0.025 * np.sqrt(np.mean(truth**2))
     consistency = estimated.estimator.consistency
-    # its ten seconds begin while the spring is not yet known
-    assert consistency.difference_rms_nm < 0.05 * consistency.link_flexibility_torque_rms_nm
+    # its ten seconds begin while the spring is known to a tenth
+    assert consistency.difference_rms_nm < 0.1 * consistency.link_flexibility_torque_rms_nm
 
 
 def test_mode_paper_has_equation_13_and_the_same_external_torque(pushed):

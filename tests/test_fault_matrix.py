@@ -1,7 +1,7 @@
 """Plausible sensor faults and true changes, a bounded part of `benchmarks/fault_matrix.py`.
 
 What is called valid is right while the balance is explained by the reference parameters, or by a change of the
-joint that explains it better than a reading that is not what it was (`estimator/core/src/isolation.rs`). Wrong without
+joint that explains it better than a reading that is not what it was (`estimator/core/src/causes.rs`). Wrong without
 any flag is what is bounded most tightly (0.05 %): here that is a few tens of milliseconds before an alarm.
 """
 

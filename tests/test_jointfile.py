@@ -91,7 +91,7 @@ def test_the_contract_s_example_is_read_as_written() -> None:
         ),
         ('name = "elbow"', "", "name: expected this key, it is missing"),
         ('name = "elbow"', 'name = "el/bow"', "name: expected letters, digits"),
-        ('"robust"', '"rob"', "estimator.mode: input should be 'robust', 'paper' or 'balance', got 'rob'"),
+        ('"robust"', '"rob"', "estimator.mode: input should be 'robust' or 'paper', got 'rob'"),
         ("gravity_nm", "grav", "link.dynamics.grav: unknown key, expected one of inertia_kg_m2"),
         ('"single"', '"serial"', 'motor: expected 2 [[motor]] with arrangement = "serial", got 1'),
         ("[bus]", "[bus", "expected TOML"),

@@ -1,10 +1,18 @@
 """The service's exceptions. Each is one line for the user: what, where, what was expected."""
 
+from drivelink.plaintext import clean_text
+
+_LONGEST = 900  # characters of a message: a file's own words may be longer
+
 
 class DrivelinkError(Exception):
     """Root of everything a user can cause. `exit_status` is what the command line returns."""
 
     exit_status = 1
+
+    def __str__(self) -> str:
+        """Return the message as one line of plain text, cut off where it would fill a screen."""
+        return clean_text(super().__str__(), _LONGEST)
 
 
 class UsageError(DrivelinkError):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -363,7 +364,11 @@ def _interruptible() -> Iterator[Callable[[], None]]:
         if stopped:
             raise KeyboardInterrupt
 
-    before = {}
+    def discarded(unraisable: sys.UnraisableHookArgs) -> None:
+        if not isinstance(unraisable.exc_value, KeyboardInterrupt):  # of that one `go_on` says so
+            say(unraisable)
+
+    before, say = {}, sys.unraisablehook
     try:
         for number in (signal.SIGINT, signal.SIGTERM):
             if signal.getsignal(number) != signal.SIG_IGN:
@@ -371,8 +376,10 @@ def _interruptible() -> Iterator[Callable[[], None]]:
     except ValueError:  # not in the main thread
         yield go_on
         return
+    sys.unraisablehook = discarded
     try:
         yield go_on
     finally:
+        sys.unraisablehook = say
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -70,7 +70,9 @@ impl Blocks {
             let frame = self.spring.frame(&projection);
             let reduced = frame.reduce(&total);
             let prior = self.prior(&total, &frame, zero);
-            self.measure(&frame, &reduced, &prior, &total);
+            if step == 0 {
+                self.measure(&frame, &reduced, &prior, &total);
+            }
             let noise = self.noise.variance * self.noise.correlated;
             let Some((mut chosen, moved)) = self.choose(&frame, &reduced, &total, &prior, noise, zero) else {
                 return;
@@ -111,7 +113,9 @@ impl Blocks {
         } else {
             floor
         };
-        for _ in 0..2 {
+        // What was found a block ago is near enough to begin with.
+        let passes = if self.ring.len() > FEWEST { 1 } else { 2 };
+        for _ in 0..passes {
             let noise = self.noise.variance * self.noise.correlated;
             let Some(whole) = solve(reduced, frame.set, prior, noise) else { return };
             let residual = frame.residual(&whole.x, whole.set);

@@ -3,7 +3,7 @@
 mod solve;
 
 use crate::balance::{self, Balance};
-use crate::causes::{Cause, Explanation, Known, Noise, Odds, TABLE};
+use crate::causes::{Cause, Known, Noise, Odds, TABLE};
 use crate::gram::{Frame, Gram, Posterior, Row, Set, UNKNOWNS, Vector, dot, inverse, set};
 use crate::model::Motor;
 use crate::settings::Priors;
@@ -370,14 +370,13 @@ impl Blocks {
     /// What is known begins with the window: the unknowns that have changed are open again, the others are as before.
     fn begin(&mut self, opens: Set) {
         self.carry(opens);
-        let waiting = std::mem::take(&mut self.waiting);
         self.ring.clear();
         self.peaks.clear();
         self.oldest = 0;
-        for block in waiting {
+        for k in 0..self.waiting.len() {
+            let block = self.waiting[k].clone();
             self.keep(block);
         }
-        self.waiting.reserve(WINDOW);
         self.end_doubt();
         if opens & set(SPRING) != 0 {
             self.spring.open();
@@ -468,12 +467,6 @@ impl Blocks {
     #[must_use]
     pub fn misfit(&self) -> f64 {
         if self.posterior.is_some() { self.quick.sqrt() } else { f64::NAN }
-    }
-
-    /// What the window says of one cause; `None`: nothing is doubted.
-    #[must_use]
-    pub fn explanation(&self, cause: Cause) -> Option<&Explanation> {
-        self.odds.as_ref().map(|odds| odds.of(cause))
     }
 
     /// Names of the effects that nobody declared and evidence chose.

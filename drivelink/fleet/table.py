@@ -1,8 +1,7 @@
 """The table of results: Parquet files with one row per recording and transmission.
 
-A run writes one part, which is replaced as a whole while it grows, so that a reader never sees a row twice or
-incomplete. A later run continues a small last part, so compaction is not needed. New results of a recording
-replace the old ones.
+A run writes parts of its own, each replaced as a whole while it grows, so that a reader never sees an
+incomplete one. At its end it merges small parts and leaves out rows that newer ones replace.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ import io
 import os
 import time
 from datetime import UTC, datetime
+from itertools import compress, islice
 from typing import Any, NamedTuple, Self
 from uuid import uuid4
 
@@ -29,77 +29,45 @@ _PART_ROWS = 5000  # a part is full: about 2 MB, rewritten in some 0.1 s
 _FLUSH_S = 5.0  # finished work that a power loss may cost
 _FLUSH_SHARE = 0.05  # share of the time for writing
 
+_TEXT, _REAL, _FEW, _MANY = pa.string(), pa.float64(), pa.int16(), pa.int64()
+_TIME = pa.timestamp("us", tz="UTC")
 _NAMED = [
-    (f"{quantity}_{name}{unit}", pa.float64())
+    (f"{quantity}_{name}{unit}", _REAL)
     for name in NAMED
-    for quantity, unit in (
-        ("deflection", "_rad"),
-        ("stiffness", "_nm_rad"),
-        ("stiffness_std", "_nm_rad"),
-    )
+    for quantity, unit in (("deflection", "_rad"), ("stiffness", "_nm_rad"), ("stiffness_std", "_nm_rad"))
 ]
-SCHEMA = pa.schema(
-    [
-        ("id", pa.string()),
-        ("joint", pa.string()),
-        ("transmission", pa.int16()),
-        ("part", pa.int16()),
-        ("parts", pa.int16()),
-        ("time", pa.timestamp("us", tz="UTC")),
-        ("recording", pa.string()),
-        ("digest", pa.string()),
-        ("size_bytes", pa.int64()),
-        ("stamp", pa.string()),
-        ("status", pa.string()),
-        ("error", pa.string()),
-        ("verdict", pa.string()),
-        ("sentence", pa.string()),
-        ("effects", pa.list_(pa.string())),
-        ("details", pa.string()),
-        ("error_before_rms_nm", pa.float64()),
-        ("error_after_rms_nm", pa.float64()),
-        ("error_before_relative", pa.float64()),
-        ("error_after_relative", pa.float64()),
-        ("validated_on", pa.string()),
-        ("model", pa.string()),
-        *_NAMED,
-        ("parameters", pa.string()),
-        ("parameters_std", pa.string()),
-        ("covariance", pa.list_(pa.float64())),
-        ("inertia_kg_m2", pa.float64()),
-        ("viscous_damping_nm_s_rad", pa.float64()),
-        ("fit_error_relative", pa.float64()),
-        ("deflection_rms_rad", pa.float64()),
-        ("torque_rms_nm", pa.float64()),
-        ("excited", pa.bool_()),
-        ("duration_s", pa.float64()),
-        ("samples", pa.int64()),
-        ("period_s", pa.float64()),
-        ("accepted_model", pa.string()),
-        ("report", pa.string()),
-        ("cpu_s", pa.float64()),
-        ("wall_s", pa.float64()),
-        ("worker", pa.string()),
-        ("version", pa.string()),
-        ("written", pa.timestamp("us", tz="UTC")),
-    ]
-)
-_INDEX = ["id", "joint", "recording", "digest", "size_bytes", "stamp", "status", "version", "accepted_model"]
+SCHEMA = pa.schema([
+    ("id", _TEXT), ("joint", _TEXT), ("transmission", _FEW), ("part", _FEW), ("parts", _FEW),
+    ("time", _TIME), ("recording", _TEXT), ("digest", _TEXT), ("size_bytes", _MANY), ("stamp", _TEXT),
+    ("status", _TEXT), ("error", _TEXT), ("verdict", _TEXT), ("sentence", _TEXT),
+    ("effects", pa.list_(pa.string())), ("details", _TEXT), ("error_before_rms_nm", _REAL),
+    ("error_after_rms_nm", _REAL), ("error_before_relative", _REAL), ("error_after_relative", _REAL),
+    ("validated_on", _TEXT), ("model", _TEXT), *_NAMED, ("parameters", _TEXT),
+    ("parameters_std", _TEXT), ("covariance", pa.list_(pa.float64())), ("inertia_kg_m2", _REAL),
+    ("viscous_damping_nm_s_rad", _REAL), ("fit_error_relative", _REAL), ("deflection_rms_rad", _REAL),
+    ("torque_rms_nm", _REAL), ("excited", pa.bool_()), ("duration_s", _REAL), ("samples", _MANY),
+    ("period_s", _REAL), ("accepted_model", _TEXT), ("report", _TEXT), ("cpu_s", _REAL),
+    ("wall_s", _REAL), ("worker", _TEXT), ("version", _TEXT), ("written", _TIME),
+])  # fmt: skip
+_INDEX = [
+    "id", "joint", "recording", "digest", "size_bytes", "stamp", "status", "version", "accepted_model",
+    "written",
+]  # fmt: skip
+_Key = tuple[str, str | None]  # digest and joint
 
 
 class Known(NamedTuple):
-    """Entry of a recording in the table; `part` is the file with its rows."""
+    """Entry of a recording in the table."""
 
     digest: str
     joint: str | None
     version: str
     failed: bool
     accepted_model: str | None
-    part: str
 
 
 class FleetTable:
-    """The table, open for appending by one run, as a context manager that flushes at the end.
+    """The table, open for appending by one run, as a context manager that flushes and compacts at the end.
 
     Args:
         store: where it is.
@@ -113,20 +81,19 @@ class FleetTable:
 
     def __init__(self, store: Store) -> None:
         self.appended = 0
-        self._store = store
-        self._lock = _locked(store)
+        self._store, self._lock = store, _locked(store)
+        self._parts = store.names(FOLDER, ".parquet")
         self._by_place: dict[tuple[str, int, str], Known] = {}
-        self._by_content: dict[tuple[str, str | None], Known] = {}
-        self._stale: dict[str, set[str]] = {}  # by part: ids that a newer row replaces
-        self._ids: dict[tuple[str, str | None], list[str]] = {}
-        self._failed: dict[str, tuple[str, str | None]] = {}  # by recording: the key of its row of error
-        self._sizes: dict[int, set[tuple[str, str | None]]] = {}
-        self._now: set[tuple[str, str | None]] = set()
+        self._by_content: dict[_Key, Known] = {}
+        self._sizes: dict[int, set[_Key]] = {}
+        self._now: set[_Key] = set()
         self._rows: list[dict[str, Any]] = []
-        self._part = f"{FOLDER}/part-{datetime.now(UTC):%Y%m%dT%H%M%S%f}-{uuid4().hex[:8]}.parquet"
-        self._changed = False
+        self._part = _new_part()
         self._flushed, self._cost = time.monotonic(), 0.0
-        self._open()
+        rows = [row for part in self._parts for row in _read(store, part, _INDEX).to_pylist()]
+        for row, current in zip(rows, _current(rows), strict=True):
+            if current:
+                self._remember(row)
 
     def __enter__(self) -> Self:
         return self
@@ -134,6 +101,8 @@ class FleetTable:
     def __exit__(self, *_: object) -> None:
         try:
             self.flush()
+            if self._lock is not None:  # parts of earlier runs are changed only under the lock
+                self._compact()
         finally:
             if self._lock is not None:
                 os.close(self._lock)
@@ -147,34 +116,27 @@ class FleetTable:
         """Whether this run has appended this content as a recording of this joint."""
         return (digest, joint) in self._now
 
-    def contents(self, size: int, version: str) -> frozenset[tuple[str, str | None]]:
+    def contents(self, size: int, version: str) -> frozenset[_Key]:
         """Digest and joint of results of this version with the same size."""
-        keys = self._sizes.get(size, set())
-        return frozenset(k for k in keys if self._by_content[k].version == version)
+        return frozenset(k for k in self._sizes.get(size, ()) if self._by_content[k].version == version)
 
     def append(self, rows: list[dict[str, Any]]) -> None:
-        """Add the rows of one recording; replace those of the same content and joint.
+        """Add the rows of one recording; they replace those of the same content and joint.
 
         Raises:
             FleetError: the table cannot be written.
         """
         now = datetime.now(UTC)
-        key = (rows[0]["digest"], rows[0]["joint"])
-        self._replace(key)
-        failed = self._failed.pop(rows[0]["recording"], key)
-        if failed != key:
-            self._replace(failed)
         for row in rows:
             self._rows.append(row | {"written": now})
-            self._remember(row, self._part)
-        self._now.add(key)
+            self._remember(row)
+        self._now.add((rows[0]["digest"], rows[0]["joint"]))
         self.appended += 1
-        self._changed = True
-        if time.monotonic() - self._flushed > max(_FLUSH_S, self._cost / _FLUSH_SHARE):
+        full = len(self._rows) >= _PART_ROWS
+        if full or time.monotonic() - self._flushed > max(_FLUSH_S, self._cost / _FLUSH_SHARE):
             self.flush()
-        if len(self._rows) >= _PART_ROWS:
-            self.flush()
-            self._rows, self._part = [], _next(self._part)
+        if full:
+            self._rows, self._part = [], _new_part()
 
     def flush(self) -> None:
         """Write the appended rows.
@@ -182,83 +144,63 @@ class FleetTable:
         Raises:
             FleetError: the table cannot be written.
         """
-        if not self._changed:
+        if not self._rows:
             return
         begin = time.monotonic()
         self._store.write(self._part, _bytes(pa.Table.from_pylist(self._rows, SCHEMA)))
-        if self._lock is not None:  # other runs' parts are changed only under the lock
-            for part, ids in self._stale.items():
-                self._drop(part, ids)
-            self._stale.clear()
-        self._changed = False
+        if self._part not in self._parts:
+            self._parts.append(self._part)
         self._flushed = time.monotonic()
         self._cost = self._flushed - begin
 
-    def _open(self) -> None:
-        """Read the parts; continue the last one if it is small and not locked."""
-        newest: dict[str, tuple[datetime, str]] = {}
-        parts = self._store.names(FOLDER, ".parquet")
-        for part in parts:
-            for row in _read(self._store, part, [*_INDEX, "written"]).to_pylist():
-                before = newest.get(row["id"])
-                if before is not None and before[0] >= row["written"]:
-                    self._stale.setdefault(part, set()).add(row["id"])
-                    continue
-                if before is not None:
-                    self._stale.setdefault(before[1], set()).add(row["id"])
-                newest[row["id"]] = (row["written"], part)
-                self._remember(row, part)
-        if not parts or self._lock is None:
-            return
-        last = _read(self._store, parts[-1])
-        if last.num_rows < _PART_ROWS:
-            stale = self._stale.pop(parts[-1], set())
-            self._part = parts[-1]
-            self._rows = [row for row in last.to_pylist() if row["id"] not in stale]
-
-    def _remember(self, row: dict[str, Any], part: str) -> None:
-        known = Known(
-            row["digest"],
-            row["joint"],
-            row["version"],
-            row["status"] != "done",
-            row["accepted_model"],
-            part,
-        )
-        key = (row["digest"], row["joint"])
+    def _remember(self, row: dict[str, Any]) -> None:
+        failed = row["status"] != "done"
+        known = Known(row["digest"], row["joint"], row["version"], failed, row["accepted_model"])
         self._by_place[(row["recording"], row["size_bytes"], row["stamp"])] = known
-        self._by_content[key] = known
-        if known.failed:
-            self._failed[row["recording"]] = key
-        else:
-            self._sizes.setdefault(row["size_bytes"], set()).add(key)
-        ids = self._ids.setdefault(key, [])
-        if row["id"] not in ids:
-            ids.append(row["id"])
+        self._by_content[known[:2]] = known
+        same = self._sizes.setdefault(row["size_bytes"], set())
+        (same.discard if failed else same.add)(known[:2])
 
-    def _replace(self, key: tuple[str, str | None]) -> None:
-        """Remove the rows of a recording; from other parts at the next flush."""
-        known = self._by_content.pop(key, None)
-        if known is None:
+    def _compact(self) -> None:
+        """Rewrite the parts that are not full or have rows that were replaced; parts of other runs stay."""
+        index = [_read(self._store, part, _INDEX).to_pylist() for part in self._parts]
+        current = iter(_current([row for rows in index for row in rows]))
+        masks = [list(islice(current, len(rows))) for rows in index]
+        again = [k for k, mask in enumerate(masks) if len(mask) < _PART_ROWS or not all(mask)]
+        if len(again) < 2 and all(all(masks[k]) for k in again):
             return
-        for keys in self._sizes.values():
-            keys.discard(key)
-        ids = set(self._ids.pop(key))
-        if known.part == self._part:
-            self._rows = [row for row in self._rows if row["id"] not in ids]
-        else:
-            self._stale.setdefault(known.part, set()).update(ids)
+        kept = [_read(self._store, self._parts[k]).filter(pa.array(masks[k], pa.bool_())) for k in again]
+        whole = pa.concat_tables(kept)
+        for begin in range(0, whole.num_rows, _PART_ROWS):
+            self._store.write(_new_part(), _bytes(whole.slice(begin, _PART_ROWS)))
+        for k in again:
+            self._store.remove(self._parts[k])
 
-    def _drop(self, part: str, ids: set[str]) -> None:
-        kept = [row for row in _read(self._store, part).to_pylist() if row["id"] not in ids]
-        if kept:
-            self._store.write(part, _bytes(pa.Table.from_pylist(kept, SCHEMA)))
-        else:
-            self._store.remove(part)
+
+def _current(rows: list[dict[str, Any]]) -> list[bool]:
+    """Whether each row is the newest of its content and, if it is an error, of its recording.
+
+    Args:
+        rows: with at least the columns of `_INDEX`.
+    """
+    of_content: dict[_Key, datetime] = {}
+    of_place: dict[str, datetime] = {}
+    for row in rows:
+        key, place, written = (row["digest"], row["joint"]), row["recording"], row["written"]
+        of_content[key] = max(of_content.get(key, written), written)
+        of_place[place] = max(of_place.get(place, written), written)
+    seen: set[str] = set()  # a kill in the middle of a compaction leaves rows twice
+    found = []
+    for row in rows:
+        newest = row["written"] == of_content[row["digest"], row["joint"]]
+        newest &= row["status"] == "done" or row["written"] == of_place[row["recording"]]
+        found.append(newest and row["id"] not in seen)
+        seen |= {row["id"]} if newest else set()
+    return found
 
 
 def read_rows(store: Store, columns: list[str] | None = None) -> list[dict[str, Any]]:
-    """The rows of a table, the newest of each id, in order of time.
+    """The rows of a table, without those that were replaced, in order of time.
 
     Args:
         store: where it is.
@@ -272,15 +214,11 @@ def read_rows(store: Store, columns: list[str] | None = None) -> list[dict[str, 
         raise FleetError(
             f"{store.url}: expected a table of `drivelink fleet` ({FOLDER}/*.parquet), found none"
         )
-    names = None if columns is None else list(dict.fromkeys([*columns, "id", "time", "recording", "written"]))
-    newest: dict[str, dict[str, Any]] = {}
-    for part in parts:
-        for row in _read(store, part, names).to_pylist():
-            before = newest.get(row["id"])
-            if before is None or before["written"] <= row["written"]:
-                newest[row["id"]] = row
+    names = None if columns is None else list(dict.fromkeys([*columns, "time", *_INDEX]))
+    rows = [row for part in parts for row in _read(store, part, names).to_pylist()]
     epoch = datetime.fromtimestamp(0, UTC)
-    return sorted(newest.values(), key=lambda row: (row["time"] or epoch, row["recording"], row["id"]))
+    kept = compress(rows, _current(rows))
+    return sorted(kept, key=lambda row: (row["time"] or epoch, row["recording"], row["id"]))
 
 
 def _read(store: Store, part: str, columns: list[str] | None = None) -> Any:
@@ -306,10 +244,9 @@ def _bytes(table: Any) -> bytes:
     return sink.getvalue()
 
 
-def _next(part: str) -> str:
-    """The name of the next part; names sort in order of writing."""
-    stem, _, number = part.removesuffix(".parquet").partition("_")
-    return f"{stem}_{int(number or 0) + 1:04d}.parquet"
+def _new_part() -> str:
+    """The name of a new part; names sort in order of writing."""
+    return f"{FOLDER}/part-{datetime.now(UTC):%Y%m%dT%H%M%S%f}-{uuid4().hex[:8]}.parquet"
 
 
 def _locked(store: Store) -> int | None:

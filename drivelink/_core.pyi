@@ -3,9 +3,7 @@ from typing import Any
 
 from drivelink.canopen.layout import NodeLayout
 from drivelink.cycle.pipeline import ResidualMonitor
-from estimator._core import Estimator as _Core
-from estimator._core import ModelMonitor as _ModelMonitor
-from estimator.online import Estimator as _Estimator
+from estimator.online import Estimator
 from estimator.sample import Estimate, External, Sample
 
 LATE: int
@@ -234,12 +232,6 @@ class Tick:
     def stamped(self, stamp_ns: int) -> Tick:
         """The same at another time."""
 
-class Estimator(_Core):
-    """`estimator._core.Estimator`, as this module has it."""
-
-class ModelMonitor(_ModelMonitor):
-    """`estimator._core.ModelMonitor`, as this module has it."""
-
 class History:
     """The last samples of a joint, for a new estimator to start from; any thread may read them."""
 
@@ -278,7 +270,7 @@ class JointPipeline:
     def __init__(
         self,
         assembler: Assembler,
-        estimator: _Estimator,
+        estimator: Estimator,
         model_monitor: ResidualMonitor | None = None,
         *,
         keep: int = 0,
@@ -286,7 +278,7 @@ class JointPipeline:
     @property
     def assembler(self) -> Assembler: ...
     @property
-    def estimator(self) -> _Estimator: ...
+    def estimator(self) -> Estimator: ...
     @property
     def model_monitor(self) -> ResidualMonitor | None: ...
     @property

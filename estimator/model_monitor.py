@@ -175,7 +175,6 @@ class ModelMonitor:
         period_s: of the samples.
         baseline: residual of the model at its fit; None: only measure.
         false_alarms_per_hour: that a sufficient model may raise.
-        core: the compiled class to use; each extension module calls its own without going through Python.
 
     Raises:
         EstimatorError: the model contradicts itself.
@@ -187,12 +186,11 @@ class ModelMonitor:
         period_s: float,
         baseline: ResidualBaseline | None,
         false_alarms_per_hour: float = _SETTINGS.false_alarms_per_hour,
-        core: type[_core.ModelMonitor] = _core.ModelMonitor,
     ) -> None:
         arguments = None
         if baseline is not None:
             arguments = (baseline.residual_nm, baseline.torque_nm, baseline.log_std, baseline.seconds)
-        self.core = core(model, period_s, arguments, false_alarms_per_hour)
+        self.core = _core.ModelMonitor(model, period_s, arguments, false_alarms_per_hour)
         self.baseline = baseline if self.core.monitoring else None
 
     def step(self, sample: Sample, estimate: Estimate, residual_nm: float) -> bool:

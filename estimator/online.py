@@ -69,14 +69,8 @@ class Estimator(Protocol):
 class _Compiled:
     """`estimator._core.Estimator` with parameters by their names."""
 
-    def __init__(
-        self,
-        model: JointModel,
-        settings: EstimatorSettings,
-        period_s: float,
-        core: type[_core.Estimator],
-    ) -> None:
-        self.core = core(model, settings, period_s)
+    def __init__(self, model: JointModel, settings: EstimatorSettings, period_s: float) -> None:
+        self.core = _core.Estimator(model, settings, period_s)
         self._model = model
         self._asked = settings.valid_within
         self.step = self.core.step
@@ -177,22 +171,16 @@ def _in_words(signal: str, motor: int, reason: str, amount: float, std: float) -
     return f"{which}: {why}"
 
 
-def make_estimator(
-    model: JointModel,
-    settings: EstimatorSettings,
-    period_s: float,
-    core: type[_core.Estimator] = _core.Estimator,
-) -> Estimator:
+def make_estimator(model: JointModel, settings: EstimatorSettings, period_s: float) -> Estimator:
     """Make the estimator that the settings select.
 
     Args:
         model: of the joint.
         settings: mode, gains and bandwidths.
         period_s: of the samples.
-        core: the compiled class to use; each extension module calls its own without going through Python.
 
     Raises:
         EstimatorError: the model names a transmission that does not exist, or contradicts itself.
     """
     require_finite(0.0, strict=True, period_s=period_s)
-    return _Compiled(model, settings, period_s, core)
+    return _Compiled(model, settings, period_s)

@@ -1,4 +1,4 @@
-"""What is installed: the compiled core of the same version, and every file that the package reads."""
+"""What is installed: one compiled core of the same version, and every file that the package reads."""
 
 from __future__ import annotations
 
@@ -13,9 +13,14 @@ import estimator._core
 ROOT = Path(__file__).parent.parent
 
 
-def test_the_core_is_of_the_version_of_the_package() -> None:
-    assert drivelink._core.__version__ == estimator._core.__version__ == drivelink.__version__
-    assert version("drivelink-vsa") == drivelink.__version__
+def test_the_one_core_is_of_the_version_of_the_package() -> None:
+    assert estimator._core.__version__ == drivelink.__version__ == version("drivelink-vsa")
+    configured = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"][
+        "setuptools-rust"
+    ]
+    assert [module["target"] for module in configured["ext-modules"]] == ["estimator._core"]
+    named = vars(drivelink._core)
+    assert all(named[name] is getattr(estimator._core, name) for name in drivelink._core.__all__)
 
 
 def test_every_data_file_of_the_packages_is_in_the_wheel() -> None:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from typing import Any, Protocol
 
-from drivelink import _core
 from drivelink._core import Assembler, JointPipeline
 from drivelink.canopen.layout import NodeLayout
 from drivelink.errors import DriveError
@@ -34,7 +33,7 @@ Built = tuple[Estimator, ResidualMonitor | None]
 
 def build(joint: JointFile) -> Built:
     """Make estimator and model monitor of a joint."""
-    estimator = make_estimator(joint.model(), joint.estimator, joint.bus.period_s, core=_core.Estimator)
+    estimator = make_estimator(joint.model(), joint.estimator, joint.bus.period_s)
     return estimator, make_model_monitor(joint)
 
 

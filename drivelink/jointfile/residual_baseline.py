@@ -6,7 +6,6 @@ import logging
 from collections.abc import Sequence
 from typing import Any
 
-from drivelink import _core
 from drivelink.jointfile import JointFile
 from estimator.errors import EstimatorError
 from estimator.model import JointModel
@@ -38,4 +37,4 @@ def make_model_monitor(joint: JointFile) -> ModelMonitor | None:
     if baseline is None or not can_monitor(model):
         return None
     rate = joint.estimator.false_alarms_per_hour
-    return ModelMonitor(model, joint.bus.period_s, baseline, rate, core=_core.ModelMonitor)
+    return ModelMonitor(model, joint.bus.period_s, baseline, rate)

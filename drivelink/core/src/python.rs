@@ -1,4 +1,4 @@
-//! The Python module `drivelink._core`: `Assembler`, `JointPipeline` and their results.
+//! The extension module: `estimator._core`, with `drivelink._core`'s `Assembler`, `JointPipeline` and their results.
 
 mod assembler;
 mod latency;
@@ -23,8 +23,7 @@ fn to_python(failure: Failure) -> PyErr {
     }
 }
 
-/// What `drivelink._core` offers.
-#[cfg(feature = "extension-module")]
+/// What the one extension offers; `drivelink/_core.py` names the service's part of it.
 #[pymodule(name = "_core")]
 mod extension {
     use pyo3::prelude::*;
@@ -40,11 +39,14 @@ mod extension {
     #[pymodule_export]
     use crate::node::Counters;
     #[pymodule_export]
-    use estimator_core::python::{Estimator, ModelMonitor};
+    use estimator_core::python::{
+        Estimator, ModelMonitor, OnlineEffects, TransmissionLaw, effect_kinds, effect_terms,
+    };
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
         module.add("LATE", crate::assembler::LATE)?;
+        module.add("STOP_EXPONENT", estimator_core::memory::STOP_EXPONENT)?;
         module.add("SYNC_COB_ID", crate::assembler::SYNC_COB_ID)?;
         module.add("__version__", env!("CARGO_PKG_VERSION"))
     }

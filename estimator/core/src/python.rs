@@ -1,10 +1,11 @@
 //! The Python binding: converts objects of `estimator.model` and `estimator.settings`.
 //!
-//! `drivelink._core` uses the conversions too.
+//! Its classes and functions are exported by the one extension module, see `drivelink/core`.
 
 use std::fmt;
 use std::sync::Arc;
 
+use pyo3::buffer::PyBuffer;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
@@ -13,7 +14,8 @@ use pyo3::types::{PyDict, PyTuple, PyType};
 use crate::effects::{Coordinates, Element, JointEffects};
 use crate::error::Error;
 use crate::external::External;
-use crate::laws::{Foreign, Law, Shape, Table};
+use crate::laws::{Foreign, Law, PARAMETERS, Shape, Table};
+use crate::library::{self, LIBRARY, Parameter, Role};
 use crate::model::{Arrangement, Link, Model, Motor, Transmission};
 use crate::model_monitor::Baseline;
 use crate::sample::{Estimate, MOTORS, Sample, TransmissionEstimate};
@@ -610,190 +612,152 @@ impl ModelMonitor {
     }
 }
 
-/// What `estimator._core` offers.
-#[cfg(feature = "extension-module")]
-#[pyo3::pymodule(name = "_core")]
-mod extension {
-    use pyo3::buffer::PyBuffer;
-    use pyo3::exceptions::PyValueError;
-    use pyo3::prelude::*;
+type EffectParameter = (&'static str, &'static str, bool, Option<f64>);
+type EffectKind =
+    (&'static str, &'static str, &'static str, Vec<&'static str>, Vec<EffectParameter>, bool, &'static str);
 
-    use crate::laws::{Law, PARAMETERS};
-    use crate::library::{Coordinates, Element, LIBRARY, Parameter, Role};
+/// A transmission's law over arrays of float64; α as `estimator.flexibility` has it.
+#[pyclass(frozen)]
+pub struct TransmissionLaw {
+    law: Law,
+}
 
-    #[pymodule_export]
-    use super::{Estimator, ModelMonitor, OnlineEffects};
+fn slice(py: Python<'_>, buffer: &PyBuffer<f64>) -> PyResult<Vec<f64>> {
+    buffer.to_vec(py)
+}
 
-    type EffectParameter = (&'static str, &'static str, bool, Option<f64>);
-    type EffectKind = (
-        &'static str,
-        &'static str,
-        &'static str,
-        Vec<&'static str>,
-        Vec<EffectParameter>,
-        bool,
-        &'static str,
-    );
+fn check(law: &Law, alpha: &[f64]) -> PyResult<()> {
+    let (got, expected) = (alpha.len(), 1 + law.shapes().len());
+    let fits = if law.is_polynomial() { (1..=PARAMETERS).contains(&got) } else { got == expected };
+    if fits { Ok(()) } else { Err(PyValueError::new_err(format!("alpha: got {got} numbers"))) }
+}
 
-    #[pymodule_init]
-    fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
-        module.add("STOP_EXPONENT", crate::memory::STOP_EXPONENT)?;
-        module.add("__version__", env!("CARGO_PKG_VERSION"))
+#[pymethods]
+impl TransmissionLaw {
+    /// By its name: linear, polynomial, vsa-ii, exponential.
+    #[new]
+    fn new(name: &str) -> PyResult<TransmissionLaw> {
+        let unknown = || PyValueError::new_err(format!("law: expected a known name, got {name}"));
+        Ok(TransmissionLaw { law: Law::named(name).ok_or_else(unknown)? })
     }
 
-    /// A transmission's law over arrays of float64; α as `estimator.flexibility` has it.
-    #[pyclass(frozen)]
-    struct TransmissionLaw {
-        law: Law,
+    /// An odd curve through points, see `estimator.flexibility.Table`.
+    #[staticmethod]
+    fn table(deflection: Vec<f64>, torque: Vec<f64>) -> PyResult<TransmissionLaw> {
+        Ok(TransmissionLaw { law: tabulated(&deflection, &torque)? })
     }
 
-    fn slice(py: Python<'_>, buffer: &PyBuffer<f64>) -> PyResult<Vec<f64>> {
-        buffer.to_vec(py)
+    /// (least, largest, usual value) of each of its shape parameters.
+    #[getter]
+    fn shapes(&self) -> Vec<(f64, f64, f64)> {
+        self.law.shapes().iter().map(|shape| (shape.low, shape.high, shape.start)).collect()
     }
 
-    fn check(law: &Law, alpha: &[f64]) -> PyResult<()> {
-        let (got, expected) = (alpha.len(), 1 + law.shapes().len());
-        let fits = if law.is_polynomial() { (1..=PARAMETERS).contains(&got) } else { got == expected };
-        if fits { Ok(()) } else { Err(PyValueError::new_err(format!("alpha: got {got} numbers"))) }
-    }
-
-    #[pymethods]
-    impl TransmissionLaw {
-        /// By its name: linear, polynomial, vsa-ii, exponential.
-        #[new]
-        fn new(name: &str) -> PyResult<TransmissionLaw> {
-            let unknown = || PyValueError::new_err(format!("law: expected a known name, got {name}"));
-            Ok(TransmissionLaw { law: Law::named(name).ok_or_else(unknown)? })
-        }
-
-        /// An odd curve through points, see `estimator.flexibility.Table`.
-        #[staticmethod]
-        fn table(deflection: Vec<f64>, torque: Vec<f64>) -> PyResult<TransmissionLaw> {
-            Ok(TransmissionLaw { law: super::tabulated(&deflection, &torque)? })
-        }
-
-        /// (least, largest, usual value) of each of its shape parameters.
-        #[getter]
-        fn shapes(&self) -> Vec<(f64, f64, f64)> {
-            self.law.shapes().iter().map(|shape| (shape.low, shape.high, shape.start)).collect()
-        }
-
-        /// Torque and stiffness at each φ into arrays of its size.
-        fn evaluate(
-            &self,
-            py: Python<'_>,
-            phi: PyBuffer<f64>,
-            alpha: Vec<f64>,
-            torque: PyBuffer<f64>,
-            stiffness: PyBuffer<f64>,
-        ) -> PyResult<()> {
-            check(&self.law, &alpha)?;
-            let phi = slice(py, &phi)?;
-            let (mut values, mut slopes) = (vec![0.0; phi.len()], vec![0.0; phi.len()]);
-            self.law.along(&phi, &alpha, &mut values, &mut slopes);
-            torque.copy_from_slice(py, &values)?;
-            stiffness.copy_from_slice(py, &slopes)
-        }
-
-        /// ∂f/∂α at each φ into an array (size of φ, size of α).
-        fn jacobian(
-            &self,
-            py: Python<'_>,
-            phi: PyBuffer<f64>,
-            alpha: Vec<f64>,
-            out: PyBuffer<f64>,
-        ) -> PyResult<()> {
-            check(&self.law, &alpha)?;
-            let phi = slice(py, &phi)?;
-            let mut rows = vec![0.0; phi.len() * alpha.len()];
-            self.law.jacobian_along(&phi, &alpha, &mut rows);
-            out.copy_from_slice(py, &rows)
-        }
-
-        /// ∂σ/∂α at each φ into an array (size of φ, size of α).
-        fn stiffness_jacobian(
-            &self,
-            py: Python<'_>,
-            phi: PyBuffer<f64>,
-            alpha: Vec<f64>,
-            out: PyBuffer<f64>,
-        ) -> PyResult<()> {
-            check(&self.law, &alpha)?;
-            let phi = slice(py, &phi)?;
-            let mut rows = vec![0.0; phi.len() * alpha.len()];
-            for (phi, row) in phi.iter().zip(rows.chunks_exact_mut(alpha.len().max(1))) {
-                self.law.stiffness_slopes(*phi, &alpha, row);
-            }
-            out.copy_from_slice(py, &rows)
-        }
-
-        /// (torque, stiffness) at one φ.
-        fn at(&self, phi: f64, alpha: Vec<f64>) -> PyResult<(f64, f64)> {
-            check(&self.law, &alpha)?;
-            Ok(self.law.at(phi, &alpha))
-        }
-
-        /// Largest |φ| for which it is defined, rad.
-        fn reach(&self, shape: Vec<f64>) -> f64 {
-            if shape.len() == self.law.shapes().len() { self.law.reach(&shape) } else { f64::INFINITY }
-        }
-    }
-
-    /// (name, location, channel, coordinates, parameters, whether it remembers, description) of every effect.
-    #[pyfunction]
-    fn effect_kinds() -> Vec<EffectKind> {
-        let parameter = |p: &Parameter| (p.name, p.meaning, p.role == Role::Linear, p.default);
-        (LIBRARY.iter())
-            .map(|kind| {
-                let (location, channel) = kind.place.names();
-                let parameters = kind.parameters.iter().map(parameter).collect();
-                let remembers = matches!(kind.law, crate::library::Law::Memory { .. });
-                (
-                    kind.name,
-                    location,
-                    channel,
-                    kind.coordinates.to_vec(),
-                    parameters,
-                    remembers,
-                    kind.description,
-                )
-            })
-            .collect()
-    }
-
-    /// The terms of one element of an effect, unweighted, over consecutive moments.
-    ///
-    /// `coordinates`: those that the effect names, each of n numbers or of one; `out`: n numbers a term.
-    #[pyfunction]
-    fn effect_terms(
+    /// Torque and stiffness at each φ into arrays of its size.
+    fn evaluate(
+        &self,
         py: Python<'_>,
-        name: &str,
-        values: Vec<f64>,
-        coordinates: Vec<PyBuffer<f64>>,
+        phi: PyBuffer<f64>,
+        alpha: Vec<f64>,
+        torque: PyBuffer<f64>,
+        stiffness: PyBuffer<f64>,
+    ) -> PyResult<()> {
+        check(&self.law, &alpha)?;
+        let phi = slice(py, &phi)?;
+        let (mut values, mut slopes) = (vec![0.0; phi.len()], vec![0.0; phi.len()]);
+        self.law.along(&phi, &alpha, &mut values, &mut slopes);
+        torque.copy_from_slice(py, &values)?;
+        stiffness.copy_from_slice(py, &slopes)
+    }
+
+    /// ∂f/∂α at each φ into an array (size of φ, size of α).
+    fn jacobian(
+        &self,
+        py: Python<'_>,
+        phi: PyBuffer<f64>,
+        alpha: Vec<f64>,
         out: PyBuffer<f64>,
     ) -> PyResult<()> {
-        let element = Element::new(name, &values)?;
-        let names = element.kind.coordinates;
-        let fields: Vec<_> = coordinates.iter().map(|field| slice(py, field)).collect::<PyResult<_>>()?;
-        let n = fields.iter().map(Vec::len).max().unwrap_or(0);
-        let terms = element.kind.terms();
-        let alike = fields.iter().all(|field| field.len() == n || field.len() == 1);
-        if !alike || fields.len() != names.len() || n == 0 || out.item_count() != n * terms {
-            return Err(PyValueError::new_err(format!(
-                "coordinates: expected arrays of one size: {names:?}"
-            )));
-        }
-        let places: Vec<usize> =
-            names.iter().filter_map(|name| Coordinates::NAMES.iter().position(|one| one == name)).collect();
-        let mut c = Coordinates::default();
-        let moments = (0..n).map(|k| {
-            for (place, field) in places.iter().zip(&fields) {
-                c.set(*place, if field.len() == 1 { field[0] } else { field[k] });
-            }
-            c
-        });
-        let mut result = vec![0.0; n * terms];
-        element.along(moments, &mut result.chunks_exact_mut(n).collect::<Vec<_>>());
-        out.copy_from_slice(py, &result)
+        check(&self.law, &alpha)?;
+        let phi = slice(py, &phi)?;
+        let mut rows = vec![0.0; phi.len() * alpha.len()];
+        self.law.jacobian_along(&phi, &alpha, &mut rows);
+        out.copy_from_slice(py, &rows)
     }
+
+    /// ∂σ/∂α at each φ into an array (size of φ, size of α).
+    fn stiffness_jacobian(
+        &self,
+        py: Python<'_>,
+        phi: PyBuffer<f64>,
+        alpha: Vec<f64>,
+        out: PyBuffer<f64>,
+    ) -> PyResult<()> {
+        check(&self.law, &alpha)?;
+        let phi = slice(py, &phi)?;
+        let mut rows = vec![0.0; phi.len() * alpha.len()];
+        for (phi, row) in phi.iter().zip(rows.chunks_exact_mut(alpha.len().max(1))) {
+            self.law.stiffness_slopes(*phi, &alpha, row);
+        }
+        out.copy_from_slice(py, &rows)
+    }
+
+    /// (torque, stiffness) at one φ.
+    fn at(&self, phi: f64, alpha: Vec<f64>) -> PyResult<(f64, f64)> {
+        check(&self.law, &alpha)?;
+        Ok(self.law.at(phi, &alpha))
+    }
+
+    /// Largest |φ| for which it is defined, rad.
+    fn reach(&self, shape: Vec<f64>) -> f64 {
+        if shape.len() == self.law.shapes().len() { self.law.reach(&shape) } else { f64::INFINITY }
+    }
+}
+
+/// (name, location, channel, coordinates, parameters, whether it remembers, description) of every effect.
+#[pyfunction]
+pub fn effect_kinds() -> Vec<EffectKind> {
+    let parameter = |p: &Parameter| (p.name, p.meaning, p.role == Role::Linear, p.default);
+    (LIBRARY.iter())
+        .map(|kind| {
+            let (location, channel) = kind.place.names();
+            let parameters = kind.parameters.iter().map(parameter).collect();
+            let remembers = matches!(kind.law, library::Law::Memory { .. });
+            (kind.name, location, channel, kind.coordinates.to_vec(), parameters, remembers, kind.description)
+        })
+        .collect()
+}
+
+/// The terms of one element of an effect, unweighted, over consecutive moments.
+///
+/// `coordinates`: those that the effect names, each of n numbers or of one; `out`: n numbers a term.
+#[pyfunction]
+pub fn effect_terms(
+    py: Python<'_>,
+    name: &str,
+    values: Vec<f64>,
+    coordinates: Vec<PyBuffer<f64>>,
+    out: PyBuffer<f64>,
+) -> PyResult<()> {
+    let element = Element::new(name, &values)?;
+    let names = element.kind.coordinates;
+    let fields: Vec<_> = coordinates.iter().map(|field| slice(py, field)).collect::<PyResult<_>>()?;
+    let n = fields.iter().map(Vec::len).max().unwrap_or(0);
+    let terms = element.kind.terms();
+    let alike = fields.iter().all(|field| field.len() == n || field.len() == 1);
+    if !alike || fields.len() != names.len() || n == 0 || out.item_count() != n * terms {
+        return Err(PyValueError::new_err(format!("coordinates: expected arrays of one size: {names:?}")));
+    }
+    let places: Vec<usize> =
+        names.iter().filter_map(|name| Coordinates::NAMES.iter().position(|one| one == name)).collect();
+    let mut c = Coordinates::default();
+    let moments = (0..n).map(|k| {
+        for (place, field) in places.iter().zip(&fields) {
+            c.set(*place, if field.len() == 1 { field[0] } else { field[k] });
+        }
+        c
+    });
+    let mut result = vec![0.0; n * terms];
+    element.along(moments, &mut result.chunks_exact_mut(n).collect::<Vec<_>>());
+    out.copy_from_slice(py, &result)
 }

@@ -4,105 +4,40 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from enum import StrEnum
+
+from canopen.profiles.p402 import State402
 
 _EMCY = struct.Struct("<HB5s")
 
 # Error codes of CiA 301 (table 26) and CiA 402-2 (annex); the most specific entry that matches is taken.
-_CODES = {
-    0x0000: "error reset or no error",
-    0x1000: "generic error",
-    0x2000: "current",
-    0x2100: "current, device input side",
-    0x2200: "current inside the device",
-    0x2250: "continuous overcurrent inside the device",
-    0x2300: "current, device output side",
-    0x2310: "continuous overcurrent",
-    0x2311: "continuous overcurrent no. 1",
-    0x2312: "continuous overcurrent no. 2",
-    0x2320: "short circuit or earth leakage",
-    0x2330: "earth leakage",
-    0x2340: "short circuit",
-    0x2350: "load level (I²t, thermal state)",
-    0x3000: "voltage",
-    0x3100: "mains voltage",
-    0x3110: "mains overvoltage",
-    0x3120: "mains undervoltage",
-    0x3130: "phase failure",
-    0x3200: "voltage inside the device",
-    0x3210: "DC link overvoltage",
-    0x3211: "overvoltage no. 1",
-    0x3212: "overvoltage no. 2",
-    0x3220: "DC link undervoltage",
-    0x3221: "undervoltage no. 1",
-    0x3222: "undervoltage no. 2",
-    0x3300: "output voltage",
-    0x4000: "temperature",
-    0x4100: "ambient temperature",
-    0x4200: "device temperature",
-    0x4210: "excess temperature of the device",
-    0x4220: "too low temperature of the device",
-    0x4300: "drive temperature",
-    0x4310: "excess temperature of the drive",
-    0x5000: "device hardware",
-    0x5100: "supply",
-    0x5112: "supply, low voltage +24 V",
-    0x5113: "supply, low voltage +5 V",
-    0x5200: "control hardware",
-    0x5300: "operating unit",
-    0x5400: "power section",
-    0x5441: "contactor",
-    0x5500: "data storage",
-    0x5530: "non-volatile memory",
-    0x6000: "device software",
-    0x6010: "software reset (watchdog)",
-    0x6100: "internal software",
-    0x6200: "user software",
-    0x6300: "data set",
-    0x6320: "parameter error",
-    0x7000: "additional modules",
-    0x7100: "power modules",
-    0x7110: "brake chopper",
-    0x7120: "motor",
-    0x7121: "motor blocked",
-    0x7122: "motor error or commutation malfunction",
-    0x7200: "measurement circuit",
-    0x7300: "sensor",
-    0x7303: "resolver 1",
-    0x7304: "resolver 2",
-    0x7305: "incremental sensor 1",
-    0x7306: "incremental sensor 2",
-    0x7310: "speed sensor",
-    0x7320: "position sensor",
-    0x7400: "computation circuit",
-    0x7500: "communication",
-    0x7600: "data storage, external",
-    0x8000: "monitoring",
-    0x8100: "communication",
-    0x8110: "CAN overrun, objects lost",
-    0x8120: "CAN in error passive mode",
-    0x8130: "life guard or heartbeat error",
-    0x8140: "recovered from bus-off",
-    0x8150: "CAN-ID collision",
-    0x8200: "protocol error",
-    0x8210: "PDO not processed because of its length",
-    0x8220: "PDO length exceeded",
-    0x8230: "DAM MPDO not processed",
-    0x8240: "unexpected SYNC data length",
-    0x8250: "RPDO timeout",
-    0x8300: "torque control",
-    0x8311: "excess torque",
-    0x8400: "velocity control",
-    0x8500: "position control",
-    0x8600: "positioning control",
-    0x8611: "following error",
-    0x8612: "reference limit",
-    0x8700: "SYNC control",
-    0x8A00: "excess deceleration or velocity",
-    0x9000: "external error",
-    0xF000: "additional functions",
-    0xF001: "deceleration",
-}
+_TABLE = """
+0000 error reset or no error; 1000 generic error; 2000 current; 2100 current, device input side;
+2200 current inside the device; 2250 continuous overcurrent inside the device;
+2300 current, device output side; 2310 continuous overcurrent; 2311 continuous overcurrent no. 1;
+2312 continuous overcurrent no. 2; 2320 short circuit or earth leakage; 2330 earth leakage;
+2340 short circuit; 2350 load level (I²t, thermal state); 3000 voltage; 3100 mains voltage;
+3110 mains overvoltage; 3120 mains undervoltage; 3130 phase failure; 3200 voltage inside the device;
+3210 DC link overvoltage; 3211 overvoltage no. 1; 3212 overvoltage no. 2; 3220 DC link undervoltage;
+3221 undervoltage no. 1; 3222 undervoltage no. 2; 3300 output voltage; 4000 temperature;
+4100 ambient temperature; 4200 device temperature; 4210 excess temperature of the device;
+4220 too low temperature of the device; 4300 drive temperature; 4310 excess temperature of the drive;
+5000 device hardware; 5100 supply; 5112 supply, low voltage +24 V; 5113 supply, low voltage +5 V;
+5200 control hardware; 5300 operating unit; 5400 power section; 5441 contactor; 5500 data storage;
+5530 non-volatile memory; 6000 device software; 6010 software reset (watchdog); 6100 internal software;
+6200 user software; 6300 data set; 6320 parameter error; 7000 additional modules; 7100 power modules;
+7110 brake chopper; 7120 motor; 7121 motor blocked; 7122 motor error or commutation malfunction;
+7200 measurement circuit; 7300 sensor; 7303 resolver 1; 7304 resolver 2; 7305 incremental sensor 1;
+7306 incremental sensor 2; 7310 speed sensor; 7320 position sensor; 7400 computation circuit;
+7500 communication; 7600 data storage, external; 8000 monitoring; 8100 communication;
+8110 CAN overrun, objects lost; 8120 CAN in error passive mode; 8130 life guard or heartbeat error;
+8140 recovered from bus-off; 8150 CAN-ID collision; 8200 protocol error;
+8210 PDO not processed because of its length; 8220 PDO length exceeded; 8230 DAM MPDO not processed;
+8240 unexpected SYNC data length; 8250 RPDO timeout; 8300 torque control; 8311 excess torque;
+8400 velocity control; 8500 position control; 8600 positioning control; 8611 following error;
+8612 reference limit; 8700 SYNC control; 8A00 excess deceleration or velocity; 9000 external error;
+F000 additional functions; F001 deceleration
+"""
+_CODES = {int(row[:4], 16): row[5:] for row in _TABLE.strip().replace("\n", " ").split("; ")}
 _REGISTER = ("generic", "current", "voltage", "temperature", "communication", "profile", "reserved", "vendor")
 
 
@@ -149,35 +84,7 @@ def parse_emergency(data: bytes) -> Emergency | None:
     return Emergency(*_EMCY.unpack(bytes(data[:8]).ljust(8, b"\0")))
 
 
-class DriveState(StrEnum):
-    """States of the power drive system (CiA 402-2, table 30)."""
-
-    NOT_READY = "not ready to switch on"
-    SWITCH_ON_DISABLED = "switch on disabled"
-    READY = "ready to switch on"
-    SWITCHED_ON = "switched on"
-    ENABLED = "operation enabled"
-    QUICK_STOP = "quick stop active"
-    FAULT_REACTION = "fault reaction active"
-    FAULT = "fault"
-    UNKNOWN = "unknown"
-
-
-_STATES = (
-    (0x4F, 0x00, DriveState.NOT_READY),
-    (0x4F, 0x40, DriveState.SWITCH_ON_DISABLED),
-    (0x6F, 0x21, DriveState.READY),
-    (0x6F, 0x23, DriveState.SWITCHED_ON),
-    (0x6F, 0x27, DriveState.ENABLED),
-    (0x6F, 0x07, DriveState.QUICK_STOP),
-    (0x4F, 0x0F, DriveState.FAULT_REACTION),
-    (0x4F, 0x08, DriveState.FAULT),
-)
-
-
-def drive_state(statusword: int) -> DriveState:
-    """The state in a statusword; bits that toggle or belong to modes are ignored."""
-    for mask, value, state in _STATES:
-        if statusword & mask == value:
-            return state
-    return DriveState.UNKNOWN
+def drive_state(statusword: int) -> str:
+    """The state in a statusword (CiA 402-2, table 30); bits that toggle or belong to modes are ignored."""
+    masks = State402.SW_MASK.items()
+    return next((name.lower() for name, (mask, value) in masks if statusword & mask == value), "unknown")

@@ -79,7 +79,7 @@ class WatchedNode:
         return {
             "state": self.state_text,
             "heartbeat_age_s": age_s if self.layout.heartbeat_ms else None,
-            "drive_state": str(drive_state(word)) if word is not None else None,
+            "drive_state": drive_state(word) if word is not None else None,
             "internal_limit": word is not None and bool(word & _LIMIT),
             "fault": node in faults,
             "emergency": f"0x{faults[node]:04X}" if faults.get(node) else None,

@@ -13,8 +13,7 @@ import os
 import re
 import types
 import typing
-from collections.abc import Callable, Iterable, Mapping
-from enum import IntFlag
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 
@@ -24,13 +23,13 @@ from pydantic_core import PydanticUndefined
 
 from drivelink import cli, jointfile
 from drivelink.jointfile import schema
-from drivelink.pubsub.wire import ESTIMATE, EXTERNAL, EXTERNAL_BITS, SAMPLE, STATUS_BITS, Field, Layout
+from drivelink.pubsub.wire import ESTIMATE, EXTERNAL, SAMPLE, Field, Layout
 from estimator.effects import LIBRARY
 from estimator.errors import EstimatorError
 from estimator.flexibility import TransmissionModel
 from estimator.ranges import range_of
 from estimator.reasons import REASONS
-from estimator.sample import ExternalStatus, Status
+from estimator.sample import Bits, ExternalStatus, Status
 from estimator.transmissions import MODELS
 from sim.effects import LISTED, UNLISTED, Definition
 
@@ -257,12 +256,12 @@ def _row(offset: str, field: Field, prefix: str = "") -> str:
     return f"| {offset} | {field.type} | `{prefix}{field.name}` | {field.meaning} |"
 
 
-def bits_table(flags: type[IntFlag], meanings: Mapping[str, str]) -> str:
+def bits_table(flags: type[Bits]) -> str:
     """One row a status bit."""
     rows = ["| bit | mask | name | meaning |", "|---|---|---|---|"]
-    for name, meaning in meanings.items():
-        bit = flags[name]
-        rows.append(f"| {bit.bit_length() - 1} | 0x{int(bit):03X} | {name.lower()} | {meaning} |")
+    for bit in flags:
+        name = str(bit.name).lower()
+        rows.append(f"| {bit.bit_length() - 1} | 0x{int(bit):03X} | {name} | {bit.meaning} |")
     return "\n".join(rows)
 
 
@@ -338,9 +337,9 @@ PARTS: dict[str, Callable[[], str]] = {
     "estimate": partial(layout_table, ESTIMATE),
     "external": partial(layout_table, EXTERNAL),
     "sample": partial(layout_table, SAMPLE),
-    "status bits": partial(bits_table, Status, STATUS_BITS),
+    "status bits": partial(bits_table, Status),
     "reasons": reasons_table,
-    "external bits": partial(bits_table, ExternalStatus, EXTERNAL_BITS),
+    "external bits": partial(bits_table, ExternalStatus),
     "effects' defaults": partial(defaults_table, LISTED.values()),
     "unlisted effects": partial(unlisted_effects_table, UNLISTED.values()),
     **{f"modules of {package}": partial(modules, package)

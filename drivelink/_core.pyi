@@ -7,6 +7,7 @@ from estimator.online import Estimator
 from estimator.sample import Estimate, External, Sample
 
 LATE: int
+STATUS_BITS: dict[str, int]
 SYNC_COB_ID: int
 __version__: str
 

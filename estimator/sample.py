@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from enum import IntFlag
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from estimator.errors import EstimatorError
 
 __all__ = [
     "SIGMA_95",
+    "Bits",
     "Consistency",
     "Estimate",
     "External",
@@ -55,25 +56,65 @@ class Sample(NamedTuple):
     external_torque_nm: float = math.nan
 
 
-class Status(IntFlag):
+class Bits(IntFlag):
+    """Bits of a status: value, meaning, roles.
+
+    Attributes:
+        meaning: in one line, for people.
+        roles: "unusable": no controller may act on an estimate with it; "replayed": it belongs to the sample,
+            so that a replay of samples sets it again.
+    """
+
+    meaning: str
+    roles: frozenset[str]
+
+    def __new__(cls, value: int, meaning: str = "", *roles: str) -> Self:  # noqa: D102
+        bit = int.__new__(cls, value)
+        bit._value_, bit.meaning, bit.roles = value, meaning, frozenset(roles)
+        return bit
+
+    @classmethod
+    def having(cls, role: str) -> int:
+        """All bits of a role."""
+        return sum(int(bit) for bit in cls if role in bit.roles)
+
+
+class Status(Bits):
     """Quality of one estimate. Bits 0-7 are the estimator's, from bit 8 on the service's."""
 
-    VALID = 1 << 0  # the numbers may be used
-    OBSERVABLE = 1 << 1  # the motion reveals the stiffness; else it is held, with a wider interval
-    GAP = 1 << 2  # samples were missing before this one and have been bridged
-    CHANGED = 1 << 3  # innovation alarm: the joint changed, the estimate is following
-    MODEL_ALARM = 1 << 4  # the residual is above the model's own baseline: the model is not sufficient
-    INPUT_REJECTED = 1 << 5  # this sample was not finite, jumped or froze, and was not used
-    RESTARTED = 1 << 6  # the estimator restarted at or shortly before this sample
-    DRIVE_FAULT = 1 << 8  # a drive reports a fault or is not in operation-capable state
-    BUS_FAULT = 1 << 9  # frames of this cycle were late or missing
-    STALE = 1 << 10  # the estimate is carried on without fresh measurements
-    UNTIMED = 1 << 11  # SYNCs of another master: the values may be of another moment; no parameter is updated
-    NODE_RESTARTED = 1 << 12  # positions may have restarted: the estimator restarts with this sample
-    PARTIAL = (
-        1 << 13
-    )  # NaN values are not available: stiffness of a rigid joint, standard deviation in mode paper
-    CONTRADICTED = 1 << 14  # two readings of one quantity contradict each other; no parameter is updated
+    VALID = 1 << 0, "the numbers may be used"
+    OBSERVABLE = 1 << 1, "the motion reveals the stiffness; otherwise it is held, with a wider interval"
+    GAP = 1 << 2, "samples were missing before this one and have been bridged"
+    CHANGED = 1 << 3, "innovation alarm: the joint changed, the estimate is following"
+    MODEL_ALARM = (
+        1 << 4,
+        "the residual is above the model's own baseline: the model is not sufficient",
+        "unusable",
+    )
+    INPUT_REJECTED = 1 << 5, "this sample was not finite, jumped or froze, and was not used"
+    RESTARTED = 1 << 6, "the estimator restarted at or shortly before this sample", "unusable"
+    DRIVE_FAULT = 1 << 8, "a drive reports a fault or is not operational", "unusable", "replayed"
+    BUS_FAULT = 1 << 9, "frames of this cycle were late or missing", "replayed"
+    STALE = 1 << 10, "the estimate is carried on without fresh measurements", "unusable"
+    UNTIMED = (
+        1 << 11,
+        "another master produced SYNC: values may be of another moment; no parameter is updated",
+        "unusable",
+        "replayed",
+    )
+    NODE_RESTARTED = (
+        1 << 12,
+        "positions may have restarted: the estimator restarts with this sample",
+        "unusable",
+        "replayed",
+    )
+    PARTIAL = 1 << 13, "not given where NaN: stiffness of a rigid joint, standard deviation in mode paper"
+    CONTRADICTED = (
+        1 << 14,
+        "two readings of one quantity contradict each other; no parameter is updated",
+        "unusable",
+        "replayed",
+    )
 
 
 class TransmissionEstimate(NamedTuple):
@@ -96,11 +137,11 @@ class Estimate(NamedTuple):
     transmissions: tuple[TransmissionEstimate, ...]
 
 
-class ExternalStatus(IntFlag):
+class ExternalStatus(Bits):
     """Quality of one external torque."""
 
-    VALID = 1 << 0  # the numbers may be used
-    CONTACT = 1 << 1  # something touches the link; only where valid
+    VALID = 1 << 0, "the numbers may be used; never where the estimate of the same cycle is not valid"
+    CONTACT = 1 << 1, "something touches the link; only where valid"
 
 
 class External(NamedTuple):

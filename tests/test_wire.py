@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from zenoh.ext import Float64, UInt32, UInt64, z_deserialize, z_serialize
 
-from drivelink._core import encode_estimate, encode_external, encode_sample
+from drivelink._core import STATUS_BITS, encode_estimate, encode_external, encode_sample
 from drivelink.errors import ZenohError
 from drivelink.pubsub import wire
-from estimator.sample import Estimate, External, ExternalStatus, Sample, Status, TransmissionEstimate
+from estimator.sample import Estimate, External, Sample, Status, TransmissionEstimate
 
 GOLDEN = Path(__file__).parent / "golden"
 NUMBER = st.floats(allow_nan=False)
@@ -151,6 +151,11 @@ def test_a_status_that_carries_higher_bits_fits_its_field():
     assert wire.decode_estimate(encode_estimate(estimate, 0)).status == 2**32 - 1
 
 
-def test_every_status_bit_is_described():
-    assert list(wire.STATUS_BITS) == [bit.name for bit in Status]
-    assert list(wire.EXTERNAL_BITS) == [bit.name for bit in ExternalStatus]
+def test_rust_and_the_examples_have_the_bits_of_status():
+    assert {
+        bit.name: int(bit) for bit in Status if bit is not Status.PARTIAL
+    } == STATUS_BITS  # by the publisher
+    against = [bit.bit_length() - 1 for bit in Status if "unusable" in bit.roles]
+    mask = " | ".join(f"1 << {number}" for number in against)
+    for example in ("examples/rust/src/lib.rs", "examples/cpp/drivelink_wire.h"):
+        assert mask in (GOLDEN.parents[1] / example).read_text(encoding="utf-8")

@@ -22,25 +22,7 @@ from estimator.sample import ExternalStatus, Status
 
 _MODEL_ALARM, _STALE = int(Status.MODEL_ALARM), int(Status.STALE)
 _TIMING_EVERY = 4  # documents between percentiles
-
-# In the order of the status document; bits of single cycles are events or not shown.
-_QUALITY = tuple(
-    (str(bit.name).lower(), int(bit))
-    for bit in (
-        Status.VALID,
-        Status.OBSERVABLE,
-        Status.GAP,
-        Status.CHANGED,
-        Status.MODEL_ALARM,
-        Status.INPUT_REJECTED,
-        Status.RESTARTED,
-        Status.DRIVE_FAULT,
-        Status.BUS_FAULT,
-        Status.STALE,
-        Status.UNTIMED,
-        Status.CONTRADICTED,
-    )
-)
+_QUALITY = tuple((str(bit.name).lower(), int(bit)) for bit in Status)
 
 
 class JointStatus:

@@ -32,19 +32,8 @@ BAND = "blue"
 _SECOND = "magenta"  # the second transmission
 _GREY = "bright_black"  # what is not valid, and the model's curve
 
-_FLAGS = (  # bit, what is shown when set, style
-    (Status.MODEL_ALARM, "model alarm", "bold red"),
-    (Status.DRIVE_FAULT, "drive fault", "bold red"),
-    (Status.BUS_FAULT, "bus fault", "bold red"),
-    (Status.STALE, "stale", "bold red"),
-    (Status.CONTRADICTED, "readings contradict", "bold red"),
-    (Status.CHANGED, "joint changed", "yellow"),
-    (Status.INPUT_REJECTED, "input rejected", "yellow"),
-    (Status.GAP, "gap", "yellow"),
-    (Status.RESTARTED, "restarted", "yellow"),
-    (Status.UNTIMED, "untimed", "yellow"),
-    (Status.NODE_RESTARTED, "node restarted", "yellow"),
-)
+_UNSHOWN = Status.VALID | Status.OBSERVABLE | Status.PARTIAL
+_UNUSABLE = Status.having("unusable")
 _TWO_ROWS = 20  # lines of the plots from which there are four
 SILENT_S = 1.0  # without an estimate, until the shown one is marked as old
 _HELP = (
@@ -371,12 +360,15 @@ class JointView:
 
 
 def flags(status: int) -> list[tuple[str, str]]:
-    """The status bits with their styles, the two most important first."""
+    """The status bits with their styles: validity, what forbids use (red), the rest."""
     found = [
         ("valid", "green") if status & Status.VALID else ("not valid", "red"),
         ("observable", "green") if status & Status.OBSERVABLE else ("not observable", "yellow"),
     ]
-    return found + [(label, style) for bit, label, style in _FLAGS if status & bit]
+    bits = sorted((bit for bit in Status if status & bit & ~_UNSHOWN), key=lambda bit: not bit & _UNUSABLE)
+    names = [str(bit.name).lower().replace("_", " ") for bit in bits]
+    styles = ["bold red" if bit & _UNUSABLE else "yellow" for bit in bits]
+    return found + list(zip(names, styles, strict=True))
 
 
 def half_interval(estimate: EstimateMessage) -> float:

@@ -16,7 +16,6 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
-from enum import IntFlag
 from typing import TYPE_CHECKING, Any
 
 import zenoh
@@ -28,10 +27,10 @@ from drivelink.errors import ZenohError
 from drivelink.jointfile import JointFile, MotorSection
 from drivelink.pubsub.session import one_line
 from drivelink.pubsub.stream import Stream
-from drivelink.pubsub.wire import ESTIMATE, EXTERNAL, EXTERNAL_BITS, SAMPLE, STATUS_BITS
+from drivelink.pubsub.wire import ESTIMATE, EXTERNAL, SAMPLE
 from drivelink.version import __version__
 from estimator.model import Effect
-from estimator.sample import ExternalStatus, Status
+from estimator.sample import Bits, ExternalStatus, Status
 from estimator.transmissions import RIGID
 
 if TYPE_CHECKING:
@@ -257,15 +256,14 @@ def schema() -> dict[str, Any]:
         "estimate": ESTIMATE.describe(),
         "external": EXTERNAL.describe(),
         "sample": SAMPLE.describe(),
-        "status_bits": _bits(Status, STATUS_BITS),
-        "external_bits": _bits(ExternalStatus, EXTERNAL_BITS),
+        "status_bits": _bits(Status),
+        "external_bits": _bits(ExternalStatus),
     }
 
 
-def _bits(flags: type[IntFlag], meanings: Mapping[str, str]) -> list[dict[str, Any]]:
+def _bits(flags: type[Bits]) -> list[dict[str, Any]]:
     return [
-        {"bit": flags[name].bit_length() - 1, "name": name.lower(), "meaning": meaning}
-        for name, meaning in meanings.items()
+        {"bit": bit.bit_length() - 1, "name": str(bit.name).lower(), "meaning": bit.meaning} for bit in flags
     ]
 
 

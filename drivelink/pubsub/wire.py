@@ -13,7 +13,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from struct import Struct
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,17 +23,7 @@ from estimator.sample import ExternalStatus, Sample, Status, TransmissionEstimat
 MAX_ELEMENTS = 8  # transmissions or motors in one message; below 128 the varint is one byte
 _STRUCT_CODES = {"u64": "Q", "u32": "I", "f64": "d"}
 _VALID, _PARTIAL = int(Status.VALID), int(Status.PARTIAL)
-# Of these bits a usable estimate has VALID only.
-_USABLE = int(
-    Status.VALID
-    | Status.MODEL_ALARM
-    | Status.RESTARTED
-    | Status.DRIVE_FAULT
-    | Status.STALE
-    | Status.UNTIMED
-    | Status.NODE_RESTARTED
-    | Status.CONTRADICTED
-)
+_JUDGED = _VALID | Status.having("unusable")  # of these bits a usable estimate has VALID only
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,33 +147,6 @@ SAMPLE = Layout(
     ),
 )
 
-STATUS_BITS: Mapping[str, str] = MappingProxyType(
-    {
-        "VALID": "the numbers may be used",
-        "OBSERVABLE": "the motion reveals the stiffness; otherwise it is held, with a wider interval",
-        "GAP": "samples were missing before this one and have been bridged",
-        "CHANGED": "innovation alarm: the joint changed, the estimate is following",
-        "MODEL_ALARM": "the residual is above the model's own baseline: the model is not sufficient",
-        "INPUT_REJECTED": "this sample was not finite, jumped or froze, and was not used",
-        "RESTARTED": "the estimator restarted at or shortly before this sample",
-        "DRIVE_FAULT": "a drive reports a fault or is not operational",
-        "BUS_FAULT": "frames of this cycle were late or missing",
-        "STALE": "the estimate is carried on without fresh measurements",
-        "UNTIMED": "another master produced SYNC: values may be of another moment; no parameter is updated",
-        "NODE_RESTARTED": "positions may have restarted: the estimator restarts with this sample",
-        "PARTIAL": "not given where NaN: stiffness of a rigid joint, standard deviation in mode paper",
-        "CONTRADICTED": "two readings of one quantity contradict each other; no parameter is updated",
-    }
-)
-
-
-EXTERNAL_BITS: Mapping[str, str] = MappingProxyType(
-    {
-        "VALID": "the numbers may be used; never where the estimate of the same cycle is not valid",
-        "CONTACT": "something touches the link; only where valid",
-    }
-)
-
 
 class EstimateMessage(NamedTuple):
     """A received estimate: an `Estimate` and the UNIX time of its SYNC."""
@@ -205,7 +167,7 @@ class EstimateMessage(NamedTuple):
     @property
     def usable(self) -> bool:
         """Whether a controller may act on this estimate: valid, and neither alarm nor fault."""
-        return self.status & _USABLE == _VALID
+        return self.status & _JUDGED == _VALID
 
     @property
     def observable(self) -> bool:

@@ -20,9 +20,7 @@ from drivelink.recording.messages import read_sample
 from estimator.sample import Record, Status
 
 _STALE = int(Status.STALE)
-_SERVICE = int(
-    Status.DRIVE_FAULT | Status.BUS_FAULT | Status.UNTIMED | Status.NODE_RESTARTED | Status.CONTRADICTED
-)
+_SERVICE = Status.having("replayed")
 _APART = 64  # largest distance in cycles between a sample and its estimate in the file
 
 

@@ -26,6 +26,8 @@ fn to_python(failure: Failure) -> PyErr {
 /// What the one extension offers; `drivelink/_core.py` names the service's part of it.
 #[pymodule(name = "_core")]
 mod extension {
+    use std::collections::HashMap;
+
     use pyo3::prelude::*;
 
     #[pymodule_export]
@@ -45,6 +47,8 @@ mod extension {
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
+        let bits = estimator_core::sample::status::BITS.iter().chain(crate::status::BITS);
+        module.add("STATUS_BITS", bits.copied().collect::<HashMap<_, _>>())?;
         module.add("LATE", crate::assembler::LATE)?;
         module.add("STOP_EXPONENT", estimator_core::memory::STOP_EXPONENT)?;
         module.add("SYNC_COB_ID", crate::assembler::SYNC_COB_ID)?;

@@ -24,22 +24,24 @@ pub struct Sample {
     pub external_torque: f64,
 }
 
+/// Constants of status bits, and `BITS`: all of them by name.
+#[macro_export]
+macro_rules! status_bits {
+    ($($name:ident = $bit:literal),* $(,)?) => {
+        $(
+            #[doc = concat!("See `Status.", stringify!($name), "` in `estimator/sample.py`.")]
+            pub const $name: u32 = 1 << $bit;
+        )*
+        /// All bits by name.
+        pub const BITS: &[(&str, u32)] = &[$((stringify!($name), $name)),*];
+    };
+}
+
 /// Bits of [`Estimate::status`]; 0 to 7 are the estimator's, from 8 on the service's.
 pub mod status {
-    /// The numbers may be used.
-    pub const VALID: u32 = 1 << 0;
-    /// The motion reveals the stiffness; else it is held, with a wider interval.
-    pub const OBSERVABLE: u32 = 1 << 1;
-    /// Samples were missing before this one and have been bridged.
-    pub const GAP: u32 = 1 << 2;
-    /// Innovation alarm: the joint changed, the estimate is following.
-    pub const CHANGED: u32 = 1 << 3;
-    /// Residual above the model's own baseline: the model is not sufficient.
-    pub const MODEL_ALARM: u32 = 1 << 4;
-    /// This sample was not finite, jumped or froze, and was not used.
-    pub const INPUT_REJECTED: u32 = 1 << 5;
-    /// The estimator started anew at or shortly before this sample.
-    pub const RESTARTED: u32 = 1 << 6;
+    status_bits! {
+        VALID = 0, OBSERVABLE = 1, GAP = 2, CHANGED = 3, MODEL_ALARM = 4, INPUT_REJECTED = 5, RESTARTED = 6,
+    }
 }
 
 /// One transmission: torque, stiffness and its standard deviation, deflection.

@@ -7,6 +7,7 @@ from estimator.online import Estimator
 from estimator.sample import Estimate, External, Sample
 
 LATE: int
+MESSAGES: dict[str, list[tuple[str, str, str]]]
 STATUS_BITS: dict[str, int]
 SYNC_COB_ID: int
 __version__: str

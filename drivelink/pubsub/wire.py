@@ -3,8 +3,8 @@
 Zenoh's serialization of a tuple of fixed-width numbers is the packed little-endian struct, and that of a
 sequence is its length as a LEB128 varint before the elements. So each message is one precompiled struct
 here, `z_deserialize` of zenoh-ext in Rust, C, C++, Kotlin and TypeScript, and a plain struct on a
-microcontroller. The tables below are the only definition: structs, the `schema` key and the documentation are
-made from them.
+microcontroller. `drivelink/core/src/wire.rs` defines the fields: structs, the `schema` key and the
+documentation are made from them.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from drivelink._core import MESSAGES
 from drivelink.errors import ZenohError
 from estimator.sample import ExternalStatus, Sample, Status, TransmissionEstimate
 
@@ -97,55 +98,18 @@ def _describe(field: Field) -> dict[str, str]:
     return {"name": field.name, "type": field.type, "meaning": field.meaning}
 
 
-_SEQUENCE = Field("sequence", "u64", "number of the SYNC; a jump by more than one is a gap of whole periods")
-_STAMP = Field("stamp_ns", "u64", "UNIX time of the SYNC, ns")
+def _part(name: str) -> tuple[Field, ...]:
+    return tuple(Field(*field) for field in MESSAGES[name])
+
 
 ESTIMATE = Layout(
     schema="drivelink.estimate/1",
-    head=(
-        _SEQUENCE,
-        _STAMP,
-        Field("status", "u32", "status bits, see below"),
-        Field("flexibility_torque_nm", "f64", "the joint's flexibility torque, N·m"),
-        Field("stiffness_nm_rad", "f64", "the joint's stiffness, N·m/rad"),
-        Field("stiffness_std_nm_rad", "f64", "its standard deviation, N·m/rad"),
-    ),
+    head=_part("estimate"),
     elements="transmissions",
-    element=(
-        Field("flexibility_torque_nm", "f64", "of this transmission, N·m"),
-        Field("stiffness_nm_rad", "f64", "of this transmission, N·m/rad"),
-        Field("stiffness_std_nm_rad", "f64", "its standard deviation, N·m/rad"),
-        Field("deflection_rad", "f64", "φ = q − θ, rad"),
-    ),
+    element=_part("transmissions"),
 )
-
-EXTERNAL = Layout(
-    schema="drivelink.external/1",
-    head=(
-        _SEQUENCE,
-        _STAMP,
-        Field("status", "u32", "bit 0 valid, bit 1 contact, see below"),
-        Field("external_torque_nm", "f64", "torque of the environment on the link, +τ_k of eqs 4, 6, N·m"),
-        Field("external_torque_std_nm", "f64", "its standard deviation, N·m"),
-    ),
-)
-
-SAMPLE = Layout(
-    schema="drivelink.sample/1",
-    head=(
-        _SEQUENCE,
-        _STAMP,
-        Field("link_position_rad", "f64", "q, rad; NaN where there is none, as below"),
-        Field("link_velocity_rad_s", "f64", "measured link velocity, rad/s"),
-        Field("external_torque_nm", "f64", "τ_k of eq. 4, N·m"),
-    ),
-    elements="motors",
-    element=(
-        Field("motor_position_rad", "f64", "θ, rad, joint side"),
-        Field("motor_velocity_rad_s", "f64", "measured motor velocity, rad/s, joint side"),
-        Field("motor_torque_nm", "f64", "τ, N·m, joint side; acts from this SYNC to the next"),
-    ),
-)
+EXTERNAL = Layout(schema="drivelink.external/1", head=_part("external"))
+SAMPLE = Layout(schema="drivelink.sample/1", head=_part("sample"), elements="motors", element=_part("motors"))
 
 
 class EstimateMessage(NamedTuple):

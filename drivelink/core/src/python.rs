@@ -49,6 +49,8 @@ mod extension {
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
         let bits = estimator_core::sample::status::BITS.iter().chain(crate::status::BITS);
         module.add("STATUS_BITS", bits.copied().collect::<HashMap<_, _>>())?;
+        let messages = crate::wire::MESSAGES.map(|(name, fields)| (name, fields.to_vec()));
+        module.add("MESSAGES", HashMap::from(messages))?;
         module.add("LATE", crate::assembler::LATE)?;
         module.add("STOP_EXPONENT", estimator_core::memory::STOP_EXPONENT)?;
         module.add("SYNC_COB_ID", crate::assembler::SYNC_COB_ID)?;

@@ -1,17 +1,79 @@
-//! The bytes of `estimate`, `external` and `sample` on zenoh: packed little-endian numbers, and before the elements of a sequence
-//! its length as a LEB128 varint. `drivelink/pubsub/wire.py` states the layout for people and decodes it.
+//! The messages `estimate`, `external` and `sample` on zenoh, the only definition: packed little-endian numbers, and before the
+//! elements of a sequence its length as a LEB128 varint. `drivelink/pubsub/wire.py` decodes and describes by [`MESSAGES`].
 
 use estimator_core::external::External;
 use estimator_core::sample::{Sample, TransmissionEstimate};
 
 /// Elements of the sequence in one message, at most: the length is one byte.
 pub const MOST_ELEMENTS: usize = 8;
-/// Bytes of an estimate before its transmissions.
-const ESTIMATE_HEAD: usize = 8 + 8 + 4 + 3 * 8 + 1;
-/// Bytes of a sample before its motors.
-const SAMPLE_HEAD: usize = 8 + 8 + 3 * 8 + 1;
 /// Bytes of a message, at most.
-pub const MOST_BYTES: usize = ESTIMATE_HEAD + MOST_ELEMENTS * 4 * 8;
+pub const MOST_BYTES: usize = EstimateHead::BYTES + 1 + MOST_ELEMENTS * TransmissionPart::BYTES;
+
+/// One number: its name with the unit in it, its type, its meaning.
+pub type Field = (&'static str, &'static str, &'static str);
+
+/// The parts of all messages by name.
+pub const MESSAGES: [(&str, &[Field]); 5] = [
+    ("estimate", EstimateHead::FIELDS),
+    ("transmissions", TransmissionPart::FIELDS),
+    ("external", ExternalHead::FIELDS),
+    ("sample", SampleHead::FIELDS),
+    ("motors", MotorPart::FIELDS),
+];
+
+const SEQUENCE: &str = "number of the SYNC; a jump by more than one is a gap of whole periods";
+const STAMP: &str = "UNIX time of the SYNC, ns";
+
+macro_rules! part {
+    ($name:ident { $($field:ident: $kind:ident = $meaning:expr),* $(,)? }) => {
+        struct $name {
+            $($field: $kind),*
+        }
+
+        impl $name {
+            const FIELDS: &[Field] = &[$((stringify!($field), stringify!($kind), $meaning)),*];
+            const BYTES: usize = 0 $(+ size_of::<$kind>())*;
+
+            fn put(&self, payload: &mut Payload) {
+                $(payload.put(self.$field.to_le_bytes());)*
+            }
+        }
+    };
+}
+
+part!(EstimateHead {
+    sequence: u64 = SEQUENCE,
+    stamp_ns: u64 = STAMP,
+    status: u32 = "status bits, see below",
+    flexibility_torque_nm: f64 = "the joint's flexibility torque, N·m",
+    stiffness_nm_rad: f64 = "the joint's stiffness, N·m/rad",
+    stiffness_std_nm_rad: f64 = "its standard deviation, N·m/rad",
+});
+part!(TransmissionPart {
+    flexibility_torque_nm: f64 = "of this transmission, N·m",
+    stiffness_nm_rad: f64 = "of this transmission, N·m/rad",
+    stiffness_std_nm_rad: f64 = "its standard deviation, N·m/rad",
+    deflection_rad: f64 = "φ = q − θ, rad",
+});
+part!(ExternalHead {
+    sequence: u64 = SEQUENCE,
+    stamp_ns: u64 = STAMP,
+    status: u32 = "bit 0 valid, bit 1 contact, see below",
+    external_torque_nm: f64 = "torque of the environment on the link, +τ_k of eqs 4, 6, N·m",
+    external_torque_std_nm: f64 = "its standard deviation, N·m",
+});
+part!(SampleHead {
+    sequence: u64 = SEQUENCE,
+    stamp_ns: u64 = STAMP,
+    link_position_rad: f64 = "q, rad; NaN where there is none, as below",
+    link_velocity_rad_s: f64 = "measured link velocity, rad/s",
+    external_torque_nm: f64 = "τ_k of eq. 4, N·m",
+});
+part!(MotorPart {
+    motor_position_rad: f64 = "θ, rad, joint side",
+    motor_velocity_rad_s: f64 = "measured motor velocity, rad/s, joint side",
+    motor_torque_nm: f64 = "τ, N·m, joint side; acts from this SYNC to the next",
+});
 
 /// The bytes of one message.
 #[derive(Clone, Copy, Debug)]
@@ -25,14 +87,9 @@ impl Payload {
         Payload { bytes: [0; MOST_BYTES], length: 0 }
     }
 
-    fn put<const N: usize>(&mut self, bytes: [u8; N]) -> &mut Payload {
+    fn put<const N: usize>(&mut self, bytes: [u8; N]) {
         self.bytes[self.length..self.length + N].copy_from_slice(&bytes);
         self.length += N;
-        self
-    }
-
-    fn f64(&mut self, number: f64) -> &mut Payload {
-        self.put(number.to_le_bytes())
     }
 
     /// What goes over the wire.
@@ -50,16 +107,29 @@ pub fn encode_estimate(
     sequence: u64,
     stamp_ns: u64,
     status: u32,
-    joint: [f64; 3],
+    [flexibility_torque_nm, stiffness_nm_rad, stiffness_std_nm_rad]: [f64; 3],
     transmissions: &[TransmissionEstimate],
 ) -> Payload {
     let transmissions = &transmissions[..transmissions.len().min(MOST_ELEMENTS)];
     let mut payload = Payload::new();
-    payload.put(sequence.to_le_bytes()).put(stamp_ns.to_le_bytes()).put(status.to_le_bytes());
-    payload.f64(joint[0]).f64(joint[1]).f64(joint[2]);
+    EstimateHead {
+        sequence,
+        stamp_ns,
+        status,
+        flexibility_torque_nm,
+        stiffness_nm_rad,
+        stiffness_std_nm_rad,
+    }
+    .put(&mut payload);
     payload.put([transmissions.len() as u8]);
     for each in transmissions {
-        payload.f64(each.flexibility_torque).f64(each.stiffness).f64(each.stiffness_std).f64(each.deflection);
+        TransmissionPart {
+            flexibility_torque_nm: each.flexibility_torque,
+            stiffness_nm_rad: each.stiffness,
+            stiffness_std_nm_rad: each.stiffness_std,
+            deflection_rad: each.deflection,
+        }
+        .put(&mut payload);
     }
     payload
 }
@@ -68,8 +138,14 @@ pub fn encode_estimate(
 #[must_use]
 pub fn encode_external(external: &External, stamp_ns: u64) -> Payload {
     let mut payload = Payload::new();
-    payload.put(external.sequence.to_le_bytes()).put(stamp_ns.to_le_bytes());
-    payload.put(external.status.to_le_bytes()).f64(external.torque).f64(external.torque_std);
+    ExternalHead {
+        sequence: external.sequence,
+        stamp_ns,
+        status: external.status,
+        external_torque_nm: external.torque,
+        external_torque_std_nm: external.torque_std,
+    }
+    .put(&mut payload);
     payload
 }
 
@@ -78,15 +154,25 @@ pub fn encode_external(external: &External, stamp_ns: u64) -> Payload {
 pub fn encode_sample(sample: &Sample, motors: usize, stamp_ns: u64) -> Payload {
     let motors = motors.min(sample.motor_position.len());
     let mut payload = Payload::new();
-    payload.put(sample.sequence.to_le_bytes()).put(stamp_ns.to_le_bytes());
-    payload.f64(sample.link_position).f64(sample.link_velocity).f64(sample.external_torque);
+    SampleHead {
+        sequence: sample.sequence,
+        stamp_ns,
+        link_position_rad: sample.link_position,
+        link_velocity_rad_s: sample.link_velocity,
+        external_torque_nm: sample.external_torque,
+    }
+    .put(&mut payload);
     payload.put([motors as u8]);
     for motor in 0..motors {
-        payload.f64(sample.motor_position[motor]);
-        payload.f64(sample.motor_velocity[motor]);
-        payload.f64(sample.motor_torque[motor]);
+        MotorPart {
+            motor_position_rad: sample.motor_position[motor],
+            motor_velocity_rad_s: sample.motor_velocity[motor],
+            motor_torque_nm: sample.motor_torque[motor],
+        }
+        .put(&mut payload);
     }
     payload
 }
 
-const _: () = assert!(SAMPLE_HEAD + MOST_ELEMENTS * 3 * 8 <= MOST_BYTES);
+const _: () = assert!(SampleHead::BYTES + 1 + MOST_ELEMENTS * MotorPart::BYTES <= MOST_BYTES);
+const _: () = assert!(ExternalHead::BYTES <= MOST_BYTES);

@@ -2,6 +2,8 @@
 
 from estimator._core import (
     LATE,
+    MESSAGES,
+    STATUS_BITS,
     SYNC_COB_ID,
     Assembler,
     History,
@@ -17,6 +19,8 @@ from estimator._core import (
 
 __all__ = [
     "LATE",
+    "MESSAGES",
+    "STATUS_BITS",
     "SYNC_COB_ID",
     "Assembler",
     "History",

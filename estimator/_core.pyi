@@ -1,9 +1,9 @@
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from numpy import float64
 from numpy.typing import NDArray
 
-from estimator.effects import Coordinates
 from estimator.model import JointModel
 from estimator.sample import Estimate, External, Sample
 from estimator.settings import EstimatorSettings
@@ -28,12 +28,17 @@ class Estimator:
     def alpha(self, motor: int) -> tuple[bool, bool, list[float], list[float]]: ...
     def suspicion(self) -> tuple[str, int, str, float, float, bool] | None: ...
     def why(self) -> tuple[str, int, float, list[str]] | None: ...
-    def time_ticks(self, samples: Sequence[Sample], ticks: int) -> list[float]: ...
 
 class TransmissionLaw:
     def __init__(self, name: str) -> None: ...
     @staticmethod
     def table(deflection: Sequence[float], torque: Sequence[float]) -> TransmissionLaw: ...
+    @staticmethod
+    def of(
+        torque: Callable[..., Any],
+        stiffness: Callable[..., Any],
+        shapes: Sequence[tuple[float, float, float]],
+    ) -> TransmissionLaw: ...
     @property
     def shapes(self) -> list[tuple[float, float, float]]: ...
     def evaluate(
@@ -47,34 +52,6 @@ class TransmissionLaw:
     def stiffness_jacobian(self, phi: Numbers, alpha: Sequence[float], out: Numbers) -> None: ...
     def at(self, phi: float, alpha: Sequence[float]) -> tuple[float, float]: ...
     def reach(self, shape: Sequence[float]) -> float: ...
-
-class OnlineEffects:
-    """The effects of a joint's model tick by tick.
-
-    `correct` comes first, on the raw sample: delays are made equal by delaying the channels that are ahead,
-    errors of link encoder and torque are removed, the offset between the encoders goes into the motor
-    position. `torques` gives x_motor and x_transmission of each motor and x_link, N·m, from coordinates that
-    have passed one filter; zeros where they are absurd or not finite.
-
-    Args:
-        model: of the joint.
-        period_s: of the samples.
-
-    Attributes:
-        active: whether the model has any effect.
-
-    Raises:
-        EstimatorError: an effect is wrong, or is where it does not belong.
-    """
-
-    def __init__(self, model: JointModel, period_s: float) -> None: ...
-    @property
-    def active(self) -> bool: ...
-    def reset(self) -> None: ...
-    def correct(self, sample: Sample) -> Sample | None: ...
-    def torques(
-        self, motors: Sequence[Coordinates], link: Coordinates
-    ) -> tuple[list[float], list[float], float]: ...
 
 class ModelMonitor:
     def __init__(

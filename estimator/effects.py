@@ -1,4 +1,4 @@
-"""The library of physical effects: what each one is, and its terms over arrays and on line.
+"""The library of physical effects: what each one is, and its terms over arrays.
 
 Names, places, parameters and laws are those of `estimator/core/src/library.rs`, which a tick uses as well.
 
@@ -17,7 +17,7 @@ from typing import Any, Literal, NamedTuple, cast
 import numpy as np
 
 from estimator import _core
-from estimator._core import STOP_EXPONENT, OnlineEffects
+from estimator._core import STOP_EXPONENT
 from estimator.errors import EstimatorError
 from estimator.model import Effect
 from estimator.sample import FloatArray
@@ -29,7 +29,6 @@ __all__ = [
     "Coordinates",
     "EffectType",
     "Location",
-    "OnlineEffects",
     "Parameter",
     "elements",
 ]

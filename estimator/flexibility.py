@@ -7,7 +7,6 @@ df/dalpha (eq 25). The laws are those of `estimator._core`, which the on-line es
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -33,123 +32,86 @@ __all__ = [
 RELATIVE_STEP = np.finfo(float).eps ** (1.0 / 3.0)  # of central differences
 
 
-class TransmissionModel(ABC):
+class TransmissionModel:
     """f(phi, alpha) = sum_h basis_h(phi, shape) * alpha_h, with alpha = (linear coefficients, shape).
+
+    One linear coefficient k unless a subclass says otherwise: f = k g(phi, shape).
 
     Attributes:
         name: as in the joint file.
+        law: its evaluation over arrays.
         linear: number of leading entries of alpha that enter linearly; None: all.
         shape_names: names of the remaining entries ("shape"), which enter nonlinearly.
-        shape_bounds: (low, high) of each shape parameter.
-        shape_start: where a search without prior knowledge starts.
     """
 
     name: str
+    law: TransmissionLaw
     linear: int | None = 1
     shape_names: tuple[str, ...] = ()
-    shape_bounds: tuple[tuple[float, float], ...] = ()
-    shape_start: tuple[float, ...] = ()
 
-    @abstractmethod
+    @property
+    def shape_bounds(self) -> tuple[tuple[float, float], ...]:
+        """(low, high) of each shape parameter."""
+        return tuple((low, high) for low, high, _ in self.law.shapes)
+
+    @property
+    def shape_start(self) -> tuple[float, ...]:
+        """Where a search without prior knowledge starts."""
+        return tuple(start for *_, start in self.law.shapes)
+
     def basis(self, phi: ArrayLike, shape: Sequence[float] = (), order: int = 1) -> FloatArray:
         """Regressors of the linear coefficients, (..., order) for phi of shape (...), in rad-powers."""
+        return self.torque(phi, (1.0, *shape))[..., None]
 
-    @abstractmethod
     def torque(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
         """tau_e = f(phi, alpha) in N·m (eq 17)."""
-
-    @abstractmethod
-    def stiffness(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """Sigma = df/dphi in N·m/rad (eq 18)."""
-
-    def both(self, phi: ArrayLike, alpha: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """(torque, stiffness), in one go where that is faster."""
-        return self.torque(phi, alpha), self.stiffness(phi, alpha)
-
-    @abstractmethod
-    def jacobian(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """df/dalpha, (..., n) (eq 25)."""
-
-    def stiffness_jacobian(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """dsigma/dalpha, (..., n), which maps the covariance of alpha to sigma."""
-        phi = np.asarray(phi, dtype=np.float64)
-        step = RELATIVE_STEP * np.maximum(np.abs(phi), 1e-3)[..., None]
-        after = self.jacobian(phi + step[..., 0], alpha)
-        before = self.jacobian(phi - step[..., 0], alpha)
-        return np.asarray((after - before) / (2.0 * step))
-
-    def at(self, phi: float, alpha: Sequence[float]) -> tuple[float, float]:
-        """(torque, stiffness) at one deflection, for a tick."""
-        return float(self.torque(phi, alpha)), float(self.stiffness(phi, alpha))
-
-    def reach(self, shape: Sequence[float] = ()) -> float:
-        """Largest |phi| for which the model is defined, rad."""
-        return math.inf
-
-    @abstractmethod
-    def parameters(self, alpha: ArrayLike) -> dict[str, ParameterValue]:
-        """Alpha by its names in the joint file."""
-
-    @abstractmethod
-    def alpha(self, parameters: Mapping[str, ParameterValue]) -> FloatArray:
-        """Alpha from its names in the joint file.
-
-        Raises:
-            EstimatorError: a name is unknown or missing, or a value is impossible.
-        """
-
-
-class _Law(TransmissionModel):
-    """A model whose law is compiled; `law` is its evaluation over arrays."""
-
-    law: TransmissionLaw
-
-    def __init_subclass__(cls) -> None:
-        """Bounds and start of the shape parameters are the law's."""
-        super().__init_subclass__()
-        shapes = cls.law.shapes if "law" in vars(cls) else []
-        cls.shape_bounds = tuple((low, high) for low, high, _ in shapes)
-        cls.shape_start = tuple(start for *_, start in shapes)
-
-    def torque(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """Flexibility torque (eq 17)."""
         return self.both(phi, alpha)[0]
 
     def stiffness(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """Its derivative (eq 18)."""
+        """Sigma = df/dphi in N·m/rad (eq 18)."""
         return self.both(phi, alpha)[1]
 
     def both(self, phi: ArrayLike, alpha: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """See TransmissionModel."""
+        """(torque, stiffness)."""
         phi = np.asarray(phi, dtype=np.float64)
         torque, stiffness = np.empty(phi.shape), np.empty(phi.shape)
         self.law.evaluate(phi.ravel(), _listed(alpha), torque.reshape(-1), stiffness.reshape(-1))
         return torque, stiffness
 
     def jacobian(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """Its Jacobian (eq 25)."""
-        phi, listed = np.asarray(phi, dtype=np.float64), _listed(alpha)
-        out = np.empty((*phi.shape, len(listed)))
-        self.law.jacobian(phi.ravel(), listed, out.reshape(-1))
-        return out
+        """df/dalpha, (..., n) (eq 25)."""
+        return _by_alpha(self.law.jacobian, phi, alpha)
 
     def stiffness_jacobian(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """See TransmissionModel."""
-        phi, listed = np.asarray(phi, dtype=np.float64), _listed(alpha)
-        out = np.empty((*phi.shape, len(listed)))
-        self.law.stiffness_jacobian(phi.ravel(), listed, out.reshape(-1))
-        return out
+        """dsigma/dalpha, (..., n), which maps the covariance of alpha to sigma."""
+        return _by_alpha(self.law.stiffness_jacobian, phi, alpha)
 
     def at(self, phi: float, alpha: Sequence[float]) -> tuple[float, float]:
-        """See TransmissionModel."""
+        """(torque, stiffness) at one deflection, for a tick."""
         return self.law.at(phi, alpha)
 
     def reach(self, shape: Sequence[float] = ()) -> float:
-        """Largest |phi| of the law: of the arcsine, the exponential or the table."""
+        """Largest |phi| for which the model is defined (arcsine, exponential, table), rad."""
         return self.law.reach(shape) if shape or not self.shape_names else math.inf
 
+    def parameters(self, alpha: ArrayLike) -> dict[str, ParameterValue]:
+        """Alpha by its names in the joint file."""
+        return dict(zip(("k_nm_rad", *self.shape_names), np.asarray(alpha).tolist(), strict=True))
 
-class Polynomial(_Law):
+    def alpha(self, parameters: Mapping[str, ParameterValue]) -> FloatArray:
+        """Alpha from its names in the joint file.
+
+        Raises:
+            EstimatorError: a name is unknown or missing, or a value is impossible.
+        """
+        values = _by_name(self.name, parameters, ("k_nm_rad", *self.shape_names))
+        for name, value, (low, high) in zip(self.shape_names, values[1:], self.shape_bounds, strict=True):
+            if not low < value < high:
+                raise EstimatorError(f"{self.name}: {name}: expected {low:g} to {high:g}, got {value:g}")
+        return values
+
+
+class Polynomial(TransmissionModel):
     """Odd powers up to phi^(2p-1) (eqs 21, 24); alpha = coefficients in N·m/rad^(2h-1)."""
 
     name = "polynomial"
@@ -186,27 +148,7 @@ class Linear(Polynomial):
         return _by_name(self.name, parameters, ("k_nm_rad",))
 
 
-class _Shaped(TransmissionModel):
-    """Shared by models with one linear coefficient k and shape parameters: f = k * g(phi, shape)."""
-
-    def basis(self, phi: ArrayLike, shape: Sequence[float] = (), order: int = 1) -> FloatArray:
-        """See TransmissionModel."""
-        return self.torque(phi, (1.0, *shape))[..., None]
-
-    def parameters(self, alpha: ArrayLike) -> dict[str, ParameterValue]:
-        """Alpha by name."""
-        return dict(zip(("k_nm_rad", *self.shape_names), np.asarray(alpha).tolist(), strict=True))
-
-    def alpha(self, parameters: Mapping[str, ParameterValue]) -> FloatArray:
-        """Alpha from names."""
-        values = _by_name(self.name, parameters, ("k_nm_rad", *self.shape_names))
-        for name, value, (low, high) in zip(self.shape_names, values[1:], self.shape_bounds, strict=True):
-            if not low < value < high:
-                raise EstimatorError(f"{self.name}: {name}: expected {low:g} to {high:g}, got {value:g}")
-        return values
-
-
-class VsaII(_Shaped, _Law):
+class VsaII(TransmissionModel):
     """One transmission of the VSA-II (eqs 19, 20): f = 2 k beta beta', beta = arcsin(C sin(phi/2)) - phi/2.
 
     alpha = (k, C), C > 1; defined for |phi| < 2 arcsin(1/C).
@@ -217,7 +159,7 @@ class VsaII(_Shaped, _Law):
     law = TransmissionLaw("vsa-ii")
 
 
-class Exponential(_Shaped, _Law):
+class Exponential(TransmissionModel):
     """f = sign(phi) (k/b) (exp(b|phi|) - 1), so sigma = k exp(b|phi|); alpha = (k, b)."""
 
     name = "exponential"
@@ -225,20 +167,21 @@ class Exponential(_Shaped, _Law):
     law = TransmissionLaw("exponential")
 
 
-class Table(_Shaped, _Law):
+class Table(TransmissionModel):
     """f = k g(phi), g an odd table with a cubic between its points; alpha = (k,). Made by `register_table`.
 
-    Attributes:
-        points: deflections in rad, growing from above 0, and the torque at each of them in N·m.
+    Args:
+        name: as in the joint file.
+        deflection_rad: growing from above 0.
+        torque_nm: the torque at each of them.
     """
 
     def __init__(self, name: str, deflection_rad: Sequence[float], torque_nm: Sequence[float]) -> None:
         self.name = name
-        self.points = [float(x) for x in deflection_rad], [float(x) for x in torque_nm]
-        self.law = TransmissionLaw.table(*self.points)
+        self.law = TransmissionLaw.table(list(map(float, deflection_rad)), list(map(float, torque_nm)))
 
 
-class Function(_Shaped):
+class Function(TransmissionModel):
     """A model from plain functions g(phi, *shape), dg/dphi: f = k g. Made by `register`."""
 
     def __init__(
@@ -249,30 +192,19 @@ class Function(_Shaped):
         shape: Mapping[str, tuple[float, float, float]],
     ) -> None:
         self.name = name
-        self._torque, self._stiffness = torque, stiffness
         self.shape_names = tuple(shape)
-        self.shape_start = tuple(start for start, _, _ in shape.values())
-        self.shape_bounds = tuple((low, high) for _, low, high in shape.values())
+        self.law = TransmissionLaw.of(
+            torque, stiffness, [(low, high, start) for start, low, high in shape.values()]
+        )
 
-    def torque(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """Flexibility torque (eq 17)."""
-        k, *shape = np.asarray(alpha, dtype=np.float64)
-        return np.asarray(k * self._torque(np.asarray(phi, dtype=np.float64), *shape))
 
-    def stiffness(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """Its derivative (eq 18)."""
-        k, *shape = np.asarray(alpha, dtype=np.float64)
-        return np.asarray(k * self._stiffness(np.asarray(phi, dtype=np.float64), *shape))
-
-    def jacobian(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """Its Jacobian (eq 25)."""
-        alpha = np.asarray(alpha, dtype=np.float64)
-        columns = [self.torque(phi, (1.0, *alpha[1:]))]
-        for i in range(1, alpha.size):
-            step = np.zeros_like(alpha)
-            step[i] = RELATIVE_STEP * max(abs(alpha[i]), 1e-3)
-            columns.append((self.torque(phi, alpha + step) - self.torque(phi, alpha - step)) / (2 * step[i]))
-        return np.stack(columns, axis=-1)
+def _by_alpha(
+    evaluate: Callable[[FloatArray, list[float], FloatArray], None], phi: ArrayLike, alpha: ArrayLike
+) -> FloatArray:
+    phi, listed = np.asarray(phi, dtype=np.float64), _listed(alpha)
+    out = np.empty((*phi.shape, len(listed)))
+    evaluate(phi.ravel(), listed, out.reshape(-1))
+    return out
 
 
 def _listed(alpha: ArrayLike) -> list[float]:

@@ -215,7 +215,8 @@ class LinkDynamics:
             if std is not None:
                 require_declared(0.0, **{name: std})
 
-    def uncertainty(self) -> tuple[float, float, float]:
+    @property
+    def std(self) -> tuple[float, float, float]:
         """Standard deviations of M (kg·m²), D_q (N·m·s/rad), gravity (N·m): as declared, or by the priors."""
         declared = (self.inertia_std_kg_m2, self.viscous_damping_std_nm_s_rad, self.gravity_std_nm)
         values = (self.inertia_kg_m2, self.viscous_damping_nm_s_rad, abs(self.gravity_nm))

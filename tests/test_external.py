@@ -337,7 +337,7 @@ def test_a_setting_that_cannot_be_is_one_line(key, value):
 
 def test_an_uncertainty_that_is_not_declared_is_the_priors():
     link = LinkDynamics(inertia_kg_m2=2.0, viscous_damping_nm_s_rad=0.5, gravity_nm=-6.0)
-    assert link.uncertainty() == pytest.approx((0.2, 0.1, 0.6))
-    assert replace(link, gravity_std_nm=0.0).uncertainty()[2] == 0.0
+    assert link.std == pytest.approx((0.2, 0.1, 0.6))
+    assert replace(link, gravity_std_nm=0.0).std[2] == 0.0
     with pytest.raises(EstimatorError, match="gravity_std_nm: expected a finite number >= 0"):
         replace(link, gravity_std_nm=-1.0)

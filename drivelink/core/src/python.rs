@@ -41,9 +41,7 @@ mod extension {
     #[pymodule_export]
     use crate::node::Counters;
     #[pymodule_export]
-    use estimator_core::python::{
-        Estimator, ModelMonitor, OnlineEffects, TransmissionLaw, effect_kinds, effect_terms,
-    };
+    use estimator_core::python::{Estimator, ModelMonitor, TransmissionLaw, effect_kinds, effect_terms};
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

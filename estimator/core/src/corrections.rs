@@ -267,4 +267,78 @@ mod tests {
             assert!((early - (torque + 7.0)).abs() < 1e-6);
         }
     }
+
+    const NOTHING: f64 = f64::NAN;
+
+    fn element(name: &str, values: &[f64]) -> Element {
+        Element::new(name, values).unwrap()
+    }
+
+    fn corrections(motor: &[Element], link: &[Element]) -> Corrections {
+        Corrections::new(&[MotorEffects::new(motor).unwrap()], link, 1e-3).unwrap()
+    }
+
+    fn sample(sequence: u64, position: f64, torque: f64, link_position: f64) -> Sample {
+        Sample {
+            sequence,
+            motor_position: [position, NOTHING],
+            motor_velocity: [NOTHING; MOTORS],
+            motor_torque: [torque, NOTHING],
+            link_position,
+            link_velocity: NOTHING,
+            external_torque: NOTHING,
+        }
+    }
+
+    fn near(found: &Sample, position: f64, torque: f64, link_position: f64, tolerance: f64) {
+        let found = [found.motor_position[0], found.motor_torque[0], found.link_position];
+        for (found, expected) in found.into_iter().zip([position, torque, link_position]) {
+            assert!((found - expected).abs() < tolerance, "{found} is not {expected}");
+        }
+    }
+
+    #[test]
+    fn what_the_sensors_did_is_undone() {
+        let motor = [element("deflection_offset", &[0.05]), element("torque_constant", &[0.1])];
+        let link = [element("encoder_scale", &[0.02]), element("encoder_eccentricity", &[0.01, 0.0])];
+        let q: f64 = 0.8;
+        let read = 1.02 * q + 0.01 * q.sin();
+        let corrected = corrections(&motor, &link).correct(&sample(0, 0.5, 2.0, read), false).unwrap();
+        // Two steps of a fixed point that contracts by 3 %: off by 3e-2 cubed of the error.
+        near(&corrected.aligned, 0.55, 2.2, q, 2e-5);
+    }
+
+    #[test]
+    fn delays_bring_all_channels_to_the_latest_one() {
+        let mut late =
+            corrections(&[element("torque_delay", &[0.001])], &[element("encoder_delay", &[0.0025])]);
+        let at = |k: u64| sample(k, k as f64, k as f64, k as f64);
+        let out: Vec<_> = (0..12).map(|k| late.correct(&at(k), false)).collect();
+        // The torque waits 3.5 periods: before, nobody knows what it was.
+        assert!(out[..4].iter().all(Option::is_none) && out[4..].iter().all(Option::is_some));
+        near(&out[11].unwrap().aligned, 11.0 - 2.5, 11.0 - 3.5, 11.0, 1e-9);
+        near(&late.correct(&at(15), false).unwrap().aligned, 12.5, 11.5, 15.0, 1e-9);
+    }
+
+    #[test]
+    fn a_torque_that_acts_with_a_lag_is_the_mean_of_what_acts_in_each_period() {
+        let mut lag = corrections(&[element("torque_lag", &[0.006])], &[]);
+        for k in 0..40 {
+            let corrected = lag.correct(&sample(k, 0.0, f64::from(u8::from(k >= 1)), 0.0), false).unwrap();
+            // The mean of 1 - exp(-t/T) from (k - 1) to k milliseconds after the step.
+            let t = |k: f64| (-k / 6.0).exp();
+            let mean = if k == 0 { 0.0 } else { 1.0 - (t(k as f64 - 1.0) - t(k as f64)) * 6.0 };
+            near(&corrected.aligned, 0.0, mean, 0.0, 1e-12);
+        }
+    }
+
+    #[test]
+    fn absurd_values_pass_as_they_are() {
+        let motor = [element("torque_constant", &[0.1]), element("torque_lag", &[0.006])];
+        let mut all = corrections(&motor, &[element("encoder_scale", &[0.02])]);
+        for absurd in [f64::INFINITY, -1e300, 1e12] {
+            let out = all.correct(&sample(1, absurd, absurd, absurd), false).unwrap().aligned;
+            assert!(out.motor_torque[0] == absurd && out.link_position == absurd);
+        }
+    }
 }

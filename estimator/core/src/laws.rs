@@ -143,21 +143,7 @@ impl Law {
                 out[1] = sign(phi) * (k / (b * b)) * (x * x.exp() - x.exp_m1());
             }
             Law::Tabulated(table) => out[0] = table.at(phi).0,
-            Law::Foreign(..) => {
-                let mut near: Alpha = [0.0; PARAMETERS];
-                near[..alpha.len()].copy_from_slice(alpha);
-                near[0] = 1.0;
-                out[0] = self.at(phi, &near[..alpha.len()]).0;
-                near[0] = alpha[0];
-                for i in 1..alpha.len() {
-                    let step = STEP * alpha[i].abs().max(1e-3);
-                    near[i] = alpha[i] + step;
-                    let more = self.at(phi, &near[..alpha.len()]).0;
-                    near[i] = alpha[i] - step;
-                    out[i] = (more - self.at(phi, &near[..alpha.len()]).0) / (2.0 * step);
-                    near[i] = alpha[i];
-                }
-            }
+            Law::Foreign(..) => self.jacobian_along(&[phi], alpha, out),
         }
     }
 
@@ -212,20 +198,45 @@ impl Law {
             }
             return;
         };
-        let (mut more, mut less, mut unused) =
-            (vec![0.0; phi.len()], vec![0.0; phi.len()], vec![0.0; phi.len()]);
-        law.evaluate(phi, &alpha[1..], &mut more, &mut unused);
-        more.iter().zip(out.chunks_exact_mut(n)).for_each(|(g, row)| row[0] = *g);
-        let mut near = alpha.to_vec();
-        for i in 1..n {
+        let (mut torque, mut unused) = (vec![0.0; phi.len()], vec![0.0; phi.len()]);
+        law.evaluate(phi, &alpha[1..], &mut torque, &mut unused);
+        torque.iter().zip(out.chunks_exact_mut(n)).for_each(|(g, row)| row[0] = *g);
+        self.differences(phi, alpha, 1, out, |law, alpha, torque| {
+            law.along(phi, alpha, torque, &mut vec![0.0; phi.len()]);
+        });
+    }
+
+    /// ∂σ/∂α at each deflection, row after row.
+    pub fn stiffness_jacobian_along(&self, phi: &[f64], alpha: &[f64], out: &mut [f64]) {
+        if let Law::Foreign(..) = self {
+            return self.differences(phi, alpha, 0, out, |law, alpha, stiffness| {
+                law.along(phi, alpha, &mut vec![0.0; phi.len()], stiffness);
+            });
+        }
+        for (phi, row) in phi.iter().zip(out.chunks_exact_mut(alpha.len())) {
+            self.stiffness_slopes(*phi, alpha, row);
+        }
+    }
+
+    /// Central differences by each parameter from the `first` on, of what `evaluate` writes; row after row.
+    fn differences(
+        &self,
+        phi: &[f64],
+        alpha: &[f64],
+        first: usize,
+        out: &mut [f64],
+        evaluate: impl Fn(&Law, &[f64], &mut [f64]),
+    ) {
+        let (mut more, mut less, mut near) = (vec![0.0; phi.len()], vec![0.0; phi.len()], alpha.to_vec());
+        for i in first..alpha.len() {
             let step = STEP * alpha[i].abs().max(1e-3);
             near[i] = alpha[i] + step;
-            law.evaluate(phi, &near[1..], &mut more, &mut unused);
+            evaluate(self, &near, &mut more);
             near[i] = alpha[i] - step;
-            law.evaluate(phi, &near[1..], &mut less, &mut unused);
+            evaluate(self, &near, &mut less);
             near[i] = alpha[i];
-            for ((more, less), row) in more.iter().zip(&less).zip(out.chunks_exact_mut(n)) {
-                row[i] = alpha[0] * (more - less) / (2.0 * step);
+            for ((more, less), row) in more.iter().zip(&less).zip(out.chunks_exact_mut(alpha.len())) {
+                row[i] = (more - less) / (2.0 * step);
             }
         }
     }

@@ -22,20 +22,26 @@ pub enum Method {
 
 /// Settings of both modes; each mode reads its own. Units as in the names of the Python class.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[cfg_attr(feature = "python", derive(pyo3::FromPyObject))]
 pub struct Settings {
     /// See [`Mode`].
     pub mode: Mode,
     /// See [`Method`].
     pub method: Method,
     /// Of the filter that all channels share in robust mode, rad/s.
+    #[cfg_attr(feature = "python", pyo3(attribute("bandwidth_rad_s")))]
     pub bandwidth: f64,
     /// K_τe of eq 14, rad/s.
+    #[cfg_attr(feature = "python", pyo3(attribute("k_tau_rad_s")))]
     pub k_tau: f64,
     /// K_σ,1 of eq 28, rad²/s².
+    #[cfg_attr(feature = "python", pyo3(attribute("k_sigma_1_rad2_s2")))]
     pub k_sigma_1: f64,
     /// K_σ,2 of eq 28, rad/s.
+    #[cfg_attr(feature = "python", pyo3(attribute("k_sigma_2_rad_s")))]
     pub k_sigma_2: f64,
     /// K_R of eq 32, s²/rad².
+    #[cfg_attr(feature = "python", pyo3(attribute("k_r_s2_rad2")))]
     pub k_r: f64,
     /// K_max < 2 of eq 33.
     pub k_max: f64,
@@ -44,10 +50,12 @@ pub struct Settings {
     /// Of the robust mode's CHANGED.
     pub false_alarms_per_hour: f64,
     /// Of the filter that the link's momentum passes in robust mode, rad/s.
+    #[cfg_attr(feature = "python", pyo3(attribute("external_bandwidth_rad_s")))]
     pub external_bandwidth: f64,
     /// Time constant of the bias that follows the external torque, s; `None`: there is no bias.
     pub external_bias_s: Option<f64>,
     /// Least external torque that is called a contact, N·m; `None`: a share of the torque that is carried.
+    #[cfg_attr(feature = "python", pyo3(attribute("contact_torque_nm")))]
     pub contact_torque: Option<f64>,
     /// Of the contact bit.
     pub contact_false_alarms_per_hour: f64,

@@ -2,11 +2,12 @@
 
 use std::sync::Mutex;
 
+use estimator_core::python::sample_object;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 
 use super::lock;
-use super::values::{NodeFields, drive_error, node_of, sample_object};
+use super::values::{NodeFields, drive_error, node_of};
 use crate::assembler;
 use crate::cross_check::{CrossCheck, Verdict};
 use crate::node::Counters;

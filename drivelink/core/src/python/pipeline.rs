@@ -6,7 +6,7 @@ use std::collections::VecDeque;
 use std::sync::Mutex;
 
 use estimator_core::external::External;
-use estimator_core::python::{Estimator, ModelMonitor, external as external_object};
+use estimator_core::python::{Estimator, ModelMonitor, estimate_object, external_object, sample_object};
 use estimator_core::sample::{Estimate, Sample};
 use pyo3::PyClass;
 use pyo3::exceptions::PyRuntimeError;
@@ -14,9 +14,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
 use super::assembler::Assembler;
-use super::values::{
-    ExternalFields, estimate_from, estimate_object, external_of, sample_from, sample_object,
-};
+use super::values::{ExternalFields, estimate_from, external_of, sample_from};
 use super::{lock, to_python};
 use crate::pipeline::{self, Due, Failure, Pipeline, Step};
 

@@ -1,100 +1,25 @@
 //! Python's values and layouts to and from the core's; the bytes of messages.
 
 use estimator_core::external::External;
+use estimator_core::python::sample;
 use estimator_core::sample::{Estimate, MOTORS, Sample, TransmissionEstimate};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use pyo3::sync::PyOnceLock;
-use pyo3::types::{PyBytes, PyTuple};
+use pyo3::types::PyBytes;
 
 use crate::layout::{MappedObject, Node, Signal, Tpdo};
 use crate::wire;
 
-pub(super) struct Types {
-    sample: Py<PyAny>,
-    estimate: Py<PyAny>,
-    transmission: Py<PyAny>,
-    drive_error: Py<PyAny>,
-}
-
-pub(super) fn types(py: Python<'_>) -> PyResult<&'static Types> {
-    static TYPES: PyOnceLock<Types> = PyOnceLock::new();
-    TYPES.get_or_try_init(py, || {
-        let module = py.import("estimator.sample")?;
-        Ok(Types {
-            sample: module.getattr("Sample")?.unbind(),
-            estimate: module.getattr("Estimate")?.unbind(),
-            transmission: module.getattr("TransmissionEstimate")?.unbind(),
-            drive_error: py.import("drivelink.errors")?.getattr("DriveError")?.unbind(),
-        })
-    })
-}
-
 pub(super) fn drive_error(py: Python<'_>, message: String) -> PyErr {
-    match types(py).and_then(|types| types.drive_error.bind(py).call1((message,))) {
-        Ok(error) => PyErr::from_value(error),
-        Err(error) => error,
-    }
-}
-
-pub(super) fn sample_object<'py>(py: Python<'py>, s: &Sample, motors: usize) -> PyResult<Bound<'py, PyAny>> {
-    types(py)?.sample.bind(py).call1((
-        s.sequence,
-        PyTuple::new(py, &s.motor_position[..motors])?,
-        PyTuple::new(py, &s.motor_velocity[..motors])?,
-        PyTuple::new(py, &s.motor_torque[..motors])?,
-        s.link_position,
-        s.link_velocity,
-        s.external_torque,
-    ))
+    let class = py.import("drivelink.errors").and_then(|module| module.getattr("DriveError"));
+    class.and_then(|class| class.call1((message,))).map_or_else(|error| error, PyErr::from_value)
 }
 
 /// A `Sample` and how many motors it has.
 pub(super) fn sample_from(object: &Bound<'_, PyAny>) -> PyResult<(Sample, usize)> {
-    type Motors = Vec<f64>;
-    let (sequence, position, velocity, torque, link_position, link_velocity, external_torque): (
-        u64,
-        Motors,
-        Motors,
-        Motors,
-        f64,
-        f64,
-        f64,
-    ) = object.extract()?;
-    let motors = position.len();
-    if motors > MOTORS || torque.len() != motors {
-        return Err(PyValueError::new_err(format!("sample: expected at most {MOTORS} motors, got {motors}")));
-    }
-    let of_motors = |values: &Motors| std::array::from_fn(|i| values.get(i).copied().unwrap_or(f64::NAN));
-    let sample = Sample {
-        sequence,
-        motor_position: of_motors(&position),
-        motor_velocity: of_motors(&velocity),
-        motor_torque: of_motors(&torque),
-        link_position,
-        link_velocity,
-        external_torque,
-    };
-    Ok((sample, motors))
-}
-
-pub(super) fn estimate_object<'py>(py: Python<'py>, e: &Estimate) -> PyResult<Bound<'py, PyAny>> {
-    let types = types(py)?;
-    let transmissions = e.transmissions[..e.motors]
-        .iter()
-        .map(|t| {
-            let numbers = (t.flexibility_torque, t.stiffness, t.stiffness_std, t.deflection);
-            types.transmission.bind(py).call1(numbers)
-        })
-        .collect::<PyResult<Vec<_>>>()?;
-    types.estimate.bind(py).call1((
-        e.sequence,
-        e.status,
-        e.flexibility_torque,
-        e.stiffness,
-        e.stiffness_std,
-        PyTuple::new(py, transmissions)?,
-    ))
+    let (sample, motors) = sample(object)?;
+    let expected = || format!("sample: expected at most {MOTORS} motors, with one torque each");
+    Ok((sample, motors.ok_or_else(|| PyValueError::new_err(expected()))?))
 }
 
 /// The fields of an `Estimate`, with any number of transmissions.

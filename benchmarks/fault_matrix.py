@@ -3,10 +3,12 @@
     python benchmarks/fault_matrix.py [--joints constant,vsa-ii,"vsa-ii fitted"] [--health 15] [--seconds 15]
 
 In lockstep on the project's simulated joints, seeded (--seed): seconds of health, then as many of one fault
-(kinds, sizes and signals: `tests/faultmatrix.py`). Wrong is off by more than 10 % and by more than five
-standard deviations. Named is a fault whose signal `suspected` names most often, of those in which it names
-any. Then true changes of the stiffness, which are to be followed: the share of the last two seconds that is
-within 5 % and valid, or, with a fitted file, has the model alarm instead.
+(kinds, sizes and signals: `tests/faultmatrix.py`; drives that reboot and count from elsewhere are among
+them). Wrong is a stiffness that is off by more than 10 % and by more than five standard deviations, and a
+torque that is off by more than a quarter of its rms. Named is a fault whose signal `suspected` names most
+often, of those in which it names any. Then true changes of the stiffness, which are to be followed: the
+share of the last two seconds that is within 5 % and valid, or, with a fitted file, has the model alarm
+instead.
 
 With --sizes instead: for each kind of fault the largest size up to which nothing is said of it in eight
 seconds (every sample valid, no flag), and by how much the stiffness is off then.
@@ -30,8 +32,8 @@ def measure(joint, health, seconds, seed):
         rows[f"{' + '.join(fault.signals)}: {fault.name}"] = outcome
         suspects += bool(outcome.suspected)
         right += outcome.names(fault)
-    samples, valid, wrong, silent = np.sum([row[:4] for row in rows.values()], axis=0).tolist()
-    worst = sorted(rows.items(), key=lambda item: -item[1].wrong)[:10]
+    samples, valid, wrong, silent, torque = np.sum([row[:5] for row in rows.values()], axis=0).tolist()
+    worst = sorted(rows.items(), key=lambda item: -item[1].wrong - item[1].torque)[:10]
     healthy = matrix.outcome(joint, None, health, seconds, seed)
     return {
         "joint": joint,
@@ -39,12 +41,14 @@ def measure(joint, health, seconds, seed):
         "valid": valid,
         "wrong": wrong,
         "silent": silent,
+        "torque": torque,
+        "torque_share": torque / max(valid, 1),
         "suspects": suspects,
         "named": right,
         "wrong_share": wrong / max(valid, 1),
         "silent_share": silent / max(valid, 1),
         "healthy_valid": healthy.valid / healthy.samples,
-        "worst": {name: row._asdict() for name, row in worst if row.wrong},
+        "worst": {name: row._asdict() for name, row in worst if row.wrong + row.torque},
         "followed": ", ".join(
             f"x{factor:g} {matrix.stepped(joint, factor, health, seconds, seed)[1]:.0%}"
             for factor in matrix.STEPS
@@ -85,8 +89,9 @@ SIZES = {"joint": "{joint}", "fault": "{fault}", "unnoticed up to": "{size}", "s
 MATRIX = {
     "joint": "{joint}",
     "valid samples": "{valid}",
-    "wrong": "{wrong} ({wrong_share:.2%})",
+    "stiffness wrong": "{wrong} ({wrong_share:.2%})",
     "without any flag": "{silent} ({silent_share:.2%})",
+    "torque wrong": "{torque} ({torque_share:.2%})",
     "named": "{named} of {suspects}",
     "healthy and valid": "{healthy_valid:.2%}",
     "steps followed": "{followed}",

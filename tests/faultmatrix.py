@@ -44,7 +44,7 @@ SUSPECTS = {  # what `suspected` may call each of them
     "link": ("link_position", "motor_or_link_position"),
 }
 LOOKED_EVERY = 50  # periods
-JOINTS = ("constant", "vsa-ii", "vsa-ii fitted")
+JOINTS = ("constant", "quadratic", "vsa-ii", "vsa-ii fitted")
 STEPS = (0.5, 0.7, 1.4, 2.0, 3.0)  # true changes of the stiffness
 FLAGS = int(Status.CHANGED | Status.MODEL_ALARM | Status.INPUT_REJECTED | Status.RESTARTED | Status.GAP)
 T = kit.PERIOD_S
@@ -56,15 +56,21 @@ Spoil = Callable[
 
 
 class Fault(NamedTuple):
-    """A fault: its kind with its size, the signals that it hits, what it does."""
+    """A fault: its kind with its size, the signals that it hits, what it does, and when.
+
+    A node that reboots says so at the begin of the fault; some faults are there from the first sample on.
+    """
 
     name: str
     signals: tuple[str, ...]
     spoil: Spoil
+    reboots: bool = False
+    from_start: bool = False
 
 
 class Outcome(NamedTuple):
-    """Samples from the begin of a fault on: valid ones, wrong ones of these, those without any flag at all.
+    """Samples from the begin of a fault on: valid ones, of these those whose stiffness is wrong, those of them
+    without any flag at all, and those whose torque is wrong.
 
     And the signal that was suspected most often; empty: none was.
     """
@@ -73,6 +79,7 @@ class Outcome(NamedTuple):
     valid: int
     wrong: int
     silent: int
+    torque: int
     suspected: str = ""
 
     def names(self, fault: Fault) -> bool:
@@ -94,6 +101,10 @@ def _drift(x: Values, size: float, rng: np.random.Generator, per_s: float) -> Va
 
 def _offset(x: Values, size: float, rng: np.random.Generator, share: float) -> Values:
     return x + share * size
+
+
+def _counts_from(x: Values, size: float, rng: np.random.Generator, rad: float) -> Values:
+    return x - x[0] if rad == 0.0 else x + rad
 
 
 def _ramp(x: Values, size: float, rng: np.random.Generator, share: float) -> Values:
@@ -158,6 +169,13 @@ def faults() -> Iterator[Fault]:
         yield Fault("steps of 2 %", one, partial(_coarse, share=0.02))
         yield Fault("every 10th", one, partial(_slow, periods=10))
         if signal != "torque":
+            yield Fault("every 50th", one, partial(_slow, periods=50))
+            yield Fault("zero off by 0.1 rad", one, partial(_counts_from, rad=0.1), from_start=True)
+            for rad in (0.0, 0.1, 2.6):
+                where = f"{rad:g} rad further on" if rad else "zero"
+                yield Fault(
+                    f"reboots, counts from {where}", one, partial(_counts_from, rad=rad), reboots=True
+                )
             yield Fault("slips once", one, partial(_slip, share=0.1, every_s=0.0))
             yield Fault("slips each second", one, partial(_slip, share=0.02, every_s=1.0))
     yield Fault("late by 3", ("motor", "torque"), partial(_late, periods=3))
@@ -223,6 +241,7 @@ def _fitted(name: str) -> tuple[JointModel, ResidualBaseline]:
 
 def _spoilt(samples: list[Sample], begin: int, fault: Fault, seed: int) -> list[Sample]:
     rng = np.random.default_rng([seed, zlib.crc32(f"{fault.name} {fault.signals}".encode())])
+    begin = 0 if fault.from_start else begin
     out = samples[:begin]
     columns = {
         "motor": np.array([s.motor_position_rad[0] for s in samples]),
@@ -231,7 +250,9 @@ def _spoilt(samples: list[Sample], begin: int, fault: Fault, seed: int) -> list[
     }
     for signal in fault.signals:
         x = columns[signal]
-        columns[signal][begin:] = fault.spoil(x[begin:].copy(), float(np.max(np.abs(x[:begin]))), rng)
+        columns[signal][begin:] = fault.spoil(
+            x[begin:].copy(), float(np.max(np.abs(x[:begin]), initial=0.0)), rng
+        )
     for k in range(begin, len(samples)):
         s = samples[k]
         out.append(
@@ -250,7 +271,8 @@ def outcome(joint: str, fault: Fault | None, health_s: float, fault_s: float, se
     motion = _healthy(name, health_s + fault_s, seed)
     begin = round(health_s / T)
     samples = motion.samples if fault is None else _spoilt(motion.samples, begin, fault, seed)
-    return _count(*_estimates(joint, samples, begin), motion.stiffness_nm_rad, begin)
+    restarted = begin if fault is not None and fault.reboots else None
+    return _count(*_estimates(joint, samples, begin, restarted), motion, begin)
 
 
 def errors(
@@ -279,11 +301,16 @@ def stepped(
     off = np.abs(estimates.stiffness_nm_rad[end] / motion.stiffness_nm_rad[end] - 1.0)
     said = int(Status.VALID | (Status.MODEL_ALARM if joint != name else 0))
     followed = float(np.mean((estimates.status[end] & said > 0) & (off < 0.05)))
-    return _count(estimates, suspected, motion.stiffness_nm_rad, begin), followed
+    return _count(estimates, suspected, motion, begin), followed
 
 
-def _estimates(joint: str, samples: list[Sample], begin: int) -> tuple[kit.Estimates, str]:
-    """The estimates from the samples, and whom the estimator suspected most often from `begin` on."""
+def _estimates(
+    joint: str, samples: list[Sample], begin: int, restarted: int | None = None
+) -> tuple[kit.Estimates, str]:
+    """The estimates from the samples, and whom the estimator suspected most often from `begin` on.
+
+    `restarted`: place of the first sample after a node has begun anew.
+    """
     suspects: Counter[str] = Counter()
 
     def look(k: int, estimator: Estimator) -> None:
@@ -292,18 +319,20 @@ def _estimates(joint: str, samples: list[Sample], begin: int) -> tuple[kit.Estim
 
     name = joint.removesuffix(" fitted")
     if joint == name:
-        estimates, _ = kit.play(kit.declared(name), samples, look=look)
+        model, monitor = kit.declared(name), None
     else:
         model, baseline = _fitted(name)
-        estimates, _ = kit.play(model, samples, model_monitor=ModelMonitor(model, T, baseline), look=look)
+        monitor = ModelMonitor(model, T, baseline)
+    estimates, _ = kit.play(model, samples, model_monitor=monitor, look=look, restarted=restarted)
     return estimates, suspects.most_common(1)[0][0] if suspects else ""
 
 
-def _count(estimates: kit.Estimates, suspected: str, truth: np.ndarray, begin: int) -> Outcome:
-    wrong = kit.wrong(estimates, truth)[begin:]
+def _count(estimates: kit.Estimates, suspected: str, motion: kit.Motion, begin: int) -> Outcome:
+    wrong = kit.wrong(estimates, motion.stiffness_nm_rad)[begin:]
     silent = wrong & (estimates.status[begin:] & FLAGS == 0)
-    valid = int(estimates.valid[begin:].sum())
-    return Outcome(len(wrong), valid, int(wrong.sum()), int(silent.sum()), suspected)
+    torque = kit.wrong_torque(estimates, motion.torque_nm)[begin:]
+    counts = (int(which.sum()) for which in (estimates.valid[begin:], wrong, silent, torque))
+    return Outcome(len(wrong), *counts, suspected)
 
 
 def unnoticed(

@@ -25,6 +25,7 @@ from drivelink.jointfile import JointFile
 from estimator.sample import Sample, Status
 from sim.canopen.node import Node
 from sim.faults import Faults
+from sim.sensors import DriveSignals
 
 __all__ = ["Stage", "Truth"]
 
@@ -32,13 +33,19 @@ _PATIENCE_S = 30.0  # of the stage's own time; every way back takes less
 
 
 class Truth:
-    """What the devices of a world measured at every SYNC, in counts, and a check of samples against it."""
+    """What the devices of a world measured at every SYNC, in counts, and a check of samples against it.
+
+    Attributes:
+        torque_rms_nm: rms of the flexibility torque until now.
+    """
 
     def __init__(self, stage: Stage) -> None:
         self._world = stage.world
         self._objects = [_position(stage.daemon, motor) for motor in range(stage.world.motors)]
         self._objects.append(_link(stage.daemon))
         self._history: list[tuple[int, ...]] = []
+        self._physics: list[tuple[float, float]] = []  # stiffness and torque at the same SYNCs
+        self._square, self.torque_rms_nm = 0.0, 0.0
         self._forgotten = 0
         self._inner = stage.world.advance
         self._synced = False
@@ -61,12 +68,22 @@ class Truth:
         world = self._world
         counts = [world.drive(motor).position_counts for motor in range(world.motors)]
         self._history.append((*counts, world.link_counts()))
+        truth = world.truth()
+        self._physics.append((truth.stiffness_nm_rad, truth.flexibility_torque_nm))
+        self._square += truth.flexibility_torque_nm**2
+        self.torque_rms_nm = (self._square / self.syncs) ** 0.5
 
     def forget(self) -> None:
         """Keep only what a sample under way may still be of."""
         keep = 100
         self._forgotten += max(0, len(self._history) - keep)
         del self._history[:-keep]
+        del self._physics[:-keep]
+
+    def physics(self, sync: int) -> tuple[float, float] | None:
+        """True stiffness and flexibility torque at a SYNC; None: forgotten."""
+        place = sync - self._forgotten
+        return self._physics[place] if 0 <= place < len(self._physics) else None
 
     def measured(self, sample: Sample, sync: int, late: bool) -> bool:
         """Whether all positions of a sample are those of one SYNC.
@@ -382,6 +399,21 @@ class Stage:
 
     def kill(self, node: int) -> None:
         self.faults.kill(self.node(node))
+
+    def recount(self, node: int, rad: float | None) -> None:
+        """From now on the motor encoder of a drive counts from elsewhere: by so much more, or (None) from zero."""
+        motor, drive = node - 1, self.world.drives[node - 1]
+        now = self.world.drive(motor).position_counts
+        moved = -now if rad is None else round(rad * abs(drive.counts_per_rad))
+        read = self.world.drive
+
+        def drive_of(which: int) -> DriveSignals:
+            signals = read(which)
+            if which != motor:
+                return signals
+            return signals._replace(position_counts=signals.position_counts + moved)
+
+        self.world.drive = drive_of  # type: ignore[method-assign]
 
     def revive(self, node: int) -> None:
         self.faults.revive(self.node(node))

@@ -29,9 +29,10 @@ from sim.plant import JointPlant
 from sim.springs import Spring
 from sim.world import record
 
-VALID, OBSERVABLE = int(Status.VALID), int(Status.OBSERVABLE)
+VALID, OBSERVABLE, NODE_RESTARTED = int(Status.VALID), int(Status.OBSERVABLE), int(Status.NODE_RESTARTED)
 PERIOD_S = 0.001
 WRONG_RELATIVE, WRONG_STD = 0.10, 5.0  # off by more than both: wrong (issue 18)
+WRONG_TORQUE = 0.25  # of the torque's rms (issue 32)
 
 
 class Motion(NamedTuple):
@@ -149,19 +150,20 @@ def play(
     samples: Iterable[Sample],
     *,
     model_monitor: ResidualMonitor | None = None,
+    restarted: int | None = None,
     look: Callable[[int, Estimator], object] = lambda _k, _estimator: None,
     **settings: Any,
 ) -> tuple[Estimates, Estimator]:
     """An estimator's word on these samples, with a model monitor's as the service adds it, and the estimator.
 
-    `look` is called after each sample, with its place.
+    `look` is called after each sample, with its place; at the place `restarted` a node has begun anew.
     """
     estimator = make_estimator(model, EstimatorSettings(**settings), PERIOD_S)
     # What it is given are samples already.
     pipeline = JointPipeline(Assembler((), 0), estimator, model_monitor)
     rows = []
     for k, sample in enumerate(samples):
-        e = pipeline.take(sample).estimate
+        e = pipeline.take(sample, NODE_RESTARTED if k == restarted else 0).estimate
         look(k, estimator)
         rows.append((e.status, e.flexibility_torque_nm, e.stiffness_nm_rad, e.stiffness_std_nm_rad))
     status, torque, stiffness, std = np.array(rows).T
@@ -173,6 +175,12 @@ def wrong(estimates: Estimates, truth: np.ndarray) -> np.ndarray:
     off = np.abs(estimates.stiffness_nm_rad - truth)
     beyond = ~(off <= np.maximum(WRONG_RELATIVE * np.abs(truth), WRONG_STD * estimates.std_nm_rad))
     return np.asarray(estimates.valid & beyond)
+
+
+def wrong_torque(estimates: Estimates, truth: np.ndarray) -> np.ndarray:
+    """Which samples are valid and have a torque that is off by more than a quarter of the true one's rms."""
+    off = np.abs(estimates.torque_nm - truth) <= WRONG_TORQUE * np.sqrt(np.mean(truth**2))
+    return np.asarray(estimates.valid & ~off)
 
 
 def without(samples: Sequence[Sample], share: float, seed: int) -> tuple[list[Sample], np.ndarray]:

@@ -16,7 +16,7 @@ from drivelink.jointfile import JointText, apply_diagnosis, effect_entry, link_e
 from drivelink.jointfile.residual_baseline import floor_entry
 from drivelink.outfile import check_target
 from drivelink.output import plots, report
-from drivelink.output.fitplot import fit_plot
+from drivelink.output.fitreport import fit_plot
 from drivelink.output.units import Units
 from drivelink.recording.columnmap import parse_column_map
 from drivelink.recording.gate import gate

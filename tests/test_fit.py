@@ -11,7 +11,7 @@ import pytest
 from drivelink import jointfile
 from drivelink.cli import main
 from drivelink.output import plots
-from drivelink.output.fitplot import fit_plot
+from drivelink.output.fitreport import fit_plot
 from estimator import EstimatorError, EstimatorSettings, Record, Status, fit, make_estimator
 from estimator.gate import judge
 from estimator.transmissions import MODELS

@@ -35,6 +35,7 @@ __all__ = [
     "make_parser",
     "moved",
     "require_distinct",
+    "warn",
 ]
 
 VERBS = {
@@ -204,6 +205,12 @@ def require_distinct(paths: Sequence[Path]) -> None:
                 f"{path}: given twice: expected another recording, which takes no part in the fit"
             )
         seen.add(path.resolve())
+
+
+def warn(path: Path, lines: Sequence[str]) -> None:
+    """Print what the gate says of a recording, on stderr."""
+    for line in lines:
+        print(f"{path}: warning: {line}", file=sys.stderr)
 
 
 def _bandwidth(text: str) -> float:

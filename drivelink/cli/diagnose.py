@@ -7,18 +7,16 @@ import json
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 
 from drivelink import analysis
-from drivelink.cli import add_recordings, require_distinct
-from drivelink.cli.gating import warn
+from drivelink.cli import add_recordings, require_distinct, warn
 from drivelink.errors import HarmfulModelError
 from drivelink.outfile import check_target
 from drivelink.output import report
+from drivelink.output.document import show
 from drivelink.output.progress import Meter
 from drivelink.output.units import Units
 from drivelink.recording.mapping import joint_of
-from estimator.diagnosis import Diagnosis
 
 EPILOG = """\
 examples:
@@ -80,38 +78,10 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(found.as_json()))
     else:
-        _print(found.outcome, Units(found.runs.source.joint.axis == "linear"))
+        units = Units(found.runs.source.joint.axis == "linear")
+        show(report.sections(found.outcome, units), Console())
         for path in made:
             print(f"wrote {path}")
     if harmful is not None:
         raise harmful
     return 0
-
-
-def _print(outcome: Diagnosis, units: Units) -> None:
-    console = Console()
-    console.print(report.sentence(outcome), highlight=False, soft_wrap=True)
-    console.print(report.unexplained(outcome, units), highlight=False, soft_wrap=True)
-    table = Table()
-    for column in ("error of the torque balance", "before", "after"):
-        table.add_column(column, justify="left" if column.startswith("error") else "right")
-    for name, one in (("training", outcome.train), ("validation", outcome.validation)):
-        unit = units.shown("N·m")
-        before = f"{one.before_rms_nm:.4g} {unit}  {one.before_relative:.2%}"
-        table.add_row(name, before, f"{one.after_rms_nm:.4g} {unit}  {one.after_relative:.2%}")
-    console.print(table)
-    for finding in outcome.effects:
-        print(f"  {report.title_of(finding, outcome)}")
-        for name, value in finding.parameters.items():
-            print(f"    {name} = {units.value(name, value, finding.std.get(name))}")
-        print(f"    probability = {finding.probability:.2f}")
-        if finding.alternatives:
-            print(f"    could also be: {report.others_of(finding)}")
-    for number, refitted in enumerate(outcome.transmissions, start=1):
-        for name, value in refitted.parameters.items():
-            text = units.value(name, value, refitted.std[name])
-            print(f"  motor {number}, refitted: {name} = {text}")
-    for name, value in outcome.alignment.items():
-        print(f"  corrected in the readings: {name} = {units.value(name, value, None)}")
-    for line in (*outcome.notes, *outcome.advice):
-        print(f"  {line}")

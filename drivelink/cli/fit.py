@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 
+from rich.console import Console
+
 from drivelink import jointfile
-from drivelink.cli import add_recordings, require_distinct
+from drivelink.cli import add_recordings, require_distinct, warn
 from drivelink.errors import RecordingError, UsageError
-from drivelink.outfile import check_target
+from drivelink.outfile import check_target, write_whole
 from drivelink.recording.mapping import joint_of
 
 EPILOG = """\
@@ -40,7 +43,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Do the job; return the exit status."""
-    folder = _plots_folder(args)
+    folder = args.out if args.plots == Path() else args.plots
+    if args.plots == Path() and args.out is None:
+        raise UsageError("--plots: expected a folder, or --out to put the plots into")
     require_distinct(args.recording)
     if args.joint is not None:
         jointfile.load(args.joint)  # its error comes first if both are wrong
@@ -50,16 +55,36 @@ def run(args: argparse.Namespace) -> int:
     if args.write is not None:  # the joint file itself may be brought up to date
         check_target(args.write, args.recording, force=args.force)
     joint_of(args.recording[0], args.joint)
-    from drivelink.cli.fitting import fit_recording  # takes a second; check the arguments first
-
-    fit_recording(args, folder)
+    _fit(args, folder)
     return 0
 
 
-def _plots_folder(args: argparse.Namespace) -> Path | None:
-    folder: Path | None = args.plots
-    if folder == Path():
-        if args.out is None:
-            raise UsageError("--plots: expected a folder, or --out to put the plots into")
-        folder = args.out
-    return folder
+def _fit(args: argparse.Namespace, folder: Path | None) -> None:
+    """Fit, print, and write the requested files, plots into `folder`."""
+    from drivelink import analysis  # takes a second; the arguments are checked
+    from drivelink.output.document import show
+    from drivelink.output.fitreport import sections
+    from drivelink.output.units import Units
+
+    options = {"bandwidth_hz": args.bandwidth_hz, "names": args.map, "strict": args.strict}
+    made = analysis.fit(args.recording, args.joint, warn=warn, **options)
+    document = made.as_json()
+    if args.json:
+        print(json.dumps(document))
+    else:  # before anything is written: a full disk loses no result
+        units = Units(made.runs.source.joint.axis == "linear")
+        show(sections(made.found, [path.name for path in args.recording], units), Console())
+    written = []
+    if args.out is not None:
+        written.append(args.out / "fit.json")
+        args.out.mkdir(parents=True, exist_ok=True)
+        inputs = [*args.recording, *([args.joint] if args.joint else [])]
+        check_target(written[0], inputs, force=True)
+        write_whole(written[0], json.dumps(document, indent=2) + "\n", force=True)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        written.append(made.plot().save(folder / "fit.png"))
+    if args.write is not None:
+        written.append(made.write(args.write, force=args.force))
+    for path in [] if args.json else written:
+        print(f"wrote {path}")

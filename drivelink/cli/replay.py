@@ -9,8 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from drivelink.cli import add_map
-from drivelink.cli.gating import warn
+from drivelink.cli import add_map, warn
 from drivelink.errors import UsageError
 from drivelink.jointfile import JointFile
 from drivelink.outfile import check_target

@@ -109,7 +109,7 @@ def analyse(
         before_relative=errors.before_relative,
         after_relative=errors.after_relative,
         report_json=json.dumps(document, indent=2) + "\n",
-        report_html=report.page(outcome, title),
+        report_html=report.html_page(outcome, title),
     )
 
 

@@ -70,13 +70,20 @@ class PlotCurve(NamedTuple):
     std: FloatArray | None = None
 
 
+def blank(width: float, height: float) -> Figure:
+    """An empty figure in the house style; inches."""
+    with rc_context(STYLE):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        FigureCanvasAgg(figure)
+    return figure
+
+
 def new_figure(
     title: str = "", rows: int = 1, columns: int = 1, width: float = 7.0, height: float = 2.6
 ) -> tuple[Figure, list[Axes]]:
     """A figure in the house style, and its axes row by row; `height` in inches is that of one row."""
+    figure = blank(width, height * rows)
     with rc_context(STYLE):
-        figure = Figure(figsize=(width, height * rows), layout="constrained")
-        FigureCanvasAgg(figure)
         axes = [figure.add_subplot(rows, columns, k + 1) for k in range(rows * columns)]
         if title:
             figure.suptitle(title, fontsize=11, x=0.01, ha="left", fontweight="bold")

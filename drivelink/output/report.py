@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import html
 import json
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from string import Template
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,16 +13,29 @@ from matplotlib.figure import Figure
 
 from drivelink.outfile import write_whole
 from drivelink.output import plots
+from drivelink.output.document import (
+    PARAMETER_HEAD,
+    Chart,
+    Document,
+    Grid,
+    Lines,
+    Paragraph,
+    Section,
+    Share,
+    page,
+    parameter_rows,
+)
 from drivelink.output.units import Units, in_words
-from estimator.diagnosis import Curve, Diagnosis, Errors, Finding, StiffnessCurve
+from estimator.choices import choice
+from estimator.diagnosis import Curve, Diagnosis, Finding, StiffnessCurve
 from estimator.effects import LIBRARY
+from estimator.sample import SIGMA_95
 
 _SCHEMA = "drivelink.diagnosis/1"
 _CURVE_POINTS = 200
 _RIVALS = 8
 _SURE, _LIKELY = 0.9, 0.3  # probabilities at which an effect is missing, and at which it has a name
-_WIDTH = 9.6  # inches of a plot as wide as the page
-_COLUMN = 5.4  # and of one in half of it
+_COLUMN = 4.6  # inches of a plot in half the page, or on a phone
 _AXES = {
     "position": "motor position / rad",
     "velocity": "motor velocity / (rad/s)",
@@ -54,7 +66,7 @@ def write(outcome: Diagnosis, title: Title, folder: Path) -> list[Path]:
     made = []
     for name, text in (
         ("report.json", json.dumps(as_json(outcome), indent=2) + "\n"),
-        ("report.html", page(outcome, title)),
+        ("report.html", html_page(outcome, title)),
     ):
         path = folder / name
         write_whole(path, text, force=True)
@@ -199,91 +211,129 @@ def _place(finding: Finding, outcome: Diagnosis) -> str:
     return f"{finding.location} {(finding.motor or 0) + 1}" if several else finding.location
 
 
-def page(outcome: Diagnosis, title: Title) -> str:
-    """The report as one self-contained page."""
-    units = Units(title.linear)
-    template = Template(Path(__file__).with_name("report.html").read_text(encoding="utf-8"))
-    return template.substitute(
-        title=html.escape(title.joint),
-        recording=html.escape(title.recording),
-        validation=html.escape(title.validation or "held-out blocks of the same recording"),
-        bandwidth=f"{outcome.bandwidth_hz:.3g}",
-        verdict=outcome.verdict.replace("_", " "),
-        verdict_class=outcome.verdict,
-        sentence=html.escape(sentence(outcome)),
-        unexplained=html.escape(unexplained(outcome, units)),
-        errors="".join(
-            _error_row(n, e, units)
-            for n, e in (("training", outcome.train), ("validation", outcome.validation))
-        ),
-        effects=_effects(outcome, units),
-        curves=_curves(outcome, units),
-        stiffness=_stiffness(outcome, units),
-        rivals=_rivals_figure(outcome),
-        series=_series_figure(outcome, units),
-        doubts=_doubts(outcome),
+def html_page(outcome: Diagnosis, title: Title) -> str:
+    """Draw the report as one self-contained page."""
+    about = (
+        f"Diagnosis of {title.recording}, validated on "
+        f"{title.validation or 'held-out blocks of the same recording'}; "
+        f"all channels filtered alike at {outcome.bandwidth_hz:.3g} Hz."
     )
+    return page(Document(f"{title.joint}: diagnosis", about, sections(outcome, Units(title.linear))))
 
 
-def _error_row(name: str, errors: Errors, units: Units) -> str:
-    bar = 100.0 * min(errors.after_rms_nm / max(errors.before_rms_nm, 1e-300), 1.0)
+def sections(outcome: Diagnosis, units: Units) -> list[Section]:
+    """Say and draw what was found, for a page and for a terminal."""
+    sure = all(finding.probability >= _SURE for finding in outcome.effects)
+    label = f"{'' if sure else 'likely '}{outcome.verdict.replace('_', ' ')}"
+    verdict = Paragraph(sentence(outcome), label, f"verdict {outcome.verdict}")
+    made = [
+        Section("", [verdict, Paragraph(unexplained(outcome, units))]),
+        Section("Error of the motor torque balance", [_errors(outcome, units)]),
+        Section("What reveals it", [_curve_chart(curve, units) for curve in outcome.curves]),
+        Section("Stiffness before and after", [_stiffness_chart(one, units) for one in outcome.stiffness]),
+        Section("Parameters", [_parameters(outcome, units)], wide=False),
+        Section("Where the candidates stood", _candidates(outcome), wide=False),
+        Section("What could not be separated, and what would separate it", [_doubts(outcome)]),
+    ]
+    if outcome.series is not None:
+        charts = partial(_measured_figure, outcome, units), partial(residual_figure, outcome, units)
+        made.append(Section("Over time", [Chart(draw) for draw in charts]))
+    return [section for section in made if section.blocks]
+
+
+def _errors(outcome: Diagnosis, units: Units) -> Grid:
     unit = units.shown("N·m")
-    return (
-        f"<tr><th>{name}</th><td>{errors.before_rms_nm:.4g} {unit}</td><td>{errors.before_relative:.2%}</td>"
-        f"<td>{errors.after_rms_nm:.4g} {unit}</td><td>{errors.after_relative:.2%}</td>"
-        f'<td class="bar"><span style="width:{bar:.1f}%"></span></td></tr>'
-    )
+    rows: list[tuple[str | Share, ...]] = []
+    for name, one in (("training", outcome.train), ("validation", outcome.validation)):
+        before, after = (
+            f"{rms:.4g} {unit}, {relative:.2%}"
+            for rms, relative in (
+                (one.before_rms_nm, one.before_relative), (one.after_rms_nm, one.after_relative)
+            )
+        )  # fmt: skip
+        part = one.after_rms_nm / max(one.before_rms_nm, 1e-300)
+        rows.append((name, before, after, Share(f"{part:.0%}", part)))
+    return Grid(("", "as declared", "with the effects", "after / before"), rows)
 
 
-def _effects(outcome: Diagnosis, units: Units) -> str:
-    rows = []
+def _parameters(outcome: Diagnosis, units: Units) -> Grid:
+    rows: list[tuple[str | Share, ...]] = []
     for finding in outcome.effects:
-        rows.append(f'<tr class="effect"><th colspan="2">{html.escape(title_of(finding, outcome))}</th></tr>')
-        if finding.name in LIBRARY:
-            rows.append(f'<tr><td colspan="2">{html.escape(LIBRARY[finding.name].description)}</td></tr>')
+        rows.append((title_of(finding, outcome),))
         for name, value in finding.parameters.items():
-            text = html.escape(units.value(name, value, finding.std.get(name)))
-            rows.append(f"<tr><td><code>{html.escape(name)}</code></td><td>{text}</td></tr>")
+            rows += parameter_rows(name, value, finding.std.get(name), units)
     for number, one in enumerate(outcome.transmissions, start=1):
-        if one.parameters:
-            rows.append(f'<tr class="effect"><th colspan="2">motor {number}, refitted</th></tr>')
+        rows += [(f"motor {number}, refitted",)] if one.parameters else []
         for name, value in one.parameters.items():
-            text = units.value(name, value, one.std[name])
-            rows.append(f"<tr><td><code>{html.escape(name)}</code></td><td>{text}</td></tr>")
-    if outcome.alignment:
-        rows.append('<tr class="effect"><th colspan="2">corrected in the readings</th></tr>')
+            rows += parameter_rows(name, value, one.std[name], units)
+    rows += [("corrected in the readings",)] if outcome.alignment else []
     for name, value in outcome.alignment.items():
-        rows.append(f"<tr><td><code>{name}</code></td><td>{units.value(name, value, None)}</td></tr>")
-    return "".join(rows)
+        rows += parameter_rows(name, value, None, units)
+    return Grid(PARAMETER_HEAD, rows)
 
 
-def _curves(outcome: Diagnosis, units: Units) -> str:
-    if not outcome.curves:
-        return ""
-    return "<h2>What reveals it</h2>" + "".join(_curve_figure(curve, units) for curve in outcome.curves)
+def _candidates(outcome: Diagnosis) -> list[Paragraph | Grid | Chart | Lines]:
+    """Each promising effect alone, and why the chosen ones were chosen."""
+    if not outcome.rivals:
+        return []
+    chances = {(f.name, f.motor): f.probability for f in outcome.effects}
+    others = {n: p for f in outcome.effects
+              for n, p in zip(f.alternatives, f.alternative_probabilities, strict=True)}  # fmt: skip
+    shown = [r for k, r in enumerate(outcome.rivals) if k < _RIVALS or (r.name, r.motor) in chances]
+    most = max(rival.error_relative for rival in shown)
+    rows: list[tuple[str | Share, ...]] = []
+    for rival in shown:
+        mine = chances.get((rival.name, rival.motor))
+        p = others.get(rival.name) if mine is None else mine
+        motor = f" {rival.motor + 1}" if rival.motor else ""
+        named = f"{'' if mine is None else '▶ '}{in_words(rival.name)}{motor}"
+        chance = "" if not chances else f"< {choice('even'):g}" if p is None else f"{p:.2f}"
+        left = Share(f"{rival.error_relative:.2%}", rival.error_relative / most)
+        rows.append((named, chance, left))
+    return [
+        Grid(("candidate", "probability", "error left with it alone"), rows),
+        Paragraph(_choice_of(outcome, [r.error_relative for r in shown if (r.name, r.motor) in chances])),
+    ]
 
 
-def _curve_figure(curve: Curve, units: Units) -> str:
-    figure, (axes,) = plots.new_figure(width=_WIDTH, height=3.2)
+def _choice_of(outcome: Diagnosis, chosen: list[float]) -> str:
+    """Why the chosen candidates were chosen, where another one leaves less error alone."""
+    if not outcome.effects:
+        return "None was chosen: alone or together they predict other stretches no better."
+    together = f" together; together they leave {outcome.train.after_relative:.2%}" if len(chosen) > 1 else ""
+    text = f"▶ chosen{together}."
+    if chosen and outcome.rivals[0].error_relative < min(chosen):
+        text += (
+            f" Though {in_words(outcome.rivals[0].name)} alone leaves less: an effect with more freedom fits "
+            "any recording better. What counts is how likely an effect is to predict other stretches of the "
+            "recording, with parameters of a plausible size."
+        )
+    return text
+
+
+def _curve_chart(curve: Curve, units: Units) -> Chart:
+    over = " and ".join(name.replace("_", " ") for name in curve.coordinates)
+    about = f", {LIBRARY[curve.name].description}" if curve.name in LIBRARY else ""
+    caption = f"Residual of the declared model over {over}, and {in_words(curve.name)}{about}."
+    return Chart(partial(_curve_figure, curve, units), caption)
+
+
+def _curve_figure(curve: Curve, units: Units) -> Figure:
+    figure, (axes,) = plots.new_figure(width=_COLUMN, height=3.0)
     across, torque = units.label(_AXES[curve.coordinates[0]]), units.label("torque / N·m")
     plots.dots(axes, curve.x, curve.residual_nm)
     order = np.argsort(curve.x)
     name = in_words(curve.name)
     if curve.second is None and _is_function(curve):
-        curves = {"residual of the model": plots.medians(curve.x, curve.residual_nm)}
+        curves = {"residual": plots.medians(curve.x, curve.residual_nm)}
         curves[name] = plots.medians(curve.x, curve.fitted_nm)
         plots.xy(axes, curves, across, torque)
     else:
         axes.plot(curve.x[order], curve.fitted_nm[order], ".", color=plots.COLORS[1], markersize=2.0)
-        axes.plot([], [], ".", color="#aaaaaa", label="residual of the model")
+        axes.plot([], [], ".", color="#aaaaaa", label="residual")
         axes.plot([], [], ".", color=plots.COLORS[1], label=name)
         plots.xy(axes, {}, across, torque)
-    return f"<figure>{plots.svg_text(figure)}<figcaption>{_caption(curve)}</figcaption></figure>"
-
-
-def _caption(curve: Curve) -> str:
-    over = " and ".join(name.replace("_", " ") for name in curve.coordinates)
-    return f"Residual of the declared model over {over}, and {html.escape(in_words(curve.name))}."
+    return figure
 
 
 def _is_function(curve: Curve) -> bool:
@@ -293,81 +343,59 @@ def _is_function(curve: Curve) -> bool:
     return float(np.std(left)) < 0.35 * float(np.std(curve.fitted_nm)) + 1e-300
 
 
-def _stiffness(outcome: Diagnosis, units: Units) -> str:
-    if not outcome.stiffness:
-        return ""
-    figures = "".join(_stiffness_figure(one, units) for one in outcome.stiffness)
-    return f"<h2>Stiffness before and after</h2>{figures}"
+def _stiffness_chart(curve: StiffnessCurve, units: Units) -> Chart:
+    zero = int(np.argmin(np.abs(curve.deflection_rad)))
+    before, after = (
+        f"{100.0 * SIGMA_95 * std[zero] / abs(value[zero]):.2g} %"
+        for value, std in (
+            (curve.before_nm_rad, curve.before_std_nm_rad), (curve.after_nm_rad, curve.after_std_nm_rad)
+        )
+    )  # fmt: skip
+    caption = (
+        f"Stiffness of motor {curve.motor + 1}'s transmission, with 95 % bands: at zero ± {before} as "
+        f"declared, ± {after} refitted. The declared model's band assumes that its other parameters are "
+        "exact and complete."
+    )
+    return Chart(partial(_stiffness_figure, curve, units), caption)
 
 
-def _stiffness_figure(curve: StiffnessCurve, units: Units) -> str:
+def _stiffness_figure(curve: StiffnessCurve, units: Units) -> Figure:
     """Stiffness over deflection, before and after, each with its 95 % band."""
-    figure, (axes,) = plots.new_figure(width=_WIDTH, height=3.0)
+    figure, (axes,) = plots.new_figure(width=_COLUMN, height=3.0)
     phi = curve.deflection_rad
     curves = {
         "as declared": plots.PlotCurve(phi, curve.before_nm_rad, curve.before_std_nm_rad),
         "refitted": plots.PlotCurve(phi, curve.after_nm_rad, curve.after_std_nm_rad),
     }
     plots.xy(axes, curves, units.label("deflection / rad"), units.label("stiffness / (N·m/rad)"))
-    caption = (
-        f"Stiffness of motor {curve.motor + 1}'s transmission, with 95 % bands. The declared model's band "
-        "assumes that its other parameters are exact and complete."
-    )
-    return f"<figure>{plots.svg_text(figure)}<figcaption>{caption}</figcaption></figure>"
-
-
-def _rivals_figure(outcome: Diagnosis) -> str:
-    if not outcome.rivals:
-        return ""
-    shown = outcome.rivals[:_RIVALS]
-    figure, (axes,) = plots.new_figure(width=_COLUMN, height=0.7 + 0.3 * len(shown))
-    chosen = {(finding.name, finding.motor) for finding in outcome.effects}
-    won = [(r.name, r.motor) in chosen for r in shown]
-    names = [
-        ("▶ " if mine else "") + in_words(r.name) + (f" {r.motor + 1}" if r.motor else "")
-        for r, mine in zip(shown, won, strict=True)
-    ]
-    values = [100.0 * r.error_relative for r in shown]
-    place = np.arange(len(shown))
-    fills = [plots.COLORS[1] if mine else "#bbbbbb" for mine in won]
-    axes.barh(place, values, color=fills, edgecolor="#222222", linewidth=0.8)
-    axes.set_yticks(place, names)
-    for label, mine in zip(axes.get_yticklabels(), won, strict=True):
-        label.set_fontweight("bold" if mine else "normal")
-    axes.invert_yaxis()
-    plots.xy(axes, {}, "error left with this effect alone / % of the torque (weighted)", "")
-    caption = "▶ chosen" if any(won) else "None was chosen."
-    return f"<figure>{plots.svg_text(figure)}<figcaption>{caption}</figcaption></figure>"
-
-
-def _series_figure(outcome: Diagnosis, units: Units) -> str:
-    if outcome.series is None:
-        return ""
-    return f"<figure>{plots.svg_text(residual_figure(outcome, units))}</figure>"
-
-
-def residual_figure(outcome: Diagnosis, units: Units) -> Figure:
-    """Measured torque, and what the model leaves of it, before and after; empty without a series."""
-    figure, axes = plots.new_figure(rows=2, width=_WIDTH, height=2.2)
-    torque, series = units.label("torque / N·m"), outcome.series
-    if series is None:
-        return figure
-    plots.over_time(axes[0], {"measured": plots.PlotCurve(series.time_s, series.torque_nm)}, torque)
-    curves = {
-        "left before": plots.PlotCurve(series.time_s, series.before_nm),
-        "left after": plots.PlotCurve(series.time_s, series.after_nm),
-    }
-    plots.over_time(axes[1], curves, torque)
     return figure
 
 
-def _doubts(outcome: Diagnosis) -> str:
+def _measured_figure(outcome: Diagnosis, units: Units) -> Figure:
+    figure, (axes,) = plots.new_figure(width=_COLUMN, height=2.6)
+    if (series := outcome.series) is not None:
+        curve = plots.PlotCurve(series.time_s, series.torque_nm)
+        plots.over_time(axes, {"measured": curve}, units.label("torque / N·m"), "Measured torque")
+    return figure
+
+
+def residual_figure(outcome: Diagnosis, units: Units) -> Figure:
+    """Draw what the model leaves of the motor torque over time, before and after; empty without a series."""
+    figure, (axes,) = plots.new_figure(width=_COLUMN, height=2.6)
+    if (series := outcome.series) is not None:
+        curves = {
+            "left before": plots.PlotCurve(series.time_s, series.before_nm),
+            "left after": plots.PlotCurve(series.time_s, series.after_nm),
+        }
+        plots.over_time(axes, curves, units.label("torque / N·m"), "Residual")
+    return figure
+
+
+def _doubts(outcome: Diagnosis) -> Lines:
     lines = [
         f"{title_of(f, outcome)}, probability {f.probability:.2f}, could also be: {others_of(f)}."
         for f in outcome.effects
         if f.alternatives
     ]
     lines += [*outcome.advice, *outcome.notes]
-    if not lines:
-        return "<p>No other effect explains these data as well.</p>"
-    return "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in lines) + "</ul>"
+    return Lines(tuple(lines) or ("No other effect explains these data as well.",))

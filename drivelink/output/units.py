@@ -75,5 +75,8 @@ class Units:
             power = str(2 * k + 1).translate(_RAISED) if k and unit.endswith(f"/{length}") else ""
             half = None if s is None else SIGMA_95 * s
             text, half_text = value_and_interval(x, half)
-            found.append((text if half_text else f"{x:.5g}", half_text, f"{unit}{power}"))
+            plain = f"{x:.5g}"
+            if not half_text and "e" not in plain:
+                text = plain
+            found.append((text, half_text, f"{unit}{power}"))
         return found

@@ -1,0 +1,167 @@
+"""What a verb reports: sections of texts, tables and charts, drawn as a page or printed in a terminal."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from string import Template
+from typing import NamedTuple
+
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from drivelink.output import plots
+from drivelink.output.units import Units
+from estimator.model import ParameterValue
+
+PARAMETER_HEAD = ("parameter", "value", "± (95 %)", "unit")
+
+
+class Paragraph(NamedTuple):
+    """A text; on the page with a label above and in a style of its own."""
+
+    text: str
+    label: str = ""
+    style: str = ""
+
+
+class Share(NamedTuple):
+    """A cell with a bar: its text, and the part of a whole cell from 0 to 1."""
+
+    text: str
+    part: float
+
+
+class Grid(NamedTuple):
+    """A table; a row of one cell is a heading of those below it, one that begins with ▶ stands out."""
+
+    head: tuple[str, ...]
+    rows: list[tuple[str | Share, ...]]
+    title: str = ""
+
+
+class Chart(NamedTuple):
+    """A figure, drawn on a page only."""
+
+    draw: Callable[[], Figure]
+    caption: str = ""
+
+
+class Lines(NamedTuple):
+    """Remarks, one line each."""
+
+    lines: tuple[str, ...]
+
+
+class Section(NamedTuple):
+    """Blocks below a heading; on the page over its whole width, or half of it."""
+
+    title: str
+    blocks: list[Paragraph | Grid | Chart | Lines]
+    wide: bool = True
+
+
+class Document(NamedTuple):
+    """A report: title, a line about its subject, sections."""
+
+    title: str
+    about: str
+    sections: list[Section]
+
+
+def parameter_rows(
+    name: str, value: ParameterValue, std: ParameterValue | None, units: Units
+) -> list[tuple[str, ...]]:
+    """Rows of a parameter below `PARAMETER_HEAD`: one, or one for each coefficient of a polynomial."""
+    return [
+        (f"{name}[{k}]" if isinstance(value, tuple) else name, *cells)
+        for k, cells in enumerate(units.parts(name, value, std), start=1)
+    ]
+
+
+def show(sections: Iterable[Section], console: Console) -> None:
+    """Print all but the charts."""
+    for section in sections:
+        for block in section.blocks:
+            if isinstance(block, Paragraph):
+                console.print(Text(block.text), soft_wrap=True)
+            elif isinstance(block, Grid):
+                console.print(_printed(block, section.title))
+            elif isinstance(block, Lines):
+                for line in block.lines:
+                    console.print(Text(f"  {line}"), soft_wrap=True)
+
+
+def _printed(grid: Grid, title: str) -> Table:
+    table = Table(title=grid.title or title, title_justify="left")
+    for k, column in enumerate(grid.head):
+        table.add_column(column, justify="left" if k == 0 or column == "unit" else "right")
+    for row in grid.rows:
+        if len(row) == 1:
+            table.add_section()
+        style = "bold" if len(row) == 1 or _text(row[0]).startswith("▶") else ""
+        table.add_row(*(Text(_text(cell)) for cell in row), style=style)
+    return table
+
+
+def page(document: Document) -> str:
+    """Draw a document as one self-contained page."""
+    template = Template(Path(__file__).with_name("document.html").read_text(encoding="utf-8"))
+    return template.substitute(
+        title=_escaped(document.title),
+        about=_escaped(document.about),
+        sections="\n".join(map(_section, document.sections)),
+    )
+
+
+def _section(section: Section) -> str:
+    parts, charts = [], []
+    for block in section.blocks:
+        if isinstance(block, Chart):
+            caption = f"<figcaption>{_escaped(block.caption)}</figcaption>" if block.caption else ""
+            charts.append(f"<figure>{plots.svg_text(block.draw())}{caption}</figure>")
+        elif isinstance(block, Grid):
+            parts.append(_table(block))
+        elif isinstance(block, Lines):
+            parts.append(f"<ul>{''.join(f'<li>{_escaped(line)}</li>' for line in block.lines)}</ul>")
+        else:
+            label = f"<b>{_escaped(block.label)}</b>" if block.label else ""
+            parts.append(f'<p class="{block.style}">{label}{_escaped(block.text)}</p>')
+    if charts:
+        parts.append(f'<div class="charts">{"".join(charts)}</div>')
+    heading = f"<h2>{_escaped(section.title)}</h2>" if section.title else ""
+    return f'<section class="{"wide" if section.wide else "half"}">{heading}{"".join(parts)}</section>'
+
+
+def _table(grid: Grid) -> str:
+    rows = "".join(map(_row, grid.rows, [len(grid.head)] * len(grid.rows)))
+    head = "".join(f"<th>{_escaped(cell)}</th>" for cell in grid.head)
+    return f'<div class="table"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
+
+
+def _row(cells: tuple[str | Share, ...], columns: int) -> str:
+    if len(cells) == 1:
+        return f'<tr class="over"><th colspan="{columns}">{_escaped(_text(cells[0]))}</th></tr>'
+    first, *rest = cells
+    drawn = "".join(map(_cell, rest))
+    kind = ' class="chosen"' if _text(first).startswith("▶") else ""
+    name = _escaped(_text(first)).replace("_", "_<wbr>")
+    return f"<tr{kind}><th>{name}</th>{drawn}</tr>"
+
+
+def _cell(cell: str | Share) -> str:
+    if isinstance(cell, str):
+        return f"<td>{_escaped(cell)}</td>"
+    width = 100.0 * min(max(cell.part, 0.0), 1.0)
+    return f'<td class="bar"><i><b style="width:{width:.1f}%"></b></i>{_escaped(cell.text)}</td>'
+
+
+def _escaped(text: str) -> str:
+    return html.escape(text, quote=False)
+
+
+def _text(cell: str | Share) -> str:
+    return cell if isinstance(cell, str) else cell.text

@@ -15,9 +15,9 @@ from drivelink import recording
 from drivelink.errors import RecordingError
 from drivelink.jointfile import JointFile
 from drivelink.recording.canframes import FrameLog, is_frame_log
-from drivelink.recording.canlog import CAN_FORMATS
 from drivelink.recording.columns import sample_columns, sample_row
 from drivelink.recording.cycles import Cycle
+from drivelink.recording.formats import FORMATS
 from drivelink.recording.mcapsamples import recorded_cycles
 from estimator.sample import Record
 
@@ -67,9 +67,8 @@ def _parts(path: Path, limit_bytes: float) -> int:
     if limit_bytes <= 0:
         return 1
     budget = max(_USED * limit_bytes - _BASE_BYTES, min(_LEAST_BYTES, limit_bytes))
-    suffix = path.suffix.lower()
-    text = suffix == ".csv" or (suffix in CAN_FORMATS and CAN_FORMATS[suffix].text)
-    needed = path.stat().st_size * (_EXPANSION_TEXT if text else _EXPANSION_OTHER)
+    kind = FORMATS.get(path.suffix.lower(), FORMATS[".csv"])
+    needed = path.stat().st_size * (_EXPANSION_TEXT if kind.text else _EXPANSION_OTHER)
     return max(1, math.ceil(needed / budget))
 
 

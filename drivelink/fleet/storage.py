@@ -23,9 +23,8 @@ from fsspec.core import url_to_fs
 from drivelink.fleet.errors import FleetError
 from drivelink.infile import open_regular
 from drivelink.recording.canlog import CAN_SUFFIXES
+from drivelink.recording.formats import FORMATS
 from drivelink.recording.mapping import side_file
-
-SUFFIXES = frozenset({".csv", ".mcap", ".mf4", *CAN_SUFFIXES})  # file name endings of recordings
 
 _CHUNK = 1 << 20
 _MODIFIED = ("mtime", "LastModified", "last_modified", "Last-Modified", "time", "created")
@@ -96,7 +95,7 @@ def _listed(pattern: str) -> list[Source]:
 
 
 def _is_recording(path: str) -> bool:
-    return Path(path).suffix.lower() in SUFFIXES
+    return Path(path).suffix.lower() in FORMATS
 
 
 def _source(url: str, info: dict[str, Any]) -> Source:

@@ -10,11 +10,10 @@ from pathlib import Path
 from drivelink.errors import RecordingError, UsageError
 from drivelink.jointfile import JointFile
 from drivelink.recording.canframes import is_frame_log, read_frame_record
-from drivelink.recording.canlog import CAN_SUFFIXES
-from drivelink.recording.columnmap import ColumnMap, column_map
-from drivelink.recording.csvfile import read_csv
+from drivelink.recording.columnmap import ColumnMap, column_map, renamed
+from drivelink.recording.columns import record_from_columns
+from drivelink.recording.formats import FORMATS
 from drivelink.recording.mcapsamples import read_mcap
-from drivelink.recording.mf4file import read_mf4
 from estimator.sample import Record
 
 __all__ = ["read"]
@@ -48,14 +47,15 @@ def read(
         raise RecordingError(f"{path}: no such file")
     if path.is_dir():
         raise RecordingError(f"{path}: expected a file, got a folder")
-    suffix = path.suffix.lower()
-    if names and (suffix == ".mcap" or suffix in CAN_SUFFIXES):
+    read_columns = FORMATS.get(path.suffix.lower(), FORMATS[".csv"]).columns
+    if read_columns is not None:
+        names = column_map(joint, names)
+        columns, ignored = read_columns(path, names)
+        ours = renamed(columns, names, str(path))
+        left = tuple(name for name in ignored if name not in ours)
+        return record_from_columns(ours, str(path), joint, keep_nan, left)
+    if names:
         raise UsageError(f"--map: {path}: only CSV and MF4 files have columns to be named")
-    names = column_map(joint, names)
     if is_frame_log(path):
         return read_frame_record(path, joint, Path(base_dir), channel)
-    if suffix == ".mcap":
-        return read_mcap(path, joint, keep_nan)
-    if suffix == ".mf4":
-        return read_mf4(path, joint, keep_nan, names)
-    return read_csv(path, joint, keep_nan, names)
+    return read_mcap(path, joint, keep_nan)

@@ -17,12 +17,10 @@ import numpy as np
 
 from drivelink.errors import RecordingError
 from drivelink.infile import open_regular
-from drivelink.jointfile import JointFile
 from drivelink.jointfile.columns import COLUMNS
-from drivelink.recording.columnmap import ColumnMap, renamed
-from drivelink.recording.columns import record_from_columns
+from drivelink.recording.columnmap import ColumnMap
 from drivelink.recording.limits import MAX_COLUMNS, MAX_LINE_BYTES, require_samples
-from estimator.sample import FloatArray, Record
+from estimator.sample import FloatArray
 
 _LOG = logging.getLogger("drivelink.recording")
 
@@ -30,29 +28,18 @@ _EMPTY = re.compile(rb"(?:(?<=,)|(?<=\n)|^)[ \t]*(?:null|none|n/a|na|-)?[ \t\r]*
 _BLOCK = 1 << 22  # bytes per read
 
 
-def read_csv(
-    path: Path, joint: JointFile | None = None, keep_nan: bool = False, names: ColumnMap | None = None
-) -> Record:
-    """Read a CSV recording (columns as in docs/reference/recordings.md).
-
-    Raises:
-        RecordingError: it cannot be read, or is incomplete.
-    """
-    columns, ignored = _read_csv_columns(path, names)
-    return record_from_columns(columns, str(path), joint, keep_nan, ignored)
-
-
-def _read_csv_columns(
-    path: Path, names: ColumnMap | None = None
-) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
-    """(rows,) values of each known column by its name, and the names of the others; an empty cell is NaN.
+def read_csv_columns(path: Path, names: ColumnMap) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
+    """Read the known columns (docs/reference/recordings.md); an empty cell is NaN.
 
     Accepts comma, semicolon or tab as separator, decimal commas with the latter two, a byte-order mark and
     `#` comments before the header. A last line without end is omitted, because it may be incomplete.
 
     Args:
         path: the file.
-        names: columns with other names or units in the file.
+        names: columns with other names in the file.
+
+    Returns:
+        (rows,) values of each by its name in the file, and the names of the others.
 
     Raises:
         RecordingError: no header, a cell that is not a number, a line with another number of columns, or too
@@ -60,7 +47,7 @@ def _read_csv_columns(
     """
     try:
         with open_regular(path) as file:
-            return _read(file, path, names or {})
+            return _read(file, path, names)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
 
@@ -82,7 +69,7 @@ def _read(file: IO[bytes], path: Path, names: ColumnMap) -> tuple[dict[str, Floa
     for k, name in enumerate(layout.used):
         columns[name] = np.concatenate([table[:, k] for table in tables])
     ignored = tuple(name for name in layout.names if name not in columns)
-    return renamed(columns, names, str(path)), ignored
+    return columns, ignored
 
 
 class _Layout(NamedTuple):

@@ -1,14 +1,56 @@
-"""Selects the writer of a recording by its file name."""
+"""The formats of recordings, by the ending of the file's name: what each holds, its reader and its writer."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from enum import Enum, auto
 from pathlib import Path
+from typing import NamedTuple
 
 from drivelink.errors import RecordingError
 from drivelink.jointfile import JointFile
 from drivelink.recording.canlog import CAN_FORMATS
-from drivelink.recording.mf4file import Mf4Sink
+from drivelink.recording.columnmap import ColumnMap
+from drivelink.recording.csvfile import read_csv_columns
+from drivelink.recording.mf4file import read_mf4_columns
 from drivelink.recording.sinks import CanSink, CsvSink, McapSink, Sink
+from estimator.sample import FloatArray
+
+Columns = tuple[dict[str, FloatArray], tuple[str, ...]]
+
+
+class Holds(Enum):
+    """What a file of a format holds."""
+
+    COLUMNS = auto()
+    MESSAGES = auto()
+    FRAMES = auto()
+
+
+class Format(NamedTuple):
+    """A format of recordings.
+
+    Attributes:
+        holds: what is in a file.
+        sink: its writer; None: only read.
+        columns: reads columns by their names in the file, and names of those left out; None: no columns.
+        text: whether it is text, some thirty times smaller than the memory that its analysis takes.
+    """
+
+    holds: Holds
+    sink: Callable[..., Sink] | None = None
+    columns: Callable[[Path, ColumnMap], Columns] | None = None
+    text: bool = False
+
+
+FORMATS = {
+    ".mcap": Format(Holds.MESSAGES, McapSink),
+    ".csv": Format(Holds.COLUMNS, CsvSink, read_csv_columns, text=True),
+    ".mf4": Format(Holds.COLUMNS, columns=read_mf4_columns),
+} | {
+    suffix: Format(Holds.FRAMES, CanSink if kind.writer else None, text=kind.text)
+    for suffix, kind in CAN_FORMATS.items()
+}
 
 
 def open_sink(path: Path, joint: JointFile, joint_text: str = "", *, force: bool = False) -> Sink:
@@ -23,14 +65,8 @@ def open_sink(path: Path, joint: JointFile, joint_text: str = "", *, force: bool
     Raises:
         RecordingError: no such format, or the file cannot be written.
     """
-    suffix = path.suffix.lower()
-    if suffix == ".mcap":
-        return McapSink(path, joint, joint_text, force=force)
-    if suffix == ".csv":
-        return CsvSink(path, joint, force=force)
-    if suffix == ".mf4":
-        return Mf4Sink(path, joint, joint_text, force=force)
-    written = [ending for ending, kind in CAN_FORMATS.items() if kind.writer]
-    if suffix in written:
-        return CanSink(path, joint, force=force)
-    raise RecordingError(f"{path}: expected a name that ends in .mcap, .csv, .mf4 or {', '.join(written)}")
+    kind = FORMATS.get(path.suffix.lower())
+    if kind is None or kind.sink is None:
+        written = [ending for ending, one in FORMATS.items() if one.sink]
+        raise RecordingError(f"{path}: expected a name that ends in {', '.join(written)}")
+    return kind.sink(path, joint, joint_text, force=force)

@@ -86,7 +86,7 @@ class CsvSink(Sink):
 
     wants = frozenset({"sample"})
 
-    def __init__(self, path: Path, joint: JointFile, *, force: bool = False) -> None:
+    def __init__(self, path: Path, joint: JointFile, _: str = "", *, force: bool = False) -> None:
         super().__init__(path, force=force)
         self._period_s = joint.bus.period_s
         columns = sample_columns(len(joint.motor))
@@ -202,7 +202,7 @@ class CanSink(Sink):
 
     wants = frozenset({"frame"})
 
-    def __init__(self, path: Path, joint: JointFile, *, force: bool = False) -> None:
+    def __init__(self, path: Path, joint: JointFile, _: str = "", *, force: bool = False) -> None:
         side = side_file(path)
         check_target(side, force=force)
         super().__init__(path, force=force)

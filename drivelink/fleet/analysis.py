@@ -25,50 +25,18 @@ from estimator.transmissions import MODELS, RIGID
 NAMED = {"zero": None, "middle": 0.5, "high": 0.95}
 
 
-class TransmissionRow(NamedTuple):
-    """Result for one transmission; the fields are columns of the table.
+class Analysis(NamedTuple):
+    """Result of a recording.
 
     Attributes:
-        transmission: its number, from 1.
-        model: its model; "none" is rigid and has no stiffness.
-        parameters: JSON of alpha by the names of the joint file.
-        parameters_std: JSON, likewise.
-        covariance: of alpha, row by row.
-        named: (deflection, stiffness, standard deviation) for each of `NAMED`; rad, N·m/rad.
-        deflection_rms_rad: excitation.
-        torque_rms_nm: excitation.
-        excited: whether the motion reveals the stiffness.
-        inertia_kg_m2: B as refitted.
-        viscous_damping_nm_s_rad: D as refitted.
-        fit_error_relative: residual of the fit over the flexibility torque.
+        joint: columns of the table that all its rows share.
+        transmissions: further columns of each transmission's row.
+        report_json: the diagnosis for programs.
+        report_html: the diagnosis for people.
     """
 
-    transmission: int
-    model: str
-    parameters: str
-    parameters_std: str
-    covariance: list[float]
-    named: dict[str, tuple[float, float, float]]
-    deflection_rms_rad: float
-    torque_rms_nm: float
-    excited: bool
-    inertia_kg_m2: float
-    viscous_damping_nm_s_rad: float
-    fit_error_relative: float
-
-
-class Analysis(NamedTuple):
-    """Result of a recording: per transmission, and of the joint."""
-
-    transmissions: list[TransmissionRow]
-    verdict: str
-    sentence: str
-    effects: list[str]
-    details: str
-    before_rms_nm: float
-    after_rms_nm: float
-    before_relative: float
-    after_relative: float
+    joint: dict[str, Any]
+    transmissions: list[dict[str, Any]]
     report_json: str
     report_html: str
 
@@ -95,21 +63,22 @@ def analyse(
     model = joint.model()
     outcome = diagnose(record, model, validation=validation)
     outcome = replace(outcome, notes=(*remarks, *outcome.notes))
-    fits = identify(record, model).fits
     document = report.as_json(outcome)
-    errors = outcome.validation
+    shared = {
+        "verdict": outcome.verdict,
+        "sentence": report.sentence(outcome),
+        "effects": _names(outcome),
+        "details": json.dumps({key: document[key] for key in ("effects", "alignment", "notes")}),
+        **{f"error_{name}": value for name, value in outcome.validation._asdict().items()},
+        "duration_s": float((record.sequence[-1] - record.sequence[0]) * record.period_s),
+        "samples": len(record),
+        "period_s": record.period_s,
+    }
     return Analysis(
-        transmissions=[_row(number, one) for number, one in enumerate(fits, start=1)],
-        verdict=outcome.verdict,
-        sentence=report.sentence(outcome),
-        effects=_names(outcome),
-        details=json.dumps({key: document[key] for key in ("effects", "alignment", "notes")}),
-        before_rms_nm=errors.before_rms_nm,
-        after_rms_nm=errors.after_rms_nm,
-        before_relative=errors.before_relative,
-        after_relative=errors.after_relative,
-        report_json=json.dumps(document, indent=2) + "\n",
-        report_html=report.html_page(outcome, title),
+        shared,
+        [_row(number, one) for number, one in enumerate(identify(record, model).fits, start=1)],
+        json.dumps(document, indent=2) + "\n",
+        report.html_page(outcome, title),
     )
 
 
@@ -122,28 +91,30 @@ def _names(outcome: Diagnosis) -> list[str]:
     ]
 
 
-def _row(number: int, one: TransmissionFit) -> TransmissionRow:
+def _row(number: int, one: TransmissionFit) -> dict[str, Any]:
+    """Columns of a transmission; rad, N·m, N·m/rad; None where not finite."""
     rigid = one.model == RIGID
     deflection = np.abs(one.deflection_rad)
-    return TransmissionRow(
-        transmission=number,
-        model=one.model,
-        parameters=json.dumps(plain_parameters(one.parameters)),
-        parameters_std=json.dumps(plain_parameters(one.std)),
-        covariance=one.covariance.ravel().tolist(),
-        named={name: _named(one, deflection, share) for name, share in NAMED.items()} if one.excited else {},
-        deflection_rms_rad=math.nan if rigid else float(np.sqrt(np.mean(deflection**2))),
-        torque_rms_nm=one.torque_rms_nm,
-        excited=one.excited,
-        inertia_kg_m2=one.inertia_kg_m2,
-        viscous_damping_nm_s_rad=one.viscous_damping_nm_s_rad,
-        fit_error_relative=math.nan if rigid else one.error_rms_nm / one.torque_rms_nm,
-    )
-
-
-def _named(one: TransmissionFit, deflection: FloatArray, share: float | None) -> tuple[float, float, float]:
-    phi = 0.0 if share is None else float(np.quantile(deflection, share))
-    return (phi, *_stiffness(one.model, one.alpha, one.covariance, phi))
+    row: dict[str, Any] = {
+        "transmission": number,
+        "model": one.model,
+        "parameters": json.dumps(plain_parameters(one.parameters)),
+        "parameters_std": json.dumps(plain_parameters(one.std)),
+        "covariance": one.covariance.ravel().tolist(),
+        "deflection_rms_rad": math.nan if rigid else float(np.sqrt(np.mean(deflection**2))),
+        "torque_rms_nm": one.torque_rms_nm,
+        "excited": one.excited,
+        "inertia_kg_m2": one.inertia_kg_m2,
+        "viscous_damping_nm_s_rad": one.viscous_damping_nm_s_rad,
+        "fit_error_relative": math.nan if rigid else one.error_rms_nm / one.torque_rms_nm,
+    }
+    for name, share in NAMED.items() if one.excited else ():
+        phi = 0.0 if share is None else float(np.quantile(deflection, share))
+        row[f"deflection_{name}_rad"] = phi
+        row[f"stiffness_{name}_nm_rad"], row[f"stiffness_std_{name}_nm_rad"] = _stiffness(
+            one.model, one.alpha, one.covariance, phi
+        )
+    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
 
 
 def stiffness_at(

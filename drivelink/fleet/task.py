@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import re
 import socket
 import time
@@ -17,7 +16,7 @@ from urllib.parse import unquote
 
 from drivelink import __version__, recording
 from drivelink.errors import DrivelinkError, RecordingError
-from drivelink.fleet.analysis import Analysis, TransmissionRow, analyse
+from drivelink.fleet.analysis import analyse
 from drivelink.fleet.joints import Joint, Joints
 from drivelink.fleet.pieces import Piece, pieces
 from drivelink.fleet.storage import Source, fetched
@@ -161,11 +160,14 @@ def _results(
             analysis = analyse(piece.record, file, validation, title, remarks)
             suffix = f"-{piece.part}" if piece.parts > 1 else ""
             folder = f"diagnoses/{joint.name}/{row['digest'][:24]}{suffix}"
-            common = row | _of_joint(analysis, piece, where) | {"report": f"{folder}/report.html"}
-            common["time"] = row["time"] and row["time"] + timedelta(seconds=at - begin)
+            common = row | analysis.joint | {
+                "status": "done", "error": None, "part": piece.part, "parts": piece.parts,
+                "validated_on": where, "report": f"{folder}/report.html",
+                "time": row["time"] and row["time"] + timedelta(seconds=at - begin),
+            }  # fmt: skip
             for one in analysis.transmissions:
-                name = f"{row['digest'][:24]}-{joint.name}-{one.transmission}{suffix}"
-                rows.append(common | _of_transmission(one) | {"id": name})
+                name = f"{row['digest'][:24]}-{joint.name}-{one['transmission']}{suffix}"
+                rows.append(common | one | {"id": name})
             reports.append((f"{folder}/report.json", analysis.report_json))
             reports.append((f"{folder}/report.html", analysis.report_html))
     return rows, reports
@@ -173,37 +175,6 @@ def _results(
 
 def _part_name(name: str, piece: Piece) -> str:
     return name if piece.parts == 1 else f"{name}, part {piece.part} of {piece.parts}"
-
-
-def _of_joint(analysis: Analysis, piece: Piece, validated_on: str) -> dict[str, Any]:
-    record = piece.record
-    return {
-        "status": "done",
-        "error": None,
-        "part": piece.part,
-        "parts": piece.parts,
-        "verdict": analysis.verdict,
-        "sentence": analysis.sentence,
-        "effects": analysis.effects,
-        "details": analysis.details,
-        "error_before_rms_nm": analysis.before_rms_nm,
-        "error_after_rms_nm": analysis.after_rms_nm,
-        "error_before_relative": analysis.before_relative,
-        "error_after_relative": analysis.after_relative,
-        "validated_on": validated_on,
-        "duration_s": float((record.sequence[-1] - record.sequence[0]) * record.period_s),
-        "samples": len(record),
-        "period_s": record.period_s,
-    }
-
-
-def _of_transmission(one: TransmissionRow) -> dict[str, Any]:
-    row = {name: value for name, value in one._asdict().items() if name != "named"}
-    for name, (deflection, stiffness, std) in one.named.items():
-        row[f"deflection_{name}_rad"] = deflection
-        row[f"stiffness_{name}_nm_rad"] = stiffness
-        row[f"stiffness_std_{name}_nm_rad"] = std
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
 
 
 @contextmanager

@@ -36,9 +36,9 @@ class Base:
             if model is None:
                 continue
             jacobian = model.jacobian(frame.motors[i].deflection, self.alpha[i])
-            made += [frame.column(i, column, column if frame.pulls[i] else None) for column in jacobian.T]
-        empty = np.zeros((frame.rows * frame.equations, 0))
-        return np.stack(made, axis=1) if made else empty
+            slopes = np.ascontiguousarray(jacobian.T)
+            made.append(frame.column(i, slopes, slopes if frame.pulls[i] else None))
+        return np.concatenate(made).T if made else np.zeros((frame.rows * frame.equations, 0))
 
     def torque(self, frame: Frame) -> FloatArray:
         """tau_e at alpha in all equations, stacked."""
@@ -104,7 +104,7 @@ def _search(frame: Frame, i: int, model: TransmissionModel, order: int) -> Float
         )
     best, found = np.inf, np.zeros(0)
     for shape in shapes:
-        columns = frame.project(np.asarray(model.basis(phi, shape, order)))
+        columns = frame.project(np.ascontiguousarray(np.asarray(model.basis(phi, shape, order)).T)).T
         with_mean = np.column_stack((columns, np.ones(len(columns))))
         solution, *_ = np.linalg.lstsq(with_mean, target, rcond=None)
         error = float(np.sum((target - with_mean @ solution) ** 2))

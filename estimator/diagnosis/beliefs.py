@@ -12,6 +12,7 @@ from estimator.diagnosis.frame import Frame
 from estimator.effects import LIBRARY
 from estimator.model import JointModel
 from estimator.priors import PRIORS
+from estimator.sample import FloatArray
 
 __all__ = ["OF_RUN", "effect_std", "everyday", "everyday_std", "least", "longest_delay_s"]
 
@@ -138,22 +139,24 @@ def _declared_std(frame: Frame, name: str, calibrating: bool) -> float:
     return PRIORS["declared" if frame.linked and not calibrating else name].std
 
 
-def effect_std(model: JointModel, candidate: Candidate, by_torque: float) -> float:
-    """Prior standard deviation of an effect's linear parameter, by torque or by reading error."""
+def effect_std(model: JointModel, candidate: Candidate, by_torque: FloatArray) -> FloatArray:
+    """Prior standard deviations of an effect's linear parameters, by torque or by reading error."""
     name = candidate.kind.name
     if name == "motor_inertia":
-        return PRIORS["anchor"].std * model.motors[candidate.motor or 0].inertia_kg_m2
+        return np.full_like(
+            by_torque, PRIORS["anchor"].std * model.motors[candidate.motor or 0].inertia_kg_m2
+        )
     if name == "link_inertia" and model.link is not None:
-        return PRIORS["anchor"].std * model.link.inertia_kg_m2
+        return np.full_like(by_torque, PRIORS["anchor"].std * model.link.inertia_kg_m2)
     if name in ("torque_constant", "torque_drift"):
-        return PRIORS["torque_scale"].std
+        return np.full_like(by_torque, PRIORS["torque_scale"].std)
     if name in ("load_dependent_friction", "back_driving_loss"):
-        return PRIORS[name].std
+        return np.full_like(by_torque, PRIORS[name].std)
     if name in ("torque_delay", "torque_lag", "encoder_delay"):
-        return min(PRIORS["late"].std, by_torque)
-    return (
-        min(PRIORS[name].std, by_torque) if name in ("encoder_scale", "encoder_eccentricity") else by_torque
-    )
+        return np.minimum(PRIORS["late"].std, by_torque)
+    if name in ("encoder_scale", "encoder_eccentricity"):
+        return np.minimum(PRIORS[name].std, by_torque)
+    return by_torque
 
 
 def longest_delay_s(period_s: float) -> float:

@@ -117,32 +117,42 @@ def _needs_deflection(kind: EffectType) -> bool:
     )
 
 
+_OF_MOTOR = {"position", "velocity", "acceleration", "time"}  # coordinates that no correction changes
+
+
 def columns(frame: Frame, candidate: Candidate, values: Values) -> FloatArray:
-    """Stacked, filtered columns (rows, k) of an effect, one per linear parameter."""
+    """Stacked, filtered columns (rows, k) of an effect, one per linear parameter; made once."""
     kind = candidate.kind
-    motor = candidate.motor or 0
-    c = frame.motors[motor]
-    terms = kind.terms(c, values)
+    lasting = kind.location == "motor" and _OF_MOTOR.issuperset(kind.coordinates)
+    memo = frame.signals.memo if lasting else frame.memo
+    key = (candidate.key, *values.values())
+    made = memo.get(key)
+    if made is None:
+        made = _columns(frame, candidate, kind.terms(frame.motors[candidate.motor or 0], values))
+        if "periods_per_rev" not in values:  # there are hundreds, which `Search` keeps
+            memo[key] = made
+    return made.T
+
+
+def _columns(frame: Frame, candidate: Candidate, terms: FloatArray) -> FloatArray:
+    """The columns (k, rows) of an effect's terms (k, n) on the grid."""
+    kind, motor = candidate.kind, candidate.motor or 0
     if kind.channel == "link_position":
-        return np.stack([_reading(frame, term) for term in terms], axis=1)
-    made = []
-    for term in terms:
-        if kind.channel == "deflection" and candidate.motor is None:
-            made.append(_zero(frame, term))
-        elif kind.channel == "deflection":
-            force = -c.stiffness * term
-            made.append(frame.column(motor, force, force if frame.pulls[motor] else None))
-        elif kind.location == "transmission":
-            made.append(frame.column(motor, term, term if frame.pulls[motor] else None))
-        elif kind.location == "motor" or frame.carried:
-            made.append(frame.column(motor, -term, None))
-        else:
-            made.append(frame.column(None, None, term))
-    return np.stack(made, axis=1)
+        return _reading(frame, terms)
+    if kind.channel == "deflection" and candidate.motor is None:
+        return _zero(frame, terms)
+    if kind.channel == "deflection":
+        force = -frame.motors[motor].stiffness * terms
+        return frame.column(motor, force, force if frame.pulls[motor] else None)
+    if kind.location == "transmission":
+        return frame.column(motor, terms, terms if frame.pulls[motor] else None)
+    if kind.location == "motor" or frame.carried:
+        return frame.column(motor, -terms, None)
+    return frame.column(None, None, terms)
 
 
 def _zero(frame: Frame, error: FloatArray) -> FloatArray:
-    """Column of a common error of all deflections."""
+    """Columns of a common error of all deflections."""
     parts: list[FloatArray | None] = [frame.project(-c.stiffness * error) for c in frame.motors]
     if frame.linked:
         force = [-c.stiffness * error for c, pulls in zip(frame.motors, frame.pulls, strict=True) if pulls]
@@ -151,7 +161,7 @@ def _zero(frame: Frame, error: FloatArray) -> FloatArray:
 
 
 def _reading(frame: Frame, error: FloatArray) -> FloatArray:
-    """Column of an error e of the link's reading, through tau_e and the link's balance."""
+    """Columns of an error e of the link's reading, through tau_e and the link's balance."""
     narrow, response = frame.signals.narrow, frame.signals.response
     parts: list[FloatArray | None] = []
     total = np.zeros_like(error)
@@ -163,8 +173,8 @@ def _reading(frame: Frame, error: FloatArray) -> FloatArray:
     if frame.linked and link is not None:
         slope = link.gravity_nm * np.cos(frame.motors[0].link_position + link.gravity_phase_rad)
         spectrum = narrow.transform(error)
-        rate = narrow.apply(spectrum, response, 1)[frame.signals.keep]
-        acceleration = narrow.apply(spectrum, response, 2)[frame.signals.keep]
+        rate = narrow.apply(spectrum, response, 1)[..., frame.signals.keep]
+        acceleration = narrow.apply(spectrum, response, 2)[..., frame.signals.keep]
         force = frame.project((total + slope) * error)
         own = link.inertia_kg_m2 * acceleration + link.viscous_damping_nm_s_rad * rate
         parts.append(-(force + own))

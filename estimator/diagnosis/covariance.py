@@ -131,8 +131,7 @@ def _kinds(problem: Problem, fitted: Fitted) -> Labels:
         parts = []
         for c, flexible in zip(frame.motors, frame.flexible, strict=True):
             parts += [c.position, c.velocity, c.acceleration] + ([c.deflection] if flexible else [])
-        state = np.stack([frame.project(x) for x in parts], axis=1)
-        made.append(state)
+        made.append(frame.project(np.stack(parts)).T)
     states = np.concatenate(made)
     states = (states - states.mean(axis=0)) / np.maximum(states.std(axis=0), 1e-300)
     _, kinds = kmeans2(states, whole("groups"), minit="++", seed=0)

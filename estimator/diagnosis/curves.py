@@ -53,14 +53,16 @@ def best_curve(search: Search, beside: Fitted, place: tuple[str, int | None] | N
     best: Fitted | None = None
     for location, motor in [place] if place else _places(frame):
         for coordinates, basis in _bases(frame, beside, location, motor or 0):
-            curve = problem.with_curve(beside, Extra(location, motor, coordinates, basis))
+            curve = problem.with_curve(beside, Extra(location, motor, coordinates, basis), steps=0)
             if best is None:
                 best = curve
             elif place:
                 best = min(best, curve, key=lambda c: float(np.sum(np.log(c.posterior.sigma))))
             elif search.advantage(curve, best) > 0.0:
                 best = curve
-    return best
+    if best is None or best.extra is None:
+        return None
+    return problem.with_curve(beside, best.extra, steps=1)
 
 
 def _places(frame: Frame) -> list[tuple[str, int | None]]:

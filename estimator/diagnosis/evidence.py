@@ -64,17 +64,17 @@ class Posterior(NamedTuple):
     bound: NDArray[np.bool_]
 
 
-class _Gram(NamedTuple):
-    """A balance as normal equations, columns scaled: A'A, A'y, y'y, number of rows."""
+class _Grams(NamedTuple):
+    """All balances as normal equations, columns scaled: A'A (g, k, k), A'y (g, k), y'y (g,), rows (g,)."""
 
     matrix: FloatArray
     side: FloatArray
-    square: float
-    rows: int
+    square: FloatArray
+    rows: FloatArray
 
-    def left(self, x: FloatArray) -> float:
-        """Squared error at x."""
-        return max(self.square - 2.0 * float(x @ self.side) + float(x @ self.matrix @ x), 0.0)
+    def left(self, x: FloatArray) -> FloatArray:
+        """(g,) squared errors at x."""
+        return np.maximum(self.square + (self.matrix @ x - 2.0 * self.side) @ x, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +99,7 @@ class Regression:
     used: NDArray[np.bool_]
     floor: FloatArray
     scales: tuple[Scale, ...]
-    _grams: list[_Gram]
+    _grams: _Grams
     _unit: FloatArray
 
     @classmethod
@@ -116,45 +116,44 @@ class Regression:
         scales: tuple[Scale, ...] = (),
     ) -> Regression:
         """Make the normal equations of each balance, with columns of norm one."""
-        unit = np.linalg.norm(design, axis=0)
+        unit = np.sqrt(np.einsum("ij,ij->j", design, design))
         unit[unit == 0.0] = 1.0
-        scaled = design / unit
         grams = []
         for g in range(int(group.max()) + 1):
-            rows = (group == g) & used
-            a, y = scaled[rows], target[rows]
-            grams.append(_Gram(a.T @ a, a.T @ y, float(y @ y), int(rows.sum())))
-        return cls(design, target, mean, std, low, group, used, floor, scales, grams, unit)
+            rows = np.flatnonzero((group == g) & used)
+            a, y = design[rows], target[rows]
+            grams.append((a.T @ a / np.outer(unit, unit), a.T @ y / unit, y @ y, float(len(rows))))
+        made = _Grams(*(np.array(part) for part in zip(*grams, strict=True)))
+        return cls(design, target, mean, std, low, group, used, floor, scales, made, unit)
 
-    def solve(self, times: FloatArray, start: FloatArray | None = None) -> Posterior:
+    def solve(self, times: FloatArray, start: Posterior | None = None) -> Posterior:
         """Parameters, noise and evidence by fixed-point iteration, with an active set for bounds.
 
         Args:
             times: (groups,) autocorrelation times of the errors, in rows.
-            start: (groups,) noise to begin with.
+            start: where to begin.
         """
-        low = self.low * self._unit
-        counts = np.array([gram.rows for gram in self._grams], dtype=np.float64)
-        if start is None:
-            start = np.array([np.sqrt(gram.square / max(gram.rows, 1)) for gram in self._grams])
-        sigma = np.maximum(start, self.floor)
+        low, grams = self.low * self._unit, self._grams
+        sigma = np.sqrt(grams.square / np.maximum(grams.rows, 1.0)) if start is None else start.sigma
+        sigma = np.maximum(sigma, self.floor)
         held = np.where(np.isfinite(low), low, 0.0)
         free = np.ones(len(low), dtype=bool)
-        x = self.mean * self._unit
+        x = (self.mean if start is None else start.x) * self._unit
         last = whole("newton_steps") + len(x) - 1
         for attempt in range(last + 1):
             precision, side = self._normal(times, sigma, x)
             old, x = x, np.where(free, 0.0, held)
-            inner = precision[np.ix_(free, free)]
-            x[free] = np.linalg.solve(inner, side[free] - precision[np.ix_(free, ~free)] @ x[~free])
-            left = np.array([gram.left(x) for gram in self._grams])
-            new = np.maximum(np.sqrt(left / counts), self.floor * self._sizes(x / self._unit))
-            steady = bool(np.all(np.abs(new - sigma) < 1e-3 * sigma))
+            whole_x = free.all()
+            inner = precision if whole_x else precision[np.ix_(free, free)]
+            x[free] = np.linalg.solve(inner, side if whole_x else (side - precision @ x)[free])
+            left = grams.left(x)
+            new = np.maximum(np.sqrt(left / grams.rows), self.floor * self._sizes(x / self._unit))
+            steady = bool((np.abs(new - sigma) < 1e-3 * sigma).all())
             sigma = new
             wrong = free & (x < low)
             if wrong.any() and attempt < last:
                 free = free & ~wrong
-            elif steady and (not self.scales or np.allclose(x, old, rtol=1e-4)):
+            elif steady and (not self.scales or bool((np.abs(x - old) <= 1e-8 + 1e-4 * np.abs(old)).all())):
                 break
         covariance = np.zeros_like(precision)
         covariance[np.ix_(free, free)] = np.linalg.inv(inner)
@@ -165,13 +164,12 @@ class Regression:
 
     def _normal(self, times: FloatArray, sigma: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Posterior precision and its side, of scaled columns, linearised at x where a torque is scaled."""
-        std = self.std * self._unit
-        precision, side = np.diag(1.0 / std**2), self.mean * self._unit / std**2
-        for w, gram in zip(1.0 / (times * sigma**2), self._grams, strict=True):
-            precision = precision + w * gram.matrix
-            side = side + w * gram.side
+        weights, prior = 1.0 / (times * sigma**2), 1.0 / (self.std * self._unit) ** 2
+        precision = np.tensordot(weights, self._grams.matrix, axes=1)
+        precision.flat[:: len(x) + 1] += prior
+        side = weights @ self._grams.side + self.mean * self._unit * prior
         for scale in self.scales:  # Newton's step of -sum log s / 2
-            rows = 0.5 * sum(self._grams[g].rows / float(times[g]) for g in scale.groups)
+            rows = 0.5 * sum(self._grams.rows[g] / float(times[g]) for g in scale.groups)
             steep = scale.slopes / self._unit[scale.columns] / scale.sizes(x / self._unit)[:, None]
             curvature = rows * (steep.T @ steep) / len(steep)
             precision[np.ix_(scale.columns, scale.columns)] += curvature
@@ -180,7 +178,7 @@ class Regression:
 
     def _sizes(self, x: FloatArray) -> FloatArray:
         """(groups,) scale of each balance against the measurement."""
-        sizes = np.ones(len(self._grams))
+        sizes = np.ones(len(self._grams.rows))
         for scale in self.scales:
             sizes[list(scale.groups)] = scale.size(x)
         return sizes
@@ -195,7 +193,7 @@ class Regression:
         inner: FloatArray,
     ) -> float:
         """Logarithm of the marginal likelihood by Laplace's approximation, up to a constant of the data."""
-        independent = np.array([gram.rows for gram in self._grams]) / times
+        independent = self._grams.rows / times
         std = self.std * self._unit
         strain = (x - self.mean * self._unit) / std
         _, logdet = np.linalg.slogdet(inner)
@@ -214,7 +212,9 @@ class Regression:
     def autocorrelation_times(self, x: FloatArray) -> FloatArray:
         """(groups,) autocorrelation times of the residual, in rows."""
         residual = self.residual(x)
-        return np.array([autocorrelation_time(residual[self.group == g]) for g in range(len(self._grams))])
+        return np.array(
+            [autocorrelation_time(residual[self.group == g]) for g in range(len(self._grams.rows))]
+        )
 
 
 def autocorrelation_time(error: FloatArray) -> float:

@@ -7,6 +7,7 @@ from t_k to t_(k+1): its hold, a delay of half a period and sin(x)/x, is part of
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -59,6 +60,9 @@ class Signals:
     Args:
         record: the recording; gaps are interpolated and not used as rows.
         bandwidth_hz: of F.
+
+    Attributes:
+        memo: columns that depend on the motors' motion alone, by effect and shape (`candidates.columns`).
     """
 
     def __init__(self, record: Record, bandwidth_hz: float) -> None:
@@ -85,6 +89,45 @@ class Signals:
         self.narrow = Band(self.light.kept, self.light.period_s, rows_step, margin)
         self.response = lowpass(self.narrow.frequency_hz, bandwidth_hz)
         self.keep = self._rows(record, sequence, margin)
+        self.memo: dict[tuple[object, ...], FloatArray] = {}
+        self._smooth = light_response(self)
+        frequency = self.light.frequency_hz * record.period_s
+        self._held = self._smooth * np.sinc(frequency) * np.exp(-1j * np.pi * frequency)
+
+    @functools.cached_property
+    def motor_paths(self) -> list[tuple[FloatArray, ...]]:
+        """Position, velocity and acceleration of each motor on the grid."""
+        return [tuple(self.light.apply(x, self._smooth, order) for order in range(3)) for x in self.theta]
+
+    @functools.cached_property
+    def external_torque(self) -> FloatArray:
+        """tau_k on the grid, zero if not measured."""
+        if self.external is None:
+            return np.zeros(self.light.kept)
+        return self.light.apply(self.external, self._smooth)
+
+    def acting(self, i: int, delay_s: float, lag_s: float) -> tuple[FloatArray, FloatArray]:
+        """A motor's torque as it acts, and its derivative, on the grid."""
+        response = self._held * _lag(self.light.frequency_hz, lag_s) if lag_s else self._held
+        torque, rate = (self.light.apply(self.tau[i], response, order, delay_s) for order in range(2))
+        return torque, rate
+
+    def link_path(self, corrections: Corrections) -> tuple[FloatArray, ...]:
+        """The link's position, velocity and acceleration, corrected for the encoder's error."""
+        assert self.q is not None
+        q, rate, acceleration = (
+            self.light.apply(self.q, self._smooth, order, -corrections.encoder_delay_s) for order in range(3)
+        )
+        a, b, scale = corrections.encoder_sin_rad, corrections.encoder_cos_rad, corrections.encoder_scale
+        if not (a or b or scale):
+            return q, rate, acceleration
+        true = q / (1.0 + scale)
+        for _ in range(3):
+            true = (q - a * np.sin(true) - b * np.cos(true)) / (1.0 + scale)
+        slope = 1.0 + scale + a * np.cos(true) - b * np.sin(true)
+        bend = -a * np.sin(true) - b * np.cos(true)
+        velocity = rate / slope
+        return true, velocity, (acceleration - bend * velocity**2) / slope
 
     def _rows(self, record: Record, sequence: NDArray[np.int64], edge: float) -> NDArray[np.bool_]:
         """Rows away from the ends and from gaps by so many seconds."""
@@ -139,6 +182,7 @@ class Frame:
         external: tau_k on the grid, zero if not measured.
         linked: whether it has the link's equation.
         flexible: per motor, whether it has a deflection.
+        memo: its columns, by effect and shape (`candidates.columns`).
     """
 
     model: JointModel
@@ -149,6 +193,7 @@ class Frame:
     linked: bool
     flexible: tuple[bool, ...]
     equations: int = field(init=False)
+    memo: dict[tuple[object, ...], FloatArray] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "equations", len(self.motors) + int(self.linked))
@@ -156,19 +201,14 @@ class Frame:
     @classmethod
     def make(cls, model: JointModel, signals: Signals, corrections: Corrections) -> Frame:
         """Make the coordinates from the spectra of the corrected readings."""
-        band = signals.light
-        f, period = band.frequency_hz, signals.period_s
-        light = light_response(signals)
-        hold = light * np.sinc(f * period) * np.exp(-1j * np.pi * f * period)
-        zero = np.zeros(band.kept)
-        q = signals.q
-        flexible = tuple(m.transmission.model != "none" and q is not None for m in model.motors)
-        paths = [tuple(band.apply(x, light, order) for order in range(3)) for x in signals.theta]
-        link = _link_path(signals, q, light, corrections) if q is not None and any(flexible) else paths[0]
+        zero = np.zeros(signals.light.kept)
+        time = np.arange(signals.light.kept) * signals.light.period_s
+        flexible = tuple(m.transmission.model != "none" and signals.q is not None for m in model.motors)
+        paths = signals.motor_paths
+        link = signals.link_path(corrections) if any(flexible) else paths[0]
         motors = []
         for i, (theta, velocity, acceleration) in enumerate(paths):
-            delay = corrections.torque_delay_s[i]
-            acting = hold * _lag(f, corrections.torque_lag_s[i])
+            torque, rate = signals.acting(i, corrections.torque_delay_s[i], corrections.torque_lag_s[i])
             motors.append(
                 Coordinates(
                     position=theta,
@@ -178,17 +218,16 @@ class Frame:
                     deflection_rate=link[1] - velocity if flexible[i] else zero,
                     flexibility_torque=zero,
                     stiffness=zero,
-                    torque=band.apply(signals.tau[i], acting, 0, delay),
-                    torque_rate=band.apply(signals.tau[i], acting, 1, delay),
+                    torque=torque,
+                    torque_rate=rate,
                     link_position=link[0],
                     link_velocity=link[1],
                     link_acceleration=link[2],
-                    time=np.arange(band.kept) * band.period_s,
+                    time=time,
                 )
             )
-        external = zero if signals.external is None else band.apply(signals.external, light)
         linked = model.link is not None and flexible[0]
-        return cls(model, signals, corrections, tuple(motors), external, linked, flexible)
+        return cls(model, signals, corrections, tuple(motors), signals.external_torque, linked, flexible)
 
     @property
     def rows(self) -> int:
@@ -212,24 +251,27 @@ class Frame:
         return tuple(self.flexible[i] and (i == 0 or second) for i in range(len(self.motors)))
 
     def project(self, x: FloatArray) -> FloatArray:
-        """F, decimation and choice of rows, for arrays on the grid, (n,) or (n, k)."""
-        return self.signals.narrow.filter(x, self.signals.response)[self.signals.keep]
+        """F, decimation and choice of rows, for arrays (..., n) on the grid."""
+        return self.signals.narrow.filter(x, self.signals.response)[..., self.signals.keep]
 
     def stack(self, parts: Sequence[FloatArray | None]) -> FloatArray:
-        """One column of the stacked regression from its part in each equation; None is zero."""
-        zero = np.zeros(self.rows)
-        return np.concatenate([zero if part is None else part for part in parts])
+        """Columns (..., n) of the stacked regression from their parts in each equation; None is zero."""
+        like = next(part for part in parts if part is not None)
+        return np.concatenate([np.zeros_like(like) if part is None else part for part in parts], axis=-1)
 
     def column(
         self, motor: int | None, on_motor: FloatArray | None, on_link: FloatArray | None
     ) -> FloatArray:
-        """A stacked, filtered column with arrays on the grid in one motor's and the link's equation."""
-        parts: list[FloatArray | None] = [None] * self.equations
+        """Stacked, filtered columns of arrays (..., n) on the grid in one motor's and the link's equation."""
+        given = on_link if on_motor is None else on_motor
+        assert given is not None
+        one = self.project(given)
+        parts = [np.zeros_like(one)] * self.equations
         if motor is not None and on_motor is not None:
-            parts[motor] = self.project(on_motor)
+            parts[motor] = one
         if self.linked and on_link is not None:
-            parts[-1] = self.project(on_link)
-        return self.stack(parts)
+            parts[-1] = one if on_link is given else self.project(on_link)
+        return np.concatenate(parts, axis=-1)
 
     def link_balance(self, link: LinkDynamics) -> FloatArray:
         """tau_k - M q" - D_q q' - g(q) on the grid, which is tau_e by eq 4."""
@@ -254,22 +296,3 @@ class Frame:
         if self.linked and self.model.link is not None:
             parts.append(self.project(self.link_balance(self.model.link)))
         return self.stack(parts)
-
-
-def _link_path(
-    signals: Signals, spectrum: Spectrum, light: FloatArray, corrections: Corrections
-) -> tuple[FloatArray, ...]:
-    """The link's position, velocity and acceleration, corrected for the encoder's error."""
-    q, rate, acceleration = (
-        signals.light.apply(spectrum, light, order, -corrections.encoder_delay_s) for order in range(3)
-    )
-    a, b, scale = corrections.encoder_sin_rad, corrections.encoder_cos_rad, corrections.encoder_scale
-    if not (a or b or scale):
-        return q, rate, acceleration
-    true = q / (1.0 + scale)
-    for _ in range(3):
-        true = (q - a * np.sin(true) - b * np.cos(true)) / (1.0 + scale)
-    slope = 1.0 + scale + a * np.cos(true) - b * np.sin(true)
-    bend = -a * np.sin(true) - b * np.cos(true)
-    velocity = rate / slope
-    return true, velocity, (acceleration - bend * velocity**2) / slope

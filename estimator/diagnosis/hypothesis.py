@@ -63,7 +63,7 @@ class Fitted:
         if like is self:
             return self.posterior.evidence
         regression = replace(self.regression, floor=like.regression.floor)
-        return regression.solve(like.times, self.posterior.sigma).evidence
+        return regression.solve(like.times, self.posterior).evidence
 
     @property
     def keys(self) -> Keys:
@@ -130,6 +130,7 @@ class Problem:
         declared = declared_corrections(model)
         self.declared = declared
         self._frames: dict[Corrections, dict[int, Frame]] = {}
+        self._points: dict[tuple[tuple[Corrections, ...], Base], list[Frame]] = {}
         frames = [self._frame(k, declared) for k in range(len(records))]
         self.frames = frames
         self.rows = [frame.rows for frame in frames]
@@ -180,13 +181,18 @@ class Problem:
         made = self._frames.setdefault(corrections, {})
         if k not in made:
             made[k] = Frame.make(self.model, self.signals[k], corrections)
-            while len(self._frames) > 24:
+            while len(self._frames) > 6:
                 self._frames.pop(next(iter(self._frames)))
         return made[k]
 
     def at(self, corrections: Sequence[Corrections], base: Base) -> list[Frame]:
         """Frames of all recordings, readings corrected, flexibility torques filled in."""
-        return [with_flexibility(self._frame(k, c), base) for k, c in enumerate(corrections)]
+        key = tuple(corrections), base
+        if key not in self._points:
+            while len(self._points) >= 6:
+                self._points.pop(next(iter(self._points)))
+            self._points[key] = [with_flexibility(self._frame(k, c), base) for k, c in enumerate(corrections)]
+        return self._points[key]
 
     # -- fitting ------------------------------------------------------------------------------------------
 
@@ -222,7 +228,7 @@ class Problem:
         fit of a healthy joint continues until it converges.
         """
         best = self._linearised(terms, base, corrections, extra, pinned or {})
-        for k in range(steps or whole("newton_steps")):
+        for k in range(whole("newton_steps") if steps is None else steps):
             if not self._curved(best) or _converged(best):
                 break
             now = self._linearised(*self._moved(best), extra, pinned or {})
@@ -242,9 +248,9 @@ class Problem:
         corrections = tuple(restored(c, self.declared, term.candidate) for c in fitted.corrections)
         return self.fit(terms, fitted.base, corrections, extra=fitted.extra, pinned=pinned)
 
-    def with_curve(self, fitted: Fitted, extra: Extra) -> Fitted:
+    def with_curve(self, fitted: Fitted, extra: Extra, steps: int) -> Fitted:
         """The hypothesis with a free curve."""
-        return self.fit(fitted.terms, fitted.base, fitted.corrections, 1, extra=extra)
+        return self.fit(fitted.terms, fitted.base, fitted.corrections, steps, extra=extra)
 
     def transferred(self, fitted: Fitted, corrections: Corrections) -> Fitted:
         """A model fitted to other recordings, evaluated on this one without refitting."""
@@ -300,10 +306,10 @@ class Problem:
         posterior = regression.solve(times)
         for _ in range(2):
             times = regression.autocorrelation_times(posterior.x)
-            posterior = regression.solve(times, posterior.sigma)
+            posterior = regression.solve(times, posterior)
         if terms:
             regression = replace(regression, floor=self._floor(regression, stack.slots, posterior.x))
-            posterior = regression.solve(times, posterior.sigma)
+            posterior = regression.solve(times, posterior)
         terms = _weighed(terms, stack.slots, posterior.x)
         slots = tuple(stack.slots)
         return Fitted(terms, base, corrections, slots, regression, times, posterior, extra, pinned)

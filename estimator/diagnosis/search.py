@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 from typing import NamedTuple
@@ -20,6 +20,7 @@ from scipy.special import softmax
 from estimator.choices import choice, whole
 from estimator.diagnosis.beliefs import effect_std
 from estimator.diagnosis.candidates import Candidate, columns, grid, members
+from estimator.diagnosis.frame import Frame
 from estimator.diagnosis.hypothesis import Fitted, Keys, Problem, Term, stretches
 from estimator.priors import PRIORS
 from estimator.sample import FloatArray
@@ -32,50 +33,66 @@ Progress = Callable[[str], None]
 
 
 @dataclass(slots=True)
-class _Columns:
-    """Columns of one candidate over its grid, at the declared model."""
+class _Entry:
+    """One candidate over its grid of n points: m columns each, at the declared model.
+
+    Attributes:
+        candidate: it. values: (n) of its nonlinear parameters.
+        rows: of the library's columns. grams: (groups, n, m, m) of the columns in each balance.
+        std: (n, m) prior of the linear parameters.
+    """
 
     candidate: Candidate
     values: list[dict[str, float]]
-    stacked: list[FloatArray]
+    rows: slice
+    grams: FloatArray
+    std: FloatArray
 
 
 class _Tried(NamedTuple):
-    """An effect added to a hypothesis: nonlinear parameters, gain of evidence, change of x."""
+    """An effect added to a hypothesis at the most promising point of its grid.
 
+    Attributes:
+        candidate: it. values: its nonlinear parameters. points: of its grid.
+        gain: of the logarithm of the evidence.
+        shift: (m, k) of x per prior standard deviation of the effect's parameters.
+        precision: (m, m) of these. side: (m,) this precision times their estimates.
+    """
+
+    candidate: Candidate
     values: dict[str, float]
+    points: int
     gain: float
-    shift: FloatArray  # (k, m) of x per prior standard deviation of the effect's parameters
-    precision: FloatArray  # (m, m) of these
-    side: FloatArray  # (m,) this precision times their estimates
+    shift: FloatArray
+    precision: FloatArray
+    side: FloatArray
 
     def independent(self, effect: float) -> _Tried:
         """The same where so many rows have the information of one (`design_effects`)."""
         eye = np.eye(len(self.precision))
-        return _tried(self.values, self.shift, eye + (self.precision - eye) / effect, self.side / effect)
+        precision, side = eye + (self.precision - eye) / effect, self.side / effect
+        return self._replace(precision=precision, side=side, gain=float(_gain(precision, side)))
 
     @property
     def covariance(self) -> FloatArray:
         """(k, k) increase of the covariance of x."""
         if not math.isfinite(self.gain):
-            return np.zeros((len(self.shift),) * 2)
-        return np.asarray(self.shift @ np.linalg.solve(self.precision, self.shift.T))
+            return np.zeros((self.shift.shape[1],) * 2)
+        return np.asarray(self.shift.T @ np.linalg.solve(self.precision, self.shift))
 
     @property
     def change(self) -> FloatArray:
         """(k,) change of x."""
-        return np.asarray(self.shift @ np.linalg.solve(self.precision, self.side))
+        return np.asarray(np.linalg.solve(self.precision, self.side) @ self.shift)
 
 
-def _tried(values: dict[str, float], shift: FloatArray, precision: FloatArray, side: FloatArray) -> _Tried:
+def _gain(precision: FloatArray, side: FloatArray) -> FloatArray:
+    """(...) gain of evidence by parameters of this precision (..., m, m), or minus infinity."""
     sign, logdet = np.linalg.slogdet(precision)
-    gain = 0.5 * float(side @ np.linalg.solve(precision, side)) - 0.5 * float(logdet)
-    return _Tried(values, gain if sign > 0.0 and math.isfinite(gain) else -math.inf, shift, precision, side)
-
-
-class _Beside(NamedTuple):
-    candidate: Candidate
-    tried: list[_Tried]
+    sound = (sign > 0.0) & np.isfinite(logdet)
+    at = np.linalg.solve(np.where(sound[..., None, None], precision, np.eye(side.shape[-1])), side[..., None])
+    gain = 0.5 * np.einsum("...i,...i", side, at[..., 0]) - 0.5 * logdet
+    return np.where(sound & np.isfinite(gain), gain, -np.inf)
 
 
 class Search:
@@ -93,15 +110,34 @@ class Search:
         self.problem, self._progress = problem, progress
         self.null = null or problem.null()
         self._singles: list[Fitted] = []
+        self._rivals: dict[tuple[Fitted, int], list[Fitted]] = {}
         self.seen: list[Fitted] = [self.null]
         frames = problem.at(self.null.corrections, self.null.base)
-        self._library = []
+        self._library: list[_Entry] = []
+        made: list[FloatArray] = []
         for candidate in members(frames[0]):
-            values = grid(frames[0], candidate, problem.smoothing_rad_s)
-            stacked = [np.concatenate([columns(f, candidate, v) for f in frames]) for v in values]
-            if values:
-                self._library.append(_Columns(candidate, values, stacked))
+            self._enter(candidate, frames, made)
+        self._columns = np.concatenate(made) if made else np.zeros((0, int(problem.used.sum())))
         self.price = math.log(max(len(self._library), 1))  # log odds against any one effect
+
+    def _enter(self, candidate: Candidate, frames: Sequence[Frame], made: list[FloatArray]) -> None:
+        """Add a candidate over its grid to the library, and its columns to those made."""
+        problem = self.problem
+        values = grid(frames[0], candidate, problem.smoothing_rad_s)
+        if not values:
+            return
+        each = [np.concatenate([columns(f, candidate, v).T for f in frames], axis=1) for v in values]
+        stacked = np.stack(each)[..., problem.used]
+        points, count, _ = stacked.shape
+        ends = np.cumsum(np.bincount(problem.group[problem.used]))[:-1]
+        grams = [mine @ mine.swapaxes(1, 2) for mine in np.split(stacked, ends, axis=-1)]
+        sizes = np.sqrt(np.mean(stacked * stacked, axis=-1)) + 1e-100
+        by_torque = PRIORS["effect"].std * problem.torque_rms / np.sqrt(count) / sizes
+        std = effect_std(problem.model, candidate, by_torque)
+        first = sum(map(len, made))
+        made.append(stacked.reshape(points * count, -1))
+        rows = slice(first, first + points * count)
+        self._library.append(_Entry(candidate, values, rows, np.array(grams), std))
 
     def run(self) -> list[Fitted]:
         """The pruned hypotheses with the most evidence, best first, including single effects."""
@@ -113,14 +149,14 @@ class Search:
             self._singles = self._singles or grown
             if not grown:
                 break
-            beam = self._ranked(grown)[: whole("beam")]
+            beam = self.ranked(grown)[: whole("beam")]
             seen += beam
-            leader = self._ranked(seen)[0]
+            leader = self.ranked(seen)[0]
             if size - len(leader.terms) >= 2 or (size > 1 and leader is best):
                 break
             best = leader
-        finalists = [self._settled(h) for h in self._ranked(seen)[: whole("beam")]]
-        best = self._pruned(self._swapped(self._merged(self._pruned(self._ranked(finalists)[0]))))
+        finalists = [self._settled(h) for h in self.ranked(seen)[: whole("beam")]]
+        best = self._pruned(self._swapped(self._merged(self._pruned(self.ranked(finalists)[0]))))
         return [best, *self.leading()]
 
     def singles(self) -> list[Fitted]:
@@ -129,7 +165,7 @@ class Search:
 
     def leading(self) -> list[Fitted]:
         """The single effects with the most evidence."""
-        return self._ranked(self._singles)[: whole("beam")] if self._singles else []
+        return self.ranked(self._singles)[: whole("beam")] if self._singles else []
 
     def children(self, parent: Fitted, like: Candidate | None = None) -> list[Fitted]:
         """The most promising extensions by one effect; `like`: see `screen`."""
@@ -175,7 +211,7 @@ class Search:
         labels = stretches(self.problem)
         return np.bincount(labels[labels >= 0], each[labels >= 0]).astype(np.float64)
 
-    def _ranked(self, hypotheses: list[Fitted]) -> list[Fitted]:
+    def ranked(self, hypotheses: list[Fitted]) -> list[Fitted]:
         """Best first, without duplicates."""
         best = min(hypotheses, key=_left)
         order = sorted(hypotheses, key=lambda h: -self.score(h, best))
@@ -202,7 +238,7 @@ class Search:
                 grown = self.children(rest)
                 if not grown:
                     continue
-                one = self._settled(self._ranked(grown)[0])
+                one = self._settled(self.ranked(grown)[0])
                 if self.chance(hypothesis, one) > choice("even"):
                     return self._merged(one)
         return hypothesis
@@ -219,6 +255,8 @@ class Search:
 
     def rivals(self, hypothesis: Fitted, k: int) -> list[Fitted]:
         """Alternatives to a term, most evidence first; a ripple elsewhere also starts at its period."""
+        if (hypothesis, k) in self._rivals:
+            return self._rivals[hypothesis, k]
         own, rest = hypothesis.terms[k], self.problem.without(hypothesis, k)
         grown = self.children(rest, like=own.candidate)
         if _PERIODS in own.values:
@@ -228,7 +266,8 @@ class Search:
             moved = [self._grown(rest, Term(c, own.values)) for c in places]
             grown += [child for child in moved if child.is_real_beside(rest)]
         made = [child for child in grown if child.terms[-1].candidate.key != own.candidate.key]
-        return self._ranked(made) if made else []
+        self._rivals[hypothesis, k] = self.ranked(made) if made else []
+        return self._rivals[hypothesis, k]
 
     def screen(self, parent: Fitted, like: Candidate | None = None) -> list[Term]:
         """The most promising additional effects, at the best point of their grid.
@@ -239,12 +278,12 @@ class Search:
         """
         found = []
         rubbing = {t.candidate.motor for t in parent.terms if t.candidate.rubs}
-        for beside in self._library_beside(parent):
-            if beside.candidate.rubs and beside.candidate.motor in rubbing:
+        for one in self._library_beside(parent):
+            if one.candidate.rubs and one.candidate.motor in rubbing:
                 continue
-            best = max(beside.tried, key=lambda one: one.gain)
-            price = math.log(len(beside.tried))
-            found.append((best.gain - price, Term(beside.candidate, dict(best.values))))
+            gain = one.gain - math.log(one.points)
+            if gain > 0.0:
+                found.append((gain, Term(one.candidate, dict(one.values))))
         found.sort(key=lambda pair: -pair[0])
         tried = whole("tried")
         more = [t for _, t in found[tried:] if like is not None and t.candidate.family == like.family]
@@ -278,8 +317,8 @@ class Search:
             candidate = one.candidate
             if self.problem.calibrating and candidate.kind.channel == "motor_torque":
                 continue
-            best = max(one.tried, key=lambda x: x.gain).independent(effect)
-            odds.append(best.gain - math.log(len(one.tried)) - self.price)
+            best = one.independent(effect)
+            odds.append(best.gain - math.log(one.points) - self.price)
             apart.append(np.outer(best.change, best.change) if math.isfinite(best.gain) else nothing)
             more = nothing if candidate.bends else best.covariance
             _, *family = candidate.family  # either side of the motor's balance is the same to it
@@ -288,29 +327,29 @@ class Search:
         between = np.tensordot(softmax(odds), apart, axes=1)
         return np.asarray(sum(families.values(), between))
 
-    def _library_beside(self, parent: Fitted) -> Iterator[_Beside]:
-        """All additional effects over their grids, linearised."""
+    def _library_beside(self, parent: Fitted) -> Iterator[_Tried]:
+        """All additional effects, linearised, each at the most promising point of its grid."""
         problem, posterior = self.problem, parent.posterior
-        rows = parent.regression.used
-        weight = (1.0 / (parent.times * posterior.sigma**2))[problem.group[rows]]
-        design = parent.regression.design[rows] * weight[:, None]
-        left = parent.regression.residual(posterior.x)[rows] * weight
+        rows = problem.used
+        weights = 1.0 / (parent.times * posterior.sigma**2)
+        weight = weights[problem.group[rows]]
+        cross = self._columns @ (parent.regression.design[rows] * weight[:, None])
+        sides = self._columns @ (parent.regression.residual(posterior.x)[rows] * weight)
         taken = {t.candidate.key for t in parent.terms}
-        scale = PRIORS["effect"].std * problem.torque_rms
         for entry in self._library:
             if entry.candidate.key in taken:
                 continue
-            tried = []
-            for values, made in zip(entry.values, entry.stacked, strict=True):
-                c = made[rows]
-                sizes = np.sqrt(np.mean(c * c, axis=0)) + 1e-100
-                by_torque = scale / np.sqrt(c.shape[1]) / sizes
-                std = np.array([effect_std(problem.model, entry.candidate, x) for x in by_torque])
-                shift = posterior.covariance @ (design.T @ c) * std
-                inner = (c.T @ (c * weight[:, None])) * np.outer(std, std) - (design.T @ c * std).T @ shift
-                side = (c.T @ left) * std
-                tried.append(_tried(values, shift, np.eye(len(std)) + inner, side))
-            yield _Beside(entry.candidate, tried)
+            std = entry.std
+            side = sides[entry.rows].reshape(std.shape) * std
+            against = cross[entry.rows].reshape(*std.shape, -1) * std[..., None]
+            shift = against @ posterior.covariance
+            inner = np.tensordot(weights, entry.grams, axes=1) * std[..., None] * std[:, None, :]
+            precision = np.eye(std.shape[1]) + inner - against @ shift.swapaxes(1, 2)
+            gain = _gain(precision, side)
+            k = int(np.argmax(gain))
+            yield _Tried(
+                entry.candidate, entry.values[k], len(gain), float(gain[k]), shift[k], precision[k], side[k]
+            )
 
 
 def parameters(term: Term) -> int:

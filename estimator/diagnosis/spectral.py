@@ -17,7 +17,7 @@ from estimator.sample import FloatArray
 
 __all__ = ["Band", "Spectrum", "lowpass"]
 
-Spectrum = tuple[NDArray[np.complex128], float, float]
+Spectrum = tuple[NDArray[np.complex128], FloatArray, FloatArray]
 
 
 def lowpass(frequency_hz: FloatArray, bandwidth_hz: float) -> FloatArray:
@@ -49,23 +49,29 @@ class Band:
         self.length = fft.next_fast_len(-(-(samples + 2 * pad) // step), real=True) * step
         self._right = self.length - samples - pad
         self._input_period_s = period_s
+        self._cut = self.length // step // 2 + 1
         self.frequency_hz: FloatArray = fft.rfftfreq(self.length, period_s)
         self.kept = -(-samples // step)
         self.period_s = period_s * step
-        self._omega = 2j * np.pi * self.frequency_hz
+        self._omega = 2j * np.pi * self.frequency_hz[: self._cut]
+        self._steps = np.arange(self.length)
+        self._times = np.arange(self.kept) * self.period_s
 
     def transform(self, x: FloatArray) -> Spectrum:
-        """Spectrum of the extended, detrended array, with the trend's value at sample 0 and slope."""
+        """Spectra of extended, detrended arrays (..., n), with each trend's value at sample 0 and slope."""
         pad, n = self._pad, self._samples
-        left = 2.0 * x[0] - x[pad:0:-1]
         right = min(self._right, n - 1)
-        extended = np.concatenate((left, x, 2.0 * x[-1] - x[-2 : -right - 2 : -1]))
-        if len(extended) < self.length:
-            extended = np.concatenate((extended, np.full(self.length - len(extended), extended[-1])))
-        slope = (extended[-1] - extended[0]) / (self.length - 1)
-        extended -= extended[0] + slope * np.arange(self.length)
-        start = 2.0 * x[0] - x[pad] if pad else x[0]
-        return fft.rfft(extended), float(start + slope * pad), slope / self._input_period_s
+        extended = np.empty((*x.shape[:-1], self.length))
+        extended[..., :pad] = 2.0 * x[..., :1] - x[..., pad:0:-1]
+        extended[..., pad : pad + n] = x
+        end = pad + n + right
+        extended[..., pad + n : end] = 2.0 * x[..., -1:] - x[..., -2 : -right - 2 : -1]
+        extended[..., end:] = extended[..., end - 1 : end]
+        start = extended[..., 0].copy()
+        slope = (extended[..., -1] - start) / (self.length - 1)
+        extended -= start[..., None] + slope[..., None] * self._steps
+        bins = fft.rfft(extended, overwrite_x=True)
+        return bins, start + slope * pad, slope / self._input_period_s
 
     def apply(
         self,
@@ -74,7 +80,7 @@ class Band:
         derivative: int = 0,
         delay_s: float = 0.0,
     ) -> FloatArray:
-        """Back in time, decimated: the filtered array, or its derivative, delay_s earlier or later.
+        """Back in time, decimated: the filtered arrays, or their derivatives, delay_s earlier or later.
 
         Args:
             spectrum: as `transform` gives it.
@@ -83,20 +89,19 @@ class Band:
             delay_s: x(t - delay_s) is returned.
         """
         bins, start, slope = spectrum
-        factor = response if derivative == 0 else response * self._omega**derivative
+        factor = response[: self._cut]
+        if derivative:
+            factor = factor * self._omega**derivative
         if delay_s:
             factor = factor * np.exp(-self._omega * delay_s)
-        length = self.length // self._step
-        cut = (bins * factor)[: length // 2 + 1]
-        values = fft.irfft(cut, length)[self._pad // self._step :][: self.kept] / self._step
+        values = fft.irfft(bins[..., : self._cut] * factor, self.length // self._step, overwrite_x=True)
+        values = values[..., self._pad // self._step :][..., : self.kept] / self._step
         if derivative == 0:
-            values += start + slope * (np.arange(self.kept) * self.period_s - delay_s)
+            values += start[..., None] + slope[..., None] * (self._times - delay_s)
         elif derivative == 1:
-            values += slope
-        return values
+            values += slope[..., None]
+        return np.asarray(values)
 
     def filter(self, x: FloatArray, response: NDArray[Any]) -> FloatArray:
-        """Filter and decimate one array (n,) or several (n, k)."""
-        if x.ndim == 1:
-            return self.apply(self.transform(x), response)
-        return np.stack([self.apply(self.transform(column), response) for column in x.T], axis=1)
+        """Filter and decimate arrays (..., n)."""
+        return self.apply(self.transform(x), response)

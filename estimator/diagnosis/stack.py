@@ -161,12 +161,12 @@ class Stack:
         candidate = term.candidate
         parts = [columns(f, candidate, term.values) for f in self._frames]
         taken = self._taken(candidate, 0)
-        width = PRIORS["effect"].std * self._torque_rms / np.sqrt(parts[0].shape[1])
-        for p in range(parts[0].shape[1]):
-            column = _of_run(parts, p, None)
-            std = effect_std(self._model, candidate, width / _rms_of(column))
+        made = [_of_run(parts, p, None) for p in range(parts[0].shape[1])]
+        sizes = np.array([_rms_of(column) for column in made])
+        width = PRIORS["effect"].std * self._torque_rms / np.sqrt(len(made)) / sizes
+        for p, std in enumerate(effect_std(self._model, candidate, width).tolist()):
             slot = Slot("term", candidate.kind.name, candidate.motor, None, k, p, float(taken[p]))
-            self._add(column, slot, std, low=least(self._model, candidate))
+            self._add(made[p], slot, std, low=least(self._model, candidate))
         if term.weights:
             for name in term.free:
                 slot = Slot("shape", name, candidate.motor, None, k, 0, 0.0)
@@ -208,22 +208,21 @@ class Stack:
     def _derivative(self, term: Term, name: str) -> FloatArray:
         """Column of a nonlinear parameter, by a difference."""
         step, scale = step_of(term, name, self._frames[0])
-        up, down = ({**term.values, name: term.values[name] + sign * step} for sign in (1.0, -1.0))
-        change = [columns(f, term.candidate, up) - columns(f, term.candidate, down) for f in self._frames]
-        return np.asarray(np.concatenate(change) @ np.array(term.weights) * (scale / (2.0 * step)))
+        up = {**term.values, name: term.values[name] + step}
+        change = [
+            columns(f, term.candidate, up) - columns(f, term.candidate, term.values) for f in self._frames
+        ]
+        return np.asarray(np.concatenate(change) @ np.array(term.weights) * (scale / step))
 
 
 def curve_columns(frame: Frame, extra: Extra) -> FloatArray:
-    """Stacked columns of a free curve."""
-    made = []
-    for wave in extra.basis(frame.motors[extra.motor or 0]).T:
-        if extra.location == "motor":
-            made.append(frame.column(extra.motor, -wave, None))
-        elif extra.location == "transmission":
-            made.append(frame.column(extra.motor, wave, wave if frame.pulls[extra.motor or 0] else None))
-        else:
-            made.append(frame.column(None, None, wave))
-    return np.stack(made, axis=1)
+    """Stacked columns (rows, k) of a free curve."""
+    waves = np.ascontiguousarray(extra.basis(frame.motors[extra.motor or 0]).T)
+    if extra.location == "motor":
+        return frame.column(extra.motor, -waves, None).T
+    if extra.location == "transmission":
+        return frame.column(extra.motor, waves, waves if frame.pulls[extra.motor or 0] else None).T
+    return frame.column(None, None, waves).T
 
 
 def step_of(term: Term, name: str, frame: Frame) -> tuple[float, float]:

@@ -6,7 +6,7 @@
 mod classes;
 mod physics;
 
-use pyo3::exceptions::PyValueError;
+use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
 use pyo3::types::{PyDict, PyTuple, PyType};
@@ -131,8 +131,17 @@ struct JointFields {
     link_effects: Vec<Element>,
 }
 
+/// What a field's conversion raised, without the `TypeError`s that name the fields around it.
+fn reason(py: Python<'_>, mut error: PyErr) -> PyErr {
+    while let Some(cause) = error.cause(py).filter(|_| error.is_instance_of::<PyTypeError>(py)) {
+        error = cause;
+    }
+    error
+}
+
 fn declared_model(joint: &Bound<'_, PyAny>) -> PyResult<Model> {
-    let JointFields { arrangement, motors, link, link_effects } = joint.extract()?;
+    let fields = joint.extract().map_err(|error| reason(joint.py(), error));
+    let JointFields { arrangement, motors, link, link_effects } = fields?;
     let motor = |motor: MotorFields| {
         let MotorFields { inertia, inertia_std, damping, damping_std, transmission, effects } = motor;
         Motor { inertia, inertia_std, damping, damping_std, transmission, effects }

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from sim.canopen.drive import Cia402Drive
 from sim.canopen.node import Node
-from sim.canopen.tpdo import Tpdo
+from sim.canopen.pdo import Tpdo
 from sim.network import Network
 from sim.sensors import DriveSignals
 

@@ -24,8 +24,7 @@ from sim.bench import Bench
 from sim.canopen.drive import Cia402Drive, DriveData
 from sim.canopen.encoder import Cia406Encoder, EncoderData
 from sim.canopen.node import Node
-from sim.canopen.profiles import profile
-from sim.canopen.quirks import Quirks
+from sim.canopen.profiles import Quirks, profile
 from sim.cases import CASES, Case, case
 from sim.effects import PlantEffect, make, parse
 from sim.errors import SimError

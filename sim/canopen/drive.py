@@ -12,7 +12,7 @@ from sim.canopen.aborts import Abort, SdoAbortedError
 from sim.canopen.dictionary import Entry, Object, variables
 from sim.canopen.edsfile import load_eds, with_members, with_values
 from sim.canopen.node import Nmt, Node
-from sim.canopen.quirks import Quirks
+from sim.canopen.profiles import Quirks
 from sim.canopen.statemachine import PowerState, StateMachine
 from sim.sensors import DriveSignals
 from sim.world import World

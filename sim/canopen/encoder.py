@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from sim.canopen.aborts import Abort, SdoAbortedError
 from sim.canopen.edsfile import load_eds, with_values
 from sim.canopen.node import Node
-from sim.canopen.quirks import Quirks
+from sim.canopen.profiles import Quirks
 from sim.world import World
 
 SCALING, REVERSED = 0x04, 0x01  # bits of 0x6000

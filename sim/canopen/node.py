@@ -7,15 +7,11 @@ from enum import IntEnum
 
 from sim.canopen.aborts import Abort, SdoAbortedError
 from sim.canopen.dictionary import Dictionary, Entry, Object
-from sim.canopen.emergency import Emergency
-from sim.canopen.heartbeat import HeartbeatConsumer, HeartbeatProducer
-from sim.canopen.pdo import COB_INVALID, restricted
-from sim.canopen.quirks import Quirks
-from sim.canopen.rpdo import Rpdo
+from sim.canopen.pdo import COB_INVALID, Rpdo, Tpdo, restricted
+from sim.canopen.profiles import Quirks
 from sim.canopen.sdo import SdoServer
-from sim.canopen.storing import watch_storing
+from sim.canopen.services import Emergency, HeartbeatConsumer, HeartbeatProducer, watch_storing
 from sim.canopen.timers import Timers
-from sim.canopen.tpdo import Tpdo
 
 _SYNC_PRODUCER = 1 << 30
 _FRAME_29_BIT = 1 << 29
@@ -23,9 +19,6 @@ _APPLICATION = (0x2000, 0xFFFF)
 
 _SYNC_LENGTH = 0x8240
 _HEARTBEAT_LOST = 0x8130
-_PDO_TOO_SHORT = 0x8210
-_PDO_TOO_LONG = 0x8220
-_RPDO_TIMEOUT = 0x8250
 _COMMUNICATION_ERROR = 0x10  # bit of the error register
 
 Route = Callable[[bytes], None]
@@ -95,39 +88,11 @@ class Node:
         self._put(can_id, data)
 
     def _make_services(self) -> None:
-        dictionary, timers = self.dictionary, self.timers
-        self.emergency = Emergency(dictionary, timers, self._send_emergency)
-        self.sdo = SdoServer(dictionary, timers, self.node_id, self.send)
-        self.heartbeat = HeartbeatProducer(dictionary, timers, self._beat)
-        self.consumer = HeartbeatConsumer(
-            dictionary, timers, self._heartbeat_lost, self._heartbeat_back, self._reroute
-        )
+        self.emergency, self.sdo = Emergency(self), SdoServer(self)
+        self.heartbeat, self.consumer = HeartbeatProducer(self), HeartbeatConsumer(self)
         numbers = range(1, 513)
-        self.tpdos = {
-            n: Tpdo(dictionary, n, self.quirks, self._is_operational, self._pdos_changed, timers, self.send)
-            for n in numbers
-            if (0x1800 + n - 1, 1) in dictionary
-        }
-        self.rpdos = {n: self._make_rpdo(n) for n in numbers if (0x1400 + n - 1, 1) in dictionary}
-
-    def _make_rpdo(self, number: int) -> Rpdo:
-        def timed_out() -> None:
-            self.emergency.raise_error(_RPDO_TIMEOUT, _COMMUNICATION_ERROR, bytes([number]))
-
-        def wrong_length(short: bool) -> None:
-            code = _PDO_TOO_SHORT if short else _PDO_TOO_LONG
-            self.emergency.raise_error(code, _COMMUNICATION_ERROR, bytes([number]))
-
-        return Rpdo(
-            self.dictionary,
-            number,
-            self.quirks,
-            self._is_operational,
-            self._pdos_changed,
-            self.timers,
-            timed_out,
-            wrong_length,
-        )
+        self.tpdos = {n: Tpdo(self, n) for n in numbers if (0x17FF + n, 1) in self.dictionary}
+        self.rpdos = {n: Rpdo(self, n) for n in numbers if (0x13FF + n, 1) in self.dictionary}
 
     def _watch_objects(self) -> None:
         find = self.dictionary.find
@@ -136,7 +101,7 @@ class Node:
         find(0x1014, 0).check = self._check_emergency_id
         overflow = self.dictionary.optional(0x1019)
         overflow.check = self._check_overflow
-        overflow.changed = self._pdos_changed
+        overflow.changed = self.pdos_changed
         watch_storing(self.dictionary)
 
     # NMT
@@ -206,36 +171,41 @@ class Node:
         if state is self.state:
             return
         left, self.state = self.state, state
-        self._pdos_changed()
+        self.pdos_changed()
         if left is Nmt.OPERATIONAL:
             self.on_leave_operational()
 
-    def _is_operational(self) -> bool:
+    @property
+    def operational(self) -> bool:
+        """Whether the NMT state is operational."""
         return self.state is Nmt.OPERATIONAL
 
-    def _pdos_changed(self) -> None:
-        operational = self.state is Nmt.OPERATIONAL
+    @property
+    def may_send_emergency(self) -> bool:
+        """Whether its NMT state has EMCY (CiA 301, table 37)."""
+        return self.state in (Nmt.PREOPERATIONAL, Nmt.OPERATIONAL)
+
+    def pdos_changed(self) -> None:
+        """Apply changed PDO parameters, or another NMT state."""
         self._counting = self.dictionary.optional(0x1019).number > 0
-        active = [pdo for pdo in self.tpdos.values() if operational and pdo.valid]
-        for tpdo in self.tpdos.values():
-            tpdo.activate(tpdo in active, self._counting)
-        for rpdo in self.rpdos.values():
-            rpdo.activate(operational and rpdo.valid)
+        active = [pdo for pdo in self.tpdos.values() if self.operational and pdo.valid]
+        received = [pdo for pdo in self.rpdos.values() if self.operational and pdo.valid]
+        for pdo in (*self.tpdos.values(), *self.rpdos.values()):
+            pdo.activate(self.operational and pdo.valid, self._counting)
         self._synchronous = tuple(pdo for pdo in active if pdo.synchronous)
         self.on_pdos(frozenset(entry for pdo in active for entry in pdo.entries if entry))
         self._change_driven = tuple(pdo for pdo in active if not pdo.synchronous and self.sends_on_change)
-        self._latched = tuple(
-            pdo for pdo in self.rpdos.values() if operational and pdo.valid and pdo.type <= 240
-        )
-        self._reroute()
+        self._latched = tuple(pdo for pdo in received if pdo.synchronous)
+        self.reroute()
         if self._change_driven:
             self.timers.after(0.0, self.process)
 
-    def _reroute(self) -> None:
+    def reroute(self) -> None:
+        """Rebuild the table of which identifier it receives."""
         routes: dict[int, Route] = {}
-        if self.state in (Nmt.PREOPERATIONAL, Nmt.OPERATIONAL):
+        if self.may_send_emergency:
             routes[0x600 + self.node_id] = self.sdo.receive
-        if self.state is Nmt.OPERATIONAL:
+        if self.operational:
             routes |= {rpdo.can_id: rpdo.receive for rpdo in self.rpdos.values() if rpdo.valid}
         for node_id in self.consumer.watched if self.state is not Nmt.INITIALISING else ():
             routes[0x700 + node_id] = self._heartbeat_route(node_id)
@@ -244,26 +214,21 @@ class Node:
 
     # Services
 
-    def _send_emergency(self, can_id: int, data: bytes) -> None:
-        if self.state in (Nmt.PREOPERATIONAL, Nmt.OPERATIONAL):
-            self.send(can_id, data)
-
-    def _beat(self) -> None:
-        self.send(0x700 + self.node_id, bytes([self.state]))
-
     def _heartbeat_route(self, node_id: int) -> Route:
         return lambda _data: self.consumer.receive(node_id)
 
-    def _heartbeat_lost(self, node_id: int) -> None:
+    def heartbeat_lost(self, node_id: int) -> None:
+        """React to the loss of a monitored node's heartbeat."""
         self.emergency.raise_error(_HEARTBEAT_LOST, _COMMUNICATION_ERROR, bytes([node_id]))
         reaction = self.dictionary.optional(0x1029, 1).number
-        if reaction == 0 and self.state is Nmt.OPERATIONAL:
+        if reaction == 0 and self.operational:
             self._enter(Nmt.PREOPERATIONAL)
         elif reaction == 2:
             self._enter(Nmt.STOPPED)
         self.on_connection_lost()
 
-    def _heartbeat_back(self, _node_id: int) -> None:
+    def heartbeat_back(self) -> None:
+        """Clear the error of a lost heartbeat."""
         self.emergency.clear_error(_HEARTBEAT_LOST)
 
     # SYNC
@@ -274,7 +239,7 @@ class Node:
         Returns:
             Whether this node will answer with its TPDOs (`transmit`).
         """
-        if self.state is not Nmt.OPERATIONAL:
+        if not self.operational:
             return False
         self._counter = data[0] if data else None
         if len(data) > 1 or bool(data) != self._counting:

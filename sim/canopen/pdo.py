@@ -7,11 +7,14 @@ of a valid PDO is compiled to one `struct.Struct` and a tuple of entries.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from sim.canopen.aborts import Abort, SdoAbortedError
-from sim.canopen.dictionary import Dictionary, Entry
-from sim.canopen.quirks import Quirks
+from sim.canopen.dictionary import Entry
+from sim.canopen.timers import Timer
+
+if TYPE_CHECKING:
+    from sim.canopen.node import Node
 
 COB_INVALID = 1 << 31
 COB_NO_RTR = 1 << 30
@@ -21,6 +24,8 @@ _FRAME_29_BIT = 1 << 29
 _LONGEST_BITS = 64
 _DUMMIES = {2: 8, 3: 16, 4: 32, 5: 8, 6: 16, 7: 32}  # bits of the data types that stand for no object
 _RESERVED_TYPES = range(241, 254)  # and RTR-only types, which this device does not do
+_TOO_SHORT, _TOO_LONG, _RPDO_TIMEOUT = 0x8210, 0x8220, 0x8250  # EMCY codes
+_COMMUNICATION_ERROR = 0x10  # bit of the error register
 
 
 def restricted(can_id: int) -> bool:
@@ -39,75 +44,81 @@ class Pdo:
     """Common part of TPDOs and RPDOs: parameters, their checks, the compiled layout.
 
     Args:
-        dictionary: holds the parameters at `communication` and `mapping`.
-        communication: index of the communication parameter record.
-        mapping: index of the mapping parameter record.
-        quirks: how this device deviates.
-        operational: whether the device is in NMT state operational.
-        changed: called after a change of validity or parameters.
+        node: the device; its dictionary holds the parameters.
+        number: from 1.
+        first: index of the communication parameter of number 1; the mapping is 0x200 behind it.
 
     Attributes:
         valid: bit 31 of the COB-ID is clear.
-        generation: counts changes of the parameters.
         can_id: its identifier on the bus.
         type: transmission type.
+        synchronous: whether it belongs to a SYNC.
         event_s: event timer or deadline; 0: none.
         entries: mapped entries in order; None: a dummy.
         layout: the frame.
     """
 
-    def __init__(
-        self,
-        dictionary: Dictionary,
-        communication: int,
-        mapping: int,
-        quirks: Quirks,
-        operational: Callable[[], bool],
-        changed: Callable[[], None],
-    ) -> None:
-        self._dictionary = dictionary
-        self._quirks = quirks
-        self._operational = operational
-        self._notify = changed
-        self._cob = dictionary.find(communication, 1)
-        self._type = dictionary.find(communication, 2)
-        self._count = dictionary.find(mapping, 0)
-        self._slots = [dictionary.find(mapping, k) for k in range(1, MAPPED_AT_MOST + 1)]
-        self._event = dictionary.optional(communication, 5)
+    def __init__(self, node: Node, number: int, first: int) -> None:
+        self._node, self.number = node, number
+        find, communication = node.dictionary.find, first + number - 1
+        self._cob, self._type = find(communication, 1), find(communication, 2)
+        self._count = find(communication + 0x200, 0)
+        self._slots = [find(communication + 0x200, k) for k in range(1, MAPPED_AT_MOST + 1)]
+        self._event = node.dictionary.optional(communication, 5)
         self.entries: tuple[Entry | None, ...] = ()
         self.layout = struct.Struct("<")
-        self.valid = False
-        self.generation = 0
-        self.can_id = 0
-        self.type = 0
+        self.valid = self.synchronous = False
+        self.can_id = self.type = self._generation = 0
         self.event_s = 0.0
-        self._cob.check = self._check_cob
-        self._cob.changed = self.compile
-        self._type.check = self._check_type
-        self._type.changed = self.compile
-        self._event.changed = self.compile
+        self._condition: tuple[bool, bool, int] | None = None
+        self._timer: Timer | None = None
+        self._cob.check, self._type.check = self._check_cob, self._check_type
+        self._cob.changed = self._type.changed = self._event.changed = self.compile
         self._count.check = self._check_count
         for slot in self._slots:
             slot.check = self._check_slot
 
     def compile(self) -> None:
         """Take over changed parameters."""
-        self.generation += 1
+        self._generation += 1
         self.valid = not self._cob.number & COB_INVALID
         self.can_id = self._cob.number & 0x7FF
         self.type = self._type.number
+        self.synchronous = self.type <= 240
         self.event_s = self._event.number * 1e-3
-        self.entries = tuple(self._mapped(slot.number) for slot in self._slots[: self._count.number])
-        bits = [slot.number & 0xFF for slot in self._slots[: self._count.number]]
-        codes = (entry.code if entry else f"{n // 8}x" for entry, n in zip(self.entries, bits, strict=True))
+        words = [slot.number for slot in self._slots[: self._count.number]]
+        self.entries = tuple(self._node.dictionary.get(word >> 16, word >> 8 & 0xFF) for word in words)
+        codes = (
+            entry.code if entry else f"{(n & 0xFF) // 8}x"
+            for entry, n in zip(self.entries, words, strict=True)
+        )
         self.layout = struct.Struct("<" + "".join(code or "" for code in codes))
-        self._notify()
+        self._node.pdos_changed()
 
-    def _mapped(self, word: int) -> Entry | None:
-        return self._dictionary.get(word >> 16, (word >> 8) & 0xFF)
+    def activate(self, active: bool, counting: bool) -> None:
+        """Start or stop, after a change of the NMT state or of parameters.
+
+        Args:
+            active: the device is operational and the PDO valid.
+            counting: SYNC messages carry a counter (0x1019).
+        """
+        condition = (active, counting, self._generation)
+        if condition != self._condition:
+            self._condition = condition
+            self._stop_timer()
+            self._begin(active, counting)
+
+    def _begin(self, active: bool, counting: bool) -> None:
+        """Begin in another state, or with other parameters."""
+        raise NotImplementedError
+
+    def _stop_timer(self) -> None:
+        if self._timer:
+            self._timer.cancel()
+            self._timer = None
 
     def _check_cob(self, value: int) -> None:
-        if self._quirks.fixed_pdos:
+        if self._node.quirks.fixed_pdos:
             raise SdoAbortedError(Abort.READ_ONLY)
         valid = not value & COB_INVALID
         can_id = value & 0x7FF
@@ -116,7 +127,7 @@ class Pdo:
             or (self.valid and valid and can_id != self.can_id)
             or (valid and restricted(can_id))
             or (valid and self._count.number == 0)
-            or (self._quirks.keep_bit_30 and (value ^ self._cob.number) & COB_NO_RTR)
+            or (self._node.quirks.keep_bit_30 and (value ^ self._cob.number) & COB_NO_RTR)
         )
         if wrong:
             raise SdoAbortedError(Abort.INVALID_VALUE)
@@ -130,22 +141,21 @@ class Pdo:
             raise SdoAbortedError(Abort.INVALID_VALUE)
 
     def _check_mapping_access(self) -> None:
-        if self._quirks.fixed_mapping or self._quirks.fixed_pdos:
+        quirks = self._node.quirks
+        if quirks.fixed_mapping or quirks.fixed_pdos:
             raise SdoAbortedError(Abort.READ_ONLY)
-        if self._quirks.mapping_in_preoperational and self._operational():
+        if quirks.mapping_in_preoperational and self._node.operational:
             raise SdoAbortedError(Abort.DEVICE_STATE)
         if self.valid:
             raise SdoAbortedError(Abort.UNSUPPORTED_ACCESS)
 
     def _check_count(self, value: int) -> None:
         self._check_mapping_access()
-        if value > self._quirks.objects_per_pdo:
+        if value > self._node.quirks.objects_per_pdo:
             raise SdoAbortedError(Abort.PDO_LENGTH)
-        total = 0
         for slot in self._slots[:value]:
             self._check_mappable(slot.number)
-            total += slot.number & 0xFF
-        if total > _LONGEST_BITS:
+        if sum(slot.number & 0xFF for slot in self._slots[:value]) > _LONGEST_BITS:
             raise SdoAbortedError(Abort.PDO_LENGTH)
 
     def _check_slot(self, value: int) -> None:
@@ -160,7 +170,7 @@ class Pdo:
         if index in _DUMMIES and subindex == 0:
             mappable, length = self._allows(None), _DUMMIES[index]
         else:
-            entry = self._dictionary.find(index, subindex)
+            entry = self._node.dictionary.find(index, subindex)
             mappable, length = self._allows(entry), entry.bits
         if not mappable or bits != length:
             raise SdoAbortedError(Abort.NOT_MAPPABLE)
@@ -168,3 +178,130 @@ class Pdo:
     def _allows(self, entry: Entry | None) -> bool:
         """Whether the entry (None: a dummy) may be in this kind of PDO."""
         raise NotImplementedError
+
+
+class Tpdo(Pdo):
+    """A PDO that the device sends: with a SYNC, on an event, or by a timer.
+
+    Attributes:
+        emit: puts (identifier, data) on the bus; faults are injected by wrapping it.
+    """
+
+    def __init__(self, node: Node, number: int) -> None:
+        super().__init__(node, number, 0x1800)
+        self.emit = node.send
+        self._inhibit = node.dictionary.optional(0x17FF + number, 3)
+        self._start = node.dictionary.optional(0x17FF + number, 6)
+        self._inhibit.check = self._start.check = self._refuse_while_valid
+        self._syncs = 0
+        self._waiting = False  # for the SYNC that carries the start value
+        self._last: bytes | None = None
+        self._inhibited: Timer | None = None
+
+    def _allows(self, entry: Entry | None) -> bool:
+        return entry is not None and entry.transmittable
+
+    def _begin(self, active: bool, counting: bool) -> None:
+        if self._inhibited:
+            self._inhibited.cancel()
+        self._inhibited = self._last = None
+        self._syncs = 0
+        self._waiting = bool(active and counting and self._start.number)
+        if active and not self.synchronous and self.event_s:
+            self._timer = self._node.timers.after(self.event_s, self._event_due)
+
+    def pack(self) -> bytes:
+        """The frame with the present values."""
+        return self.layout.pack(*[entry.value for entry in self.entries if entry])
+
+    def sync(self, counter: int | None) -> None:
+        """Handle a SYNC after the process data have been sampled."""
+        if self.type == 1 and not self._waiting:
+            self.emit(self.can_id, self.pack())
+            return
+        if self._waiting:
+            if counter != self._start.number:
+                return
+            self._waiting = False
+            self._syncs = self.type - 1
+        if self.type == 0:
+            data = self.pack()
+            if data != self._last:
+                self._last = data
+                self.emit(self.can_id, data)
+            return
+        self._syncs += 1
+        if self._syncs >= self.type:
+            self._syncs = 0
+            self.emit(self.can_id, self.pack())
+
+    def event(self) -> None:
+        """Send an event-driven PDO if its data have changed."""
+        if not self._inhibited:
+            data = self.pack()
+            if data != self._last:
+                self._send_event(data)
+
+    def _event_due(self) -> None:
+        self._timer = None
+        if self._inhibited:
+            self._timer = self._node.timers.after(self._inhibit.number * 1e-4, self._event_due)
+        else:
+            self._send_event(self.pack())
+
+    def _send_event(self, data: bytes) -> None:
+        self._last = data
+        if self._inhibit.number:
+            self._inhibited = self._node.timers.after(self._inhibit.number * 1e-4, self._release)
+        if self.event_s:
+            self._stop_timer()
+            self._timer = self._node.timers.after(self.event_s, self._event_due)
+        self.emit(self.can_id, data)
+
+    def _release(self) -> None:
+        self._inhibited = None
+        self.event()
+
+
+class Rpdo(Pdo):
+    """A PDO that the device receives: it acts when it comes, or with the next SYNC."""
+
+    def __init__(self, node: Node, number: int) -> None:
+        super().__init__(node, number, 0x1400)
+        self._pending: bytes | None = None
+
+    def _allows(self, entry: Entry | None) -> bool:
+        return entry is None or entry.receivable
+
+    def _begin(self, active: bool, counting: bool) -> None:
+        self._pending = None
+
+    def _fail(self, code: int) -> None:
+        self._node.emergency.raise_error(code, _COMMUNICATION_ERROR, bytes([self.number]))
+
+    def receive(self, data: bytes) -> None:
+        """Handle a frame now or, if synchronous, with the next SYNC."""
+        if len(data) != self.layout.size:
+            self._fail(_TOO_SHORT if len(data) < self.layout.size else _TOO_LONG)
+        if len(data) < self.layout.size:
+            return
+        self._stop_timer()
+        if self.event_s:
+            self._timer = self._node.timers.after(self.event_s, lambda: self._fail(_RPDO_TIMEOUT))
+        self._pending = data
+        if not self.synchronous:
+            self.apply()
+
+    def apply(self) -> None:
+        """Store the mapped values of a pending frame."""
+        data, self._pending = self._pending, None
+        if data is None:
+            return
+        values = iter(self.layout.unpack_from(data))
+        for entry in self.entries:
+            if entry is None:  # a dummy entry
+                continue
+            try:
+                entry.write(next(values))
+            except SdoAbortedError:  # out of range: the object keeps its value, as drives do
+                continue

@@ -7,13 +7,16 @@ server may do, and a block download is aborted.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from canopen.sdo.server import SdoServer as CanopenServer
 
 from sim.canopen.aborts import Abort, SdoAbortedError
-from sim.canopen.dictionary import LONGEST_STRING, Dictionary
-from sim.canopen.timers import Timer, Timers
+from sim.canopen.dictionary import LONGEST_STRING
+from sim.canopen.timers import Timer
+
+if TYPE_CHECKING:
+    from sim.canopen.node import Node
 
 _TIMEOUT_S = 1.0  # between two frames of a transfer
 _DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = range(5)  # command specifiers
@@ -24,10 +27,7 @@ class SdoServer(CanopenServer):
     """One server on the default pair of identifiers.
 
     Args:
-        dictionary: what it serves.
-        timers: for timeouts.
-        node_id: of the device.
-        send: puts (identifier, data) on the bus.
+        node: the device.
 
     Attributes:
         ignored: requests that it will not answer, for tests.
@@ -36,14 +36,12 @@ class SdoServer(CanopenServer):
         endless: for tests: bytes in each segment of an upload that never ends; -1: normal operation.
     """
 
-    def __init__(
-        self, dictionary: Dictionary, timers: Timers, node_id: int, send: Callable[[int, bytes], None]
-    ) -> None:
-        super().__init__(0x600 + node_id, 0x580 + node_id, dictionary)
+    def __init__(self, node: Node) -> None:
+        super().__init__(0x600 + node.node_id, 0x580 + node.node_id, node.dictionary)
         self.ignored = self.refused = 0
         self.refusal = int(Abort.DATA_TRANSFER)
         self.endless = -1
-        self._dictionary, self._timers, self._put = dictionary, timers, send
+        self._device = node
         self._timer: Timer | None = None
         self._index = self._subindex = 0
         self.reset()
@@ -56,7 +54,7 @@ class SdoServer(CanopenServer):
 
     def send_response(self, response: bytes) -> None:
         """Put eight bytes on the bus."""
-        self._put(self.tx_cobid, bytes(response))
+        self._device.send(self.tx_cobid, bytes(response))
 
     def abort(self, abort_code: int = 0x08000000) -> None:
         """End the transfer, telling the client why."""
@@ -102,7 +100,7 @@ class SdoServer(CanopenServer):
         """Refuse at once what the last segment would refuse; without a size the object's own counts."""
         command, index, subindex = struct.unpack_from("<BHB", request)
         self._index, self._subindex = index, subindex
-        entry = self._dictionary.find(index, subindex)
+        entry = self._device.dictionary.find(index, subindex)
         entry.writable()
         size = entry.bits // 8
         if command & _EXPEDITED and not command & _SIZED:
@@ -123,4 +121,6 @@ class SdoServer(CanopenServer):
         if self._timer:
             self._timer.cancel()
         busy = self._buffer is not None
-        self._timer = self._timers.after(_TIMEOUT_S, lambda: self.abort(Abort.TIMEOUT)) if busy else None
+        self._timer = (
+            self._device.timers.after(_TIMEOUT_S, lambda: self.abort(Abort.TIMEOUT)) if busy else None
+        )

@@ -96,6 +96,11 @@ Apply = Callable[[Assembly, int, Values], None]
 """(assembly, motor index, parameter values): puts one effect in."""
 
 
+Default = float | Callable[[float], float]
+Described = str | tuple[str, Default]
+"""Meaning of a parameter, and its default if it has one."""
+
+
 @dataclass(frozen=True, slots=True)
 class EffectParameter:
     """A parameter of an effect.
@@ -108,7 +113,7 @@ class EffectParameter:
 
     name: str
     meaning: str
-    default: float | Callable[[float], float] | None = None
+    default: Default | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,13 +142,18 @@ UNLISTED: dict[str, Definition] = {}
 
 
 def define(
-    library: dict[str, Definition], location: str, name: str, meaning: str, *parameters: EffectParameter
+    library: dict[str, Definition], location: str, name: str, meaning: str, **parameters: Described
 ) -> Callable[[Apply], Apply]:
     """Put a function into a library as an effect; the arguments are those of `Definition`."""
+    described = {key: (text,) if isinstance(text, str) else text for key, text in parameters.items()}
 
     def put(apply: Apply) -> Apply:
         library[name] = Definition(
-            name=name, location=location, meaning=meaning, parameters=parameters, apply=apply
+            name=name,
+            location=location,
+            meaning=meaning,
+            parameters=tuple(EffectParameter(key, *text) for key, text in described.items()),
+            apply=apply,
         )
         return apply
 

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import math
 
-from sim.effects.assembly import EffectParameter, Values
+from sim.effects.assembly import Described, Values
 from sim.effects.memory import Slip
 from sim.errors import SimError
 from sim.plant import Dry
 
-SMOOTHING = EffectParameter(
-    "smoothing_rad_s", "velocity below which an oil film carries the load; 0: dry, it sticks", 0.0
-)
-SLIP = (
-    EffectParameter("torque_nm", "torque once everything slides"),
-    EffectParameter("displacement_rad", "displacement over which it builds up", 0.01),
-    EffectParameter("exponent", "n of the law (1: Dahl, 2: Bouc-Wen, 50: a spring that slips)", 2.0),
-    EffectParameter("shape", "s of the law (1: Dahl, 0.5: Bouc-Wen)", 0.5),
-    EffectParameter("elements", "elements side by side, their scales a factor of two apart", 3.0),
-)
+SMOOTHING: dict[str, Described] = {
+    "smoothing_rad_s": ("velocity below which an oil film carries the load; 0: dry, it sticks", 0.0)
+}
+SLIP: dict[str, Described] = {
+    "torque_nm": "torque once everything slides",
+    "displacement_rad": ("displacement over which it builds up", 0.01),
+    "exponent": ("n of the law (1: Dahl, 2: Bouc-Wen, 50: a spring that slips)", 2.0),
+    "shape": ("s of the law (1: Dahl, 0.5: Bouc-Wen)", 0.5),
+    "elements": ("elements side by side, their scales a factor of two apart", 3.0),
+}
 
 
 def at_speed(level: Dry, smoothing: float) -> Dry:
@@ -45,7 +45,7 @@ def not_negative(values: Values, name: str) -> float:
 
 def slip(values: Values) -> Slip:
     """The element with memory that `SLIP` describes."""
-    return Slip(*(values[parameter.name] for parameter in SLIP))
+    return Slip(*(values[name] for name in SLIP))
 
 
 def wave(sine: float, cosine: float, periods: float) -> tuple[float, float]:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from functools import partial
 
-from sim.effects.assembly import LISTED, Assembly, EffectParameter, Values, define
+from sim.effects.assembly import LISTED, Assembly, Values, define
 from sim.effects.common import SLIP, not_negative, slip, wave
 from sim.errors import SimError
 from sim.springs import Law
@@ -25,7 +25,7 @@ def _power(coefficient: float, power: float) -> Callable[[Law], Law]:
     )
 
 
-@_effect("hysteresis", "torque that depends on the way the deflection has come", *SLIP)
+@_effect("hysteresis", "torque that depends on the way the deflection has come", **SLIP)
 def _hysteresis(a: Assembly, m: int, p: Values) -> None:
     element = slip(p)
     a.motors[m].extras.append(lambda phi, rate, theta: element.torque(phi))
@@ -35,10 +35,8 @@ def _hysteresis(a: Assembly, m: int, p: Values) -> None:
 @_effect(
     "backlash",
     "play: a range of deflection without torque",
-    EffectParameter("half_gap_rad", "half of the gap"),
-    EffectParameter(
-        "stiffness_nm_rad", "stiffness that is missing inside the gap; 0: the spring as a whole", 0.0
-    ),
+    half_gap_rad="half of the gap",
+    stiffness_nm_rad=("stiffness that is missing inside the gap; 0: the spring as a whole", 0.0),
 )
 def _backlash(a: Assembly, m: int, p: Values) -> None:
     gap, k = not_negative(p, "half_gap_rad"), p["stiffness_nm_rad"]
@@ -66,7 +64,7 @@ def _backlash(a: Assembly, m: int, p: Values) -> None:
 @_effect(
     "asymmetric_stiffness",
     "stiffness that differs between the directions",
-    EffectParameter("coefficient_nm_rad2", "torque per squared deflection"),
+    coefficient_nm_rad2="torque per squared deflection",
 )
 def _asymmetric_stiffness(a: Assembly, m: int, p: Values) -> None:
     a.motors[m].reshape.append(_power(p["coefficient_nm_rad2"], 2.0))
@@ -75,8 +73,8 @@ def _asymmetric_stiffness(a: Assembly, m: int, p: Values) -> None:
 @_effect(
     "higher_order_stiffness",
     "stiffening beyond the declared law",
-    EffectParameter("coefficient", "torque per power of deflection, N·m/rad^power"),
-    EffectParameter("power", "power of the deflection", 5.0),
+    coefficient="torque per power of deflection, N·m/rad^power",
+    power=("power of the deflection", 5.0),
 )
 def _higher_order(a: Assembly, m: int, p: Values) -> None:
     a.motors[m].reshape.append(_power(p["coefficient"], p["power"]))
@@ -85,7 +83,7 @@ def _higher_order(a: Assembly, m: int, p: Values) -> None:
 @_effect(
     "transmission_damping",
     "viscous damping of the transmission",
-    EffectParameter("damping_nm_s_rad", "torque per deflection rate"),
+    damping_nm_s_rad="torque per deflection rate",
 )
 def _transmission_damping(a: Assembly, m: int, p: Values) -> None:
     d = p["damping_nm_s_rad"]
@@ -95,9 +93,9 @@ def _transmission_damping(a: Assembly, m: int, p: Values) -> None:
 @_effect(
     "kinematic_error",
     "the gear turns unevenly: the spring sees more deflection than there is",
-    EffectParameter("sin_rad", "amplitude of the sine, as a deflection"),
-    EffectParameter("cos_rad", "amplitude of the cosine", 0.0),
-    EffectParameter("periods_per_rev", "periods in one joint revolution", 16.0),
+    sin_rad="amplitude of the sine, as a deflection",
+    cos_rad=("amplitude of the cosine", 0.0),
+    periods_per_rev=("periods in one joint revolution", 16.0),
 )
 def _kinematic_error(a: Assembly, m: int, p: Values) -> None:
     n, sin, cos = p["periods_per_rev"], math.sin, math.cos

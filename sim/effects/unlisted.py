@@ -5,23 +5,23 @@ from __future__ import annotations
 import math
 from functools import partial
 
-from sim.effects.assembly import UNLISTED, Assembly, EffectParameter, Values, define
+from sim.effects.assembly import UNLISTED, Assembly, Described, Values, define
 from sim.effects.common import not_negative
 from sim.effects.memory import Creep
 from sim.errors import SimError
 
 _effect = partial(define, UNLISTED)
 
-_WIDTH = EffectParameter("width_rad", "how far it reaches", 0.1)
+_WIDTH: dict[str, Described] = {"width_rad": ("how far it reaches", 0.1)}
 
 
 @_effect(
     "motor",
     "damaged_tooth",
     "dry friction in one place only",
-    EffectParameter("torque_nm", "friction torque there"),
-    EffectParameter("position_rad", "where, as motor position at the joint", 0.0),
-    _WIDTH,
+    torque_nm="friction torque there",
+    position_rad=("where, as motor position at the joint", 0.0),
+    **_WIDTH,
 )
 def _damaged_tooth(a: Assembly, m: int, p: Values) -> None:
     level, at, per, exp = not_negative(p, "torque_nm"), p["position_rad"], 1.0 / p["width_rad"], math.exp
@@ -32,8 +32,8 @@ def _damaged_tooth(a: Assembly, m: int, p: Values) -> None:
     "motor",
     "cold_grease",
     "dry friction that fades as the joint warms up",
-    EffectParameter("torque_nm", "friction torque at the start"),
-    EffectParameter("time_constant_s", "in which it fades", 5.0),
+    torque_nm="friction torque at the start",
+    time_constant_s=("in which it fades", 5.0),
 )
 def _cold_grease(a: Assembly, m: int, p: Values) -> None:
     level, rate, exp = not_negative(p, "torque_nm"), 1.0 / p["time_constant_s"], math.exp
@@ -44,8 +44,8 @@ def _cold_grease(a: Assembly, m: int, p: Values) -> None:
     "motor",
     "phase_imbalance",
     "ripple in proportion to the torque, over the motor position",
-    EffectParameter("relative", "share of the torque"),
-    EffectParameter("periods_per_rev", "periods in one joint revolution", 20.0),
+    relative="share of the torque",
+    periods_per_rev=("periods in one joint revolution", 20.0),
 )
 def _phase_imbalance(a: Assembly, m: int, p: Values) -> None:
     share, n, sin = p["relative"], p["periods_per_rev"], math.sin
@@ -56,8 +56,8 @@ def _phase_imbalance(a: Assembly, m: int, p: Values) -> None:
     "transmission",
     "mesh_stiffness",
     "stiffness that varies over the motor position",
-    EffectParameter("relative", "share of the stiffness"),
-    EffectParameter("periods_per_rev", "periods in one joint revolution", 10.0),
+    relative="share of the stiffness",
+    periods_per_rev=("periods in one joint revolution", 10.0),
 )
 def _mesh_stiffness(a: Assembly, m: int, p: Values) -> None:
     share, n, sin = p["relative"], p["periods_per_rev"], math.sin
@@ -69,8 +69,8 @@ def _mesh_stiffness(a: Assembly, m: int, p: Values) -> None:
     "transmission",
     "creep",
     "a further spring that relaxes (Maxwell)",
-    EffectParameter("stiffness_nm_rad", "stiffness at once"),
-    EffectParameter("time_constant_s", "in which it relaxes", 0.5),
+    stiffness_nm_rad="stiffness at once",
+    time_constant_s=("in which it relaxes", 0.5),
 )
 def _creep(a: Assembly, m: int, p: Values) -> None:
     if p["time_constant_s"] <= 0.0:
@@ -84,9 +84,9 @@ def _creep(a: Assembly, m: int, p: Values) -> None:
     "link",
     "cable_pull",
     "a cable that is pushed aside in one place",
-    EffectParameter("torque_nm", "largest torque, on either side of it"),
-    EffectParameter("position_rad", "where", 0.1),
-    _WIDTH,
+    torque_nm="largest torque, on either side of it",
+    position_rad=("where", 0.1),
+    **_WIDTH,
 )
 def _cable_pull(a: Assembly, m: int, p: Values) -> None:
     height, at, per, exp = p["torque_nm"], p["position_rad"], 1.0 / p["width_rad"], math.exp
@@ -102,7 +102,7 @@ def _cable_pull(a: Assembly, m: int, p: Values) -> None:
     "link",
     "air_drag",
     "drag with the square of the link velocity",
-    EffectParameter("damping_nm_s2_rad2", "torque per squared velocity"),
+    damping_nm_s2_rad2="torque per squared velocity",
 )
 def _air_drag(a: Assembly, m: int, p: Values) -> None:
     c = p["damping_nm_s2_rad2"]
@@ -113,8 +113,8 @@ def _air_drag(a: Assembly, m: int, p: Values) -> None:
     "measurement",
     "interpolation_error",
     "the link encoder errs within each of its lines",
-    EffectParameter("amplitude_rad", "largest error"),
-    EffectParameter("periods_per_rev", "lines of its disc", 64.0),
+    amplitude_rad="largest error",
+    periods_per_rev=("lines of its disc", 64.0),
 )
 def _interpolation_error(a: Assembly, m: int, p: Values) -> None:
     height, n, sin = p["amplitude_rad"], p["periods_per_rev"], math.sin

@@ -23,17 +23,9 @@ from drivelink.demo.simulate import network_from_joint, world_from_joint
 from drivelink.doctor import Report, Section, examine, examine_eds
 from drivelink.doctor.interface import examine_interface, judge_link
 from drivelink.doctor.machine import examine_machine, percentile
-from drivelink.doctor.motion import (
-    MotionReader,
-    MotionSample,
-    judge_gathered,
-    judge_motion,
-    judge_record,
-    record_of_motion,
-    slope,
-)
+from drivelink.doctor.motion import judge_motion, judge_record, slope
 from drivelink.doctor.nodes import _describe_node
-from drivelink.doctor.sampletap import SampleTap
+from drivelink.doctor.livevalues import Asked, Heard, Series, record_of
 from drivelink.doctor.syncs import Daemons, judge_sync
 from drivelink.jointfile import BusSection, parse
 from drivelink.notice import Notice, Severity
@@ -142,9 +134,8 @@ def live(change=lambda text: text, seconds=8.0):
             network.poll()
 
         surveys = [run_program(survey_node(role), ours, idle=step) for role in roles(joint)]
-        reader = MotionReader(surveys, lambda: world.time_s)
-        samples = run_program(reader.program(seconds), ours, idle=step)
-    judge_record(section, joint, record_of_motion(surveys, samples, 1, True))
+        readings = run_program(Asked(surveys, lambda: world.time_s).program(seconds), ours, idle=step)
+    judge_record(section, joint, record_of(readings, 1, True))
     return section
 
 
@@ -209,14 +200,14 @@ def test_a_bus_that_may_not_be_touched_is_judged_by_its_frames(direction):
     for layout in layouts:  # the map is the real one, what the joint file says of the encoder is not
         if layout.motor is None and direction < 0:
             configurator.adopt([turned(layout)])
-    tap, syncs = SampleTap(joint, configurator), 0
+    heard, syncs = Heard(joint, configurator), 0
     for message in frames:
         syncs += message.arbitration_id == 0x80
         message.timestamp = 1e9 + 1e-3 * syncs
-        tap.take(message)
+        heard.take(message)
     section = Section("Units and signs")
-    judge_gathered(section, tap.joint, tap.gathered)
-    assert tap.samples > 7000
+    assert len(heard.samples) > 7000
+    judge_record(section, heard.joint, record_of(heard.readings(), 2, True))
     (finding,) = section.notices
     if direction < 0:
         assert finding.severity is Severity.ERROR
@@ -555,28 +546,23 @@ def test_a_value_that_is_not_there_before_the_drive_runs_is_left_out():
     slave._sdo = lambda data: (
         b"\x80" + data[1:4] + b"\x22\0\0\x08" if data[1:3] == b"\x6c\x60" else answer(data)
     )
-    samples = run_program(MotionReader([found]).program(0.05), Wire([slave]))[5]
-    assert samples
-    assert all(Signal.MOTOR_VELOCITY not in sample.values for sample in samples)
-    assert all(Signal.MOTOR_POSITION in sample.values for sample in samples)
+    readings = run_program(Asked([found]).program(0.05), Wire([slave]))
+    assert (Signal.MOTOR_VELOCITY, 0) not in readings
+    assert readings[Signal.MOTOR_POSITION, 0].values
 
 
 def moving(ratio=1.0, link=None, amplitude=0.5):
-    samples = []
-    for k in range(400):
-        t = 0.005 * k
-        values = {
-            Signal.MOTOR_POSITION: amplitude * math.sin(3 * t),
-            Signal.MOTOR_VELOCITY: amplitude * 3 * math.cos(3 * t) / ratio if ratio else 0.0,
-        }
-        if link is not None:
-            values[Signal.LINK_POSITION] = link * amplitude * math.sin(3 * t)
-        samples.append(MotionSample(t, values, dict.fromkeys(values, t), dict.fromkeys(values, 0.001)))
-    return samples
+    times = [0.005 * k for k in range(400)]
+    position = [amplitude * math.sin(3 * t) for t in times]
+    values = {(Signal.MOTOR_POSITION, 0): position}
+    values[Signal.MOTOR_VELOCITY, 0] = [amplitude * 3 * math.cos(3 * t) / ratio for t in times]
+    if link is not None:
+        values[Signal.LINK_POSITION, None] = [link * x for x in position]
+    return {channel: Series(times, each, [0.001] * len(each)) for channel, each in values.items()}
 
 
 @pytest.mark.parametrize(
-    ("samples", "severity", "expected"),
+    ("readings", "severity", "expected"),
     [
         (moving(), Severity.OK, "velocity agrees"),
         (moving(-1.0), Severity.WARNING, "opposite signs"),
@@ -587,9 +573,9 @@ def moving(ratio=1.0, link=None, amplitude=0.5):
         (moving(link=20.0), Severity.WARNING, "moves 20 times as far"),
     ],
 )
-def test_signs_and_units_are_checked_against_each_other(samples, severity, expected):
+def test_signs_and_units_are_checked_against_each_other(readings, severity, expected):
     section = Section("Node 5")
-    judge_motion(section, survey()[0], samples)
+    judge_motion(section, survey(link="[link.encoder]\ncounts_per_rev = 65536")[0], readings)
     finding = next(finding for finding in section.notices if expected in finding.text)
     assert finding.severity is severity
 
@@ -604,25 +590,30 @@ def test_positions_are_sampled_over_the_roll_over():
         slave.objects[0x6064, 0].value = (0x7FFFFFF0 + k) & 0xFFFFFFFF
         return 0.01 * k
 
-    samples = run_program(MotionReader([node], clock).program(1.0), Wire([slave]))[5]
-    positions = [sample.values[Signal.MOTOR_POSITION] for sample in samples]
+    readings = run_program(Asked([node], clock).program(1.0), Wire([slave]))
+    positions = readings[Signal.MOTOR_POSITION, 0].values
     assert all(0 < after - before < 1e-4 for before, after in itertools.pairwise(positions))
+
+
+CHANNELS_READ = ((Signal.MOTOR_POSITION, 0), (Signal.MOTOR_TORQUE, 0), (Signal.LINK_POSITION, None))
+
+
+def sines(times):
+    """A sine, by each channel at its own times: those of all, and so long the answers took."""
+    return {
+        channel: Series(list(ts), [math.sin(2.0 * t) for t in ts], [0.001] * len(ts))
+        for channel, ts in zip(CHANNELS_READ, times, strict=True)
+    }
 
 
 def test_values_read_one_after_the_other_are_put_on_one_grid():
     """Each at its own time: a sine that is read late by half a turn is no other sine."""
-    found, _ = survey(link="[link.encoder]\ncounts_per_rev = 65536")
-    signals = (Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE, Signal.LINK_POSITION)
-    samples = []
-    for k in range(500):
-        times = {signal: 0.01 * k + 0.003 * j for j, signal in enumerate(signals)}
-        values = {signal: math.sin(2.0 * times[signal]) for signal in signals}
-        waits = dict.fromkeys(signals, 0.001)
-        if not k % 7:  # an answer that was long in coming, its time a bad guess
-            times[signals[1]] += 0.05
-            waits[signals[1]] = 0.1
-        samples.append(MotionSample(times[signals[0]], values, times, waits))
-    record = record_of_motion([found], {5: samples}, 1, True)
+    readings = sines([[0.01 * k + 0.003 * j for k in range(500)] for j in range(3)])
+    torque = readings[CHANNELS_READ[1]]
+    for k in range(0, 500, 7):  # an answer that was long in coming, its time a bad guess
+        torque.times_s[k] += 0.05
+        torque.waits_s[k] = 0.1
+    record = record_of(readings, 1, True)
     assert record.period_s == pytest.approx(0.01)
     # a straight line between two readings is off by at most (2 rad/s)² (0.01 s)² / 8, by four times that
     # where one between them is left out
@@ -631,14 +622,8 @@ def test_values_read_one_after_the_other_are_put_on_one_grid():
 
 
 def test_where_the_nodes_stall_there_is_a_gap_and_after_long_the_recording_ends():
-    found, _ = survey(link="[link.encoder]\ncounts_per_rev = 65536")
-    signals = (Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE, Signal.LINK_POSITION)
-    samples = []
-    for k in range(600):
-        t = 0.01 * k + 0.5 * (k >= 200) + 0.1 * (k >= 400)
-        values = dict.fromkeys(signals, math.sin(2.0 * t))
-        samples.append(MotionSample(t, values, dict.fromkeys(signals, t), dict.fromkeys(signals, 0.001)))
-    record = record_of_motion([found], {5: samples}, 1, True)
+    times = [0.01 * k + 0.5 * (k >= 200) + 0.1 * (k >= 400) for k in range(600)]
+    record = record_of(sines([times] * 3), 1, True)
     assert len(record) == pytest.approx(400, abs=2)
     assert record.motor_position_rad[0, 0] == pytest.approx(math.sin(2.0 * 2.5), abs=1e-3)
     steps = [after - before for before, after in itertools.pairwise(record.sequence)]

@@ -14,7 +14,7 @@ import pytest
 
 from drivelink.cli import main
 from drivelink.demo.simulate import network_from_joint
-from drivelink.doctor.byhand import ByHand, Value, check_by_hand
+from drivelink.doctor.manualcheck import ByHand, Value, check_by_hand
 from drivelink.jointfile import JointFile, load, parse
 
 JOINT = """

@@ -14,8 +14,8 @@ from rich.console import Console
 
 from drivelink.cli import add_bus, moved
 from drivelink.doctor import examine, examine_eds
-from drivelink.doctor.byhand import check_by_hand
 from drivelink.doctor.livevalues import live_values
+from drivelink.doctor.manualcheck import check_by_hand
 from drivelink.errors import UsageError
 from drivelink.jointfile import JointFile, load
 from drivelink.notice import Severity

@@ -13,7 +13,7 @@ from drivelink.canopen.roles import Role
 from drivelink.canopen.tpdo_assignment import Assignment, assign
 from drivelink.canopen.units import offer
 from drivelink.canopen.vendors import vendor_of
-from drivelink.doctor.freechecks import say_free_checks, say_second_encoder
+from drivelink.doctor.checkadvice import say_checks
 from drivelink.doctor.report import Section
 from drivelink.errors import DriveError
 from drivelink.jointfile import DriveSection, EncoderSection
@@ -77,8 +77,7 @@ def examine_sheet(section: Section, path: Path) -> None:
         text = " + ".join(entry_text(entry) for entry in entries)
         section.ok("configured", f"TPDO{number} = {text}, {kept}at every SYNC")
     checks = _checks(sheet, available)
-    say_free_checks(section, role, mappable, checks, tpdos)
-    say_second_encoder(section, role, mappable, checks, tpdos)
+    say_checks(section, role, mappable, checks, tpdos)
     section.facts["mapping"] = [
         {"tpdo": number, "objects": [f"0x{i:04X}:{s:02X}:{b}" for i, s, b in entries]}
         for number, entries in map(planned_entries, plan)

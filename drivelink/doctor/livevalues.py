@@ -1,96 +1,303 @@
-"""Reads a joint's channels now: by SDO, or from the traffic of another master."""
+"""A joint's channels as they are now: asked by SDO, or heard in the frames of a bus that may not be asked."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import can
 import numpy as np
+from numpy.typing import NDArray
 
+from drivelink._core import SYNC_COB_ID, Assembler
 from drivelink.canopen.blocking import run_program
 from drivelink.canopen.bus import open_bus
 from drivelink.canopen.guard import SilentBus
-from drivelink.canopen.layout import Signal
+from drivelink.canopen.layout import MappedObject, Signal
 from drivelink.canopen.node import NodeSurvey, survey_node
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.canopen.roles import roles
 from drivelink.canopen.scan import listen
-from drivelink.doctor.byhand import Value, Values
-from drivelink.doctor.motion import MotionReader
-from drivelink.doctor.sampletap import SampleTap
+from drivelink.canopen.sdo import Program, Read, SdoAbort
+from drivelink.cycle.pipeline import make_assembler
+from drivelink.cycle.syncclock import MEASURED_SYNCS, SyncClock, measure_period
+from drivelink.doctor.manualcheck import Value
 from drivelink.errors import DriveError
-from drivelink.jointfile import BusSection, JointFile
-from estimator.sample import Sample
+from drivelink.jointfile import JointFile
+from estimator.sample import FloatArray, Record, Sample
 
+_READ = (Signal.MOTOR_POSITION, Signal.MOTOR_VELOCITY, Signal.MOTOR_TORQUE, Signal.LINK_POSITION)
+_NAMES = {Signal.MOTOR_POSITION: "position", Signal.MOTOR_TORQUE: "torque"}
+_STALL = 4.0  # turns without an answer that make a gap,
+_STALL_S = 0.01  # and their duration: at 10 Hz linear interpolation over it is off by (2 pi f t)²/8 = 5 %
+_LONG_STALL_S = 0.25  # stall that ends the recording; a shorter one is a gap
+_LEAST_PERIOD_S = 0.001  # of the recording made from the answers, enough for a joint's motion
+_PROMPT = 1.5  # times the usual answer time; later answers have an uncertain time and are omitted
+_MOST_SAMPLES = 60_000  # that are kept of what is heard; more add no information
 _PATIENCE_S = 5.0  # timeout for a sample from the frames of a passive bus
-_CHANNELS = {Signal.MOTOR_POSITION: "position", Signal.MOTOR_TORQUE: "torque"}
+
+Channel = tuple[Signal, int | None]
+"""A signal of a motor, or of the link (None)."""
 
 
-class AskedValues:
-    """Reads the nodes by SDO; writes nothing.
+@dataclass(slots=True)
+class Series:
+    """The values of one channel.
 
-    Args:
-        bus: where they are.
-        section: of the joint file.
-        surveys: of the nodes.
+    Attributes:
+        times_s: of each value; for an answer, halfway between it and its request.
+        values: SI at the joint side.
+        waits_s: from request to answer; 0: heard.
     """
 
-    def __init__(self, bus: can.BusABC, section: BusSection, surveys: Sequence[NodeSurvey]) -> None:
-        self._bus, self._section, self._surveys = bus, section, surveys
-        self._reader = MotionReader(surveys)
+    times_s: list[float] = field(default_factory=list)
+    values: list[float] = field(default_factory=list)
+    waits_s: list[float] = field(default_factory=list)
+
+
+Readings = Mapping[Channel, Series]
+
+
+class Asked:
+    """Reads positions, velocity and torque of the nodes in turn, as fast as they answer; writes nothing.
+
+    Args:
+        surveys: of the nodes.
+        clock: monotonic seconds.
+    """
+
+    def __init__(self, surveys: Sequence[NodeSurvey], clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._counters: dict[Channel, tuple[int, _Unwrapped]] = {
+            (signal, None if signal is Signal.LINK_POSITION else survey.role.motor): (
+                survey.role.node_id,
+                _Unwrapped(survey.available[signal][0]),
+            )
+            for survey in surveys
+            for signal in _READ
+            if survey.available.get(signal)
+        }
+
+    def program(self, seconds: float) -> Program[Readings]:
+        """The readings of so many seconds, of the channels that have a value in every turn."""
+        clock, turns = self._clock, 0
+        found: dict[Channel, Series] = {channel: Series() for channel in self._counters}
+        end_s = clock() + seconds
+        while clock() < end_s and self._counters:
+            turns += 1
+            for channel, (node, counter) in self._counters.items():
+                before_s, series = clock(), found[channel]
+                try:
+                    data = yield Read(node, *counter.address)
+                except SdoAbort:  # some have no value before the drive runs
+                    continue
+                series.values.append(counter.take(data))
+                series.waits_s.append(clock() - before_s)
+                series.times_s.append(before_s + series.waits_s[-1] / 2)
+        return {channel: series for channel, series in found.items() if 0 < len(series.values) == turns}
+
+
+class _Unwrapped:
+    """One object's bytes to SI, rolled-over counters straightened."""
+
+    def __init__(self, candidate: MappedObject) -> None:
+        self._candidate = candidate
+        self.address = candidate.address
+        self._last: int | None = None
+        self._total = 0
+
+    def take(self, data: bytes) -> float:
+        """The SI value of the bytes."""
+        data = data[: max(1, self._candidate.bits // 8)]
+        count = int.from_bytes(data, "little", signed=self._candidate.signed)
+        if self._candidate.wraps:
+            span = self._candidate.modulus or 1 << 8 * max(1, len(data))
+            if self._last is None:
+                self._total = count
+            else:
+                self._total += (count - self._last + span // 2) % span - span // 2
+            self._last, count = count, self._total
+        return count * self._candidate.scale
+
+
+class Heard:
+    """Makes samples from the frames of a passive bus, as the daemon would.
+
+    Args:
+        joint: the joint.
+        configurator: knows the mapping of its nodes, or takes it from the frames.
+
+    Attributes:
+        joint: the joint, with the measured period of SYNC.
+        samples: the first of them since `readings` was last called.
+    """
+
+    def __init__(self, joint: JointFile, configurator: PassiveConfigurator) -> None:
+        self.joint = joint
+        self.samples: list[Sample] = []
+        self._missing = ""
+        self._configurator = configurator
+        self._syncs_ns: list[int] = []
+        self._clock: SyncClock | None = None
+        self._assembler: Assembler | None = None
+
+    @property
+    def missing(self) -> str:
+        """Why there are no samples."""
+        reasons = [*map(str, self._configurator.missing.values()), self._missing]
+        return next((text for text in reasons if text), "no SYNC, or not all of its frames")
+
+    def take(self, message: can.Message) -> None:
+        """Take a frame, in bus order."""
+        if message.is_extended_id or message.is_remote_frame or message.is_error_frame:
+            return
+        cob_id, data = message.arbitration_id, bytes(message.data)
+        stamp_s = message.timestamp or time.time()
+        self._configurator.feed(cob_id, data, stamp_s)
+        if self._configurator.poll(stamp_s):
+            self._assembler = None  # a node has another mapping now
+        stamp_ns = round(stamp_s * 1e9)
+        if self._clock is None:
+            self._measure(cob_id, stamp_ns)
+        elif self._assembler is None:
+            self._begin()
+        else:
+            jump = self._clock.jump(stamp_ns) if cob_id == SYNC_COB_ID else 1
+            sample = self._assembler.feed(cob_id, data, jump)
+            if sample is not None and len(self.samples) < _MOST_SAMPLES:
+                self.samples.append(sample)
+
+    def _measure(self, cob_id: int, stamp_ns: int) -> None:
+        """Measure the period from the first SYNCs."""
+        if cob_id != SYNC_COB_ID:
+            return
+        self._syncs_ns.append(stamp_ns)
+        if len(self._syncs_ns) < MEASURED_SYNCS:
+            return
+        period_s = self.joint.bus.period_s
+        measured = measure_period(self._syncs_ns, period_s)
+        if measured is not None and not measured.same:
+            period_s = measured.period_s
+        bus = self.joint.bus.model_copy(update={"period_s": period_s})
+        self.joint = self.joint.model_copy(update={"bus": bus})
+        self._clock = SyncClock(period_s)
+
+    def _begin(self) -> None:
+        """Make the assembler once the mapping of every node is known."""
+        if self._configurator.busy:
+            return
+        try:
+            self._assembler = make_assembler(self.joint, tuple(self._configurator.layouts.values()))
+        except DriveError as error:
+            self._missing = str(error)
+
+    def readings(self) -> Readings:
+        """What was heard since the last call, of the channels that have every value."""
+        samples, self.samples = self.samples, []
+        motors = range(len(samples[0].motor_position_rad) if samples else 0)
+        values: dict[Channel, list[float]] = {}
+        for i in motors:
+            values[Signal.MOTOR_POSITION, i] = [sample.motor_position_rad[i] for sample in samples]
+            values[Signal.MOTOR_TORQUE, i] = [sample.motor_torque_nm[i] for sample in samples]
+        values[Signal.LINK_POSITION, None] = [sample.link_position_rad for sample in samples]
+        times = [sample.sequence * self.joint.bus.period_s for sample in samples]
+        heard = {channel: each for channel, each in values.items() if each and np.all(np.isfinite(each))}
+        return {channel: Series(times, each, [0.0] * len(each)) for channel, each in heard.items()}
+
+    def listen(self, bus: SilentBus, seconds: float) -> Readings:
+        """What is heard in the next seconds; sends nothing."""
+        self.samples = []
+        listen(bus, seconds, self.take)
+        return self.readings()
+
+
+def record_of(readings: Readings, motors: int, linked: bool) -> Record | None:
+    """Channels, each read at its own times, as a recording with one period.
+
+    Slow answers are omitted because their time is uncertain. Several turns without an answer make a gap, a
+    long stall ends the recording.
+
+    Args:
+        readings: of the joint.
+        motors: number of motors.
+        linked: whether the link position is needed.
+
+    Returns:
+        The recording; None if a channel is missing or there are fewer than three turns.
+    """
+    needed = [(signal, i) for signal in (Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE) for i in range(motors)]
+    wanted: list[Channel] = [*needed, *([(Signal.LINK_POSITION, None)] if linked else [])]
+    series = {channel: _prompt(readings[channel]) for channel in wanted if channel in readings}
+    if any(channel not in series or len(series[channel][0]) < 3 for channel in wanted):
+        return None
+    begin = max(float(times[0]) for times, _ in series.values())
+    end = min(float(times[-1]) for times, _ in series.values())
+    period_s = max(float(np.median(np.diff(series[wanted[0]][0]))), _LEAST_PERIOD_S)
+    if not (end - begin > 2.0 * period_s > 0.0):
+        return None
+    turns = np.asarray(begin + period_s * np.arange(int((end - begin) / period_s) + 1), dtype=np.float64)
+    sequence = _known(turns, [times for times, _ in series.values()], max(_STALL * period_s, _STALL_S))
+    column = {channel: np.asarray(np.interp(turns[sequence], *each)) for channel, each in series.items()}
+    return Record(
+        period_s=period_s,
+        sequence=sequence,
+        motor_position_rad=np.stack([column[Signal.MOTOR_POSITION, i] for i in range(motors)], axis=1),
+        motor_torque_nm=np.stack([column[Signal.MOTOR_TORQUE, i] for i in range(motors)], axis=1),
+        link_position_rad=column[Signal.LINK_POSITION, None] if linked else None,
+    )
+
+
+def _prompt(series: Series) -> tuple[FloatArray, FloatArray]:
+    """Times and values of the prompt answers."""
+    prompt = np.asarray(series.waits_s) <= _PROMPT * np.median(series.waits_s)
+    return np.asarray(series.times_s)[prompt], np.asarray(series.values)[prompt]
+
+
+def _known(grid: FloatArray, channels: Sequence[FloatArray], most_s: float) -> NDArray[np.int64]:
+    """Places of the grid where no channel's readings are further apart than that: those of the longest part
+    that no long stall interrupts.
+    """
+    good = np.ones(len(grid), dtype=bool)
+    for times in channels:
+        for k in np.flatnonzero(np.diff(times) > most_s):
+            good &= (grid <= times[k]) | (grid >= times[k + 1])
+    places = np.flatnonzero(good)
+    if not len(places):
+        return places
+    parts = np.split(places, np.flatnonzero(np.diff(grid[places]) > _LONG_STALL_S) + 1)
+    return max(parts, key=len)
+
+
+class LiveValues:
+    """The channels' values, for the checks by hand.
+
+    Args:
+        collect: readings of the next so many seconds.
+    """
+
+    def __init__(self, collect: Callable[[float], Readings]) -> None:
+        self._collect = collect
 
     def read(self, seconds: float) -> Mapping[str, Value]:
-        """The channels of the next seconds.
+        """Mean and standard deviation over the next seconds: "motor1_position", …, "link_position".
 
         Raises:
             DriveError: a node does not answer.
         """
-        samples = run_program(self._reader.program(seconds), self._bus, self._section)
         found = {}
-        for survey in self._surveys:
-            mine = samples[survey.role.node_id]
-            for signal in mine[0].values if mine else ():
-                name = _channel(signal, survey.role.motor)
-                if name:
-                    found[name] = _value([sample.values[signal] for sample in mine])
+        for (signal, motor), series in self._collect(seconds).items():
+            name = "link_position" if motor is None else f"motor{motor + 1}_{_NAMES.get(signal, '')}"
+            if motor is None or signal in _NAMES:
+                found[name] = Value(float(np.mean(series.values)), float(np.std(series.values)))
         return found
 
 
-class HeardValues:
-    """Listens to the frames of a bus; sends nothing.
-
-    Args:
-        bus: listened to only.
-        tap: makes samples from its frames.
-    """
-
-    def __init__(self, bus: SilentBus, tap: SampleTap) -> None:
-        self._bus, self._tap = bus, tap
-
-    def read(self, seconds: float) -> Mapping[str, Value]:
-        """The channels of the next seconds."""
-        heard: list[Sample] = []
-
-        def take(message: can.Message) -> None:
-            before = self._tap.samples
-            self._tap.take(message)
-            if self._tap.samples != before and self._tap.latest is not None:
-                heard.append(self._tap.latest)
-
-        listen(self._bus, seconds, take)
-        if not heard:
-            return {}
-        motors = range(len(heard[0].motor_position_rad))
-        found = {f"motor{i + 1}_position": _value([s.motor_position_rad[i] for s in heard]) for i in motors}
-        found |= {f"motor{i + 1}_torque": _value([s.motor_torque_nm[i] for s in heard]) for i in motors}
-        found["link_position"] = _value([s.link_position_rad for s in heard])
-        return {name: value for name, value in found.items() if np.isfinite(value.mean)}
-
-
 @contextmanager
-def live_values(joint: JointFile, base_dir: Path) -> Iterator[Values]:
+def live_values(joint: JointFile, base_dir: Path) -> Iterator[LiveValues]:
     """The channels of a joint on its bus.
 
     Raises:
@@ -100,24 +307,13 @@ def live_values(joint: JointFile, base_dir: Path) -> Iterator[Values]:
     bus = open_bus(joint.bus)
     try:
         if joint.bus.configure:
-            surveys = [run_program(survey_node(role), bus, joint.bus) for role in roles(joint, base_dir)]
-            yield AskedValues(bus, joint.bus, surveys)
+            asked = Asked([run_program(survey_node(role), bus, joint.bus) for role in roles(joint, base_dir)])
+            yield LiveValues(lambda seconds: run_program(asked.program(seconds), bus, joint.bus))
         else:
-            silent, configurator = SilentBus(bus), PassiveConfigurator([joint], [base_dir])
-            tap = SampleTap(joint, configurator)
-            listen(silent, _PATIENCE_S, tap.take)
-            if tap.latest is None:
-                raise DriveError(f"{joint.name}: no sample in {_PATIENCE_S:g} s: {tap.missing}")
-            yield HeardValues(silent, tap)
+            silent = SilentBus(bus)
+            heard = Heard(joint, PassiveConfigurator([joint], [base_dir]))
+            if not heard.listen(silent, _PATIENCE_S):
+                raise DriveError(f"{joint.name}: no sample in {_PATIENCE_S:g} s: {heard.missing}")
+            yield LiveValues(partial(heard.listen, silent))
     finally:
         bus.shutdown()
-
-
-def _channel(signal: Signal, motor: int | None) -> str:
-    if signal is Signal.LINK_POSITION:
-        return "link_position"
-    return f"motor{motor + 1}_{_CHANNELS[signal]}" if motor is not None and signal in _CHANNELS else ""
-
-
-def _value(values: Sequence[float]) -> Value:
-    return Value(float(np.mean(values)), float(np.std(values)))

@@ -5,172 +5,27 @@ The drives are only read; move the joint meanwhile, by hand or by its controller
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from drivelink.canopen.layout import MappedObject, Signal
+from drivelink.canopen.layout import Signal
 from drivelink.canopen.node import NodeSurvey
-from drivelink.canopen.sdo import Program, Read, SdoAbort
+from drivelink.doctor.livevalues import Readings
 from drivelink.doctor.report import Section
 from drivelink.jointfile import JointFile
 from drivelink.notice import Severity
-from drivelink.recording.gate import Gathered, corrections
+from drivelink.recording.gate import corrections
 from estimator.errors import EstimatorError
 from estimator.gate import Judgement, check, judge
-from estimator.sample import FloatArray, Record
+from estimator.sample import Record
 
-_READ = (Signal.MOTOR_POSITION, Signal.MOTOR_VELOCITY, Signal.MOTOR_TORQUE, Signal.LINK_POSITION)
 _WINDOW_S = 0.02  # differences over less are mostly quantisation
 _LEAST_COUNTS = 50  # minimum number for a decision
 _TOLERANCE = 0.15  # relative; velocities are filtered in the drive
 _LINK_TOLERANCE = 0.35  # the transmission bends
-_STALL = 4.0  # turns without an answer that make a gap,
-_STALL_S = 0.01  # and their duration: at 10 Hz linear interpolation over it is off by (2 pi f t)²/8 = 5 %
-_LONG_STALL_S = 0.25  # stall that ends the recording; a shorter one is a gap
-_LEAST_PERIOD_S = 0.001  # of the recording made from the answers, enough for a joint's motion
-_PROMPT = 1.5  # times the usual answer time; later answers have an uncertain time and are omitted
 _LONGER = "move the joint during the check, by its controller (--seconds 20 gives more time)"
-
-
-@dataclass(frozen=True, slots=True)
-class MotionSample:
-    """Answers of one node in one turn.
-
-    Attributes:
-        time_s: monotonic, of its position.
-        values: SI at the joint side, by signal.
-        times_s: monotonic, of each value: halfway between request and answer.
-        waits_s: time between the two.
-    """
-
-    time_s: float
-    values: dict[Signal, float]
-    times_s: dict[Signal, float]
-    waits_s: dict[Signal, float]
-
-
-class MotionReader:
-    """Reads positions, velocity and torque of the nodes in turn, as fast as they answer; writes nothing.
-
-    Args:
-        surveys: of the nodes.
-        clock: monotonic seconds.
-    """
-
-    def __init__(self, surveys: Sequence[NodeSurvey], clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._counters = {
-            survey.role.node_id: {
-                signal: _Unwrapped(survey.available[signal][0])
-                for signal in _READ
-                if survey.available.get(signal)
-            }
-            for survey in surveys
-        }
-
-    def program(self, seconds: float) -> Program[dict[int, list[MotionSample]]]:
-        """The samples of so many seconds by node id, with the signals that all samples of a node have."""
-        clock = self._clock
-        samples: dict[int, list[MotionSample]] = {node: [] for node in self._counters}
-        end_s = clock() + seconds
-        while clock() < end_s and any(self._counters.values()):
-            for node, counters in self._counters.items():
-                values, times_s, waits_s = {}, {}, {}
-                begin_s = clock()
-                for signal, counter in counters.items():
-                    before_s = clock()
-                    try:
-                        data = yield Read(node, *counter.address)
-                    except SdoAbort:  # some have no value before the drive runs
-                        continue
-                    values[signal] = counter.take(data)
-                    waits_s[signal] = clock() - before_s
-                    times_s[signal] = before_s + waits_s[signal] / 2
-                at_s = times_s.get(Signal.MOTOR_POSITION, begin_s)
-                samples[node].append(MotionSample(at_s, values, times_s, waits_s))
-        return {node: _complete(found) for node, found in samples.items()}
-
-
-def _complete(samples: list[MotionSample]) -> list[MotionSample]:
-    """The signals that every sample has."""
-    if not samples:
-        return []
-    everywhere = set(samples[0].values).intersection(*(sample.values for sample in samples))
-    return [
-        replace(sample, values={signal: sample.values[signal] for signal in everywhere})
-        for sample in samples
-        if everywhere
-    ]
-
-
-def record_of_motion(
-    surveys: Sequence[NodeSurvey], samples: Mapping[int, Sequence[MotionSample]], motors: int, linked: bool
-) -> Record | None:
-    """The nodes' answers, each read at a different time, as a recording with one period.
-
-    Slow answers are omitted because their time is uncertain. Several turns without an answer make a gap, a
-    long stall ends the recording.
-
-    Args:
-        surveys: of the nodes.
-        samples: answers by node id.
-        motors: number of motors.
-        linked: whether the link position is needed.
-
-    Returns:
-        The recording; None if a channel is missing or there are fewer than three turns.
-    """
-    series: dict[tuple[Signal, int | None], tuple[FloatArray, FloatArray]] = {}
-    for survey in surveys:
-        mine = samples.get(survey.role.node_id, ())
-        for signal in mine[0].values if mine else ():
-            waits = np.array([sample.waits_s[signal] for sample in mine])
-            prompt = waits <= _PROMPT * np.median(waits)
-            times = np.array([sample.times_s[signal] for sample in mine])[prompt]
-            values = np.array([sample.values[signal] for sample in mine])[prompt]
-            series[signal, None if signal is Signal.LINK_POSITION else survey.role.motor] = (times, values)
-    needed = [(signal, i) for signal in (Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE) for i in range(motors)]
-    wanted: list[tuple[Signal, int | None]] = [*needed, *([(Signal.LINK_POSITION, None)] if linked else [])]
-    if any(key not in series or len(series[key][0]) < 3 for key in wanted):
-        return None
-    begin = max(float(series[key][0][0]) for key in wanted)
-    end = min(float(series[key][0][-1]) for key in wanted)
-    period_s = max(float(np.median(np.diff(series[wanted[0]][0]))), _LEAST_PERIOD_S)
-    if not (end - begin > 2.0 * period_s > 0.0):
-        return None
-    turns = np.asarray(begin + period_s * np.arange(int((end - begin) / period_s) + 1), dtype=np.float64)
-    sequence = _known(turns, [series[key][0] for key in wanted], max(_STALL * period_s, _STALL_S))
-    grid = turns[sequence]
-
-    def column(signal: Signal, motor: int | None) -> FloatArray:
-        return np.asarray(np.interp(grid, *series[signal, motor]))
-
-    return Record(
-        period_s=period_s,
-        sequence=sequence,
-        motor_position_rad=np.stack([column(Signal.MOTOR_POSITION, i) for i in range(motors)], axis=1),
-        motor_torque_nm=np.stack([column(Signal.MOTOR_TORQUE, i) for i in range(motors)], axis=1),
-        link_position_rad=column(Signal.LINK_POSITION, None) if linked else None,
-    )
-
-
-def _known(grid: FloatArray, channels: Sequence[FloatArray], most_s: float) -> NDArray[np.int64]:
-    """Places of the grid where no channel's readings are further apart than that: those of the longest part
-    that no long stall interrupts.
-    """
-    good = np.ones(len(grid), dtype=bool)
-    for times in channels:
-        for k in np.flatnonzero(np.diff(times) > most_s):
-            good &= (grid <= times[k]) | (grid >= times[k + 1])
-    places = np.flatnonzero(good)
-    if not len(places):
-        return places
-    parts = np.split(places, np.flatnonzero(np.diff(grid[places]) > _LONG_STALL_S) + 1)
-    return max(parts, key=len)
 
 
 def judge_record(section: Section, joint: JointFile, record: Record | None) -> None:
@@ -187,14 +42,6 @@ def judge_record(section: Section, joint: JointFile, record: Record | None) -> N
         return
     section.facts["samples"] = len(record)
     _say_judgement(section, joint, judgement)
-
-
-def judge_gathered(section: Section, joint: JointFile, gathered: Gathered) -> None:
-    """The same for samples from frames on the bus."""
-    try:
-        _say_judgement(section, joint, gathered.judgement())
-    except EstimatorError as error:
-        section.say(Severity.INFO, joint.name, str(error))
 
 
 def _say_judgement(section: Section, joint: JointFile, judgement: Judgement) -> None:
@@ -215,49 +62,22 @@ def _say_judgement(section: Section, joint: JointFile, judgement: Judgement) -> 
         section.ok(joint.name, text)
 
 
-class _Unwrapped:
-    """One object's bytes to SI, rolled-over counters straightened."""
-
-    def __init__(self, candidate: MappedObject) -> None:
-        self._candidate = candidate
-        self._last: int | None = None
-        self._total = 0
-
-    @property
-    def address(self) -> tuple[int, int]:
-        """Of the object."""
-        return self._candidate.address
-
-    def take(self, data: bytes) -> float:
-        """The SI value of the bytes."""
-        data = data[: max(1, self._candidate.bits // 8)]
-        count = int.from_bytes(data, "little", signed=self._candidate.signed)
-        if self._candidate.wraps:
-            span = self._candidate.modulus or 1 << 8 * max(1, len(data))
-            if self._last is None:
-                self._total = count
-            else:
-                self._total += (count - self._last + span // 2) % span - span // 2
-            self._last, count = count, self._total
-        return count * self._candidate.scale
-
-
 def slope(x: Sequence[float], y: Sequence[float]) -> float:
     """Least-squares factor k of y = k x."""
     square = sum(a * a for a in x)
     return sum(a * b for a, b in zip(x, y, strict=True)) / square if square else 0.0
 
 
-def judge_motion(section: Section, survey: NodeSurvey, samples: Sequence[MotionSample]) -> bool:
-    """Compare the channels of the samples; return whether the motor moved."""
-    subject, key = survey.role.subject, survey.role.key
+def judge_motion(section: Section, survey: NodeSurvey, readings: Readings) -> bool:
+    """Compare the channels of a drive; return whether the motor moved."""
+    subject, key, motor = survey.role.subject, survey.role.key, survey.role.motor
     position = next(iter(survey.available.get(Signal.MOTOR_POSITION, ())), None)
-    if position is None or len(samples) < 3 or Signal.MOTOR_POSITION not in samples[0].values:
+    series = readings.get((Signal.MOTOR_POSITION, motor))
+    if position is None or series is None or len(series.values) < 3:
         return False
-    times = [sample.time_s for sample in samples]
-    motor = [sample.values[Signal.MOTOR_POSITION] for sample in samples]
-    section.facts[f"{subject} travel_rad"] = max(motor) - min(motor)
-    if max(motor) - min(motor) < _LEAST_COUNTS * abs(position.scale):
+    times, moved = series.times_s, series.values
+    section.facts[f"{subject} travel_rad"] = max(moved) - min(moved)
+    if max(moved) - min(moved) < _LEAST_COUNTS * abs(position.scale):
         section.say(
             Severity.INFO,
             subject,
@@ -265,13 +85,12 @@ def judge_motion(section: Section, survey: NodeSurvey, samples: Sequence[MotionS
             "turn the joint by hand during the check (--seconds 10: more time), or drivelink doctor --move",
         )
         return False
-    if Signal.MOTOR_VELOCITY in samples[0].values:
-        velocity = [sample.values[Signal.MOTOR_VELOCITY] for sample in samples]
-        _judge_velocity(section, subject, key, *_differences(times, motor, velocity))
-    if Signal.LINK_POSITION in samples[0].values:
-        link = [sample.values[Signal.LINK_POSITION] for sample in samples]
-        moved, followed = _steps(times, motor), _steps(times, link)
-        _judge_link(section, subject, slope(moved, followed))
+    velocity = readings.get((Signal.MOTOR_VELOCITY, motor))
+    if velocity is not None:
+        _judge_velocity(section, subject, key, *_differences(times, moved, velocity.values))
+    link = readings.get((Signal.LINK_POSITION, None))
+    if link is not None and Signal.LINK_POSITION in survey.available:
+        _judge_link(section, subject, slope(_steps(times, moved), _steps(times, link.values)))
     return True
 
 

@@ -21,17 +21,16 @@ from drivelink.canopen.roles import Role, roles
 from drivelink.canopen.scan import FoundNode, Traffic, identify, listen, scan
 from drivelink.canopen.tpdo_assignment import CHECKS, Available, assign, unused
 from drivelink.canopen.vendors import vendor_of
-from drivelink.doctor.datasheet import planned_entries
-from drivelink.doctor.freechecks import (
+from drivelink.doctor.checkadvice import (
     asked_signals,
-    say_free_checks,
-    say_second_encoder,
+    say_checks,
     say_sync_counter,
     second_encoder,
 )
-from drivelink.doctor.motion import MotionReader, judge_gathered, judge_motion, judge_record, record_of_motion
+from drivelink.doctor.datasheet import planned_entries
+from drivelink.doctor.livevalues import Asked, Heard, record_of
+from drivelink.doctor.motion import judge_motion, judge_record
 from drivelink.doctor.report import Report, Section
-from drivelink.doctor.sampletap import SampleTap
 from drivelink.doctor.syncs import Daemons, judge_sync
 from drivelink.errors import BusError, DriveError, JointFileError
 from drivelink.jointfile import BusSection, JointFile
@@ -121,17 +120,17 @@ def _watch_motion(
     nodes = list(surveys.values())
     together = report.section("Units and signs")
     try:
-        samples = run_program(MotionReader(nodes).program(seconds), bus, joint.bus)
+        readings = run_program(Asked(nodes).program(seconds), bus, joint.bus)
     except DriveError as error:
         together.say(Severity.ERROR, joint.name, str(error))
         return
     moving = False
     for title, survey in surveys.items():
         if survey.role.motor is not None:
-            moving |= judge_motion(sections[title], survey, samples[survey.role.node_id])
+            moving |= judge_motion(sections[title], survey, readings)
     if moving:
         linked = joint.model().has_deflection
-        judge_record(together, joint, record_of_motion(nodes, samples, len(joint.motor), linked))
+        judge_record(together, joint, record_of(readings, len(joint.motor), linked))
 
 
 def _list(nodes: Sequence[int]) -> str:
@@ -247,10 +246,10 @@ def _judge_mapping(section: Section, role: Role, survey: NodeSurvey) -> NodeLayo
             f"will be configured to send {'; '.join(parts)}",
             "drivelink run does it",
         )
-    say_free_checks(section, role, wanted, available, survey.tpdos)
-    seconds = available.get(Signal.SECOND_POSITION, ())
-    if all(o.address != vendor_of(survey.identity[0]).sensorless for o in seconds):
-        say_second_encoder(section, role, wanted, available, survey.tpdos)
+    sensorless = vendor_of(survey.identity[0]).sensorless
+    if any(o.address == sensorless for o in available.get(Signal.SECOND_POSITION, ())):
+        del available[Signal.SECOND_POSITION]
+    say_checks(section, role, wanted, available, survey.tpdos)
     tpdos = tuple(
         TpdoLayout(cob_id=0x181, objects=a.objects) if a.objects is not None else decode([a.tpdo], wanted)[0]
         for a in plan
@@ -303,8 +302,8 @@ def _overhear(
 ) -> None:
     """Check a passive bus by listening."""
     configurator = PassiveConfigurator([joint], [base_dir])
-    tap = SampleTap(joint, configurator)
-    traffic = listen(bus, seconds, tap.take)
+    heard = Heard(joint, configurator)
+    traffic = listen(bus, seconds, heard.take)
     _judge_traffic(section, traffic, joint.bus, daemons)
     for error in configurator.missing.values():
         section.say(Severity.ERROR, joint.bus.channel, str(error))
@@ -326,10 +325,11 @@ def _overhear(
             else:
                 section.ok(f"node {node}", f"0x{tpdo.cob_id:03X} heard {count} times")
     _judge_load(section, list(configurator.layouts.values()), joint.bus)
-    if tap.samples:
-        judge_gathered(report.section("Units and signs"), tap.joint, tap.gathered)
+    if heard.samples:
+        record = record_of(heard.readings(), len(joint.motor), joint.model().has_deflection)
+        judge_record(report.section("Units and signs"), heard.joint, record)
     elif not configurator.missing:  # already reported
-        text = f"units and signs cannot be checked: no sample in {seconds:g} s: {tap.missing}"
+        text = f"units and signs cannot be checked: no sample in {seconds:g} s: {heard.missing}"
         section.say(Severity.INFO, joint.name, text)
 
 

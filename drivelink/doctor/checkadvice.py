@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from drivelink.canopen.layout import Signal
 from drivelink.canopen.pdo import Tpdo
@@ -38,25 +38,6 @@ def second_encoder(role: Role) -> str:
     return next(each for each in _ENCODERS if each.lower() != link.lower())
 
 
-def say_second_encoder(
-    section: Section, role: Role, wanted: Available, available: Available, tpdos: Sequence[Tpdo]
-) -> None:
-    """Report an encoder that nothing uses, and the line for the joint file."""
-    if role.drive is None or role.drive.second_encoder is not None:
-        return
-    objects = {Signal.SECOND_POSITION: unused(wanted, available.get(Signal.SECOND_POSITION, ()))}
-    frames = _cost(role, wanted, objects, tpdos) if all(objects.values()) else None
-    if frames is not None:
-        index, subindex = objects[Signal.SECOND_POSITION][0].address
-        name = f"0x{index:04X}:{subindex:02X}"
-        section.say(
-            Severity.INFO,
-            "cross-check",
-            f"second encoder ({name}), if on the motor, can be compared with position: {_frames(frames)}",
-            f'[motor.drive] second_encoder = "{name}"',
-        )
-
-
 def say_sync_counter(section: Section, subject: str, bus: BusSection) -> None:
     """Report a SYNC counter (0x1019) that is off: it shows each lost SYNC."""
     if bus.sync == "produce" and not bus.sync_counter_overflow:
@@ -65,7 +46,7 @@ def say_sync_counter(section: Section, subject: str, bus: BusSection) -> None:
         section.say(Severity.INFO, "cross-check", text, line)
 
 
-def say_free_checks(
+def say_checks(
     section: Section, role: Role, wanted: Available, available: Available, tpdos: Sequence[Tpdo]
 ) -> None:
     """Report which checks the drive can send, their cost in frames, and the line for the joint file.
@@ -77,29 +58,42 @@ def say_free_checks(
         available: its objects for cross-checks.
         tpdos: present TPDOs.
     """
-    if role.drive is None:
+    drive = role.drive
+    if drive is None:
         return
-    found = {}
-    for name, signals in _SIGNALS.items():
-        objects = {signal: unused(wanted, available.get(signal, ())) for signal in signals}
-        asked = name in role.drive.checks or (name == "velocity" and role.drive.velocity)
-        if not asked and all(objects.values()):
-            found[name] = objects
+    mapped = {*drive.checks, *(["velocity"] if drive.velocity else [])}
+    offered = {
+        name: {signal: unused(wanted, available.get(signal, ())) for signal in signals}
+        for name, signals in (_SIGNALS | {"second_encoder": (Signal.SECOND_POSITION,)}).items()
+    }
+    found = {
+        name: objects for name, objects in offered.items() if name not in mapped and all(objects.values())
+    }
+    encoder = found.pop("second_encoder", None)
+
+    def say(text: str, objects: Available, line: str) -> None:
+        frames = _cost(role, wanted, objects, tpdos)
+        if frames is not None:
+            section.say(Severity.INFO, "cross-check", f"{text}: {_frames(frames)}", f"[motor.drive] {line}")
+
+    def checks(names: Iterable[str]) -> str:
+        return f"checks = {json.dumps([*drive.checks, *names])}"
+
     for name, objects in found.items():
-        what = " + ".join(f"0x{o[0].address[0]:04X}:{o[0].address[1]:02X}" for o in objects.values())
-        text = f"{name} ({what}) can be compared with {_AGAINST[name]}"
-        _say(section, role, [name], text, _cost(role, wanted, objects, tpdos))
+        say(f"{name} ({_names(objects)}) can be compared with {_AGAINST[name]}", objects, checks([name]))
     if len(found) > 1:
-        everything = {signal: each for objects in found.values() for signal, each in objects.items()}
-        _say(section, role, list(found), "all of them", _cost(role, wanted, everything, tpdos))
+        say(
+            "all of them", {signal: o for each in found.values() for signal, o in each.items()}, checks(found)
+        )
+    if encoder is not None and drive.second_encoder is None:
+        name = _names(encoder)
+        text = f"second encoder ({name}), if on the motor, can be compared with position"
+        say(text, encoder, f'second_encoder = "{name}"')
     section.facts["cross_checks"] = list(found)
 
 
-def _say(section: Section, role: Role, names: list[str], text: str, frames: int | None) -> None:
-    if role.drive is None or frames is None:
-        return
-    line = f"[motor.drive] checks = {json.dumps([*role.drive.checks, *names])}"
-    section.say(Severity.INFO, "cross-check", f"{text}: {_frames(frames)}", line)
+def _names(objects: Available) -> str:
+    return " + ".join(f"0x{o[0].address[0]:04X}:{o[0].address[1]:02X}" for o in objects.values())
 
 
 def _frames(more: int) -> str:

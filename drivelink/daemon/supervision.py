@@ -16,7 +16,7 @@ from drivelink.canopen.emcy import parse_emergency
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator, is_mapping
 from drivelink.canopen.sdo_sniffer import written_object
-from drivelink.cycle.following import MapFollower
+from drivelink.cycle.following import OwnFollower, PassiveFollower
 from drivelink.cycle.framesource import OVERFLOW, LostSource
 from drivelink.cycle.loop import CycleLoop, LoopJoint
 from drivelink.cycle.objectcheck import ObjectCheck
@@ -26,7 +26,6 @@ from drivelink.daemon.jointwatch import JointWatch
 from drivelink.daemon.nodewatch import OPERATIONAL, STATES, WatchedNode
 from drivelink.daemon.readback import ReadBack
 from drivelink.daemon.status import EventLog
-from drivelink.errors import DriveError
 
 logger = logging.getLogger(__name__)
 
@@ -60,52 +59,49 @@ class Supervisor:
         self._loop = loop
         self._events = events
         self._configurator = configurator
-        self._follower: MapFollower | None = None
         self._read_back: ReadBack | None = None
         self.bus = BusWatch(loop, events)
         self._joints = JointWatch(events, self.contradiction)
         loop.on_fault = self._say_fault
         self._unread = 0  # frames lost by receive overflow
-        self._due: dict[int, tuple[NodeLayout, int]] = {}  # configured nodes, and the SYNC before their start
         self._nodes: dict[int, WatchedNode] = {}
         for loop_joint, mine in layouts.items():
-            loop_joint.pipeline.assembler.supervise()
             for layout in mine:
-                self._nodes[layout.node_id] = WatchedNode(layout, loop_joint, loop.clock())
-                loop.listeners[0x700 + layout.node_id] = self._heartbeat
-                loop.listeners[0x080 + layout.node_id] = self._emergency
-                loop.listeners[0x580 + layout.node_id] = self._answer
-                loop.listeners[0x600 + layout.node_id] = self._foreign_request
-        if isinstance(configurator, PassiveConfigurator):
-            self._follow(configurator)
-        elif configurator.bus.read_back_s:
-            section = configurator.bus
-            self._read_back = ReadBack(
-                configurator.ask, section.read_back_s, ObjectCheck(section.sdo_timeout_s)
-            )
-            for watched in self._nodes.values():
-                self._read_back.watch(watched.layout, watched.loop_joint.pipeline)
-            loop.on_sent = self._sent
-            loop.after_sync.append(self._check_objects)
-        loop.after_sync.append(self._use_configured)
+                node = layout.node_id
+                self._nodes[node] = WatchedNode(layout, loop_joint, loop.clock())
+                loop.listeners[0x700 + node] = self._heartbeat
+                loop.listeners[0x080 + node] = self._emergency
+        self._follower = self._follow(configurator)
+        loop.after_sync.append(self._sync)
 
-    def _follow(self, configurator: PassiveConfigurator) -> None:
-        """Follow another master's mapping: process its frames in bus order."""
+    def _follow(self, configurator: Configurator | PassiveConfigurator) -> PassiveFollower | OwnFollower:
+        """Follow the mappings, by frames in bus order."""
         loop, nodes = self._loop, self._nodes
-        self._follower = MapFollower(
-            configurator,
-            {node: watched.loop_joint.pipeline.assembler for node, watched in nodes.items()},
-            {node: watched.layout for node, watched in nodes.items()},
-            self._listen_anew,
-        )
-        loop.listeners[0] = self._overhear
+        assemblers = {node: watched.assembler for node, watched in nodes.items()}
+        layouts = {node: watched.layout for node, watched in nodes.items()}
+        if isinstance(configurator, PassiveConfigurator):
+            for cob_id in (0, *(base + node for base in (0x580, 0x600) for node in nodes)):
+                loop.listeners[cob_id] = self._overhear
+            return PassiveFollower(configurator, assemblers, layouts, self._use)
+        section = configurator.bus
+        if section.read_back_s:
+            check = ObjectCheck(section.sdo_timeout_s)
+            self._read_back = ReadBack(configurator.ask, section.read_back_s, check)
+            for watched in nodes.values():
+                self._read_back.watch(watched.layout, watched.loop_joint.pipeline)
         for node in nodes:
-            loop.listeners[0x580 + node] = loop.listeners[0x600 + node] = self._overhear
-        loop.after_sync.append(self._follower.sync)
+            loop.listeners[0x580 + node] = self._answer
+            loop.listeners[0x600 + node] = self._foreign_request
+        follower = OwnFollower(
+            configurator, assemblers, layouts, self._use, self._read_back.check if self._read_back else None
+        )
+        loop.on_sent = lambda cob_id, data: follower.feed(
+            cob_id, data, loop.clock() / _NS, loop.syncs - loop.cycles
+        )
+        return follower
 
     def _overhear(self, cob_id: int, data: bytes) -> None:
-        if self._follower is not None:
-            self._follower.feed(cob_id, data, self._loop.clock() / _NS)
+        self._follower.feed(cob_id, data, self._loop.clock() / _NS)
 
     @property
     def receive_ids(self) -> tuple[int, ...]:
@@ -127,59 +123,48 @@ class Supervisor:
 
     def step(self, now_ns: int) -> None:
         """Advance running configurations."""
-        if self._configurator.busy and self._follower is None:
+        if self._configurator.busy:
             self._proceed(now_ns)
         elif self._read_back is not None:
             self._read_back.step(now_ns / _NS)
 
-    def _check_objects(self) -> None:
-        """At a SYNC, configure nodes anew that say something else by SDO than is in use."""
-        for found in self._read_back.check.sync() if self._read_back is not None else ():
+    def _sync(self) -> None:
+        """At a SYNC, use new mappings; configure nodes anew that say something else by SDO than is in use."""
+        for found in self._follower.sync():
             self._nodes[found.node].attempt_ns = self._loop.clock()
             text = f"{found.text}: it is configured again"
             self._events.say(text, logging.WARNING, key=f"read back {found.node}")
-            self._configure(found.node)
-
-    def _configure(self, node: int, *, stopped: bool = False) -> None:
-        """Begin to configure a node."""
-        self._due.pop(node, None)
-        self._configurator.start(node, stopped=stopped)
+            self._configurator.start(found.node)
 
     def _proceed(self, now_ns: int) -> None:
         configurator = self._configurator
+        if not isinstance(configurator, Configurator):
+            return
         for node, result in configurator.poll(now_ns / _NS):
             watched = self._nodes[node]
             watched.attempt_ns = watched.seen_ns = now_ns
-            if not isinstance(result, NodeLayout):
-                watched.failures += 1
-                self._events.begin(f"configure {node}", f"node {node} cannot be configured: {result}")
+            if isinstance(result, NodeLayout):
+                watched.failures = 0
                 continue
-            watched.failures = 0
-            self._due[node] = result, self._loop.syncs
+            watched.failures += 1
+            self._events.begin(f"configure {node}", f"node {node} cannot be configured: {result}")
 
-    def _use_configured(self) -> None:
-        """At a SYNC, use the nodes that were started before it: from here on a log shows it, too."""
-        for node, (result, started) in list(self._due.items()):
-            if self._loop.cycles <= started:
-                continue
-            del self._due[node]
-            watched = self._nodes[node]
-            if result.tpdos != watched.layout.tpdos:
-                try:
-                    watched.loop_joint.pipeline.assembler.relayout(result)
-                except DriveError as error:  # what it has answered cannot be
-                    self._events.begin(f"configure {node}", f"node {node} cannot be configured: {error}")
-                    continue
-                self._loop.reroute()
-                self._events.say(f"node {node} has another mapping now: {_maps(result)}")
-            watched.layout = result
-            if self._read_back is not None:
-                self._read_back.watch(result, watched.loop_joint.pipeline)
-            self._events.end(f"configure {node}")
-            watched.loop_joint.pipeline.assembler.trust(node)
-            if not watched.started:
-                self._events.say(f"node {node} is configured again and started")
-            watched.started = True
+    def _use(self, node: int, layout: NodeLayout) -> None:
+        """At a SYNC, a layout has come into use."""
+        watched = self._nodes[node]
+        if layout.tpdos != watched.layout.tpdos:
+            self._loop.reroute()
+            self._loop.source.narrow(self._loop.receive_ids())
+            self._events.say(f"node {node} has another mapping now: {_maps(layout)}")
+        watched.layout = layout
+        if isinstance(self._configurator, PassiveConfigurator):
+            return
+        if self._read_back is not None:
+            self._read_back.watch(layout, watched.loop_joint.pipeline)
+        self._events.end(f"configure {node}")
+        if not watched.started:
+            self._events.say(f"node {node} is configured again and started")
+        watched.started = True
 
     def check(self) -> None:
         """Check for changes since the last call; a few tens of microseconds."""
@@ -192,30 +177,24 @@ class Supervisor:
             watched.check(self._events, now)
         for loop_joint in self._loop.loop_joints:
             self._joints.check(loop_joint)
-        if self._follower is not None:
+        follower = self._follower
+        if isinstance(follower, PassiveFollower):
             unread = self._loop.source.errors.get(OVERFLOW, 0)
             if unread > self._unread:
-                self._follower.lose_sight(None, "frames were lost by receive overflow")
+                follower.lose_sight(None, "frames were lost by receive overflow")
             self._unread = unread
-            self._check_maps(self._follower)
+            self._check_maps(follower)
+        else:
+            for node, refused in follower.refused.items():
+                self._events.begin(f"configure {node}", f"node {node} cannot be configured: {refused}")
         self.bus.check()
 
-    def _listen_anew(self) -> None:
-        self._loop.reroute()
-        self._loop.source.narrow(self._loop.receive_ids())
-
-    def _check_maps(self, follower: MapFollower) -> None:
-        for node, layout in follower.changed.items():
-            watched = self._nodes[node]
-            if layout.tpdos != watched.layout.tpdos:
-                self._events.say(f"node {node} has another mapping now: {_maps(layout)}")
-            watched.layout = layout
-        follower.changed.clear()
-        for node in self._nodes:
+    def _check_maps(self, follower: PassiveFollower) -> None:
+        doubts = follower.doubts
+        for node, watched in self._nodes.items():
             over = f"node {node}: its mapping is known, its frames are used"
-            doubts = follower.doubts
             self._events.keep(f"mapping {node}", node in doubts, doubts.get(node, ""), over)
-            watched, unasked = self._nodes[node], follower.unasked(node)
+            unasked = follower.unasked(node)
             if unasked > watched.unasked:
                 watched.unasked = unasked
                 text = f"node {node}: {unasked} SDO answers so far belong to no request heard: not used"
@@ -233,8 +212,8 @@ class Supervisor:
             if isinstance(self._configurator, Configurator):
                 assembler.distrust(node)
             watched.begin(assembler.counters[node], self._loop.clock())
-            self._configure(node)
-        if self._follower is not None:
+            self._configurator.start(node)
+        if isinstance(self._follower, PassiveFollower):
             self._follower.lose_sight()
 
     def _check_frames(self, node: int, watched: WatchedNode, now: int) -> None:
@@ -254,7 +233,7 @@ class Supervisor:
         pause_ns = min(_RETRY_NS, _SOON_NS << failures) if failures else _RETRY_NS
         if lost and not self._configurator.busy and now - watched.attempt_ns > pause_ns:
             watched.attempt_ns = now
-            self._configure(node, stopped=watched.state == _STOPPED)
+            self._configurator.start(node, stopped=watched.state == _STOPPED)
             if watched.started:
                 self._say_unstarted(node, watched)
 
@@ -277,8 +256,8 @@ class Supervisor:
         if state == 0:  # every time: it may reboot while being configured
             self._events.say(f"node {node} has rebooted", logging.WARNING)
             watched.attempt_ns = watched.heartbeat_ns
-            self._configure(node)
-            if self._follower is not None:  # its heartbeat has its default again
+            self._configurator.start(node)
+            if isinstance(self._follower, PassiveFollower):  # its heartbeat has its default again
                 watched.layout = replace(watched.layout, heartbeat_ms=0)
         self._overhear(cob_id, data)
         if state in STATES:
@@ -291,29 +270,22 @@ class Supervisor:
             key, source = f"EMCY {node} {code}", f"EMCY {node}"
             self._events.say(f"node {node}: {emergency}", logging.WARNING, key, source)
 
-    def _sent(self, cob_id: int, data: bytes) -> None:
-        if self._read_back is not None and 0x600 < cob_id < 0x680:
-            self._read_back.check.request(cob_id - 0x600, data, self._loop.clock() / _NS)
-
     def _answer(self, cob_id: int, data: bytes) -> None:
         now_ns = self._loop.clock()
-        if self._read_back is not None:
-            self._read_back.check.response(cob_id - 0x580, data, now_ns / _NS)
-            if not self._configurator.busy:
-                self._read_back.feed(cob_id, data, now_ns / _NS)
-                return
-        self._configurator.feed(cob_id, data, now_ns / _NS)
-        self._proceed(now_ns)  # do not decode its frames by the old layout
+        self._follower.feed(cob_id, data, now_ns / _NS)
+        if self._configurator.busy:
+            self._proceed(now_ns)  # do not decode its frames by the old layout
+        elif self._read_back is not None:
+            self._read_back.feed(cob_id, data, now_ns / _NS)
 
     def _foreign_request(self, cob_id: int, data: bytes) -> None:
         """Somebody else talks to a node by SDO; our own frames are not heard."""
-        self._sent(cob_id, data)
+        self._overhear(cob_id, data)
         if self._read_back is not None:
             self._read_back.feed(cob_id, data, self._loop.clock() / _NS)
-        node, address = cob_id - 0x600, written_object(data)
+        address = written_object(data)
         if address is not None and is_mapping(address):
-            self._nodes[node].loop_joint.pipeline.assembler.distrust(node)
-            text = f"node {node}: somebody else writes its mapping: it is configured again"
+            text = f"node {cob_id - 0x600}: somebody else writes its mapping: it is configured again"
             self._events.say(text, logging.WARNING)
 
 

@@ -20,7 +20,7 @@ import zenoh.ext
 from drivelink._core import SYNC_COB_ID, Assembler
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cycle.following import ConfigurationFollower, MapFollower, follow_log
+from drivelink.cycle.following import MapFollower, follow_log
 from drivelink.cycle.framesource import BusLostError
 from drivelink.cycle.objectcheck import RecentSamples
 from drivelink.cycle.pipeline import make_assembler
@@ -199,7 +199,7 @@ class BusTap:
         if self._listener is not None:
             self._listener.adopt(layouts)
         self._assembler: Assembler | None = None
-        self._follower: MapFollower | ConfigurationFollower | None = None
+        self._follower: MapFollower | None = None
         self._recent = RecentSamples(joint.bus.period_s)
         self._lacking = ""  # missing parts of a known mapping
         self._numbering = SyncNumbering(joint.bus.period_s, measure=True)

@@ -498,7 +498,7 @@ class TestMeasuredPeriod:
                 for k in range(300)
                 if rng.random() >= lost
             ]
-            assert measure_period(sorted(stamps)[:64], 0.001) == (0.001, True)
+            assert measure_period(sorted(stamps)[:64], 0.001)[:2] == (0.001, True)
 
     @pytest.mark.parametrize("share", [0.02, 0.03, 0.1])
     def test_a_master_that_stalls_has_its_declared_period(self, share: float) -> None:
@@ -507,7 +507,7 @@ class TestMeasuredPeriod:
             for k in range(64):
                 late += rng.uniform(0.3, 20.0) if rng.random() < share else 0.0
                 stamps.append(round((k + late + rng.uniform(0.0, 0.02)) * MS))
-            assert measure_period(stamps, 0.001) == (0.001, True)
+            assert measure_period(stamps, 0.001)[:2] == (0.001, True)
 
     def test_too_few_stamps_decide_nothing(self) -> None:
         assert measure_period([k * MS for k in range(7)], 0.001) is None

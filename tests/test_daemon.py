@@ -268,6 +268,34 @@ def test_the_new_model_comes_into_use_even_where_its_thread_gets_no_time(
     made.close()
 
 
+def test_another_period_of_the_master_begins_anew_with_the_model_in_use(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = reloadable(tmp_path)
+    made.run(100)
+    (before,) = made.daemon.pipelines
+    changed = made.joint.model_copy(update={"provenance": {"a": "reloaded"}})
+    monkeypatch.setattr(made.daemon._reloaders[0], "_joint", changed)
+    periods = iter([0.002])
+
+    def paced(loop: object) -> None:
+        assert loop is made.daemon.loop
+        for period_s in periods:
+            made.daemon._supervisor.bus.on_period(period_s)
+            return
+
+    monkeypatch.setattr("drivelink.daemon.service.pacing.run", paced)
+    made.daemon.run()
+    (pipeline,) = made.daemon.pipelines
+    assert pipeline is not before and made.daemon.loop.period_ns == 2_000_000
+    assert made.daemon._joints[0].joint is changed
+    assert "SYNC comes every 2 ms, not 1 ms: estimates begin anew with it" in made.events
+    made.daemon.run_lockstep(50)
+    status = made.daemon.documents()[0]
+    assert (status["period_s"], status["estimates"], status["conditions"]) == (0.002, 50, [])
+    made.close()
+
+
 def test_a_joint_file_with_an_error_leaves_the_model_as_it_is(tmp_path: Path) -> None:
     made = reloadable(tmp_path)
     made.run(100)

@@ -22,10 +22,10 @@ from drivelink.cli import main
 from drivelink.demo.simulate import network_from_joint, world_from_joint
 from drivelink.doctor import Report, Section, examine, examine_eds
 from drivelink.doctor.interface import examine_interface, judge_link
+from drivelink.doctor.livevalues import Asked, Heard, Series, record_of
 from drivelink.doctor.machine import examine_machine, percentile
 from drivelink.doctor.motion import judge_motion, judge_record, slope
 from drivelink.doctor.nodes import _describe_node
-from drivelink.doctor.livevalues import Asked, Heard, Series, record_of
 from drivelink.doctor.syncs import Daemons, judge_sync
 from drivelink.jointfile import BusSection, parse
 from drivelink.notice import Notice, Severity

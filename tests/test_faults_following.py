@@ -23,6 +23,8 @@ class Follower:
         self.counter = 0
         self.found: list[tuple[int, int, set[float]]] = []
         self.run.judge.put_sample = self._keep  # type: ignore[method-assign]
+        self.periods: list[float] = []  # that the daemon is to begin anew with
+        self.run.supervisor.bus.on_period = self.periods.append
 
     def _keep(self, sample, _stamp_ns: int) -> None:
         status = self.run.pipeline.estimate.status
@@ -153,9 +155,13 @@ def test_a_second_master_is_named_when_following_too(monkeypatch: pytest.MonkeyP
         follower.run.loop.receive()
     follower.run.supervisor.check()
     assert any(text.startswith("a second master produces SYNC too") for text in follower.events)
+    follower.jittering(3000, lambda: 0.0)
+    assert follower.periods == []
 
 
-def test_a_master_that_changes_its_period_is_named_with_both(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_master_that_changes_its_period_is_named_with_both_and_followed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     follower = Follower()
     monkeypatch.setattr(time, "monotonic_ns", lambda: follower.stamp_ns)
     follower.jittering(1500, lambda: 0.0)
@@ -163,6 +169,7 @@ def test_a_master_that_changes_its_period_is_named_with_both(monkeypatch: pytest
     follower.jittering(2500, lambda: 0.0, 1.5 * PERIOD_NS)
     text = "SYNC comes every 1.5 ms now, 1 ms is in use"
     assert any(active.startswith(text) for active in follower.run.events.active.values())
+    assert set(follower.periods) == {0.0015}
     follower.jittering(2500, lambda: 0.0)
     assert "SYNC comes every 1 ms again" in follower.events
 

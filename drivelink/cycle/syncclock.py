@@ -34,10 +34,12 @@ class MeasuredPeriod(NamedTuple):
     Attributes:
         period_s: measured; the expected one if the stamps cannot separate the two.
         same: whether it is the expected one.
+        steady: whether most steps are as long: one master, without much jitter.
     """
 
     period_s: float
     same: bool
+    steady: bool
 
 
 def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPeriod | None:
@@ -69,7 +71,7 @@ def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPerio
     steady = spread < _STEADY and abs(period_s - expected_s) <= _SAME * expected_s
     near = abs(period_s - expected_s) <= _NEAR * expected_s
     if steady or (near and _agreeing(stamps / expected_s) >= _MOST):
-        return MeasuredPeriod(expected_s, True)
+        return MeasuredPeriod(expected_s, True, spread <= _JITTERY)
     if spread > _JITTERY:
         # A step of nearly two periods may be jitter; only larger ones count as lost.
         lost = np.where(gaps > 2.2 * period_s, np.rint(gaps / period_s) - 1, 0)
@@ -83,10 +85,10 @@ def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPerio
                 slope, std = _slope(np.cumsum(np.maximum(jumps, 0))[jumps > 0], stamps[jumps > 0])
     tolerance = _SIGMAS * std
     if abs(slope - expected_s) <= max(_SAME * expected_s, tolerance):
-        return MeasuredPeriod(expected_s, True)
+        return MeasuredPeriod(expected_s, True, spread <= _JITTERY)
     rounded = (float(f"{slope:.{digits}g}") for digits in range(1, 6))
     found = next((r for r in rounded if abs(r - slope) <= max(tolerance, 1e-3 * slope)), slope)
-    return MeasuredPeriod(found, False)
+    return MeasuredPeriod(found, False, spread <= _JITTERY)
 
 
 def _agreeing(places: FloatArray) -> float:

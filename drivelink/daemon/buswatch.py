@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
+from collections.abc import Callable
 
 from drivelink.cycle.framesource import OVERFLOW
 from drivelink.cycle.loop import CycleLoop
@@ -11,6 +12,7 @@ from drivelink.cycle.syncclock import MEASURED_SYNCS, measure_period
 from drivelink.daemon.status import EventLog
 
 _NS = 1_000_000_000
+_SURE, _ALIKE = 3, 0.01  # measurements in a row that differ by less, relative: another period
 _MANY_SYNCS = 3  # SYNCs beyond the number of periods in a second
 
 
@@ -22,6 +24,7 @@ class BusWatch:
         events: the event log.
 
     Attributes:
+        on_period: called with another period, once the master has kept to it for so long that it is sure.
         sync_period_s: last measured period of the followed master; None: not yet, or SYNC is produced.
     """
 
@@ -31,7 +34,8 @@ class BusWatch:
         self._counter_jumps = self._lost_sends = self._clock_steps = 0
         self._bus_offs = self._restarts = self._measured_ns = 0
         self._slow = self._slow_ns = 0
-        self._off_period = 0  # consecutive measurements
+        self._off_period: list[float] = []  # consecutive measurements
+        self.on_period: Callable[[float], object] = lambda _period_s: None
         self._foreign = deque([(loop.clock(), 0, 0)])  # in the last second: SYNCs not due, periods without
         self.sync_period_s: float | None = None
 
@@ -101,16 +105,21 @@ class BusWatch:
         if measured is None:
             return
         self.sync_period_s = measured.period_s
-        self._off_period = 0 if measured.same else self._off_period + 1
         if measured.same:
+            self._off_period.clear()
             self._events.end("period", f"SYNC comes every {used_s * 1e3:g} ms again")
-        elif self._off_period > 1:  # once may have been a stall
+            return
+        self._off_period.append(measured.period_s)
+        if len(self._off_period) > 1:  # once may have been a stall
             self._events.begin(
                 "period",
                 f"SYNC comes every {measured.period_s * 1e3:.4g} ms now, {used_s * 1e3:g} ms is in use: "
-                "cycles are lost or doubled until the master returns to it or the daemon is restarted",
+                "cycles are lost or doubled until the master returns to it, or keeps to another one",
                 logging.ERROR,
             )
+        last = self._off_period[-_SURE:]
+        if measured.steady and len(last) == _SURE and max(last) - min(last) < _ALIKE * min(last):
+            self.on_period(measured.period_s)
 
     def _check_speed(self) -> None:
         """Check that this machine keeps up with the cycle."""

@@ -44,6 +44,9 @@ class Reloader:
         build: makes estimator and model monitor of a joint file; called in a thread.
         publish: called with the new joint file after an exchange.
         events: the event log.
+
+    Attributes:
+        path: as given.
     """
 
     def __init__(
@@ -55,7 +58,7 @@ class Reloader:
         publish: Callable[[JointFile], None],
         events: EventLog,
     ) -> None:
-        self._path = path
+        self.path = path
         self._joint = joint
         self._pipeline, self._history = pipeline, pipeline.history
         self._build = build
@@ -72,6 +75,11 @@ class Reloader:
     def request(self) -> None:
         """Reload even an unchanged file; callable from a signal handler."""
         self._requested = True
+
+    def close(self) -> JointFile:
+        """Give up a reload that is under way; return the joint file in use."""
+        self._thread = None
+        return self._joint
 
     def check(self) -> None:
         """In the slack: start a reload if the file has changed."""
@@ -103,18 +111,18 @@ class Reloader:
             self._turn.release()
         self._joint = joint
         self._publish(joint)
-        self._events.say(f"{self._path.name}: the model in it is now in use")
+        self._events.say(f"{self.path.name}: the model in it is now in use")
 
     def _signature(self) -> tuple[int, int, int] | None:
         try:
-            status = self._path.stat()
+            status = self.path.stat()
         except OSError:
             return None
         return status.st_mtime_ns, status.st_size, status.st_ino
 
     def _prepare(self) -> None:
         try:
-            joint = load_apart(self._path)
+            joint = load_apart(self.path)
             self._refuse_changes(joint)
             built = self._build(joint)
         except (DrivelinkError, EstimatorError) as error:
@@ -147,7 +155,7 @@ class Reloader:
         ]
         if changed:
             self._events.say(
-                f"{self._path.name}: {', '.join(changed)} changed, which requires a restart of the daemon",
+                f"{self.path.name}: {', '.join(changed)} changed, which requires a restart of the daemon",
                 logging.WARNING,
             )
         if joint.arrangement != self._joint.arrangement:

@@ -21,6 +21,7 @@ import zenoh
 from drivelink._core import JointPipeline
 from drivelink.canopen.bus import open_bus
 from drivelink.canopen.layout import NodeLayout
+from drivelink.canopen.roles import roles
 from drivelink.cycle import pacing, realtime
 from drivelink.cycle.busport import BusPort
 from drivelink.cycle.loop import CycleLoop, LoopJoint
@@ -105,6 +106,7 @@ class Daemon:
         self._end_ns: int | None = None
         self._lockstep_ns = time.monotonic_ns()
         self.events = EventLog(logger)
+        self._stopping, self._another_s = False, 0.0  # the end is asked for; another period of SYNC
         try:
             self._publishers = self._open_publishers(session) if publish else [None] * len(joints)
             self._port = BusPort(open_bus(self._section))
@@ -113,28 +115,51 @@ class Daemon:
             self._configurator, layouts = join_bus(
                 self._port, [s.joint for s in joints], [s.folder for s in joints], idle=devices
             )
-            self._section = self._configurator.bus  # with the measured period of another master's SYNC
-            keep = round(HISTORY_S / self._section.period_s)
-            self._loop_joints = [
-                LoopJoint(
-                    served.joint.name, make_pipeline(self._timed(served.joint), mine, keep=keep), publisher
-                )
-                for served, mine, publisher in zip(joints, layouts, self._publishers, strict=True)
-            ]
-            self.loop = self._make_loop()
-            self._supervisor = Supervisor(
-                self.loop, dict(zip(self._loop_joints, layouts, strict=True)), self.events, self._configurator
-            )
-            self._status = self._make_status()
-            for served, mine, publisher in zip(joints, layouts, self._publishers, strict=True):
-                self._republish(publisher, mine)(served.joint)
-            self._reloaders = self._make_reloaders(layouts)
-            self._plan_housekeeping()
-            self._rehearse()
-            self.loop.source.narrow(self.loop.receive_ids())
+            self._assemble(layouts)
         except BaseException:
             self._closing.close()
             raise
+
+    def _assemble(self, layouts: Sequence[tuple[NodeLayout, ...]]) -> None:
+        """Make everything that knows the period of SYNC: pipelines, loop, and what is beside it."""
+        self._section = self._configurator.bus  # with the measured period of another master's SYNC
+        keep = round(HISTORY_S / self._section.period_s)
+        self._loop_joints = [
+            LoopJoint(served.joint.name, make_pipeline(self._timed(served.joint), mine, keep=keep), publisher)
+            for served, mine, publisher in zip(self._joints, layouts, self._publishers, strict=True)
+        ]
+        self.loop = self._make_loop()
+        self._supervisor = Supervisor(
+            self.loop, dict(zip(self._loop_joints, layouts, strict=True)), self.events, self._configurator
+        )
+        self._supervisor.bus.on_period = self._take_period
+        self._status = self._make_status()
+        for served, mine, publisher in zip(self._joints, layouts, self._publishers, strict=True):
+            self._republish(publisher, mine)(served.joint)
+        self._reloaders = self._make_reloaders(layouts)
+        self._plan_housekeeping()
+        self._rehearse()
+        self.loop.source.narrow(self.loop.receive_ids())
+
+    def _take_period(self, period_s: float) -> None:
+        """The master has another period: begin anew with it, once the loop has ended."""
+        self._another_s = period_s
+        self.loop.stop()
+
+    def _begin_anew(self) -> None:
+        before_s, after_s, self._another_s = self._section.period_s, self._another_s, 0.0
+        self._configurator.bus = self._section.model_copy(update={"period_s": after_s})
+        self.events.end("period")
+        text = f"SYNC comes every {after_s * 1e3:.4g} ms, not {before_s * 1e3:.4g} ms"
+        self.events.say(f"{text}: estimates begin anew with it", logging.WARNING)
+        present = {reloader.path: reloader.close() for reloader in self._reloaders}
+        self._joints = tuple(
+            ServedJoint(joint=present[one.path], path=one.path) if one.path in present else one
+            for one in self._joints
+        )
+        known = self._configurator.layouts
+        served = [roles(one.joint, one.folder) for one in self._joints]
+        self._assemble([tuple(known[role.node_id] for role in each) for each in served])
 
     def __enter__(self) -> Daemon:
         return self
@@ -161,13 +186,17 @@ class Daemon:
         obtained = realtime.acquire(privileged=self._real_time)
         for line in obtained.lines:
             logger.info("%s", line)
-        for status in self._status:
-            status.real_time = obtained
         if seconds is not None:
             self._end_ns = time.monotonic_ns() + round(seconds * 1e9)
         try:
             notify("READY=1", "STATUS=running")
-            pacing.run(self.loop)
+            while True:
+                for status in self._status:
+                    status.real_time = obtained
+                pacing.run(self.loop)
+                if self._stopping or not self._another_s:
+                    break
+                self._begin_anew()
         finally:
             notify("STOPPING=1")
             realtime.release(obtained)
@@ -179,6 +208,7 @@ class Daemon:
 
     def stop(self) -> None:
         """Make `run` return within a few cycles; callable from any thread or signal handler."""
+        self._stopping = True
         self.loop.stop()
 
     def reload(self) -> None:
@@ -309,7 +339,7 @@ class Daemon:
 
     def _check_end(self) -> None:
         if self._end_ns is not None and time.monotonic_ns() >= self._end_ns:
-            self.loop.stop()
+            self.stop()
 
 
 def _put_status(publisher: JointPublisher, status: JointStatus) -> Generator[None]:

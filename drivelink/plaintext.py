@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import codecs
 import logging
+import os
+import shutil
 import sys
+import textwrap
+import time
 import unicodedata
+from typing import TextIO
 
 MAX_TEXT = 4096  # characters of one text
 # Control and format characters (direction, zero width), surrogates, private and unassigned ones.
@@ -52,6 +57,21 @@ def spell_out() -> None:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="drivelink.spelt")
+
+
+def stamped(text: str, stream: TextIO, indent: int = 9) -> str:
+    """Put the time of day before a line, and fold it to at most 100 columns of a terminal.
+
+    Args:
+        text: the line.
+        stream: where it goes; a journal has stamps of its own.
+        indent: of further lines.
+    """
+    if not stream.isatty():
+        return text if "JOURNAL_STREAM" in os.environ else f"{time.strftime('%H:%M:%S')} {text}"
+    columns = min(100, shutil.get_terminal_size().columns)
+    line = f"{time.strftime('%H:%M:%S')} {text}"
+    return textwrap.fill(line, columns, subsequent_indent=" " * indent, break_on_hyphens=False)
 
 
 class PlainFormatter(logging.Formatter):

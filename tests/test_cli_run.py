@@ -10,11 +10,13 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from daemonkit import vsa_text
 from zenohkit import free_endpoint, until
 
+from drivelink.plaintext import stamped
 from drivelink.pubsub.client import subscribe
 from estimator.sample import Status
 
@@ -52,7 +54,7 @@ def finished(*arguments: str) -> subprocess.CompletedProcess[str]:
 def one_line(result: subprocess.CompletedProcess[str], status: int, pattern: str) -> None:
     """It failed as a user should see it: this exit status, and one line of plain words."""
     assert result.returncode == status, result.stderr
-    lines = [line for line in result.stderr.splitlines() if not re.match(r"[DIW] ", line)]
+    lines = [line for line in result.stderr.splitlines() if not re.match(r"\d\d:\d\d:\d\d [DIW] ", line)]
     assert len(lines) == 1, result.stderr
     assert re.search(pattern, lines[0])
     assert "Traceback" not in result.stderr
@@ -88,7 +90,7 @@ def test_simulated_drives_daemon_and_subscriber_are_three_processes(joint: Path,
         assert "ready" in drives.stdout.readline()
         with process("run", str(joint), "--no-realtime", NOTIFY_SOCKET=address) as daemon:
             line = daemon.stdout.readline()
-            assert line.startswith("drivelink run: elbow on socketcand can0, 200 Hz, ready"), (
+            assert line[9:].startswith("drivelink run: elbow on socketcand can0, 200 Hz, ready"), (
                 daemon.stderr.read()
             )
             assert manager.recv(100).startswith(b"READY=1")
@@ -100,7 +102,7 @@ def test_simulated_drives_daemon_and_subscriber_are_three_processes(joint: Path,
                 daemon.send_signal(signal.SIGTERM)
                 out, err = daemon.communicate(timeout=60)
             assert daemon.returncode == 0, err
-            assert re.match(r"elbow: \d+ cycles, \d+ estimates, \d+ missed", out.splitlines()[-1])
+            assert re.match(r"\d\d:\d\d:\d\d elbow: \d+ cycles, \d+ missed", out.splitlines()[-1])
             assert "Traceback" not in err
         with process("run", str(joint), "--no-realtime") as again:  # the drives were left as they were
             assert "ready" in again.stdout.readline()
@@ -138,3 +140,13 @@ def test_what_cannot_run_is_one_line(
 
 def test_a_joint_file_that_is_not_there_is_one_line() -> None:
     one_line(finished("run", "missing.toml"), 2, "missing.toml: cannot be read")
+
+
+def test_a_long_line_is_stamped_and_folded_on_a_terminal_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("JOURNAL_STREAM", raising=False)
+    text = "W " + "this machine is too slow for the cycle; " * 6
+    for terminal in (True, False):
+        folded = stamped(text, SimpleNamespace(isatty=lambda terminal=terminal: terminal), 11)
+        assert re.match(r"\d\d:\d\d:\d\d W this", folded)
+        assert (max(map(len, folded.splitlines())) <= 100) is terminal
+        assert " ".join(folded.split())[9:] == text.strip()

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from drivelink.cli import ALONE, add_bus, moved
 from drivelink.errors import UsageError
 from drivelink.jointfile import BusSection, load
-from drivelink.plaintext import PlainFormatter
+from drivelink.plaintext import PlainFormatter, stamped
 
 if TYPE_CHECKING:
     from drivelink.daemon.service import Daemon
@@ -93,8 +93,11 @@ def run(args: argparse.Namespace) -> int:
         finally:
             ended.set()
         last = daemon.documents() if args.json else []
-        end = to_json({"event": "end", "joints": last}).decode() if args.json else daemon.summary()
-    print(end, flush=True)
+        summary = daemon.summary()
+    if args.json:
+        print(to_json({"event": "end", "joints": last}).decode(), flush=True)
+    else:
+        _say(summary)
     return 0
 
 
@@ -105,19 +108,32 @@ def _say_ready(names: list[str], bus: BusSection, args: argparse.Namespace) -> N
         print(json.dumps({"event": "ready", "joints": names, **where}), flush=True)
         return
     where_text = f"{bus.interface} {bus.channel}, {rate_hz:g} Hz"
-    print(f"drivelink run: {', '.join(names)} on {where_text}, ready", flush=True)
+    _say(f"drivelink run: {', '.join(names)} on {where_text}, ready")
 
 
 def _set_up_logging(level: str) -> None:
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(PlainFormatter("%(levelname).1s %(message)s"))
+    handler.setFormatter(_Stamped("%(levelname).1s %(message)s"))
     logging.basicConfig(level=getattr(logging, level.upper()), handlers=[handler])
     logging.getLogger("canopen").setLevel(logging.ERROR)
 
 
 def _show(daemon: Daemon, ended: threading.Event) -> None:
     while not ended.wait(_LINE_S):
-        print(daemon.summary(), flush=True)
+        _say(daemon.summary())
+
+
+def _say(text: str) -> None:
+    for line in text.splitlines():
+        print(stamped(line, sys.stdout), flush=True)
+
+
+class _Stamped(PlainFormatter):
+    """Formats log records as lines with the time of day."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record's lines."""
+        return "\n".join(stamped(line, sys.stderr, 11) for line in super().format(record).split("\n"))
 
 
 @contextmanager

@@ -12,10 +12,11 @@ from drivelink.cycle.framesource import LostSource
 from drivelink.cycle.loop import CycleLoop, LoopJoint
 from drivelink.cycle.realtime import RealTime
 from drivelink.daemon.crosschecks import cross_checks
-from drivelink.daemon.jointwatch import residual_text
+from drivelink.daemon.jointwatch import residual_ratio
 from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor
 from drivelink.jointfile import JointFile
+from drivelink.output.digits import number
 from drivelink.version import __version__
 from estimator.reasons import why_not_valid
 from estimator.sample import ExternalStatus, Status
@@ -196,13 +197,12 @@ class JointStatus:
         """The run in one line."""
         loop_joint, loop = self._loop_joint, self._loop
         work, jitter = loop_joint.work.total(), loop.lateness.total()
-        text = f"{loop_joint.name}: {loop.cycles} cycles, {loop_joint.estimates} estimates, "
-        text += f"{loop_joint.pipeline.missed + loop.overruns} missed"
+        missed = loop_joint.pipeline.missed + loop.overruns
+        text = f"{loop_joint.name}: {loop.cycles} cycles, {missed} missed"
         if work and jitter:
-            text += (
-                f"; a cycle's work p99 {work['p99_us']:.0f} µs, SYNC late by p99 {jitter['p99_us']:.0f} µs"
-            )
+            text += f"; p99 work {work['p99_us']:.0f} µs, SYNC late {jitter['p99_us']:.0f} µs"
         residual = loop_joint.pipeline.estimator.residual_nm
         if math.isfinite(residual):
-            text += f"; residual {residual:.3g} N·m" + residual_text(loop_joint.pipeline.model_monitor)
-        return text
+            text += f"; residual {number(residual, 2)} N·m"
+        ratio = residual_ratio(loop_joint.pipeline.model_monitor)
+        return text if ratio is None else f"{text}, {ratio:.2g} × baseline"

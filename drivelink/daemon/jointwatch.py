@@ -86,8 +86,15 @@ class JointWatch:
 
 def residual_text(monitor: ResidualMonitor | None) -> str:
     """The residual against its baseline in words, if known."""
+    location = monitor.describe().get("location") if monitor is not None else None
+    ratio = residual_ratio(monitor)
+    where = f", likely at the {location}" if location else ""
+    return "" if ratio is None else f": the residual is {ratio:.2g} times its baseline{where}"
+
+
+def residual_ratio(monitor: ResidualMonitor | None) -> float | None:
+    """The largest residual over its baseline, if known."""
     described = monitor.describe() if monitor is not None else {}
     residuals, baselines = described.get("residual_nm") or (), described.get("floor_nm") or ()
     ratios = [r / b for r, b in zip(residuals, baselines, strict=False) if b > 0.0 and math.isfinite(r)]
-    where = f", likely at the {described['location']}" if described.get("location") else ""
-    return f": the residual is {max(ratios):.2g} times its baseline{where}" if ratios else ""
+    return max(ratios, default=None)

@@ -314,6 +314,24 @@ class JointPipeline:
             Exception: whatever an estimator in Python raises.
         """
 
+    def snapshot(self) -> tuple[int, bytes] | None:
+        """The state of estimator and monitor, for `restore`; holds the interpreter's lock while it is copied.
+
+        Returns:
+            Number of the last sample in it, and its bytes. None: the last cycle had no sample, or part of it
+            is Python.
+        """
+
+    def restore(self, snapshot: bytes) -> int:
+        """Take the state that a pipeline of the same joint file had; it goes on from there bit for bit.
+
+        Returns:
+            Number of the last sample in it.
+
+        Raises:
+            ValueError: the bytes are of another version or kind of joint, or no snapshot.
+        """
+
     def take(self, sample: Sample, flags: int = 0, stamp_ns: int = 0) -> Tick:
         """Take one sample as it was recorded.
 

@@ -19,10 +19,13 @@ from test_recording_recorder import joint_file
 from drivelink import cli, jointfile
 from drivelink.loop.blackbox import AFTER_S, BlackBox
 from drivelink.loop.folder import drop_oldest, event_of, kept
+from drivelink.pubsub.inbound import DECODERS
 from drivelink.pubsub.wire import EstimateMessage
 from drivelink.recording.mapping import joint_of
-from drivelink.recording.mcapfile import read_messages
+from drivelink.recording.mcapfile import SNAPSHOT, read_attachment, read_messages
 from drivelink.recording.mcapsamples import recorded_cycles
+from drivelink.recording.messages import estimate_encoder
+from drivelink.recording.playback import open_playback
 from estimator.sample import Sample, Status, TransmissionEstimate
 
 PERIOD_S = 0.125  # exact in binary
@@ -61,9 +64,12 @@ class Scene:
         return [(path, event_of(path).cause) for path in kept(self.path.parent / "kept", "elbow")]
 
 
-def test_an_alarm_keeps_the_time_before_and_after_it_bit_for_bit(tmp_path: Path) -> None:
+def test_an_alarm_keeps_the_time_before_and_after_it_bit_for_bit(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     scene = Scene(tmp_path)
     scene.run(500)
+    scene.box.snapshot(b"garbage")
     scene.run(300, Status.MODEL_ALARM)
     ((path, cause),) = scene.finish()
     assert cause == "model alarm" and path.name.endswith("-model-alarm.mcap")
@@ -80,12 +86,15 @@ def test_an_alarm_keeps_the_time_before_and_after_it_bit_for_bit(tmp_path: Path)
         "elbow.toml"
     )
     assert notes["black box"]["time"].endswith("+00:00")
+    assert read_attachment(path, SNAPSHOT) == b"garbage"
+    assert len(list(open_playback(path, scene.box._text.joint, tmp_path))) == len(numbers)
+    assert "the estimator begins anew: snapshot: expected one of version" in caplog.text
 
 
 def test_memory_holds_no_more_than_is_kept(tmp_path: Path) -> None:
     scene = Scene(tmp_path)
     scene.run(2000)
-    reach_s = 10.0 + 2 * AFTER_S  # before, after, and until it is written
+    reach_s = 10.0 + 12.0 + 2 * AFTER_S  # before, a state before that, after, and until it is written
     assert len(scene.box._ring) <= 3 * (reach_s / PERIOD_S + 1)
     assert not scene.finish()
 
@@ -166,9 +175,7 @@ def test_keep_asks_the_box_of_a_running_daemon(tmp_path: Path, capsys: pytest.Ca
     assert list(recorded_cycles(made, 1))
 
 
-def test_the_box_of_a_daemon_has_frames_that_replay_to_the_samples(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_box_of_a_daemon_has_frames_and_replays_bit_for_bit(tmp_path: Path) -> None:
     bus = f'interface = "socketcand"\noptions = {{ host = "127.0.0.1", port = {free_port()} }}\nperiod_s = 0.005'
     path = tmp_path / "elbow.toml"
     text = vsa_text(channel="can0", endpoint=zenohkit.free_endpoint(), bus=bus)
@@ -178,6 +185,7 @@ def test_the_box_of_a_daemon_has_frames_that_replay_to_the_samples(
         with process("run", str(path), "--no-realtime", "--json") as daemon:
             assert "ready" in daemon.stdout.readline()
             zenohkit.until((tmp_path / "kept").is_dir)
+            time.sleep(3.0)  # until the box has a state of the estimator
             zenohkit.until(lambda: cli.main(["keep", str(path)]) == 0)
             time.sleep(2.0)  # something to keep
             daemon.send_signal(signal.SIGTERM)
@@ -187,7 +195,12 @@ def test_the_box_of_a_daemon_has_frames_that_replay_to_the_samples(
     kept = list(recorded_cycles(made[0], 2))
     assert len(kept) > 100
     assert any(m.topic == "/elbow/can" for m in read_messages(made[0]))
-    capsys.readouterr()
-    estimates = tmp_path / "e.csv"
-    assert cli.main(["replay", str(made[0]), "--out", str(estimates)]) == 0
-    assert estimates.read_text().count("\n") == len(kept) + 1
+    joint = jointfile.parse(text)
+    encode = estimate_encoder(2, joint.bus.period_s)
+    ticks = [played.tick for played in open_playback(made[0], joint, tmp_path)]
+    again = [encode(DECODERS["estimate"](tick.estimate_payload)) for tick in ticks]
+    recorded = [m.data for m in read_messages(made[0], frozenset({"estimate"}))]
+    assert len(again) > 100 and again == recorded[-len(again) :]  # bit for bit
+    assert (
+        ticks[0].sequence > kept[0].sequence
+    )  # from a state that the estimator had in the middle of the run

@@ -37,7 +37,7 @@ from drivelink.daemon.supervision import Supervisor
 from drivelink.daemon.systemd_notify import Watchdog, notify, watchdog_period_s
 from drivelink.errors import UsageError
 from drivelink.jointfile import JointFile
-from drivelink.loop.feed import FindingFeed
+from drivelink.loop.feed import FindingFeed, SnapshotFeed
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_session
 
@@ -294,11 +294,12 @@ class Daemon:
             if publisher is not None:
                 housekeeping.every(_STATUS_S, partial(_put_status, publisher, status))
                 housekeeping.every(_ANSWER_S, publisher.answer)
-        for served, publisher in zip(self._joints, self._publishers, strict=True):
+        for served, mine, publisher in zip(self._joints, self._loop_joints, self._publishers, strict=True):
             kept = served.joint.recording.folder
             if publisher is not None and kept is not None:
                 feed = FindingFeed(served.folder / kept, served.joint.name, publisher.put_finding)
                 housekeeping.every(_FINDING_S, feed.check)
+                housekeeping.every(_FINDING_S, SnapshotFeed(mine.pipeline, publisher).check)
         for reloader in self._reloaders:
             housekeeping.urgent.append(reloader.step)
             housekeeping.every(_FILE_S, reloader.check)

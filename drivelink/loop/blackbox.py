@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import threading
 import time
 from collections import deque
@@ -22,6 +23,8 @@ _LOG = logging.getLogger("drivelink.recording")
 
 AFTER_S = 15.0  # that is kept after an event
 _QUIET_S = 60.0  # in which the same cause is not kept again
+_STATE_S = 12.0  # between two states of the estimator, at most
+_LATE_S = 1.0  # that a state may come after its sample
 _ITEMS_PER_S = 25_000  # frames of a full bus at 1 Mbit/s, samples and estimates: bounds the memory
 _BLOCK = 20_000  # items between two syncs to disk
 _FLAGS = {
@@ -56,7 +59,7 @@ class BlackBox(Sink):
         RecordingError: the folder cannot be made.
     """
 
-    wants = frozenset({"sample", "estimate", "external", "document", "frame"})
+    wants = frozenset({"sample", "estimate", "external", "document", "frame", "snapshot"})
 
     def __init__(self, text: JointText, clock: Callable[[], float] = time.monotonic) -> None:
         self.counts = dict.fromkeys(sorted(self.wants), 0)
@@ -64,12 +67,13 @@ class BlackBox(Sink):
         self._section = text.joint.recording
         self._wish = wish_of(text)
         self._folder = self._wish.parent
-        self._reach_s = self._section.keep_s + AFTER_S
+        self._reach_s = self._section.keep_s + AFTER_S + _STATE_S
         self._ring: deque[tuple[float, str, tuple[Any, ...]]] = deque(
             maxlen=int(self._reach_s * _ITEMS_PER_S)
         )
         self._mapping: tuple[dict[str, Any], int] | None = None
         self._model: tuple[str, bytes, int] | None = None
+        self._model_s = -math.inf  # when it came
         self._holding: set[str] = set()  # causes of the last status document
         self._flags, self._contact = 0, False
         self._last_s: dict[str, float] = {}
@@ -107,7 +111,7 @@ class BlackBox(Sink):
         """Take a JSON document; a suspected signal, a fault or a lost bus in a status is an event."""
         self._take("document", name, payload, stamp_ns)
         if name == "model":
-            self._model = (name, payload, stamp_ns)
+            self._model, self._model_s = (name, payload, stamp_ns), self._clock()
             self._reread()
             return
         status = json.loads(payload)
@@ -127,6 +131,10 @@ class BlackBox(Sink):
     def frame(self, stamp_ns: int, cob_id: int, data: bytes) -> None:
         """Take one CAN frame."""
         self._take("frame", stamp_ns, cob_id, data)
+
+    def snapshot(self, state: bytes) -> None:
+        """Take the estimator's state, with which a recording begins: a replay goes on from it."""
+        self._take("snapshot", state)
 
     def mapping(self, document: dict[str, Any], stamp_ns: int) -> None:
         """Take the mapping document: every recording begins with it."""
@@ -187,7 +195,18 @@ class BlackBox(Sink):
 
     def _begin(self, event: _Event) -> threading.Thread:
         first, last = event.at_s - self._section.keep_s, event.at_s + AFTER_S
-        items = [(kind, values) for at_s, kind, values in self._ring if first <= at_s <= last]
+        states = [
+            (at_s, values)
+            for at_s, kind, values in self._ring
+            if kind == "snapshot" and self._model_s <= at_s <= event.at_s
+        ]
+        items: list[tuple[str, tuple[Any, ...]]] = []
+        if states:
+            at_s, values = next((state for state in reversed(states) if state[0] <= first), states[0])
+            items.append(("snapshot", values))
+            first = min(first, at_s - _LATE_S)
+        within = (item for item in self._ring if first <= item[0] <= last)
+        items += [(kind, values) for _, kind, values in within if kind != "snapshot"]
         self._event = None
         self._writer = threading.Thread(target=self._write, args=(event, items), name="black box")
         self._writer.start()

@@ -1,13 +1,46 @@
-"""The newest finding of a joint, for the daemon to publish: read in a thread when the folder has changed."""
+"""What the daemon does for the loop, in threads: its state for the black box, the newest finding."""
 
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from drivelink._core import JointPipeline
 from drivelink.loop import finding
+from drivelink.pubsub.publisher import JointPublisher
+
+_SNAPSHOT_S = 10.0
+
+
+class SnapshotFeed:
+    """Publishes the state of a joint's estimator now and then: the black box's recordings begin with it.
+
+    Args:
+        pipeline: of the joint.
+        publisher: likewise.
+    """
+
+    def __init__(self, pipeline: JointPipeline, publisher: JointPublisher) -> None:
+        self._pipeline, self._publisher = pipeline, publisher
+        self._due_s = 0.0
+        self._thread: threading.Thread | None = None
+
+    def check(self) -> None:
+        """In the slack: begin to make one if it is due and a black box listens."""
+        if self._thread is not None and self._thread.is_alive():
+            return
+        if self._publisher.snapshot_wanted and time.monotonic() >= self._due_s:
+            self._thread = threading.Thread(target=self._make, name="snapshot", daemon=True)
+            self._thread.start()
+
+    def _make(self) -> None:
+        made = self._pipeline.snapshot()
+        if made is not None:
+            self._due_s = time.monotonic() + _SNAPSHOT_S
+            self._publisher.put_snapshot(*made)
 
 
 class FindingFeed:

@@ -73,6 +73,7 @@ class JointPublisher:
             self._estimate = self._stream("estimate", ESTIMATE.schema, zenoh.Priority.REAL_TIME)
             self._external = self._stream("external", EXTERNAL.schema, zenoh.Priority.REAL_TIME)
             self._sample = self._stream("sample", SAMPLE.schema, zenoh.Priority.INTERACTIVE_HIGH)
+            self._snapshot = self._background("snapshot")
             self._latched = {name: self._latch(name) for name in ("status", "model", "finding")}
             self._answer("schema", to_json(schema()))
             self.put_joint(joint)
@@ -102,6 +103,15 @@ class JointPublisher:
             self._sample.put(payload)
         if self._ros2 is not None:
             self._ros2.put_cycle(tick)
+
+    @property
+    def snapshot_wanted(self) -> bool:
+        """Whether anybody subscribes to the estimator's state."""
+        return self._snapshot.wanted
+
+    def put_snapshot(self, sequence: int, state: bytes) -> None:
+        """Publish the estimator's state after a sample (`JointPipeline.snapshot`); waits for who is slow."""
+        self._snapshot.put(sequence.to_bytes(8, "little") + state)
 
     def put_status(self, status: Mapping[str, Any]) -> None:
         """Publish the daemon's status; non-finite values become null."""
@@ -176,6 +186,16 @@ class JointPublisher:
             congestion_control=self._congestion_control,
             priority=priority,
             express=self._express,
+        )
+        self._entities.append(publisher)
+        return Stream(publisher)
+
+    def _background(self, name: str) -> Stream:
+        publisher = self._session.declare_publisher(
+            f"{self.key}/{name}",
+            encoding=zenoh.Encoding.APPLICATION_OCTET_STREAM,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.BACKGROUND,
         )
         self._entities.append(publisher)
         return Stream(publisher)

@@ -31,6 +31,8 @@ _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _CHUNK = struct.Struct("<QQQII")  # first, last, size, CRC, length of the compression's name
 _CHANNEL_HEAD = struct.Struct("<HHI")  # channel, schema, length of the topic
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE_OP, _CHUNK_OP, _DATA_END = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F
+_ATTACHMENT = 0x09
+SNAPSHOT = "estimator"  # name of the attachment from whose state a replay goes on
 _WANTED = frozenset({_CHANNEL, _MESSAGE_OP, _CHUNK_OP})
 _MESSAGE_BYTES = 64 << 10  # of a sample, an estimate or a frame: ours have some 500
 _ZSTD_WINDOW = 128 << 20  # memory limit of its decoder, the same as in zstd's tools
@@ -81,6 +83,46 @@ def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[
     except _BrokenError:
         pass
     _warn_once(path, path.stat().st_mtime_ns)
+
+
+def read_attachment(path: Path, name: str) -> bytes | None:
+    """The first attachment of that name; None: the file has none before a damaged place.
+
+    Raises:
+        RecordingError: the file cannot be read, or the attachment is larger than `MAX_BLOCK_BYTES`.
+    """
+    try:
+        with open_regular(path) as file:
+            left = os.fstat(file.fileno()).st_size - len(_MAGIC)
+            file.seek(len(_MAGIC))
+            while len(head := file.read(_HEAD.size)) == _HEAD.size:
+                opcode, length = _HEAD.unpack(head)
+                left -= _HEAD.size + length
+                if left < 0 or opcode == _DATA_END:
+                    return None
+                if opcode != _ATTACHMENT:
+                    file.seek(length, os.SEEK_CUR)
+                    continue
+                _require_size(length, path)
+                found, data = _attached(file.read(length))
+                if found == name:
+                    return data
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+    except struct.error:
+        pass
+    return None
+
+
+def _attached(body: bytes) -> tuple[str, bytes]:
+    """Name and data of an attachment."""
+    place, texts = 16, []  # after its times
+    for _ in ("name", "media type"):
+        (size,) = struct.unpack_from("<I", body, place)
+        texts.append(body[place + 4 : place + 4 + size].decode(errors="replace"))
+        place += 4 + size
+    (size,) = struct.unpack_from("<Q", body, place)
+    return texts[0], body[place + 8 : place + 8 + size]
 
 
 def message_fields(data: bytes) -> dict[str, Any]:

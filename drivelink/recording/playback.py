@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import gc
+import logging
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from itertools import dropwhile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,9 +16,12 @@ from drivelink.jointfile import JointFile
 from drivelink.recording import read
 from drivelink.recording.canframes import FrameLog, is_frame_log
 from drivelink.recording.columnmap import ColumnMap
-from drivelink.recording.cycles import estimated
+from drivelink.recording.cycles import Cycle, estimated
+from drivelink.recording.mcapfile import SNAPSHOT, read_attachment
 from drivelink.recording.mcapsamples import recorded_cycles
 from estimator.sample import Sample
+
+_LOG = logging.getLogger("drivelink.recording")
 
 
 class Played(NamedTuple):
@@ -106,8 +111,12 @@ def open_playback(
     if path.suffix.lower() == ".mcap":
         period_s = joint.bus.period_s
         recorded = recorded_cycles(path, len(joint.motor), joint.recording.scale)
+        state = read_attachment(path, SNAPSHOT)
         return Playback(
-            joint, period_s, None, lambda pipeline: _played(estimated(recorded, pipeline), period_s)
+            joint,
+            period_s,
+            None,
+            lambda pipeline: _played(estimated(_after(state, recorded, pipeline, path), pipeline), period_s),
         )
     record = read(path, joint, keep_nan=True, names=names)
     times = record.time_s.tolist()
@@ -123,6 +132,23 @@ def _from_samples(samples: Iterable[Sample], times: list[float], pipeline: Joint
     take = pipeline.take
     for time_s, sample in zip(times, samples, strict=True):
         yield Played(time_s, take(sample, 0, round(time_s * 1e9)))
+
+
+def _after(
+    state: bytes | None, cycles: Iterable[Cycle], pipeline: JointPipeline, path: Path
+) -> Iterable[Cycle]:
+    """The cycles after a recorded state, which the pipeline takes; all of them where there is none.
+
+    A state of another version of drivelink, or of another model than the pipeline's, is not used.
+    """
+    if state is None:
+        return cycles
+    try:
+        last = pipeline.restore(state)
+    except ValueError as error:
+        _LOG.warning("%s: the estimator begins anew: %s", path, error)
+        return cycles
+    return dropwhile(lambda cycle: cycle.sequence <= last, cycles)
 
 
 def _played(ticks: Iterable[Tick], period_s: float) -> Iterator[Played]:

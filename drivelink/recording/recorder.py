@@ -30,11 +30,13 @@ from drivelink.jointfile import JointFile
 from drivelink.pubsub.identity import DaemonIdentity, source_of
 from drivelink.pubsub.inbound import DECODERS
 from drivelink.recording.canlog import LoggedFrame
+from drivelink.recording.limits import MAX_BLOCK_BYTES
 from drivelink.recording.sinks import Sink
 from drivelink.recording.syncnumbers import SyncNumbering
 from estimator.sample import Sample
 
 _QUEUE = 30_000  # waiting messages per key: half a minute at 1 kHz
+_SNAPSHOTS = 2  # that wait: each has some megabytes
 _FLUSH_S = 1.0
 _POLL_S = 0.005
 _STALE_S = 1.0  # after which another session may take over without a liveliness token
@@ -97,6 +99,9 @@ class ZenohTap:
         self._streams: list[tuple[Any, Callable[[zenoh.Sample], None]]] = [
             (session.declare_subscriber(f"{key}/{name}", ring(_QUEUE)), take) for name, take in wanted.items()
         ]
+        if "snapshot" in sink.wants:
+            plain = session.declare_subscriber(f"{key}/snapshot", ring(_SNAPSHOTS))
+            self._streams.append((plain, self._snapshot))
         for name in ("status", "model") if "document" in sink.wants else ():
             subscriber = zenoh.ext.declare_advanced_subscriber(
                 session, f"{key}/{name}", ring(16), history=history
@@ -155,6 +160,12 @@ class ZenohTap:
 
     def _external(self, message: zenoh.Sample) -> None:
         self._sink.external(DECODERS["external"](message.payload.to_bytes()))
+
+    def _snapshot(self, message: zenoh.Sample) -> None:
+        payload = message.payload.to_bytes()
+        if not 8 < len(payload) <= MAX_BLOCK_BYTES:
+            raise ZenohError(f"expected a snapshot of at most {MAX_BLOCK_BYTES >> 20} MiB")
+        self._sink.snapshot(payload[8:])
 
     def _document(self, message: zenoh.Sample) -> None:
         name = str(message.key_expr).rpartition("/")[2]

@@ -21,6 +21,7 @@ from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from drivelink.recording.canlog import CAN_FORMATS
 from drivelink.recording.columns import sample_columns, sample_row
 from drivelink.recording.mapping import side_file
+from drivelink.recording.mcapfile import SNAPSHOT
 from drivelink.recording.messages import (
     SCHEMA_NAMES,
     TOPICS,
@@ -41,7 +42,7 @@ class Sink:
 
     Attributes:
         counts: number of items of each kind.
-        wants: the kinds it stores: "sample", "estimate", "external", "document", "frame".
+        wants: the kinds it stores: "sample", "estimate", "external", "document", "frame", "snapshot".
     """
 
     wants: frozenset[str] = frozenset()
@@ -64,6 +65,9 @@ class Sink:
 
     def frame(self, stamp_ns: int, cob_id: int, data: bytes) -> None:
         """Take one CAN frame."""
+
+    def snapshot(self, state: bytes) -> None:
+        """Take the state of the estimator after the newest samples, see `JointPipeline.snapshot`."""
 
     def mapping(self, document: dict[str, Any], stamp_ns: int) -> None:
         """Take the mapping document, see `drivelink.recording.mapping`."""
@@ -179,6 +183,10 @@ class McapSink(MessageSink):
     def note(self, name: str, fields: Mapping[str, str]) -> None:
         """Write a metadata record."""
         self._writer.add_metadata(name, dict(fields))
+
+    def snapshot(self, state: bytes) -> None:
+        """Attach the state from which a replay of this recording goes on."""
+        self._writer.add_attachment(0, 0, SNAPSHOT, "application/octet-stream", state)
 
     def flush(self) -> None:
         """Write everything to disk as one chunk."""

@@ -1,11 +1,13 @@
 //! Shifts late channels back to a common time.
 
+use serde::{Deserialize, Serialize};
+
 use crate::sample::MOTORS;
 
 const LONGEST: usize = 12; // periods
 
 /// Positions of a joint at one moment.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Positions {
     /// q, rad.
     pub link: f64,
@@ -38,7 +40,7 @@ impl Positions {
 }
 
 /// What is measured of a joint at one tick.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Inputs {
     /// q and θ as of the moment of the torques.
     pub at: Positions,
@@ -61,7 +63,7 @@ impl Inputs {
 }
 
 /// Delays the motors' channels (or the link's) by a fraction of periods, so that all are equally late.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Alignment {
     /// By how many periods the link is later than the motors.
     pub periods: f64,

@@ -3,6 +3,8 @@
 //! F τ = B F θ″ + D F θ′ + offset + friction − F f(φ) − …: every column passes the same filters, so their lag
 //! cancels. The spring is a curve over [`crate::spring`]'s functions of u = φ over the deflection's size.
 
+use serde::{Deserialize, Serialize};
+
 use crate::filters::StateVariableFilter;
 use crate::gram::{COLUMNS, Gram, Row};
 use crate::signals::{Channel, Filters, Formed};
@@ -50,7 +52,7 @@ const CURVE: usize = 2 * TERMS + CLIP_WIDTHS.len(); // columns that are function
 const FORMED: usize = 9; // columns of lightly filtered signals: dry, soft, load ×2, late, read, stops ×3
 
 /// What the columns are scaled by, taken from the motion.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Size {
     /// |φ| of u = 1, rad: the spring's.
     pub deflection: f64,
@@ -61,9 +63,11 @@ pub struct Size {
 }
 
 /// Signals side by side through one filter; what they were at the last sample.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 struct Lanes<const N: usize, const L: usize> {
+    #[serde(with = "crate::snapshot::rows")]
     state: [[f64; L]; N],
+    #[serde(with = "crate::snapshot::array")]
     last: [f64; L],
 }
 
@@ -87,7 +91,7 @@ impl<const N: usize, const L: usize> Lanes<N, L> {
 }
 
 /// The filtered columns of one motor.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Balance {
     /// What the columns are scaled by; zero before there was motion.
     pub size: Size,

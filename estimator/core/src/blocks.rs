@@ -2,6 +2,8 @@
 
 mod solve;
 
+use serde::{Deserialize, Serialize};
+
 use crate::balance::{self, Balance};
 use crate::causes::{Cause, Known, Noise, Odds, TABLE};
 use crate::gram::{Frame, Gram, Posterior, Row, Set, UNKNOWNS, Vector, dot, inverse, set};
@@ -37,7 +39,7 @@ pub enum Closed {
 }
 
 /// What was known when the sum began anew, α and the zero as they are.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 struct Carried {
     x: Vector,
     precision: [Vector; UNKNOWNS],
@@ -45,7 +47,7 @@ struct Carried {
 }
 
 /// Blocks of one motor's rows.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Blocks {
     motor: Motor,
     priors: Priors,

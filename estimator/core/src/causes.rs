@@ -6,6 +6,8 @@
 //! Willsky and Jones ("A generalized likelihood ratio approach to the detection and estimation of jumps in linear
 //! systems", IEEE TAC 1976).
 
+use serde::{Deserialize, Serialize};
+
 use crate::balance::{ACCELERATION, DRY, LATE, OFFSET, READ, SPRING, TORQUE, TORQUE_RATE, VELOCITY};
 use crate::gram::{
     COLUMNS, Frame, Gram, Matrix, Prior, Row, Set, UNKNOWNS, log_determinant, solve, unknowns,
@@ -14,7 +16,7 @@ use crate::spring::{Coefficients, TERMS};
 use crate::unknowns;
 
 /// A cause.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Cause {
     /// What is known holds.
     Nothing,
@@ -130,7 +132,7 @@ pub struct Known<'a> {
 }
 
 /// One cause as a window has it.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Explanation {
     /// Probability.
     pub probability: f64,
@@ -143,7 +145,7 @@ pub struct Explanation {
 }
 
 /// All causes held against one window.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Odds {
     /// One for each row of [`TABLE`].
     pub of: [Explanation; CAUSES],
@@ -152,7 +154,7 @@ pub struct Odds {
 }
 
 /// How noisy rows are.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Noise {
     /// Variance of a row.
     pub variance: f64,

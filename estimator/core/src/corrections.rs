@@ -1,5 +1,7 @@
 //! Corrects a sample for the declared effects of its sensors.
 
+use serde::{Deserialize, Serialize};
+
 use crate::effects::{MotorEffects, link_sum};
 use crate::error::Error;
 use crate::library::{ABSURD, Coordinates, Element, Place};
@@ -9,7 +11,7 @@ use crate::sample::{MOTORS, Sample};
 ///
 /// T₀ > 0: the reported torque is held from its sample to the next, the acting one follows it with T₀; what
 /// acts in a period is its mean. T₀ < 0: the reported torque follows, so the acting one is ahead by its slope.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 struct Lag {
     periods: f64, // T₀ / T
     behind: f64,  // the torque that lags
@@ -39,7 +41,7 @@ impl Lag {
 }
 
 /// How many periods each channel waits.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 struct Waits {
     motor: f64,
     link: f64,
@@ -56,7 +58,7 @@ pub struct Corrected {
 }
 
 /// What makes a sample one of perfect sensors.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Corrections {
     period: f64,
     active: bool,

@@ -12,6 +12,8 @@
 //! turn out to be noisier than assumed: the state has taken up that noise already, so its covariance grows
 //! with the noise's.
 
+use serde::{Deserialize, Serialize};
+
 const ASTRAY: f64 = 10.0; // rad, and times what is measured: no prediction of one period is so far off
 const STATES: usize = 5;
 type State = [f64; STATES];
@@ -28,7 +30,7 @@ const PLAIN: f64 = 3.0; // its bandwidth, over that of the regression's filter
 const STIFF: f64 = 0.3; // σ T²/B above which the motor's equation is not integrated any more
 
 /// See the module; fed every tick, tuned at every update.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct DeflectionFilter {
     inertia: f64,
     damping: f64,
@@ -53,7 +55,7 @@ pub struct DeflectionFilter {
 }
 
 /// How the joint moves, and how well that is foreseen.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Motion {
     jerk: f64,         // mean square of φ‴ …
     peak: f64,         // … and its largest value of late

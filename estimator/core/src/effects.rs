@@ -2,6 +2,8 @@
 //! defines them.
 
 pub use crate::corrections::Corrections;
+use serde::{Deserialize, Serialize};
+
 use crate::error::Error;
 pub use crate::library::{Coordinates, Element};
 use crate::library::{Law, Place};
@@ -10,7 +12,7 @@ use crate::model::Model;
 use crate::sample::MOTORS;
 
 /// The elements at one place, with their memories.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Sum {
     elements: Vec<(Element, Memory)>,
 }
@@ -48,7 +50,7 @@ impl Sum {
 }
 
 /// The effects of one motor and its transmission.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct MotorEffects {
     /// x_motor.
     pub motor: Sum,
@@ -129,7 +131,7 @@ pub fn link_sum(effects: &[Element]) -> Result<Sum, Error> {
 }
 
 /// All effects of a joint: readings corrected first, then torques from values filtered alike.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct JointEffects {
     /// See [`Corrections`].
     pub corrections: Corrections,

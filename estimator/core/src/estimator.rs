@@ -1,5 +1,7 @@
 //! The estimator of a joint: one `step` a tick.
 
+use serde::{Deserialize, Serialize};
+
 use crate::error::Error;
 use crate::external::External;
 use crate::laws::Law;
@@ -12,7 +14,7 @@ use crate::settings::{Mode, Priors, Settings};
 use crate::suspicion::Suspicion;
 
 /// The modes behind one interface.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub enum Estimator {
     /// See [`Paper`].
     Paper(Box<Paper>),

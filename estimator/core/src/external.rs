@@ -20,6 +20,8 @@ mod paper;
 pub use contact::ContactTest;
 pub use paper::PaperMomentum;
 
+use serde::{Deserialize, Serialize};
+
 use crate::effects::{Coordinates, Element};
 use crate::filters::StateVariableFilter;
 use crate::model::{Link, Model};
@@ -43,7 +45,7 @@ pub mod status {
 }
 
 /// What the world does to the link at one SYNC.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct External {
     /// That of the sample.
     pub sequence: u64,
@@ -82,7 +84,7 @@ impl External {
 }
 
 /// What a transmission, or all of them, do to the link at one deflection.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Carried {
     /// τ_e,t, with what else the transmissions transmit, N·m.
     pub torque: f64,
@@ -108,7 +110,7 @@ impl Carried {
 }
 
 /// What was said last; and mean squares of the flexibility torque's difference between both sides, and of the link's.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Said {
     now: External,
     squares: Option<[f64; 2]>,
@@ -148,7 +150,7 @@ fn gravity(link: &Link, q: f64) -> f64 {
 }
 
 /// The link's momentum of robust mode: everything through F(s) = w³/(s + w)³.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct LinkMomentum {
     link: Link,
     effects: Vec<Element>,

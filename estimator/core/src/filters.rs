@@ -4,6 +4,8 @@
 //! samples (first-order hold). Filters built on these assumptions give a signal and its derivatives without
 //! differentiating samples.
 
+use serde::{Deserialize, Serialize};
+
 const TERMS: usize = 18; // of the exponential's series: at a norm of 1/2 the next one is below rounding
 
 /// Pole exp(−K T) of K/(s + K), discretised exactly.
@@ -13,10 +15,13 @@ pub fn first_order_pole(k_rad_s: f64, period_s: f64) -> f64 {
 }
 
 /// x_k = A x_(k−1) + old u_(k−1) + new u_k.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Step<const N: usize> {
+    #[serde(with = "crate::snapshot::rows")]
     advance: [[f64; N]; N],
+    #[serde(with = "crate::snapshot::array")]
     old: [f64; N],
+    #[serde(with = "crate::snapshot::array")]
     new: [f64; N],
 }
 
@@ -58,7 +63,7 @@ impl<const N: usize> Step<N> {
 /// As the derivatives come from one filter on one interpolated signal, their ratios are those of (jω)^i
 /// exactly; only the interpolation itself acts on the amplitude, by 1 − (ωT)²/12, the same for every
 /// derivative.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct StateVariableFilter<const N: usize> {
     /// w, rad/s.
     pub bandwidth: f64,

@@ -4,6 +4,8 @@
 //! space of the columns. Rows are summed into blocks G = Σ z zᵀ; blocks are summed. Estimates, their covariance,
 //! the evidence of a sub-model and the misfit of a block follow from sums.
 
+use serde::{Deserialize, Serialize};
+
 /// Columns of a row.
 pub const COLUMNS: usize = 32;
 
@@ -42,7 +44,7 @@ pub fn dot(z: &Row, c: &Row) -> f64 {
 }
 
 /// Σ z zᵀ of rows: the lower triangle, and how many rows.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Gram {
     sums: [Row; COLUMNS],
     /// Number of rows.
@@ -120,7 +122,7 @@ impl Gram {
 }
 
 /// What each unknown adds to a row's balance, and what they explain together.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Frame {
     /// z · left is what is explained.
     pub left: Row,
@@ -162,7 +164,7 @@ pub fn unknowns(set: Set) -> impl Iterator<Item = usize> {
 }
 
 /// Gaussian prior of the unknowns.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Prior {
     /// Expected values.
     pub mean: Vector,
@@ -181,7 +183,7 @@ impl Prior {
 }
 
 /// Maximum a posteriori unknowns of a set, and what is known of them.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Posterior {
     /// The unknowns that there are.
     pub set: Set,

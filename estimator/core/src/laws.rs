@@ -3,6 +3,8 @@
 //! Every law is odd in φ (eq 2). α holds the linear coefficients first, then the shape parameters. All
 //! laws but the polynomials have one linear coefficient: f = k g(φ, shape).
 
+use serde::{Deserialize, Serialize};
+
 use std::fmt::Debug;
 use std::sync::Arc;
 
@@ -35,7 +37,7 @@ pub struct Shape {
 }
 
 /// g(φ) as a table for φ ≥ 0, from (0, 0) on, a cubic with the slopes of its neighbours between the points.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Table {
     deflection: Vec<f64>,
     torque: Vec<f64>,
@@ -43,7 +45,7 @@ pub struct Table {
 }
 
 /// A transmission's law.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub enum Law {
     /// f = K φ; α = (K).
     Linear,
@@ -56,6 +58,7 @@ pub enum Law {
     /// f = k g(φ), g a table; α = (k).
     Tabulated(Arc<Table>),
     /// f = k g(φ, shape) of somebody else's making.
+    #[serde(skip)]
     Foreign(Arc<dyn Foreign>, Arc<[Shape]>),
 }
 

@@ -34,6 +34,7 @@ pub mod sample_validator;
 pub mod settings;
 pub mod side;
 pub mod signals;
+pub mod snapshot;
 pub mod spring;
 pub mod student;
 pub mod suspicion;

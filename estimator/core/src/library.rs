@@ -8,6 +8,8 @@
 //! times its linear parameter. A measured torque is the acting torque plus x; a reading is the true position
 //! plus its error.
 
+use serde::{Deserialize, Serialize};
+
 use crate::error::Error;
 use crate::memory::Memory;
 
@@ -545,9 +547,10 @@ impl Kind {
 }
 
 /// One element of an effect.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Element {
     /// What it is.
+    #[serde(with = "crate::snapshot::kind")]
     pub kind: &'static Kind,
     /// Its parameters.
     pub values: Values,

@@ -1,5 +1,7 @@
 //! Friction and hysteresis with memory: one element of the Dahl, Bouc-Wen and elastic-slip family.
 
+use serde::{Deserialize, Serialize};
+
 use crate::library::{Element, Law};
 
 /// From this exponent on an element is elastic up to its limit and then slips (Jenkins).
@@ -11,7 +13,7 @@ pub const STOP_EXPONENT: f64 = 50.0;
 /// is Bouc-Wen's, n ≥ [`STOP_EXPONENT`] an elastic-slip element. Between two reversals y = z sgn(u′) moves
 /// along one curve y(s), whatever the increments: an increment is a look-up on it. The curve is kept as
 /// w = −ln(1 − y) over s, which is straight for Dahl's law.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Memory {
     displacement: f64,
     arc: Vec<f64>, // s at each of equally spaced w; empty: elastic up to the limit

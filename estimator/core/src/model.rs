@@ -1,11 +1,13 @@
 //! The declared model of a joint: the known terms of eqs 4-7.
 
+use serde::{Deserialize, Serialize};
+
 use crate::effects::Element;
 use crate::error::Error;
 use crate::laws::{Law, PARAMETERS};
 
 /// How the transmissions act on the link.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Arrangement {
     /// One motor.
     Single,
@@ -18,7 +20,7 @@ pub enum Arrangement {
 }
 
 /// A transmission as it is declared.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub enum Transmission {
     /// No deflection: the torque is what the motor's balance leaves.
     Rigid,
@@ -38,7 +40,7 @@ pub enum Transmission {
 }
 
 /// The motor side of one transmission, eq 5 or 7, reflected to the joint.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Motor {
     /// B, kg·m².
     pub inertia: f64,
@@ -55,7 +57,7 @@ pub struct Motor {
 }
 
 /// The link side, eq 4 or 6, with g(q) = gravity · sin(q + gravity_phase).
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Link {
     /// M, kg·m².
     pub inertia: f64,
@@ -74,7 +76,7 @@ pub struct Link {
 }
 
 /// A joint.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Model {
     /// See [`Arrangement`].
     pub arrangement: Arrangement,

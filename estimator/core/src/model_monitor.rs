@@ -13,6 +13,8 @@
 //! neither affects the flexibility torque: it helps to locate an effect, but raises no alarm (see
 //! [`crate::external`]).
 
+use serde::{Deserialize, Serialize};
+
 use crate::effects::{Coordinates, JointEffects, Torques};
 use crate::error::Error;
 use crate::filters::StateVariableFilter;
@@ -39,7 +41,7 @@ const EXTERNAL: usize = LINK + 1;
 const CHANNELS: usize = EXTERNAL + 1;
 
 /// What a sufficient model leaves of each balance, from the seconds of a healthy recording.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Baseline {
     /// Usual rms of each second, N·m.
     pub residual: [f64; BALANCES],
@@ -52,7 +54,7 @@ pub struct Baseline {
 }
 
 /// What was found in the last whole second.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Found {
     /// Rms of each balance, N·m.
     pub residual: [f64; BALANCES],
@@ -79,7 +81,7 @@ impl Found {
     };
 }
 
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 struct MotorSide {
     inertia: f64,
     damping: f64,
@@ -88,7 +90,7 @@ struct MotorSide {
 }
 
 /// See the module.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct ModelMonitor {
     motors: Vec<MotorSide>,
     flexible: bool,

@@ -1,12 +1,14 @@
 //! Encoder noise from third differences of the readings, at least the uniform rounding of a count (variance
 //! 1/12 count²).
 
+use serde::{Deserialize, Serialize};
+
 const MEMORY_S: f64 = 2.0; // over which the noise is measured
 const OUTLIER: f64 = 100.0; // times the variance: no noise
 const THIRD: f64 = 0.05; // the third difference of white noise has 20 times its variance
 
 /// Variance of the noise of one smooth signal.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 pub struct NoiseMeter {
     past: [f64; 3], // newest first
     known: u8,

@@ -3,6 +3,8 @@
 //! As printed: regressors are not filtered like the residual, velocities are the drive's (else differences of
 //! positions). The robust mode avoids the resulting errors on real drives.
 
+use serde::{Deserialize, Serialize};
+
 use crate::external::{External, PaperMomentum};
 use crate::filters::{first_order_pole, tustin_biquad};
 use crate::laws::{Alpha, Law, PARAMETERS, powers};
@@ -18,7 +20,7 @@ const SCATTER_S: f64 = 0.5; // over which the stiffness's mean and scatter are t
 const SIGMA_95: f64 = 1.96; // a 95 % interval, which may not hold zero
 
 /// y = B θ′ + D θ − ∫τ, whose derivative is τ_e (from eq 5); the torque is held from sample to sample.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 struct Balance {
     inertia: f64,
     damping: f64,
@@ -38,7 +40,7 @@ impl Balance {
 }
 
 /// r_τe of eq 14, K s/(s + K) y: r_k = a r_(k−1) + (1 − a)(y_k − y_(k−1))/T, exact for a straight y.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 struct FirstOrder {
     balance: Balance,
     k: f64,
@@ -58,7 +60,7 @@ impl FirstOrder {
 }
 
 /// r_σ of eq 28, K1 s²/(s² + K2 s + K1) y by the bilinear transform; a gap is bridged along a straight y.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 struct SecondOrder {
     balance: Balance,
     b: [f64; 3],
@@ -96,7 +98,7 @@ pub fn regressor_step(stiffness: f64, residual: f64, rate: f64, k_r: f64, k_max:
 ///
 /// Kept as the triangular square root of the normal equations (QR by Givens rotations), so that columns of
 /// very different size (φ, φ³, φ⁵ …) cost no more accuracy than they do in a batch QR.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct RecursiveLeastSquares {
     size: usize,
     r: [[f64; PARAMETERS + 1]; PARAMETERS],
@@ -165,7 +167,7 @@ impl RecursiveLeastSquares {
 }
 
 /// One motor with its transmission.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 struct Part {
     period: f64,
     rigid: bool,
@@ -303,7 +305,7 @@ impl Part {
 }
 
 /// The paper's estimator for a whole joint.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Paper {
     arrangement: Arrangement,
     validator: SampleValidator,

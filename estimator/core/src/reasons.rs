@@ -1,9 +1,11 @@
 //! Why an estimate is not valid. The sentences are in `estimator/reasons.py`, by the names here.
 
+use serde::{Deserialize, Serialize};
+
 use crate::causes::{CAUSES, TABLE};
 
 /// Why one transmission's numbers, or the joint's, may not be used.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub enum Reason {
     /// The filters still hold what was before the start, a gap or a jump.
     Settling,
@@ -73,7 +75,7 @@ impl Reason {
 }
 
 /// A reason, whose it is, and what may have changed.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Why {
     /// See [`Reason`].
     pub reason: Reason,

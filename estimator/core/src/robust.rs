@@ -3,6 +3,8 @@
 //! Each tick: check the sample, correct it, bridge a gap, align the channels, filter them, add each motor's row;
 //! a full block solves. Torque and stiffness are the law's at the deflection of this moment.
 
+use serde::{Deserialize, Serialize};
+
 use crate::align::{Alignment, Inputs, Positions};
 use crate::corrections::Corrections;
 use crate::deflection::Present;
@@ -28,7 +30,7 @@ const FORESEEN_S: f64 = 0.04; // how far ahead a deflection is extrapolated
 const HOME: f64 = 0.01; // of a jump: a zero that comes back so near to the first one is that one
 
 /// See the module.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Robust {
     arrangement: Arrangement,
     motors: usize,

@@ -1,12 +1,14 @@
 //! Inputs and outputs of an estimator, one tick at a time.
 
+use serde::{Deserialize, Serialize};
+
 use crate::model::Arrangement;
 
 /// Motors of a joint, at most.
 pub const MOTORS: usize = 2;
 
 /// What was measured at one SYNC; NaN stands for what is not there.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Sample {
     /// Number of the SYNC; a jump by more than one is a gap of whole periods.
     pub sequence: u64,
@@ -45,7 +47,7 @@ pub mod status {
 }
 
 /// One transmission: torque, stiffness and its standard deviation, deflection.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TransmissionEstimate {
     /// τ_e, N·m.
     pub flexibility_torque: f64,
@@ -68,7 +70,7 @@ impl TransmissionEstimate {
 }
 
 /// The joint at one SYNC: totals (eqs 9, 11) and each transmission's own.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Estimate {
     /// That of the sample.
     pub sequence: u64,

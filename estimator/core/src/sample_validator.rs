@@ -1,5 +1,7 @@
 //! Validates samples before the mathematics: gaps, non-finite values, positions that jump.
 
+use serde::{Deserialize, Serialize};
+
 use crate::model::Model;
 use crate::sample::{MOTORS, Sample, status};
 use crate::suspicion::{Reason, Signal, Suspicion};
@@ -53,7 +55,7 @@ pub struct Accepted {
 /// out unless it persists. A channel is frozen when it repeats itself exactly for longer than it has ever
 /// done in good times, while a position moves; a position only if it stopped out of motion: a link that
 /// comes to rest while the motors go on, as under a controller, is no fault.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct SampleValidator {
     motors: usize,
     flexible: bool,
@@ -70,7 +72,7 @@ pub struct SampleValidator {
     memory: Memory,
 }
 
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 struct Memory {
     sequence: Option<u64>,
     places: [f64; PLACES],

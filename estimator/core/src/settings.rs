@@ -1,7 +1,9 @@
 //! Settings of an estimator.
 
+use serde::{Deserialize, Serialize};
+
 /// Which estimator.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Mode {
     /// The default: sums of blocks of one balance; see [`crate::robust`].
     Robust,
@@ -10,7 +12,7 @@ pub enum Mode {
 }
 
 /// Where the stiffness comes from.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Method {
     /// Robust: the transmission's model wherever it has one. Paper: black box.
     Auto,
@@ -21,7 +23,7 @@ pub enum Method {
 }
 
 /// Settings of both modes; each mode reads its own. Units as in the names of the Python class.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "python", derive(pyo3::FromPyObject))]
 pub struct Settings {
     /// See [`Mode`].
@@ -83,7 +85,7 @@ impl Default for Settings {
 }
 
 /// What is believed about a joint before any data: standard deviations, from `estimator.priors`.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Priors {
     /// Of B, relative to what is declared.
     pub motor_inertia: f64,

@@ -1,5 +1,7 @@
 //! One motor and its transmission on line: its balance, what that has taught, and what it says at this moment.
 
+use serde::{Deserialize, Serialize};
+
 use crate::align::Inputs;
 use crate::balance::{Balance, correlated_rows};
 use crate::blocks::{Blocks, Closed};
@@ -45,7 +47,7 @@ pub struct Moment<'a> {
 }
 
 /// One motor: its columns, what they have taught, and its declared effects.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Side {
     /// Whether its transmission is rigid.
     pub rigid: bool,

@@ -1,11 +1,13 @@
 //! The filtered signals of one motor's balance, and the excitation of their motion.
 
+use serde::{Deserialize, Serialize};
+
 use crate::filters::StateVariableFilter;
 
 const LIGHT_RATIO: f64 = 5.0; // bandwidth of the light filter over that of the main one
 
 /// The two filters that every channel passes, F G.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Filters {
     /// G: light, exact for what each channel is; what is nonlinear in velocities is formed behind it.
     pub light: StateVariableFilter<3>,
@@ -43,7 +45,7 @@ impl Filters {
 }
 
 /// A measured signal: its values behind G and behind F G, with their derivatives.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Channel {
     /// G of the signal and its derivatives.
     pub light: [f64; 3],
@@ -79,7 +81,7 @@ impl Channel {
 }
 
 /// A signal that is formed from lightly filtered ones, and passes F alone.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 pub struct Formed {
     /// F of the signal and its derivatives.
     pub main: [f64; 4],
@@ -98,7 +100,7 @@ impl Formed {
 ///
 /// The noise of the filtered rate follows from that of the positions; the largest of late counts, as a
 /// quantised position at rest has none.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 pub struct Excitation {
     noise: f64,
     square: f64,

@@ -4,6 +4,8 @@
 //! the law, and their slopes, which a moved zero needs. A law, its slopes by its parameters and by φ become such
 //! sums by least squares over the range of u; nothing that was filtered has to be filtered again.
 
+use serde::{Deserialize, Serialize};
+
 use std::sync::Arc;
 
 use crate::laws::{Law, Table};
@@ -19,7 +21,7 @@ const MARGIN: f64 = 1.1; // times the size: a motion grows a little before it is
 const RIDGE: f64 = 1e-12; // of the diagonal: two functions may be one
 
 /// The functions that a curve is a sum of.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub enum Family {
     /// u, u³, u⁵, u⁷, u⁹.
     Smooth,
@@ -104,9 +106,11 @@ impl Family {
 }
 
 /// Least squares of functions of φ over a family, at one size of the deflection.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Projection {
+    #[serde(with = "crate::snapshot::array")]
     nodes: [f64; NODES], // φ
+    #[serde(with = "crate::snapshot::rows")]
     weights: [[f64; NODES]; 2 * TERMS],
 }
 

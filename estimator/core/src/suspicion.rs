@@ -1,5 +1,7 @@
 //! Which reading is suspected, and why, while readings contradict the model.
 
+use serde::{Deserialize, Serialize};
+
 use crate::causes::{Cause, Odds, TABLE};
 use crate::sample::MOTORS;
 
@@ -7,7 +9,7 @@ const EXPLAINED: f64 = -20.0; // ln of the odds of a change where a balance is e
 const EXPLAINS: f64 = 2.0; // times the usual mean square that a cause may leave
 
 /// A signal of a joint; motors are counted from 0.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Signal {
     /// θ.
     MotorPosition(usize),
@@ -20,7 +22,7 @@ pub enum Signal {
 }
 
 /// What is wrong with it.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub enum Reason {
     /// Larger by this share.
     Scale,
@@ -37,7 +39,7 @@ pub enum Reason {
 }
 
 /// See the module.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Suspicion {
     /// What is suspected …
     pub signal: Signal,

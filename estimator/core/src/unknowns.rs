@@ -1,6 +1,8 @@
 //! The unknowns of a motor's balance: what each adds to a row, what is believed of it before any data, and what
 //! torque and stiffness they make at a deflection.
 
+use serde::{Deserialize, Serialize};
+
 use crate::balance::{self, Balance};
 use crate::gram::{COLUMNS, Frame, Gram, Matrix, Posterior, Prior, Row, Set, UNKNOWNS, Vector, inverse, set};
 use crate::laws::{Alpha, Law, PARAMETERS};
@@ -72,7 +74,7 @@ pub struct Scale {
 }
 
 /// The law of a spring, with the point at which it is linearised.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Spring {
     /// The law; a spring of which nothing is known is a polynomial.
     pub law: Law,

@@ -8,8 +8,9 @@ use std::sync::Mutex;
 use estimator_core::external::External;
 use estimator_core::python::{Estimator, ModelMonitor, estimate_object, external_object, sample_object};
 use estimator_core::sample::{Estimate, Sample};
+use estimator_core::{estimator, model_monitor, snapshot};
 use pyo3::PyClass;
-use pyo3::exceptions::PyRuntimeError;
+use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
@@ -210,6 +211,9 @@ impl Step for Driver {
     }
 }
 
+/// Number of the last sample, and what goes on from there.
+type State = (i64, estimator::Estimator, Option<model_monitor::ModelMonitor>);
+
 /// Frames of one joint in, estimates and their bytes out.
 #[pyclass(frozen, module = "drivelink._core")]
 pub(super) struct JointPipeline {
@@ -332,6 +336,40 @@ impl JointPipeline {
             }
             Some(Due::Missed(sequence, flags)) => Ok(self.carry_on(sequence, flags, None)),
         }
+    }
+
+    fn snapshot<'py>(&self, py: Python<'py>) -> PyResult<Option<(i64, Bound<'py, PyBytes>)>> {
+        let state: State = {
+            let Some(tick) = lock(&self.state).last().copied() else { return Ok(None) };
+            let Ok(driver) = self.driver.try_lock() else { return Ok(None) }; // it is in Python's code
+            let (Some(compiled), Some(sample)) = (&driver.compiled, tick.sample) else { return Ok(None) };
+            if driver.model_monitor.is_some() && driver.compiled_monitor.is_none() {
+                return Ok(None);
+            }
+            let monitor = driver.compiled_monitor.as_ref();
+            let monitor = monitor.map(|monitor| Ok::<_, PyErr>(monitor.try_borrow(py)?.inner.clone()));
+            (sample.sequence as i64, compiled.try_borrow(py)?.inner.clone(), monitor.transpose()?)
+        };
+        // None: of a law that is no data.
+        let Ok(bytes) = py.detach(|| snapshot::keep(&state)) else { return Ok(None) };
+        Ok(Some((state.0, PyBytes::new(py, &bytes))))
+    }
+
+    fn restore(&self, py: Python<'_>, bytes: &[u8]) -> PyResult<i64> {
+        let (sequence, estimator, monitor): State =
+            snapshot::restore(bytes).map_err(|error| PyValueError::new_err(error.to_string()))?;
+        let Ok(driver) = self.driver.try_lock() else {
+            return Err(PyRuntimeError::new_err("two threads feed one joint"));
+        };
+        match (&driver.compiled, &driver.compiled_monitor, monitor) {
+            (Some(own), None, None) => own.try_borrow_mut(py)?.inner = estimator,
+            (Some(own), Some(own_monitor), Some(monitor)) => {
+                own.try_borrow_mut(py)?.inner = estimator;
+                own_monitor.try_borrow_mut(py)?.inner = monitor;
+            }
+            _ => return Err(PyValueError::new_err("snapshot: expected one of a joint like this")),
+        }
+        Ok(sequence)
     }
 
     #[pyo3(signature = (sample, flags = 0, stamp_ns = 0))]

@@ -1,5 +1,7 @@
 //! Contact detection: a sequential test on the external torque beyond the band of declared uncertainties.
 
+use serde::{Deserialize, Serialize};
+
 use super::{BAND_SIGMA, TINY};
 use crate::settings::Settings;
 
@@ -14,7 +16,7 @@ const CAP: f64 = 2.0; // thresholds that a sum may reach: a long contact ends as
 /// Its reference value is the one with which the smallest push is found in [`FIND_S`], its threshold follows
 /// from the rate of false alarms by Siegmund's approximation of the average run length. Torques are looked
 /// at so far apart that their noise is not positively correlated, so the rate is an upper bound.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct ContactTest {
     every: u32,
     reference: f64,
@@ -81,7 +83,7 @@ fn threshold_of(k: f64, run: f64) -> f64 {
 }
 
 /// What both modes do with the sum once they have it: a bias that follows, the band, the test.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct Judge {
     least: Option<f64>,
     follow: f64, // share of the residual that the bias takes in a period; 0: there is none

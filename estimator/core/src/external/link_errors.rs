@@ -1,5 +1,7 @@
 //! Identifies the errors of the declared link from its balance.
 
+use serde::{Deserialize, Serialize};
+
 use super::{MEMORY_S, TINY};
 use crate::model::Link;
 
@@ -21,7 +23,7 @@ pub(super) const DRY: usize = 3;
 /// only, a load and friction are the same even so, since the load changes the speed: no friction is identified
 /// there. A skew between the encoders makes σ d q′, which looks like damping; from the motor's side it looks like
 /// the motor's friction.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 pub(super) struct LinkErrors {
     information: [[f64; PARAMETERS]; PARAMETERS], // of the data alone; the lower triangle
     vector: [f64; PARAMETERS],

@@ -1,5 +1,7 @@
 //! External torque in mode "paper": eqs 12 and 13 as printed.
 
+use serde::{Deserialize, Serialize};
+
 use super::contact::Judge;
 use super::{External, SETTLED, Said, TINY, gravity, status};
 use crate::filters::first_order_pole;
@@ -9,7 +11,7 @@ use crate::sample::Sample;
 use crate::settings::{Priors, Settings};
 
 /// K s/(s + K) of one term of y, exact for a straight y.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 struct Term {
     value: f64,
     last: Option<f64>,
@@ -27,7 +29,7 @@ impl Term {
 ///
 /// y = M q′ + D_q q − ∫(τ_k − g) is a sum, and K s/(s + K) is linear: each term has its own residual, so that
 /// what is uncertain of each is known. τ_k and g are smooth: their integrals are trapezoidal.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct PaperMomentum {
     link: Link,
     k: f64,

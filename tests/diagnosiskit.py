@@ -1,9 +1,10 @@
-"""A world for the diagnosis to be tested in, of its own: many joints at once, Heun's method, plain numpy."""
+"""Joints with the effects that a diagnosis names: many at once, by the integrator of `joints`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import joints
 import numpy as np
 
 from estimator.model import JointModel, LinkDynamics, Motor, Transmission
@@ -12,7 +13,6 @@ from estimator.sample import FloatArray, Record
 PERIOD_S = 1e-3
 SECONDS = 16.0
 PUSHES_S = (2.3, 4.1, 7.7, 9.2, 13.4)
-_SUBSTEPS = 2
 INERTIA, DAMPING, STIFFNESS = 0.12, 0.7, 140.0
 LINK_INERTIA, LINK_DAMPING, GRAVITY = 0.35, 0.12, 4.0
 MOTOR_LSB, LINK_LSB, TORQUE_NOISE = 2 * np.pi / 65536, 2 * np.pi / 2**17, 0.01
@@ -26,7 +26,6 @@ class World:
     seed: int = 1
     slow: bool = False
     records: list[Record] = field(default_factory=list)
-    _time: float = 0.0
 
     def run(self) -> list[Record]:
         """Simulate and measure: encoders quantised, torque noisy, sampled at 1 kHz."""
@@ -34,23 +33,61 @@ class World:
         rng = np.random.default_rng(self.seed)
         reference = self._reference(n, rng)
         rate = np.gradient(reference, PERIOD_S)
-        state = np.zeros((4, m))  # theta, theta', q, q'
-        memory = np.zeros(m)
-        rows = np.empty((n, 3, m))
-        step = PERIOD_S / _SUBSTEPS
-        for k in range(n):
-            self._time = k * PERIOD_S
-            torque = 170.0 * (reference[k] - state[0]) + 6.0 * (rate[k] - state[1])
-            rows[k] = state[0], torque, state[2]
-            for _ in range(_SUBSTEPS):
-                first = self._slope(state, torque, memory)
-                second = self._slope(state + step * first, torque, memory)
-                before = state[2] - state[0]
-                state = state + 0.5 * step * (first + second)
-                u = (state[2] - state[0] - before) / self._value("hysteresis_rad", 1.0)
-                memory = memory + u * (1.0 - np.abs(memory) * np.sign(u * memory))
+
+        def controller(k: int, x: FloatArray) -> FloatArray:
+            return 170.0 * (reference[k] - x[:, :1]) + 6.0 * (rate[k] - x[:, 1:2])
+
+        truth = joints.simulate(self._plants(m), controller, PERIOD_S, 2, size=(n, m, 1), method=joints.HEUN)
+        rows = np.stack([truth.theta[..., 0], truth.tau[..., 0], truth.q], axis=1)
         self.records = [self._measured(rows[:, :, j], self.effects[j], rng) for j in range(m)]
         return self.records
+
+    def _plants(self, m: int) -> joints.Plants:
+        inertia = INERTIA + self._value("inertia_kg_m2")
+        return joints.Plants(
+            *joints.polynomial(np.full((m, 1, 1), STIFFNESS)),
+            inertia[:, None],
+            np.full((m, 1), DAMPING),
+            np.full(m, LINK_INERTIA),
+            np.full(m, LINK_DAMPING),
+            GRAVITY + self._value("gravity_nm"),
+            more=self._more(inertia),
+            memories=1,
+        )
+
+    def _more(self, inertia: FloatArray) -> joints.More:
+        names = (
+            "coulomb_nm offset_nm cogging_nm fading_nm bump_nm constant ripple link_nm push_nm hysteresis_nm"
+        )
+        v = {name: self._value(name) for name in names.split()}
+        width = self._value("hysteresis_rad", 1.0)
+        on = {name for name, values in v.items() if np.any(values)}
+
+        def more(t: float, x: FloatArray, out: FloatArray, tau: FloatArray) -> None:
+            theta, w, _, link_w, memory = x.T
+            motor = link = np.zeros(len(x))
+            if on & {"coulomb_nm", "fading_nm"}:
+                sign = w / np.sqrt(w * w + 4e-6)
+                motor = motor - (v["coulomb_nm"] + v["fading_nm"] * np.exp(-t / 5.0)) * sign
+            if on & {"offset_nm", "cogging_nm", "bump_nm"}:
+                motor = motor - v["offset_nm"] - v["cogging_nm"] * np.sin(17.0 * theta)
+                motor = motor - v["bump_nm"] * np.exp(-(((theta + 1.0) / 0.12) ** 2))
+            if on & {"constant", "ripple"}:
+                gain = (1.0 + v["constant"]) * (1.0 + v["ripple"] * np.sin(9.0 * theta))
+                motor = motor + (gain - 1.0) * tau[:, 0]
+            if "hysteresis_nm" in on:
+                through, rate = v["hysteresis_nm"] * memory, (link_w - w) / width
+                motor, link = motor + through, link - through
+                out[:, 4] = rate * (1.0 - np.abs(memory) * np.sign(rate * memory))
+            if "link_nm" in on:
+                link = link - v["link_nm"] * link_w / np.sqrt(link_w * link_w + 4e-6)
+            if "push_nm" in on:
+                link = link + v["push_nm"] * sum(np.exp(-(((t - at) / 0.15) ** 2)) for at in PUSHES_S)
+            if on:
+                out[:, 1] += motor / inertia
+                out[:, 3] += link / LINK_INERTIA
+
+        return more
 
     def _reference(self, n: int, rng: np.random.Generator) -> FloatArray:
         time = np.arange(n) * PERIOD_S
@@ -63,23 +100,6 @@ class World:
 
     def _value(self, name: str, default: float = 0.0) -> FloatArray:
         return np.array([e.get(name, default) for e in self.effects])
-
-    def _slope(self, state: FloatArray, torque: FloatArray, memory: FloatArray) -> FloatArray:
-        theta, w, q, v = state
-        through = STIFFNESS * (q - theta) + self._value("hysteresis_nm") * memory
-        x = self._value("coulomb_nm") * w / np.sqrt(w * w + 4e-6) + self._value("offset_nm")
-        x = x + self._value("cogging_nm") * np.sin(17.0 * theta)
-        x = x + self._value("fading_nm") * np.exp(-self._time / 5.0) * w / np.sqrt(w * w + 4e-6)
-        x = x + self._value("bump_nm") * np.exp(-(((theta + 1.0) / 0.12) ** 2))
-        acting = (
-            torque * (1.0 + self._value("constant")) * (1.0 + self._value("ripple") * np.sin(9.0 * theta))
-        )
-        inertia = INERTIA + self._value("inertia_kg_m2")
-        link = LINK_DAMPING * v + (GRAVITY + self._value("gravity_nm")) * np.sin(q) + through
-        link = link + self._value("link_nm") * v / np.sqrt(v * v + 4e-6)
-        pushes = [np.exp(-(((self._time - at) / 0.15) ** 2)) for at in PUSHES_S]
-        link = link - self._value("push_nm") * sum(pushes)
-        return np.array([w, (acting - DAMPING * w - x + through) / inertia, v, -link / LINK_INERTIA])
 
     @staticmethod
     def _measured(rows: FloatArray, effects: dict[str, float], rng: np.random.Generator) -> Record:

@@ -1,7 +1,8 @@
-"""A joint whose motor a controller holds while a hand moves the link, with presliding friction; in closed form."""
+"""A joint whose motor a controller holds while a hand moves the link, with presliding friction (Dahl)."""
 
 import math
 
+import joints
 import numpy as np
 import onlinekit as kit
 
@@ -12,44 +13,39 @@ PRESLIDING, SLIDING = 30.0, 0.5  # N·m/rad, up to so many N·m (Dahl's law)
 KP, KD = 100.0, 4.0
 HAND, HAND_DAMPING = 100.0, 2.0
 COUNT = 2.0 * math.pi / 2**21
-STEPS = 10  # of the integration in one period
 NAN = (math.nan,)
 
 
-def tones(rng, low, high, rms):
-    """A sum of eight sines between two frequencies, as a function of time."""
-    frequency = np.geomspace(low, high, 8) * rng.uniform(0.9, 1.1, 8)
-    phase = rng.uniform(0.0, 2.0 * math.pi, 8)
-    size = rms / 2.0  # of each: eight of them
-    return lambda t: size * float(np.sum(np.sin(2.0 * math.pi * frequency * t + phase)))
-
-
-def moved(seconds, by_hand_until=math.inf, kp=KP, hand_rad=0.02):
-    """Samples of a held motor whose link a hand moves; then the motor is driven, and nobody touches the link."""
+def moved(seconds, kp=KP, hand_rad=0.02):
+    """Samples of a held motor whose link a hand moves along a sum of eight sines."""
     rng = np.random.default_rng(4)
-    hand, drive = tones(rng, 0.2, 3.0, hand_rad), tones(rng, 0.3, 5.0, 6.0)
-    theta = omega = q = v = friction = before = 0.0
-    h = kit.PERIOD_S / STEPS
-    samples = []
-    for k in range(round(seconds / kit.PERIOD_S)):
-        t = k * kit.PERIOD_S
-        read = round(theta / COUNT) * COUNT
-        torque = -kp * read - KD * (read - before) / kit.PERIOD_S
-        target, before = None, read
-        if t < by_hand_until:
-            target = hand(t)
-        else:
-            torque = drive(t) - 0.1 * K * read
-        samples.append(Sample(k, (read,), NAN, (torque,), round(q / COUNT) * COUNT))
-        for _ in range(STEPS):
-            elastic = K * (q - theta)
-            external = 0.0 if target is None else HAND * (target - q) - HAND_DAMPING * v
-            friction += h * PRESLIDING * (omega - abs(omega) * friction / SLIDING)
-            omega += h / B * (torque + elastic - D * omega - friction)
-            v += h / M * (external - elastic)
-            theta += h * omega
-            q += h * v
-    return samples
+    frequency = 2.0 * math.pi * np.geomspace(0.2, 3.0, 8) * rng.uniform(0.9, 1.1, 8)
+    phase = rng.uniform(0.0, 2.0 * math.pi, 8)
+    reads = [0.0]
+
+    def controller(k, x):
+        reads.append(round(x[0, 0] / COUNT) * COUNT)
+        return np.array([[-kp * reads[-1] - KD * (reads[-1] - reads[-2]) / kit.PERIOD_S]])
+
+    def hand_and_friction(t, x, rate, tau):
+        _, omega, q, v, friction = x[0]
+        rate[0, 1] -= friction / B
+        hand = 0.5 * hand_rad * np.sum(np.sin(frequency * t + phase))
+        rate[0, 3] += (HAND * (hand - q) - HAND_DAMPING * v) / M
+        rate[0, 4] = PRESLIDING * (omega - abs(omega) * friction / SLIDING)
+
+    plants = joints.Plants(
+        *joints.polynomial(np.array([[[K]]])),
+        *(np.array([[x]]) for x in (B, D)),
+        *(np.array([x]) for x in (M, 0.0, 0.0)),
+        more=hand_and_friction,
+        memories=1,
+    )
+    size = (round(seconds / kit.PERIOD_S), 1, 1)
+    truth = joints.simulate(plants, controller, kit.PERIOD_S, 2, size=size, method=joints.HEUN)
+    link = np.round(truth.q[:, 0] / COUNT) * COUNT
+    rows = zip(reads[1:], truth.tau[:, 0, 0].tolist(), link.tolist(), strict=True)
+    return [Sample(k, (read,), NAN, (torque,), q) for k, (read, torque, q) in enumerate(rows)]
 
 
 def declared():

@@ -15,25 +15,41 @@ from estimator import JointModel, Motor, Record, Transmission
 
 Array = np.ndarray
 
-_A = (
-    (),
-    (1 / 5,),
-    (3 / 40, 9 / 40),
-    (44 / 45, -56 / 15, 32 / 9),
-    (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
-    (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
+# (nodes, rows, weights) of explicit Runge-Kutta methods.
+Method = tuple[tuple[float, ...], list[Array], Array]
+DORMAND_PRINCE: Method = (
+    (0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0),
+    [
+        np.array(row)
+        for row in (
+            (1 / 5,),
+            (3 / 40, 9 / 40),
+            (44 / 45, -56 / 15, 32 / 9),
+            (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
+            (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
+        )
+    ],
+    np.array((35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84)),
 )
-_B = (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84)
+HEUN: Method = ((0.0, 1.0), [np.array((1.0,))], np.array((0.5, 0.5)))
 
 
 def polynomial(coefficients: Array) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
     """(torque, stiffness) for coefficients (N, m, p), phi (N, m)."""
+    alpha = np.moveaxis(coefficients, -1, 0)
+    odd = 2 * np.arange(len(alpha)) + 1
+
+    def even(by_power: list[Array], phi: Array) -> Array:
+        square, total = phi * phi, by_power[-1]
+        for coefficient in by_power[-2::-1]:
+            total = coefficient + square * total
+        return total
 
     def torque(phi: Array) -> Array:
-        return sum(coefficients[..., h] * phi ** (2 * h + 1) for h in range(coefficients.shape[-1]))
+        return phi * even(list(alpha), phi)
 
     def stiffness(phi: Array) -> Array:
-        return sum((2 * h + 1) * coefficients[..., h] * phi ** (2 * h) for h in range(coefficients.shape[-1]))
+        return even([k * a for k, a in zip(odd, alpha, strict=True)], phi) + 0.0 * phi
 
     return torque, stiffness
 
@@ -42,8 +58,9 @@ def vsa_ii(k: Array, c: Array) -> tuple[Callable[[Array], Array], Callable[[Arra
     """(torque, stiffness) of eqs 19, 20, written out from the potential U = k beta²."""
 
     def torque(phi: Array) -> Array:
-        beta = np.arcsin(c * np.sin(phi / 2)) - phi / 2
-        slope = c * np.cos(phi / 2) / (2 * np.sqrt(1 - (c * np.sin(phi / 2)) ** 2)) - 0.5
+        sine = c * np.sin(phi / 2)
+        beta = np.arcsin(sine) - phi / 2
+        slope = c * np.cos(phi / 2) / (2 * np.sqrt(1 - sine**2)) - 0.5
         return 2 * k * beta * slope
 
     def stiffness(phi: Array) -> Array:
@@ -55,9 +72,16 @@ def vsa_ii(k: Array, c: Array) -> tuple[Callable[[Array], Array], Callable[[Arra
     return torque, stiffness
 
 
+More = Callable[[float, Array, Array, Array], None]
+
+
 @dataclass
 class Plants:
-    """N joints with m motors; every array broadcasts against (N, m) or (N,)."""
+    """N joints with m motors; every array broadcasts against (N, m) or (N,).
+
+    `more(t, state, rate, tau)` adds further physics to the rate of the state (theta, theta', q, q'), and sets
+    that of its memories behind them.
+    """
 
     torque: Callable[[Array], Array]
     stiffness: Callable[[Array], Array]
@@ -68,6 +92,8 @@ class Plants:
     gravity: Array
     coulomb: Array = field(default_factory=lambda: np.zeros(1))
     scale_at: tuple[float, float] = (np.inf, 1.0)  # (time, factor): a step of the stiffness
+    more: More | None = None
+    memories: int = 0
 
 
 @dataclass
@@ -81,43 +107,67 @@ class Truth:
     sigma: Array
 
 
-def simulate(plants: Plants, tau: Array, period_s: float, substeps: int = 2) -> Truth:
-    """Integrate from rest; tau is (n, N, m), row k held from t_k to t_(k+1)."""
-    n, N, m = tau.shape
-    state = np.zeros((N, 2 * m + 2))
-    states = np.empty((n, N, 2 * m + 2))
-    h = period_s / substeps
-    scale = 1.0
+def simulate(
+    plants: Plants,
+    tau: Array | Callable[[int, Array], Array],
+    period_s: float,
+    substeps: int | None = None,
+    *,
+    size: tuple[int, int, int] | None = None,
+    method: Method = DORMAND_PRINCE,
+) -> Truth:
+    """Integrate from rest; row k of tau (n, N, m) is held from t_k to t_(k+1).
 
-    def rate(x: Array, u: Array) -> Array:
-        theta, omega, q, dq = x[:, :m], x[:, m : 2 * m], x[:, 2 * m], x[:, 2 * m + 1]
+    A controller's tau makes row k of the state and needs `size`. Without `substeps`, two steps a period where
+    dry friction is steep or the joint stiff, else one.
+    """
+    n, N, m = size or tau.shape
+    B, D, M, Dq, gravity = plants.B, plants.D, plants.M, plants.Dq, plants.gravity
+    dry = bool(np.any(plants.coulomb))
+    if substeps is None:
+        eigen = np.sqrt(plants.stiffness(np.zeros((N, m))) * (1 / B + 1 / np.reshape(M, (-1, 1))))
+        substeps = 2 if dry or np.max(eigen) * period_s > 0.1 else 1
+    nodes, rows, weights = method
+    h, width = period_s / substeps, 2 * m + 2 + plants.memories
+    x, stages = np.zeros((N, width)), np.zeros((len(nodes), N, width))
+    flat = stages.reshape(len(nodes), -1)
+    theta, omega, q, dq = x[:, :m], x[:, m : 2 * m], x[:, 2 * m], x[:, 2 * m + 1]
+    states, held = np.empty((n, N, width)), np.empty((n, N, m))
+    scales = np.where(np.arange(n) * period_s >= plants.scale_at[0], plants.scale_at[1], 1.0)
+
+    def rate(t: float, scale: float, u: Array, out: Array) -> None:
         spring = scale * plants.torque(q[:, None] - theta)
-        friction = plants.coulomb * np.tanh(omega / 1e-3)
-        out = np.empty_like(x)
         out[:, :m] = omega
-        out[:, m : 2 * m] = (u + spring - plants.D * omega - friction) / plants.B
+        push = u + spring - D * omega
+        if dry:
+            push = push - plants.coulomb * np.tanh(omega / 1e-3)
+        out[:, m : 2 * m] = push / B
         out[:, 2 * m] = dq
-        out[:, 2 * m + 1] = -(spring.sum(1) + plants.Dq * dq + plants.gravity * np.sin(q)) / plants.M
-        return out
+        out[:, 2 * m + 1] = -(spring.sum(1) + Dq * dq + gravity * np.sin(q)) / M
+        if plants.more is not None:
+            plants.more(t, x, out, u)
 
-    scales = np.empty(n)
     for k in range(n):
-        scale = plants.scale_at[1] if k * period_s >= plants.scale_at[0] else 1.0
-        states[k], scales[k] = state, scale
-        for _ in range(substeps):
-            stages: list[Array] = []
-            for row in _A:
-                stages.append(
-                    rate(
-                        state + h * sum((a * s for a, s in zip(row, stages, strict=True)), 0 * state), tau[k]
-                    )
-                )
-            state = state + h * sum(b * s for b, s in zip(_B, stages, strict=True))
-    theta, omega = states[..., :m], states[..., m : 2 * m]
-    q, dq = states[..., 2 * m], states[..., 2 * m + 1]
-    phi = q[..., None] - theta
+        states[k] = x
+        held[k] = u = tau(k, x) if callable(tau) else tau[k]
+        for step in range(substeps):
+            before, start = x.copy(), k * period_s + step * h
+            for i, node in enumerate(nodes):
+                if i:
+                    x[:] = before + h * (rows[i - 1] @ flat[:i]).reshape(N, width)
+                rate(start + node * h, scales[k], u, stages[i])
+            x[:] = before + h * (weights @ flat).reshape(N, width)
+    phi = states[..., 2 * m, None] - states[..., :m]
     scales = scales[:, None, None]
-    return Truth(theta, omega, q, dq, tau, scales * plants.torque(phi), scales * plants.stiffness(phi))
+    return Truth(
+        states[..., :m],
+        states[..., m : 2 * m],
+        states[..., 2 * m],
+        states[..., 2 * m + 1],
+        held,
+        scales * plants.torque(phi),
+        scales * plants.stiffness(phi),
+    )
 
 
 def quantise(x: Array, step: float) -> Array:

@@ -61,6 +61,11 @@ def mean_squares(amplitude: float = 1.0) -> tuple[float, float]:
     return float(np.mean(motion(amplitude)[1] ** 2)), 0.5 * STRANGE_NM**2
 
 
+@pytest.fixture(scope="module")
+def healthy() -> Record:
+    return kit.World([{}], seed=5).run()[0]
+
+
 @pytest.fixture
 def model() -> JointModel:
     return kit.model(linked=False)
@@ -136,8 +141,8 @@ def test_errors_beyond_the_residual_widen_what_the_data_tell_not_what_is_declare
     assert after[inertia] == pytest.approx(before[inertia], rel=1e-3)
 
 
-def test_a_file_that_explains_less_than_the_declared_one_is_not_written() -> None:
-    record, model = kit.World([{}], seed=5).run()[0], kit.model()
+def test_a_file_that_explains_less_than_the_declared_one_is_not_written(healthy: Record) -> None:
+    record, model = healthy, kit.model()
     (motor,) = model.motors
 
     def with_spring(stiffness: float) -> JointModel:
@@ -159,8 +164,8 @@ def test_a_variance_below_zero_is_no_certainty(variance: float, determined: bool
 
 
 @pytest.mark.parametrize("linked", [True, False])
-def test_a_damping_that_nobody_declared_is_no_anchor_at_zero(linked: bool) -> None:
-    record, known = kit.World([{}], seed=5).run()[0], kit.model(linked=linked)
+def test_a_damping_that_nobody_declared_is_no_anchor_at_zero(healthy: Record, linked: bool) -> None:
+    record, known = healthy, kit.model(linked=linked)
     motor = replace(known.motors[0], viscous_damping_nm_s_rad=0.0)
     (fitted,) = identify(record, replace(known, motors=(motor,))).fits
     error = abs(fitted.viscous_damping_nm_s_rad - kit.DAMPING)
@@ -168,8 +173,8 @@ def test_a_damping_that_nobody_declared_is_no_anchor_at_zero(linked: bool) -> No
     assert fitted.nuisance_std["damping"] < 0.1 * kit.DAMPING
 
 
-def test_a_deflection_that_a_law_cannot_have_is_an_error_that_says_so() -> None:
-    record, linear = kit.World([{}], seed=5).run()[0], kit.model()
+def test_a_deflection_that_a_law_cannot_have_is_an_error_that_says_so(healthy: Record) -> None:
+    record, linear = healthy, kit.model()
     own = replace(linear.motors[0], transmission=Transmission(model="vsa-ii"))
     far = replace(record, motor_position_rad=1e6 * record.motor_position_rad)
     with pytest.raises(EstimatorError, match="more than a transmission of model"):

@@ -1,4 +1,4 @@
-"""The robust mode on drive-like signals: accuracy, honesty, changes, standstill, bad input."""
+"""The robust mode on drive-like signals: accuracy, honesty, standstill, bad input."""
 
 import math
 
@@ -15,11 +15,10 @@ USABLE = int(Status.VALID | Status.OBSERVABLE)
 
 
 class RecordedJoint:
-    """Six soft joints on one motion; from 9 s on their stiffness is 20 % less, from 12 s on they rest."""
+    """Soft joints on one motion; from a time on they rest."""
 
-    def __init__(self, step_at: float = math.inf, rest_at: float = math.inf, seconds: float = 9.0) -> None:
-        rng = np.random.default_rng(21)
-        N, n = 6, int(seconds / T)
+    def __init__(self, N: int = 6, rest_at: float = math.inf) -> None:
+        rng, n = np.random.default_rng(21), 9000
         K = rng.uniform(80, 220, (N, 1))
         self.alpha = np.stack([K, K * rng.uniform(2, 12, (N, 1))], axis=-1)
         torque, stiffness = joints.polynomial(self.alpha)
@@ -32,7 +31,6 @@ class RecordedJoint:
             np.full(N, 0.45),
             np.full(N, 0.3),
             np.full(N, 5.0),
-            scale_at=(step_at, 0.8),
         )
         tau = joints.sweep(rng, n, N, 1, T, np.full((1, N, 1), 8.0), 3.0)
         tau[np.arange(n) * T >= rest_at] = 0.0
@@ -54,11 +52,6 @@ class RecordedJoint:
 @pytest.fixture(scope="module")
 def rig():
     return RecordedJoint()
-
-
-@pytest.fixture(scope="module")
-def changing():
-    return RecordedJoint(step_at=7.0, rest_at=9.0, seconds=14.0)
 
 
 def _usable(out):
@@ -118,17 +111,6 @@ def test_deflection_is_that_of_this_moment_however_late_the_link_encoder(rig, la
         assert abs(rate @ (error - error.mean()) / (rate @ rate)) < 0.1 * T
 
 
-def test_a_stiffness_step_is_announced_at_once_and_followed_within_a_second_or_so(changing):
-    for j in range(3):
-        out, _ = changing.run(j)
-        status = out[:, 1].astype(int)
-        assert not np.any(status[:7000] & Status.CHANGED)
-        assert np.any(status[7000:7400] & Status.CHANGED)
-        # The filters forget what was before (0.35 s), and two blocks of a quarter of a second agree.
-        error = np.abs(out[8100:9000, 3] / changing.truth.sigma[8100:9000, j, 0] - 1)
-        assert np.median(error) < 0.02
-
-
 @pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in (1, 2))])
 def test_the_first_reversal_of_a_motion_is_no_change(seed):
     """Coulomb friction is unknown before it, so one large innovation is foreseen there; three are not."""
@@ -150,16 +132,17 @@ def test_the_first_reversal_of_a_motion_is_no_change(seed):
         assert not any(estimator.step(sample).status & Status.CHANGED for sample in samples)
 
 
-def test_standstill_moves_nothing_and_is_not_called_observable(changing):
-    for j in range(3):
-        out, estimator = changing.run(j)
-        rest = slice(12500, 14000)
+def test_standstill_moves_nothing_and_is_not_called_observable():
+    resting = RecordedJoint(N=2, rest_at=3.0)
+    for j in range(2):
+        out, estimator = resting.run(j)
+        rest = slice(8000, None)
         assert np.ptp(out[rest, 3]) < np.min(out[rest, 4])
         assert not np.any(out[rest, 1].astype(int) & Status.OBSERVABLE)
         assert np.all(out[rest, 1].astype(int) & Status.VALID)
         (reported,) = estimator.parameters()
-        expected = 0.8 * changing.alpha[j, 0]
-        assert reported["parameters"]["coefficients_nm_rad"][0] == pytest.approx(expected[0], rel=1e-2)
+        found = reported["parameters"]["coefficients_nm_rad"][0]
+        assert found == pytest.approx(resting.alpha[j, 0, 0], rel=1e-2)
 
 
 def test_replay_gives_the_same_bits_as_live(rig):

@@ -57,8 +57,11 @@ fn call(py: Python<'_>, function: &Py<PyAny>, phi: &[f64], shape: &[f64], out: &
         arguments.push(value.into_pyobject(py)?.into_any());
     }
     let result = function.bind(py).call1(PyTuple::new(py, arguments)?)?;
-    let wide = numpy.call_method1("broadcast_to", (result, (phi.len(),)))?;
-    let values: Vec<f64> = wide.call_method1("astype", ("float64",))?.call_method0("tolist")?.extract()?;
+    let mut values = numpy.call_method1("asarray", (result, "float64"))?;
+    if !values.getattr("shape")?.eq((phi.len(),))? {
+        values = numpy.call_method1("broadcast_to", (values, (phi.len(),)))?; // a constant
+    }
+    let values: Vec<f64> = values.call_method0("tolist")?.extract()?;
     out.copy_from_slice(&values);
     Ok(())
 }

@@ -80,6 +80,7 @@ def sizes(
         "deflection_offset": {"offset_rad": angle},
         "encoder_eccentricity": {"sin_rad": angle, "cos_rad": 0.7 * angle},
         "encoder_delay": {"delay_s": 0.0025 + 0.01 * share},
+        "deflection_delay": {"delay_s": 0.005 + 0.2 * share},
         "encoder_scale": {"relative_error": 0.3 * share},
         "gravity": {"sin_nm": 2.0 * x, "cos_nm": 0.5 * x},
         "link_coulomb_friction": {"torque_nm": x},

@@ -78,7 +78,7 @@ class ModelMonitor:
     def location(self) -> str: ...
 
 def effect_kinds() -> list[
-    tuple[str, str, str, list[str], list[tuple[str, str, bool, float | None]], bool, str]
+    tuple[str, str, str, list[str], list[tuple[str, str, bool, bool, float | None]], bool, str]
 ]: ...
 def effect_terms(
     name: str, values: Sequence[float], coordinates: Sequence[Numbers], out: Numbers

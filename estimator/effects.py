@@ -78,12 +78,14 @@ class Parameter(NamedTuple):
         name: with its unit, as it stands in a joint file.
         meaning: in words.
         linear: whether the effect is proportional to it; the k-th linear parameter weighs the k-th term.
+        positive: whether it is not negative, as of what only dissipates.
         default: value used if the joint file omits it; None: required.
     """
 
     name: str
     meaning: str
     linear: bool
+    positive: bool
     default: float | None
 
 

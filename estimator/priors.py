@@ -94,6 +94,9 @@ PRIORS: dict[str, Prior] = {
     "late": Prior(
         0.005, "absolute", "delay or lag beyond a sample, s", "current filters and fieldbus cycles"
     ),
+    "late_deflection": Prior(
+        0.03, "absolute", "delay of a deflection's sensor, s", "amplifiers of strain gauges take 5 to 100 ms"
+    ),
     "encoder_scale": Prior(
         0.02, "absolute", "scale error of an encoder", "encoders count; gear ratios are rounded"
     ),

@@ -87,7 +87,8 @@ class LinkScale:
 
     Attributes:
         counts: the reading.
-        history: receives every plant step if the reading lags; else None.
+        history: receives every plant step of the link if the reading lags; else None.
+        deflection: receives every plant step of the deflection if its sensor lags; else None.
     """
 
     def __init__(self, encoder: LinkEncoder, noise: Iterator[float]) -> None:
@@ -99,19 +100,23 @@ class LinkScale:
         """
         self.counts = 0
         self.history: PositionHistory | None = None
+        self.deflection: PositionHistory | None = None
         self._encoder, self._noise = encoder, noise
         self._readings: tuple[Reading, ...] = ()
 
-    def fit(self, parts: LinkParts, step_s: float, position: float) -> None:
-        """Add effects, with an integration step of step_s and the link at this position (rad)."""
-        delay = parts.reading_delay_s
+    def fit(self, parts: LinkParts, step_s: float, position: float, theta: float) -> None:
+        """Add effects, with an integration step of step_s, link and first motor at these angles (rad)."""
+        delay, late = parts.reading_delay_s, parts.deflection_delay_s
         self._readings = tuple(parts.readings)
         self.history = PositionHistory(delay, step_s, position) if delay > 0.0 else None
+        self.deflection = PositionHistory(late, step_s, position - theta) if late > 0.0 else None
 
-    def sample(self, position: float) -> None:
-        """Sample at this link position (rad)."""
+    def sample(self, position: float, theta: float) -> None:
+        """Sample at these positions of link and first motor (rad)."""
         if self.history is not None:
             position = self.history.position()
+        if self.deflection is not None:
+            position = theta + self.deflection.position()
         for read in self._readings:
             position = read(position)
         encoder = self._encoder

@@ -158,7 +158,7 @@ class World:
         self._elastic = elasticity(self.plant)
         for amplifier, parts in zip(self._amplifiers, assembly.motors, strict=True):
             amplifier.fit(parts)
-        self._scale.fit(assembly.link, self.plant_step_s, self._state[0])
+        self._scale.fit(assembly.link, self.plant_step_s, self._state[0], self._state[2])
 
     def command(self, motor: int, torque_nm: float | None) -> None:
         """Set-point of one drive, from the next period on.
@@ -176,7 +176,8 @@ class World:
 
     def advance(self, periods: int = 1) -> None:
         """Advance by whole control periods."""
-        step, settle, state, history = self._step, self._settle, self._state, self._scale.history
+        step, settle, state = self._step, self._settle, self._state
+        history, deflection = self._scale.history, self._scale.deflection
         first, last = self._amplifiers[0], self._amplifiers[-1]
         for _ in range(periods):
             tau_k, time_s = self._external, self._tick * self.period_s
@@ -187,6 +188,8 @@ class World:
                     settle(state, time_s)
                 if history is not None:
                     history.push(state[0], state[1])
+                if deflection is not None:
+                    deflection.push(state[0] - state[2], state[1] - state[3])
             self._tick += 1
             self._latch()
 
@@ -204,7 +207,7 @@ class World:
             else:
                 amplifier.latch(0.0, t, theta, w)
         self._external = excitation.external(t) if excitation is not None and excitation.external else 0.0
-        self._scale.sample(state[0])
+        self._scale.sample(state[0], state[2])
 
     def drive(self, motor: int) -> DriveSignals:
         """Signals of this drive at the present instant."""

@@ -106,6 +106,8 @@ class World:
         theta, torque, q = rows.T
         late = effects.get("late_s", 0.0) / PERIOD_S
         index = np.arange(len(q))
+        if gauge := effects.get("gauge_late_s", 0.0) / PERIOD_S:
+            q = theta + np.interp(index - gauge, index, q - theta)
         q = np.interp(index - late, index, q) + effects.get("zero_rad", 0.0)
         return Record(
             period_s=PERIOD_S,

@@ -32,6 +32,9 @@ CASES: dict[str, tuple[dict[str, float], str, str, str, float, float]] = {
     ),
     "zero": ({"zero_rad": 0.006}, "deflection_offset", "measurement", "offset_rad", 0.006, 2e-4),
     "late": ({"late_s": 0.004}, "encoder_delay", "measurement", "delay_s", 0.004, 1e-4),
+    "gauge": (
+        {"gauge_late_s": 0.03}, "deflection_delay", "measurement", "delay_s", 0.03, 1e-4,
+    ),
     "gravity": ({"gravity_nm": 0.8}, "gravity", "link", "sin_nm", 0.8, 0.03),
     "link": ({"link_nm": 0.3}, "link_coulomb_friction", "link", "torque_nm", 0.3, 0.02),
 }  # fmt: skip

@@ -22,7 +22,7 @@ NAMES = {
     "transmission": (
         "hysteresis backlash asymmetric_stiffness higher_order_stiffness transmission_damping kinematic_error"
     ),
-    "measurement": "deflection_offset encoder_eccentricity encoder_delay encoder_scale",
+    "measurement": "deflection_offset encoder_eccentricity encoder_delay deflection_delay encoder_scale",
     "link": "gravity link_coulomb_friction link_viscous_damping link_inertia contact",
 }
 VALUES = {"power": 5.0, "exponent": 2.0, "shape": 0.5, "side": -1.0, "periods_per_rev": 7.0}

@@ -26,7 +26,7 @@ NOTICEABLE = {
     "hysteresis": 1.0, "backlash": 0.01,
     "asymmetric_stiffness": 1000.0, "higher_order_stiffness": 1e6, "transmission_damping": 1.0,
     "kinematic_error": 0.005, "deflection_offset": 0.01, "encoder_eccentricity": 0.005,
-    "encoder_delay": 0.002, "encoder_scale": 0.02, "gravity": 2.0, "link_coulomb_friction": 1.0,
+    "encoder_delay": 0.002, "deflection_delay": 0.02, "encoder_scale": 0.02, "gravity": 2.0, "link_coulomb_friction": 1.0,
     "link_viscous_damping": 1.0, "link_inertia": 0.1, "contact": 50.0,
     "damaged_tooth": 1.0, "cold_grease": 1.0, "phase_imbalance": 0.1, "mesh_stiffness": 0.2, "creep": 50.0,
     "cable_pull": 1.0, "air_drag": 1.0, "interpolation_error": 0.001,
@@ -255,6 +255,13 @@ def test_a_reading_errs_and_the_joint_does_not(name: str) -> None:
     assert r["link_position_rad"] == pytest.approx(READINGS[name](r), abs=1e-9)
 
 
+def test_a_late_deflection_is_read_beside_the_present_motor() -> None:
+    r = measured(sea(HARDENING), make("deflection_delay", {"delay_s": 0.02}))
+    theta = r["truth_motor1_position_rad"]
+    phi = np.interp(r["time_s"] - 0.02, r["time_s"], r["truth_link_position_rad"] - theta)
+    assert r["link_position_rad"][25:] == pytest.approx((theta + phi)[25:], abs=2e-5)
+
+
 @pytest.mark.parametrize("delay_s", [0.002, 0.0023, 0.0001])
 def test_a_late_encoder_reads_where_the_link_was(delay_s: float) -> None:
     r = measured(sea(HARDENING), make("encoder_delay", {"delay_s": delay_s}))
@@ -396,8 +403,8 @@ def test_the_names_are_those_of_the_contract() -> None:
         "load_dependent_friction", "viscous_damping", "quadratic_damping", "cogging", "torque_offset",
         "torque_constant", "torque_saturation", "torque_drift", "motor_inertia", "torque_delay",
         "torque_lag", "back_driving_loss", "hysteresis", "backlash", "asymmetric_stiffness", "higher_order_stiffness", "transmission_damping",
-        "kinematic_error", "deflection_offset", "encoder_eccentricity", "encoder_delay", "encoder_scale",
-        "gravity", "link_coulomb_friction", "link_viscous_damping", "link_inertia", "contact",
+        "kinematic_error", "deflection_offset", "encoder_eccentricity", "encoder_delay", "deflection_delay",
+        "encoder_scale", "gravity", "link_coulomb_friction", "link_viscous_damping", "link_inertia", "contact",
     }  # fmt: skip
     assert len(UNLISTED) >= 4
     assert not set(UNLISTED) & set(LISTED)

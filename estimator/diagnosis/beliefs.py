@@ -27,23 +27,6 @@ _AT_MOTOR = (
 )
 _AT_LINK = ("encoder_delay", "link_inertia", "link_viscous_damping", "gravity")
 
-# Effects that only dissipate energy.
-_POSITIVE = {
-    "coulomb_friction",
-    "presliding_friction",
-    "load_dependent_friction",
-    "quadratic_damping",
-    "hysteresis",
-    "backlash",
-    "transmission_damping",
-    "link_coulomb_friction",
-    "contact",
-    "back_driving_loss",
-    "torque_saturation",
-    "stribeck_friction",
-    "asymmetric_friction",
-}
-
 
 def everyday(frame: Frame) -> list[Candidate]:
     """Errors of every rig: inexact declared numbers, and offsets and skews of readings."""
@@ -152,6 +135,8 @@ def effect_std(model: JointModel, candidate: Candidate, by_torque: FloatArray) -
         return np.full_like(by_torque, PRIORS["torque_scale"].std)
     if name in ("load_dependent_friction", "back_driving_loss"):
         return np.full_like(by_torque, PRIORS[name].std)
+    if name == "deflection_delay":
+        return np.full_like(by_torque, PRIORS["late_deflection"].std)
     if name in ("torque_delay", "torque_lag", "encoder_delay"):
         return np.minimum(PRIORS["late"].std, by_torque)
     if name in ("encoder_scale", "encoder_eccentricity"):
@@ -168,7 +153,7 @@ def least(model: JointModel, candidate: Candidate) -> float:
     """Physical lower bound of an effect's linear parameters, beyond the declared value."""
     name = candidate.kind.name
     motor, link = model.motors[candidate.motor or 0], model.link
-    if name in _POSITIVE:
+    if candidate.kind.parameters[0].positive:
         return 0.0
     if name == "motor_inertia":
         return -motor.inertia_kg_m2

@@ -78,7 +78,7 @@ def members(frame: Frame) -> list[Candidate]:
             if external and (not smooth or reverses(frame.motors[0].link_velocity)):
                 found.append(Candidate(kind, None))
         elif kind.channel == "link_position":
-            if any(frame.flexible):
+            if any(frame.flexible) and (len(frame.motors) == 1 or kind.name != "deflection_delay"):
                 found.append(Candidate(kind, None))
         else:
             if kind.channel == "deflection" and sum(frame.flexible) > 1 and frame.linked:

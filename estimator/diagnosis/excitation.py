@@ -41,6 +41,10 @@ _HINTS = {
         "viscous_damping or encoder_delay: move faster, so that the deflection changes with acceleration, or "
         "declare [link.dynamics]"
     ),
+    frozenset({"transmission_damping", "deflection_delay"}): (
+        "transmission_damping or deflection_delay: move faster, or declare [link.dynamics]; damping acts on "
+        "the link, a late sensor does not"
+    ),
     frozenset({"encoder_scale", "motor_inertia"}): (
         "encoder_scale or motor_inertia: hold different positions under load at standstill"
     ),

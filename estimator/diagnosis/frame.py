@@ -34,6 +34,7 @@ class Corrections:
             order; negative: the reported one lags.
         offset_rad: per motor, reading of a zero deflection.
         encoder_delay_s: delay of the link position after the other channels.
+        deflection_delay_s: delay of a deflection's sensor, read beside the first motor's position.
         encoder_sin_rad: error of the link reading per sin(q).
         encoder_cos_rad: per cos(q).
         encoder_scale: per q.
@@ -43,6 +44,7 @@ class Corrections:
     torque_lag_s: tuple[float, ...]
     offset_rad: tuple[float, ...]
     encoder_delay_s: float = 0.0
+    deflection_delay_s: float = 0.0
     encoder_sin_rad: float = 0.0
     encoder_cos_rad: float = 0.0
     encoder_scale: float = 0.0
@@ -115,9 +117,15 @@ class Signals:
     def link_path(self, corrections: Corrections) -> tuple[FloatArray, ...]:
         """The link's position, velocity and acceleration, corrected for the encoder's error."""
         assert self.q is not None
-        q, rate, acceleration = (
-            self.light.apply(self.q, self._smooth, order, -corrections.encoder_delay_s) for order in range(3)
-        )
+        sensor = corrections.deflection_delay_s
+        late = corrections.encoder_delay_s + sensor
+        q, rate, acceleration = (self.light.apply(self.q, self._smooth, order, -late) for order in range(3))
+        if sensor:
+            now = self.motor_paths[0]
+            then = (self.light.apply(self.theta[0], self._smooth, order, -sensor) for order in range(3))
+            q, rate, acceleration = (
+                x + a - b for x, a, b in zip((q, rate, acceleration), now, then, strict=True)
+            )
         a, b, scale = corrections.encoder_sin_rad, corrections.encoder_cos_rad, corrections.encoder_scale
         if not (a or b or scale):
             return q, rate, acceleration

@@ -168,6 +168,13 @@ class Problem:
         """The longest sampling period."""
         return max(signals.period_s for signals in self.signals)
 
+    def resolution_rad(self, motor: int) -> float:
+        """Of a deflection: one count of each of its encoders."""
+        link = self.records[0].link_position_rad
+        read = [self.records[0].motor_position_rad[:, motor], *([] if link is None else [link])]
+        steps = [np.abs(np.diff(x)) for x in read]
+        return sum(float(np.quantile(x[x > 0.0], 0.01)) if np.any(x > 0.0) else 0.0 for x in steps)
+
     def unit_of(self, term: Term, name: str) -> float:
         """A nonlinear parameter's unit per unit of its slot."""
         return step_of(term, name, self.frames[0])[1]
@@ -237,9 +244,14 @@ class Problem:
             best = now
         return best
 
-    def added(self, fitted: Fitted, term: Term, steps: int | None = None) -> Fitted:
-        """The hypothesis with one more term."""
-        return self.fit((*fitted.terms, term), fitted.base, fitted.corrections, steps)
+    def added(self, fitted: Fitted, term: Term, steps: int | None = None, begin: float = 0.0) -> Fitted:
+        """The hypothesis with one more term; that of a reading begins at a correction."""
+        candidate = term.candidate
+        corrections = fitted.corrections
+        if begin:
+            name, motor = candidate.key
+            corrections = tuple(corrected(c, name, motor, 0, begin) for c in corrections)
+        return self.fit((*fitted.terms, term), fitted.base, corrections, steps)
 
     def without(self, fitted: Fitted, k: int, pinned: Pinned | None = None) -> Fitted:
         """The hypothesis without one term; its correction of a reading is undone."""

@@ -27,6 +27,7 @@ def declared_corrections(model: JointModel) -> Corrections:
         torque_lag_s=tuple(lags),
         offset_rad=tuple(offsets),
         encoder_delay_s=_sum(link, "encoder_delay", "delay_s"),
+        deflection_delay_s=_sum(link, "deflection_delay", "delay_s"),
         encoder_sin_rad=_sum(link, "encoder_eccentricity", "sin_rad"),
         encoder_cos_rad=_sum(link, "encoder_eccentricity", "cos_rad"),
         encoder_scale=_sum(link, "encoder_scale", "relative_error"),

@@ -14,6 +14,7 @@ READINGS = (
     "torque_lag",
     "deflection_offset",
     "encoder_delay",
+    "deflection_delay",
     "encoder_scale",
     "encoder_eccentricity",
 )
@@ -27,6 +28,7 @@ def read(c: Corrections, candidate: Candidate) -> tuple[float, ...]:
         "torque_lag": (c.torque_lag_s[motor],),
         "deflection_offset": (c.offset_rad[motor],),
         "encoder_delay": (c.encoder_delay_s,),
+        "deflection_delay": (c.deflection_delay_s,),
         "encoder_scale": (c.encoder_scale,),
         "encoder_eccentricity": (c.encoder_sin_rad, c.encoder_cos_rad),
     }.get(candidate.kind.name, (0.0,) * len(candidate.kind.linear))
@@ -46,6 +48,8 @@ def corrected(c: Corrections, name: str, motor: int | None, part: int, more: flo
         return replace(c, offset_rad=put(c.offset_rad))
     if name == "encoder_delay":
         return replace(c, encoder_delay_s=c.encoder_delay_s + more)
+    if name == "deflection_delay":
+        return replace(c, deflection_delay_s=c.deflection_delay_s + more)
     if name == "encoder_scale":
         return replace(c, encoder_scale=c.encoder_scale + more)
     if part == 0:

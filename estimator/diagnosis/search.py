@@ -173,8 +173,12 @@ class Search:
         return [child for child in grown if child.is_real_beside(parent)]
 
     def _grown(self, parent: Fitted, term: Term) -> Fitted:
-        """Add one effect; from two starts, as the smoothing of friction has several optima."""
+        """Add one effect; from several starts, as the smoothing of friction and a long delay have optima."""
         child = self.problem.added(parent, term, whole("rough_steps"))
+        if term.candidate.kind.name == "deflection_delay":
+            late = (PRIORS["late_deflection"].std * 2.0**k for k in (-1.0, 0.0, 1.0, 1.75))
+            others = [self.problem.added(parent, term, whole("rough_steps"), one) for one in late]
+            return max(child, *others, key=lambda h: h.evidence(child))
         if _SMOOTHING not in term.values:
             return child
         softer = {**term.values, _SMOOTHING: choice("softer") * term.values[_SMOOTHING]}

@@ -44,6 +44,8 @@ class LinkParts:
     dry: list[Dry] = field(default_factory=list)
     readings: list[Reading] = field(default_factory=list)
     reading_delay_s: float = 0.0
+    deflection_delay_s: float = 0.0
+    """Of a sensor of the deflection, whose reading with the first motor's position is that of the link."""
 
 
 class Assembly:

@@ -41,6 +41,15 @@ def _encoder_delay(a: Assembly, m: int, p: Values) -> None:
 
 
 @_effect(
+    "deflection_delay",
+    "the deflection's sensor (strain gauges) is older than the rest",
+    delay_s="by this time",
+)
+def _deflection_delay(a: Assembly, m: int, p: Values) -> None:
+    a.link.deflection_delay_s += not_negative(p, "delay_s")
+
+
+@_effect(
     "encoder_scale", "the link encoder's scale is wrong", relative_error="share by which it reads too much"
 )
 def _encoder_scale(a: Assembly, m: int, p: Values) -> None:

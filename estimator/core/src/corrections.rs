@@ -70,7 +70,8 @@ pub struct Corrections {
     // these delays as common, motor positions wait that long, the rest what is left of it. In periods.
     delayed: bool,
     aligned: Waits,
-    present: Waits, // the positions wait for each other only
+    present: Waits,  // the positions wait for each other only
+    deflection: f64, // by so much of its wait the deflection's sensor is late
     first: Option<u64>,
     last: u64,
     past: Vec<Sample>,
@@ -87,7 +88,9 @@ impl Corrections {
         link_sum(link)?;
         let at = |place: Place| link.iter().filter(move |element| element.kind.place == place);
         let reading: Vec<Element> = at(Place::LinkReading).copied().collect();
-        let encoder_delay: f64 = at(Place::LinkDelay).map(|element| element.values[0]).sum();
+        let sum = |place: Place| at(place).map(|element| element.values[0]).sum::<f64>();
+        let deflection_delay = sum(Place::DeflectionDelay);
+        let encoder_delay = sum(Place::LinkDelay) + deflection_delay;
         let (mut drive, mut offset, mut delays): ([Vec<Element>; MOTORS], _, _) =
             (Default::default(), [0.0; MOTORS], [0.0; MOTORS]);
         let mut lag = [Lag::new(0.0); MOTORS];
@@ -127,6 +130,7 @@ impl Corrections {
             delayed,
             aligned,
             present,
+            deflection: deflection_delay / period_s,
             first: None,
             last: 0,
             past: vec![nothing; longest as usize + 2],
@@ -229,6 +233,12 @@ impl Corrections {
         let (a, b, share) = self.at(now, waits.link)?;
         out.link_position = mix(a.link_position, b.link_position, share);
         out.link_velocity = mix(a.link_velocity, b.link_velocity, share);
+        if self.deflection != 0.0 {
+            // Read was the deflection of then beside the motor's position of a delay later.
+            let (a, b, share) = self.at(now, (waits.motor - self.deflection).max(0.0))?;
+            out.link_position += out.motor_position[0] - mix(a.motor_position[0], b.motor_position[0], share);
+            out.link_velocity += out.motor_velocity[0] - mix(a.motor_velocity[0], b.motor_velocity[0], share);
+        }
         Some(out)
     }
 
@@ -320,6 +330,18 @@ mod tests {
         assert!(out[..4].iter().all(Option::is_none) && out[4..].iter().all(Option::is_some));
         near(&out[11].unwrap().aligned, 11.0 - 2.5, 11.0 - 3.5, 11.0, 1e-9);
         near(&late.correct(&at(15), false).unwrap().aligned, 12.5, 11.5, 15.0, 1e-9);
+    }
+
+    #[test]
+    fn a_late_deflection_is_read_beside_the_present_motor() {
+        let mut late = corrections(&[], &[element("deflection_delay", &[0.03])]);
+        let phi = |k: f64| 0.01 * k;
+        let mut out = None;
+        for k in 0..100 {
+            let (now, then) = (f64::from(k), (f64::from(k) - 30.0).max(0.0));
+            out = late.correct(&sample(k as u64, now, now, now + phi(then)), false);
+        }
+        near(&out.unwrap().aligned, 69.0, 69.0, 69.0 + phi(69.0), 1e-9);
     }
 
     #[test]

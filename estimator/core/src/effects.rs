@@ -79,7 +79,7 @@ impl MotorEffects {
                 Place::TorqueDelay => sorted.delay += element.values[0],
                 Place::TorqueLag => sorted.lag += element.values[0],
                 Place::Deflection => sorted.offset += element.values[0],
-                Place::Link | Place::LinkReading | Place::LinkDelay => {
+                Place::Link | Place::LinkReading | Place::LinkDelay | Place::DeflectionDelay => {
                     let name = element.kind.name;
                     return Err(Error(format!("effect \"{name}\": expected it under [[link.effect]]")));
                 }

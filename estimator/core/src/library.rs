@@ -102,6 +102,8 @@ pub enum Place {
     LinkReading,
     /// When the link encoder reads.
     LinkDelay,
+    /// When a sensor of the deflection reads, whose sum with the first motor's position is the link's.
+    DeflectionDelay,
 }
 
 impl Place {
@@ -114,14 +116,16 @@ impl Place {
             Place::Link => ("link", "torque"),
             Place::Torque | Place::TorqueDelay | Place::TorqueLag => ("motor", "motor_torque"),
             Place::Deflection => ("measurement", "deflection"),
-            Place::LinkReading | Place::LinkDelay => ("measurement", "link_position"),
+            Place::LinkReading | Place::LinkDelay | Place::DeflectionDelay => {
+                ("measurement", "link_position")
+            }
         }
     }
 
     /// Whether it belongs to the link or its encoder, not to a motor.
     #[must_use]
     pub fn on_link(self) -> bool {
-        matches!(self, Place::Link | Place::LinkReading | Place::LinkDelay)
+        matches!(self, Place::Link | Place::LinkReading | Place::LinkDelay | Place::DeflectionDelay)
     }
 }
 
@@ -130,10 +134,20 @@ impl Place {
 pub enum Role {
     /// The effect is proportional to it; the k-th of them weighs the k-th term.
     Linear,
+    /// The same, and it is not negative: it only dissipates, or is only missing.
+    Loss,
     /// It enters nonlinearly; any number.
     Shape,
     /// It enters nonlinearly, and is above 0.
     Scale,
+}
+
+impl Role {
+    /// Whether the effect is proportional to the parameter.
+    #[must_use]
+    pub fn linear(self) -> bool {
+        matches!(self, Role::Linear | Role::Loss)
+    }
 }
 
 /// One parameter of an effect.
@@ -189,6 +203,10 @@ const fn linear(name: &'static str, meaning: &'static str) -> Parameter {
     Parameter { name, meaning, role: Role::Linear, default: None }
 }
 
+const fn loss(name: &'static str, meaning: &'static str) -> Parameter {
+    Parameter { name, meaning, role: Role::Loss, default: None }
+}
+
 const fn shape(name: &'static str, meaning: &'static str, default: Option<f64>) -> Parameter {
     Parameter { name, meaning, role: Role::Shape, default }
 }
@@ -203,7 +221,7 @@ const RELATIVE_ERROR: Parameter = linear("relative_error", "share by which the s
 const DAMPING: Parameter = linear("damping_nm_s_rad", "damping beyond what is declared");
 const INERTIA: Parameter = linear("inertia_kg_m2", "inertia beyond what is declared");
 const MEMORY: &[Parameter] = &[
-    linear("torque_nm", "torque at full sliding"),
+    loss("torque_nm", "torque at full sliding"),
     scale("displacement_rad", "displacement scale of the build-up", None),
     scale("exponent", "1: Dahl; 2: Bouc-Wen; 50 and more: elastic up to the limit", Some(1.0)),
     shape("shape", "share of the law that depends on the direction (Dahl 1, Bouc-Wen 0.5)", Some(1.0)),
@@ -228,7 +246,7 @@ pub static LIBRARY: &[Kind] = &[
         name: "coulomb_friction",
         place: Place::Motor,
         coordinates: &["velocity"],
-        parameters: &[linear("torque_nm", "friction torque"), SMOOTHING],
+        parameters: &[loss("torque_nm", "friction torque"), SMOOTHING],
         law: Law::Terms(|c, v| one(sign(c.velocity, v[1]))),
         description: "dry friction of the motor",
     },
@@ -237,8 +255,8 @@ pub static LIBRARY: &[Kind] = &[
         place: Place::Motor,
         coordinates: &["velocity"],
         parameters: &[
-            linear("torque_nm", "friction torque while sliding"),
-            linear("stribeck_nm", "what is added near standstill"),
+            loss("torque_nm", "friction torque while sliding"),
+            loss("stribeck_nm", "what is added near standstill"),
             scale("stribeck_velocity_rad_s", "velocity at which it has decayed", None),
             SMOOTHING,
         ],
@@ -253,8 +271,8 @@ pub static LIBRARY: &[Kind] = &[
         place: Place::Motor,
         coordinates: &["velocity"],
         parameters: &[
-            linear("positive_nm", "friction torque in positive motion"),
-            linear("negative_nm", "friction torque in negative motion"),
+            loss("positive_nm", "friction torque in positive motion"),
+            loss("negative_nm", "friction torque in negative motion"),
             SMOOTHING,
         ],
         law: Law::Terms(|c, v| {
@@ -275,7 +293,7 @@ pub static LIBRARY: &[Kind] = &[
         name: "load_dependent_friction",
         place: Place::Motor,
         coordinates: &["velocity", "flexibility_torque"],
-        parameters: &[linear("coefficient", "friction per flexibility torque"), SMOOTHING],
+        parameters: &[loss("coefficient", "friction per flexibility torque"), SMOOTHING],
         law: Law::Terms(|c, v| one(c.flexibility_torque.abs() * sign(c.velocity, v[1]))),
         description: "dry friction that grows with the transmitted torque",
     },
@@ -291,7 +309,7 @@ pub static LIBRARY: &[Kind] = &[
         name: "quadratic_damping",
         place: Place::Motor,
         coordinates: &["velocity"],
-        parameters: &[linear("damping_nm_s2_rad2", "torque per squared velocity")],
+        parameters: &[loss("damping_nm_s2_rad2", "torque per squared velocity")],
         law: Law::Terms(|c, _| one(c.velocity * c.velocity.abs())),
         description: "damping that grows with the square of velocity",
     },
@@ -327,7 +345,7 @@ pub static LIBRARY: &[Kind] = &[
         name: "torque_saturation",
         place: Place::Torque,
         coordinates: &["torque"],
-        parameters: &[linear("coefficient_per_nm2", "what is lost per cubed torque")],
+        parameters: &[loss("coefficient_per_nm2", "what is lost per cubed torque")],
         law: Law::Terms(|c, _| one(c.torque * c.torque * c.torque)),
         description: "large torques fall short of what is reported",
     },
@@ -373,7 +391,7 @@ pub static LIBRARY: &[Kind] = &[
         name: "back_driving_loss",
         place: Place::Motor,
         coordinates: &["velocity", "flexibility_torque"],
-        parameters: &[linear("coefficient", "loss per flexibility torque while the link drives"), SMOOTHING],
+        parameters: &[loss("coefficient", "loss per flexibility torque while the link drives"), SMOOTHING],
         // τ_e acts on the motor as +τ_e: the link drives while it has the velocity's sign.
         law: Law::Terms(|c, v| {
             let (torque, sign) = (c.flexibility_torque, sign(c.velocity, v[1]));
@@ -394,7 +412,7 @@ pub static LIBRARY: &[Kind] = &[
         place: Place::Transmission,
         coordinates: &["deflection"],
         parameters: &[
-            linear("stiffness_nm_rad", "stiffness that is missing inside the gap"),
+            loss("stiffness_nm_rad", "stiffness that is missing inside the gap"),
             scale("half_gap_rad", "half of the gap", None),
         ],
         law: Law::Spring(|phi, v| {
@@ -429,7 +447,7 @@ pub static LIBRARY: &[Kind] = &[
         name: "transmission_damping",
         place: Place::Transmission,
         coordinates: &["deflection_rate"],
-        parameters: &[linear("damping_nm_s_rad", "torque per deflection rate")],
+        parameters: &[loss("damping_nm_s_rad", "torque per deflection rate")],
         law: Law::Terms(|c, _| one(c.deflection_rate)),
         description: "viscous damping of the transmission",
     },
@@ -473,6 +491,14 @@ pub static LIBRARY: &[Kind] = &[
         description: "the link encoder lags the other channels",
     },
     Kind {
+        name: "deflection_delay",
+        place: Place::DeflectionDelay,
+        coordinates: &["deflection_rate"],
+        parameters: &[loss("delay_s", "the deflection is read later than the rest by")],
+        law: Law::Terms(|c, _| one(-c.deflection_rate)),
+        description: "the deflection's sensor lags the other channels",
+    },
+    Kind {
         name: "encoder_scale",
         place: Place::LinkReading,
         coordinates: &["link_position"],
@@ -495,7 +521,7 @@ pub static LIBRARY: &[Kind] = &[
         name: "link_coulomb_friction",
         place: Place::Link,
         coordinates: &["link_velocity"],
-        parameters: &[linear("torque_nm", "friction torque"), SMOOTHING],
+        parameters: &[loss("torque_nm", "friction torque"), SMOOTHING],
         law: Law::Terms(|c, v| one(sign(c.link_velocity, v[1]))),
         description: "dry friction of the link",
     },
@@ -520,7 +546,7 @@ pub static LIBRARY: &[Kind] = &[
         place: Place::Link,
         coordinates: &["link_position"],
         parameters: &[
-            linear("stiffness_nm_rad", "stiffness of what is touched"),
+            loss("stiffness_nm_rad", "stiffness of what is touched"),
             shape("position_rad", "link position of the first touch", None),
             shape("side", "1: touched from below, -1: from above", Some(1.0)),
         ],
@@ -542,7 +568,7 @@ impl Kind {
     /// How many linear parameters it has, each weighing one term.
     #[must_use]
     pub fn terms(&self) -> usize {
-        self.parameters.iter().filter(|parameter| parameter.role == Role::Linear).count()
+        self.parameters.iter().filter(|parameter| parameter.role.linear()).count()
     }
 }
 
@@ -646,7 +672,7 @@ mod tests {
         for kind in LIBRARY {
             assert!(std::ptr::eq(Kind::named(kind.name).unwrap(), kind), "{}: a name twice", kind.name);
             assert!((1..=2).contains(&kind.terms()) && kind.parameters.len() <= VALUES, "{}", kind.name);
-            let linear = |parameter: &Parameter| parameter.role == Role::Linear;
+            let linear = |parameter: &Parameter| parameter.role.linear();
             assert!(kind.parameters[..kind.terms()].iter().all(linear), "{}: linear ones first", kind.name);
             if let Law::Memory { .. } = kind.law {
                 assert!(kind.parameters == MEMORY);

@@ -66,7 +66,7 @@ fn call(py: Python<'_>, function: &Py<PyAny>, phi: &[f64], shape: &[f64], out: &
     Ok(())
 }
 
-type EffectParameter = (&'static str, &'static str, bool, Option<f64>);
+type EffectParameter = (&'static str, &'static str, bool, bool, Option<f64>);
 type EffectKind =
     (&'static str, &'static str, &'static str, Vec<&'static str>, Vec<EffectParameter>, bool, &'static str);
 
@@ -186,7 +186,7 @@ impl TransmissionLaw {
 /// (name, location, channel, coordinates, parameters, whether it remembers, description) of every effect.
 #[pyfunction]
 pub fn effect_kinds() -> Vec<EffectKind> {
-    let parameter = |p: &Parameter| (p.name, p.meaning, p.role == Role::Linear, p.default);
+    let parameter = |p: &Parameter| (p.name, p.meaning, p.role.linear(), p.role == Role::Loss, p.default);
     (LIBRARY.iter())
         .map(|kind| {
             let (location, channel) = kind.place.names();

@@ -25,6 +25,10 @@ class Estimator(Protocol):
         """Residual of the torque balance at the last sample, N·m; NaN: unknown."""
 
     @property
+    def flexibility_torque_std_nm(self) -> float:
+        """Standard deviation of the joint's flexibility torque at the last sample, N·m; NaN: unknown."""
+
+    @property
     def external(self) -> External | None:
         """External torque on the link at the last sample. None: no link dynamics declared, or no sample yet.
         Never valid if no transmission deflects.
@@ -42,6 +46,12 @@ class Estimator(Protocol):
 
     def distrust(self) -> None:
         """Use the next sample without updating parameters: its timing is in doubt."""
+
+    def lose_zeros(self) -> None:
+        """Forget where the positions' zeros are: a drive that restarts may count from anywhere.
+
+        What was learned of the joint is kept. What depends on the zeros is valid again when motion has shown them.
+        """
 
     def reset(self) -> None:
         """Reset: forget every estimate."""
@@ -75,12 +85,18 @@ class _Compiled:
         self._asked = settings.valid_within
         self.step = self.core.step
         self.reset = self.core.reset
+        self.lose_zeros = self.core.lose_zeros
         self.distrust = self.core.distrust
 
     @property
     def residual_nm(self) -> float:
         """See `Estimator`."""
         return self.core.residual_nm
+
+    @property
+    def flexibility_torque_std_nm(self) -> float:
+        """See `Estimator`."""
+        return self.core.flexibility_torque_std_nm
 
     @property
     def external(self) -> External | None:

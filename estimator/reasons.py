@@ -27,12 +27,13 @@ REASONS: dict[str, str] = {
     "unmoved": "the motion has not revealed the stiffness yet",
     "open": "the motion leaves the stiffness open",
     "imprecise": "stiffness known to ± {share:.2g} %, asked for ± {asked:.2g} %",
+    "torque_imprecise": "torque known to ± {share:.2g} % of its rms, asked for ± {asked:.2g} %",
     "not_positive": "the stiffness comes out at or below zero: check signs, torque and inertia",
     "motor": "no motor of the declared inertia and damping fits the motion",
     "unexplained": "the model leaves {share:.2g} % of the torque balance unexplained",
     "beyond": "the deflection is larger than any that was learned from",
     "changed": "{changes} changed",
-    "lost": "the zero between the encoders is not known: move the joint, or home it",
+    "lost": "the zero between the encoders, or the torque's, is not known: move the joint, or home it",
 }
 
 CHANGES: dict[str, str] = {

@@ -82,7 +82,7 @@ class Bits(IntFlag):
 class Status(Bits):
     """Quality of one estimate. Bits 0-7 are the estimator's, from bit 8 on the service's."""
 
-    VALID = 1 << 0, "the numbers may be used"
+    VALID = 1 << 0, "all numbers may be used"
     OBSERVABLE = 1 << 1, "the motion reveals the stiffness; otherwise it is held, with a wider interval"
     GAP = 1 << 2, "samples were missing before this one and have been bridged"
     CHANGED = 1 << 3, "innovation alarm: the joint changed, the estimate is following"
@@ -93,6 +93,7 @@ class Status(Bits):
     )
     INPUT_REJECTED = 1 << 5, "this sample was not finite, jumped or froze, and was not used"
     RESTARTED = 1 << 6, "the estimator restarted at or shortly before this sample", "unusable"
+    TORQUE_VALID = 1 << 7, "the flexibility torque may be used, also where the stiffness may not"
     DRIVE_FAULT = 1 << 8, "a drive reports a fault or is not operational", "unusable", "replayed"
     BUS_FAULT = 1 << 9, "frames of this cycle were late or missing", "replayed"
     STALE = 1 << 10, "the estimate is carried on without fresh measurements", "unusable"
@@ -104,7 +105,7 @@ class Status(Bits):
     )
     NODE_RESTARTED = (
         1 << 12,
-        "positions may have restarted: the estimator restarts with this sample",
+        "positions may count from anywhere: their zeros are unknown until motion shows them",
         "unusable",
         "replayed",
     )

@@ -46,7 +46,7 @@ class Witness:
     def distrust(self) -> None:
         pass
 
-    def reset(self) -> None:
+    def lose_zeros(self) -> None:
         pass
 
     def parameters(self) -> list[dict[str, Any]]:

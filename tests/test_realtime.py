@@ -95,7 +95,7 @@ class Last:
     def step(self, sample: Sample) -> Estimate:
         return Estimate(sample.sequence, 1, 0.0, 0.0, 0.0, ())
 
-    def reset(self) -> None:
+    def lose_zeros(self) -> None:
         pass
 
     def parameters(self) -> list[dict[str, object]]:

@@ -4,7 +4,7 @@
 
 use estimator_core::estimator::Estimator;
 use estimator_core::external::External;
-use estimator_core::sample::status::{MODEL_ALARM, RESTARTED, VALID};
+use estimator_core::sample::status::{MODEL_ALARM, RESTARTED, USABLE, VALID};
 use estimator_core::sample::{Estimate, Sample};
 
 use crate::assembler::{Assembler, SYNC_COB_ID};
@@ -22,11 +22,11 @@ pub trait Step: Send {
     /// The estimator is not ours, and failed.
     fn step(&mut self, sample: &Sample) -> Result<Estimate, Failure>;
 
-    /// Forget everything that was learned.
+    /// Positions may count from anywhere after this.
     ///
     /// # Errors
     /// As for `step`.
-    fn reset(&mut self) -> Result<(), Failure>;
+    fn lose_zeros(&mut self) -> Result<(), Failure>;
 
     /// The next sample may not be of its moment: use it, but learn nothing from it.
     ///
@@ -56,8 +56,8 @@ impl Step for Estimator {
         Ok(Estimator::step(self, sample))
     }
 
-    fn reset(&mut self) -> Result<(), Failure> {
-        Estimator::reset(self);
+    fn lose_zeros(&mut self) -> Result<(), Failure> {
+        Estimator::lose_zeros(self);
         Ok(())
     }
 
@@ -169,7 +169,7 @@ impl Pipeline {
         let Tick { mut estimate, external, motors, .. } = self.last?;
         estimate.sequence = sequence as u64;
         // Neither is true of an estimate that is carried on.
-        estimate.status = estimate.status & !(VALID | NODE_RESTARTED) | STALE | flags;
+        estimate.status = estimate.status & !(USABLE | NODE_RESTARTED) | STALE | flags;
         let external = external.map(|external| external.void(estimate.sequence));
         Some(self.publish((estimate, external), None, motors, stamp_ns))
     }
@@ -207,7 +207,7 @@ fn gated(mut estimate: Estimate, external: Option<External>) -> (Estimate, Optio
         && parts.iter().all(|p| finite(p.flexibility_torque, p.stiffness, p.deflection.is_nan()))
         && !estimate.stiffness_std.is_infinite();
     if !sound {
-        estimate.status &= !VALID;
+        estimate.status &= !USABLE;
     }
     let valid = estimate.status & VALID != 0;
     let external = external.map(|external| match valid && external.torque.is_finite() {
@@ -227,7 +227,7 @@ pub fn estimate(
     mut flags: u32,
 ) -> Result<(Estimate, Option<External>), Failure> {
     if flags & NODE_RESTARTED != 0 {
-        estimator.reset()?;
+        estimator.lose_zeros()?;
         flags |= RESTARTED;
     }
     if flags & (UNTIMED | CONTRADICTED) != 0 {
@@ -236,10 +236,10 @@ pub fn estimate(
     let mut estimate = estimator.step(sample)?;
     if estimator.alarm(sample, &estimate)? {
         flags |= MODEL_ALARM;
-        estimate.status &= !VALID; // a model that is not sufficient makes no number that may be used
+        estimate.status &= !USABLE; // a model that is not sufficient makes no number that may be used
     }
     if flags & CONTRADICTED != 0 {
-        estimate.status &= !VALID; // one of two readings lies, and nobody can say that it is not the one in use
+        estimate.status &= !USABLE; // one of two readings lies, and nobody can say that it is not the one in use
     }
     estimate.status |= flags;
     Ok((estimate, estimator.external()?))

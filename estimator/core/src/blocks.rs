@@ -44,6 +44,7 @@ struct Carried {
     x: Vector,
     precision: [Vector; UNKNOWNS],
     set: Set,
+    deflection: f64, // the largest, until then
 }
 
 /// Blocks of one motor's rows.
@@ -67,7 +68,8 @@ pub struct Blocks {
     projection: Option<Projection>,
     deflection: f64,
     noise: Noise,
-    own: f64, // rms that the chosen unknowns leave
+    own: f64,    // rms that the chosen unknowns leave
+    torque: f64, // rms of the transmission's torque
     quick: f64,
     peak: f64,       // of it in the open block …
     peaks: Vec<f64>, // … and in those of the ring
@@ -77,7 +79,7 @@ pub struct Blocks {
     skipped: u32, // rows that are still of what was before
     settle: u32,
     fitted: bool, // what the file knows has been held against a block
-    lost: bool,   // where the zero is
+    lost: bool,   // the zero: it may be anywhere, but for what motion shows
     powers: [f64; TERMS],
     frame: Option<Frame>,
     residual: Row,
@@ -88,6 +90,8 @@ pub struct Blocks {
     pub white: f64,
     /// Resolution of the deflection, rad: rounding moves its zero by as much.
     pub resolution: f64,
+    /// How far a lost zero is from where deflections are counted from, rad; 0: near.
+    pub off: f64,
     /// Whether evidence chose a zero that is not the declared one.
     pub moved: bool,
     /// Maximum a posteriori, with its covariance; `None`: not enough motion yet.
@@ -127,6 +131,7 @@ impl Blocks {
             deflection: 0.0,
             noise: Noise { variance: f64::NAN, correlated, tails: TAILS },
             own: f64::NAN,
+            torque: f64::NAN,
             quick: 0.0,
             peak: 0.0,
             peaks: Vec::with_capacity(BLOCKS),
@@ -144,6 +149,7 @@ impl Blocks {
             spoilt: false,
             white: 0.0,
             resolution: 0.0,
+            off: 0.0,
             moved: false,
             posterior: None,
         }
@@ -164,7 +170,7 @@ impl Blocks {
         (self.posterior, self.frame) = (self.spring.declared_posterior(), None);
         (self.oldest, self.moved, self.skipped, self.fitted) = (0, false, 0, false);
         self.end_doubt();
-        (self.noise.variance, self.own, self.quick) = (f64::NAN, f64::NAN, 0.0);
+        (self.noise.variance, self.own, self.torque, self.quick) = (f64::NAN, f64::NAN, f64::NAN, 0.0);
     }
 
     /// What follows is not as what was before: half a block is a block.
@@ -196,7 +202,7 @@ impl Blocks {
         self.doubting
     }
 
-    /// Whether the zero between the encoders is somewhere, and no motion has told where yet.
+    /// Whether motion alone tells where the zero between the encoders is.
     #[must_use]
     pub fn is_lost(&self) -> bool {
         self.lost
@@ -282,6 +288,7 @@ impl Blocks {
         self.noise.variance = EARLY * EARLY * balance::variance(block, balance::TORQUE);
         self.own = self.noise.variance.sqrt();
         self.residual = frame.residual(&prior.mean, known);
+        self.torque = self.spring.torque_rms(&projection, block);
         self.posterior = Some(Posterior { set: known, x: prior.mean, covariance, log_evidence: 0.0 });
         (self.frame, self.fitted) = (Some(frame), true);
     }
@@ -311,7 +318,7 @@ impl Blocks {
         let projection = self.projection.as_ref()?;
         let precision = inverse(&posterior.covariance, posterior.set);
         let spring = &self.spring;
-        let torque = projection.of(|phi| spring.law.at(phi + spring.zero, spring.parameters()).0);
+        let torque = spring.torque(projection);
         let known = Known {
             frame,
             residual: &self.residual,
@@ -355,7 +362,10 @@ impl Blocks {
             self.waiting.clear(); // samples that could not be used were among them: no joint is like that
         }
         if self.waiting.len() >= 2 && of_joint > DECIDED && explained {
-            self.begin(best.map_or(0, |cause| cause.entry().opens));
+            // All that the window does not tell apart is open.
+            let likely = odds.likely(|cause| cause.entry().opens != 0);
+            let opens = TABLE.iter().zip(likely).filter(|(_, likely)| *likely).map(|(entry, _)| entry.opens);
+            self.begin(opens.fold(0, |all, one| all | one));
             return Closed::Begun;
         }
         if self.doubted >= BLOCKS {
@@ -383,6 +393,7 @@ impl Blocks {
         if opens & set(SPRING) != 0 {
             self.spring.open();
         }
+        self.lost |= opens >> ZERO & 1 == 1;
         self.solve();
     }
 
@@ -394,15 +405,20 @@ impl Blocks {
             x[unknown] = self.spring.alpha[i];
         }
         x[ZERO] = self.spring.zero;
-        self.carried = Some(Carried { x, precision: inverse(&posterior.covariance, kept), set: kept });
+        self.carried = Some(Carried {
+            x,
+            precision: inverse(&posterior.covariance, kept),
+            set: kept,
+            deflection: self.deflection,
+        });
     }
 
     /// Where the zero between the encoders is, is not known any more.
     pub fn lose_zero(&mut self) {
-        self.carry(1 << ZERO | 1 << OFFSET);
+        self.carry(1 << ZERO);
         let (carried, noise, own) = (self.carried.take(), self.noise, self.own);
         self.forget_rows();
-        (self.carried, self.lost) = (carried, true);
+        (self.carried, self.lost, self.posterior) = (carried, true, None);
         if self.carried.is_some() {
             (self.noise, self.own) = (noise, own);
         }
@@ -452,6 +468,12 @@ impl Blocks {
         self.posterior
             .as_ref()
             .map_or(f64::INFINITY, |known| self.own.hypot(known.x[DRY].hypot(known.x[SOFT])))
+    }
+
+    /// rms of the transmission's torque over what is known, N·m; NaN before.
+    #[must_use]
+    pub fn torque_rms(&self) -> f64 {
+        self.torque
     }
 
     /// rms of what is left of the balance, over the rms of the measured torque without its mean.

@@ -325,6 +325,8 @@ fn information(reduced: &Matrix, precision: &Matrix, scale: f64) -> Matrix {
     out
 }
 
+const LIKELY: f64 = 0.05; // of the likeliest cause's probability: what is less is told from it
+
 impl Odds {
     fn normalise(&mut self, before: f64) {
         let each = (before / (CAUSES - 1) as f64).max(f64::MIN_POSITIVE).ln();
@@ -339,6 +341,14 @@ impl Odds {
     #[must_use]
     pub fn of(&self, cause: Cause) -> &Explanation {
         &self.of[cause as usize]
+    }
+
+    /// Which of some causes the window does not tell from the likeliest of them.
+    #[must_use]
+    pub fn likely(&self, wanted: impl Fn(Cause) -> bool) -> [bool; CAUSES] {
+        let Some(best) = self.best(&wanted) else { return [false; CAUSES] };
+        let least = LIKELY * self.of(best).probability;
+        std::array::from_fn(|k| wanted(TABLE[k].cause) && self.of[k].probability > least)
     }
 
     /// The most probable cause of those that are asked for.

@@ -61,11 +61,30 @@ impl Estimator {
         }
     }
 
+    /// Positions may count from anywhere after this, as those of a drive that has restarted.
+    ///
+    /// The joint is the same: what was learned of it is kept, but for where its zeros are.
+    pub fn lose_zeros(&mut self) {
+        match self {
+            Estimator::Paper(paper) => paper.reset(),
+            Estimator::Robust(robust) => robust.lose_zeros(),
+        }
+    }
+
     /// The next sample may not be of its moment: use it, but learn nothing from it.
     pub fn distrust(&mut self) {
         match self {
             Estimator::Paper(_) => {}
             Estimator::Robust(robust) => robust.distrust(),
+        }
+    }
+
+    /// Standard deviation of the joint's flexibility torque at the last sample, N·m; NaN: unknown.
+    #[must_use]
+    pub fn flexibility_torque_std(&self) -> f64 {
+        match self {
+            Estimator::Paper(_) => f64::NAN,
+            Estimator::Robust(robust) => robust.flexibility_torque_std(),
         }
     }
 

@@ -276,6 +276,7 @@ impl Part {
             flexibility_torque: torque,
             stiffness: self.stiffness,
             stiffness_std: f64::NAN,
+            flexibility_torque_std: f64::NAN,
             deflection: phi,
         };
     }
@@ -388,7 +389,7 @@ impl Paper {
             }
         }
         if self.parts.iter().all(Part::of_use) {
-            flags |= status::VALID;
+            flags |= status::USABLE;
         }
         let flexible = self.parts.iter().any(|part| !part.rigid);
         if accepted.periods > 0 && flexible && self.parts.iter().all(|p| p.rigid || p.observable()) {

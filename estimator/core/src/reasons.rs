@@ -17,6 +17,8 @@ pub enum Reason {
     Open,
     /// The relative standard deviation of the stiffness, above what was asked for.
     Imprecise(f64),
+    /// The standard deviation of the torque over the torque's rms, above what was asked for.
+    TorqueImprecise(f64),
     /// The stiffness is not above zero.
     NotPositive,
     /// The balance fits no motor of the declared inertia and damping.
@@ -41,6 +43,7 @@ impl Reason {
             Reason::Unmoved => "unmoved",
             Reason::Open => "open",
             Reason::Imprecise(_) => "imprecise",
+            Reason::TorqueImprecise(_) => "torque_imprecise",
             Reason::NotPositive => "not_positive",
             Reason::Motor => "motor",
             Reason::Unexplained(_) => "unexplained",
@@ -54,7 +57,7 @@ impl Reason {
     #[must_use]
     pub fn share(self) -> f64 {
         match self {
-            Reason::Imprecise(share) | Reason::Unexplained(share) => share,
+            Reason::Imprecise(share) | Reason::TorqueImprecise(share) | Reason::Unexplained(share) => share,
             _ => f64::NAN,
         }
     }

@@ -18,7 +18,7 @@ use crate::reasons::{Reason, Why};
 use crate::sample::{Estimate, MOTORS, Sample, TransmissionEstimate, joint_estimate, status};
 use crate::sample_validator::SampleValidator;
 use crate::settings::{Method, Priors, Settings};
-use crate::side::{Moment, SETTLE_DELAYS, Side};
+use crate::side::{Moment, SETTLE_DELAYS, Shift, Side};
 use crate::signals::{Channel, Filters};
 use crate::suspicion::Suspicion;
 
@@ -54,6 +54,7 @@ pub struct Robust {
     noise_gains: [f64; 3],
     zeros: Positions, // where the encoders' zeros have moved to
     last: Inputs,
+    centred: bool,                     // deflections, since zeros were lost
     begins: bool,                      // with the next sample that the corrections let pass …
     jumped: Option<[f64; MOTORS + 1]>, // … after encoders moved their zeros
     started: bool,
@@ -115,6 +116,7 @@ impl Robust {
             zeros: Positions::default(),
             last: Inputs::default(),
             begins: true,
+            centred: true,
             jumped: None,
             started: false,
             tick: 0,
@@ -140,8 +142,22 @@ impl Robust {
         self.torque_noise = [NoiseMeter::default(); MOTORS];
         (self.zeros, self.last, self.begins, self.jumped) =
             (Positions::default(), Inputs::default(), true, None);
+        self.centred = true;
         (self.started, self.tick, self.unsettled, self.said, self.rejected) = (false, 0, 0, 0, 0);
         (self.sequence, self.refused, self.external, self.why, self.estimate) = (0, None, None, None, None);
+    }
+
+    /// Positions may count from anywhere after this: nothing that depends on where their zeros are is known.
+    pub fn lose_zeros(&mut self) {
+        if !self.started {
+            return self.reset(); // the zeros are those that are declared
+        }
+        self.validator.reset();
+        self.corrections.reset();
+        self.momentum.iter_mut().for_each(LinkMomentum::reset);
+        self.sides.iter_mut().for_each(|side| side.move_zero(false));
+        (self.begins, self.centred, self.jumped) = (true, false, None);
+        (self.rejected, self.refused, self.external, self.why, self.estimate) = (0, None, None, None, None);
     }
 
     /// The next sample may not be of its moment: learn nothing until the filters have forgotten it.
@@ -167,6 +183,12 @@ impl Robust {
     #[must_use]
     pub fn residual(&self) -> f64 {
         self.sides.iter().map(|side| side.blocks.misfit()).fold(f64::NAN, f64::max)
+    }
+
+    /// Standard deviation of the joint's flexibility torque at the last sample that was used, N·m.
+    #[must_use]
+    pub fn flexibility_torque_std(&self) -> f64 {
+        self.estimate.map_or(f64::NAN, |estimate| estimate.flexibility_torque_std)
     }
 
     /// Effects of one motor that nobody declared and evidence chose.
@@ -216,6 +238,9 @@ impl Robust {
         let (at, present) = (self.positions(&corrected.aligned), self.positions(&corrected.present));
         if let Some(jumps) = self.jumped.take() {
             self.move_zeros(jumps, &at, sample.sequence);
+        }
+        if !std::mem::replace(&mut self.centred, true) {
+            self.centre(&at);
         }
         self.sequence = sample.sequence;
         let mut torque = corrected.aligned.motor_torque;
@@ -302,7 +327,8 @@ impl Robust {
             }
             if usable && side.excited {
                 side.blocks.spoilt = self.refused.is_some();
-                shift = side.learn(&self.link, noise, torque_noise, &self.noise_gains).or(shift);
+                let found = side.learn(&self.link, noise, torque_noise, &self.noise_gains);
+                shift = found.map(|found| (i, found)).or(shift);
             }
         }
         if self.momentum.is_some() {
@@ -312,8 +338,10 @@ impl Robust {
         }
         self.last = *now;
         self.unsettled -= 1;
-        if let Some(periods) = shift {
-            self.shift(periods);
+        match shift {
+            Some((_, Shift::Late(periods))) => self.shift(periods),
+            Some((i, Shift::Zero(off))) => self.recentre(i, off),
+            None => {}
         }
     }
 
@@ -336,6 +364,18 @@ impl Robust {
         }
     }
 
+    /// The zero of one motor has been found so far from where its deflections are counted from.
+    fn recentre(&mut self, i: usize, off: f64) {
+        self.zeros.motor[i] += off;
+        self.last.at.motor[i] -= off;
+        self.last.present.motor[i] -= off;
+        self.unsettled = self.settle;
+        let at = &self.last.at;
+        let side = &mut self.sides[i];
+        side.restart(at.motor[i], at.deflection(i), self.last.torque[i]);
+        side.move_zero(false);
+    }
+
     /// What the transmissions do to the link; `None` where a curve is not trusted.
     fn carried(&self, now: &Positions) -> Option<Carried> {
         let pulls = if self.arrangement == Arrangement::Antagonistic { self.motors } else { 1 };
@@ -344,6 +384,15 @@ impl Robust {
             all = all.and(side.carried(now.deflection(i), self.noise_of(i)[0])?);
         }
         Some(all)
+    }
+
+    /// Where the zeros are is not known: deflections are counted from this moment's.
+    fn centre(&mut self, at: &Positions) {
+        self.zeros = Positions::default();
+        if self.flexible {
+            let m = self.motors;
+            self.zeros.motor[..m].iter_mut().zip(&at.motor).for_each(|(zero, theta)| *zero = theta - at.link);
+        }
     }
 
     /// Encoders have moved their zeros: go on as if they had not.
@@ -391,14 +440,11 @@ impl Robust {
         let settled = self.unsettled <= 0;
         let parts = self.read(0.0);
         self.sides.iter_mut().for_each(Side::act);
-        let why = |(i, side): (usize, &Side)| {
-            let mut why = Why::new(side.reason(&parts[i], self.valid_within, settled)?, Some(i));
-            why.changes = side.likely_causes();
-            Some(why)
-        };
-        self.why = self.sides.iter().enumerate().find_map(why);
-        if flags & status::INPUT_REJECTED != 0 {
-            self.why = Some(Why::new(Reason::Rejected, None));
+        let [why, of_torque] = self.reasons(&parts, settled);
+        let rejected = (flags & status::INPUT_REJECTED != 0).then(|| Why::new(Reason::Rejected, None));
+        self.why = rejected.or(why);
+        if rejected.or(of_torque).is_none() {
+            flags |= status::TORQUE_VALID;
         }
         if self.sides.iter().any(|side| side.doubtful || side.followed_s > 0.0) {
             flags |= status::CHANGED;
@@ -437,20 +483,39 @@ impl Robust {
             return joint_estimate(self.arrangement, sequence, flags, self.read(0.0), self.motors);
         };
         let mut flags = flags | last.status & (status::CHANGED | status::RESTARTED);
+        let was = |bit: u32| last.status & bit != 0;
         if since > TRUST_S {
             self.why = rejected;
             return Estimate { sequence, status: flags, ..last };
         }
         let parts = self.read(since);
-        if last.status & status::VALID != 0 {
-            let reason = |(i, side): (usize, &Side)| side.reason(&parts[i], self.valid_within, true);
-            let why = self.sides.iter().enumerate().find_map(reason);
-            self.why = why.map(|reason| Why::new(reason, None));
+        let [why, of_torque] = self.reasons(&parts, true);
+        if was(status::VALID) {
+            self.why = why;
         }
         if self.why.is_none() {
             flags |= status::VALID;
         }
+        if was(status::TORQUE_VALID) && of_torque.is_none() {
+            flags |= status::TORQUE_VALID;
+        }
         joint_estimate(self.arrangement, sequence, flags, parts, self.motors)
+    }
+
+    /// Why the joint's numbers may not be used, and why its torque may not.
+    fn reasons(&self, parts: &[TransmissionEstimate; MOTORS], settled: bool) -> [Option<Why>; 2] {
+        let mut found = [None; 2];
+        for (i, (side, part)) in self.sides.iter().zip(parts).enumerate() {
+            let reasons = side.reasons(part, self.valid_within, settled);
+            for (found, reason) in found.iter_mut().zip(reasons) {
+                *found = found.or(reason.map(|reason| Why {
+                    reason,
+                    motor: Some(i),
+                    changes: side.likely_causes(),
+                }));
+            }
+        }
+        found
     }
 
     /// Each transmission's estimate, so long after the last sample.

@@ -43,14 +43,19 @@ macro_rules! status_bits {
 pub mod status {
     status_bits! {
         VALID = 0, OBSERVABLE = 1, GAP = 2, CHANGED = 3, MODEL_ALARM = 4, INPUT_REJECTED = 5, RESTARTED = 6,
+        TORQUE_VALID = 7,
     }
+    /// All numbers may be used.
+    pub const USABLE: u32 = VALID | TORQUE_VALID;
 }
 
-/// One transmission: torque, stiffness and its standard deviation, deflection.
+/// One transmission: torque and stiffness with their standard deviations, deflection.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TransmissionEstimate {
     /// τ_e, N·m.
     pub flexibility_torque: f64,
+    /// Its standard deviation, N·m.
+    pub flexibility_torque_std: f64,
     /// σ, N·m/rad.
     pub stiffness: f64,
     /// Its standard deviation, N·m/rad.
@@ -63,6 +68,7 @@ impl TransmissionEstimate {
     /// Nothing is known yet.
     pub const NOTHING: TransmissionEstimate = TransmissionEstimate {
         flexibility_torque: f64::NAN,
+        flexibility_torque_std: f64::NAN,
         stiffness: f64::NAN,
         stiffness_std: f64::NAN,
         deflection: f64::NAN,
@@ -78,6 +84,8 @@ pub struct Estimate {
     pub status: u32,
     /// τ_e,t, N·m.
     pub flexibility_torque: f64,
+    /// Its standard deviation, N·m.
+    pub flexibility_torque_std: f64,
     /// σ_t, N·m/rad.
     pub stiffness: f64,
     /// Its standard deviation, N·m/rad.
@@ -102,6 +110,7 @@ pub fn joint_estimate(
         sequence,
         status,
         flexibility_torque: first.flexibility_torque,
+        flexibility_torque_std: first.flexibility_torque_std,
         stiffness: first.stiffness,
         stiffness_std: first.stiffness_std,
         transmissions,
@@ -109,6 +118,7 @@ pub fn joint_estimate(
     };
     if arrangement == Arrangement::Antagonistic {
         joint.flexibility_torque += second.flexibility_torque;
+        joint.flexibility_torque_std = first.flexibility_torque_std.hypot(second.flexibility_torque_std);
         joint.stiffness += second.stiffness;
         joint.stiffness_std = first.stiffness_std.hypot(second.stiffness_std);
     }

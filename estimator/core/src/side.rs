@@ -5,10 +5,11 @@ use serde::{Deserialize, Serialize};
 use crate::align::Inputs;
 use crate::balance::{Balance, correlated_rows};
 use crate::blocks::{Blocks, Closed};
-use crate::causes::{CAUSES, Cause, TABLE};
-use crate::deflection::{DeflectionFilter, Present, Tuning};
+use crate::causes::{CAUSES, Cause};
+use crate::deflection::{AT_REST, DeflectionFilter, Motion, Present, Tuning};
 use crate::effects::{Coordinates, MotorEffects};
 use crate::external::Carried;
+use crate::gram::Vector;
 use crate::laws::Law;
 use crate::model::Motor;
 use crate::reasons::Reason;
@@ -27,7 +28,6 @@ const HALF: f64 = 0.5; // periods: what is later is shifted, the rest is a colum
 const SURE: f64 = 3.0; // standard deviations of a delay that is shifted
 const CONFIRMED_S: f64 = 0.05; // of rows that agree with what is known before a moved zero is believed
 const FOLLOWED_S: f64 = 0.5; // how long it is said that a change has been followed
-const LIKELY: f64 = 0.05; // of the likeliest cause's probability: less is not named beside it
 const DRIFT: f64 = 1e-4; // relative growth of the standard deviation per second without motion …
 const WIDEST: f64 = 0.02; // … up to this
 
@@ -46,6 +46,15 @@ pub struct Moment<'a> {
     pub usable: bool,
 }
 
+/// What the inputs are shifted by, before anything is learned from them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Shift {
+    /// The link is so many periods late.
+    Late(f64),
+    /// The zero is at this deflection, rad.
+    Zero(f64),
+}
+
 /// One motor: its columns, what they have taught, and its declared effects.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Side {
@@ -59,6 +68,7 @@ pub struct Side {
     pub deflection: DeflectionFilter,
     acting: f64, // torque of the transmission at the last sample
     stiffness: f64,
+    usual: Motion, // of blocks that were explained
     /// What has been learned.
     pub blocks: Blocks,
     effects: MotorEffects,
@@ -106,6 +116,7 @@ impl Side {
                 period_s,
                 look_s,
             ),
+            usual: AT_REST,
             acting: 0.0,
             stiffness: 0.0,
             blocks,
@@ -249,7 +260,7 @@ impl Side {
         });
     }
 
-    /// The row of this moment; by how many periods the link has been found late.
+    /// The row of this moment; what has been found to be shifted.
     ///
     /// `noise`: variances of θ and q; `torque_noise`: of τ; `gains`: of the filters for white noise.
     pub fn learn(
@@ -258,7 +269,7 @@ impl Side {
         noise: [f64; 2],
         torque_noise: f64,
         gains: &[f64; 3],
-    ) -> Option<f64> {
+    ) -> Option<Shift> {
         self.held_s = 0.0;
         self.unconfirmed_s -= self.period;
         let positions = noise[0] + noise[1];
@@ -267,13 +278,22 @@ impl Side {
             + gains[2] * self.inertia.powi(2) * noise[0];
         let row = self.balance.row(link);
         let closed = self.blocks.add(&row)?;
-        if closed == Closed::Begun {
-            self.followed_s = FOLLOWED_S;
-        }
+        let doubted = self.doubtful;
         self.judge();
+        match closed {
+            Closed::Begun => self.followed_s = FOLLOWED_S,
+            Closed::Added if doubted => self.deflection.recall(self.usual), // what was read since may be no motion
+            Closed::Added => self.usual = self.deflection.motion(),
+            Closed::Unexplained => {}
+        }
+        let off = std::mem::take(&mut self.blocks.off);
+        if off != 0.0 {
+            return Some(Shift::Zero(off));
+        }
         let (late, std) = self.blocks.delay().filter(|_| !self.doubtful)?;
         let (periods, std) = (late / self.period, std / self.period);
-        (periods.abs() > HALF && periods.abs() - HALF > SURE * std).then(|| periods.round())
+        let late = periods.abs() > HALF && periods.abs() - HALF > SURE * std;
+        late.then(|| Shift::Late(periods.round()))
     }
 
     /// What the blocks say of themselves, at their ends.
@@ -319,25 +339,52 @@ impl Side {
         };
         let more = self.effects.spring(phi);
         let stiffness = at.stiffness + more.1;
-        let stiffness_std = self.blocks.posterior.as_ref().map_or(f64::NAN, |known| {
-            let variance = known.variance_along(&at.by_stiffness);
-            // A stiffness that changes with φ is as uncertain as φ is.
-            let held = (DRIFT * self.held_s).min(WIDEST) * stiffness;
-            (variance + at.bend.powi(2) * self.deflection.variance() + held * held).sqrt()
-        });
-        let trusted = self.fits && at.stiffness > 0.0;
-        let flexibility_torque = if trusted { at.torque + more.0 } else { left() };
+        let held = (DRIFT * self.held_s).min(WIDEST);
+        // A curve is as uncertain as its parameters, and as φ is where it bends.
+        let std = |by: &Vector, slope: f64, value: f64| {
+            let variance = self.blocks.posterior.as_ref().map_or(f64::NAN, |known| known.variance_along(by));
+            (variance + slope.powi(2) * self.deflection.variance() + (held * value).powi(2)).sqrt()
+        };
+        let stiffness_std = std(&at.by_stiffness, at.bend, stiffness);
+        let (flexibility_torque, flexibility_torque_std) = if self.fits && at.stiffness > 0.0 {
+            let torque = at.torque + more.0;
+            (torque, std(&at.by_torque, stiffness, torque))
+        } else {
+            (left(), f64::NAN)
+        };
         TransmissionEstimate {
             flexibility_torque,
+            flexibility_torque_std,
             stiffness,
             stiffness_std,
             deflection: phi + self.blocks.spring.zero,
         }
     }
 
-    /// Why the estimate at this moment may not be used.
+    /// Why the estimate at this moment may not be used, and its torque.
     #[must_use]
-    pub fn reason(&self, part: &TransmissionEstimate, valid_within: f64, settled: bool) -> Option<Reason> {
+    pub fn reasons(
+        &self,
+        part: &TransmissionEstimate,
+        valid_within: f64,
+        settled: bool,
+    ) -> [Option<Reason>; 2] {
+        if let Some(reason) = self.unusable(part, settled) {
+            return [Some(reason); 2];
+        }
+        if self.rigid {
+            return [None; 2];
+        }
+        let lost = |reason: Reason| if self.blocks.is_lost() { Reason::Lost } else { reason };
+        let share = part.flexibility_torque_std / self.blocks.torque_rms();
+        let imprecise = share >= valid_within || part.flexibility_torque_std.is_nan();
+        let torque = imprecise.then_some(Reason::TorqueImprecise(share)).map(lost);
+        let stiffness = Reason::of_precision(part.stiffness, part.stiffness_std, valid_within).map(lost);
+        [stiffness.or(torque), torque]
+    }
+
+    /// Why none of the numbers at this moment may be used.
+    fn unusable(&self, part: &TransmissionEstimate, settled: bool) -> Option<Reason> {
         if self.rigid {
             return (!part.flexibility_torque.is_finite()).then_some(Reason::Settling);
         }
@@ -345,21 +392,19 @@ impl Side {
             return Some(Reason::Settling);
         }
         if self.blocks.posterior.is_none() {
-            return Some(if settled { Reason::Unmoved } else { Reason::Settling });
+            let unmoved = if self.blocks.is_lost() { Reason::Lost } else { Reason::Unmoved };
+            return Some(if settled { unmoved } else { Reason::Settling });
         }
         if self.doubtful {
             return Some(Reason::Changed);
-        }
-        if self.blocks.is_lost() {
-            return Some(Reason::Lost);
         }
         if !self.fits {
             return Some(Reason::Unexplained(self.unexplained));
         }
         let reach = (BEYOND * self.balance.largest()).min(EDGE * self.blocks.spring.reach());
-        let within = part.deflection.abs() < if reach > 0.0 { reach } else { f64::INFINITY };
-        Reason::of_precision(part.stiffness, part.stiffness_std, valid_within)
-            .or((!within).then_some(Reason::Beyond))
+        let phi = part.deflection - self.blocks.spring.zero;
+        let within = phi.abs() < if reach > 0.0 { reach } else { f64::INFINITY };
+        (!within).then_some(Reason::Beyond)
     }
 
     /// Which causes the window does not tell from the likeliest one.
@@ -367,9 +412,7 @@ impl Side {
     pub fn likely_causes(&self) -> [bool; CAUSES] {
         let Some(odds) = self.blocks.odds() else { return [false; CAUSES] };
         let named = |cause: Cause| !matches!(cause, Cause::Nothing | Cause::Noise);
-        let Some(best) = odds.best(named) else { return [false; CAUSES] };
-        let least = LIKELY * odds.of(best).probability;
-        std::array::from_fn(|k| named(TABLE[k].cause) && odds.of[k].probability > least)
+        odds.likely(named)
     }
 
     /// What it does to the link at a deflection as it is measured; `None` where no curve is trusted.

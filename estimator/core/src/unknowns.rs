@@ -272,8 +272,7 @@ impl Spring {
             place(&mut frame.directions[unknown], &projection.fit(&column), 1.0);
         }
         if !self.is_linear() {
-            let torque = projection.of(|phi| self.law.at(phi + self.zero, alpha).0);
-            place(&mut frame.left, &torque, -1.0);
+            place(&mut frame.left, &self.torque(projection), -1.0);
         }
         let slope = self.slope(projection);
         place(&mut frame.directions[ZERO], &slope, 1.0);
@@ -285,6 +284,20 @@ impl Spring {
             frame.set &= !(1 << ZERO | 1 << LATE);
         }
         frame
+    }
+
+    /// τ_e as a sum of the family's functions.
+    #[must_use]
+    pub fn torque(&self, projection: &Projection) -> Coefficients {
+        projection.of(|phi| self.law.at(phi + self.zero, self.parameters()).0)
+    }
+
+    /// rms of τ_e over some rows, N·m.
+    #[must_use]
+    pub fn torque_rms(&self, projection: &Projection, rows: &Gram) -> f64 {
+        let mut direction = [0.0; COLUMNS];
+        place(&mut direction, &self.torque(projection), 1.0);
+        (rows.quadratic(&direction) / rows.rows).sqrt()
     }
 
     /// σ as a sum of the family's functions.

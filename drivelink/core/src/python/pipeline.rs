@@ -176,8 +176,8 @@ impl Step for Driver {
         .map_err(Failure::from)
     }
 
-    fn reset(&mut self) -> Result<(), Failure> {
-        Python::attach(|py| self.estimator.call_method0(py, "reset").map(drop)).map_err(Failure::from)
+    fn lose_zeros(&mut self) -> Result<(), Failure> {
+        Python::attach(|py| self.estimator.call_method0(py, "lose_zeros").map(drop)).map_err(Failure::from)
     }
 
     fn distrust(&mut self) -> Result<(), Failure> {

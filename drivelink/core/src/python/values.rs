@@ -27,7 +27,8 @@ pub(super) type EstimateFields = (u64, i64, f64, f64, f64, Vec<(f64, f64, f64, f
 
 pub(super) fn transmission_of(numbers: (f64, f64, f64, f64)) -> TransmissionEstimate {
     let (flexibility_torque, stiffness, stiffness_std, deflection) = numbers;
-    TransmissionEstimate { flexibility_torque, stiffness, stiffness_std, deflection }
+    let flexibility_torque_std = f64::NAN;
+    TransmissionEstimate { flexibility_torque, flexibility_torque_std, stiffness, stiffness_std, deflection }
 }
 
 pub(super) fn estimate_from(object: &Bound<'_, PyAny>) -> PyResult<Estimate> {
@@ -45,6 +46,7 @@ pub(super) fn estimate_from(object: &Bound<'_, PyAny>) -> PyResult<Estimate> {
         sequence,
         status: status as u32,
         flexibility_torque,
+        flexibility_torque_std: f64::NAN,
         stiffness,
         stiffness_std,
         transmissions,

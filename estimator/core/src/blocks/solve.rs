@@ -7,8 +7,9 @@ use crate::gram::{
     solve, unknowns,
 };
 use crate::student::t_95;
-use crate::unknowns::{ACTIVE, CANDIDATES, RATE, SPRING, Scale, ZERO};
+use crate::unknowns::{ACTIVE, CANDIDATES, RATE, SPRING, Scale, Spring, ZERO};
 
+const ZEROS: i32 = 12; // of a lost zero that are tried to either side, over the deflection seen
 const STEPS: usize = 3; // of Gauss and Newton's iteration at a block's end
 const EXACT: f64 = 3e-4; // of the torque: what filters, sampling and rounding leave of a true model
 const MISSING: f64 = 0.1; // share of what no noise explains that one unknown takes in: there are some ten of them
@@ -16,14 +17,18 @@ const ACCUSED: f64 = 1000.0; // odds at which the declared zero is called wrong
 
 impl Blocks {
     pub(super) fn prior(&self, total: &Gram, frame: &Frame, zero_std: f64) -> Prior {
+        self.prior_of(&self.spring, total, frame, zero_std)
+    }
+
+    fn prior_of(&self, spring: &Spring, total: &Gram, frame: &Frame, zero_std: f64) -> Prior {
         let scale = Scale { zero_std, deflection: self.deflection, period_s: self.period };
-        let mut prior = self.spring.prior(&self.motor, &self.priors, total, frame, &scale);
+        let mut prior = spring.prior(&self.motor, &self.priors, total, frame, &scale);
         let Some(carried) = &self.carried else { return prior };
         for i in unknowns(carried.set) {
             prior.precision[i] = carried.precision[i];
             prior.mean[i] = carried.x[i];
         }
-        self.spring.from_base(&mut prior.mean, carried.set);
+        spring.from_base(&mut prior.mean, carried.set);
         prior
     }
 
@@ -51,6 +56,29 @@ impl Blocks {
         self.spring.known |= best.is_some();
     }
 
+    /// Where the zero is by evidence, in steps over the deflections that the joint has had.
+    fn find_zero(&mut self, total: &Gram, noise: f64) -> f64 {
+        let (Some(projection), Some(carried)) = (&self.projection, &self.carried) else { return 0.0 };
+        let within = carried.deflection;
+        let mut best = (f64::NEG_INFINITY, 0.0);
+        let mut tried = self.spring.clone();
+        for k in -ZEROS..=ZEROS {
+            tried.zero = within * f64::from(k) / f64::from(ZEROS);
+            if tried.zero.abs() + self.deflection > tried.reach() {
+                continue;
+            }
+            let frame = tried.frame(projection);
+            let prior = self.prior_of(&tried, total, &frame, self.deflection);
+            let log = log_evidence(&frame.reduce(total), frame.set & ACTIVE, &prior, noise);
+            if log > best.0 {
+                best = (log, tried.zero);
+            }
+        }
+        // It is within a step of there.
+        self.carried.iter_mut().for_each(|carried| carried.deflection = within / f64::from(ZEROS));
+        best.1
+    }
+
     pub(super) fn solve(&mut self) {
         let mut total = Gram::default();
         self.ring.iter().for_each(|block| total.add(block, 1.0));
@@ -62,6 +90,13 @@ impl Blocks {
             && (!self.spring.known || self.ring.len() <= FEWEST && self.carried.is_none())
         {
             self.start(&total, self.noise.variance * self.correlated);
+        }
+        if self.lost && self.ring.len() == 1 && !self.spring.is_constant() {
+            self.spring.zero = self.find_zero(&total, self.noise.variance * self.correlated);
+            if self.spring.zero.abs() > self.deflection / f64::from(ZEROS) {
+                self.off = std::mem::take(&mut self.spring.zero);
+                return;
+            }
         }
         let Some(projection) = self.projection.clone() else { return };
         let near = self.priors.deflection_offset * self.deflection + self.resolution;
@@ -91,13 +126,9 @@ impl Blocks {
                 continue;
             }
             self.widen(&frame, &mut chosen, &used, noise, own, &total);
+            self.torque = self.spring.torque_rms(&projection, &total);
             (self.posterior, self.frame) = (Some(chosen), Some(frame));
             break;
-        }
-        if self.lost {
-            let zero =
-                self.posterior.as_ref().map_or(f64::INFINITY, |known| known.covariance[ZERO][ZERO].sqrt());
-            self.lost = zero > self.priors.deflection_offset.max(0.02) * self.deflection;
         }
     }
 

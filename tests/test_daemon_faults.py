@@ -180,7 +180,7 @@ def test_whatever_goes_wrong_in_the_configuration_of_a_node_is_that_nodes_own(
             " ".join(made.events)
         )
         monkeypatch.undo()
-        assert any(valid(made.run(ENOUGH)))
+        assert any(valid(made.run(ENOUGH + 3000)))  # and until motion has shown its zero
 
 
 def test_cycles_lost_because_this_machine_is_too_slow_are_said_with_their_number() -> None:

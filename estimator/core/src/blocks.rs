@@ -13,6 +13,8 @@ use crate::spring::{Projection, TERMS};
 use crate::student::f_quantile;
 use crate::unknowns::{ACTIVE, CANDIDATES, DRY, LATE, OFFSET, RATE, Reading, SOFT, SPRING, Spring, ZERO};
 
+/// Share of the torque that a curve may leave unexplained.
+pub const USEFUL: f64 = 0.2;
 const BLOCK_S: f64 = 0.25; // of motion: longer than the filters' memory, so that blocks are nearly independent
 const BLOCKS: usize = 100; // 25 s of motion: what a joint's temperature and load leave as they are
 const FEWEST: usize = 8; // blocks before one is held against the others
@@ -90,6 +92,7 @@ pub struct Blocks {
     pub white: f64,
     /// Resolution of the deflection, rad: rounding moves its zero by as much.
     pub resolution: f64,
+    located: bool, // a lost zero, so well that the balance can be linearised
     /// How far a lost zero is from where deflections are counted from, rad; 0: near.
     pub off: f64,
     /// Whether evidence chose a zero that is not the declared one.
@@ -149,6 +152,7 @@ impl Blocks {
             spoilt: false,
             white: 0.0,
             resolution: 0.0,
+            located: false,
             off: 0.0,
             moved: false,
             posterior: None,
@@ -206,6 +210,12 @@ impl Blocks {
     #[must_use]
     pub fn is_lost(&self) -> bool {
         self.lost
+    }
+
+    /// Whether a lost zero has been found by less than what ends a doubt.
+    #[must_use]
+    pub fn is_unconfirmed(&self) -> bool {
+        self.lost && self.ring.len() <= CONVINCING && !self.spring.is_constant()
     }
 
     /// Whether enough is known to hold rows against it.
@@ -274,6 +284,9 @@ impl Blocks {
         }
         self.end_doubt();
         self.solve();
+        if self.lost && self.located && self.unexplained() > USEFUL {
+            self.lose_zero(); // it was located wrongly
+        }
         Closed::Added
     }
 
@@ -393,7 +406,7 @@ impl Blocks {
         if opens & set(SPRING) != 0 {
             self.spring.open();
         }
-        self.lost |= opens >> ZERO & 1 == 1;
+        (self.lost, self.located) = (self.lost || opens >> ZERO & 1 == 1, true); // it is not far
         self.solve();
     }
 
@@ -415,13 +428,25 @@ impl Blocks {
 
     /// Where the zero between the encoders is, is not known any more.
     pub fn lose_zero(&mut self) {
-        self.carry(1 << ZERO);
+        if let Some(carried) = self.carried.as_ref().filter(|_| self.lost) {
+            // What was learned without a zero may be of another one: as it was before.
+            self.spring.alpha[..TERMS].copy_from_slice(&carried.x[SPRING]);
+        } else {
+            self.carry(1 << ZERO);
+        }
         let (carried, noise, own) = (self.carried.take(), self.noise, self.own);
         self.forget_rows();
-        (self.carried, self.lost, self.posterior) = (carried, true, None);
+        (self.carried, self.lost, self.posterior, self.located) = (carried, true, None, false);
+        self.spring.zero = 0.0; // deflections are counted from elsewhere
         if self.carried.is_some() {
             (self.noise, self.own) = (noise, own);
         }
+    }
+
+    /// The deflections are counted from near the zero, from now on.
+    pub fn recentre(&mut self) {
+        self.lose_zero();
+        self.located = true;
     }
 
     /// The spring's columns have grown by these factors.

@@ -372,8 +372,7 @@ impl Robust {
         self.unsettled = self.settle;
         let at = &self.last.at;
         let side = &mut self.sides[i];
-        side.restart(at.motor[i], at.deflection(i), self.last.torque[i]);
-        side.move_zero(false);
+        side.recentre(at.motor[i], at.deflection(i), self.last.torque[i]);
     }
 
     /// What the transmissions do to the link; `None` where a curve is not trusted.

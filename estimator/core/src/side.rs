@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::align::Inputs;
 use crate::balance::{Balance, correlated_rows};
-use crate::blocks::{Blocks, Closed};
+use crate::blocks::{Blocks, Closed, USEFUL};
 use crate::causes::{CAUSES, Cause};
 use crate::deflection::{AT_REST, DeflectionFilter, Motion, Present, Tuning};
 use crate::effects::{Coordinates, MotorEffects};
@@ -21,7 +21,6 @@ use crate::unknowns::{DAMPING, INERTIA, SPRING};
 
 /// Filter delays after which a wrong start is forgotten.
 pub const SETTLE_DELAYS: f64 = 4.5;
-const USEFUL: f64 = 0.2; // share of the torque that a curve may leave unexplained
 const BEYOND: f64 = 1.5; // times the largest deflection: no more is known of the curve
 const EDGE: f64 = 0.98; // of where a law ends
 const HALF: f64 = 0.5; // periods: what is later is shifted, the rest is a column
@@ -181,6 +180,13 @@ impl Side {
             self.balance.forget_range();
         }
         self.judge();
+    }
+
+    /// Where its deflections are counted from has been moved to near the zero.
+    pub fn recentre(&mut self, theta: f64, phi: f64, torque: f64) {
+        self.restart(theta, phi, torque);
+        self.blocks.recentre();
+        self.balance.forget_range();
     }
 
     /// Whether a deflection is one that the joint can have.
@@ -391,7 +397,8 @@ impl Side {
         if self.deflection.unsettled > 0 || self.unconfirmed_s > 0.0 {
             return Some(Reason::Settling);
         }
-        if self.blocks.posterior.is_none() {
+        let nothing = self.blocks.posterior.is_none();
+        if nothing || self.blocks.is_unconfirmed() {
             let unmoved = if self.blocks.is_lost() { Reason::Lost } else { Reason::Unmoved };
             return Some(if settled { unmoved } else { Reason::Settling });
         }

@@ -56,27 +56,23 @@ impl Blocks {
         self.spring.known |= best.is_some();
     }
 
-    /// Where the zero is by evidence, in steps over the deflections that the joint has had.
-    fn find_zero(&mut self, total: &Gram, noise: f64) -> f64 {
-        let (Some(projection), Some(carried)) = (&self.projection, &self.carried) else { return 0.0 };
-        let within = carried.deflection;
-        let mut best = (f64::NEG_INFINITY, 0.0);
+    /// Where a lost zero is by evidence, in steps over the deflections that the joint has had; `None`: it may be elsewhere.
+    fn locate(&self, total: &Gram, noise: f64) -> Option<f64> {
+        let (projection, carried) = (self.projection.as_ref()?, self.carried.as_ref()?);
         let mut tried = self.spring.clone();
-        for k in -ZEROS..=ZEROS {
-            tried.zero = within * f64::from(k) / f64::from(ZEROS);
+        let step = carried.deflection / f64::from(ZEROS);
+        let logs: [f64; 2 * ZEROS as usize + 1] = std::array::from_fn(|k| {
+            tried.zero = step * (k as f64 - f64::from(ZEROS));
             if tried.zero.abs() + self.deflection > tried.reach() {
-                continue;
+                return f64::NEG_INFINITY;
             }
             let frame = tried.frame(projection);
             let prior = self.prior_of(&tried, total, &frame, self.deflection);
-            let log = log_evidence(&frame.reduce(total), frame.set & ACTIVE, &prior, noise);
-            if log > best.0 {
-                best = (log, tried.zero);
-            }
-        }
-        // It is within a step of there.
-        self.carried.iter_mut().for_each(|carried| carried.deflection = within / f64::from(ZEROS));
-        best.1
+            log_evidence(&frame.reduce(total), frame.set & ACTIVE, &prior, noise)
+        });
+        let best = (0..logs.len()).max_by(|a, b| logs[*a].total_cmp(&logs[*b]))?;
+        let rival = |k: usize| k.abs_diff(best) > 2 && logs[k] > logs[best] - ACCUSED.ln();
+        (!(0..logs.len()).any(rival)).then(|| step * (best as f64 - f64::from(ZEROS)))
     }
 
     pub(super) fn solve(&mut self) {
@@ -91,12 +87,14 @@ impl Blocks {
         {
             self.start(&total, self.noise.variance * self.correlated);
         }
-        if self.lost && self.ring.len() == 1 && !self.spring.is_constant() {
-            self.spring.zero = self.find_zero(&total, self.noise.variance * self.correlated);
-            if self.spring.zero.abs() > self.deflection / f64::from(ZEROS) {
-                self.off = std::mem::take(&mut self.spring.zero);
+        if self.lost && !self.located && !self.spring.is_constant() {
+            let Some(zero) = self.locate(&total, self.noise.variance * self.correlated) else { return };
+            self.located = true;
+            if zero.abs() > self.deflection / f64::from(ZEROS) {
+                self.off = zero;
                 return;
             }
+            self.spring.zero = zero;
         }
         let Some(projection) = self.projection.clone() else { return };
         let near = self.priors.deflection_offset * self.deflection + self.resolution;

@@ -44,6 +44,17 @@ impl Estimator {
         self.inner.reset();
     }
 
+    /// Positions may count from anywhere after this: what was learned is kept, but for where the zeros are.
+    fn lose_zeros(&mut self) {
+        self.inner.lose_zeros();
+    }
+
+    /// Standard deviation of the joint's flexibility torque at the last sample, N·m; NaN: unknown.
+    #[getter]
+    fn flexibility_torque_std_nm(&self) -> f64 {
+        self.inner.flexibility_torque_std()
+    }
+
     /// The next sample may not be of its moment: use it, but learn nothing from it.
     fn distrust(&mut self) {
         self.inner.distrust();

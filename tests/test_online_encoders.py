@@ -67,3 +67,29 @@ def test_a_joint_that_turns_all_the_time_is_valid():
     # At 38 rad/s what is unknown of the link's delay makes the torque, not the stiffness, uncertain.
     sure = found.std_nm_rad < 0.2 * found.stiffness_nm_rad
     assert np.mean(sure[SETTLED:]) > 0.95
+
+
+@pytest.mark.parametrize("off", [0.0, 0.1, 2.6])
+@pytest.mark.parametrize("name", ["constant", "quadratic", "vsa-ii"])
+def test_a_drive_that_counts_from_elsewhere_after_a_reboot_is_not_believed_before_motion_has_shown_from_where(
+    name, off
+):
+    lost, motion = round(6.0 / kit.PERIOD_S), kit.motion(name, 14.0)
+    estimator = kit.make_estimator(kit.declared(name), kit.EstimatorSettings(), kit.PERIOD_S)
+    found = []
+    for k, sample in enumerate(motion.samples):
+        if k == lost:
+            estimator.lose_zeros()
+        moved = sample.motor_position_rad[0] + (off if k >= lost else 0.0)
+        found.append(
+            estimator.step(sample._replace(motor_position_rad=(moved, *sample.motor_position_rad[1:])))
+        )
+        assert k != lost + 500 or estimator.why()[0] == "lost"
+    valid = np.array([bool(one.status & 1) for one in found])
+    assert valid[lost - 1000 : lost].all()
+    assert valid[-4000:].mean() > 0.9
+    stiffness = np.array([one.stiffness_nm_rad for one in found])
+    torque = np.array([one.flexibility_torque_nm for one in found])
+    assert np.all(np.abs(stiffness / motion.stiffness_nm_rad - 1.0)[valid] < 0.1)
+    # The limit of the fault matrix, a quarter of the torque's rms.
+    assert np.all(np.abs(torque - motion.torque_nm)[valid] < 0.25 * np.sqrt(np.mean(motion.torque_nm**2)))

@@ -50,7 +50,7 @@ class Estimator(Protocol):
     def lose_zeros(self) -> None:
         """Forget where the positions' zeros are: a drive that restarts may count from anywhere.
 
-        What was learned of the joint is kept. What depends on the zeros is valid again when motion has shown them.
+        What was learned of the joint is kept. What depends on the zeros is valid when motion has shown them.
         """
 
     def reset(self) -> None:

@@ -34,7 +34,7 @@ const SETTLED: f64 = 4.5; // delays of the filter after which a wrong start is f
 const MEMORY_S: f64 = 20.0; // of how far the declared link is off, as that of the regression
 const FLOOR: f64 = 1e-3; // of the torque carried: no curve is known better
 const CONSISTENCY_S: f64 = 10.0; // over which the two flexibility torques are compared
-const TINY: f64 = 1e-12;
+const TINY: f64 = 1e-12; // keeps a division finite
 
 /// Bits of [`External::status`].
 pub mod status {

@@ -20,6 +20,7 @@ pub mod estimator;
 pub mod external;
 pub mod filters;
 pub mod gram;
+pub mod joint_effects;
 pub mod laws;
 pub mod library;
 pub mod memory;

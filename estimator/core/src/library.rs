@@ -11,7 +11,6 @@
 use serde::{Deserialize, Serialize};
 
 use crate::error::Error;
-use crate::memory::Memory;
 
 /// Parameters of one element, at most.
 pub const VALUES: usize = 4;
@@ -576,10 +575,27 @@ impl Kind {
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Element {
     /// What it is.
-    #[serde(with = "crate::snapshot::kind")]
+    #[serde(with = "by_name")]
     pub kind: &'static Kind,
     /// Its parameters.
     pub values: Values,
+}
+
+/// A kind as its name.
+mod by_name {
+    use serde::de::Error;
+    use serde::{Deserialize, Deserializer, Serializer};
+
+    use super::Kind;
+
+    pub fn serialize<S: Serializer>(kind: &&'static Kind, to: S) -> Result<S::Ok, S::Error> {
+        to.serialize_str(kind.name)
+    }
+
+    pub fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<&'static Kind, D::Error> {
+        let name = <&str>::deserialize(from)?;
+        Kind::named(name).ok_or_else(|| D::Error::custom(format!("no such effect: {name}")))
+    }
 }
 
 impl Element {
@@ -615,24 +631,6 @@ impl Element {
             Law::Terms(terms) => terms(c, &self.values),
             Law::Spring(term) => one(term(c.deflection, &self.values).0),
             Law::Memory { .. } => [0.0; 2],
-        }
-    }
-
-    /// Its terms, unweighted, over consecutive moments: column k into `out[k]`.
-    pub fn along(&self, moments: impl Iterator<Item = Coordinates>, out: &mut [&mut [f64]]) {
-        let mut memory = Memory::of(self);
-        let mut from = None;
-        for (k, c) in moments.enumerate() {
-            let terms = match self.kind.law {
-                Law::Memory { path, .. } => {
-                    let now = path(&c);
-                    one(memory.advance(now - from.replace(now).unwrap_or(now)))
-                }
-                _ => self.terms(&c),
-            };
-            for (column, term) in out.iter_mut().zip(terms) {
-                column[k] = term;
-            }
         }
     }
 

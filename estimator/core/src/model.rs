@@ -2,9 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::effects::Element;
 use crate::error::Error;
 use crate::laws::{Law, PARAMETERS};
+use crate::library::Element;
 
 /// How the transmissions act on the link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

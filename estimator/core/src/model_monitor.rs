@@ -15,9 +15,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::effects::{Coordinates, JointEffects, Torques};
+use crate::effects::Coordinates;
 use crate::error::Error;
 use crate::filters::StateVariableFilter;
+use crate::joint_effects::{JointEffects, Torques};
 use crate::laws::Law;
 use crate::model::{Arrangement, Link, Model, Transmission};
 use crate::sample::{MOTORS, Sample};
@@ -33,7 +34,7 @@ const SETTLED: f64 = 30.0; // rad of the narrow filter's bandwidth until a start
 const BRIDGED: f64 = 0.4; // rad that it turns by in a gap: over a longer one the monitor begins anew
 const MOTION: f64 = 0.35; // standard deviation of x between one motion and another one
 const LEAST: f64 = 0.003; // of the torque: what filters, sampling and rounding leave of a true model
-const ABSURD: f64 = 1e9;
+const ABSURD: f64 = 1e9; // beyond it nothing is a measurement
 
 const TORQUE: usize = MOTORS; // channels: motor positions, motor torques, link position, external torque
 const LINK: usize = 2 * MOTORS;

@@ -110,7 +110,7 @@ pub struct Excitation {
 
 impl Excitation {
     const WINDOW_S: f64 = 0.3; // over which the rate's mean square is taken
-    const NOISE_MARGIN: f64 = 5.0;
+    const NOISE_MARGIN: f64 = 5.0; // so much above its noise a rate is motion
     const SHARE: f64 = 0.02; // of the largest rate seen: what is slower teaches next to nothing
     const PEAK_S: f64 = 60.0; // how long the largest rate is remembered
 

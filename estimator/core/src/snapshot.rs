@@ -6,7 +6,6 @@ use serde::de::{DeserializeOwned, Error as _};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::error::Error;
-use crate::library::Kind;
 
 const VERSION: &str = env!("CARGO_PKG_VERSION");
 
@@ -76,19 +75,4 @@ pub(crate) mod rows {
 
 fn fitting<'de, D: Deserializer<'de>>(values: Vec<f64>) -> D::Error {
     D::Error::custom(format!("an array of {} numbers does not fit", values.len()))
-}
-
-/// An effect of the library by its name.
-pub(crate) mod kind {
-    use super::{Deserialize, Deserializer, Kind, Serializer};
-    use serde::de::Error;
-
-    pub fn serialize<S: Serializer>(kind: &&'static Kind, to: S) -> Result<S::Ok, S::Error> {
-        to.serialize_str(kind.name)
-    }
-
-    pub fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<&'static Kind, D::Error> {
-        let name = <&str>::deserialize(from)?;
-        Kind::named(name).ok_or_else(|| D::Error::custom(format!("no such effect: {name}")))
-    }
 }

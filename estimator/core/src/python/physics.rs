@@ -8,6 +8,7 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyTuple;
 
+use crate::effects::along;
 use crate::error::Error;
 use crate::laws::{Foreign, Law, PARAMETERS, Shape, Table};
 use crate::library::{self, Coordinates, Element, LIBRARY, Parameter, Role};
@@ -227,6 +228,6 @@ pub fn effect_terms(
         c
     });
     let mut result = vec![0.0; n * terms];
-    element.along(moments, &mut result.chunks_exact_mut(n).collect::<Vec<_>>());
+    along(&element, moments, &mut result.chunks_exact_mut(n).collect::<Vec<_>>());
     out.copy_from_slice(py, &result)
 }

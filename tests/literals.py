@@ -1,0 +1,113 @@
+"""Numbers inside functions of the estimator, in both languages, and what each of them is.
+
+A choice that might be another number belongs into a table (`estimator.choices`, `estimator.priors`) or to the
+constants at the top of its module, with unit and reason. What stands here is a property of mathematics, of a grid that
+is refined afterwards, or of rounding.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+_PLAIN = {0.0, 0.25, 0.5, 0.75, 1.5, *map(float, range(11)), 12.0}  # counts, halves, exponents
+_UNITS = {100.0, 1000.0, 3600.0}  # per cent, milli, seconds in an hour
+_ROUNDING = 1e-6  # and less, or the inverse and more: keeps rounding or infinity from deciding
+_FINITE = 700.0  # exponent that is still a number
+
+OF_FILES = {
+    "core/src/student.rs": "series of Student's quantile",
+    "core/src/settings.rs": "defaults, each with its meaning and unit in estimator/settings.py",
+    "core/src/causes.rs": "the table of causes: amplitudes' priors",
+}
+REASONS: dict[str, dict[str, str]] = {
+    "diagnosis/base.py": {
+        "0.9999 1.0001": "keeps a shape inside its open interval",
+        "0.02 1.02 1.1 20.0": "ends of a grid of shapes that is refined afterwards",
+        "1.001": "keeps the largest deflection inside the law's reach",
+    },
+    "diagnosis/candidates.py": {
+        "0.04 0.8": "grid of velocities, shares of their rms",
+        "0.0002 11.0": "grid of displacements over the range of motion",
+        "0.9 0.05 0.95 0.96 0.99 0.01 0.4": "quantiles of what was measured",
+        "20.0": "largest exponent that is told from a stop",
+    },
+    "diagnosis/evidence.py": {"0.001": "relative change that ends an iteration", "0.0001": "likewise, of x"},
+    "diagnosis/frame.py": {"0.45": "of the sampling rate: below half of it"},
+    "diagnosis/hypothesis.py": {
+        "0.01": "quantile of the steps of a reading: one count",
+        "0.7": "place of held-out blocks: not the middle of a period",
+    },
+    "diagnosis/search.py": {"1.75": "last point of a grid of delays in octaves"},
+    "diagnosis/stack.py": {"0.001": "relative step of a difference", "0.7": "ln 2: factors of at most two"},
+    "filters.py": {"14.0": "time constants until e^-14 is below 1e-6", "64.0": "entries of a cache"},
+    "gate/causes.py": {"1.3": "a factor this near to a unit's is that unit"},
+    "gate/evidence.py": {
+        "0.002 0.998": "quantiles of what was measured",
+        "20.0": "third differences of white noise have 20 times its variance",
+        "60.0": "periods in a recording, at least",
+    },
+    "gate/usable.py": {"0.995": "share of values that stay: a sensor that is silent"},
+    "transmissions.py": {"41.0": "points at which a registered law is compared with its slope"},
+    "core/src/balance.rs": {"6.4": "32/5: correlation time of white noise behind the filter"},
+    "core/src/blocks.rs": {"0.98": "keeps the deflection inside the law's reach"},
+    "core/src/blocks/solve.rs": {
+        "0.0001": "share of the torque: the noise before the first block",
+        "0.1": "standard deviations: a shape this near to its start has not moved",
+        "0.02": "of the deflection: a zero that is known to this is found again",
+    },
+    "core/src/deflection.rs": {
+        "0.1": "of the largest: an acceleration's change that is never thought to be smaller",
+        "20.0": "fifth power of time over 20: variance of integrated white jerk",
+    },
+    "core/src/external/contact.rs": {"0.05 80.0": "grid of the reference value of a cumulative sum"},
+    "core/src/laws.rs": {"0.001": "scale of a difference's step at zero"},
+    "core/src/memory.rs": {"0.001": "slope that ends an integral over a stop"},
+    "core/src/sample_validator.rs": {
+        "0.05 0.1 0.2": "forgetting of running means, and the share that is motion"
+    },
+}
+
+
+def unexplained(estimator: Path) -> Iterator[str]:
+    """Numbers without a reason, as "path:line number"."""
+    for path in sorted([*estimator.rglob("*.py"), *(estimator / "core" / "src").rglob("*.rs")]):
+        name = path.relative_to(estimator).as_posix()
+        if name in ("choices.py", "priors.py", *OF_FILES):
+            continue
+        known = {float(x) for numbers in REASONS.get(name, {}) for x in numbers.split()}
+        found = _python(path) if path.suffix == ".py" else _rust(path)
+        for line, number in found:
+            size = abs(number)
+            plain = size in _PLAIN | _UNITS | {_FINITE} or size <= _ROUNDING or size >= 1.0 / _ROUNDING
+            if not plain and size not in known:
+                yield f"{name}:{line} {number:g}"
+
+
+def uncommented(source: Path) -> Iterator[str]:
+    """Constants of Rust that say neither beside nor above themselves what they are."""
+    for path in sorted(source.rglob("*.rs")):
+        lines = path.read_text(encoding="utf-8").split("#[cfg(test)]")[0].splitlines()
+        for before, line in zip(["", *lines], lines, strict=False):
+            said = "//" in line or before.lstrip().startswith("//")
+            if re.match(r"\s*(pub(\(\w+\))? )?const \w+: f64 = -?[\d.]", line) and not said:
+                yield f"{path.name}: {line.strip()}"
+
+
+def _python(path: Path) -> Iterator[tuple[int, float]]:
+    for function in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(function, ast.FunctionDef):
+            for node in ast.walk(function):
+                if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+                    yield node.lineno, float(node.value)
+
+
+def _rust(path: Path) -> Iterator[tuple[int, float]]:
+    text = path.read_text(encoding="utf-8").split("#[cfg(test)]")[0]
+    for number, line in enumerate(text.splitlines(), 1):
+        code = re.sub(r'"[^"]*"', '""', line.split("//")[0])
+        if not re.match(r"\s*(pub(\(\w+\))? )?(const|static) ", code):
+            for found in re.findall(r"(?<![\w.])\d[\d_]*(?:\.\d+)?(?:e-?\d+)?(?![\w.])", code):
+                yield number, float(found.replace("_", ""))

@@ -1,7 +1,8 @@
-"""Makes the parts of the documentation that the code describes: keys, effects, layouts, commands, modules.
+"""Makes the parts of the documentation that the code describes: `python docs/generate.py` writes them.
 
-A page asks for a part by a link to its source, alone in a line, with the title "from the code". In the
-repository it is that link; docs/hooks.py puts the part in its place when the documentation is built.
+Keys, effects, layouts and commands stand in the pages between `<!-- from the code: NAME -->` and
+`<!-- end -->`. Lists of modules are put in place when the documentation is built (docs/hooks.py): for them a
+page has a link to the package, alone in a line, with the title "from the code".
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from sim.effects import LISTED, UNLISTED, Definition
 
 ROOT = Path(__file__).parent.parent
 SIZES = {"u64": 8, "u32": 4, "f64": 8}
+MARKED = re.compile(r"(<!-- from the code: (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
 ASKED = re.compile(r'^\[(.+)\]\(\S+ "from the code"\)$', re.MULTILINE)
 
 SECTIONS: list[tuple[str, type]] = [
@@ -224,7 +226,7 @@ def joint_file() -> str:
 
 def commands_help() -> str:
     """Every verb's --help, for the built documentation."""
-    os.environ["COLUMNS"] = "100"
+    os.environ["COLUMNS"] = "82"
     parser = cli.make_parser(list(cli.VERBS))
     parts = []
     actions = [action for action in parser._actions if action.dest == "verb"]
@@ -348,5 +350,18 @@ PARTS: dict[str, Callable[[], str]] = {
 
 
 def filled(text: str) -> str:
-    """A page with the parts it asks for."""
+    """A page with the lists of modules it asks for."""
     return ASKED.sub(lambda match: PARTS[match[1]](), text)
+
+
+def updated(text: str) -> str:
+    """A page with the present parts between its marks."""
+    return MARKED.sub(lambda match: f"{match[1]}\n{PARTS[match[2]]().strip()}\n\n{match[3]}", text)
+
+
+if __name__ == "__main__":
+    for page in sorted((ROOT / "docs").rglob("*.md")):
+        old = page.read_text(encoding="utf-8")
+        if (new := updated(old)) != old:
+            page.write_text(new, encoding="utf-8")
+            print(f"{page.relative_to(ROOT)} written")

@@ -72,10 +72,10 @@ def test_formulas_diagrams_and_the_help_of_commands_are_rendered(site: Path) -> 
 
 
 @pytest.mark.skipif(chromium.EXECUTABLE is None, reason="needs Chromium")
-def test_in_a_browser_nothing_is_asked_of_another_host_and_a_phone_shows_whole_pages(
+def test_in_a_browser_nothing_is_asked_of_another_host_and_a_phone_shows_whole_pages_and_searches(
     site: Path, address: str, tmp_path: Path
 ) -> None:
-    pages = ["index.html", "architecture.html", "explanation/estimation.html", "reference/python.html"]
+    pages = ["index.html", "architecture.html", "explanation/estimation.html", "reference/commands.html"]
     with chromium.Chromium(tmp_path / "profile") as browser:
         browser.resize(390, 844)
         for page in pages:
@@ -85,3 +85,7 @@ def test_in_a_browser_nothing_is_asked_of_another_host_and_a_phone_shows_whole_p
             )
             assert set(hosts) <= {address}, page
             assert browser.evaluate("document.documentElement.scrollWidth") <= 390, page
+            cut = "[...document.querySelectorAll('math, pre code')].filter(e => e.scrollWidth > innerWidth).length"
+            assert browser.evaluate(cut) == 0, page
+        browser.open(f"{(site / 'index.html').as_uri()}?q=covariance")  # the search works without a server
+        assert browser.wait_for("document.querySelectorAll('.md-search-result__item').length")

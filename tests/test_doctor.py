@@ -7,6 +7,7 @@ from pathlib import Path
 
 import can
 import daemonkit
+import numpy as np
 import pytest
 from canopenkit import Item, Slave, Wire, drive_objects, joint_text
 from rich.console import Console
@@ -29,6 +30,7 @@ from drivelink.doctor.nodes import _describe_node
 from drivelink.doctor.syncs import Daemons, judge_sync
 from drivelink.jointfile import BusSection, parse
 from drivelink.notice import Notice, Severity
+from estimator.sample import Record
 
 REPOSITORY = Path(__file__).parents[1]
 CHANNELS = itertools.count()
@@ -149,6 +151,14 @@ def test_too_short_a_look_is_no_judgement():
     (finding,) = live(seconds=1.0).notices
     assert finding.severity is Severity.INFO
     assert "too short" in finding.text
+    assert "the joint moves: look longer" in finding.fix  # it is not told to move what moves
+    still, section = np.zeros((9000, 1)), Section("Units and signs")
+    record = Record(
+        period_s=1e-3, sequence=np.arange(9000), motor_position_rad=still, motor_torque_nm=still,
+        link_position_rad=still[:, 0],
+    )  # fmt: skip
+    judge_record(section, parse(joint_on("still")), record)
+    assert "move the joint during the check" in section.notices[0].fix
 
 
 @pytest.mark.parametrize(

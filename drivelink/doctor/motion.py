@@ -25,7 +25,8 @@ _WINDOW_S = 0.02  # differences over less are mostly quantisation
 _LEAST_COUNTS = 50  # minimum number for a decision
 _TOLERANCE = 0.15  # relative; velocities are filtered in the drive
 _LINK_TOLERANCE = 0.35  # the transmission bends
-_LONGER = "move the joint during the check, by its controller (--seconds 20 gives more time)"
+_STILL = "move the joint during the check, by its controller (--seconds 20 gives more time)"
+_MOVING = "the joint moves: look longer (--seconds 20), or at a faster and wider motion"
 
 
 def judge_record(section: Section, joint: JointFile, record: Record | None) -> None:
@@ -38,13 +39,23 @@ def judge_record(section: Section, joint: JointFile, record: Record | None) -> N
         check(record, model)
         judgement = judge(record, model)
     except EstimatorError as error:
-        section.say(Severity.INFO, joint.name, f"units and signs cannot be checked: {error}", _LONGER)
+        section.say(Severity.INFO, joint.name, f"units and signs cannot be checked: {error}", _advice(record))
         return
     section.facts["samples"] = len(record)
-    _say_judgement(section, joint, judgement)
+    _say_judgement(section, joint, judgement, record)
 
 
-def _say_judgement(section: Section, joint: JointFile, judgement: Judgement) -> None:
+def _advice(record: Record) -> str:
+    """What would decide what could not be decided."""
+    for position in record.motor_position_rad.T:
+        steps = np.abs(np.diff(position))
+        count = np.min(steps[steps > 0.0], initial=np.inf)
+        if np.ptp(position) > _LEAST_COUNTS * count:
+            return _MOVING
+    return _STILL
+
+
+def _say_judgement(section: Section, joint: JointFile, judgement: Judgement, record: Record) -> None:
     section.facts["torque_left"] = None if np.isnan(judgement.left) else judgement.left
     if judgement.findings:
         needed = [change for finding in judgement.findings for change in finding.changes]
@@ -54,7 +65,8 @@ def _say_judgement(section: Section, joint: JointFile, judgement: Judgement) -> 
         fix = "; ".join(map(str, corrections(joint, needed, live=True)))
         section.say(Severity.ERROR, joint.name, text, f"in the joint file: {fix}")
     elif judgement.remark:
-        section.say(Severity.INFO, joint.name, judgement.remark, f"{_LONGER}; or drivelink doctor --move")
+        fix = f"{_advice(record)}; or drivelink doctor --move"
+        section.say(Severity.INFO, joint.name, judgement.remark, fix)
     else:
         text = (
             f"units and signs of positions and torque agree: the torque balance leaves {judgement.left:.1%}"

@@ -68,7 +68,7 @@ def test_an_injected_effect_is_named_located_and_measured(case: str, records: di
     at_noise = found.validation.after_relative < choice("floor")
     assert found.validation.after_rms_nm <= found.validation.before_rms_nm or at_noise
     assert first.probability > 0.9
-    assert any("of what it did, the link's " in note for note in found.notes)
+    assert any("error after over before: " in note for note in found.notes)
 
 
 @pytest.mark.parametrize("case", ["clean", pytest.param("clean2", marks=pytest.mark.slow), "skew"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -36,6 +37,7 @@ _CURVE_POINTS = 200
 _RIVALS = 8
 _SURE, _LIKELY = 0.9, 0.3  # probabilities at which an effect is missing, and at which it has a name
 _COLUMN = 4.6  # inches of a plot in half the page, or on a phone
+_LIBRARY_NAME = re.compile(rf"\b({'|'.join(LIBRARY)})\b")
 _AXES = {
     "position": "motor position / rad",
     "velocity": "motor velocity / (rad/s)",
@@ -397,5 +399,6 @@ def _doubts(outcome: Diagnosis) -> Lines:
         for f in outcome.effects
         if f.alternatives
     ]
-    lines += [*outcome.advice, *outcome.notes]
+    lines += [_LIBRARY_NAME.sub(lambda name: in_words(name[0]), line) for line in outcome.advice]
+    lines += outcome.notes
     return Lines(tuple(lines) or ("No other effect explains these data as well.",))

@@ -233,7 +233,8 @@ class Judge:
             [[np.sqrt(np.mean(r[side & problem.used] ** 2)) for side in sides] for r in residuals]
         )
         motor, link = left[1] / np.maximum(left[0], 1e-300)
-        return [f"the motor's balance leaves {motor:.1%} of what it did, the link's {link:.1%}"]
+        said = f"error after over before: {motor:.1%} in the motor's balance, {link:.1%} in the link's"
+        return [f"{said} (an effect at one side lowers only that side's)"]
 
     def _left(self, found: Fitted) -> float:
         """Relative error of the motors' balances."""

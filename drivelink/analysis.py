@@ -189,7 +189,7 @@ class Fit:
                 )
 
     def as_json(self) -> dict[str, Any]:
-        """The content of fit.json."""
+        """Return the content of fit.json."""
         found = self.found
         pairs = zip(found.fits, found.model.motors, strict=True)
         document: dict[str, Any] = {"transmissions": [_entry(one, motor) for one, motor in pairs]}
@@ -232,7 +232,7 @@ class Diagnosed:
         return replace(self.outcome, notes=(*self.runs.notes, *self.outcome.notes))
 
     def as_json(self) -> dict[str, Any]:
-        """The content of report.json."""
+        """Return the content of report.json."""
         return report.as_json(self.documented)
 
     def report(self, folder: str | Path) -> list[Path]:

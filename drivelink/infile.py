@@ -22,7 +22,7 @@ def open_regular(path: Path) -> io.BufferedReader:
 
 
 def read_regular(path: Path, most_bytes: int) -> bytes:
-    """The content of a file.
+    """Return the content of a file.
 
     Raises:
         OSError: as `open_regular`, or it is larger than `most_bytes`.

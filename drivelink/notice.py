@@ -50,7 +50,7 @@ class Notice:
         return f"{self.subject}: {self.text}" + (f" [{self.fix}]" if self.fix else "")
 
     def as_dict(self) -> dict[str, str]:
-        """For JSON: the severity by name."""
+        """Return for JSON: the severity by name."""
         return {**asdict(self), "severity": self.severity.name.lower()}
 
 

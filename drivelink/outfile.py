@@ -85,7 +85,7 @@ class NewFile:
             raise OSError(error.errno, error.strerror, str(path)) from error
 
     def place(self) -> None:
-        """Sync the file and give it its final name; a second call only syncs.
+        """Sync the file and rename it to its final name; a second call only syncs.
 
         Raises:
             OSError: it cannot be written, or a file exists and `force` is not given.

@@ -18,7 +18,7 @@ _UNSHOWABLE = frozenset({"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"})
 
 
 def clean_text(text: str, length: int = MAX_TEXT) -> str:
-    """The text in one line, without control and format characters.
+    """Return the text in one line, without control and format characters.
 
     Args:
         text: of anybody.
@@ -52,7 +52,7 @@ def _spelt(error: UnicodeError) -> tuple[str, int]:
 
 
 def spell_out() -> None:
-    """Have stdout and stderr spell the characters that their encoding lacks: a C locale, a serial console."""
+    """Make stdout and stderr spell out characters that their encoding lacks: a C locale, a serial console."""
     codecs.register_error("drivelink.spelt", _spelt)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
@@ -78,5 +78,5 @@ class PlainFormatter(logging.Formatter):
     """Formats log records as plain text, line by line."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record's lines."""
+        """Return the record's lines."""
         return "\n".join(clean_text(line) for line in super().format(record).split("\n"))

@@ -128,18 +128,18 @@ class JointFit(NamedTuple):
     doubts: tuple[str, ...] = ()
 
     def places(self, key: Key) -> list[int]:
-        """Columns of an everyday error: its parts, or its values in each recording."""
+        """Return the columns of an everyday error: its parts, or its values in each recording."""
         return [
             j for j, s in enumerate(self.fitted.slots) if s.kind == "everyday" and (s.name, s.motor) == key
         ]
 
     def values(self, key: Key) -> FloatArray:
-        """The estimated error beyond the declared value, in the same order."""
+        """Return the estimated error beyond the declared value, in the same order."""
         mine = self.places(key)
         return np.zeros(len(mine)) if key in self.absent else _totals(self.fitted)[mine]
 
     def mean(self, name: str, motor: int | None) -> tuple[float, float]:
-        """An error and its standard deviation, the mean of the recordings where each has its own."""
+        """Return an error and its standard deviation, the mean of the recordings where each has its own."""
         mine = self.places((name, motor))
         if not mine:
             return 0.0, 0.0
@@ -322,7 +322,7 @@ def _rows_of(frames: Sequence[Frame], motor: int, coordinate: str) -> FloatArray
 
 
 def transmission_fits(joint: JointFit) -> list[TransmissionFit]:
-    """The result of a fit for each motor and its transmission."""
+    """Return the result of a fit for each motor and its transmission."""
     problem, fitted = joint.problem, joint.fitted
     frames = problem.at(fitted.corrections, fitted.base)
     base = fitted.moved_base(problem)

@@ -154,30 +154,32 @@ CHOICES: dict[str, Choice] = {
 
 
 def choice(name: str) -> float:
-    """That number."""
+    """Return that number."""
     return CHOICES[name].value
 
 
 def whole(name: str) -> int:
-    """That number as an integer."""
+    """Return that number as an integer."""
     return max(1, round(CHOICES[name].value))
 
 
 def least_rows() -> int:
-    """Fewest rows of a recording: two in each period of the bandwidth."""
+    """Return the fewest rows of a recording: two in each period of the bandwidth."""
     return 2 * whole("fit_periods")
 
 
 def rate() -> float:
-    """Samples behind a low-pass in each period of its bandwidth: Nyquist's two up to the end of its skirt."""
+    """Return samples behind a low-pass in each period of its bandwidth: Nyquist's two up to
+    the end of its skirt.
+    """
     return 2.0 * (1.0 + choice("skirt"))
 
 
 def chance() -> float:
-    """Probability that a correct reading is `sure` standard deviations or more off."""
+    """Return the probability that a correct reading is `sure` standard deviations or more off."""
     return 2.0 * NormalDist().cdf(-choice("sure"))
 
 
 def log_odds(probability: float) -> float:
-    """Logarithm of the odds, in nats."""
+    """Return the logarithm of the odds, in nats."""
     return math.log(probability / (1.0 - probability))

@@ -25,7 +25,7 @@ _TERMS = 18  # of the exponential's series: at a norm of 1/2 the next one is bel
 def linear_filter(
     b: Sequence[float] | FloatArray, a: Sequence[float] | FloatArray, signal: FloatArray
 ) -> FloatArray:
-    """B(z) / A(z) over a whole recording, from rest, along axis 0: `scipy.signal.lfilter`.
+    """Return b(z) / A(z) over a whole recording, from rest, along axis 0: `scipy.signal.lfilter`.
 
     Imported here because scipy.signal would double the start-up time of a daemon, which does not need it.
     """
@@ -35,7 +35,7 @@ def linear_filter(
 
 
 def critically_damped(order: int, bandwidth_rad_s: float) -> tuple[float, ...]:
-    """Coefficients a_0 … a_(n-1) of (s + w)^n without its leading 1: all poles at w."""
+    """Return the coefficients a_0 … a_(n-1) of (s + w)^n without its leading 1: all poles at w."""
     return tuple(math.comb(order, i) * bandwidth_rad_s ** (order - i) for i in range(order))
 
 
@@ -75,13 +75,13 @@ class StateVariableFilter:
         return math.ceil((14.0 + 3.0 * (self.order - 1)) / (self.bandwidth_rad_s * self.period_s))
 
     def rest(self, value: float) -> FloatArray:
-        """Steady state (n,) for a constant input."""
+        """Return the steady state (n,) for a constant input."""
         state = np.zeros(self.order)
         state[0] = value
         return state
 
     def impulse(self, periods: int, *, held: bool = False) -> FloatArray:
-        """Impulse responses of all states, (periods, n), newest first."""
+        """Return impulse responses of all states, (periods, n), newest first."""
         step = self.held if held else self.smooth
         out = np.empty((periods, self.order))
         state = step.new.copy()

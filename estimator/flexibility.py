@@ -60,46 +60,48 @@ class TransmissionModel:
         return tuple(start for *_, start in self.law.shapes)
 
     def basis(self, phi: ArrayLike, shape: Sequence[float] = (), order: int = 1) -> FloatArray:
-        """Regressors of the linear coefficients, (..., order) for phi of shape (...), in rad-powers."""
+        """Return the regressors of the linear coefficients, (..., order) for phi of shape
+        (...), in rad-powers.
+        """
         return self.torque(phi, (1.0, *shape))[..., None]
 
     def torque(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """tau_e = f(phi, alpha) in N·m (eq 17)."""
+        """Return tau_e = f(phi, alpha) in N·m (eq 17)."""
         return self.both(phi, alpha)[0]
 
     def stiffness(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """Sigma = df/dphi in N·m/rad (eq 18)."""
+        """Return sigma = df/dphi in N·m/rad (eq 18)."""
         return self.both(phi, alpha)[1]
 
     def both(self, phi: ArrayLike, alpha: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """(torque, stiffness)."""
+        """Return the (torque, stiffness)."""
         phi = np.asarray(phi, dtype=np.float64)
         torque, stiffness = np.empty(phi.shape), np.empty(phi.shape)
         self.law.evaluate(phi.ravel(), _listed(alpha), torque.reshape(-1), stiffness.reshape(-1))
         return torque, stiffness
 
     def jacobian(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """df/dalpha, (..., n) (eq 25)."""
+        """Return df/dalpha, (..., n) (eq 25)."""
         return _by_alpha(self.law.jacobian, phi, alpha)
 
     def stiffness_jacobian(self, phi: ArrayLike, alpha: ArrayLike) -> FloatArray:
-        """dsigma/dalpha, (..., n), which maps the covariance of alpha to sigma."""
+        """Return dsigma/dalpha, (..., n), which maps the covariance of alpha to sigma."""
         return _by_alpha(self.law.stiffness_jacobian, phi, alpha)
 
     def at(self, phi: float, alpha: Sequence[float]) -> tuple[float, float]:
-        """(torque, stiffness) at one deflection, for a tick."""
+        """Return the (torque, stiffness) at one deflection, for a tick."""
         return self.law.at(phi, alpha)
 
     def reach(self, shape: Sequence[float] = ()) -> float:
-        """Largest |phi| for which the model is defined (arcsine, exponential, table), rad."""
+        """Return the largest |phi| for which the model is defined (arcsine, exponential, table), rad."""
         return self.law.reach(shape) if shape or not self.shape_names else math.inf
 
     def parameters(self, alpha: ArrayLike) -> dict[str, ParameterValue]:
-        """Alpha by its names in the joint file."""
+        """Return alpha by its names in the joint file."""
         return dict(zip(("k_nm_rad", *self.shape_names), np.asarray(alpha).tolist(), strict=True))
 
     def alpha(self, parameters: Mapping[str, ParameterValue]) -> FloatArray:
-        """Alpha from its names in the joint file.
+        """Return alpha from its names in the joint file.
 
         Raises:
             EstimatorError: a name is unknown or missing, or a value is impossible.
@@ -123,11 +125,11 @@ class Polynomial(TransmissionModel):
         return self.jacobian(phi, np.zeros(order))
 
     def parameters(self, alpha: ArrayLike) -> dict[str, ParameterValue]:
-        """Alpha by name."""
+        """Return alpha by name."""
         return {"coefficients_nm_rad": tuple(np.asarray(alpha, dtype=np.float64).tolist())}
 
     def alpha(self, parameters: Mapping[str, ParameterValue]) -> FloatArray:
-        """Alpha from names."""
+        """Return alpha from names."""
         _expect_names(self.name, parameters, ("coefficients_nm_rad",))
         return _finite(self.name, "coefficients_nm_rad", parameters["coefficients_nm_rad"])
 
@@ -140,11 +142,11 @@ class Linear(Polynomial):
     law = TransmissionLaw("linear")
 
     def parameters(self, alpha: ArrayLike) -> dict[str, ParameterValue]:
-        """Alpha by name."""
+        """Return alpha by name."""
         return {"k_nm_rad": float(np.asarray(alpha)[..., 0])}
 
     def alpha(self, parameters: Mapping[str, ParameterValue]) -> FloatArray:
-        """Alpha from names."""
+        """Return alpha from names."""
         return _by_name(self.name, parameters, ("k_nm_rad",))
 
 

@@ -59,7 +59,7 @@ class ResidualBaseline:
             require_finite(0.0, log_std=std)
 
     def as_dict(self) -> dict[str, Any]:
-        """The baseline as plain values for the joint file."""
+        """Return the baseline as plain values for the joint file."""
         return {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(self).items()}
 
     @classmethod
@@ -77,7 +77,7 @@ class ResidualBaseline:
 
 
 def can_monitor(model: JointModel) -> bool:
-    """Whether every transmission's torque is known from the model alone."""
+    """Return whether every transmission's torque is known from the model alone."""
     return all(m.transmission.model == "none" or m.transmission.parameters for m in model.motors)
 
 
@@ -221,11 +221,11 @@ class ModelMonitor:
         return not math.isnan(self.residual_nm[0])
 
     def location(self) -> str:
-        """Likely location of the effect that the model lacks."""
+        """Return the likely location of the effect that the model lacks."""
         return self.core.location()
 
     def describe(self) -> dict[str, Any]:
-        """Residual and baseline per balance, their ratio and its limit, the location."""
+        """Return the residual and baseline per balance, their ratio and its limit, the location."""
         found: dict[str, Any] = {"watching": self.baseline is not None}
         if self.settled:
             found["residual_nm"] = list(self.residual_nm)

@@ -57,16 +57,22 @@ class Estimator(Protocol):
         """Reset: forget every estimate."""
 
     def parameters(self) -> list[dict[str, Any]]:
-        """Current {"model", "parameters", "std"} of each transmission, names as in the joint file."""
+        """Return the current {"model", "parameters", "std"} of each transmission, names as in
+        the joint file.
+        """
 
     def undeclared(self) -> list[list[str]]:
-        """Effects of each motor that nobody declared and the motion has shown, names as in `report.json`."""
+        """Return effects of each motor that nobody declared and the motion has shown, names
+        as in `report.json`.
+        """
 
     def why(self) -> tuple[str, str] | None:
-        """Why the last estimate is not valid: key of `estimator.reasons.REASONS`, sentence; None: it is."""
+        """Return why the last estimate is not valid: key of `estimator.reasons.REASONS`,
+        sentence; None: it is.
+        """
 
     def suspicion(self) -> dict[str, Any] | None:
-        """The reading that is suspected while readings contradict the model; None: none.
+        """Return the reading that is suspected while readings contradict the model; None: none.
 
         {"signal": "motor_position" | "motor_torque" | "link_position" | "motor_or_link_position",
         "motor": from 1 on (0: the link's),

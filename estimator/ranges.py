@@ -70,7 +70,7 @@ RANGES: dict[str, Range] = {  # the longest end that fits counts
 
 
 def range_of(name: str) -> Range:
-    """The range of a number of that name."""
+    """Return the range of a number of that name."""
     return RANGES[max((end for end in RANGES if name.endswith(end)), key=len)]
 
 

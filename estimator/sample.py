@@ -75,7 +75,7 @@ class Bits(IntFlag):
 
     @classmethod
     def having(cls, role: str) -> int:
-        """All bits of a role."""
+        """Return all bits of a role."""
         return sum(int(bit) for bit in cls if role in bit.roles)
 
 
@@ -242,13 +242,13 @@ class Record:
         return np.asarray(self.start_s + self.sequence * self.period_s, dtype=np.float64)
 
     def rows(self, chosen: NDArray[np.bool_]) -> Record:
-        """Some rows, (n,) booleans; the others become gaps."""
+        """Return some rows, (n,) booleans; the others become gaps."""
         channels = {each.name: getattr(self, each.name) for each in fields(self)}
         kept: dict[str, Any] = {k: x[chosen] for k, x in channels.items() if isinstance(x, np.ndarray)}
         return replace(self, **kept)
 
     def samples(self) -> Iterator[Sample]:
-        """The recording tick by tick, as the live loop would have seen it."""
+        """Yield the recording tick by tick, as in the live loop."""
         n, m = self.motor_position_rad.shape
         nan_rows = np.full((n, m), np.nan)
         nan_column = np.full(n, np.nan)

@@ -110,7 +110,7 @@ def register_table(
 
 
 def transmission_model(transmission: Transmission) -> TransmissionModel | None:
-    """The model of a transmission; None if it is rigid or unknown.
+    """Return the model of a transmission; None if it is rigid or unknown.
 
     Raises:
         EstimatorError: no model has that name, or its parameters do not fit it.

@@ -40,7 +40,7 @@ class Bench:
                 raise SimError(f"expected a node id of its own for each device, got {node_id} twice")
 
     def network(self, bus: can.BusABC) -> Network:
-        """All devices on a bus."""
+        """Return all devices on a bus."""
         return Network(bus, self.nodes, *self.worlds)
 
     def serve(self, bus: can.BusABC, stop: threading.Event) -> None:
@@ -48,7 +48,7 @@ class Bench:
         self.network(bus).serve(stop)
 
     def devices(self) -> dict[str, dict[str, list[int]]]:
-        """Node ids of the drives and encoders, by joint."""
+        """Return node ids of the drives and encoders, by joint."""
         found: dict[str, dict[str, list[int]]] = {}
         for name, group in self._groups:
             kinds = found.setdefault(name, {"drive": [], "encoder": []})
@@ -57,7 +57,7 @@ class Bench:
         return found
 
     def describe(self) -> str:
-        """Joints and node ids, for messages."""
+        """Return joints and node ids, for messages."""
         parts = []
         for name, group in self._groups:
             kinds = (f"{'drive' if isinstance(n, Cia402Drive) else 'encoder'} {n.node_id}" for n in group)

@@ -77,7 +77,7 @@ class Case:
         plant_step_s: float | None = None,
         seed: int = 0,
     ) -> World:
-        """The case at rest.
+        """Return the case at rest.
 
         Args:
             excitation: a table in place of the paper's.
@@ -207,7 +207,7 @@ CASES: Mapping[str, Callable[[], Case]] = {"constant": _constant, "quadratic": _
 
 
 def case(name: str) -> Case:
-    """The case of that name.
+    """Return the case of that name.
 
     Raises:
         SimError: there is none.

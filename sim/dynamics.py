@@ -29,7 +29,7 @@ Coupling = Callable[[float, float, float, float], tuple[float, float]]
 
 
 def spring_deflection(motor: MotorPlant) -> Load:
-    """(q, theta) -> deflection of the spring: phi minus the gear's errors, rad."""
+    """Return (q, theta) -> deflection of the spring: phi minus the gear's errors, rad."""
     kinematics = motor.terms.kinematics
     return lambda q, theta: q - theta - sum(error(theta)[0] for error in kinematics)
 
@@ -126,7 +126,7 @@ def _link_load(link: LinkPlant) -> Load:
 
 
 def equations(plant: JointPlant) -> Pair | Triple:
-    """Accelerations of the joint as one closure."""
+    """Return accelerations of the joint as one closure."""
     if plant.rigid:
         return _rigid(plant)
     if plant.arrangement == "serial":

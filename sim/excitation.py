@@ -37,7 +37,7 @@ class Excitation:
     centring_nm_s_rad: float = 0.0
 
     def torque(self, motor: int, time_s: float, position_rad: float, velocity_rad_s: float) -> float:
-        """Torque for the period that begins now, N·m at the joint."""
+        """Return the torque for the period that begins now, N·m at the joint."""
         hold = self.centring_nm_rad * (position_rad - self.centre_rad[motor])
         return self.profiles[motor](time_s) - hold - self.centring_nm_s_rad * velocity_rad_s
 
@@ -72,7 +72,7 @@ class _Keys:
         return int(value)
 
     def each(self, key: str, default: float | None, motors: int, minimum: float = -math.inf) -> list[float]:
-        """One number for all motors, or a list with one number a motor."""
+        """Return one number for all motors, or a list with one number a motor."""
         value = self._left.get(key)
         if not isinstance(value, list | tuple):
             return [self.number(key, default, minimum)] * motors

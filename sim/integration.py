@@ -23,7 +23,7 @@ Settle = Callable[[State, float], None]
 
 
 def integrator(plant: JointPlant, step_s: float) -> Step:
-    """Runge-Kutta of order four over one step, torques held.
+    """Return Runge-Kutta of order four over one step, torques held.
 
     For x" = a(x, x') the four classical stages read, with one acceleration each,
         x+ = x + h v + h²/6 (a1 + a2 + a3),  v+ = v + h/6 (a1 + 2 a2 + 2 a3 + a4).
@@ -85,7 +85,7 @@ def _rk4_triple(acc: Triple, h: float) -> Step:
 
 
 def whole_fraction(period_s: float, step_s: float | None, plant: JointPlant, fine: bool = False) -> int:
-    """Steps in a control period.
+    """Return steps in a control period.
 
     Args:
         period_s: the control period.
@@ -125,7 +125,7 @@ def _fastest(plant: JointPlant) -> float:
 
 
 def settling(plant: JointPlant, step_s: float) -> Settle | None:
-    """Dry friction and memories between two steps; None if the joint has neither."""
+    """Return dry friction and memories between two steps; None if the joint has neither."""
     bodies = _dry_bodies(plant, step_s)
     commits = [
         (2 + 2 * i, spring_deflection(motor), commit)

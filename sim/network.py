@@ -80,7 +80,7 @@ class Network:
     # Devices
 
     def add(self, node: Node) -> None:
-        """One more device, switched on at once."""
+        """Add a device, switched on at once."""
         node.attach(self._sender(), self._reroute)
         self.nodes.append(node)
         self.power_on(node)

@@ -64,7 +64,7 @@ class MotorPlant:
         _check("motor", self.inertia_kg_m2, self.viscous_damping_nm_s_rad)
 
     def law(self) -> Law:
-        """The elastic law including effects."""
+        """Return the elastic law including effects."""
         law = self.spring.law()
         for reshape in self.reshape:
             law = reshape(law)

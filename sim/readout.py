@@ -68,7 +68,7 @@ class Amplifier:
             self._filtered = self._velocity = before + share * (velocity - before)
 
     def signals(self) -> DriveSignals:
-        """The sampled signals."""
+        """Return the sampled signals."""
         drive, theta = self.drive, self._theta
         for read in self._readings:
             theta = read(theta)

@@ -141,7 +141,7 @@ def _require(name: str, value: float, *, positive: bool) -> None:
 
 
 def noise(seed: tuple[int, ...], std: float) -> Iterator[float]:
-    """An endless stream of white Gaussian noise from a seed; zeros for std 0."""
+    """Yield white Gaussian noise from a seed without end; zeros for std 0."""
     if std == 0.0:
         while True:
             yield 0.0

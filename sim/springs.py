@@ -55,7 +55,7 @@ class Spring:
         return self.model == RIGID
 
     def law(self) -> Law:
-        """The law as closures.
+        """Return the law as closures.
 
         Raises:
             SimError: unknown model, missing, unknown or impossible parameter, or a rigid coupling.

@@ -70,7 +70,7 @@ def _motor(motor: MotorPlant, key: str, name: str, value: float) -> MotorPlant:
 
 
 def typical_torque_nm(plant: JointPlant) -> float:
-    """A torque with a suitable motion: 0.15 rad in a soft spring, less in a stiff one."""
+    """Return a torque with a suitable motion: 0.15 rad in a soft spring, less in a stiff one."""
     springs = [motor.spring for motor in plant.motors if not motor.spring.rigid]
     if not springs:
         return max(abs(plant.link.gravity_nm), 5.0 * plant.link.inertia_kg_m2)
@@ -80,7 +80,7 @@ def typical_torque_nm(plant: JointPlant) -> float:
 
 
 def suitable(plant: JointPlant) -> dict[str, Any]:
-    """Excitation table for `sim.excitation.build`: rich, with soft centring against drift."""
+    """Return the excitation table for `sim.excitation.build`: rich, with soft centring against drift."""
     torque = typical_torque_nm(plant)
     inertia = plant.link.inertia_kg_m2 + sum(motor.inertia_kg_m2 for motor in plant.motors)
     hold = 3.0 * torque

@@ -161,7 +161,7 @@ class World:
         self._scale.fit(assembly.link, self.plant_step_s, self._state[0], self._state[2])
 
     def command(self, motor: int, torque_nm: float | None) -> None:
-        """Set-point of one drive, from the next period on.
+        """Command one drive's set-point from the next period on.
 
         Args:
             motor: index.
@@ -210,15 +210,15 @@ class World:
         self._scale.sample(state[0], state[2])
 
     def drive(self, motor: int) -> DriveSignals:
-        """Signals of this drive at the present instant."""
+        """Return signals of this drive at the present instant."""
         return self._amplifiers[motor].signals()
 
     def link_counts(self) -> int:
-        """Reading of the link encoder at the present instant."""
+        """Return the reading of the link encoder at the present instant."""
         return self._scale.counts
 
     def truth(self) -> Truth:
-        """True state of the joint now."""
+        """Return the true state of the joint now."""
         state = self._state
         elastic = self._elastic(state)
         motors = tuple(

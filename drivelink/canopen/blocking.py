@@ -27,7 +27,7 @@ class FrameBus(Protocol):
     """Required interface of a bus: python-can's `Bus`, or `BusPort`."""
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Put a frame on the bus."""
+        """Send a frame."""
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """The next frame, or None after the timeout."""

@@ -167,7 +167,9 @@ def _socketcand_socket(bus: can.BusABC) -> socket.socket:
 
 
 def server_has_gone(bus: can.BusABC) -> bool:
-    """Whether a socketcand server has closed the connection, which python-can's client does not notice."""
+    """Return whether a socketcand server has closed the connection, which python-can's client
+    does not notice.
+    """
     try:
         return _socketcand_socket(bus).recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b""
     except BlockingIOError:
@@ -177,12 +179,12 @@ def server_has_gone(bus: can.BusABC) -> bool:
 
 
 def listening_s(section: BusSection) -> float:
-    """How long to listen for periodic frames before the bus counts as silent, s."""
+    """Return how long to listen for periodic frames before the bus counts as silent, s."""
     return max(_DELIVERY_S.get(section.interface, _SLOWEST_DELIVERY_S), 3 * section.period_s)
 
 
 def interface_is_up(name: str) -> bool:
-    """Whether a network interface exists and is up; cheap enough for repeated use in a run."""
+    """Return whether a network interface exists and is up; cheap enough for repeated use in a run."""
     try:
         flags = (_SYS_NET / name / "flags").read_text(encoding="ascii")
         return bool(int(flags, 16) & _IFF_UP)
@@ -211,7 +213,7 @@ def _size_receive_buffer(bus: can.BusABC, section: BusSection) -> None:
 
 
 def receive_buffer_frames(bus: can.BusABC) -> int:
-    """Frames that the kernel buffers for a SocketCAN bus."""
+    """Return the frames that the kernel buffers for a SocketCAN bus."""
     sock: socket.socket = bus.socket  # type: ignore[attr-defined]
     return sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // _BYTES_PER_FRAME
 

@@ -18,7 +18,7 @@ COMFORTABLE = 0.7  # above it, event-driven frames of others begin to delay the 
 
 
 def frame_bits(data_bytes: int) -> int:
-    """Bits on the wire of a standard frame, worst case."""
+    """Return bits on the wire of a standard frame, worst case."""
     return 47 + 8 * data_bytes + (33 + 8 * data_bytes) // 4
 
 

@@ -14,7 +14,9 @@ _DIMENSIONLESS, _INCREMENTS = 0x00, 0xB5
 
 
 def angle_unit_rad(unit: int) -> float | None:
-    """Radians per count of a position in the unit of 0x60A8; None where that is no angle (increments)."""
+    """Return radians per count of a position in the unit of 0x60A8; None where that is no
+    angle (increments).
+    """
     angle = _ANGLES_RAD.get(unit >> 16 & 0xFF)
     return None if angle is None else float(angle * 10.0 ** _signed8(unit >> 24))
 
@@ -24,7 +26,7 @@ def _signed8(byte: int) -> int:
 
 
 def velocity_unit_rad_s(unit: int, counts_per_rev: float | None) -> float | None:
-    """Radians per second and count of 0x606C, from 0x60A9.
+    """Return radians per second and count of 0x606C, from 0x60A9.
 
     Byte 3 is the power of ten, byte 2 the numerator, byte 1 the denominator (CiA 303-2): 0x00B44700 is
     revolutions per minute, 0x00B50300 increments per second.

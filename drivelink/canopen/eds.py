@@ -59,7 +59,7 @@ class DataSheet:
     problems: list[str] = field(default_factory=list)
 
     def value(self, index: int, subindex: int = 0) -> int | None:
-        """Value of an object as an unsigned number of its length; None if the file has none."""
+        """Return the value of an object as an unsigned number of its length; None if the file has none."""
         entry = self.objects.get((index, subindex))
         if entry is None:
             return None
@@ -67,12 +67,12 @@ class DataSheet:
         return None if value is None else value & ((1 << len(entry)) - 1)
 
     def values(self) -> dict[tuple[int, int], int]:
-        """All values, as `value` gives them."""
+        """Return all values, as `value` gives them."""
         pairs = ((address, self.value(*address)) for address in self.objects)
         return {address: value for address, value in pairs if value is not None}
 
     def tpdos(self) -> tuple[Tpdo, ...]:
-        """The TPDOs in the file; `fixed` if it declares them read-only."""
+        """Return the TPDOs in the file; `fixed` if it declares them read-only."""
         return tuple(replace(tpdo, fixed=self._fixed(tpdo)) for tpdo in tpdos_of(self.values()))
 
     def _fixed(self, tpdo: Tpdo) -> bool:

@@ -68,7 +68,7 @@ class Emergency:
 
 
 def emergency_text(code: int) -> str:
-    """What an error code means; 0xFFxx is the maker's."""
+    """Return what an error code means; 0xFFxx is the maker's."""
     if code & 0xFF00 == 0xFF00:
         return "device specific"
     for mask in (0xFFFF, 0xFFF0, 0xFF00, 0xF000):
@@ -78,13 +78,15 @@ def emergency_text(code: int) -> str:
 
 
 def parse_emergency(data: bytes) -> Emergency | None:
-    """An EMCY's bytes; None where there are too few to say anything."""
+    """Return an EMCY's bytes; None where there are too few to say anything."""
     if len(data) < 2:
         return None
     return Emergency(*_EMCY.unpack(bytes(data[:8]).ljust(8, b"\0")))
 
 
 def drive_state(statusword: int) -> str:
-    """The state in a statusword (CiA 402-2, table 30); bits that toggle or belong to modes are ignored."""
+    """Return the state in a statusword (CiA 402-2, table 30); bits that toggle or belong to
+    modes are ignored.
+    """
     masks = State402.SW_MASK.items()
     return next((name.lower() for name, (mask, value) in masks if statusword & mask == value), "unknown")

@@ -113,14 +113,14 @@ class NodeLayout:
 
 
 def layout_document(layout: NodeLayout) -> dict[str, Any]:
-    """A layout as plain values, for the model document; without unit objects and notices."""
+    """Return a layout as plain values, for the model document; without unit objects and notices."""
     document = asdict(layout)
     del document["reported"], document["notices"]
     return document
 
 
 def layout_from(document: Mapping[str, Any]) -> NodeLayout:
-    """A layout from its plain values.
+    """Return a layout from its plain values.
 
     Raises:
         ValueError, KeyError, TypeError: they are none.

@@ -83,7 +83,7 @@ class Mapper:
     _refusal: str = field(default="", init=False)
 
     def program(self) -> Program[tuple[TpdoLayout, ...]]:
-        """The program: map, read back, decode.
+        """Return the program: map, read back, decode.
 
         Raises:
             DriveError: the node lacks a needed signal, or does not keep the mapping.

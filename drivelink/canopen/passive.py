@@ -65,7 +65,7 @@ class _PassiveNode:
         return (index, subindex) in self._units | _COMMUNICATION or (index, subindex) in _STORED
 
     def is_unit(self, address: Address) -> bool:
-        """Whether the scale of a signal depends on an object."""
+        """Return whether the scale of a signal depends on an object."""
         return address in self._units
 
     def restart(self) -> None:
@@ -101,7 +101,7 @@ class _PassiveNode:
                     self.lose_sight("it has another identity or date of configuration than before")
 
     def dispute(self) -> str:
-        """One line on an object whose value is not known although it was transferred; empty: none."""
+        """Return one line on an object whose value is not known although it was transferred; empty: none."""
         if not self.listener.disputed:
             return ""
         index, subindex = min(self.listener.disputed)
@@ -118,7 +118,7 @@ class _PassiveNode:
         return pending is not None and is_mapping(pending)
 
     def layout(self) -> tuple[NodeLayout, str]:
-        """The best known layout, and why it is not trusted (empty: it is).
+        """Return the best known layout, and why it is not trusted (empty: it is).
 
         Raises:
             DriveError: mapping or scale of a needed signal is unknown.
@@ -138,7 +138,7 @@ class _PassiveNode:
             return layout, self.doubt()
 
     def doubt(self) -> str:
-        """One line on a mapping that is not trusted, with the remedy."""
+        """Return one line on a mapping that is not trusted, with the remedy."""
         role = self.role
         if self.lost:
             why = f"{self.lost}, and its mapping was neither written nor read since"
@@ -156,7 +156,7 @@ class _PassiveNode:
         )
 
     def offered(self) -> str:
-        """TOML for the joint file that declares the mapping, from a data sheet if there is one."""
+        """Return TOML for the joint file that declares the mapping, from a data sheet if there is one."""
         if self.role.tpdo:
             return f"default = true in {self._keys()}"
         tpdos = self._sheet_tpdos()
@@ -251,7 +251,7 @@ class _PassiveNode:
 
 
 def is_mapping(address: Address) -> bool:
-    """Whether an object is a parameter of a TPDO (CiA 301, 7.5.2.37 and 38)."""
+    """Return whether an object is a parameter of a TPDO (CiA 301, 7.5.2.37 and 38)."""
     return 0x1800 <= address[0] <= 0x1BFF
 
 
@@ -342,11 +342,11 @@ class PassiveConfigurator:
         )
 
     def unasked(self, node: int) -> int:
-        """SDO answers for a node that belong to no request heard; they are not used."""
+        """Return SDO answers for a node that belong to no request heard; they are not used."""
         return self._nodes[node].listener.unasked
 
     def units(self, node: int) -> dict[Address, int]:
-        """The unit objects of a node as heard, with their unsigned values."""
+        """Return the unit objects of a node as heard, with their unsigned values."""
         one = self._nodes[node]
         return {address: value for address, value in one.listener.values.items() if one.is_unit(address)}
 
@@ -398,7 +398,7 @@ class PassiveConfigurator:
             one.heard[cob_id] = len(data)
 
     def poll(self, now_s: float) -> list[tuple[int, NodeLayout | DriveError]]:
-        """Nodes whose layout became known or changed since the last call."""
+        """Return the nodes whose layout became known or changed since the last call."""
         ended: list[tuple[int, NodeLayout | DriveError]] = []
         for node_id, node in self._nodes.items():
             if node.seen_changes == node.listener.changes:
@@ -425,5 +425,5 @@ class PassiveConfigurator:
         return ended
 
     def load(self) -> BusLoad:
-        """Bus load of all known TPDOs."""
+        """Return the bus load of all known TPDOs."""
         return bus_load(self.layouts.values(), self.bus)

@@ -72,13 +72,13 @@ class Tpdo:
 
 
 def entry_text(entry: Entry) -> str:
-    """An entry as text."""
+    """Return an entry as text."""
     index, subindex, bits = entry
     return f"0x{index:04X}:{subindex:02X} ({bits} bit)"
 
 
 def describe(tpdos: Iterable[Tpdo]) -> str:
-    """The mappings in one line."""
+    """Return the mappings in one line."""
     parts = []
     for tpdo in tpdos:
         objects = " + ".join(f"0x{index:04X}:{subindex:02X}" for index, subindex, _ in tpdo.entries) or (
@@ -97,7 +97,7 @@ def read_optional(node: int, index: int, subindex: int) -> Program[int | None]:
 
 
 def read_identity(node: int) -> Program[tuple[int, int, int, int]]:
-    """Vendor, product code, revision and serial number of 0x1018; 0 where not reported."""
+    """Return vendor, product code, revision and serial number of 0x1018; 0 where not reported."""
     vendor = (yield from read_optional(node, 0x1018, 1)) or 0
     product = (yield from read_optional(node, 0x1018, 2)) or 0
     revision = (yield from read_optional(node, 0x1018, 3)) or 0
@@ -153,7 +153,7 @@ def read_tpdo(node: int, number: int, *, exactly: bool = False) -> Program[Tpdo 
 
 
 def read_tpdos(node: int) -> Program[tuple[Tpdo, ...]]:
-    """All TPDOs of a node."""
+    """Return all TPDOs of a node."""
     found = []
     for number in range(1, _MOST_TPDOS + 1):
         tpdo = yield from read_tpdo(node, number)
@@ -165,7 +165,7 @@ def read_tpdos(node: int) -> Program[tuple[Tpdo, ...]]:
 
 
 def tpdos_of(values: Mapping[Address, int]) -> tuple[Tpdo, ...]:
-    """TPDOs from the values of 0x1800 to 0x1BFF; one with an incomplete mapping is not `known`.
+    """Return TPDOs from the values of 0x1800 to 0x1BFF; one with an incomplete mapping is not `known`.
 
     Args:
         values: unsigned values by (index, subindex), from a data sheet or the traffic.
@@ -205,7 +205,7 @@ def _entries(values: Mapping[Address, int], mapping: int) -> tuple[Entry, ...] |
 def decode(
     tpdos: Sequence[Tpdo], candidates: Mapping[Signal, Sequence[MappedObject]]
 ) -> tuple[TpdoLayout, ...]:
-    """Layouts of the frames, from the mapping read back.
+    """Return the layouts of the frames, from the mapping read back.
 
     Of several mapped objects for one signal the best one is used; of an object that is mapped twice, its
     place in a frame sent at every SYNC, else the first. An object serves the first signal it can. Others are

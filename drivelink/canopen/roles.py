@@ -39,7 +39,7 @@ class Role:
 
 
 def roles(joint: JointFile, base_dir: Path = Path()) -> tuple[Role, ...]:
-    """The nodes of a joint, motors first.
+    """Return the nodes of a joint, motors first.
 
     Args:
         joint: the joint file.
@@ -87,7 +87,7 @@ def roles(joint: JointFile, base_dir: Path = Path()) -> tuple[Role, ...]:
 
 
 def roles_by_node(joints: Sequence[JointFile], base_dirs: Sequence[Path] | None) -> dict[int, Role]:
-    """The nodes of all joints on one bus by node id, in the order of the joint files.
+    """Return the nodes of all joints on one bus by node id, in the order of the joint files.
 
     Args:
         joints: the joint files.
@@ -116,7 +116,7 @@ def _encoder_node(joint: JointFile) -> int | None:
 
 
 def object_address(text: str, key: str) -> tuple[int, int]:
-    """Index and subindex of "0x60E4:01".
+    """Return the index and subindex of "0x60E4:01".
 
     Raises:
         JointFileError: the text has another form.

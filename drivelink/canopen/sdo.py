@@ -29,7 +29,7 @@ _TRANSFER_TIMEOUTS = 4  # limit of a whole transfer, in timeouts
 
 
 def abort_text(code: int) -> str:
-    """An abort code with its meaning (CiA 301, table 22)."""
+    """Return an abort code with its meaning (CiA 301, table 22)."""
     text = SdoAbortedError.CODES.get(code)
     return f"0x{code:08X}" + (f" ({text})" if text else "")
 
@@ -127,7 +127,7 @@ Program = Generator[Request, bytes, T]
 
 
 def read_number(node: int, index: int, subindex: int) -> Program[int]:
-    """An object as an unsigned number.
+    """Return an object as an unsigned number.
 
     Raises:
         SdoAbort: the node refuses, or answers with too many bytes.

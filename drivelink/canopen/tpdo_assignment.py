@@ -49,7 +49,7 @@ class Assignment:
 
 
 def pack(objects: Iterable[MappedObject], most: int = FRAME_BITS) -> list[tuple[MappedObject, ...]]:
-    """Frames of at most eight bytes and `most` objects, first fit, in the order of importance."""
+    """Return the frames of at most eight bytes and `most` objects, first fit, in the order of importance."""
     frames: list[list[MappedObject]] = []
     for candidate in sorted(objects, key=lambda candidate: _ORDER.index(candidate.signal)):
         for frame in frames:
@@ -62,7 +62,7 @@ def pack(objects: Iterable[MappedObject], most: int = FRAME_BITS) -> list[tuple[
 
 
 def unused(wanted: Available, objects: Sequence[MappedObject]) -> tuple[MappedObject, ...]:
-    """Objects that do not serve a signal already: an object does not check itself."""
+    """Return objects that do not serve a signal already: an object does not check itself."""
     used = {candidates[0].address for candidates in wanted.values() if candidates}
     return tuple(candidate for candidate in objects if candidate.address not in used)
 
@@ -150,7 +150,7 @@ def _cannot(role: Role, wanted: Available, tpdos: Sequence[Tpdo]) -> str:
 
 
 def choose_cob_id(node: int, tpdo: Tpdo, taken: set[int]) -> int:
-    """Identifier for a TPDO: its own if usable, else the predefined one, else a free one.
+    """Return the identifier for a TPDO: its own if usable, else the predefined one, else a free one.
 
     Args:
         node: node id.

@@ -34,7 +34,7 @@ _MICRO_FROM = 20_000  # 0x6076 of a maker that uses µN·m and mN·m but has no 
 
 
 def unit_objects(role: Role, vendor: Vendor) -> tuple[Address, ...]:
-    """Objects that `offer` needs the values of."""
+    """Return objects that `offer` needs the values of."""
     wanted: tuple[Address, ...] = ()
     if role.drive is not None:
         wanted += _DRIVE_OBJECTS + vendor.objects()
@@ -51,7 +51,7 @@ def unit_objects(role: Role, vendor: Vendor) -> tuple[Address, ...]:
 
 
 def offer(role: Role, reported: Mapping[Address, int], vendor: Vendor) -> Offer:
-    """Signals that a node can send, with their scales.
+    """Return signals that a node can send, with their scales.
 
     Args:
         role: role of the node, with its section of the joint file.

@@ -64,13 +64,13 @@ class Vendor:
     others: tuple[tuple[Address, Vendor], ...] = ()
 
     def objects(self) -> tuple[Address, ...]:
-        """Vendor objects that are read for units."""
+        """Return vendor objects that are read for units."""
         single = (self.counts_per_rev, self.torque_constant, self.nominal_current)
         own = tuple(address for address in single if address) + (self.gear or ())
         return own + tuple(address for _, other in self.others for address in other.objects())
 
     def generation(self, reported: Mapping[Address, int]) -> Vendor:
-        """This vendor's variant for a drive that has reported these objects."""
+        """Return this vendor's variant for a drive that has reported these objects."""
         if self.counts_per_rev not in reported:
             for marker, other in self.others:
                 if marker in reported:
@@ -113,5 +113,5 @@ VENDORS = {
 
 
 def vendor_of(vendor_id: int) -> Vendor:
-    """The vendor of 0x1018:01, or a generic one."""
+    """Return the vendor of 0x1018:01, or a generic one."""
     return VENDORS.get(vendor_id, GENERIC)

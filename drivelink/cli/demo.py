@@ -36,7 +36,7 @@ examples:
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `demo`."""
+    """Add the arguments of `demo`."""
     parser.add_argument("--case", choices=CASES, default="vsa-ii", help="which joint, and what happens to it")
     parser.add_argument(
         "--seconds",

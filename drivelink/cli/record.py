@@ -192,7 +192,7 @@ def _session(joint: JointFile, folder: Path, needed: bool) -> zenoh.Session | No
 
 
 def known_layouts(source: JointText) -> Sequence[NodeLayout]:
-    """Mapping of the joint's nodes by a running daemon, else by the joint file; () if unknown."""
+    """Return the mapping of the joint's nodes by a running daemon, else by the joint file; () if unknown."""
     session = _session(source.joint, source.folder, needed=False)
     try:
         alive = session is not None and _alive(session, source.joint)
@@ -242,7 +242,7 @@ class _Summary:
         self._next = self._begin + _SAY_EVERY_S
 
     def document(self) -> dict[str, Any]:
-        """Recorded counts as a JSON document."""
+        """Return recorded counts as a JSON document."""
         return {
             "file": str(self._path),
             "seconds": round(time.monotonic() - self._begin, 3),
@@ -252,7 +252,7 @@ class _Summary:
         }
 
     def text(self) -> str:
-        """Recorded counts as text."""
+        """Return recorded counts as text."""
         counts = [f"{n} {_PLURAL[kind]}" for kind, n in self._recorder.sink.counts.items() if n]
         missed = self._missed()
         lost = f", {missed} cycles without sample" if missed else ""

@@ -132,7 +132,7 @@ class _Stamped(PlainFormatter):
     """Formats log records as lines with the time of day."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record's lines."""
+        """Return the record's lines."""
         return "\n".join(stamped(line, sys.stderr, 11) for line in super().format(record).split("\n"))
 
 

@@ -30,5 +30,5 @@ class BusPort:
             self.loop.send(msg.arbitration_id, bytes(msg.data))
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """The next frame; only before the loop runs."""
+        """Return the next frame; only before the loop runs."""
         return self.bus.recv(timeout)

@@ -140,7 +140,7 @@ class PassiveFollower(MapFollower):
         return ()
 
     def unasked(self, node: int) -> int:
-        """SDO answers for a node that belong to no request heard."""
+        """Return SDO answers for a node that belong to no request heard."""
         return self._configurator.unasked(node)
 
     def lose_sight(self, nodes: Iterable[int] | None = None, why: str = "the bus was lost") -> None:

@@ -68,7 +68,7 @@ class FrameSource(Protocol):
         """The received data frames with 11-bit identifiers, in order."""
 
     def send(self, cob_id: int, data: bytes) -> None:
-        """Put a frame on the bus; a full transmit queue is counted, not raised."""
+        """Send a frame; a full transmit queue is counted, not raised."""
 
     def narrow(self, cob_ids: Iterable[int]) -> None:
         """Receive these identifiers only, if the kernel can filter."""

@@ -182,7 +182,7 @@ class CycleLoop:
                 self._loop_joints_of.setdefault(cob_id, []).append(loop_joint)
 
     def receive_ids(self) -> set[int]:
-        """Identifiers with a receiver."""
+        """Return the identifiers with a receiver."""
         return {SYNC_COB_ID, *self._loop_joints_of, *self.listeners}
 
     def send(self, cob_id: int, data: bytes) -> None:
@@ -215,7 +215,7 @@ class CycleLoop:
             self.housekeeping.run(stamp_ns, self.period_ns)
 
     def stamps(self, cycles: int, start_ns: int) -> range:
-        """The stamps of so many SYNCs on time."""
+        """Return the stamps of so many SYNCs on time."""
         return range(start_ns, start_ns + cycles * self.period_ns, self.period_ns)
 
     def tick(self, stamp_ns: int, jump: int = 1) -> None:

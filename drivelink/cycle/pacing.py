@@ -19,7 +19,7 @@ _LONGEST_WAIT_NS = 20_000_000
 
 
 def run(loop: CycleLoop) -> None:
-    """Cycle until the loop is stopped."""
+    """Run cycles until the loop is stopped."""
     if loop.produce:
         _produce(loop)
     else:

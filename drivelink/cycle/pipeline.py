@@ -25,7 +25,7 @@ class ResidualMonitor(Protocol):
         """Take a sample; return whether the alarm is on."""
 
     def describe(self) -> dict[str, Any]:
-        """Residual against its baseline and likely location, for the status key."""
+        """Return the residual against its baseline and likely location, for the status key."""
 
 
 Built = tuple[Estimator, ResidualMonitor | None]

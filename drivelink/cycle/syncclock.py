@@ -43,7 +43,7 @@ class MeasuredPeriod(NamedTuple):
 
 
 def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPeriod | None:
-    """The period of SYNCs from their stamps, robust to jitter, stalls and lost SYNCs.
+    """Return the period of SYNCs from their stamps, robust to jitter, stalls and lost SYNCs.
 
     The expected one where the median step is as long and steady, or where most SYNCs come at its times. Else
     the slope of a line through the stamps over their numbers, rounded to a value within three standard
@@ -131,7 +131,7 @@ class SyncClock:
         self._skipped = 0  # periods without SYNC that may only be late
 
     def jump(self, stamp_ns: int, monotonic_ns: int | None = None) -> int:
-        """Periods since the previous SYNC: 1 is normal, more is a gap, 0 is a SYNC that was not due.
+        """Return periods since the previous SYNC: 1 is normal, more is a gap, 0 is a SYNC that was not due.
 
         A SYNC that comes after its period was counted as lost is `LATE`.
 

@@ -46,7 +46,7 @@ class BusKeeper:
         self._events.begin("bus", f"{self._section.channel}: the bus is lost: {reason}", logging.ERROR)
 
     def check(self) -> bool:
-        """In the slack: try to reopen a lost bus; return whether it is back."""
+        """Try to reopen a lost bus in the slack of a cycle; return whether it is back."""
         loop = self._port.loop
         if loop is None or not isinstance(loop.source, LostSource):
             return False

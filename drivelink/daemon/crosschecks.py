@@ -15,7 +15,7 @@ _WORDS = {
 
 
 def cross_checks(assembler: Assembler) -> list[dict[str, Any]]:
-    """All checks that the mapping makes possible.
+    """Return all checks that the mapping makes possible.
 
     {"motor": from 1 on, "check": "velocity" | "current" | "second_encoder" | "following_error", "verdict":
     "untested" | "agrees" | "contradicts", "scale": of the second reading against the first, "std": of that}.
@@ -27,7 +27,7 @@ def cross_checks(assembler: Assembler) -> list[dict[str, Any]]:
 
 
 def contradiction(assembler: Assembler) -> dict[str, Any] | None:
-    """The reading that a cross-check suspects, in the form of `Estimator.suspicion`; None: none.
+    """Return the reading that a cross-check suspects, in the form of `Estimator.suspicion`; None: none.
 
     If a second check confirms the position, the other reading is wrong; if two contradict it and none
     confirms it, the position is; otherwise it is undecided.

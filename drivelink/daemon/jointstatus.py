@@ -75,7 +75,7 @@ class JointStatus:
         self._asked = 0
 
     def document(self, state: str = "") -> dict[str, Any]:
-        """The state of the joint now.
+        """Return the state of the joint now.
 
         Args:
             state: "starting" or "stopped"; default: determined from the loop.
@@ -194,7 +194,7 @@ class JointStatus:
         }
 
     def summary(self) -> str:
-        """The run in one line."""
+        """Return the run in one line."""
         loop_joint, loop = self._loop_joint, self._loop
         work, jitter = loop_joint.work.total(), loop.lateness.total()
         missed = loop_joint.pipeline.missed + loop.overruns

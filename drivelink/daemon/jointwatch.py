@@ -85,7 +85,7 @@ class JointWatch:
 
 
 def residual_text(monitor: ResidualMonitor | None) -> str:
-    """The residual against its baseline in words, if known."""
+    """Return the residual against its baseline in words, if known."""
     location = monitor.describe().get("location") if monitor is not None else None
     ratio = residual_ratio(monitor)
     where = f", likely at the {location}" if location else ""
@@ -93,7 +93,7 @@ def residual_text(monitor: ResidualMonitor | None) -> str:
 
 
 def residual_ratio(monitor: ResidualMonitor | None) -> float | None:
-    """The largest residual over its baseline, if known."""
+    """Return the largest residual over its baseline, if known."""
     described = monitor.describe() if monitor is not None else {}
     residuals, baselines = described.get("residual_nm") or (), described.get("floor_nm") or ()
     ratios = [r / b for r, b in zip(residuals, baselines, strict=False) if b > 0.0 and math.isfinite(r)]

@@ -72,7 +72,7 @@ class WatchedNode:
         return STATES.get(self.state, f"0x{self.state:02X}")
 
     def status(self, now: int) -> dict[str, Any]:
-        """Its part of the status document, at a time in ns."""
+        """Return its part of the status document, at a time in ns."""
         node, assembler = self.layout.node_id, self.assembler
         word, faults = assembler.statuswords.get(node), assembler.faults
         age_s = round((now - self.heartbeat_ns) / _NS, 3)

@@ -107,7 +107,9 @@ class ReadBack:
         self._due_s = now_s + (_FIRST_S if self._asked < _CLOSELY else self._period_s)
 
     def contradiction(self, assembler: Assembler) -> dict[str, Any] | None:
-        """What is contradicted of one joint, as `crosschecks.contradiction` gives it; None: nothing."""
+        """Return what is contradicted of one joint, as `crosschecks.contradiction` gives it;
+        None: nothing.
+        """
         contradicted = self.check.contradiction(assembler)
         if contradicted is None:
             return None

@@ -224,13 +224,13 @@ class Daemon:
         self._publishers = []
 
     def documents(self) -> list[dict[str, Any]]:
-        """Status document of each joint now."""
+        """Return the status document of each joint now."""
         for status in self._status:
             status.refresh_timing()
         return [status.document() for status in self._status]
 
     def summary(self) -> str:
-        """Summary of the run, one line per joint."""
+        """Return the summary of the run, one line per joint."""
         return "\n".join(status.summary() for status in self._status)
 
     def _open_publishers(self, session: zenoh.Session | None) -> list[JointPublisher | None]:

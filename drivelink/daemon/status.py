@@ -45,7 +45,7 @@ class EventLog:
         return dict(self._active)
 
     def recent(self) -> list[dict[str, Any]]:
-        """The last events, oldest first: {"time", "text", "count"}."""
+        """Return the last events, oldest first: {"time", "text", "count"}."""
         return [dict(event) for event in self._recent]
 
     def say(self, text: str, level: int = logging.INFO, key: str = "", source: str = "") -> None:

@@ -28,7 +28,7 @@ def notify(*lines: str) -> bool:
 
 
 def watchdog_period_s() -> float | None:
-    """Interval of "WATCHDOG=1", a quarter of systemd's timeout, s; None: no watchdog."""
+    """Return the interval of "WATCHDOG=1", a quarter of systemd's timeout, s; None: no watchdog."""
     if os.environ.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
         return None
     try:

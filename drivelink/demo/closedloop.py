@@ -180,7 +180,7 @@ class ClosedLoop(DemoRun):
         self.trial = Trial(self._path, time.monotonic())
 
     def _note(self, step: str, text: str, unix_s: float | None = None) -> None:
-        """Say a step once, with its time since the change."""
+        """Report a step once, with its time since the change."""
         if step in self.times:
             return
         self.times[step] = time.time() if unix_s is None else unix_s
@@ -192,7 +192,7 @@ class ClosedLoop(DemoRun):
 
 
 def found_values(report: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
-    """Every parameter of a diagnosis with its standard deviation, by its name."""
+    """Return every parameter of a diagnosis with its standard deviation, by its name."""
     tables = [(f"{one['name']}.", one) for one in report.get("effects", ())]
     tables += [("", one) for one in report.get("transmissions", ())]
     values: dict[str, tuple[float, float]] = {}
@@ -207,7 +207,7 @@ def found_values(report: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
 
 
 def result(name: str, run: ClosedLoop, summary: RunSummary) -> dict[str, Any]:
-    """A run as a JSON object; missing numbers are null."""
+    """Return a run as a JSON object; missing numbers are null."""
     times, begin = run.times, run.times.get("changed")
     document: dict[str, Any] = {
         "case": name,
@@ -233,7 +233,7 @@ def result(name: str, run: ClosedLoop, summary: RunSummary) -> dict[str, Any]:
 
 
 def closing(document: Mapping[str, Any]) -> list[Table | Text]:
-    """The end of a run: truth beside what was found, errors, times."""
+    """Return the end of a run: truth beside what was found, errors, times."""
     table = Table(title=f"{document['case']}: truth beside finding", title_justify="left")
     for heading in ("", "truth", "found", "95 %"):
         table.add_column(heading, justify="left" if not heading else "right", no_wrap=True)

@@ -18,7 +18,7 @@ from estimator.sample import SIGMA_95, Status
 def closing_table(
     case: str, comparison: Comparison, summary: RunSummary, received: int, period_s: float
 ) -> RenderableType:
-    """The last pair of truth and estimate, the errors of the whole run, and the cycle's figures."""
+    """Return the last pair of truth and estimate, the errors of the whole run, and the cycle's figures."""
     errors = comparison.errors()
     table = Table(title=f"{case}: truth beside estimate", title_justify="left")
     for heading in ("", "truth", "estimate", "95 %", "rms error"):
@@ -59,7 +59,7 @@ def closing_table(
 
 
 def as_json(case: str, comparison: Comparison, summary: RunSummary, received: int) -> dict[str, Any]:
-    """The same as a JSON object; missing numbers are null."""
+    """Return the same as a JSON object; missing numbers are null."""
     errors = comparison.errors()
     return {
         "case": case,

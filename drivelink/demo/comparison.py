@@ -61,7 +61,7 @@ class Comparison:
             _keep(self._truth, truth.sequence, truth)
 
     def errors(self) -> RmsErrors:
-        """Errors over all pairs so far; NaN before the first valid estimate."""
+        """Return errors over all pairs so far; NaN before the first valid estimate."""
         if self._cycles == 0:
             return RmsErrors(0, math.nan, math.nan, math.nan)
         stiffness, true_stiffness, torque, true_torque = self._sums

@@ -61,7 +61,7 @@ def world_from_joint(
     seed: int | None = None,
     file: Path | None = None,
 ) -> World:
-    """The world that a joint file describes, at rest.
+    """Return the world that a joint file describes, at rest.
 
     Args:
         joint: the joint file.
@@ -111,7 +111,7 @@ def alter(world: World, effects: Sequence[str], parameters: Mapping[str, float])
 
 
 def assumptions(joint: JointFile) -> list[str]:
-    """Assumed values that the joint file does not declare, one line each."""
+    """Return assumed values that the joint file does not declare, one line each."""
     if joint.sim is not None and joint.sim.case is not None:
         return []
     lines = []
@@ -241,7 +241,7 @@ def _scale(joint: JointFile, given: Case | None) -> LinkEncoder | None:
 def nodes_from_joint(
     joint: JointFile, world: World, *, quirks: str | None = None, file: Path | None = None
 ) -> tuple[Node, ...]:
-    """The drives and the encoder of a joint.
+    """Return the drives and the encoder of a joint.
 
     Args:
         joint: the joint file.
@@ -300,7 +300,7 @@ def _drive_data(world: World, motor: int, has_link_encoder: bool) -> DriveData:
 def network_from_joint(
     joint: JointFile, bus: can.BusABC, *, world: World | None = None, quirks: str | None = None
 ) -> Network:
-    """The devices of one joint on a bus, in lockstep (`poll`) or served (`start`)."""
+    """Return the devices of one joint on a bus, in lockstep (`poll`) or served (`start`)."""
     world = world or world_from_joint(joint)
     return Network(bus, nodes_from_joint(joint, world, quirks=quirks), world)
 
@@ -314,7 +314,7 @@ def bench_from_joints(
     seed: int | None = None,
     files: Sequence[Path] = (),
 ) -> Bench:
-    """Worlds and devices of several joints; arguments as for `world_from_joint`, `nodes_from_joint`.
+    """Return worlds and devices of several joints; arguments as for `world_from_joint`, `nodes_from_joint`.
 
     Raises:
         JointFileError: a joint file cannot be simulated.

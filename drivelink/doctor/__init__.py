@@ -45,7 +45,7 @@ def examine(joint: JointFile | None, base_dir: Path, seconds: float) -> Report:
 
 
 def examine_eds(path: Path) -> Report:
-    """Signals that a drive can send, from its EDS or DCF alone.
+    """Return signals that a drive can send, from its EDS or DCF alone.
 
     Raises:
         DriveError: the file cannot be read at all.

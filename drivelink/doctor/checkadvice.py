@@ -25,7 +25,7 @@ _COUNTER = 240  # CiA 301, 7.5.2.22: the longest
 
 
 def asked_signals(role: Role) -> set[Signal]:
-    """Signals that the joint file requests for cross-checks."""
+    """Return signals that the joint file requests for cross-checks."""
     if role.drive is None:
         return set()
     asked = {signal for name in role.drive.checks for signal in _SIGNALS[name]}
@@ -33,7 +33,7 @@ def asked_signals(role: Role) -> set[Signal]:
 
 
 def second_encoder(role: Role) -> str:
-    """The object where a second encoder of the motor would be: the first that is not the link's."""
+    """Return the object where a second encoder of the motor would be: the first that is not the link's."""
     link = "" if role.encoder is None else role.encoder.object or _ENCODERS[0]
     return next(each for each in _ENCODERS if each.lower() != link.lower())
 

@@ -43,7 +43,7 @@ _ASSUMED_COUNTS = 4096.0  # a stand-in for units that need it
 
 
 def examine_sheet(section: Section, path: Path) -> None:
-    """Findings about one file.
+    """Add the findings about one file.
 
     Raises:
         DriveError: it cannot be read.
@@ -95,7 +95,7 @@ def _title(sheet: DataSheet) -> str:
 
 
 def planned_entries(assignment: Assignment) -> tuple[int, tuple[Entry, ...]]:
-    """Number and entries of a TPDO as it would be configured."""
+    """Return the number and entries of a TPDO as it would be configured."""
     if assignment.objects is None:
         return assignment.tpdo.number, assignment.tpdo.entries
     return assignment.tpdo.number, tuple((*c.address, c.bits) for c in assignment.objects)

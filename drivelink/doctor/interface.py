@@ -15,7 +15,7 @@ _GOOD_QUEUE = 100  # frames; the kernel's default of 10 is full with two cycles 
 
 
 def can_interfaces() -> list[str]:
-    """SocketCAN interfaces of this machine."""
+    """Return SocketCAN interfaces of this machine."""
     links = _links("-details")
     return [link["ifname"] for link in links if link.get("link_type") == "can"]
 

@@ -19,7 +19,7 @@ _CAP_SYS_NICE, _CAP_IPC_LOCK = 23, 14
 
 
 def examine_machine(section: Section, period_s: float, seconds: float) -> None:
-    """Kernel, rights and timer.
+    """Examine kernel, rights and timer.
 
     Args:
         section: receives the findings.
@@ -138,6 +138,6 @@ def _timer(section: Section, period_s: float, seconds: float) -> None:
 
 
 def percentile(values: list[float], fraction: float) -> float:
-    """The given quantile of the values."""
+    """Return the given quantile of the values."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, int(fraction * len(ordered)))]

@@ -67,7 +67,7 @@ class Report:
         return max(severities, default=Severity.OK)
 
     def as_dict(self) -> dict[str, Any]:
-        """For `--json`."""
+        """Return for `--json`."""
         return {
             "schema": "drivelink.doctor/1",
             "verdict": self.worst.name.lower(),

@@ -106,7 +106,7 @@ def series_test(time_s: FloatArray, value: FloatArray, std: FloatArray) -> Serie
 
 
 def changes(time_s: FloatArray, value: FloatArray, std: FloatArray, level: float) -> list[SeriesChange]:
-    """The changes of a series, one after the other as long as the next is significant.
+    """Return the changes of a series, one after the other as long as the next is significant.
 
     Args:
         time_s: (n,) increasing.
@@ -274,7 +274,9 @@ def appearance(found: NDArray[np.bool_]) -> Appearance:
 
 
 def q_values(p: FloatArray) -> FloatArray:
-    """Smallest false discovery rate at which each test would be a discovery (Benjamini and Hochberg 1995)."""
+    """Return the smallest false discovery rate at which each test would be a discovery
+    (Benjamini and Hochberg 1995).
+    """
     n = len(p)
     order = np.argsort(p)
     ranked = np.asarray(p)[order] * n / np.arange(1, n + 1)

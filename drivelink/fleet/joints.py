@@ -103,7 +103,7 @@ class Joints:
         return cls({name: one for name, (_, one) in best.items()})
 
     def of(self, path: Path, url: str) -> Joint:
-        """The joint of a recording.
+        """Return the joint of a recording.
 
         Args:
             path: the recording, as a local file.
@@ -118,7 +118,7 @@ class Joints:
         return self.named(url)
 
     def named(self, url: str) -> Joint:
-        """The joint whose name is in an address: in the file's name, else in that of a folder above.
+        """Return the joint whose name is in an address: in the file's name, else in that of a folder above.
 
         Raises:
             RecordingError: none, or several.
@@ -135,7 +135,7 @@ class Joints:
 
 
 def carried_joint(path: Path) -> Joint | None:
-    """The joint file that a recording carries, if any.
+    """Return the joint file that a recording carries, if any.
 
     Raises:
         RecordingError: the carried file cannot be read.

@@ -10,7 +10,7 @@ from estimator.transmissions import RIGID
 
 
 def usable(row: dict[str, Any]) -> bool:
-    """Whether a row has a usable stiffness."""
+    """Return whether a row has a usable stiffness."""
     value, std = row["stiffness_middle_nm_rad"], row["stiffness_std_middle_nm_rad"]
     return bool(
         row["status"] == "done" and row["excited"] and value is not None and value > 0.0 and std is not None
@@ -18,7 +18,7 @@ def usable(row: dict[str, Any]) -> bool:
 
 
 def unusable(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Recordings that show no stiffness of a transmission that has one, and why."""
+    """Return the recordings that show no stiffness of a transmission that has one, and why."""
     return [
         {
             "time": iso(row["time"]),
@@ -42,7 +42,7 @@ def _reason(row: dict[str, Any]) -> str:
 
 
 def lost(transmissions: list[dict[str, Any]], unusable: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The latest recordings, as far as they show no stiffness where earlier ones do."""
+    """Return the latest recordings, as far as they show no stiffness where earlier ones do."""
     found = []
     for one in transmissions:
         last = one["series"][-1]["time"]
@@ -54,7 +54,7 @@ def lost(transmissions: list[dict[str, Any]], unusable: list[dict[str, Any]]) ->
 
 
 def parameters(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Damping, and the parameters of the effects that were found, over the recordings."""
+    """Return the damping, and the parameters of the effects that were found, over the recordings."""
     series: dict[tuple[str, int], list[dict[str, Any]]] = {}
 
     def add(row: dict[str, Any], name: str, motor: int, value: Any, std: Any) -> None:

@@ -226,7 +226,7 @@ class Store:
             self._made.add(folder)
 
     def read(self, name: str) -> bytes:
-        """The content of a file.
+        """Return the content of a file.
 
         Raises:
             FleetError: it cannot be read.
@@ -237,7 +237,9 @@ class Store:
             raise FleetError(f"{self.url}/{name}: cannot be read: {_line(error)}") from error
 
     def names(self, folder: str, suffix: str) -> list[str]:
-        """Names of the files in a folder with this ending, relative to the store, without hidden ones."""
+        """Return the names of the files in a folder with this ending, relative to the store,
+        without hidden ones.
+        """
         self._fs.invalidate_cache()
         try:
             paths = self._fs.ls(f"{self._root}/{folder}", detail=False)

@@ -66,7 +66,7 @@ class _Place(NamedTuple):
 
 
 def summarise(rows: list[dict[str, Any]], false_discovery_rate: float) -> dict[str, Any]:
-    """The document of fleet.json and the page.
+    """Return the document of fleet.json and the page.
 
     Args:
         rows: of the table, in order of time, with at least `COLUMNS`, `recording` and `time`.
@@ -335,5 +335,5 @@ def _sentence(
 
 
 def spaced(place: str) -> str:
-    """A place as it stands in a sentence: motor 1."""
+    """Return a place as it stands in a sentence: motor 1."""
     return place.rstrip("12") + (f" {place[-1]}" if place[-1] in "12" else "")

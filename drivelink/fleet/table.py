@@ -109,15 +109,15 @@ class FleetTable:
                 self._lock = None
 
     def at(self, source: Source) -> Known | None:
-        """Entry of the recording at this address, if size and stamp are unchanged."""
+        """Return the entry of the recording at this address, if size and stamp are unchanged."""
         return self._by_place.get((source.url, source.size, source.stamp)) if source.stamp else None
 
     def has_now(self, digest: str, joint: str | None) -> bool:
-        """Whether this run has appended this content as a recording of this joint."""
+        """Return whether this run has appended this content as a recording of this joint."""
         return (digest, joint) in self._now
 
     def contents(self, size: int, version: str) -> frozenset[_Key]:
-        """Digest and joint of results of this version with the same size."""
+        """Return the digest and joint of results of this version with the same size."""
         return frozenset(k for k in self._sizes.get(size, ()) if self._by_content[k].version == version)
 
     def append(self, rows: list[dict[str, Any]]) -> None:
@@ -200,7 +200,7 @@ def _current(rows: list[dict[str, Any]]) -> list[bool]:
 
 
 def read_rows(store: Store, columns: list[str] | None = None) -> list[dict[str, Any]]:
-    """The rows of a table, without those that were replaced, in order of time.
+    """Return the rows of a table, without those that were replaced, in order of time.
 
     Args:
         store: where it is.

@@ -115,7 +115,7 @@ def process(task: Task, joints: Joints) -> Outcome:
 
 
 def broken_row(task: Task, error: str) -> dict[str, Any]:
-    """The row of a recording that could not be read."""
+    """Return the row of a recording that could not be read."""
     time_ = named_time(task.source) or task.source.modified
     place = f"{task.source.url}|{task.source.size}|{task.source.stamp}"
     return {
@@ -195,7 +195,7 @@ def _validation(task: Task, joint: Joint, base: Path) -> Iterator[Record | None]
 
 
 def named_time(source: Source) -> datetime | None:
-    """Date and, if present, time (UTC) in the name of a file or of a folder above."""
+    """Return the date and, if present, time (UTC) in the name of a file or of a folder above."""
     for part in reversed(re.split(r"[/\\]", unquote(source.url))):
         for match in _DATE.finditer(part):
             year, month, day, hour, minute, second = (int(text or 0) for text in match.groups())
@@ -207,7 +207,7 @@ def named_time(source: Source) -> datetime | None:
 
 
 def recorded_time(path: Path, source: Source, joint: JointFile | None = None) -> datetime | None:
-    """Time of a recording: UNIX stamps, else the date in its name, else its modification time."""
+    """Return the time of a recording: UNIX stamps, else the date in its name, else its modification time."""
     stamp_s = 0.0
     suffix = path.suffix.lower()
     if suffix == ".mcap":

@@ -58,7 +58,7 @@ def write(
 
 
 def diagnosed_model(joint: JointFile, outcome: Diagnosis) -> JointModel:
-    """The model that `write` writes."""
+    """Return the model that `write` writes."""
     model = joint.model()
     motors = tuple(
         replace(

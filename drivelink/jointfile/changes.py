@@ -12,14 +12,16 @@ _DIGITS = 9  # of a covariance
 
 
 def changes_to(model: JointModel) -> dict[str, Any]:
-    """The changes of `write_model` that put a model's numbers and their uncertainty into a joint file."""
+    """Return the changes of `write_model` that put a model's numbers and their uncertainty
+    into a joint file.
+    """
     changes: dict[str, Any] = {"motor": [_motor(motor) for motor in model.motors]}
     link = link_entry(model)
     return changes | ({"link": link} if link else {})
 
 
 def link_entry(model: JointModel) -> dict[str, Any]:
-    """Table [link]: dynamics, effects of link and encoder."""
+    """Return table [link]: dynamics, effects of link and encoder."""
     link: dict[str, Any] = {}
     if model.link is not None:
         link["dynamics"] = {name: x for name, x in asdict(model.link).items() if x is not None}
@@ -29,13 +31,13 @@ def link_entry(model: JointModel) -> dict[str, Any]:
 
 
 def effect_entry(effect: Effect) -> dict[str, Any]:
-    """One effect: name, parameters, and the standard deviations of those that were fitted."""
+    """Return one effect: name, parameters, and the standard deviations of those that were fitted."""
     entry = {"name": effect.name, "parameters": plain_parameters(effect.parameters)}
     return entry | ({"std": plain_parameters(effect.std)} if effect.std else {})
 
 
 def plain_parameters(parameters: Mapping[str, ParameterValue]) -> dict[str, float | list[float]]:
-    """Parameters as a file has them: numbers and lists of numbers."""
+    """Return the parameters as a file has them: numbers and lists of numbers."""
     return {name: list(v) if isinstance(v, tuple) else float(v) for name, v in parameters.items()}
 
 

@@ -38,7 +38,7 @@ UNITS: dict[str, dict[str, float]] = {
 
 
 def si_factor(column: str, unit: str | float) -> float:
-    """SI value of one unit of a column; a number, also as text, is a factor; "" is SI.
+    """Return SI value of one unit of a column; a number, also as text, is a factor; "" is SI.
 
     Raises:
         ValueError: no such unit.

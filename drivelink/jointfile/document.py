@@ -91,7 +91,7 @@ def parse(text: str, where: str = "joint file") -> JointFile:
 
 
 def to_json(text: str, where: str) -> str:
-    """The text of a joint file as JSON, not yet validated.
+    """Return the text of a joint file as JSON, not yet validated.
 
     Raises:
         JointFileError: too large, a line too long, cut off, nested too deep, or not TOML.
@@ -162,7 +162,7 @@ def _checked(text: str) -> str:
 
 
 def without_check(text: str) -> str:
-    """The text of a joint file without the first and the check line that drivelink writes."""
+    """Return the text of a joint file without the first and the check line that drivelink writes."""
     return _CHECK.sub("", text).replace(f"{_MARK}\n", "", 1)
 
 

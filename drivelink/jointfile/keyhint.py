@@ -11,7 +11,7 @@ from pydantic import BaseModel
 
 
 def unknown_key(root: type, location: tuple[int | str, ...]) -> str:
-    """The message for an unknown key, from the keys of its table.
+    """Return the message for an unknown key, from the keys of its table.
 
     Args:
         root: the schema of the whole file.

@@ -17,7 +17,8 @@ _LOG = logging.getLogger(__name__)
 
 
 def floor_entry(record: Record | Sequence[Record], model: JointModel, surplus: float) -> dict[str, Any]:
-    """Entry of [provenance] with the baseline (see `measure_baseline`); empty, with a log line, if it cannot
+    """Return the entry of [provenance] with the baseline (see `measure_baseline`); empty, with a
+    log line, if it cannot
     be measured.
     """
     if not can_monitor(model):
@@ -30,7 +31,7 @@ def floor_entry(record: Record | Sequence[Record], model: JointModel, surplus: f
 
 
 def make_model_monitor(joint: JointFile) -> ModelMonitor | None:
-    """The model monitor of a joint; None without complete model or baseline."""
+    """Return the model monitor of a joint; None without complete model or baseline."""
     entry = joint.provenance.get(_KEY)
     baseline = ResidualBaseline.from_dict(entry) if isinstance(entry, dict) else None
     model = joint.model()

@@ -162,7 +162,7 @@ class MotorSection(_Section):
         return self
 
     def motor(self) -> Motor:
-        """The motor of the estimator's model."""
+        """Return the motor of the estimator's model."""
         drive = self.drive
         return Motor(
             inertia_kg_m2=self.inertia_kg_m2,
@@ -214,7 +214,7 @@ class BusSection(_Section):
     )
 
     def moved(self, interface: str | None = None, channel: str | None = None) -> BusSection:
-        """The section with another interface or channel, if given.
+        """Return the section with another interface or channel, if given.
 
         `options` are dropped for another interface.
         """
@@ -359,7 +359,7 @@ class JointFile(_Section):
         return self
 
     def model(self) -> JointModel:
-        """The estimator's model of this joint."""
+        """Return the estimator's model of this joint."""
         return JointModel(
             arrangement=self.arrangement,
             motors=tuple(section.motor() for section in self.motor),

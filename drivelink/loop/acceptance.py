@@ -41,13 +41,15 @@ class Proposal(NamedTuple):
     proposed: JointText
 
     def difference(self) -> str:
-        """The lines of the joint file that change, as a unified diff; baseline and origin follow them."""
+        """Return the lines of the joint file that change, as a unified diff; baseline and
+        origin follow them.
+        """
         before, after = (_model_lines(text.text) for text in (self.source, self.proposed))
         name = Path(self.source.name).name
         return "\n".join(difflib.unified_diff(before, after, name, f"{name}, proposed", lineterm="", n=1))
 
     def lines(self) -> list[str]:
-        """What a person sees before accepting, line by line."""
+        """Return what a person sees before accepting, line by line."""
         found, error = self.finding, self.finding.get("error") or {}
         lines = [str(found["sentence"]), f"from {self.recording.name}"]
         lines += [f"  {text}" for text in found.get("parameters") or ()]
@@ -59,7 +61,7 @@ class Proposal(NamedTuple):
 
 
 def proposal(path: Path) -> Proposal:
-    """The newest finding of a joint, if a joint file is proposed by it.
+    """Return the newest finding of a joint, if a joint file is proposed by it.
 
     Args:
         path: the joint file.
@@ -87,7 +89,7 @@ def proposal(path: Path) -> Proposal:
 
 
 def accept(offer: Proposal) -> Path:
-    """Put the proposed joint file in the place of the one in use.
+    """Replace the joint file in use by the proposed one.
 
     Returns:
         Where the old one is kept.
@@ -109,7 +111,7 @@ def accept(offer: Proposal) -> Path:
 
 
 def undo(path: Path) -> Path:
-    """Put the joint file that was in use before the last acceptance back.
+    """Restore the joint file that was in use before the last acceptance.
 
     Returns:
         Where it was kept.
@@ -154,7 +156,7 @@ def _copy(path: Path, target: Path) -> None:
 
 
 def accepted_at(joint: JointFile | Mapping[str, Any]) -> str:
-    """When what is in a joint file, or in a model document, was accepted; empty: it was not."""
+    """Return the time at which a joint file or model document was accepted; empty: it was not."""
     provenance = joint.provenance if isinstance(joint, JointFile) else joint.get("provenance")
     accepted = provenance.get("accepted") if isinstance(provenance, Mapping) else None
     return str(accepted.get("time")) if isinstance(accepted, Mapping) else ""
@@ -211,7 +213,7 @@ class Trial:
         self._quiet = self._quiet + 1 if within else 0
 
     def sentence(self) -> str:
-        """What has come of it so far."""
+        """Return what has come of it so far."""
         level = f"{max(self.ratios):.2g} × its baseline" if self.ratios else "not measured yet"
         if self.fallen:
             return (

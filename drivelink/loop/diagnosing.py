@@ -121,7 +121,7 @@ def _unix_s(recording: Path, record: Record, sequence: int) -> float:
 
 
 def rms(values: Sequence[Sequence[float]]) -> float:
-    """Root of the mean over the seconds of the sum over the motors of the squares."""
+    """Return the root of the mean over the seconds of the sum over the motors of the squares."""
     return math.sqrt(float(np.mean(np.sum(np.square(values), axis=1))))
 
 

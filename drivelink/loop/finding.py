@@ -24,12 +24,12 @@ UNDONE = "undone"
 
 
 def fingerprint(text: str) -> str:
-    """What says of two joint files whether they are the same."""
+    """Return what says of two joint files whether they are the same."""
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def begun(recording: Path, state: str, sentence: str) -> dict[str, Any]:
-    """What every finding says; all of it, where the diagnosis is under way or failed."""
+    """Return what every finding says; all of it, where the diagnosis is under way or failed."""
     joint, time, cause = event_of(recording)
     about = {"schema": SCHEMA, "joint": joint, "recording": recording.name, "cause": cause}
     return about | {"time": time.isoformat(), "state": state, "sentence": sentence}
@@ -49,7 +49,7 @@ def write(recording: Path, finding: Mapping[str, Any]) -> None:
 
 
 def read(recording: Path) -> dict[str, Any] | None:
-    """The finding beside a recording, with safe values; None: there is none, or it cannot be read."""
+    """Return the finding beside a recording, with safe values; None: there is none, or it cannot be read."""
     try:
         found = decode_document(read_regular(finding_file(recording), MAX_BYTES))
     except (OSError, DrivelinkError):
@@ -58,7 +58,7 @@ def read(recording: Path) -> dict[str, Any] | None:
 
 
 def newest(folder: Path, joint: str) -> tuple[Path, dict[str, Any]] | None:
-    """The newest recording of a joint with a finding, and that; None: there is none."""
+    """Return the newest recording of a joint with a finding, and that; None: there is none."""
     try:
         recordings = kept(folder, joint)
     except OSError:
@@ -71,7 +71,7 @@ def newest(folder: Path, joint: str) -> tuple[Path, dict[str, Any]] | None:
 
 
 def line(finding: Mapping[str, Any]) -> str:
-    """A finding in one short line for a view; empty without one."""
+    """Return a finding in one short line for a view; empty without one."""
     state, sentence = finding.get("state"), finding.get("sentence")
     if not isinstance(sentence, str) or not isinstance(state, str):
         return ""

@@ -17,12 +17,12 @@ UNFINISHED = ".part"  # ending of a recording that is being written
 
 
 def recording_name(joint: str, cause: str, wall: datetime) -> str:
-    """The name of a recording, e.g. `elbow-20260105T081500Z-model-alarm.mcap`."""
+    """Return the name of a recording, e.g. `elbow-20260105T081500Z-model-alarm.mcap`."""
     return f"{joint}-{wall:{_STAMP}}-{cause.replace(' ', '-')}.mcap"
 
 
 def kept(folder: Path, joint: str, ending: str = ".mcap") -> list[Path]:
-    """The recordings of a joint's black box, oldest first.
+    """Return the recordings of a joint's black box, oldest first.
 
     Args:
         folder: of the black box.
@@ -45,7 +45,7 @@ class Event(NamedTuple):
 
 
 def event_of(recording: Path) -> Event:
-    """The event of a recording, by its name.
+    """Return the event of a recording, by its name.
 
     Raises:
         RecordingError: it is no recording of a black box.
@@ -58,17 +58,17 @@ def event_of(recording: Path) -> Event:
 
 
 def finding_file(recording: Path) -> Path:
-    """Where the finding of a recording lies."""
+    """Return where the finding of a recording lies."""
     return recording.with_suffix(".finding.json")
 
 
 def proposal_file(recording: Path) -> Path:
-    """Where the joint file lies that the finding proposes."""
+    """Return where the joint file lies that the finding proposes."""
     return recording.with_suffix(".toml")
 
 
 def folder_of(text: JointText) -> Path:
-    """The folder of a joint's black box.
+    """Return the folder of a joint's black box.
 
     Raises:
         RecordingError: the joint file declares none.
@@ -80,7 +80,7 @@ def folder_of(text: JointText) -> Path:
 
 
 def wish_of(text: JointText) -> Path:
-    """The file that asks the black box of a joint to keep the last minute; it removes it.
+    """Return the file that asks the black box of a joint to keep the last minute; it removes it.
 
     Raises:
         RecordingError: the joint file declares no folder.

@@ -92,7 +92,7 @@ class Diagnoses:
 
 
 def next_due(folder: Path, joint: str, tried: Collection[Path] = ()) -> Path | None:
-    """The newest recording to be diagnosed: of a doubt that is no part of one diagnosed already.
+    """Return the newest recording to be diagnosed: of a doubt that is no part of one diagnosed already.
 
     Args:
         folder: of the black box.

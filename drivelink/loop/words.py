@@ -19,7 +19,7 @@ class Summary(NamedTuple):
 
 
 def summary(outcome: Diagnosis, error: Errors, joint: JointFile) -> Summary:
-    """Say what was found.
+    """Describe what was found.
 
     Args:
         outcome: the diagnosis.

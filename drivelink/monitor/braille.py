@@ -17,7 +17,7 @@ _BLANK = 0x2800
 
 
 def sparkline(values: Sequence[float], width: int) -> str:
-    """The values as at most `width` bars, each the mean of its share; blank if not finite.
+    """Return the values as at most `width` bars, each the mean of its share; blank if not finite.
 
     Outliers get the lowest or highest bar.
     """
@@ -38,7 +38,7 @@ def sparkline(values: Sequence[float], width: int) -> str:
 
 
 def gauge(value: float, full: float, width: int) -> str:
-    """A bar of so many characters, full at `full`; empty if the value is not finite."""
+    """Return a bar of so many characters, full at `full`; empty if the value is not finite."""
     eighths = round(8 * width * min(max(value / full, 0.0), 1.0)) if math.isfinite(value) else 0
     whole, rest = divmod(eighths, 8)
     return ("█" * whole + (" ▏▎▍▌▋▊▉"[rest] if rest else "")).ljust(width, "░")
@@ -91,13 +91,13 @@ class DotPlot:
             last = here
 
     def band(self, points: Sequence[tuple[float, float, float]], style: str) -> None:
-        """The edges of a band as dotted lines, from (x, low, high), inside the plot."""
+        """Draw the edges of a band as dotted lines, from (x, low, high), inside the plot."""
         below, above = self._y
         self.curve([(x, low if low >= below else math.nan) for x, low, _ in points], style, every=3)
         self.curve([(x, high if high <= above else math.nan) for x, _, high in points], style, every=3)
 
     def mark(self, x: float, y: float, style: str) -> None:
-        """A highlighted point, if inside the plot."""
+        """Draw a highlighted point, if inside the plot."""
         if math.isfinite(x) and math.isfinite(y):
             across, down = self._place(x, y)
             column, row = math.floor(across / 2), math.floor(down / 4)
@@ -109,7 +109,7 @@ class DotPlot:
         self._note = text
 
     def render(self, title: str, x_unit: str = "") -> Text:
-        """The plot as lines of text."""
+        """Return the plot as lines of text."""
         text = Text(no_wrap=True)
         text.append(" " * (self._margin + 1) + title[: self.columns], style="bold")
         if self._note:

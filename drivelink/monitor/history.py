@@ -76,7 +76,7 @@ class GrowingCurve:
             self._places = {place // 2: point for place, point in self._places.items()}
 
     def points(self) -> list[tuple[float, float, float]]:
-        """(deflection, stiffness, standard deviation), by deflection.
+        """Return the (deflection, stiffness, standard deviation), by deflection.
 
         Omits outdated values: one from before the estimator knew the curve has a much larger standard
         deviation than its neighbours.
@@ -185,14 +185,15 @@ class JointHistory:
             self.residuals.append((self.moments[-1].time_s, ratio))
 
     def window(self) -> list[Moment]:
-        """The moments within `seconds` of the last one."""
+        """Return the moments within `seconds` of the last one."""
         if not self.moments:
             return []
         since = self.moments[-1].time_s - self.seconds
         return [moment for moment in self.moments if moment.time_s >= since]
 
     def relative_errors(self) -> tuple[float, float]:
-        """Relative rms error of (stiffness, torque) against the truth over the valid part of the window.
+        """Return the relative rms error of (stiffness, torque) against the truth over the
+        valid part of the window.
 
         NaN without truth.
         """
@@ -204,7 +205,7 @@ class JointHistory:
 
 
 def usual_range(values: Sequence[float], most: float = 0.02) -> tuple[float, float]:
-    """The range of a plot: that of all but the outermost values, extended to those by at most half.
+    """Return the range of a plot: that of all but the outermost values, extended to those by at most half.
 
     Args:
         values: values to draw; non-finite ones are omitted.

@@ -14,7 +14,7 @@ from drivelink.output.digits import number, value_and_interval
 
 
 def joints_table(views: Mapping[str, JointView], width: int) -> Table:
-    """Several joints, one line each; columns that do not fit are omitted."""
+    """Return several joints, one line each; columns that do not fit are omitted."""
     sparks = width - 100
     columns = [("joint", 10), ("stiffness / N·m/rad", 19), ("torque / N·m", 12)]
     if width >= 80:

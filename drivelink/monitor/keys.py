@@ -37,7 +37,7 @@ class Keys:
         return self._before is not None
 
     def pressed(self) -> str:
-        """The keys pressed since the last call; an arrow or function key gives several characters."""
+        """Return the keys pressed since the last call; an arrow or function key gives several characters."""
         if self._before is None or not select.select([self._terminal], [], [], 0)[0]:
             return ""
         return os.read(self._terminal, 64).decode("utf-8", "replace")

@@ -17,7 +17,7 @@ _POINTS = 60
 def model_curves(
     model: Mapping[str, Any], curves: list[list[tuple[float, float, float]]]
 ) -> list[list[tuple[float, float]]]:
-    """Stiffness of each transmission by the model in use, over the deflections seen so far.
+    """Return the stiffness of each transmission by the model in use, over the deflections seen so far.
 
     Args:
         model: the model document, whatever it contains.

@@ -205,7 +205,7 @@ def status_text(
     model: Mapping[str, Any] | None = None,
     finding: Mapping[str, Any] | None = None,
 ) -> str:
-    """Cycle, residual, advice and finding as text, as far as the documents contain them."""
+    """Return cycle, residual, advice and finding as text, as far as the documents contain them."""
     shown = shape(status, model)
     why = f"not valid: {shown.not_valid}" if shown.not_valid else ""
     found = _text(findings.line(finding or {}))
@@ -244,7 +244,9 @@ def status_lines(
     model: Mapping[str, Any] | None = None,
     finding: Mapping[str, Any] | None = None,
 ) -> list[Text]:
-    """At most seven lines: cycle, nodes, residual, why not valid, what to do, what is wrong, the finding."""
+    """Return seven lines at most: cycle, nodes, residual, why not valid, what to do, what is
+    wrong, the finding.
+    """
     if not status:
         return []
     shown = shape(status, model)

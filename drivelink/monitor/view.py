@@ -149,7 +149,7 @@ class JointView:
         return flags(estimate.status) + ([("contact", "yellow")] if touch and touch.contact else [])
 
     def line(self) -> str:
-        """The joint in one plain line, for pipes and logs."""
+        """Return the joint in one plain line, for pipes and logs."""
         estimate = self.history.latest
         if estimate is None:
             return f"{self.name}: {self.hint or 'no estimate yet'}"
@@ -360,7 +360,7 @@ class JointView:
 
 
 def flags(status: int) -> list[tuple[str, str]]:
-    """The status bits with their styles: validity, what forbids use (red), the rest."""
+    """Return the status bits with their styles: validity, what forbids use (red), the rest."""
     found = [
         ("valid", "green") if status & Status.VALID else ("not valid", "red"),
         ("observable", "green") if status & Status.OBSERVABLE else ("not observable", "yellow"),
@@ -372,5 +372,5 @@ def flags(status: int) -> list[tuple[str, str]]:
 
 
 def half_interval(estimate: EstimateMessage) -> float:
-    """Half the 95 % interval of the joint's stiffness."""
+    """Return half the 95 % interval of the joint's stiffness."""
     return SIGMA_95 * estimate.stiffness_std_nm_rad

@@ -110,7 +110,7 @@ class WebView:
                 self._streams.remove(over)
 
     def event(self, since: dict[str, float]) -> bytes:
-        """The state of every joint as JSON, with the moments newer than `since`, which is updated."""
+        """Return the state of every joint as JSON, with the moments newer than `since`, which is updated."""
         with self._lock:
             joints = {
                 name: snapshot(view, name in self._watcher.alive, since)
@@ -124,7 +124,7 @@ class WebView:
 
 
 def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str, Any]:
-    """Data of one joint for the page; invalid and non-finite values are null.
+    """Return the data of one joint for the page; invalid and non-finite values are null.
 
     Args:
         view: of the joint.
@@ -159,7 +159,7 @@ def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str,
 
 
 def document(view: JointView) -> dict[str, Any]:
-    """A joint's present state for `monitor --json`; non-finite values are null."""
+    """Return a joint's present state for `monitor --json`; non-finite values are null."""
     return {"joint": view.name, "time": time.time(), **_now(view), "status": view.status}
 
 
@@ -312,7 +312,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send("application/json", json.dumps(acceptance.act(action, asked)).encode())
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002  (named so in the base class)
-        """Say nothing."""
+        """Log nothing."""
 
     def _page(self) -> None:
         self.close_connection = True

@@ -44,7 +44,7 @@ class WebAcceptance:
         self._trial: Trial | None = None
 
     def allows(self, headers: Message) -> bool:
-        """Whether a request comes from the page: it has the token, and its origin is this server."""
+        """Return whether a request comes from the page: it has the token, and its origin is this server."""
         given = str(headers.get(TOKEN_HEADER, "")).encode()
         own = headers.get("Origin") == f"http://{headers.get('Host')}"
         return own and hmac.compare_digest(given, self.token.encode())
@@ -73,7 +73,7 @@ class WebAcceptance:
         return {"text": f"{self._path.name} is written; the old one is {old.name}"}
 
     def trial(self, view: JointView) -> dict[str, Any] | None:
-        """What has come of the last acceptance so far; None without one."""
+        """Return what has come of the last acceptance so far; None without one."""
         if self._trial is None:
             return None
         fallen = self._trial.take(view.status, view.model, time.monotonic())

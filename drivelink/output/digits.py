@@ -6,7 +6,9 @@ import math
 
 
 def number(value: float, digits: int = 4) -> str:
-    """A number in few characters, with so many significant digits; very large and small ones like 4.1e6."""
+    """Return a number in few characters, with so many significant digits; very large and
+    small ones like 4.1e6.
+    """
     if not math.isfinite(value):
         return "–"
     if value != 0.0 and not 1e-3 <= abs(value) < 1e5:
@@ -17,7 +19,7 @@ def number(value: float, digits: int = 4) -> str:
 
 
 def value_and_interval(value: float, half: float | None, digits: int = 4) -> tuple[str, str]:
-    """A value to the last digit that its interval leaves, and half its interval with two digits.
+    """Return a value to the last digit that its interval leaves, and half its interval with two digits.
 
     Args:
         value: the number.

@@ -71,7 +71,7 @@ class PlotCurve(NamedTuple):
 
 
 def blank(width: float, height: float) -> Figure:
-    """An empty figure in the house style; inches."""
+    """Return an empty figure in the house style; inches."""
     with rc_context(STYLE):
         figure = Figure(figsize=(width, height), layout="constrained")
         FigureCanvasAgg(figure)
@@ -81,7 +81,7 @@ def blank(width: float, height: float) -> Figure:
 def new_figure(
     title: str = "", rows: int = 1, columns: int = 1, width: float = 7.0, height: float = 2.6
 ) -> tuple[Figure, list[Axes]]:
-    """A figure in the house style, and its axes row by row; `height` in inches is that of one row."""
+    """Return a figure in the house style, and its axes row by row; `height` in inches is that of one row."""
     figure = blank(width, height * rows)
     with rc_context(STYLE):
         axes = [figure.add_subplot(rows, columns, k + 1) for k in range(rows * columns)]
@@ -126,7 +126,7 @@ def save(figure: Figure, path: Path) -> Path:
 
 
 def png(figure: Figure) -> bytes:
-    """The figure as a PNG picture."""
+    """Return the figure as a PNG picture."""
     buffer = io.BytesIO()
     with rc_context(STYLE):
         figure.savefig(buffer, format="png")
@@ -134,7 +134,7 @@ def png(figure: Figure) -> bytes:
 
 
 def svg_text(figure: Figure) -> str:
-    """The figure as inline SVG for an HTML page, transparent and in the page's text colour.
+    """Return the figure as inline SVG for an HTML page, transparent and in the page's text colour.
 
     A page may define `--curve-1`, `--curve-2`, … and `--grid` for a theme of its own.
     """
@@ -149,7 +149,7 @@ def svg_text(figure: Figure) -> str:
 
 
 def medians(x: FloatArray, y: FloatArray, bins: int = 80) -> PlotCurve:
-    """Medians of scattered samples in bins of x, without the outermost x."""
+    """Return medians of scattered samples in bins of x, without the outermost x."""
     low, high = np.quantile(x, [0.002, 0.998])
     least = min(_MIN_OF_SCATTERED, len(x))
     bins = min(bins, max(1, len(x) // least))  # one of them, at least, is full

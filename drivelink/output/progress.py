@@ -47,16 +47,16 @@ class Meter:
             self._bar.stop()
 
     def stage(self, text: str) -> None:
-        """One step more, and what is being done now: "bandwidth"."""
+        """Count one step more, and name what is being done now: "bandwidth"."""
         self._stage = text
         self.advance()
 
     def advance(self, items: int = 1) -> None:
-        """So many items more are done."""
+        """Count so many items more as done."""
         self.update(self.done + items)
 
     def update(self, done: int) -> None:
-        """So many items are done in all."""
+        """Set the number of items done in all."""
         self.done = done
         now = time.monotonic()
         if now - self._begin < _QUIET_S:

@@ -224,7 +224,7 @@ def html_page(outcome: Diagnosis, title: Title) -> str:
 
 
 def sections(outcome: Diagnosis, units: Units) -> list[Section]:
-    """Say and draw what was found, for a page and for a terminal."""
+    """Describe and draw what was found, for a page and for a terminal."""
     sure = all(finding.probability >= _SURE for finding in outcome.effects)
     label = f"{'' if sure else 'likely '}{outcome.verdict.replace('_', ' ')}"
     verdict = Paragraph(sentence(outcome), label, f"verdict {outcome.verdict}")

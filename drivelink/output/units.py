@@ -22,12 +22,12 @@ _LINEAR = {  # of a linear axis: metres for rad, newtons for N·m
 
 
 def in_words(name: str) -> str:
-    """The name of an effect as it stands in a sentence."""
+    """Return the name of an effect as it stands in a sentence."""
     return name.replace("_", " ").replace("coulomb", "Coulomb").replace("stribeck", "Stribeck")
 
 
 def bare_name(name: str) -> str:
-    """The name of a parameter in words, without its unit."""
+    """Return the name of a parameter in words, without its unit."""
     ending = next((end for end, _ in _UNITS if f"_{name}".endswith(end)), "")
     return name.removesuffix(ending).replace("_", " ") or name
 
@@ -43,21 +43,23 @@ class Units:
         self._linear = linear
 
     def shown(self, unit: str) -> str:
-        """The unit of this axis for one of a rotary axis."""
+        """Return the unit of this axis for one of a rotary axis."""
         return _LINEAR.get(unit, unit) if self._linear else unit
 
     def label(self, text: str) -> str:
-        """An axis label "quantity / unit" as it is for this one."""
+        """Return an axis label "quantity / unit" as it is for this one."""
         quantity, _, unit = text.rpartition(" / ")
         bare = unit.strip("()")
         return f"{quantity} / {unit.replace(bare, self.shown(bare))}"
 
     def of(self, name: str) -> str:
-        """The unit of a parameter by the end of its name, or empty."""
+        """Return the unit of a parameter by the end of its name, or empty."""
         return self.shown(next((unit for end, unit in _UNITS if f"_{name}".endswith(end)), ""))
 
     def value(self, name: str, value: ParameterValue, std: ParameterValue | None) -> str:
-        """A parameter with its 95 % interval and unit; of a polynomial each coefficient has its own."""
+        """Return a parameter with its 95 % interval and unit; of a polynomial each
+        coefficient has its own.
+        """
         return ", ".join(
             f"{text}{f' ± {half}' if half else ''} {unit}".rstrip()
             for text, half, unit in self.parts(name, value, std)
@@ -66,7 +68,9 @@ class Units:
     def parts(
         self, name: str, value: ParameterValue, std: ParameterValue | None
     ) -> list[tuple[str, str, str]]:
-        """(value, half its 95 % interval, unit) of a parameter, or of each of a polynomial's coefficients."""
+        """Return (value, half its 95 % interval, unit) of a parameter, or of each of a
+        polynomial's coefficients.
+        """
         unit, length = self.of(name), self.shown("rad")
         values = value if isinstance(value, tuple) else (value,)
         deviations = std if isinstance(std, tuple) else (std,) * len(values)

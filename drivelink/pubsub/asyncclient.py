@@ -25,11 +25,11 @@ class AsyncSubscription(Client):
     """Estimates of one joint for asyncio; see `subscribe_async`."""
 
     async def wait(self, timeout_s: float | None = None) -> EstimateMessage | None:
-        """The next cycle: the newest estimate that was not read yet, or None when the time is over."""
+        """Return the next cycle: the newest estimate that was not read yet, or None when the time is over."""
         return await self._wait(timeout_s, self._newest)
 
     async def cycles(self, timeout_s: float | None = None) -> AsyncIterator[EstimateMessage | None]:
-        """Every estimate in order; None whenever `timeout_s` passed without one. Ends when closed."""
+        """Yield every estimate in order; None whenever `timeout_s` passed without one. Ends when closed."""
         while not self._closed:
             message = await self._wait(timeout_s, self._oldest)
             if message is not None or not self._closed:
@@ -93,7 +93,7 @@ def subscribe_async(
     depth: int = 1024,
     stale_after_s: float | None = None,
 ) -> AsyncSubscription:
-    """The same as `subscribe` for asyncio, to be called in a running loop.
+    """Return the same as `subscribe` for asyncio, to be called in a running loop.
 
     Raises:
         ZenohError: no session can be opened, or a name cannot be part of a key.

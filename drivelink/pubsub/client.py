@@ -31,7 +31,7 @@ class Subscription(Client):
     """Estimates of one joint; see `subscribe`."""
 
     def wait(self, timeout_s: float | None = None) -> EstimateMessage | None:
-        """The newest unread estimate; wait for one if there is none.
+        """Return the newest unread estimate; wait for one if there is none.
 
         Args:
             timeout_s: longest wait; None: forever.
@@ -42,7 +42,7 @@ class Subscription(Client):
         return self._wait(timeout_s, self._newest)
 
     def cycles(self, timeout_s: float | None = None) -> Iterator[EstimateMessage | None]:
-        """Every estimate in order; None whenever `timeout_s` passed without one. Ends when closed."""
+        """Yield every estimate in order; None whenever `timeout_s` passed without one. Ends when closed."""
         while not self._closed:
             message = self._wait(timeout_s, self._oldest)
             if message is not None or not self._closed:

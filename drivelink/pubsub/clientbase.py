@@ -92,12 +92,12 @@ class Client:
         raise NotImplementedError
 
     def latest(self) -> EstimateMessage | None:
-        """The newest estimate, without waiting; None until the first one came."""
+        """Return the newest estimate, without waiting; None until the first one came."""
         self._drain()
         return self._feed.latest
 
     def take(self) -> NDArray[np.void]:
-        """Every estimate not yet read, oldest first, as one numpy record array; never waits.
+        """Return every estimate not yet read, oldest first, as one numpy record array; never waits.
 
         Fields are those of the wire (`drivelink.pubsub.wire.ESTIMATE`): `a["stiffness_nm_rad"]` is (n,),
         `a["transmissions"]["deflection_rad"]` is (n, transmissions).
@@ -266,7 +266,7 @@ class Client:
         return document if writer == identity.bound else None
 
     def _hint(self) -> None:
-        """Say once that there is no daemon of this name, and which others there are; never waits."""
+        """Report once that there is no daemon of this name, and which others there are; never waits."""
         if time.monotonic() < self._hint_s:
             return
         self._hint_s = math.inf

@@ -63,7 +63,7 @@ class Arrivals:
         self._empty_ns = now_ns
 
     def age_ns(self, now_ns: int) -> int:
-        """Time since the arrival of the latest estimate."""
+        """Return the time since the arrival of the latest estimate."""
         return now_ns - self._arrival_ns
 
 
@@ -92,7 +92,7 @@ class Feed:
         self._source: str | None = None  # session that wrote the latest estimate
 
     def trusts(self, source: str, now_ns: int) -> bool:
-        """Whether a message of this session is from the daemon; see `DaemonIdentity.accepts`."""
+        """Return whether a message of this session is from the daemon; see `DaemonIdentity.accepts`."""
         identity = self.identity
         return identity.accepts(source, source != identity.bound and self.stale(now_ns))
 
@@ -138,7 +138,7 @@ class Feed:
             self._period_ns = min(elapsed_ns // step, _LONGEST_PERIOD_NS)
 
     def stale(self, now_ns: int) -> bool:
-        """Whether the latest estimate is too old to act on, or marked stale."""
+        """Return whether the latest estimate is too old to act on, or marked stale."""
         if self.latest is None or self.latest.status & Status.STALE:
             return True
         limit_ns = self._stale_after_ns
@@ -148,7 +148,7 @@ class Feed:
         return self.arrivals.age_ns(now_ns) > limit_ns
 
     def state(self, now_ns: int) -> State:
-        """The daemon's state, seen from here."""
+        """Return the daemon's state, seen from here."""
         if not self.stale(now_ns):
             return State.LIVE
         if self.identity.alive:

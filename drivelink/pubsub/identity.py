@@ -21,7 +21,7 @@ _ZID = re.compile(r"[0-9a-f]{1,32}")
 
 
 def source_of(sample: zenoh.Sample) -> str:
-    """The session that wrote a sample, or ""."""
+    """Return the session that wrote a sample, or ""."""
     info = sample.source_info
     return str(info.source_id.zid) if info else ""
 
@@ -87,7 +87,7 @@ class DaemonIdentity:
                 self._overflow = True
 
     def accepts(self, source: str, stale: bool) -> bool:
-        """Whether to accept a message of this session; the first accepted one binds to its session.
+        """Return whether to accept a message of this session; the first accepted one binds to its session.
 
         Args:
             source: as by `source_of`.

@@ -54,7 +54,7 @@ class _Cleaner:
         self._left = MAX_ELEMENTS
 
     def clean(self, value: Any, depth: int) -> Any:
-        """The value made safe.
+        """Return the value made safe.
 
         Raises:
             ZenohError: it has too many elements or levels.

@@ -54,7 +54,7 @@ def ask(session: zenoh.Session, prefix: str, answer: Callable[[list[str]], None]
 
 
 def absent(joint: str, names: Sequence[str]) -> str:
-    """Say that a joint has no daemon, and which others have one."""
+    """Report that a joint has no daemon, and which others have one."""
     if not names:
         return f'no daemon of "{joint}", nor of any other joint: drivelink run JOINT starts one'
     near = difflib.get_close_matches(joint, names, n=1, cutoff=0.5)

@@ -230,7 +230,7 @@ class JointPublisher:
 
 
 def describe_model(joint: JointFile, layouts: Sequence[NodeLayout] = ()) -> dict[str, Any]:
-    """The model in use, with its effects and provenance.
+    """Return the model in use, with its effects and provenance.
 
     Args:
         joint: the joint file.
@@ -288,7 +288,7 @@ def _bits(flags: type[Bits]) -> list[dict[str, Any]]:
 
 
 def to_json(document: Mapping[str, Any]) -> bytes:
-    """Portable JSON: non-finite numbers become null."""
+    """Return portable JSON: non-finite numbers become null."""
     try:
         text = json.dumps(document, allow_nan=False, default=_plain)
     except ValueError:

@@ -22,7 +22,7 @@ _CONNECT_S = 0.5
 
 
 def answers(endpoint: str) -> bool:
-    """Whether anything accepts a TCP connection at the endpoint."""
+    """Return whether anything accepts a TCP connection at the endpoint."""
     address = _address(endpoint)
     if address is None:
         return False

@@ -67,7 +67,7 @@ class Template:
         self._changing: list[int] = []
 
     def number(self, code: str, value: int | None = None) -> Template:
-        """A number of struct code `code`, aligned to its size; None: variable."""
+        """Return a number of struct code `code`, aligned to its size; None: variable."""
         size = Struct("<" + code).size
         padding = -self._offset % size
         self._format += f"{padding}x{code}" if padding else code
@@ -78,7 +78,7 @@ class Template:
         return self
 
     def text(self, text: str) -> Template:
-        """A string: its length with the final zero, its bytes, the zero."""
+        """Return a string: its length with the final zero, its bytes, the zero."""
         data = text.encode() + b"\0"
         self.number("I", len(data))
         self._format += f"{len(data)}s"
@@ -87,18 +87,18 @@ class Template:
         return self
 
     def doubles(self, length: int) -> Template:
-        """A sequence of variable float64."""
+        """Return a sequence of variable float64."""
         self.number("I", length)
         for _ in range(length):
             self.number("d")
         return self
 
     def header(self, frame_id: str) -> Template:
-        """std_msgs/Header with variable stamp."""
+        """Return std_msgs/Header with variable stamp."""
         return self.number("i").number("I").text(frame_id)
 
     def packer(self) -> Any:
-        """A function from the variable numbers to the message's bytes."""
+        """Return a function from the variable numbers to the message's bytes."""
         packing, values, changing = Struct(self._format).pack, self._values, self._changing
 
         def message(*numbers: float) -> bytes:
@@ -111,13 +111,16 @@ class Template:
 
 
 def joint_state(name: str) -> Any:
-    """Packer of sensor_msgs/JointState of one joint: (s, ns, position, velocity, effort) to bytes."""
+    """Return the packer of sensor_msgs/JointState of one joint: (s, ns, position, velocity,
+    effort) to bytes.
+    """
     template = Template().header("").number("I", 1).text(name)
     return template.doubles(1).doubles(1).doubles(1).packer()
 
 
 def stiffness_array(transmissions: int) -> Any:
-    """Packer of std_msgs/Float64MultiArray, (1 + transmissions, 2): stiffness and its standard deviation.
+    """Return the packer of std_msgs/Float64MultiArray, (1 + transmissions, 2): stiffness and
+    its standard deviation.
 
     Row 0 is the joint, then one row per transmission; the labels of the dimensions name rows and columns.
     """
@@ -130,7 +133,9 @@ def stiffness_array(transmissions: int) -> Any:
 
 
 def dynamic_joint_state(name: str, transmissions: int, linked: bool = False) -> Any:
-    """Packer of control_msgs/DynamicJointState of one joint: (s, ns, *values of `interfaces`) to bytes."""
+    """Return the packer of control_msgs/DynamicJointState of one joint: (s, ns, *values of
+    `interfaces`) to bytes.
+    """
     template = Template().header("").number("I", 1).text(name).number("I", 1)
     names = interfaces(transmissions, linked)
     template.number("I", len(names))
@@ -140,7 +145,8 @@ def dynamic_joint_state(name: str, transmissions: int, linked: bool = False) -> 
 
 
 def interfaces(transmissions: int, linked: bool = False) -> tuple[str, ...]:
-    """Interfaces of a joint's DynamicJointState: numbers, flags (1 or 0), numbers of each transmission.
+    """Return interfaces of a joint's DynamicJointState: numbers, flags (1 or 0), numbers of
+    each transmission.
 
     Args:
         transmissions: how many it has.
@@ -152,7 +158,9 @@ def interfaces(transmissions: int, linked: bool = False) -> tuple[str, ...]:
 
 
 def wrench(frame_id: str) -> Any:
-    """Packer of geometry_msgs/WrenchStamped, z being the joint's axis: (s, ns, torque) to bytes."""
+    """Return the packer of geometry_msgs/WrenchStamped, z being the joint's axis: (s, ns,
+    torque) to bytes.
+    """
     template = Template().header(frame_id)
     for _ in range(6):
         template.number("d")
@@ -213,11 +221,11 @@ class _Node:
         self._id = next(_entities)
 
     def token(self) -> str:
-        """Liveliness key of the node."""
+        """Return the liveliness key of the node."""
         return self._token(self._id, "NN")
 
     def publisher_token(self, rest: str) -> str:
-        """Liveliness key of its next publisher."""
+        """Return the liveliness key of its next publisher."""
         return f"{self._token(next(_entities), 'MP')}/{rest}"
 
     def _token(self, entity: int, kind: str) -> str:

@@ -58,14 +58,16 @@ _open_sessions: list[tuple[zenoh.Session, Rendezvous | None]] = []
 
 
 def daemon_config(endpoint: str, listen: bool) -> zenoh.Config:
-    """A peer on loopback that listens at `endpoint`, or connects to its listener."""
+    """Return a peer on loopback that listens at `endpoint`, or connects to its listener."""
     if listen:
         return _config({"listen/endpoints": [endpoint]})
     return _config({"listen/endpoints": ["tcp/127.0.0.1:0"], "connect/endpoints": [endpoint], **_CONNECT})
 
 
 def client_config(endpoint: str) -> zenoh.Config:
-    """A peer without listener that connects to `endpoint`, and through it to every daemon of the machine."""
+    """Return a peer without listener that connects to `endpoint`, and through it to every
+    daemon of the machine.
+    """
     return _config({"listen/endpoints": [], "connect/endpoints": [endpoint], **_CONNECT})
 
 
@@ -137,7 +139,7 @@ def close_session(session: zenoh.Session) -> None:
 
 
 def one_line(error: BaseException) -> str:
-    """A zenoh error without locations in zenoh's sources."""
+    """Return a zenoh error without locations in zenoh's sources."""
     text = " ".join(str(error).split())
     return re.sub(r"\s+at /\S+?:\d+\.?(?=\]|\s|$)", "", text)
 
@@ -186,7 +188,7 @@ def _keep(session: zenoh.Session, rendezvous: Rendezvous | None = None) -> zenoh
 
 
 def connected(session: zenoh.Session) -> bool:
-    """Whether the session has a connection, or gets one within two seconds."""
+    """Return whether the session has a connection, or gets one within two seconds."""
     deadline = time.monotonic() + _MEETING_S
     while time.monotonic() < deadline:
         if session.info.peers_zid() or session.info.routers_zid():

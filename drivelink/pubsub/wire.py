@@ -53,16 +53,18 @@ class Layout:
     element: tuple[Field, ...] = ()
 
     def struct(self, count: int = 0) -> Struct:
-        """The whole message with `count` elements, the one-byte length between head and elements included."""
+        """Return the whole message with `count` elements, the one-byte length between head
+        and elements included.
+        """
         length = "B" if self.elements else ""
         return Struct("<" + _codes(self.head) + length + _codes(self.element) * count)
 
     def size(self, count: int = 0) -> int:
-        """Bytes of a message with `count` elements."""
+        """Return the bytes of a message with `count` elements."""
         return self.struct(count).size
 
     def dtype(self, count: int = 0) -> np.dtype[np.void]:
-        """The message as a numpy record: `np.frombuffer(payload, layout.dtype(1))`."""
+        """Return the message as a numpy record: `np.frombuffer(payload, layout.dtype(1))`."""
         head = [(field.name, _numpy(field)) for field in self.head]
         if not self.elements:
             return np.dtype(head)
@@ -70,7 +72,7 @@ class Layout:
         return np.dtype([*head, ("count", "u1"), (self.elements, element, (count,))])
 
     def describe(self) -> dict[str, Any]:
-        """The layout as plain data, for the `schema` key."""
+        """Return the layout as plain data, for the `schema` key."""
         described: dict[str, Any] = {
             "schema": self.schema,
             "encoding": "zenoh/serialized",

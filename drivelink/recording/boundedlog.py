@@ -82,7 +82,7 @@ class _Text(io.TextIOBase):
         self._number = 0
 
     def readline(self, size: int = -1, /) -> str:  # type: ignore[override]
-        """The next line in the reader's form; "" at the end.
+        """Return the next line in the reader's form; "" at the end.
 
         Raises:
             RecordingError: it is too long, or of an unknown version.

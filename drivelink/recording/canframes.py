@@ -44,7 +44,7 @@ _PEEK = 20_000  # messages that show whether an MCAP file has samples
 
 
 def is_frame_log(path: Path, frames: bool | None = None) -> bool:
-    """Whether to read a recording as raw frames.
+    """Return whether to read a recording as raw frames.
 
     Args:
         path: the recording.
@@ -113,7 +113,7 @@ class FrameLog:
             raise RecordingError(f"{path}: {error}") from error
 
     def cycles(self) -> Iterator[Cycle]:
-        """The cycles of the frames; may be iterated once.
+        """Yield the cycles of the frames; to be iterated once.
 
         Raises:
             RecordingError: the recording is damaged, or contains no sample.
@@ -137,7 +137,7 @@ class FrameLog:
         return self._fed(feed)
 
     def ticks(self, pipeline: JointPipeline) -> Iterator[Tick]:
-        """The published output of the cycles; may be iterated once.
+        """Yield the published output of the cycles; to be iterated once.
 
         Args:
             pipeline: made with `assembler`.

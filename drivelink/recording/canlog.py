@@ -105,7 +105,7 @@ _DATE = re.compile(rb"^[ \t]*\((\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d)\.(\d+)\)")
 
 
 def read_frames(path: Path, channel: str | None = None, configured: str = "") -> Iterator[LoggedFrame]:
-    """The frames of one channel of a log, in order.
+    """Yield the frames of one channel of a log, in order.
 
     Args:
         path: its ending says the format; `.log` and `.candump` are text as candump writes it.
@@ -252,7 +252,7 @@ class _Lines:
         self.understood += lines
 
     def frames(self, block: bytes) -> Iterator[LoggedFrame]:
-        """The data frames with 11-bit identifiers among the lines of a block."""
+        """Yield the data frames with 11-bit identifiers among the lines of a block."""
         for line in BytesIO(block):
             self._number += 1
             if line.isspace() or line.lstrip().startswith((b"#", b";")):

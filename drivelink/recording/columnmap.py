@@ -54,7 +54,7 @@ def parse_column_map(texts: Sequence[str]) -> ColumnMap:
 
 
 def column_map(joint: JointFile | None, asked: ColumnMap | None) -> ColumnMap:
-    """The columns of the joint file, replaced by what `--map` asks for."""
+    """Return the columns of the joint file, replaced by what `--map` asks for."""
     declared = joint.recording.columns if joint else {}
     return {
         name: Source(one.name, one.sign * si_factor(name, one.unit), asked=False)
@@ -63,7 +63,7 @@ def column_map(joint: JointFile | None, asked: ColumnMap | None) -> ColumnMap:
 
 
 def renamed(columns: Mapping[str, FloatArray], names: ColumnMap, where: str) -> dict[str, FloatArray]:
-    """The columns under our names in SI units; sources are no longer available by their own names.
+    """Return the columns under our names in SI units; sources are no longer available by their own names.
 
     Raises:
         RecordingError: a source is missing.

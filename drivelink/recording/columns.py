@@ -25,13 +25,13 @@ _SHOWN = 12  # names in a message
 
 
 def sample_columns(motors: int) -> tuple[str, ...]:
-    """Names of a sample's columns, in the order of `sample_row`."""
+    """Return the names of a sample's columns, in the order of `sample_row`."""
     per_motor = [f"motor{i}_{name}" for i in range(1, motors + 1) for name in OF_MOTOR[:3]]
     return ("time_s", *per_motor, *OF_LINK)
 
 
 def sample_row(sample: Sample, period_s: float) -> tuple[float, ...]:
-    """A sample as the values of `sample_columns`; its time is that of its SYNC, sequence * period."""
+    """Return a sample as the values of `sample_columns`; its time is that of its SYNC, sequence * period."""
     per_motor = zip(
         sample.motor_position_rad, sample.motor_velocity_rad_s, sample.motor_torque_nm, strict=True
     )

@@ -88,7 +88,7 @@ class _Layout(NamedTuple):
     separator: bytes
 
     def with_commas(self, block: bytes) -> bytes:
-        """Lines with commas between their columns and points in their numbers."""
+        """Return the lines with commas between their columns and points in their numbers."""
         if self.separator != b",":
             block = block.replace(b",", b".").replace(self.separator, b",")
         return block.replace(b"\r\n", b"\n")

@@ -44,7 +44,7 @@ def estimated(cycles: Iterable[Cycle], pipeline: JointPipeline) -> Iterator[Tick
 
 
 def batches(cycles: Iterable[Cycle]) -> Iterator[list[Cycle]]:
-    """Lists of cycles; before an error of the recording, the cycles up to it."""
+    """Yield lists of cycles; before an error of the recording, those up to it."""
     source = iter(cycles)
     error: DrivelinkError | None = None
     while error is None:

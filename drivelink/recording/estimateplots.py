@@ -13,7 +13,7 @@ from estimator.sample import FloatArray
 
 
 def plot_curves(columns: Mapping[str, FloatArray], motors: int, path: Path, title: str) -> Path:
-    """Stiffness over deflection of each transmission; columns as in estimates.csv."""
+    """Return the stiffness over deflection of each transmission; columns as in estimates.csv."""
     figure, axes = plots.new_figure(title, height=3.6)
     seen = columns["observable"] > 0
     curves = {
@@ -29,7 +29,9 @@ def plot_curves(columns: Mapping[str, FloatArray], motors: int, path: Path, titl
 
 
 def plot_over_time(columns: Mapping[str, FloatArray], path: Path, title: str) -> Path:
-    """The joint's flexibility torque and stiffness over time, on one time axis; gaps where not valid."""
+    """Return the joint's flexibility torque and stiffness over time, on one time axis; gaps
+    where not valid.
+    """
     figure, axes = plots.new_figure(title, rows=2)
     t = columns["time_s"]
     valid = {name: np.where(columns["valid"] > 0, values, np.nan) for name, values in columns.items()}

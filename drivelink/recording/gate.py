@@ -112,7 +112,7 @@ class Gathered:
         )
 
     def remarks(self, *, live: bool) -> list[str]:
-        """Findings with corrections, or what the motion does not reveal, one line each."""
+        """Return findings with corrections, or what the motion does not reveal, one line each."""
         try:
             judgement = self.judgement()
         except EstimatorError as error:
@@ -165,7 +165,7 @@ def _text_of(joint: JointFile, findings: Sequence[Discrepancy], *, live: bool) -
 
 
 def corrections(joint: JointFile, needed: Sequence[Change], *, live: bool) -> list[Correction]:
-    """Corrections of the joint file.
+    """Return the corrections of the joint file.
 
     Args:
         joint: as it is.

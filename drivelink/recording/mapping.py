@@ -23,14 +23,14 @@ MAX_BYTES = 1 << 20  # of such a document
 
 
 def side_file(path: Path) -> Path:
-    """The mapping file beside a raw CAN log."""
+    """Return the mapping file beside a raw CAN log."""
     return path.with_name(path.name + ".mapping.json")
 
 
 def mapping_document(
     joint: str, layouts: Iterable[NodeLayout], text: str = "", *, daemon: bool = False
 ) -> dict[str, Any]:
-    """The mapping document of a recording of frames.
+    """Return the mapping document of a recording of frames.
 
     Args:
         joint: its name.
@@ -44,7 +44,7 @@ def mapping_document(
 
 
 def layouts_from(data: bytes, joint: str, *, daemon: bool = False) -> list[NodeLayout]:
-    """The layouts in a mapping or model document; none if it belongs to another joint.
+    """Return the layouts in a mapping or model document; none if it belongs to another joint.
 
     Args:
         data: the document.
@@ -66,7 +66,7 @@ def layouts_from(data: bytes, joint: str, *, daemon: bool = False) -> list[NodeL
 
 
 def recorded_layouts(path: Path, joint: str, *, daemon: bool) -> Sequence[NodeLayout]:
-    """The first layouts of a joint's nodes in a recording, or ().
+    """Return the first layouts of a joint's nodes in a recording, or ().
 
     Args:
         path: the recording.
@@ -89,7 +89,7 @@ def recorded_layouts(path: Path, joint: str, *, daemon: bool) -> Sequence[NodeLa
 
 
 def joint_of(path: Path, named: Path | None) -> JointText:
-    """The given joint file, or the one in the recording.
+    """Return the given joint file, or the one in the recording.
 
     Raises:
         JointFileError: it is wrong.
@@ -114,7 +114,9 @@ def joint_of(path: Path, named: Path | None) -> JointText:
 
 
 def contained(joint: JointFile) -> JointFile:
-    """A recording's joint file without the keys that name something outside: data sheets, endpoints."""
+    """Return a recording's joint file without the keys that name something outside: data
+    sheets, endpoints.
+    """
     motors = [
         motor.model_copy(update={"drive": motor.drive and motor.drive.model_copy(update={"eds": None})})
         for motor in joint.motor

@@ -47,7 +47,7 @@ class McapMessage(NamedTuple):
 
 
 def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[McapMessage]:
-    """The messages of a file in order, up to a damaged place.
+    """Yield the messages of a file in order, up to a damaged place.
 
     Args:
         path: the file.
@@ -86,7 +86,7 @@ def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[
 
 
 def read_attachment(path: Path, name: str) -> bytes | None:
-    """The first attachment of that name; None: the file has none before a damaged place.
+    """Return the first attachment of that name; None: the file has none before a damaged place.
 
     Raises:
         RecordingError: the file cannot be read, or the attachment is larger than `MAX_BLOCK_BYTES`.
@@ -126,7 +126,7 @@ def _attached(body: bytes) -> tuple[str, bytes]:
 
 
 def message_fields(data: bytes) -> dict[str, Any]:
-    """The fields of a message.
+    """Return the fields of a message.
 
     Raises:
         ValueError: it is too long, or not a JSON object.

@@ -25,7 +25,7 @@ _APART = 64  # largest distance in cycles between a sample and its estimate in t
 
 
 def recorded_cycles(path: Path, motors: int, scale: Mapping[str, float] | None = None) -> Iterator[Cycle]:
-    """The cycles of a recording in order.
+    """Yield the cycles of a recording in order.
 
     A sample gets the flags of its estimate; a stale estimate is a cycle without sample.
 

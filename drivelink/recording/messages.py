@@ -27,7 +27,7 @@ _JSON = ("false", "true")
 
 
 def estimate_columns(motors: int) -> tuple[str, ...]:
-    """Names of an estimate's values, in the order of `estimate_row`."""
+    """Return the names of an estimate's values, in the order of `estimate_row`."""
     return (
         "time_s",
         "flexibility_torque_nm",
@@ -44,18 +44,18 @@ def estimate_row(
     totals: tuple[float, float, float],
     transmissions: tuple[TransmissionEstimate, ...],
 ) -> tuple[float, ...]:
-    """An estimate as the values of `estimate_columns`."""
+    """Return an estimate as the values of `estimate_columns`."""
     observable = 1 if status & _OBSERVABLE else 0
     return (time_s, *totals, observable, *(value for one in transmissions for value in one))
 
 
 def external_columns() -> tuple[str, ...]:
-    """Names of the further values with declared link dynamics, in the order of `external_row`."""
+    """Return the names of the further values with declared link dynamics, in the order of `external_row`."""
     return (*EXTERNAL_COLUMNS, "link_flexibility_torque_nm", "flexibility_difference_nm")
 
 
 def external_row(external: External | None) -> tuple[float, ...]:
-    """An external torque as the values of `external_columns`."""
+    """Return an external torque as the values of `external_columns`."""
     if external is None:
         return (math.nan, math.nan, 0, 0, math.nan, math.nan)
     _, status, torque, std, link_torque, difference = external
@@ -82,7 +82,7 @@ def _estimate_names(motors: int) -> tuple[str, ...]:
 
 
 def sample_encoder(motors: int, period_s: float) -> Callable[[Sample], bytes]:
-    """The function that makes a sample's message."""
+    """Return the function that makes a sample's message."""
     fill = _template(("sequence",), (), sample_columns(motors))
 
     def encode(sample: Sample) -> bytes:
@@ -92,7 +92,7 @@ def sample_encoder(motors: int, period_s: float) -> Callable[[Sample], bytes]:
 
 
 def estimate_encoder(motors: int, period_s: float) -> Callable[[EstimateMessage], bytes]:
-    """The function that makes an estimate's message."""
+    """Return the function that makes an estimate's message."""
     fill = _template(("sequence", "status"), ("valid", "observable"), _estimate_names(motors))
 
     def encode(message: EstimateMessage) -> bytes:
@@ -107,7 +107,7 @@ def estimate_encoder(motors: int, period_s: float) -> Callable[[EstimateMessage]
 
 
 def external_encoder(period_s: float) -> Callable[[ExternalMessage], bytes]:
-    """The function that makes an external torque's message."""
+    """Return the function that makes an external torque's message."""
     fill = _template(("sequence", "status"), ("valid", "contact"), _EXTERNAL_NAMES)
 
     def encode(message: ExternalMessage) -> bytes:
@@ -119,7 +119,7 @@ def external_encoder(period_s: float) -> Callable[[ExternalMessage], bytes]:
 
 
 def events_of(status: bytes) -> list[tuple[float, str]]:
-    """UNIX time in s and text of the events of a status document, whatever it contains."""
+    """Return UNIX time in s and text of the events of a status document, whatever it contains."""
     document = json.loads(status)
     events = document.get("events") if isinstance(document, dict) else None
     return [
@@ -133,7 +133,7 @@ def events_of(status: bytes) -> list[tuple[float, str]]:
 
 
 def log_message(joint: str, time_s: float, text: str) -> bytes:
-    """An event of the daemon as foxglove.Log."""
+    """Return an event of the daemon as foxglove.Log."""
     seconds, nanoseconds = divmod(round(time_s * 1e9), 10**9)
     stamp = {"sec": seconds, "nsec": nanoseconds}
     fields = {"timestamp": stamp, "level": _WARNING, "message": text, "name": joint, "file": "", "line": 0}
@@ -141,7 +141,7 @@ def log_message(joint: str, time_s: float, text: str) -> bytes:
 
 
 def read_sample(message: Mapping[str, Any], motors: int) -> Sample:
-    """The sample of a message, bit for bit; null becomes NaN."""
+    """Return the sample of a message, bit for bit; null becomes NaN."""
 
     def value(name: str) -> float:
         found = message.get(name)
@@ -160,7 +160,7 @@ def read_sample(message: Mapping[str, Any], motors: int) -> Sample:
 
 
 def message_schema(topic: str, motors: int) -> bytes:
-    """The JSON schema of a channel's messages."""
+    """Return the JSON schema of a channel's messages."""
     integer, text, flag = {"type": "integer"}, {"type": "string"}, {"type": "boolean"}
     properties: dict[str, Any]
     if topic == "sample":

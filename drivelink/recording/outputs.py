@@ -188,7 +188,7 @@ class Summary:
             self._values.extend(_row(played))
 
     def text(self, took_s: float) -> str:
-        """The replay in one line."""
+        """Return the replay in one line."""
         if self._last is None:
             return "no cycle in it"
         seconds = self._last.time_s - self._first_s
@@ -203,14 +203,16 @@ class Summary:
         )
 
     def reasons(self) -> list[str]:
-        """Each reason why cycles are not valid, most frequent first: share of the cycles, last sentence."""
+        """Return each reason why cycles are not valid, most frequent first: share of the
+        cycles, last sentence.
+        """
         return [f"{100 * count / self.count:.1f} % of the cycles: {text}" for count, text in self._sorted()]
 
     def _sorted(self) -> list[tuple[int, str]]:
         return sorted(self._why.values(), reverse=True)
 
     def document(self) -> dict[str, Any]:
-        """Summary of the replay as a JSON document; non-finite values are None."""
+        """Return the summary of the replay as a JSON document; non-finite values are None."""
         estimate = self._last.tick.estimate if self._last is not None else None
         end = {
             name: value if estimate is not None and math.isfinite(value := getattr(estimate, name)) else None

@@ -15,7 +15,7 @@ _HELD = ("torque_nm", "current_a")  # from one row to the next, as a drive holds
 
 
 def stamps_are_instants(time_s: FloatArray, number: FloatArray, x: FloatArray) -> bool:
-    """Whether a signal is smoother over its stamps than over its rows' numbers.
+    """Return whether a signal is smoother over its stamps than over its rows' numbers.
 
     If it is, the rows were taken when the stamps say; else the stamps are arrival times of uniform samples.
     Each sample is compared with the line through its neighbours.
@@ -39,7 +39,8 @@ def _roughness(s: FloatArray, x: FloatArray) -> float:
 
 
 def resampled(columns: Mapping[str, FloatArray], rows: NDArray[np.bool_]) -> dict[str, FloatArray]:
-    """Columns on a grid of the median step; torques and currents keep their impulse, gaps stay gaps.
+    """Return the columns on a grid of the median step; torques and currents keep their
+    impulse, gaps stay gaps.
 
     Args:
         columns: (n,) each, `time_s` among them; all finite in the rows used.

@@ -41,15 +41,15 @@ class SafeFile(io.BufferedIOBase):
             raise RecordingError(f"{path}: cannot be written: {error.strerror}") from error
 
     def writable(self) -> bool:
-        """Always."""
+        """Return always."""
         return True
 
     def seekable(self) -> bool:
-        """Always True: a header may be rewritten at the end."""
+        """Return always True: a header may be rewritten at the end."""
         return True
 
     def tell(self) -> int:
-        """Position of the next byte."""
+        """Return the position of the next byte."""
         return self._size + len(self._pending) if self._place is None else self._place
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:

@@ -73,7 +73,7 @@ class Sink:
         """Take the mapping document, see `drivelink.recording.mapping`."""
 
     def flush(self) -> None:
-        """Put everything on the disk."""
+        """Write everything to the disk."""
         self._file.sync()
 
     def close(self) -> None:
@@ -241,7 +241,7 @@ class CanSink(Sink):
         self._beside = json.dumps(document, indent=1) + "\n"
 
     def flush(self) -> None:
-        """Put everything on the disk."""
+        """Write everything to the disk."""
         if self._text is not None:
             self._text.flush()
         else:

@@ -36,7 +36,7 @@ class Installation:
 
 
 def unit_name(joint: str) -> str:
-    """The unit of a joint.
+    """Return the unit of a joint.
 
     Raises:
         UsageError: not a name for systemd.
@@ -55,7 +55,7 @@ def installation(
     allow: Sequence[str] = (),
     credentials: Sequence[str] = (),
 ) -> Installation:
-    """The files that run a joint as a service.
+    """Return the files that run a joint as a service.
 
     Args:
         joint: the joint file's content.
@@ -111,7 +111,7 @@ def _check_bus(interface: str, channel: str, path: Path) -> None:
 
 
 def network_files(channel: str) -> tuple[Path, ...]:
-    """Possible paths of a CAN interface's network files."""
+    """Return the possible paths of a CAN interface's network files."""
     return tuple(NETWORKS / f"80-drivelink-{channel}.{kind}" for kind in ("network", "netdev"))
 
 

@@ -18,12 +18,13 @@ __all__ = ["choose_bandwidth", "torque_rms", "widest"]
 
 
 def torque_rms(record: Record) -> float:
-    """rms of the motor torque without its mean, N·m; the larger one of two motors."""
+    """Return the rms of the motor torque without its mean, N·m; the larger one of two motors."""
     return float(np.max(np.std(record.motor_torque_nm, axis=0)))
 
 
 def choose_bandwidth(records: Sequence[Record], model: JointModel) -> float:
-    """A bandwidth from the data, Hz: that of the recording that needs the narrowest, but wide enough for
+    """Return a bandwidth from the data, Hz: that of the recording that needs the narrowest,
+    but wide enough for
     `fit_periods` of it in the shortest.
     """
     shortest_s = min(len(one) * one.period_s for one in records)
@@ -45,7 +46,7 @@ def _suits(record: Record, model: JointModel) -> float:
     signals, stiffness = Signals(record, wanted), rough_stiffness(record, model)
 
     def beyond(bandwidth_hz: float) -> float:
-        """Noise beyond what is allowed; rises with the bandwidth."""
+        """Return the noise beyond what is allowed; rises with the bandwidth."""
         noise = equation_noise(signals, model, stiffness, bandwidth_hz)
         return float(np.max(noise)) - 2.0 * choice("floor") * torque_rms(record)
 
@@ -56,12 +57,12 @@ def _suits(record: Record, model: JointModel) -> float:
 
 
 def widest(period_s: float) -> float:
-    """Largest bandwidth, Hz: every sample is a row."""
+    """Return the largest bandwidth, Hz: every sample is a row."""
     return 1.0 / (rate() * period_s)
 
 
 def rough_stiffness(record: Record, model: JointModel) -> list[float]:
-    """K of each transmission from the slow part of torque and deflection, N·m/rad."""
+    """Return K of each transmission from the slow part of torque and deflection, N·m/rad."""
     found = []
     for i, motor in enumerate(model.motors):
         if motor.transmission.model == "none" or record.link_position_rad is None:
@@ -77,7 +78,7 @@ def rough_stiffness(record: Record, model: JointModel) -> list[float]:
 def equation_noise(
     signals: Signals, model: JointModel, stiffness: list[float], bandwidth_hz: float
 ) -> FloatArray:
-    """Standard deviation that the channels' noise has in each motor's balance at a bandwidth, N·m."""
+    """Return the standard deviation of the channels' noise in each motor's balance at a bandwidth, N·m."""
     f = signals.light.frequency_hz
     s = 2j * np.pi * f
     narrow = lowpass(f, bandwidth_hz)

@@ -23,14 +23,14 @@ class Base:
     alpha: tuple[FloatArray, ...]
 
     def models(self, frame: Frame) -> list[TransmissionModel | None]:
-        """The transmission models, None where rigid."""
+        """Return the transmission models, None where rigid."""
         return [
             transmission_model(motor.transmission) if flexible else None
             for motor, flexible in zip(frame.model.motors, frame.flexible, strict=True)
         ]
 
     def design(self, frame: Frame) -> FloatArray:
-        """Columns d tau_e / d alpha of all motors, stacked."""
+        """Return the columns d tau_e / d alpha of all motors, stacked."""
         made = []
         for i, model in enumerate(self.models(frame)):
             if model is None:
@@ -41,7 +41,7 @@ class Base:
         return np.concatenate(made).T if made else np.zeros((frame.rows * frame.equations, 0))
 
     def torque(self, frame: Frame) -> FloatArray:
-        """tau_e at alpha in all equations, stacked."""
+        """Return tau_e at alpha in all equations, stacked."""
         total = np.zeros(frame.rows * frame.equations)
         for i, model in enumerate(self.models(frame)):
             if model is not None:
@@ -50,7 +50,7 @@ class Base:
         return total
 
     def moved(self, frame: Frame, step: FloatArray) -> Base:
-        """Alpha plus a step, with shape parameters limited to their bounds."""
+        """Return alpha plus a step, with shape parameters limited to their bounds."""
         alpha, begin = [], 0
         for model, old in zip(self.models(frame), self.alpha, strict=True):
             new = old + step[begin : begin + len(old)]
@@ -65,7 +65,7 @@ class Base:
         return replace(self, alpha=tuple(alpha))
 
     def parameters(self, frame: Frame) -> list[dict[str, ParameterValue]]:
-        """Alpha by its names in the joint file, one mapping per motor."""
+        """Return alpha by its names in the joint file, one mapping per motor."""
         return [
             {} if model is None else model.parameters(alpha)
             for model, alpha in zip(self.models(frame), self.alpha, strict=True)
@@ -114,7 +114,7 @@ def _search(frame: Frame, i: int, model: TransmissionModel, order: int) -> Float
 
 
 def with_flexibility(frame: Frame, base: Base) -> Frame:
-    """The frame with tau_e and stiffness in its coordinates."""
+    """Return the frame with tau_e and stiffness in its coordinates."""
     motors = []
     for c, model, alpha in zip(frame.motors, base.models(frame), base.alpha, strict=True):
         if model is None:

@@ -29,7 +29,7 @@ _AT_LINK = ("encoder_delay", "link_inertia", "link_viscous_damping", "gravity")
 
 
 def everyday(frame: Frame) -> list[Candidate]:
-    """Errors of every rig: inexact declared numbers, and offsets and skews of readings."""
+    """Return errors of every rig: inexact declared numbers, and offsets and skews of readings."""
     made = []
     for i, flexible in enumerate(frame.flexible):
         names = [n for n in _AT_MOTOR if flexible or n not in ("deflection_offset", "torque_delay")]
@@ -46,7 +46,8 @@ def everyday(frame: Frame) -> list[Candidate]:
 def everyday_std(
     frames: Sequence[Frame], candidate: Candidate, torque_rms: float, calibrating: bool
 ) -> tuple[float, ...]:
-    """Prior standard deviation of each linear parameter of an everyday error; 0: it does not apply.
+    """Return the prior standard deviation of each linear parameter of an everyday error; 0:
+    it does not apply.
 
     Args:
         frames: of all recordings.
@@ -123,7 +124,9 @@ def _declared_std(frame: Frame, name: str, calibrating: bool) -> float:
 
 
 def effect_std(model: JointModel, candidate: Candidate, by_torque: FloatArray) -> FloatArray:
-    """Prior standard deviations of an effect's linear parameters, by torque or by reading error."""
+    """Return the prior standard deviations of an effect's linear parameters, by torque or by
+    reading error.
+    """
     name = candidate.kind.name
     if name == "motor_inertia":
         return np.full_like(
@@ -145,12 +148,12 @@ def effect_std(model: JointModel, candidate: Candidate, by_torque: FloatArray) -
 
 
 def longest_delay_s(period_s: float) -> float:
-    """Beyond this a delay is an error of the time stamps: three deviations of its prior, or three samples."""
+    """Return the longest delay that is none of the time stamps: three deviations of its prior or samples."""
     return choice("sure") * max(PRIORS["late"].std, period_s)
 
 
 def least(model: JointModel, candidate: Candidate) -> float:
-    """Physical lower bound of an effect's linear parameters, beyond the declared value."""
+    """Return the physical lower bound of an effect's linear parameters, beyond the declared value."""
     name = candidate.kind.name
     motor, link = model.motors[candidate.motor or 0], model.link
     if candidate.kind.parameters[0].positive:

@@ -38,7 +38,9 @@ class Standing(NamedTuple):
 
 
 def accounts(search: Search, found: Fitted, others: Sequence[Fitted]) -> list[Account]:
-    """The account found and others with at most as many effects; the best fit for each set of effects."""
+    """Return the account found and others with at most as many effects; the best fit for each
+    set of effects.
+    """
     made: dict[Keys, Account] = {found.keys: Account(1.0, found)}
     for other in others:
         if len(other.terms) > len(found.terms) or other.keys == found.keys:
@@ -51,7 +53,7 @@ def accounts(search: Search, found: Fitted, others: Sequence[Fitted]) -> list[Ac
 
 
 def standing(search: Search, found: Fitted, k: int, beside: Sequence[Account]) -> Standing:
-    """Probability and alternatives of the k-th effect found."""
+    """Return the probability and alternatives of the k-th effect found."""
     key = found.terms[k].candidate.key
     own = {name for name, _ in found.keys}
     total = sum(a.weight for a in beside)

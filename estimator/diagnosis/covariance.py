@@ -29,7 +29,7 @@ Labels = NDArray[np.int64]
 
 
 def hac_covariance(problem: Problem, fitted: Fitted, surplus: float = 1.0) -> FloatArray:
-    """(k, k) covariance of the parameters, at least that of the posterior.
+    """Return (k, k) covariance of the parameters, at least that of the posterior.
 
     Standard deviations are scaled so that 1.96 of them are the 95 % interval of a t distribution, whose
     degrees of freedom follow from the number of groups that determine the parameter.
@@ -48,7 +48,7 @@ def hac_covariance(problem: Problem, fitted: Fitted, surplus: float = 1.0) -> Fl
 
 
 def design_effects(problem: Problem, fitted: Fitted, surplus: float = 1.0) -> FloatArray:
-    """(k,) variance of each parameter over that of independent rows, at least 1.
+    """Return (k,) variance of each parameter over that of independent rows, at least 1.
 
     So many rows have the information of one (Kish, Survey Sampling, 1965).
     """

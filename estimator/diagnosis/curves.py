@@ -41,7 +41,7 @@ class _Splines:
 
 
 def best_curve(search: Search, beside: Fitted, place: tuple[str, int | None] | None = None) -> Fitted | None:
-    """The free curve with the most evidence when added to a model, over all places and coordinates.
+    """Return the free curve with the most evidence when added to a model, over all places and coordinates.
 
     Args:
         search: the recordings.

@@ -38,11 +38,13 @@ class Scale(NamedTuple):
     slopes: FloatArray
 
     def sizes(self, x: FloatArray) -> FloatArray:
-        """(m,) s at each moment."""
+        """Return (m,) s at each moment."""
         return np.maximum(1.0 + self.slopes @ x[self.columns], choice("least_scale"))
 
     def size(self, x: FloatArray) -> float:
-        """Divisor of r in the less favourable of both assumptions: geometric mean of s, at most one."""
+        """Return the divisor of r in the less favourable of both assumptions: geometric mean of
+        s, at most one.
+        """
         return min(float(np.exp(np.mean(np.log(self.sizes(x))))), 1.0)
 
 
@@ -73,7 +75,7 @@ class _Grams(NamedTuple):
     rows: FloatArray
 
     def left(self, x: FloatArray) -> FloatArray:
-        """(g,) squared errors at x."""
+        """Return (g,) squared errors at x."""
         return np.maximum(self.square + (self.matrix @ x - 2.0 * self.side) @ x, 0.0)
 
 
@@ -127,7 +129,7 @@ class Regression:
         return cls(design, target, mean, std, low, group, used, floor, scales, made, unit)
 
     def solve(self, times: FloatArray, start: Posterior | None = None) -> Posterior:
-        """Parameters, noise and evidence by fixed-point iteration, with an active set for bounds.
+        """Return the parameters, noise and evidence by fixed-point iteration, with an active set for bounds.
 
         Args:
             times: (groups,) autocorrelation times of the errors, in rows.
@@ -206,11 +208,11 @@ class Regression:
         )
 
     def residual(self, x: FloatArray) -> FloatArray:
-        """(n,) residual of every row."""
+        """Return (n,) residual of every row."""
         return np.asarray(self.target - self.design @ x)
 
     def autocorrelation_times(self, x: FloatArray) -> FloatArray:
-        """(groups,) autocorrelation times of the residual, in rows."""
+        """Return the (groups,) autocorrelation times of the residual, in rows."""
         residual = self.residual(x)
         return np.array(
             [autocorrelation_time(residual[self.group == g]) for g in range(len(self._grams.rows))]
@@ -218,7 +220,7 @@ class Regression:
 
 
 def autocorrelation_time(error: FloatArray) -> float:
-    """1 + 2 sum of the squared autocorrelation: rows per independent error."""
+    """Return 1 + 2 sum of the squared autocorrelation: rows per independent error."""
     error = error - error.mean()
     n = len(error)
     size = 1 << (2 * n - 1).bit_length()

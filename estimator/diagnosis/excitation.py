@@ -13,7 +13,7 @@ __all__ = ["advice_for", "lines", "poor"]
 
 
 def lines(x: FloatArray) -> float:
-    """Effective number of spectral lines of a signal: (sum S)² / sum S², one for a sine."""
+    """Return the effective number of spectral lines of a signal: (sum S)² / sum S², one for a sine."""
     window = np.hanning(len(x))
     power = np.abs(fft.rfft((x - x.mean()) * window)) ** 2
     # A line is three bins wide behind this window, with powers 1/4, 1, 1/4 of its peak.
@@ -21,7 +21,7 @@ def lines(x: FloatArray) -> float:
 
 
 def poor(frame: Frame) -> bool:
-    """Whether the motion is little more than one sine."""
+    """Return whether the motion is little more than one sine."""
     return all(
         lines(frame.project(c.velocity)) < choice("one_sine")
         and lines(frame.project(c.torque)) < choice("one_sine")
@@ -67,7 +67,7 @@ _HINTS = {
 
 
 def advice_for(name: str, alternatives: tuple[str, ...]) -> list[str]:
-    """Advice: the motion or knowledge that would separate an effect from its alternatives."""
+    """Return advice: the motion or knowledge that would separate an effect from its alternatives."""
     said = []
     for other in alternatives:
         hint = _HINTS.get(frozenset({name, other}))

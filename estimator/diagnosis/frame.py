@@ -51,7 +51,7 @@ class Corrections:
 
     @classmethod
     def none(cls, motors: int) -> Corrections:
-        """No corrections."""
+        """Return no corrections."""
         none = (0.0,) * motors
         return cls(torque_delay_s=none, torque_lag_s=none, offset_rad=none)
 
@@ -109,13 +109,13 @@ class Signals:
         return self.light.apply(self.external, self._smooth)
 
     def acting(self, i: int, delay_s: float, lag_s: float) -> tuple[FloatArray, FloatArray]:
-        """A motor's torque as it acts, and its derivative, on the grid."""
+        """Return a motor's torque as it acts, and its derivative, on the grid."""
         response = self._held * _lag(self.light.frequency_hz, lag_s) if lag_s else self._held
         torque, rate = (self.light.apply(self.tau[i], response, order, delay_s) for order in range(2))
         return torque, rate
 
     def link_path(self, corrections: Corrections) -> tuple[FloatArray, ...]:
-        """The link's position, velocity and acceleration, corrected for the encoder's error."""
+        """Return the link's position, velocity and acceleration, corrected for the encoder's error."""
         assert self.q is not None
         sensor = corrections.deflection_delay_s
         late = corrections.encoder_delay_s + sensor
@@ -148,7 +148,8 @@ class Signals:
         return keep
 
     def noise(self, spectrum: Spectrum, response: NDArray[Any]) -> float:
-        """Variance of a channel's white noise after a filter; the noise is read from the upper end.
+        """Return the variance of a channel's white noise after a filter; the noise is read
+        from the upper end.
 
         Args:
             spectrum: of the channel.
@@ -159,7 +160,7 @@ class Signals:
         return 2.0 * white * float(np.sum(np.abs(response) ** 2)) / self.light.length**2
 
     def velocity_noise(self, motor: int) -> float:
-        """Standard deviation of a motor's velocity behind the light filter, rad/s."""
+        """Return the standard deviation of a motor's velocity behind the light filter, rad/s."""
         frequency = self.light.frequency_hz
         response = 2.0 * np.pi * frequency * light_response(self)
         return float(np.sqrt(self.noise(self.theta[motor], response)))
@@ -172,7 +173,7 @@ def _lag(frequency_hz: FloatArray, time_constant_s: float) -> NDArray[Any]:
 
 
 def light_response(signals: Signals) -> FloatArray:
-    """Response of G."""
+    """Return the response of G."""
     return lowpass(
         signals.light.frequency_hz, min(choice("harmonics") * signals.bandwidth_hz, 0.45 / signals.period_s)
     )
@@ -259,18 +260,22 @@ class Frame:
         return tuple(self.flexible[i] and (i == 0 or second) for i in range(len(self.motors)))
 
     def project(self, x: FloatArray) -> FloatArray:
-        """F, decimation and choice of rows, for arrays (..., n) on the grid."""
+        """Return f, decimation and choice of rows, for arrays (..., n) on the grid."""
         return self.signals.narrow.filter(x, self.signals.response)[..., self.signals.keep]
 
     def stack(self, parts: Sequence[FloatArray | None]) -> FloatArray:
-        """Columns (..., n) of the stacked regression from their parts in each equation; None is zero."""
+        """Return the columns (..., n) of the stacked regression from their parts in each
+        equation; None is zero.
+        """
         like = next(part for part in parts if part is not None)
         return np.concatenate([np.zeros_like(like) if part is None else part for part in parts], axis=-1)
 
     def column(
         self, motor: int | None, on_motor: FloatArray | None, on_link: FloatArray | None
     ) -> FloatArray:
-        """Stacked, filtered columns of arrays (..., n) on the grid in one motor's and the link's equation."""
+        """Return stacked, filtered columns of arrays (..., n) on the grid in one motor's and
+        the link's equation.
+        """
         given = on_link if on_motor is None else on_motor
         assert given is not None
         one = self.project(given)
@@ -282,14 +287,14 @@ class Frame:
         return np.concatenate(parts, axis=-1)
 
     def link_balance(self, link: LinkDynamics) -> FloatArray:
-        """tau_k - M q" - D_q q' - g(q) on the grid, which is tau_e by eq 4."""
+        """Return tau_k - M q" - D_q q' - g(q) on the grid, which is tau_e by eq 4."""
         c = self.motors[0]
         gravity = link.gravity_nm * np.sin(c.link_position + link.gravity_phase_rad)
         own = link.inertia_kg_m2 * c.link_acceleration + link.viscous_damping_nm_s_rad * c.link_velocity
         return np.asarray(self.external - own - gravity)
 
     def motor_balance(self, i: int) -> FloatArray:
-        """B theta" + D theta' - tau on the grid, which is tau_e by eq 5."""
+        """Return B theta" + D theta' - tau on the grid, which is tau_e by eq 5."""
         motor, link, c = self.model.motors[i], self.model.link, self.motors[i]
         own = motor.inertia_kg_m2 * c.acceleration + motor.viscous_damping_nm_s_rad * c.velocity
         if link is not None and self.carried and i == 0:
@@ -297,7 +302,7 @@ class Frame:
         return np.asarray(own - c.torque)
 
     def target(self) -> FloatArray:
-        """The stacked balances as rows."""
+        """Return the stacked balances as rows."""
         parts: list[FloatArray | None] = [
             self.project(self.motor_balance(i)) for i in range(len(self.motors))
         ]

@@ -81,7 +81,7 @@ class Held:
         self._memo: dict[int, tuple[Fitted, list[Residual]]] = {}
 
     def residuals(self, fitted: Fitted) -> list[Residual]:
-        """Held-out residual of each fold, the model fitted again to what is kept."""
+        """Return the held-out residual of each fold, the model fitted again to what is kept."""
         if id(fitted) not in self._memo:
             self._memo[id(fitted)] = fitted, [self._residual(fitted, fold) for fold in self._folds]
         return self._memo[id(fitted)][1]
@@ -102,7 +102,7 @@ class Held:
         return float(np.mean([one.square / one.torque_square for one in self.residuals(fitted)]))
 
     def confirms(self, found: Fitted, rest: Fitted) -> bool:
-        """Whether held-out data need what one model has beyond another.
+        """Return whether held-out data need what one model has beyond another.
 
         The error falls by more than filters and rounding leave, and the mean of its logarithm over stretches
         of time by more than its standard error.
@@ -145,18 +145,18 @@ class Held:
         return max(float(np.mean(ratios)), 1.0)
 
     def errors(self, before: Fitted, after: Fitted) -> Errors:
-        """Errors of all held-out data."""
+        """Return errors of all held-out data."""
         return _errors(_joined(self.residuals(before)), _joined(self.residuals(after)))
 
     def of(self, k: int, before: Fitted, after: Fitted) -> Errors | None:
-        """Errors of the k-th recording when held out; None if it never is."""
+        """Return errors of the k-th recording when held out; None if it never is."""
         if len(self._folds) < 2:
             return None
         return _errors(self.residuals(before)[k], self.residuals(after)[k])
 
 
 def held_out(problem: Problem, validation: Record | None = None) -> Held:
-    """The validation recording; or each recording in turn; or blocks of the only one."""
+    """Return the validation recording; or each recording in turn; or blocks of the only one."""
     records, every = problem.records, range(len(problem.records))
     if validation is not None:
         return Held(problem, [Fold(problem, every, problem.alike([validation]), problem.used)])
@@ -172,18 +172,18 @@ def held_out(problem: Problem, validation: Record | None = None) -> Held:
 
 
 def residual_of(problem: Problem, fitted: Fitted, rows: NDArray[np.bool_]) -> Residual:
-    """Residual of some rows under a model fitted to that problem."""
+    """Return the residual of some rows under a model fitted to that problem."""
     left, torque, motors = _residual(problem, fitted, fitted.regression.residual(fitted.posterior.x))
     return Residual(left[rows], torque[rows], motors[rows])
 
 
 def errors_of(problem: Problem, before: Fitted, after: Fitted, rows: NDArray[np.bool_]) -> Errors:
-    """Errors of the motors' balances over some of the rows that were fitted."""
+    """Return errors of the motors' balances over some of the rows that were fitted."""
     return _errors(residual_of(problem, before, rows), residual_of(problem, after, rows))
 
 
 def wider(surplus: float) -> list[str]:
-    """One sentence on a `Held.surplus` that shows in the intervals."""
+    """Return one sentence on a `Held.surplus` that shows in the intervals."""
     factor = f"{np.sqrt(surplus):.1f}"
     if factor == "1.0":
         return []

@@ -72,7 +72,9 @@ class Fitted:
         return own if self.extra is None else own | {("unlisted", self.extra.motor)}
 
     def is_real_beside(self, parent: Fitted) -> bool:
-        """Whether every effect contributes, and no spring is at zero that has a stiffness in the parent."""
+        """Return whether every effect contributes, and no spring is at zero that has a
+        stiffness in the parent.
+        """
         lost = self._at_zero("base") - parent._at_zero("base")
         return not lost and not self._at_zero("term")
 
@@ -85,14 +87,14 @@ class Fitted:
         }
 
     def moved_base(self, problem: Problem) -> Base:
-        """The transmission parameters as fitted."""
+        """Return the transmission parameters as fitted."""
         own = np.array(
             [x for slot, x in zip(self.slots, self.posterior.x, strict=True) if slot.kind == "base"]
         )
         return self.base.moved(problem.frames[0], own)
 
     def total(self, kind: str, name: str, motor: int | None, run: int | None = None) -> list[float]:
-        """The total quantity of some slots, including corrections already applied."""
+        """Return the total quantity of some slots, including corrections already applied."""
         return [
             slot.taken + float(x)
             for slot, x in zip(self.slots, self.posterior.x, strict=True)
@@ -160,7 +162,7 @@ class Problem:
         )
 
     def alike(self, records: Sequence[Record], held: bool = False) -> Problem:
-        """The same joint and filter with other recordings."""
+        """Return the same joint and filter with other recordings."""
         return Problem(records, self.model, self.bandwidth_hz, held, self.calibrating)
 
     @property
@@ -169,14 +171,14 @@ class Problem:
         return max(signals.period_s for signals in self.signals)
 
     def resolution_rad(self, motor: int) -> float:
-        """Of a deflection: one count of each of its encoders."""
+        """Return the resolution of a deflection: one count of each of its encoders."""
         link = self.records[0].link_position_rad
         read = [self.records[0].motor_position_rad[:, motor], *([] if link is None else [link])]
         steps = [np.abs(np.diff(x)) for x in read]
         return sum(float(np.quantile(x[x > 0.0], 0.01)) if np.any(x > 0.0) else 0.0 for x in steps)
 
     def unit_of(self, term: Term, name: str) -> float:
-        """A nonlinear parameter's unit per unit of its slot."""
+        """Return a nonlinear parameter's unit per unit of its slot."""
         return step_of(term, name, self.frames[0])[1]
 
     @property
@@ -193,7 +195,7 @@ class Problem:
         return made[k]
 
     def at(self, corrections: Sequence[Corrections], base: Base) -> list[Frame]:
-        """Frames of all recordings, readings corrected, flexibility torques filled in."""
+        """Return the frames of all recordings, readings corrected, flexibility torques filled in."""
         key = tuple(corrections), base
         if key not in self._points:
             while len(self._points) >= 6:
@@ -204,13 +206,13 @@ class Problem:
     # -- fitting ------------------------------------------------------------------------------------------
 
     def null(self, pinned: Pinned | None = None) -> Fitted:
-        """The fitted declared model, everyday errors within their priors or pinned."""
+        """Return the fitted declared model, everyday errors within their priors or pinned."""
         corrections = tuple(self.declared for _ in self.signals)
         widest = max(self.frames, key=lambda f: max(float(np.ptp(c.deflection)) for c in f.motors))
         return self.fit((), start(widest), corrections, pinned=pinned)
 
     def numbers(self, like: Fitted | None = None) -> Pinned:
-        """The declared numbers, pinned as they are declared or as another hypothesis has them."""
+        """Return the declared numbers, pinned as they are declared or as another hypothesis has them."""
         made = {}
         for candidate in everyday(self.frames[0]):
             name, motor = candidate.key
@@ -229,7 +231,7 @@ class Problem:
         extra: Extra | None = None,
         pinned: Pinned | None = None,
     ) -> Fitted:
-        """Gauss-Newton iteration from a given point; return the best point.
+        """Return the Gauss-Newton iteration from a given point; return the best point.
 
         The evidence of the first steps is too optimistic far from the optimum and is not used to stop; the
         fit of a healthy joint continues until it converges.
@@ -245,7 +247,7 @@ class Problem:
         return best
 
     def added(self, fitted: Fitted, term: Term, steps: int | None = None, begin: float = 0.0) -> Fitted:
-        """The hypothesis with one more term; that of a reading begins at a correction."""
+        """Return the hypothesis with one more term; that of a reading begins at a correction."""
         candidate = term.candidate
         corrections = fitted.corrections
         if begin:
@@ -254,18 +256,18 @@ class Problem:
         return self.fit((*fitted.terms, term), fitted.base, corrections, steps)
 
     def without(self, fitted: Fitted, k: int, pinned: Pinned | None = None) -> Fitted:
-        """The hypothesis without one term; its correction of a reading is undone."""
+        """Return the hypothesis without one term; its correction of a reading is undone."""
         term = fitted.terms[k]
         terms = fitted.terms[:k] + fitted.terms[k + 1 :]
         corrections = tuple(restored(c, self.declared, term.candidate) for c in fitted.corrections)
         return self.fit(terms, fitted.base, corrections, extra=fitted.extra, pinned=pinned)
 
     def with_curve(self, fitted: Fitted, extra: Extra, steps: int) -> Fitted:
-        """The hypothesis with a free curve."""
+        """Return the hypothesis with a free curve."""
         return self.fit(fitted.terms, fitted.base, fitted.corrections, steps, extra=extra)
 
     def transferred(self, fitted: Fitted, corrections: Corrections) -> Fitted:
-        """A model fitted to other recordings, evaluated on this one without refitting."""
+        """Return a model fitted to other recordings, evaluated on this one without refitting."""
         bare = tuple(replace(t, weights=()) for t in fitted.terms)
         kept = [(s, x) for s, x in zip(fitted.slots, fitted.posterior.x, strict=True) if s.kind != "shape"]
         there = self._linearised(bare, fitted.base, (corrections,), fitted.extra, fitted.pinned)
@@ -274,7 +276,7 @@ class Problem:
         return replace(there, posterior=there.posterior._replace(x=x))
 
     def torque(self) -> FloatArray:
-        """Measured torque of each row without its mean, as declared; zero in the link's balance."""
+        """Return the measured torque of each row without its mean, as declared; zero for the link."""
         made = []
         for frame in self.frames:
             made += [frame.project(c.torque) - float(np.mean(frame.project(c.torque))) for c in frame.motors]
@@ -353,7 +355,7 @@ class Problem:
 
 
 def stretches(problem: Problem) -> NDArray[np.int64]:
-    """(n,) stretch of time of each row, equal in all balances of a recording; -1: not used."""
+    """Return (n,) stretch of time of each row, equal in all balances of a recording; -1: not used."""
     made = []
     count = whole("groups")
     for k, frame in enumerate(problem.frames):

@@ -15,7 +15,7 @@ __all__ = ["declared_corrections", "declared_torque"]
 
 
 def declared_corrections(model: JointModel) -> Corrections:
-    """Corrections of the readings by the declared effects."""
+    """Return the corrections of the readings by the declared effects."""
     delays, lags, offsets = [], [], []
     for motor in model.motors:
         delays.append(_sum(motor.effects, "torque_delay", "delay_s"))
@@ -39,7 +39,7 @@ def _sum(effects: tuple[Effect, ...], name: str, parameter: str) -> float:
 
 
 def declared_torque(frame: Frame) -> FloatArray:
-    """Contribution of the declared effects to the stacked balances."""
+    """Return the contribution of the declared effects to the stacked balances."""
     total = np.zeros(frame.rows * frame.equations)
     owners = [(i, effect) for i, motor in enumerate(frame.model.motors) for effect in motor.effects]
     for motor, effect in [*owners, *((None, effect) for effect in frame.model.link_effects)]:

@@ -12,7 +12,7 @@ __all__ = ["raised"]
 
 
 def raised(model: JointModel, effects: Iterable[Finding]) -> JointModel | None:
-    """The model with open orders raised to those found by a diagnosis (eq 24).
+    """Return the model with open orders raised to those found by a diagnosis (eq 24).
 
     Args:
         model: as it was diagnosed.

@@ -39,7 +39,7 @@ _CHANNELS = {"torque_delay": "torque_delay_s", "deflection_offset": "deflection_
 def findings_of(
     problem: Problem, found: Fitted, null: Fitted, standings: Sequence[Standing], surplus: float
 ) -> list[Finding]:
-    """The effects, the most important first, including delays of more than a sample."""
+    """Return the effects, the most important first, including delays of more than a sample."""
     std = np.sqrt(np.maximum(np.diag(hac_covariance(problem, found, surplus)), 0.0))
     made = []
     total = float(np.sum(null.posterior.sigma**2))
@@ -128,7 +128,7 @@ def _absolute(problem: Problem, found: Fitted, k: int, name: str, x: float) -> f
 
 
 def stamped_wrongly(name: str, delay_s: float, period_s: float) -> str | None:
-    """One sentence on a delay that no drive and no bus has."""
+    """Return one sentence on a delay that no drive and no bus has."""
     longest = longest_delay_s(period_s)
     if name not in DELAYS or abs(delay_s) <= longest:
         return None
@@ -139,7 +139,7 @@ def stamped_wrongly(name: str, delay_s: float, period_s: float) -> str | None:
 
 
 def alignment_of(problem: Problem, after: Fitted, effects: list[Finding], surplus: float) -> dict[str, float]:
-    """Everyday corrections of the readings, by channel."""
+    """Return everyday corrections of the readings, by channel."""
     named = {(f.name, f.motor) for f in effects}
     pairs: dict[str, float] = {}
     std = np.sqrt(np.maximum(np.diag(hac_covariance(problem, after, surplus)), 0.0))
@@ -167,7 +167,7 @@ def transmissions_of(
     surplus: float,
     left: Sequence[float],
 ) -> tuple[tuple[Refitted, ...], list[str]]:
-    """Each motor's transmission, and doubts about them.
+    """Return each motor's transmission, and doubts about them.
 
     The covariance is that of the fit plus that between explanations (Bayesian model averaging; Hoeting et
     al., Statistical Science 14, 1999), because another set of effects may imply another stiffness, plus the
@@ -240,7 +240,7 @@ def _between(
 
 
 def rivals_of(search: Search) -> list[Rival]:
-    """Relative error with each promising effect alone, best first."""
+    """Return the relative error with each promising effect alone, best first."""
     standing = []
     for found in search.singles():
         candidate = found.terms[-1].candidate
@@ -252,7 +252,9 @@ def rivals_of(search: Search) -> list[Rival]:
 
 
 def curves_of(problem: Problem, after: Fitted) -> tuple[Curve, ...]:
-    """Residual without each effect over its revealing coordinate, with the effect, on the first recording."""
+    """Return the residual without each effect over its revealing coordinate, with the effect,
+    on the first recording.
+    """
     frame = problem.at(after.corrections, after.base)[0]
     rows = np.arange(frame.rows)
     left = after.regression.residual(after.posterior.x)
@@ -296,7 +298,7 @@ def curves_of(problem: Problem, after: Fitted) -> tuple[Curve, ...]:
 
 
 def series_of(problem: Problem, before: Fitted, after: Fitted) -> Series:
-    """Torque of the first motor and its residual over time."""
+    """Return the torque of the first motor and its residual over time."""
     frame = problem.frames[0]
     keep = frame.signals.keep
     return Series(

@@ -21,7 +21,7 @@ READINGS = (
 
 
 def read(c: Corrections, candidate: Candidate) -> tuple[float, ...]:
-    """The correction of the readings by an effect."""
+    """Return the correction of the readings by an effect."""
     motor = candidate.motor or 0
     return {
         "torque_delay": (c.torque_delay_s[motor],),
@@ -35,7 +35,7 @@ def read(c: Corrections, candidate: Candidate) -> tuple[float, ...]:
 
 
 def corrected(c: Corrections, name: str, motor: int | None, part: int, more: float) -> Corrections:
-    """Corrections with an increment for one effect."""
+    """Return the corrections with an increment for one effect."""
 
     def put(values: tuple[float, ...]) -> tuple[float, ...]:
         return tuple(v + more if motor in (None, i) else v for i, v in enumerate(values))
@@ -58,7 +58,7 @@ def corrected(c: Corrections, name: str, motor: int | None, part: int, more: flo
 
 
 def restored(c: Corrections, declared: Corrections, candidate: Candidate) -> Corrections:
-    """Corrections with one effect reset to its declared value."""
+    """Return the corrections with one effect reset to its declared value."""
     name = candidate.kind.name
     if name not in READINGS:
         return c

@@ -68,7 +68,7 @@ class _Tried(NamedTuple):
     side: FloatArray
 
     def independent(self, effect: float) -> _Tried:
-        """The same where so many rows have the information of one (`design_effects`)."""
+        """Return the same where so many rows have the information of one (`design_effects`)."""
         eye = np.eye(len(self.precision))
         precision, side = eye + (self.precision - eye) / effect, self.side / effect
         return self._replace(precision=precision, side=side, gain=float(_gain(precision, side)))
@@ -140,7 +140,7 @@ class Search:
         self._library.append(_Entry(candidate, values, rows, np.array(grams), std))
 
     def run(self) -> list[Fitted]:
-        """The pruned hypotheses with the most evidence, best first, including single effects."""
+        """Return the pruned hypotheses with the most evidence, best first, including single effects."""
         seen = self.seen
         beam, best = [self.null], self.null
         for size in itertools.count(1):
@@ -160,15 +160,15 @@ class Search:
         return [best, *self.leading()]
 
     def singles(self) -> list[Fitted]:
-        """The promising effects, each alone."""
+        """Return the promising effects, each alone."""
         return self._singles
 
     def leading(self) -> list[Fitted]:
-        """The single effects with the most evidence."""
+        """Return the single effects with the most evidence."""
         return self.ranked(self._singles)[: whole("beam")] if self._singles else []
 
     def children(self, parent: Fitted, like: Candidate | None = None) -> list[Fitted]:
-        """The most promising extensions by one effect; `like`: see `screen`."""
+        """Return the most promising extensions by one effect; `like`: see `screen`."""
         grown = (self._grown(parent, term) for term in self.screen(parent, like))
         return [child for child in grown if child.is_real_beside(parent)]
 
@@ -195,7 +195,8 @@ class Search:
         return self.score(one, best) - self.score(other, best)
 
     def chance(self, found: Fitted, rival: Fitted, surplus: float = 1.0) -> float:
-        """Probability that the rival would be better on a longer recording; `surplus`: see `Held.surplus`.
+        """Return the probability that the rival would be better on a longer recording;
+        `surplus`: see `Held.surplus`.
 
         From the log odds and their scatter between stretches of time, which gives their sum a standard
         deviation (Vuong, Econometrica 57, 1989). Otherwise the many rows would make a slightly wrong model
@@ -216,7 +217,7 @@ class Search:
         return np.bincount(labels[labels >= 0], each[labels >= 0]).astype(np.float64)
 
     def ranked(self, hypotheses: list[Fitted]) -> list[Fitted]:
-        """Best first, without duplicates."""
+        """Return the best first, without duplicates."""
         best = min(hypotheses, key=_left)
         order = sorted(hypotheses, key=lambda h: -self.score(h, best))
         unique: dict[Keys, Fitted] = {}
@@ -258,7 +259,9 @@ class Search:
         return hypothesis
 
     def rivals(self, hypothesis: Fitted, k: int) -> list[Fitted]:
-        """Alternatives to a term, most evidence first; a ripple elsewhere also starts at its period."""
+        """Return alternatives to a term, most evidence first; a ripple elsewhere also starts
+        at its period.
+        """
         if (hypothesis, k) in self._rivals:
             return self._rivals[hypothesis, k]
         own, rest = hypothesis.terms[k], self.problem.without(hypothesis, k)
@@ -274,7 +277,7 @@ class Search:
         return self._rivals[hypothesis, k]
 
     def screen(self, parent: Fitted, like: Candidate | None = None) -> list[Term]:
-        """The most promising additional effects, at the best point of their grid.
+        """Return the most promising additional effects, at the best point of their grid.
 
         Args:
             parent: the hypothesis.
@@ -357,7 +360,7 @@ class Search:
 
 
 def parameters(term: Term) -> int:
-    """Number of an effect's parameters."""
+    """Return the number of an effect's parameters."""
     return len(term.candidate.kind.parameters)
 
 

@@ -21,7 +21,7 @@ Spectrum = tuple[NDArray[np.complex128], FloatArray, FloatArray]
 
 
 def lowpass(frequency_hz: FloatArray, bandwidth_hz: float) -> FloatArray:
-    """Magnitude 1/sqrt(1 + (f/fc)^16): -3 dB at fc, no phase."""
+    """Return the magnitude 1/sqrt(1 + (f/fc)^16): -3 dB at fc, no phase."""
     return np.asarray(1.0 / np.sqrt(1.0 + (frequency_hz / bandwidth_hz) ** (2 * whole("order"))))
 
 
@@ -58,7 +58,9 @@ class Band:
         self._times = np.arange(self.kept) * self.period_s
 
     def transform(self, x: FloatArray) -> Spectrum:
-        """Spectra of extended, detrended arrays (..., n), with each trend's value at sample 0 and slope."""
+        """Return spectra of extended, detrended arrays (..., n), with each trend's value at
+        sample 0 and slope.
+        """
         pad, n = self._pad, self._samples
         right = min(self._right, n - 1)
         extended = np.empty((*x.shape[:-1], self.length))
@@ -80,7 +82,8 @@ class Band:
         derivative: int = 0,
         delay_s: float = 0.0,
     ) -> FloatArray:
-        """Back in time, decimated: the filtered arrays, or their derivatives, delay_s earlier or later.
+        """Return the arrays back in time, decimated: the filtered arrays, or their
+        derivatives, delay_s earlier or later.
 
         Args:
             spectrum: as `transform` gives it.

@@ -173,14 +173,14 @@ class Stack:
                 self._add(self._derivative(term, name), slot, 1.0)
 
     def curve(self, extra: Extra) -> None:
-        """A free curve."""
+        """Build a free curve."""
         shaped = np.concatenate([curve_columns(f, extra) for f in self._frames])
         width = choice("curve_width") * PRIORS["effect"].std * self._torque_rms
         for p, column in enumerate(shaped.T):
             self._add(column, Slot("curve", "", extra.motor, None, p, 0, 0.0), width)
 
     def scales(self, terms: Sequence[Term]) -> tuple[Scale, ...]:
-        """The motors' balances against the measured torque."""
+        """Return the motors' balances against the measured torque."""
         made = []
         equations = self._frames[0].equations
         for i in range(len(self._frames[0].motors)):
@@ -216,7 +216,7 @@ class Stack:
 
 
 def curve_columns(frame: Frame, extra: Extra) -> FloatArray:
-    """Stacked columns (rows, k) of a free curve."""
+    """Return stacked columns (rows, k) of a free curve."""
     waves = np.ascontiguousarray(extra.basis(frame.motors[extra.motor or 0]).T)
     if extra.location == "motor":
         return frame.column(extra.motor, -waves, None).T
@@ -236,7 +236,7 @@ def step_of(term: Term, name: str, frame: Frame) -> tuple[float, float]:
 
 
 def stepped(term: Term, name: str, x: float, frame: Frame) -> dict[str, float]:
-    """The nonlinear parameters after a step; positive ones change by factors of at most two."""
+    """Return the nonlinear parameters after a step; positive ones change by factors of at most two."""
     value, scale = term.values[name], reach_of(frame, term.candidate, name)
     if scale is None:
         low, high = bounds_of(frame, term.candidate, name)

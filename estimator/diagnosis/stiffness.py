@@ -39,7 +39,7 @@ class Middle(NamedTuple):
 
 
 def middle(model: TransmissionModel, alpha: FloatArray, covariance: FloatArray, phi: FloatArray) -> Middle:
-    """The stiffness at the median of the deflections' sizes.
+    """Return the stiffness at the median of the deflections' sizes.
 
     Args:
         model: the transmission.
@@ -58,7 +58,7 @@ def middle(model: TransmissionModel, alpha: FloatArray, covariance: FloatArray, 
 def stiffness_curves(
     problem: Problem, before: Fitted, after: Fitted, surplus: float
 ) -> tuple[StiffnessCurve, ...]:
-    """One curve for each flexible transmission, over the deflections of the first recording."""
+    """Return one curve for each flexible transmission, over the deflections of the first recording."""
     both = [(fitted, hac_covariance(problem, fitted, surplus)) for fitted in (before, after)]
     frame, made = problem.frames[0], []
     for i, motor in enumerate(problem.model.motors):

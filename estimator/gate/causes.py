@@ -62,7 +62,7 @@ class Cause:
 
 
 def scales(found: Sequence[Cause], motor: int) -> Scales:
-    """The combined scales of some causes in the balance of one motor."""
+    """Return the combined scales of some causes in the balance of one motor."""
     factors = {change.channel: change.factor for cause in found for change in cause.changes}
     own = f"motor{motor + 1}_"
     return Scales(
@@ -76,7 +76,7 @@ def scales(found: Sequence[Cause], motor: int) -> Scales:
 
 
 def causes(model: JointModel, linked: bool, ratios: Sequence[float | None]) -> list[Cause]:
-    """All causes that are tested.
+    """Return all causes that are tested.
 
     Args:
         model: the joint as declared.

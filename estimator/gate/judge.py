@@ -176,11 +176,13 @@ class _Joint:
         return total
 
     def weighed(self, hypotheses: Sequence[tuple[Cause, ...]]) -> list[tuple[float, tuple[Cause, ...]]]:
-        """Evidence and hypothesis, the best one first."""
+        """Return the evidence and hypothesis, the best one first."""
         return sorted(((self.evidence(h), h) for h in hypotheses), key=lambda e: -e[0])
 
     def controlled(self, found: Sequence[Cause]) -> bool:
-        """Whether controllers that see only their motors explain the torques as well as these corrections."""
+        """Return whether controllers that see only their motors explain the torques as well
+        as these corrections.
+        """
         return (
             sum(
                 float(self.counts[i] @ np.log(self.balances[i].controlled() / fit.errors))
@@ -190,7 +192,7 @@ class _Joint:
         )
 
     def left(self, found: Sequence[Cause]) -> float:
-        """The largest relative residual of the motors' balances."""
+        """Return the largest relative residual of the motors' balances."""
         return max(fit.error for _, fit in self.fits(found).values())
 
 
@@ -285,7 +287,7 @@ def _undecided(joint: _Joint, single: Sequence[Cause], declared: float) -> tuple
 
 
 def examine(record: Record, model: JointModel) -> list[Discrepancy]:
-    """The findings of `judge`."""
+    """Return the findings of `judge`."""
     return list(judge(record, model).findings)
 
 

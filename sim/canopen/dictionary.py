@@ -20,7 +20,7 @@ LONGEST_STRING = 889  # bytes
 
 
 def variables(described: Object) -> list[ODVariable]:
-    """The sub-indices of an object; a variable is its own."""
+    """Return the sub-indices of an object; a variable is its own."""
     return [described] if isinstance(described, ODVariable) else list(described.subindices.values())
 
 
@@ -73,7 +73,7 @@ class Entry:
         return self.item.pdo_mappable and self.item.access_type in ("wo", "rw", "rww")
 
     def upload(self) -> bytes:
-        """The value's bytes, as an SDO read gives them."""
+        """Return the value's bytes, as an SDO read gives them."""
         if self.item.access_type == "wo":
             raise SdoAbortedError(Abort.WRITE_ONLY)
         if self.refresh:
@@ -135,11 +135,11 @@ class Dictionary:
         return iter(self._entries.values())
 
     def get(self, index: int, subindex: int = 0) -> Entry | None:
-        """The entry, or None."""
+        """Return the entry, or None."""
         return self._entries.get((index, subindex))
 
     def find(self, index: int, subindex: int) -> Entry:
-        """The entry.
+        """Return the entry.
 
         Raises:
             SdoAbortedError: there is none.
@@ -158,7 +158,7 @@ class Dictionary:
         self.find(index, subindex).download(bytes(data))
 
     def optional(self, index: int, subindex: int = 0) -> Entry:
-        """The entry, or a hidden one with the value 0 if this device lacks it."""
+        """Return the entry, or a hidden one with the value 0 if this device lacks it."""
         absent = ODVariable("absent", index, subindex)
         absent.data_type = datatypes.INTEGER32
         return self._entries.get((index, subindex)) or Entry(absent, 0)

@@ -53,7 +53,7 @@ class DriveData:
     link_counts_per_rev: int | None = None
 
     def values(self) -> dict[tuple[int, int], int]:
-        """Power-on values, by (index, subindex)."""
+        """Return power-on values, by (index, subindex)."""
         motor, shaft = self.gear
         return {
             (0x6073, 0): self.max_current_per_mille,
@@ -204,7 +204,7 @@ class Cia402Drive(Node):
             self._error_code.value = 0
 
     def fault(self, code: int, register: int = 0, vendor: bytes = b"") -> None:
-        """A fault occurs in the drive: EMCY, fault reaction, fault.
+        """Let a fault occur in the drive: EMCY, fault reaction, fault.
 
         Args:
             code: EMCY error code, e.g. 0x2310 (over-current).
@@ -317,7 +317,7 @@ class Cia402Drive(Node):
         self._measure()
 
     def on_leave_operational(self) -> None:
-        """An enabled drive stops without its master."""
+        """Stop an enabled drive without its master."""
         if self.state in (Nmt.STOPPED, Nmt.INITIALISING):
             self.on_connection_lost()
 

@@ -17,19 +17,21 @@ _CODES: dict[type, int] = {ODVariable: 0x7, ODArray: 0x8, ODRecord: 0x9}  # CiA 
 
 
 def eds_directory() -> Path:
-    """Directory of the shipped EDS files."""
+    """Return the directory of the shipped EDS files."""
     return Path(__file__).parent.parent / "eds"
 
 
 @cache
 def load_eds(name: str) -> tuple[Object, ...]:
-    """The objects of a shipped EDS file, by index."""
+    """Return the objects of a shipped EDS file, by index."""
     dictionary = import_od(str(eds_directory() / f"{name}.eds"), 0)
     return tuple(dictionary[index] for index in sorted(dictionary) if index >= 0x1000)
 
 
 def with_values(objects: Iterable[Object], values: Mapping[tuple[int, int], int | str]) -> list[Object]:
-    """Copies with other power-on values, by (index, subindex); those of missing objects are ignored."""
+    """Return copies with other power-on values, by (index, subindex); those of missing
+    objects are ignored.
+    """
 
     def changed(variable: ODVariable) -> ODVariable:
         made = copy(variable)
@@ -40,7 +42,7 @@ def with_values(objects: Iterable[Object], values: Mapping[tuple[int, int], int 
 
 
 def with_members(described: Object, members: Iterable[ODVariable]) -> Object:
-    """An object like this one with other sub-indices."""
+    """Return an object like this one with other sub-indices."""
     if isinstance(described, ODVariable):
         return next(iter(members))
     made = type(described)(described.name, described.index)
@@ -50,7 +52,7 @@ def with_members(described: Object, members: Iterable[ODVariable]) -> Object:
 
 
 def node_eds(file_name: str, node: Node) -> str:
-    """The EDS file of a device, with its present power-on values."""
+    """Return the EDS file of a device, with its present power-on values."""
     shipped = (eds_directory() / f"{node.quirks.eds}.eds").read_text(encoding="ascii")
     head = shipped.partition("\n[1000]\n")[0]
     objects = node.dictionary.objects

@@ -29,7 +29,7 @@ class EncoderData:
     range_counts: int = 1 << 32
 
     def values(self) -> dict[tuple[int, int], int]:
-        """Power-on values, by (index, subindex)."""
+        """Return power-on values, by (index, subindex)."""
         return {
             (0x6001, 0): self.counts_per_rev,
             (0x6002, 0): min(0xFFFF_FFFF, self.range_counts),
@@ -134,5 +134,5 @@ class Cia406Encoder(Node):
             self._last, self._last_s = counts, time_s
 
     def on_reset_node(self) -> None:
-        """Power-on scaling."""
+        """Restore the power-on scaling."""
         self._take_operating()

@@ -132,13 +132,13 @@ class Node:
             self.reset_communication()
 
     def reset_node(self) -> None:
-        """Power-on values everywhere, then boot."""
+        """Restore power-on values everywhere, then boot."""
         self.dictionary.reset(*_APPLICATION)
         self._reset(keep_pdos=False)
         self.on_reset_node()
 
     def reset_communication(self) -> None:
-        """Power-on values of the communication profile, then boot."""
+        """Restore the communication profile's power-on values, then boot."""
         self._reset(keep_pdos=self.quirks.keeps_pdos)
 
     def _reset(self, keep_pdos: bool) -> None:
@@ -252,7 +252,7 @@ class Node:
         return True
 
     def transmit(self) -> None:
-        """The sampling instant of a SYNC: sample, and send the due TPDOs."""
+        """Sample at the instant of a SYNC, and send the due TPDOs."""
         self.on_sample()
         for tpdo in self._synchronous:
             tpdo.sync(self._counter)
@@ -286,7 +286,7 @@ class Node:
     # What a device does besides
 
     def on_pdos(self, mapped: frozenset[Entry]) -> None:
-        """The active TPDOs have changed; they contain these entries."""
+        """React to a change of the active TPDOs, which contain these entries."""
 
     def on_control(self, periods: int) -> None:
         """Control periods begin."""
@@ -295,10 +295,10 @@ class Node:
         """Update the process data."""
 
     def on_reset_node(self) -> None:
-        """The application has been reset."""
+        """React to a reset of the application."""
 
     def on_leave_operational(self) -> None:
-        """The NMT state operational has been left."""
+        """React to leaving the NMT state operational."""
 
     def on_connection_lost(self) -> None:
-        """A monitored node's heartbeat has timed out."""
+        """React to the loss of a monitored node's heartbeat."""

@@ -29,7 +29,7 @@ _COMMUNICATION_ERROR = 0x10  # bit of the error register
 
 
 def restricted(can_id: int) -> bool:
-    """Whether an identifier is restricted: not allowed for PDO, SYNC or EMCY (CiA 301, table 40)."""
+    """Return whether an identifier is restricted: not allowed for PDO, SYNC or EMCY (CiA 301, table 40)."""
     return (
         can_id <= 0x07F
         or 0x101 <= can_id <= 0x180
@@ -211,7 +211,7 @@ class Tpdo(Pdo):
             self._timer = self._node.timers.after(self.event_s, self._event_due)
 
     def pack(self) -> bytes:
-        """The frame with the present values."""
+        """Return the frame with the present values."""
         return self.layout.pack(*[entry.value for entry in self.entries if entry])
 
     def sync(self, counter: int | None) -> None:

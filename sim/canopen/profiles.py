@@ -85,7 +85,7 @@ PROFILES: dict[str, Quirks] = {
 
 
 def profile(name: str) -> Quirks:
-    """The profile of that name.
+    """Return the profile of that name.
 
     Raises:
         SimError: there is none.

@@ -119,7 +119,7 @@ class HeartbeatProducer:
         self._timer: Timer | None = None
 
     def stop(self) -> None:
-        """No further heartbeat."""
+        """Send no further heartbeat."""
         if self._timer:
             self._timer.cancel()
             self._timer = None
@@ -163,7 +163,7 @@ class HeartbeatConsumer:
         self._node.reroute()
 
     def receive(self, node_id: int) -> None:
-        """A heartbeat or boot-up message of a watched node has come."""
+        """Take a heartbeat or boot-up message of a watched node."""
         time_s = self.watched.get(node_id)
         if time_s is None:
             return

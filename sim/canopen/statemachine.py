@@ -35,17 +35,17 @@ class StateMachine:
         self._last = 0
 
     def reset(self) -> None:
-        """As after power-on: transitions 0 and 1."""
+        """Enter the state after power-on: transitions 0 and 1."""
         self.state = PowerState.SWITCH_ON_DISABLED
         self._last = 0
 
     def fault(self) -> None:
-        """Transition 13: a fault has occurred."""
+        """Enter the fault reaction (transition 13)."""
         if self.state is not PowerState.FAULT:
             self.state = PowerState.FAULT_REACTION
 
     def step(self) -> None:
-        """Automatic transitions of a control cycle: end of the fault reaction and of a quick stop."""
+        """Take the automatic transitions of a cycle: end of the fault reaction and of a quick stop."""
         if self.state is PowerState.FAULT_REACTION:
             self.state = PowerState.FAULT
         elif self.state is PowerState.QUICK_STOP_ACTIVE and self.quick_stop_option not in _QUICK_STOP_STAYS:

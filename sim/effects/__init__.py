@@ -45,7 +45,7 @@ class PlantEffect:
 
 
 def make(name: str, parameters: Mapping[str, object], motor: int | None = None) -> PlantEffect:
-    """An effect by name.
+    """Return an effect by name.
 
     Args:
         name: of `LISTED` or `UNLISTED`.
@@ -89,7 +89,8 @@ def _number(where: str, value: object) -> float:
 
 
 def parse(text: str) -> PlantEffect:
-    """An effect from the command line: "coulomb_friction=0.3" or "cogging=0.1,periods_per_rev=12,motor=2".
+    """Return an effect from the command line: "coulomb_friction=0.3" or
+    "cogging=0.1,periods_per_rev=12,motor=2".
 
     The first value is the effect's main amplitude, in its unit; further ones go by name.
 

@@ -64,7 +64,7 @@ class Assembly:
         self.link = LinkParts()
 
     def joint(self) -> JointPlant:
-        """The plant with all mechanical contributions."""
+        """Return the plant with all mechanical contributions."""
         motors = tuple(
             replace(
                 motor,

@@ -22,7 +22,9 @@ SLIP: dict[str, Described] = {
 
 
 def at_speed(level: Dry, smoothing: float) -> Dry:
-    """The level of dry friction, smoothed to zero at standstill over `smoothing` (rad/s); 0: unchanged."""
+    """Return the level of dry friction, smoothed to zero at standstill over `smoothing`
+    (rad/s); 0: unchanged.
+    """
     if smoothing <= 0.0:
         return level
 
@@ -33,7 +35,7 @@ def at_speed(level: Dry, smoothing: float) -> Dry:
 
 
 def not_negative(values: Values, name: str) -> float:
-    """That parameter.
+    """Return that parameter.
 
     Raises:
         SimError: it is negative.
@@ -44,12 +46,12 @@ def not_negative(values: Values, name: str) -> float:
 
 
 def slip(values: Values) -> Slip:
-    """The element with memory that `SLIP` describes."""
+    """Return the element with memory that `SLIP` describes."""
     return Slip(*(values[name] for name in SLIP))
 
 
 def wave(sine: float, cosine: float, periods: float) -> tuple[float, float]:
-    """sine sin(n x) + cosine cos(n x) as amplitude and phase of one sine."""
+    """Return sine sin(n x) + cosine cos(n x) as amplitude and phase of one sine."""
     if periods <= 0.0:
         raise SimError(f"periods_per_rev: expected a number > 0, got {periods!r}")
     return math.hypot(sine, cosine), math.atan2(cosine, sine)

@@ -45,7 +45,7 @@ class Slip:
         self._x: float | None = None  # unloaded at its first position
 
     def torque(self, x: float) -> float:
-        """Torque (N·m) at displacement x (rad)."""
+        """Return the torque (N·m) at displacement x (rad)."""
         return self._each * sum(self._moved(x))
 
     def commit(self, x: float) -> None:
@@ -114,7 +114,7 @@ class Creep:
         self._x: float | None = None  # unloaded at its first position
 
     def torque(self, x: float) -> float:
-        """Torque (N·m) at deflection x (rad)."""
+        """Return the torque (N·m) at deflection x (rad)."""
         if self._x is None:
             self._x = x
         return self._torque + self._k * (x - self._x)
@@ -139,7 +139,7 @@ class Delayed:
         self._past: deque[float] = deque([0.0] * back, maxlen=back)
 
     def schedule(self, torque: float) -> list[float]:
-        """Torque of each step of the period that begins with this set-point."""
+        """Return the torque of each step of the period that begins with this set-point."""
         past = self._past
         past.append(torque)
         last = len(past) - 1
@@ -177,11 +177,11 @@ class PositionHistory:
         )
 
     def push(self, position: float, velocity: float) -> None:
-        """One step later."""
+        """Advance by one step."""
         self._past.append((position, velocity))
 
     def position(self) -> float:
-        """The delayed position."""
+        """Return the delayed position."""
         (a, va), s, h = self._past[0], self._along, self._step_s
         if s == 0.0:
             return a

@@ -29,7 +29,7 @@ use crate::settings::{Priors, Settings};
 use contact::Judge;
 use link_errors::{DRY, LinkErrors};
 
-const BAND_SIGMA: f64 = 3.0; // of what is declared: so many joints in a thousand are further off than they say
+const BAND_SIGMA: f64 = 3.0; // standard deviations of what is declared: 0.3 % of joints are further off
 const SETTLED: f64 = 4.5; // delays of the filter after which a wrong start is forgotten
 const MEMORY_S: f64 = 20.0; // of how far the declared link is off, as that of the regression
 const FLOOR: f64 = 1e-3; // of the torque carried: no curve is known better

@@ -13,7 +13,6 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
-from drivelink._core import SYNC_COB_ID, Assembler
 from drivelink.canopen.blocking import run_program
 from drivelink.canopen.bus import open_bus
 from drivelink.canopen.guard import SilentBus
@@ -23,11 +22,11 @@ from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.canopen.roles import roles
 from drivelink.canopen.scan import listen
 from drivelink.canopen.sdo import Program, Read, SdoAbort
-from drivelink.cycle.pipeline import make_assembler
-from drivelink.cycle.syncclock import MEASURED_SYNCS, SyncClock, measure_period
 from drivelink.doctor.manualcheck import Value
 from drivelink.errors import DriveError
 from drivelink.jointfile import JointFile
+from drivelink.recording.canlog import LoggedFrame
+from drivelink.recording.framesamples import FrameSamples
 from estimator.sample import FloatArray, Record, Sample
 
 _READ = (Signal.MOTOR_POSITION, Signal.MOTOR_VELOCITY, Signal.MOTOR_TORQUE, Signal.LINK_POSITION)
@@ -125,79 +124,42 @@ class _Unwrapped:
 
 
 class Heard:
-    """Makes samples from the frames of a passive bus, as the daemon would.
+    """Makes samples from the frames of a passive bus, as the daemon would; sends nothing.
 
     Args:
         joint: the joint.
         configurator: knows the mapping of its nodes, or takes it from the frames.
-
-    Attributes:
-        joint: the joint, with the measured period of SYNC.
-        samples: the first of them since `readings` was last called.
     """
 
     def __init__(self, joint: JointFile, configurator: PassiveConfigurator) -> None:
-        self.joint = joint
-        self.samples: list[Sample] = []
-        self._missing = ""
-        self._configurator = configurator
-        self._syncs_ns: list[int] = []
-        self._clock: SyncClock | None = None
-        self._assembler: Assembler | None = None
+        self._frames = FrameSamples(joint, configurator)
+        self._samples: list[Sample] = []
+
+    @property
+    def joint(self) -> JointFile:
+        """The joint, with the measured period of SYNC."""
+        return self._frames.joint
 
     @property
     def missing(self) -> str:
         """Why there are no samples."""
-        reasons = [*map(str, self._configurator.missing.values()), self._missing]
-        return next((text for text in reasons if text), "no SYNC, or not all of its frames")
+        return self._frames.missing or "no SYNC, or not all of its frames"
 
     def take(self, message: can.Message) -> None:
         """Take a frame, in bus order."""
-        if message.is_extended_id or message.is_remote_frame or message.is_error_frame:
-            return
-        cob_id, data = message.arbitration_id, bytes(message.data)
-        stamp_s = message.timestamp or time.time()
-        self._configurator.feed(cob_id, data, stamp_s)
-        if self._configurator.poll(stamp_s):
-            self._assembler = None  # a node has another mapping now
-        stamp_ns = round(stamp_s * 1e9)
-        if self._clock is None:
-            self._measure(cob_id, stamp_ns)
-        elif self._assembler is None:
-            self._begin()
-        else:
-            jump = self._clock.jump(stamp_ns) if cob_id == SYNC_COB_ID else 1
-            sample = self._assembler.feed(cob_id, data, jump)
-            if sample is not None and len(self.samples) < _MOST_SAMPLES:
-                self.samples.append(sample)
+        if not (message.is_extended_id or message.is_remote_frame or message.is_error_frame):
+            stamp_ns = round((message.timestamp or time.time()) * 1e9)
+            frame = LoggedFrame(stamp_ns, message.arbitration_id, bytes(message.data), "")
+            self._keep(self._frames.take(frame))
 
-    def _measure(self, cob_id: int, stamp_ns: int) -> None:
-        """Measure the period from the first SYNCs."""
-        if cob_id != SYNC_COB_ID:
-            return
-        self._syncs_ns.append(stamp_ns)
-        if len(self._syncs_ns) < MEASURED_SYNCS:
-            return
-        period_s = self.joint.bus.period_s
-        measured = measure_period(self._syncs_ns, period_s)
-        if measured is not None and not measured.same:
-            period_s = measured.period_s
-        bus = self.joint.bus.model_copy(update={"period_s": period_s})
-        self.joint = self.joint.model_copy(update={"bus": bus})
-        self._clock = SyncClock(period_s)
-
-    def _begin(self) -> None:
-        """Make the assembler once the mapping of every node is known."""
-        if self._configurator.busy:
-            return
-        try:
-            self._assembler = make_assembler(self.joint, tuple(self._configurator.layouts.values()))
-        except DriveError as error:
-            self._missing = str(error)
+    def _keep(self, made: list[tuple[Sample, int]]) -> None:
+        if len(self._samples) < _MOST_SAMPLES:
+            self._samples += [sample for sample, _ in made]
 
     def readings(self) -> Readings:
         """What was heard since the last call, of the channels that have every value."""
-        samples, self.samples = self.samples, []
+        self._keep(self._frames.rest())
+        samples, self._samples = self._samples, []
         motors = range(len(samples[0].motor_position_rad) if samples else 0)
         values: dict[Channel, list[float]] = {}
         for i in motors:
@@ -209,8 +171,8 @@ class Heard:
         return {channel: Series(times, each, [0.0] * len(each)) for channel, each in heard.items()}
 
     def listen(self, bus: SilentBus, seconds: float) -> Readings:
-        """What is heard in the next seconds; sends nothing."""
-        self.samples = []
+        """What is heard in the next seconds."""
+        self.readings()
         listen(bus, seconds, self.take)
         return self.readings()
 

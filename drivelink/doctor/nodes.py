@@ -325,8 +325,9 @@ def _overhear(
             else:
                 section.ok(f"node {node}", f"0x{tpdo.cob_id:03X} heard {count} times")
     _judge_load(section, list(configurator.layouts.values()), joint.bus)
-    if heard.samples:
-        record = record_of(heard.readings(), len(joint.motor), joint.model().has_deflection)
+    readings = heard.readings()
+    if readings:
+        record = record_of(readings, len(joint.motor), joint.model().has_deflection)
         judge_record(report.section("Units and signs"), heard.joint, record)
     elif not configurator.missing:  # already reported
         text = f"units and signs cannot be checked: no sample in {seconds:g} s: {heard.missing}"

@@ -6,6 +6,7 @@ It only subscribes and receives. Data wait in zenoh's and the kernel's queues; d
 from __future__ import annotations
 
 import json
+import logging
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -17,23 +18,21 @@ import can
 import zenoh
 import zenoh.ext
 
-from drivelink._core import SYNC_COB_ID, Assembler
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cycle.following import MapFollower, follow_log
 from drivelink.cycle.framesource import BusLostError
-from drivelink.cycle.objectcheck import RecentSamples
-from drivelink.cycle.pipeline import make_assembler
 from drivelink.cycle.sources import open_source
-from drivelink.errors import BusError, DriveError, ZenohError
+from drivelink.errors import BusError, ZenohError
 from drivelink.jointfile import JointFile
 from drivelink.pubsub.identity import DaemonIdentity, source_of
 from drivelink.pubsub.inbound import DECODERS
 from drivelink.recording.canlog import LoggedFrame
+from drivelink.recording.framesamples import FrameSamples
 from drivelink.recording.limits import MAX_BLOCK_BYTES
 from drivelink.recording.sinks import Sink
-from drivelink.recording.syncnumbers import SyncNumbering
 from estimator.sample import Sample
+
+_LOG = logging.getLogger("drivelink.recording")
 
 _QUEUE = 30_000  # waiting messages per key: half a minute at 1 kHz
 _SNAPSHOTS = 2  # that wait: each has some megabytes
@@ -206,29 +205,23 @@ class BusTap:
         self._source = open_source(bus)
         self._sink = sink
         self._joint = joint
-        self._listener = PassiveConfigurator([joint], [base_dir]) if base_dir is not None else None
-        if self._listener is not None:
-            self._listener.adopt(layouts)
-        self._assembler: Assembler | None = None
-        self._follower: MapFollower | None = None
-        self._recent = RecentSamples(joint.bus.period_s)
-        self._lacking = ""  # missing parts of a known mapping
-        self._numbering = SyncNumbering(joint.bus.period_s, measure=True)
-        self._stamp_ns = 0
+        self._samples: FrameSamples | None = None
+        if base_dir is not None:
+            listener = PassiveConfigurator([joint], [base_dir])
+            listener.adopt(layouts)
+            self._samples = FrameSamples(joint, listener)
+        self._period_s = joint.bus.period_s  # as said last
         self.frames = 0
 
     @property
     def assembling(self) -> bool:
         """Whether samples are made."""
-        return self._assembler is not None
+        return self._samples is not None and self._samples.assembling
 
     @property
     def missing(self) -> str:
         """Why no samples can be made."""
-        if self._listener is None:
-            return self._lacking
-        reasons = [*map(str, self._listener.missing.values()), *self._listener.doubts.values()]
-        return reasons[0] if reasons else ""
+        return self._samples.missing if self._samples is not None else ""
 
     def poll(self) -> None:
         """Take everything that has come.
@@ -240,48 +233,24 @@ class BusTap:
             while frames := self._source.take():
                 for cob_id, data, stamp_ns in frames:
                     self._sink.frame(stamp_ns, cob_id, data)
-                    if self._listener is not None:
-                        for frame, jump in self._numbering.push(LoggedFrame(stamp_ns, cob_id, data, "")):
-                            self._assemble(frame, jump)
+                    if self._samples is not None:
+                        self._give(self._samples.take(LoggedFrame(stamp_ns, cob_id, data, "")))
                 self.frames += len(frames)
         except BusLostError as error:
             raise BusError(f"the bus is gone: {error}") from error
 
     def finish(self) -> None:
         """Take the samples waiting for later SYNCs."""
-        for frame, jump in self._numbering.rest():
-            self._assemble(frame, jump)
+        if self._samples is not None:
+            self._give(self._samples.rest())
 
-    def _assemble(self, frame: LoggedFrame, jump: int) -> None:
-        stamp_ns, cob_id, data, _ = frame
-        listener = self._listener
-        if listener is None:
-            return
-        passive = not self._joint.bus.configure
-        sdo = 0x581 <= cob_id <= 0x67F
-        if self._follower is None and (sdo or (passive and (cob_id == 0 or cob_id >= 0x700))):
-            listener.feed(cob_id, data, stamp_ns * 1e-9)
-            listener.poll(stamp_ns * 1e-9)
-        if self._assembler is None:
-            if listener.busy:
-                return
-            try:
-                self._assembler = make_assembler(self._joint, tuple(listener.layouts.values()))
-                self._follower = follow_log(listener, self._assembler, self._recent)
-            except DriveError as error:  # frames are recorded anyway
-                self._lacking, self._listener = str(error), None
-                return
-        before_ns = self._stamp_ns
-        if cob_id == SYNC_COB_ID and jump > 0:
-            self._stamp_ns = stamp_ns
-        sample = self._assembler.feed(cob_id, data, jump)
-        if sample is not None:
-            self._recent.add(sample)
-        if self._follower is not None:
-            self._follower.feed(cob_id, data, stamp_ns * 1e-9)
-        if sample is not None:
-            late = sample.sequence != self._assembler.sequence
-            self._gate.sample(self, sample, before_ns if late else self._stamp_ns)
+    def _give(self, samples: list[tuple[Sample, int]]) -> None:
+        period_s = self._samples.period_s if samples and self._samples is not None else self._period_s
+        if period_s != self._period_s:
+            _LOG.warning("SYNC comes every %.4g ms: samples are numbered by that", period_s * 1e3)
+            self._period_s = period_s
+        for sample, stamp_ns in samples:
+            self._gate.sample(self, sample, stamp_ns)
 
 
 class Recorder:

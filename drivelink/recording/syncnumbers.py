@@ -6,15 +6,12 @@ one all stay behind. `SyncClock` has to decide at once and cannot distinguish th
 
 from __future__ import annotations
 
-import logging
 from collections import deque
 from collections.abc import Iterable, Iterator
 
 from drivelink._core import SYNC_COB_ID
 from drivelink.cycle.syncclock import SyncClock, measure_period
 from drivelink.recording.canlog import NO_STAMP, LoggedFrame
-
-_LOG = logging.getLogger("drivelink.recording")
 
 _AHEAD = 64  # later SYNCs used to number one
 _EXTRA = -0.5  # periods too early: a SYNC of another master
@@ -45,10 +42,13 @@ class SyncNumbering:
     Args:
         period_s: the communication cycle.
         measure: use the period of the first SYNCs if it differs.
+
+    Attributes:
+        period_s: in use.
     """
 
     def __init__(self, period_s: float, *, measure: bool = False) -> None:
-        self._period_ns = period_s * 1e9
+        self.period_s = period_s
         self._measure = measure
         self._last: int | None = None
         self._due_ns: float | None = None
@@ -75,19 +75,14 @@ class SyncNumbering:
         sync, *others = self._cycles.popleft()
         return [(sync, self._jump()), *[(frame, 1) for frame in others]]
 
-    def _take_measure(self, stamps: list[int]) -> None:
-        measured = measure_period(stamps, self._period_ns * 1e-9) if NO_STAMP not in stamps else None
-        if measured is not None and not measured.same:
-            _LOG.warning("SYNC comes every %.4g ms: samples are numbered by that", measured.period_s * 1e3)
-            self._period_ns = measured.period_s * 1e9
-
     def _jump(self) -> int:
         """The jump of the first waiting SYNC."""
         stamps = self._stamps
         if self._measure:
             self._measure = False
-            self._take_measure(list(stamps))
-        period_ns = self._period_ns
+            measured = measure_period(list(stamps), self.period_s) if NO_STAMP not in stamps else None
+            self.period_s = self.period_s if measured is None else measured.period_s
+        period_ns = self.period_s * 1e9
         stamp = stamps.popleft()
         if stamp == NO_STAMP:
             return 1

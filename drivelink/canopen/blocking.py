@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Protocol, TypeVar
 
 import can
@@ -78,10 +78,28 @@ def run_program(
             idle()
         message = receive(bus, 0.0 if idle is not None else POLL_S)
         while message is not None:
-            if not (message.is_extended_id or message.is_error_frame or message.is_remote_frame):
+            if is_canopen(message):
                 session.feed(message.arbitration_id, bytes(message.data), time.monotonic())
             message = receive(bus, 0.0)
     return session.result
+
+
+def frames(bus: FrameBus, seconds: float, idle: Idle | None = None) -> Iterator[can.Message | None]:
+    """The frames of so many seconds; None where there is none for a while.
+
+    Raises:
+        BusError: the bus fails.
+    """
+    end_s = time.monotonic() + seconds
+    while (left_s := end_s - time.monotonic()) > 0:
+        if idle is not None:
+            idle()
+        yield receive(bus, min(left_s, POLL_S))
+
+
+def is_canopen(message: can.Message) -> bool:
+    """Whether it is a data frame with an 11-bit identifier."""
+    return not (message.is_extended_id or message.is_error_frame or message.is_remote_frame)
 
 
 def receive(bus: FrameBus, timeout_s: float) -> can.Message | None:
@@ -92,5 +110,5 @@ def receive(bus: FrameBus, timeout_s: float) -> can.Message | None:
     """
     try:
         return bus.recv(timeout_s)
-    except can.CanError as error:
+    except (can.CanError, OSError) as error:
         raise BusError(f"the bus cannot be read: {error}") from error

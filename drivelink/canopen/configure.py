@@ -8,11 +8,11 @@ Nothing here waits or reads the bus.
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from drivelink.canopen.blocking import POLL_S, FrameBus, Idle, receive, run_program, sender
+from drivelink._core import SYNC_COB_ID
+from drivelink.canopen.blocking import FrameBus, Idle, frames, is_canopen, run_program, sender
 from drivelink.canopen.bus import listening_s
 from drivelink.canopen.busload import COMFORTABLE, BusLoad, bus_load, check_capacity
 from drivelink.canopen.layout import NodeLayout
@@ -210,22 +210,10 @@ def refuse_foreign_sync(bus: FrameBus, section: BusSection, idle: Idle | None) -
     Raises:
         BusError: another master does.
     """
-    heard = _listen(bus, listening_s(section), idle)
-    syncs = sum(1 for cob_id in heard if cob_id == 0x80)
+    heard = frames(bus, listening_s(section), idle)
+    syncs = sum(m is not None and is_canopen(m) and m.arbitration_id == SYNC_COB_ID for m in heard)
     if syncs > 1:
         raise BusError(
             f"another master already produces SYNC on {section.interface} {section.channel}: "
             'set bus.sync = "follow", or stop it'
         )
-
-
-def _listen(bus: FrameBus, seconds: float, idle: Idle | None) -> Iterable[int]:
-    end_s = time.monotonic() + seconds
-    heard = []
-    while (left_s := end_s - time.monotonic()) > 0:
-        if idle is not None:
-            idle()
-        message = receive(bus, min(left_s, POLL_S))
-        if message is not None and not message.is_extended_id and not message.is_error_frame:
-            heard.append(message.arbitration_id)
-    return heard

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import can
 
 from drivelink._core import SYNC_COB_ID
-from drivelink.canopen.blocking import FrameBus, receive, run_program, sender
+from drivelink.canopen.blocking import FrameBus, frames, run_program, sender
 from drivelink.canopen.guard import check_frame
 from drivelink.canopen.pdo import read_identity, read_optional
 from drivelink.canopen.sdo import Program, Read, SdoAbort
@@ -97,9 +97,7 @@ class Traffic:
 def listen(bus: FrameBus, seconds: float, on_frame: Callable[[can.Message], None] | None = None) -> Traffic:
     """Listen for a while; sends nothing."""
     traffic = Traffic(seconds=seconds)
-    end_s = time.monotonic() + seconds
-    while (left_s := end_s - time.monotonic()) > 0:
-        message = receive(bus, min(left_s, 0.05))
+    for message in frames(bus, seconds):
         if message is not None:
             traffic.add(message)
             if on_frame is not None:
@@ -132,9 +130,7 @@ def scan(bus: FrameBus, node_ids: Iterable[int] = range(1, 128)) -> tuple[list[i
 
 
 def _drain(bus: FrameBus, traffic: Traffic, seconds: float) -> None:
-    end_s = time.monotonic() + seconds
-    while (left_s := end_s - time.monotonic()) > 0:
-        message = receive(bus, left_s)
+    for message in frames(bus, seconds):
         if message is not None:
             traffic.add(message)
 

@@ -26,31 +26,18 @@ _TOGGLE = 0x10
 
 @dataclass(slots=True)
 class _Transfer:
-    """One transfer.
-
-    Attributes:
-        address: the object.
-        writing: whether it is a download.
-        asked_s: time of the present request.
-        segmented: it goes on in segments.
-        data: to or from the node so far.
-        due: the command that answers the present request; None: it has been answered.
-        answer: the last one accepted.
-        toggle: toggle bit of the present segment.
-        last: the present segment is the last one.
-        ended: complete, aborted or disputed.
-    """
+    """One transfer."""
 
     address: Address
     writing: bool
-    asked_s: float
-    due: int | None
+    asked_s: float  # time of the present request
+    due: int | None  # the command that answers it; None: it has been answered
     segmented: bool = False
-    data: bytearray = field(default_factory=bytearray)
-    answer: bytes = b""
-    toggle: int = _TOGGLE
-    last: bool = False
-    ended: bool = False
+    data: bytearray = field(default_factory=bytearray)  # to or from the node so far
+    answer: bytes = b""  # the last one accepted
+    toggle: int = _TOGGLE  # of the present segment
+    last: bool = False  # the present segment is the last one
+    ended: bool = False  # complete, aborted or disputed
 
 
 class SdoSniffer:

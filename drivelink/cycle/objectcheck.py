@@ -20,6 +20,7 @@ from estimator.sample import Sample
 
 Address = tuple[int, int]
 Samples = Callable[[int, int], Sequence[Sample]]
+Pick = Callable[[Sample], float]
 
 HISTORY_S = 2.0  # of samples: longer than a transfer and its surroundings; a new estimator starts from them
 _AROUND = 20  # cycles before a request and after its answer: a value of these is one of that time
@@ -43,14 +44,6 @@ class Mismatch:
 
 
 @dataclass(frozen=True, slots=True)
-class _Value:
-    """A mapped object, and where a sample has it."""
-
-    mapped: MappedObject
-    pick: Callable[[Sample], float]
-
-
-@dataclass(frozen=True, slots=True)
 class _Answer:
     """What a node has said of an object, and the numbers of the SYNCs before request and answer."""
 
@@ -62,33 +55,19 @@ class _Answer:
 
 @dataclass(slots=True)
 class _Node:
-    """One node.
+    """One node."""
 
-    Attributes:
-        assembler: of its joint.
-        samples: those after a SYNC, oldest first, at most so many.
-        motor: its motor, from 1 on (0: the link's).
-        since: the SYNC since which its frames are read as now.
-        units: unit objects with their numbers, as configured.
-        values: mapped objects.
-        sniffer: follows its SDO transfers.
-        asked: the SYNC before the present request.
-        answers: not judged yet.
-        doubts: by object, answers in a row that contradict what is in use.
-        found: the value that is contradicted.
-    """
-
-    assembler: Assembler
+    assembler: Assembler  # of its joint
     samples: Samples
-    motor: int
-    since: int
-    units: Mapping[Address, int]
-    values: Mapping[Address, _Value]
+    motor: int  # from 1 on (0: the link's)
+    since: int  # the SYNC since which its frames are read as now
+    units: Mapping[Address, int]  # as configured
+    values: Mapping[Address, tuple[MappedObject, Pick]]  # mapped objects, and where a sample has them
     sniffer: SdoSniffer
-    asked: int = -1
-    answers: deque[_Answer] = field(default_factory=deque)
-    doubts: Counter[Address] = field(default_factory=Counter)
-    found: Mismatch | None = None
+    asked: int = -1  # the SYNC before the present request
+    answers: deque[_Answer] = field(default_factory=deque)  # not judged yet
+    doubts: Counter[Address] = field(default_factory=Counter)  # answers in a row that contradict
+    found: Mismatch | None = None  # the value that is contradicted
 
 
 class RecentSamples:
@@ -145,7 +124,7 @@ class ObjectCheck:
             ),
         )
         if before is not None and before.found is not None:
-            if before.found.signal in {value.mapped.signal for value in node.values.values()}:
+            if before.found.signal in {mapped.signal for mapped, _ in node.values.values()}:
                 node.found = before.found
             else:
                 assembler.contradict(node_id, False)
@@ -205,7 +184,7 @@ class ObjectCheck:
     def _judge(self, node_id: int, node: _Node, answer: _Answer) -> Mismatch | None:
         address = answer.address
         value = node.values.get(address)
-        signal = value.mapped.signal if value is not None else None
+        signal = value[0].signal if value is not None else None
         text: str | None
         if address in node.sniffer.disputed:
             text = f"{_name(address)} has two different answers: does another device answer for it?"
@@ -243,12 +222,12 @@ def _unit_text(configured: int, answer: _Answer) -> str:
     return f"{_name(answer.address)} was {configured} when it was configured, it is {number} now"
 
 
-def _value_text(node: _Node, value: _Value, answer: _Answer) -> str | None:
+def _value_text(node: _Node, value: tuple[MappedObject, Pick], answer: _Answer) -> str | None:
     """What an answer contradicts; empty: nothing; None: there is too little to be compared."""
-    mapped, data = value.mapped, answer.data
+    (mapped, pick), data = value, answer.data
     size, before = (mapped.bits + 7) // 8, max(answer.asked - _AROUND - 1, node.since)
     samples = node.samples(before, answer.answered + _AROUND - before)
-    places = [(value.pick(sample) + mapped.offset) / mapped.scale for sample in samples]
+    places = [(pick(sample) + mapped.offset) / mapped.scale for sample in samples]
     places = [place for place in places if math.isfinite(place)]
     if len(data) < size or len(places) < _AROUND:
         return None
@@ -266,14 +245,14 @@ def _name(address: Address) -> str:
     return f"0x{address[0]:04X}:{address[1]:02X}"
 
 
-def _values(layout: NodeLayout) -> dict[Address, _Value]:
+def _values(layout: NodeLayout) -> dict[Address, tuple[MappedObject, Pick]]:
     """What a sample has of a node's frames."""
     motor = layout.motor or 0
-    picks: dict[Signal, Callable[[Sample], float]] = {
+    picks: dict[Signal, Pick] = {
         Signal.MOTOR_POSITION: lambda sample: sample.motor_position_rad[motor],
         Signal.MOTOR_TORQUE: lambda sample: sample.motor_torque_nm[motor],
         Signal.MOTOR_VELOCITY: lambda sample: sample.motor_velocity_rad_s[motor],
         Signal.LINK_POSITION: lambda sample: sample.link_position_rad,
     }
     mapped = [mapped for tpdo in layout.tpdos for mapped in tpdo.objects if mapped.signal in picks]
-    return {(one.index, one.subindex): _Value(one, picks[one.signal]) for one in mapped}
+    return {one.address: (one, picks[one.signal]) for one in mapped}

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-import can
-
 from drivelink._core import SYNC_COB_ID
+from drivelink.canopen.blocking import Idle, frames, is_canopen
 from drivelink.canopen.configure import Configurator, configure_joints, refuse_foreign_sync
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
@@ -20,12 +19,10 @@ from drivelink.errors import BusError, DriveError
 from drivelink.jointfile import BusSection, JointFile
 
 Joined = tuple[Configurator | PassiveConfigurator, tuple[tuple[NodeLayout, ...], ...]]
-Idle = Callable[[], object]
 
 logger = logging.getLogger(__name__)
 
 _PATIENCE_S = 5.0  # timeout for another master's SYNC, and for the frames that answer it
-_POLL_S = 0.01
 
 
 def join_bus(
@@ -93,18 +90,11 @@ def _timed(section: BusSection, stamps_ns: Sequence[int]) -> BusSection:
 
 
 def _frames(port: BusPort, idle: Idle | None, seconds: float) -> Iterator[tuple[int, bytes, int]]:
-    """Data frames with 11-bit identifiers and their stamps in ns, for so long; -1 if there is none."""
-    end_s = time.monotonic() + seconds
-    while (left_s := end_s - time.monotonic()) > 0:
-        if idle is not None:
-            idle()
-        try:
-            message = port.recv(min(left_s, _POLL_S))
-        except (can.CanError, OSError) as error:
-            raise BusError(f"the bus cannot be read: {error}") from error
+    """CANopen frames and their stamps in ns, for so long; -1 if there is none."""
+    for message in frames(port, seconds, idle):
         if message is None:
             yield -1, b"", 0
-        elif not (message.is_extended_id or message.is_error_frame or message.is_remote_frame):
+        elif is_canopen(message):
             yield message.arbitration_id, bytes(message.data), int(message.timestamp * 1e9)
 
 

@@ -25,27 +25,16 @@ _AMOUNT = re.compile(r"([+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*(\D*)", re.ASCII)  # num
 
 
 class _Axis(NamedTuple):
-    """Units and words for the motion of an axis.
-
-    Attributes:
-        verb: "turn" or "move".
-        asked: default amount, rad or m.
-        unit: everyday unit as printed after a number; a scale may be wrong by it.
-        everyday: its value in rad or m.
-        units: accepted units in rad or m.
-        example: amounts.
-        force: unit of what a motor exerts.
-        known: formula for a push.
-    """
+    """Units and words for the motion of an axis."""
 
     verb: str
-    asked: float
-    unit: str
-    everyday: float
-    units: Mapping[str, float]
-    example: str
-    force: str
-    known: str
+    asked: float  # default amount, rad or m
+    unit: str  # everyday unit as printed after a number; a scale may be wrong by it
+    everyday: float  # its value in rad or m
+    units: Mapping[str, float]  # accepted units in rad or m
+    example: str  # amounts
+    force: str  # unit of what a motor exerts
+    known: str  # formula for a push
 
     def shown(self, value: float) -> str:
         """An amount in the everyday unit and in SI."""

@@ -52,8 +52,18 @@ FLAT_OBJECTS = 2000  # what is made once, at the first fault of a kind; a leak o
 COUNTS_FROM = (None, 0.1, -0.1, 2.6)  # rad beyond what it was; None: zero
 _ON_ANY_BUS = {
     *("mute", "delay", "resize", "repeat", "reverse", "drop_sync", "emergency", "mend", "kill", "revive"),
-    *("reboot", "send", "ignore_sdo", "refuse_sdo", "impostor", "banish", "foreign_sync", "babble", "quiet"),
-    *("babble_as", "unplug", "plug", "error_frame"),
+    *(
+        "reboot",
+        "inject",
+        "ignore_sdo",
+        "refuse_sdo",
+        "impostor",
+        "banish",
+        "foreign_sync",
+        "babble",
+        "quiet",
+    ),
+    *("quiet", "babble_as", "unplug", "plug", "error_frame"),
 }
 
 

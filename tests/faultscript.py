@@ -100,7 +100,7 @@ SCRIPT: tuple[Fault, ...] = (
     ),
     Fault(
         name="EMCY and fault, and their reset",
-        steps=(at(0.1, "emergency", 2, 0x2310), at(0.4, "mend", 2)),
+        steps=(at(0.1, "emergency", 2, 0x2310, 0x02), at(0.4, "mend", 2)),
         flags=Status.DRIVE_FAULT,
         says=(
             r"^node 2: EMCY 0x2310 .*overcurrent",
@@ -129,28 +129,28 @@ SCRIPT: tuple[Fault, ...] = (
     ),
     Fault(
         name="a drive reboots, and another master starts it before we have configured it",
-        steps=(at(0.1, "reboot", 2), at(0.1, "send", 0x000, b"\x01\x00")),
+        steps=(at(0.1, "reboot", 2), at(0.1, "inject", 0x000, b"\x01\x00")),
         flags=Status.STALE | Status.RESTARTED,
         gaps=True,
         says=(REBOOTED, STARTED),
     ),
     Fault(
         name="a drive reboots, and another master starts that drive before we have configured it",
-        steps=(at(0.1, "reboot", 2), at(0.1, "send", 0x000, b"\x01\x02")),
+        steps=(at(0.1, "reboot", 2), at(0.1, "inject", 0x000, b"\x01\x02")),
         flags=Status.STALE | Status.RESTARTED,
         gaps=True,
         says=(REBOOTED, STARTED),
     ),
     Fault(
         name="a foreign master resets the communication of all nodes",
-        steps=(at(0.1, "send", 0x000, b"\x82\x00"),),
+        steps=(at(0.1, "inject", 0x000, b"\x82\x00"),),
         flags=Status.STALE | Status.RESTARTED,
         gaps=True,
         says=(REBOOTED, STARTED),
     ),
     Fault(
         name="a drive is stopped by another master",
-        steps=(at(0.1, "send", 0x000, b"\x02\x02"),),
+        steps=(at(0.1, "inject", 0x000, b"\x02\x02"),),
         flags=Status.STALE,
         gaps=True,
         says=(MISSING, STARTED),
@@ -207,7 +207,7 @@ SCRIPT: tuple[Fault, ...] = (
     Fault(
         name="garbage on every service identifier of a drive",
         steps=tuple(
-            at(0.1 + 0.01 * k, "send", cob_id, data)
+            at(0.1 + 0.01 * k, "inject", cob_id, data)
             for k, (cob_id, data) in enumerate(
                 (cob_id, data)
                 for cob_id in (0x082, 0x582, 0x702, 0x000, 0x602, 0x183)

@@ -6,6 +6,7 @@ and the same SYNC, and that is the latest.
 
 from __future__ import annotations
 
+import inspect
 import logging
 import re
 import threading
@@ -277,7 +278,21 @@ class Stage:
     def start(self, fault: Fault) -> None:
         """Plan what the script has for a fault."""
         for seconds, action, arguments in fault.steps:
-            self.schedule(seconds, partial(getattr(self, action), *arguments))
+            self.schedule(seconds, partial(self.do, action, *arguments))
+
+    def do(self, action: str, *arguments: Any) -> None:
+        """An action of the script: a method of this class, or of `Faults` with a node (and its TPDO) by node id."""
+        own = getattr(self, action, None)
+        if own is not None:
+            own(*arguments)
+            return
+        what = getattr(self.faults, action)
+        names = [*inspect.signature(what).parameters]
+        if names[:1] == ["node"]:
+            node_id, *arguments = arguments
+            tpdo = [self.daemon.layouts[node_id].tpdos[0].number] if "tpdo" in names else []
+            arguments = [self.node(node_id), *tpdo, *arguments]
+        what(*arguments)
 
     def play(self, fault: Fault) -> None:
         """Replay one fault and hold the daemon to what the script expects."""
@@ -369,36 +384,9 @@ class Stage:
     def node(self, node_id: int) -> Node:
         return next(node for node in self.network.nodes if node.node_id == node_id)
 
-    def _tpdo(self, node_id: int) -> int:
-        return self.daemon.layouts[node_id].tpdos[0].number
-
-    def mute(self, node: int, cycles: int) -> None:
-        self.faults.mute(self.node(node), self._tpdo(node), cycles)
-
-    def delay(self, node: int, cycles: int) -> None:
-        self.faults.delay(self.node(node), self._tpdo(node), cycles)
-
-    def resize(self, node: int, length: int, cycles: int) -> None:
-        self.faults.resize(self.node(node), self._tpdo(node), length, cycles)
-
-    def repeat(self, node: int, cycles: int) -> None:
-        self.faults.repeat(self.node(node), self._tpdo(node), cycles)
-
-    def reverse(self) -> None:
-        self.faults.reverse()
-
-    def drop_sync(self, count: int) -> None:
-        self.faults.drop_sync(count)
-
-    def emergency(self, node: int, code: int) -> None:
-        self.faults.emergency(self.node(node), code, 0x02)
-
     def mend(self, node: int) -> None:
         self.inject(0x200 + node, b"\x80\x00")  # whoever has control resets the fault; we never do
         self.inject(0x200 + node, b"\x00\x00")
-
-    def kill(self, node: int) -> None:
-        self.faults.kill(self.node(node))
 
     def recount(self, node: int, rad: float | None) -> None:
         """From now on the motor encoder of a drive counts from elsewhere: by so much more, or (None) from zero."""
@@ -414,18 +402,6 @@ class Stage:
             return signals._replace(position_counts=signals.position_counts + moved)
 
         self.world.drive = drive_of  # type: ignore[method-assign]
-
-    def revive(self, node: int) -> None:
-        self.faults.revive(self.node(node))
-
-    def reboot(self, node: int) -> None:
-        self.faults.reboot(self.node(node))
-
-    def ignore_sdo(self, node: int, requests: int) -> None:
-        self.faults.ignore_sdo(self.node(node), requests)
-
-    def refuse_sdo(self, node: int, code: int, requests: int) -> None:
-        self.faults.refuse_sdo(self.node(node), code, requests)
 
     def impostor(self, node_id: int) -> None:
         """A second device with the node id of a drive, in a world of its own."""
@@ -443,9 +419,6 @@ class Stage:
         for k in range(count):
             self.schedule(0.005 * k, lambda: self.inject(0x080, b""))
 
-    def babble(self, cob_id: int, data: bytes, per_cycle: int) -> None:
-        self.faults.babble(cob_id, data, per_cycle)
-
     def babble_as(self, node_id: int, per_cycle: int) -> None:
         """Frames with the identifier of a drive, after its own."""
         node, cob_id = self.node(node_id), self.daemon.layouts[node_id].tpdos[0].cob_id
@@ -462,15 +435,6 @@ class Stage:
         self.faults.babble(0, b"", 0)
         for node in self.network.nodes:
             vars(node).pop("transmit", None)
-
-    def unplug(self) -> None:
-        self.faults.unplug()
-
-    def plug(self) -> None:
-        self.faults.plug()
-
-    def send(self, cob_id: int, data: bytes) -> None:
-        self.inject(cob_id, data)
 
     def inject(self, cob_id: int, data: bytes) -> None:
         """A frame from a third party on the same bus."""

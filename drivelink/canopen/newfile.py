@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from drivelink.canopen.scan import FoundNode
 from drivelink.canopen.vendors import vendor_of
 from drivelink.errors import DriveError
-from drivelink.jointfile import JointFile, parse
+from drivelink.jointfile import parse
 
 _GCM2 = 1e-7  # kg·m² a g·cm²
 _PLACEHOLDER = 0.1  # kg·m², where the inertia is not known
@@ -82,112 +82,113 @@ def joint_text(answers: Answers) -> str:
     free = (node for node in range(1, 128) if node not in nodes)
     while len(nodes) < answers.motors:
         nodes.append(next(free))
-    parts = [_head(answers)]
+    meaning = _ARRANGEMENTS.get(answers.arrangement, "")
+    parts = [_HEAD.format(name=answers.name, arrangement=answers.arrangement, meaning=meaning)]
     parts += [_motor(answers, index, node) for index, node in enumerate(nodes[: answers.motors])]
-    parts += [_link(answers), _bus(answers), _ZENOH]
+    bus = {key: getattr(answers, key) for key in ("interface", "channel", "bitrate")}
+    parts += [_link(answers), _BUS.format(**bus, master=_PASSIVE if answers.passive else _ACTIVE), _ZENOH]
     text = "\n".join(parts)
-    _validated(text)
+    parse(text, "these answers")
     return text
 
 
-def _validated(text: str) -> JointFile:
-    return parse(text, "these answers")
-
-
-def _head(answers: Answers) -> str:
-    meaning = {
-        "single": "one motor behind one transmission",
-        "antagonistic": "two motors pull against each other (eqs 9, 11)",
-        "serial": "a second motor sets the stiffness",
-    }.get(answers.arrangement, "")
-    return (
-        "# A joint of drivelink: what it is, how it is reached, where its estimates go.\n"
-        "# Check it, the bus and the drives with `drivelink doctor`, then `drivelink run`.\n"
-        f'name = "{answers.name}"  # part of the key: drivelink/{answers.name}/estimate\n'
-        f'arrangement = "{answers.arrangement}"  # {meaning}\n'
-    )
+_ARRANGEMENTS = {
+    "single": "one motor behind one transmission",
+    "antagonistic": "two motors pull against each other (eqs 9, 11)",
+    "serial": "a second motor sets the stiffness",
+}
+_HEAD = """\
+# A joint of drivelink: what it is, how it is reached, where its estimates go.
+# Check it, the bus and the drives with `drivelink doctor`, then `drivelink run`.
+name = "{name}"  # part of the key: drivelink/{name}/estimate
+arrangement = "{arrangement}"  # {meaning}
+"""
+_MOTOR = """\
+[[motor]]  # motor {number}
+inertia_kg_m2 = {inertia:.6g}  # joint side: {origin}
+viscous_damping_nm_s_rad = {damping:g}  # joint side{unknown}
+[motor.transmission]
+model = "{model}"  # form of the flexibility torque; "none" if rigid
+# order = 2  # of a polynomial; left out: chosen from the data
+[motor.drive]
+node_id = {node}{remark}
+{gear}
+# counts_per_rev = 16384  # at the motor; left out: the drive's (0x608F)
+# rated_torque_nm = 0.5  # left out: the drive's (0x6076)
+{constant}
+# direction = -1  # where the motor counts against the joint
+# eds = "drive.eds"  # only needed where the drive may not be asked (configure = false)
+"""
+_LINK = """\
+[link]
+[link.encoder]
+{encoder}
+# direction = -1
+# [link.dynamics]  # makes external torques visible (eq 12)
+# inertia_kg_m2 = 0.4
+"""
+_BUS = """\
+[bus]
+interface = "{interface}"  # any of python-can's
+channel = "{channel}"
+bitrate = {bitrate}
+period_s = 0.001  # one SYNC, one sample, one estimate
+{master}
+"""
+_PASSIVE = """\
+configure = false  # never send a frame: another master is in charge
+sync = "follow\""""
+_ACTIVE = """\
+# sync = "follow"  # where another master makes SYNC
+# configure = false  # never send a frame: another master configures the drives"""
+_ZENOH = """\
+[zenoh]
+# endpoint = "tcp/127.0.0.1:7447"  # where subscribers connect
+# config = "zenoh.json5"  # instead: a zenoh configuration of your own
+"""
 
 
 def _motor(answers: Answers, index: int, node: int) -> str:
-    remark = f"  # {answers.remarks[node]}" if node in answers.remarks else ""
     gear = (
         "# gear_ratio = 1.0  # motor revolutions per joint revolution; left out: the drive's (0x6091), else 1"
         if answers.gear_ratio is None
         else f"gear_ratio = {answers.gear_ratio:g}  # motor revolutions per joint revolution"
     )
-    inertia = answers.joint_inertia_kg_m2
-    origin = "rotor inertia times gear ratio squared"
+    inertia, origin = answers.joint_inertia_kg_m2, "rotor inertia times gear ratio squared"
     if inertia is None:
         inertia, origin = _PLACEHOLDER, f"PLACEHOLDER, put in yours: {origin}"
-    elif answers.conversion:
-        origin = answers.conversion
-    damping = answers.viscous_damping_nm_s_rad
-    unknown = "" if damping else "; not known: fit finds it"
-    constant = (
-        "# torque_constant_nm_a = 0.05  # where the torque has to come from the current\n"
-        if answers.torque_constant_mnm_a is None
-        else f"torque_constant_nm_a = {answers.torque_constant_mnm_a * 1e-3:.6g}"
-        f"  # at the shaft: {answers.torque_constant_mnm_a:g} mN·m/A\n"
+    constant = answers.torque_constant_mnm_a
+    return _MOTOR.format(
+        number=index + 1,
+        inertia=inertia,
+        origin=answers.conversion or origin,
+        damping=answers.viscous_damping_nm_s_rad,
+        unknown="" if answers.viscous_damping_nm_s_rad else "; not known: fit finds it",
+        model=answers.model,
+        node=node,
+        remark=_remark(answers, node),
+        gear=gear,
+        constant="# torque_constant_nm_a = 0.05  # where the torque has to come from the current"
+        if constant is None
+        else f"torque_constant_nm_a = {constant * 1e-3:.6g}  # at the shaft: {constant:g} mN·m/A",
     )
-    return (
-        f"[[motor]]  # motor {index + 1}\n"
-        f"inertia_kg_m2 = {inertia:.6g}  # joint side: {origin}\n"
-        f"viscous_damping_nm_s_rad = {damping:g}  # joint side{unknown}\n"
-        "[motor.transmission]\n"
-        f'model = "{answers.model}"  # form of the flexibility torque; "none" if rigid\n'
-        "# order = 2  # of a polynomial; left out: chosen from the data\n"
-        "[motor.drive]\n"
-        f"node_id = {node}{remark}\n"
-        f"{gear}\n"
-        "# counts_per_rev = 16384  # at the motor; left out: the drive's (0x608F)\n"
-        "# rated_torque_nm = 0.5  # left out: the drive's (0x6076)\n"
-        f"{constant}"
-        "# direction = -1  # where the motor counts against the joint\n"
-        '# eds = "drive.eds"  # only needed where the drive may not be asked (configure = false)\n'
-    )
+
+
+def _remark(answers: Answers, node: int) -> str:
+    return f"  # {answers.remarks[node]}" if node in answers.remarks else ""
 
 
 def _link(answers: Answers) -> str:
     if answers.encoder == "none":
         return "[link]\n# no link encoder: only with a rigid transmission\n"
-    lines = ["[link]", "[link.encoder]"]
-    if answers.encoder == "drive":
-        lines.append('source = "drive"  # second encoder of the first drive, 0x60E4:01')
-        lines.append("counts_per_rev = 65536  # per joint revolution")
-    else:
+    encoder = 'source = "drive"  # second encoder of the first drive, 0x60E4:01\n'
+    encoder += "counts_per_rev = 65536  # per joint revolution"
+    if answers.encoder != "drive":
         node = int(answers.encoder)
-        remark = f"  # {answers.remarks[node]}" if node in answers.remarks else ""
-        lines.append('source = "cia406"  # an encoder that is a node of its own')
-        lines.append(f"node_id = {node}{remark}")
-        lines.append("# counts_per_rev = 65536  # per joint revolution; left out: the encoder's (0x6501)")
-    lines.append("# direction = -1")
-    lines.append("# [link.dynamics]  # makes external torques visible (eq 12)")
-    lines.append("# inertia_kg_m2 = 0.4")
-    return "\n".join(lines) + "\n"
-
-
-def _bus(answers: Answers) -> str:
-    passive = (
-        'configure = false  # never send a frame: another master is in charge\nsync = "follow"\n'
-        if answers.passive
-        else '# sync = "follow"  # where another master makes SYNC\n'
-        "# configure = false  # never send a frame: another master configures the drives\n"
-    )
-    return (
-        "[bus]\n"
-        f'interface = "{answers.interface}"  # any of python-can\'s\n'
-        f'channel = "{answers.channel}"\n'
-        f"bitrate = {answers.bitrate}\n"
-        "period_s = 0.001  # one SYNC, one sample, one estimate\n"
-        f"{passive}"
-    )
-
-
-_ZENOH = (
-    "[zenoh]\n"
-    '# endpoint = "tcp/127.0.0.1:7447"  # where subscribers connect\n'
-    '# config = "zenoh.json5"  # instead: a zenoh configuration of your own\n'
-)
+        encoder = 'source = "cia406"  # an encoder that is a node of its own\n'
+        encoder += f"node_id = {node}{_remark(answers, node)}\n"
+        encoder += "# counts_per_rev = 65536  # per joint revolution; left out: the encoder's (0x6501)"
+    return _LINK.format(encoder=encoder)
 
 
 def answers_from_bus(answers: Answers, found: list[FoundNode]) -> Answers:

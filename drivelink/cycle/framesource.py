@@ -92,6 +92,11 @@ class BusSource:
         self.lost_sends = 0
         self.errors: dict[str, int] = {}
 
+    @property
+    def waiting(self) -> bool:
+        """Whether a frame is known to be there."""
+        return bool(self._waiting)
+
     def wait(self, timeout_s: float) -> bool:
         """See FrameSource."""
         if self._waiting:
@@ -158,10 +163,15 @@ class VirtualSource(BusSource):
         self._channel_id = bus.channel_id
         self._pending = bus.queue.queue  # the deque inside: its popleft is atomic, and needs no lock
 
+    @property
+    def waiting(self) -> bool:
+        """Whether a frame is known to be there."""
+        return bool(self._pending or self._waiting)
+
     def wait(self, timeout_s: float) -> bool:
         """See FrameSource."""
         self._check()
-        if self._pending or self._waiting:
+        if self.waiting:
             return True
         if timeout_s <= 0:
             return False
@@ -173,7 +183,7 @@ class VirtualSource(BusSource):
 
     def take(self) -> list[CanFrame]:
         """See FrameSource."""
-        if not (self._pending or self._waiting):
+        if not self.waiting:
             self._check()
             return []
         messages, self._waiting = self._waiting, []
@@ -202,50 +212,30 @@ class VirtualSource(BusSource):
             raise BusLostError("the virtual bus is closed")
 
 
-class PumpedSource(VirtualSource):
-    """The virtual bus with simulated devices in this thread, which answer immediately.
+class Pumped:
+    """A bus with simulated devices in this thread, which answer immediately.
 
     Args:
-        bus: the virtual bus.
+        source: the bus.
         devices: lets them handle sent frames and due timers.
     """
 
-    def __init__(self, bus: Any, devices: Callable[[], object]) -> None:
-        super().__init__(bus)
-        self._devices = devices
+    def __init__(self, source: BusSource, devices: Callable[[], object]) -> None:
+        self._source, self._devices = source, devices
+        self.lost_sends = 0
+        self.errors = source.errors
+        self.wait, self.narrow = source.wait, source.narrow
 
     def take(self) -> list[CanFrame]:
         """See FrameSource."""
-        if not self._pending:
+        if not self._source.waiting:
             self._devices()
-        return super().take()
+        return self._source.take()
 
     def send(self, cob_id: int, data: bytes) -> None:
         """See FrameSource."""
-        super().send(cob_id, data)
-        self._devices()
-
-
-class PumpedBus(BusSource):
-    """As `PumpedSource`, for any bus with immediate delivery, such as vcan.
-
-    Args:
-        bus: any python-can bus.
-        devices: see `PumpedSource`.
-    """
-
-    def __init__(self, bus: can.BusABC, devices: Callable[[], object]) -> None:
-        super().__init__(bus)
-        self._devices = devices
-
-    def take(self) -> list[CanFrame]:
-        """See FrameSource."""
-        self._devices()
-        return super().take()
-
-    def send(self, cob_id: int, data: bytes) -> None:
-        """See FrameSource."""
-        super().send(cob_id, data)
+        self._source.send(cob_id, data)
+        self.lost_sends = self._source.lost_sends
         self._devices()
 
 

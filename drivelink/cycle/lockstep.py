@@ -8,9 +8,9 @@ from typing import Protocol
 
 from drivelink.canopen.bus import open_bus
 from drivelink.cycle.busport import BusPort
-from drivelink.cycle.framesource import PumpedSource
 from drivelink.cycle.loop import CycleLoop, CycleSink, LoopJoint
 from drivelink.cycle.pipeline import make_pipeline
+from drivelink.cycle.sources import open_source
 from drivelink.cycle.startup import join_bus
 from drivelink.jointfile import JointFile
 
@@ -55,7 +55,7 @@ def run_lockstep(
         _, layouts = join_bus(port, [joint], [folder], idle=devices.poll)
         loop_joint = LoopJoint(joint.name, make_pipeline(joint, layouts[0]), sink)
         loop = CycleLoop(
-            PumpedSource(bus, devices.poll),
+            open_source(bus, devices.poll),
             [loop_joint],
             period_s=joint.bus.period_s,
             counter_overflow=joint.bus.sync_counter_overflow,

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import can
 
-from drivelink.cycle.framesource import BusSource, FrameSource, PumpedBus, PumpedSource, VirtualSource
+from drivelink.cycle.framesource import BusSource, FrameSource, Pumped, VirtualSource
 from drivelink.cycle.socketcan import SocketCanSource
 from drivelink.cycle.socketcand import SocketcandSource
 
@@ -14,7 +14,7 @@ from drivelink.cycle.socketcand import SocketcandSource
 def open_source(bus: can.BusABC, devices: Callable[[], object] | None = None) -> FrameSource:
     """Open the fastest source for this bus, also with devices in this thread."""
     if devices is not None:
-        return PumpedSource(bus, devices) if type(bus).__name__ == "VirtualBus" else PumpedBus(bus, devices)
+        return Pumped(VirtualSource(bus) if type(bus).__name__ == "VirtualBus" else BusSource(bus), devices)
     if type(bus).__name__ == "SocketcanBus":
         return SocketCanSource(bus)
     if type(bus).__name__ == "SocketCanDaemonBus":

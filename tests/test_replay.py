@@ -419,6 +419,8 @@ def test_estimates_csv_has_the_columns_of_the_contract_and_a_row_for_each_sample
     assert {row["observable"] for row in table} <= {"0", "1"}
     assert {row["valid"] for row in table} == {"0", "1"}  # not valid where it begins
     assert all(int(row["status"]) & 1 == int(row["valid"]) for row in table)
+    sure = [row for row in table if row["torque_valid"] == "1"]
+    assert len(sure) > 700 and all(0.0 <= float(row["flexibility_torque_std_nm"]) < math.inf for row in sure)
     # The truth is 150 N·m/rad and noise-free: 1 % after three seconds is a wide bound.
     assert float(table[-1]["stiffness_nm_rad"]) == pytest.approx(150.0, rel=0.01)
     assert all((plots / name).stat().st_size > 5000 for name in ("stiffness.png", "time.png"))

@@ -90,7 +90,8 @@ def run(args: argparse.Namespace) -> int:
         takers: list[Taker] = [summary.take, gathered.take]
         if args.out is not None:
             linked = joint.link.dynamics is not None
-            rows = EstimatesFile(args.out, playback.motors, linked=linked, force=args.force)
+            estimator = playback.pipeline.estimator
+            rows = EstimatesFile(args.out, playback.motors, estimator, linked=linked, force=args.force)
             stack.callback(rows.close)
             takers.append(rows.take)
         if args.publish or speed is not None:

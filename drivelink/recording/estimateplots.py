@@ -29,15 +29,14 @@ def plot_curves(columns: Mapping[str, FloatArray], motors: int, path: Path, titl
 
 
 def plot_over_time(columns: Mapping[str, FloatArray], path: Path, title: str) -> Path:
-    """Return the joint's flexibility torque and stiffness over time, on one time axis; gaps
-    where not valid.
-    """
+    """Draw the joint's flexibility torque and stiffness over one time axis; gaps where each is not valid."""
     figure, axes = plots.new_figure(title, rows=2)
     t = columns["time_s"]
     valid = {name: np.where(columns["valid"] > 0, values, np.nan) for name, values in columns.items()}
     axes[1].sharex(axes[0])
-    torque = {"estimate": PlotCurve(t, valid["flexibility_torque_nm"])}
-    plots.over_time(axes[0], torque, "torque / N·m", "Flexibility torque")
+    torque = np.where(columns["torque_valid"] > 0, columns["flexibility_torque_nm"], np.nan)
+    curve = PlotCurve(t, torque, columns["flexibility_torque_std_nm"])
+    plots.over_time(axes[0], {"estimate": curve}, "torque / N·m", "Flexibility torque")
     stiffness = PlotCurve(t, valid["stiffness_nm_rad"], valid["stiffness_std_nm_rad"])
     plots.over_time(axes[1], {"estimate": stiffness}, "stiffness / (N·m/rad)", "Stiffness")
     low, high = np.nanpercentile(stiffness.y, [1, 99]) if np.any(np.isfinite(stiffness.y)) else (0.0, 1.0)

@@ -29,20 +29,21 @@ from estimator.sample import SIGMA_95, FloatArray, Status
 _STATUS_EVERY_S = 0.25
 _ROWS = 2048  # rows per write
 # Plain integers: an IntFlag costs a microsecond.
-_VALID, _OBSERVABLE = int(Status.VALID), int(Status.OBSERVABLE)
+_VALID, _OBSERVABLE, _TORQUE_VALID = int(Status.VALID), int(Status.OBSERVABLE), int(Status.TORQUE_VALID)
 
 
 def _columns(motors: int) -> tuple[str, ...]:
     """Names of a cycle's values, in the order of `_row`."""
-    return (*estimate_columns(motors), "valid", "status")
+    return (*estimate_columns(motors), "valid", "status", "torque_valid", "flexibility_torque_std_nm")
 
 
-def _row(played: Played) -> tuple[float, ...]:
-    """A cycle as the values of `_columns`."""
+def _row(played: Played, estimator: Estimator) -> tuple[float, ...]:
+    """A cycle, the last of the estimator, as the values of `_columns`."""
     estimate = played.tick.estimate
     totals = (estimate.flexibility_torque_nm, estimate.stiffness_nm_rad, estimate.stiffness_std_nm_rad)
     row = estimate_row(played.time_s, estimate.status, totals, estimate.transmissions)
-    return (*row, estimate.status & _VALID, estimate.status)
+    torque_valid, std = int(bool(estimate.status & _TORQUE_VALID)), estimator.flexibility_torque_std_nm
+    return (*row, estimate.status & _VALID, estimate.status, torque_valid, std)
 
 
 class EstimatesFile:
@@ -51,6 +52,7 @@ class EstimatesFile:
     Args:
         path: the file.
         motors: of the joint.
+        estimator: of the replay.
         linked: with declared link dynamics; adds columns of the external torque.
         force: replace an existing file.
 
@@ -58,9 +60,11 @@ class EstimatesFile:
         RecordingError: it cannot be opened or, later, written; an existing file is unchanged.
     """
 
-    def __init__(self, path: Path, motors: int, *, linked: bool = False, force: bool = False) -> None:
+    def __init__(
+        self, path: Path, motors: int, estimator: Estimator, *, linked: bool = False, force: bool = False
+    ) -> None:
         columns = _columns(motors) + (external_columns() if linked else ())
-        self._linked = linked
+        self._linked, self._estimator = linked, estimator
         self._path = path
         self._line = ",".join(["%r"] * len(columns)) + "\n"
         self._rows = [",".join(columns) + "\n"]
@@ -72,7 +76,7 @@ class EstimatesFile:
     def take(self, played: Played) -> None:
         """Write one row."""
         tick = played.tick
-        row = _row(played)
+        row = _row(played, self._estimator)
         self._rows.append(self._line % (row + external_row(tick.external) if self._linked else row))
         if len(self._rows) >= _ROWS:
             self._write()
@@ -185,7 +189,7 @@ class Summary:
         self.observable += status & _OBSERVABLE != 0
         self._last = played
         if self._keep:
-            self._values.extend(_row(played))
+            self._values.extend(_row(played, self._estimator))
 
     def text(self, took_s: float) -> str:
         """Return the replay in one line."""

@@ -98,6 +98,23 @@ def test_a_drive_that_takes_the_start_and_does_not_run_is_said_once() -> None:
         assert made.status["conditions"] == []
 
 
+@pytest.mark.parametrize("able", [True, False])
+def test_a_node_that_goes_on_without_its_heartbeat_is_configured_again_once(able: bool) -> None:
+    """As one in whose place another device with its number was configured."""
+    with rig() as made:
+        settle(made)
+        heartbeat = made.node(2).heartbeat
+        heartbeat._period.value = 0
+        heartbeat.stop()
+        if not able:
+            heartbeat._period.changed = heartbeat.stop
+        made.run(8000 + ENOUGH)
+        said = [text for text in made.events if text.startswith("node 2")]
+        assert sum("is configured again" in text for text in said) == 1
+        assert (said[-1] == "node 2: heartbeat is back") == able
+        assert made.run(1)[0].status & Status.VALID
+
+
 def test_a_second_reboot_in_the_middle_of_the_configuration_begins_it_anew() -> None:
     with rig() as made:
         settle(made)

@@ -32,6 +32,7 @@ logger = logging.getLogger(__name__)
 _NS = 1_000_000_000
 _BOOT_UP, _STOPPED = 0x00, 0x04  # NMT states
 _SILENT_NS = _NS // 2  # time without a PDO until the node is configured again
+_MUTE_NS = 5 * _NS  # without a heartbeat while frames come, likewise
 _RETRY_NS = _NS  # between two attempts
 _SOON_NS = _NS // 40  # doubled, up to that, with each attempt that has failed: one SDO abort costs little
 
@@ -229,6 +230,9 @@ class Supervisor:
             self._events.end(f"start {node}", f"node {node} sends its frames")
         lost = now - watched.seen_ns > _SILENT_NS or node in assembler.untrusted
         lost = lost or (watched.state != OPERATIONAL and now - watched.heartbeat_ns < _NS)
+        # Frames without the heartbeat: another device may have been configured in its place. Asked for once.
+        mute_ns = watched.heartbeat_ns + _MUTE_NS
+        lost = lost or (watched.layout.heartbeat_ms > 0 and now > mute_ns > watched.attempt_ns)
         failures = min(watched.failures, 10)
         pause_ns = min(_RETRY_NS, _SOON_NS << failures) if failures else _RETRY_NS
         if lost and not self._configurator.busy and now - watched.attempt_ns > pause_ns:

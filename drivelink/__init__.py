@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from drivelink.analysis import Picture as Picture
     from drivelink.analysis import diagnose as diagnose
     from drivelink.analysis import fit as fit
+    from drivelink.comparison import Comparison as Comparison
+    from drivelink.comparison import compare as compare
     from drivelink.pubsub.asyncclient import AsyncSubscription as AsyncSubscription
     from drivelink.pubsub.asyncclient import subscribe_async as subscribe_async
     from drivelink.pubsub.client import Subscription as Subscription
@@ -31,12 +33,14 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AsyncSubscription",
+    "Comparison",
     "Diagnosed",
     "Fit",
     "Picture",
     "State",
     "Subscription",
     "__version__",
+    "compare",
     "diagnose",
     "fit",
     "joints",
@@ -46,11 +50,13 @@ __all__ = [
 
 _LAZY = {  # imported when asked for, so that `import drivelink` stays cheap
     "AsyncSubscription": "drivelink.pubsub.asyncclient",
+    "Comparison": "drivelink.comparison",
     "Diagnosed": "drivelink.analysis",
     "Fit": "drivelink.analysis",
     "Picture": "drivelink.analysis",
     "State": "drivelink.pubsub.feed",
     "Subscription": "drivelink.pubsub.client",
+    "compare": "drivelink.comparison",
     "diagnose": "drivelink.analysis",
     "fit": "drivelink.analysis",
     "joints": "drivelink.pubsub.names",

@@ -38,6 +38,7 @@ class Truth:
 
     Attributes:
         torque_rms_nm: rms of the flexibility torque until now.
+        unseen: whether the devices did not see the last SYNC.
     """
 
     def __init__(self, stage: Stage) -> None:
@@ -49,7 +50,7 @@ class Truth:
         self._square, self.torque_rms_nm = 0.0, 0.0
         self._forgotten = 0
         self._inner = stage.world.advance
-        self._synced = False
+        self._synced = self.unseen = False
         stage.world.advance = self._advance  # type: ignore[method-assign]
 
     @property
@@ -125,7 +126,8 @@ class Sink(Collector):
     def put_sample(self, sample: Sample, stamp_ns: int) -> None:
         super().put_sample(sample, stamp_ns)
         current = sample.sequence == self._stage.loop_joint.pipeline.assembler.sequence
-        self.due.append(self._stage.truth.syncs - (1 if current else 2))
+        truth = self._stage.truth
+        self.due.append(truth.syncs - (1 if current or truth.unseen else 2))
 
 
 def _objects(daemon: Daemon) -> Iterator[tuple[int | None, MappedObject]]:
@@ -190,6 +192,7 @@ class Stage:
 
         def sync(data: bytes) -> bool:
             seen = inner(data)
+            self.truth.unseen = not seen
             if seen:
                 self.truth.sync()
             return seen

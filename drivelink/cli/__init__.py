@@ -50,6 +50,7 @@ VERBS = {
     "dbc": "describe the joint's frames as a DBC database for other CAN tools",
     "replay": "run a recording through the same code as live data",
     "fit": "fit the transmission to a recording (model-based estimation)",
+    "compare": "two models, two recordings, or a model beside a machine: free run, residual, curves",
     "diagnose": "find the physical effect that the model lacks, and add it",
     "fleet": "fit and diagnose many recordings of many joints, here or on a cluster: table, trends, report",
     "doctor": "check machine, bus and drives, and name the fix for each problem",

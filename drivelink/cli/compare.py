@@ -1,0 +1,68 @@
+"""`drivelink compare A B`: two models, two recordings, or a model beside a machine."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from rich.console import Console
+
+from drivelink.cli import add_map
+from drivelink.errors import RecordingError, UsageError
+from drivelink.outfile import write_whole
+
+EPILOG = """\
+examples:
+  drivelink compare elbow.toml monday.mcap --out page/     the model beside the machine
+  drivelink compare before.csv after.csv --joint elbow.toml
+  drivelink compare elbow.toml elbow-20260105T081500Z.toml
+
+A recording is fitted first. Every recording is simulated with both models from its motor torque, in windows
+that start from the measured state: the fit is 100 (1 - |y - y_sim| / |y - mean y|). The page has simulation
+over measurement, the residual's correlation with itself and with the torque, and curves of stiffness and
+friction with their 95 % intervals.
+"""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("a", type=Path, metavar="A", help="joint file or recording")
+    parser.add_argument("b", type=Path, metavar="B", help="joint file or recording")
+    parser.add_argument("--joint", type=Path, metavar="JOINT", help="joint file of the recordings")
+    parser.add_argument("--horizon", type=float, metavar="S", help="time between new starts of a free run")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="write comparison.json and comparison.html there"
+    )
+    parser.add_argument(
+        "--json", action="store_true", help="print the content of comparison.json, nothing else"
+    )
+    add_map(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do the job; return the exit status."""
+    if args.horizon is not None and not args.horizon > 0.0:
+        raise UsageError(f"--horizon: expected a number of seconds above 0, got {args.horizon:g}")
+    for path in (args.a, args.b):
+        if not path.exists():
+            raise RecordingError(f"{path}: no such file")
+    from drivelink.comparison import compare  # takes a second; the arguments are checked
+    from drivelink.output.document import page, show
+
+    made = compare(args.a, args.b, args.joint, names=args.map, horizon_s=args.horizon)
+    document = made.as_json()
+    if args.json:
+        print(json.dumps(document))
+    else:
+        show(made.document().sections, Console())
+    if args.out is not None:
+        args.out.mkdir(parents=True, exist_ok=True)
+        for name, text in (
+            ("comparison.json", json.dumps(document, indent=2) + "\n"),
+            ("comparison.html", page(made.document())),
+        ):
+            write_whole(args.out / name, text, force=True)
+            if not args.json:
+                print(f"wrote {args.out / name}")
+    return 0

@@ -32,7 +32,8 @@ def measure(joint, health, seconds, seed):
         rows[f"{' + '.join(fault.signals)}: {fault.name}"] = outcome
         suspects += bool(outcome.suspected)
         right += outcome.names(fault)
-    samples, valid, wrong, silent, torque = np.sum([row[:5] for row in rows.values()], axis=0).tolist()
+    counts = np.sum([row[:6] for row in rows.values()], axis=0).tolist()
+    samples, valid, wrong, silent, torque_valid, torque = counts
     worst = sorted(rows.items(), key=lambda item: -item[1].wrong - item[1].torque)[:10]
     healthy = matrix.outcome(joint, None, health, seconds, seed)
     return {
@@ -42,7 +43,8 @@ def measure(joint, health, seconds, seed):
         "wrong": wrong,
         "silent": silent,
         "torque": torque,
-        "torque_share": torque / max(valid, 1),
+        "torque_valid": torque_valid,
+        "torque_share": torque / max(torque_valid, 1),
         "suspects": suspects,
         "named": right,
         "wrong_share": wrong / max(valid, 1),
@@ -91,7 +93,7 @@ MATRIX = {
     "valid samples": "{valid}",
     "stiffness wrong": "{wrong} ({wrong_share:.2%})",
     "without any flag": "{silent} ({silent_share:.2%})",
-    "torque wrong": "{torque} ({torque_share:.2%})",
+    "torque wrong, of valid ones": "{torque} of {torque_valid} ({torque_share:.2%})",
     "named": "{named} of {suspects}",
     "healthy and valid": "{healthy_valid:.2%}",
     "steps followed": "{followed}",

@@ -70,7 +70,7 @@ class Fault(NamedTuple):
 
 class Outcome(NamedTuple):
     """Samples from the begin of a fault on: valid ones, of these those whose stiffness is wrong, those of them
-    without any flag at all, and those whose torque is wrong.
+    without any flag at all; those with a valid torque, and of these those whose torque is wrong.
 
     And the signal that was suspected most often; empty: none was.
     """
@@ -79,6 +79,7 @@ class Outcome(NamedTuple):
     valid: int
     wrong: int
     silent: int
+    torque_valid: int
     torque: int
     suspected: str = ""
 
@@ -331,7 +332,8 @@ def _count(estimates: kit.Estimates, suspected: str, motion: kit.Motion, begin: 
     wrong = kit.wrong(estimates, motion.stiffness_nm_rad)[begin:]
     silent = wrong & (estimates.status[begin:] & FLAGS == 0)
     torque = kit.wrong_torque(estimates, motion.torque_nm)[begin:]
-    counts = (int(which.sum()) for which in (estimates.valid[begin:], wrong, silent, torque))
+    valid = estimates.valid[begin:], estimates.torque_valid[begin:]
+    counts = (int(which.sum()) for which in (valid[0], wrong, silent, valid[1], torque))
     return Outcome(len(wrong), *counts, suspected)
 
 

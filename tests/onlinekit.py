@@ -55,6 +55,10 @@ class Estimates(NamedTuple):
     def valid(self) -> np.ndarray:
         return self.status & VALID > 0
 
+    @property
+    def torque_valid(self) -> np.ndarray:
+        return self.status & (VALID | int(Status.TORQUE_VALID)) > 0
+
 
 def motion(
     name: str,
@@ -178,9 +182,9 @@ def wrong(estimates: Estimates, truth: np.ndarray) -> np.ndarray:
 
 
 def wrong_torque(estimates: Estimates, truth: np.ndarray) -> np.ndarray:
-    """Which samples are valid and have a torque that is off by more than a quarter of the true one's rms."""
+    """Which samples have a valid torque that is off by more than a quarter of the true one's rms."""
     off = np.abs(estimates.torque_nm - truth) <= WRONG_TORQUE * np.sqrt(np.mean(truth**2))
-    return np.asarray(estimates.valid & ~off)
+    return np.asarray(estimates.torque_valid & ~off)
 
 
 def without(samples: Sequence[Sample], share: float, seed: int) -> tuple[list[Sample], np.ndarray]:

@@ -16,7 +16,7 @@ from drivelink.jointfile import parse
 from drivelink.jointfile.columns import UNITS
 from drivelink.recording import read
 from drivelink.recording.columnmap import parse_column_map
-from drivelink.recording.formats import open_sink
+from drivelink.recording.formats import FORMATS, Format, open_sink
 
 TEXT = """\
 name = "sine"
@@ -88,6 +88,18 @@ def test_channels_of_an_mf4_file_are_read_and_mapped_where_asammdf_is_installed(
     assert np.array_equal(back.sequence, record.sequence) and np.array_equal(back.motor_torque_nm, torque)
     turned = read(path, None, names=parse_column_map(["link_position_rad=motor1_position_rad:deg"]))
     assert np.allclose(turned.motor_position_rad[:, 0], np.radians(link), rtol=1e-14)
+
+
+def test_a_format_with_columns_is_one_entry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = Format(columns=lambda path, _: (dict(np.load(path)), ()))
+    monkeypatch.setitem(FORMATS, ".npz", entry)
+    record, path = read(ours(tmp_path / "r.csv"), JOINT), tmp_path / "r.npz"
+    motor, link = record.motor_position_rad[:, 0], record.link_position_rad
+    columns = {"motor1_position_rad": motor, "motor1_torque_nm": record.motor_torque_nm[:, 0]}
+    np.savez(path, time_s=record.time_s, link_position_rad=link, **columns)
+    assert np.array_equal(read(path, JOINT).motor_torque_nm, record.motor_torque_nm)
+    find = pytest.importorskip("drivelink.fleet.storage").find
+    assert [one.name for one in find([str(tmp_path)])[0]] == ["r.csv", "r.npz"]  # for `fleet`, too
 
 
 def test_a_column_that_is_mapped_takes_the_place_of_one_that_has_the_name(tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ Credentials and endpoints are those of fsspec (configuration files, `FSSPEC_…`
 from __future__ import annotations
 
 import hashlib
-import os
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -22,6 +21,7 @@ from fsspec.core import url_to_fs
 
 from drivelink.fleet.errors import FleetError
 from drivelink.infile import open_regular
+from drivelink.outfile import write_whole
 from drivelink.recording.canlog import CAN_SUFFIXES
 from drivelink.recording.formats import FORMATS
 from drivelink.recording.mapping import side_file
@@ -203,16 +203,13 @@ class Store:
         Raises:
             FleetError: it cannot be written.
         """
-        target, temporary = f"{self._root}/{name}", f"{self._root}/{name}.{uuid4().hex}.tmp"
+        target = f"{self._root}/{name}"
         try:
             self._make(target.rpartition("/")[0])
             if self.folder is not None:
-                with Path(temporary).open("wb") as file:
-                    file.write(data)
-                    file.flush()
-                    os.fsync(file.fileno())
-                Path(temporary).replace(target)
+                write_whole(Path(target), data, force=True)
             elif hasattr(self._fs, "ftp"):
+                temporary = f"{target}.{uuid4().hex}.tmp"
                 self._fs.pipe_file(temporary, data)
                 self._fs.ftp.posix_rename(temporary, target)
             else:

@@ -61,7 +61,7 @@ class Watcher:
         self._hint_s = time.monotonic() + PATIENCE_S
         self._hint = ""
         self._joints: dict[str, _Joint] = {}
-        self._claims: deque[tuple[str, str, bool]] = deque()  # tokens that came since the last poll
+        self._claims: deque[zenoh.Sample] = deque()  # tokens that came since the last poll
         ring = zenoh.handlers.RingChannel
         key = f"{prefix}/{joint or '*'}"
         history = zenoh.ext.HistoryConfig(max_samples=1, detect_late_publishers=True)
@@ -97,10 +97,9 @@ class Watcher:
     def poll(self) -> None:
         """Process all new messages."""
         while self._claims:
-            name, session, there = self._claims.popleft()
-            joint = self._joint(name)
-            if joint is not None:
-                joint.identity.token(session, there)
+            token = self._claims.popleft()
+            if (joint := self._joint(self._name(token))) is not None:
+                joint.identity.heard(token)
         now_s = time.monotonic()
         if now_s > self._hint_s and self._asked is not None:
             self._hint_s = now_s + PATIENCE_S
@@ -149,10 +148,8 @@ class Watcher:
 
     def _token(self, token: zenoh.Sample) -> None:
         """In zenoh's thread."""
-        name = self._name(token)
-        session = str(token.key_expr).removeprefix(f"{self._prefix}{name}/alive").lstrip("/")
         if len(self._claims) < 4 * MAX_CLAIMS:
-            self._claims.append((name, session, token.kind == zenoh.SampleKind.PUT))
+            self._claims.append(token)
 
     def _name(self, sample: zenoh.Sample) -> str:
         """The joint's name from the key."""

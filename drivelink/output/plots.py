@@ -11,7 +11,6 @@ Figures are made without pyplot: no global state, no window, safe in any thread.
 from __future__ import annotations
 
 import io
-import itertools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +20,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from scipy.stats import binned_statistic
 
 from drivelink.outfile import write_whole
 from estimator.sample import SIGMA_95, FloatArray
@@ -58,7 +58,6 @@ _THEMED = {
 _MAX_POINTS = 4000  # curves with more points are reduced to the extremes of each pixel column
 _BINS = 240
 _MIN_OF_SCATTERED = 3  # samples in a bin of `medians`
-_MIN_IN_BIN = 1
 _MARKERS_A_CURVE = 12
 
 
@@ -234,18 +233,6 @@ def _binned(curve: PlotCurve) -> PlotCurve:
         order = np.argsort(x, kind="stable")
         return PlotCurve(x[order], y[order], None if curve.std is None else curve.std[finite][order])
     edges = np.linspace(x.min(), x.max(), _BINS + 1)
-    place = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, _BINS - 1)
-    order = np.argsort(place, kind="stable")
-    starts = np.searchsorted(place[order], np.arange(_BINS + 1))
-
-    def medians(values: FloatArray) -> FloatArray:
-        sorted_values = values[order]
-        return np.array(
-            [
-                np.median(sorted_values[a:b]) if b - a >= _MIN_IN_BIN else np.nan
-                for a, b in itertools.pairwise(starts)
-            ]
-        )
-
-    std = None if curve.std is None else medians(curve.std[finite])
-    return PlotCurve((edges[1:] + edges[:-1]) / 2, medians(y), std)
+    values = [y] if curve.std is None else [y, curve.std[finite]]
+    middle = binned_statistic(x, values, "median", edges).statistic
+    return PlotCurve((edges[1:] + edges[:-1]) / 2, *middle)

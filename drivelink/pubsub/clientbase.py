@@ -73,7 +73,7 @@ class Client:
         ring = zenoh.handlers.RingChannel
         liveliness = self._session.liveliness()
         # In zenoh's thread (indirect=False), which does not block the process's end; no token is dropped.
-        heard = zenoh.handlers.Callback(self._liveliness, indirect=False)
+        heard = zenoh.handlers.Callback(self._feed.identity.heard, indirect=False)
         self._tokens = liveliness.declare_subscriber(f"{self.key}/alive/**", heard, history=True)
         self._estimates = self._declare_estimates(self.key + "/estimate")
         self._externals = self._session.declare_subscriber(self.key + "/external", ring(1))
@@ -289,10 +289,6 @@ class Client:
                 overrun = False
             if len(samples) < self._depth:
                 self._feed.arrivals.empty(now_ns)
-
-    def _liveliness(self, token: zenoh.Sample) -> None:
-        session = str(token.key_expr).removeprefix(f"{self.key}/alive").lstrip("/")
-        self._feed.identity.token(session, token.kind == zenoh.SampleKind.PUT)
 
     def _admit(self, sample: zenoh.Sample, now_ns: int, overrun: bool = False) -> None:
         payload = sample.payload.to_bytes()

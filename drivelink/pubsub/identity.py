@@ -68,6 +68,11 @@ class DaemonIdentity:
         """Whether a daemon was ever seen."""
         return self._seen or self.bound is not None
 
+    def heard(self, token: zenoh.Sample) -> None:
+        """Take a liveliness token that appeared or vanished."""
+        session = str(token.key_expr).rpartition("/alive")[2].lstrip("/")
+        self.token(session, token.kind == zenoh.SampleKind.PUT)
+
     def token(self, session: str, there: bool) -> None:
         """A liveliness token appeared or vanished.
 

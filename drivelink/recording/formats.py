@@ -1,9 +1,8 @@
-"""The formats of recordings, by the ending of the file's name: what each holds, its reader and its writer."""
+"""The formats of recordings, by the ending of the file's name: reader of columns, writer."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from enum import Enum, auto
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,38 +18,25 @@ from estimator.sample import FloatArray
 Columns = tuple[dict[str, FloatArray], tuple[str, ...]]
 
 
-class Holds(Enum):
-    """What a file of a format holds."""
-
-    COLUMNS = auto()
-    MESSAGES = auto()
-    FRAMES = auto()
-
-
 class Format(NamedTuple):
     """A format of recordings.
 
     Attributes:
-        holds: what is in a file.
         sink: its writer; None: only read.
-        columns: reads columns by their names in the file, and names of those left out; None: no columns.
+        columns: reads columns by their names in the file, and names of those left out; None: it has none.
         text: whether it is text, some thirty times smaller than the memory that its analysis takes.
     """
 
-    holds: Holds
     sink: Callable[..., Sink] | None = None
     columns: Callable[[Path, ColumnMap], Columns] | None = None
     text: bool = False
 
 
 FORMATS = {
-    ".mcap": Format(Holds.MESSAGES, McapSink),
-    ".csv": Format(Holds.COLUMNS, CsvSink, read_csv_columns, text=True),
-    ".mf4": Format(Holds.COLUMNS, columns=read_mf4_columns),
-} | {
-    suffix: Format(Holds.FRAMES, CanSink if kind.writer else None, text=kind.text)
-    for suffix, kind in CAN_FORMATS.items()
-}
+    ".mcap": Format(McapSink),
+    ".csv": Format(CsvSink, read_csv_columns, text=True),
+    ".mf4": Format(columns=read_mf4_columns),
+} | {suffix: Format(CanSink if kind.writer else None, text=kind.text) for suffix, kind in CAN_FORMATS.items()}
 
 
 def open_sink(path: Path, joint: JointFile, joint_text: str = "", *, force: bool = False) -> Sink:

@@ -159,35 +159,37 @@ def read_sample(message: Mapping[str, Any], motors: int) -> Sample:
     )
 
 
+_INTEGER, _TEXT, _FLAG = {"type": "integer"}, {"type": "string"}, {"type": "boolean"}
+_STATUS_BITS = _INTEGER | {"description": "status bits"}
+_USABLE = _FLAG | {"description": "the numbers may be used"}
+_PROPERTIES: Mapping[str, dict[str, Any]] = {  # but for numbers with units
+    "sample": {"sequence": _INTEGER},
+    "estimate": {
+        "sequence": _INTEGER, "status": _STATUS_BITS, "valid": _USABLE,
+        "observable": _FLAG | {"description": "the motion reveals the stiffness"},
+    },
+    "external": {
+        "sequence": _INTEGER, "status": _STATUS_BITS, "valid": _USABLE,
+        "contact": _FLAG | {"description": "something touches the link"},
+    },
+    "log": {
+        "timestamp": {"type": "object", "properties": {"sec": _INTEGER, "nsec": _INTEGER}},
+        "level": _INTEGER, "message": _TEXT, "name": _TEXT, "file": _TEXT, "line": _INTEGER,
+    },
+    "can": {"id": _INTEGER, "data": _TEXT | {"description": "bytes, two hex digits each"}},
+    "mapping": {"joint": _TEXT, "nodes": {"type": "array", "items": {"type": "object"}}},
+    "joint": {"text": _TEXT | {"description": "the joint file"}},
+}  # fmt: skip
+
+
 def message_schema(topic: str, motors: int) -> bytes:
     """Return the JSON schema of a channel's messages."""
-    integer, text, flag = {"type": "integer"}, {"type": "string"}, {"type": "boolean"}
-    properties: dict[str, Any]
-    if topic == "sample":
-        properties = {"sequence": integer, **_numbers(sample_columns(motors))}
-    elif topic == "estimate":
-        properties = {
-            "sequence": integer,
-            "status": integer | {"description": "status bits"},
-            "valid": flag | {"description": "the numbers may be used"},
-            "observable": flag | {"description": "the motion reveals the stiffness"},
-            **_numbers(_estimate_names(motors)),
-        }
-    elif topic == "external":
-        flags = {"valid": flag, "contact": flag | {"description": "something touches the link"}}
-        properties = {"sequence": integer, "status": integer, **flags, **_numbers(_EXTERNAL_NAMES)}
-    elif topic == "log":
-        stamp = {"type": "object", "properties": {"sec": integer, "nsec": integer}}
-        properties = {"timestamp": stamp, "level": integer, "message": text, "name": text}
-        properties |= {"file": text, "line": integer}
-    elif topic == "can":
-        properties = {"id": integer, "data": text | {"description": "bytes, two hex digits each"}}
-    elif topic == "mapping":
-        properties = {"joint": text, "nodes": {"type": "array", "items": {"type": "object"}}}
-    elif topic == "joint":
-        properties = {"text": text | {"description": "the joint file"}}
-    else:
-        properties = {}
+    names: Mapping[str, tuple[str, ...]] = {
+        "sample": sample_columns(motors),
+        "estimate": _estimate_names(motors),
+        "external": _EXTERNAL_NAMES,
+    }
+    properties = _PROPERTIES.get(topic, {}) | _numbers(names.get(topic, ()))
     schema = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": SCHEMA_NAMES.get(topic, f"drivelink.{topic}"),

@@ -108,7 +108,7 @@ class ZenohTap:
             self._streams.append((subscriber, self._document))
 
         # In zenoh's thread (indirect=False), which never keeps the process from ending.
-        heard = zenoh.handlers.Callback(self._token, indirect=False)
+        heard = zenoh.handlers.Callback(self._identity.heard, indirect=False)
         tokens: Any = session.liveliness().declare_subscriber(f"{key}/alive/**", heard, history=True)
         self._tokens = tokens
 
@@ -137,10 +137,6 @@ class ZenohTap:
         """Stop listening."""
         for subscriber in (self._tokens, *(subscriber for subscriber, _ in self._streams)):
             subscriber.undeclare()
-
-    def _token(self, token: zenoh.Sample) -> None:
-        session = str(token.key_expr).rpartition("/alive")[2].lstrip("/")
-        self._identity.token(session, token.kind == zenoh.SampleKind.PUT)
 
     def _sample(self, message: zenoh.Sample) -> None:
         sample, stamp_ns = DECODERS["sample"](message.payload.to_bytes())

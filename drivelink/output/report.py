@@ -228,11 +228,12 @@ def sections(outcome: Diagnosis, units: Units) -> list[Section]:
     sure = all(finding.probability >= _SURE for finding in outcome.effects)
     label = f"{'' if sure else 'likely '}{outcome.verdict.replace('_', ' ')}"
     verdict = Paragraph(sentence(outcome), label, f"verdict {outcome.verdict}")
+    wide = max(len(outcome.curves), len(outcome.stiffness)) > 1
     made = [
         Section("", [verdict, Paragraph(unexplained(outcome, units))]),
         Section("Error of the motor torque balance", [_errors(outcome, units)]),
-        Section("What reveals it", [_curve_chart(curve, units) for curve in outcome.curves]),
-        Section("Stiffness before and after", [_stiffness_chart(one, units) for one in outcome.stiffness]),
+        Section("What reveals it", [_curve_chart(curve, units) for curve in outcome.curves], wide),
+        Section("Stiffness before and after", [_stiffness_chart(s, units) for s in outcome.stiffness], wide),
         Section("Parameters", [_parameters(outcome, units)], wide=False),
         Section("Where the candidates stood", _candidates(outcome), wide=False),
         Section("What could not be separated, and what would separate it", [_doubts(outcome)]),
@@ -255,13 +256,14 @@ def _errors(outcome: Diagnosis, units: Units) -> Grid:
         )  # fmt: skip
         part = one.after_rms_nm / max(one.before_rms_nm, 1e-300)
         rows.append((name, before, after, Share(f"{part:.0%}", part)))
-    return Grid(("", "as declared", "with the effects", "after / before"), rows)
+    after = "with the effects" if outcome.effects else "refitted"
+    return Grid(("", "as declared", after, "after / before"), rows)
 
 
 def _parameters(outcome: Diagnosis, units: Units) -> Grid:
     rows: list[tuple[str | Share, ...]] = []
     for finding in outcome.effects:
-        rows.append((title_of(finding, outcome),))
+        rows += [(title_of(finding, outcome),)] if finding.parameters else []
         for name, value in finding.parameters.items():
             rows += parameter_rows(name, value, finding.std.get(name), units)
     for number, one in enumerate(outcome.transmissions, start=1):
@@ -315,8 +317,9 @@ def _choice_of(outcome: Diagnosis, chosen: list[float]) -> str:
 
 def _curve_chart(curve: Curve, units: Units) -> Chart:
     over = " and ".join(name.replace("_", " ") for name in curve.coordinates)
+    name = "a free curve" if curve.name == "unlisted" else in_words(curve.name)
     about = f", {LIBRARY[curve.name].description}" if curve.name in LIBRARY else ""
-    caption = f"Residual of the declared model over {over}, and {in_words(curve.name)}{about}."
+    caption = f"Residual of the declared model over {over}, and {name}{about}."
     return Chart(partial(_curve_figure, curve, units), caption)
 
 
@@ -325,7 +328,7 @@ def _curve_figure(curve: Curve, units: Units) -> Figure:
     across, torque = units.label(_AXES[curve.coordinates[0]]), units.label("torque / N·m")
     plots.dots(axes, curve.x, curve.residual_nm)
     order = np.argsort(curve.x)
-    name = in_words(curve.name)
+    name = "free curve" if curve.name == "unlisted" else in_words(curve.name)
     if curve.second is None and _is_function(curve):
         curves = {"residual": plots.medians(curve.x, curve.residual_nm)}
         curves[name] = plots.medians(curve.x, curve.fitted_nm)
@@ -401,4 +404,5 @@ def _doubts(outcome: Diagnosis) -> Lines:
     ]
     lines += [_LIBRARY_NAME.sub(lambda name: in_words(name[0]), line) for line in outcome.advice]
     lines += outcome.notes
-    return Lines(tuple(lines) or ("No other effect explains these data as well.",))
+    other = "No other effect" if outcome.effects else "No effect"
+    return Lines(tuple(lines) or (f"{other} explains these data as well.",))

@@ -140,6 +140,12 @@ class _Joint:
         ]
         self.elements = [_elements(motor.effects) for motor in model.motors]
         self.link_elements = _elements(model.link_effects)
+        acting = [[e for e in mine if e[0].channel == "torque" and _instant(e[0])] for mine in self.elements]
+        self.through = [[e for e in mine if e[0].location == "transmission"] for mine in acting]
+        self.on_motor = [[e for e in mine if e[0].location == "motor"] for mine in acting]
+        self.zero = [[e for e in mine if e[0].channel == "deflection"] for mine in self.elements]
+        self.on_link = [e for e in self.link_elements if e[0].location == "link" and _instant(e[0])]
+        self.reading = [e for e in self.link_elements if e[0].channel == "link_position"]
         self.remembered: set[str] = set()
         q = record.link_position_rad
         if q is None:
@@ -234,20 +240,16 @@ class _Joint:
         c = _coordinates(x[:, i], v[:, i], x[:, -1], v[:, -1], self.torque[row, i], self.record.time_s[row])
         law = self.laws[i]
         if law:
-            zero = _sum([e for e in self.elements[i] if e[0].channel == "deflection"], c)
-            phi = c.deflection - zero
-            spring, k = law.torque(phi, self.alphas[i]), law.stiffness(phi, self.alphas[i])
+            phi = c.deflection - _sum(self.zero[i], c)
+            spring, k = law.both(phi, self.alphas[i])
             c = c._replace(deflection=phi, flexibility_torque=spring, stiffness=k)
         else:
             spring = np.zeros(len(x))
-        acting = [e for e in self.elements[i] if e[0].channel == "torque" and _instant(e[0])]
-        through = _sum([e for e in acting if e[0].location == "transmission"], c)
-        return spring + through, _sum([e for e in acting if e[0].location == "motor"], c), c
+        return spring + _sum(self.through[i], c), _sum(self.on_motor[i], c), c
 
     def _link_load(self, q: FloatArray, rate: FloatArray) -> FloatArray:
         link, c = self.model.link, _coordinates(q, rate, q, rate, 0.0 * q, 0.0 * q)
-        own = [e for e in self.link_elements if e[0].location == "link" and _instant(e[0])]
-        load = _sum(own, c)
+        load = _sum(self.on_link, c)
         if link is None:
             return load
         turned = np.sin(q + link.gravity_phase_rad)
@@ -256,7 +258,7 @@ class _Joint:
     def _reading(self, q: FloatArray, rate: FloatArray) -> FloatArray:
         """Error of the link encoder's reading."""
         c = _coordinates(q, rate, q, rate, 0.0 * q, 0.0 * q)
-        return _sum([e for e in self.link_elements if e[0].channel == "link_position"], c)
+        return _sum(self.reading, c)
 
     def _acting(self) -> FloatArray:
         """(n, m + 1) torque that acts on each body from outside: measured, less the measurement's error."""

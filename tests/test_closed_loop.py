@@ -58,7 +58,7 @@ channel = "{channel}"
 excitation = {{ kind = "rich", seed = {motion} }}
 """
 
-CYCLES = 24_000  # of a millisecond, one run
+CYCLES = 14_000  # of a millisecond, one run
 START_S = 1_700_000_000
 CALIBRATION, SUSPECT, CHECK = 1, 2, 3  # three motions: what is judged live is not what was recorded
 

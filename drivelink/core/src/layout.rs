@@ -82,3 +82,18 @@ pub struct Node {
     /// Its frames.
     pub tpdos: Vec<Tpdo>,
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sample_waits_for_no_reading_that_only_checks_another() {
+        for signal in [Signal::MotorPosition, Signal::MotorTorque, Signal::LinkPosition, Signal::Other] {
+            assert!(!signal.checks());
+        }
+        for signal in [Signal::VelocityCheck, Signal::TorqueCheck, Signal::SecondPosition] {
+            assert!(signal.checks());
+        }
+    }
+}

@@ -161,3 +161,72 @@ impl Node {
         self.faulted = faulted;
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn nobody() -> impl Iterator<Item = &'static mut TpdoDecoder> {
+        std::iter::empty()
+    }
+
+    #[test]
+    fn a_node_that_booted_is_believed_when_it_is_started_by_its_own_number() {
+        let mut node = Node::new(3, true);
+        node.heartbeat(0, nobody());
+        assert!(!node.trusted && node.restarted && node.counters.reboots == 1);
+        node.command(START, 0, nobody()); // somebody else's start of all
+        assert!(!node.trusted);
+        node.command(START, 3, nobody());
+        assert!(node.trusted);
+        node.command(0x81, 0, nobody());
+        assert!(!node.trusted);
+        node.supervised = true;
+        node.command(START, 3, nobody());
+        assert!(!node.trusted);
+    }
+
+    #[test]
+    fn a_heartbeat_is_no_boot_up() {
+        let mut node = Node::new(3, true);
+        node.heartbeat(0x85, nobody()); // operational, with a toggle bit as node guarding has it
+        assert!(node.trusted && node.counters.reboots == 0);
+    }
+
+    #[test]
+    fn an_error_lasts_until_its_reset_or_the_end_of_the_fault_state() {
+        let mut node = Node::new(1, true);
+        node.error(0x2310);
+        assert_eq!((node.emergency, node.counters.emergencies), (0x2310, 1));
+        node.error(0);
+        assert_eq!((node.emergency, node.counters.emergencies), (0, 1));
+        node.error(0x2310);
+        node.take_statusword(0x0008);
+        assert!(node.faulted && node.emergency == 0x2310);
+        node.take_statusword(0x0027);
+        assert!(!node.faulted && node.emergency == 0);
+    }
+
+    #[test]
+    fn a_homing_and_another_home_offset_lose_the_zero() {
+        let request = |index: u16, value: u8| {
+            let [low, high] = index.to_le_bytes();
+            [0x2F, low, high, 0, value, 0, 0, 0]
+        };
+        for (index, value, lost) in
+            [(MODE, HOMING, true), (MODE, 8, false), (0x607C, 0, true), (0x6040, 6, false)]
+        {
+            let mut node = Node::new(1, true);
+            node.request(&request(index, value));
+            assert_eq!(node.restarted, lost, "{index:#x}");
+            let mut node = Node::new(1, true);
+            node.request(&[0x40, request(index, value)[1], request(index, value)[2], 0, value, 0, 0, 0]);
+            assert!(!node.restarted, "an upload changes nothing");
+        }
+        let mut node = Node::new(1, true);
+        node.request(&request(MODE, HOMING));
+        node.restarted = false;
+        node.request(&request(MODE, 8)); // the homing is over
+        assert!(node.restarted);
+    }
+}

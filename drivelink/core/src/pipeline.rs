@@ -244,3 +244,99 @@ pub fn estimate(
     estimate.status |= flags;
     Ok((estimate, estimator.external()?))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use estimator_core::sample::{MOTORS, TransmissionEstimate};
+
+    const SAMPLE: Sample = Sample {
+        sequence: 5,
+        motor_position: [0.1; MOTORS],
+        motor_velocity: [f64::NAN; MOTORS],
+        motor_torque: [0.0; MOTORS],
+        link_position: 0.2,
+        link_velocity: f64::NAN,
+        external_torque: f64::NAN,
+    };
+
+    /// Says always the same, and keeps what it was told.
+    struct Fixed {
+        stiffness: f64,
+        alarm: bool,
+        told: Vec<&'static str>,
+    }
+
+    impl Step for Fixed {
+        fn step(&mut self, sample: &Sample) -> Result<Estimate, Failure> {
+            let part = TransmissionEstimate {
+                flexibility_torque: 1.0,
+                stiffness: self.stiffness,
+                stiffness_std: 1.0,
+                deflection: 0.1,
+                ..TransmissionEstimate::NOTHING
+            };
+            Ok(Estimate {
+                sequence: sample.sequence,
+                status: VALID,
+                flexibility_torque: 1.0,
+                flexibility_torque_std: 0.1,
+                stiffness: self.stiffness,
+                stiffness_std: 1.0,
+                transmissions: [part; MOTORS],
+                motors: 1,
+            })
+        }
+
+        fn lose_zeros(&mut self) -> Result<(), Failure> {
+            self.told.push("lose_zeros");
+            Ok(())
+        }
+
+        fn distrust(&mut self) -> Result<(), Failure> {
+            self.told.push("distrust");
+            Ok(())
+        }
+
+        fn alarm(&mut self, _: &Sample, _: &Estimate) -> Result<bool, Failure> {
+            Ok(self.alarm)
+        }
+    }
+
+    fn run(stiffness: f64, alarm: bool, flags: u32) -> (u32, Vec<&'static str>) {
+        let mut fixed = Fixed { stiffness, alarm, told: Vec::new() };
+        let results = estimate(&mut fixed, &SAMPLE, flags).unwrap();
+        (Pipeline::default().take(&SAMPLE, 1, results, Some(9)).estimate.status, fixed.told)
+    }
+
+    #[test]
+    fn service_bits_are_added_and_take_what_may_not_be_used() {
+        assert_eq!(run(150.0, false, 0), (VALID, vec![]));
+        assert_eq!(
+            run(150.0, false, NODE_RESTARTED),
+            (VALID | NODE_RESTARTED | RESTARTED, vec!["lose_zeros"])
+        );
+        assert_eq!(run(150.0, false, UNTIMED), (VALID | UNTIMED, vec!["distrust"]));
+        assert_eq!(run(150.0, false, CONTRADICTED), (CONTRADICTED, vec!["distrust"]));
+        assert_eq!(run(150.0, true, 0), (MODEL_ALARM, vec![]));
+    }
+
+    #[test]
+    fn what_is_no_number_is_not_valid() {
+        assert_eq!(run(f64::NAN, false, 0).0, 0);
+        assert_eq!(run(f64::INFINITY, false, 0).0, 0);
+    }
+
+    #[test]
+    fn a_cycle_without_a_sample_carries_the_last_estimate_on_stale() {
+        let mut pipeline = Pipeline::default();
+        assert!(pipeline.carry_on(1, 0, None).is_none());
+        let mut fixed = Fixed { stiffness: 150.0, alarm: false, told: Vec::new() };
+        let results = estimate(&mut fixed, &SAMPLE, 0).unwrap();
+        pipeline.take(&SAMPLE, 1, results, Some(9));
+        let tick = pipeline.carry_on(6, 0, Some(10)).unwrap();
+        assert_eq!((tick.estimate.sequence, tick.estimate.status, tick.stamp_ns), (6, STALE, 10));
+        assert_eq!(tick.estimate.stiffness, 150.0);
+        assert!(tick.sample_payload().is_none() && tick.external_payload().is_none());
+    }
+}

@@ -176,3 +176,60 @@ pub fn encode_sample(sample: &Sample, motors: usize, stamp_ns: u64) -> Payload {
 
 const _: () = assert!(SampleHead::BYTES + 1 + MOST_ELEMENTS * MotorPart::BYTES <= MOST_BYTES);
 const _: () = assert!(ExternalHead::BYTES <= MOST_BYTES);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PART: TransmissionEstimate = TransmissionEstimate {
+        flexibility_torque: 1.0,
+        stiffness: 2.0,
+        stiffness_std: 3.0,
+        deflection: 4.0,
+        ..TransmissionEstimate::NOTHING
+    };
+
+    fn number(bytes: &[u8], at: usize) -> f64 {
+        f64::from_le_bytes(bytes[at..at + 8].try_into().unwrap())
+    }
+
+    #[test]
+    fn an_estimate_is_packed_little_endian_with_the_length_of_its_sequence() {
+        let payload = encode_estimate(7, 1_000_000, 0x0102, [-1.5, 150.0, 0.25], &[PART, PART]);
+        let bytes = payload.bytes();
+        assert_eq!(bytes.len(), 8 + 8 + 4 + 3 * 8 + 1 + 2 * 4 * 8);
+        assert_eq!(bytes[..8], 7u64.to_le_bytes());
+        assert_eq!(bytes[8..16], 1_000_000u64.to_le_bytes());
+        assert_eq!(bytes[16..20], [2, 1, 0, 0]);
+        assert_eq!([20, 28, 36].map(|at| number(bytes, at)), [-1.5, 150.0, 0.25]);
+        assert_eq!(bytes[44], 2);
+        assert_eq!([45, 53, 61, 69, 77].map(|at| number(bytes, at)), [1.0, 2.0, 3.0, 4.0, 1.0]);
+    }
+
+    #[test]
+    fn more_elements_than_a_message_holds_are_left_out() {
+        let payload = encode_estimate(0, 0, 0, [0.0; 3], &[PART; MOST_ELEMENTS + 1]);
+        assert_eq!(payload.bytes()[EstimateHead::BYTES] as usize, MOST_ELEMENTS);
+        assert_eq!(payload.bytes().len(), MOST_BYTES);
+    }
+
+    #[test]
+    fn a_sample_has_as_many_motors_as_the_joint() {
+        let two = |a, b| [a, b];
+        let sample = Sample {
+            sequence: 1,
+            motor_position: two(0.1, 0.2),
+            motor_velocity: two(0.3, 0.4),
+            motor_torque: two(0.5, 0.6),
+            link_position: 0.7,
+            link_velocity: 0.8,
+            external_torque: 0.9,
+        };
+        for motors in [1, 2] {
+            let payload = encode_sample(&sample, motors, 0);
+            assert_eq!(payload.bytes().len(), SampleHead::BYTES + 1 + motors * MotorPart::BYTES);
+            assert_eq!(payload.bytes()[SampleHead::BYTES] as usize, motors);
+            assert_eq!(number(payload.bytes(), SampleHead::BYTES + 1), 0.1);
+        }
+    }
+}

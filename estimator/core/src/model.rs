@@ -141,3 +141,38 @@ impl Model {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn motor(transmission: Transmission) -> Motor {
+        let (inertia_std, damping_std) = (None, None);
+        Motor { inertia: 0.1, inertia_std, damping: 0.0, damping_std, transmission, effects: vec![] }
+    }
+
+    fn elastic(law: Law, parameters: &[f64], covariance: Option<Vec<f64>>) -> Transmission {
+        Transmission::Elastic { law, order: None, parameters: parameters.to_vec(), covariance }
+    }
+
+    fn checked(arrangement: Arrangement, motors: Vec<Motor>) -> String {
+        let model = Model { arrangement, motors, link: None, link_effects: vec![] };
+        model.check().map_or_else(|error| error.to_string(), |()| "right".into())
+    }
+
+    #[test]
+    fn parts_that_contradict_each_other_are_one_line() {
+        let linear = || motor(elastic(Law::Linear, &[100.0], None));
+        let rigid = || motor(Transmission::Rigid);
+        assert!(linear().flexible() && !rigid().flexible());
+        assert_eq!(checked(Arrangement::Single, vec![linear()]), "right");
+        assert_eq!(checked(Arrangement::Serial, vec![linear(), rigid()]), "right");
+        assert_eq!(checked(Arrangement::Antagonistic, vec![linear()]), "motors: expected 2, got 1");
+        let serial = checked(Arrangement::Serial, vec![linear(), linear()]);
+        assert!(serial.contains("motor[2].transmission.model: expected \"none\""), "{serial}");
+        let wrong = elastic(Law::VsaII, &[1.0], None);
+        assert!(checked(Arrangement::Single, vec![motor(wrong)]).contains("got 1, expected 2"));
+        let wrong = elastic(Law::VsaII, &[1.0, 1.5], Some(vec![1.0; 3]));
+        assert!(checked(Arrangement::Single, vec![motor(wrong)]).contains("covariance: got 3, expected 4"));
+    }
+}

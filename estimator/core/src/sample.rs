@@ -124,3 +124,26 @@ pub fn joint_estimate(
     }
     joint
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn torques_and_stiffnesses_of_an_antagonistic_joint_add_and_so_do_variances() {
+        let part = |torque, stiffness, stiffness_std| TransmissionEstimate {
+            flexibility_torque: torque,
+            stiffness,
+            stiffness_std,
+            ..TransmissionEstimate::NOTHING
+        };
+        let parts = [part(1.0, 100.0, 3.0), part(-4.0, 50.0, 4.0)];
+        let totals = |arrangement| {
+            let joint = joint_estimate(arrangement, 7, status::VALID, parts, 2);
+            assert_eq!((joint.sequence, joint.status, joint.motors), (7, status::VALID, 2));
+            (joint.flexibility_torque, joint.stiffness, joint.stiffness_std)
+        };
+        assert_eq!(totals(Arrangement::Antagonistic), (-3.0, 150.0, 5.0));
+        assert_eq!(totals(Arrangement::Serial), (1.0, 100.0, 3.0));
+    }
+}

@@ -136,3 +136,63 @@ impl Excitation {
         rms > Self::NOISE_MARGIN * self.noise.max(noise) && rms > Self::SHARE * self.peak && rms > 0.0
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const T: f64 = 1e-3;
+
+    #[test]
+    fn a_ramp_is_late_by_the_filters_delay_and_keeps_its_slope() {
+        let filters = Filters::new(60.0, T);
+        let (mut channel, mut formed) = (Channel::rest(0.0), Formed::default());
+        let slope = 2.0;
+        for k in 1..4000 {
+            channel.smooth(&filters, slope * T * f64::from(k));
+            formed.pass(&filters, slope * T * f64::from(k));
+        }
+        let now = slope * T * 3999.0;
+        assert!((now - channel.light[0] - slope * 3.0 / filters.light.bandwidth).abs() < 1e-9);
+        assert!((now - channel.main[0] - slope * filters.delay).abs() < 1e-9);
+        assert!((now - formed.main[0] - slope * 4.0 / filters.main.bandwidth).abs() < 1e-9);
+        assert!((channel.main[1] - slope).abs() < 1e-9 && channel.main[2].abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_torque_that_is_held_acts_from_its_sample_on_and_one_at_rest_stays() {
+        let filters = Filters::new(60.0, T);
+        let (mut held, mut rest) = (Channel::rest(0.0), Channel::rest(3.0));
+        held.held(&filters, 1.0);
+        assert_eq!(held.main[0], 0.0); // it acts from now on
+        for _ in 0..2000 {
+            held.held(&filters, 1.0);
+            rest.smooth(&filters, 3.0);
+        }
+        assert!((held.main[0] - 1.0).abs() < 1e-9 && (rest.main[0] - 3.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn the_gain_of_white_noise_is_that_of_the_impulse_response() {
+        let filters = Filters::new(60.0, T);
+        let gains = filters.noise_gains(T);
+        assert_eq!(filters.rate_gain(T), gains[1].sqrt());
+        // F alone, (w/(s + w))^4: 5 w/32 times the period; G before it takes a little.
+        let main = 5.0 / 32.0 * 60.0 * T;
+        assert!(gains[0] < main && gains[0] > 0.9 * main, "{} is not below {main}", gains[0]);
+    }
+
+    #[test]
+    fn motion_is_what_is_above_its_noise() {
+        let swing = |noise: f64, usable: bool| {
+            let mut excitation = Excitation::default();
+            (0..2000).fold(false, |_, k| {
+                let rate = (10.0 * T * f64::from(k)).sin();
+                excitation.update(rate, noise, usable, true, T)
+            })
+        };
+        assert!(swing(0.01, true));
+        assert!(!swing(0.5, true));
+        assert!(!swing(0.01, false));
+    }
+}

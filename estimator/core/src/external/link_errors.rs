@@ -96,3 +96,40 @@ impl LinkErrors {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn errors_of_the_link_are_found_from_its_balance_and_a_constant_is_not_taken_off() {
+        let link = Link {
+            inertia: 0.4,
+            damping: 0.1,
+            gravity: 6.0,
+            gravity_phase: 0.0,
+            inertia_std: 0.04,
+            damping_std: 0.02,
+            gravity_std: 0.6,
+        };
+        let truth: Row = [0.7, 0.03, -0.05, 0.2, 0.5, -0.1];
+        let prior: Row = [1e6; PARAMETERS];
+        let mut errors = LinkErrors { direction: Some(0.0), ..LinkErrors::default() };
+        let mut row = [0.0; PARAMETERS];
+        for k in 0..4000 {
+            let t = 5e-3 * f64::from(k);
+            let (a, b) = (0.8 * (2.0 * t).sin(), 0.3 * (7.0 * t).sin());
+            let speed = 1.6 * (2.0 * t).cos() + 2.1 * (7.0 * t).cos();
+            row = errors.row(&link, [a + b, speed, -4.0 * a - 49.0 * b]);
+            let left = row.iter().zip(truth).map(|(x, p)| x * p).sum();
+            errors.forget(speed.signum(), 1e-6);
+            errors.identify(&row, left, 1e-4);
+        }
+        let (torque, variance) = errors.at(&row, &prior);
+        let expected: f64 = row.iter().zip(truth).skip(1).map(|(x, p)| x * p).sum();
+        assert!((torque - expected).abs() < 1e-4, "{torque} is not {expected}");
+        assert!(variance > 0.0 && variance < 1e-4);
+        // What is declared without doubt stays.
+        assert!(LinkErrors::default().at(&row, &prior).0 == 0.0);
+    }
+}

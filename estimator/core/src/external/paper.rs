@@ -147,3 +147,61 @@ impl PaperMomentum {
         self.said.say(external, span)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::Arrangement;
+    use crate::sample::MOTORS;
+
+    #[test]
+    fn a_push_of_a_free_link_is_its_acceleration_behind_the_pole() {
+        let link = Link {
+            inertia: 0.5,
+            damping: 0.0,
+            gravity: 0.0,
+            gravity_phase: 0.0,
+            inertia_std: 0.0,
+            damping_std: 0.0,
+            gravity_std: 0.0,
+        };
+        let model = Model {
+            arrangement: Arrangement::Single,
+            motors: vec![],
+            link: Some(link),
+            link_effects: vec![],
+        };
+        let priors = Priors {
+            motor_inertia: 0.05,
+            viscous_damping: 0.2,
+            viscous_damping_floor: 0.05,
+            coulomb_friction: 0.1,
+            torque_offset: 0.3,
+            deflection_offset: 1.0,
+            encoder_delay: 1.0,
+        };
+        let settings = Settings { k_tau: 100.0, ..Settings::default() };
+        let mut momentum = PaperMomentum::new(&model, &settings, &priors, 1e-3).unwrap();
+        let acceleration = 6.0; // of 3 N·m
+        for k in 0..60u32 {
+            let t = 1e-3 * f64::from(k);
+            let sample = Sample {
+                sequence: u64::from(k),
+                motor_position: [f64::NAN; MOTORS],
+                motor_velocity: [f64::NAN; MOTORS],
+                motor_torque: [f64::NAN; MOTORS],
+                link_position: 0.5 * acceleration * t * t,
+                link_velocity: acceleration * t,
+                external_torque: f64::NAN,
+            };
+            let found = momentum.update(&sample, 1, 0.0, 0.0, true);
+            if k > 0 {
+                let expected = 3.0 * (1.0 - (-100.0 * t).exp());
+                assert!((found.torque - expected).abs() < 1e-9, "{} is not {expected}", found.torque);
+                assert!((found.link_torque + expected).abs() < 1e-9);
+            }
+        }
+        let nothing = Model { link: None, ..model };
+        assert!(PaperMomentum::new(&nothing, &settings, &priors, 1e-3).is_none());
+    }
+}

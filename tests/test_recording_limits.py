@@ -316,12 +316,20 @@ def test_a_huge_message_is_refused_before_it_is_parsed(topic: str, data: bytes, 
     assert peak_mib() - before < MOST_MIB
 
 
-def test_frames_without_a_sync_are_not_held(tmp_path: Path) -> None:
-    frame = ("can", 0, b'{"id": 385, "data": ""}')
-    path = mcap_of(tmp_path / "r.mcap", [frame] * 600_000)
+@pytest.mark.parametrize(
+    ("data", "count", "said"),
+    [
+        (b'{"id": 385, "data": ""}', 300_000, "expected SYNC frames"),  # held in vain
+        (b'{"id": 128, "data": ""}', 600_000, "expected to unpack to at most 64 times its size"),
+    ],
+)
+def test_frames_without_end_are_neither_held_nor_read(
+    data: bytes, count: int, said: str, tmp_path: Path
+) -> None:
+    path = mcap_of(tmp_path / "r.mcap", [("can", 0, data)] * count)
     assert path.stat().st_size < 40_000
     before = peak_mib()
-    with pytest.raises(RecordingError, match="expected SYNC frames"):
+    with pytest.raises(RecordingError, match=said):
         read(path, JOINT)
     assert peak_mib() - before < 200
 

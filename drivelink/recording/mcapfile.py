@@ -34,6 +34,8 @@ _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE_OP, _CHUNK_OP, _DATA_END = 0x02, 0x03, 0x04
 _ATTACHMENT = 0x09
 SNAPSHOT = "estimator"  # name of the attachment from whose state a replay goes on
 _WANTED = frozenset({_CHANNEL, _MESSAGE_OP, _CHUNK_OP})
+_MOST_RATIO = 64  # of unpacked bytes to those of the file: of a joint at rest they are some 30
+_SMALL_BYTES = 16 << 20  # that any file may unpack to
 _MESSAGE_BYTES = 64 << 10  # of a sample, an estimate or a frame: ours have some 500
 _ZSTD_WINDOW = 128 << 20  # memory limit of its decoder, the same as in zstd's tools
 
@@ -61,7 +63,8 @@ def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[
         with open_regular(path) as file:
             if file.read(len(_MAGIC)) != _MAGIC:
                 raise RecordingError(f"{path}: expected an MCAP file, its first bytes are not those of one")
-            left = os.fstat(file.fileno()).st_size - len(_MAGIC)
+            size = os.fstat(file.fileno()).st_size
+            left, unpacked = size - len(_MAGIC), 0
             while len(head := file.read(_HEAD.size)) == _HEAD.size:
                 opcode, length = _HEAD.unpack(head)
                 left -= _HEAD.size + length
@@ -75,6 +78,11 @@ def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[
                 _require_size(length, path)
                 body = file.read(length)
                 records = _decompressed(body, path) if opcode == _CHUNK_OP else head + body
+                unpacked += len(records)
+                if unpacked > _MOST_RATIO * size + _SMALL_BYTES:
+                    raise RecordingError(
+                        f"{path}: expected to unpack to at most {_MOST_RATIO} times its size"
+                    )
                 for message in _messages(records, channels, topics):
                     require_stamp(message.log_time_ns, path)
                     yield message

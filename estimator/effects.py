@@ -140,11 +140,22 @@ class EffectType:
         Returns:
             (k, n), one row per linear parameter.
         """
-        named = (getattr(c, name) for name in self.coordinates)
+        return self._evaluated(self.name, self.coordinates, c, values)
+
+    def reaction(self, c: Coordinates, values: Mapping[str, float]) -> FloatArray | None:
+        """Terms that act on the motor beside them, with the same parameters; None: there are none."""
+        if self.name != "kinematic_error":
+            return None
+        return self._evaluated("kinematic_reaction", ("position", "flexibility_torque"), c, values)
+
+    def _evaluated(
+        self, name: str, coordinates: tuple[str, ...], c: Coordinates, values: Mapping[str, float]
+    ) -> FloatArray:
+        named = (getattr(c, each) for each in coordinates)
         fields = [np.ascontiguousarray(field, dtype=np.float64).reshape(-1) for field in named]
         listed = [1.0 if p.linear else values[p.name] for p in self.parameters]
         out = np.empty((len(self.linear), max(map(len, fields))))
-        _core.effect_terms(self.name, listed, fields, out.reshape(-1))
+        _core.effect_terms(name, listed, fields, out.reshape(-1))
         return out
 
 

@@ -245,7 +245,11 @@ class _Joint:
             c = c._replace(deflection=phi, flexibility_torque=spring, stiffness=k)
         else:
             spring = np.zeros(len(x))
-        return spring + _sum(self.through[i], c), _sum(self.on_motor[i], c), c
+        on_motor = _sum(self.on_motor[i], c)
+        for kind, values in self.through[i]:
+            if (reaction := kind.reaction(c, values)) is not None:
+                on_motor = on_motor + np.array([values[name] for name in kind.linear]) @ reaction
+        return spring + _sum(self.through[i], c), on_motor, c
 
     def _link_load(self, q: FloatArray, rate: FloatArray) -> FloatArray:
         link, c = self.model.link, _coordinates(q, rate, q, rate, 0.0 * q, 0.0 * q)

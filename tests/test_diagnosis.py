@@ -12,7 +12,7 @@ import pytest
 from estimator.choices import choice
 from estimator.diagnosis import diagnose, tracing
 from estimator.diagnosis.candidates import Candidate
-from estimator.diagnosis.hypothesis import Term
+from estimator.diagnosis.hypothesis import Fitted, Term
 from estimator.effects import LIBRARY
 from estimator.errors import EstimatorError
 from estimator.identify import identify
@@ -271,10 +271,11 @@ def test_of_laws_of_one_family_the_simpler_one_is_chosen_while_it_is_an_alternat
     behind: float, other: str, chosen: str
 ) -> None:
     hypotheses = [
-        SimpleNamespace(terms=(Term(Candidate(LIBRARY[name], 0), {}),), odds=odds)
-        for name, odds in (("asymmetric_friction", 0.0), (other, -np.log(behind)))
+        Fitted((Term(Candidate(LIBRARY[name], 0), {}),), *(None,) * 6)
+        for name in ("asymmetric_friction", other)
     ]
-    search = SimpleNamespace(advantage=lambda one, _: one.odds)
+    odds = dict(zip(hypotheses, (0.0, -np.log(behind)), strict=True))
+    search = SimpleNamespace(advantage=lambda one, _: odds[one])
     held = SimpleNamespace(log_likelihood=lambda *_: 0.0)
     (term,) = tracing._chosen(search, held, hypotheses).terms
     assert term.candidate.kind.name == chosen

@@ -128,15 +128,16 @@ def columns(frame: Frame, candidate: Candidate, values: Values) -> FloatArray:
     key = (candidate.key, *values.values())
     made = memo.get(key)
     if made is None:
-        made = _columns(frame, candidate, kind.terms(frame.motors[candidate.motor or 0], values))
+        made = _columns(frame, candidate, values)
         if "periods_per_rev" not in values:  # there are hundreds, which `Search` keeps
             memo[key] = made
     return made.T
 
 
-def _columns(frame: Frame, candidate: Candidate, terms: FloatArray) -> FloatArray:
-    """The columns (k, rows) of an effect's terms (k, n) on the grid."""
+def _columns(frame: Frame, candidate: Candidate, values: Values) -> FloatArray:
+    """The columns (k, rows) of an effect."""
     kind, motor = candidate.kind, candidate.motor or 0
+    terms = kind.terms(frame.motors[motor], values)
     if kind.channel == "link_position":
         return _reading(frame, terms)
     if kind.channel == "deflection" and candidate.motor is None:
@@ -145,7 +146,9 @@ def _columns(frame: Frame, candidate: Candidate, terms: FloatArray) -> FloatArra
         force = -frame.motors[motor].stiffness * terms
         return frame.column(motor, force, force if frame.pulls[motor] else None)
     if kind.location == "transmission":
-        return frame.column(motor, terms, terms if frame.pulls[motor] else None)
+        reaction = kind.reaction(frame.motors[motor], values)
+        on_motor = terms if reaction is None else terms - reaction
+        return frame.column(motor, on_motor, terms if frame.pulls[motor] else None)
     if kind.location == "motor" or frame.carried:
         return frame.column(motor, -terms, None)
     return frame.column(None, None, terms)
@@ -246,7 +249,11 @@ def _waves(frame: Frame, c: Coordinates) -> FloatArray:
     most = 2.0 * np.pi * frame.signals.bandwidth_hz / max(slow, 1e-12)
     step = np.pi / spread
     count = int(np.clip((most - least) / step, 0, whole("ripples")))
-    return np.asarray(least + step * np.arange(count))
+    # Once and twice a turn of the output and of the motor, where the motion has a whole period.
+    gear = frame.model.motors[[own is c for own in frame.motors].index(True)].gear_ratio
+    turns = np.array([1.0, 2.0] if gear is None else [1.0, 2.0, gear, 2.0 * gear])
+    turns = turns[(turns * spread >= 2.0 * np.pi) & (turns <= most)]
+    return np.concatenate((turns, least + step * np.arange(count)))
 
 
 def least_periods(position: FloatArray) -> float:

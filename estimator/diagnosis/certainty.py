@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from estimator.choices import choice
+from estimator.diagnosis.heldout import Held
 from estimator.diagnosis.hypothesis import Fitted, Keys
 from estimator.diagnosis.search import Search
 
@@ -37,15 +38,21 @@ class Standing(NamedTuple):
     alternatives: tuple[tuple[str, float], ...]
 
 
-def accounts(search: Search, found: Fitted, others: Sequence[Fitted]) -> list[Account]:
+def accounts(search: Search, held: Held, found: Fitted, others: Sequence[Fitted]) -> list[Account]:
     """Return the account found and others with at most as many effects; the best fit for each
     set of effects.
+
+    One of the same families, with at most as many parameters, that held-out data cannot tell from it is as
+    likely.
     """
     made: dict[Keys, Account] = {found.keys: Account(1.0, found)}
     for other in others:
         if len(other.terms) > len(found.terms) or other.keys == found.keys:
             continue
         chance = min(search.chance(found, other), 0.5)  # nothing is likelier than what was found
+        simpler = other.families == found.families and other.parameters <= found.parameters
+        if simpler and held.alike(found, other):
+            chance = 0.5
         account = Account(chance / (1.0 - chance), other)
         if other.keys not in made or account.weight > made[other.keys].weight:
             made[other.keys] = account

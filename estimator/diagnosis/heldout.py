@@ -113,6 +113,13 @@ class Held:
         gain = np.log((self._by_stretch(rest) + least) / (self._by_stretch(found) + least))
         return bool(np.mean(gain) > np.std(gain, ddof=1) / np.sqrt(len(gain)))
 
+    def alike(self, found: Fitted, other: Fitted) -> bool:
+        """Whether held-out data cannot tell another model from the one found; fitted alike well, too."""
+        square = [residual_of(self._problem, one, self._problem.used).square for one in (found, other)]
+        if square[1] - square[0] > (choice("floor") * self._problem.torque_rms) ** 2:
+            return False
+        return not self.confirms(found, other)
+
     def _by_stretch(self, fitted: Fitted) -> FloatArray:
         """Mean squared error of stretches of time, relative to each recording's torque."""
         made = []

@@ -71,6 +71,16 @@ class Fitted:
         own = frozenset(t.candidate.key for t in self.terms)
         return own if self.extra is None else own | {("unlisted", self.extra.motor)}
 
+    @property
+    def parameters(self) -> int:
+        """Number of its effects' parameters."""
+        return sum(len(t.candidate.kind.parameters) for t in self.terms)
+
+    @property
+    def families(self) -> list[object]:
+        """Families of its effects, in order."""
+        return sorted((t.candidate.family for t in self.terms), key=str)
+
     def is_real_beside(self, parent: Fitted) -> bool:
         """Return whether every effect contributes, and no spring is at zero that has a
         stiffness in the parent.

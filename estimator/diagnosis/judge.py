@@ -77,7 +77,7 @@ class Judge:
 
     def _effects(self, others: list[Fitted]) -> list[Finding]:
         """The effects found, with their probabilities beside all other explanations."""
-        beside = accounts(self.search, self.found, [*others, *self.search.seen])
+        beside = accounts(self.search, self.held, self.found, [*others, *self.search.seen])
         standings = [standing(self.search, self.found, k, beside) for k in range(len(self.found.terms))]
         return findings_of(self.problem, self.found, self.search.null, standings, self.surplus)
 

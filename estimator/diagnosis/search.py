@@ -25,7 +25,7 @@ from estimator.diagnosis.hypothesis import Fitted, Keys, Problem, Term, stretche
 from estimator.priors import PRIORS
 from estimator.sample import FloatArray
 
-__all__ = ["Progress", "Search", "parameters"]
+__all__ = ["Progress", "Search"]
 
 _SMOOTHING, _PERIODS = "smoothing_rad_s", "periods_per_rev"
 
@@ -252,7 +252,7 @@ class Search:
         """Each term in turn replaced by one with more evidence, or by a simpler one that is nearly even."""
         for k in range(len(hypothesis.terms)):
             for other in self.rivals(hypothesis, k):
-                simpler = parameters(other.terms[-1]) < parameters(hypothesis.terms[k])
+                simpler = other.parameters < hypothesis.parameters
                 if self.advantage(other, hypothesis) > (math.log(choice("even")) if simpler else 0.0):
                     hypothesis = self._settled(other)
                     break
@@ -357,11 +357,6 @@ class Search:
             yield _Tried(
                 entry.candidate, entry.values[k], len(gain), float(gain[k]), shift[k], precision[k], side[k]
             )
-
-
-def parameters(term: Term) -> int:
-    """Return the number of an effect's parameters."""
-    return len(term.candidate.kind.parameters)
 
 
 def _left(hypothesis: Fitted) -> float:

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
-
-import numpy as np
 
 from estimator.choices import choice, least_rows
 from estimator.diagnosis.bandwidth import choose_bandwidth, widest
@@ -15,7 +12,7 @@ from estimator.diagnosis.hypothesis import Fitted, Problem
 from estimator.diagnosis.judge import Judge
 from estimator.diagnosis.openorder import raised
 from estimator.diagnosis.result import Diagnosis
-from estimator.diagnosis.search import Progress, Search, parameters
+from estimator.diagnosis.search import Progress, Search
 from estimator.errors import EstimatorError
 from estimator.gate import check
 from estimator.model import JointModel
@@ -72,23 +69,19 @@ def diagnose(
 
 
 def _chosen(search: Search, held: Held, hypotheses: list[Fitted]) -> Fitted:
-    """Of the hypotheses that pass the held-out test, the one with the best odds on all data.
+    """The hypothesis with the best odds on all data, or a simpler one that is as good.
 
-    Of laws of one family, fewer parameters are preferred while they are an alternative, as in the search.
+    As good is one with fewer effects that held-out data cannot tell from it, and one with fewer parameters
+    while it is an alternative.
     """
     first = hypotheses[0]
-    odds = [search.advantage(one, first) + held.log_likelihood(one, first) for one in hypotheses]
-    best = int(np.argmax(odds))
+    odds = {one: search.advantage(one, first) + held.log_likelihood(one, first) for one in hypotheses}
+    best = max(hypotheses, key=lambda one: odds[one])
+    fewer = (one for one in hypotheses if len(one.terms) < len(best.terms) and not held.confirms(best, one))
+    best = min(fewer, key=lambda one: (len(one.terms), -odds[one]), default=best)
     least = odds[best] + math.log(choice("even"))
-
-    def families(k: int) -> Counter[tuple[str, str, str, int | None]]:
-        return Counter(term.candidate.family for term in hypotheses[k].terms)
-
-    def simplicity(k: int) -> tuple[int, float]:
-        return sum(parameters(term) for term in hypotheses[k].terms), -odds[k]
-
-    alike = (k for k, x in enumerate(odds) if x >= least and families(k) == families(best))
-    return hypotheses[min(alike, key=simplicity)]
+    alike = [one for one in hypotheses if odds[one] >= least and one.families == best.families]
+    return min(alike, key=lambda one: (one.parameters, -odds[one]))
 
 
 def _gated(search: Search, held: Held, found: Fitted) -> Fitted:

@@ -81,6 +81,9 @@ impl MotorEffects {
                     return Err(Error(format!("effect \"{name}\": expected it under [[link.effect]]")));
                 }
             }
+            if let Some(kind) = element.kind.reaction() {
+                sorted.motor.add(&Element { kind, values: element.values });
+            }
             if matches!(element.kind.law, Law::Spring(_)) {
                 sorted.springs.push(*element);
             }

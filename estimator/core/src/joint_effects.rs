@@ -136,8 +136,12 @@ mod tests {
             each.iter().for_each(|e| sum.add(e));
             sum.torque(&c, 1e-3)
         };
+        let react = |e: &Element| Some(Element { kind: e.kind.reaction()?, values: e.values });
+        let reactions: Vec<Element> = every(false).iter().filter_map(react).collect();
         let expected = (
-            weighted(Place::Motor, &every(false)) + memories(&Place::Motor),
+            weighted(Place::Motor, &every(false))
+                + weighted(Place::Motor, &reactions)
+                + memories(&Place::Motor),
             weighted(Place::Transmission, &every(false)) + memories(&Place::Transmission),
         );
         let x = effects.torques(&[c], &c);

@@ -557,11 +557,32 @@ pub static LIBRARY: &[Kind] = &[
     },
 ];
 
+/// What a `kinematic_error` e(θ) does to its motor: the spring's torque acts as τ_e (1 − e′), since it does as
+/// much work on both sides. Of the same parameters; no effect of its own.
+pub static REACTION: Kind = Kind {
+    name: "kinematic_reaction",
+    place: Place::Motor,
+    coordinates: &["position", "flexibility_torque"],
+    parameters: &[linear("sin_rad", "of the error"), linear("cos_rad", "of the error"), PERIODS],
+    law: Law::Terms(|c, v| {
+        let [sine, cosine] = waves(v[2] * c.position);
+        let steep = v[2] * c.flexibility_torque;
+        [steep * cosine, -steep * sine]
+    }),
+    description: "reaction of a kinematic error",
+};
+
 impl Kind {
     /// By its name.
     #[must_use]
     pub fn named(name: &str) -> Option<&'static Kind> {
-        LIBRARY.iter().find(|kind| kind.name == name)
+        LIBRARY.iter().chain([&REACTION]).find(|kind| kind.name == name)
+    }
+
+    /// What acts on the motor beside it, with the same parameters.
+    #[must_use]
+    pub fn reaction(&self) -> Option<&'static Kind> {
+        (self.name == "kinematic_error").then_some(&REACTION)
     }
 
     /// How many linear parameters it has, each weighing one term.

@@ -36,7 +36,6 @@ NO_CHOICE = {  # mathematics, units, rounding, and what a format or the literatu
     "diagnosis.candidates.LAWS": "Dahl's law, Bouc-Wen with equal parts, elastic up to the limit",
     "diagnosis.covariance._FULL": "keeps rounding from dividing by zero",
     "diagnosis.curves._DEGREE": "cubic splines",
-    "filters._TERMS": "of a series, the next one is below rounding",
     "flexibility.RELATIVE_STEP": "of central differences: cube root of the rounding",
     "freerun._CUBIC": "least degree whose slope is exact to second order",
     "freerun._SMOOTHED": "samples: the least that average an encoder's rounding, short of the motion's bends",

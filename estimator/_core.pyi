@@ -86,3 +86,6 @@ def effect_kinds() -> list[
 def effect_terms(
     name: str, values: Sequence[float], coordinates: Sequence[Numbers], out: Numbers
 ) -> None: ...
+def state_variable_filter(
+    order: int, bandwidth_rad_s: float, period_s: float, signal: Numbers, held: bool, out: Numbers
+) -> None: ...

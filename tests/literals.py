@@ -42,7 +42,7 @@ REASONS: dict[str, dict[str, str]] = {
     },
     "diagnosis/search.py": {"1.75": "last point of a grid of delays in octaves"},
     "diagnosis/stack.py": {"0.001": "relative step of a difference", "0.7": "ln 2: factors of at most two"},
-    "filters.py": {"14.0": "time constants until e^-14 is below 1e-6", "64.0": "entries of a cache"},
+    "filters.py": {"14.0": "time constants until e^-14 is below 1e-6"},
     "gate/causes.py": {"1.3": "a factor this near to a unit's is that unit"},
     "gate/evidence.py": {
         "0.002 0.998": "quantiles of what was measured",

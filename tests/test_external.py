@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from drivelink._core import Assembler, JointPipeline
 from estimator import (
@@ -20,7 +21,7 @@ from estimator import (
     Transmission,
     make_estimator,
 )
-from estimator.filters import StateVariableFilter, linear_filter
+from estimator.filters import StateVariableFilter
 from estimator.identify import identify
 from sim.effects import parse
 from sim.excitation import build
@@ -244,7 +245,7 @@ def test_mode_paper_has_equation_13_and_the_same_external_torque(pushed):
     """-r of eq 12 is tau_e,t through K/(s + K); noise of the differenced position is averaged away over 50 ms."""
     estimated = Estimates(model(), pushed, measured=True, mode="paper", k_tau_rad_s=100.0)
     a = math.exp(-100.0 * T)
-    truth = linear_filter([1.0 - a], [1.0, -a], pushed["truth_flexibility_torque_nm"])
+    truth = lfilter([1.0 - a], [1.0, -a], pushed["truth_flexibility_torque_nm"])
     smooth = np.ones(50) / 50
     off = np.convolve(estimated.link_torque - truth, smooth, "same")[1000:-1000]
     assert np.sqrt(np.mean(off**2)) < 0.02 * np.sqrt(np.mean(truth**2))

@@ -41,7 +41,9 @@ mod extension {
     #[pymodule_export]
     use crate::node::Counters;
     #[pymodule_export]
-    use estimator_core::python::{Estimator, ModelMonitor, TransmissionLaw, effect_kinds, effect_terms};
+    use estimator_core::python::{
+        Estimator, ModelMonitor, TransmissionLaw, effect_kinds, effect_terms, state_variable_filter,
+    };
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

@@ -12,7 +12,7 @@ use pyo3::sync::PyOnceLock;
 use pyo3::types::{PyDict, PyTuple, PyType};
 
 pub use self::classes::{Estimator, ModelMonitor};
-pub use self::physics::{TransmissionLaw, effect_kinds, effect_terms};
+pub use self::physics::{TransmissionLaw, effect_kinds, effect_terms, state_variable_filter};
 use crate::effects::Element;
 use crate::error::Error;
 use crate::external::External;

@@ -10,6 +10,7 @@ use pyo3::types::PyTuple;
 
 use crate::effects::along;
 use crate::error::Error;
+use crate::filters::StateVariableFilter;
 use crate::laws::{Foreign, Law, PARAMETERS, Shape, Table};
 use crate::library::{self, Coordinates, Element, LIBRARY, Parameter, Role};
 
@@ -230,4 +231,36 @@ pub fn effect_terms(
     let mut result = vec![0.0; n * terms];
     along(&element, moments, &mut result.chunks_exact_mut(n).collect::<Vec<_>>());
     out.copy_from_slice(py, &result)
+}
+
+/// Filter a recording from rest by wⁿ/(s + w)ⁿ, n from 1 to 8: state i into row i of `out`.
+#[pyfunction]
+pub fn state_variable_filter(
+    py: Python<'_>,
+    order: usize,
+    bandwidth_rad_s: f64,
+    period_s: f64,
+    signal: PyBuffer<f64>,
+    held: bool,
+    out: PyBuffer<f64>,
+) -> PyResult<()> {
+    fn run<const N: usize>(w: f64, period_s: f64, signal: &[f64], held: bool, rows: &mut [&mut [f64]]) {
+        StateVariableFilter::<N>::new(w, period_s).along(signal, held, rows);
+    }
+    let signal = slice(py, &signal)?;
+    let mut states = vec![0.0; order * signal.len()];
+    let mut rows: Vec<&mut [f64]> = states.chunks_exact_mut(signal.len().max(1)).collect();
+    let run = match order {
+        1 => run::<1>,
+        2 => run::<2>,
+        3 => run::<3>,
+        4 => run::<4>,
+        5 => run::<5>,
+        6 => run::<6>,
+        7 => run::<7>,
+        8 => run::<8>,
+        _ => return Err(PyValueError::new_err(format!("order: expected 1 to 8, got {order}"))),
+    };
+    run(bandwidth_rad_s, period_s, &signal, held, &mut rows);
+    out.copy_from_slice(py, &states)
 }

@@ -105,7 +105,7 @@ def quintic():
 )
 def test_a_registered_model_with_two_shape_parameters_is_estimated_on_line(quintic, declared):
     rng = np.random.default_rng(1)
-    n, T = 7000, 1e-3
+    n, T = 4500, 1e-3
     torque, stiffness = joints.polynomial(150.0 * np.array([[[1.0, 20.0, 100.0]]]))
     one = np.ones(1)
     plants = joints.Plants(

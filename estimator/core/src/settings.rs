@@ -89,9 +89,9 @@ impl Default for Settings {
 pub struct Priors {
     /// Of B, relative to what is declared.
     pub motor_inertia: f64,
-    /// Of D, relative to what is declared …
+    /// Of D, relative to what is declared, beside the floor.
     pub viscous_damping: f64,
-    /// … plus this share of torque over speed.
+    /// Of D where nothing is declared, as a share of torque over speed.
     pub viscous_damping_floor: f64,
     /// Of undeclared dry friction, as a share of the torque.
     pub coulomb_friction: f64,

@@ -1,6 +1,6 @@
 """How the loop closes on each effect of the library: alarm, finding, its name, the residual after it.
 
-    python benchmarks/loop.py [--effects NAME ...] [--share X] [--json FILE]
+    python benchmarks/loop.py [--effects NAME,…] [--share X] [--json FILE]
 
 The joint of `drivelink demo --case friction` with its daemon in lockstep, healthy for 10 s; then the effect,
 which takes about a share of the torque. What the black box would keep is diagnosed, and the proposed joint
@@ -10,19 +10,15 @@ diagnosis, here at normal priority. `drivelink demo --case …` does the same in
 
 from __future__ import annotations
 
-import argparse
-import json
 import tempfile
 import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import scene
 from diagnosis_seeds import LIKELY, sizes
-from rich.console import Console
-from rich.progress import track
 
 from drivelink import jointfile
 from drivelink.cycle.loop import ObjectSink
@@ -66,13 +62,13 @@ def effect_text(name: str, share: float) -> str:
     return f"{name}={values[main]!r}{further}"
 
 
-def scene(name: str, share: float) -> dict[str, Any]:
+def closed(name: str, share: float) -> scene.Row:
     """One effect from its begin to the residual after its finding."""
     joint = jointfile.load(ELBOW)
     world, bus, taken = world_from_joint(joint), open_sim_bus(joint.bus), Taken()
     network = network_from_joint(joint, bus, world=world)
     per_s = round(1.0 / joint.bus.period_s)
-    result: dict[str, Any] = {"effect": name, "alarm_s": None}
+    result: scene.Row = {"effect": name, "alarm_s": None}
     with (
         bus,
         Daemon([ServedJoint(joint=joint)], publish=False, real_time=False, devices=network.poll) as daemon,
@@ -94,7 +90,7 @@ def scene(name: str, share: float) -> dict[str, Any]:
     return result | judged(name, kept, taken.samples[len(kept) :])
 
 
-def judged(name: str, kept: Sequence[Sample], after: Sequence[Sample]) -> dict[str, Any]:
+def judged(name: str, kept: Sequence[Sample], after: Sequence[Sample]) -> scene.Row:
     """The finding of what was kept, and the residual of the proposed model on what follows."""
     source = jointfile.load_text(ELBOW)
     with tempfile.TemporaryDirectory() as folder:
@@ -139,47 +135,54 @@ def ratio_of(joint: jointfile.JointFile, samples: Sequence[Sample]) -> tuple[flo
     return max(ratios), alarm
 
 
-def row(one: dict[str, Any]) -> str:
-    """A scene as a row of the table."""
+def shown(one: scene.Row) -> scene.Row:
+    """Add what a table says in words."""
     if one["alarm_s"] is None:
-        return f"| {one['effect']} | – | | | | | |"
-    error, after = one.get("error"), one.get("after_ratio")
-    said = "yes" if one.get("named") else f"listed ({one['found'][0]})" if one.get("listed") else "no"
-    if not (one.get("named") or one.get("listed")):
-        said = ", ".join(one.get("found") or ()) or one["state"]
-    fall = f"{error['before_relative']:.1%} → {error['after_relative']:.1%}" if error else ""
-    residual = "" if after is None else f"{after:.2g}{' alarm' if one['alarm_after'] else ''}"
-    found_s = one["alarm_s"] + AFTER_S + one.get("diagnosis_s", 0.0)
-    before = f"{one['before_ratio']:.0f}" if "before_ratio" in one else ""
-    cells = (one["effect"], f"{one['alarm_s']:.1f}", f"{found_s:.0f}", said, fall, before, residual)
-    return f"| {' | '.join(cells)} |"
+        return one | dict.fromkeys(
+            ("finding_s", "said", "error_before", "error_after", "before_ratio", "after")
+        )
+    error, after = one.get("error") or {}, one.get("after_ratio")
+    said = "yes" if one.get("named") else f"listed ({one['found'][0]})" if one.get("listed") else None
+    return one | {
+        "finding_s": one["alarm_s"] + AFTER_S + one.get("diagnosis_s", 0.0),
+        "said": said or ", ".join(one.get("found") or ()) or one["state"],
+        "error_before": error.get("before_relative"),
+        "error_after": error.get("after_relative"),
+        "before_ratio": one.get("before_ratio"),
+        "after": None if after is None else f"{after:.2g}{' alarm' if one['alarm_after'] else ''}",
+    }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--effects", nargs="*", default=list(LIBRARY), choices=list(LIBRARY), metavar="NAME")
-    parser.add_argument("--share", type=float, default=0.1, help="of the torque (default: %(default)s)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write every outcome there")
-    args = parser.parse_args()
-    print("| effect | alarm / s | finding / s | named | error on held-out data | residual before | after |")
-    print("|---" * 7 + "|", flush=True)
-    made = []
-    for name in track(args.effects, "loop", console=Console(stderr=True)):
-        made.append(scene(name, args.share))
-        print(row(made[-1]), flush=True)
+def total(made: list[scene.Row]) -> str:
+    """All effects together."""
     alarmed = [one for one in made if one["alarm_s"] is not None]
     proposed = [one for one in alarmed if one["state"] == finding.PROPOSED]
     quiet = sum(not one["alarm_after"] for one in proposed)
-    print(
-        f"\nResiduals are times their baseline. Of {len(made)} effects {len(alarmed)} alarm, "
+    return (
+        f"Residuals are times their baseline. Of {len(made)} effects {len(alarmed)} alarm, "
         f"{sum(bool(one.get('named')) for one in alarmed)} are named first, "
         f"{sum(bool(one.get('listed')) for one in alarmed)} named or listed. {len(proposed)} lead to a "
         f"proposal; of {quiet} of these the new test stays quiet for {WATCHED_S:g} s. "
         f"False alarms before the effect: {sum(one['false_alarm'] for one in made)}."
     )
-    if args.json:
-        args.json.write_text(json.dumps(made, indent=2) + "\n", encoding="utf-8")
 
+
+COLUMNS = {
+    "effect": "{effect}",
+    "alarm / s": "{alarm_s:.1f}",
+    "finding / s": "{finding_s:.0f}",
+    "named": "{said}",
+    "error on held-out data": "{error_before:.1%} → {error_after:.1%}",
+    "residual before": "{before_ratio:.0f}",
+    "after": "{after}",
+}
 
 if __name__ == "__main__":
-    main()
+    scene.main(
+        __doc__,
+        lambda args: (shown(closed(name, args.share)) for name in args.effects),
+        COLUMNS,
+        scene.Option("--effects", list(LIBRARY)),
+        scene.Option("--share", 0.1, "of the torque"),
+        after=total,
+    )

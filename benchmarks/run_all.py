@@ -53,7 +53,7 @@ SECTIONS = {
         "Two effects at once", "--pairs --seeds 1", "--pairs --seeds 1 --seconds 10", of="diagnosis_seeds"
     ),
     "loop": Section(
-        "The loop that closes itself, on each effect", quick="--effects coulomb_friction backlash"
+        "The loop that closes itself, on each effect", quick="--effects coulomb_friction,backlash"
     ),
     "gate": Section("Wrong units, signs, gears and time", "--seeds 2", "--seeds 1 --kinds serial"),
     "real_data": Section("Real data before and after"),

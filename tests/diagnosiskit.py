@@ -25,11 +25,12 @@ class World:
     effects: list[dict[str, float]]
     seed: int = 1
     slow: bool = False
+    seconds: float = SECONDS
     records: list[Record] = field(default_factory=list)
 
     def run(self) -> list[Record]:
         """Simulate and measure: encoders quantised, torque noisy, sampled at 1 kHz."""
-        n, m = round(SECONDS / PERIOD_S), len(self.effects)
+        n, m = round(self.seconds / PERIOD_S), len(self.effects)
         rng = np.random.default_rng(self.seed)
         reference = self._reference(n, rng)
         rate = np.gradient(reference, PERIOD_S)

@@ -46,15 +46,10 @@ def write_csv(record: Record, path: Path) -> Path:
 
 def make_fleet(folder: Path, nights: int = 2) -> Path:
     """FOLDER/joints and FOLDER/recordings of two joints; the second night of the wrist has friction."""
-    seconds = kit.SECONDS
-    kit.SECONDS = SECONDS
-    try:
-        for night in range(nights):
-            effects = [{}, {"coulomb_nm": 0.4} if night % 2 else {}]
-            for name, record in zip(NAMES, kit.World(effects, seed=10 + night).run(), strict=True):
-                write_csv(record, folder / "recordings" / f"{name}-2026-01-{night + 5:02d}.csv")
-    finally:
-        kit.SECONDS = seconds
+    for night in range(nights):
+        world = kit.World([{}, {"coulomb_nm": 0.4} if night % 2 else {}], seed=10 + night, seconds=SECONDS)
+        for name, record in zip(NAMES, world.run(), strict=True):
+            write_csv(record, folder / "recordings" / f"{name}-2026-01-{night + 5:02d}.csv")
     for name in NAMES:
         path = folder / "joints" / f"{name}.toml"
         path.parent.mkdir(parents=True, exist_ok=True)

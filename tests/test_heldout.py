@@ -63,7 +63,7 @@ def mean_squares(amplitude: float = 1.0) -> tuple[float, float]:
 
 @pytest.fixture(scope="module")
 def healthy() -> Record:
-    return kit.World([{}], seed=5).run()[0]
+    return kit.World([{}], seed=5, seconds=8.0).run()[0]
 
 
 @pytest.fixture

@@ -97,8 +97,9 @@ def test_a_one_way_motion_has_no_free_curve_over_time(speed: float) -> None:
     assert bool(over_time) is (speed == 0.0)
 
 
-def test_of_the_motors_dry_friction_there_is_one_law(healthy: tuple[Record, Record]) -> None:
-    search = Search(Problem([healthy[0]], kit.model(), 15.0))
+def test_of_the_motors_dry_friction_there_is_one_law() -> None:
+    rubbing = kit.World([{"coulomb_nm": 0.4}], seed=31, seconds=8.0).run()
+    search = Search(Problem(rubbing, kit.model(), 15.0))
     dry = [e.candidate for e in search._library if e.candidate.rubs]
     assert {"coulomb_friction", "presliding_friction"} <= {one.kind.name for one in dry}
     coulomb = next(one for one in search.screen(search.null, dry[0]) if one.candidate.rubs)

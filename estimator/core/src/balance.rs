@@ -189,6 +189,12 @@ impl Balance {
         }
     }
 
+    /// The least and the largest φ seen, rad.
+    #[must_use]
+    pub fn seen(&self) -> [f64; 2] {
+        [self.low, self.high]
+    }
+
     /// Largest |φ| seen, rad.
     #[must_use]
     pub fn largest(&self) -> f64 {

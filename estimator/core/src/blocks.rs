@@ -9,7 +9,7 @@ use crate::causes::{Cause, Known, Noise, Odds, TABLE};
 use crate::gram::{Frame, Gram, Posterior, Row, Set, UNKNOWNS, Vector, dot, inverse, set};
 use crate::model::Motor;
 use crate::settings::Priors;
-use crate::spring::{Projection, TERMS};
+use crate::spring::{Family, Projection, TERMS};
 use crate::student::f_quantile;
 use crate::unknowns::{ACTIVE, CANDIDATES, DRY, LATE, OFFSET, RATE, Reading, SOFT, SPRING, Spring, ZERO};
 
@@ -28,6 +28,7 @@ const EXPLAINED: f64 = 3.0; // times the usual mean square, that a change of the
 const EARLY: f64 = 0.005; // of the torque's fluctuation: what a drive's torque is known to, before any data
 const TAILS: f64 = 8.0; // degrees of freedom of a block's noise level: it varies within a factor of two
 const BURST: f64 = 3.0; // times the largest mean square that was explained: friction comes in bursts, at reversals
+const REACHED: f64 = 0.98; // of where a law ends
 
 /// What a block did.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -92,6 +93,9 @@ pub struct Blocks {
     pub white: f64,
     /// Resolution of the deflection, rad: rounding moves its zero by as much.
     pub resolution: f64,
+    /// The least and the largest deflection since they are counted from where they are, rad.
+    pub seen: [f64; 2],
+    family: Family,
     located: bool, // a lost zero, so well that the balance can be linearised
     /// How far a lost zero is from where deflections are counted from, rad; 0: near.
     pub off: f64,
@@ -115,6 +119,7 @@ impl Blocks {
     ) -> Blocks {
         let rows = (BLOCK_S / period_s).round().max(8.0);
         let errors = (rows / correlated).max(1.0); // independent ones in a block
+        let spring = Spring::new(motor);
         Blocks {
             motor: motor.clone(),
             priors: *priors,
@@ -129,7 +134,6 @@ impl Blocks {
             waiting: Vec::with_capacity(WINDOW),
             scores: Vec::with_capacity(BLOCKS),
             carried: None,
-            spring: Spring::new(motor),
             projection: None,
             deflection: 0.0,
             noise: Noise { variance: f64::NAN, correlated, tails: TAILS },
@@ -152,10 +156,13 @@ impl Blocks {
             spoilt: false,
             white: 0.0,
             resolution: 0.0,
+            seen: [0.0; 2],
+            family: Family::of(Some(&spring.law)),
             located: false,
             off: 0.0,
             moved: false,
             posterior: None,
+            spring,
         }
     }
 
@@ -284,7 +291,7 @@ impl Blocks {
         }
         self.end_doubt();
         self.solve();
-        if self.lost && self.located && self.unexplained() > USEFUL {
+        if self.lost && self.located && self.off == 0.0 && self.unexplained() > USEFUL {
             self.lose_zero(); // it was located wrongly
         }
         Closed::Added
@@ -455,7 +462,7 @@ impl Blocks {
             gram.scale(factors);
         }
         self.deflection = balance.size.deflection;
-        let reach = 0.98 * self.spring.widest_reach(self.deflection);
+        let reach = REACHED * self.spring.widest_reach(self.deflection);
         self.projection = Some(Projection::new(balance.family(), self.deflection, reach));
         self.powers = balance.family().powers();
         if !self.ring.is_empty() {

@@ -308,7 +308,7 @@ impl Robust {
             see(&mut self.torque_noise[i], now.torque[i]);
         }
         let (look, time) = (self.tick % self.looks == 0, self.tick as f64 * period);
-        let mut shift = None;
+        let mut shifts = [None; MOTORS];
         for i in 0..self.motors {
             let noise = self.noise_of(i);
             let torque_noise = self.torque_noise[i].variance(f64::INFINITY);
@@ -327,8 +327,7 @@ impl Robust {
             }
             if usable && side.excited {
                 side.blocks.spoilt = self.refused.is_some();
-                let found = side.learn(&self.link, noise, torque_noise, &self.noise_gains);
-                shift = found.map(|found| (i, found)).or(shift);
+                shifts[i] = side.learn(&self.link, noise, torque_noise, &self.noise_gains);
             }
         }
         if self.momentum.is_some() {
@@ -338,10 +337,16 @@ impl Robust {
         }
         self.last = *now;
         self.unsettled -= 1;
-        match shift {
-            Some((_, Shift::Late(periods))) => self.shift(periods),
-            Some((i, Shift::Zero(off))) => self.recentre(i, off),
-            None => {}
+        let mut late = None;
+        for (i, shift) in shifts.into_iter().enumerate() {
+            match shift {
+                Some(Shift::Late(periods)) => late = Some(periods),
+                Some(Shift::Zero(off)) => self.recentre(i, off),
+                None => {}
+            }
+        }
+        if let Some(periods) = late {
+            self.shift(periods);
         }
     }
 

@@ -279,6 +279,7 @@ impl Side {
         self.held_s = 0.0;
         self.unconfirmed_s -= self.period;
         let positions = noise[0] + noise[1];
+        self.blocks.seen = self.balance.seen();
         self.blocks.resolution = (12.0 * positions).sqrt();
         self.blocks.white = gains[0] * (torque_noise + self.stiffness.powi(2) * positions)
             + gains[2] * self.inertia.powi(2) * noise[0];

@@ -119,9 +119,15 @@ impl Projection {
     #[must_use]
     pub fn new(family: &Family, size: f64, reach: f64) -> Projection {
         let edge = (MARGIN * size).min(reach);
+        Projection::between(family, size, -edge, edge)
+    }
+
+    /// Over the deflections from `low` to `high`, by columns that are scaled by `size`.
+    #[must_use]
+    pub fn between(family: &Family, size: f64, low: f64, high: f64) -> Projection {
         let mut nodes = [0.0; NODES];
         for (k, node) in nodes.iter_mut().enumerate() {
-            *node = edge * (2.0 * k as f64 / (NODES - 1) as f64 - 1.0);
+            *node = low + (high - low) * k as f64 / (NODES - 1) as f64;
         }
         let rows = nodes.map(|phi| family.at(phi / size, size));
         const N: usize = 2 * TERMS;

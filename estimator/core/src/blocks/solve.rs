@@ -1,11 +1,12 @@
 //! The unknowns of one motor's balance from the sum of its blocks: prior, noise, choice, interval.
 
-use super::{Blocks, EARLY, FEWEST};
+use super::{Blocks, EARLY, FEWEST, REACHED};
 use crate::balance;
 use crate::gram::{
     Frame, Gram, Matrix, Posterior, Prior, Row, Set, UNKNOWNS, choose, cluster, dot, log_evidence, set,
     solve, unknowns,
 };
+use crate::spring::Projection;
 use crate::student::t_95;
 use crate::unknowns::{ACTIVE, CANDIDATES, RATE, SPRING, Scale, Spring, ZERO};
 
@@ -58,21 +59,23 @@ impl Blocks {
 
     /// Where a lost zero is by evidence, in steps over the deflections that the joint has had; `None`: it may be elsewhere.
     fn locate(&self, total: &Gram, noise: f64) -> Option<f64> {
-        let (projection, carried) = (self.projection.as_ref()?, self.carried.as_ref()?);
+        let (carried, [low, high]) = (self.carried.as_ref()?, self.seen);
+        let projection = Projection::between(&self.family, self.deflection, low, high);
         let mut tried = self.spring.clone();
         let step = carried.deflection / f64::from(ZEROS);
         let logs: [f64; 2 * ZEROS as usize + 1] = std::array::from_fn(|k| {
             tried.zero = step * (k as f64 - f64::from(ZEROS));
-            if tried.zero.abs() + self.deflection > tried.reach() {
+            if (tried.zero + low).abs().max((tried.zero + high).abs()) > REACHED * tried.reach() {
                 return f64::NEG_INFINITY;
             }
-            let frame = tried.frame(projection);
+            let frame = tried.frame(&projection);
             let prior = self.prior_of(&tried, total, &frame, self.deflection);
             log_evidence(&frame.reduce(total), frame.set & ACTIVE, &prior, noise)
         });
         let best = (0..logs.len()).max_by(|a, b| logs[*a].total_cmp(&logs[*b]))?;
         let rival = |k: usize| k.abs_diff(best) > 2 && logs[k] > logs[best] - ACCUSED.ln();
-        (!(0..logs.len()).any(rival)).then(|| step * (best as f64 - f64::from(ZEROS)))
+        (logs[best].is_finite() && !(0..logs.len()).any(rival))
+            .then(|| step * (best as f64 - f64::from(ZEROS)))
     }
 
     pub(super) fn solve(&mut self) {

@@ -189,13 +189,15 @@ def fit_joint(
     return _aligned(free._replace(doubts=doubts))
 
 
-def _joint_problem(records: Sequence[Record], model: JointModel, bandwidth_hz: float) -> Problem:
+def _joint_problem(
+    records: Sequence[Record], model: JointModel, bandwidth_hz: float, like: Problem | None = None
+) -> Problem:
     """The regression of a healthy joint.
 
     Raises:
         EstimatorError: too short for the bandwidth, or a deflection that does not change.
     """
-    problem = Problem(records, model, bandwidth_hz, calibrating=True, least=least_rows())
+    problem = Problem(records, model, bandwidth_hz, calibrating=True, least=least_rows(), like=like)
     for i, motor in enumerate(model.motors):
         if motor.flexible and not any(np.ptp(f.motors[i].deflection) > 0.0 for f in problem.frames):
             raise EstimatorError("recording: expected a deflection that changes, it stands still")
@@ -231,7 +233,7 @@ def _ordered(records: Sequence[Record], model: JointModel, bandwidth_hz: float) 
         for order in range(1, HIGHEST_ORDER + 1):
             own = replace(motor, transmission=replace(motor.transmission, order=order))
             motors = (*problem.model.motors[:i], own, *problem.model.motors[i + 1 :])
-            one = _joint_problem(records, replace(problem.model, motors=motors), bandwidth_hz)
+            one = _joint_problem(records, replace(problem.model, motors=motors), bandwidth_hz, problem)
             raised = one.null()
             closest = min((fitted, raised), key=lambda h: float(np.sum(np.log(h.posterior.sigma))))
             if order > 1 and raised.evidence(closest) <= fitted.evidence(closest):

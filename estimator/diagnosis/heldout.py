@@ -77,7 +77,7 @@ class Held:
     """
 
     def __init__(self, problem: Problem, folds: Sequence[Fold]) -> None:
-        self._problem, self._folds = problem, folds
+        self.problem, self._folds = problem, folds
         self._memo: dict[int, tuple[Fitted, list[Residual]]] = {}
 
     def residuals(self, fitted: Fitted) -> list[Residual]:
@@ -88,7 +88,7 @@ class Held:
 
     def _residual(self, fitted: Fitted, fold: Fold) -> Residual:
         again = fitted
-        if fold.fitted is not self._problem:
+        if fold.fitted is not self.problem:
             corrections = tuple(fitted.corrections[k] for k in fold.kept)
             again = fold.fitted.fit(
                 fitted.terms, fitted.base, corrections, extra=fitted.extra, pinned=fitted.pinned
@@ -115,8 +115,8 @@ class Held:
 
     def alike(self, found: Fitted, other: Fitted) -> bool:
         """Whether held-out data cannot tell another model from the one found; fitted alike well, too."""
-        square = [residual_of(self._problem, one, self._problem.used).square for one in (found, other)]
-        if square[1] - square[0] > (choice("floor") * self._problem.torque_rms) ** 2:
+        square = [residual_of(self.problem, one, self.problem.used).square for one in (found, other)]
+        if square[1] - square[0] > (choice("floor") * self.problem.torque_rms) ** 2:
             return False
         return not self.confirms(found, other)
 
@@ -124,14 +124,14 @@ class Held:
         """Mean squared error of stretches of time, relative to each recording's torque."""
         made = []
         for one in self.residuals(fitted):
-            square = (one.left_nm**2).reshape(self._problem.equations, -1).mean(axis=0) / one.torque_square
+            square = (one.left_nm**2).reshape(self.problem.equations, -1).mean(axis=0) / one.torque_square
             made += [np.mean(part) for part in np.array_split(square, whole("groups"))]
         return np.array(made)
 
     def log_likelihood(self, fitted: Fitted, like: Fitted) -> float:
         """Log likelihood of the held-out data, up to a constant, with the noise of another hypothesis."""
         rows = sum(len(one.left_nm) for one in self.residuals(fitted))
-        least = float(np.mean(like.regression.floor**2)) / self._problem.torque_rms**2
+        least = float(np.mean(like.regression.floor**2)) / self.problem.torque_rms**2
         error = self.squared(fitted) + least  # errors at the level of rounding are not compared
         return -0.5 * rows / float(np.mean(like.times)) * float(np.log(error))
 
@@ -146,7 +146,7 @@ class Held:
         least = float(np.mean(fitted.regression.floor**2))
         ratios = []
         for fold, outside in zip(self._folds, self.residuals(fitted), strict=True):
-            inside = residual_of(self._problem, fitted, fold.like)
+            inside = residual_of(self.problem, fitted, fold.like)
             larger = max(outside.torque_square / max(inside.torque_square, 1e-300), 1.0)
             ratios.append((outside.square + least) / (inside.square + least) / larger)
         return max(float(np.mean(ratios)), 1.0)

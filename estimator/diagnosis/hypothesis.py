@@ -122,6 +122,7 @@ class Problem:
         held: hold out some blocks of each recording.
         calibrating: the recordings are of a healthy joint and determine its declared numbers.
         least: required independent rows per recording.
+        like: another problem, with the same filter: recordings of both are filtered once.
 
     Raises:
         EstimatorError: a recording has fewer.
@@ -135,10 +136,14 @@ class Problem:
         held: bool = False,
         calibrating: bool = False,
         least: int = 1,
+        like: Problem | None = None,
     ) -> None:
         self.records, self.model, self.bandwidth_hz = records, model, bandwidth_hz
         self.held, self.calibrating = held, calibrating
-        self.signals = [Signals(record, bandwidth_hz) for record in records]
+        known = [] if like is None else list(zip(like.records, like.signals, strict=True))
+        made = [next((s for r, s in known if r is record), None) for record in records]
+        pairs = zip(records, made, strict=True)
+        self.signals: list[Signals] = [s or Signals(record, bandwidth_hz) for record, s in pairs]
         declared = declared_corrections(model)
         self.declared = declared
         self._frames: dict[Corrections, dict[int, Frame]] = {}
@@ -173,7 +178,7 @@ class Problem:
 
     def alike(self, records: Sequence[Record], held: bool = False) -> Problem:
         """Return the same joint and filter with other recordings."""
-        return Problem(records, self.model, self.bandwidth_hz, held, self.calibrating)
+        return Problem(records, self.model, self.bandwidth_hz, held, self.calibrating, like=self)
 
     @property
     def period_s(self) -> float:

@@ -262,7 +262,7 @@ class Stage:
             if self.well and also():
                 return
         document = self.document()
-        kept = {key: document[key] for key in ("state", "conditions", "quality", "nodes")}
+        kept = {key: document[key] for key in ("state", "not_valid", "conditions", "quality", "nodes")}
         raise AssertionError(f"not well again: {kept}")
 
     def forget(self) -> None:

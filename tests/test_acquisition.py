@@ -277,6 +277,19 @@ def test_an_overheard_homing_has_lost_the_zero(writes: list[str], lost: list[boo
     assert found == lost
 
 
+@pytest.mark.parametrize(("silent", "lost"), [(10, False), (11, True)])
+def test_a_node_that_was_not_heard_for_a_while_may_count_from_elsewhere(silent: int, lost: bool) -> None:
+    assembler = Assembler(VSA, 2, active=False, hold_periods=10)
+    run(assembler, [(SYNC, b""), *vsa_cycle(0)])
+    assert not assembler.flags & Status.NODE_RESTARTED  # the first sample is none after a silence
+    run(assembler, [(SYNC, b"")] * silent)
+    found = []
+    for k in range(3):
+        run(assembler, [(SYNC, b""), *vsa_cycle(k)])
+        found.append(bool(assembler.flags & Status.NODE_RESTARTED))
+    assert any(found) == lost and sum(found) <= 1
+
+
 @pytest.mark.parametrize("tpdos", [(TpdoLayout(cob_id=0x183, transmission_type=1, objects=()),), ()])
 def test_a_mapping_that_cannot_be_changes_nothing(tpdos: tuple[TpdoLayout, ...]) -> None:
     assembler = Assembler(VSA, 2)

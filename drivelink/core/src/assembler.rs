@@ -83,7 +83,8 @@ impl Assembler {
     /// `active`: whether we configure the nodes. Then a node that rebooted is believed again when it is started again;
     /// else `trust` alone makes it so. `hold_periods`: how long the last value of a TPDO that is not
     /// sent on SYNC may be used while nothing at all is heard of its node; and how long one that is sent on SYNC may
-    /// fail before a node that we configure is not believed any more, since it may have lost its mapping meanwhile.
+    /// fail before its node may have started anew unheard: positions may count from elsewhere then, and a node that we
+    /// configure is not believed any more.
     /// `period_s`: communication cycle.
     ///
     /// # Errors
@@ -272,8 +273,10 @@ impl Assembler {
         self.missed = None;
         for decoder in self.decoders.iter_mut().filter(|decoder| decoder.needed() && !decoder.arrived) {
             decoder.silent += jump;
-            if self.active && decoder.every > 0 && decoder.silent > self.hold_periods {
-                self.nodes[decoder.node].trusted = false; // nobody knows what it has lived through
+            if decoder.every > 0 && decoder.silent > self.hold_periods {
+                // Nobody knows what it has lived through: its boot-up message may have got lost with its frames.
+                self.restart |= decoder.heard && decoder.silent - jump <= self.hold_periods;
+                self.nodes[decoder.node].trusted &= !self.active;
             }
         }
         if !was_open {

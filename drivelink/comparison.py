@@ -64,18 +64,18 @@ class Comparison:
     units: Units
 
     def residuals(self, side: Side, run: FreeRun) -> tuple[Correlation, Correlation]:
-        """Correlations of the residual of one free run: that of the first motor's last channel."""
+        """Return the correlations of the residual of one free run: that of the first motor's last channel."""
         assert side.record is not None
         return correlations(run, side.record, self.channel(run), 0, run.horizon_s / 4.0)
 
     def channel(self, run: FreeRun) -> int:
-        """The first motor's deflection, or its position where that is rigid."""
+        """Return the first motor's deflection, or its position where that is rigid."""
         return run.channels.index(
             next((c for c in run.channels if c == "motor1_deflection"), run.channels[0])
         )
 
     def curves(self, motor: int) -> dict[str, list[tuple[str, Curve]]]:
-        """Stiffness over deflection and friction over velocity of one motor, of both sides."""
+        """Return the stiffness over deflection and friction over velocity of one motor, of both sides."""
         reach, speed = _ranges([side.record for side in self.sides if side.record is not None], motor)
         phi, velocity = np.linspace(-reach, reach, _POINTS), np.linspace(-speed, speed, _POINTS)
         made: dict[str, list[tuple[str, Curve]]] = {"stiffness": [], "friction": []}
@@ -87,7 +87,7 @@ class Comparison:
         return made
 
     def differences(self) -> list[Difference]:
-        """Of each pair of curves the place where they differ by most standard deviations, or most at all."""
+        """Return where each pair of curves differs by most standard deviations, or most at all."""
         made = []
         for motor in range(len(self.sides[0].model.motors)):
             for kind, curves in self.curves(motor).items():
@@ -100,7 +100,7 @@ class Comparison:
         return made
 
     def as_json(self) -> dict[str, Any]:
-        """What the page says, as numbers."""
+        """Return what the page says, as numbers."""
         document: dict[str, Any] = {"schema": "drivelink.comparison/1"}
         document |= {letter: side.name for letter, side in zip("ab", self.sides, strict=True)}
         document["curves"] = [one._asdict() for one in self.differences()]
@@ -118,7 +118,7 @@ class Comparison:
         return document
 
     def document(self) -> Document:
-        """The page."""
+        """Return the page."""
         about = " · ".join(f"{letter}: {side.name}" for letter, side in zip("AB", self.sides, strict=True))
         sections = [Section("curves", [self._differences()])]
         if self.runs:

@@ -43,7 +43,7 @@ class Curve(NamedTuple):
 def correlations(
     run: FreeRun, record: Record, channel: int, motor: int, longest_s: float
 ) -> tuple[Correlation, Correlation]:
-    """A free run's residual with itself, and with the motor torque that drives it, within its windows.
+    """Correlate a free run's residual with itself, and with the motor torque that drives it, within its windows.
 
     Args:
         run: of that recording.
@@ -90,7 +90,9 @@ def _correlation(first: FloatArray, second: FloatArray, lags: NDArray[np.int64])
 
 
 def stiffness_curve(motor: Motor, deflection_rad: FloatArray) -> Curve | None:
-    """Stiffness of a transmission (N·m/rad) with its covariance's interval; None: it has no parameters."""
+    """Return the stiffness of a transmission (N·m/rad) with its covariance's interval; None:
+    it has no parameters.
+    """
     transmission = motor.transmission
     law = transmission_model(transmission)
     if law is None or not transmission.parameters:
@@ -105,7 +107,7 @@ def stiffness_curve(motor: Motor, deflection_rad: FloatArray) -> Curve | None:
 
 
 def friction_curve(motor: Motor, velocity_rad_s: FloatArray) -> Curve:
-    """Torque of damping and of the effects of the motor's velocity alone (N·m), in steady motion.
+    """Return the torque of damping and of the effects of the motor's velocity alone (N·m), in steady motion.
 
     Its standard deviation is that of the parameters, each moved by its own.
     """

@@ -128,7 +128,7 @@ class EffectType:
         return self.location == "link" or self.channel == "link_position"
 
     def terms(self, c: Coordinates, values: Mapping[str, float]) -> FloatArray:
-        """Its terms over consecutive moments, unweighted.
+        """Return the effect's terms over consecutive moments, unweighted.
 
         Channel "torque": torques; "motor_torque": error of the measured torque, N·m; "deflection" and
         "link_position": error of the reading, rad. Effects with memory start unloaded.
@@ -143,7 +143,7 @@ class EffectType:
         return self._evaluated(self.name, self.coordinates, c, values)
 
     def reaction(self, c: Coordinates, values: Mapping[str, float]) -> FloatArray | None:
-        """Terms that act on the motor beside them, with the same parameters; None: there are none."""
+        """Return the terms that act on the motor beside them, with the same parameters; None: there are none."""
         if self.name != "kinematic_error":
             return None
         return self._evaluated("kinematic_reaction", ("position", "flexibility_torque"), c, values)
@@ -174,7 +174,7 @@ LIBRARY: dict[str, EffectType] = {
 
 
 def elements(effect: Effect) -> tuple[EffectType, list[dict[str, float]]]:
-    """An effect as its type and one set of plain numbers per element.
+    """Return an effect as its type and one set of plain numbers per element.
 
     A parameter given as an array makes a sum of elements, e.g. cogging with two harmonics; plain numbers
     beside it belong to every element. What is left out takes its default.

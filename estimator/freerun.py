@@ -61,7 +61,7 @@ class FreeRun:
 
 
 def nrmse_fit(measured: FloatArray, simulated: FloatArray) -> float:
-    """100 (1 - |y - y_sim| / |y - mean y|) in %; NaN if y does not vary."""
+    """Return 100 (1 - |y - y_sim| / |y - mean y|) in %; NaN if y does not vary."""
     spread = float(np.linalg.norm(measured - np.mean(measured)))
     return 100.0 * (1.0 - float(np.linalg.norm(measured - simulated)) / spread) if spread else np.nan
 
@@ -173,7 +173,7 @@ class _Joint:
         return (*motors, *link, *flexible)
 
     def channels(self, x: FloatArray) -> FloatArray:
-        """Positions and deflections (n, c) of states (n, m + 1)."""
+        """Return the positions and deflections (n, c) of states (n, m + 1)."""
         columns = [x[:, i] for i in range(self.m)]
         if self.model.link is not None and not self.carried:
             columns.append(x[:, -1])
@@ -181,7 +181,7 @@ class _Joint:
         return np.column_stack(columns)
 
     def run(self, rows: NDArray[np.int64]) -> FloatArray:
-        """(size, windows, m + 1) simulated readings of windows of rows (size, windows)."""
+        """Return the (size, windows, m + 1) simulated readings of windows of rows (size, windows)."""
         h = self.record.period_s / _SUBSTEPS
         x, v = self.state[rows[0]].copy(), self.rate[rows[0]].copy()
         out = np.empty((*rows.shape, self.m + 1))

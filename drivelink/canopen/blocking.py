@@ -30,7 +30,7 @@ class FrameBus(Protocol):
         """Send a frame."""
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """The next frame, or None after the timeout."""
+        """Return the next frame, or None after the timeout."""
 
 
 def sender(bus: FrameBus) -> Callable[[int, bytes], None]:
@@ -98,12 +98,12 @@ def frames(bus: FrameBus, seconds: float, idle: Idle | None = None) -> Iterator[
 
 
 def is_canopen(message: can.Message) -> bool:
-    """Whether it is a data frame with an 11-bit identifier."""
+    """Return whether it is a data frame with an 11-bit identifier."""
     return not (message.is_extended_id or message.is_error_frame or message.is_remote_frame)
 
 
 def receive(bus: FrameBus, timeout_s: float) -> can.Message | None:
-    """The next frame, or None after the timeout.
+    """Return the next frame, or None after the timeout.
 
     Raises:
         BusError: the bus fails.

@@ -59,7 +59,7 @@ class Configurator:
         return tuple(self._roles)
 
     def program(self, node: int, *, start: bool, stopped: bool = False) -> Program[NodeLayout]:
-        """The SDO program that configures a node; a stopped node is woken first."""
+        """Return the SDO program that configures a node; a stopped node is woken first."""
         taken = {
             tpdo.cob_id
             for other, layout in self.layouts.items()
@@ -123,7 +123,7 @@ class Configurator:
         self._broken[node] = DriveError(f"node {node}: {type(error).__name__} in its configuration: {error}")
 
     def load(self) -> BusLoad:
-        """Bus load of all configured nodes."""
+        """Return the bus load of all configured nodes."""
         return bus_load(self.layouts.values(), self.bus)
 
 

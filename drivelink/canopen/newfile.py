@@ -73,7 +73,7 @@ class Answers:
 
 
 def joint_text(answers: Answers) -> str:
-    """The text of the file, validated.
+    """Return the text of the file, validated.
 
     Raises:
         JointFileError: an answer is invalid.

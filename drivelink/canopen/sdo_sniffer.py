@@ -181,7 +181,7 @@ class SdoSniffer:
 
 
 def written_object(data: bytes) -> Address | None:
-    """The object that a frame of the master begins to write."""
+    """Return the object that a frame of the master begins to write."""
     begins = len(data) == 8 and (data[0] >> 5 == _DOWNLOAD or data[0] & 0xE1 == _BLOCK_DOWNLOAD << 5)
     return _address(data) if begins else None
 

@@ -91,7 +91,7 @@ class Verb(Protocol):
 
 
 def make_parser(verbs: list[str]) -> argparse.ArgumentParser:
-    """The parser; only the modules of the given verbs are imported and configured."""
+    """Return the parser; only the modules of the given verbs are imported and configured."""
     parser = argparse.ArgumentParser(
         prog="drivelink",
         description=sys.modules["drivelink"].__doc__,
@@ -232,7 +232,7 @@ def add_bus(parser: argparse.ArgumentParser) -> None:
 
 
 def moved(joint: JointFile, args: argparse.Namespace) -> JointFile:
-    """The joint on the interface and channel of the command line."""
+    """Return the joint on the interface and channel of the command line."""
     return joint.model_copy(update={"bus": joint.bus.moved(args.interface, args.channel)})
 
 

@@ -65,7 +65,7 @@ class FrameSource(Protocol):
         """Wait for a frame; return whether there is one."""
 
     def take(self) -> list[CanFrame]:
-        """The received data frames with 11-bit identifiers, in order."""
+        """Return the received data frames with 11-bit identifiers, in order."""
 
     def send(self, cob_id: int, data: bytes) -> None:
         """Send a frame; a full transmit queue is counted, not raised."""

@@ -85,7 +85,7 @@ class RecentSamples:
         self._samples.append(sample)
 
     def after(self, sequence: int, most: int) -> list[Sample]:
-        """Those after a SYNC, oldest first, at most so many."""
+        """Return the samples after a SYNC, oldest first, at most so many."""
         return list(islice((sample for sample in self._samples if sample.sequence > sequence), most))
 
 
@@ -130,7 +130,7 @@ class ObjectCheck:
                 assembler.contradict(node_id, False)
 
     def objects(self, node: int) -> list[Address]:
-        """What can be asked of a node: values, then units."""
+        """Return what can be asked of a node: values, then units."""
         return [*self._nodes[node].values, *self._nodes[node].units]
 
     def request(self, node: int, data: bytes, now_s: float) -> None:
@@ -145,11 +145,11 @@ class ObjectCheck:
             self._nodes[node].sniffer.response(data, now_s)
 
     def undecided(self, node: int, address: Address) -> bool:
-        """Whether an answer waits for the cycles that it is compared with."""
+        """Return whether an answer waits for the cycles that it is compared with."""
         return any(answer.address == address for answer in self._nodes[node].answers)
 
     def doubts(self, node: int, address: Address) -> int:
-        """Answers in a row that contradict what is in use."""
+        """Count answers in a row that contradict what is in use."""
         return self._nodes[node].doubts[address]
 
     def sync(self) -> list[Mismatch]:
@@ -168,7 +168,9 @@ class ObjectCheck:
         return found
 
     def contradiction(self, assembler: Assembler) -> tuple[int, Mismatch] | None:
-        """A motor (0: the link) of a joint whose frames carry something else than it says, and what."""
+        """Return a motor (0: the link) of a joint whose frames carry something else than it
+        says, and what.
+        """
         for node in self._nodes.values():
             if node.assembler is assembler and node.found is not None:
                 return node.motor, node.found

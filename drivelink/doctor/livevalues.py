@@ -82,7 +82,7 @@ class Asked:
         }
 
     def program(self, seconds: float) -> Program[Readings]:
-        """The readings of so many seconds, of the channels that have a value in every turn."""
+        """Return the readings of so many seconds, of the channels that have a value in every turn."""
         clock, turns = self._clock, 0
         found: dict[Channel, Series] = {channel: Series() for channel in self._counters}
         end_s = clock() + seconds
@@ -110,7 +110,7 @@ class _Unwrapped:
         self._total = 0
 
     def take(self, data: bytes) -> float:
-        """The SI value of the bytes."""
+        """Return the SI value of the bytes."""
         data = data[: max(1, self._candidate.bits // 8)]
         count = int.from_bytes(data, "little", signed=self._candidate.signed)
         if self._candidate.wraps:
@@ -157,7 +157,7 @@ class Heard:
             self._samples += [sample for sample, _ in made]
 
     def readings(self) -> Readings:
-        """What was heard since the last call, of the channels that have every value."""
+        """Return what was heard since the last call, of the channels that have every value."""
         self._keep(self._frames.rest())
         samples, self._samples = self._samples, []
         motors = range(len(samples[0].motor_position_rad) if samples else 0)
@@ -171,14 +171,14 @@ class Heard:
         return {channel: Series(times, each, [0.0] * len(each)) for channel, each in heard.items()}
 
     def listen(self, bus: SilentBus, seconds: float) -> Readings:
-        """What is heard in the next seconds."""
+        """Return what is heard in the next seconds."""
         self.readings()
         listen(bus, seconds, self.take)
         return self.readings()
 
 
 def record_of(readings: Readings, motors: int, linked: bool) -> Record | None:
-    """Channels, each read at its own times, as a recording with one period.
+    """Return the channels, each read at its own times, as a recording with one period.
 
     Slow answers are omitted because their time is uncertain. Several turns without an answer make a gap, a
     long stall ends the recording.

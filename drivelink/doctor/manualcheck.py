@@ -37,7 +37,7 @@ class _Axis(NamedTuple):
     known: str  # formula for a push
 
     def shown(self, value: float) -> str:
-        """An amount in the everyday unit and in SI."""
+        """Return an amount in the everyday unit and in SI."""
         return f"{value / self.everyday:+.4g}{self.unit} ({value:+.3g})"
 
 
@@ -75,7 +75,7 @@ class Values(Protocol):
     """Source of the channels' values."""
 
     def read(self, seconds: float) -> Mapping[str, Value]:
-        """Values over the next seconds: "motor1_position", "motor1_torque", …, "link_position"."""
+        """Return the values over the next seconds: "motor1_position", "motor1_torque", …, "link_position"."""
 
 
 class Person(Protocol):
@@ -130,7 +130,7 @@ class ByHand:
         return all(checked) if checked else None
 
     def as_dict(self) -> dict[str, Any]:
-        """For `--json`."""
+        """Return the document for `--json`."""
         return {
             "schema": "drivelink.doctor.move/1",
             "good": self.good,

@@ -75,7 +75,7 @@ def _say_judgement(section: Section, joint: JointFile, judgement: Judgement, rec
 
 
 def slope(x: Sequence[float], y: Sequence[float]) -> float:
-    """Least-squares factor k of y = k x."""
+    """Return the least-squares factor k of y = k x."""
     square = sum(a * a for a in x)
     return sum(a * b for a, b in zip(x, y, strict=True)) / square if square else 0.0
 

@@ -77,7 +77,7 @@ def write(outcome: Diagnosis, title: Title, folder: Path) -> list[Path]:
 
 
 def as_json(outcome: Diagnosis) -> dict[str, Any]:
-    """The content of report.json."""
+    """Return the content of report.json."""
     unlisted = _curve_of_unlisted(outcome)
     return {
         "schema": _SCHEMA,
@@ -135,7 +135,7 @@ def _points(curve: Curve) -> dict[str, list[float]]:
 
 
 def sentence(outcome: Diagnosis) -> str:
-    """The verdict in one sentence."""
+    """Return the verdict in one sentence."""
     lower = outcome.validation.after_rms_nm <= outcome.validation.before_rms_nm
     fall = (
         f"the torque balance's error on held-out data {'falls' if lower else 'rises'} from "
@@ -162,7 +162,7 @@ def sentence(outcome: Diagnosis) -> str:
 
 
 def lacks(outcome: Diagnosis) -> str:
-    """What is missing, said as surely as it is known."""
+    """Return what is missing, said as surely as it is known."""
     sure = [title_of(f, outcome) for f in outcome.effects if f.probability >= _SURE]
     likely = [
         f"{title_of(f, outcome)} ({f.probability:.2f})" + (f", else {others_of(f)}" if f.alternatives else "")
@@ -183,7 +183,7 @@ def lacks(outcome: Diagnosis) -> str:
 
 
 def unexplained(outcome: Diagnosis, units: Units | None = None) -> str:
-    """The remaining error in one sentence."""
+    """Return the remaining error in one sentence."""
     unit = (units or Units(False)).shown("N·m")
     left = outcome.validation
     text = f"{left.after_relative:.2%} of the torque ({left.after_rms_nm:.3g} {unit} rms) stays unexplained"
@@ -195,14 +195,14 @@ def unexplained(outcome: Diagnosis, units: Units | None = None) -> str:
 
 
 def title_of(finding: Finding, outcome: Diagnosis) -> str:
-    """An effect in words, with its place."""
+    """Return an effect in words, with its place."""
     if finding.name == "unlisted":
         return f"an unlisted effect at the {_place(finding, outcome)}"
     return f"{in_words(finding.name)} ({_place(finding, outcome)})"
 
 
 def others_of(finding: Finding) -> str:
-    """Alternatives of an effect, with their probabilities."""
+    """Return the alternatives of an effect, with their probabilities."""
     pairs = zip(finding.alternatives, finding.alternative_probabilities, strict=True)
     return ", ".join(f"{in_words(name)} ({p:.2f})" for name, p in pairs)
 

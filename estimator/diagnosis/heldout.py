@@ -114,7 +114,9 @@ class Held:
         return bool(np.mean(gain) > np.std(gain, ddof=1) / np.sqrt(len(gain)))
 
     def alike(self, found: Fitted, other: Fitted) -> bool:
-        """Whether held-out data cannot tell another model from the one found; fitted alike well, too."""
+        """Return whether held-out data cannot tell another model from the one found; fitted
+        alike well, too.
+        """
         square = [residual_of(self.problem, one, self.problem.used).square for one in (found, other)]
         if square[1] - square[0] > (choice("floor") * self.problem.torque_rms) ** 2:
             return False

@@ -43,7 +43,7 @@ class Curve(NamedTuple):
 def correlations(
     run: FreeRun, record: Record, channel: int, motor: int, longest_s: float
 ) -> tuple[Correlation, Correlation]:
-    """Correlate a free run's residual with itself, and with the motor torque that drives it, within its windows.
+    """Correlate a free run's residual with itself and with the motor torque, within its windows.
 
     Args:
         run: of that recording.

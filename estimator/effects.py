@@ -143,7 +143,7 @@ class EffectType:
         return self._evaluated(self.name, self.coordinates, c, values)
 
     def reaction(self, c: Coordinates, values: Mapping[str, float]) -> FloatArray | None:
-        """Return the terms that act on the motor beside them, with the same parameters; None: there are none."""
+        """Return the terms that act on the motor beside them, with the same parameters; None: none."""
         if self.name != "kinematic_error":
             return None
         return self._evaluated("kinematic_reaction", ("position", "flexibility_torque"), c, values)

@@ -12,8 +12,10 @@ from pathlib import Path
 import can
 import pytest
 
+from drivelink.canopen.layout import Signal
 from drivelink.cli import main
 from drivelink.demo.simulate import network_from_joint
+from drivelink.doctor.livevalues import LiveValues, Readings, Series
 from drivelink.doctor.manualcheck import ByHand, Value, check_by_hand
 from drivelink.jointfile import JointFile, load, parse
 
@@ -270,6 +272,30 @@ def test_the_command_leads_through_the_steps_and_says_what_was_not_checked(
     )
     assert "· motor 1 position, sign: did not follow" in said
     assert "0 checked and right" in said
+
+
+def test_a_reading_that_stands_still_is_as_uncertain_as_its_count() -> None:
+    def collect(seconds: float) -> Readings:
+        return {(Signal.MOTOR_TORQUE, 0): Series([0.0, 0.1], [0.24, 0.24], [0.0, 0.0], step=0.12)}
+
+    read = LiveValues(collect).read(0.1)["motor1_torque"]
+    assert read.mean == 0.24 and read.std == pytest.approx(0.12 / math.sqrt(12.0))
+
+
+def test_a_torque_that_moves_by_two_counts_is_no_reaction_to_a_push() -> None:
+    class Rounded(HandMovedJoint):
+        def read(self, seconds: float) -> Mapping[str, Value]:
+            step = 0.12
+            return {
+                name: Value(value.mean, step / math.sqrt(12.0))
+                for name, value in super().read(seconds).items()
+            }
+
+    rig = Rounded({})
+    rig.push = 0.24
+    done = check_by_hand(joint(), rig, rig)
+    (mark,) = (mark for mark in done.marks if mark.channel == "motor1_torque")
+    assert mark.good is None and "no reaction" in mark.text and "motor1_torque" not in done.needed
 
 
 def test_the_command_s_json_is_alone_on_stdout(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:

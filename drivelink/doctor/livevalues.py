@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -51,11 +52,13 @@ class Series:
         times_s: of each value; for an answer, halfway between it and its request.
         values: SI at the joint side.
         waits_s: from request to answer; 0: heard.
+        step: of the values, as the device counts them.
     """
 
     times_s: list[float] = field(default_factory=list)
     values: list[float] = field(default_factory=list)
     waits_s: list[float] = field(default_factory=list)
+    step: float = 0.0
 
 
 Readings = Mapping[Channel, Series]
@@ -84,7 +87,9 @@ class Asked:
     def program(self, seconds: float) -> Program[Readings]:
         """Return the readings of so many seconds, of the channels that have a value in every turn."""
         clock, turns = self._clock, 0
-        found: dict[Channel, Series] = {channel: Series() for channel in self._counters}
+        found: dict[Channel, Series] = {
+            channel: Series(step=counter.step) for channel, (_, counter) in self._counters.items()
+        }
         end_s = clock() + seconds
         while clock() < end_s and self._counters:
             turns += 1
@@ -105,7 +110,7 @@ class _Unwrapped:
 
     def __init__(self, candidate: MappedObject) -> None:
         self._candidate = candidate
-        self.address = candidate.address
+        self.address, self.step = candidate.address, abs(candidate.scale)
         self._last: int | None = None
         self._total = 0
 
@@ -132,7 +137,7 @@ class Heard:
     """
 
     def __init__(self, joint: JointFile, configurator: PassiveConfigurator) -> None:
-        self._frames = FrameSamples(joint, configurator)
+        self._frames, self._configurator = FrameSamples(joint, configurator), configurator
         self._samples: list[Sample] = []
 
     @property
@@ -168,7 +173,16 @@ class Heard:
         values[Signal.LINK_POSITION, None] = [sample.link_position_rad for sample in samples]
         times = [sample.sequence * self.joint.bus.period_s for sample in samples]
         heard = {channel: each for channel, each in values.items() if each and np.all(np.isfinite(each))}
-        return {channel: Series(times, each, [0.0] * len(each)) for channel, each in heard.items()}
+        steps: dict[Channel, float] = {
+            (one.signal, None if one.signal is Signal.LINK_POSITION else layout.motor): abs(one.scale)
+            for layout in self._configurator.layouts.values()
+            for tpdo in layout.tpdos
+            for one in tpdo.objects
+        }
+        return {
+            channel: Series(times, each, [0.0] * len(each), steps.get(channel, 0.0))
+            for channel, each in heard.items()
+        }
 
     def listen(self, bus: SilentBus, seconds: float) -> Readings:
         """Return what is heard in the next seconds."""
@@ -254,7 +268,8 @@ class LiveValues:
         for (signal, motor), series in self._collect(seconds).items():
             name = "link_position" if motor is None else f"motor{motor + 1}_{_NAMES.get(signal, '')}"
             if motor is None or signal in _NAMES:
-                found[name] = Value(float(np.mean(series.values)), float(np.std(series.values)))
+                std = math.hypot(float(np.std(series.values)), series.step / math.sqrt(12.0))
+                found[name] = Value(float(np.mean(series.values)), std)
         return found
 
 

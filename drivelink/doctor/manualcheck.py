@@ -20,7 +20,7 @@ _STILL = 0.1  # of the requested motion: a channel that moves less did not follo
 _BY_EYE = 0.15  # relative accuracy of an angle turned by eye
 _FRICTION = 2.0  # factor: uncertainty of a torque by friction in the gear and a push by hand
 _GEARED = 3.0  # ratios closer to one than this are a scale error, not a gear
-_SIGMAS = 5.0  # standard deviations of the torque's noise that a push has to exceed
+_SIGMAS = 5.0  # standard deviations of a difference of two torques that a push has to exceed
 _AMOUNT = re.compile(r"([+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*(\D*)", re.ASCII)  # number, unit
 
 
@@ -65,7 +65,7 @@ _LINEAR = _Axis(
 
 
 class Value(NamedTuple):
-    """One channel over a short while: mean and standard deviation, SI at the joint side."""
+    """One channel over a short while: mean and standard deviation with rounding, SI at the joint side."""
 
     mean: float
     std: float
@@ -254,7 +254,8 @@ class _Steps:
                 unread = True
                 continue
             change = after[channel].mean - before[channel].mean
-            if abs(change) < max(_SIGMAS * before[channel].std, 1e-12):
+            noise = math.sqrt(2.0) * before[channel].std
+            if abs(change) < max(_SIGMAS * noise, 1e-12):
                 text = f"no reaction ({change:+.3g} {unit}): does the drive hold?"
                 self._mark(channel, "sign", None, text)
                 continue

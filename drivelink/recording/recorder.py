@@ -200,7 +200,6 @@ class BusTap:
         self._gate = gate or FirstSource(sink)
         self._source = open_source(bus)
         self._sink = sink
-        self._joint = joint
         self._samples: FrameSamples | None = None
         if base_dir is not None:
             listener = PassiveConfigurator([joint], [base_dir])

@@ -36,8 +36,7 @@ def moved(seconds, kp=KP, hand_rad=0.02):
 
     plants = joints.Plants(
         *joints.polynomial(np.array([[[K]]])),
-        *(np.array([[x]]) for x in (B, D)),
-        *(np.array([x]) for x in (M, 0.0, 0.0)),
+        *(B, D, M, 0.0, 0.0),
         more=hand_and_friction,
         memories=1,
     )

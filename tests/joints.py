@@ -77,7 +77,7 @@ More = Callable[[float, Array, Array, Array], None]
 
 @dataclass
 class Plants:
-    """N joints with m motors; every array broadcasts against (N, m) or (N,).
+    """N joints with m motors; every number or array broadcasts against (N, m) or (N,).
 
     `more(t, state, rate, tau)` adds further physics to the rate of the state (theta, theta', q, q'), and sets
     that of its memories behind them.
@@ -85,11 +85,11 @@ class Plants:
 
     torque: Callable[[Array], Array]
     stiffness: Callable[[Array], Array]
-    B: Array
-    D: Array
-    M: Array
-    Dq: Array
-    gravity: Array
+    B: Array | float
+    D: Array | float
+    M: Array | float
+    Dq: Array | float
+    gravity: Array | float
     coulomb: Array = field(default_factory=lambda: np.zeros(1))
     scale_at: tuple[float, float] = (np.inf, 1.0)  # (time, factor): a step of the stiffness
     more: More | None = None
@@ -207,7 +207,7 @@ def record(
 
 
 def sweep(
-    rng: np.random.Generator, n: int, N: int, m: int, period_s: float, size: Array, top_hz: float
+    rng: np.random.Generator, n: int, N: int, m: int, period_s: float, size: Array | float, top_hz: float
 ) -> Array:
     """Rich excitation: a sum of sines from 0.2 Hz to top_hz with random phases, (n, N, m)."""
     t = np.arange(n)[:, None, None] * period_s

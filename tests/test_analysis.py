@@ -35,10 +35,10 @@ def joint(**motor: object) -> JointModel:
 
 @cache
 def run(seconds: float = 2.5) -> Record:
-    torque, stiffness = polynomial(np.full((1, 1, 1), 8.0))
+    torque, stiffness = polynomial(np.array([[[8.0]]]))
     plants = Plants(
-        torque, stiffness, B=np.full((1, 1), 0.02), D=np.full((1, 1), 0.05), M=np.full(1, 0.04),
-        Dq=np.full(1, 0.01), gravity=np.full(1, 0.6), coulomb=np.full((1, 1), 0.05),
+        torque, stiffness, B=0.02, D=0.05, M=0.04,
+        Dq=0.01, gravity=0.6, coulomb=0.05,
     )  # fmt: skip
     t = np.arange(round(seconds / PERIOD_S)) * PERIOD_S
     tau = 0.7 * np.sin(2 * np.pi * 0.9 * t) + 0.5 * np.sin(2 * np.pi * 2.3 * t + 1.0)

@@ -18,9 +18,8 @@ HIGHER = tuple(
 def rig():
     rng = np.random.default_rng(5)
     torque, stiffness = joints.polynomial(np.array([[CURVE]]))
-    one = np.ones((1, 1))
-    plants = joints.Plants(torque, stiffness, 0.12 * one, 0.8 * one, one[0] * 0.45, one[0] * 0.3, one[0] * 5)
-    tau = joints.sweep(rng, 9000, 1, 1, T, np.full((1, 1, 1), 10.0), 3.0)
+    plants = joints.Plants(torque, stiffness, 0.12, 0.8, 0.45, 0.3, 5.0)
+    tau = joints.sweep(rng, 9000, 1, 1, T, 10.0, 3.0)
     truth = joints.simulate(plants, tau, T)
     return truth, joints.record(truth, 0, T, motor_counts=16384 * 8, link_bits=18)
 

@@ -28,8 +28,8 @@ def elbow():
     alpha = np.stack([K, K * rng.uniform(2, 15, (N, 1))], axis=-1)
     torque, stiffness = joints.polynomial(alpha)
     B, D = rng.uniform(0.08, 0.2, (N, 1)), rng.uniform(0.4, 1.2, (N, 1))
-    plants = joints.Plants(torque, stiffness, B, D, np.full(N, 0.45), np.full(N, 0.2), np.full(N, 5.0))
-    truth = joints.simulate(plants, joints.sweep(rng, n, N, 1, T, np.full((1, N, 1), 8.0), 3.0), T)
+    plants = joints.Plants(torque, stiffness, B, D, 0.45, 0.2, 5.0)
+    truth = joints.simulate(plants, joints.sweep(rng, n, N, 1, T, 8.0, 3.0), T)
     return plants, alpha[:, 0], truth
 
 
@@ -93,10 +93,9 @@ def test_an_exponential_spring_is_found_from_nothing_in_batch_and_on_line(b):
     plants = joints.Plants(
         lambda phi: np.sign(phi) * 150.0 / b * np.expm1(b * np.abs(phi)),
         lambda phi: 150.0 * np.exp(b * np.abs(phi)),
-        *(np.array([[value]]) for value in (0.1, 0.5)),
-        *(np.array([value]) for value in (0.45, 0.3, 5.0)),
+        *(0.1, 0.5, 0.45, 0.3, 5.0),
     )
-    truth = joints.simulate(plants, joints.sweep(rng, n, 1, 1, T, np.full((1, 1, 1), 6.0), 3.0), T)
+    truth = joints.simulate(plants, joints.sweep(rng, n, 1, 1, T, 6.0, 3.0), T)
     record = _record(truth, 0)
     model = joints.joint_model(0.1, 0.5, model="exponential", order=None)
     (found,) = fit(record, model)
@@ -219,8 +218,8 @@ def wrist():
     alpha = np.stack([K, K * rng.uniform(0, 1.5e4, (N, 1))], axis=-1)
     torque, stiffness = joints.polynomial(alpha)
     B, D = rng.uniform(0.4, 1.2, (N, 1)), rng.uniform(2, 8, (N, 1))
-    plants = joints.Plants(torque, stiffness, B, D, np.full(N, 1.5), np.full(N, 2.0), np.full(N, 20.0))
-    truth = joints.simulate(plants, joints.sweep(rng, n, N, 1, T, np.full((1, N, 1), 30.0), 1.5), T)
+    plants = joints.Plants(torque, stiffness, B, D, 1.5, 2.0, 20.0)
+    truth = joints.simulate(plants, joints.sweep(rng, n, N, 1, T, 30.0, 1.5), T)
     return plants, truth
 
 
@@ -241,18 +240,16 @@ def test_no_delay_is_made_of_noise_and_one_that_is_there_has_an_honest_interval(
     assert np.sqrt(np.mean(np.square(z))) < 2.0
 
 
-def test_what_the_motion_does_not_reveal_of_units_and_signs_is_said(monkeypatch):
-    monkeypatch.setattr(kit, "SECONDS", 6.0)
-    (gentle,), (rich,) = kit.World([{}], slow=True).run(), kit.World([{}]).run()
+def test_what_the_motion_does_not_reveal_of_units_and_signs_is_said():
+    (gentle,), (rich,) = (kit.World([{}], slow=slow, seconds=6.0).run() for slow in (True, False))
     unrevealed = "this motion does not reveal the unit of the positions"
     assert judge(gentle, kit.model()).remark.startswith(unrevealed)
     assert "does not reveal" not in judge(rich, kit.model()).remark
 
 
-def test_what_is_left_shows_friction_as_a_step_and_hysteresis_as_a_loop(monkeypatch, tmp_path):
-    monkeypatch.setattr(kit, "SECONDS", 8.0)
+def test_what_is_left_shows_friction_as_a_step_and_hysteresis_as_a_loop(tmp_path):
     effects = [{"coulomb_nm": 0.5}, {"hysteresis_nm": 1.0, "hysteresis_rad": 0.01}]
-    (stuck,), (looping,) = (fit(record, kit.model()) for record in kit.World(effects).run())
+    (stuck,), (looping,) = (fit(record, kit.model()) for record in kit.World(effects, seconds=8.0).run())
     step = [np.median(stuck.unexplained_nm[side * stuck.velocity_rad_s > 0.3]) for side in (1, -1)]
     assert step == pytest.approx([-0.5, 0.5], abs=0.05)
     directions = (looping.deflection_rate_rad_s > 0.0, looping.deflection_rate_rad_s < 0.0)

@@ -135,8 +135,7 @@ def test_units_and_signs_are_checked_before_anything_else(
 def test_a_recording_larger_than_the_memory_is_cut_into_parts(
     joints: Joints, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(kit, "SECONDS", 12.0)
-    (record,) = kit.World([{}]).run()
+    (record,) = kit.World([{}], seconds=12.0).run()
     path = fleetkit.write_csv(record, tmp_path / "elbow.csv")
     monkeypatch.setattr(pieces, "_BASE_BYTES", 0)
     monkeypatch.setattr(pieces, "_LEAST_BYTES", 0)

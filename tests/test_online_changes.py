@@ -29,11 +29,10 @@ def run(seconds, *, scale_at=(np.inf, 1.0), coulomb=0.0, seed=11):
     K = rng.uniform(80, 220, (N, 1))
     alpha = np.stack([K, K * rng.uniform(10, 60, (N, 1))], axis=-1)
     B, D = rng.uniform(0.08, 0.2, (N, 1)), rng.uniform(0.4, 1.2, (N, 1))
-    M, Dq, gravity = np.full(N, 0.45), np.full(N, 0.3), np.full(N, 3.0)
     plants = joints.Plants(
-        *joints.polynomial(alpha), B, D, M, Dq, gravity, coulomb=coulomb, scale_at=scale_at
+        *joints.polynomial(alpha), B, D, 0.45, 0.3, 3.0, coulomb=coulomb, scale_at=scale_at
     )
-    truth = joints.simulate(plants, joints.sweep(rng, n, N, 1, T, np.full((1, N, 1), 7.0), 3.0), T)
+    truth = joints.simulate(plants, joints.sweep(rng, n, N, 1, T, 7.0, 3.0), T)
     estimates = []
     for j in range(N):
         record = joints.record(
@@ -115,11 +114,8 @@ def test_a_measured_curve_is_a_model_too():
         rng = np.random.default_rng(4)
         n = 6000
         alpha = 1.15 * np.array([[[100.0, 400.0]]])
-        B, D = np.full((1, 1), 0.12), np.full((1, 1), 0.8)
-        plants = joints.Plants(
-            *joints.polynomial(alpha), B, D, np.full(1, 0.45), np.full(1, 0.3), np.full(1, 3.0)
-        )
-        truth = joints.simulate(plants, joints.sweep(rng, n, 1, 1, T, np.full((1, 1, 1), 7.0), 3.0), T)
+        plants = joints.Plants(*joints.polynomial(alpha), 0.12, 0.8, 0.45, 0.3, 3.0)
+        truth = joints.simulate(plants, joints.sweep(rng, n, 1, 1, T, 7.0, 3.0), T)
         record = joints.record(truth, 0, T, motor_counts=16384, link_bits=18, velocity_rad_s=None)
         transmission = Transmission(model=name, parameters={"k_nm_rad": 1.0})
         motor = Motor(inertia_kg_m2=0.12, viscous_damping_nm_s_rad=0.8, transmission=transmission)

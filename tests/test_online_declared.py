@@ -67,16 +67,8 @@ def registered():
 def moved(model):
     """The joint in motion, with deflections that every declaration's domain holds."""
     torque, stiffness, _ = SPRINGS[model]
-    plants = joints.Plants(
-        torque,
-        stiffness,
-        np.array([[B]]),
-        np.array([[D]]),
-        np.array([0.45]),
-        np.array([0.3]),
-        np.array([3.0]),
-    )
-    size = np.full((1, 1, 1), 4.0 if model == "vsa-ii" else 8.0)
+    plants = joints.Plants(torque, stiffness, B, D, 0.45, 0.3, 3.0)
+    size = 4.0 if model == "vsa-ii" else 8.0
     tau = joints.sweep(np.random.default_rng(3), N, 1, 1, T, size, 3.0)
     return joints.simulate(plants, tau, T)
 

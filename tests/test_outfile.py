@@ -210,14 +210,8 @@ def test_a_full_disk_cuts_a_recording_at_a_whole_block(folder: Path) -> None:
 def data(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """Eight seconds of a linear joint, as CSV."""
     rng = np.random.default_rng(5)
-    torque, stiffness = joints.polynomial(np.full((1, 1, 1), 100.0))
-    plants = joints.Plants(
-        torque,
-        stiffness,
-        *(np.full((1, 1), x) for x in (0.5, 0.8)),
-        *(np.full(1, x) for x in (0.4, 0.2, 5.0)),
-    )
-    truth = joints.simulate(plants, joints.sweep(rng, 8000, 1, 1, 0.001, np.full((1, 1, 1), 8.0), 3.0), 0.001)
+    plants = joints.Plants(*joints.polynomial(np.array([[[100.0]]])), 0.5, 0.8, 0.4, 0.2, 5.0)
+    truth = joints.simulate(plants, joints.sweep(rng, 8000, 1, 1, 0.001, 8.0, 3.0), 0.001)
     record = joints.record(truth, 0, 0.001)
     table = np.column_stack(
         (

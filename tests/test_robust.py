@@ -23,16 +23,8 @@ class RecordedJoint:
         self.alpha = np.stack([K, K * rng.uniform(2, 12, (N, 1))], axis=-1)
         torque, stiffness = joints.polynomial(self.alpha)
         self.B, self.D = rng.uniform(0.08, 0.2, (N, 1)), rng.uniform(0.4, 1.2, (N, 1))
-        plants = joints.Plants(
-            torque,
-            stiffness,
-            self.B,
-            self.D,
-            np.full(N, 0.45),
-            np.full(N, 0.3),
-            np.full(N, 5.0),
-        )
-        tau = joints.sweep(rng, n, N, 1, T, np.full((1, N, 1), 8.0), 3.0)
+        plants = joints.Plants(torque, stiffness, self.B, self.D, 0.45, 0.3, 5.0)
+        tau = joints.sweep(rng, n, N, 1, T, 8.0, 3.0)
         tau[np.arange(n) * T >= rest_at] = 0.0
         self.truth = joints.simulate(plants, tau, T)
 
@@ -119,8 +111,8 @@ def test_the_first_reversal_of_a_motion_is_no_change(seed):
     K = rng.uniform(80, 220, (N, 1))
     torque, stiffness = joints.polynomial(np.stack([K, 5 * K], axis=-1))
     B, D = rng.uniform(0.08, 0.2, (N, 1)), rng.uniform(0.8, 1.2, (N, 1))
-    plants = joints.Plants(torque, stiffness, B, D, np.full(N, 0.45), np.full(N, 0.3), np.zeros(N))
-    tau = joints.sweep(rng, n, N, 1, T, np.full((1, N, 1), 3.0), 3.0)
+    plants = joints.Plants(torque, stiffness, B, D, 0.45, 0.3, 0.0)
+    tau = joints.sweep(rng, n, N, 1, T, 3.0, 3.0)
     tau += np.where(np.arange(n) < reversal, 10.0, -10.0)[:, None, None]
     truth = joints.simulate(plants, tau, T)
     assert np.all(truth.omega[600:reversal] > 0) and np.all(truth.omega[-1] < 0)
@@ -247,7 +239,7 @@ def test_vsa_ii_is_found_from_nothing_on_both_sides():
     t = np.arange(n) * T
     torque, stiffness = joints.vsa_ii(np.array(0.5), np.array(1.75))
     B = np.full((1, 2), 0.02)
-    plants = joints.Plants(torque, stiffness, B, B, np.full(1, 0.05), np.full(1, 0.01), np.zeros(1))
+    plants = joints.Plants(torque, stiffness, B, B, 0.05, 0.01, 0.0)
     tau = np.zeros((n, 1, 2))
     tau[:, 0, 0] = 0.06 * np.sin(2 * np.pi * 0.5 * t) + 0.05 * np.sin(2 * np.pi * 1.3 * t)
     tau[:, 0, 1] = 0.06 * np.sin(2 * np.pi * 0.7 * t) - 0.05 * np.sin(2 * np.pi * 1.7 * t)
@@ -273,8 +265,8 @@ def test_what_a_nonlinear_model_is_declared_with_does_not_matter_after_some_seco
     k, c = rng.uniform(300, 700, (N, 1)), rng.uniform(1.5, 1.9, (N, 1))
     torque, stiffness = joints.vsa_ii(k, c)
     B, D = rng.uniform(0.08, 0.2, (N, 1)), rng.uniform(0.4, 1.2, (N, 1))
-    plants = joints.Plants(torque, stiffness, B, D, np.full(N, 0.45), np.full(N, 0.3), np.full(N, 3.0))
-    truth = joints.simulate(plants, joints.sweep(rng, n, N, 1, T, np.full((1, N, 1), 8.0), 3.0), T)
+    plants = joints.Plants(torque, stiffness, B, D, 0.45, 0.3, 3.0)
+    truth = joints.simulate(plants, joints.sweep(rng, n, N, 1, T, 8.0, 3.0), T)
     late = slice(8000, None)
     inside = []
     for j in range(N):

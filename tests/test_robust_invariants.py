@@ -24,10 +24,8 @@ def rigs(stiff):
     B, D = rng.uniform(0.08, 0.2, (N, 1)), rng.uniform(0.4, 1.2, (N, 1))
     scale = 6.0 if stiff else 1.0
     M, Dq, gravity, size = (1.5, 2.0, 20.0, 40.0) if stiff else (0.45, 0.3, 5.0, 8.0)
-    plants = joints.Plants(
-        *joints.polynomial(alpha), scale * B, scale * D, np.full(N, M), np.full(N, Dq), np.full(N, gravity)
-    )
-    tau = joints.sweep(rng, 7000, N, 1, T, np.full((1, N, 1), size), 3.0)
+    plants = joints.Plants(*joints.polynomial(alpha), scale * B, scale * D, M, Dq, gravity)
+    tau = joints.sweep(rng, 7000, N, 1, T, size, 3.0)
     return plants, joints.simulate(plants, tau, T)
 
 

@@ -107,11 +107,8 @@ def test_a_registered_model_with_two_shape_parameters_is_estimated_on_line(quint
     rng = np.random.default_rng(1)
     n, T = 4500, 1e-3
     torque, stiffness = joints.polynomial(150.0 * np.array([[[1.0, 20.0, 100.0]]]))
-    one = np.ones(1)
-    plants = joints.Plants(
-        torque, stiffness, 0.1 * one[:, None], 0.5 * one[:, None], 0.45 * one, 0.3 * one, 5.0 * one
-    )
-    truth = joints.simulate(plants, joints.sweep(rng, n, 1, 1, T, np.full((1, 1, 1), 8.0), 3.0), T)
+    plants = joints.Plants(torque, stiffness, 0.1, 0.5, 0.45, 0.3, 5.0)
+    truth = joints.simulate(plants, joints.sweep(rng, n, 1, 1, T, 8.0, 3.0), T)
     noise = rng.normal(0, 0.03, (n, 1))
     how = {"motor_counts": 16384, "link_bits": 17, "velocity_rad_s": None, "torque_noise": noise}
     model = joints.joint_model(0.1, 0.5, model=quintic, order=None, parameters=declared)

@@ -36,10 +36,7 @@ EXACT = ("motor_counts=0", "link_bits=0", "seconds=3")
 
 def test_the_joint_without_effects_is_that_of_another_integrator(world):
     _, c, _ = world("spring=cubic", *EXACT)
-    spring = joints.polynomial(np.array([[[150.0, 5000.0]]]))
-    plants = joints.Plants(
-        *spring, *(np.array([[x]]) for x in (0.12, 0.8)), *map(np.array, ([0.45], [0.5], [3.0]))
-    )
+    plants = joints.Plants(*joints.polynomial(np.array([[[150.0, 5000.0]]])), 0.12, 0.8, 0.45, 0.5, 3.0)
     truth = joints.simulate(plants, c["motor1_torque_nm"][:, None, None], 1e-3)
     for name, expected in (
         ("motor1_position_rad", truth.theta),

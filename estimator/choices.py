@@ -74,6 +74,7 @@ CHOICES: dict[str, Choice] = {
     "ripple_periods": Choice(
         2.0, "periods", "of a ripple in the range of motion, at least", "fewer are a bend"
     ),
+    "ripples_each": Choice(3, "", "ripples of one kind at one motor", "once and twice a turn, and the teeth"),
     "ripples": Choice(900, "", "frequencies of a ripple at most", "time; a gear has fewer"),
     "smoothing": Choice(
         0.05, "largest velocity", "over which a sign may change, at most", "smoother, it is damping"

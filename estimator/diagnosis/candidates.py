@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from estimator.effects import LIBRARY, Coordinates, EffectType, elements
 from estimator.sample import FloatArray
 
 __all__ = [
+    "AGAIN",
     "Candidate",
     "bounds_of",
     "columns",
@@ -26,6 +27,7 @@ __all__ = [
 ]
 
 Values = Mapping[str, float]
+AGAIN = "'"  # behind the name of a further ripple of the same kind
 
 # Laws of friction and hysteresis with memory: Dahl, Bouc-Wen, elastic up to the limit.
 LAWS = ((1.0, 1.0), (2.0, 0.5), (50.0, 1.0))
@@ -36,15 +38,22 @@ _SCALES = ("torque_constant", "torque_saturation", "torque_drift")
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """One effect at one motor (None: at the link)."""
+    """One effect at one motor (None: at the link); `again`: a ripple's place among those of its kind."""
 
     kind: EffectType
     motor: int | None
+    again: int = 0
 
     @property
     def key(self) -> tuple[str, int | None]:
         """Its identity: name and motor."""
-        return self.kind.name, self.motor
+        return self.kind.name + AGAIN * self.again, self.motor
+
+    def beside(self, taken: Container[tuple[str, int | None]]) -> Candidate | None:
+        """The candidate, or a further ripple of its kind, beside those taken; None: there is none."""
+        ripple = "periods_per_rev" in self.kind.nonlinear
+        each = (replace(self, again=k) for k in range(whole("ripples_each") if ripple else 1))
+        return next((one for one in each if one.key not in taken), None)
 
     @property
     def bends(self) -> bool:

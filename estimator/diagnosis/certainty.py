@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from estimator.choices import choice
+from estimator.diagnosis.candidates import AGAIN
 from estimator.diagnosis.heldout import Held
 from estimator.diagnosis.hypothesis import Fitted, Keys
 from estimator.diagnosis.search import Search
@@ -62,13 +63,13 @@ def accounts(search: Search, held: Held, found: Fitted, others: Sequence[Fitted]
 def standing(search: Search, found: Fitted, k: int, beside: Sequence[Account]) -> Standing:
     """Return the probability and alternatives of the k-th effect found."""
     key = found.terms[k].candidate.key
-    own = {name for name, _ in found.keys}
+    own = {name.rstrip(AGAIN) for name, _ in found.keys}
     total = sum(a.weight for a in beside)
     probability = sum(a.weight for a in beside if key in a.keys) / total
     others: dict[str, float] = {}
     for account in beside:
         if key not in account.keys:
-            for name in {name for name, _ in account.keys} - own:
+            for name in {name.rstrip(AGAIN) for name, _ in account.keys} - own:
                 others[name] = others.get(name, 0.0) + account.weight / total
     if key[0] == "motor_inertia" and not search.problem.frames[0].linked:
         # Without a second balance torque scale and inertia scale cannot be separated.

@@ -344,7 +344,8 @@ class Search:
         sides = self._columns @ (parent.regression.residual(posterior.x)[rows] * weight)
         taken = {t.candidate.key for t in parent.terms}
         for entry in self._library:
-            if entry.candidate.key in taken:
+            candidate = entry.candidate.beside(taken)
+            if candidate is None:
                 continue
             std = entry.std
             side = sides[entry.rows].reshape(std.shape) * std
@@ -355,7 +356,7 @@ class Search:
             gain = _gain(precision, side)
             k = int(np.argmax(gain))
             yield _Tried(
-                entry.candidate, entry.values[k], len(gain), float(gain[k]), shift[k], precision[k], side[k]
+                candidate, entry.values[k], len(gain), float(gain[k]), shift[k], precision[k], side[k]
             )
 
 

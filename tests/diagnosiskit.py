@@ -58,7 +58,8 @@ class World:
 
     def _more(self, inertia: FloatArray) -> joints.More:
         names = (
-            "coulomb_nm offset_nm cogging_nm fading_nm bump_nm constant ripple link_nm push_nm hysteresis_nm"
+            "coulomb_nm offset_nm cogging_nm second_nm fading_nm bump_nm constant ripple link_nm push_nm "
+            "hysteresis_nm"
         )
         v = {name: self._value(name) for name in names.split()}
         width = self._value("hysteresis_rad", 1.0)
@@ -70,8 +71,9 @@ class World:
             if on & {"coulomb_nm", "fading_nm"}:
                 sign = w / np.sqrt(w * w + 4e-6)
                 motor = motor - (v["coulomb_nm"] + v["fading_nm"] * np.exp(-t / 5.0)) * sign
-            if on & {"offset_nm", "cogging_nm", "bump_nm"}:
+            if on & {"offset_nm", "cogging_nm", "second_nm", "bump_nm"}:
                 motor = motor - v["offset_nm"] - v["cogging_nm"] * np.sin(17.0 * theta)
+                motor = motor - v["second_nm"] * np.sin(34.0 * theta)
                 motor = motor - v["bump_nm"] * np.exp(-(((theta + 1.0) / 0.12) ** 2))
             if on & {"constant", "ripple"}:
                 gain = (1.0 + v["constant"]) * (1.0 + v["ripple"] * np.sin(9.0 * theta))

@@ -52,7 +52,7 @@ def accounts(search: Search, held: Held, found: Fitted, others: Sequence[Fitted]
             continue
         chance = min(search.chance(found, other), 0.5)  # nothing is likelier than what was found
         simpler = other.families == found.families and other.parameters <= found.parameters
-        if simpler and held.alike(found, other):
+        if simpler and other.believable and held.alike(found, other):
             chance = 0.5
         account = Account(chance / (1.0 - chance), other)
         if other.keys not in made or account.weight > made[other.keys].weight:

@@ -81,6 +81,13 @@ class Fitted:
         """Families of its effects, in order."""
         return sorted((t.candidate.family for t in self.terms), key=str)
 
+    @property
+    def believable(self) -> bool:
+        """Whether no declared number and no reading is further off than its prior lets believe."""
+        everyday = np.array([slot.kind == "everyday" for slot in self.slots], dtype=bool)
+        off = np.abs(self.posterior.x - self.regression.mean) / self.regression.std
+        return bool(np.all(off[everyday] < choice("sure")))
+
     def is_real_beside(self, parent: Fitted) -> bool:
         """Return whether every effect contributes, and no spring is at zero that has a
         stiffness in the parent.

@@ -289,7 +289,7 @@ class Search:
             if one.candidate.rubs and one.candidate.motor in rubbing:
                 continue
             gain = one.gain - math.log(one.points)
-            if gain > 0.0:
+            if gain > 0.0 or not parent.terms:  # fitted alone, one may gain that does not on the grid
                 found.append((gain, Term(one.candidate, dict(one.values))))
         found.sort(key=lambda pair: -pair[0])
         tried = whole("tried")

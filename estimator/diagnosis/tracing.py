@@ -71,13 +71,14 @@ def diagnose(
 def _chosen(search: Search, held: Held, hypotheses: list[Fitted]) -> Fitted:
     """The hypothesis with the best odds on all data, or a simpler one that is as good.
 
-    As good is one with fewer effects that held-out data cannot tell from it, and one with fewer parameters
-    while it is an alternative.
+    As good is one with fewer effects and believable numbers that held-out data cannot tell from it, and one
+    with fewer parameters while it is an alternative.
     """
     first = hypotheses[0]
     odds = {one: search.advantage(one, first) + held.log_likelihood(one, first) for one in hypotheses}
     best = max(hypotheses, key=lambda one: odds[one])
-    fewer = (one for one in hypotheses if len(one.terms) < len(best.terms) and not held.confirms(best, one))
+    fewer = [one for one in hypotheses if len(one.terms) < len(best.terms) and one.believable]
+    fewer = [one for one in fewer if not held.confirms(best, one)]
     best = min(fewer, key=lambda one: (len(one.terms), -odds[one]), default=best)
     least = odds[best] + math.log(choice("even"))
     alike = [one for one in hypotheses if odds[one] >= least and one.families == best.families]

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import onlinekit as kit
 
-from estimator import Estimator, JointModel, Record
+from estimator import Estimator, JointModel
 from estimator.identify import identify
 from estimator.model_monitor import ModelMonitor, ResidualBaseline, measure_baseline
 from estimator.sample import Sample, Status
@@ -228,13 +228,7 @@ def _healthy(name: str, seconds: float, seed: int) -> kit.Motion:
 def _fitted(name: str) -> tuple[JointModel, ResidualBaseline]:
     """As `fit --write` leaves it: fitted and calibrated on another run, with its model's baseline."""
     motion = kit.motion(name, 20.0, seed=99)
-    record = Record(
-        period_s=T,
-        sequence=np.arange(len(motion.samples)),
-        motor_position_rad=np.array([s.motor_position_rad for s in motion.samples]),
-        motor_torque_nm=np.array([s.motor_torque_nm for s in motion.samples]),
-        link_position_rad=np.array([s.link_position_rad for s in motion.samples]),
-    )
+    record = kit.recorded(motion.samples)
     declared = kit.declared(name, parameters={})
     model = identify(record, declared).model
     return model, measure_baseline(record, model)

@@ -18,6 +18,7 @@ from estimator import (
     EstimatorSettings,
     JointModel,
     Motor,
+    Record,
     Sample,
     Status,
     Transmission,
@@ -118,6 +119,17 @@ def motion(
         )
     ]
     return Motion(samples, rows["truth_stiffness_nm_rad"], rows["truth_flexibility_torque_nm"])
+
+
+def recorded(samples: Sequence[Sample], sign: float = 1.0) -> Record:
+    """The samples as a recording; torque and link position may have the other sign."""
+    return Record(
+        period_s=PERIOD_S,
+        sequence=np.arange(len(samples)),
+        motor_position_rad=np.array([s.motor_position_rad for s in samples]),
+        motor_torque_nm=sign * np.array([s.motor_torque_nm for s in samples]),
+        link_position_rad=sign * np.array([s.link_position_rad for s in samples]),
+    )
 
 
 def _stiffer(plant: JointPlant, factor: float) -> JointPlant:

@@ -14,6 +14,7 @@ from pathlib import Path
 import gatekit
 import heldmotor
 import numpy as np
+import onlinekit
 import pytest
 
 from drivelink import jointfile, recording
@@ -116,13 +117,7 @@ def test_the_sign_of_a_link_that_is_held_is_reported_as_undecided() -> None:
 @pytest.mark.parametrize(("kp", "hand_rad"), [(heldmotor.KP, 0.02), (0.0, 0.3)], ids=["holds", "damps"])
 def test_a_motor_that_its_controller_holds_is_not_called_wrong(kp: float, hand_rad: float) -> None:
     samples = heldmotor.moved(8.0, kp=kp, hand_rad=hand_rad)
-    record = Record(
-        period_s=1e-3,
-        sequence=np.arange(len(samples)),
-        motor_position_rad=np.array([s.motor_position_rad for s in samples]),
-        motor_torque_nm=np.array([s.motor_torque_nm for s in samples]),
-        link_position_rad=np.array([s.link_position_rad for s in samples]),
-    )
+    record = onlinekit.recorded(samples)
     judgement = judge(record, heldmotor.declared())
     assert judgement.findings == ()
     assert any("sign" in text and "motor" in text for text in judgement.undecided), judgement

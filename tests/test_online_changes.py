@@ -9,7 +9,6 @@ from estimator import (
     EstimatorSettings,
     JointModel,
     Motor,
-    Record,
     Status,
     Transmission,
     fit,
@@ -89,14 +88,7 @@ def test_friction_that_nobody_declared_is_no_change_but_widens_the_interval():
 
 
 def test_a_fitted_spring_is_not_left_for_a_wrong_one():
-    fitted = kit.motion("constant", 30.0)
-    record = Record(
-        period_s=kit.PERIOD_S,
-        sequence=np.arange(len(fitted.samples)),
-        motor_position_rad=np.array([s.motor_position_rad for s in fitted.samples]),
-        motor_torque_nm=np.array([s.motor_torque_nm for s in fitted.samples]),
-        link_position_rad=np.array([s.link_position_rad for s in fitted.samples]),
-    )
+    record = kit.recorded(kit.motion("constant", 30.0).samples)
     found = fit(record, kit.declared("constant", parameters={}))
     for seed in (1, 2):
         motion = kit.motion("constant", 8.0, seed=seed)

@@ -17,7 +17,7 @@ import pytest
 
 from drivelink import jointfile, recording
 from drivelink.errors import JointFileError
-from estimator import EstimatorSettings, Motor, Record, Status, Transmission, fit, make_estimator
+from estimator import EstimatorSettings, Motor, Status, Transmission, fit, make_estimator
 from estimator.errors import EstimatorError
 from estimator.gate import judge
 from sim.cases import CASES, case
@@ -87,17 +87,8 @@ def test_a_fit_with_the_torque_reversed_has_no_stiffness_and_the_gate_says_why()
 
     model = kit.declared("constant", parameters={})
 
-    def recorded(sign):
-        return Record(
-            period_s=kit.PERIOD_S,
-            sequence=np.arange(len(motion.samples)),
-            motor_position_rad=np.array([s.motor_position_rad for s in motion.samples]),
-            motor_torque_nm=sign * np.array([s.motor_torque_nm for s in motion.samples]),
-            link_position_rad=sign * np.array([s.link_position_rad for s in motion.samples]),
-        )
-
-    assert fit(recorded(1.0), model)[0].stiffens
-    wrong = recorded(-1.0)
+    assert fit(kit.recorded(motion.samples), model)[0].stiffens
+    wrong = kit.recorded(motion.samples, -1.0)
     assert "wrong sign" in judge(wrong, model).remark
     assert not fit(wrong, model)[0].stiffens
 

@@ -73,7 +73,7 @@ def test_after_garbage_of_five_seconds_the_way_back_takes_less_than_five(joint, 
     """What was learned before holds again; how large and how noisy the garbage was is no measure of the joint."""
     if (joint, share, positions) == ("vsa-ii", 1.0, True):
         pytest.xfail(
-            "of two motors whose every sample is garbage for seconds, the spring is relearned wrongly first"
+            "the first garbage is taken for a larger deflection, in which the law's end is poorly resolved"
         )
     valid, wrong = matrix.garbled(joint, share, positions, health_s=6.0, garbage_s=5.0, after_s=6.0)
     assert valid[-1000:].all()

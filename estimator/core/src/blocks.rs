@@ -11,7 +11,7 @@ use crate::model::Motor;
 use crate::settings::Priors;
 use crate::spring::{Family, Projection, TERMS};
 use crate::student::f_quantile;
-use crate::unknowns::{ACTIVE, CANDIDATES, DRY, LATE, OFFSET, RATE, Reading, SOFT, SPRING, Spring, ZERO};
+use crate::unknowns::{ACTIVE, CANDIDATES, LATE, OFFSET, RATE, Reading, SPRING, Spring, ZERO};
 
 /// Share of the torque that a curve may leave unexplained.
 pub const USEFUL: f64 = 0.2;
@@ -71,8 +71,9 @@ pub struct Blocks {
     projection: Option<Projection>,
     deflection: f64,
     noise: Noise,
-    own: f64,    // rms that the chosen unknowns leave
-    torque: f64, // rms of the transmission's torque
+    own: f64,      // rms that the chosen unknowns leave
+    torque: f64,   // rms of the transmission's torque
+    friction: f64, // rms of friction and hysteresis
     quick: f64,
     peak: f64,       // of it in the open block …
     peaks: Vec<f64>, // … and in those of the ring
@@ -139,6 +140,7 @@ impl Blocks {
             noise: Noise { variance: f64::NAN, correlated, tails: TAILS },
             own: f64::NAN,
             torque: f64::NAN,
+            friction: 0.0,
             quick: 0.0,
             peak: 0.0,
             peaks: Vec::with_capacity(BLOCKS),
@@ -488,18 +490,16 @@ impl Blocks {
         }
     }
 
-    /// Constant torque on the motor, N·m.
+    /// Torque on the motor beside the spring's that depends on no memory and no sign, N·m; `rate`: φ′.
     #[must_use]
-    pub fn offset(&self) -> f64 {
-        self.posterior.as_ref().map_or(0.0, |known| known.x[OFFSET])
+    pub fn rest(&self, rate: f64) -> f64 {
+        self.posterior.as_ref().map_or(0.0, |known| known.x[RATE] * rate - known.x[OFFSET])
     }
 
     /// rms of what the motor's equation leaves where friction is not taken off, N·m; ∞: unknown.
     #[must_use]
     pub fn unmodelled(&self) -> f64 {
-        self.posterior
-            .as_ref()
-            .map_or(f64::INFINITY, |known| self.own.hypot(known.x[DRY].hypot(known.x[SOFT])))
+        if self.posterior.is_some() { self.own.hypot(self.friction) } else { f64::INFINITY }
     }
 
     /// rms of the transmission's torque over what is known, N·m; NaN before.

@@ -171,6 +171,12 @@ impl DeflectionFilter {
         foreseen + share * (present.phi - self.at(t))
     }
 
+    /// φ′ at the last sample, rad/s.
+    #[must_use]
+    pub fn rate(&self) -> f64 {
+        self.x[3]
+    }
+
     /// Velocity of the link at the last sample, rad/s.
     #[must_use]
     pub fn link_rate(&self) -> f64 {

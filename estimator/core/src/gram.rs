@@ -143,6 +143,16 @@ impl Frame {
         c
     }
 
+    /// rms of what some of the unknowns explain of the rows.
+    #[must_use]
+    pub fn rms(&self, gram: &Gram, known: &Posterior, of: Set) -> f64 {
+        let mut c = [0.0; COLUMNS];
+        for j in unknowns(of & known.set & self.set) {
+            c.iter_mut().zip(&self.directions[j]).for_each(|(c, d)| *c += known.x[j] * d);
+        }
+        (gram.quadratic(&c) / gram.rows.max(1.0)).sqrt()
+    }
+
     /// Dᵀ G D with `left` as the direction of index 0.
     #[must_use]
     pub fn reduce(&self, gram: &Gram) -> Matrix {
@@ -336,7 +346,7 @@ pub fn solve(reduced: &Matrix, set: Set, prior: &Prior, noise: f64) -> Option<Po
 /// any data.
 #[must_use]
 pub fn choose(reduced: &Matrix, base: Set, groups: &[Set], prior: &Prior, noise: f64) -> Set {
-    let threshold = (groups.len().max(1) as f64).ln();
+    let threshold = (groups.iter().filter(|group| **group != 0).count().max(1) as f64).ln();
     let (mut set, mut best) = (base, log_evidence(reduced, base, prior, noise));
     loop {
         let mut next = (set, best + threshold);
@@ -375,7 +385,13 @@ pub fn cluster(posterior: &mut Posterior, scores: &[Vector], prior: &Prior, nois
             middle[i].iter_mut().zip(score).for_each(|(m, s)| *m += scaled * s);
         }
     }
-    let mut half = [[0.0; UNKNOWNS]; UNKNOWNS];
+    posterior.covariance = sandwich(&bread, &middle, set);
+    Some(freedom)
+}
+
+/// C M C of a set's unknowns.
+fn sandwich(bread: &Matrix, middle: &Matrix, set: Set) -> Matrix {
+    let (mut half, mut out) = ([[0.0; UNKNOWNS]; UNKNOWNS], [[0.0; UNKNOWNS]; UNKNOWNS]);
     for i in unknowns(set) {
         for k in unknowns(set) {
             let factor = bread[i][k];
@@ -384,10 +400,19 @@ pub fn cluster(posterior: &mut Posterior, scores: &[Vector], prior: &Prior, nois
     }
     for i in unknowns(set) {
         for j in unknowns(set) {
-            posterior.covariance[i][j] = unknowns(set).map(|k| half[i][k] * bread[k][j]).sum();
+            out[i][j] = unknowns(set).map(|k| half[i][k] * bread[k][j]).sum();
         }
     }
-    Some(freedom)
+    out
+}
+
+/// C − C P C: the covariance that errors of the rows make, as large as the noise; none where the prior decides.
+#[must_use]
+pub fn by_rows(posterior: &Posterior, prior: &Prior) -> Matrix {
+    let mut out = posterior.covariance;
+    let by_prior = sandwich(&posterior.covariance, &prior.precision, posterior.set);
+    out.iter_mut().flatten().zip(by_prior.iter().flatten()).for_each(|(c, p)| *c -= p);
+    out
 }
 
 #[cfg(test)]

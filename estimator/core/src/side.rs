@@ -200,7 +200,10 @@ impl Side {
     pub fn feed(&mut self, filters: &Filters, i: usize, moment: &Moment) {
         let Moment { now, last, link, time, usable } = *moment;
         let (theta, phi, torque) = (now.at.motor[i], now.at.deflection(i), now.torque[i]);
-        if !self.rigid && self.balance.outgrown(phi) && (!self.doubtful || self.blocks.are_few()) {
+        let few = self.blocks.are_few();
+        // No spring is deflected beyond where its law ends.
+        let can_be = few || !self.doubtful && phi.abs() < EDGE * self.blocks.spring.reach();
+        if !self.rigid && can_be && self.balance.outgrown(phi) {
             let factors = self.balance.grow(phi);
             self.blocks.grow(&factors, &self.balance);
             self.judge();
@@ -211,7 +214,7 @@ impl Side {
         self.held_s += self.period;
         if !self.rigid {
             self.deflection.update(theta, phi, last.torque[i] + self.acting - self.effect);
-            self.balance.observe(phi, usable && (!self.doubtful || self.blocks.are_few()));
+            self.balance.observe(phi, usable && can_be);
         }
     }
 
@@ -318,7 +321,8 @@ impl Side {
         let known = self.blocks.at(self.deflection.at(0.0), 0.0, &self.balance);
         match known.filter(|known| self.fits && known.stiffness > 0.0) {
             Some(known) => {
-                (self.stiffness, self.acting) = (known.stiffness, known.torque - self.blocks.offset());
+                (self.stiffness, self.acting) =
+                    (known.stiffness, known.torque + self.blocks.rest(self.deflection.rate()));
             }
             None => (self.stiffness, self.acting) = (0.0, self.left(0.0)),
         }

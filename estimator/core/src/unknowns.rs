@@ -318,7 +318,8 @@ impl Spring {
             |unknown: usize| (total.quadratic(&frame.directions[unknown]) / total.rows).sqrt().max(1e-12);
         let (mut mean, mut std) = ([0.0; UNKNOWNS], [1.0; UNKNOWNS]);
         for unknown in SOFT..UNKNOWNS {
-            std[unknown] = UNDECLARED * torque / rms(unknown);
+            let share = if LOAD.contains(&unknown) { 0.25 } else { UNDECLARED };
+            std[unknown] = share * torque / rms(unknown);
         }
         let inertia = motor.inertia_std.unwrap_or(priors.motor_inertia);
         (mean[INERTIA], std[INERTIA]) = (motor.inertia, inertia * motor.inertia);

@@ -3,18 +3,21 @@
 use super::{Blocks, EARLY, FEWEST, REACHED};
 use crate::balance;
 use crate::gram::{
-    Frame, Gram, Matrix, Posterior, Prior, Row, Set, UNKNOWNS, choose, cluster, dot, log_evidence, set,
-    solve, unknowns,
+    Frame, Gram, Matrix, Posterior, Prior, Row, Set, UNKNOWNS, by_rows, choose, cluster, dot, log_evidence,
+    set, solve, unknowns,
 };
 use crate::spring::Projection;
 use crate::student::t_95;
-use crate::unknowns::{ACTIVE, CANDIDATES, RATE, SPRING, Scale, Spring, ZERO};
+use crate::unknowns::{ACTIVE, CANDIDATES, DRY, RATE, SOFT, SPRING, STOPS, Scale, Spring, ZERO};
 
 const ZEROS: i32 = 12; // of a lost zero that are tried to either side, over the deflection seen
 const STEPS: usize = 3; // of Gauss and Newton's iteration at a block's end
 const EXACT: f64 = 3e-4; // of the torque: what filters, sampling and rounding leave of a true model
 const MISSING: f64 = 0.1; // share of what no noise explains that one unknown takes in: there are some ten of them
+const UNLIKELY: f64 = 0.05; // probability that an interval of 95 % need not hold
 const ACCUSED: f64 = 1000.0; // odds at which the declared zero is called wrong
+
+type Groups = [Set; CANDIDATES.len() + SPRING.end - SPRING.start];
 
 impl Blocks {
     pub(super) fn prior(&self, total: &Gram, frame: &Frame, zero_std: f64) -> Prior {
@@ -110,7 +113,7 @@ impl Blocks {
                 self.measure(&frame, &reduced, &prior, &total);
             }
             let noise = self.noise.variance * self.noise.correlated;
-            let Some((mut chosen, moved)) = self.choose(&frame, &reduced, &total, &prior, noise, zero) else {
+            let Some((mut chosen, moved)) = self.choose(&frame, &reduced, &total, &prior, noise) else {
                 return;
             };
             let used = if moved { self.prior(&total, &frame, self.deflection) } else { prior };
@@ -126,7 +129,11 @@ impl Blocks {
             if step + 1 < STEPS && far && !self.spring.is_settled() {
                 continue;
             }
+            self.friction = frame.rms(&total, &chosen, set(DRY..SPRING.start) | set(SOFT..RATE) | set(STOPS));
+            let omitted = self.omitted(&frame, &reduced, &chosen, &used, noise);
             self.widen(&frame, &mut chosen, &used, noise, own, &total);
+            let entries = chosen.covariance.iter_mut().flatten().zip(omitted.iter().flatten());
+            entries.for_each(|(v, more)| *v += more);
             self.torque = self.spring.torque_rms(&projection, &total);
             (self.posterior, self.frame) = (Some(chosen), Some(frame));
             break;
@@ -177,6 +184,22 @@ impl Blocks {
         }
     }
 
+    /// The unknowns that there are without a choice, and the groups that evidence adds.
+    fn groups(&self, frame: &Frame) -> (Set, Groups) {
+        let mut groups = Groups::default();
+        let mut base = frame.set & (ACTIVE | self.carried.as_ref().map_or(0, |carried| carried.set));
+        for (group, candidate) in groups.iter_mut().zip(&CANDIDATES) {
+            *group = set(candidate.unknowns.clone());
+        }
+        if self.spring.open {
+            base &= !set(SPRING.start + 1..SPRING.end);
+            for (group, more) in groups[CANDIDATES.len()..].iter_mut().zip(2..=self.spring.size) {
+                *group = set(SPRING.start..SPRING.start + more);
+            }
+        }
+        (base, groups)
+    }
+
     /// The unknowns that evidence chooses, and whether the zero is anywhere.
     fn choose(
         &self,
@@ -185,35 +208,54 @@ impl Blocks {
         total: &Gram,
         prior: &Prior,
         noise: f64,
-        zero: f64,
     ) -> Option<(Posterior, bool)> {
-        let mut groups: [Set; CANDIDATES.len() + SPRING.end - SPRING.start] = Default::default();
-        let mut n = 0;
-        // At first only what a late link would be mistaken for.
+        let (base, mut groups) = self.groups(frame);
         let many = self.ring.len() >= FEWEST;
-        for candidate in CANDIDATES.iter().filter(|candidate| many || candidate.unknowns.start == RATE) {
-            groups[n] = set(candidate.unknowns.clone());
-            n += 1;
+        if !many {
+            groups[..CANDIDATES.len()].fill(0); // few rows show noise as effects
         }
-        let mut base = frame.set & (ACTIVE | self.carried.as_ref().map_or(0, |carried| carried.set));
-        if self.spring.open {
-            base &= !set(SPRING.start + 1..SPRING.end);
-            for more in 2..=self.spring.size {
-                groups[n] = set(SPRING.start..SPRING.start + more);
-                n += 1;
-            }
-        }
-        let found = choose(reduced, base, &groups[..n], prior, noise);
-        let log = log_evidence(reduced, found, prior, noise);
-        if self.ring.len() >= FEWEST && zero < self.deflection && frame.set >> ZERO & 1 == 1 {
+        let found = choose(reduced, base, &groups, prior, noise);
+        if many && !self.lost && frame.set >> ZERO & 1 == 1 {
             // The zero is where it is declared, or anywhere in the range.
+            let log = log_evidence(reduced, found, prior, noise);
             let elsewhere = self.prior(total, frame, self.deflection);
-            let other = choose(reduced, base, &groups[..n], &elsewhere, noise);
+            let other = choose(reduced, base, &groups, &elsewhere, noise);
             if log_evidence(reduced, other, &elsewhere, noise) > log + ACCUSED.ln() {
                 return solve(reduced, other, &elsewhere, noise).map(|found| (found, true));
             }
         }
         solve(reduced, found, prior, noise).map(|found| (found, false))
+    }
+
+    /// What the groups that were not chosen may change: the covariance between models, by their probabilities.
+    ///
+    /// Hoeting et al., "Bayesian model averaging: a tutorial", Statistical Science 14(4), 1999.
+    fn omitted(
+        &self,
+        frame: &Frame,
+        reduced: &Matrix,
+        chosen: &Posterior,
+        prior: &Prior,
+        noise: f64,
+    ) -> Matrix {
+        let mut between = [[0.0; UNKNOWNS]; UNKNOWNS];
+        let (_, groups) = self.groups(frame);
+        let many = groups.iter().filter(|group| **group != 0).count() as f64;
+        for group in groups.iter().filter(|group| *group & !chosen.set & frame.set != 0) {
+            let Some(other) = solve(reduced, chosen.set | group, prior, noise) else { continue };
+            let odds = (other.log_evidence - chosen.log_evidence).exp() / many;
+            let probability = odds / (1.0 + odds);
+            if probability < UNLIKELY {
+                continue;
+            }
+            for i in unknowns(chosen.set) {
+                for j in unknowns(chosen.set) {
+                    let moved = (other.x[i] - chosen.x[i]) * (other.x[j] - chosen.x[j]);
+                    between[i][j] += probability * (moved + other.covariance[i][j] - chosen.covariance[i][j]);
+                }
+            }
+        }
+        between
     }
 
     /// What the chosen unknowns leave beyond the noise is an error of the model: scores of blocks hold it.
@@ -231,7 +273,7 @@ impl Blocks {
         // What no noise explains is an effect that is missing: alike in all blocks, their scores do not show it.
         let missing = (own - self.white - (EXACT * total.rms(balance::TORQUE)).powi(2)).max(0.0);
         let alike = MISSING * missing * total.rows / noise;
-        let naive = chosen.covariance;
+        let by_rows = by_rows(chosen, prior);
         let few = self.ring.len() as f64;
         let enough = self.ring.len() >= FEWEST;
         let clustered = if enough { cluster(chosen, &self.scores, prior, noise) } else { None };
@@ -239,7 +281,7 @@ impl Blocks {
             Some(freedom) => t_95(freedom),
             None => (own / self.noise.variance).sqrt().max(1.0) * t_95(few.max(3.0)),
         };
-        let entries = chosen.covariance.iter_mut().flatten().zip(naive.iter().flatten());
-        entries.for_each(|(v, naive)| *v = *v * wider * wider + alike * naive);
+        let entries = chosen.covariance.iter_mut().flatten().zip(by_rows.iter().flatten());
+        entries.for_each(|(v, by_rows)| *v = *v * wider * wider + alike * by_rows);
     }
 }

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::balance::{ACCELERATION, DRY, LATE, OFFSET, READ, SPRING, TORQUE, TORQUE_RATE, VELOCITY};
 use crate::gram::{
-    COLUMNS, Frame, Gram, Matrix, Prior, Row, Set, UNKNOWNS, log_determinant, solve, unknowns,
+    COLUMNS, Frame, Gram, Matrix, Prior, Row, Set, UNKNOWNS, dot, log_determinant, solve, unknowns,
 };
 use crate::spring::{Coefficients, TERMS};
 use crate::unknowns;
@@ -165,84 +165,78 @@ pub struct Noise {
 }
 
 impl Known<'_> {
+    /// What is known before the window, with the amplitude of a cause in the place `own`.
+    fn precision_with(&self, entry: &Entry, own: usize) -> Matrix {
+        let mut precision = *self.precision;
+        precision[own][own] = entry.std.powi(-2);
+        if matches!(entry.cause, Cause::MotorScale | Cause::LinkScale) && self.set >> unknowns::ZERO & 1 == 1
+        {
+            // A reading of another scale is of another zero, too: where it was right is not known.
+            (0..UNKNOWNS).for_each(|i| precision[i][unknowns::ZERO] = 0.0);
+            precision[unknowns::ZERO] = [0.0; UNKNOWNS];
+            precision[unknowns::ZERO][unknowns::ZERO] = self.deflection.powi(-2);
+        }
+        precision
+    }
+
     /// The direction of a cause in the space of a row's columns, for an amplitude of 1 in the table's unit; and what
     /// an amplitude of 1 is in SI units. `None`: it has no direction.
     #[must_use]
     fn direction(&self, cause: Cause) -> Option<(Row, f64)> {
         let mut v = [0.0; COLUMNS];
-        let (inertia, damping) = self.motor;
-        let spring = |v: &mut Row, factor: f64| {
-            let columns = v[SPRING.start..SPRING.start + 2 * TERMS].iter_mut();
-            columns.zip(self.torque).for_each(|(v, c)| *v += factor * c);
-        };
-        let slope = |v: &mut Row, from: usize, factor: f64| {
-            let columns = v[from..from + READ.len()].iter_mut();
-            columns.zip(&self.slope[TERMS..]).for_each(|(v, c)| *v += factor * c);
-        };
         let unit = match cause {
             Cause::Nothing | Cause::Noise => return None,
-            Cause::Stiffness => {
-                spring(&mut v, 1.0);
-                1.0
-            }
+            Cause::Stiffness => self.add_spring(&mut v, self.torque, 1.0),
             Cause::Shape => {
                 // The curve with another bend, the torque at the largest deflection as it was.
                 let whole: f64 = self.torque[..TERMS].iter().sum();
                 (v[SPRING.start], v[SPRING.start + 1]) = (whole, -whole);
                 1.0
             }
-            Cause::Friction => {
-                v[DRY] = self.torque_rms;
-                self.torque_rms
-            }
-            Cause::TorqueZero => {
-                v[OFFSET] = self.torque_rms;
-                self.torque_rms
-            }
-            Cause::PositionZero => {
-                let columns = v[SPRING.start..SPRING.start + 2 * TERMS].iter_mut();
-                columns.zip(self.slope).for_each(|(v, c)| *v = self.deflection * c);
-                self.deflection
-            }
+            Cause::Friction => put(&mut v, DRY, self.torque_rms),
+            Cause::TorqueZero => put(&mut v, OFFSET, self.torque_rms),
+            Cause::PositionZero => self.add_spring(&mut v, self.slope, self.deflection),
             Cause::Inertia => {
-                v[ACCELERATION] = inertia;
+                v[ACCELERATION] = self.motor.0;
                 1.0
             }
-            Cause::LinkDelay => {
-                slope(&mut v, LATE.start, self.period_s);
-                self.period_s
-            }
-            Cause::LinkScale => {
-                // q reads (1 + a) q.
-                slope(&mut v, READ.start, -1.0);
-                1.0
-            }
-            Cause::MotorScale => {
-                // θ reads (1 + a) θ; σ θ = σ q − σ φ, and σ φ is the torque of a spring of these powers.
-                (v[ACCELERATION], v[VELOCITY]) = (-inertia, -damping);
-                slope(&mut v, READ.start, 1.0);
-                for (k, c) in self.slope[TERMS..].iter().enumerate() {
-                    v[SPRING.start + k] -= c * self.deflection * self.powers[k];
-                }
-                1.0
-            }
-            Cause::TorqueScale => {
-                // τ reads (1 + a) τ.
-                v[TORQUE] = 1.0;
-                1.0
-            }
-            Cause::TorqueDelay => {
-                v[TORQUE_RATE] = -self.period_s;
-                self.period_s
-            }
+            Cause::LinkDelay => self.add_slope(&mut v, LATE.start, self.period_s),
+            // q reads (1 + a) q.
+            Cause::LinkScale => -self.add_slope(&mut v, READ.start, -1.0),
+            Cause::MotorScale => self.add_motor_scale(&mut v),
+            // τ reads (1 + a) τ.
+            Cause::TorqueScale => put(&mut v, TORQUE, 1.0),
+            Cause::TorqueDelay => -put(&mut v, TORQUE_RATE, -self.period_s),
             Cause::MotorDelay => {
                 // The same as a link and a torque that are early.
-                slope(&mut v, LATE.start, -self.period_s);
-                v[TORQUE_RATE] = self.period_s;
-                self.period_s
+                self.add_slope(&mut v, LATE.start, -self.period_s);
+                put(&mut v, TORQUE_RATE, self.period_s)
             }
         };
         Some((v, unit))
+    }
+
+    /// A multiple of a curve of the spring's; returns the factor.
+    fn add_spring(&self, v: &mut Row, curve: &Coefficients, factor: f64) -> f64 {
+        let columns = v[SPRING.start..SPRING.start + 2 * TERMS].iter_mut();
+        columns.zip(curve).for_each(|(v, c)| *v += factor * c);
+        factor
+    }
+
+    /// A multiple of σ times a signal of the link, from the column `from` on; returns the factor.
+    fn add_slope(&self, v: &mut Row, from: usize, factor: f64) -> f64 {
+        let columns = v[from..from + READ.len()].iter_mut();
+        columns.zip(&self.slope[TERMS..]).for_each(|(v, c)| *v += factor * c);
+        factor
+    }
+
+    /// θ reads (1 + a) θ; σ θ = σ q − σ φ, and σ φ is the torque of a spring of these powers.
+    fn add_motor_scale(&self, v: &mut Row) -> f64 {
+        (v[ACCELERATION], v[VELOCITY]) = (-self.motor.0, -self.motor.1);
+        for (k, c) in self.slope[TERMS..].iter().enumerate() {
+            v[SPRING.start + k] -= c * self.deflection * self.powers[k];
+        }
+        self.add_slope(v, READ.start, 1.0)
     }
 
     /// Hold every cause against a window; `before`: probability, before it, that something has changed.
@@ -282,26 +276,8 @@ impl Known<'_> {
         if let Some(own) = own {
             for entry in &TABLE[1..] {
                 let Some((v, unit)) = self.direction(entry.cause) else { continue };
-                let image = window.times(&v);
-                let mut more = reduced;
-                let with = |c: &Row| image.iter().zip(c).map(|(a, b)| a * b).sum::<f64>();
-                for i in unknowns(self.set) {
-                    let value = with(&frame.directions[i]);
-                    (more[own][i], more[i][own]) = (value, value);
-                }
-                let value = with(&frame.left);
-                (more[own][0], more[0][own]) = (value, value);
-                more[own][own] = with(&v);
-                prior.precision = *self.precision;
-                prior.precision[own][own] = entry.std.powi(-2);
-                if matches!(entry.cause, Cause::MotorScale | Cause::LinkScale)
-                    && self.set >> unknowns::ZERO & 1 == 1
-                {
-                    // A reading of another scale is of another zero, too: where it was right is not known.
-                    (0..UNKNOWNS).for_each(|i| prior.precision[i][unknowns::ZERO] = 0.0);
-                    prior.precision[unknowns::ZERO] = [0.0; UNKNOWNS];
-                    prior.precision[unknowns::ZERO][unknowns::ZERO] = self.deflection.powi(-2);
-                }
+                let more = with_direction(&reduced, window, &frame, &v, own);
+                prior.precision = self.precision_with(entry, own);
                 judged(entry.cause, &more, self.set | bit(own), &prior, unit);
             }
         }
@@ -315,6 +291,25 @@ impl Known<'_> {
         odds.normalise(before);
         odds
     }
+}
+
+/// Reduced sums with one more direction, in the place `own`.
+fn with_direction(reduced: &Matrix, window: &Gram, frame: &Frame, v: &Row, own: usize) -> Matrix {
+    let mut more = *reduced;
+    let image = window.times(v);
+    for i in unknowns(frame.set) {
+        let value = dot(&image, &frame.directions[i]);
+        (more[own][i], more[i][own]) = (value, value);
+    }
+    let value = dot(&image, &frame.left);
+    (more[own][0], more[0][own]) = (value, value);
+    more[own][own] = dot(&image, v);
+    more
+}
+
+fn put(v: &mut Row, column: usize, value: f64) -> f64 {
+    v[column] = value;
+    value
 }
 
 fn information(reduced: &Matrix, precision: &Matrix, scale: f64) -> Matrix {

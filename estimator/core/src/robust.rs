@@ -296,17 +296,8 @@ impl Robust {
         let usable = self.unsettled <= 0;
         self.tick += 1;
         self.link.smooth(&self.filters, now.at.link);
-        // Noise is that of usual times: what lies is not measured by it.
-        let doubtful = !usable || self.sides.iter().any(|side| side.doubtful);
+        self.measure_noise(now, usable);
         let period = self.period;
-        let see = |meter: &mut NoiseMeter, value: f64| {
-            if doubtful && meter.is_known() { meter.restart() } else { meter.see(value, period) }
-        };
-        see(&mut self.noise[self.motors], now.at.link);
-        for i in 0..self.motors {
-            see(&mut self.noise[i], now.at.motor[i]);
-            see(&mut self.torque_noise[i], now.torque[i]);
-        }
         let (look, time) = (self.tick % self.looks == 0, self.tick as f64 * period);
         let mut shifts = [None; MOTORS];
         for i in 0..self.motors {
@@ -347,6 +338,20 @@ impl Robust {
         }
         if let Some(periods) = late {
             self.shift(periods);
+        }
+    }
+
+    /// Noise is that of usual times: what lies is not measured by it.
+    fn measure_noise(&mut self, now: &Inputs, usable: bool) {
+        let doubtful = !usable || self.sides.iter().any(|side| side.doubtful);
+        let period = self.period;
+        let see = |meter: &mut NoiseMeter, value: f64| {
+            if doubtful && meter.is_known() { meter.restart() } else { meter.see(value, period) }
+        };
+        see(&mut self.noise[self.motors], now.at.link);
+        for i in 0..self.motors {
+            see(&mut self.noise[i], now.at.motor[i]);
+            see(&mut self.torque_noise[i], now.torque[i]);
         }
     }
 

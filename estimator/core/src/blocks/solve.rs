@@ -81,6 +81,22 @@ impl Blocks {
             .then(|| step * (best as f64 - f64::from(ZEROS)))
     }
 
+    /// Whether the balance can be linearised where its zero is.
+    fn is_located(&mut self, total: &Gram) -> bool {
+        if !self.lost || self.located || self.spring.is_constant() {
+            return true;
+        }
+        let Some(zero) = self.locate(total, self.noise.variance * self.correlated) else { return false };
+        self.located = true;
+        if zero.abs() > self.deflection / f64::from(ZEROS) {
+            self.off = zero;
+            return false;
+        }
+        self.spring.zero = zero;
+        true
+    }
+
+    /// The unknowns from all blocks.
     pub(super) fn solve(&mut self) {
         let mut total = Gram::default();
         self.ring.iter().for_each(|block| total.add(block, 1.0));
@@ -93,14 +109,8 @@ impl Blocks {
         {
             self.start(&total, self.noise.variance * self.correlated);
         }
-        if self.lost && !self.located && !self.spring.is_constant() {
-            let Some(zero) = self.locate(&total, self.noise.variance * self.correlated) else { return };
-            self.located = true;
-            if zero.abs() > self.deflection / f64::from(ZEROS) {
-                self.off = zero;
-                return;
-            }
-            self.spring.zero = zero;
+        if !self.is_located(&total) {
+            return;
         }
         let Some(projection) = self.projection.clone() else { return };
         let near = self.priors.deflection_offset * self.deflection + self.resolution;

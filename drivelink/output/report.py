@@ -351,7 +351,7 @@ def _is_function(curve: Curve) -> bool:
 def _stiffness_chart(curve: StiffnessCurve, units: Units) -> Chart:
     zero = int(np.argmin(np.abs(curve.deflection_rad)))
     before, after = (
-        f"{100.0 * SIGMA_95 * std[zero] / abs(value[zero]):.2g} %"
+        f"{100.0 * SIGMA_95 * std[zero] / abs(value[zero]):.2g} %" if value[zero] else "no stiffness"
         for value, std in (
             (curve.before_nm_rad, curve.before_std_nm_rad), (curve.after_nm_rad, curve.after_std_nm_rad)
         )

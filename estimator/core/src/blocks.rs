@@ -39,6 +39,8 @@ pub enum Closed {
     Unexplained,
     /// Several were not explained: what is known begins with them.
     Begun,
+    /// It is not explained after a restart: the zero is not where it was.
+    Lost,
 }
 
 /// What was known when the sum began anew, α and the zero as they are.
@@ -80,7 +82,8 @@ pub struct Blocks {
     good: usize,     // blocks in a row that were explained
     doubted: usize,  // blocks since the last explained one
     doubting: bool,
-    skipped: u32, // rows that are still of what was before
+    suspected: bool, // the zero, of being elsewhere since a restart
+    skipped: u32,    // rows that are still of what was before
     settle: u32,
     fitted: bool, // what the file knows has been held against a block
     lost: bool,   // the zero: it may be anywhere, but for what motion shows
@@ -147,6 +150,7 @@ impl Blocks {
             good: 0,
             doubted: 0,
             doubting: false,
+            suspected: false,
             skipped: 0,
             settle,
             fitted: false,
@@ -221,14 +225,15 @@ impl Blocks {
         self.lost
     }
 
-    /// Whether a lost zero has been found by less than what ends a doubt.
+    /// Whether a lost zero has been found by fewer blocks than an interval needs.
     #[must_use]
     pub fn is_unconfirmed(&self) -> bool {
-        self.lost && self.ring.len() <= CONVINCING && !self.spring.is_constant()
+        self.lost && self.ring.len() < FEWEST && !self.spring.is_constant()
     }
 
     /// Whether enough is known to hold rows against it.
-    fn is_reference(&self) -> bool {
+    #[must_use]
+    pub fn is_reference(&self) -> bool {
         self.frame.is_some() && (self.ring.len() >= FEWEST || self.carried.is_some() || self.fitted)
     }
 
@@ -282,6 +287,10 @@ impl Blocks {
             if !self.doubting {
                 return self.begin_doubt();
             }
+            if self.suspected {
+                self.end_doubt();
+                return Closed::Lost;
+            }
             self.good = 0;
             self.waiting.push(block);
             return self.doubt(odds);
@@ -318,6 +327,7 @@ impl Blocks {
     fn end_doubt(&mut self) {
         self.waiting.clear();
         (self.odds, self.doubting, self.doubted, self.quick) = (None, false, 0, 0.0);
+        self.suspected = false;
     }
 
     fn keep(&mut self, block: Gram) {
@@ -433,6 +443,18 @@ impl Blocks {
             set: kept,
             deflection: self.deflection,
         });
+    }
+
+    /// Positions may count from elsewhere since a restart: blocks tell.
+    pub fn suspect_zero(&mut self) {
+        self.begin_doubt();
+        self.suspected = true;
+    }
+
+    /// Whether it is still to be told where positions count from since a restart.
+    #[must_use]
+    pub fn is_suspected(&self) -> bool {
+        self.suspected
     }
 
     /// Where the zero between the encoders is, is not known any more.

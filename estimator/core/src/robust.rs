@@ -54,7 +54,7 @@ pub struct Robust {
     noise_gains: [f64; 3],
     zeros: Positions, // where the encoders' zeros have moved to
     last: Inputs,
-    centred: bool,                     // deflections, since zeros were lost
+    zeros_known: bool,                 // or what the next sample is held against
     begins: bool,                      // with the next sample that the corrections let pass …
     jumped: Option<[f64; MOTORS + 1]>, // … after encoders moved their zeros
     started: bool,
@@ -116,7 +116,7 @@ impl Robust {
             zeros: Positions::default(),
             last: Inputs::default(),
             begins: true,
-            centred: true,
+            zeros_known: true,
             jumped: None,
             started: false,
             tick: 0,
@@ -142,7 +142,7 @@ impl Robust {
         self.torque_noise = [NoiseMeter::default(); MOTORS];
         (self.zeros, self.last, self.begins, self.jumped) =
             (Positions::default(), Inputs::default(), true, None);
-        self.centred = true;
+        self.zeros_known = true;
         (self.started, self.tick, self.unsettled, self.said, self.rejected) = (false, 0, 0, 0, 0);
         (self.sequence, self.refused, self.external, self.why, self.estimate) = (0, None, None, None, None);
     }
@@ -155,8 +155,7 @@ impl Robust {
         self.validator.reset();
         self.corrections.reset();
         self.momentum.iter_mut().for_each(LinkMomentum::reset);
-        self.sides.iter_mut().for_each(|side| side.move_zero(false));
-        (self.begins, self.centred, self.jumped) = (true, false, None);
+        (self.begins, self.zeros_known, self.jumped) = (true, false, None);
         (self.rejected, self.refused, self.external, self.why, self.estimate) = (0, None, None, None, None);
     }
 
@@ -239,8 +238,8 @@ impl Robust {
         if let Some(jumps) = self.jumped.take() {
             self.move_zeros(jumps, &at, sample.sequence);
         }
-        if !std::mem::replace(&mut self.centred, true) {
-            self.centre(&at);
+        if !std::mem::replace(&mut self.zeros_known, true) {
+            self.resume(&at);
         }
         self.sequence = sample.sequence;
         let mut torque = corrected.aligned.motor_torque;
@@ -328,15 +327,18 @@ impl Robust {
         }
         self.last = *now;
         self.unsettled -= 1;
-        let mut late = None;
+        let (mut late, mut lost) = (None, false);
         for (i, shift) in shifts.into_iter().enumerate() {
             match shift {
                 Some(Shift::Late(periods)) => late = Some(periods),
                 Some(Shift::Zero(off)) => self.recentre(i, off),
+                Some(Shift::Lost) => lost = true,
                 None => {}
             }
         }
-        if let Some(periods) = late {
+        if lost {
+            self.lose_here();
+        } else if let Some(periods) = late {
             self.shift(periods);
         }
     }
@@ -395,12 +397,35 @@ impl Robust {
         Some(all)
     }
 
-    /// Where the zeros are is not known: deflections are counted from this moment's.
-    fn centre(&mut self, at: &Positions) {
-        self.zeros = Positions::default();
-        if self.flexible {
-            let m = self.motors;
-            self.zeros.motor[..m].iter_mut().zip(&at.motor).for_each(|(zero, theta)| *zero = theta - at.link);
+    /// Positions may count from anywhere: from where they did, if blocks bear it out, or from this moment's.
+    fn resume(&mut self, at: &Positions) {
+        let now = at.from_zeros(&self.zeros);
+        let as_before = |(i, side): (usize, &Side)| side.may_be_as_before(now.deflection(i));
+        if self.sides.iter().enumerate().all(as_before) {
+            self.sides.iter_mut().for_each(Side::suspect_zero);
+        } else {
+            self.count_from(&now);
+        }
+    }
+
+    /// Where the zeros are is not known: deflections are counted from these.
+    fn count_from(&mut self, now: &Positions) {
+        for (i, side) in self.sides.iter_mut().enumerate() {
+            self.zeros.motor[i] -= if self.flexible { now.deflection(i) } else { 0.0 };
+            side.move_zero(false);
+        }
+    }
+
+    /// The zeros are not where they were before a restart.
+    fn lose_here(&mut self) {
+        let now = self.last.at;
+        self.count_from(&now);
+        self.unsettled = self.settle;
+        for (i, side) in self.sides.iter_mut().enumerate() {
+            let off = if self.flexible { now.deflection(i) } else { 0.0 };
+            self.last.at.motor[i] += off;
+            self.last.present.motor[i] += off;
+            side.restart(self.last.at.motor[i], self.last.at.deflection(i), self.last.torque[i]);
         }
     }
 
@@ -455,7 +480,7 @@ impl Robust {
         if rejected.or(of_torque).is_none() {
             flags |= status::TORQUE_VALID;
         }
-        if self.sides.iter().any(|side| side.doubtful || side.followed_s > 0.0) {
+        if self.sides.iter().any(Side::has_changed) {
             flags |= status::CHANGED;
         }
         if self.why.is_none() {

@@ -52,6 +52,8 @@ pub enum Shift {
     Late(f64),
     /// The zero is at this deflection, rad.
     Zero(f64),
+    /// The zero is not where it was.
+    Lost,
 }
 
 /// One motor: its columns, what they have taught, and its declared effects.
@@ -182,6 +184,26 @@ impl Side {
         self.judge();
     }
 
+    /// Whether a deflection after a restart can be told from one with another zero.
+    #[must_use]
+    pub fn may_be_as_before(&self, phi: f64) -> bool {
+        self.rigid || self.blocks.is_reference() && phi.abs() <= self.balance.largest()
+    }
+
+    /// The zero is believed again when blocks bear it out.
+    pub fn suspect_zero(&mut self) {
+        if !self.rigid {
+            self.blocks.suspect_zero();
+            self.judge();
+        }
+    }
+
+    /// Whether the joint has changed, or has lately.
+    #[must_use]
+    pub fn has_changed(&self) -> bool {
+        self.doubtful && !self.blocks.is_suspected() || self.followed_s > 0.0
+    }
+
     /// Where its deflections are counted from has been moved to near the zero.
     pub fn recentre(&mut self, theta: f64, phi: f64, torque: f64) {
         self.restart(theta, phi, torque);
@@ -295,6 +317,7 @@ impl Side {
             Closed::Added if doubted => self.deflection.recall(self.usual), // what was read since may be no motion
             Closed::Added => self.usual = self.deflection.motion(),
             Closed::Unexplained => {}
+            Closed::Lost => return Some(Shift::Lost),
         }
         let off = std::mem::take(&mut self.blocks.off);
         if off != 0.0 {
@@ -408,7 +431,7 @@ impl Side {
             return Some(if settled { unmoved } else { Reason::Settling });
         }
         if self.doubtful {
-            return Some(Reason::Changed);
+            return Some(if self.blocks.is_suspected() { Reason::Lost } else { Reason::Changed });
         }
         if !self.fits {
             return Some(Reason::Unexplained(self.unexplained));

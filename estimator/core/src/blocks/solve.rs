@@ -83,7 +83,7 @@ impl Blocks {
 
     /// Whether the balance can be linearised where its zero is.
     fn is_located(&mut self, total: &Gram) -> bool {
-        if !self.lost || self.located || self.spring.is_constant() {
+        if !self.lost || self.located || self.carried.is_none() || self.spring.is_constant() {
             return true;
         }
         let Some(zero) = self.locate(total, self.noise.variance * self.correlated) else { return false };

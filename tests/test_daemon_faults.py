@@ -118,6 +118,7 @@ def test_a_node_that_goes_on_without_its_heartbeat_is_configured_again_once(able
 def test_a_second_reboot_in_the_middle_of_the_configuration_begins_it_anew() -> None:
     with rig() as made:
         settle(made)
+        made.run(2000)  # enough is learned to hold blocks after a reboot against
         made.faults.reboot(made.node(2))
         for _ in range(3):
             made.run(8)
@@ -185,6 +186,7 @@ def test_whatever_goes_wrong_in_the_configuration_of_a_node_is_that_nodes_own(
 ) -> None:
     with rig() as made:
         settle(made)
+        made.run(2000)  # enough is learned to hold blocks after a reboot against
 
         def broken(*_: object, **__: object) -> None:
             raise OverflowError("int too large to convert to float")

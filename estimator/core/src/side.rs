@@ -187,7 +187,7 @@ impl Side {
     /// Whether a deflection after a restart can be told from one with another zero.
     #[must_use]
     pub fn may_be_as_before(&self, phi: f64) -> bool {
-        self.rigid || self.blocks.is_reference() && phi.abs() <= self.balance.largest()
+        self.rigid || self.blocks.is_reference() && self.is_within(phi)
     }
 
     /// The zero is believed again when blocks bear it out.

@@ -312,7 +312,6 @@ impl Spring {
     #[must_use]
     pub fn prior(&self, motor: &Motor, priors: &Priors, total: &Gram, frame: &Frame, scale: &Scale) -> Prior {
         let Scale { zero_std, deflection, period_s } = *scale;
-        let mean_torque = total.at(balance::TORQUE, balance::OFFSET) / total.rows;
         let torque = balance::variance(total, balance::TORQUE).max(f64::MIN_POSITIVE).sqrt();
         let rms =
             |unknown: usize| (total.quadratic(&frame.directions[unknown]) / total.rows).sqrt().max(1e-12);
@@ -327,7 +326,7 @@ impl Spring {
         std[DAMPING] = motor.damping_std.unwrap_or_else(|| {
             priors.viscous_damping * motor.damping + priors.viscous_damping_floor * torque / rms(DAMPING)
         });
-        std[OFFSET] = priors.torque_offset * torque + mean_torque.abs();
+        std[OFFSET] = priors.torque_offset * torque;
         std[DRY] = priors.coulomb_friction * torque;
         let base = self.base();
         let shapes = self.law.shapes();

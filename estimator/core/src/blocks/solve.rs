@@ -140,7 +140,7 @@ impl Blocks {
                 continue;
             }
             self.friction = frame.rms(&total, &chosen, set(DRY..SPRING.start) | set(SOFT..RATE) | set(STOPS));
-            let omitted = self.omitted(&frame, &reduced, &chosen, &used, noise);
+            let omitted = self.omitted(&frame, &reduced, &total, &chosen, &used, noise);
             self.widen(&frame, &mut chosen, &used, noise, own, &total);
             let entries = chosen.covariance.iter_mut().flatten().zip(omitted.iter().flatten());
             entries.for_each(|(v, more)| *v += more);
@@ -237,13 +237,15 @@ impl Blocks {
         solve(reduced, found, prior, noise).map(|found| (found, false))
     }
 
-    /// What the groups that were not chosen may change: the covariance between models, by their probabilities.
+    /// What the groups that were not chosen, or a zero elsewhere, may change: the covariance between models, by their
+    /// probabilities.
     ///
     /// Hoeting et al., "Bayesian model averaging: a tutorial", Statistical Science 14(4), 1999.
     fn omitted(
         &self,
         frame: &Frame,
         reduced: &Matrix,
+        total: &Gram,
         chosen: &Posterior,
         prior: &Prior,
         noise: f64,
@@ -251,8 +253,11 @@ impl Blocks {
         let mut between = [[0.0; UNKNOWNS]; UNKNOWNS];
         let (_, groups) = self.groups(frame);
         let many = groups.iter().filter(|group| **group != 0).count() as f64;
-        for group in groups.iter().filter(|group| *group & !chosen.set & frame.set != 0) {
-            let Some(other) = solve(reduced, chosen.set | group, prior, noise) else { continue };
+        let elsewhere = self.prior(total, frame, self.deflection);
+        let left_out = groups.iter().filter(|group| *group & !chosen.set & frame.set != 0);
+        let rivals = left_out.map(|group| (chosen.set | group, prior)).chain([(chosen.set, &elsewhere)]);
+        for (set, prior) in rivals {
+            let Some(other) = solve(reduced, set, prior, noise) else { continue };
             let odds = (other.log_evidence - chosen.log_evidence).exp() / many;
             let probability = odds / (1.0 + odds);
             if probability < UNLIKELY {

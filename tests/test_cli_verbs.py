@@ -114,7 +114,7 @@ def test_an_unknown_option_prints_the_usage_of_its_own_verb(
 ) -> None:
     positional = {
         "run": ["a"], "sim": ["a"], "record": ["a", "--out", "b.csv"], "keep": ["a"], "replay": ["a"], "fit": ["a"],
-            "accept": ["a"], "dbc": ["a"],
+            "accept": ["a"], "dbc": ["a"], "compare": ["a", "b"],
         "diagnose": ["a"], "fleet": ["a"], "service": ["install", "a"], "completion": ["bash"],
     }  # fmt: skip
     with pytest.raises(SystemExit) as ended:

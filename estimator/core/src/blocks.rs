@@ -231,6 +231,12 @@ impl Blocks {
         self.lost && self.ring.len() < FEWEST && !self.spring.is_constant()
     }
 
+    /// Whether nothing has been learned, and no zero has been lost.
+    #[must_use]
+    pub fn knows_nothing(&self) -> bool {
+        self.posterior.is_none() && !self.lost
+    }
+
     /// Whether enough is known to hold rows against it.
     #[must_use]
     pub fn is_reference(&self) -> bool {
@@ -399,6 +405,10 @@ impl Blocks {
             let opens = TABLE.iter().zip(likely).filter(|(_, likely)| *likely).map(|(entry, _)| entry.opens);
             self.begin(opens.fold(0, |all, one| all | one));
             return Closed::Begun;
+        }
+        if self.lost && self.doubted >= FEWEST {
+            self.lose_zero(); // it was located wrongly
+            return Closed::Unexplained;
         }
         if self.doubted >= BLOCKS {
             // Nothing in the table, for as long as anything is remembered: another joint.

@@ -97,12 +97,6 @@ impl Cause {
     pub fn entry(self) -> &'static Entry {
         &TABLE[self as usize]
     }
-
-    /// Whether it is of a reading that the balance has no unknown for.
-    #[must_use]
-    pub fn is_reading(self) -> bool {
-        !matches!(self, Cause::Nothing | Cause::Noise) && self.entry().opens == 0
-    }
 }
 
 /// What is known of a balance, as the causes need it.

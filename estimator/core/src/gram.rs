@@ -215,14 +215,6 @@ impl Posterior {
         }
         sum.max(0.0)
     }
-
-    /// Σ (z·d)ᵀ C (z·d) over the rows of a reduced block: the misfit that uncertain unknowns explain.
-    #[must_use]
-    pub fn predicted(&self, reduced: &Matrix) -> f64 {
-        let product =
-            |i: usize| -> f64 { unknowns(self.set).map(|j| self.covariance[i][j] * reduced[i][j]).sum() };
-        unknowns(self.set).map(product).sum::<f64>().max(0.0)
-    }
 }
 
 /// A positive definite matrix of a set's unknowns as L Lᵀ, scaled by its diagonal.

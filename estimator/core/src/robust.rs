@@ -149,8 +149,8 @@ impl Robust {
 
     /// Positions may count from anywhere after this: nothing that depends on where their zeros are is known.
     pub fn lose_zeros(&mut self) {
-        if !self.started {
-            return self.reset(); // the zeros are those that are declared
+        if self.sides.iter().all(Side::knows_nothing) {
+            return self.reset(); // as at a start: the zeros are those that are declared
         }
         self.validator.reset();
         self.corrections.reset();

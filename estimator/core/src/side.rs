@@ -184,6 +184,12 @@ impl Side {
         self.judge();
     }
 
+    /// Whether nothing has been learned, and no zero has been lost.
+    #[must_use]
+    pub fn knows_nothing(&self) -> bool {
+        self.rigid || self.blocks.knows_nothing()
+    }
+
     /// Whether a deflection after a restart can be told from one with another zero.
     #[must_use]
     pub fn may_be_as_before(&self, phi: f64) -> bool {

@@ -1,6 +1,7 @@
 """The fault script on the virtual bus, in lockstep: every fault in turn, one daemon, never a restart."""
 
 import sys
+from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,7 +33,8 @@ def test_each_fault_is_flagged_said_once_and_survived_without_a_restart(
 
 @pytest.mark.slow
 def test_a_short_soak_in_real_time_ends_well_and_with_as_many_threads() -> None:
-    result = Soak(20.0, seed=7, lockstep=False).run()
+    options = Namespace(seconds=20.0, seed=7, lockstep=False, two=0.0, recount=0.0)
+    result = Soak(options).run()
     assert result["faults"] >= 3
     assert len(result["threads"]) == 1
     assert result["samples_checked"] > 100

@@ -93,3 +93,23 @@ def test_a_drive_that_counts_from_elsewhere_after_a_reboot_is_not_believed_befor
     assert np.all(np.abs(stiffness / motion.stiffness_nm_rad - 1.0)[valid] < 0.1)
     # The limit of the fault matrix, a quarter of the torque's rms.
     assert np.all(np.abs(torque - motion.torque_nm)[valid] < 0.25 * np.sqrt(np.mean(motion.torque_nm**2)))
+
+
+@pytest.mark.parametrize("after", [840, 880, 920])
+@pytest.mark.parametrize("name", ["constant", "quadratic"])
+def test_a_doubted_sample_in_the_middle_of_that_judgement_does_not_end_it(name, after):
+    """The half block before a sample whose moment is in doubt is not judged as a whole one."""
+    lost, motion = 6000, kit.motion(name, 13.0)
+    estimator = kit.make_estimator(kit.declared(name), kit.EstimatorSettings(), kit.PERIOD_S)
+    off = []
+    for k, sample in enumerate(motion.samples):
+        if k == lost:
+            estimator.lose_zeros()
+        if k == lost + after:
+            estimator.distrust()
+        moved = sample.motor_position_rad[0] + (0.1 if k >= lost else 0.0)
+        one = estimator.step(sample._replace(motor_position_rad=(moved, *sample.motor_position_rad[1:])))
+        if k >= lost and one.status & 1:
+            off.append(abs(one.flexibility_torque_nm - motion.torque_nm[k]))
+    assert off
+    assert max(off) < 0.25 * np.sqrt(np.mean(motion.torque_nm**2))

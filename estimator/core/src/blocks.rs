@@ -190,9 +190,9 @@ impl Blocks {
         (self.noise.variance, self.own, self.torque, self.quick) = (f64::NAN, f64::NAN, f64::NAN, 0.0);
     }
 
-    /// What follows is not as what was before: half a block is a block.
+    /// What follows is not as what was before: half a block is a block, but for what a restart is judged by.
     pub fn cut(&mut self) {
-        if self.open.rows >= 0.5 * self.rows && self.ring.len() >= FEWEST {
+        if self.open.rows >= 0.5 * self.rows && self.ring.len() >= FEWEST && !self.suspected {
             let block = std::mem::take(&mut self.open);
             self.close(block);
         } else {

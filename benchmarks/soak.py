@@ -220,9 +220,9 @@ class Soak:
 
 
 def _thirds(values: FloatArray) -> list[int]:
-    """Medians of the first and the last third."""
-    parts = np.array_split(values, 3)
-    return [int(np.median(parts[k])) for k in (0, -1)]
+    """Medians of the first and the last third, of one value at least each."""
+    third = max(1, len(values) // 3)
+    return [int(np.median(part)) for part in (values[:third], values[-third:])]
 
 
 def main() -> None:

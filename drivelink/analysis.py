@@ -56,21 +56,13 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Runs:
-    """Recordings of one joint, as read.
+    """Recordings of one joint, as read."""
 
-    Attributes:
-        source: the joint file, given or carried by the first recording.
-        paths: of the recordings.
-        records: their values.
-        notes: what the gate says of units, signs, gears and time.
-        names: columns of others under our names.
-    """
-
-    source: JointText
-    paths: tuple[Path, ...]
-    records: tuple[Record, ...]
-    notes: tuple[str, ...]
-    names: tuple[str, ...] = ()
+    source: JointText  # the joint file, given or carried by the first recording
+    paths: tuple[Path, ...]  # of the recordings
+    records: tuple[Record, ...]  # their values
+    notes: tuple[str, ...]  # what the gate says of units, signs, gears and time
+    names: tuple[str, ...] = ()  # columns of others under our names
 
     @property
     def named(self) -> str:
@@ -209,19 +201,12 @@ class Fit:
 
 @dataclass(frozen=True, slots=True)
 class Diagnosed:
-    """What a joint's model lacks.
+    """What a joint's model lacks."""
 
-    Attributes:
-        runs: the recordings; their notes include those of the validation.
-        outcome: verdict, effects with parameters and probabilities, errors before and after in N·m.
-        validated: the held-out recording's name; None: held-out blocks.
-        held: its values.
-    """
-
-    runs: Runs
-    outcome: Diagnosis
-    validated: str | None = None
-    held: Record | None = None
+    runs: Runs  # the recordings; their notes include those of the validation
+    outcome: Diagnosis  # verdict, effects with parameters and probabilities, errors before and after in N·m
+    validated: str | None = None  # the held-out recording's name; None: held-out blocks
+    held: Record | None = None  # its values
 
     def __str__(self) -> str:
         return report.sentence(self.outcome)

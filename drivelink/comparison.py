@@ -201,9 +201,7 @@ def compare(
 
     Args:
         a: a joint file or a recording.
-        b: likewise.
         joint: the joint file of recordings; left out: that of the other side, or what they carry.
-        names: columns of others, as of `drivelink.fit`.
         horizon_s: time between new starts of a free run, s; left out: as `free_run` does, by A's model.
 
     Raises:

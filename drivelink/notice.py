@@ -28,19 +28,12 @@ _LEVELS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Notice:
-    """One thing that was noticed; its words, which may be those of a drive or a file, as plain text.
+    """One thing that was noticed; its words, which may be those of a drive or a file, as plain text."""
 
-    Attributes:
-        severity: how bad it is.
-        subject: e.g. "can0" or "node 1".
-        text: one line: what was found, and what it should be.
-        fix: the command or joint-file line that fixes it, or empty.
-    """
-
-    severity: Severity
-    subject: str
-    text: str
-    fix: str = ""
+    severity: Severity  # how bad it is
+    subject: str  # e.g. "can0" or "node 1".
+    text: str  # one line: what was found, and what it should be
+    fix: str = ""  # the command or joint-file line that fixes it, or empty
 
     def __post_init__(self) -> None:
         for name in ("subject", "text", "fix"):

@@ -26,7 +26,6 @@ def check_target(path: Path, inputs: Iterable[Path] = (), *, force: bool = False
     """Check an output path before any work is done for it.
 
     Args:
-        path: of the output.
         inputs: input files; symbolic and hard links count as the same file.
         force: replace an existing file.
 
@@ -57,10 +56,6 @@ class NewFile:
             directly.
         force: whether it may take the place of another file.
 
-    Attributes:
-        fd: descriptor to write to.
-        placed: whether it has its final name.
-
     Raises:
         OSError: it cannot be written; `filename` is the final path.
     """
@@ -71,14 +66,14 @@ class NewFile:
         self._force = force
         try:
             mode = _mode(self._place)
-            self.placed = mode is not None and not stat.S_ISREG(mode)
+            self.placed = mode is not None and not stat.S_ISREG(mode)  # whether it has its final name
             if mode is not None and not (force or self.placed):
                 raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST))
             self._temporary = self._place if self.placed else _beside(self._place)
             if mode is not None and not os.access(self._place, os.W_OK):
                 raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))  # rename would replace it
             flags = os.O_WRONLY if self.placed else os.O_WRONLY | os.O_CREAT | os.O_EXCL
-            self.fd = os.open(self._temporary, flags | os.O_CLOEXEC, 0o666)
+            self.fd = os.open(self._temporary, flags | os.O_CLOEXEC, 0o666)  # descriptor to write to
             if mode is not None and not self.placed:
                 os.fchmod(self.fd, stat.S_IMODE(mode))
         except OSError as error:
@@ -113,7 +108,6 @@ def write_whole(path: Path, data: str | bytes, *, force: bool = False) -> None:
     """Write a file atomically.
 
     Args:
-        path: its place.
         data: bytes, or text for UTF-8.
         force: whether it may take the place of another file.
 

@@ -18,12 +18,7 @@ _UNSHOWABLE = frozenset({"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"})
 
 
 def clean_text(text: str, length: int = MAX_TEXT) -> str:
-    """Return the text in one line, without control and format characters.
-
-    Args:
-        text: of anybody.
-        length: characters at most.
-    """
+    """Return the text in one line, without control and format characters."""
     text = text[: length + 1]
     if not text.isascii() or not text.isprintable():
         text = "".join(_shown(character) for character in text)
@@ -63,9 +58,7 @@ def stamped(text: str, stream: TextIO, indent: int = 9) -> str:
     """Put the time of day before a line, and fold it to at most 100 columns of a terminal.
 
     Args:
-        text: the line.
         stream: where it goes; a journal has stamps of its own.
-        indent: of further lines.
     """
     if not stream.isatty():
         return text if "JOURNAL_STREAM" in os.environ else f"{time.strftime('%H:%M:%S')} {text}"

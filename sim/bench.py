@@ -19,11 +19,6 @@ from sim.world import World
 class Bench:
     """Several joints on one bus.
 
-    Args:
-        names: of the joints.
-        worlds: one per joint.
-        nodes: devices, one sequence per joint.
-
     Raises:
         SimError: two devices have the same node id.
     """

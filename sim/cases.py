@@ -33,40 +33,24 @@ from sim.world import World
 
 @dataclass(frozen=True, slots=True)
 class Assumption:
-    """A value that the paper does not give.
-
-    Attributes:
-        quantity: what it is.
-        value: with its unit.
-        reason: why this one.
-    """
+    """A value that the paper does not give."""
 
     quantity: str
-    value: str
-    reason: str
+    value: str  # with its unit
+    reason: str  # why this one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """A named case.
+    """A named case."""
 
-    Attributes:
-        name: "constant", "quadratic" or "vsa-ii".
-        plant: the joint.
-        drives: one per motor.
-        encoder: at the link.
-        excitation: the paper's torque, as a table for `sim.excitation.build`.
-        rich: a richer torque for the same joint.
-        assumed: values that the paper does not state.
-    """
-
-    name: str
+    name: str  # "constant", "quadratic" or "vsa-ii"
     plant: JointPlant
-    drives: tuple[DriveHardware, ...]
-    encoder: LinkEncoder
-    excitation: Mapping[str, Any]
-    rich: Mapping[str, Any]
-    assumed: tuple[Assumption, ...]
+    drives: tuple[DriveHardware, ...]  # one per motor
+    encoder: LinkEncoder  # at the link
+    excitation: Mapping[str, Any]  # the paper's torque, as a table for `sim.excitation.build`
+    rich: Mapping[str, Any]  # a richer torque for the same joint
+    assumed: tuple[Assumption, ...]  # values that the paper does not state
 
     def world(
         self,
@@ -81,10 +65,7 @@ class Case:
 
         Args:
             excitation: a table in place of the paper's.
-            effects: effects to switch on.
-            period_s: control period.
             plant_step_s: integration step; None: chosen.
-            seed: of the sensor noise.
         """
         return World(
             self.plant,

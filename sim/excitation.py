@@ -20,21 +20,13 @@ Profile = Callable[[float], float]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Excitation:
-    """Torques that the rig applies.
+    """Torques that the rig applies."""
 
-    Attributes:
-        profiles: torque (N·m, joint side) over time (s), one per motor.
-        external: tau_k of eq 4 over time.
-        centre_rad: centre of the spring for each motor.
-        centring_nm_rad: stiffness of that hold.
-        centring_nm_s_rad: damping of that hold.
-    """
-
-    profiles: tuple[Profile, ...]
-    external: Profile | None = None
-    centre_rad: tuple[float, ...] = (0.0, 0.0)
-    centring_nm_rad: float = 0.0
-    centring_nm_s_rad: float = 0.0
+    profiles: tuple[Profile, ...]  # torque (N·m, joint side) over time (s), one per motor
+    external: Profile | None = None  # tau_k of eq 4 over time
+    centre_rad: tuple[float, ...] = (0.0, 0.0)  # centre of the spring for each motor
+    centring_nm_rad: float = 0.0  # stiffness of that hold
+    centring_nm_s_rad: float = 0.0  # damping of that hold
 
     def torque(self, motor: int, time_s: float, position_rad: float, velocity_rad_s: float) -> float:
         """Return the torque for the period that begins now, N·m at the joint."""
@@ -99,9 +91,7 @@ def build(
 
     Args:
         table: `kind` and its keys (see `docs/reference/simulation.md`); an empty table is "rich".
-        motors: number of motors.
         amplitude_nm: default of the key of that name; None: the key is required.
-        where: begins every message.
 
     Raises:
         SimError: unknown, missing or impossible key.

@@ -43,11 +43,7 @@ class _Tap:
 
 
 class Faults:
-    """Injects faults into a network.
-
-    Args:
-        network: its devices.
-    """
+    """Injects faults into a network."""
 
     def __init__(self, network: Network) -> None:
         self._network = network

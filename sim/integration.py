@@ -88,10 +88,8 @@ def whole_fraction(period_s: float, step_s: float | None, plant: JointPlant, fin
     """Return steps in a control period.
 
     Args:
-        period_s: the control period.
         step_s: the step; None: at most a tenth of a radian of the fastest oscillation that the springs
             allow at twice their stiffness at rest, 1 ms, and 0.5 ms with dry friction or memories.
-        plant: the joint.
         fine: whether it has dry friction or memories.
 
     Raises:

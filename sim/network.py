@@ -35,14 +35,6 @@ class Network:
         nodes: the devices, switched on in this order with the first poll.
         worlds: what they measure; the same SYNC advances all.
         clock: monotonic seconds, for the devices' timers.
-
-    Attributes:
-        nodes: the devices, also those switched off.
-        syncs: SYNC messages seen, dropped ones included.
-        send_failures: frames that the bus did not take.
-        send: puts any frame (identifier, data) on the bus, for tests.
-        plugged: for tests: whether the cable is plugged in.
-        sync_filter: called with each SYNC's data; False drops it for all devices. For tests.
     """
 
     def __init__(
@@ -52,10 +44,11 @@ class Network:
         *worlds: World,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.nodes = list(nodes)
-        self.syncs = 0
-        self.send_failures = 0
-        self.plugged = True
+        self.nodes = list(nodes)  # the devices, also those switched off
+        self.syncs = 0  # SYNC messages seen, dropped ones included
+        self.send_failures = 0  # frames that the bus did not take
+        self.plugged = True  # for tests: whether the cable is plugged in
+        # called with each SYNC's data; False drops it for all devices. For tests.
         self.sync_filter: Callable[[bytes], bool] | None = None
         self._bus = bus
         self._worlds = worlds
@@ -75,7 +68,7 @@ class Network:
         self._stop = threading.Event()
         for node in self.nodes:
             node.attach(self._sender(), self._reroute)
-        self.send = self._sender()
+        self.send = self._sender()  # puts any frame (identifier, data) on the bus, for tests
 
     # Devices
 

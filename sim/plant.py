@@ -25,40 +25,24 @@ Commit = Callable[[float, float], None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Terms:
-    """Terms that effects add to one body.
+    """Terms that effects add to one body."""
 
-    Attributes:
-        loads: x(position, velocity), N·m.
-        dry: levels of dry friction, N·m.
-        extras: of a motor's transmission, added to tau_e on both sides.
-        kinematics: of a motor's gear.
-        commits: memories to update at each step.
-    """
-
-    loads: tuple[Load, ...] = ()
-    dry: tuple[Dry, ...] = ()
-    extras: tuple[Extra, ...] = ()
-    kinematics: tuple[Kinematics, ...] = ()
-    commits: tuple[Commit, ...] = ()
+    loads: tuple[Load, ...] = ()  # x(position, velocity), N·m
+    dry: tuple[Dry, ...] = ()  # levels of dry friction, N·m
+    extras: tuple[Extra, ...] = ()  # of a motor's transmission, added to tau_e on both sides
+    kinematics: tuple[Kinematics, ...] = ()  # of a motor's gear
+    commits: tuple[Commit, ...] = ()  # memories to update at each step
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotorPlant:
-    """A motor and its transmission, reflected to the joint.
+    """A motor and its transmission, reflected to the joint."""
 
-    Attributes:
-        inertia_kg_m2: B > 0.
-        viscous_damping_nm_s_rad: D_theta >= 0.
-        spring: tau_e(phi); rigid: motor and link are one body.
-        reshape: changes of the spring's law by effects, applied in order.
-        terms: further physics.
-    """
-
-    inertia_kg_m2: float
-    viscous_damping_nm_s_rad: float = 0.0
-    spring: Spring
-    reshape: tuple[Callable[[Law], Law], ...] = ()
-    terms: Terms = Terms()
+    inertia_kg_m2: float  # B > 0
+    viscous_damping_nm_s_rad: float = 0.0  # D_theta >= 0
+    spring: Spring  # tau_e(phi); rigid: motor and link are one body
+    reshape: tuple[Callable[[Law], Law], ...] = ()  # changes of the spring's law by effects, applied in order
+    terms: Terms = Terms()  # further physics
 
     def __post_init__(self) -> None:
         _check("motor", self.inertia_kg_m2, self.viscous_damping_nm_s_rad)
@@ -73,21 +57,13 @@ class MotorPlant:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkPlant:
-    """The link: g(q) = gravity_nm sin(q + gravity_phase_rad).
+    """The link: g(q) = gravity_nm sin(q + gravity_phase_rad)."""
 
-    Attributes:
-        inertia_kg_m2: M > 0.
-        viscous_damping_nm_s_rad: D_q >= 0.
-        gravity_nm: amplitude of gravity.
-        gravity_phase_rad: angle added to q.
-        terms: further physics.
-    """
-
-    inertia_kg_m2: float
-    viscous_damping_nm_s_rad: float = 0.0
-    gravity_nm: float = 0.0
-    gravity_phase_rad: float = 0.0
-    terms: Terms = Terms()
+    inertia_kg_m2: float  # M > 0
+    viscous_damping_nm_s_rad: float = 0.0  # D_q >= 0
+    gravity_nm: float = 0.0  # amplitude of gravity
+    gravity_phase_rad: float = 0.0  # angle added to q
+    terms: Terms = Terms()  # further physics
 
     def __post_init__(self) -> None:
         _check("link", self.inertia_kg_m2, self.viscous_damping_nm_s_rad)
@@ -95,19 +71,13 @@ class LinkPlant:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JointPlant:
-    """A joint: motors, transmissions and link.
+    """A joint: motors, transmissions and link."""
 
-    Attributes:
-        arrangement: "single", "antagonistic" (eq 9) or "serial" (motor 2 sets the lever of motor 1's spring).
-        motors: one, or two.
-        link: the link.
-        lever_per_rad: l of the serial arrangement, 1/rad; unused otherwise.
-    """
-
+    # "single", "antagonistic" (eq 9) or "serial" (motor 2 sets the lever of motor 1's spring)
     arrangement: Arrangement
-    motors: tuple[MotorPlant, ...]
-    link: LinkPlant
-    lever_per_rad: float = 0.0
+    motors: tuple[MotorPlant, ...]  # one, or two
+    link: LinkPlant  # the link
+    lever_per_rad: float = 0.0  # l of the serial arrangement, 1/rad; unused otherwise
 
     def __post_init__(self) -> None:
         expected = 1 if self.arrangement == "single" else 2

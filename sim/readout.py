@@ -16,14 +16,7 @@ class Amplifier:
     """
 
     def __init__(self, drive: DriveHardware, period_s: float, substeps: int, noise: Iterator[float]) -> None:
-        """Switch the drive on.
-
-        Args:
-            drive: its data.
-            period_s: control period.
-            substeps: integration steps in one period.
-            noise: of the reported current, A.
-        """
+        """Switch the drive on."""
         self.drive = drive
         self.schedule = [0.0] * substeps
         self._substeps, self._period_s, self._noise = substeps, period_s, noise
@@ -44,8 +37,6 @@ class Amplifier:
         """Start a period with this set-point, and sample.
 
         Args:
-            current_a: set-point, limited by the drive.
-            time_s: now.
             theta: motor position at the joint, rad.
             velocity: motor velocity at the joint, rad/s.
         """
@@ -83,23 +74,14 @@ class Amplifier:
 
 
 class LinkScale:
-    """The link encoder's disc and its sampled reading.
-
-    Attributes:
-        counts: the reading.
-        history: receives every plant step of the link if the reading lags; else None.
-        deflection: receives every plant step of the deflection if its sensor lags; else None.
-    """
+    """The link encoder's disc and its sampled reading."""
 
     def __init__(self, encoder: LinkEncoder, noise: Iterator[float]) -> None:
-        """Switch the encoder on.
-
-        Args:
-            encoder: its data.
-            noise: of the reading, counts.
-        """
-        self.counts = 0
+        """Switch the encoder on."""
+        self.counts = 0  # the reading
+        # receives every plant step of the link if the reading lags; else None
         self.history: PositionHistory | None = None
+        # receives every plant step of the deflection if its sensor lags; else None
         self.deflection: PositionHistory | None = None
         self._encoder, self._noise = encoder, noise
         self._readings: tuple[Reading, ...] = ()

@@ -21,49 +21,31 @@ _BLOCK = 4096
 
 
 class DriveSignals(NamedTuple):
-    """Signals of a drive at one sampling instant, at the motor shaft, with the drive's signs.
+    """Signals of a drive at one sampling instant, at the motor shaft, with the drive's signs."""
 
-    Attributes:
-        position_counts: encoder counts since the joint's zero, unbounded (a bus object wraps it).
-        velocity_rad_s: actual velocity in steps of the drive's resolution.
-        current_a: actual current, noise and resolution included.
-        torque_nm: that current times the torque constant.
-    """
-
-    position_counts: int
-    velocity_rad_s: float
-    current_a: float
-    torque_nm: float
+    position_counts: int  # encoder counts since the joint's zero, unbounded (a bus object wraps it)
+    velocity_rad_s: float  # actual velocity in steps of the drive's resolution
+    current_a: float  # actual current, noise and resolution included
+    torque_nm: float  # that current times the torque constant
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DriveHardware:
-    """A drive, its motor's encoder and gear.
+    """A drive, its motor's encoder and gear."""
 
-    Attributes:
-        counts_per_rev: encoder counts per revolution of the motor shaft.
-        gear_ratio: motor revolutions per joint revolution.
-        torque_constant_nm_a: torque at the motor shaft per ampere.
-        rated_current_a: the thousandth of it is the unit of the reported current.
-        max_current_a: the drive's limit; None: three times the rated current.
-        current_resolution_a: step of the reported current; None: a thousandth of the rated current.
-        current_noise_a: standard deviation of the reported current (white, one draw a period).
-        velocity_resolution_rad_s: step of the reported velocity at the shaft, 1 rpm on most drives.
-        velocity_filter_s: time constant of the drive's velocity filter; 0: none.
-        direction: sign of the motor position against the joint's.
-        torque_direction: sign of current and torque against the joint's; None: like direction.
-    """
-
-    counts_per_rev: float = 4096.0
-    gear_ratio: float = 1.0
-    torque_constant_nm_a: float = 0.05
-    rated_current_a: float = 2.0
-    max_current_a: float | None = None
+    counts_per_rev: float = 4096.0  # encoder counts per revolution of the motor shaft
+    gear_ratio: float = 1.0  # motor revolutions per joint revolution
+    torque_constant_nm_a: float = 0.05  # torque at the motor shaft per ampere
+    rated_current_a: float = 2.0  # the thousandth of it is the unit of the reported current
+    max_current_a: float | None = None  # the drive's limit; None: three times the rated current
+    # step of the reported current; None: a thousandth of the rated current
     current_resolution_a: float | None = None
-    current_noise_a: float = 0.0
+    current_noise_a: float = 0.0  # standard deviation of the reported current (white, one draw a period)
+    # step of the reported velocity at the shaft, 1 rpm on most drives
     velocity_resolution_rad_s: float = RPM_RAD_S
-    velocity_filter_s: float = 0.0
-    direction: int = 1
+    velocity_filter_s: float = 0.0  # time constant of the drive's velocity filter; 0: none
+    direction: int = 1  # sign of the motor position against the joint's
+    # sign of current and torque against the joint's; None: like direction
     torque_direction: int | None = None
 
     def __post_init__(self) -> None:
@@ -108,19 +90,12 @@ class DriveHardware:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkEncoder:
-    """The encoder at the link.
+    """The encoder at the link."""
 
-    Attributes:
-        counts_per_rev: counts per revolution of the joint.
-        direction: sign against the joint's.
-        zero_rad: joint angle at which it reads zero.
-        noise_counts: standard deviation of its reading before it is rounded.
-    """
-
-    counts_per_rev: float = 262144.0
-    direction: int = 1
-    zero_rad: float = 0.0
-    noise_counts: float = 0.0
+    counts_per_rev: float = 262144.0  # counts per revolution of the joint
+    direction: int = 1  # sign against the joint's
+    zero_rad: float = 0.0  # joint angle at which it reads zero
+    noise_counts: float = 0.0  # standard deviation of its reading before it is rounded
 
     def __post_init__(self) -> None:
         _require("counts_per_rev", self.counts_per_rev, positive=True)

@@ -20,30 +20,19 @@ RIGID = "none"
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    """A transmission's elastic law over its deflection phi (rad).
+    """A transmission's elastic law over its deflection phi (rad)."""
 
-    Attributes:
-        torque: tau_e(phi), N·m (eq 1).
-        stiffness: sigma(phi) = d tau_e / d phi, N·m/rad (eq 3).
-        potential: U_e(phi), J.
-    """
-
-    torque: Scalar
-    stiffness: Scalar
-    potential: Scalar
+    torque: Scalar  # tau_e(phi), N·m (eq 1)
+    stiffness: Scalar  # sigma(phi) = d tau_e / d phi, N·m/rad (eq 3)
+    potential: Scalar  # U_e(phi), J
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spring:
-    """A transmission law by name and parameters.
+    """A transmission law by name and parameters."""
 
-    Attributes:
-        model: "linear", "polynomial", "vsa-ii", "exponential", or "none" for a rigid coupling.
-        parameters: by names that carry their unit (see `MODELS`).
-    """
-
-    model: str
-    parameters: Parameters = field(default_factory=dict)
+    model: str  # "linear", "polynomial", "vsa-ii", "exponential", or "none" for a rigid coupling
+    parameters: Parameters = field(default_factory=dict)  # by names that carry their unit (see `MODELS`)
 
     def __post_init__(self) -> None:
         if self.model != RIGID:

@@ -19,7 +19,6 @@ def with_parameters(plant: JointPlant, parameters: Mapping[str, float]) -> Joint
     """Replace values of a plant.
 
     Args:
-        plant: the plant to change.
         parameters: `link_inertia_kg_m2`, `link_gravity_nm`, `motor1_viscous_damping_nm_s_rad`,
             `motor2_k_nm_rad`, `motor1_coefficient2_nm_rad` (the second of `coefficients_nm_rad`), …;
             `lever_per_rad` of a serial joint.

@@ -25,45 +25,26 @@ from sim.sensors import DriveHardware, DriveSignals, LinkEncoder, noise
 
 
 class MotorTruth(NamedTuple):
-    """True state of one motor and its transmission, joint side.
+    """True state of one motor and its transmission, joint side."""
 
-    Attributes:
-        position_rad: theta.
-        velocity_rad_s: theta'.
-        torque_nm: the acting torque, which may differ from the reported one.
-        deflection_rad: phi = q - theta.
-        flexibility_torque_nm: tau_e(phi), the elastic part of the transmission's torque.
-        stiffness_nm_rad: sigma = d tau_e / d phi.
-    """
-
-    position_rad: float
-    velocity_rad_s: float
-    torque_nm: float
-    deflection_rad: float
-    flexibility_torque_nm: float
-    stiffness_nm_rad: float
+    position_rad: float  # theta
+    velocity_rad_s: float  # theta'
+    torque_nm: float  # the acting torque, which may differ from the reported one
+    deflection_rad: float  # phi = q - theta
+    flexibility_torque_nm: float  # tau_e(phi), the elastic part of the transmission's torque
+    stiffness_nm_rad: float  # sigma = d tau_e / d phi
 
 
 class Truth(NamedTuple):
-    """True state of the joint at one sampling instant.
+    """True state of the joint at one sampling instant."""
 
-    Attributes:
-        time_s: t_k.
-        link_position_rad: q.
-        link_velocity_rad_s: q'.
-        external_torque_nm: tau_k, held over the period.
-        flexibility_torque_nm: tau_e,t (eq 9).
-        stiffness_nm_rad: sigma_t (eq 11).
-        motors: one per motor.
-    """
-
-    time_s: float
-    link_position_rad: float
-    link_velocity_rad_s: float
-    external_torque_nm: float
-    flexibility_torque_nm: float
-    stiffness_nm_rad: float
-    motors: tuple[MotorTruth, ...]
+    time_s: float  # t_k
+    link_position_rad: float  # q
+    link_velocity_rad_s: float  # q'
+    external_torque_nm: float  # tau_k, held over the period
+    flexibility_torque_nm: float  # tau_e,t (eq 9)
+    stiffness_nm_rad: float  # sigma_t (eq 11)
+    motors: tuple[MotorTruth, ...]  # one per motor
 
 
 class World:
@@ -85,14 +66,9 @@ class World:
         """Build the joint, at rest.
 
         Args:
-            plant: its physics as declared.
-            drives: one per motor.
             encoder: the link encoder; None: a fine one.
             excitation: the rig's torque while no master commands; None: no torque.
-            effects: effects to switch on.
-            period_s: control period.
             plant_step_s: integration step, a whole fraction of the period; None: chosen from the plant.
-            seed: of the sensor noise.
             initial_rad: q, theta_1 (, theta_2) at the start; empty: zero.
 
         Raises:
@@ -164,7 +140,6 @@ class World:
         """Command one drive's set-point from the next period on.
 
         Args:
-            motor: index.
             torque_nm: at the motor shaft in the drive's own direction; None: the rig's excitation acts.
 
         Raises:

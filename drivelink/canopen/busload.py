@@ -24,17 +24,11 @@ def frame_bits(data_bytes: int) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BusLoad:
-    """Load of the cycle on the bus.
+    """Load of the cycle on the bus."""
 
-    Attributes:
-        bits_per_s: worst case.
-        bitrate: bit/s of the bus.
-        frames_per_s: of them.
-    """
-
-    bits_per_s: float
-    bitrate: int
-    frames_per_s: float
+    bits_per_s: float  # worst case
+    bitrate: int  # bit/s of the bus
+    frames_per_s: float  # of them
 
     @property
     def fraction(self) -> float:

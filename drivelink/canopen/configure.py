@@ -36,7 +36,6 @@ class Configurator:
     Args:
         send: puts a frame (identifier, data) on the bus.
         joints: joint files on this bus; the first one's bus section counts.
-        base_dirs: their folders, for EDS files.
     """
 
     def __init__(
@@ -141,9 +140,7 @@ def configure_joints(
     """Configure and start all nodes of all joints on one bus, and check the bus load.
 
     Args:
-        bus: open, without another reader.
         joints: joint files with `configure = true`; the first one's bus section counts.
-        base_dirs: their folders, for EDS files.
         idle: called between receptions, e.g. the simulated devices' `poll` in lockstep.
 
     Returns:

@@ -36,27 +36,16 @@ _NODE = re.compile(r"\$(my_)?node_?id", re.IGNORECASE)  # $NODEID, and Roboteq's
 
 @dataclass(slots=True, kw_only=True)
 class DataSheet:
-    """The content of an EDS or DCF file.
-
-    Attributes:
-        path: the file.
-        vendor_name: as the file has it.
-        product_name: as the file has it.
-        vendor_id: VendorNumber, or 0x1018:01; 0 where neither gives it.
-        product_code: ProductNumber, or 0x1018:02.
-        revision: RevisionNumber, or 0x1018:03.
-        objects: by (index, subindex).
-        problems: problems of the file, one line each.
-    """
+    """The content of an EDS or DCF file."""
 
     path: Path
-    vendor_name: str = ""
-    product_name: str = ""
-    vendor_id: int = 0
-    product_code: int = 0
-    revision: int = 0
-    objects: dict[Address, ODVariable] = field(default_factory=dict)
-    problems: list[str] = field(default_factory=list)
+    vendor_name: str = ""  # as the file has it
+    product_name: str = ""  # as the file has it
+    vendor_id: int = 0  # VendorNumber, or 0x1018:01; 0 where neither gives it
+    product_code: int = 0  # ProductNumber, or 0x1018:02
+    revision: int = 0  # RevisionNumber, or 0x1018:03
+    objects: dict[Address, ODVariable] = field(default_factory=dict)  # by (index, subindex)
+    problems: list[str] = field(default_factory=list)  # problems of the file, one line each
 
     def value(self, index: int, subindex: int = 0) -> int | None:
         """Return the value of an object as an unsigned number of its length; None if the file has none."""
@@ -84,7 +73,6 @@ def load_eds(path: Path, node_id: int | None = None) -> DataSheet:
     """Read an EDS or DCF file.
 
     Args:
-        path: the file.
         node_id: the node it is for; identifiers are computed with it. Left out: the one a DCF was made
             for, or 1.
 

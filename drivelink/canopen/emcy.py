@@ -43,17 +43,11 @@ _REGISTER = ("generic", "current", "voltage", "temperature", "communication", "p
 
 @dataclass(frozen=True, slots=True)
 class Emergency:
-    """An EMCY message.
+    """An EMCY message."""
 
-    Attributes:
-        code: error code; 0x00xx resets.
-        register: 0x1001.
-        vendor: the five bytes of the maker.
-    """
-
-    code: int
-    register: int
-    vendor: bytes
+    code: int  # error code; 0x00xx resets
+    register: int  # 0x1001
+    vendor: bytes  # the five bytes of the maker
 
     @property
     def is_reset(self) -> bool:

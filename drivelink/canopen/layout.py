@@ -32,29 +32,19 @@ class Signal(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MappedObject:
-    """One object in a TPDO, or one that a node could send in one.
+    """One object in a TPDO, or one that a node could send in one."""
 
-    Attributes:
-        signal: what it means.
-        index: object index.
-        subindex: object subindex.
-        bits: its length in the frame.
-        signed: whether two's complement.
-        scale: SI units at the joint side per count, direction and gear included (1 for the statusword).
-        wraps: whether the counter rolls over at its length (absolute or incremental position).
-        offset: SI units, subtracted after scaling (0 but for the link encoder's zero).
-        modulus: counts after which it rolls over, where that is less than its length allows (the measuring
-            range of an absolute encoder, 0x6002 of CiA 406); 0: at its length.
-    """
-
-    signal: Signal
-    index: int
-    subindex: int
-    bits: int
-    signed: bool
+    signal: Signal  # what it means
+    index: int  # object index
+    subindex: int  # object subindex
+    bits: int  # its length in the frame
+    signed: bool  # whether two's complement
+    # SI units at the joint side per count, direction and gear included (1 for the statusword)
     scale: float = 1.0
-    wraps: bool = False
-    offset: float = 0.0
+    wraps: bool = False  # whether the counter rolls over at its length (absolute or incremental position)
+    offset: float = 0.0  # SI units, subtracted after scaling (0 but for the link encoder's zero)
+    # counts after which it rolls over, where that is less than its length allows (the measuring range of an
+    # absolute encoder, 0x6002 of CiA 406); 0: at its length
     modulus: int = 0
 
     @property
@@ -65,21 +55,13 @@ class MappedObject:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TpdoLayout:
-    """One TPDO: its identifier and the objects in it, in order from bit 0.
+    """One TPDO: its identifier and the objects in it, in order from bit 0."""
 
-    Attributes:
-        cob_id: identifier of the frame.
-        objects: what is in it.
-        transmission_type: 1 to 240: every so many SYNCs; 254, 255: event-driven.
-        number: 1 for 0x1800/0x1A00 and so on; 0: unknown (passive).
-        inhibit_s: shortest time between two frames with types 254 and 255; 0: none, or not known.
-    """
-
-    cob_id: int
-    objects: tuple[MappedObject, ...]
-    transmission_type: int = 1
-    number: int = 0
-    inhibit_s: float = 0.0
+    cob_id: int  # identifier of the frame
+    objects: tuple[MappedObject, ...]  # what is in it
+    transmission_type: int = 1  # 1 to 240: every so many SYNCs; 254, 255: event-driven
+    number: int = 0  # 1 for 0x1800/0x1A00 and so on; 0: unknown (passive)
+    inhibit_s: float = 0.0  # shortest time between two frames with types 254 and 255; 0: none, or not known
 
     @property
     def length(self) -> int:
@@ -89,27 +71,18 @@ class TpdoLayout:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodeLayout:
-    """One node of a joint.
+    """One node of a joint."""
 
-    Attributes:
-        node_id: 1 to 127.
-        motor: index of the motor this drive belongs to, or None for a node that is only an encoder.
-        tpdos: its frames that carry signals of the joint.
-        other_tpdos: enabled frames of this node that are not used but load the bus.
-        heartbeat_ms: period of the heartbeat the node produces, as read back; 0: none, or not known.
-        identity: (vendor, product code, revision, serial number) of 0x1018; 0 where not reported.
-        reported: unit objects with their unsigned values, as read while it was configured.
-        notices: findings of its configuration.
-    """
-
-    node_id: int
-    motor: int | None
-    tpdos: tuple[TpdoLayout, ...]
-    other_tpdos: tuple[TpdoLayout, ...] = ()
-    heartbeat_ms: int = 0
+    node_id: int  # 1 to 127
+    motor: int | None  # index of the motor this drive belongs to, or None for a node that is only an encoder
+    tpdos: tuple[TpdoLayout, ...]  # its frames that carry signals of the joint
+    other_tpdos: tuple[TpdoLayout, ...] = ()  # enabled frames of this node that are not used but load the bus
+    heartbeat_ms: int = 0  # period of the heartbeat the node produces, as read back; 0: none, or not known
+    # (vendor, product code, revision, serial number) of 0x1018; 0 where not reported
     identity: tuple[int, int, int, int] = (0, 0, 0, 0)
+    # unit objects with their unsigned values, as read while it was configured
     reported: tuple[tuple[tuple[int, int], int], ...] = ()
-    notices: tuple[Notice, ...] = ()
+    notices: tuple[Notice, ...] = ()  # findings of its configuration
 
 
 def layout_document(layout: NodeLayout) -> dict[str, Any]:

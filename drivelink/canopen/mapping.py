@@ -56,26 +56,17 @@ class _ObjectRefused(Exception):  # noqa: N818
 
 @dataclass(slots=True)
 class Mapper:
-    """Mapping of one node.
+    """Mapping of one node."""
 
-    Attributes:
-        role: what the node is there for.
-        available: for each signal, the objects that the node has for it, best first.
-        tpdos: as they are in the node.
-        taken: identifiers in use elsewhere on the bus.
-        prefer_unused: see `tpdo_assignment.assign`.
-        notices: remarks, added to.
-        period_s: communication cycle, at which a TPDO is asked for that cannot be sent on SYNC.
-        readable: further signals that are read if they are mapped anyway.
-    """
-
-    role: Role
+    role: Role  # what the node is there for
+    # for each signal, the objects that the node has for it, best first
     available: Mapping[Signal, Sequence[MappedObject]]
-    tpdos: list[Tpdo]
-    taken: set[int]
-    prefer_unused: bool
-    notices: list[Notice]
-    period_s: float = 0.001
+    tpdos: list[Tpdo]  # as they are in the node
+    taken: set[int]  # identifiers in use elsewhere on the bus
+    prefer_unused: bool  # see `tpdo_assignment.assign`
+    notices: list[Notice]  # remarks, added to
+    period_s: float = 0.001  # communication cycle, at which a TPDO is asked for that cannot be sent on SYNC
+    # further signals that are read if they are mapped anyway
     readable: Mapping[Signal, Sequence[MappedObject]] = field(default_factory=dict)
     _pre_operational: bool = field(default=False, init=False)
     _chosen: dict[int, int] = field(default_factory=dict, init=False)

@@ -15,41 +15,23 @@ _PLACEHOLDER = 0.1  # kg·m², where the inertia is not known
 
 @dataclass(slots=True, kw_only=True)
 class Answers:
-    """Answers for a new joint file.
+    """Answers for a new joint file."""
 
-    Attributes:
-        name: of the joint.
-        arrangement: single, antagonistic or serial.
-        inertia_kg_m2: of each motor, joint side; None: unknown, a placeholder is written.
-        rotor_inertia_gcm2: of each motor, from its data sheet; requires the gear ratio.
-        torque_constant_mnm_a: likewise; None: the drive reports a torque.
-        viscous_damping_nm_s_rad: of each motor, joint side; 0: unknown.
-        model: of the transmission.
-        nodes: node ids of the drives, motor by motor.
-        gear_ratio: motor revolutions per joint revolution; None: read from the drive.
-        encoder: "drive", "none", or the node id of a CiA 406 encoder.
-        interface: python-can's.
-        channel: python-can's.
-        bitrate: bit/s.
-        passive: another master configures the drives and produces SYNC.
-        remarks: comments by node.
-    """
-
-    name: str = "joint"
-    arrangement: str = "single"
-    inertia_kg_m2: float | None = None
-    rotor_inertia_gcm2: float | None = None
-    torque_constant_mnm_a: float | None = None
-    viscous_damping_nm_s_rad: float = 0.0
-    model: str = "polynomial"
-    nodes: list[int] = field(default_factory=list)
-    gear_ratio: float | None = None
-    encoder: str = "drive"
-    interface: str = "socketcan"
-    channel: str = "can0"
-    bitrate: int = 1_000_000
-    passive: bool = False
-    remarks: dict[int, str] = field(default_factory=dict)
+    name: str = "joint"  # of the joint
+    arrangement: str = "single"  # single, antagonistic or serial
+    inertia_kg_m2: float | None = None  # of each motor, joint side; None: unknown, a placeholder is written
+    rotor_inertia_gcm2: float | None = None  # of each motor, from its data sheet; requires the gear ratio
+    torque_constant_mnm_a: float | None = None  # likewise; None: the drive reports a torque
+    viscous_damping_nm_s_rad: float = 0.0  # of each motor, joint side; 0: unknown
+    model: str = "polynomial"  # of the transmission
+    nodes: list[int] = field(default_factory=list)  # node ids of the drives, motor by motor
+    gear_ratio: float | None = None  # motor revolutions per joint revolution; None: read from the drive
+    encoder: str = "drive"  # "drive", "none", or the node id of a CiA 406 encoder
+    interface: str = "socketcan"  # python-can's
+    channel: str = "can0"  # python-can's
+    bitrate: int = 1_000_000  # bit/s
+    passive: bool = False  # another master configures the drives and produces SYNC
+    remarks: dict[int, str] = field(default_factory=dict)  # comments by node
 
     @property
     def motors(self) -> int:

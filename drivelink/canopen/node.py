@@ -42,34 +42,23 @@ BOOT_S = 3.0  # until a node answers after power-on; the slowest take two second
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodeSurvey:
-    """Data read from a node.
+    """Data read from a node."""
 
-    Attributes:
-        role: what it is there for.
-        device_type: 0x1000; 0 if it has no value.
-        identity: 0x1018.
-        reported: unsigned values of the requested objects that exist.
-        offer: signals it can send.
-        refused: the last aborted read of an object that may exist, or None.
-        available: for each signal, the objects that exist, best first, at their real length.
-        tpdos: present TPDOs.
-    """
-
-    role: Role
-    device_type: int
-    identity: tuple[int, int, int, int]
-    reported: Mapping[Address, int]
-    offer: Offer
-    refused: SdoAbort | None
+    role: Role  # what it is there for
+    device_type: int  # 0x1000; 0 if it has no value
+    identity: tuple[int, int, int, int]  # 0x1018
+    reported: Mapping[Address, int]  # unsigned values of the requested objects that exist
+    offer: Offer  # signals it can send
+    refused: SdoAbort | None  # the last aborted read of an object that may exist, or None
+    # for each signal, the objects that exist, best first, at their real length
     available: Mapping[Signal, tuple[MappedObject, ...]]
-    tpdos: tuple[Tpdo, ...]
+    tpdos: tuple[Tpdo, ...]  # present TPDOs
 
 
 def survey_node(role: Role, patience: int = 1, *, wake: bool = False) -> Program[NodeSurvey]:
     """Read identity, possible signals and present TPDOs of a node; write nothing.
 
     Args:
-        role: what it is there for.
         patience: attempts, each with SDO timeout and retries, before the node counts as absent.
         wake: send a silent node to pre-operational: a stopped node has no SDO (CiA 301, 7.3.2.2.4).
     """
@@ -165,11 +154,7 @@ def configure_node(
     Its identity and units are read before and after: where they differ, it is configured once more.
 
     Args:
-        role: what the node is there for.
         bus: the bus section of the joint file.
-        taken: identifiers of other nodes' TPDOs.
-        drop_others: disable unused TPDOs of this node.
-        start: send NMT start at the end.
         stopped: the node is stopped and does not answer SDO until it is woken.
 
     Raises:

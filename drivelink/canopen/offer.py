@@ -10,19 +10,14 @@ from drivelink.notice import Notice, Severity
 
 @dataclass(slots=True, kw_only=True)
 class Offer:
-    """What a node can give.
+    """What a node can give."""
 
-    Attributes:
-        candidates: for each signal the objects that can give it, best first.
-        checks: the same for cross-checks: not mapped, but read if the node maps them.
-        missing: for a signal with no candidate, why.
-        notices: disagreements and remarks.
-    """
-
+    # for each signal the objects that can give it, best first
     candidates: dict[Signal, tuple[MappedObject, ...]] = field(default_factory=dict)
+    # the same for cross-checks: not mapped, but read if the node maps them
     checks: dict[Signal, tuple[MappedObject, ...]] = field(default_factory=dict)
-    missing: dict[Signal, str] = field(default_factory=dict)
-    notices: list[Notice] = field(default_factory=list)
+    missing: dict[Signal, str] = field(default_factory=dict)  # for a signal with no candidate, why
+    notices: list[Notice] = field(default_factory=list)  # disagreements and remarks
 
     @property
     def readable(self) -> dict[Signal, tuple[MappedObject, ...]]:

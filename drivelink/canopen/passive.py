@@ -303,12 +303,6 @@ class PassiveConfigurator:
 
     Args:
         joints: joint files on this bus; the first one's bus section counts.
-        base_dirs: their folders, for EDS files.
-
-    Attributes:
-        layouts: of the nodes that are known so far.
-        missing: for the others, what is missing.
-        doubts: of the nodes in `layouts`, those whose layout is not trusted now: reason and remedy.
     """
 
     def __init__(self, joints: Sequence[JointFile], base_dirs: Sequence[Path] | None = None) -> None:
@@ -317,8 +311,9 @@ class PassiveConfigurator:
             node: _PassiveNode(role, self.bus.sdo_timeout_s)
             for node, role in roles_by_node(joints, base_dirs).items()
         }
-        self.layouts: dict[int, NodeLayout] = {}
-        self.missing: dict[int, DriveError] = {}
+        self.layouts: dict[int, NodeLayout] = {}  # of the nodes that are known so far
+        self.missing: dict[int, DriveError] = {}  # for the others, what is missing
+        # of the nodes in `layouts`, those whose layout is not trusted now: reason and remedy
         self.doubts: dict[int, str] = {}
         self.poll(0.0)
 
@@ -371,8 +366,6 @@ class PassiveConfigurator:
         """Take a frame: SDO, boot-up, NMT resets, PDOs.
 
         Args:
-            cob_id: its identifier.
-            data: its bytes.
             now_s: time by any clock, for the SDO time-out.
         """
         if cob_id == 0:

@@ -26,29 +26,17 @@ _ALWAYS = 4  # some makers leave gaps among the first four
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tpdo:
-    """One TPDO of a node.
+    """One TPDO of a node."""
 
-    Attributes:
-        number: 1 for 0x1800/0x1A00.
-        cob: 0x1800:01: bit 31 invalid, bit 30 no RTR, and the identifier.
-        transmission_type: 0x1800:02.
-        inhibit_100us: 0x1800:03.
-        event_ms: 0x1800:05.
-        entries: what is mapped, in order.
-        fixed: whether its mapping cannot be changed.
-        most: objects that can be mapped into it.
-        known: whether the entries are known.
-    """
-
-    number: int
-    cob: int
-    transmission_type: int
-    inhibit_100us: int = 0
-    event_ms: int = 0
-    entries: tuple[Entry, ...] = ()
-    fixed: bool = False
-    most: int = 64
-    known: bool = True
+    number: int  # 1 for 0x1800/0x1A00
+    cob: int  # 0x1800:01: bit 31 invalid, bit 30 no RTR, and the identifier
+    transmission_type: int  # 0x1800:02
+    inhibit_100us: int = 0  # 0x1800:03
+    event_ms: int = 0  # 0x1800:05
+    entries: tuple[Entry, ...] = ()  # what is mapped, in order
+    fixed: bool = False  # whether its mapping cannot be changed
+    most: int = 64  # objects that can be mapped into it
+    known: bool = True  # whether the entries are known
 
     @property
     def cob_id(self) -> int:
@@ -117,7 +105,6 @@ def read_tpdo(node: int, number: int, *, exactly: bool = False) -> Program[Tpdo 
     """Read one TPDO; None if it does not exist.
 
     Args:
-        node: node id.
         number: from 1.
         exactly: raise if part of the mapping cannot be read, because frames will be decoded by it.
 

@@ -12,25 +12,15 @@ from drivelink.jointfile import DriveSection, EncoderSection, JointFile, TpdoSec
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Role:
-    """One node of a joint.
+    """One node of a joint."""
 
-    Attributes:
-        node_id: 1 to 127.
-        motor: index of the motor it drives, or None.
-        drive: its section of the joint file, or None.
-        encoder: the link encoder, if connected to this node.
-        key: its key in the joint file, for messages.
-        eds: its EDS or DCF file, if the joint file names one.
-        tpdo: its mapping, if the joint file declares it.
-    """
-
-    node_id: int
-    motor: int | None
-    drive: DriveSection | None
-    encoder: EncoderSection | None
-    key: str
-    eds: Path | None
-    tpdo: tuple[TpdoSection, ...]
+    node_id: int  # 1 to 127
+    motor: int | None  # index of the motor it drives, or None
+    drive: DriveSection | None  # its section of the joint file, or None
+    encoder: EncoderSection | None  # the link encoder, if connected to this node
+    key: str  # its key in the joint file, for messages
+    eds: Path | None  # its EDS or DCF file, if the joint file names one
+    tpdo: tuple[TpdoSection, ...]  # its mapping, if the joint file declares it
 
     @property
     def subject(self) -> str:
@@ -42,7 +32,6 @@ def roles(joint: JointFile, base_dir: Path = Path()) -> tuple[Role, ...]:
     """Return the nodes of a joint, motors first.
 
     Args:
-        joint: the joint file.
         base_dir: its folder; EDS paths are relative to it.
 
     Raises:
@@ -90,7 +79,6 @@ def roles_by_node(joints: Sequence[JointFile], base_dirs: Sequence[Path] | None)
     """Return the nodes of all joints on one bus by node id, in the order of the joint files.
 
     Args:
-        joints: the joint files.
         base_dirs: their folders; None: the current one.
 
     Raises:

@@ -31,19 +31,12 @@ _MOST_STAMPS = 200_000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FoundNode:
-    """A node found on the bus.
+    """A node found on the bus."""
 
-    Attributes:
-        node_id: 1 to 127.
-        device_type: 0x1000; 0: no value, None: no SDO answer.
-        identity: 0x1018.
-        name: 0x1008.
-    """
-
-    node_id: int
-    device_type: int | None
-    identity: tuple[int, int, int, int] = (0, 0, 0, 0)
-    name: str = ""
+    node_id: int  # 1 to 127
+    device_type: int | None  # 0x1000; 0: no value, None: no SDO answer
+    identity: tuple[int, int, int, int] = (0, 0, 0, 0)  # 0x1018
+    name: str = ""  # 0x1008
 
     @property
     def profile(self) -> str:
@@ -56,25 +49,15 @@ class FoundNode:
 
 @dataclass(slots=True)
 class Traffic:
-    """Frames received in an interval.
+    """Frames received in an interval."""
 
-    Attributes:
-        seconds: how long.
-        sync_s: stamps of SYNC frames.
-        counts: frames by identifier.
-        heartbeats: last NMT state by node.
-        error_frames: seen.
-        fd_frames: CAN FD frames seen.
-        last: last data by identifier.
-    """
-
-    seconds: float = 0.0
-    sync_s: list[float] = field(default_factory=list)
-    counts: dict[int, int] = field(default_factory=dict)
-    heartbeats: dict[int, str] = field(default_factory=dict)
-    error_frames: int = 0
-    fd_frames: int = 0
-    last: dict[int, bytes] = field(default_factory=dict)
+    seconds: float = 0.0  # how long
+    sync_s: list[float] = field(default_factory=list)  # stamps of SYNC frames
+    counts: dict[int, int] = field(default_factory=dict)  # frames by identifier
+    heartbeats: dict[int, str] = field(default_factory=dict)  # last NMT state by node
+    error_frames: int = 0  # seen
+    fd_frames: int = 0  # CAN FD frames seen
+    last: dict[int, bytes] = field(default_factory=dict)  # last data by identifier
 
     def add(self, message: can.Message) -> None:
         """Count one frame."""

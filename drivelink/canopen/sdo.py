@@ -136,23 +136,17 @@ def read_number(node: int, index: int, subindex: int) -> Program[int]:
 
 
 class _Transfer:
-    """One upload or download.
-
-    Attributes:
-        request: what it is for.
-        result: its result; None until it has ended.
-        answered: the server has begun to answer.
-    """
+    """One upload or download."""
 
     def __init__(self, request: Read | Write) -> None:
-        self.request = request
-        self.result: bytes | None = None
+        self.request = request  # what it is for
+        self.result: bytes | None = None  # its result; None until it has ended
         self._buffer = bytearray()
         self._toggle = 0
         self._segmented = False
         self._declared: int | None = None
         self._most = 0
-        self.answered = False
+        self.answered = False  # the server has begun to answer
 
     def first(self) -> bytes:
         self._buffer.clear()
@@ -232,7 +226,6 @@ class Session(Generic[T]):
     """Runs one program; never blocks.
 
     Args:
-        program: what to do.
         send: puts a frame (identifier, data) on the bus.
         timeout_s: for each answer; four times as long for a whole transfer.
         retries: further attempts after a timeout.

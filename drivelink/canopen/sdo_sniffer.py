@@ -45,15 +45,7 @@ class SdoSniffer:
 
     Args:
         interesting: whether to keep the value of an object.
-        timeout_s: of an answer.
         read: called with each object of interest that was read, and its bytes.
-
-    Attributes:
-        values: confirmed unsigned values by (index, subindex).
-        written: those of them that were written, not read.
-        disputed: objects with two different answers to one request, or a download that was given up.
-        unasked: answers that belong to no request.
-        changes: number of new, changed, forgotten and disputed values.
     """
 
     def __init__(
@@ -65,11 +57,12 @@ class SdoSniffer:
         self._interesting = interesting
         self._timeout_s = timeout_s
         self._read = read
-        self.values: dict[Address, int] = {}
-        self.written: set[Address] = set()
+        self.values: dict[Address, int] = {}  # confirmed unsigned values by (index, subindex)
+        self.written: set[Address] = set()  # those of them that were written, not read
+        # objects with two different answers to one request, or a download that was given up
         self.disputed: set[Address] = set()
-        self.unasked = 0
-        self.changes = 0
+        self.unasked = 0  # answers that belong to no request
+        self.changes = 0  # number of new, changed, forgotten and disputed values
         self._transfer: _Transfer | None = None
         self._blocks = False  # a block transfer
         self._block_s = -math.inf  # time of the last segment of a block download

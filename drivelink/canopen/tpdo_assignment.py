@@ -37,15 +37,10 @@ Available = Mapping[Signal, Sequence[MappedObject]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Assignment:
-    """One TPDO and its assigned objects.
+    """One TPDO and its assigned objects."""
 
-    Attributes:
-        tpdo: as it is in the node.
-        objects: objects to map in order; None: keep its mapping.
-    """
-
-    tpdo: Tpdo
-    objects: tuple[MappedObject, ...] | None
+    tpdo: Tpdo  # as it is in the node
+    objects: tuple[MappedObject, ...] | None  # objects to map in order; None: keep its mapping
 
 
 def pack(objects: Iterable[MappedObject], most: int = FRAME_BITS) -> list[tuple[MappedObject, ...]]:
@@ -73,9 +68,7 @@ def assign(
     """Assign signals to TPDOs.
 
     Args:
-        role: the node, for messages.
         available: for each signal wanted, the objects the node has for it, best first.
-        tpdos: as they are in the node.
         prefer_unused: prefer disabled TPDOs, because another master may rely on the enabled ones.
 
     Raises:
@@ -153,7 +146,6 @@ def choose_cob_id(node: int, tpdo: Tpdo, taken: set[int]) -> int:
     """Return the identifier for a TPDO: its own if usable, else the predefined one, else a free one.
 
     Args:
-        node: node id.
         tpdo: the TPDO; a DCF may have given it another node's identifier.
         taken: identifiers that other TPDOs on this bus have.
 

@@ -56,7 +56,6 @@ def offer(role: Role, reported: Mapping[Address, int], vendor: Vendor) -> Offer:
     Args:
         role: role of the node, with its section of the joint file.
         reported: known unsigned values of the node's objects.
-        vendor: its maker.
     """
     result = Offer()
     vendor = vendor.generation(reported)

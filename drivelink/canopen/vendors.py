@@ -15,52 +15,34 @@ Address = tuple[int, int]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CurrentObject:
-    """A vendor object for the motor current.
+    """A vendor object for the motor current."""
 
-    Attributes:
-        address: index and subindex.
-        unit_a: amperes per count.
-        bits: its length.
-    """
-
-    address: Address
-    unit_a: float
-    bits: int = 32
+    address: Address  # index and subindex
+    unit_a: float  # amperes per count
+    bits: int = 32  # its length
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Vendor:
-    """One maker.
+    """One maker."""
 
-    Attributes:
-        name: as users know it.
-        current: object of the current, if not 0x6078.
-        counts_per_rev: object with the counts per motor revolution, if not 0x608F.
-        gear: objects with numerator and denominator of the gear, if not 0x6091.
-        torque_constant: object with the torque constant in µN·m/A.
-        nominal_current: object with the nominal current in mA.
-        rated_torque_micro: whether 0x6076 may be in µN·m.
-        counts_factor: what that one is multiplied by: 4 where it counts the pulses of a quadrature encoder.
-        velocity_rad_s: rad/s per count of 0x606C, where 0x60A9 does not give it.
-        velocity_counts_s: counts per second and count of 0x606C, where 0x60A9 does not give it.
-        sensorless: object of 0x60E4 that is a sensorless estimate.
-        toggling_statusword_bits: bits of 0x6041 that change by themselves.
-        others: (object, its like): the maker's drives that have this object and not `counts_per_rev` are
-            another generation.
-    """
-
-    name: str
-    current: CurrentObject | None = None
-    counts_per_rev: Address | None = None
+    name: str  # as users know it
+    current: CurrentObject | None = None  # object of the current, if not 0x6078
+    counts_per_rev: Address | None = None  # object with the counts per motor revolution, if not 0x608F
+    # objects with numerator and denominator of the gear, if not 0x6091
     gear: tuple[Address, Address] | None = None
-    torque_constant: Address | None = None
-    nominal_current: Address | None = None
-    rated_torque_micro: bool = False
+    torque_constant: Address | None = None  # object with the torque constant in µN·m/A
+    nominal_current: Address | None = None  # object with the nominal current in mA
+    rated_torque_micro: bool = False  # whether 0x6076 may be in µN·m
+    # what that one is multiplied by: 4 where it counts the pulses of a quadrature encoder
     counts_factor: int = 1
-    velocity_rad_s: float | None = None
+    velocity_rad_s: float | None = None  # rad/s per count of 0x606C, where 0x60A9 does not give it
+    # counts per second and count of 0x606C, where 0x60A9 does not give it
     velocity_counts_s: float | None = None
-    sensorless: Address | None = None
-    toggling_statusword_bits: int = 0
+    sensorless: Address | None = None  # object of 0x60E4 that is a sensorless estimate
+    toggling_statusword_bits: int = 0  # bits of 0x6041 that change by themselves
+    # (object, its like): the maker's drives that have this object and not `counts_per_rev` are another
+    # generation
     others: tuple[tuple[Address, Vendor], ...] = ()
 
     def objects(self) -> tuple[Address, ...]:

@@ -32,13 +32,7 @@ _AGAIN_S = 5.0  # after which one that was killed is started again
 
 @contextmanager
 def black_box(joint: JointFile, path: Path | None, *, quiet: bool = False) -> Iterator[None]:
-    """The black box of a joint in a process, if its joint file asks for one; it ends with this process.
-
-    Args:
-        joint: with the bus in use.
-        path: its joint file.
-        quiet: say nothing on stderr.
-    """
+    """The black box of a joint in a process, if its joint file asks for one; it ends with this process."""
     if joint.recording.folder is None or path is None:
         yield
         return

@@ -11,16 +11,11 @@ if TYPE_CHECKING:
 
 
 class BusPort:
-    """The bus for senders of python-can messages: directly before the loop runs, through the loop afterwards.
-
-    Attributes:
-        bus: the open bus.
-        loop: the only reader, once it runs.
-    """
+    """The bus for senders of python-can messages: directly, or through the loop while it runs."""
 
     def __init__(self, bus: can.BusABC) -> None:
-        self.bus = bus
-        self.loop: CycleLoop | None = None
+        self.bus = bus  # the open bus
+        self.loop: CycleLoop | None = None  # the only reader, once it runs
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Put a frame on the bus."""

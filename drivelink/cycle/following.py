@@ -31,11 +31,6 @@ class MapFollower:
 
     Args:
         assemblers: of each node's joint.
-        layouts: the present layouts.
-        used: see `Used`.
-
-    Attributes:
-        refused: by node, why a mapping cannot be used.
     """
 
     def __init__(
@@ -44,7 +39,7 @@ class MapFollower:
         self._assemblers = assemblers
         self._in_use = dict(layouts)
         self._used = used
-        self.refused: dict[int, str] = {}
+        self.refused: dict[int, str] = {}  # by node, why a mapping cannot be used
         for assembler in assemblers.values():
             assembler.supervise()
 
@@ -85,8 +80,6 @@ class PassiveFollower(MapFollower):
     Args:
         configurator: takes the mappings from the traffic; starts with the layouts given here.
         assemblers: of each node's joint.
-        layouts: the present layouts.
-        used: see `Used`.
     """
 
     def __init__(
@@ -197,8 +190,6 @@ class OwnFollower(MapFollower):
     Args:
         configurator: the daemon's, or in a log one that takes the mappings from the traffic.
         assemblers: of each node's joint.
-        layouts: the present layouts.
-        used: see `Used`.
         check: compares what the nodes say by SDO with what is in use; None: nothing was read back.
     """
 
@@ -220,8 +211,6 @@ class OwnFollower(MapFollower):
         """See `MapFollower.feed`.
 
         Args:
-            cob_id: identifier of the frame.
-            data: its bytes.
             now_s: time by any clock, for the SDO time-out.
             ahead: SYNCs that were sent before the frame, and come here after it.
         """
@@ -267,8 +256,6 @@ def follow_log(configurator: PassiveConfigurator, assembler: Assembler, recent: 
     """Follow the mappings in a log of one joint as its daemon did.
 
     Args:
-        configurator: knows the mapping of every node.
-        assembler: of the joint.
         recent: is given every sample, before the follower takes the frame that has completed it.
     """
     layouts, section = configurator.layouts, configurator.bus

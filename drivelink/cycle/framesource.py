@@ -51,15 +51,10 @@ class BusLostError(Exception):
 
 
 class FrameSource(Protocol):
-    """Interface of a bus for the loop.
+    """Interface of a bus for the loop."""
 
-    Attributes:
-        lost_sends: frames that could not be sent because the transmit queue was full.
-        errors: error frames, by kind.
-    """
-
-    lost_sends: int
-    errors: dict[str, int]
+    lost_sends: int  # frames that could not be sent because the transmit queue was full
+    errors: dict[str, int]  # error frames, by kind
 
     def wait(self, timeout_s: float) -> bool:
         """Wait for a frame; return whether there is one."""
@@ -216,7 +211,6 @@ class Pumped:
     """A bus with simulated devices in this thread, which answer immediately.
 
     Args:
-        source: the bus.
         devices: lets them handle sent frames and due timers.
     """
 

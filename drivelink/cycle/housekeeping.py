@@ -30,18 +30,14 @@ class Housekeeping:
     """Periodic tasks; the loop runs one at a time if there is time.
 
     An exception ends only this run of the task that raised it.
-
-    Attributes:
-        urgent: called in every cycle with slack, for stepwise work.
-        on_fault: called with an exception.
     """
 
     def __init__(self) -> None:
         self._tasks: list[_Periodic] = []
         self._next_ns = 0
         self._parts: Generator[None] | None = None
-        self.urgent: list[Callable[[int], None]] = []
-        self.on_fault: Callable[[Exception], None] = _raise
+        self.urgent: list[Callable[[int], None]] = []  # called in every cycle with slack, for stepwise work
+        self.on_fault: Callable[[Exception], None] = _raise  # called with an exception
 
     def every(self, period_s: float, action: Task) -> None:
         """Call `action` periodically; it, or each part of it, must take less than 0.2 ms."""

@@ -38,8 +38,6 @@ def run_lockstep(
         joint: on the virtual bus of the devices.
         devices: polled in this thread; SYNC advances their world by one period.
         sink: gets estimates and samples, e.g. a `JointPublisher`; None: only the loop_joint counts them.
-        cycles: how many.
-        folder: of the joint file.
         start_ns: UNIX time that the first SYNC is stamped with.
         each: called after every cycle, e.g. to look at the truth.
 

@@ -55,31 +55,21 @@ class ObjectSink(ABC):
 
 
 class LoopJoint:
-    """One joint in the loop.
-
-    Attributes:
-        name: of the joint.
-        pipeline: frames to estimates.
-        sink: receives its output, or None.
-        fault: the exception that ended its estimates, or empty; a new estimator in the pipeline clears it.
-        estimates: published from fresh samples.
-        stale: cycles without a sample.
-        work: from the last frame in hand to the estimate published.
-        response: from SYNC to the last frame in hand.
-    """
+    """One joint in the loop."""
 
     __slots__ = ("broken", "estimates", "fault", "name", "pipeline", "response", "sink", "stale", "work")
 
     def __init__(self, name: str, pipeline: JointPipeline, sink: CycleSink | None) -> None:
-        self.name = name
-        self.pipeline = pipeline
-        self.sink = sink
+        self.name = name  # of the joint
+        self.pipeline = pipeline  # frames to estimates
+        self.sink = sink  # receives its output, or None
+        # the exception that ended its estimates, or empty; a new estimator in the pipeline clears it
         self.fault = ""
         self.broken: object = None  # the estimator that failed
-        self.estimates = 0
-        self.stale = 0
-        self.work = LatencyHistogram()
-        self.response = LatencyHistogram()
+        self.estimates = 0  # published from fresh samples
+        self.stale = 0  # cycles without a sample
+        self.work = LatencyHistogram()  # from the last frame in hand to the estimate published
+        self.response = LatencyHistogram()  # from SYNC to the last frame in hand
 
 
 def _log_fault(where: str, error: Exception) -> None:
@@ -90,9 +80,6 @@ class CycleLoop:
     """The one thread's work for all joints of one bus.
 
     Args:
-        source: the bus.
-        loop_joints: the joints.
-        period_s: communication cycle.
         produce: make SYNC; else follow it.
         counter_overflow: 0x1019; 0: SYNC carries no counter.
         world_steps: only SYNC advances the (simulated) world, so a skipped SYNC is no gap.
@@ -205,7 +192,6 @@ class CycleLoop:
         Supervision and housekeeping use the stamps as their clock.
 
         Args:
-            cycles: how many.
             start_ns: stamp of the first SYNC; the others follow by periods.
         """
         for stamp_ns in self.stamps(cycles, start_ns):

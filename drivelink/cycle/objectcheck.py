@@ -30,17 +30,11 @@ _SURE = 3  # answers in a row that contradict what is in use
 
 @dataclass(frozen=True, slots=True)
 class Mismatch:
-    """A node says something else than what is in use.
+    """A node says something else than what is in use."""
 
-    Attributes:
-        node: its id.
-        text: what.
-        signal: whose value differs; None: a unit.
-    """
-
-    node: int
-    text: str
-    signal: Signal | None
+    node: int  # its id
+    text: str  # what
+    signal: Signal | None  # whose value differs; None: a unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,11 +65,7 @@ class _Node:
 
 
 class RecentSamples:
-    """The last samples of a joint.
-
-    Args:
-        period_s: of the cycle.
-    """
+    """The last samples of a joint."""
 
     def __init__(self, period_s: float) -> None:
         self._samples: deque[Sample] = deque(maxlen=round(HISTORY_S / period_s))
@@ -90,11 +80,7 @@ class RecentSamples:
 
 
 class ObjectCheck:
-    """The objects of all nodes of one bus.
-
-    Args:
-        timeout_s: of an SDO answer.
-    """
+    """The objects of all nodes of one bus."""
 
     def __init__(self, timeout_s: float) -> None:
         self._timeout_s = timeout_s
@@ -106,9 +92,6 @@ class ObjectCheck:
         """Begin with a node that has been configured.
 
         Args:
-            layout: its frames.
-            units: its unit objects, as configured.
-            assembler: of its joint.
             samples: the joint's samples after a SYNC, at most so many.
         """
         node_id, before = layout.node_id, self._nodes.get(layout.node_id)

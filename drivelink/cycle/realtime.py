@@ -23,27 +23,16 @@ _PR_SET_TIMERSLACK = 29  # prctl(2)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RealTime:
-    """What was granted, and the previous settings.
+    """What was granted, and the previous settings."""
 
-    Attributes:
-        scheduling: SCHED_FIFO was granted.
-        memory: the process is locked into memory.
-        lines: refusals, one line each, with the remedy.
-        switch_interval_s: previous value.
-    """
-
-    scheduling: bool
-    memory: bool
-    lines: tuple[str, ...]
-    switch_interval_s: float
+    scheduling: bool  # SCHED_FIFO was granted
+    memory: bool  # the process is locked into memory
+    lines: tuple[str, ...]  # refusals, one line each, with the remedy
+    switch_interval_s: float  # previous value
 
 
 def acquire(*, privileged: bool = True) -> RealTime:
-    """Prepare the calling thread and the process for a cycle of a millisecond.
-
-    Args:
-        privileged: also request SCHED_FIFO and locked memory.
-    """
+    """Prepare the calling thread and the process for a cycle of a millisecond."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     gc.collect()

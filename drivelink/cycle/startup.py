@@ -39,11 +39,7 @@ def join_bus(
     period in the joint file is logged.
 
     Args:
-        port: the bus, without another reader.
-        joints: joint files whose bus sections agree.
-        folders: of the joint files.
         idle: called between receptions.
-        patience_s: timeout for actions of others.
 
     Raises:
         BusError: SYNC is missing or unexpected, or the bus fails.

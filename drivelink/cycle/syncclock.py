@@ -29,17 +29,11 @@ _CLOCK_STEP_NS = 50_000_000  # stamps and receptions differ by less, unless one 
 
 
 class MeasuredPeriod(NamedTuple):
-    """The period of a master.
+    """The period of a master."""
 
-    Attributes:
-        period_s: measured; the expected one if the stamps cannot separate the two.
-        same: whether it is the expected one.
-        steady: whether most steps are as long: one master, without much jitter.
-    """
-
-    period_s: float
-    same: bool
-    steady: bool
+    period_s: float  # measured; the expected one if the stamps cannot separate the two
+    same: bool  # whether it is the expected one
+    steady: bool  # whether most steps are as long: one master, without much jitter
 
 
 def measure_period(stamps_ns: Sequence[int], expected_s: float) -> MeasuredPeriod | None:
@@ -112,9 +106,6 @@ class SyncClock:
     later, when a jitter of half a period must not move it. It follows rates within two per cent of the
     expected one. A SYNC counts as the next one unless it is off by half a period, or by more if its master
     jitters more.
-
-    Args:
-        period_s: the communication cycle.
     """
 
     _SLOWEST = 0.01  # of the deviation, per SYNC: jitter of half a period then moves it by 2 % of a period

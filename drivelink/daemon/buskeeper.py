@@ -26,8 +26,6 @@ class BusKeeper:
 
     Args:
         port: the daemon's port.
-        section: how to open it.
-        events: reports loss and return.
         devices: simulated devices in the loop's thread, or None.
     """
 

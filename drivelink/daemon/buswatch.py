@@ -17,16 +17,7 @@ _MANY_SYNCS = 3  # SYNCs beyond the number of periods in a second
 
 
 class BusWatch:
-    """The state of the bus, from the counters of the loop.
-
-    Args:
-        loop: the cycle.
-        events: the event log.
-
-    Attributes:
-        on_period: called with another period, once the master has kept to it for so long that it is sure.
-        sync_period_s: last measured period of the followed master; None: not yet, or SYNC is produced.
-    """
+    """The state of the bus, from the counters of the loop."""
 
     def __init__(self, loop: CycleLoop, events: EventLog) -> None:
         self._loop = loop
@@ -35,8 +26,10 @@ class BusWatch:
         self._bus_offs = self._restarts = self._measured_ns = 0
         self._slow = self._slow_ns = 0
         self._off_period: list[float] = []  # consecutive measurements
+        # called with another period, once the master has kept to it for so long that it is sure
         self.on_period: Callable[[float], object] = lambda _period_s: None
         self._foreign = deque([(loop.clock(), 0, 0)])  # in the last second: SYNCs not due, periods without
+        # last measured period of the followed master; None: not yet, or SYNC is produced
         self.sync_period_s: float | None = None
 
     def check(self) -> None:

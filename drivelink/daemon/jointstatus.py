@@ -30,11 +30,6 @@ class JointStatus:
     """Makes the status documents of one joint.
 
     Args:
-        joint: its joint file.
-        loop: the cycle it runs in.
-        loop_joint: the joint in the loop.
-        supervisor: of its nodes.
-        events: the event log.
         bus_load: fraction of the bit rate that the configured frames take.
     """
 

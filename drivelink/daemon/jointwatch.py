@@ -20,7 +20,6 @@ class JointWatch:
     """The state of the joints; every event is reported once.
 
     Args:
-        events: the event log.
         contradiction: the reading of a joint that a second one contradicts, or None.
     """
 

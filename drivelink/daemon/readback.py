@@ -42,17 +42,12 @@ class ReadBack:
 
     Args:
         ask: begins to read an object of a node.
-        period_s: between two questions.
-        check: judges the answers.
-
-    Attributes:
-        check: as given.
     """
 
     def __init__(self, ask: Ask, period_s: float, check: ObjectCheck) -> None:
         self._ask = ask
         self._period_s = period_s
-        self.check = check
+        self.check = check  # as given
         self._assemblers: dict[int, Assembler] = {}
         self._first: deque[_Question] = deque()  # new, or in doubt: not by turns
         self._values: deque[_Question] = deque()

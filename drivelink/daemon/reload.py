@@ -38,15 +38,8 @@ class Reloader:
     """Watches one joint file and exchanges the estimator of its pipeline.
 
     Args:
-        path: the joint file.
-        joint: the joint file in use.
-        pipeline: its pipeline.
         build: makes estimator and model monitor of a joint file; called in a thread.
         publish: called with the new joint file after an exchange.
-        events: the event log.
-
-    Attributes:
-        path: as given.
     """
 
     def __init__(
@@ -58,7 +51,7 @@ class Reloader:
         publish: Callable[[JointFile], None],
         events: EventLog,
     ) -> None:
-        self.path = path
+        self.path = path  # as given
         self._joint = joint
         self._pipeline, self._history = pipeline, pipeline.history
         self._build = build

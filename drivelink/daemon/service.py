@@ -53,15 +53,10 @@ _COLLECT_S = 5.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServedJoint:
-    """A joint the daemon serves.
-
-    Attributes:
-        joint: its joint file.
-        path: its path; None: it cannot be reloaded and refers to no other files.
-    """
+    """A joint the daemon serves."""
 
     joint: JointFile
-    path: Path | None = None
+    path: Path | None = None  # its path; None: it cannot be reloaded and refers to no other files
 
     @property
     def folder(self) -> Path:
@@ -73,10 +68,7 @@ class Daemon:
     """Serves the joints of one bus: construct, `run`, `close`.
 
     Args:
-        joints: their bus sections agree.
-        publish: on zenoh.
         session: an open zenoh session to publish on; None: open one.
-        real_time: request real-time scheduling and locked memory.
         devices: simulated devices in the daemon's thread. They answer immediately, and SYNC advances their
             world; for demonstrations, tests and faster than real time.
 

@@ -19,8 +19,6 @@ class EventLog:
     also with other numbers, are counted instead of logged.
 
     Args:
-        logger: receives the lines.
-        keep: number of events in the status.
         clock: UNIX time, s.
     """
 
@@ -52,8 +50,6 @@ class EventLog:
         """Report an event.
 
         Args:
-            text: what.
-            level: of the log line.
             key: identifies texts that differ only in numbers; default: the text itself.
             source: who decides how many different events there are, such as a node.
         """

@@ -41,13 +41,8 @@ class Supervisor:
     """Heartbeats, faults and reconfiguration of all nodes of the loop.
 
     Args:
-        loop: its listeners are set.
         layouts: of each loop_joint's nodes.
-        events: the event log.
         configurator: configures nodes again or, passive, follows another master.
-
-    Attributes:
-        bus: watches SYNC, the bus and this machine.
     """
 
     def __init__(
@@ -61,7 +56,7 @@ class Supervisor:
         self._events = events
         self._configurator = configurator
         self._read_back: ReadBack | None = None
-        self.bus = BusWatch(loop, events)
+        self.bus = BusWatch(loop, events)  # watches SYNC, the bus and this machine
         self._joints = JointWatch(events, self.contradiction)
         loop.on_fault = self._say_fault
         self._unread = 0  # frames lost by receive overflow

@@ -42,9 +42,6 @@ class Watchdog:
     """Feeds systemd's watchdog while the loop makes its cycles.
 
     A loop that skips most of them, because something else holds the interpreter or the processor, is not fed.
-
-    Args:
-        loop: the cycle.
     """
 
     def __init__(self, loop: CycleLoop) -> None:

@@ -32,19 +32,12 @@ _AFTERGLOW_S = 3.0  # of the healthy view at the end
 
 
 class LoopCase(NamedTuple):
-    """What happens to the joint.
+    """What happens to the joint."""
 
-    Attributes:
-        text: in words.
-        effects: as `sim --effect` takes them.
-        parameters: as `[sim] parameters`.
-        truth: the numbers that a diagnosis should find, by their names in it.
-    """
-
-    text: str
-    effects: tuple[str, ...]
-    parameters: Mapping[str, float]
-    truth: Mapping[str, float]
+    text: str  # in words
+    effects: tuple[str, ...]  # as `sim --effect` takes them
+    parameters: Mapping[str, float]  # as `[sim] parameters`
+    truth: Mapping[str, float]  # the numbers that a diagnosis should find, by their names in it
 
     @property
     def change(self) -> Change:
@@ -74,22 +67,7 @@ CASES: Mapping[str, LoopCase] = {
 
 
 class ClosedLoop(DemoRun):
-    """Follows the loop from the change to the fallen residual.
-
-    Args:
-        joint: the joint file as parsed.
-        path: of it.
-        case: what happens.
-        console: for the terminal.
-        live: draw the live view.
-        yes: accept without asking.
-        limit_s: of the whole run.
-
-    Attributes:
-        times: UNIX time of each step: changed, alarm, recorded, found, accepted, fallen.
-        offer: what was proposed, or None.
-        trial: the residual after it, or None.
-    """
+    """Follows the loop from the change to the fallen residual."""
 
     def __init__(
         self,
@@ -103,9 +81,10 @@ class ClosedLoop(DemoRun):
         limit_s: float,
     ) -> None:
         super().__init__(joint, console, live=live, height=_LINES)
+        # UNIX time of each step: changed, alarm, recorded, found, accepted, fallen
         self.times: dict[str, float] = {}
-        self.offer: Proposal | None = None
-        self.trial: Trial | None = None
+        self.offer: Proposal | None = None  # what was proposed, or None
+        self.trial: Trial | None = None  # the residual after it, or None
         self._path, self._case, self._yes = path, case, yes
         self._keys = Keys()
         self._end_s = time.monotonic() + limit_s

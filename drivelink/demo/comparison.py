@@ -15,19 +15,12 @@ _UNMATCHED = 5_000  # sequence numbers kept while waiting for the other side
 
 
 class RmsErrors(NamedTuple):
-    """Root-mean-square errors over the cycles whose estimate is valid, relative to the truth's rms.
+    """Root-mean-square errors over the cycles whose estimate is valid, relative to the truth's rms."""
 
-    Attributes:
-        cycles: number of compared cycles.
-        stiffness: relative error of the stiffness.
-        flexibility_torque: relative error of the flexibility torque.
-        covered: fraction of the cycles whose 95 % interval of the stiffness holds the truth.
-    """
-
-    cycles: int
-    stiffness: float
-    flexibility_torque: float
-    covered: float
+    cycles: int  # number of compared cycles
+    stiffness: float  # relative error of the stiffness
+    flexibility_torque: float  # relative error of the flexibility torque
+    covered: float  # fraction of the cycles whose 95 % interval of the stiffness holds the truth
 
 
 class Comparison:

@@ -40,17 +40,11 @@ class RunSummary(NamedTuple):
 
 
 class Change(NamedTuple):
-    """What becomes of the simulated joint in the middle of the run, undeclared.
+    """What becomes of the simulated joint in the middle of the run, undeclared."""
 
-    Attributes:
-        after_s: of the run.
-        effects: that it then has, as `sim --effect` takes them.
-        parameters: that it then has, as `[sim] parameters`.
-    """
-
-    after_s: float
-    effects: tuple[str, ...] = ()
-    parameters: Mapping[str, float] = MappingProxyType({})
+    after_s: float  # of the run
+    effects: tuple[str, ...] = ()  # that it then has, as `sim --effect` takes them
+    parameters: Mapping[str, float] = MappingProxyType({})  # that it then has, as `[sim] parameters`
 
 
 class Changed(NamedTuple):
@@ -109,7 +103,6 @@ def serve(path: Path, seconds: float | None, connection: Connection, change: Cha
     Args:
         path: joint file with a `[sim]` section, on the virtual bus.
         seconds: of the run; None: until SIGTERM.
-        connection: to the watcher.
         change: of the joint in the middle of the run.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; the watcher decides

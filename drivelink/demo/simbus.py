@@ -46,17 +46,13 @@ class JoinedBus(can.BusABC):
 
     Args:
         bus: python-can's client.
-
-    Attributes:
-        lost: whether the server has closed the connection.
-        on_lost: called then.
     """
 
     def __init__(self, bus: can.BusABC) -> None:
         self._is_shutdown = False
         self._bus = bus
-        self.lost = False
-        self.on_lost: Callable[[], object] = lambda: None
+        self.lost = False  # whether the server has closed the connection
+        self.on_lost: Callable[[], object] = lambda: None  # called then
         self.channel_info = bus.channel_info
         super().__init__(channel=bus.channel_info)
 

@@ -64,11 +64,9 @@ def world_from_joint(
     """Return the world that a joint file describes, at rest.
 
     Args:
-        joint: the joint file.
         effects: "NAME=VALUE" as `sim --effect` takes them, besides those of the file.
         case_name: one of the paper's cases instead of `sim.case`.
         seed: of the sensor noise, instead of `sim.seed`.
-        file: the joint file, for messages.
 
     Raises:
         JointFileError: a missing or impossible value.
@@ -100,7 +98,6 @@ def alter(world: World, effects: Sequence[str], parameters: Mapping[str, float])
     """Make a world another one from now on.
 
     Args:
-        world: at motion.
         effects: all that it then has, "NAME=VALUE".
         parameters: that it then has, as `[sim] parameters`.
 
@@ -244,10 +241,7 @@ def nodes_from_joint(
     """Return the drives and the encoder of a joint.
 
     Args:
-        joint: the joint file.
-        world: the world they measure.
         quirks: name of a profile instead of `sim.quirks`.
-        file: the joint file, for messages.
 
     Raises:
         JointFileError: a motor without a drive, or an unknown profile in the file.

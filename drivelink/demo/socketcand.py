@@ -43,11 +43,7 @@ class SocketcandServer(can.BusABC):
 
     Args:
         channel: name that clients have to open; empty: any name.
-        host: address to listen on.
         port: TCP port; 0 takes a free one.
-
-    Attributes:
-        port: the port in use.
 
     Raises:
         OSError: the address cannot be used.
@@ -65,7 +61,7 @@ class SocketcandServer(can.BusABC):
         self._frames: deque[can.Message] = deque()
         self._listener.setblocking(False)
         self._selector.register(self._listener, selectors.EVENT_READ, None)
-        self.port: int = self._listener.getsockname()[1]
+        self.port: int = self._listener.getsockname()[1]  # the port in use
         self.channel = channel
         self.channel_info = f"socketcand server for {channel or 'any channel'} at {host}:{self.port}"
         super().__init__(channel=channel, **kwargs)

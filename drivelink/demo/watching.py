@@ -53,18 +53,12 @@ def rig_process(path: Path, seconds: float | None, change: Change | None = None)
 
 
 class DemoRun:
-    """Follows a run to its end, on a terminal or in plain lines.
-
-    Attributes:
-        comparison: truth beside estimate.
-        received: estimates that came in.
-        summary: the daemon's own; None until it ended.
-    """
+    """Follows a run to its end, on a terminal or in plain lines."""
 
     def __init__(self, joint: JointFile, console: Console, *, live: bool, height: int | None = None) -> None:
-        self.comparison = Comparison()
-        self.received = 0
-        self.summary: RunSummary | None = None
+        self.comparison = Comparison()  # truth beside estimate
+        self.received = 0  # estimates that came in
+        self.summary: RunSummary | None = None  # the daemon's own; None until it ended
         self._view = JointView(joint.name, subtitle="simulated, on the virtual bus", height=height)
         self._view.footer = "Ctrl-C ends"
         self._console = console

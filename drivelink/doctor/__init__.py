@@ -24,8 +24,6 @@ def examine(joint: JointFile | None, base_dir: Path, seconds: float) -> Report:
 
     Args:
         joint: the joint file; None: only the machine.
-        base_dir: its folder.
-        seconds: for each measurement (timer, SYNC, motion).
     """
     report = Report()
     period_s = joint.bus.period_s if joint is not None else _DEFAULT_PERIOD_S

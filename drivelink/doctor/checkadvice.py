@@ -49,15 +49,7 @@ def say_sync_counter(section: Section, subject: str, bus: BusSection) -> None:
 def say_checks(
     section: Section, role: Role, wanted: Available, available: Available, tpdos: Sequence[Tpdo]
 ) -> None:
-    """Report which checks the drive can send, their cost in frames, and the line for the joint file.
-
-    Args:
-        section: of the drive.
-        role: the drive.
-        wanted: signals that are mapped anyway.
-        available: its objects for cross-checks.
-        tpdos: present TPDOs.
-    """
+    """Report which checks the drive can send, their cost in frames, and the line for the joint file."""
     drive = role.drive
     if drive is None:
         return

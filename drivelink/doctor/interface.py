@@ -68,13 +68,7 @@ def _links(*arguments: str) -> list[dict[str, Any]]:
 
 
 def judge_link(section: Section, link: dict[str, Any], bus: BusSection) -> None:
-    """Check the output of `ip -json -details -statistics link show`.
-
-    Args:
-        section: receives the findings.
-        link: its object for the interface.
-        bus: section of the joint file.
-    """
+    """Check the output of `ip -json -details -statistics link show`."""
     name = bus.channel
     info = link.get("linkinfo", {})
     data = info.get("info_data", {})

@@ -46,19 +46,13 @@ Channel = tuple[Signal, int | None]
 
 @dataclass(slots=True)
 class Series:
-    """The values of one channel.
+    """The values of one channel."""
 
-    Attributes:
-        times_s: of each value; for an answer, halfway between it and its request.
-        values: SI at the joint side.
-        waits_s: from request to answer; 0: heard.
-        step: of the values, as the device counts them.
-    """
-
+    # of each value; for an answer, halfway between it and its request
     times_s: list[float] = field(default_factory=list)
-    values: list[float] = field(default_factory=list)
-    waits_s: list[float] = field(default_factory=list)
-    step: float = 0.0
+    values: list[float] = field(default_factory=list)  # SI at the joint side
+    waits_s: list[float] = field(default_factory=list)  # from request to answer; 0: heard
+    step: float = 0.0  # of the values, as the device counts them
 
 
 Readings = Mapping[Channel, Series]
@@ -68,7 +62,6 @@ class Asked:
     """Reads positions, velocity and torque of the nodes in turn, as fast as they answer; writes nothing.
 
     Args:
-        surveys: of the nodes.
         clock: monotonic seconds.
     """
 
@@ -132,7 +125,6 @@ class Heard:
     """Makes samples from the frames of a passive bus, as the daemon would; sends nothing.
 
     Args:
-        joint: the joint.
         configurator: knows the mapping of its nodes, or takes it from the frames.
     """
 
@@ -198,8 +190,6 @@ def record_of(readings: Readings, motors: int, linked: bool) -> Record | None:
     long stall ends the recording.
 
     Args:
-        readings: of the joint.
-        motors: number of motors.
         linked: whether the link position is needed.
 
     Returns:

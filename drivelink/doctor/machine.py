@@ -19,13 +19,7 @@ _CAP_SYS_NICE, _CAP_IPC_LOCK = 23, 14
 
 
 def examine_machine(section: Section, period_s: float, seconds: float) -> None:
-    """Examine kernel, rights and timer.
-
-    Args:
-        section: receives the findings.
-        period_s: of the cycle.
-        seconds: how long the timer is measured.
-    """
+    """Examine kernel, rights and timer."""
     kernel = platform.release()
     realtime = Path("/sys/kernel/realtime").exists() or "PREEMPT_RT" in platform.version()
     section.ok("kernel", f"Linux {kernel}" + (", PREEMPT_RT" if realtime else ""))

@@ -90,19 +90,12 @@ class Person(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mark:
-    """One sign or scale.
+    """One sign or scale."""
 
-    Attributes:
-        channel: e.g. "motor1_position".
-        what: "sign" or "scale".
-        good: whether it is right; None: not checked.
-        text: the observation.
-    """
-
-    channel: str
-    what: str
-    good: bool | None
-    text: str
+    channel: str  # e.g. "motor1_position".
+    what: str  # "sign" or "scale"
+    good: bool | None  # whether it is right; None: not checked
+    text: str  # the observation
 
     def __str__(self) -> str:
         sign = {True: "✓", False: "✗", None: "·"}[self.good]
@@ -111,17 +104,11 @@ class Mark:
 
 @dataclass(slots=True)
 class ByHand:
-    """How the checks went.
+    """How the checks went."""
 
-    Attributes:
-        marks: one for each sign and scale.
-        needed: what the channels need.
-        paste: the lines for the joint file.
-    """
-
-    marks: list[Mark] = field(default_factory=list)
-    needed: dict[str, float] = field(default_factory=dict)
-    paste: list[str] = field(default_factory=list)
+    marks: list[Mark] = field(default_factory=list)  # one for each sign and scale
+    needed: dict[str, float] = field(default_factory=dict)  # what the channels need
+    paste: list[str] = field(default_factory=list)  # the lines for the joint file
 
     @property
     def good(self) -> bool | None:
@@ -143,9 +130,6 @@ def check_by_hand(joint: JointFile, values: Values, person: Person, seconds: flo
     """Lead a person through the checks.
 
     Args:
-        joint: as it is.
-        values: of its channels.
-        person: who moves it.
         seconds: over which a channel at rest is averaged.
 
     Raises:
@@ -168,16 +152,12 @@ def check_by_hand(joint: JointFile, values: Values, person: Person, seconds: flo
 
 
 class _Steps:
-    """The checks in order.
-
-    Attributes:
-        done: results so far.
-    """
+    """The checks in order."""
 
     def __init__(self, joint: JointFile, values: Values, person: Person, seconds: float) -> None:
         self._joint, self._values, self._person, self._seconds = joint, values, person, seconds
         self._axis = _LINEAR if joint.axis == "linear" else _ROTARY
-        self.done = ByHand()
+        self.done = ByHand()  # results so far
 
     def positions(self, channels: Sequence[str], what: str) -> None:
         """Check positions against a motion of known amount."""

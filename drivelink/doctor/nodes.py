@@ -44,9 +44,6 @@ def examine_bus(
 
     Args:
         report: receives a section for the bus and one per node.
-        joint: the joint file.
-        base_dir: its folder.
-        seconds: for each measurement.
         alive: liveliness keys of running daemons, one of which may produce SYNC.
     """
     section = report.section("Bus")

@@ -22,17 +22,11 @@ _MARKS = {
 
 @dataclass(slots=True)
 class Section:
-    """Findings that belong together.
+    """Findings that belong together."""
 
-    Attributes:
-        title: their subject.
-        notices: the findings.
-        facts: figures for `--json`.
-    """
-
-    title: str
-    notices: list[Notice] = field(default_factory=list)
-    facts: dict[str, Any] = field(default_factory=dict)
+    title: str  # their subject
+    notices: list[Notice] = field(default_factory=list)  # the findings
+    facts: dict[str, Any] = field(default_factory=dict)  # figures for `--json`
 
     def say(self, severity: Severity, subject: str, text: str, fix: str = "") -> None:
         """Add a finding."""
@@ -45,15 +39,10 @@ class Section:
 
 @dataclass(slots=True)
 class Report:
-    """All sections.
+    """All sections."""
 
-    Attributes:
-        sections: in their order.
-        fine: summary without findings.
-    """
-
-    sections: list[Section] = field(default_factory=list)
-    fine: str = "no problem found"
+    sections: list[Section] = field(default_factory=list)  # in their order
+    fine: str = "no problem found"  # summary without findings
 
     def section(self, title: str) -> Section:
         """Begin a section."""

@@ -14,15 +14,10 @@ from drivelink.notice import Severity
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Daemons:
-    """Running drivelink daemons of this machine.
+    """Running drivelink daemons of this machine."""
 
-    Attributes:
-        ours: whether one of them serves this joint.
-        others: names of the other joints that are served.
-    """
-
-    ours: bool
-    others: Sequence[str]
+    ours: bool  # whether one of them serves this joint
+    others: Sequence[str]  # names of the other joints that are served
 
 
 def judge_sync(
@@ -31,9 +26,6 @@ def judge_sync(
     """Check rate and jitter of SYNC.
 
     Args:
-        section: receives the findings.
-        stamps_s: receive stamps of the SYNC frames.
-        bus: section of the joint file.
         daemons: running daemons, one of which may produce SYNC.
     """
     if len(stamps_s) < 3:

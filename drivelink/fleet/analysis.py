@@ -26,19 +26,12 @@ NAMED = {"zero": None, "middle": 0.5, "high": 0.95}
 
 
 class Analysis(NamedTuple):
-    """Result of a recording.
+    """Result of a recording."""
 
-    Attributes:
-        joint: columns of the table that all its rows share.
-        transmissions: further columns of each transmission's row.
-        report_json: the diagnosis for programs.
-        report_html: the diagnosis for people.
-    """
-
-    joint: dict[str, Any]
-    transmissions: list[dict[str, Any]]
-    report_json: str
-    report_html: str
+    joint: dict[str, Any]  # columns of the table that all its rows share
+    transmissions: list[dict[str, Any]]  # further columns of each transmission's row
+    report_json: str  # the diagnosis for programs
+    report_html: str  # the diagnosis for people
 
 
 def analyse(
@@ -54,8 +47,6 @@ def analyse(
         record: the recording, or a part of it.
         joint: the joint's last accepted model.
         validation: a recording that takes no part in fit and selection; None: blocks are held out.
-        title: of the report.
-        remarks: of the gate, for the report.
 
     Raises:
         EstimatorError: the recording cannot be fitted.

@@ -39,25 +39,15 @@ _MAD = 1.4826  # standard deviation of a normal variable over its median absolut
 
 
 class SeriesChange(NamedTuple):
-    """One change of a series.
+    """One change of a series."""
 
-    Attributes:
-        kind: "step" or "drift".
-        first: index of the first recording after it, or of the one where the drift begins.
-        earliest: 95 % interval of `first`.
-        latest: 95 % interval of `first`.
-        amount: of the step, or of the drift up to the last recording; unit of the series.
-        amount_std: its standard deviation.
-        shape: (n,) amount as it comes about.
-    """
-
-    kind: str
-    first: int
-    earliest: int
-    latest: int
-    amount: float
-    amount_std: float
-    shape: FloatArray
+    kind: str  # "step" or "drift"
+    first: int  # index of the first recording after it, or of the one where the drift begins
+    earliest: int  # 95 % interval of `first`
+    latest: int  # 95 % interval of `first`
+    amount: float  # of the step, or of the drift up to the last recording; unit of the series
+    amount_std: float  # its standard deviation
+    shape: FloatArray  # (n,) amount as it comes about
 
 
 class SeriesTest(NamedTuple):
@@ -112,7 +102,6 @@ def changes(time_s: FloatArray, value: FloatArray, std: FloatArray, level: float
         time_s: (n,) increasing.
         value: (n,) estimates.
         std: (n,) their standard deviations.
-        level: of significance for each.
 
     Returns:
         In order of time; empty where the first is not significant.

@@ -22,21 +22,13 @@ from drivelink.recording.mapping import contained, joint_of
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """A joint file as it travels to the workers.
+    """A joint file as it travels to the workers."""
 
-    Attributes:
-        name: of the joint.
-        text: of the joint file.
-        where: path of the file, for messages.
-        eds: the EDS and DCF files it refers to: (name, content) each.
-        carried: from a recording, whose joint file refers to nothing.
-    """
-
-    name: str
-    text: str
-    where: str
-    eds: tuple[tuple[str, bytes], ...] = ()
-    carried: bool = False
+    name: str  # of the joint
+    text: str  # of the joint file
+    where: str  # path of the file, for messages
+    eds: tuple[tuple[str, bytes], ...] = ()  # the EDS and DCF files it refers to: (name, content) each
+    carried: bool = False  # from a recording, whose joint file refers to nothing
 
     @property
     def file(self) -> JointFile:
@@ -106,7 +98,6 @@ class Joints:
         """Return the joint of a recording.
 
         Args:
-            path: the recording, as a local file.
             url: its address, by which it is named.
 
         Raises:

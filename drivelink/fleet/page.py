@@ -46,11 +46,7 @@ class _Frame(NamedTuple):
 
 
 def page(document: dict[str, Any]) -> str:
-    """Draw the document of `summarise`.
-
-    Args:
-        document: fleet.json.
-    """
+    """Draw the document of `summarise`."""
     joints = document["joints"]
     orders = _orders(joints)
     template = Template(Path(__file__).with_name("fleet.html").read_text(encoding="utf-8"))

@@ -42,8 +42,6 @@ def pieces(path: Path, joint: JointFile, base_dir: Path, limit_bytes: float) -> 
     """Read a recording, in equal parts in time if it does not fit.
 
     Args:
-        path: the recording.
-        joint: its joint.
         base_dir: folder in which the joint's EDS files are found.
         limit_bytes: memory of the worker; not above 0: no limit.
 

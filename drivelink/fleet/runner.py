@@ -35,26 +35,19 @@ _EPOCH = datetime.fromtimestamp(0, UTC)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """Settings of a run.
+    """Settings of a run."""
 
-    Attributes:
-        scheduler: address of a running Dask scheduler, `tls://…`; None: a local cluster.
-        insecure: accept a scheduler without TLS, where anybody who reaches it runs code as its workers' user.
-        workers: processes of the local cluster; None: one a core.
-        memory: limit of each worker, e.g. "2GiB"; None: equal shares of the local memory, or the limits of
-            the scheduler's workers.
-        since: omit earlier recordings.
-        validate: "previous" validates on the joint's recording before; None: on held-out blocks.
-        again: repeat recordings that are in the table.
-    """
-
-    scheduler: str | None = None
+    scheduler: str | None = None  # address of a running Dask scheduler, `tls://…`; None: a local cluster
+    # accept a scheduler without TLS, where anybody who reaches it runs code as its workers' user
     insecure: bool = False
-    workers: int | None = None
+    workers: int | None = None  # processes of the local cluster; None: one a core
+    # limit of each worker, e.g. "2GiB"; None: equal shares of the local memory, or the limits of the
+    # scheduler's workers.
     memory: str | None = None
-    since: datetime | None = None
+    since: datetime | None = None  # omit earlier recordings
+    # "previous" validates on the joint's recording before; None: on held-out blocks
     validate: Literal["previous"] | None = None
-    again: bool = False
+    again: bool = False  # repeat recordings that are in the table
 
     @property
     def limit_bytes(self) -> float:
@@ -96,10 +89,7 @@ def run(
     Finished work is in the table however the run ends.
 
     Args:
-        sources: the recordings.
         joints: the fleet's joints.
-        store: the folder of results.
-        settings: how.
         progress: called after each recording.
         say: called with messages for the user.
 

@@ -31,19 +31,12 @@ _MODIFIED = ("mtime", "LastModified", "last_modified", "Last-Modified", "time", 
 
 
 class Source(NamedTuple):
-    """Listing of a recording.
+    """Listing of a recording."""
 
-    Attributes:
-        url: address; an absolute path for local files.
-        size: bytes; -1: unknown.
-        stamp: changes when the content does: the entity tag, else the time of modification; "" if unknown.
-        modified: time of modification, if known.
-    """
-
-    url: str
-    size: int
-    stamp: str
-    modified: datetime | None
+    url: str  # address; an absolute path for local files
+    size: int  # bytes; -1: unknown
+    stamp: str  # changes when the content does: the entity tag, else the time of modification; "" if unknown
+    modified: datetime | None  # time of modification, if known
 
     @property
     def name(self) -> str:
@@ -182,19 +175,15 @@ class Store:
     Args:
         url: the folder; created if missing.
 
-    Attributes:
-        url: as given.
-        folder: the local folder, or None.
-
     Raises:
         FleetError: it cannot be reached or created.
     """
 
     def __init__(self, url: str) -> None:
-        self.url = url
+        self.url = url  # as given
         self._fs, self._root = _opened(url)
         local = "file" in ([self._fs.protocol] if isinstance(self._fs.protocol, str) else self._fs.protocol)
-        self.folder: Path | None = Path(self._root) if local else None
+        self.folder: Path | None = Path(self._root) if local else None  # the local folder, or None
         self._made: set[str] = set()
 
     def write(self, name: str, data: bytes) -> None:

@@ -72,15 +72,12 @@ class FleetTable:
     Args:
         store: where it is.
 
-    Attributes:
-        appended: recordings appended by this run.
-
     Raises:
         FleetError: a part cannot be read.
     """
 
     def __init__(self, store: Store) -> None:
-        self.appended = 0
+        self.appended = 0  # recordings appended by this run
         self._store, self._lock = store, _locked(store)
         self._parts = store.names(FOLDER, ".parquet")
         self._by_place: dict[tuple[str, int, str], Known] = {}

@@ -40,46 +40,31 @@ _DATE = re.compile(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Task:
-    """Input of a task.
-
-    Attributes:
-        source: the recording.
-        version: required version of drivelink.
-        done: finished contents of the same size, with their joints.
-        previous: the joint's previous recording, for validation.
-        since: omit earlier recordings.
-        limit_bytes: memory of a worker; 0: Dask's limit.
-    """
+    """Input of a task."""
 
     source: Source
-    version: str
+    version: str  # required version of drivelink
+    # finished contents of the same size, with their joints
     done: frozenset[tuple[str, str | None]] = frozenset()
-    previous: Source | None = None
-    since: datetime | None = None
-    limit_bytes: float = 0.0
+    previous: Source | None = None  # the joint's previous recording, for validation
+    since: datetime | None = None  # omit earlier recordings
+    limit_bytes: float = 0.0  # memory of a worker; 0: Dask's limit
 
 
 class Outcome(NamedTuple):
-    """What came of it.
+    """What came of it."""
 
-    Attributes:
-        kind: "done", "error", "known" (the same content is in the table already) or "early" (before `since`).
-        rows: for the table.
-        reports: (name below the result folder, content).
-        notes: messages for the user.
-    """
-
+    # "done", "error", "known" (the same content is in the table already) or "early" (before `since`)
     kind: str
-    rows: list[dict[str, Any]]
-    reports: list[tuple[str, str]]
-    notes: list[str]
+    rows: list[dict[str, Any]]  # for the table
+    reports: list[tuple[str, str]]  # (name below the result folder, content)
+    notes: list[str]  # messages for the user
 
 
 def process(task: Task, joints: Joints) -> Outcome:
     """Fetch, identify, read, fit, diagnose. An error becomes a row.
 
     Args:
-        task: what to do.
         joints: the fleet's joints.
     """
     begin, start = time.process_time(), time.monotonic()

@@ -29,10 +29,6 @@ def write(
 
     Args:
         source: the joint file the diagnosis was made with.
-        target: path of the copy.
-        outcome: the diagnosis.
-        record: the recording it was made from.
-        recording: its name.
         force: replace an existing file.
 
     Raises:

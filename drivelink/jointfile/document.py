@@ -39,21 +39,13 @@ _PATTERNS = {  # in words, by key
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JointText:
-    """A joint file and its text.
+    """A joint file and its text."""
 
-    Attributes:
-        joint: the parsed file.
-        text: the whole text, comments included.
-        folder: base of its EDS and zenoh files.
-        name: for messages.
-        path: the file; None: from a recording.
-    """
-
-    joint: JointFile
-    text: str
-    folder: Path
-    name: str
-    path: Path | None = None
+    joint: JointFile  # the parsed file
+    text: str  # the whole text, comments included
+    folder: Path  # base of its EDS and zenoh files
+    name: str  # for messages
+    path: Path | None = None  # the file; None: from a recording
 
 
 def load(path: str | Path) -> JointFile:
@@ -135,7 +127,6 @@ def write_model(
     The copy ends with a check line, so that readers detect a truncated file.
 
     Args:
-        source: joint file to start from.
         target: path of the copy; written atomically, and only if valid.
         changes: nested like the file. Mappings are merged, a list of mappings for an array (`motor`) element
             by element; everything else, and `effect`, is replaced.

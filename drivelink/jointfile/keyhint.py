@@ -11,12 +11,7 @@ from pydantic import BaseModel
 
 
 def unknown_key(root: type, location: tuple[int | str, ...]) -> str:
-    """Return the message for an unknown key, from the keys of its table.
-
-    Args:
-        root: the schema of the whole file.
-        location: of the key, from pydantic.
-    """
+    """Return the message for an unknown key, from the keys of its table."""
     section: Any = root
     for part in location[:-1]:
         if isinstance(part, str):

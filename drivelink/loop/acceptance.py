@@ -26,19 +26,12 @@ _STAMP = "%Y%m%dT%H%M%SZ"
 
 
 class Proposal(NamedTuple):
-    """What may be accepted.
+    """What may be accepted."""
 
-    Attributes:
-        source: the joint file in use.
-        recording: the diagnosed one.
-        finding: of it.
-        proposed: the joint file with the finding.
-    """
-
-    source: JointText
-    recording: Path
-    finding: dict[str, Any]
-    proposed: JointText
+    source: JointText  # the joint file in use
+    recording: Path  # the diagnosed one
+    finding: dict[str, Any]  # of it
+    proposed: JointText  # the joint file with the finding
 
     def difference(self) -> str:
         """Return the lines of the joint file that change, as a unified diff; baseline and
@@ -62,9 +55,6 @@ class Proposal(NamedTuple):
 
 def proposal(path: Path) -> Proposal:
     """Return the newest finding of a joint, if a joint file is proposed by it.
-
-    Args:
-        path: the joint file.
 
     Raises:
         JointFileError: the joint file, or the proposed one, is wrong.
@@ -168,17 +158,13 @@ class Trial:
     Args:
         path: the joint file as it is now.
         now_s: monotonic time.
-
-    Attributes:
-        in_use: the daemon has the new model.
-        ratios: residual over baseline of each balance in the newest second, or empty.
-        fallen: True: it has; False: not within a minute; None: not decided yet.
     """
 
     def __init__(self, path: Path, now_s: float) -> None:
-        self.in_use = False
+        self.in_use = False  # the daemon has the new model
+        # residual over baseline of each balance in the newest second, or empty
         self.ratios: tuple[float, ...] = ()
-        self.fallen: bool | None = None
+        self.fallen: bool | None = None  # True: it has; False: not within a minute; None: not decided yet
         self._accepted, self._end_s = accepted_at(load(path)), now_s + PATIENCE_S
         self._quiet = self._moved = 0
         self._last: object = None

@@ -144,7 +144,6 @@ class BlackBox(Sink):
         """Keep the time before now, and what comes after it; not if the same cause was kept a moment ago.
 
         Args:
-            cause: what has happened.
             asked: by a person: also shortly after the same cause.
         """
         now_s = self._clock()

@@ -16,12 +16,7 @@ _SNAPSHOT_S = 10.0
 
 
 class SnapshotFeed:
-    """Publishes the state of a joint's estimator now and then: the black box's recordings begin with it.
-
-    Args:
-        pipeline: of the joint.
-        publisher: likewise.
-    """
+    """Publishes the state of a joint's estimator now and then: the black box's recordings begin with it."""
 
     def __init__(self, pipeline: JointPipeline, publisher: JointPublisher) -> None:
         self._pipeline, self._publisher = pipeline, publisher
@@ -48,7 +43,6 @@ class FindingFeed:
 
     Args:
         folder: of the black box; it need not exist yet.
-        joint: its name.
         publish: called with each new finding, in the slack.
     """
 

@@ -25,8 +25,6 @@ def kept(folder: Path, joint: str, ending: str = ".mcap") -> list[Path]:
     """Return the recordings of a joint's black box, oldest first.
 
     Args:
-        folder: of the black box.
-        joint: its name.
         ending: of finished ones, or `UNFINISHED`.
 
     Raises:

@@ -21,12 +21,7 @@ _UNDER_WAY = "what the model may lack is being looked for"
 
 
 class Diagnoses:
-    """Has the recordings of one folder diagnosed, one at a time; the newest first.
-
-    Args:
-        folder: of the black box.
-        joint: its name.
-    """
+    """Has the recordings of one folder diagnosed, one at a time; the newest first."""
 
     def __init__(self, folder: Path, joint: str) -> None:
         self._folder, self._joint = folder, joint
@@ -93,11 +88,6 @@ class Diagnoses:
 
 def next_due(folder: Path, joint: str, tried: Collection[Path] = ()) -> Path | None:
     """Return the newest recording to be diagnosed: of a doubt that is no part of one diagnosed already.
-
-    Args:
-        folder: of the black box.
-        joint: its name.
-        tried: those not to be tried again.
 
     Raises:
         OSError: the folder cannot be read.

@@ -22,9 +22,7 @@ def summary(outcome: Diagnosis, error: Errors, joint: JointFile) -> Summary:
     """Describe what was found.
 
     Args:
-        outcome: the diagnosis.
         error: of the model in use and of the proposed one, on held-out data.
-        joint: the joint file in use.
     """
     units = Units(joint.axis == "linear")
     fall = f"{error.before_relative:.2%} to {error.after_relative:.2%}"

@@ -50,8 +50,6 @@ class DotPlot:
     Args:
         width: characters of the whole plot, labels included.
         height: lines of the whole plot, title and axis included.
-        x: (low, high) of the horizontal axis.
-        y: (low, high) of the vertical axis.
     """
 
     def __init__(self, width: int, height: int, x: tuple[float, float], y: tuple[float, float]) -> None:

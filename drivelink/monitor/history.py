@@ -92,31 +92,21 @@ class GrowingCurve:
 
 
 class JointHistory:
-    """The last seconds of a joint and its curve.
-
-    Args:
-        seconds: its length.
-        points: number of moments kept.
-
-    Attributes:
-        moments: thinned estimates, oldest first.
-        curves: stiffness over deflection of each transmission, where it is usable.
-        doubtful: the same since the estimate stopped being usable; empty while it is.
-        latest: the newest estimate.
-        residuals: (time of the newest estimate, s; largest residual over its baseline).
-        touches: thinned external torques, oldest first; empty without link dynamics.
-        touch: the newest one.
-    """
+    """The last seconds of a joint and its curve."""
 
     def __init__(self, seconds: float = 12.0, points: int = 600) -> None:
         self.seconds = seconds
-        self.moments: deque[Moment] = deque(maxlen=points)
+        self.moments: deque[Moment] = deque(maxlen=points)  # thinned estimates, oldest first
+        # stiffness over deflection of each transmission, where it is usable
         self.curves: tuple[GrowingCurve, ...] = ()
+        # the same since the estimate stopped being usable; empty while it is
         self.doubtful: tuple[GrowingCurve, ...] = ()
+        # (time of the newest estimate, s; largest residual over its baseline)
         self.residuals: deque[tuple[float, float]] = deque(maxlen=points)
+        # thinned external torques, oldest first; empty without link dynamics
         self.touches: deque[Touch] = deque(maxlen=points)
-        self.touch: Touch | None = None
-        self.latest: EstimateMessage | None = None
+        self.touch: Touch | None = None  # the newest one
+        self.latest: EstimateMessage | None = None  # the newest estimate
         self._apart_s = seconds / points
 
     def add(self, estimate: EstimateMessage, time_s: float, truth: TruePoint | None = None) -> None:

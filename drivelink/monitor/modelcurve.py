@@ -20,7 +20,6 @@ def model_curves(
     """Return the stiffness of each transmission by the model in use, over the deflections seen so far.
 
     Args:
-        model: the model document, whatever it contains.
         curves: (deflection, stiffness, standard deviation) of each transmission, by deflection.
 
     Returns:

@@ -60,40 +60,24 @@ class ResidualGauge(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shown:
-    """Shown parts of the documents; empty if missing.
+    """Shown parts of the documents; empty if missing."""
 
-    Attributes:
-        state: in a word.
-        rate, missed, cpu, load: of the cycle; texts.
-        times: (name, 99th percentile, µs).
-        nodes: of the bus.
-        wrong: faults and conditions that hold now.
-        not_valid: why the estimate is not valid; empty: it is.
-        alarm: whether the model alarm is on.
-        location: likely location of the missing effect.
-        residual_nm: of the whole model, N·m, or None.
-        balances: residual and baseline per motor and of the link.
-        improved: relative error before and after diagnose.
-        events: the last ones, newest first.
-        recording: where to.
-    """
-
-    state: str = ""
-    rate: str = ""
+    state: str = ""  # in a word
+    rate: str = ""  # of the cycle; texts
     missed: str = ""
     cpu: str = ""
     load: str = ""
-    times: tuple[tuple[str, float], ...] = ()
-    nodes: tuple[NodeState, ...] = ()
-    wrong: tuple[str, ...] = ()
-    not_valid: str = ""
-    alarm: bool = False
-    location: str = ""
-    residual_nm: float | None = None
-    balances: tuple[ResidualGauge, ...] = ()
-    improved: tuple[float, float] | None = None
-    events: tuple[Event, ...] = ()
-    recording: str = ""
+    times: tuple[tuple[str, float], ...] = ()  # (name, 99th percentile, µs)
+    nodes: tuple[NodeState, ...] = ()  # of the bus
+    wrong: tuple[str, ...] = ()  # faults and conditions that hold now
+    not_valid: str = ""  # why the estimate is not valid; empty: it is
+    alarm: bool = False  # whether the model alarm is on
+    location: str = ""  # likely location of the missing effect
+    residual_nm: float | None = None  # of the whole model, N·m, or None
+    balances: tuple[ResidualGauge, ...] = ()  # residual and baseline per motor and of the link
+    improved: tuple[float, float] | None = None  # relative error before and after diagnose
+    events: tuple[Event, ...] = ()  # the last ones, newest first
+    recording: str = ""  # where to
 
     @property
     def ratio(self) -> float | None:

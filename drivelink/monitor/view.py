@@ -69,7 +69,6 @@ class JointView:
     Args:
         name: the joint's name.
         subtitle: e.g. its case or bus.
-        seconds: length of the plots over time.
         height: lines; default: those of the terminal.
 
     Attributes:

@@ -46,7 +46,6 @@ class Watcher:
 
     Args:
         session: an open session; it stays open.
-        prefix: first part of every key.
         joint: only this one; None: all joints, up to MAX_JOINTS.
 
     Attributes:

@@ -51,9 +51,6 @@ class WebView:
         port: on loopback; 0: any free one.
         acceptance: what the page may change; None: nothing.
 
-    Attributes:
-        url: address of the page.
-
     Raises:
         UsageError: the port is taken.
     """
@@ -76,7 +73,7 @@ class WebView:
             raise UsageError(f"--port {port}: cannot be served: {reason}") from error
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True)
         self._thread.start()
-        self.url = f"http://127.0.0.1:{self._server.server_address[1]}/"
+        self.url = f"http://127.0.0.1:{self._server.server_address[1]}/"  # address of the page
 
     def poll(self) -> None:
         """Process new messages; to be called often."""
@@ -127,7 +124,6 @@ def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str,
     """Return the data of one joint for the page; invalid and non-finite values are null.
 
     Args:
-        view: of the joint.
         alive: whether its daemon is alive.
         since: times of the page's newest moment and residual, by joint; updated.
     """

@@ -26,20 +26,13 @@ ACTIONS = ("proposal", "accept", "undo")
 class WebAcceptance:
     """The actions of the page on one joint file.
 
-    Args:
-        path: the joint file.
-
-    Attributes:
-        token: what the page has to send.
-        joint: name of the joint.
-
     Raises:
         JointFileError: the joint file is wrong.
     """
 
     def __init__(self, path: Path) -> None:
-        self.token = secrets.token_urlsafe(32)
-        self.joint = jointfile.load(path).name
+        self.token = secrets.token_urlsafe(32)  # what the page has to send
+        self.joint = jointfile.load(path).name  # name of the joint
         self._path = path
         self._trial: Trial | None = None
 
@@ -53,7 +46,6 @@ class WebAcceptance:
         """Do what the page asks for; what goes wrong is `error`, in one line.
 
         Args:
-            action: of `ACTIONS`.
             asked: to accept, `recording`: the one whose proposal was shown.
         """
         try:

@@ -22,7 +22,6 @@ def value_and_interval(value: float, half: float | None, digits: int = 4) -> tup
     """Return a value to the last digit that its interval leaves, and half its interval with two digits.
 
     Args:
-        value: the number.
         half: half the width of its interval; None, zero or not finite: unknown.
         digits: significant ones of the value where the interval is unknown.
 

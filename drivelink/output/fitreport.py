@@ -28,13 +28,7 @@ _Rows = list[tuple[str | Share, ...]]
 
 
 def sections(found: Identified, names: Sequence[str], units: Units) -> list[Section]:
-    """Tabulate what was fitted.
-
-    Args:
-        found: the fit.
-        names: of the recordings.
-        units: of the axis.
-    """
+    """Tabulate what was fitted."""
     made = []
     for number, (one, motor) in enumerate(zip(found.fits, found.model.motors, strict=True), start=1):
         rows: _Rows = []
@@ -106,10 +100,6 @@ def _remarks(one: TransmissionFit) -> list[str]:
 
 def fit_plot(fits: Sequence[TransmissionFit], joint: JointFile) -> Figure:
     """Draw each flexible transmission: stiffness, its interval, torque; and the residuals, larger.
-
-    Args:
-        fits: one per motor.
-        joint: its joint file.
 
     Raises:
         UsageError: every transmission is rigid.

@@ -100,7 +100,6 @@ class Feed:
         """Decode one message of a trusted source; None: not an estimate.
 
         Args:
-            payload: its bytes.
             now_ns: local monotonic clock.
             overrun: whether older messages were dropped here, unread, before this one.
         """

@@ -30,15 +30,11 @@ class DaemonIdentity:
     """The daemon of one joint, as seen by a subscriber.
 
     `token` may be called from zenoh's thread, all else from the subscriber's.
-
-    Attributes:
-        bound: the accepted session, or None.
-        refused: messages of other sessions.
     """
 
     def __init__(self) -> None:
-        self.bound: str | None = None
-        self.refused = 0
+        self.bound: str | None = None  # the accepted session, or None
+        self.refused = 0  # messages of other sessions
         self._vouched = False  # whether the bound session ever had a token
         self._claims: set[str] = set()
         self._plain = False  # whether the token without a session is there
@@ -95,7 +91,6 @@ class DaemonIdentity:
         """Return whether to accept a message of this session; the first accepted one binds to its session.
 
         Args:
-            source: as by `source_of`.
             stale: whether the bound session is stale.
         """
         claims = self._claims

@@ -26,7 +26,6 @@ def joints(
     Args:
         endpoint: where a daemon or a router listens.
         config: a zenoh configuration file (JSON5) instead.
-        prefix: first part of every key.
 
     Raises:
         ZenohError: no session can be opened.

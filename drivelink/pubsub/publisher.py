@@ -130,7 +130,6 @@ class JointPublisher:
         """Publish the model in use, on every change.
 
         Args:
-            joint: the joint file in use.
             layouts: of its nodes, once they are known.
         """
         rigid = any(motor.transmission.model == RIGID for motor in joint.motor)
@@ -233,7 +232,6 @@ def describe_model(joint: JointFile, layouts: Sequence[NodeLayout] = ()) -> dict
     """Return the model in use, with its effects and provenance.
 
     Args:
-        joint: the joint file.
         layouts: of its nodes, if known; they make recorded frames decodable.
     """
     return {

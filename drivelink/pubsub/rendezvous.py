@@ -39,11 +39,7 @@ def _address(endpoint: str) -> tuple[str, int] | None:
 
 
 class Rendezvous:
-    """Takes over the endpoint of a dead daemon on this machine.
-
-    Args:
-        endpoint: the common endpoint.
-    """
+    """Takes over the endpoint of a dead daemon on this machine."""
 
     def __init__(self, endpoint: str) -> None:
         self._endpoint = endpoint

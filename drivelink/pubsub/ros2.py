@@ -149,7 +149,6 @@ def interfaces(transmissions: int, linked: bool = False) -> tuple[str, ...]:
     each transmission.
 
     Args:
-        transmissions: how many it has.
         linked: with declared link dynamics; adds the external torque at the end.
     """
     numbers = ("flexibility_torque_nm", "stiffness_nm_rad", "stiffness_std_nm_rad")
@@ -244,10 +243,6 @@ class Ros2Publisher:
         session: the daemon's session, which it does not close.
         joint: with a `[ros2]` section.
 
-    Attributes:
-        latest: the newest estimate, for diagnostics.
-        finding: what the newest diagnosis found, or empty.
-
     Raises:
         ZenohError: zenoh refuses a key.
     """
@@ -285,8 +280,8 @@ class Ros2Publisher:
         self._velocity_rad_s = 0.0
         self._before: tuple[int, float] | None = None
         self._reported_ns: int | None = None
-        self.latest: Estimate | None = None
-        self.finding: Mapping[str, Any] = {}
+        self.latest: Estimate | None = None  # the newest estimate, for diagnostics
+        self.finding: Mapping[str, Any] = {}  # what the newest diagnosis found, or empty
 
     def put_cycle(self, tick: Tick) -> None:
         """Publish one cycle, to topics with a subscriber; cheap enough for the loop."""
@@ -325,7 +320,6 @@ class Ros2Publisher:
         """Publish diagnostics, at most once a second.
 
         Args:
-            status: as on the status key.
             stamp_ns: UNIX time, ns.
         """
         if self._reported_ns is not None and 0 <= stamp_ns - self._reported_ns < _NS:

@@ -75,7 +75,6 @@ def open_session(section: ZenohSection, base_dir: Path) -> zenoh.Session:
     """Open the daemon's session, connected to the other daemons of the machine.
 
     Args:
-        section: `[zenoh]` of the joint file.
         base_dir: base of a relative `config`: the joint file's directory.
 
     Raises:

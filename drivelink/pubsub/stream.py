@@ -8,21 +8,14 @@ import zenoh
 
 
 class Stream:
-    """Puts bytes with the identity of the writing session.
-
-    Args:
-        publisher: declared and undeclared by the caller.
-
-    Attributes:
-        wanted: whether there is a subscriber; set by zenoh's thread.
-    """
+    """Puts bytes with the identity of the writing session."""
 
     __slots__ = ("_listener", "_publisher", "_source", "wanted")
 
     def __init__(self, publisher: zenoh.Publisher) -> None:
         self._publisher = publisher
         self._source = zenoh.SourceInfo(publisher.id, 0)
-        self.wanted = False
+        self.wanted = False  # whether there is a subscriber; set by zenoh's thread
         # indirect=False: in zenoh's thread, which never keeps the process from ending
         heard = zenoh.handlers.Callback(self._match, indirect=False)
         self._listener = publisher.declare_matching_listener(heard)

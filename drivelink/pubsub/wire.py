@@ -38,19 +38,12 @@ class Field:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
-    """A message: fixed fields, then a sequence of equal elements, where it has one.
+    """A message: fixed fields, then a sequence of equal elements, where it has one."""
 
-    Attributes:
-        schema: name and version, carried in the zenoh encoding.
-        head: the fixed fields, from byte 0.
-        elements: name of the sequence; empty: there is none, nor its length.
-        element: the fields of one element.
-    """
-
-    schema: str
-    head: tuple[Field, ...]
-    elements: str = ""
-    element: tuple[Field, ...] = ()
+    schema: str  # name and version, carried in the zenoh encoding
+    head: tuple[Field, ...]  # the fixed fields, from byte 0
+    elements: str = ""  # name of the sequence; empty: there is none, nor its length
+    element: tuple[Field, ...] = ()  # the fields of one element
 
     def struct(self, count: int = 0) -> Struct:
         """Return the whole message with `count` elements, the one-byte length between head

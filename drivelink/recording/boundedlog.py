@@ -32,12 +32,7 @@ _TRC_VERSIONS = ("1.0", "1.1", "1.2", "1.3", "2.0", "2.1")
 
 
 class BlfBytes(io.BufferedIOBase):
-    """The bytes of a BLF file, with limits on packed and unpacked containers.
-
-    Args:
-        file: open for reading bytes.
-        path: begins every message.
-    """
+    """The bytes of a BLF file, with limits on packed and unpacked containers."""
 
     def __init__(self, file: IO[bytes], path: Path) -> None:
         super().__init__()
@@ -69,12 +64,7 @@ class BlfBytes(io.BufferedIOBase):
 
 
 class _Text(io.TextIOBase):
-    """The lines of a log; an incomplete last line is omitted.
-
-    Args:
-        file: open for reading bytes.
-        path: begins every message.
-    """
+    """The lines of a log; an incomplete last line is omitted."""
 
     def __init__(self, file: IO[bytes], path: Path) -> None:
         super().__init__()

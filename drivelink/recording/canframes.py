@@ -47,7 +47,6 @@ def is_frame_log(path: Path, frames: bool | None = None) -> bool:
     """Return whether to read a recording as raw frames.
 
     Args:
-        path: the recording.
         frames: the user's choice for a file with both; None: frames if there are no samples.
     """
     suffix = path.suffix.lower()
@@ -71,14 +70,7 @@ class FrameLog:
     """A raw CAN recording of a joint.
 
     Args:
-        path: the recording.
-        joint: the joint.
         base_dir: folder of the joint file, base of its EDS files.
-        channel: of a recording with several.
-
-    Attributes:
-        period_s: the communication cycle, from its SYNCs.
-        assembler: makes the samples.
 
     Raises:
         RecordingError: no SYNC or no frames, or the mapping of a node is unknown or incomplete.
@@ -105,9 +97,10 @@ class FrameLog:
             self._listener.adopt(known)  # the nodes were configured before the recording began
             self._head, self._frames = [], frames()
         self._check_complete()
-        self.period_s = self._period(syncs, joint.bus.period_s)
+        self.period_s = self._period(syncs, joint.bus.period_s)  # the communication cycle, from its SYNCs
         timed = joint.model_copy(update={"bus": joint.bus.model_copy(update={"period_s": self.period_s})})
         try:
+            # makes the samples
             self.assembler = make_assembler(timed, tuple(self._listener.layouts.values()))
         except DriveError as error:
             raise RecordingError(f"{path}: {error}") from error
@@ -138,9 +131,6 @@ class FrameLog:
 
     def ticks(self, pipeline: JointPipeline) -> Iterator[Tick]:
         """Yield the published output of the cycles; to be iterated once.
-
-        Args:
-            pipeline: made with `assembler`.
 
         Raises:
             RecordingError: as for `cycles`.

@@ -33,19 +33,12 @@ class _BlfWriter(can.BLFWriter):
 
 
 class CanFormat(NamedTuple):
-    """A format of raw frames.
+    """A format of raw frames."""
 
-    Attributes:
-        writer: python-can's; None: not written.
-        reader: python-can's; None: text as candump writes it, read here.
-        bounded: what the reader reads from, see `boundedlog`.
-        text: whether it has lines.
-    """
-
-    writer: Any
-    reader: Any = None
-    bounded: Any = None
-    text: bool = True
+    writer: Any  # python-can's; None: not written
+    reader: Any = None  # python-can's; None: text as candump writes it, read here
+    bounded: Any = None  # what the reader reads from, see `boundedlog`
+    text: bool = True  # whether it has lines
 
 
 CAN_FORMATS = {
@@ -71,19 +64,12 @@ _LOOK_AHEAD = 2000  # frames examined for the meaning of stamps, and for channel
 
 
 class LoggedFrame(NamedTuple):
-    """One frame of a log.
+    """One frame of a log."""
 
-    Attributes:
-        stamp_ns: time by the log's clock; NO_STAMP if the log has none.
-        can_id: its 11-bit identifier.
-        data: its bytes.
-        channel: its interface, by the log's name.
-    """
-
-    stamp_ns: int
-    can_id: int
-    data: bytes
-    channel: str
+    stamp_ns: int  # time by the log's clock; NO_STAMP if the log has none
+    can_id: int  # its 11-bit identifier
+    data: bytes  # its bytes
+    channel: str  # its interface, by the log's name
 
 
 # (1436509052.249713) vcan0 044#2A366C2BBA R          candump -L, to the letter

@@ -12,16 +12,11 @@ from estimator.sample import FloatArray
 
 
 class Source(NamedTuple):
-    """Source of one of our columns: SI value = factor * value in the file.
+    """Source of one of our columns: SI value = factor * value in the file."""
 
-    Attributes:
-        column: its name in the file.
-        factor: SI value of its unit, with its sign.
-        asked: by `--map`: it has to be there. Else our own name is taken where the source is missing.
-    """
-
-    column: str
-    factor: float
+    column: str  # its name in the file
+    factor: float  # SI value of its unit, with its sign
+    # by `--map`: it has to be there. Else our own name is taken where the source is missing.
     asked: bool = True
 
 

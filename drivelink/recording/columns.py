@@ -55,7 +55,6 @@ def record_from_columns(
 
     Args:
         columns: (rows,) each; names other than `COLUMNS` are ignored with a warning.
-        where: begins every message.
         joint: gives the number of motors, whether a link position is needed, and torque constants.
         keep_nan: keep rows with NaN, for use tick by tick.
         ignored: names of columns in the file that are not in `columns`.

@@ -35,7 +35,6 @@ def read_csv_columns(path: Path, names: ColumnMap) -> tuple[dict[str, FloatArray
     `#` comments before the header. A last line without end is omitted, because it may be incomplete.
 
     Args:
-        path: the file.
         names: columns with other names in the file.
 
     Returns:
@@ -73,19 +72,12 @@ def _read(file: IO[bytes], path: Path, names: ColumnMap) -> tuple[dict[str, Floa
 
 
 class _Layout(NamedTuple):
-    """The columns of a file.
+    """The columns of a file."""
 
-    Attributes:
-        names: of all of them.
-        used: of those that are read.
-        places: their indices.
-        separator: between columns.
-    """
-
-    names: tuple[str, ...]
-    used: tuple[str, ...]
-    places: tuple[int, ...]
-    separator: bytes
+    names: tuple[str, ...]  # of all of them
+    used: tuple[str, ...]  # of those that are read
+    places: tuple[int, ...]  # their indices
+    separator: bytes  # between columns
 
     def with_commas(self, block: bytes) -> bytes:
         """Return the lines with commas between their columns and points in their numbers."""

@@ -14,19 +14,12 @@ _BATCH = 512
 
 
 class Cycle(NamedTuple):
-    """One recorded cycle.
+    """One recorded cycle."""
 
-    Attributes:
-        sequence: number of its SYNC.
-        stamp_ns: UNIX time of its SYNC.
-        sample: of this cycle, or None.
-        flags: its service bits of `Status`.
-    """
-
-    sequence: int
-    stamp_ns: int
-    sample: Sample | None
-    flags: int
+    sequence: int  # number of its SYNC
+    stamp_ns: int  # UNIX time of its SYNC
+    sample: Sample | None  # of this cycle, or None
+    flags: int  # its service bits of `Status`
 
 
 def estimated(cycles: Iterable[Cycle], pipeline: JointPipeline) -> Iterator[Tick]:

@@ -24,10 +24,6 @@ _UNITS = {
 def dbc_text(joint: str, layouts: Iterable[NodeLayout]) -> str:
     """Describe every TPDO of a joint's nodes, in SI at the joint side.
 
-    Args:
-        joint: its name.
-        layouts: of its nodes.
-
     Raises:
         UsageError: cantools is not installed.
     """

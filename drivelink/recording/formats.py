@@ -19,16 +19,12 @@ Columns = tuple[dict[str, FloatArray], tuple[str, ...]]
 
 
 class Format(NamedTuple):
-    """A format of recordings.
+    """A format of recordings."""
 
-    Attributes:
-        sink: its writer; None: only read.
-        columns: reads columns by their names in the file, and names of those left out; None: it has none.
-        text: whether it is text, some thirty times smaller than the memory that its analysis takes.
-    """
-
-    sink: Callable[..., Sink] | None = None
+    sink: Callable[..., Sink] | None = None  # its writer; None: only read
+    # reads columns by their names in the file, and names of those left out; None: it has none
     columns: Callable[[Path, ColumnMap], Columns] | None = None
+    # whether it is text, some thirty times smaller than the memory that its analysis takes
     text: bool = False
 
 
@@ -43,8 +39,6 @@ def open_sink(path: Path, joint: JointFile, joint_text: str = "", *, force: bool
     """Open the writer for the file's ending.
 
     Args:
-        path: the recording.
-        joint: the joint.
         joint_text: its joint file, stored if the format allows.
         force: replace an existing file.
 

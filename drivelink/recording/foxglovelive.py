@@ -14,11 +14,7 @@ class FoxgloveSink(MessageSink):
     """Serves each topic to Foxglove Studio and PlotJuggler, on loopback.
 
     Args:
-        joint: whose messages they are.
         port: of the server; 0: any.
-
-    Attributes:
-        port: where it listens.
 
     Raises:
         UsageError: foxglove-sdk is not installed, or the port is taken.
@@ -40,7 +36,7 @@ class FoxgloveSink(MessageSink):
             )
         except (OSError, RuntimeError) as error:
             raise UsageError(f"--port {port}: cannot be served: {error}") from error
-        self.port: int = self._server.port
+        self.port: int = self._server.port  # where it listens
         self._channels = {}
         for topic in TOPICS:
             name = SCHEMA_NAMES.get(topic, f"drivelink.{topic}")

@@ -18,7 +18,6 @@ class FrameSamples:
     """Takes frames in bus order and makes the samples of one joint, as its daemon would.
 
     Args:
-        joint: the joint.
         listener: knows the mapping of its nodes, or takes it from the frames.
     """
 

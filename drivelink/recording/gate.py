@@ -25,19 +25,12 @@ _LONGEST_S = 60.0  # of a run that is examined; more adds no information
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Correction:
-    """A corrected key of the joint file.
+    """A corrected key of the joint file."""
 
-    Attributes:
-        table: e.g. "motor[1].drive" or "recording.scale".
-        key: its name.
-        value: its new value; None: only the factor is known.
-        factor: new value over old one.
-    """
-
-    table: str
+    table: str  # e.g. "motor[1].drive" or "recording.scale".
     key: str
-    value: float | int | None
-    factor: float
+    value: float | int | None  # its new value; None: only the factor is known
+    factor: float  # new value over old one
 
     def __str__(self) -> str:
         if self.value is None:
@@ -47,12 +40,6 @@ class Correction:
 
 def gate(path: Path, joint: JointFile, record: Record, *, strict: bool) -> list[str]:
     """Check units, signs, gears and time of a recording against the joint as declared.
-
-    Args:
-        path: of the recording.
-        joint: as declared.
-        record: what was read of it.
-        strict: refuse what is found.
 
     Returns:
         What is wrong, with the line to paste, or what the motion does not reveal; empty or one line.
@@ -80,12 +67,7 @@ def _line(joint: JointFile, judgement: Judgement, *, live: bool) -> str:
 
 
 class Gathered:
-    """Keeps the first minute of samples for a later check of units and signs.
-
-    Args:
-        joint: of the samples.
-        period_s: between them.
-    """
+    """Keeps the first minute of samples for a later check of units and signs."""
 
     def __init__(self, joint: JointFile, period_s: float) -> None:
         self._joint, self._period_s = joint, period_s
@@ -168,8 +150,6 @@ def corrections(joint: JointFile, needed: Sequence[Change], *, live: bool) -> li
     """Return the corrections of the joint file.
 
     Args:
-        joint: as it is.
-        needed: corrections of the channels.
         live: correct the keys of drives and encoder, used by `run` and recordings of frames; else the factors
             of `[recording]`, used by files with columns.
     """

@@ -35,21 +35,13 @@ class NotUniformError(RecordingError):
 
 
 class Grid(NamedTuple):
-    """Position of each row on the grid.
+    """Position of each row on the grid."""
 
-    Attributes:
-        period_s: the sampling period T.
-        sequence: (n,) whole periods since the first row, strictly increasing.
-        start_s: time of sequence 0.
-        keep: (rows,) rows of the input on the grid: those with a stamp, without repetitions.
-        jittering: largest distance of a stamp from the grid, periods; 0: as good as none.
-    """
-
-    period_s: float
-    sequence: NDArray[np.int64]
-    start_s: float
-    keep: NDArray[np.bool_]
-    jittering: float = 0.0
+    period_s: float  # the sampling period T
+    sequence: NDArray[np.int64]  # (n,) whole periods since the first row, strictly increasing
+    start_s: float  # time of sequence 0
+    keep: NDArray[np.bool_]  # (rows,) rows of the input on the grid: those with a stamp, without repetitions
+    jittering: float = 0.0  # largest distance of a stamp from the grid, periods; 0: as good as none
 
 
 def find_grid(
@@ -62,7 +54,6 @@ def find_grid(
 
     Args:
         time_s: (rows,) stamps; a row without one (NaN) becomes a gap.
-        where: begins every message.
         nominal_s: expected period, used if the stamps agree with it.
         repeats: (rows,) whether a row repeats the previous one; such rows are omitted.
 

@@ -33,9 +33,7 @@ def mapping_document(
     """Return the mapping document of a recording of frames.
 
     Args:
-        joint: its name.
         layouts: of its nodes, if known.
-        text: the joint file.
         daemon: whether the layouts come from a daemon rather than a file.
     """
     nodes = [layout_document(layout) for layout in layouts]
@@ -47,8 +45,6 @@ def layouts_from(data: bytes, joint: str, *, daemon: bool = False) -> list[NodeL
     """Return the layouts in a mapping or model document; none if it belongs to another joint.
 
     Args:
-        data: the document.
-        joint: name of the joint.
         daemon: only what a daemon said.
 
     Raises:
@@ -69,8 +65,6 @@ def recorded_layouts(path: Path, joint: str, *, daemon: bool) -> Sequence[NodeLa
     """Return the first layouts of a joint's nodes in a recording, or ().
 
     Args:
-        path: the recording.
-        joint: name of the joint.
         daemon: only from a daemon, whose layouts are those on the bus.
 
     Raises:

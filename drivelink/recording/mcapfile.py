@@ -52,7 +52,6 @@ def read_messages(path: Path, topics: frozenset[str] | None = None) -> Iterator[
     """Yield the messages of a file in order, up to a damaged place.
 
     Args:
-        path: the file.
         topics: last parts of the topics of interest (`sample` for `/elbow/sample`); None: all.
 
     Raises:

@@ -30,8 +30,6 @@ def recorded_cycles(path: Path, motors: int, scale: Mapping[str, float] | None =
     A sample gets the flags of its estimate; a stale estimate is a cycle without sample.
 
     Args:
-        path: the recording.
-        motors: number of motors.
         scale: factors by column, as `[recording]` of the joint file gives them.
 
     Raises:

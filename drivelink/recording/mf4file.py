@@ -18,7 +18,6 @@ def read_mf4_columns(path: Path, names: ColumnMap) -> tuple[dict[str, FloatArray
     """Read the channels named like the CSV columns, at the times of the first one, held in between.
 
     Args:
-        path: the file.
         names: columns with other names in the file.
 
     Returns:

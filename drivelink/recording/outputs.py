@@ -50,9 +50,6 @@ class EstimatesFile:
     """Writes estimates.csv, one row per cycle; placed on `close`.
 
     Args:
-        path: the file.
-        motors: of the joint.
-        estimator: of the replay.
         linked: with declared link dynamics; adds columns of the external torque.
         force: replace an existing file.
 
@@ -111,7 +108,6 @@ class Publication:
     """Publishes the cycles like the daemon, with present stamps.
 
     Args:
-        publisher: of the joint.
         speed: recorded seconds per second; None: as fast as possible.
         about: text on the replay in the status document.
     """
@@ -157,13 +153,7 @@ class Publication:
 
 
 class Summary:
-    """Counts cycles, and why they are not valid; keeps the columns for plots.
-
-    Args:
-        motors: of the joint.
-        estimator: of the replay.
-        keep: keep the columns.
-    """
+    """Counts cycles, and why they are not valid; keeps the columns for plots."""
 
     def __init__(self, motors: int, estimator: Estimator, keep: bool) -> None:
         self._estimator = estimator

@@ -25,27 +25,16 @@ _LOG = logging.getLogger("drivelink.recording")
 
 
 class Played(NamedTuple):
-    """One recorded cycle and its estimate.
+    """One recorded cycle and its estimate."""
 
-    Attributes:
-        time_s: of its SYNC, in the recording's time.
-        tick: output as published by the daemon, stamped with the UNIX time of its SYNC if recorded, else with
-            `time_s` in ns.
-    """
-
-    time_s: float
+    time_s: float  # of its SYNC, in the recording's time
+    # output as published by the daemon, stamped with the UNIX time of its SYNC if recorded, else with
+    # `time_s` in ns
     tick: Tick
 
 
 class Playback:
-    """The cycles of a recording in order, estimated on iteration.
-
-    Attributes:
-        motors: number of motors.
-        period_s: of recording and estimator.
-        total: number of cycles, if known.
-        pipeline: their pipeline.
-    """
+    """The cycles of a recording in order, estimated on iteration."""
 
     def __init__(
         self,
@@ -55,12 +44,12 @@ class Playback:
         cycles: Callable[[JointPipeline], Iterator[Played]],
         assembler: Assembler | None = None,
     ) -> None:
-        self.motors = len(joint.motor)
-        self.period_s = period_s
-        self.total = total
+        self.motors = len(joint.motor)  # number of motors
+        self.period_s = period_s  # of recording and estimator
+        self.total = total  # number of cycles, if known
         timed = joint.model_copy(update={"bus": joint.bus.model_copy(update={"period_s": period_s})})
         # Without an assembler its input are samples.
-        self.pipeline = JointPipeline(assembler or Assembler((), 0), *build(timed))
+        self.pipeline = JointPipeline(assembler or Assembler((), 0), *build(timed))  # their pipeline
         self._cycles = cycles
 
     def __iter__(self) -> Iterator[Played]:
@@ -91,8 +80,6 @@ def open_playback(
     """Open a recording of any format for playback.
 
     Args:
-        path: the recording.
-        joint: the joint it was made with.
         base_dir: folder of the joint file, base of its EDS files.
         frames: of an MCAP file, play the raw frames (True) or the samples (False); None: the samples, and
             the frames where there are none.

@@ -65,9 +65,7 @@ class ZenohTap:
 
     Args:
         session: an open session; it stays open.
-        joint: the joint.
         sink: where it goes.
-        gate: decides between its samples and others.
 
     Attributes:
         missed: cycles without sample.
@@ -177,10 +175,8 @@ class BusTap:
 
     Args:
         bus: an open bus; it stays open.
-        joint: the joint.
         sink: where it goes.
         base_dir: folder of the joint file; None: make no samples.
-        gate: decides between its samples and others.
         layouts: of its nodes, if reported by a daemon.
 
     Attributes:
@@ -253,7 +249,6 @@ class Recorder:
 
     Args:
         sink: the recording; closed at the end.
-        taps: its sources.
     """
 
     def __init__(self, sink: Sink, taps: list[ZenohTap | BusTap]) -> None:

@@ -18,11 +18,7 @@ class SafeFile(io.BufferedIOBase):
     between two records.
 
     Args:
-        path: the file.
         force: replace an existing file, at the first `sync`.
-
-    Attributes:
-        name: the path.
 
     Raises:
         RecordingError: it cannot be opened or, later, written.
@@ -31,7 +27,7 @@ class SafeFile(io.BufferedIOBase):
     def __init__(self, path: Path, *, force: bool = False) -> None:
         super().__init__()
         self._path = path
-        self.name = str(path)
+        self.name = str(path)  # the path
         self._pending = bytearray()
         self._place: int | None = None  # position of a write before the end
         self._size = 0

@@ -38,18 +38,14 @@ from estimator.sample import Sample
 
 
 class Sink:
-    """A recording being written; each format ignores kinds that it cannot store.
+    """A recording being written; each format ignores kinds that it cannot store."""
 
-    Attributes:
-        counts: number of items of each kind.
-        wants: the kinds it stores: "sample", "estimate", "external", "document", "frame", "snapshot".
-    """
-
+    # the kinds it stores: "sample", "estimate", "external", "document", "frame", "snapshot"
     wants: frozenset[str] = frozenset()
 
     def __init__(self, path: Path, *, force: bool = False) -> None:
         self._file = SafeFile(path, force=force)
-        self.counts: dict[str, int] = dict.fromkeys(sorted(self.wants), 0)
+        self.counts: dict[str, int] = dict.fromkeys(sorted(self.wants), 0)  # number of items of each kind
 
     def sample(self, sample: Sample, stamp_ns: int) -> None:
         """Take what was measured at one SYNC."""

@@ -40,15 +40,11 @@ class SyncNumbering:
     """Numbers the SYNCs of a stream once enough others have followed.
 
     Args:
-        period_s: the communication cycle.
         measure: use the period of the first SYNCs if it differs.
-
-    Attributes:
-        period_s: in use.
     """
 
     def __init__(self, period_s: float, *, measure: bool = False) -> None:
-        self.period_s = period_s
+        self.period_s = period_s  # in use
         self._measure = measure
         self._last: int | None = None
         self._due_ns: float | None = None

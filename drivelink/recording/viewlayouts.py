@@ -32,7 +32,6 @@ def write_layouts(joint: JointFile, folder: Path) -> list[Path]:
 
     Args:
         joint: the joint; its name is part of the topics.
-        folder: of the files.
 
     Raises:
         OSError: they cannot be written.

@@ -25,32 +25,25 @@ def variables(described: Object) -> list[ODVariable]:
 
 
 class Entry:
-    """One live sub-index.
-
-    Attributes:
-        item: its description.
-        code: its format in a `struct.Struct`; None: a string or domain.
-        default: power-on value.
-        value: the present value; an int, or bytes for strings and domains.
-        refresh: called before an SDO read, for values taken from the simulated joint.
-        check: called with the new value before it is stored; raises `SdoAbortedError` to refuse it.
-        changed: called after a write has been stored.
-    """
+    """One live sub-index."""
 
     __slots__ = ("changed", "check", "code", "default", "item", "refresh", "value")
 
     def __init__(self, item: ODVariable, node_id: int) -> None:
-        self.item = item
+        self.item = item  # its description
         packed = ODVariable.STRUCT_TYPES.get(item.data_type or 0)
+        # its format in a `struct.Struct`; None: a string or domain
         self.code = packed.format.lstrip("<") if packed else None
         if packed:
-            self.default: Value = (item.default or 0) + (node_id if item.relative else 0)
+            self.default: Value = (item.default or 0) + (node_id if item.relative else 0)  # power-on value
         else:
             self.default = str(item.default or "").encode()
-        self.value = self.default
+        self.value = self.default  # the present value; an int, or bytes for strings and domains
+        # called before an SDO read, for values taken from the simulated joint
         self.refresh: Callable[[], None] | None = None
+        # called with the new value before it is stored; raises `SdoAbortedError` to refuse it
         self.check: Callable[[int], None] | None = None
-        self.changed: Callable[[], None] | None = None
+        self.changed: Callable[[], None] | None = None  # called after a write has been stored
 
     @property
     def number(self) -> int:

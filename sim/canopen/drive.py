@@ -34,23 +34,14 @@ _SECONDS = {0x03: 1.0, 0x47: 60.0}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DriveData:
-    """The nameplate of one drive with its motor, encoders and gear.
+    """The nameplate of one drive with its motor, encoders and gear."""
 
-    Attributes:
-        rated_current_ma: 0x6075.
-        rated_torque_mnm: 0x6076, at the motor shaft.
-        max_current_per_mille: 0x6073.
-        counts_per_rev: 0x608F:1, per motor revolution.
-        gear: 0x6091: motor revolutions per shaft revolutions.
-        link_counts_per_rev: 0x60E6:1, of the second encoder; None: it is not wired.
-    """
-
-    rated_current_ma: int = 2000
-    rated_torque_mnm: int = 100
-    max_current_per_mille: int = 3000
-    counts_per_rev: int = 4096
-    gear: tuple[int, int] = (1, 1)
-    link_counts_per_rev: int | None = None
+    rated_current_ma: int = 2000  # 0x6075
+    rated_torque_mnm: int = 100  # 0x6076, at the motor shaft
+    max_current_per_mille: int = 3000  # 0x6073
+    counts_per_rev: int = 4096  # 0x608F:1, per motor revolution
+    gear: tuple[int, int] = (1, 1)  # 0x6091: motor revolutions per shaft revolutions
+    link_counts_per_rev: int | None = None  # 0x60E6:1, of the second encoder; None: it is not wired
 
     def values(self) -> dict[tuple[int, int], int]:
         """Return power-on values, by (index, subindex)."""
@@ -98,10 +89,6 @@ class Cia402Drive(Node):
 
     Args:
         node_id: 1 to 127.
-        rig: the world it is wired to.
-        motor: index of its motor there.
-        data: its nameplate.
-        quirks: how it deviates.
     """
 
     def __init__(
@@ -209,7 +196,6 @@ class Cia402Drive(Node):
         Args:
             code: EMCY error code, e.g. 0x2310 (over-current).
             register: bits of the error register besides bit 0.
-            vendor: up to five bytes.
         """
         self.machine.fault()
         self._error_code.value = code

@@ -18,15 +18,10 @@ _OPERATING_BITS = SCALING | REVERSED
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EncoderData:
-    """The nameplate of an encoder.
+    """The nameplate of an encoder."""
 
-    Attributes:
-        counts_per_rev: 0x6501.
-        range_counts: where the position rolls over, 2 to 2**32.
-    """
-
-    counts_per_rev: int = 262144
-    range_counts: int = 1 << 32
+    counts_per_rev: int = 262144  # 0x6501
+    range_counts: int = 1 << 32  # where the position rolls over, 2 to 2**32
 
     def values(self) -> dict[tuple[int, int], int]:
         """Return power-on values, by (index, subindex)."""
@@ -43,9 +38,6 @@ class Cia406Encoder(Node):
 
     Args:
         node_id: 1 to 127.
-        scale: what it reads.
-        data: its nameplate.
-        quirks: how it deviates.
     """
 
     sends_on_change = False  # CiA 406: the asynchronous TPDO goes by the cyclic timer

@@ -38,7 +38,6 @@ class Node:
 
     Args:
         node_id: 1 to 127.
-        objects: its dictionary.
         quirks: how it deviates from a strict device.
 
     Attributes:

@@ -181,15 +181,11 @@ class Pdo:
 
 
 class Tpdo(Pdo):
-    """A PDO that the device sends: with a SYNC, on an event, or by a timer.
-
-    Attributes:
-        emit: puts (identifier, data) on the bus; faults are injected by wrapping it.
-    """
+    """A PDO that the device sends: with a SYNC, on an event, or by a timer."""
 
     def __init__(self, node: Node, number: int) -> None:
         super().__init__(node, number, 0x1800)
-        self.emit = node.send
+        self.emit = node.send  # puts (identifier, data) on the bus; faults are injected by wrapping it
         self._inhibit = node.dictionary.optional(0x17FF + number, 3)
         self._start = node.dictionary.optional(0x17FF + number, 6)
         self._inhibit.check = self._start.check = self._refuse_while_valid

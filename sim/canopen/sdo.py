@@ -26,9 +26,6 @@ _EXPEDITED, _SIZED, _LAST = 2, 1, 1
 class SdoServer(CanopenServer):
     """One server on the default pair of identifiers.
 
-    Args:
-        node: the device.
-
     Attributes:
         ignored: requests that it will not answer, for tests.
         refused: requests that it will abort, with `refusal`, for tests.

@@ -22,16 +22,11 @@ class PowerState(IntEnum):
 
 
 class StateMachine:
-    """Transitions 0 to 16 by controlwords, by faults, and automatic ones.
-
-    Attributes:
-        state: the present one.
-        quick_stop_option: 0x605A.
-    """
+    """Transitions 0 to 16 by controlwords, by faults, and automatic ones."""
 
     def __init__(self) -> None:
-        self.state = PowerState.SWITCH_ON_DISABLED
-        self.quick_stop_option = 2
+        self.state = PowerState.SWITCH_ON_DISABLED  # the present one
+        self.quick_stop_option = 2  # 0x605A
         self._last = 0
 
     def reset(self) -> None:

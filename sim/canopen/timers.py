@@ -23,16 +23,11 @@ class Timer:
 
 
 class Timers:
-    """Scheduled calls in order of time.
-
-    Attributes:
-        now_s: the present, as last given to `run`.
-        next_s: when the first call is due; infinity with none.
-    """
+    """Scheduled calls in order of time."""
 
     def __init__(self) -> None:
-        self.now_s = 0.0
-        self.next_s = math.inf
+        self.now_s = 0.0  # the present, as last given to `run`
+        self.next_s = math.inf  # when the first call is due; infinity with none
         self._heap: list[tuple[float, int, Timer]] = []
         self._count = itertools.count()
 

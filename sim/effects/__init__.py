@@ -26,17 +26,11 @@ for _place in ("motor", "transmission", "measurement", "link", "unlisted"):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlantEffect:
-    """One effect with its parameters.
-
-    Attributes:
-        definition: what it is.
-        values: all its parameters.
-        motor: index of the motor it acts on, if any.
-    """
+    """One effect with its parameters."""
 
     definition: Definition
-    values: Values = field(default_factory=dict)
-    motor: int = 0
+    values: Values = field(default_factory=dict)  # all its parameters
+    motor: int = 0  # index of the motor it acts on, if any
 
     @property
     def name(self) -> str:

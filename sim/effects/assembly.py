@@ -55,7 +55,6 @@ class Assembly:
         """Start with a plant.
 
         Args:
-            plant: the joint.
             step_s: the integration step, needed by effects with memory over time.
         """
         self.plant = plant
@@ -105,36 +104,23 @@ Described = str | tuple[str, Default]
 
 @dataclass(frozen=True, slots=True)
 class EffectParameter:
-    """A parameter of an effect.
+    """A parameter of an effect."""
 
-    Attributes:
-        name: with its unit.
-        meaning: what it is.
-        default: default value, or default as a function of the first parameter; None: required.
-    """
-
-    name: str
+    name: str  # with its unit
     meaning: str
+    # default value, or default as a function of the first parameter; None: required
     default: Default | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Definition:
-    """Definition of an effect.
+    """Definition of an effect."""
 
-    Attributes:
-        name: of the effect.
-        location: "motor", "transmission", "link" or "measurement".
-        meaning: the physics.
-        parameters: the first is the amplitude that `NAME=VALUE` sets.
-        apply: puts it into a plant.
-    """
-
-    name: str
-    location: str
-    meaning: str
-    parameters: tuple[EffectParameter, ...]
-    apply: Apply
+    name: str  # of the effect
+    location: str  # "motor", "transmission", "link" or "measurement"
+    meaning: str  # the physics
+    parameters: tuple[EffectParameter, ...]  # the first is the amplitude that `NAME=VALUE` sets
+    apply: Apply  # puts it into a plant
 
 
 LISTED: dict[str, Definition] = {}

@@ -1,6 +1,7 @@
 """Layouts and frames for the tests of the loop: a VSA of two drives and a CiA 406 encoder."""
 
 import struct
+from typing import Any
 
 from drivelink.canopen.layout import MappedObject, NodeLayout, Signal, TpdoLayout
 
@@ -9,56 +10,27 @@ TORQUE_NM = 1e-3
 LINK_RAD = 2e-4
 
 
+def mapped(signal: Signal, index: int, *, bits: int = 32, signed: bool = True, **more: Any) -> MappedObject:
+    """One mapped object, of 32 signed bits if nothing else is said."""
+    return MappedObject(signal=signal, index=index, subindex=0, bits=bits, signed=signed, **more)
+
+
 def drive(node_id: int, motor: int | None, transmission_type: int = 1) -> NodeLayout:
     """A drive whose one TPDO carries 0x6064 (32), 0x6077 (16), 0x6041 (16): eight bytes."""
-    return NodeLayout(
-        node_id=node_id,
-        motor=motor,
-        tpdos=(
-            TpdoLayout(
-                cob_id=0x180 + node_id,
-                transmission_type=transmission_type,
-                objects=(
-                    MappedObject(
-                        signal=Signal.MOTOR_POSITION,
-                        index=0x6064,
-                        subindex=0,
-                        bits=32,
-                        signed=True,
-                        scale=COUNT_RAD,
-                        wraps=True,
-                    ),
-                    MappedObject(
-                        signal=Signal.MOTOR_TORQUE,
-                        index=0x6077,
-                        subindex=0,
-                        bits=16,
-                        signed=True,
-                        scale=TORQUE_NM,
-                    ),
-                    MappedObject(signal=Signal.STATUSWORD, index=0x6041, subindex=0, bits=16, signed=False),
-                ),
-            ),
-        ),
-    )
+    position = mapped(Signal.MOTOR_POSITION, 0x6064, scale=COUNT_RAD, wraps=True)
+    torque = mapped(Signal.MOTOR_TORQUE, 0x6077, bits=16, scale=TORQUE_NM)
+    status = mapped(Signal.STATUSWORD, 0x6041, bits=16, signed=False)
+    cob_id, objects = 0x180 + node_id, (position, torque, status)
+    tpdo = TpdoLayout(cob_id=cob_id, transmission_type=transmission_type, objects=objects)
+    return NodeLayout(node_id=node_id, motor=motor, tpdos=(tpdo,))
 
 
 def encoder(node_id: int, bits: int = 32, modulus: int = 0, offset: float = 0.0) -> NodeLayout:
     """A CiA 406 encoder node: 0x6004."""
-    position = MappedObject(
-        signal=Signal.LINK_POSITION,
-        index=0x6004,
-        subindex=0,
-        bits=bits,
-        signed=False,
-        scale=LINK_RAD,
-        wraps=True,
-        modulus=modulus,
-        offset=offset,
-    )
-    return NodeLayout(
-        node_id=node_id, motor=None, tpdos=(TpdoLayout(cob_id=0x180 + node_id, objects=(position,)),)
-    )
+    wrapped = {"wraps": True, "modulus": modulus, "offset": offset}
+    position = mapped(Signal.LINK_POSITION, 0x6004, bits=bits, signed=False, scale=LINK_RAD, **wrapped)
+    tpdo = TpdoLayout(cob_id=0x180 + node_id, objects=(position,))
+    return NodeLayout(node_id=node_id, motor=None, tpdos=(tpdo,))
 
 
 VSA = (drive(1, 0), drive(2, 1), encoder(3))

@@ -6,12 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from canlayouts import COUNT_RAD, drive
+from canlayouts import COUNT_RAD, drive, mapped
 from daemonkit import DaemonRig, rig, vsa
 from scipy.signal import lfilter
 
 from drivelink._core import Assembler
-from drivelink.canopen.layout import MappedObject, NodeLayout, Signal, TpdoLayout
+from drivelink.canopen.layout import NodeLayout, Signal, TpdoLayout
 from drivelink.jointfile import JointFile
 from estimator.sample import Status
 from sim.canopen.drive import Cia402Drive
@@ -127,20 +127,10 @@ def test_a_check_that_does_not_come_costs_no_sample() -> None:
 
 def layout(*extra: tuple[Signal, int, float]) -> NodeLayout:
     """A drive with further objects of 32 bits in a second TPDO."""
-    plain = drive(1, 0)
-    objects = tuple(
-        MappedObject(
-            signal=signal,
-            index=index,
-            subindex=0,
-            bits=32,
-            signed=True,
-            scale=scale,
-            wraps=signal in (Signal.SECOND_POSITION, Signal.POSITION_DEMAND),
-        )
-        for signal, index, scale in extra
-    )
-    return NodeLayout(node_id=1, motor=0, tpdos=(*plain.tpdos, TpdoLayout(cob_id=0x281, objects=objects)))
+    absolute = (Signal.SECOND_POSITION, Signal.POSITION_DEMAND)
+    objects = tuple(mapped(s, index, scale=scale, wraps=s in absolute) for s, index, scale in extra)
+    further = TpdoLayout(cob_id=0x281, objects=objects)
+    return NodeLayout(node_id=1, motor=0, tpdos=(*drive(1, 0).tpdos, further))
 
 
 def feed(

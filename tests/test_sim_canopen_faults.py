@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+import pytest
 from simkit import StubRig, Wire, wired
 
 from sim.canopen.drive import Cia402Drive
@@ -32,37 +33,50 @@ def position(frame: str) -> int:
     return int.from_bytes(bytes.fromhex(frame[4:])[:4], "little", signed=True)
 
 
-def test_without_a_fault_both_answer_every_sync() -> None:
-    with operational() as (wire, _, _, _):
-        for cycle in range(1, 20):
-            frames = wire.say("080")
-            assert ids(frames) == ["281", "282"]
-            assert position(frames[0]) == 100 * cycle
+BOTH, SECOND = ["281", "282"], ["282"]
+ASK, ANSWER = "601 40 00 10 00 00 00 00 00", ["581"]
+REFUSED, ABORT = "601 40 64 60 00 00 00 00 00", ["581 80 64 60 00 22 00 00 08"]
+Said = list[tuple[str, list[str]]]
+# What is done to the first of two drives, then what is said on the bus (a SYNC is 080) and what is heard.
+FAULTS: dict[str, tuple[Callable[[Faults, Cia402Drive], object], Said]] = {
+    "none": (lambda f, d: None, [("080", BOTH)] * 3),
+    "a reboot": (lambda f, d: f.at(2, lambda: f.reboot(d)), [("080", BOTH), ("080", ["701", "282"])]),
+    "muted for two cycles": (lambda f, d: f.mute(d, 2, cycles=2), [("080", SECOND)] * 2 + [("080", BOTH)]),
+    "the opposite order": (lambda f, d: f.reverse(), [("080", ["282", "281"])]),
+    "dropped SYNCs": (lambda f, d: f.drop_sync(2), [("080", []), ("080", []), ("080", BOTH)]),
+    "an unanswered SDO request": (lambda f, d: f.ignore_sdo(d, 1), [(ASK, []), (ASK, ANSWER)]),
+    "a refused one": (lambda f, d: f.refuse_sdo(d, 0x08000022, 1), [(REFUSED, ABORT), (REFUSED, ANSWER)]),
+    "no cable": (lambda f, d: f.unplug(), [("080", [])]),
+    "and back": (lambda f, d: (f.unplug(), f.plug()), [("080", BOTH)]),
+    "one node id twice": (lambda f, d: f.impostor(Cia402Drive(1, StubRig(), 0)), [(ASK, ANSWER * 2)]),
+    "babble": (lambda f, d: f.babble(0x1AA, b"\xff" * 8, per_cycle=3), [("080", ["1AA"] * 3 + BOTH)]),
+    "babble that ends": (
+        lambda f, d: (f.babble(0x1AA, b"\xff" * 8, per_cycle=3), f.babble(0x1AA, per_cycle=0)),
+        [("080", BOTH)],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_does_what_its_name_says_and_no_more(name: str) -> None:
+    do, said = FAULTS[name]
+    with operational() as (wire, faults, first, _):
+        do(faults, first)
+        wire.heard()
+        for text, expected in said:
+            frames = wire.say(text)
+            assert [f if len(e) > 3 else f[:3] for f, e in zip(frames, expected, strict=True)] == expected
 
 
 def test_a_killed_drive_is_silent_and_boots_when_its_supply_returns() -> None:
     with operational() as (wire, faults, first, _):
         faults.kill(first)
-        assert ids(wire.say("080")) == ["282"]
-        assert wire.say("601 40 00 10 00 00 00 00 00") == []
-        assert wire.say("000 82 01") == []
+        assert ids(wire.say("080")) == SECOND
+        assert wire.say(ASK) == wire.say("000 82 01") == []
         faults.revive(first)
         assert wire.heard() == ["701 00"]
-        assert ids(wire.say("080")) == ["282"]
+        assert ids(wire.say("080")) == SECOND
         assert wire.read(1, 0x1800, 1) == 0x40000181  # power-on mapping
-
-
-def test_a_drive_that_reboots_loses_its_configuration_and_says_so() -> None:
-    with operational() as (wire, faults, first, _):
-        faults.at(wire.network.syncs + 2, lambda: faults.reboot(first))
-        assert ids(wire.say("080")) == ["281", "282"]
-        assert ids(wire.say("080")) == ["701", "282"]
-
-
-def test_a_muted_tpdo_leaves_out_exactly_so_many_cycles() -> None:
-    with operational() as (wire, faults, first, _):
-        faults.mute(first, 2, cycles=2)
-        assert [ids(wire.say("080")) for _ in range(3)] == [["282"], ["282"], ["281", "282"]]
 
 
 def test_a_late_tpdo_comes_after_the_next_sync_with_the_old_values() -> None:
@@ -83,41 +97,6 @@ def test_a_tpdo_of_wrong_length_and_one_that_comes_twice() -> None:
         assert len(frames[0].split()) == 1 + 5
         assert frames[1] == frames[2]
         assert len(wire.say("080")[0].split()) == 1 + 8
-
-
-def test_devices_that_answer_in_the_opposite_order() -> None:
-    with operational() as (wire, faults, _, _):
-        faults.reverse()
-        assert ids(wire.say("080")) == ["282", "281"]
-
-
-def test_a_dropped_sync_is_seen_by_no_device() -> None:
-    with operational() as (wire, faults, _, _):
-        faults.drop_sync(2)
-        assert [wire.say("080"), wire.say("080")] == [[], []]
-        assert position(wire.say("080")[0]) == 100
-
-
-def test_a_babbling_node_is_heard_with_every_sync_until_it_is_silenced() -> None:
-    with operational() as (wire, faults, _, _):
-        faults.babble(0x1AA, b"\xff" * 8, per_cycle=3)
-        assert ids(wire.say("080")) == ["1AA"] * 3 + ["281", "282"]
-        faults.babble(0x1AA, per_cycle=0)
-        assert ids(wire.say("080")) == ["281", "282"]
-
-
-def test_two_devices_with_one_node_id_both_answer() -> None:
-    with operational() as (wire, faults, _, _):
-        faults.impostor(Cia402Drive(1, StubRig(), 0))
-        assert wire.heard() == ["701 00"]
-        assert ids(wire.say("601 40 00 10 00 00 00 00 00")) == ["581", "581"]
-
-
-def test_an_unanswered_sdo_request() -> None:
-    with operational() as (wire, faults, first, _):
-        faults.ignore_sdo(first, 1)
-        assert wire.say("601 40 00 10 00 00 00 00 00") == []
-        assert ids(wire.say("601 40 00 10 00 00 00 00 00")) == ["581"]
 
 
 def test_an_emergency_brings_the_fault_state_until_a_rising_edge_of_bit_7() -> None:
@@ -162,18 +141,3 @@ def test_a_watched_node_that_falls_silent_ends_the_operation_of_its_watcher() ->
         assert wire.read(1, 0x6041) & 0x4F in (0x0F, 0x08)  # 0x6007 = 1: fault
         faults.revive(second)
         assert any(frame.startswith("081 00 00") for frame in wire.wait(0.1))  # the boot-up was heard
-
-
-def test_a_refused_request_is_aborted_with_the_given_code_and_the_next_one_answered() -> None:
-    with operational() as (wire, faults, first, _):
-        faults.refuse_sdo(first, 0x08000022, 1)
-        assert wire.say("601 40 64 60 00 00 00 00 00") == ["581 80 64 60 00 22 00 00 08"]
-        assert wire.say("601 40 64 60 00 00 00 00 00")[0].startswith("581 43 64 60 00")
-
-
-def test_a_cable_that_is_out_carries_nothing_either_way() -> None:
-    with operational() as (wire, faults, _, _):
-        faults.unplug()
-        assert wire.say("080") == []
-        faults.plug()
-        assert ids(wire.say("080")) == ["281", "282"]

@@ -48,52 +48,52 @@ def test_the_standard_order_maps_every_profile_and_sync_brings_the_frame(name: s
         assert frames[0].startswith("281 ") or frames[1].startswith("281 ")
 
 
-def test_an_epos4_like_drive_lacks_what_an_epos4_lacks() -> None:
+PRE, START, SYNC, RANGE, STATE = "000 80 00", "000 01 00", "080", 0x06090030, 0x08000022
+# What each does beside the standard: a frame that is said, an object that is read and its value or abort code (< 0),
+# an object that is written with its size, and the abort code or 0.
+HABITS: dict[str, list[str | tuple[int, ...]]] = {
+    "epos4": [
+        *(
+            (index, 0, -NO_OBJECT)
+            for index in (0x6063, 0x6075, 0x6078, 0x607E, 0x608F, 0x6091, 0x1006, 0x1019)
+        ),
+        *((0x1800, 5, -NO_SUBINDEX), (0x1800, 0, 3), (0x1800, 2, 255), (0x1800, 3, 10)),  # 1 ms
+        (0x1005, 0, 0x90, 4, READ_ONLY),
+        *((0x30D1, 2, 500), (0x60A9, 0, 0x00B44700), (0x606C, 0, 30)),  # mA, whole rpm
+    ],
+    "elmo": [(0x60A9, 0, -NO_OBJECT), (0x606C, 0, 2048)],  # half a turn a second of 4096 counts
+    # the sensorless position before the link encoder, in counts/s
+    "nanotec": [SYNC, (0x60E4, 1, 0), (0x60E4, 2, 7), (0x60E5, 2, 7000), (0x6076, 0, -NO_OBJECT)],
+    "copley": [
+        *((0x1801, 1, 0xC0000281, 4, 0), (0x1A01, 1, 0x606C0020, 4, 0x06010000), (0x1A01, 0, 0, 1, 0)),
+        *((0x1A01, 1, 0x606C0020, 4, 0), (0x606C, 0, 20480)),  # 0.1 counts/s
+    ],
+    "synapticon": [
+        *((0x60A9, 0, 0x00B44700, 4, 0), (0x606C, 0, 30), (0x60A9, 0, 0xFFB44700, 4, 0), (0x606C, 0, 300)),
+        *((0x60A9, 0, 0xFDB44700, 4, 0), (0x606C, 0, 30000), (0x60A9, 0, 0xFCB44700, 4, RANGE)),
+        *(START, (0x1801, 1, 0xC0000281, 4, 0), (0x1A01, 0, 0, 1, STATE), PRE, (0x1A01, 0, 0, 1, 0)),
+    ],
+    "fixed-map": [
+        *((0x1801, 1, 0xC0000281, 4, 0), (0x1A01, 0, 0, 1, READ_ONLY), (0x1A01, 1, 0x60640020, 4, READ_ONLY)),
+        *((0x1A01, k, value) for k, value in enumerate((3, 0x60410010, 0x60640020, 0x60770010))),
+    ],
+}
+
+
+@pytest.mark.parametrize("name", HABITS)
+def test_a_drive_has_its_makers_habits(name: str) -> None:
     rig = StubRig()
-    with wired(drive(rig, "epos4"), rig=rig) as wire:
+    with wired(drive(rig, name), rig=rig) as wire:
         wire.power_on()
-        for index in (0x6063, 0x6075, 0x6078, 0x607E, 0x608F, 0x6091, 0x1006, 0x1019):
-            assert abort_of_read(wire, index) == NO_OBJECT
-        assert abort_of_read(wire, 0x1800, 5) == NO_SUBINDEX
-        assert wire.read(1, 0x1800, 0) == 3
-        assert wire.read(1, 0x1800, 2) == 255
-        assert wire.read(1, 0x1800, 3) == 10  # 1 ms
-        assert wire.write(1, 0x1005, 0, 0x90, 4) == READ_ONLY
-        assert wire.read(1, 0x30D1, 2) == 500  # mA
-        assert wire.read(1, 0x60A9) == 0x00B44700
-        assert wire.read(1, 0x606C) == 30  # whole rpm
-
-
-def test_an_elmo_like_drive_counts_velocity_in_counts_per_second() -> None:
-    rig = StubRig()
-    with wired(drive(rig, "elmo"), rig=rig) as wire:
-        wire.power_on()
-        assert abort_of_read(wire, 0x60A9) == NO_OBJECT
-        assert wire.read(1, 0x606C) == 2048  # half a turn a second of 4096 counts
-        wire.say("000 01 00")
-        assert [frame[:3] for frame in wire.say("080")] == ["181", "381"]
-
-
-def test_a_nanotec_like_drive_has_the_sensorless_position_before_the_link_encoder() -> None:
-    rig = StubRig()
-    with wired(drive(rig, "nanotec"), rig=rig) as wire:
-        wire.power_on()
-        wire.say("080")
-        assert wire.read(1, 0x60E4, 1) == 0
-        assert wire.read(1, 0x60E4, 2) == 7
-        assert wire.read(1, 0x60E5, 2) == 7000  # counts/s
-        assert abort_of_read(wire, 0x6076) == NO_OBJECT
-
-
-def test_a_copley_like_drive_wants_the_number_of_objects_zeroed_first() -> None:
-    rig = StubRig()
-    with wired(drive(rig, "copley"), rig=rig) as wire:
-        wire.power_on()
-        assert wire.write(1, 0x1801, 1, 0xC0000281, 4) == 0
-        assert wire.write(1, 0x1A01, 1, 0x606C0020, 4) == 0x06010000
-        assert wire.write(1, 0x1A01, 0, 0, 1) == 0
-        assert wire.write(1, 0x1A01, 1, 0x606C0020, 4) == 0
-        assert wire.read(1, 0x606C) == 20480  # 0.1 counts/s
+        for step in HABITS[name]:
+            if isinstance(step, str):
+                wire.say(step)
+            elif len(step) == 5:
+                assert wire.write(1, *step[:4]) == step[4], step
+            elif step[2] < 0:
+                assert abort_of_read(wire, *step[:2]) == -step[2], step
+            else:
+                assert wire.read(1, *step[:2]) == step[2], step
 
 
 def test_a_roboteq_like_drive_refuses_to_lose_bit_30_and_starts_itself() -> None:
@@ -103,31 +103,6 @@ def test_a_roboteq_like_drive_refuses_to_lose_bit_30_and_starts_itself() -> None
         wire.say("000 80 00")
         assert wire.write(1, 0x1801, 1, 0x80000281, 4) == 0x06090030
         assert map_tpdo2(wire) == [0] * 8
-
-
-def test_a_synapticon_like_drive_maps_in_preoperational_only_and_has_four_velocity_units() -> None:
-    rig = StubRig()
-    with wired(drive(rig, "synapticon"), rig=rig) as wire:
-        wire.power_on()
-        for unit, expected in ((0x00B44700, 30), (0xFFB44700, 300), (0xFDB44700, 30000)):
-            assert wire.write(1, 0x60A9, 0, unit, 4) == 0
-            assert wire.read(1, 0x606C) == expected
-        assert wire.write(1, 0x60A9, 0, 0xFCB44700, 4) == 0x06090030
-        wire.say("000 01 00")
-        assert wire.write(1, 0x1801, 1, 0xC0000281, 4) == 0
-        assert wire.write(1, 0x1A01, 0, 0, 1) == 0x08000022
-        wire.say("000 80 00")
-        assert wire.write(1, 0x1A01, 0, 0, 1) == 0
-
-
-def test_a_fixed_map_stays_and_carries_what_is_needed() -> None:
-    rig = StubRig()
-    with wired(drive(rig, "fixed-map"), rig=rig) as wire:
-        wire.power_on()
-        assert wire.write(1, 0x1801, 1, 0xC0000281, 4) == 0
-        assert wire.write(1, 0x1A01, 0, 0, 1) == READ_ONLY
-        assert wire.write(1, 0x1A01, 1, 0x60640020, 4) == READ_ONLY
-        assert [wire.read(1, 0x1A01, k) for k in range(4)] == [3, 0x60410010, 0x60640020, 0x60770010]
 
 
 def test_bit_10_toggles_with_each_sample_and_not_with_sdo_reads() -> None:

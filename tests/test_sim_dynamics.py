@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -126,13 +127,6 @@ def test_both_motors_of_a_vsa_pull_at_the_link() -> None:
     assert state[5] / 1e-4 == pytest.approx(3.0 / 0.125, rel=1e-3)
 
 
-@pytest.mark.parametrize("step_s", [0.0003, 0.002, 0.0, -0.001, math.nan])
-def test_a_step_that_is_no_whole_fraction_of_the_period_is_refused(step_s: float) -> None:
-    with pytest.raises(SimError, match="plant_step_s: expected") as caught:
-        whole_fraction(0.001, step_s, sea())
-    assert "\n" not in str(caught.value)
-
-
 def test_the_step_is_chosen_from_the_stiffness() -> None:
     assert whole_fraction(0.001, None, sea()) == 1
     assert whole_fraction(0.001, None, sea(), fine=True) == 2
@@ -140,24 +134,31 @@ def test_the_step_is_chosen_from_the_stiffness() -> None:
 
 
 @pytest.mark.parametrize(
-    ("model", "parameters", "message"),
+    ("make", "message"),
     [
-        ("cubic", {}, "expected one of"),
-        ("linear", {}, "expected k_nm_rad, got nothing"),
-        ("linear", {"k_nm_rad": -1.0}, "k_nm_rad: expected a finite number > 0"),
-        ("vsa-ii", {"k_nm_rad": 0.5, "c": 0.9}, "c: expected a number > 1"),
-        ("polynomial", {"coefficients_nm_rad": 3.0}, "expected a list"),
+        (lambda: Spring(model="cubic", parameters={}), "expected one of"),
+        (lambda: Spring(model="linear", parameters={}), "expected k_nm_rad, got nothing"),
+        (
+            lambda: Spring(model="linear", parameters={"k_nm_rad": -1.0}),
+            "k_nm_rad: expected a finite number > 0",
+        ),
+        (lambda: Spring(model="vsa-ii", parameters={"k_nm_rad": 0.5, "c": 0.9}), "c: expected a number > 1"),
+        (lambda: Spring(model="polynomial", parameters={"coefficients_nm_rad": 3.0}), "expected a list"),
+        (lambda: LinkPlant(inertia_kg_m2=0.0), "inertia_kg_m2: expected a finite number > 0"),
+        (
+            lambda: JointPlant(arrangement="antagonistic", motors=sea().motors, link=sea().link),
+            r"expected 2 motor\(s\), got 1",
+        ),
+        (lambda: sea(RIGID, motors=2), "expected a flexible transmission"),
+        *(
+            (lambda step=step: whole_fraction(0.001, step, sea()), "plant_step_s: expected")
+            for step in (0.0003, 0.002, 0.0, -0.001, math.nan)
+        ),
     ],
 )
-def test_impossible_springs_are_one_clear_line(model: str, parameters: dict, message: str) -> None:
-    with pytest.raises(SimError, match=message):
-        Spring(model=model, parameters=parameters)
-
-
-def test_impossible_joints_are_one_clear_line() -> None:
-    with pytest.raises(SimError, match=r"inertia_kg_m2: expected a finite number > 0"):
-        LinkPlant(inertia_kg_m2=0.0)
-    with pytest.raises(SimError, match=r"expected 2 motor\(s\), got 1"):
-        JointPlant(arrangement="antagonistic", motors=sea().motors, link=sea().link)
-    with pytest.raises(SimError, match="expected a flexible transmission"):
-        sea(RIGID, motors=2)
+def test_impossible_springs_joints_and_steps_are_one_clear_line(
+    make: Callable[[], object], message: str
+) -> None:
+    with pytest.raises(SimError, match=message) as caught:
+        make()
+    assert "\n" not in str(caught.value)

@@ -60,13 +60,10 @@ def test_a_chirp_sweeps_up_and_down_without_a_jump() -> None:
     assert rates.min() == pytest.approx(0.5, rel=0.35)  # mean over a period that already sweeps
 
 
-def test_offset_and_ramp() -> None:
+def test_offset_ramp_and_hold() -> None:
     torque = profile({"kind": "none", "offset_nm": 3.0, "ramp_s": 2.0}, 4.0)
     assert torque[:201] == pytest.approx(np.linspace(0.0, 3.0, 201))
     assert torque[201:] == pytest.approx(3.0)
-
-
-def test_the_hold_pulls_back_and_damps() -> None:
     table = {"kind": "none", "centre_rad": [0.1, -0.1], "centring_nm_rad": 10.0, "centring_nm_s_rad": 2.0}
     excitation = build(table, 2)
     assert excitation.torque(0, 0.0, 0.3, 0.5) == pytest.approx(-10.0 * 0.2 - 1.0)

@@ -69,33 +69,7 @@ SECTIONS = {
         of="fault_matrix",
     ),
     "soak": Section("Ten minutes of random faults in real time", quick="--seconds 60"),
-    "fleet_throughput": Section(
-        "A fleet: two workers beside one",
-        "throughput --nights 2 --recordings 12 --rounds 2",
-        "throughput --nights 2 --recordings 4",
-        of="fleet",
-    ),
-    "fleet_cpu": Section(
-        "A fleet: CPU of a recording beside fit and diagnose alone",
-        "cpu --nights 2 --recordings 8",
-        "cpu --nights 2 --recordings 2",
-        of="fleet",
-    ),
-    "fleet_table": Section(
-        "A fleet: 10 000 rows appended and reported", "table", "table --rows 1000", of="fleet"
-    ),
-    "fleet_statistics": Section(
-        "A fleet: false discoveries and power of the tests",
-        "statistics --fleets 120",
-        "statistics --fleets 10",
-        of="fleet",
-    ),
-    "fleet_changes": Section(
-        "A fleet: 40 joints, 25 nights, one of two workers killed half-way",
-        "changes --seconds 5",
-        "changes --seconds 5 --joints 8 --nights 8",
-        of="fleet",
-    ),
+    "fleet_memory": Section("Memory of a recording in a fleet", quick="--seconds 8,16"),
 }
 
 

@@ -15,13 +15,18 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-__all__ = ["ROOT", "Columns", "Option", "Row", "faultmatrix", "gatekit", "joints", "main", "table"]
+__all__ = [
+    "ROOT", "Columns", "Option", "Row", "diagnosiskit", "faultmatrix", "fleetkit", "gatekit", "joints",
+    "main", "table",
+]  # fmt: skip
 
 Row = dict[str, Any]
 Columns = dict[str, str]  # header: template
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.append(str(ROOT / "tests"))  # the simulators and stages that the tests have
+import diagnosiskit  # noqa: E402
 import faultmatrix  # noqa: E402
+import fleetkit  # noqa: E402
 import gatekit  # noqa: E402
 import joints  # noqa: E402
 

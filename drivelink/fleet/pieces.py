@@ -22,7 +22,7 @@ from drivelink.recording.mcapsamples import recorded_cycles
 from estimator.sample import Record
 
 # Rise of the peak memory of fit, diagnosis and report over that of the file's size. Of a CSV it is measured
-# (22 at 500 Hz, benchmarks/fleet.py memory; less at a higher rate) and rounded up. A text log has about as
+# (26 at 1 kHz, benchmarks/fleet_memory.py) and rounded up. A text log has about as
 # many bytes a sample, compressed formats have a fraction.
 _EXPANSION_TEXT, _EXPANSION_OTHER = 30.0, 100.0
 _BASE_BYTES = 550 << 20  # memory of a worker without a recording: interpreter, libraries, Dask, caches

@@ -24,10 +24,9 @@ import zenoh
 from rig import PERIOD_S, Devices, free_endpoint, joint, subscriber
 from rivals import Floor, Textbook
 
-from drivelink.canopen.busload import bus_load
-from drivelink.canopen.layout import NodeLayout
+from drivelink.canopen.layout import NodeLayout, bus_load
 from drivelink.cycle import realtime
-from drivelink.cycle.lockstep import run_lockstep
+from drivelink.cycle.startup import run_lockstep
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simbus import open_sim_bus
 from drivelink.demo.simulate import network_from_joint

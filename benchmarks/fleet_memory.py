@@ -2,7 +2,7 @@
 
     python benchmarks/fleet_memory.py [--seconds S,S]
 
-The rise over that of the file's size is what `drivelink/fleet/pieces.py` plans with.
+The rise over that of the file's size is what `drivelink/fleet/task.py` plans with.
 """
 
 from __future__ import annotations

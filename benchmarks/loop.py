@@ -25,7 +25,7 @@ from drivelink.cycle.loop import ObjectSink
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simbus import open_sim_bus
 from drivelink.demo.simulate import alter, network_from_joint, world_from_joint
-from drivelink.jointfile.residual_baseline import make_model_monitor
+from drivelink.jointfile.apply_diagnosis import make_model_monitor
 from drivelink.loop import diagnosing, finding
 from drivelink.loop.blackbox import AFTER_S
 from drivelink.loop.folder import proposal_file, recording_name

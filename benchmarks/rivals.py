@@ -16,9 +16,8 @@ from rig import AnsweringBus, Devices
 
 from drivelink._core import SYNC_COB_ID, LatencyHistogram, encode_estimate
 from drivelink.canopen.layout import NodeLayout, Signal
-from drivelink.cycle.framesource import FrameSource
 from drivelink.cycle.realtime import Alarm
-from drivelink.cycle.sources import open_source
+from drivelink.cycle.sources import FrameSource, open_source
 from drivelink.jointfile import JointFile
 from estimator.sample import Estimate, TransmissionEstimate
 from sim.canopen.edsfile import node_eds

@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     from drivelink.analysis import fit as fit
     from drivelink.comparison import Comparison as Comparison
     from drivelink.comparison import compare as compare
-    from drivelink.pubsub.asyncclient import AsyncSubscription as AsyncSubscription
-    from drivelink.pubsub.asyncclient import subscribe_async as subscribe_async
+    from drivelink.pubsub.client import AsyncSubscription as AsyncSubscription
     from drivelink.pubsub.client import Subscription as Subscription
     from drivelink.pubsub.client import subscribe as subscribe
+    from drivelink.pubsub.client import subscribe_async as subscribe_async
+    from drivelink.pubsub.clientbase import joints as joints
     from drivelink.pubsub.feed import State as State
-    from drivelink.pubsub.names import joints as joints
 
 __all__ = [
     "AsyncSubscription",
@@ -49,7 +49,7 @@ __all__ = [
 ]
 
 _LAZY = {  # imported when asked for, so that `import drivelink` stays cheap
-    "AsyncSubscription": "drivelink.pubsub.asyncclient",
+    "AsyncSubscription": "drivelink.pubsub.client",
     "Comparison": "drivelink.comparison",
     "Diagnosed": "drivelink.analysis",
     "Fit": "drivelink.analysis",
@@ -59,9 +59,9 @@ _LAZY = {  # imported when asked for, so that `import drivelink` stays cheap
     "compare": "drivelink.comparison",
     "diagnose": "drivelink.analysis",
     "fit": "drivelink.analysis",
-    "joints": "drivelink.pubsub.names",
+    "joints": "drivelink.pubsub.clientbase",
     "subscribe": "drivelink.pubsub.client",
-    "subscribe_async": "drivelink.pubsub.asyncclient",
+    "subscribe_async": "drivelink.pubsub.client",
 }
 
 

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 from drivelink import jointfile, recording
 from drivelink.errors import HarmfulModelError, RecordingError
+from drivelink.files import check_target
 from drivelink.jointfile import JointText, apply_diagnosis, effect_entry, link_entry
-from drivelink.jointfile.residual_baseline import floor_entry
-from drivelink.outfile import check_target
+from drivelink.jointfile.apply_diagnosis import floor_entry
 from drivelink.output import plots, report
 from drivelink.output.fitreport import fit_plot
-from drivelink.output.units import Units
-from drivelink.recording.columnmap import parse_column_map
+from drivelink.output.numbers import Units
+from drivelink.recording.columns import parse_column_map
 from drivelink.recording.gate import gate
 from drivelink.recording.mapping import joint_of
 from drivelink.version import __version__

@@ -15,7 +15,7 @@ from drivelink import analysis, jointfile
 from drivelink.errors import RecordingError, UsageError
 from drivelink.output import plots
 from drivelink.output.document import Chart, Document, Grid, Section, Share
-from drivelink.output.units import Units
+from drivelink.output.numbers import Units
 from estimator.comparison import Correlation, Curve, correlations, friction_curve, stiffness_curve
 from estimator.errors import EstimatorError
 from estimator.freerun import FreeRun, free_run

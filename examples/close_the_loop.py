@@ -12,8 +12,8 @@ from pathlib import Path
 import drivelink
 from drivelink import jointfile
 from drivelink.canopen.bus import open_bus
-from drivelink.cycle.lockstep import run_lockstep
 from drivelink.cycle.loop import ObjectSink
+from drivelink.cycle.startup import run_lockstep
 from drivelink.demo.simulate import network_from_joint, world_from_joint
 from drivelink.recording.formats import open_sink
 from estimator.sample import Estimate, Sample

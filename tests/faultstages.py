@@ -11,7 +11,7 @@ from contextlib import suppress
 import can
 from faultstage import Stage
 
-import drivelink.daemon.buskeeper
+import drivelink.daemon.buswatch
 from drivelink.canopen.bus import open_bus
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simbus import open_sim_bus
@@ -32,7 +32,7 @@ class LockstepStage(Stage):
         super().__init__(joint, open_sim_bus(joint.bus))
         self._patch = patch
         self._open = True
-        patch(drivelink.daemon.buskeeper, "open_bus", self._reopened)
+        patch(drivelink.daemon.buswatch, "open_bus", self._reopened)
         self.daemon = Daemon(
             [ServedJoint(joint=joint)], publish=False, real_time=False, devices=self.network.poll
         )

@@ -23,8 +23,8 @@ import can
 from canopenkit import drive_objects
 from fuzznodes import FuzzNode, encoder_objects, trap_objects
 
-from drivelink.cycle.framesource import CanFrame
 from drivelink.cycle.loop import CycleLoop
+from drivelink.cycle.sources import CanFrame
 
 __all__ = ["MIXES", "FuzzBus"]
 

@@ -22,7 +22,7 @@ from drivelink.jointfile import load, parse
 from drivelink.pubsub import wire
 from drivelink.recording import read
 from drivelink.recording.canlog import CAN_FORMATS
-from drivelink.recording.columnmap import parse_column_map
+from drivelink.recording.columns import parse_column_map
 from drivelink.recording.formats import open_sink
 from drivelink.recording.mapping import joint_of, layouts_from
 from drivelink.recording.playback import open_playback

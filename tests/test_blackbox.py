@@ -19,11 +19,10 @@ from test_recording_recorder import joint_file
 from drivelink import cli, jointfile
 from drivelink.loop.blackbox import AFTER_S, BlackBox
 from drivelink.loop.folder import drop_oldest, event_of, kept
-from drivelink.pubsub.inbound import DECODERS
+from drivelink.pubsub.feed import DECODERS
 from drivelink.pubsub.wire import EstimateMessage
 from drivelink.recording.mapping import joint_of
-from drivelink.recording.mcapfile import SNAPSHOT, read_attachment, read_messages
-from drivelink.recording.mcapsamples import recorded_cycles
+from drivelink.recording.mcapfile import SNAPSHOT, read_attachment, read_messages, recorded_cycles
 from drivelink.recording.messages import estimate_encoder
 from drivelink.recording.playback import open_playback
 from estimator.sample import Sample, Status, TransmissionEstimate
@@ -133,7 +132,7 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(
     scene = Scene(tmp_path)
     scene.run(20)
     scene.box.keep("asked")
-    monkeypatch.setattr("drivelink.recording.safefile.os.pwrite", full)
+    monkeypatch.setattr("drivelink.recording.sinks.os.pwrite", full)
     assert not scene.finish()
     assert [record.getMessage().count("No space left on device") for record in caplog.records] == [1]
     assert not list((tmp_path / "kept").iterdir())

@@ -10,8 +10,15 @@ import pytest
 from canopenkit import Slave, configure, drive_objects, joint_text
 
 from drivelink.canopen.bus import interface_is_up, open_bus, receive_buffer_frames
-from drivelink.canopen.busload import bus_load, check_capacity, frame_bits
-from drivelink.canopen.layout import MappedObject, NodeLayout, Signal, TpdoLayout
+from drivelink.canopen.layout import (
+    MappedObject,
+    NodeLayout,
+    Signal,
+    TpdoLayout,
+    bus_load,
+    check_capacity,
+    frame_bits,
+)
 from drivelink.errors import BusError
 from drivelink.jointfile import BusSection, parse
 

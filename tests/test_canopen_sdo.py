@@ -2,7 +2,7 @@ import can
 import pytest
 from canopenkit import Item, Slave, Wire, drive_objects
 
-from drivelink.canopen.blocking import run_program
+from drivelink.canopen.bus import run_program
 from drivelink.canopen.guard import ForbiddenFrameError, SilentBus, check_frame
 from drivelink.canopen.pdo import read_optional
 from drivelink.canopen.sdo import (

@@ -3,11 +3,9 @@ import math
 import pytest
 from canopenkit import joint_text
 
-from drivelink.canopen.cia303 import velocity_unit_rad_s
-from drivelink.canopen.layout import Signal
-from drivelink.canopen.roles import object_address, roles
+from drivelink.canopen.layout import Signal, object_address, roles
 from drivelink.canopen.units import offer
-from drivelink.canopen.vendors import GENERIC, VENDORS
+from drivelink.canopen.vendors import GENERIC, VENDORS, velocity_unit_rad_s
 from drivelink.errors import JointFileError
 from drivelink.jointfile import parse
 from drivelink.notice import Severity

@@ -433,7 +433,7 @@ def test_importing_drivelink_does_not_import_zenoh():
 
 @pytest.fixture
 def hasty(monkeypatch):
-    for module in ("clientbase", "asyncclient"):
+    for module in ("clientbase", "client"):
         monkeypatch.setattr(f"drivelink.pubsub.{module}.PATIENCE_S", 0.3)
 
 

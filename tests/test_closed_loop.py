@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 from drivelink import cli, jointfile
-from drivelink.cycle.lockstep import run_lockstep
 from drivelink.cycle.loop import ObjectSink
+from drivelink.cycle.startup import run_lockstep
 from drivelink.demo.simbus import open_sim_bus
 from drivelink.demo.simulate import network_from_joint, world_from_joint
 from drivelink.jointfile import JointFile

@@ -15,7 +15,7 @@ from drivelink.errors import JointFileError, RecordingError, UsageError
 from drivelink.jointfile import parse
 from drivelink.jointfile.columns import UNITS
 from drivelink.recording import read
-from drivelink.recording.columnmap import parse_column_map
+from drivelink.recording.columns import parse_column_map
 from drivelink.recording.formats import FORMATS, Format, open_sink
 
 TEXT = """\

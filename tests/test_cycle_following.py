@@ -9,7 +9,7 @@ import pytest
 from canopenkit import INVALID, joint_text
 from fuzzrun import FuzzRun
 
-from drivelink.cycle.framesource import OVERFLOW
+from drivelink.cycle.sources import OVERFLOW
 from drivelink.errors import RecordingError
 from drivelink.jointfile import parse
 from drivelink.recording.canframes import FrameLog

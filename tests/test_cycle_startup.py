@@ -11,8 +11,7 @@ import can
 import pytest
 from canopenkit import joint_text
 
-from drivelink.cycle.busport import BusPort
-from drivelink.cycle.startup import join_bus
+from drivelink.cycle.startup import BusPort, join_bus
 from drivelink.jointfile import parse
 
 DRIVE = """counts_per_rev = 16384

@@ -15,9 +15,8 @@ from daemonkit import Collector, DaemonRig, Listener, rig, running, served, vsa,
 from zenohkit import LIMIT_S, free_endpoint, until
 
 from drivelink._core import SYNC_COB_ID
-from drivelink.cycle.lockstep import run_lockstep
 from drivelink.cycle.pipeline import make_pipeline
-from drivelink.cycle.startup import join_bus
+from drivelink.cycle.startup import join_bus, run_lockstep
 from drivelink.daemon import reload
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simbus import open_sim_bus
@@ -284,7 +283,7 @@ def test_another_period_of_the_master_begins_anew_with_the_model_in_use(
             made.daemon._supervisor.bus.on_period(period_s)
             return
 
-    monkeypatch.setattr("drivelink.daemon.service.pacing.run", paced)
+    monkeypatch.setattr("drivelink.daemon.service.realtime.run", paced)
     made.daemon.run()
     (pipeline,) = made.daemon.pipelines
     assert pipeline is not before and made.daemon.loop.period_ns == 2_000_000

@@ -18,8 +18,7 @@ from drivelink import jointfile
 from drivelink.cycle.loop import ObjectSink
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.closedloop import CASES, STEPS
-from drivelink.demo.closing import as_json, closing_table
-from drivelink.demo.comparison import Comparison
+from drivelink.demo.closing import Comparison, as_json, closing_table
 from drivelink.demo.rig import RunSummary
 from drivelink.demo.simbus import open_sim_bus
 from drivelink.demo.simulate import network_from_joint, world_from_joint

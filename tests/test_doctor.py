@@ -12,22 +12,20 @@ import pytest
 from canopenkit import Item, Slave, Wire, drive_objects, joint_text
 from rich.console import Console
 
-from drivelink.canopen.blocking import run_program
+from drivelink.canopen.bus import run_program
 from drivelink.canopen.guard import check_frame
-from drivelink.canopen.layout import Signal
+from drivelink.canopen.layout import Signal, roles
 from drivelink.canopen.node import survey_node
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.canopen.roles import roles
 from drivelink.canopen.scan import _identify, listen, scan
 from drivelink.cli import main
 from drivelink.demo.simulate import network_from_joint, world_from_joint
 from drivelink.doctor import Report, Section, examine, examine_eds
 from drivelink.doctor.interface import examine_interface, judge_link
 from drivelink.doctor.livevalues import Asked, Heard, Series, record_of
-from drivelink.doctor.machine import examine_machine, percentile
+from drivelink.doctor.machine import Daemons, examine_machine, judge_sync, percentile
 from drivelink.doctor.motion import judge_motion, judge_record, slope
 from drivelink.doctor.nodes import _describe_node
-from drivelink.doctor.syncs import Daemons, judge_sync
 from drivelink.jointfile import BusSection, parse
 from drivelink.notice import Notice, Severity
 from estimator.sample import Record

@@ -30,11 +30,14 @@ pq = pytest.importorskip("pyarrow.parquet", reason=REASON)
 from drivelink import __version__, recording  # noqa: E402
 from drivelink.cli import main  # noqa: E402
 from drivelink.errors import RecordingError  # noqa: E402
-from drivelink.fleet import pieces, runner, storage, table, task  # noqa: E402
-from drivelink.fleet.errors import FleetError  # noqa: E402
+from drivelink.fleet import runner, storage, table, task  # noqa: E402
 from drivelink.fleet.joints import Joints  # noqa: E402
 from drivelink.fleet.page import page  # noqa: E402
-from drivelink.fleet.storage import Source, Store  # noqa: E402
+from drivelink.fleet.storage import (  # noqa: E402
+    FleetError,
+    Source,
+    Store,
+)
 from drivelink.fleet.summary import COLUMNS, summarise  # noqa: E402
 from drivelink.fleet.table import FleetTable, read_rows  # noqa: E402
 
@@ -137,8 +140,8 @@ def test_a_recording_larger_than_the_memory_is_cut_into_parts(
 ) -> None:
     (record,) = kit.World([{}], seconds=12.0).run()
     path = fleetkit.write_csv(record, tmp_path / "elbow.csv")
-    monkeypatch.setattr(pieces, "_BASE_BYTES", 0)
-    monkeypatch.setattr(pieces, "_LEAST_BYTES", 0)
+    monkeypatch.setattr(task, "_BASE_BYTES", 0)
+    monkeypatch.setattr(task, "_LEAST_BYTES", 0)
     outcome = done(path, joints, limit_bytes=30.0 * path.stat().st_size)
     assert [(row["part"], row["parts"]) for row in outcome.rows] == [(1, 2), (2, 2)]
     assert sum(row["samples"] for row in outcome.rows) == len(record)

@@ -16,8 +16,7 @@ from zenohkit import until
 
 from drivelink._core import JointPipeline
 from drivelink.canopen.bus import open_bus
-from drivelink.cycle.framesource import BusLostError
-from drivelink.cycle.sources import open_source
+from drivelink.cycle.sources import BusLostError, open_source
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simbus import open_sim_bus
 from drivelink.demo.simulate import network_from_joint

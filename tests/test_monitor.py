@@ -29,12 +29,12 @@ from rich.console import Console
 from drivelink import cli
 from drivelink.monitor.braille import DotPlot, sparkline
 from drivelink.monitor.history import GrowingCurve, JointHistory, usual_range
-from drivelink.monitor.jointstable import joints_table
 from drivelink.monitor.statuslines import shape, status_lines, status_text
+from drivelink.monitor.terminal import joints_table
 from drivelink.monitor.view import JointView
 from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.web import MAX_CONNECTIONS, MAX_STREAMS, WebView, snapshot
-from drivelink.output.digits import number, with_interval
+from drivelink.output.numbers import number, with_interval
 from drivelink.pubsub.session import close_session, open_client
 from drivelink.pubsub.wire import ExternalMessage
 from estimator.sample import Estimate, Status, TransmissionEstimate

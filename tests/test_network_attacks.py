@@ -26,13 +26,13 @@ from zenohkit import (
 import drivelink
 from drivelink._core import encode_estimate, encode_sample
 from drivelink.errors import ZenohError
-from drivelink.monitor.jointstable import joints_table
 from drivelink.monitor.statuslines import shape, status_lines, status_text
+from drivelink.monitor.terminal import joints_table
 from drivelink.monitor.view import JointView
 from drivelink.monitor.watcher import MAX_JOINTS, Watcher
 from drivelink.monitor.web import snapshot
-from drivelink.pubsub import inbound
-from drivelink.pubsub.identity import MAX_CLAIMS, DaemonIdentity
+from drivelink.pubsub import feed
+from drivelink.pubsub.feed import MAX_CLAIMS, DaemonIdentity
 from drivelink.pubsub.publisher import JointPublisher, to_json
 from drivelink.pubsub.session import close_session, daemon_config, open_client, open_session
 from drivelink.recording.formats import open_sink
@@ -130,7 +130,7 @@ def source(session, key):
 @pytest.mark.parametrize("name", DOCUMENTS)
 def test_whatever_a_document_holds_it_is_refused_in_a_line_or_made_safe(name):
     try:
-        document = inbound.decode_document(DOCUMENTS[name])
+        document = feed.decode_document(DOCUMENTS[name])
     except ZenohError as error:
         assert "\n" not in str(error) and len(str(error)) < 100
         return
@@ -159,7 +159,7 @@ def test_what_is_well_formed_stays_as_it_is():
         "deep": [{"a": [None, True, -1.5]}],
         "e": "φ · N·m",
     }
-    assert inbound.decode_document(to_json(document)) == document
+    assert feed.decode_document(to_json(document)) == document
 
 
 @pytest.mark.parametrize("name", ESTIMATES)
@@ -168,7 +168,7 @@ def test_no_estimate_ends_a_view(name):
     for k in range(50):
         view.update(make_estimate(k), k * 0.05)
     try:
-        message = inbound.DECODERS["estimate"](ESTIMATES[name])
+        message = feed.DECODERS["estimate"](ESTIMATES[name])
     except ZenohError:
         return
     for _ in range(3):

@@ -12,7 +12,7 @@ from can.interfaces.virtual import VirtualBus
 from daemonkit import DaemonRig, Listener, listens, patient, rig, running, served, vsa, vsa_text
 from zenohkit import until
 
-from drivelink.cycle.framesource import VirtualSource
+from drivelink.cycle.sources import VirtualSource
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.jointfile import parse
 

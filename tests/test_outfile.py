@@ -18,12 +18,13 @@ import joints
 import numpy as np
 import pytest
 
-from drivelink import cli, outfile
+from drivelink import cli
+from drivelink import files as written
 from drivelink.errors import RecordingError, UsageError
+from drivelink.files import NewFile, check_target, write_whole
 from drivelink.jointfile import parse
-from drivelink.outfile import NewFile, check_target, write_whole
 from drivelink.recording.formats import open_sink
-from drivelink.recording.safefile import SafeFile
+from drivelink.recording.sinks import SafeFile
 from estimator.sample import Sample
 
 JOINT = 'name = "elbow"\n[[motor]]\ninertia_kg_m2 = 0.5\n[motor.transmission]\nmodel = "linear"\n'
@@ -119,7 +120,7 @@ def test_a_full_disk_leaves_what_was_there(folder: Path) -> None:
     path.write_text("kept")
     script = (
         "import resource, signal, sys\nfrom pathlib import Path\n"
-        "from drivelink.outfile import write_whole\n"
+        "from drivelink.files import write_whole\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
         "try:\n    write_whole(Path(sys.argv[1]), b'x' * 5000, force=True)\n"
@@ -139,7 +140,7 @@ def test_a_kill_at_any_moment_leaves_the_old_file_or_the_new_one(tmp_path: Path)
         """
         import sys
         from pathlib import Path
-        from drivelink.outfile import write_whole
+        from drivelink.files import write_whole
         print("ready", flush=True)
         while True:
             for letter in "ab":
@@ -302,7 +303,7 @@ def test_fit_brings_its_own_joint_file_up_to_date_in_one_step(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(outfile, "put_in_place", killed)
+        patch.setattr(written, "put_in_place", killed)
         assert cli.main([*arguments, "--force"]) == 130
     assert joint.read_text() == before
     assert cli.main([*arguments, "--force"]) == 0

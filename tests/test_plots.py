@@ -14,11 +14,11 @@ from drivelink.output.plots import (
     medians,
     new_figure,
     over_time,
+    plot_over_time,
     save,
     stiffness_against_deflection,
     svg_text,
 )
-from drivelink.recording.estimateplots import plot_over_time
 
 
 def wave(n: int = 20_000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

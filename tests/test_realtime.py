@@ -15,12 +15,12 @@ import pytest
 from canlayouts import VSA, vsa_cycle
 
 from drivelink._core import Assembler, JointPipeline
-from drivelink.cycle import pacing, realtime
-from drivelink.cycle.framesource import CanFrame
+from drivelink.cycle import realtime
 from drivelink.cycle.housekeeping import Housekeeping
 from drivelink.cycle.loop import CycleLoop, LoopJoint, ObjectSink
-from drivelink.daemon import systemd_notify
-from drivelink.daemon.systemd_notify import Watchdog, notify, watchdog_period_s
+from drivelink.cycle.sources import CanFrame
+from drivelink.systemd import unit
+from drivelink.systemd.unit import Watchdog, notify, watchdog_period_s
 from estimator.sample import Estimate, Sample
 
 MS = 1_000_000
@@ -125,7 +125,7 @@ def test_deadlines_move_by_whole_periods_and_late_cycles_are_left_out_as_gaps() 
     source.delay = {20: 0.005, 50: 0.0101}
     loop_joint = LoopJoint("x", JointPipeline(Assembler(VSA, 2), Last()), sink)
     loop = sink.loop = CycleLoop(source, [loop_joint], period_s=0.001)
-    pacing.run(loop)
+    realtime.run(loop)
     assert loop.overruns >= 4 + 9
     for (before, stamp_before), (after, stamp) in pairwise(sink.seen):
         assert stamp - stamp_before == (after - before) * MS
@@ -200,8 +200,8 @@ def test_the_watchdog_is_fed_four_times_as_often_as_it_asks(monkeypatch: pytest.
 def test_the_watchdog_is_fed_by_the_cycles_that_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
     loop: Any = SimpleNamespace(period_ns=1_000_000, overruns=0, behind=0)
     now_ns, fed = [0], []
-    monkeypatch.setattr(systemd_notify, "notify", fed.append)
-    monkeypatch.setattr(systemd_notify.time, "monotonic_ns", lambda: now_ns[0])
+    monkeypatch.setattr(unit, "notify", fed.append)
+    monkeypatch.setattr(unit.time, "monotonic_ns", lambda: now_ns[0])
     watchdog = Watchdog(loop)
     for overruns, behind, fine in ((0, 0, True), (100, 0, True), (450, 0, False), (450, 490, False)):
         now_ns[0] += 500_000_000

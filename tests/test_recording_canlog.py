@@ -12,8 +12,8 @@ import pytest
 from drivelink.errors import RecordingError
 from drivelink.jointfile import parse
 from drivelink.recording.canlog import NO_STAMP, LoggedFrame, read_frames
+from drivelink.recording.cycles import SyncNumbering, numbered_ahead, numbered_at_once
 from drivelink.recording.formats import open_sink
-from drivelink.recording.syncnumbers import SyncNumbering, numbered_ahead, numbered_at_once
 
 JOINT = parse('name = "j"\n[[motor]]\ninertia_kg_m2 = 0.1\n[bus]\nchannel = "can0"\n')
 FRAME = LoggedFrame(1_436_509_052_249_713_000, 0x181, bytes.fromhex("2A366C2BBA"), "can0")

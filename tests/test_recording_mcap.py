@@ -24,11 +24,10 @@ from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from drivelink.recording import read
 from drivelink.recording.columns import record_from_columns
 from drivelink.recording.formats import open_sink
+from drivelink.recording.foxglove import write_layouts
 from drivelink.recording.mapping import joint_of
-from drivelink.recording.mcapfile import read_messages
-from drivelink.recording.mcapsamples import recorded_cycles
+from drivelink.recording.mcapfile import read_messages, recorded_cycles
 from drivelink.recording.messages import message_schema
-from drivelink.recording.viewlayouts import write_layouts
 from estimator.sample import SIGMA_95, Sample, Status, TransmissionEstimate
 
 TEXT = 'name = "elbow"\n[[motor]]\ninertia_kg_m2 = 0.1\n'

@@ -18,7 +18,7 @@ import zenohkit
 from drivelink import cli, jointfile
 from drivelink.canopen.bus import open_bus
 from drivelink.cli.record import _Summary
-from drivelink.cycle.framesource import CanFrame, FrameSource
+from drivelink.cycle.sources import CanFrame, FrameSource
 from drivelink.recording import read
 from drivelink.recording.canlog import read_frames
 from drivelink.recording.formats import open_sink

@@ -13,8 +13,8 @@ import pytest
 
 from drivelink import jointfile
 from drivelink.cli import main
-from drivelink.jointfile.residual_baseline import floor_entry, make_model_monitor
-from drivelink.output.units import Units
+from drivelink.jointfile.apply_diagnosis import floor_entry, make_model_monitor
+from drivelink.output.numbers import Units
 from estimator.model import JointModel, Motor, Transmission
 from estimator.sample import Record
 

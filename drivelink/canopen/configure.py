@@ -12,13 +12,18 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from drivelink._core import SYNC_COB_ID
-from drivelink.canopen.blocking import FrameBus, Idle, frames, is_canopen, run_program, sender
-from drivelink.canopen.bus import listening_s
-from drivelink.canopen.busload import COMFORTABLE, BusLoad, bus_load, check_capacity
-from drivelink.canopen.layout import NodeLayout
+from drivelink.canopen.bus import FrameBus, Idle, frames, is_canopen, listening_s, run_program, sender
+from drivelink.canopen.layout import (
+    COMFORTABLE,
+    BusLoad,
+    NodeLayout,
+    bus_load,
+    check_capacity,
+    roles,
+    roles_by_node,
+)
 from drivelink.canopen.mapping import NMT_START
 from drivelink.canopen.node import configure_node
-from drivelink.canopen.roles import roles, roles_by_node
 from drivelink.canopen.sdo import Program, Read, SdoTimeout, Session
 from drivelink.errors import BusError, DriveError
 from drivelink.jointfile import BusSection, JointFile

@@ -18,7 +18,7 @@ from canopen.objectdictionary.eds import RECORD, import_eds
 
 from drivelink.canopen.pdo import Tpdo, tpdos_of
 from drivelink.errors import DriveError
-from drivelink.infile import read_regular
+from drivelink.files import read_regular
 from drivelink.plaintext import clean_text
 
 Sections = dict[str, dict[str, str]]

@@ -1,16 +1,130 @@
-"""The configured PDOs: which frame carries which signal, at what scale.
+"""The nodes of a joint: roles, which frame carries which signal at what scale, and the load on the bus.
 
-The only interface between configuration (active or passive) and acquisition.
+`NodeLayout` is the only interface between configuration (active or passive) and acquisition. A standard frame
+with n data bytes takes at most 47 + 8 n + ⌊(33 + 8 n) / 4⌋ bits, interframe space and worst-case stuffing
+included: 55 for a SYNC, 135 for eight bytes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
+from pathlib import Path
 from typing import Any
 
-from drivelink.notice import Notice
+from drivelink.errors import BusError, JointFileError
+from drivelink.jointfile import BusSection, DriveSection, EncoderSection, JointFile, TpdoSection
+from drivelink.notice import Notice, Severity
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Role:
+    """One node of a joint."""
+
+    node_id: int  # 1 to 127
+    motor: int | None  # index of the motor it drives, or None
+    drive: DriveSection | None  # its section of the joint file, or None
+    encoder: EncoderSection | None  # the link encoder, if connected to this node
+    key: str  # its key in the joint file, for messages
+    eds: Path | None  # its EDS or DCF file, if the joint file names one
+    tpdo: tuple[TpdoSection, ...]  # its mapping, if the joint file declares it
+
+    @property
+    def subject(self) -> str:
+        """For notices and messages."""
+        return f"node {self.node_id}"
+
+
+def roles(joint: JointFile, base_dir: Path = Path()) -> tuple[Role, ...]:
+    """Return the nodes of a joint, motors first.
+
+    Args:
+        base_dir: its folder; EDS paths are relative to it.
+
+    Raises:
+        JointFileError: a motor has no drive.
+    """
+    encoder = joint.link.encoder
+    encoder_node = _encoder_node(joint)
+    found: list[Role] = []
+    for number, motor in enumerate(joint.motor):
+        drive = motor.drive
+        if drive is None:
+            raise JointFileError(
+                f"{joint.name}: motor[{number + 1}].drive: expected this table, it is missing: "
+                "no bus without it"
+            )
+        mine = encoder if encoder is not None and encoder_node == drive.node_id else None
+        eds = drive.eds or (mine.eds if mine else None)
+        found.append(
+            Role(
+                node_id=drive.node_id,
+                motor=number,
+                drive=drive,
+                encoder=mine,
+                key=f"motor[{number + 1}].drive",
+                eds=base_dir / eds if eds else None,
+                tpdo=drive.tpdo + (mine.tpdo if mine else ()),
+            )
+        )
+    if encoder is not None and encoder_node is not None and all(role.encoder is None for role in found):
+        found.append(
+            Role(
+                node_id=encoder_node,
+                motor=None,
+                drive=None,
+                encoder=encoder,
+                key="link.encoder",
+                eds=base_dir / encoder.eds if encoder.eds else None,
+                tpdo=encoder.tpdo,
+            )
+        )
+    return tuple(found)
+
+
+def roles_by_node(joints: Sequence[JointFile], base_dirs: Sequence[Path] | None) -> dict[int, Role]:
+    """Return the nodes of all joints on one bus by node id, in the order of the joint files.
+
+    Args:
+        base_dirs: their folders; None: the current one.
+
+    Raises:
+        BusError: two joints claim one node.
+    """
+    found: dict[int, Role] = {}
+    for joint, folder in zip(joints, base_dirs or [Path()] * len(joints), strict=True):
+        for role in roles(joint, folder):
+            if role.node_id in found:
+                raise BusError(f"node {role.node_id} is claimed by two joints on one bus")
+            found[role.node_id] = role
+    return found
+
+
+def _encoder_node(joint: JointFile) -> int | None:
+    encoder = joint.link.encoder
+    if encoder is None:
+        return None
+    if encoder.node_id is not None:
+        return encoder.node_id
+    first = joint.motor[0].drive
+    return first.node_id if first else None
+
+
+def object_address(text: str, key: str) -> tuple[int, int]:
+    """Return the index and subindex of "0x60E4:01".
+
+    Raises:
+        JointFileError: the text has another form.
+    """
+    index, _, subindex = text.partition(":")
+    try:
+        address = int(index, 16), int(subindex or "0", 16)
+    except ValueError:
+        address = (0, 0)
+    if not (0x1000 <= address[0] <= 0xFFFF and 0 <= address[1] <= 0xFF):
+        raise JointFileError(f'{key}: expected an object like "0x60E4:01", got "{text}"')
+    return address
 
 
 class Signal(StrEnum):
@@ -114,3 +228,87 @@ def _tpdo_from(document: Mapping[str, Any]) -> TpdoLayout:
         MappedObject(**{**each, "signal": Signal(each["signal"])}) for each in document["objects"]
     )
     return TpdoLayout(**{**document, "objects": objects})
+
+
+@dataclass(slots=True, kw_only=True)
+class Offer:
+    """What a node can give."""
+
+    # for each signal the objects that can give it, best first
+    candidates: dict[Signal, tuple[MappedObject, ...]] = field(default_factory=dict)
+    # the same for cross-checks: not mapped, but read if the node maps them
+    checks: dict[Signal, tuple[MappedObject, ...]] = field(default_factory=dict)
+    missing: dict[Signal, str] = field(default_factory=dict)  # for a signal with no candidate, why
+    notices: list[Notice] = field(default_factory=list)  # disagreements and remarks
+
+    @property
+    def readable(self) -> dict[Signal, tuple[MappedObject, ...]]:
+        """All objects for decoding, candidates first."""
+        rest = {signal: objects for signal, objects in self.checks.items() if signal not in self.candidates}
+        return {**self.candidates, **rest}
+
+    def say(self, severity: Severity, subject: str, text: str, fix: str = "") -> None:
+        """Add a remark."""
+        self.notices.append(Notice(severity=severity, subject=subject, text=text, fix=fix))
+
+
+CAPACITY = 1.0  # of the bit rate, worst-case stuffing
+COMFORTABLE = 0.7  # above it, event-driven frames of others begin to delay the cycle
+
+
+def frame_bits(data_bytes: int) -> int:
+    """Return bits on the wire of a standard frame, worst case."""
+    return 47 + 8 * data_bytes + (33 + 8 * data_bytes) // 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BusLoad:
+    """Load of the cycle on the bus."""
+
+    bits_per_s: float  # worst case
+    bitrate: int  # bit/s of the bus
+    frames_per_s: float  # of them
+
+    @property
+    def fraction(self) -> float:
+        """Of the bit rate."""
+        return self.bits_per_s / self.bitrate
+
+
+def _tpdo_rate_hz(tpdo: TpdoLayout, sync_hz: float) -> float:
+    if 1 <= tpdo.transmission_type <= 240:
+        return sync_hz / tpdo.transmission_type
+    # On change: a measured value changes in every control cycle, so only the inhibit time bounds it.
+    return min(sync_hz, 1 / tpdo.inhibit_s) if tpdo.inhibit_s > 0 else sync_hz
+
+
+def bus_load(layouts: Iterable[NodeLayout], bus: BusSection) -> BusLoad:
+    """Load of SYNC, all enabled TPDOs and heartbeats of all nodes on a bus."""
+    sync_hz = 1 / bus.period_s
+    frames = [(sync_hz, frame_bits(1 if bus.sync_counter_overflow else 0))]
+    for layout in layouts:
+        frames += [
+            (_tpdo_rate_hz(tpdo, sync_hz), frame_bits(tpdo.length))
+            for tpdo in layout.tpdos + layout.other_tpdos
+        ]
+        if layout.heartbeat_ms:
+            frames.append((1000 / layout.heartbeat_ms, frame_bits(1)))
+    return BusLoad(
+        bits_per_s=sum(rate * bits for rate, bits in frames),
+        bitrate=bus.bitrate,
+        frames_per_s=sum(rate for rate, _ in frames),
+    )
+
+
+def check_capacity(load: BusLoad, period_s: float) -> None:
+    """Check that the bus can carry the load.
+
+    Raises:
+        BusError: more bits per second than the bit rate.
+    """
+    if load.fraction > CAPACITY:
+        raise BusError(
+            f"bus load would be {load.fraction:.0%}: {load.frames_per_s:.0f} frames/s need up to "
+            f"{load.bits_per_s / 1000:.0f} kbit/s of {load.bitrate / 1000:.0f} kbit/s; a period of "
+            f"{period_s * load.fraction / COMFORTABLE * 1000:.2g} ms (bus.period_s) or fewer drives would fit"
+        )

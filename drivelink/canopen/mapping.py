@@ -10,22 +10,24 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from drivelink.canopen.layout import MappedObject, Signal, TpdoLayout
+from drivelink.canopen.layout import MappedObject, Role, Signal, TpdoLayout
 from drivelink.canopen.pdo import (
     EXTENDED,
     INVALID,
     NO_RTR,
+    OPTIONAL,
     SYNC_TYPES,
+    Assignment,
     Entry,
     Tpdo,
+    assign,
+    choose_cob_id,
     decode,
     describe,
     read_optional,
     read_tpdo,
 )
-from drivelink.canopen.roles import Role
 from drivelink.canopen.sdo import Nmt, Pause, Program, Read, SdoAbort, Write, abort_text
-from drivelink.canopen.tpdo_assignment import OPTIONAL, Assignment, assign, choose_cob_id
 from drivelink.errors import DriveError
 from drivelink.notice import Notice, Severity
 

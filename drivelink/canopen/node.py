@@ -7,11 +7,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from drivelink._core import SYNC_COB_ID
-from drivelink.canopen.layout import MappedObject, NodeLayout, Signal
+from drivelink.canopen.layout import MappedObject, NodeLayout, Offer, Role, Signal
 from drivelink.canopen.mapping import NMT_PRE_OPERATIONAL, NMT_START, SETTLE_S, Mapper, disable
-from drivelink.canopen.offer import Offer
-from drivelink.canopen.pdo import ABSENT, Tpdo, decode, read_identity, read_optional, read_tpdos
-from drivelink.canopen.roles import Role
+from drivelink.canopen.pdo import (
+    ABSENT,
+    CHECKS,
+    OPTIONAL,
+    Tpdo,
+    decode,
+    read_identity,
+    read_optional,
+    read_tpdos,
+    unused,
+)
 from drivelink.canopen.sdo import (
     Nmt,
     Pause,
@@ -24,7 +32,6 @@ from drivelink.canopen.sdo import (
     abort_text,
     read_number,
 )
-from drivelink.canopen.tpdo_assignment import CHECKS, OPTIONAL, unused
 from drivelink.canopen.units import offer, unit_objects
 from drivelink.canopen.vendors import Vendor, vendor_of
 from drivelink.errors import DriveError

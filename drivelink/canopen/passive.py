@@ -9,13 +9,10 @@ import logging
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from drivelink.canopen.busload import BusLoad, bus_load
 from drivelink.canopen.eds import load_eds
-from drivelink.canopen.layout import NodeLayout, Signal
-from drivelink.canopen.pdo import Tpdo, decode, describe, tpdos_of
-from drivelink.canopen.roles import Role, roles_by_node
+from drivelink.canopen.layout import BusLoad, NodeLayout, Role, Signal, bus_load, roles_by_node
+from drivelink.canopen.pdo import OPTIONAL, Tpdo, decode, describe, tpdos_of
 from drivelink.canopen.sdo_sniffer import SdoSniffer, written_object
-from drivelink.canopen.tpdo_assignment import OPTIONAL
 from drivelink.canopen.units import offer, unit_objects
 from drivelink.canopen.vendors import VENDORS, vendor_of
 from drivelink.errors import DriveError

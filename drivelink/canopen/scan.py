@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import can
 
 from drivelink._core import SYNC_COB_ID
-from drivelink.canopen.blocking import FrameBus, frames, run_program, sender
+from drivelink.canopen.bus import FrameBus, frames, run_program, sender
 from drivelink.canopen.guard import check_frame
 from drivelink.canopen.pdo import read_identity, read_optional
 from drivelink.canopen.sdo import Program, Read, SdoAbort

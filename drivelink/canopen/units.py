@@ -12,11 +12,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 
-from drivelink.canopen.cia303 import angle_unit_rad, velocity_unit_rad_s
-from drivelink.canopen.layout import MappedObject, Signal
-from drivelink.canopen.offer import Offer
-from drivelink.canopen.roles import Role, object_address
-from drivelink.canopen.vendors import Vendor
+from drivelink.canopen.layout import MappedObject, Offer, Role, Signal, object_address
+from drivelink.canopen.vendors import Vendor, angle_unit_rad, velocity_unit_rad_s
 from drivelink.jointfile import DriveSection, EncoderSection
 from drivelink.notice import Severity
 

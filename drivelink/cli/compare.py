@@ -10,7 +10,7 @@ from rich.console import Console
 
 from drivelink.cli import add_map
 from drivelink.errors import RecordingError, UsageError
-from drivelink.outfile import write_whole
+from drivelink.files import write_whole
 
 EPILOG = """\
 examples:

@@ -8,9 +8,8 @@ from pathlib import Path
 from drivelink import jointfile
 from drivelink.cli.record import known_layouts
 from drivelink.errors import UsageError
-from drivelink.outfile import check_target, write_whole
-from drivelink.recording.dbcfile import dbc_text
-from drivelink.recording.mapping import joint_of, recorded_layouts
+from drivelink.files import check_target, write_whole
+from drivelink.recording.mapping import dbc_text, joint_of, recorded_layouts
 
 EPILOG = """\
 examples:

@@ -11,11 +11,11 @@ from rich.console import Console
 from drivelink import analysis
 from drivelink.cli import add_recordings, require_distinct, warn
 from drivelink.errors import HarmfulModelError
-from drivelink.outfile import check_target
+from drivelink.files import check_target
 from drivelink.output import report
 from drivelink.output.document import show
+from drivelink.output.numbers import Units
 from drivelink.output.progress import Meter
-from drivelink.output.units import Units
 from drivelink.recording.mapping import joint_of
 
 EPILOG = """\

@@ -11,7 +11,7 @@ from rich.console import Console
 from drivelink import jointfile
 from drivelink.cli import add_recordings, require_distinct, warn
 from drivelink.errors import RecordingError, UsageError
-from drivelink.outfile import check_target, write_whole
+from drivelink.files import check_target, write_whole
 from drivelink.recording.mapping import joint_of
 
 EPILOG = """\
@@ -64,7 +64,7 @@ def _fit(args: argparse.Namespace, folder: Path | None) -> None:
     from drivelink import analysis  # takes a second; the arguments are checked
     from drivelink.output.document import show
     from drivelink.output.fitreport import sections
-    from drivelink.output.units import Units
+    from drivelink.output.numbers import Units
 
     options = {"bandwidth_hz": args.bandwidth_hz, "names": args.map, "strict": args.strict}
     made = analysis.fit(args.recording, args.joint, warn=warn, **options)

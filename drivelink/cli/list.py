@@ -7,8 +7,8 @@ import json
 import sys
 
 from drivelink.cli.monitor import add_zenoh
-from drivelink.pubsub.clientbase import ENDPOINT
-from drivelink.pubsub.names import joints
+from drivelink.pubsub.clientbase import joints
+from drivelink.pubsub.session import ENDPOINT
 
 EPILOG = """\
 examples:

@@ -15,15 +15,13 @@ from rich.text import Text
 
 from drivelink import jointfile
 from drivelink.errors import UsageError
-from drivelink.monitor.jointstable import joints_table
-from drivelink.monitor.keys import Keys
 from drivelink.monitor.statuslines import shape
+from drivelink.monitor.terminal import Keys, joints_table
 from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.web import WebView, document
 from drivelink.monitor.webaccept import WebAcceptance
-from drivelink.pubsub.clientbase import ENDPOINT
-from drivelink.pubsub.names import PATIENCE_S
-from drivelink.pubsub.session import close_session, open_client
+from drivelink.pubsub.clientbase import PATIENCE_S
+from drivelink.pubsub.session import ENDPOINT, close_session, open_client
 
 _POLL_S = 0.02
 _FRAME_S = 0.1
@@ -112,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _foxglove(args: argparse.Namespace) -> int:
     """Serve a joint's messages until the end or Ctrl-C."""
-    from drivelink.recording.foxglovelive import FoxgloveSink
+    from drivelink.recording.foxglove import FoxgloveSink
     from drivelink.recording.recorder import FirstSource, Recorder, ZenohTap
 
     if args.web or args.json or args.joint is None or not _is_file(args.joint):

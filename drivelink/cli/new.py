@@ -19,8 +19,8 @@ from drivelink.canopen.bus import open_bus
 from drivelink.canopen.newfile import Answers, answers_from_bus, joint_text
 from drivelink.canopen.scan import identify, scan
 from drivelink.errors import UsageError
+from drivelink.files import check_target, write_whole
 from drivelink.jointfile import BusSection, parse
-from drivelink.outfile import check_target, write_whole
 
 _CASES = ("constant", "quadratic", "vsa-ii")
 _ARRANGEMENTS = ("single", "antagonistic", "serial")

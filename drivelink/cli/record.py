@@ -22,15 +22,15 @@ from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cli import add_bus, moved
 from drivelink.errors import BusError, DrivelinkError, RecordingError, UsageError, ZenohError
+from drivelink.files import check_target
 from drivelink.jointfile import JointFile, JointText
-from drivelink.outfile import check_target
-from drivelink.pubsub.inbound import DECODERS
+from drivelink.pubsub.feed import DECODERS
 from drivelink.pubsub.session import close_session, open_client
 from drivelink.recording.formats import open_sink
+from drivelink.recording.foxglove import write_layouts
 from drivelink.recording.mapping import layouts_from, mapping_document
 from drivelink.recording.recorder import BusTap, FirstSource, Recorder, ZenohTap
 from drivelink.recording.sinks import Sink
-from drivelink.recording.viewlayouts import write_layouts
 
 _ALIVE_S = 1.0  # in which a daemon answers
 _SAY_EVERY_S = 10.0

@@ -11,14 +11,14 @@ from pathlib import Path
 
 from drivelink.cli import add_map, warn
 from drivelink.errors import UsageError
+from drivelink.files import check_target
 from drivelink.jointfile import JointFile
-from drivelink.outfile import check_target
 from drivelink.output.progress import Meter
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_session
 from drivelink.recording import read
 from drivelink.recording.canframes import is_frame_log
-from drivelink.recording.columnmap import parse_column_map
+from drivelink.recording.columns import parse_column_map
 from drivelink.recording.gate import Gathered, gate
 from drivelink.recording.mapping import joint_of
 from drivelink.recording.outputs import EstimatesFile, Publication, Summary

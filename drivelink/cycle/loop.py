@@ -1,6 +1,6 @@
 """The cycle's work: SYNC, frames, estimate, publication, for all joints of one bus.
 
-A cycle is `tick` and `receive`. `drivelink.cycle.pacing` calls them by the clock or by the SYNC of another
+A cycle is `tick` and `receive`. `drivelink.cycle.realtime` calls them by the clock or by the SYNC of another
 master; `run_lockstep` without a clock.
 """
 
@@ -15,8 +15,8 @@ from functools import partial
 from typing import Protocol
 
 from drivelink._core import LATE, SYNC_COB_ID, JointPipeline, LatencyHistogram, Tick
-from drivelink.cycle.framesource import BusLostError, CanFrame, FrameSource, LostSource
 from drivelink.cycle.housekeeping import Housekeeping
+from drivelink.cycle.sources import BusLostError, CanFrame, FrameSource, LostSource
 from drivelink.cycle.syncclock import MEASURED_SYNCS, SyncClock
 from estimator.sample import Estimate, Sample
 

@@ -10,7 +10,7 @@ from drivelink._core import Assembler, JointPipeline
 from drivelink.canopen.layout import NodeLayout
 from drivelink.errors import DriveError
 from drivelink.jointfile import JointFile
-from drivelink.jointfile.residual_baseline import make_model_monitor
+from drivelink.jointfile.apply_diagnosis import make_model_monitor
 from estimator import Estimator, make_estimator
 from estimator.sample import Estimate, Sample
 

@@ -8,15 +8,14 @@ import time
 from typing import Any
 
 from drivelink.canopen.emcy import emergency_text
-from drivelink.cycle.framesource import LostSource
 from drivelink.cycle.loop import CycleLoop, LoopJoint
 from drivelink.cycle.realtime import RealTime
-from drivelink.daemon.crosschecks import cross_checks
-from drivelink.daemon.jointwatch import residual_ratio
+from drivelink.cycle.sources import LostSource
+from drivelink.daemon.jointwatch import cross_checks, residual_ratio
 from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor
 from drivelink.jointfile import JointFile
-from drivelink.output.digits import number
+from drivelink.output.numbers import number
 from drivelink.version import __version__
 from estimator.reasons import why_not_valid
 from estimator.sample import ExternalStatus, Status

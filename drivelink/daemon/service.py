@@ -20,26 +20,24 @@ import zenoh
 
 from drivelink._core import JointPipeline
 from drivelink.canopen.bus import open_bus
-from drivelink.canopen.layout import NodeLayout
-from drivelink.canopen.roles import roles
-from drivelink.cycle import pacing, realtime
-from drivelink.cycle.busport import BusPort
+from drivelink.canopen.layout import NodeLayout, roles
+from drivelink.cycle import realtime
 from drivelink.cycle.loop import CycleLoop, LoopJoint
 from drivelink.cycle.objectcheck import HISTORY_S
 from drivelink.cycle.pipeline import build, make_pipeline, rehearse
 from drivelink.cycle.sources import open_source
-from drivelink.cycle.startup import join_bus
-from drivelink.daemon.buskeeper import BusKeeper
+from drivelink.cycle.startup import BusPort, join_bus
+from drivelink.daemon.buswatch import BusKeeper
 from drivelink.daemon.jointstatus import JointStatus
 from drivelink.daemon.reload import Reloader
 from drivelink.daemon.status import EventLog
 from drivelink.daemon.supervision import Supervisor
-from drivelink.daemon.systemd_notify import Watchdog, notify, watchdog_period_s
 from drivelink.errors import UsageError
 from drivelink.jointfile import JointFile
 from drivelink.loop.feed import FindingFeed, SnapshotFeed
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_session
+from drivelink.systemd.unit import Watchdog, notify, watchdog_period_s
 
 logger = logging.getLogger("drivelink")
 
@@ -185,7 +183,7 @@ class Daemon:
             while True:
                 for status in self._status:
                     status.real_time = obtained
-                pacing.run(self.loop)
+                realtime.run(self.loop)
                 if self._stopping or not self._another_s:
                     break
                 self._begin_anew()

@@ -17,14 +17,11 @@ from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator, is_mapping
 from drivelink.canopen.sdo_sniffer import written_object
 from drivelink.cycle.following import OwnFollower, PassiveFollower
-from drivelink.cycle.framesource import OVERFLOW, LostSource
 from drivelink.cycle.loop import CycleLoop, LoopJoint
-from drivelink.cycle.objectcheck import ObjectCheck
+from drivelink.cycle.objectcheck import ObjectCheck, ReadBack
+from drivelink.cycle.sources import OVERFLOW, LostSource
 from drivelink.daemon.buswatch import BusWatch
-from drivelink.daemon.crosschecks import contradiction
-from drivelink.daemon.jointwatch import JointWatch
-from drivelink.daemon.nodewatch import OPERATIONAL, STATES, WatchedNode
-from drivelink.daemon.readback import ReadBack
+from drivelink.daemon.jointwatch import OPERATIONAL, STATES, JointWatch, WatchedNode, contradiction
 from drivelink.daemon.status import EventLog
 
 logger = logging.getLogger(__name__)

@@ -21,7 +21,7 @@ from drivelink.demo.watching import DemoRun
 from drivelink.jointfile import JointFile
 from drivelink.loop import finding
 from drivelink.loop.acceptance import Proposal, Trial, accept, proposal
-from drivelink.monitor.keys import Keys
+from drivelink.monitor.terminal import Keys
 from drivelink.pubsub.client import Subscription
 from estimator.sample import SIGMA_95, Status
 

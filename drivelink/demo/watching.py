@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from rich.console import Console
 from rich.live import Live
 
-from drivelink.demo.comparison import Comparison
+from drivelink.demo.closing import Comparison
 from drivelink.demo.rig import Change, Failure, RunSummary, serve
 from drivelink.errors import DrivelinkError
 from drivelink.jointfile import JointFile

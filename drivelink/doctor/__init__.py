@@ -6,10 +6,9 @@ from pathlib import Path
 
 from drivelink.doctor.datasheet import examine_sheet
 from drivelink.doctor.interface import can_interfaces, examine_interface
-from drivelink.doctor.machine import examine_machine
+from drivelink.doctor.machine import examine_machine, examine_zenoh
 from drivelink.doctor.nodes import examine_bus
 from drivelink.doctor.report import Report, Section
-from drivelink.doctor.zenohcheck import examine_zenoh
 from drivelink.jointfile import JointFile
 from drivelink.notice import Severity
 

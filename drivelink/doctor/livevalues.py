@@ -14,20 +14,18 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
-from drivelink.canopen.blocking import run_program
-from drivelink.canopen.bus import open_bus
+from drivelink.canopen.bus import open_bus, run_program
 from drivelink.canopen.guard import SilentBus
-from drivelink.canopen.layout import MappedObject, Signal
+from drivelink.canopen.layout import MappedObject, Signal, roles
 from drivelink.canopen.node import NodeSurvey, survey_node
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.canopen.roles import roles
 from drivelink.canopen.scan import listen
 from drivelink.canopen.sdo import Program, Read, SdoAbort
 from drivelink.doctor.manualcheck import Value
 from drivelink.errors import DriveError
 from drivelink.jointfile import JointFile
 from drivelink.recording.canlog import LoggedFrame
-from drivelink.recording.framesamples import FrameSamples
+from drivelink.recording.cycles import FrameSamples
 from estimator.sample import FloatArray, Record, Sample
 
 _READ = (Signal.MOTOR_POSITION, Signal.MOTOR_VELOCITY, Signal.MOTOR_TORQUE, Signal.LINK_POSITION)

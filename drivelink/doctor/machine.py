@@ -1,16 +1,23 @@
-"""Checks kernel and permissions: scheduling, locked memory, CPU clock, timer."""
+"""Checks this machine (scheduling, memory, CPU clock, timer), SYNC on its bus, and zenoh by a subscriber."""
 
 from __future__ import annotations
 
+import itertools
 import os
 import platform
 import resource
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+import zenoh
+
 from drivelink.doctor.report import Section
+from drivelink.errors import ZenohError
+from drivelink.jointfile import BusSection, JointFile
 from drivelink.notice import Severity
-from drivelink.pubsub.session import FILES
+from drivelink.pubsub.session import FILES, answers, close_session, open_client
 
 _CPU = Path("/sys/devices/system/cpu")
 _NEEDED_LOCKED = 256 << 20  # bytes; the daemon's resident size is below
@@ -135,3 +142,117 @@ def percentile(values: list[float], fraction: float) -> float:
     """Return the given quantile of the values."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, int(fraction * len(ordered)))]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Daemons:
+    """Running drivelink daemons of this machine."""
+
+    ours: bool  # whether one of them serves this joint
+    others: Sequence[str]  # names of the other joints that are served
+
+
+def judge_sync(
+    section: Section, stamps_s: Sequence[float], bus: BusSection, daemons: Daemons | None = None
+) -> None:
+    """Check rate and jitter of SYNC.
+
+    Args:
+        daemons: running daemons, one of which may produce SYNC.
+    """
+    if len(stamps_s) < 3:
+        if bus.sync == "follow":
+            section.say(
+                Severity.ERROR, "SYNC", "nobody makes SYNC", 'start the other master, or bus.sync = "produce"'
+            )
+        else:
+            section.ok("SYNC", "not produced yet: drivelink run will produce it")
+        return
+    gaps = [after - before for before, after in itertools.pairwise(stamps_s)]
+    period_s = percentile(gaps, 0.5)
+    deviation_us = [abs(gap - period_s) * 1e6 for gap in gaps]
+    p99, worst = percentile(deviation_us, 0.99), max(deviation_us)
+    section.facts["sync"] = {"period_s": period_s, "jitter_us": {"p99": p99, "max": worst}}
+    text = f"every {period_s * 1000:.3f} ms, jitter {p99:.0f} µs (p99), {worst:.0f} µs (max)"
+    if bus.sync == "produce":
+        _judge_producer(section, text, daemons or Daemons(ours=False, others=()))
+    elif "period_s" in bus.model_fields_set and abs(period_s - bus.period_s) > 0.02 * bus.period_s:
+        section.say(
+            Severity.ERROR,
+            "SYNC",
+            f"{text}, the joint file says {bus.period_s * 1000:g} ms",
+            f"bus.period_s = {round(period_s, 5):g}",
+        )
+    else:
+        section.ok("SYNC", text)
+
+
+def _judge_producer(section: Section, text: str, daemons: Daemons) -> None:
+    """Who produces the SYNC that this joint is to produce."""
+    if daemons.ours:
+        section.ok("SYNC", f"{text}, produced by the drivelink daemon that runs")
+    elif daemons.others:
+        section.say(
+            Severity.WARNING,
+            "SYNC",
+            f"{text}: the drivelink daemon of {', '.join(daemons.others)} may make it",
+            "joints on one bus go into one command: drivelink run A.toml B.toml; "
+            'with another master: bus.sync = "follow"',
+        )
+    else:
+        section.say(
+            Severity.WARNING,
+            "SYNC",
+            f"{text}: another master produces it, no drivelink daemon is alive",
+            'bus.sync = "follow", or stop the other master',
+        )
+
+
+_WAIT_S = 2.0
+
+
+def examine_zenoh(section: Section, joint: JointFile, base_dir: Path) -> None:
+    """Check who listens at the endpoint, which daemons are alive, and whether this joint's key is taken."""
+    settings = joint.zenoh
+    if settings.config is not None and not (base_dir / settings.config).is_file():
+        section.say(
+            Severity.ERROR, "zenoh", f"{settings.config}: there is no such file", "correct zenoh.config"
+        )
+        return
+    where = settings.config or settings.endpoint
+    if settings.config is None and not answers(settings.endpoint):
+        section.ok("zenoh", f"{where}: nobody there yet, the daemon will listen there")
+        return
+    try:
+        session = open_client(settings.endpoint, base_dir / settings.config if settings.config else None)
+    except ZenohError as error:
+        section.say(Severity.ERROR, "zenoh", str(error))
+        return
+    try:
+        alive = _alive(session, f"{settings.prefix}/*/alive")
+    finally:
+        close_session(session)
+    section.facts["alive"] = alive
+    if not alive:
+        section.ok("zenoh", f"{where}: reachable, no daemon is alive there")
+        return
+    names = [key.split("/")[-2] for key in alive]
+    section.ok("zenoh", f"{where}: reachable, alive: {', '.join(names)}")
+    if joint.name in names:
+        section.say(
+            Severity.INFO,
+            "zenoh",
+            f'a daemon for "{joint.name}" runs: a second one would be refused',
+            f"drivelink monitor {joint.name}",
+        )
+
+
+def _alive(session: zenoh.Session, key: str) -> list[str]:
+    end_s = time.monotonic() + _WAIT_S
+    while time.monotonic() < end_s:
+        replies = session.liveliness().get(key, timeout=0.5)
+        found = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+        if found:
+            return sorted(found)
+        time.sleep(0.1)
+    return []

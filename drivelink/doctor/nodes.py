@@ -8,30 +8,35 @@ from pathlib import Path
 
 import can
 
-from drivelink.canopen.blocking import run_program
-from drivelink.canopen.bus import open_bus
-from drivelink.canopen.busload import COMFORTABLE, bus_load
+from drivelink.canopen.bus import open_bus, run_program
 from drivelink.canopen.eds import load_eds
 from drivelink.canopen.guard import SilentBus
-from drivelink.canopen.layout import NodeLayout, Signal, TpdoLayout
+from drivelink.canopen.layout import COMFORTABLE, NodeLayout, Role, Signal, TpdoLayout, bus_load, roles
 from drivelink.canopen.node import NodeSurvey, survey_node
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.canopen.pdo import decode, describe, entry_text, read_optional
-from drivelink.canopen.roles import Role, roles
+from drivelink.canopen.pdo import (
+    CHECKS,
+    Available,
+    assign,
+    decode,
+    describe,
+    entry_text,
+    read_optional,
+    unused,
+)
 from drivelink.canopen.scan import FoundNode, Traffic, identify, listen, scan
-from drivelink.canopen.tpdo_assignment import CHECKS, Available, assign, unused
 from drivelink.canopen.vendors import vendor_of
-from drivelink.doctor.checkadvice import (
+from drivelink.doctor.datasheet import (
     asked_signals,
+    planned_entries,
     say_checks,
     say_sync_counter,
     second_encoder,
 )
-from drivelink.doctor.datasheet import planned_entries
 from drivelink.doctor.livevalues import Asked, Heard, record_of
+from drivelink.doctor.machine import Daemons, judge_sync
 from drivelink.doctor.motion import judge_motion, judge_record
 from drivelink.doctor.report import Report, Section
-from drivelink.doctor.syncs import Daemons, judge_sync
 from drivelink.errors import BusError, DriveError, JointFileError
 from drivelink.jointfile import BusSection, JointFile
 from drivelink.notice import Notice, Severity

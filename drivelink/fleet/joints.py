@@ -15,7 +15,7 @@ from urllib.parse import unquote
 
 from drivelink import jointfile
 from drivelink.errors import DrivelinkError, RecordingError, UsageError
-from drivelink.fleet.errors import FleetError
+from drivelink.fleet.storage import FleetError
 from drivelink.jointfile import JointFile
 from drivelink.recording.mapping import contained, joint_of
 

@@ -13,8 +13,7 @@ from string import Template
 from typing import Any, NamedTuple
 
 from drivelink.fleet.summary import LOOK, STATES, spaced
-from drivelink.output.digits import number, with_interval
-from drivelink.output.units import Units, bare_name, in_words
+from drivelink.output.numbers import Units, bare_name, in_words, number, with_interval
 from estimator.sample import SIGMA_95
 
 _CHARTS = 400  # joints with a chart, the most urgent first; more would make the page too large

@@ -22,9 +22,8 @@ from distributed.scheduler import KilledWorker
 from distributed.security import Security
 
 from drivelink import __version__
-from drivelink.fleet.errors import FleetError
 from drivelink.fleet.joints import Joints, carried_joint
-from drivelink.fleet.storage import Source, Store, fetched
+from drivelink.fleet.storage import FleetError, Source, Store, fetched
 from drivelink.fleet.table import FleetTable
 from drivelink.fleet.task import Outcome, Task, broken_row, named_time, process, recorded_time
 

@@ -19,12 +19,18 @@ from uuid import uuid4
 import fsspec
 from fsspec.core import url_to_fs
 
-from drivelink.fleet.errors import FleetError
-from drivelink.infile import open_regular
-from drivelink.outfile import write_whole
+from drivelink.errors import DrivelinkError
+from drivelink.files import open_regular, write_whole
 from drivelink.recording.canlog import CAN_SUFFIXES
 from drivelink.recording.formats import FORMATS
 from drivelink.recording.mapping import side_file
+
+
+class FleetError(DrivelinkError):
+    """The scheduler, the joint folder or the result folder cannot be used."""
+
+    exit_status = 3
+
 
 _CHUNK = 1 << 20
 _MODIFIED = ("mtime", "LastModified", "last_modified", "Last-Modified", "time", "created")

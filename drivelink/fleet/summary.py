@@ -18,12 +18,15 @@ from drivelink.fleet.changes import (
     SeriesTest,
     appearance,
     changes,
+    iso,
+    lost,
+    parameters,
     q_values,
     series_test,
+    unusable,
+    usable,
 )
-from drivelink.fleet.rows import iso, lost, parameters, unusable, usable
-from drivelink.output.digits import with_interval
-from drivelink.output.units import in_words
+from drivelink.output.numbers import in_words, with_interval
 from estimator.sample import SIGMA_95, FloatArray
 from estimator.transmissions import MODELS
 

@@ -20,8 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from drivelink.fleet.analysis import NAMED
-from drivelink.fleet.errors import FleetError
-from drivelink.fleet.storage import Source, Store
+from drivelink.fleet.storage import FleetError, Source, Store
 
 FOLDER = "table"
 

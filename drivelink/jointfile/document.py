@@ -2,24 +2,109 @@
 
 from __future__ import annotations
 
+import dataclasses
+import difflib
 import hashlib
 import json
 import logging
 import re
 import tomllib
-from dataclasses import dataclass
+import typing
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import tomlkit
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 from tomlkit.container import Container
 
 from drivelink.errors import JointFileError
-from drivelink.infile import read_regular
-from drivelink.jointfile.keyhint import unknown_key
+from drivelink.files import read_regular, write_whole
 from drivelink.jointfile.schema import JointFile
-from drivelink.outfile import write_whole
+from estimator.model import Effect, JointModel, Motor, ParameterValue
+
+_DIGITS = 9  # of a covariance
+
+
+def changes_to(model: JointModel) -> dict[str, Any]:
+    """Return the changes of `write_model` that put a model's numbers and their uncertainty
+    into a joint file.
+    """
+    changes: dict[str, Any] = {"motor": [_motor(motor) for motor in model.motors]}
+    link = link_entry(model)
+    return changes | ({"link": link} if link else {})
+
+
+def link_entry(model: JointModel) -> dict[str, Any]:
+    """Return table [link]: dynamics, effects of link and encoder."""
+    link: dict[str, Any] = {}
+    if model.link is not None:
+        link["dynamics"] = {name: x for name, x in asdict(model.link).items() if x is not None}
+    if model.link_effects:
+        link["effect"] = [effect_entry(effect) for effect in model.link_effects]
+    return link
+
+
+def effect_entry(effect: Effect) -> dict[str, Any]:
+    """Return one effect: name, parameters, and the standard deviations of those that were fitted."""
+    entry = {"name": effect.name, "parameters": plain_parameters(effect.parameters)}
+    return entry | ({"std": plain_parameters(effect.std)} if effect.std else {})
+
+
+def plain_parameters(parameters: Mapping[str, ParameterValue]) -> dict[str, float | list[float]]:
+    """Return the parameters as a file has them: numbers and lists of numbers."""
+    return {name: list(v) if isinstance(v, tuple) else float(v) for name, v in parameters.items()}
+
+
+def _motor(motor: Motor) -> dict[str, Any]:
+    names = (
+        "inertia_kg_m2", "inertia_std_relative", "viscous_damping_nm_s_rad", "viscous_damping_std_nm_s_rad"
+    )  # fmt: skip
+    entry: dict[str, Any] = {name: x for name in names if (x := getattr(motor, name)) is not None}
+    own = motor.transmission
+    if own.parameters:
+        entry["transmission"] = {"model": own.model, "parameters": plain_parameters(own.parameters)}
+        if own.order is not None:
+            entry["transmission"]["order"] = own.order
+        if own.covariance is not None:
+            rows = [[float(f"{x:.{_DIGITS}g}") for x in row] for row in own.covariance]
+            entry["transmission"]["covariance"] = rows
+    if motor.effects:
+        entry["effect"] = [effect_entry(effect) for effect in motor.effects]
+    return entry
+
+
+def unknown_key(root: type, location: tuple[int | str, ...]) -> str:
+    """Return the message for an unknown key, from the keys of its table."""
+    section: Any = root
+    for part in location[:-1]:
+        if isinstance(part, str):
+            section = _table(_keys(section).get(part))
+    known = list(_keys(section))
+    close = difflib.get_close_matches(str(location[-1]), known, n=1)
+    if close:
+        return f"unknown key, did you mean {close[0]}?"
+    return f"unknown key, expected one of {', '.join(known)}" if known else "unknown key"
+
+
+def _keys(section: Any) -> dict[str, Any]:
+    """Name and annotation of each key of a table's schema."""
+    if isinstance(section, type) and issubclass(section, BaseModel):
+        return {name: info.annotation for name, info in section.model_fields.items()}
+    if dataclasses.is_dataclass(section) and isinstance(section, type):
+        hints = typing.get_type_hints(section)
+        return {field.name: hints[field.name] for field in dataclasses.fields(section)}
+    return {}
+
+
+def _table(annotation: Any) -> Any:
+    """The table's schema in an annotation like `tuple[MotorSection, ...]` or `Section | None`."""
+    if _keys(annotation):
+        return annotation
+    found = (_table(argument) for argument in typing.get_args(annotation))
+    return next((table for table in found if table is not None), None)
+
 
 _LOG = logging.getLogger(__name__)
 

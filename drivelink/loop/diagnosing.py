@@ -18,7 +18,7 @@ import numpy as np
 from drivelink import recording as recordings
 from drivelink.errors import DrivelinkError
 from drivelink.jointfile import JointFile, apply_diagnosis
-from drivelink.jointfile.residual_baseline import make_model_monitor
+from drivelink.jointfile.apply_diagnosis import make_model_monitor
 from drivelink.loop import finding
 from drivelink.loop.folder import proposal_file
 from drivelink.loop.words import summary

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from drivelink.errors import DrivelinkError, RecordingError
-from drivelink.infile import read_regular
+from drivelink.files import read_regular, write_whole
 from drivelink.loop.folder import event_of, finding_file, kept
-from drivelink.outfile import write_whole
-from drivelink.pubsub.inbound import MAX_BYTES, decode_document
+from drivelink.pubsub.feed import MAX_BYTES, decode_document
 
 SCHEMA = "drivelink.finding/1"
 DIAGNOSING = "diagnosing"

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from drivelink.jointfile import JointFile
 from drivelink.output import report
-from drivelink.output.units import Units
+from drivelink.output.numbers import Units
 from estimator.diagnosis import Diagnosis, Errors
 
 

@@ -1,4 +1,4 @@
-"""Data of a live view: the last seconds, decimated, and stiffness over deflection.
+"""Data of a live view: the last seconds, decimated, and stiffness over deflection, live and by the model.
 
 Fed with every estimate (a few microseconds each), read a few times a second.
 """
@@ -7,11 +7,16 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
+from estimator.errors import EstimatorError
 from estimator.sample import Status
+from estimator.transmissions import MODELS
 
 _BINS = 160
 _USABLE = int(Status.VALID | Status.OBSERVABLE)
@@ -218,3 +223,38 @@ def _relative(pairs: list[tuple[float, float]]) -> float:
     known = [(value, true) for value, true in pairs if math.isfinite(value) and math.isfinite(true)]
     power = sum(true**2 for _, true in known)
     return math.sqrt(sum((value - true) ** 2 for value, true in known) / power) if power else math.nan
+
+
+_POINTS = 60
+
+
+def model_curves(
+    model: Mapping[str, Any], curves: list[list[tuple[float, float, float]]]
+) -> list[list[tuple[float, float]]]:
+    """Return the stiffness of each transmission by the model in use, over the deflections seen so far.
+
+    Args:
+        curves: (deflection, stiffness, standard deviation) of each transmission, by deflection.
+
+    Returns:
+        (deflection, stiffness) of each, rad, N·m/rad; empty where its parameters are not known.
+    """
+    motors = model.get("motors")
+    known = motors if isinstance(motors, list) else ()
+    return [_curve(motor, points) for motor, points in zip(known, curves, strict=False)]
+
+
+def _curve(motor: Any, points: list[tuple[float, float, float]]) -> list[tuple[float, float]]:
+    # The document comes from the network: whatever cannot be evaluated is not drawn.
+    with suppress(EstimatorError, KeyError, TypeError, ValueError, AttributeError, OverflowError):
+        transmission = motor["transmission"]
+        parameters = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in transmission["parameters"].items()
+        }
+        if points and parameters:
+            law = MODELS[transmission["model"]]
+            phi = np.linspace(points[0][0], points[-1][0], _POINTS)
+            values = law.stiffness(phi, law.alpha(parameters))
+            if np.all(np.isfinite(values)):
+                return list(zip(phi.tolist(), values.tolist(), strict=True))
+    return []

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from drivelink.loop import finding as findings
 from drivelink.monitor.braille import gauge
-from drivelink.output.digits import number
+from drivelink.output.numbers import number
 from drivelink.plaintext import clean_text
 
 MODEL_ALARM_ADVICE = (

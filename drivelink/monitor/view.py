@@ -19,10 +19,9 @@ from rich.table import Table
 from rich.text import Text
 
 from drivelink.monitor.braille import DotPlot, sparkline
-from drivelink.monitor.history import JointHistory, TruePoint, usual_range
-from drivelink.monitor.modelcurve import model_curves
+from drivelink.monitor.history import JointHistory, TruePoint, model_curves, usual_range
 from drivelink.monitor.statuslines import MODEL_ALARM_ADVICE, shape, status_lines, status_text
-from drivelink.output.digits import number, value_and_interval, with_interval
+from drivelink.output.numbers import number, value_and_interval, with_interval
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from estimator.sample import SIGMA_95, Status
 

@@ -1,7 +1,7 @@
 """Collects the daemons' messages for the live views.
 
 Each joint follows one daemon, as a controller's subscription does. Everything passes
-`drivelink.pubsub.inbound`, so no network input ends a view or fills its memory.
+`drivelink.pubsub.feed`, so no network input ends a view or fills its memory.
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ import zenoh.ext
 from drivelink.errors import ZenohError
 from drivelink.monitor.view import JointView
 from drivelink.plaintext import clean_text
-from drivelink.pubsub.identity import MAX_CLAIMS, DaemonIdentity, source_of
-from drivelink.pubsub.inbound import DECODERS
-from drivelink.pubsub.names import PATIENCE_S, absent, ask
+from drivelink.pubsub.clientbase import PATIENCE_S, absent, ask
+from drivelink.pubsub.feed import DECODERS, MAX_CLAIMS, DaemonIdentity, source_of
 
 MAX_JOINTS = 64  # limit on joints shown, also against invented names
 _QUEUE = 8192

@@ -20,14 +20,13 @@ from typing import Any
 
 from drivelink.errors import UsageError, ZenohError
 from drivelink.loop import finding as findings
-from drivelink.monitor.history import Moment, Touch
-from drivelink.monitor.modelcurve import model_curves
+from drivelink.monitor.history import Moment, Touch, model_curves
 from drivelink.monitor.statuslines import Shown, shape
 from drivelink.monitor.view import JointView
 from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.webaccept import ACTIONS, WebAcceptance
-from drivelink.output.digits import number
-from drivelink.pubsub.inbound import decode_document
+from drivelink.output.numbers import number
+from drivelink.pubsub.feed import decode_document
 
 MAX_CONNECTIONS = 16
 MAX_STREAMS = 8

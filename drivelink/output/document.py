@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from drivelink.output import plots
-from drivelink.output.units import Units
+from drivelink.output.numbers import Units
 from estimator.model import ParameterValue
 
 PARAMETER_HEAD = ("parameter", "value", "± (95 %)", "unit")

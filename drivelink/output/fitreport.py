@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 
 from drivelink.errors import UsageError
 from drivelink.jointfile import JointFile, link_entry
-from drivelink.output import digits, plots
+from drivelink.output import plots
 from drivelink.output.document import PARAMETER_HEAD, Grid, Lines, Section, Share, parameter_rows
-from drivelink.output.units import Units, bare_name
+from drivelink.output.numbers import Units, bare_name, number
 from estimator.batch import TransmissionFit
 from estimator.identify import Identified
 from estimator.model import Effect
@@ -30,14 +30,14 @@ _Rows = list[tuple[str | Share, ...]]
 def sections(found: Identified, names: Sequence[str], units: Units) -> list[Section]:
     """Tabulate what was fitted."""
     made = []
-    for number, (one, motor) in enumerate(zip(found.fits, found.model.motors, strict=True), start=1):
+    for index, (one, motor) in enumerate(zip(found.fits, found.model.motors, strict=True), start=1):
         rows: _Rows = []
         for name, value in one.parameters.items():
             rows += parameter_rows(name, value, one.std[name], units)
         for name, key in (("inertia_kg_m2", "inertia"), ("viscous_damping_nm_s_rad", "damping")):
             rows += parameter_rows(name, getattr(motor, name), one.nuisance_std[key], units)
         rows += _effects(motor.effects, units)
-        title = f"motor {number}: {'rigid' if one.model == RIGID else one.model}"
+        title = f"motor {index}: {'rigid' if one.model == RIGID else one.model}"
         made.append(
             Section(title, [Grid(PARAMETER_HEAD, rows), Lines((_balance(one, units), *_remarks(one)))])
         )
@@ -69,7 +69,7 @@ def _effects(effects: Iterable[Effect], units: Units) -> _Rows:
 
 def _balance(one: TransmissionFit, units: Units) -> str:
     whole = "flexibility torque" if one.excited else "motor torque"
-    left = f"{digits.number(one.error_rms_nm, 3)} {units.shown('N·m')} rms left"
+    left = f"{number(one.error_rms_nm, 3)} {units.shown('N·m')} rms left"
     return f"torque balance: {left}, {_share(one)} of the {whole}"
 
 
@@ -110,11 +110,11 @@ def fit_plot(fits: Sequence[TransmissionFit], joint: JointFile) -> Figure:
     units = Units(joint.axis == "linear")
     figure = plots.blank(width=_WIDTH, height=_HEIGHT * len(flexible))
     parts = figure.subfigures(len(flexible), 1, squeeze=False)[:, 0]
-    for part, (number, one) in zip(parts, flexible, strict=True):
+    for part, (index, one) in zip(parts, flexible, strict=True):
         numbers = _numbers(one, units)
         more = ", …" if len(numbers) > _SHOWN else ""
-        left = f"residual {digits.number(one.error_rms_nm, 2)} {units.shown('N·m')} rms"
-        title = f"{joint.name}, motor {number} ({one.model}), {left}, {_share(one)} of the torque"
+        left = f"residual {number(one.error_rms_nm, 2)} {units.shown('N·m')} rms"
+        title = f"{joint.name}, motor {index} ({one.model}), {left}, {_share(one)} of the torque"
         title += f"\n{', '.join(numbers[:_SHOWN])}{more}"
         part.suptitle(title, fontsize=10, x=0.01, ha="left")
         grid = part.add_gridspec(2, 6, height_ratios=(2, 3))

@@ -22,7 +22,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.stats import binned_statistic
 
-from drivelink.outfile import write_whole
+from drivelink.files import write_whole
 from estimator.sample import SIGMA_95, FloatArray
 
 # Colours of Okabe and Ito (distinguishable with any colour vision), different in lightness for grey prints,
@@ -236,3 +236,36 @@ def _binned(curve: PlotCurve) -> PlotCurve:
     values = [y] if curve.std is None else [y, curve.std[finite]]
     middle = binned_statistic(x, values, "median", edges).statistic
     return PlotCurve((edges[1:] + edges[:-1]) / 2, *middle)
+
+
+def plot_curves(columns: Mapping[str, FloatArray], motors: int, path: Path, title: str) -> Path:
+    """Return the stiffness over deflection of each transmission; columns as in estimates.csv."""
+    figure, axes = new_figure(title, height=3.6)
+    seen = columns["observable"] > 0
+    curves = {
+        f"motor {i}": PlotCurve(
+            columns[f"motor{i}_deflection_rad"][seen],
+            columns[f"motor{i}_stiffness_nm_rad"][seen],
+            columns[f"motor{i}_stiffness_std_nm_rad"][seen],
+        )
+        for i in range(1, motors + 1)
+    }
+    stiffness_against_deflection(axes[0], curves, "Stiffness of the transmission, where observable")
+    return save(figure, path)
+
+
+def plot_over_time(columns: Mapping[str, FloatArray], path: Path, title: str) -> Path:
+    """Draw the joint's flexibility torque and stiffness over one time axis; gaps where each is not valid."""
+    figure, axes = new_figure(title, rows=2)
+    t = columns["time_s"]
+    valid = {name: np.where(columns["valid"] > 0, values, np.nan) for name, values in columns.items()}
+    axes[1].sharex(axes[0])
+    torque = np.where(columns["torque_valid"] > 0, columns["flexibility_torque_nm"], np.nan)
+    curve = PlotCurve(t, torque, columns["flexibility_torque_std_nm"])
+    over_time(axes[0], {"estimate": curve}, "torque / N·m", "Flexibility torque")
+    stiffness = PlotCurve(t, valid["stiffness_nm_rad"], valid["stiffness_std_nm_rad"])
+    over_time(axes[1], {"estimate": stiffness}, "stiffness / (N·m/rad)", "Stiffness")
+    low, high = np.nanpercentile(stiffness.y, [1, 99]) if np.any(np.isfinite(stiffness.y)) else (0.0, 1.0)
+    margin = 0.25 * (high - low) + 0.02 * abs(high)
+    axes[1].set_ylim(low - margin, high + margin)  # the wide band of the first samples would hide the rest
+    return save(figure, path)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from drivelink.outfile import write_whole
+from drivelink.files import write_whole
 from drivelink.output import plots
 from drivelink.output.document import (
     PARAMETER_HEAD,
@@ -26,7 +26,7 @@ from drivelink.output.document import (
     page,
     parameter_rows,
 )
-from drivelink.output.units import Units, in_words
+from drivelink.output.numbers import Units, in_words
 from estimator.choices import choice
 from estimator.diagnosis import Curve, Diagnosis, Finding, StiffnessCurve
 from estimator.effects import LIBRARY

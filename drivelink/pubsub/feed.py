@@ -1,19 +1,199 @@
-"""Bookkeeping of a subscriber: arrivals, sources and gaps of estimates.
+"""What a subscriber receives: validation of all input, whose messages count, and gaps of the estimates.
 
-Shared by the blocking and the asyncio client, without waiting. It processes zenoh's queue when the user calls
-a method, so that nothing runs while the user computes.
+Everything from the network passes here before a client, view or recorder uses it. Binary messages have the
+length of their layout. JSON documents are limited in bytes, depth, elements and text; their numbers are
+finite, and their texts contain no control or direction characters and no half surrogates.
+
+A daemon names its zenoh session in the liveliness token `<prefix>/<joint>/alive/<zid>`, and every message
+carries the session that wrote it. `DaemonIdentity` accepts one session with a token until the token is gone.
+Without tokens (a plain publisher, or access control) it accepts the session that writes first, until that is
+stale. A session can forge its identity. What stops that is TLS and access control:
+docs/how-to/secure-zenoh.md.
 """
 
 from __future__ import annotations
 
+import json
+import math
+import re
 from collections import deque
+from collections.abc import Callable, Mapping
 from enum import StrEnum
+from types import MappingProxyType
+from typing import Any
+
+import zenoh
 
 from drivelink.errors import ZenohError
-from drivelink.pubsub.identity import DaemonIdentity
-from drivelink.pubsub.inbound import DECODERS
-from drivelink.pubsub.wire import EstimateMessage
+from drivelink.plaintext import clean_text
+from drivelink.pubsub.wire import EstimateMessage, decode_estimate, decode_external, decode_sample
 from estimator.sample import Status
+
+MAX_BYTES = 1 << 20  # of a document; a status has some 3 kB, a model with its nodes some 10 kB
+MAX_DEPTH = 16
+MAX_ELEMENTS = 20_000  # numbers, texts and containers of a document
+MAX_KEY = 256  # characters of a name
+_LARGEST_INTEGER = 1 << 64
+_TOO_DEEP = f"document: expected at most {MAX_DEPTH} levels"
+
+
+def decode_document(payload: bytes) -> dict[str, Any]:
+    """Read a JSON document: `status`, `model`, `finding`.
+
+    Non-finite numbers and integers beyond 64 bits become None.
+
+    Raises:
+        ZenohError: it is too large, too deep, or not a JSON object.
+    """
+    if len(payload) > MAX_BYTES:
+        raise ZenohError(f"document: expected at most {MAX_BYTES} bytes, got {len(payload)}")
+    try:
+        document = json.loads(payload.decode("utf-8"))
+    except RecursionError:
+        raise ZenohError(_TOO_DEEP) from None
+    except ValueError as error:
+        raise ZenohError("document: expected JSON in UTF-8") from error
+    if not isinstance(document, dict):
+        raise ZenohError("document: expected a JSON object")
+    cleaned: dict[str, Any] = _Cleaner().clean(document, 0)
+    return cleaned
+
+
+class _Cleaner:
+    """Makes a parsed document safe, counting its elements."""
+
+    def __init__(self) -> None:
+        self._left = MAX_ELEMENTS
+
+    def clean(self, value: Any, depth: int) -> Any:
+        """Return the value made safe.
+
+        Raises:
+            ZenohError: it has too many elements or levels.
+        """
+        self._left -= 1
+        if self._left < 0:
+            raise ZenohError(f"document: expected at most {MAX_ELEMENTS} elements")
+        if isinstance(value, str):
+            return clean_text(value)
+        if isinstance(value, bool) or value is None:
+            return value
+        if isinstance(value, int):
+            return value if abs(value) <= _LARGEST_INTEGER else None
+        if isinstance(value, float):
+            return value if math.isfinite(value) else None
+        if depth == MAX_DEPTH:
+            raise ZenohError(_TOO_DEEP)
+        if isinstance(value, list):
+            return [self.clean(item, depth + 1) for item in value]
+        return {clean_text(key, MAX_KEY): self.clean(item, depth + 1) for key, item in value.items()}
+
+
+# The payloads of a joint's keys, by the last part of the key.
+DECODERS: Mapping[str, Callable[[bytes], Any]] = MappingProxyType(
+    {
+        "estimate": decode_estimate,
+        "external": decode_external,
+        "sample": decode_sample,
+        "status": decode_document,
+        "model": decode_document,
+        "finding": decode_document,
+    }
+)
+
+
+MAX_CLAIMS = (
+    4096  # limit on tokens of one joint; beyond it tokens are ignored, so that a flood locks nobody out
+)
+_ZID = re.compile(r"[0-9a-f]{1,32}")
+
+
+def source_of(sample: zenoh.Sample) -> str:
+    """Return the session that wrote a sample, or ""."""
+    info = sample.source_info
+    return str(info.source_id.zid) if info else ""
+
+
+class DaemonIdentity:
+    """The daemon of one joint, as seen by a subscriber.
+
+    `token` may be called from zenoh's thread, all else from the subscriber's.
+    """
+
+    def __init__(self) -> None:
+        self.bound: str | None = None  # the accepted session, or None
+        self.refused = 0  # messages of other sessions
+        self._vouched = False  # whether the bound session ever had a token
+        self._claims: set[str] = set()
+        self._plain = False  # whether the token without a session is there
+        self._overflow = False
+        self._seen = False
+
+    @property
+    def claims(self) -> frozenset[str]:
+        """Sessions that claim to be this joint's daemon."""
+        return frozenset(self._claims)
+
+    @property
+    def rivals(self) -> int:
+        """Number of other sessions that claim to be this joint's daemon."""
+        claims = self._claims
+        return max(0, len(claims) - (1 if self.bound in claims or self.bound is None else 0))
+
+    @property
+    def alive(self) -> bool:
+        """Whether the accepted session, or else any session, has a token."""
+        if self._vouched:
+            return self.bound in self._claims
+        return self._plain or bool(self._claims)
+
+    @property
+    def seen(self) -> bool:
+        """Whether a daemon was ever seen."""
+        return self._seen or self.bound is not None
+
+    def heard(self, token: zenoh.Sample) -> None:
+        """Take a liveliness token that appeared or vanished."""
+        session = str(token.key_expr).rpartition("/alive")[2].lstrip("/")
+        self.token(session, token.kind == zenoh.SampleKind.PUT)
+
+    def token(self, session: str, there: bool) -> None:
+        """A liveliness token appeared or vanished.
+
+        Args:
+            session: what follows `alive/` in its key; "" for the joint's own token.
+            there: whether it appeared.
+        """
+        self._seen = self._seen or there
+        if not session:
+            self._plain = there
+        elif not there:
+            self._claims.discard(session)
+        elif _ZID.fullmatch(session):
+            if len(self._claims) < MAX_CLAIMS:
+                self._claims.add(session)
+            else:
+                self._overflow = True
+
+    def accepts(self, source: str, stale: bool) -> bool:
+        """Return whether to accept a message of this session; the first accepted one binds to its session.
+
+        Args:
+            stale: whether the bound session is stale.
+        """
+        claims = self._claims
+        if source == self.bound and (self._vouched or source in claims or not claims):
+            self._vouched = self._vouched or source in claims
+            return True
+        free = self.bound is None or (self.bound not in claims if self._vouched else bool(claims) or stale)
+        vouched = source in claims or not claims or (self._overflow and stale)
+        if not (free and vouched):
+            self.refused += 1
+            return False
+        self.bound = source
+        self._vouched = source in claims
+        return True
+
 
 WAKE = b"drivelink.wake"  # attachment of a local message that ends a blocking receive
 _DRIFT = 1e-4  # drift between two clocks: 100 ppm

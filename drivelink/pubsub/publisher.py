@@ -25,8 +25,7 @@ from drivelink._core import Tick
 from drivelink.canopen.layout import NodeLayout, layout_document
 from drivelink.errors import ZenohError
 from drivelink.jointfile import JointFile, MotorSection
-from drivelink.pubsub.session import one_line
-from drivelink.pubsub.stream import Stream
+from drivelink.pubsub.session import Stream, one_line
 from drivelink.pubsub.wire import ESTIMATE, EXTERNAL, SAMPLE
 from drivelink.version import __version__
 from estimator.model import Effect

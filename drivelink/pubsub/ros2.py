@@ -19,8 +19,7 @@ import zenoh
 from drivelink._core import Tick
 from drivelink.errors import ZenohError
 from drivelink.jointfile import JointFile, Ros2Section
-from drivelink.pubsub.session import one_line
-from drivelink.pubsub.stream import Stream
+from drivelink.pubsub.session import Stream, one_line
 from drivelink.pubsub.wire import EXTERNAL_COLUMNS
 from estimator.sample import Estimate, External, ExternalStatus, Status
 

@@ -2,10 +2,12 @@
 
 Without a configuration file a daemon is a peer on loopback. The first one of a machine listens at the
 endpoint, `tcp/127.0.0.1:7447`; the others connect to it, so that a plain client there receives all of them.
-When the first one dies, `drivelink.pubsub.rendezvous` lets another one take over. Nothing listens beyond
-loopback or is multicast.
+Nothing listens beyond loopback or is multicast. A configuration file replaces all of these defaults.
 
-A configuration file replaces all of these defaults.
+When the first one dies, another takes over. Zenoh can retry a listener itself, but such a session takes ten
+seconds to close (1.10). Therefore a daemon that lost a connection checks whether anything answers at the
+endpoint; if not, it opens another session that only listens there. Daemons and clients keep reconnecting to
+the endpoint. A router is not replaced: it will restart.
 """
 
 from __future__ import annotations
@@ -14,6 +16,8 @@ import atexit
 import json
 import re
 import resource
+import socket
+import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,11 +25,133 @@ from typing import TYPE_CHECKING, Any
 import zenoh
 
 from drivelink.errors import ZenohError
-from drivelink.infile import read_regular
-from drivelink.pubsub.rendezvous import Rendezvous, answers
+from drivelink.files import read_regular
 
 if TYPE_CHECKING:
     from drivelink.jointfile import ZenohSection  # a subscriber need not wait for its validator's import
+
+
+class Stream:
+    """Puts bytes with the identity of the writing session."""
+
+    __slots__ = ("_listener", "_publisher", "_source", "wanted")
+
+    def __init__(self, publisher: zenoh.Publisher) -> None:
+        self._publisher = publisher
+        self._source = zenoh.SourceInfo(publisher.id, 0)
+        self.wanted = False  # whether there is a subscriber; set by zenoh's thread
+        # indirect=False: in zenoh's thread, which never keeps the process from ending
+        heard = zenoh.handlers.Callback(self._match, indirect=False)
+        self._listener = publisher.declare_matching_listener(heard)
+        before: Any = publisher.matching_status  # its stub says bool
+        self.wanted = self.wanted or before.matching
+
+    def _match(self, status: zenoh.MatchingStatus) -> None:
+        self.wanted = status.matching
+
+    def put(self, payload: bytes, attachment: bytes | None = None) -> None:
+        """Put a message; a full queue drops it unless the publisher waits."""
+        self._publisher.put(payload, attachment=attachment, source_info=self._source)
+
+
+_ATTEMPT_S = 0.2
+_LOOKS = 3  # consecutive answers required: a killed process loses its connections before its listener
+_CONNECT_S = 0.5
+
+
+def answers(endpoint: str) -> bool:
+    """Return whether anything accepts a TCP connection at the endpoint."""
+    address = _address(endpoint)
+    if address is None:
+        return False
+    try:
+        with socket.create_connection(address, timeout=_CONNECT_S):
+            return True
+    except OSError:
+        return False
+
+
+def _address(endpoint: str) -> tuple[str, int] | None:
+    match = re.fullmatch(r"(?:tcp|tls)/\[?([^\[\]#?]+?)\]?:(\d+)(?:[#?].*)?", endpoint)
+    return (match[1], int(match[2])) if match else None
+
+
+class Rendezvous:
+    """Takes over the endpoint of a dead daemon on this machine."""
+
+    def __init__(self, endpoint: str) -> None:
+        self._endpoint = endpoint
+        address = _address(endpoint)
+        self._here = address is not None and (address[0] == "localhost" or address[0].startswith("127."))
+        self._routed = False  # whether a router was ever there
+        self._closed = threading.Event()
+        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._session: zenoh.Session | None = None
+        self._listener: Any = None
+
+    def watch(self, session: zenoh.Session) -> None:
+        """Check the endpoint whenever this session loses a connection."""
+        if self._here:
+            # indirect=False: in zenoh's thread, which never keeps the process from ending
+            handler = zenoh.handlers.Callback(self._changed, indirect=False)
+            self._listener = session.info.declare_transport_events_listener(handler, history=True)
+
+    def close(self) -> None:
+        """Stop listening; a second time does nothing."""
+        self._closed.set()
+        with self._lock:
+            thread, session = self._thread, self._session
+            self._session = None
+        if thread is not None:
+            thread.join()
+        if session is not None:
+            session.close()  # type: ignore[no-untyped-call]
+
+    def _changed(self, event: zenoh.TransportEvent) -> None:
+        if event.transport.whatami == zenoh.WhatAmI.ROUTER:
+            self._routed = True
+        if event.kind != zenoh.SampleKind.DELETE or self._routed:
+            return
+        with self._lock:
+            busy = self._thread is not None and self._thread.is_alive()
+            if not busy and self._session is None and not self._closed.is_set():
+                self._thread = threading.Thread(target=self._follow, name="drivelink-rendezvous", daemon=True)
+                self._thread.start()
+
+    def _follow(self) -> None:
+        answered = 0
+        while answered < _LOOKS and not self._closed.wait(_ATTEMPT_S if answered else 0.0):
+            if answers(self._endpoint):
+                answered += 1
+            elif self._listen():
+                return
+            else:  # another daemon was quicker, or the port is not free yet
+                answered = 0
+                self._closed.wait(_ATTEMPT_S)
+
+    def _listen(self) -> bool:
+        config = zenoh.Config()
+        settings = {
+            "mode": "peer",
+            "listen/endpoints": [self._endpoint],
+            "scouting/multicast/enabled": False,
+            "adminspace/enabled": False,
+            "transport/shared_memory/enabled": False,
+        }
+        for key, value in settings.items():
+            config.insert_json5(key, json.dumps(value))
+        try:
+            session = zenoh.open(config)
+        except zenoh.ZError:
+            return False
+        with self._lock:
+            if not self._closed.is_set():
+                self._session = session
+                return True
+        session.close()  # type: ignore[no-untyped-call]
+        return True
+
 
 _MEETING_S = 2.0  # timeout of a local handshake, reached only if another program answers
 _POLL_S = 0.01

@@ -10,10 +10,9 @@ from pathlib import Path
 from drivelink.errors import RecordingError, UsageError
 from drivelink.jointfile import JointFile
 from drivelink.recording.canframes import is_frame_log, read_frame_record
-from drivelink.recording.columnmap import ColumnMap, column_map, renamed
-from drivelink.recording.columns import record_from_columns
+from drivelink.recording.columns import ColumnMap, column_map, record_from_columns, renamed
 from drivelink.recording.formats import FORMATS
-from drivelink.recording.mcapsamples import read_mcap
+from drivelink.recording.mcapfile import read_mcap
 from estimator.sample import Record
 
 __all__ = ["read"]

@@ -26,12 +26,11 @@ from drivelink.errors import DriveError, RecordingError
 from drivelink.jointfile import JointFile
 from drivelink.recording.canlog import CAN_SUFFIXES, NO_STAMP, LoggedFrame, in_order, read_frames
 from drivelink.recording.columns import sample_columns, sample_row
-from drivelink.recording.cycles import Cycle
+from drivelink.recording.cycles import Cycle, numbered_ahead, numbered_at_once
 from drivelink.recording.grid import report_gaps
 from drivelink.recording.limits import require_samples
 from drivelink.recording.mapping import recorded_layouts, side_file
 from drivelink.recording.mcapfile import message_fields, read_messages
-from drivelink.recording.syncnumbers import numbered_ahead, numbered_at_once
 from estimator.sample import FloatArray, Record
 
 _LOG = logging.getLogger("drivelink.recording")

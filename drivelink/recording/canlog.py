@@ -17,9 +17,8 @@ from typing import IO, Any, NamedTuple
 import can
 
 from drivelink.errors import RecordingError
-from drivelink.infile import open_regular
-from drivelink.recording.boundedlog import AscText, BlfBytes, TrcText
-from drivelink.recording.limits import MAX_LINE_BYTES, require_stamp
+from drivelink.files import open_regular
+from drivelink.recording.limits import MAX_LINE_BYTES, AscText, BlfBytes, TrcText, require_stamp
 
 _LOG = logging.getLogger("drivelink.recording")
 

@@ -1,19 +1,238 @@
-"""The formats of recordings, by the ending of the file's name: reader of columns, writer."""
+"""The formats of recordings, by the ending of the file's name: reader of columns (CSV, MF4), writer.
+
+A file is read in blocks of lines; only the numbers of known columns are kept in memory.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import csv
+import io
+import logging
+import re
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, NamedTuple
+
+import numpy as np
 
 from drivelink.errors import RecordingError
+from drivelink.files import open_regular
 from drivelink.jointfile import JointFile
+from drivelink.jointfile.columns import COLUMNS
 from drivelink.recording.canlog import CAN_FORMATS
-from drivelink.recording.columnmap import ColumnMap
-from drivelink.recording.csvfile import read_csv_columns
-from drivelink.recording.mf4file import read_mf4_columns
+from drivelink.recording.columns import ColumnMap
+from drivelink.recording.limits import MAX_COLUMNS, MAX_LINE_BYTES, require_samples
 from drivelink.recording.sinks import CanSink, CsvSink, McapSink, Sink
 from estimator.sample import FloatArray
+
+_LOG = logging.getLogger("drivelink.recording")
+
+_EMPTY = re.compile(rb"(?:(?<=,)|(?<=\n)|^)[ \t]*(?:null|none|n/a|na|-)?[ \t\r]*(?=,|\n|$)", re.IGNORECASE)
+_BLOCK = 1 << 22  # bytes per read
+
+
+def read_csv_columns(path: Path, names: ColumnMap) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
+    """Read the known columns (docs/reference/recordings.md); an empty cell is NaN.
+
+    Accepts comma, semicolon or tab as separator, decimal commas with the latter two, a byte-order mark and
+    `#` comments before the header. A last line without end is omitted, because it may be incomplete.
+
+    Args:
+        names: columns with other names in the file.
+
+    Returns:
+        (rows,) values of each by its name in the file, and the names of the others.
+
+    Raises:
+        RecordingError: no header, a cell that is not a number, a line with another number of columns, or too
+            many lines or columns.
+    """
+    try:
+        with open_regular(path) as file:
+            return _read(file, path, names)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def _read(file: IO[bytes], path: Path, names: ColumnMap) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
+    header, first_line = _header(file, path)
+    layout = _layout(header, path, names)
+    tables: list[FloatArray] = []
+    rows = 0
+    for block, line in _blocks(file, path, first_line):
+        if block.strip():
+            table = _numbers(layout.with_commas(block), layout, path, line)
+            rows += len(table)
+            require_samples(rows, str(path))
+            tables.append(table)
+    if not rows:
+        raise RecordingError(f"{path}: expected samples below the header, got none")
+    columns: dict[str, FloatArray] = {}
+    for k, name in enumerate(layout.used):
+        columns[name] = np.concatenate([table[:, k] for table in tables])
+    ignored = tuple(name for name in layout.names if name not in columns)
+    return columns, ignored
+
+
+class _Layout(NamedTuple):
+    """The columns of a file."""
+
+    names: tuple[str, ...]  # of all of them
+    used: tuple[str, ...]  # of those that are read
+    places: tuple[int, ...]  # their indices
+    separator: bytes  # between columns
+
+    def with_commas(self, block: bytes) -> bytes:
+        """Return the lines with commas between their columns and points in their numbers."""
+        if self.separator != b",":
+            block = block.replace(b",", b".").replace(self.separator, b",")
+        return block.replace(b"\r\n", b"\n")
+
+
+def _header(file: IO[bytes], path: Path) -> tuple[str, int]:
+    """Header line, and the number of the line after it."""
+    number = 0
+    while line := file.readline(MAX_LINE_BYTES + 1):
+        if not number:
+            if line.startswith((b"\xff\xfe", b"\xfe\xff")):
+                raise RecordingError(f"{path}: expected UTF-8 text, got UTF-16 (save it as plain CSV)")
+            line = line.removeprefix(b"\xef\xbb\xbf")
+        number += 1
+        if len(line) > MAX_LINE_BYTES:
+            raise RecordingError(f"{path}: line {number}: expected at most {MAX_LINE_BYTES >> 10} KiB")
+        if line.strip() and not line.lstrip().startswith(b"#"):
+            if b"\0" in line:
+                break
+            return line.decode("utf-8", errors="replace").strip(), number + 1
+    raise RecordingError(f"{path}: expected a CSV file with a line of column names, got no text")
+
+
+def _layout(header: str, path: Path, wanted: ColumnMap) -> _Layout:
+    separator = max(",;\t", key=header.count)
+    if (count := header.count(separator) + 1) > MAX_COLUMNS:
+        raise RecordingError(f"{path}: expected at most {MAX_COLUMNS} columns, got {count}")
+    names = tuple(name.strip().strip("\"'").strip() for name in header.split(separator))
+    sources = {source.column for source in wanted.values()}
+    used = tuple(name for name in names if name in COLUMNS or name in sources)
+    if not used:
+        raise RecordingError(
+            f"{path}: expected a header with time_s, motor1_position_rad, motor1_torque_nm, …, "
+            f"got {header[:60]!r} (--map SOURCE=COLUMN[:UNIT] names columns of others)"
+        )
+    twice = {name for name in names if name and names.count(name) > 1}
+    if twice:
+        raise RecordingError(f"{path}: column {min(twice)} appears twice")
+    return _Layout(names, used, tuple(map(names.index, used)), separator.encode())
+
+
+def _blocks(file: IO[bytes], path: Path, line: int) -> Iterator[tuple[bytes, int]]:
+    """Blocks of whole lines with the number of the first; text after the last line end is omitted."""
+    rest, padding = b"", False
+    while data := file.read(_BLOCK):
+        if not data.strip(b"\0"):
+            padding = True  # padding after a power loss
+            continue
+        end = data.rfind(b"\n") + 1
+        if padding or (not end and len(rest) + len(data) > MAX_LINE_BYTES):
+            raise RecordingError(f"{path}: line {line}: expected at most {MAX_LINE_BYTES >> 10} KiB")
+        if end:
+            yield rest + data[:end], line
+            line += data.count(b"\n")
+            rest = data[end:]
+        else:
+            rest += data
+    if rest.strip(b" \t\r\0"):
+        _LOG.warning("%s: the last line has no end and is omitted: it may be truncated", path)
+
+
+def _numbers(block: bytes, layout: _Layout, path: Path, first_line: int) -> FloatArray:
+    """(rows, used columns) numbers of some lines."""
+    even = _even(block, len(layout.names))
+    for attempt in ("as it is", "with empty cells filled") if even else ():
+        text = block if attempt == "as it is" else _EMPTY.sub(b"nan", block.rstrip())
+        try:
+            return np.loadtxt(
+                io.BytesIO(text),
+                dtype=np.float64,
+                delimiter=",",
+                ndmin=2,
+                comments="#",
+                quotechar='"',
+                usecols=layout.places,
+            )
+        except ValueError:
+            continue
+    raise RecordingError(_wrong_line(block, layout, path, first_line))
+
+
+def _even(block: bytes, width: int) -> bool:
+    """Whether every line has so many columns, which a reader of some columns does not check."""
+    if b"#" in block or b'"' in block or b"\n\n" in block or block.startswith(b"\n"):
+        lines = (line.partition("#")[0] for line in io.StringIO(block.decode("utf-8", errors="replace")))
+        try:
+            return all(len(cells) == width for cells in csv.reader(lines) if "".join(cells).strip())
+        except csv.Error:  # a cell too long
+            return False
+    data = np.frombuffer(block, dtype=np.uint8)
+    commas = np.flatnonzero(data == ord(","))
+    ends = np.flatnonzero(data == ord("\n"))
+    each = np.diff(np.searchsorted(commas, ends), prepend=0)
+    return bool(np.all(each == width - 1))
+
+
+def _wrong_line(block: bytes, layout: _Layout, path: Path, first_line: int) -> str:
+    """Find the wrong line and cell after the fast reader failed."""
+    for number, line in enumerate(block.split(b"\n"), first_line):
+        text = line.decode("utf-8", errors="replace").partition("#")[0]
+        if not text.strip():
+            continue
+        try:
+            cells = next(csv.reader([text]))
+        except csv.Error as error:
+            return f"{path}: line {number}: {error}"
+        if len(cells) != len(layout.names):
+            return f"{path}: line {number}: expected {len(layout.names)} columns, got {len(cells)}"
+        for name, place in zip(layout.used, layout.places, strict=True):
+            try:
+                float(cells[place].strip() or "nan")
+            except ValueError:
+                return f"{path}: line {number}: {name}: expected a number, got {cells[place].strip()[:40]!r}"
+    return f"{path}: cannot be read as CSV"
+
+
+def read_mf4_columns(path: Path, names: ColumnMap) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
+    """Read the channels named like the CSV columns, at the times of the first one, held in between.
+
+    Args:
+        names: columns with other names in the file.
+
+    Returns:
+        (rows,) values of each by its name in the file; no names of others.
+
+    Raises:
+        RecordingError: asammdf is not installed, or the file cannot be read.
+    """
+    try:
+        from asammdf import MDF
+    except ImportError as error:
+        raise RecordingError(f'{path}: MF4 needs asammdf: pip install "drivelink-vsa[mf4]"') from error
+    wanted = {source.column for source in names.values()} | COLUMNS - {"time_s"}
+    try:
+        open_regular(path).close()
+        with MDF(path) as mdf:
+            for group in mdf.groups:
+                require_samples(group.channel_group.cycles_nr, str(path))
+            signals = mdf.select([name for name in mdf.channels_db if name in wanted])
+        if not signals:
+            raise RecordingError(f"{path}: expected channels named motor1_position_rad, …, found none")
+        times = signals[0].timestamps
+        columns = {one.name: one.interp(times, 0, 0).samples for one in signals}
+    except RecordingError:
+        raise
+    except Exception as error:  # asammdf raises whatever a broken byte leads it to
+        raise RecordingError(f"{path}: cannot be read as MF4: {error}") from error
+    return {k: np.asarray(v, dtype=np.float64) for k, v in {"time_s": times, **columns}.items()}, ()
+
 
 Columns = tuple[dict[str, FloatArray], tuple[str, ...]]
 

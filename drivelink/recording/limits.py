@@ -1,12 +1,18 @@
-"""Memory limits of recordings, checked before allocation.
+"""Memory limits of recordings, checked before allocation, and bounded input of python-can's readers.
 
 A file declares the lengths of its parts and may declare anything. Real recordings are far below these limits
-(docs/reference/recordings.md).
+(docs/reference/recordings.md). python-can's readers accept lines and containers of any length, read a PCAN
+trace of an unknown version as version 1.0, and ignore relative stamps of an ASC file.
 """
 
 from __future__ import annotations
 
+import io
+import logging
+import re
+import zlib
 from pathlib import Path
+from typing import IO
 
 from drivelink.errors import RecordingError
 
@@ -38,3 +44,125 @@ def require_stamp(stamp_ns: int, path: Path) -> None:
     """
     if stamp_ns > _LAST_STAMP_NS:
         raise RecordingError(f"{path}: expected stamps below 2^63 ns, got {stamp_ns:.3g}")
+
+
+_LOG = logging.getLogger("drivelink.recording")
+
+_DEFLATE_RATIO = 1032  # of zlib at its best
+_CONTAINER_HEAD = 16  # header bytes of a BLF container
+_STAMP = re.compile(r"^[ \t]*(\d{1,12}\.\d{1,12})(?=[ \t])")
+_RELATIVE = re.compile(r"^\s*base\s+\w+\s+timestamps\s+relative", re.IGNORECASE)
+# time CANFD channel Rx identifier [name] BRS ESI DLC length duration bits flags …, of a frame without data
+_EMPTY_FD = re.compile(
+    r"^\s*(\S+)\s+CANFD\s+(\d+)\s+(\w+)\s+(\w+)(?:\s+\w*[^\W01]\w*)?\s+[01]\s+[01]\s+0\s+0"
+    r"\s+\d+\s+\d+\s+([0-9A-Fa-f]+)(?:\s|$)"
+)
+_REMOTE = 0x10  # among these flags
+_TRC_VERSIONS = ("1.0", "1.1", "1.2", "1.3", "2.0", "2.1")
+
+
+class BlfBytes(io.BufferedIOBase):
+    """The bytes of a BLF file, with limits on packed and unpacked containers."""
+
+    def __init__(self, file: IO[bytes], path: Path) -> None:
+        super().__init__()
+        self._file, self._path = file, path
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read so many bytes.
+
+        Raises:
+            RecordingError: a container exceeds the limit.
+        """
+        if size is None or not 0 <= size <= MAX_BLOCK_BYTES:
+            raise self._too_large()
+        data = self._file.read(size)
+        if len(data) * _DEFLATE_RATIO > MAX_BLOCK_BYTES:
+            unpacker = zlib.decompressobj()
+            try:
+                unpacker.decompress(data[_CONTAINER_HEAD:], MAX_BLOCK_BYTES)
+            except zlib.error:
+                return data  # not packed
+            if unpacker.unconsumed_tail:
+                raise self._too_large()
+        return data
+
+    def _too_large(self) -> RecordingError:
+        return RecordingError(
+            f"{self._path}: expected containers of at most {MAX_BLOCK_BYTES >> 20} MiB, got a larger one"
+        )
+
+
+class _Text(io.TextIOBase):
+    """The lines of a log; an incomplete last line is omitted."""
+
+    def __init__(self, file: IO[bytes], path: Path) -> None:
+        super().__init__()
+        self._file, self._path = file, path
+        self._number = 0
+
+    def readline(self, size: int = -1, /) -> str:  # type: ignore[override]
+        """Return the next line in the reader's form; "" at the end.
+
+        Raises:
+            RecordingError: it is too long, or of an unknown version.
+        """
+        line = self._file.readline(MAX_LINE_BYTES + 1)
+        self._number += 1
+        if len(line) > MAX_LINE_BYTES:
+            raise RecordingError(
+                f"{self._path}: line {self._number}: expected at most {MAX_LINE_BYTES >> 10} KiB"
+            )
+        if not line.endswith(b"\n"):
+            if line.strip():
+                _LOG.warning("%s: the last line has no end and is omitted: it may be truncated", self._path)
+            return ""
+        return self._known(line.decode(errors="replace"))
+
+    def _known(self, line: str) -> str:
+        """The line in the reader's form."""
+        raise NotImplementedError
+
+
+class AscText(_Text):
+    """An ASC file with relative stamps converted to absolute ones."""
+
+    def __init__(self, file: IO[bytes], path: Path) -> None:
+        super().__init__(file, path)
+        self._relative = False
+        self._total = 0.0
+
+    def _known(self, line: str) -> str:
+        if _RELATIVE.match(line):
+            self._relative = True
+        elif self._relative and (stamp := _STAMP.match(line)):
+            self._total += float(stamp[1])
+            line = f"{self._total:.9f}{line[stamp.end() :]}"
+        if (empty := _EMPTY_FD.match(line)) and not int(empty[5], 16) & _REMOTE:
+            return f"{empty[1]} {empty[2]} {empty[4]} {empty[3]} d 0\n"  # else it is read as a remote frame
+        return line
+
+
+class TrcText(_Text):
+    """A PCAN trace; version 1.2 lacks the empty column before the length of version 1.3."""
+
+    def __init__(self, file: IO[bytes], path: Path) -> None:
+        super().__init__(file, path)
+        self._without_column = False
+
+    def _known(self, line: str) -> str:
+        line = line.lstrip("\ufeff")
+        if line.startswith(";$FILEVERSION"):
+            version = line.partition("=")[2].strip()
+            if version not in _TRC_VERSIONS:
+                raise RecordingError(
+                    f"{self._path}: expected a PCAN trace of version {', '.join(_TRC_VERSIONS)}, "
+                    f"got {version[:20]!r}"
+                )
+            if version == "1.2":
+                self._without_column = True
+                return ";$FILEVERSION=1.3\n"
+        elif self._without_column and not line.startswith(";"):
+            cells = line.split(maxsplit=5)
+            return " ".join([*cells[:5], "-", *cells[5:]]).rstrip() + "\n" if len(cells) > 5 else line
+        return line

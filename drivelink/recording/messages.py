@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from drivelink.output.units import Units, bare_name
+from drivelink.output.numbers import Units, bare_name
 from drivelink.pubsub.wire import EXTERNAL_COLUMNS, EstimateMessage, ExternalMessage
 from drivelink.recording.columns import sample_columns, sample_row
 from estimator.sample import SIGMA_95, External, ExternalStatus, Sample, Status, TransmissionEstimate

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from drivelink.errors import RecordingError
-from drivelink.outfile import NewFile
-from drivelink.output.digits import with_interval
+from drivelink.files import NewFile
+from drivelink.output.numbers import with_interval
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.recording.messages import (
     estimate_columns,
@@ -219,7 +219,7 @@ class Summary:
 
     def plot(self, folder: Path, title: str) -> list[Path]:
         """Write stiffness over deflection, and torque and stiffness over time."""
-        from drivelink.recording.estimateplots import plot_curves, plot_over_time  # matplotlib on demand
+        from drivelink.output.plots import plot_curves, plot_over_time  # matplotlib on demand
 
         folder.mkdir(parents=True, exist_ok=True)
         table = np.frombuffer(self._values, dtype=np.float64).reshape(-1, self._width)

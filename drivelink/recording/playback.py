@@ -15,10 +15,9 @@ from drivelink.cycle.pipeline import build
 from drivelink.jointfile import JointFile
 from drivelink.recording import read
 from drivelink.recording.canframes import FrameLog, is_frame_log
-from drivelink.recording.columnmap import ColumnMap
+from drivelink.recording.columns import ColumnMap
 from drivelink.recording.cycles import Cycle, estimated
-from drivelink.recording.mcapfile import SNAPSHOT, read_attachment
-from drivelink.recording.mcapsamples import recorded_cycles
+from drivelink.recording.mcapfile import SNAPSHOT, read_attachment, recorded_cycles
 from estimator.sample import Sample
 
 _LOG = logging.getLogger("drivelink.recording")

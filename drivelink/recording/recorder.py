@@ -20,14 +20,12 @@ import zenoh.ext
 
 from drivelink.canopen.layout import NodeLayout
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cycle.framesource import BusLostError
-from drivelink.cycle.sources import open_source
+from drivelink.cycle.sources import BusLostError, open_source
 from drivelink.errors import BusError, ZenohError
 from drivelink.jointfile import JointFile
-from drivelink.pubsub.identity import DaemonIdentity, source_of
-from drivelink.pubsub.inbound import DECODERS
+from drivelink.pubsub.feed import DECODERS, DaemonIdentity, source_of
 from drivelink.recording.canlog import LoggedFrame
-from drivelink.recording.framesamples import FrameSamples
+from drivelink.recording.cycles import FrameSamples
 from drivelink.recording.limits import MAX_BLOCK_BYTES
 from drivelink.recording.sinks import Sink
 from estimator.sample import Sample

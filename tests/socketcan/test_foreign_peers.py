@@ -15,8 +15,7 @@ from drivelink._core import SYNC_COB_ID, Assembler
 from drivelink.canopen.bus import interface_is_up, open_bus
 from drivelink.canopen.layout import Signal
 from drivelink.canopen.passive import PassiveConfigurator
-from drivelink.cycle.framesource import OVERFLOW
-from drivelink.cycle.socketcan import SocketCanSource
+from drivelink.cycle.sources import OVERFLOW, SocketCanSource
 from drivelink.cycle.syncclock import SyncClock, measure_period
 from drivelink.jointfile import BusSection, parse
 

@@ -17,9 +17,7 @@ from daemonkit import running, vsa, vsa_text
 from zenohkit import LIMIT_S, free_endpoint, until
 
 from drivelink.canopen.bus import interface_is_up, open_bus
-from drivelink.cycle.framesource import BusLostError
-from drivelink.cycle.socketcan import SocketCanSource
-from drivelink.cycle.sources import open_source
+from drivelink.cycle.sources import BusLostError, SocketCanSource, open_source
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simbus import open_sim_bus
 from drivelink.demo.simulate import network_from_joint

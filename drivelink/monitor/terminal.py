@@ -1,16 +1,23 @@
-"""Several joints in the terminal, one line each."""
+"""The terminal of a view: several joints, one line each; single keys without Enter."""
 
 from __future__ import annotations
 
 import math
+import os
+import select
+import sys
+import termios
+import tty
 from collections.abc import Mapping
+from types import TracebackType
+from typing import Any, Self
 
 from rich.table import Table
 from rich.text import Text
 
 from drivelink.monitor.braille import sparkline
 from drivelink.monitor.view import ESTIMATE, JointView, half_interval
-from drivelink.output.digits import number, value_and_interval
+from drivelink.output.numbers import number, value_and_interval
 
 
 def joints_table(views: Mapping[str, JointView], width: int) -> Table:
@@ -44,3 +51,35 @@ def joints_table(views: Mapping[str, JointView], width: int) -> Table:
             cells.append(Text(*worst[0]) if worst else Text(view.state or "valid", style="green"))
         table.add_row(*cells)
     return table
+
+
+class Keys:
+    """Keys pressed in the terminal on standard input; none without a terminal."""
+
+    def __init__(self) -> None:
+        self._before: list[Any] | None = None
+        self._terminal = -1
+
+    def __enter__(self) -> Self:
+        if sys.stdin.isatty():
+            self._terminal = sys.stdin.fileno()
+            self._before = termios.tcgetattr(self._terminal)
+            tty.setcbreak(self._terminal)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._before is not None:
+            termios.tcsetattr(self._terminal, termios.TCSADRAIN, self._before)
+
+    @property
+    def there(self) -> bool:
+        """Whether there is a terminal."""
+        return self._before is not None
+
+    def pressed(self) -> str:
+        """Return the keys pressed since the last call; an arrow or function key gives several characters."""
+        if self._before is None or not select.select([self._terminal], [], [], 0)[0]:
+            return ""
+        return os.read(self._terminal, 64).decode("utf-8", "replace")

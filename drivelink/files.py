@@ -1,7 +1,8 @@
-"""Writes files atomically, without replacing existing files or inputs unasked.
+"""Opens input files, and writes files atomically, without replacing existing files or inputs unasked.
 
-A file is written under a temporary name in the same folder, synced and renamed, so that either the old or the
-new file exists, never a part.
+Input is of regular files only, where a device or a pipe would hang or never end. A file is written under a
+temporary name in the same folder, synced and renamed, so that either the old or the new file exists, never a
+part.
 
 For all verbs: a named file (`--out FILE`, `--write`, `new PATH`) is replaced only with `--force`, an input
 never. Files of a results folder (`--out DIR`, `--plots DIR`) are replaced by each run.
@@ -10,6 +11,7 @@ never. Files of a results folder (`--out DIR`, `--plots DIR`) are replaced by ea
 from __future__ import annotations
 
 import errno
+import io
 import os
 import secrets
 import stat
@@ -18,6 +20,33 @@ from contextlib import suppress
 from pathlib import Path
 
 from drivelink.errors import UsageError
+
+
+def open_regular(path: Path) -> io.BufferedReader:
+    """Open a file for reading bytes.
+
+    Raises:
+        OSError: it cannot be opened, or is a folder, a device, a pipe or a socket.
+    """
+    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # of a pipe, O_NONBLOCK returns at once
+    if not stat.S_ISREG(os.fstat(fd).st_mode):
+        os.close(fd)
+        raise OSError(0, "expected a regular file", str(path))
+    return os.fdopen(fd, "rb")
+
+
+def read_regular(path: Path, most_bytes: int) -> bytes:
+    """Return the content of a file.
+
+    Raises:
+        OSError: as `open_regular`, or it is larger than `most_bytes`.
+    """
+    with open_regular(path) as file:
+        data = file.read(most_bytes + 1)
+    if len(data) > most_bytes:
+        raise OSError(0, f"expected at most {most_bytes >> 10} KiB, got more", str(path))
+    return data
+
 
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
 

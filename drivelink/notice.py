@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from enum import IntEnum
 
 from drivelink.plaintext import clean_text
@@ -45,6 +45,33 @@ class Notice:
     def as_dict(self) -> dict[str, str]:
         """Return for JSON: the severity by name."""
         return {**asdict(self), "severity": self.severity.name.lower()}
+
+
+@dataclass(slots=True)
+class Findings:
+    """A list of notices to add to, by severity."""
+
+    notices: list[Notice] = field(default_factory=list, kw_only=True)
+
+    def add(self, severity: Severity, subject: str, text: str, fix: str = "") -> None:
+        """Add a notice."""
+        self.notices.append(Notice(severity=severity, subject=subject, text=text, fix=fix))
+
+    def ok(self, subject: str, text: str) -> None:
+        """Add a passed check."""
+        self.add(Severity.OK, subject, text)
+
+    def info(self, subject: str, text: str, fix: str = "") -> None:
+        """Add a remark."""
+        self.add(Severity.INFO, subject, text, fix)
+
+    def warn(self, subject: str, text: str, fix: str = "") -> None:
+        """Add what someone should look at."""
+        self.add(Severity.WARNING, subject, text, fix)
+
+    def error(self, subject: str, text: str, fix: str = "") -> None:
+        """Add what prevents operation."""
+        self.add(Severity.ERROR, subject, text, fix)
 
 
 def log_notices(logger: logging.Logger, findings: tuple[Notice, ...] | list[Notice]) -> None:

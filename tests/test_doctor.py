@@ -421,7 +421,7 @@ def test_too_few_files_are_said(monkeypatch, limit, severity):
 
 def test_text_of_devices_is_shown_as_it_is():
     report = Report()
-    report.section("A").say(Severity.WARNING, "node 1", "called [bold]x[/nonsense]", "echo '[red]'")
+    report.section("A").warn("node 1", "called [bold]x[/nonsense]", "echo '[red]'")
     console = Console(width=100, record=True, file=None)
     with console.capture() as capture:
         report.show(console)

@@ -15,7 +15,7 @@ from typing import Any
 
 from drivelink.errors import BusError, JointFileError
 from drivelink.jointfile import BusSection, DriveSection, EncoderSection, JointFile, TpdoSection
-from drivelink.notice import Notice, Severity
+from drivelink.notice import Findings, Notice
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -231,25 +231,20 @@ def _tpdo_from(document: Mapping[str, Any]) -> TpdoLayout:
 
 
 @dataclass(slots=True, kw_only=True)
-class Offer:
-    """What a node can give."""
+class Offer(Findings):
+    """What a node can give; disagreements and remarks on it."""
 
     # for each signal the objects that can give it, best first
     candidates: dict[Signal, tuple[MappedObject, ...]] = field(default_factory=dict)
     # the same for cross-checks: not mapped, but read if the node maps them
     checks: dict[Signal, tuple[MappedObject, ...]] = field(default_factory=dict)
     missing: dict[Signal, str] = field(default_factory=dict)  # for a signal with no candidate, why
-    notices: list[Notice] = field(default_factory=list)  # disagreements and remarks
 
     @property
     def readable(self) -> dict[Signal, tuple[MappedObject, ...]]:
         """All objects for decoding, candidates first."""
         rest = {signal: objects for signal, objects in self.checks.items() if signal not in self.candidates}
         return {**self.candidates, **rest}
-
-    def say(self, severity: Severity, subject: str, text: str, fix: str = "") -> None:
-        """Add a remark."""
-        self.notices.append(Notice(severity=severity, subject=subject, text=text, fix=fix))
 
 
 CAPACITY = 1.0  # of the bit rate, worst-case stuffing

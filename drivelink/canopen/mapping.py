@@ -29,7 +29,7 @@ from drivelink.canopen.pdo import (
 )
 from drivelink.canopen.sdo import Nmt, Pause, Program, Read, SdoAbort, Write, abort_text
 from drivelink.errors import DriveError
-from drivelink.notice import Notice, Severity
+from drivelink.notice import Findings, Severity
 
 NMT_START = 0x01
 NMT_PRE_OPERATIONAL = 0x80
@@ -66,7 +66,7 @@ class Mapper:
     tpdos: list[Tpdo]  # as they are in the node
     taken: set[int]  # identifiers in use elsewhere on the bus
     prefer_unused: bool  # see `tpdo_assignment.assign`
-    notices: list[Notice]  # remarks, added to
+    findings: Findings  # added to
     period_s: float = 0.001  # communication cycle, at which a TPDO is asked for that cannot be sent on SYNC
     # further signals that are read if they are mapped anyway
     readable: Mapping[Signal, Sequence[MappedObject]] = field(default_factory=dict)
@@ -102,9 +102,6 @@ class Mapper:
         """Node id."""
         return self.role.node_id
 
-    def _say(self, severity: Severity, text: str, fix: str = "") -> None:
-        self.notices.append(Notice(severity=severity, subject=self.role.subject, text=text, fix=fix))
-
     def _drop(self, available: dict[Signal, list[MappedObject]], refused: _ObjectRefused) -> None:
         signal = refused.candidate.signal
         index, subindex = refused.candidate.address
@@ -114,7 +111,8 @@ class Mapper:
             raise DriveError(
                 f"{self.role.subject} refuses the mapping: {text}, and it has no other object for {signal}"
             )
-        self._say(Severity.INFO if available[signal] else Severity.WARNING, text)
+        severity = Severity.INFO if available[signal] else Severity.WARNING
+        self.findings.add(severity, self.role.subject, text)
 
     def _replace(self, tpdo: Tpdo) -> None:
         self.tpdos[[other.number for other in self.tpdos].index(tpdo.number)] = tpdo
@@ -199,7 +197,7 @@ class Mapper:
 
     def _refuse(self, what: str, tpdo: Tpdo, abort: SdoAbort) -> None:
         answer = f"0x{abort.index:04X}:{abort.subindex:02X} answers {abort_text(abort.code)}"
-        self._say(Severity.INFO, f"TPDO{tpdo.number} {what} ({answer})")
+        self.findings.info(self.role.subject, f"TPDO{tpdo.number} {what} ({answer})")
         self._refusal = self._refusal or f"; writing {answer}"
 
     def _timing(self, tpdo: Tpdo) -> Program[None]:
@@ -225,8 +223,9 @@ class Mapper:
             if subindex == 2 and abort.code in _NOT_NOW:
                 raise  # not essential, unlike transmission at SYNC
             old = ": its values may be older than their SYNC" if subindex == 2 else ""
-            self._say(
+            self.findings.add(
                 Severity.WARNING if subindex == 2 else Severity.INFO,
+                self.role.subject,
                 f"TPDO{tpdo.number} keeps {_TIMING_NAMES[subindex]} {has} instead of {wanted}{old} "
                 f"(SDO abort {abort_text(abort.code)})",
             )
@@ -286,7 +285,7 @@ class Mapper:
                 yield Write(self.node, tpdo.mapping, 0, len(tpdo.entries), 1)
             yield from self._cob(tpdo, tpdo.cob)
         except SdoAbort as abort:
-            self._say(Severity.WARNING, f"TPDO{tpdo.number} could not be put back: {abort}")
+            self.findings.warn(self.role.subject, f"TPDO{tpdo.number} could not be put back: {abort}")
 
     def _is_fixed(self, tpdo: Tpdo) -> bool:
         return any(other.fixed for other in self.tpdos if other.number == tpdo.number)
@@ -309,7 +308,7 @@ class Mapper:
                     f"{describe(used)}"
                 )
             if signal not in given:
-                self._say(Severity.WARNING, f"gives no {signal}: {describe(used)}")
+                self.findings.warn(self.role.subject, f"gives no {signal}: {describe(used)}")
         return layouts
 
 

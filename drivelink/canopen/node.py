@@ -36,7 +36,7 @@ from drivelink.canopen.units import offer, unit_objects
 from drivelink.canopen.vendors import Vendor, vendor_of
 from drivelink.errors import DriveError
 from drivelink.jointfile import BusSection
-from drivelink.notice import Notice, Severity
+from drivelink.notice import Findings
 
 Address = tuple[int, int]
 
@@ -189,24 +189,24 @@ def _configured(
 ) -> Program[tuple[NodeSurvey, NodeLayout]]:
     attempt_s = bus.sdo_timeout_s * (1 + bus.sdo_retries)
     survey = yield from survey_node(role, max(2, math.ceil(BOOT_S / attempt_s)), wake=True)
-    notices = list(survey.offer.notices)
-    available = _wanted(survey, notices)
+    findings = Findings(notices=list(survey.offer.notices))
+    available = _wanted(survey, findings)
     mapper = Mapper(
         role=role,
         available=available,
         tpdos=list(survey.tpdos),
         taken=taken,
         prefer_unused=bus.sync == "follow",
-        notices=notices,
+        findings=findings,
         period_s=bus.period_s,
         readable=survey.offer.checks,
     )
     layouts = yield from mapper.program()
     used = {layout.number for layout in layouts}
     others = tuple(tpdo for tpdo in mapper.tpdos if tpdo.enabled and tpdo.number not in used)
-    others = yield from _others(role, others, {layout.cob_id for layout in layouts}, drop_others, notices)
-    yield from _sync(role, bus, notices)
-    heartbeat_ms = yield from _heartbeat(role, notices)
+    others = yield from _others(role, others, {layout.cob_id for layout in layouts}, drop_others, findings)
+    yield from _sync(role, bus, findings)
+    heartbeat_ms = yield from _heartbeat(role, findings)
     return survey, NodeLayout(
         node_id=role.node_id,
         motor=role.motor,
@@ -215,11 +215,11 @@ def _configured(
         heartbeat_ms=heartbeat_ms,
         identity=survey.identity,
         reported=tuple(survey.reported.items()),
-        notices=tuple(notices),
+        notices=tuple(findings.notices),
     )
 
 
-def _wanted(survey: NodeSurvey, notices: list[Notice]) -> dict[Signal, tuple[MappedObject, ...]]:
+def _wanted(survey: NodeSurvey, findings: Findings) -> dict[Signal, tuple[MappedObject, ...]]:
     """Signals to map, each with the objects that carry it.
 
     Raises:
@@ -230,7 +230,7 @@ def _wanted(survey: NodeSurvey, notices: list[Notice]) -> dict[Signal, tuple[Map
         if signal not in OPTIONAL:
             why = f"; {survey.refused}" if survey.refused is not None else ""
             raise DriveError(f"{subject} ({survey.role.key}): {reason}{why}")
-        notices.append(Notice(severity=Severity.WARNING, subject=subject, text=f"no {signal}: {reason}"))
+        findings.warn(subject, f"no {signal}: {reason}")
     wanted: dict[Signal, tuple[MappedObject, ...]] = {}
     for signal, objects in survey.available.items():
         candidates = unused(wanted, objects) if signal in CHECKS else objects
@@ -240,14 +240,12 @@ def _wanted(survey: NodeSurvey, notices: list[Notice]) -> dict[Signal, tuple[Map
         tried = ", ".join(f"0x{c.address[0]:04X}:{c.address[1]:02X}" for c in survey.offer.candidates[signal])
         if signal not in OPTIONAL:
             raise DriveError(f"{subject} ({survey.role.key}) gives no {signal}: it has no {tried}")
-        notices.append(
-            Notice(severity=Severity.WARNING, subject=subject, text=f"gives no {signal}: it has no {tried}")
-        )
+        findings.warn(subject, f"gives no {signal}: it has no {tried}")
     return wanted
 
 
 def _others(
-    role: Role, others: tuple[Tpdo, ...], used: set[int], drop: bool, notices: list[Notice]
+    role: Role, others: tuple[Tpdo, ...], used: set[int], drop: bool, findings: Findings
 ) -> Program[tuple[Tpdo, ...]]:
     """Disable TPDOs that share an identifier with ours and, on request, unused ones."""
     left = []
@@ -264,11 +262,11 @@ def _others(
             left.append(tpdo)
             why += f", but it stays on: SDO abort {abort_text(abort.code)}"
         text = f"TPDO{tpdo.number} (0x{tpdo.cob_id:03X}), which nobody here needs, is switched off: {why}"
-        notices.append(Notice(severity=Severity.INFO, subject=role.subject, text=text))
+        findings.info(role.subject, text)
     return tuple(left)
 
 
-def _sync(role: Role, bus: BusSection, notices: list[Notice]) -> Program[None]:
+def _sync(role: Role, bus: BusSection, findings: Findings) -> Program[None]:
     """Configure SYNC: identifier, one producer, the same counter on both sides."""
     node = role.node_id
     cob = yield from read_optional(node, 0x1005, 0)
@@ -286,14 +284,8 @@ def _sync(role: Role, bus: BusSection, notices: list[Notice]) -> Program[None]:
     if overflow == wanted or (overflow is None and not wanted):
         return
     if overflow is None:
-        notices.append(
-            Notice(
-                severity=Severity.WARNING,
-                subject=role.subject,
-                text="has no SYNC counter (0x1019) and may reject a SYNC with one",
-                fix="bus.sync_counter_overflow = 0",
-            )
-        )
+        text = "has no SYNC counter (0x1019) and may reject a SYNC with one"
+        findings.warn(role.subject, text, "bus.sync_counter_overflow = 0")
         return
     yield from _sync_counter(node, wanted)
 
@@ -308,7 +300,7 @@ def _sync_counter(node: int, overflow: int) -> Program[None]:
         yield Write(node, 0x1006, 0, period, 4)
 
 
-def _heartbeat(role: Role, notices: list[Notice]) -> Program[int]:
+def _heartbeat(role: Role, findings: Findings) -> Program[int]:
     """Request a heartbeat; the value read back is monitored."""
     node = role.node_id
     wanted = role.drive.heartbeat_ms if role.drive is not None else _ENCODER_HEARTBEAT_MS
@@ -319,6 +311,6 @@ def _heartbeat(role: Role, notices: list[Notice]) -> Program[int]:
         yield Write(node, 0x1017, 0, wanted, 2)
     except SdoAbort as abort:
         text = f"keeps its heartbeat of {has} ms instead of {wanted} ms: SDO abort {abort_text(abort.code)}"
-        notices.append(Notice(severity=Severity.WARNING, subject=role.subject, text=text))
+        findings.warn(role.subject, text)
         return has
     return (yield from read_optional(node, 0x1017, 0)) or 0

@@ -17,7 +17,7 @@ from drivelink.canopen.units import offer, unit_objects
 from drivelink.canopen.vendors import VENDORS, vendor_of
 from drivelink.errors import DriveError
 from drivelink.jointfile import BusSection, JointFile, TpdoSection
-from drivelink.notice import Notice, Severity, log_notices
+from drivelink.notice import log_notices
 
 logger = logging.getLogger(__name__)
 
@@ -173,12 +173,9 @@ class _PassiveNode:
         if self._sheet is not None and self._sheet.vendor_id:
             values.setdefault((0x1018, 1), self._sheet.vendor_id)
         offered = offer(role, values, vendor_of(values.get((0x1018, 1), 0)))
-        notices = list(offered.notices)
         if self._sheet is not None:
-            notices += [
-                Notice(severity=Severity.INFO, subject=str(self._sheet.path.name), text=problem)
-                for problem in self._sheet.problems
-            ]
+            for problem in self._sheet.problems:
+                offered.info(self._sheet.path.name, problem)
         for signal, reason in offered.missing.items() if tpdos else ():
             if signal not in OPTIONAL:
                 raise DriveError(f"{role.subject} ({role.key}): {reason}")
@@ -196,7 +193,7 @@ class _PassiveNode:
             other_tpdos=tuple(layout for layout in layouts if layout not in used),
             heartbeat_ms=self.listener.values.get((0x1017, 0), 0),
             identity=(identity[0], identity[1], identity[2], identity[3]),
-            notices=tuple(notices),
+            notices=tuple(offered.notices),
         )
 
     def _believed_tpdos(self) -> tuple[Tpdo, ...]:
@@ -288,10 +285,7 @@ def _declared(section: TpdoSection) -> Tpdo:
         index, subindex, bits = text.split(":")
         entries.append((int(index, 16), int(subindex, 16), int(bits)))
     return Tpdo(
-        number=0,
-        cob=section.cob_id,
-        transmission_type=section.transmission_type,
-        entries=tuple(entries),
+        number=0, cob=section.cob_id, transmission_type=section.transmission_type, entries=tuple(entries)
     )
 
 

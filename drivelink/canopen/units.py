@@ -15,7 +15,6 @@ from functools import partial
 from drivelink.canopen.layout import MappedObject, Offer, Role, Signal, object_address
 from drivelink.canopen.vendors import Vendor, angle_unit_rad, velocity_unit_rad_s
 from drivelink.jointfile import DriveSection, EncoderSection
-from drivelink.notice import Severity
 
 Address = tuple[int, int]
 
@@ -62,8 +61,7 @@ def offer(role: Role, reported: Mapping[Address, int], vendor: Vendor) -> Offer:
         _offer_link(role, role.encoder, reported, result)
         if vendor.sensorless == _encoder_address(role.encoder, role.key) and role.encoder.object is None:
             index, subindex = vendor.sensorless
-            result.say(
-                Severity.WARNING,
+            result.warn(
                 role.subject,
                 f"0x{index:04X}:{subindex:02X} is {vendor.name}'s sensorless position, no encoder",
                 f'link.encoder.object = "0x{index:04X}:{subindex + 1:02X}" for the one wired to it',
@@ -100,17 +98,14 @@ class _Drive:
         if stated is None or reported is None:
             return reported if stated is None else stated
         if not math.isclose(stated, reported, rel_tol=_SAME):
-            self._say(
-                Severity.WARNING,
+            self._result.warn(
+                self._role.subject,
                 f"{what}: the drive says {reported:.6g} ({source}), the joint file {stated:.6g}; "
                 f"{stated:.6g} is used",
                 f"{self._role.key}: {key} = {reported:.6g}, or leave it out, "
                 f"or correct {source} in the drive",
             )
         return stated
-
-    def _say(self, severity: Severity, text: str, fix: str = "") -> None:
-        self._result.say(severity, self._role.subject, text, fix)
 
     def _ratio(self, numerator: Address, denominator: Address) -> float | None:
         above, below = self._reported.get(numerator, 0), self._reported.get(denominator, 1)
@@ -129,8 +124,8 @@ class _Drive:
         if "gear_ratio" not in self._drive.model_fields_set:
             return stated if reported is None else reported
         if reported == 1.0 and stated != 1.0:  # usual: the drive was never configured with its gear
-            self._say(
-                Severity.INFO,
+            self._result.info(
+                self._role.subject,
                 f"gear ratio: the drive says 1 ({source}), the joint file {stated:.6g}; {stated:.6g} is used",
             )
             return stated
@@ -169,8 +164,8 @@ class _Drive:
         scale = self._drive.direction * math.tau / (counts * gear)
         feed = self._ratio((0x6092, 1), (0x6092, 2))
         if feed is not None and feed > 1 and not math.isclose(feed, counts * gear, rel_tol=_SAME):
-            self._say(
-                Severity.INFO,
+            self._result.info(
+                self._role.subject,
                 f"feed constant 0x6092 says {feed:.6g} units per shaft revolution, "
                 f"encoder and gear {counts * gear:.6g}; {counts * gear:.6g} is used",
             )
@@ -322,14 +317,14 @@ class _Drive:
     def _polarity(self) -> None:
         polarity = self._reported.get((0x607E, 0), 0)
         if polarity & 0x80:
-            self._say(
-                Severity.INFO,
+            self._result.info(
+                self._role.subject,
                 f"polarity 0x607E is 0x{polarity:02X}: the drive itself turns the position's sign; "
                 f"direction = {self._drive.direction} applies to what it reports",
             )
         if bool(polarity & 0x80) != bool(polarity & 0x40):
-            self._say(
-                Severity.WARNING,
+            self._result.warn(
+                self._role.subject,
                 f"polarity 0x607E is 0x{polarity:02X}: position and velocity have opposite signs",
                 "set bits 7 and 6 of 0x607E alike with the maker's tool",
             )
@@ -369,8 +364,7 @@ def _offer_link(role: Role, encoder: EncoderSection, reported: Mapping[Address, 
         return
     if stated is not None and counts is not None and not math.isclose(stated, counts, rel_tol=_SAME):
         text = f"link encoder, counts per revolution: the node says {counts:.6g} ({source}), "
-        result.say(
-            Severity.WARNING,
+        result.warn(
             role.subject,
             f"{text}the joint file {stated:.6g}; {stated:.6g} is used",
             f"link.encoder: counts_per_rev = {counts:.6g}, or leave it out",

@@ -10,7 +10,6 @@ from drivelink.doctor.machine import examine_machine, examine_zenoh
 from drivelink.doctor.nodes import examine_bus
 from drivelink.doctor.report import Report, Section
 from drivelink.jointfile import JointFile
-from drivelink.notice import Severity
 
 __all__ = ["Report", "Section", "examine", "examine_eds"]
 
@@ -31,7 +30,7 @@ def examine(joint: JointFile | None, base_dir: Path, seconds: float) -> Report:
     if joint is None:
         known = can_interfaces()
         text = ", ".join(known) if known else "none of SocketCAN's"
-        section.say(Severity.INFO, "interfaces", text, "drivelink doctor JOINT examines bus and drives too")
+        section.info("interfaces", text, "drivelink doctor JOINT examines bus and drives too")
         return report
     examine_interface(section, joint.bus)
     zenoh = Section("Zenoh")

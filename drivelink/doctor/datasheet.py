@@ -46,7 +46,7 @@ def say_sync_counter(section: Section, subject: str, bus: BusSection) -> None:
     if bus.sync == "produce" and not bus.sync_counter_overflow:
         line = f"[bus] sync_counter_overflow = {_COUNTER}"
         text = f"{subject} has a SYNC counter (0x1019), which numbers each SYNC in logs: no further frame"
-        section.say(Severity.INFO, "cross-check", text, line)
+        section.info("cross-check", text, line)
 
 
 def say_checks(
@@ -69,7 +69,7 @@ def say_checks(
     def say(text: str, objects: Available, line: str) -> None:
         frames = _cost(role, wanted, objects, tpdos)
         if frames is not None:
-            section.say(Severity.INFO, "cross-check", f"{text}: {_frames(frames)}", f"[motor.drive] {line}")
+            section.info("cross-check", f"{text}: {_frames(frames)}", f"[motor.drive] {line}")
 
     def checks(names: Iterable[str]) -> str:
         return f"checks = {json.dumps([*drive.checks, *names])}"
@@ -136,10 +136,10 @@ def examine_sheet(section: Section, path: Path) -> None:
     sheet = load_eds(path)
     section.ok(path.name, _title(sheet))
     for problem in sheet.problems:
-        section.say(Severity.INFO, path.name, problem)
+        section.info(path.name, problem)
     available = _signals(section, sheet)
     tpdos = sheet.tpdos()
-    section.say(Severity.INFO, "by default", describe(tpdo for tpdo in tpdos if tpdo.enabled))
+    section.info("by default", describe(tpdo for tpdo in tpdos if tpdo.enabled))
     role = _role(sheet)
     mappable = {signal: objects for signal, objects in available.items() if objects}
     mappable.pop(Signal.MOTOR_VELOCITY, None)  # not mapped by default
@@ -149,12 +149,7 @@ def examine_sheet(section: Section, path: Path) -> None:
     try:
         plan = assign(role, mappable, tpdos, prefer_unused=False) if mappable else ()
     except DriveError as error:
-        section.say(
-            Severity.ERROR,
-            "mapping",
-            str(error).removeprefix(f"{role.subject} "),
-            "another drive, or firmware",
-        )
+        section.error("mapping", str(error).removeprefix(f"{role.subject} "), "another drive, or firmware")
         return
     for assignment in plan:
         number, entries = planned_entries(assignment)
@@ -268,10 +263,10 @@ def _say_signal(
     elif there:
         parts = [f"0x{i:04X}:{s:02X}" for i, s in there]
         severity = Severity.ERROR if signal in _needed(sheet) else Severity.INFO
-        section.say(severity, name, f"{', '.join(parts)} is there, but cannot be mapped into a TPDO")
+        section.add(severity, name, f"{', '.join(parts)} is there, but cannot be mapped into a TPDO")
     else:
         severity = Severity.ERROR if signal in _needed(sheet) else Severity.INFO
-        section.say(severity, name, "no object provides it")
+        section.add(severity, name, "no object provides it")
 
 
 def _more(signal: Signal, sheet: DataSheet, usable: list[tuple[int, int]]) -> str:
@@ -298,11 +293,11 @@ def _units(section: Section, sheet: DataSheet) -> None:
         text = (
             f"0x6501 says {counts} counts per revolution" if counts else "state link.encoder.counts_per_rev"
         )
-        section.say(Severity.INFO, "units", text)
+        section.info("units", text)
         return
     drive = DriveSection(node_id=1)
     bare = Role(node_id=1, motor=0, drive=drive, encoder=None, key="motor.drive", eds=sheet.path, tpdo=())
     offered = offer(bare, sheet.values(), vendor_of(sheet.vendor_id))
     for signal, missing in _UNDECLARED.items():
         if signal in offered.missing:
-            section.say(Severity.INFO, "units", missing, _STATE[signal])
+            section.info("units", missing, _STATE[signal])

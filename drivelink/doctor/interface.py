@@ -23,8 +23,7 @@ def can_interfaces() -> list[str]:
 def examine_interface(section: Section, bus: BusSection) -> None:
     """Check the interface of a joint file without opening it."""
     if bus.interface == "virtual":
-        section.say(
-            Severity.INFO,
+        section.info(
             "virtual",
             "exists inside one process only: no other program can join it",
             "for two processes: sudo modprobe vcan && sudo ip link add vcan0 type vcan && "
@@ -32,20 +31,15 @@ def examine_interface(section: Section, bus: BusSection) -> None:
         )
         return
     if bus.interface != "socketcan":
-        section.say(
-            Severity.INFO, bus.interface, f"{bus.channel}: the system has no information on such an interface"
-        )
+        section.info(bus.interface, f"{bus.channel}: the system has no information on such an interface")
         return
     if shutil.which("ip") is None:
-        section.say(
-            Severity.WARNING, bus.channel, "`ip` is missing: state unknown", "sudo apt install iproute2"
-        )
+        section.warn(bus.channel, "`ip` is missing: state unknown", "sudo apt install iproute2")
         return
     links = _links("-details", "-statistics", "dev", bus.channel)
     if not links:
         known = can_interfaces()
-        section.say(
-            Severity.ERROR,
+        section.error(
             bus.channel,
             "there is no such interface" + (f"; there is {', '.join(known)}" if known else ""),
             f"sudo ip link add {bus.channel} type vcan && sudo ip link set {bus.channel} up"
@@ -79,36 +73,34 @@ def judge_link(section: Section, link: dict[str, Any], bus: BusSection) -> None:
         bitrate=data.get("bittiming", {}).get("bitrate"),
     )
     if link.get("link_type") != "can":
-        section.say(Severity.ERROR, name, "is not a CAN interface", "correct bus.channel")
+        section.error(name, "is not a CAN interface", "correct bus.channel")
         return
     kind = "" if virtual else f" type can bitrate {bus.bitrate} restart-ms 100"
     if "UP" not in link.get("flags", []):
-        section.say(Severity.ERROR, name, "is down", f"sudo ip link set {name} up{kind}")
+        section.error(name, "is down", f"sudo ip link set {name} up{kind}")
         return
     section.ok(name, "is up" + (", virtual (no bit rate, no errors)" if virtual else ""))
     if not virtual:
         _judge_controller(section, data, info, bus)
     queue = link.get("txqlen", 0)
     if queue < _GOOD_QUEUE:
-        section.say(
-            Severity.WARNING,
+        section.warn(
             name,
             f"transmit queue of {queue} frames: SYNC may find it full (ENOBUFS)",
             f"sudo ip link set {name} txqueuelen 1000",
         )
     if link.get("mtu", 16) > 16:
-        section.say(Severity.INFO, name, "CAN FD: FD frames are accepted, CANopen uses the classic ones")
+        section.info(name, "CAN FD: FD frames are accepted, CANopen uses the classic ones")
     dropped = link.get("stats64", {}).get("rx", {}).get("dropped", 0)
     if dropped:
-        section.say(Severity.WARNING, name, f"{dropped} received frames were dropped since it is up")
+        section.warn(name, f"{dropped} received frames were dropped since it is up")
 
 
 def _judge_controller(section: Section, data: dict[str, Any], info: dict[str, Any], bus: BusSection) -> None:
     name = bus.channel
     bitrate = data.get("bittiming", {}).get("bitrate", 0)
     if bitrate and bitrate != bus.bitrate:
-        section.say(
-            Severity.ERROR,
+        section.error(
             name,
             f"runs at {bitrate // 1000} kbit/s, the joint file says {bus.bitrate // 1000} kbit/s",
             f"sudo ip link set {name} down && sudo ip link set {name} up type can bitrate {bus.bitrate}, "
@@ -123,7 +115,7 @@ def _judge_controller(section: Section, data: dict[str, Any], info: dict[str, An
         section.ok(name, f"error-active, {errors}")
     else:
         severity = Severity.ERROR if state in ("BUS-OFF", "STOPPED") else Severity.WARNING
-        section.say(
+        section.add(
             severity,
             name,
             f"is {state.lower()}, {errors}: check cable, termination (2 x 120 Ω), bit rate, and that "
@@ -133,8 +125,7 @@ def _judge_controller(section: Section, data: dict[str, Any], info: dict[str, An
             else "",
         )
     if not data.get("restart_ms"):
-        section.say(
-            Severity.WARNING,
+        section.warn(
             name,
             "does not recover from bus-off by itself",
             f"sudo ip link set {name} down && sudo ip link set {name} type can restart-ms 100 && "
@@ -142,4 +133,4 @@ def _judge_controller(section: Section, data: dict[str, Any], info: dict[str, An
         )
     offs = info.get("info_xstats", {}).get("bus_off", 0)
     if offs:
-        section.say(Severity.WARNING, name, f"was bus-off {offs} times since it is up")
+        section.warn(name, f"was bus-off {offs} times since it is up")

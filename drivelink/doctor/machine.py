@@ -16,7 +16,6 @@ import zenoh
 from drivelink.doctor.report import Section
 from drivelink.errors import ZenohError
 from drivelink.jointfile import BusSection, JointFile
-from drivelink.notice import Severity
 from drivelink.pubsub.session import FILES, answers, close_session, open_client
 
 _CPU = Path("/sys/devices/system/cpu")
@@ -50,8 +49,7 @@ def _scheduling(section: Section, capabilities: int) -> None:
     if limit == resource.RLIM_INFINITY or limit >= 80 or capabilities >> _CAP_SYS_NICE & 1:
         section.ok("real time", "SCHED_FIFO is allowed")
     else:
-        section.say(
-            Severity.WARNING,
+        section.warn(
             "real time",
             f"SCHED_FIFO is not allowed (limit {limit}, 80 is wanted): expect a larger jitter",
             f"echo '{_user()} - rtprio 99' | sudo tee -a /etc/security/limits.d/drivelink.conf, "
@@ -64,8 +62,7 @@ def _memory(section: Section, capabilities: int) -> None:
     if limit == resource.RLIM_INFINITY or limit >= _NEEDED_LOCKED or capabilities >> _CAP_IPC_LOCK & 1:
         section.ok("memory", "can be locked")
     else:
-        section.say(
-            Severity.WARNING,
+        section.warn(
             "memory",
             f"only {limit >> 10} KiB may be locked: a page fault may delay a cycle",
             f"echo '{_user()} - memlock unlimited' | sudo tee -a /etc/security/limits.d/drivelink.conf, "
@@ -78,8 +75,7 @@ def _files(section: Section) -> None:
     if limit == resource.RLIM_INFINITY or limit >= FILES:
         section.ok("files", f"{FILES} may be open: connections that say nothing lock no subscriber out")
     else:
-        section.say(
-            Severity.WARNING,
+        section.warn(
             "files",
             f"only {limit} may be open, {FILES} are wanted: as many connections lock new subscribers out",
             f"echo '{_user()} - nofile {FILES}' | sudo tee -a /etc/security/limits.d/drivelink.conf, "
@@ -100,15 +96,14 @@ def _governor(section: Section) -> None:
     elif governors == {"performance"}:
         section.ok("CPU clock", "governor performance")
     else:
-        section.say(
-            Severity.WARNING,
+        section.warn(
             "CPU clock",
             f"governor {', '.join(sorted(governors))}: the CPU clock first has to rise after each idle phase",
             "sudo cpupower frequency-set -g performance",
         )
     cores = os.cpu_count() or 1
     if cores < 2:
-        section.say(Severity.WARNING, "CPU", "one core only: everything else on it delays the cycle")
+        section.warn("CPU", "one core only: everything else on it delays the cycle")
 
 
 def _timer(section: Section, period_s: float, seconds: float) -> None:
@@ -128,10 +123,9 @@ def _timer(section: Section, period_s: float, seconds: float) -> None:
     if p99 <= _GOOD_JITTER_US:
         section.ok("timer", text)
     elif p99 < min(_BAD_JITTER_US, period_s * 1e6):
-        section.say(Severity.INFO, "timer", text)
+        section.info("timer", text)
     else:
-        section.say(
-            Severity.WARNING,
+        section.warn(
             "timer",
             text + f": more than a period of {period_s * 1000:g} ms allows",
             "a kernel with PREEMPT_RT, fewer programs beside it, or a longer bus.period_s",
@@ -162,9 +156,7 @@ def judge_sync(
     """
     if len(stamps_s) < 3:
         if bus.sync == "follow":
-            section.say(
-                Severity.ERROR, "SYNC", "nobody makes SYNC", 'start the other master, or bus.sync = "produce"'
-            )
+            section.error("SYNC", "nobody makes SYNC", 'start the other master, or bus.sync = "produce"')
         else:
             section.ok("SYNC", "not produced yet: drivelink run will produce it")
         return
@@ -177,8 +169,7 @@ def judge_sync(
     if bus.sync == "produce":
         _judge_producer(section, text, daemons or Daemons(ours=False, others=()))
     elif "period_s" in bus.model_fields_set and abs(period_s - bus.period_s) > 0.02 * bus.period_s:
-        section.say(
-            Severity.ERROR,
+        section.error(
             "SYNC",
             f"{text}, the joint file says {bus.period_s * 1000:g} ms",
             f"bus.period_s = {round(period_s, 5):g}",
@@ -192,16 +183,14 @@ def _judge_producer(section: Section, text: str, daemons: Daemons) -> None:
     if daemons.ours:
         section.ok("SYNC", f"{text}, produced by the drivelink daemon that runs")
     elif daemons.others:
-        section.say(
-            Severity.WARNING,
+        section.warn(
             "SYNC",
             f"{text}: the drivelink daemon of {', '.join(daemons.others)} may make it",
             "joints on one bus go into one command: drivelink run A.toml B.toml; "
             'with another master: bus.sync = "follow"',
         )
     else:
-        section.say(
-            Severity.WARNING,
+        section.warn(
             "SYNC",
             f"{text}: another master produces it, no drivelink daemon is alive",
             'bus.sync = "follow", or stop the other master',
@@ -215,9 +204,7 @@ def examine_zenoh(section: Section, joint: JointFile, base_dir: Path) -> None:
     """Check who listens at the endpoint, which daemons are alive, and whether this joint's key is taken."""
     settings = joint.zenoh
     if settings.config is not None and not (base_dir / settings.config).is_file():
-        section.say(
-            Severity.ERROR, "zenoh", f"{settings.config}: there is no such file", "correct zenoh.config"
-        )
+        section.error("zenoh", f"{settings.config}: there is no such file", "correct zenoh.config")
         return
     where = settings.config or settings.endpoint
     if settings.config is None and not answers(settings.endpoint):
@@ -226,7 +213,7 @@ def examine_zenoh(section: Section, joint: JointFile, base_dir: Path) -> None:
     try:
         session = open_client(settings.endpoint, base_dir / settings.config if settings.config else None)
     except ZenohError as error:
-        section.say(Severity.ERROR, "zenoh", str(error))
+        section.error("zenoh", str(error))
         return
     try:
         alive = _alive(session, f"{settings.prefix}/*/alive")
@@ -239,8 +226,7 @@ def examine_zenoh(section: Section, joint: JointFile, base_dir: Path) -> None:
     names = [key.split("/")[-2] for key in alive]
     section.ok("zenoh", f"{where}: reachable, alive: {', '.join(names)}")
     if joint.name in names:
-        section.say(
-            Severity.INFO,
+        section.info(
             "zenoh",
             f'a daemon for "{joint.name}" runs: a second one would be refused',
             f"drivelink monitor {joint.name}",

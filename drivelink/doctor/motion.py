@@ -15,7 +15,6 @@ from drivelink.canopen.node import NodeSurvey
 from drivelink.doctor.livevalues import Readings
 from drivelink.doctor.report import Section
 from drivelink.jointfile import JointFile
-from drivelink.notice import Severity
 from drivelink.recording.gate import corrections
 from estimator.errors import EstimatorError
 from estimator.gate import Judgement, check, judge
@@ -32,14 +31,14 @@ _MOVING = "the joint moves: look longer (--seconds 20), or at a faster and wider
 def judge_record(section: Section, joint: JointFile, record: Record | None) -> None:
     """Check units and signs of a moving joint by the gate for recordings (eq 5)."""
     if record is None:
-        section.say(Severity.INFO, joint.name, "units and signs of torque: not every channel was read")
+        section.info(joint.name, "units and signs of torque: not every channel was read")
         return
     model = replace(joint.model(), period_s=record.period_s)
     try:
         check(record, model)
         judgement = judge(record, model)
     except EstimatorError as error:
-        section.say(Severity.INFO, joint.name, f"units and signs cannot be checked: {error}", _advice(record))
+        section.info(joint.name, f"units and signs cannot be checked: {error}", _advice(record))
         return
     section.facts["samples"] = len(record)
     _say_judgement(section, joint, judgement, record)
@@ -63,10 +62,10 @@ def _say_judgement(section: Section, joint: JointFile, judgement: Judgement, rec
         text = ", and ".join(map(str, judgement.findings))
         text += f": the torque balance leaves {first.left_before:.0%}, {first.left_after:.1%} put right"
         fix = "; ".join(map(str, corrections(joint, needed, live=True)))
-        section.say(Severity.ERROR, joint.name, text, f"in the joint file: {fix}")
+        section.error(joint.name, text, f"in the joint file: {fix}")
     elif judgement.remark:
         fix = f"{_advice(record)}; or drivelink doctor --move"
-        section.say(Severity.INFO, joint.name, judgement.remark, fix)
+        section.info(joint.name, judgement.remark, fix)
     else:
         text = (
             f"units and signs of positions and torque agree: the torque balance leaves {judgement.left:.1%}"
@@ -90,8 +89,7 @@ def judge_motion(section: Section, survey: NodeSurvey, readings: Readings) -> bo
     times, moved = series.times_s, series.values
     section.facts[f"{subject} travel_rad"] = max(moved) - min(moved)
     if max(moved) - min(moved) < _LEAST_COUNTS * abs(position.scale):
-        section.say(
-            Severity.INFO,
+        section.info(
             subject,
             "stands still: signs and units could not be checked against each other",
             "turn the joint by hand during the check (--seconds 10: more time), or drivelink doctor --move",
@@ -141,15 +139,13 @@ def _judge_velocity(
     if abs(ratio - 1) <= _TOLERANCE:
         section.ok(subject, f"velocity agrees with the differences of positions (ratio {ratio:.3f})")
     elif ratio < 0:
-        section.say(
-            Severity.WARNING,
+        section.warn(
             subject,
             f"{text}: they have opposite signs",
             "bits 7 and 6 of the polarity 0x607E, with the maker's tool",
         )
     else:
-        section.say(
-            Severity.WARNING,
+        section.warn(
             subject,
             f"{text}: counts_per_rev or the velocity unit is wrong",
             f"correct {key}: counts_per_rev, or velocity_rad_s_per_count",
@@ -163,13 +159,6 @@ def _judge_link(section: Section, subject: str, ratio: float) -> None:
         return
     text = f"the link moves {ratio:.3g} times as far as the motor, both at the joint side"
     if ratio < 0:
-        section.say(
-            Severity.WARNING, subject, text, "reverse the sign of link.encoder.direction, or the drive's"
-        )
+        section.warn(subject, text, "reverse the sign of link.encoder.direction, or the drive's")
     else:
-        section.say(
-            Severity.WARNING,
-            subject,
-            text,
-            "correct gear_ratio, counts_per_rev or link.encoder.counts_per_rev",
-        )
+        section.warn(subject, text, "correct gear_ratio, counts_per_rev or link.encoder.counts_per_rev")

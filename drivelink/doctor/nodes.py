@@ -39,7 +39,7 @@ from drivelink.doctor.motion import judge_motion, judge_record
 from drivelink.doctor.report import Report, Section
 from drivelink.errors import BusError, DriveError, JointFileError
 from drivelink.jointfile import BusSection, JointFile
-from drivelink.notice import Notice, Severity
+from drivelink.notice import Severity
 
 
 def examine_bus(
@@ -57,7 +57,7 @@ def examine_bus(
     try:
         bus = open_bus(joint.bus)
     except BusError as error:
-        section.say(Severity.ERROR, joint.bus.channel, str(error))
+        section.error(joint.bus.channel, str(error))
         return
     try:
         if joint.bus.configure:
@@ -65,7 +65,7 @@ def examine_bus(
         else:
             _overhear(report, section, SilentBus(bus), joint, base_dir, seconds, daemons)
     except (BusError, DriveError, JointFileError) as error:
-        section.say(Severity.ERROR, joint.bus.channel, str(error))
+        section.error(joint.bus.channel, str(error))
     finally:
         bus.shutdown()
 
@@ -86,10 +86,9 @@ def _ask(
     others = [node for node in sorted(set(found) | set(traffic.heartbeats)) if node not in mine]
     for node in others:
         known = identify(bus, joint.bus, node)
-        section.say(Severity.INFO, f"node {node}", f"{_describe_node(known)}, not in the joint file")
+        section.info(f"node {node}", f"{_describe_node(known)}, not in the joint file")
     if not found:
-        section.say(
-            Severity.ERROR,
+        section.error(
             joint.bus.channel,
             "no node answers or sends",
             "power the drives; check cable, termination, bit rate and node ids",
@@ -103,8 +102,7 @@ def _ask(
             if survey is not None:
                 surveys[own.title] = survey
         else:
-            section.say(
-                Severity.ERROR,
+            section.error(
                 role.subject,
                 f"({role.key}) does not answer" + (f"; there are {_list(others)}" if others else ""),
                 f"power it, or correct {role.key}.node_id",
@@ -124,7 +122,7 @@ def _watch_motion(
     try:
         readings = run_program(Asked(nodes).program(seconds), bus, joint.bus)
     except DriveError as error:
-        together.say(Severity.ERROR, joint.name, str(error))
+        together.error(joint.name, str(error))
         return
     moving = False
     for title, survey in surveys.items():
@@ -165,7 +163,7 @@ def _examine_node(
     try:
         survey = run_program(survey_node(curious), bus, joint.bus)
     except DriveError as error:
-        section.say(Severity.ERROR, subject, str(error))
+        section.error(subject, str(error))
         return None, None
     _judge_profile(section, role, node)
     _judge_eds(section, role, node)
@@ -186,9 +184,7 @@ def _has(bus: can.BusABC, section: BusSection, node: int, index: int) -> bool:
 def _judge_profile(section: Section, role: Role, node: FoundNode) -> None:
     wanted = 402 if role.motor is not None else 406
     if node.device_type and node.device_type & 0xFFFF not in (wanted, 402):
-        section.say(
-            Severity.WARNING, role.subject, f"is {node.profile}, {role.key} wants a CiA {wanted} device"
-        )
+        section.warn(role.subject, f"is {node.profile}, {role.key} wants a CiA {wanted} device")
 
 
 def _judge_eds(section: Section, role: Role, node: FoundNode) -> None:
@@ -197,13 +193,12 @@ def _judge_eds(section: Section, role: Role, node: FoundNode) -> None:
     try:
         sheet = load_eds(role.eds, role.node_id)
     except DriveError as error:
-        section.say(Severity.ERROR, role.subject, str(error), f"correct {role.key}.eds")
+        section.error(role.subject, str(error), f"correct {role.key}.eds")
         return
     said = (sheet.vendor_id, sheet.product_code)
     is_ = node.identity[:2]
     if any(a and b and a != b for a, b in zip(said, is_, strict=True)):
-        section.say(
-            Severity.WARNING,
+        section.warn(
             role.subject,
             f"{role.eds.name} is of vendor 0x{said[0]:X}, product 0x{said[1]:X}; "
             f"the node says 0x{is_[0]:X}, 0x{is_[1]:X}",
@@ -211,9 +206,8 @@ def _judge_eds(section: Section, role: Role, node: FoundNode) -> None:
         )
     else:
         section.ok(role.subject, f"{role.eds.name} matches its identity")
-    section.notices += [
-        Notice(severity=Severity.INFO, subject=role.eds.name, text=problem) for problem in sheet.problems
-    ]
+    for problem in sheet.problems:
+        section.info(role.eds.name, problem)
 
 
 def _judge_mapping(section: Section, role: Role, survey: NodeSurvey) -> NodeLayout | None:
@@ -227,13 +221,13 @@ def _judge_mapping(section: Section, role: Role, survey: NodeSurvey) -> NodeLayo
         wanted[Signal.MOTOR_VELOCITY] = velocity
     wanted |= {s: unused(wanted, objects) for s, objects in available.items() if s in asked}
     enabled = [tpdo for tpdo in survey.tpdos if tpdo.enabled]
-    section.say(Severity.INFO, role.subject, f"sends {describe(enabled)}")
+    section.info(role.subject, f"sends {describe(enabled)}")
     if not _has_all(section, role, survey, wanted):
         return None
     try:
         plan = assign(role, wanted, survey.tpdos, prefer_unused=False)
     except DriveError as error:
-        section.say(Severity.ERROR, role.subject, str(error))
+        section.error(role.subject, str(error))
         return None
     now = {mapped.signal for layout in decode(enabled, wanted) for mapped in layout.objects}
     if all(signal in now for signal, objects in wanted.items() if objects):
@@ -242,12 +236,7 @@ def _judge_mapping(section: Section, role: Role, survey: NodeSurvey) -> NodeLayo
         parts = []
         for number, entries in map(planned_entries, plan):
             parts.append(f"TPDO{number} = {' + '.join(map(entry_text, entries))}")
-        section.say(
-            Severity.INFO,
-            role.subject,
-            f"will be configured to send {'; '.join(parts)}",
-            "drivelink run does it",
-        )
+        section.info(role.subject, f"will be configured to send {'; '.join(parts)}", "drivelink run does it")
     sensorless = vendor_of(survey.identity[0]).sensorless
     if any(o.address == sensorless for o in available.get(Signal.SECOND_POSITION, ())):
         del available[Signal.SECOND_POSITION]
@@ -270,11 +259,11 @@ def _has_all(section: Section, role: Role, survey: NodeSurvey, wanted: Available
             tried = [f"0x{c.address[0]:04X}:{c.address[1]:02X}" for c in offered] or ["object for it"]
             needed = signal not in (Signal.STATUSWORD, *CHECKS)
             severity = Severity.ERROR if needed else Severity.WARNING
-            section.say(severity, role.subject, f"gives no {signal}: it has no {', '.join(tried)}")
+            section.add(severity, role.subject, f"gives no {signal}: it has no {', '.join(tried)}")
             complete = complete and severity is not Severity.ERROR
     for signal, reason in survey.offer.missing.items():
         if signal is not Signal.MOTOR_VELOCITY:
-            section.say(Severity.ERROR, role.subject, reason)
+            section.error(role.subject, reason)
             complete = False
     return complete
 
@@ -290,7 +279,7 @@ def _judge_load(section: Section, layouts: Sequence[NodeLayout], bus: BusSection
     else:
         fits_ms = bus.period_s * load.fraction / COMFORTABLE * 1000
         severity = Severity.ERROR if load.fraction > 1 else Severity.WARNING
-        section.say(severity, "bus load", text, f"bus.period_s = {fits_ms / 1000:.2g}, or fewer signals")
+        section.add(severity, "bus load", text, f"bus.period_s = {fits_ms / 1000:.2g}, or fewer signals")
 
 
 def _overhear(
@@ -308,18 +297,17 @@ def _overhear(
     traffic = listen(bus, seconds, heard.take)
     _judge_traffic(section, traffic, joint.bus, daemons)
     for error in configurator.missing.values():
-        section.say(Severity.ERROR, joint.bus.channel, str(error))
+        section.error(joint.bus.channel, str(error))
     for node, doubt in configurator.doubts.items():
-        section.say(Severity.WARNING, f"node {node}", doubt)
+        section.warn(f"node {node}", doubt)
     for node, layout in configurator.layouts.items():
         section.notices += layout.notices
         for tpdo in layout.tpdos:
             count, length = traffic.counts.get(tpdo.cob_id, 0), len(traffic.last.get(tpdo.cob_id, b""))
             if not count:
-                section.say(Severity.WARNING, f"node {node}", f"0x{tpdo.cob_id:03X} was not heard")
+                section.warn(f"node {node}", f"0x{tpdo.cob_id:03X} was not heard")
             elif length < tpdo.length:
-                section.say(
-                    Severity.ERROR,
+                section.error(
                     f"node {node}",
                     f"0x{tpdo.cob_id:03X} has {length} bytes, its mapping {tpdo.length}",
                     "correct the mapping in the joint file or its EDS",
@@ -333,7 +321,7 @@ def _overhear(
         judge_record(report.section("Units and signs"), heard.joint, record)
     elif not configurator.missing:  # already reported
         text = f"units and signs cannot be checked: no sample in {seconds:g} s: {heard.missing}"
-        section.say(Severity.INFO, joint.name, text)
+        section.info(joint.name, text)
 
 
 def _judge_traffic(section: Section, traffic: Traffic, bus: BusSection, daemons: Daemons) -> None:
@@ -341,8 +329,7 @@ def _judge_traffic(section: Section, traffic: Traffic, bus: BusSection, daemons:
     section.facts["frames_per_s"] = frames / traffic.seconds if traffic.seconds else 0.0
     section.facts["identifiers"] = {f"0x{cob:03X}": n for cob, n in sorted(traffic.counts.items())}
     if traffic.error_frames:
-        section.say(
-            Severity.WARNING,
+        section.warn(
             bus.channel,
             f"{traffic.error_frames} error frames in {traffic.seconds:g} s",
             "check cable, termination (2 x 120 Ω) and that all nodes have the same bit rate",

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.padding import Padding
 from rich.table import Table
 
-from drivelink.notice import Notice, Severity
+from drivelink.notice import Findings, Severity
 
 _MARKS = {
     Severity.OK: ("✓", "green"),
@@ -21,20 +21,11 @@ _MARKS = {
 
 
 @dataclass(slots=True)
-class Section:
+class Section(Findings):
     """Findings that belong together."""
 
     title: str  # their subject
-    notices: list[Notice] = field(default_factory=list)  # the findings
     facts: dict[str, Any] = field(default_factory=dict)  # figures for `--json`
-
-    def say(self, severity: Severity, subject: str, text: str, fix: str = "") -> None:
-        """Add a finding."""
-        self.notices.append(Notice(severity=severity, subject=subject, text=text, fix=fix))
-
-    def ok(self, subject: str, text: str) -> None:
-        """Add a passed check."""
-        self.say(Severity.OK, subject, text)
 
 
 @dataclass(slots=True)

@@ -50,9 +50,8 @@ from estimator.filters import StateVariableFilter
 from sim.cases import case
 from sim.effects import parse
 from sim.excitation import build
-from sim.plant import JointPlant, LinkPlant, MotorPlant
+from sim.plant import JointPlant, LinkPlant, MotorPlant, Spring
 from sim.sensors import DriveHardware, LinkEncoder
-from sim.springs import Spring
 from sim.world import World
 
 T = 0.001

@@ -56,7 +56,6 @@ def check_target(path: Path, inputs: Iterable[Path] = (), *, force: bool = False
 
     Args:
         inputs: input files; symbolic and hard links count as the same file.
-        force: replace an existing file.
 
     Raises:
         UsageError: it is an input or a folder, or it exists.

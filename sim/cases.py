@@ -25,9 +25,8 @@ from typing import Any
 from sim.effects import PlantEffect
 from sim.errors import SimError
 from sim.excitation import build
-from sim.plant import JointPlant, LinkPlant, MotorPlant
+from sim.plant import JointPlant, LinkPlant, MotorPlant, Spring
 from sim.sensors import RPM_RAD_S, DriveHardware, LinkEncoder
-from sim.springs import Spring
 from sim.world import World
 
 

@@ -20,8 +20,7 @@ from sim.errors import SimError
 from sim.excitation import Excitation
 from sim.integration import integrator, settling, whole_fraction
 from sim.plant import JointPlant
-from sim.readout import Amplifier, LinkScale
-from sim.sensors import DriveHardware, DriveSignals, LinkEncoder, noise
+from sim.sensors import Amplifier, DriveHardware, DriveSignals, LinkEncoder, LinkScale, noise
 
 
 class MotorTruth(NamedTuple):

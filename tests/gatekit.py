@@ -15,9 +15,8 @@ import numpy as np
 from estimator import JointModel, Motor, Record, Transmission
 from sim.effects import PlantEffect, make
 from sim.excitation import build
-from sim.plant import JointPlant, LinkPlant, MotorPlant
+from sim.plant import JointPlant, LinkPlant, MotorPlant, Spring
 from sim.sensors import DriveHardware, LinkEncoder
-from sim.springs import Spring
 from sim.variation import suitable, typical_torque_nm
 from sim.world import World, record
 

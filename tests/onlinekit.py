@@ -26,8 +26,7 @@ from estimator import (
 )
 from sim.cases import case
 from sim.effects import PlantEffect
-from sim.plant import JointPlant
-from sim.springs import Spring
+from sim.plant import JointPlant, Spring
 from sim.world import record
 
 VALID, OBSERVABLE, NODE_RESTARTED = int(Status.VALID), int(Status.OBSERVABLE), int(Status.NODE_RESTARTED)

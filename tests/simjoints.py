@@ -8,9 +8,8 @@ import numpy as np
 
 from sim.effects import PlantEffect
 from sim.excitation import build
-from sim.plant import JointPlant, LinkPlant, MotorPlant
+from sim.plant import JointPlant, LinkPlant, MotorPlant, Spring
 from sim.sensors import DriveHardware, LinkEncoder
-from sim.springs import Spring
 from sim.world import World, record
 
 LINEAR = Spring(model="linear", parameters={"k_nm_rad": 150.0})

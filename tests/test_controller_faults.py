@@ -18,7 +18,7 @@ from drivelink import jointfile
 from drivelink._core import encode_sample
 from drivelink.pubsub.wire import EstimateMessage
 from estimator.sample import Sample, Status, TransmissionEstimate
-from sim.canopen.statemachine import PowerState
+from sim.canopen.drive import PowerState
 from sim.effects import parse
 from sim.excitation import build
 

@@ -25,9 +25,8 @@ from estimator.filters import StateVariableFilter
 from estimator.identify import identify
 from sim.effects import parse
 from sim.excitation import build
-from sim.plant import JointPlant, LinkPlant, MotorPlant
+from sim.plant import JointPlant, LinkPlant, MotorPlant, Spring
 from sim.sensors import DriveHardware, LinkEncoder
-from sim.springs import Spring
 from sim.world import World, record
 
 T = 1e-3

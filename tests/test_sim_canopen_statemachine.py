@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from sim.canopen.statemachine import PowerState as P
-from sim.canopen.statemachine import StateMachine
+from sim.canopen.drive import PowerState as P
+from sim.canopen.drive import StateMachine
 
 SHUTDOWN, SWITCH_ON, ENABLE, DISABLE_VOLTAGE, QUICK_STOP = 0x06, 0x07, 0x0F, 0x00, 0x02
 

@@ -12,8 +12,7 @@ from simjoints import EXPONENTIAL, HARDENING, LINEAR, RIGID, VSA_II, energy, sea
 
 from sim.errors import SimError
 from sim.integration import integrator, whole_fraction
-from sim.plant import JointPlant, LinkPlant, MotorPlant
-from sim.springs import Spring
+from sim.plant import JointPlant, LinkPlant, MotorPlant, Spring
 
 SPRINGS = [LINEAR, HARDENING, VSA_II, EXPONENTIAL]
 

@@ -288,7 +288,6 @@ def run_program(
     """Run a program to its end on a bus without another reader.
 
     Args:
-        bus: where.
         section: of the joint file, for SDO timeout and retries; None: the defaults.
         idle: called between receptions, e.g. the simulated devices' `poll` in lockstep.
 

@@ -161,7 +161,6 @@ def configure_node(
     Its identity and units are read before and after: where they differ, it is configured once more.
 
     Args:
-        bus: the bus section of the joint file.
         stopped: the node is stopped and does not answer SDO until it is woken.
 
     Raises:

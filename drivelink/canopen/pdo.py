@@ -108,7 +108,6 @@ def read_tpdo(node: int, number: int, *, exactly: bool = False) -> Program[Tpdo 
     """Read one TPDO; None if it does not exist.
 
     Args:
-        number: from 1.
         exactly: raise if part of the mapping cannot be read, because frames will be decoded by it.
 
     Raises:

@@ -92,7 +92,6 @@ def scan(bus: FrameBus, node_ids: Iterable[int] = range(1, 128)) -> tuple[list[i
     """Ask node ids for their device type.
 
     Args:
-        bus: where.
         node_ids: ids to ask; default: all.
 
     Returns:

@@ -51,7 +51,6 @@ def offer(role: Role, reported: Mapping[Address, int], vendor: Vendor) -> Offer:
 
     Args:
         role: role of the node, with its section of the joint file.
-        reported: known unsigned values of the node's objects.
     """
     result = Offer()
     vendor = vendor.generation(reported)

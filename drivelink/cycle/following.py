@@ -27,11 +27,7 @@ Used = Callable[[int, NodeLayout], object]
 
 
 class MapFollower:
-    """Common part of the two followers.
-
-    Args:
-        assemblers: of each node's joint.
-    """
+    """Common part of the two followers."""
 
     def __init__(
         self, assemblers: Mapping[int, Assembler], layouts: Mapping[int, NodeLayout], used: Used
@@ -79,7 +75,6 @@ class PassiveFollower(MapFollower):
 
     Args:
         configurator: takes the mappings from the traffic; starts with the layouts given here.
-        assemblers: of each node's joint.
     """
 
     def __init__(
@@ -189,7 +184,6 @@ class OwnFollower(MapFollower):
 
     Args:
         configurator: the daemon's, or in a log one that takes the mappings from the traffic.
-        assemblers: of each node's joint.
         check: compares what the nodes say by SDO with what is in use; None: nothing was read back.
     """
 

@@ -208,7 +208,6 @@ class CycleLoop:
         """Produce SYNC. Frames received before it belong to the previous cycle.
 
         Args:
-            stamp_ns: UNIX time of this SYNC.
             jump: periods since the one before.
         """
         self.syncs += 1

@@ -267,11 +267,7 @@ class _Question:
 
 
 class ReadBack:
-    """The questions to all nodes of one bus, in turn.
-
-    Args:
-        ask: begins to read an object of a node.
-    """
+    """The questions to all nodes of one bus, in turn."""
 
     def __init__(self, ask: Ask, period_s: float, check: ObjectCheck) -> None:
         self._ask = ask

@@ -65,9 +65,6 @@ def join_bus(
     The period of another master's SYNC is measured and returned in the configurator's `bus`; a different
     period in the joint file is logged.
 
-    Args:
-        idle: called between receptions.
-
     Raises:
         BusError: SYNC is missing or unexpected, or the bus fails.
         DriveError: a node is absent, refuses, or its mapping is not known.

@@ -167,7 +167,6 @@ class BusKeeper:
     """Reopens a lost bus in a thread and hands it to the loop.
 
     Args:
-        port: the daemon's port.
         devices: simulated devices in the loop's thread, or None.
     """
 

@@ -38,7 +38,6 @@ class Supervisor:
     """Heartbeats, faults and reconfiguration of all nodes of the loop.
 
     Args:
-        layouts: of each loop_joint's nodes.
         configurator: configures nodes again or, passive, follows another master.
     """
 

@@ -20,7 +20,6 @@ import can
 from drivelink.errors import JointFileError, UsageError
 from drivelink.jointfile import JointFile, MotorSection, SimSection
 from estimator.model import LinkDynamics
-from sim.bench import Bench
 from sim.canopen.drive import Cia402Drive, DriveData
 from sim.canopen.encoder import Cia406Encoder, EncoderData
 from sim.canopen.node import Node
@@ -29,10 +28,9 @@ from sim.cases import CASES, Case, case
 from sim.effects import PlantEffect, make, parse
 from sim.errors import SimError
 from sim.excitation import build
-from sim.network import Network
-from sim.plant import JointPlant, LinkPlant, MotorPlant
+from sim.network import Bench, Network
+from sim.plant import JointPlant, LinkPlant, MotorPlant, Spring
 from sim.sensors import DriveHardware, LinkEncoder
-from sim.springs import Spring
 from sim.variation import suitable, typical_torque_nm, with_parameters
 from sim.world import World as World
 

@@ -57,11 +57,7 @@ Readings = Mapping[Channel, Series]
 
 
 class Asked:
-    """Reads positions, velocity and torque of the nodes in turn, as fast as they answer; writes nothing.
-
-    Args:
-        clock: monotonic seconds.
-    """
+    """Reads positions, velocity and torque of the nodes in turn, as fast as they answer; writes nothing."""
 
     def __init__(self, surveys: Sequence[NodeSurvey], clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock

@@ -44,8 +44,6 @@ def analyse(
     """Fit and diagnose one record.
 
     Args:
-        record: the recording, or a part of it.
-        joint: the joint's last accepted model.
         validation: a recording that takes no part in fit and selection; None: blocks are held out.
 
     Raises:

@@ -97,9 +97,6 @@ class Joints:
     def of(self, path: Path, url: str) -> Joint:
         """Return the joint of a recording.
 
-        Args:
-            url: its address, by which it is named.
-
         Raises:
             RecordingError: it carries no joint file, and its name contains none or several of the joints.
         """

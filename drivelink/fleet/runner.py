@@ -87,11 +87,6 @@ def run(
 
     Finished work is in the table however the run ends.
 
-    Args:
-        joints: the fleet's joints.
-        progress: called after each recording.
-        say: called with messages for the user.
-
     Raises:
         FleetError: the scheduler is not reached or lost, or results cannot be written.
         KeyboardInterrupt: Ctrl-C or SIGTERM.

@@ -68,9 +68,6 @@ class Known(NamedTuple):
 class FleetTable:
     """The table, open for appending by one run, as a context manager that flushes and compacts at the end.
 
-    Args:
-        store: where it is.
-
     Raises:
         FleetError: a part cannot be read.
     """
@@ -174,11 +171,7 @@ class FleetTable:
 
 
 def _current(rows: list[dict[str, Any]]) -> list[bool]:
-    """Whether each row is the newest of its content and, if it is an error, of its recording.
-
-    Args:
-        rows: with at least the columns of `_INDEX`.
-    """
+    """Whether each row is the newest of its content and, if it is an error, of its recording."""
     of_content: dict[_Key, datetime] = {}
     of_place: dict[str, datetime] = {}
     for row in rows:
@@ -197,10 +190,6 @@ def _current(rows: list[dict[str, Any]]) -> list[bool]:
 
 def read_rows(store: Store, columns: list[str] | None = None) -> list[dict[str, Any]]:
     """Return the rows of a table, without those that were replaced, in order of time.
-
-    Args:
-        store: where it is.
-        columns: columns to read; None: all.
 
     Raises:
         FleetError: there is none, or a part cannot be read.

@@ -158,11 +158,7 @@ class Outcome(NamedTuple):
 
 
 def process(task: Task, joints: Joints) -> Outcome:
-    """Fetch, identify, read, fit, diagnose. An error becomes a row.
-
-    Args:
-        joints: the fleet's joints.
-    """
+    """Fetch, identify, read, fit, diagnose. An error becomes a row."""
     begin, start = time.process_time(), time.monotonic()
     row: dict[str, Any] = broken_row(task, "")
     where = task.source.url

@@ -61,7 +61,6 @@ def write(
 
     Args:
         source: the joint file the diagnosis was made with.
-        force: replace an existing file.
 
     Raises:
         JointFileError: the copy cannot be written.

@@ -215,7 +215,6 @@ def write_model(
         target: path of the copy; written atomically, and only if valid.
         changes: nested like the file. Mappings are merged, a list of mappings for an array (`motor`) element
             by element; everything else, and `effect`, is replaced.
-        force: replace an existing file.
 
     Raises:
         JointFileError: the result is invalid, or the target cannot be written.

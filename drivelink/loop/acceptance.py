@@ -152,12 +152,7 @@ def accepted_at(joint: JointFile | Mapping[str, Any]) -> str:
 
 
 class Trial:
-    """Whether the residual falls to its baseline once the daemon has the new model.
-
-    Args:
-        path: the joint file as it is now.
-        now_s: monotonic time.
-    """
+    """Whether the residual falls to its baseline once the daemon has the new model."""
 
     def __init__(self, path: Path, now_s: float) -> None:
         self.in_use = False  # the daemon has the new model

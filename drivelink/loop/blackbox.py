@@ -53,7 +53,6 @@ class BlackBox(Sink):
 
     Args:
         text: the joint file; its `[recording]` section has folder and limits.
-        clock: monotonic time, s.
 
     Raises:
         RecordingError: the folder cannot be made.

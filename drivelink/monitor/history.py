@@ -203,7 +203,6 @@ def usual_range(values: Sequence[float], most: float = 0.02) -> tuple[float, flo
     """Return the range of a plot: that of all but the outermost values, extended to those by at most half.
 
     Args:
-        values: values to draw; non-finite ones are omitted.
         most: fraction of outermost values, both ends together.
 
     Returns:

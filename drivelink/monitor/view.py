@@ -66,7 +66,6 @@ class JointView:
     """One joint, live: numbers with their band, curves, cycle, drives; a renderable of `rich`.
 
     Args:
-        name: the joint's name.
         subtitle: e.g. its case or bus.
         height: lines; default: those of the terminal.
 

@@ -123,7 +123,6 @@ def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str,
     """Return the data of one joint for the page; invalid and non-finite values are null.
 
     Args:
-        alive: whether its daemon is alive.
         since: times of the page's newest moment and residual, by joint; updated.
     """
     history = view.history

@@ -80,11 +80,7 @@ def bare_name(name: str) -> str:
 
 
 class Units:
-    """Units in reports of an axis.
-
-    Args:
-        linear: whether it is a linear axis.
-    """
+    """Units in reports of an axis."""
 
     def __init__(self, linear: bool) -> None:
         self._linear = linear

@@ -24,7 +24,6 @@ class Meter:
     Args:
         what: the job in a few words, e.g. "replay".
         total: how much there is to do, where it is known.
-        console: where to show it; stderr if left out.
     """
 
     def __init__(self, what: str, total: int | None = None, console: Console | None = None) -> None:

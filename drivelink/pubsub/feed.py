@@ -162,7 +162,6 @@ class DaemonIdentity:
 
         Args:
             session: what follows `alive/` in its key; "" for the joint's own token.
-            there: whether it appeared.
         """
         self._seen = self._seen or there
         if not session:

@@ -126,11 +126,7 @@ class JointPublisher:
             self._ros2.finding = finding
 
     def put_joint(self, joint: JointFile, layouts: Sequence[NodeLayout] = ()) -> None:
-        """Publish the model in use, on every change.
-
-        Args:
-            layouts: of its nodes, once they are known.
-        """
+        """Publish the model in use, on every change."""
         rigid = any(motor.transmission.model == RIGID for motor in joint.motor)
         self._partial = rigid or joint.estimator.mode == "paper"
         self._put_document("model", describe_model(joint, layouts))

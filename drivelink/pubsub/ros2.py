@@ -240,7 +240,6 @@ class Ros2Publisher:
 
     Args:
         session: the daemon's session, which it does not close.
-        joint: with a `[ros2]` section.
 
     Raises:
         ZenohError: zenoh refuses a key.

@@ -259,7 +259,6 @@ def open_sink(path: Path, joint: JointFile, joint_text: str = "", *, force: bool
 
     Args:
         joint_text: its joint file, stored if the format allows.
-        force: replace an existing file.
 
     Raises:
         RecordingError: no such format, or the file cannot be written.

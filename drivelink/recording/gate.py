@@ -123,13 +123,7 @@ def _record_of(samples: Sequence[Sample], model: JointModel, period_s: float) ->
 
 
 def _text_of(joint: JointFile, findings: Sequence[Discrepancy], *, live: bool) -> str:
-    """The correction as text for the joint file.
-
-    Args:
-        joint: as it is.
-        findings: of the gate.
-        live: whether the values come from the drives by the joint file's scales.
-    """
+    """The correction as text for the joint file."""
     changes = [change for finding in findings for change in finding.changes]
     found = corrections(joint, changes, live=live)
     scale = ", ".join(f"{c.key} = {c.value:.7g}" for c in found if c.table == "recording.scale")

@@ -40,7 +40,6 @@ def mapping_document(
     """Return the mapping document of a recording of frames.
 
     Args:
-        layouts: of its nodes, if known.
         daemon: whether the layouts come from a daemon rather than a file.
     """
     nodes = [layout_document(layout) for layout in layouts]

@@ -51,7 +51,6 @@ class EstimatesFile:
 
     Args:
         linked: with declared link dynamics; adds columns of the external torque.
-        force: replace an existing file.
 
     Raises:
         RecordingError: it cannot be opened or, later, written; an existing file is unchanged.

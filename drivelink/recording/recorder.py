@@ -40,11 +40,7 @@ _STALE_S = 1.0  # after which another session may take over without a liveliness
 
 
 class FirstSource:
-    """Passes the samples of one source, the first of daemon and bus.
-
-    Args:
-        sink: where they go.
-    """
+    """Passes the samples of one source, the first of daemon and bus."""
 
     def __init__(self, sink: Sink) -> None:
         self._sink = sink
@@ -63,7 +59,6 @@ class ZenohTap:
 
     Args:
         session: an open session; it stays open.
-        sink: where it goes.
 
     Attributes:
         missed: cycles without sample.
@@ -173,7 +168,6 @@ class BusTap:
 
     Args:
         bus: an open bus; it stays open.
-        sink: where it goes.
         base_dir: folder of the joint file; None: make no samples.
         layouts: of its nodes, if reported by a daemon.
 

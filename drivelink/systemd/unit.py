@@ -58,8 +58,6 @@ def installation(
     """Return the files that run a joint as a service.
 
     Args:
-        joint: the joint file's content.
-        path: where it is.
         bus: options of `drivelink run` for another bus than the joint file's.
         allow: addresses beside this machine that may connect, e.g. "10.0.0.0/24".
         credentials: "NAME=FILE": keys that the unit hands to the daemon as

@@ -1,17 +1,44 @@
 """The object dictionary of a simulated device: typed entries with access rights, limits and hooks.
 
 A dictionary is made of canopen's description of an EDS file and holds the live `Entry` of each sub-index.
-PDOs are packed from `Entry.value`, without a dictionary access.
+PDOs are packed from `Entry.value`, without a dictionary access. Refusals are SDO aborts
+(CiA 301, 7.2.4.3.17); `canopen.SdoAbortedError` carries one to the client.
 """
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterable, Iterator
+from enum import IntEnum
 
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
+from canopen.sdo.exceptions import SdoAbortedError
 
-from sim.canopen.aborts import Abort, SdoAbortedError
+__all__ = ["Abort", "SdoAbortedError"]
+
+
+class Abort(IntEnum):
+    """The codes that a simulated device answers with, besides those of canopen's server."""
+
+    TIMEOUT = 0x05040000
+    COMMAND = 0x05040001  # client/server command specifier not valid
+    UNSUPPORTED_ACCESS = 0x06010000
+    WRITE_ONLY = 0x06010001
+    READ_ONLY = 0x06010002
+    NO_OBJECT = 0x06020000
+    NOT_MAPPABLE = 0x06040041
+    PDO_LENGTH = 0x06040042
+    INCOMPATIBLE = 0x06040043
+    TOO_LONG = 0x06070012
+    TOO_SHORT = 0x06070013
+    NO_SUBINDEX = 0x06090011
+    INVALID_VALUE = 0x06090030
+    TOO_HIGH = 0x06090031
+    TOO_LOW = 0x06090032
+    DATA_TRANSFER = 0x08000020
+    DEVICE_STATE = 0x08000022
+    NO_DATA = 0x08000024
+
 
 Value = int | bytes
 Object = ODVariable | ODRecord | ODArray

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from sim.canopen.aborts import Abort, SdoAbortedError
+from sim.canopen.dictionary import Abort, SdoAbortedError
 from sim.canopen.edsfile import load_eds, with_values
 from sim.canopen.node import Node
 from sim.canopen.profiles import Quirks
@@ -34,11 +34,7 @@ class EncoderData:
 
 
 class Cia406Encoder(Node):
-    """The encoder at the link.
-
-    Args:
-        node_id: 1 to 127.
-    """
+    """The encoder at the link."""
 
     sends_on_change = False  # CiA 406: the asynchronous TPDO goes by the cyclic timer
 

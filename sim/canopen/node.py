@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from enum import IntEnum
 
-from sim.canopen.aborts import Abort, SdoAbortedError
-from sim.canopen.dictionary import Dictionary, Entry, Object
+from sim.canopen.dictionary import Abort, Dictionary, Entry, Object, SdoAbortedError
 from sim.canopen.pdo import COB_INVALID, Rpdo, Tpdo, restricted
 from sim.canopen.profiles import Quirks
 from sim.canopen.sdo import SdoServer
@@ -35,10 +34,6 @@ class Nmt(IntEnum):
 
 class Node:
     """One device on the bus; drives and encoders derive from it and override the `on_…` hooks.
-
-    Args:
-        node_id: 1 to 127.
-        quirks: how it deviates from a strict device.
 
     Attributes:
         node_id: 1 to 127.

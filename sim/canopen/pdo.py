@@ -9,8 +9,7 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING
 
-from sim.canopen.aborts import Abort, SdoAbortedError
-from sim.canopen.dictionary import Entry
+from sim.canopen.dictionary import Abort, Entry, SdoAbortedError
 from sim.canopen.timers import Timer
 
 if TYPE_CHECKING:
@@ -44,8 +43,6 @@ class Pdo:
     """Common part of TPDOs and RPDOs: parameters, their checks, the compiled layout.
 
     Args:
-        node: the device; its dictionary holds the parameters.
-        number: from 1.
         first: index of the communication parameter of number 1; the mapping is 0x200 behind it.
 
     Attributes:

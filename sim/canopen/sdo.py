@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 from canopen.sdo.server import SdoServer as CanopenServer
 
-from sim.canopen.aborts import Abort, SdoAbortedError
-from sim.canopen.dictionary import LONGEST_STRING
+from sim.canopen.dictionary import LONGEST_STRING, Abort, SdoAbortedError
 from sim.canopen.timers import Timer
 
 if TYPE_CHECKING:

@@ -6,8 +6,7 @@ import struct
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from sim.canopen.aborts import Abort, SdoAbortedError
-from sim.canopen.dictionary import Dictionary, Entry
+from sim.canopen.dictionary import Abort, Dictionary, Entry, SdoAbortedError
 from sim.canopen.pdo import COB_INVALID
 from sim.canopen.timers import Timer
 

@@ -20,7 +20,7 @@ from sim.plant import JointPlant
 
 __all__ = ["LISTED", "UNLISTED", "Assembly", "Definition", "PlantEffect", "assemble", "make", "parse"]
 
-for _place in ("motor", "transmission", "measurement", "link", "unlisted"):
+for _place in ("motor", "transmission", "link", "unlisted"):
     import_module(f"sim.effects.{_place}")
 
 

@@ -1,12 +1,11 @@
-"""Effects at the link."""
+"""Effects at the link, and in the measurement of positions: a reading is the true angle plus its error."""
 
 from __future__ import annotations
 
 import math
 from functools import partial
 
-from sim.effects.assembly import LISTED, Assembly, Values, define
-from sim.effects.common import SMOOTHING, at_speed, not_negative, wave
+from sim.effects.assembly import LISTED, SMOOTHING, Assembly, Values, at_speed, define, not_negative, wave
 
 _effect = partial(define, LISTED, "link")
 
@@ -55,3 +54,52 @@ def _link_inertia(a: Assembly, m: int, p: Values) -> None:
 def _contact(a: Assembly, m: int, p: Values) -> None:
     k, at, side = p["stiffness_nm_rad"], p["position_rad"], math.copysign(1.0, p["side"])
     a.link.loads.append(lambda q, v: side * k * max(0.0, side * (q - at)))
+
+
+_of_measurement = partial(define, LISTED, "measurement")
+
+
+@_of_measurement(
+    "deflection_offset",
+    "constant offset of the link encoder, or with two motors of that motor's encoder",
+    offset_rad="deflection that is read where there is none",
+)
+def _deflection_offset(a: Assembly, m: int, p: Values) -> None:
+    offset = p["offset_rad"]
+    if len(a.motors) == 1:
+        a.link.readings.append(lambda q: q + offset)
+    else:
+        a.motors[m].readings.append(lambda theta: theta - offset)
+
+
+@_of_measurement(
+    "encoder_eccentricity",
+    "the link encoder's disc is off centre",
+    sin_rad="error of the reading, sine of q",
+    cos_rad=("error of the reading, cosine of q", 0.0),
+)
+def _eccentricity(a: Assembly, m: int, p: Values) -> None:
+    height, phase = wave(p["sin_rad"], p["cos_rad"], 1.0)
+    a.link.readings.append(lambda q: q + height * math.sin(q + phase))
+
+
+@_of_measurement("encoder_delay", "the link position is older than the rest", delay_s="by this time")
+def _encoder_delay(a: Assembly, m: int, p: Values) -> None:
+    a.link.reading_delay_s += not_negative(p, "delay_s")
+
+
+@_of_measurement(
+    "deflection_delay",
+    "the deflection's sensor (strain gauges) is older than the rest",
+    delay_s="by this time",
+)
+def _deflection_delay(a: Assembly, m: int, p: Values) -> None:
+    a.link.deflection_delay_s += not_negative(p, "delay_s")
+
+
+@_of_measurement(
+    "encoder_scale", "the link encoder's scale is wrong", relative_error="share by which it reads too much"
+)
+def _encoder_scale(a: Assembly, m: int, p: Values) -> None:
+    scale = 1.0 + p["relative_error"]
+    a.link.readings.append(lambda q: q * scale)

@@ -5,8 +5,18 @@ from __future__ import annotations
 import math
 from functools import partial
 
-from sim.effects.assembly import LISTED, Assembly, Values, define
-from sim.effects.common import SLIP, SMOOTHING, at_speed, not_negative, slip, wave
+from sim.effects.assembly import (
+    LISTED,
+    SLIP,
+    SMOOTHING,
+    Assembly,
+    Values,
+    at_speed,
+    define,
+    not_negative,
+    slip,
+    wave,
+)
 
 _effect = partial(define, LISTED, "motor")
 

@@ -6,10 +6,9 @@ import math
 from collections.abc import Callable
 from functools import partial
 
-from sim.effects.assembly import LISTED, Assembly, Values, define
-from sim.effects.common import SLIP, not_negative, slip, wave
+from sim.effects.assembly import LISTED, SLIP, Assembly, Values, define, not_negative, slip, wave
 from sim.errors import SimError
-from sim.springs import Law
+from sim.plant import Law
 
 _effect = partial(define, LISTED, "transmission")
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from functools import partial
 
-from sim.effects.assembly import UNLISTED, Assembly, Described, Values, define
-from sim.effects.common import not_negative
+from sim.effects.assembly import UNLISTED, Assembly, Described, Values, define, not_negative
 from sim.effects.memory import Creep
 from sim.errors import SimError
 

@@ -67,7 +67,14 @@ _LAZY = {  # imported when asked for, so that `import drivelink` stays cheap
 
 def __getattr__(name: str) -> Any:
     if name in _LAZY:
-        return getattr(import_module(_LAZY[name]), name)
+        try:
+            return getattr(import_module(_LAZY[name]), name)
+        except ModuleNotFoundError as error:
+            if error.name != _LAZY[name]:
+                raise
+            # the wheel of the client alone (packaging/client.py)
+            text = f"drivelink.{name}: expected drivelink-vsa, only its client is installed"
+            raise ImportError(text) from None
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

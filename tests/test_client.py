@@ -4,6 +4,7 @@ import asyncio
 import math
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -209,10 +210,10 @@ def test_iteration_can_report_that_nothing_came(publisher, joint):
 
 
 def test_iteration_ends_when_the_subscription_is_closed_meanwhile(publisher, joint):
-    timer = threading.Timer(0.1, joint.close)
-    timer.start()
+    threading.Timer(0.1, joint.close).start()
     assert list(joint) == []
-    timer.join()
+    with ThreadPoolExecutor(8) as threads:  # several at once: as one
+        assert list(threads.map(lambda _: joint.close(), range(8))) == [None] * 8
     assert joint.wait() is None
     assert joint.latest() is None
 

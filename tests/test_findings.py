@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import diagnosiskit as kit
@@ -49,6 +50,14 @@ def outcome(*effects: Finding, advice: tuple[str, ...] = ()) -> Diagnosis:
 )
 def test_an_effect_is_said_as_surely_as_it_is_known(effects: tuple[Finding, ...], said: str) -> None:
     assert sentence(outcome(*effects, advice=("move faster",))).startswith(said)
+
+
+def test_a_free_curve_that_raises_the_error_is_not_said_to_explain_it() -> None:
+    unlisted = finding("unlisted", 1.0, coordinates=("position", "torque"))
+    worse = replace(outcome(unlisted), verdict="unexplained", validation=Errors(1.0, 3.0, 0.82, 2.47))
+    assert sentence(worse).endswith(
+        "what was tried over position and torque does not lower the torque balance's error on held-out data, 82.00%."
+    )
 
 
 @pytest.fixture(scope="module")

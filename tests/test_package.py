@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import runpy
+import subprocess
+import sys
 import tomllib
 from importlib.metadata import version
 from pathlib import Path
+
+import numpy
+import zenoh
+from zenohkit import free_endpoint, ready, script
 
 import drivelink
 import drivelink._core
@@ -42,3 +50,36 @@ def test_every_data_file_of_the_packages_is_in_the_wheel() -> None:
         if path.is_file() and path.suffix not in sources and "core" not in path.relative_to(ROOT).parts
     }
     assert data <= packed
+
+
+_SUBSCRIBER = """
+import sys, drivelink
+with drivelink.subscribe("elbow", endpoint=sys.argv[1]) as elbow:
+    estimate = elbow.wait(60.0)
+    print(estimate.usable, estimate.stiffness_nm_rad, elbow.take().dtype.names[:2])
+print({"scipy", "matplotlib", "estimator._core"} & set(sys.modules))
+drivelink.fit
+"""
+
+
+def test_the_client_alone_subscribes_with_numpy_and_zenoh_and_nothing_compiled(tmp_path: Path) -> None:
+    runpy.run_path(str(ROOT / "packaging" / "client.py"))["write"](tmp_path / "client")
+    project = tomllib.loads((tmp_path / "client" / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert [need.split(">")[0] for need in project["dependencies"]] == ["numpy", "eclipse-zenoh"]
+    for package in (numpy, zenoh):  # all that a path has beside the client
+        found = Path(str(package.__file__)).parent
+        for each in (found, found.with_name(f"{found.name}.libs")):
+            if each.exists():
+                (tmp_path / each.name).symlink_to(each)
+    endpoint = free_endpoint()
+    with script("elbow", endpoint) as daemon:
+        ready(daemon)
+        done = subprocess.run(
+            [sys.executable, "-S", "-c", _SUBSCRIBER, endpoint],
+            env=os.environ | {"PYTHONPATH": f"{tmp_path / 'client'}:{tmp_path}"},
+            cwd=tmp_path, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+    assert done.stdout == "True 700.0 ('sequence', 'stamp_ns')\nset()\n", done.stderr
+    assert done.stderr.splitlines()[-1] == (
+        "ImportError: drivelink.fit: expected drivelink-vsa, only its client is installed"
+    )

@@ -136,11 +136,10 @@ def _points(curve: Curve) -> dict[str, list[float]]:
 
 def sentence(outcome: Diagnosis) -> str:
     """Return the verdict in one sentence."""
-    lower = outcome.validation.after_rms_nm <= outcome.validation.before_rms_nm
-    fall = (
-        f"the torque balance's error on held-out data {'falls' if lower else 'rises'} from "
-        f"{outcome.validation.before_relative:.2%} to {outcome.validation.after_relative:.2%}"
-    )
+    error, held = "the torque balance's error on held-out data", outcome.validation
+    lower = held.after_rms_nm <= held.before_rms_nm
+    moves = "falls" if lower else "rises"
+    fall = f"{error} {moves} from {held.before_relative:.2%} to {held.after_relative:.2%}"
     if outcome.verdict == "effect":
         return f"{lacks(outcome)}: {fall}."
     names = " and ".join(title_of(finding, outcome) for finding in outcome.effects)
@@ -148,9 +147,11 @@ def sentence(outcome: Diagnosis) -> str:
         where = outcome.effects[0]
         place = _place(where, outcome)
         over = " and ".join(name.replace("_", " ") for name in where.coordinates)
-        return (
-            f"The model lacks something at the {place} that is not in the library, a function of {over}: "
-            f"{'with a free curve' if _curve_of_unlisted(outcome) else 'with it'} {fall}."
+        by = "a free curve" if _curve_of_unlisted(outcome) else "what was tried"
+        return f"The model lacks something at the {place} that is not in the library" + (
+            f", a function of {over}: with {by} {fall}."
+            if lower
+            else f", and {by} over {over} does not lower {error}, {held.before_relative:.2%}."
         )
     if outcome.verdict == "insufficient_excitation":
         said = f" (it might be {names})" if names else ""

@@ -9,6 +9,7 @@ import difflib
 import logging
 import math
 import re
+import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -115,6 +116,7 @@ class Client:
         self._documents: dict[str, tuple[str | None, dict[str, Any]]] = {}  # who wrote it, and what
         self._external: tuple[str | None, ExternalMessage] | None = None  # who wrote it, and what
         self._closed = False
+        self._leaving = threading.RLock()  # who closes second waits until the first is done
         self._prefix = prefix
         self._hint_s = time.monotonic() + PATIENCE_S  # when to say that there is no daemon
         try:
@@ -289,12 +291,13 @@ class Client:
     def close(self) -> None:
         """Leave; a second time does nothing."""
         self._closed = True
-        for name in ("_estimates", "_externals", "_tokens"):
-            self._undeclare(getattr(self, name, None))
-        for subscriber in getattr(self, "_latched", {}).values():
-            self._undeclare(subscriber)
-        if self._owned:
-            close_session(self._session)
+        with self._leaving:
+            for name in ("_estimates", "_externals", "_tokens"):
+                self._undeclare(getattr(self, name, None))
+            for subscriber in getattr(self, "_latched", {}).values():
+                self._undeclare(subscriber)
+            if self._owned:
+                close_session(self._session)
 
     @staticmethod
     def _undeclare(entity: Any) -> None:

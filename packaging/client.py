@@ -16,11 +16,11 @@ from pathlib import Path
 from pprint import pformat
 
 ROOT = Path(__file__).parent.parent
-_PUBLIC = ("drivelink.pubsub.client", "drivelink.pubsub.asyncclient", "drivelink.pubsub.names")
 _OURS = ("drivelink", "estimator")
 _NEEDS = ("numpy", "eclipse-zenoh")
 _LOADED = f"""
-import sys, {", ".join(_PUBLIC)}
+import sys
+from drivelink import State, joints, subscribe, subscribe_async
 print(*(name for name in sys.modules if name.split(".")[0] in {_OURS}))
 """
 

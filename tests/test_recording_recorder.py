@@ -105,6 +105,7 @@ def test_a_recording_of_nothing_is_an_error(tmp_path: Path) -> None:
         error = process.communicate(timeout=60)[1].splitlines()[-1]
         assert process.returncode != 0
     assert "nothing was recorded; expected a daemon that serves elbow" in error
+    assert not out.exists()
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from drivelink.pubsub.feed import DECODERS
 from drivelink.pubsub.session import close_session, open_client
 from drivelink.recording.formats import open_sink
 from drivelink.recording.foxglove import write_layouts
-from drivelink.recording.mapping import layouts_from, mapping_document
+from drivelink.recording.mapping import layouts_from, mapping_document, side_file
 from drivelink.recording.recorder import BusTap, FirstSource, Recorder, ZenohTap
 from drivelink.recording.sinks import Sink
 
@@ -104,6 +104,9 @@ def run(args: argparse.Namespace) -> int:
         recorder.run(lambda: stopped.is_set() or time.monotonic() >= end, say.tick)
     print(json.dumps(say.document()) if args.json else f"{args.out}: {say.text()}")
     if not any(recorder.sink.counts.get(kind) for kind in ("sample", "estimate", "frame")):
+        for path in (args.out, side_file(args.out)):
+            if path.is_file():
+                path.unlink()
         raise RecordingError(
             f"{args.out}: nothing was recorded; expected a daemon that serves {joint.name} "
             f"at {joint.zenoh.endpoint}, or its bus"

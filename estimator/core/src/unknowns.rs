@@ -315,6 +315,10 @@ impl Spring {
         let torque = balance::variance(total, balance::TORQUE).max(f64::MIN_POSITIVE).sqrt();
         let rms =
             |unknown: usize| (total.quadratic(&frame.directions[unknown]) / total.rows).sqrt().max(1e-12);
+        let fluctuation = |unknown: usize| {
+            let mean = total.times(&frame.directions[unknown])[balance::OFFSET] / total.rows;
+            (rms(unknown).powi(2) - mean * mean).max(0.0).sqrt().max(1e-12)
+        };
         let (mut mean, mut std) = ([0.0; UNKNOWNS], [1.0; UNKNOWNS]);
         for unknown in SOFT..UNKNOWNS {
             let share = if LOAD.contains(&unknown) { 0.25 } else { UNDECLARED };
@@ -336,7 +340,7 @@ impl Spring {
                 (true, Some(shape)) => DECLARED * (self.start[i] - shape.low),
                 (true, None) if self.start[i] != 0.0 => DECLARED * self.start[i].abs(),
                 (false, Some(shape)) => (2.0 * (self.alpha[i] - shape.low)).max(1.0 / deflection),
-                _ => SPRING_SHARE * torque / rms(unknown),
+                _ => SPRING_SHARE * torque / fluctuation(unknown), // its mean may be a zero that is elsewhere
             };
         }
         (mean[ZERO], std[ZERO]) = (-self.zero, zero_std);

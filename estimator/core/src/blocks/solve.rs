@@ -120,7 +120,8 @@ impl Blocks {
             let reduced = frame.reduce(&total);
             let prior = self.prior(&total, &frame, zero);
             if step == 0 {
-                self.measure(&frame, &reduced, &prior, &total);
+                let elsewhere = self.prior(&total, &frame, self.deflection);
+                self.measure(&frame, &reduced, &elsewhere, &total);
             }
             let noise = self.noise.variance * self.noise.correlated;
             let Some((mut chosen, moved)) = self.choose(&frame, &reduced, &total, &prior, noise) else {
@@ -150,7 +151,7 @@ impl Blocks {
         }
     }
 
-    /// The noise is what all unknowns together leave; it decides how many of them there are.
+    /// The noise is what all unknowns together leave, the zero anywhere; it decides how many of them there are.
     fn measure(&mut self, frame: &Frame, reduced: &Matrix, prior: &Prior, total: &Gram) {
         let floor = (EXACT * total.rms(balance::TORQUE)).powi(2);
         if self.carried.is_some() && self.ring.len() < FEWEST {

@@ -231,7 +231,7 @@ impl Blocks {
             let log = log_evidence(reduced, found, prior, noise);
             let elsewhere = self.prior(total, frame, self.deflection);
             let other = choose(reduced, base, &groups, &elsewhere, noise);
-            if log_evidence(reduced, other, &elsewhere, noise) > log + ACCUSED.ln() {
+            if log_evidence(reduced, other, &elsewhere, noise) > log + (groups.len() as f64).ln() {
                 return solve(reduced, other, &elsewhere, noise).map(|found| (found, true));
             }
         }

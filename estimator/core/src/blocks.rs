@@ -432,6 +432,7 @@ impl Blocks {
             self.keep(block);
         }
         self.end_doubt();
+        (self.doubting, self.good) = (true, CONVINCING - 1); // until another block bears it out
         if opens & set(SPRING) != 0 {
             self.spring.open();
         }

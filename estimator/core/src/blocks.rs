@@ -14,7 +14,7 @@ use crate::student::f_quantile;
 use crate::unknowns::{ACTIVE, CANDIDATES, LATE, OFFSET, RATE, Reading, SPRING, Spring, ZERO};
 
 /// Share of the torque that a curve may leave unexplained.
-pub const USEFUL: f64 = 0.2;
+const USEFUL: f64 = 0.2;
 const BLOCK_S: f64 = 0.25; // of motion: longer than the filters' memory, so that blocks are nearly independent
 const BLOCKS: usize = 100; // 25 s of motion: what a joint's temperature and load leave as they are
 const FEWEST: usize = 8; // blocks before one is held against the others
@@ -50,6 +50,7 @@ struct Carried {
     precision: [Vector; UNKNOWNS],
     set: Set,
     deflection: f64, // the largest, until then
+    unexplained: f64,
 }
 
 /// Blocks of one motor's rows.
@@ -73,9 +74,11 @@ pub struct Blocks {
     projection: Option<Projection>,
     deflection: f64,
     noise: Noise,
-    own: f64,      // rms that the chosen unknowns leave
-    torque: f64,   // rms of the transmission's torque
-    friction: f64, // rms of friction and hysteresis
+    own: f64,         // rms that the chosen unknowns leave
+    fluctuation: f64, // variance of the motor's torque
+    unexplained: f64, // share of its rms
+    torque: f64,      // rms of the transmission's torque
+    friction: f64,    // rms of friction and hysteresis
     quick: f64,
     peak: f64,       // of it in the open block …
     peaks: Vec<f64>, // … and in those of the ring
@@ -142,6 +145,8 @@ impl Blocks {
             deflection: 0.0,
             noise: Noise { variance: f64::NAN, correlated, tails: TAILS },
             own: f64::NAN,
+            fluctuation: f64::NAN,
+            unexplained: f64::NAN,
             torque: f64::NAN,
             friction: 0.0,
             quick: 0.0,
@@ -188,6 +193,7 @@ impl Blocks {
         (self.oldest, self.moved, self.skipped, self.fitted) = (0, false, 0, false);
         self.end_doubt();
         (self.noise.variance, self.own, self.torque, self.quick) = (f64::NAN, f64::NAN, f64::NAN, 0.0);
+        self.unexplained = if self.posterior.is_some() { 0.0 } else { f64::NAN };
     }
 
     /// What follows is not as what was before: half a block is a block, but for what a restart is judged by.
@@ -308,7 +314,7 @@ impl Blocks {
         }
         self.end_doubt();
         self.solve();
-        if self.lost && self.located && self.off == 0.0 && self.unexplained() > USEFUL {
+        if self.lost && self.located && self.off == 0.0 && !self.is_explained() {
             self.lose_zero(); // it was located wrongly
         }
         Closed::Added
@@ -453,6 +459,7 @@ impl Blocks {
             precision: inverse(&posterior.covariance, kept),
             set: kept,
             deflection: self.deflection,
+            unexplained: if self.is_explained() { self.unexplained } else { self.usual_unexplained() },
         });
     }
 
@@ -541,15 +548,23 @@ impl Blocks {
         self.torque
     }
 
-    /// rms of what is left of the balance, over the rms of the measured torque without its mean.
+    /// rms of what is left of the balance, over that of the measured torque without its mean; NaN before any.
     #[must_use]
     pub fn unexplained(&self) -> f64 {
-        if self.ring.is_empty() {
-            return if self.posterior.is_some() { 0.0 } else { f64::NAN };
-        }
-        let mut total = Gram::default();
-        self.ring.iter().for_each(|block| total.add(block, 1.0));
-        (self.own * self.own / balance::variance(&total, balance::TORQUE)).sqrt()
+        self.unexplained
+    }
+
+    /// What was left before a change, or before a zero was lost: neither makes the balance noisier.
+    fn usual_unexplained(&self) -> f64 {
+        self.carried.as_ref().map_or(f64::INFINITY, |carried| carried.unexplained)
+    }
+
+    /// Whether the balance leaves less than a useful estimate may, and about what it left before a change.
+    #[must_use]
+    pub fn is_explained(&self) -> bool {
+        let usual = self.usual_unexplained().max((self.white / self.fluctuation).sqrt());
+        let noisier = self.ring.len() < BLOCKS && self.unexplained > EXPLAINED.sqrt() * usual;
+        self.unexplained < USEFUL && !noisier
     }
 
     /// rms of what the balance has left over the last moments, N·m.

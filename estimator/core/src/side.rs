@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::align::Inputs;
 use crate::balance::{Balance, correlated_rows};
-use crate::blocks::{Blocks, Closed, USEFUL};
+use crate::blocks::{Blocks, Closed};
 use crate::causes::{CAUSES, Cause};
 use crate::deflection::{AT_REST, DeflectionFilter, Motion, Present, Tuning};
 use crate::effects::{Coordinates, MotorEffects};
@@ -339,7 +339,7 @@ impl Side {
     fn judge(&mut self) {
         self.doubtful = self.blocks.is_doubting();
         self.unexplained = self.blocks.unexplained();
-        self.fits = self.unexplained < USEFUL;
+        self.fits = self.blocks.is_explained();
     }
 
     /// The torque and stiffness that the deflection's filter goes on with.

@@ -131,6 +131,7 @@ impl Blocks {
             self.moved = moved;
             let own = total.quadratic(&frame.residual(&chosen.x, chosen.set)) / total.rows;
             self.own = own.sqrt().max(EXACT * total.rms(balance::TORQUE));
+            (self.fluctuation, self.unexplained) = (torque, self.own / torque.sqrt());
             let far = SPRING.clone().chain([ZERO]).any(|i| {
                 chosen.x[i].abs() > 0.1 * chosen.covariance[i][i].sqrt() && chosen.set >> i & 1 == 1
             });

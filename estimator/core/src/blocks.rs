@@ -459,7 +459,7 @@ impl Blocks {
             precision: inverse(&posterior.covariance, kept),
             set: kept,
             deflection: self.deflection,
-            unexplained: if self.is_explained() { self.unexplained } else { self.usual_unexplained() },
+            unexplained: self.usual_unexplained().min(self.unexplained),
         });
     }
 
@@ -556,15 +556,15 @@ impl Blocks {
 
     /// What was left before a change, or before a zero was lost: neither makes the balance noisier.
     fn usual_unexplained(&self) -> f64 {
-        self.carried.as_ref().map_or(f64::INFINITY, |carried| carried.unexplained)
+        let carried = self.carried.as_ref().filter(|_| self.ring.len() < BLOCKS);
+        carried.map_or(f64::INFINITY, |carried| carried.unexplained)
     }
 
     /// Whether the balance leaves less than a useful estimate may, and about what it left before a change.
     #[must_use]
     pub fn is_explained(&self) -> bool {
         let usual = self.usual_unexplained().max((self.white / self.fluctuation).sqrt());
-        let noisier = self.ring.len() < BLOCKS && self.unexplained > EXPLAINED.sqrt() * usual;
-        self.unexplained < USEFUL && !noisier
+        self.unexplained < USEFUL && self.unexplained <= EXPLAINED.sqrt() * usual
     }
 
     /// rms of what the balance has left over the last moments, N·m.

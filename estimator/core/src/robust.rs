@@ -20,7 +20,7 @@ use crate::sample_validator::SampleValidator;
 use crate::settings::{Method, Priors, Settings};
 use crate::side::{Moment, SETTLE_DELAYS, Shift, Side};
 use crate::signals::{Channel, Filters};
-use crate::suspicion::Suspicion;
+use crate::suspicion::{self, Suspicion};
 
 const LOOK_S: f64 = 0.03; // between two looks at the excitation: the filters' correlation time at 60 rad/s
 const BRIDGED: f64 = 0.4; // rad that the filter turns by in a gap: a longer one is not learned from
@@ -475,7 +475,9 @@ impl Robust {
         let parts = self.read(0.0);
         self.sides.iter_mut().for_each(Side::act);
         let [why, of_torque] = self.reasons(&parts, settled);
-        let rejected = (flags & status::INPUT_REJECTED != 0).then(|| Why::new(Reason::Rejected, None));
+        let repeats = self.refused.is_some_and(|(what, _)| what.reason == suspicion::Reason::Frozen);
+        let rejected =
+            (repeats || flags & status::INPUT_REJECTED != 0).then(|| Why::new(Reason::Rejected, None));
         self.why = rejected.or(why);
         if rejected.or(of_torque).is_none() {
             flags |= status::TORQUE_VALID;

@@ -11,7 +11,9 @@ use crate::model::Motor;
 use crate::settings::Priors;
 use crate::spring::{Family, Projection, TERMS};
 use crate::student::f_quantile;
-use crate::unknowns::{ACTIVE, CANDIDATES, LATE, OFFSET, RATE, Reading, SPRING, Spring, ZERO};
+use crate::unknowns::{
+    ACTIVE, CANDIDATES, DAMPING, INERTIA, LATE, OFFSET, RATE, Reading, SPRING, Spring, ZERO,
+};
 
 /// Share of the torque that a curve may leave unexplained.
 const USEFUL: f64 = 0.2;
@@ -312,6 +314,10 @@ impl Blocks {
         if self.doubting && self.good < CONVINCING {
             return Closed::Unexplained;
         }
+        if let Some(odds) = self.judge_latest() {
+            self.doubt_latest();
+            return self.doubt(odds);
+        }
         self.end_doubt();
         self.solve();
         if self.lost && self.located && self.off == 0.0 && !self.is_explained() {
@@ -353,40 +359,69 @@ impl Blocks {
         }
     }
 
-    /// What the causes say of a block; `None`: nothing has changed.
+    /// What the causes say of a block, with those that wait; `None`: it is explained.
     fn judge(&self, block: &Gram) -> Option<Odds> {
-        let (frame, posterior) = (self.frame.as_ref()?, self.posterior.as_ref()?);
-        if !self.is_reference() {
-            return None;
-        }
-        let projection = self.projection.as_ref()?;
-        let precision = inverse(&posterior.covariance, posterior.set);
-        let spring = &self.spring;
-        let torque = spring.torque(projection);
-        let known = Known {
-            frame,
-            residual: &self.residual,
-            set: posterior.set,
-            precision: &precision,
-            torque: &torque,
-            slope: &spring.slope(projection),
-            powers: self.powers,
-            motor: (posterior.x[crate::unknowns::INERTIA], posterior.x[crate::unknowns::DAMPING]),
-            torque_rms: balance::variance(block, balance::TORQUE).sqrt(),
-            deflection: self.deflection,
-            period_s: self.period,
-        };
-        let noise = Noise { variance: self.own * self.own, ..self.noise };
-        let odds = known.judge(block, &noise, self.per_block);
-        if odds.of(Cause::Nothing).probability >= 0.5 {
-            return None;
-        }
+        let odds = self.odds_of(block)?;
         if self.waiting.is_empty() {
             return Some(odds);
         }
         let mut window = block.clone();
         self.waiting.iter().for_each(|one| window.add(one, 1.0));
-        Some(known.judge(&window, &noise, self.per_block))
+        self.weigh(&window)
+    }
+
+    /// What the causes say of the last blocks together, each of which was explained: a change may be slow.
+    fn judge_latest(&self) -> Option<Odds> {
+        if self.ring.len() < 2 * WINDOW {
+            return None;
+        }
+        let mut window = Gram::default();
+        (0..WINDOW).for_each(|k| window.add(&self.ring[self.place(k)], 1.0));
+        self.odds_of(&window)
+    }
+
+    /// The place of a block in the ring; 0: the newest.
+    fn place(&self, age: usize) -> usize {
+        (self.oldest + self.ring.len() - 1 - age) % self.ring.len()
+    }
+
+    /// The last blocks are left out of the sum, and wait.
+    fn doubt_latest(&mut self) {
+        self.begin_doubt();
+        self.skipped = 0;
+        self.ring.rotate_left(self.oldest);
+        self.peaks.rotate_left(self.oldest);
+        self.oldest = 0;
+        let kept = self.ring.len() - WINDOW;
+        self.waiting.extend(self.ring.drain(kept..));
+        self.peaks.truncate(kept);
+        self.solve();
+    }
+
+    /// What the causes say of rows; `None`: nothing has changed.
+    fn odds_of(&self, rows: &Gram) -> Option<Odds> {
+        self.weigh(rows).filter(|odds| odds.of(Cause::Nothing).probability < 0.5)
+    }
+
+    /// The probability of each cause for some rows; `None`: nothing is known to hold them against.
+    fn weigh(&self, rows: &Gram) -> Option<Odds> {
+        let (frame, posterior) = (self.frame.as_ref()?, self.posterior.as_ref()?);
+        let projection = self.projection.as_ref().filter(|_| self.is_reference())?;
+        let known = Known {
+            frame,
+            residual: &self.residual,
+            set: posterior.set,
+            precision: &inverse(&posterior.covariance, posterior.set),
+            torque: &self.spring.torque(projection),
+            slope: &self.spring.slope(projection),
+            powers: self.powers,
+            motor: (posterior.x[INERTIA], posterior.x[DAMPING]),
+            torque_rms: balance::variance(rows, balance::TORQUE).sqrt(),
+            deflection: self.deflection,
+            period_s: self.period,
+        };
+        let noise = Noise { variance: self.own * self.own, ..self.noise };
+        Some(known.judge(rows, &noise, self.per_block))
     }
 
     /// The window is not explained: is it the joint that has changed, or a reading?

@@ -51,7 +51,6 @@ def at(seconds: float, action: str, *arguments: Any) -> Step:
 
 
 MISSING = r"^node 2: frames are missing$"
-ARRIVE = r"^node 2: frames arrive again"
 REBOOTED = r"^node 2 has rebooted$"
 STARTED = r"^node 2 is configured again and started$"
 

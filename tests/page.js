@@ -25,7 +25,7 @@ globalThis.devicePixelRatio = 1;
 globalThis.innerWidth = 1200;
 globalThis.innerHeight = 900;
 globalThis.addEventListener = (name, listener) => { listeners[name] = listener; };
-globalThis.EventSource = class {};
+globalThis.EventSource = class { close() {} };
 const press = key => listeners.keydown({ key, target: { tagName: "BODY" }, preventDefault() {} });
 const hover = (id, x, y) => document.getElementById(id).onmousemove({ offsetX: x, offsetY: y, clientX: x, clientY: y });
 const shown = id => document.getElementById(id).text;

@@ -31,7 +31,7 @@ from drivelink.monitor.braille import DotPlot, sparkline
 from drivelink.monitor.history import GrowingCurve, JointHistory, usual_range
 from drivelink.monitor.statuslines import shape, status_lines, status_text
 from drivelink.monitor.terminal import joints_table
-from drivelink.monitor.view import JointView
+from drivelink.monitor.view import JointView, flags
 from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.web import MAX_CONNECTIONS, MAX_STREAMS, WebView, snapshot
 from drivelink.output.numbers import number, with_interval
@@ -128,6 +128,8 @@ def test_the_view_shows_what_touches_the_link_where_that_is_known() -> None:
     (row,) = (line for line in lines(view) if line.startswith("│ external"))
     assert "0.5" in row and "± 0.20 N·m" in row and "contact" in row
     assert ("contact", "yellow") in view.flags
+    assert flags(Status.VALID | Status.TORQUE_VALID) == [("valid", "green"), ("not observable", "yellow")]
+    assert flags(Status.TORQUE_VALID)[2:] == [("torque valid", "green")]
     assert "external 0.5" in view.line() and "contact" in view.line()
     view.update_external(ExternalMessage(4000, 4_000_000_000, 0, math.nan, math.nan), 4.0)
     assert any("not valid" in line for line in lines(view)) and "external not valid" in view.line()
@@ -422,6 +424,23 @@ def test_the_page_draws_live_plots_in_a_browser(web: WebView, tmp_path: Path) ->
             browser.wait_for("(joints.elbow.moments.at(-1)[0] - frozen.elbow.moments.at(-1)[0]) > 0.2")
             browser.screenshot(tmp_path / "page.png")
             assert (tmp_path / "page.png").stat().st_size > 20_000
+            # the motor signals: subscribed to while they are shown, and saved with the rest
+            samples = ["estimate", "sample"]
+            subscribed = lambda: [name for name, _ in web._watcher._streams if name in samples]  # noqa: E731
+            assert subscribed() == samples[:1]
+            browser.evaluate("pause(); $('measured').click()")
+            browser.wait_for("joints.elbow.signals.length > 9 && $('motortorque').shown.series[0].length > 9")
+            assert subscribed() == samples
+            browser.evaluate(
+                "HTMLAnchorElement.prototype.click = function() { saved = this.href; }; $('save').click()"
+            )
+            head, *rows = browser.evaluate("decodeURIComponent(saved)").removeprefix("data:text/csv,").split()
+            assert head.startswith(
+                "time_s,flexibility_torque_nm,stiffness_nm_rad,stiffness_std_nm_rad,valid,motor1_t"
+            )
+            assert any(row.endswith("1.5,0.5,0,0.25") for row in rows)
+            browser.evaluate("$('measured').click()")
+            zenohkit.until(lambda: subscribed() == samples[:1])
     finally:
         over.set()
         poller.join()

@@ -84,6 +84,7 @@ def main() -> int:
     add_bus(parser)
     args = parser.parse_args()
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname).1s %(message)s")
+    logging.getLogger("can").setLevel(logging.CRITICAL)  # some interfaces log every partial read
     os.nice(_NICE)
     ended = threading.Event()
     threading.Thread(target=_wait, args=(ended,), daemon=True).start()

@@ -163,19 +163,13 @@ _HEARTBEATS_LOST = 3.5  # of them missing: the node is gone
 STATES = {0x00: "boot-up", 0x04: "stopped", 0x05: "operational", 0x7F: "pre-operational"}
 OPERATIONAL = 0x05
 _STATE_BITS, _ENABLED, _LIMIT = 0x6F, 0x27, 0x0800  # of the statusword (CiA 402-2, 8.4.2)
-_COUNTED = (  # counter of a node; its smallest reported increase, message then, and message when it stops
-    ("missing", 1, "frames are missing", "frames arrive again, {} were missing so far"),
-    (
-        "wrong_length",
-        1,
-        "frames of the wrong length are not used",
-        "frames have the right length again, {} were wrong so far",
-    ),
+_COUNTED = (  # counter of a node; its smallest reported increase, and the message: its end is not worth one
+    ("missing", 1, "frames are missing"),
+    ("wrong_length", 1, "frames of the wrong length are not used"),
     (
         "conflicting",
         3,  # a single one may be a late frame
         "different frames in one cycle are not used: does another device have its node ID or identifiers?",
-        "one frame per cycle again, {} cycles had several so far",
     ),
 )
 
@@ -237,7 +231,7 @@ class WatchedNode:
     def check_counters(self, events: EventLog, now: int) -> None:
         """Report missing, wrong and conflicting frames since the last call, at a time in ns."""
         node, counters = self.layout.node_id, self.assembler.counters[self.layout.node_id]
-        for name, least, grows, stopped in _COUNTED:
+        for name, least, grows in _COUNTED:
             count, (before, since_ns) = getattr(counters, name), self.counted[name]
             if count - before >= least:
                 self.counted[name] = (count, now)
@@ -251,7 +245,7 @@ class WatchedNode:
                 self.counted[name] = (count, now)
                 if name == "conflicting":
                     self.bunched_ns = 0
-                events.end(f"{name} {node}", f"node {node}: {stopped.format(count)}")
+                events.end(f"{name} {node}")
 
     def check(self, events: EventLog, now: int) -> None:
         """Report changes of heartbeat, fault and statusword since the last call, at a time in ns."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from estimator.errors import EstimatorError
-from estimator.sample import Status
+from estimator.sample import Sample, Status
 from estimator.transmissions import MODELS
 
 _BINS = 160
@@ -111,6 +111,8 @@ class JointHistory:
         # thinned external torques, oldest first; empty without link dynamics
         self.touches: deque[Touch] = deque(maxlen=points)
         self.touch: Touch | None = None  # the newest one
+        # thinned (time, s; sample), oldest first; empty while nobody asks for them
+        self.signals: deque[tuple[float, Sample]] = deque(maxlen=points)
         self.latest: EstimateMessage | None = None  # the newest estimate
         self._apart_s = seconds / points
 
@@ -173,6 +175,14 @@ class JointHistory:
             if not begins:
                 return
         self.touches.append(self.touch)
+
+    def add_sample(self, sample: Sample, time_s: float) -> None:
+        """Enter what was measured at one SYNC."""
+        since = time_s - self.signals[-1][0] if self.signals else math.inf
+        if since < 0.0:  # the daemon restarted
+            self.signals.clear()
+        if since < 0.0 or since >= 0.999 * self._apart_s:
+            self.signals.append((time_s, sample))
 
     def add_residual(self, ratio: float) -> None:
         """Enter the present residual over its baseline."""

@@ -31,7 +31,7 @@ BAND = "blue"
 _SECOND = "magenta"  # the second transmission
 _GREY = "bright_black"  # what is not valid, and the model's curve
 
-_UNSHOWN = Status.VALID | Status.OBSERVABLE | Status.PARTIAL
+_UNSHOWN = Status.VALID | Status.OBSERVABLE | Status.PARTIAL | Status.TORQUE_VALID
 _UNUSABLE = Status.having("unusable")
 _TWO_ROWS = 20  # lines of the plots from which there are four
 SILENT_S = 1.0  # without an estimate, until the shown one is marked as old
@@ -362,6 +362,8 @@ def flags(status: int) -> list[tuple[str, str]]:
         ("valid", "green") if status & Status.VALID else ("not valid", "red"),
         ("observable", "green") if status & Status.OBSERVABLE else ("not observable", "yellow"),
     ]
+    if status & (Status.VALID | Status.TORQUE_VALID) == Status.TORQUE_VALID:
+        found.append(("torque valid", "green"))
     bits = sorted((bit for bit in Status if status & bit & ~_UNSHOWN), key=lambda bit: not bit & _UNUSABLE)
     names = [str(bit.name).lower().replace("_", " ") for bit in bits]
     styles = ["bold red" if bit & _UNUSABLE else "yellow" for bit in bits]

@@ -59,9 +59,10 @@ class Watcher:
         self._hint_s = time.monotonic() + PATIENCE_S
         self._hint = ""
         self._joints: dict[str, _Joint] = {}
+        self._samples: Any = None
         self._claims: deque[zenoh.Sample] = deque()  # tokens that came since the last poll
         ring = zenoh.handlers.RingChannel
-        key = f"{prefix}/{joint or '*'}"
+        key = self._key = f"{prefix}/{joint or '*'}"
         history = zenoh.ext.HistoryConfig(max_samples=1, detect_late_publishers=True)
         try:
             self._streams: list[tuple[str, Any]] = [
@@ -111,6 +112,19 @@ class Watcher:
             view.gone = not joint.identity.alive and view.history.latest is not None
             view.silent_s = now_s - joint.estimate_s if view.history.latest is not None else 0.0
 
+    def follow_signals(self, wanted: bool) -> None:
+        """Subscribe to the samples only while somebody looks at them: else no daemon sends any."""
+        if wanted and self._samples is None:
+            ring = zenoh.handlers.RingChannel(_QUEUE)
+            self._samples = self._session.declare_subscriber(f"{self._key}/sample", ring)
+            self._streams.append(("sample", self._samples))
+        elif not wanted and self._samples is not None:
+            self._streams.remove(("sample", self._samples))
+            self._samples.undeclare()
+            self._samples = None
+            for joint in self._joints.values():
+                joint.view.history.signals.clear()
+
     def close(self) -> None:
         """Stop following."""
         for subscriber in (self._tokens, *(subscriber for _, subscriber in self._streams)):
@@ -137,6 +151,8 @@ class Watcher:
             joint.view.model = message
         elif kind == "finding":
             joint.view.finding = message
+        elif kind == "sample":
+            joint.view.history.add_sample(message.sample, message.stamp_ns * 1e-9)
         elif kind == "external":
             joint.view.update_external(message, message.stamp_ns * 1e-9)
         else:

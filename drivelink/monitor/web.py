@@ -27,6 +27,7 @@ from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.webaccept import ACTIONS, WebAcceptance
 from drivelink.output.numbers import number
 from drivelink.pubsub.feed import decode_document
+from estimator.sample import Sample
 
 MAX_CONNECTIONS = 16
 MAX_STREAMS = 8
@@ -60,6 +61,7 @@ class WebView:
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self._streams: deque[threading.Event] = deque()
+        self._lookers = 0  # streams that want the motor signals
         view = self
 
         class Handler(_Handler):
@@ -77,6 +79,7 @@ class WebView:
     def poll(self) -> None:
         """Process new messages; to be called often."""
         with self._lock:
+            self._watcher.follow_signals(self._lookers > 0)
             self._watcher.poll()
 
     def close(self) -> None:
@@ -90,11 +93,16 @@ class WebView:
         self._thread.join()
 
     @contextmanager
-    def stream(self) -> Iterator[threading.Event]:
-        """A place among the streams; the event is set when a newer stream needs it, and at the end."""
+    def stream(self, signals: bool = False) -> Iterator[threading.Event]:
+        """A place among the streams; the event is set when a newer stream needs it, and at the end.
+
+        Args:
+            signals: it wants the motor signals as well.
+        """
         over = threading.Event()
         with self._lock:
             self._streams.append(over)
+            self._lookers += signals
             if self._closing.is_set():
                 over.set()
             if len(self._streams) > MAX_STREAMS:
@@ -103,6 +111,7 @@ class WebView:
             yield over
         finally:
             with self._lock, suppress(ValueError):
+                self._lookers -= signals
                 self._streams.remove(over)
 
     def event(self, since: dict[str, float]) -> bytes:
@@ -146,6 +155,7 @@ def snapshot(view: JointView, alive: bool, since: dict[str, float]) -> dict[str,
         "moments": [_moment(moment) for moment in fresh],
         "residuals": residuals,
         "touches": [_touch(touch) for touch in touches],
+        "signals": [_signals(*pair) for pair in history.signals if last < pair[0] <= newest],
         "curves": [_points(points) for points in curves],
         "doubtful": [_points(points) for points in grey],
         "model": [_points(points) for points in model_curves(view.model, curves if any(curves) else grey)],
@@ -190,6 +200,16 @@ def _touch(touch: Touch) -> list[float | bool | None]:
     """[time, external torque, standard deviation, contact, valid]."""
     contact = touch.valid and touch.contact
     return [touch.time_s, _finite(touch.torque_nm), _finite(touch.std_nm), contact, touch.valid]
+
+
+def _signals(time_s: float, sample: Sample) -> list[Any]:
+    """[time, torque of each motor, position of each, velocity of each, position of the link]."""
+    motors = sample.motor_torque_nm, sample.motor_position_rad, sample.motor_velocity_rad_s
+    return [
+        time_s,
+        *([_finite(value) for value in each] for each in motors),
+        _finite(sample.link_position_rad),
+    ]
 
 
 def _describe(shown: Shown) -> dict[str, Any]:
@@ -282,7 +302,10 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(HTTPStatus.FORBIDDEN)
         elif self.path == "/":
             self._page()
-        elif self.path == "/events" and self.headers.get("Sec-Fetch-Site", "none") in _OWN_PAGES:
+        elif (
+            self.path in ("/events", "/events?signals")
+            and self.headers.get("Sec-Fetch-Site", "none") in _OWN_PAGES
+        ):
             self._events()
         else:
             self.send_error(HTTPStatus.NOT_FOUND)
@@ -334,7 +357,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         since: dict[str, float] = {}
         try:
-            with self.web.stream() as over:
+            with self.web.stream(signals=self.path.endswith("?signals")) as over:
                 while not over.is_set():
                     begin = time.monotonic()
                     self.wfile.write(b"data: " + self.web.event(since) + b"\n\n")

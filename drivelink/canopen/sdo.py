@@ -39,19 +39,15 @@ def _name(index: int, subindex: int) -> str:
 
 
 class SdoAbort(DriveError):  # noqa: N818 - the protocol's own word
-    """The drive refused a transfer.
-
-    Attributes:
-        node: node id.
-        index: object.
-        subindex: of it.
-        code: abort code.
-    """
+    """The drive refused a transfer."""
 
     def __init__(self, node: int, index: int, subindex: int, code: int, *, writing: bool = False) -> None:
         what = "refused writing" if writing else "refused reading"
         super().__init__(f"node {node} {what} {_name(index, subindex)}: SDO abort {abort_text(code)}")
-        self.node, self.index, self.subindex, self.code = node, index, subindex, code
+        self.node = node  # node id
+        self.index = index  # object
+        self.subindex = subindex  # of it
+        self.code = code  # abort code
 
 
 class SdoBreach(SdoAbort):
@@ -64,12 +60,7 @@ class SdoBreach(SdoAbort):
 
 
 class SdoTimeout(DriveError):  # noqa: N818 - as above
-    """The drive did not answer.
-
-    Attributes:
-        node: node id.
-        index: object it was asked for.
-    """
+    """The drive did not answer."""
 
     def __init__(
         self, node: int, index: int, subindex: int, timeout_s: float, attempts: int, *, begun: bool = False
@@ -79,7 +70,8 @@ class SdoTimeout(DriveError):  # noqa: N818 - as above
             f"node {node} does not {does}: SDO {_name(index, subindex)}, {what} within {timeout_s:g} s, "
             f"the last {attempts} time{'s' if attempts > 1 else ''} it was asked"
         )
-        self.node, self.index = node, index
+        self.node = node  # node id
+        self.index = index  # object it was asked for
 
 
 class Unsized(bytes):

@@ -85,34 +85,8 @@ class CycleLoop:
         world_steps: only SYNC advances the (simulated) world, so a skipped SYNC is no gap.
 
     Attributes:
-        produce: as given.
-        world_steps: as given.
-        period_ns: the communication cycle.
-        stopped: `stop` was called.
         sync_ns: monotonic time of the present SYNC.
         received_ns: monotonic time of the last reception.
-        unix_ns: UNIX time less monotonic time.
-        source: the bus; replaced when it is lost and reopened.
-        housekeeping: what is done in the slack.
-        listeners: further handlers by identifier: SDO, heartbeat, EMCY.
-        after_sync: called at each SYNC, after the joints have taken it.
-        clock: the clock of supervision, ns.
-        on_sent: called with each frame that `send` has sent.
-        on_lost: called when the bus is lost.
-        on_fault: called with an exception of one joint or node, and its name; the loop continues without it.
-        cycles: SYNCs since the start.
-        syncs: those on the bus; when producing, one more than `cycles` while frames before it are processed.
-        overruns: periods skipped because this process was late.
-        foreign_syncs: SYNCs of another master while we produce it, or that were not due.
-        behind: when following, SYNCs read more than a period after their stamp.
-        skipped_periods: when following, periods without SYNC.
-        late_syncs: when following, SYNCs that came after their period.
-        sync_stamps: when following, stamps of the last SYNCs.
-        counter_jumps: SYNCs whose counter did not continue the previous one.
-        clock_step_ns: last change of the system's clock.
-        clock_steps: number of such changes.
-        silent: when following: there is no SYNC.
-        lateness: of SYNC against its deadline; when following, against the previous SYNC.
     """
 
     def __init__(
@@ -126,33 +100,44 @@ class CycleLoop:
         world_steps: bool = False,
     ) -> None:
         self.world_steps = world_steps
-        self.source = source
+        self.source = source  # the bus; replaced when it is lost and reopened
         self.loop_joints = tuple(loop_joints)
-        self.housekeeping = Housekeeping()
-        self.listeners: dict[int, Listener] = {}
-        self.after_sync: list[Callable[[], None]] = []
-        self.clock: Callable[[], int] = time.monotonic_ns
+        self.housekeeping = Housekeeping()  # what is done in the slack
+        self.listeners: dict[int, Listener] = {}  # further handlers by identifier: SDO, heartbeat, EMCY
+        self.after_sync: list[Callable[[], None]] = []  # called at each SYNC, after the joints have taken it
+        self.clock: Callable[[], int] = time.monotonic_ns  # the clock of supervision, ns
+        # called with each frame that `send` has sent
         self.on_sent: Callable[[int, bytes], None] = lambda _cob_id, _data: None
-        self.on_lost: Callable[[str], None] = lambda _reason: None
+        self.on_lost: Callable[[str], None] = lambda _reason: None  # called when the bus is lost
+        # called with an exception of one joint or node, and its name; the loop continues without it
         self.on_fault: Callable[[str, Exception], None] = _log_fault
         self.housekeeping.on_fault = lambda error: self.on_fault("housekeeping", error)
-        self.behind = self.skipped_periods = 0
-        self.cycles = self.syncs = self.overruns = 0
-        self.foreign_syncs = self.late_syncs = self.counter_jumps = 0
+        self.behind = 0  # when following, SYNCs read more than a period after their stamp
+        self.skipped_periods = 0  # when following, periods without SYNC
+        self.cycles = 0  # SYNCs since the start
+        # those on the bus; when producing, one more than `cycles` while frames before it are processed
+        self.syncs = 0
+        self.overruns = 0  # periods skipped because this process was late
+        self.foreign_syncs = 0  # SYNCs of another master while we produce it, or that were not due
+        self.late_syncs = 0  # when following, SYNCs that came after their period
+        self.counter_jumps = 0  # SYNCs whose counter did not continue the previous one
+        # when following, stamps of the last SYNCs
         self.sync_stamps: deque[int] = deque(maxlen=MEASURED_SYNCS)
-        self.clock_step_ns = self.clock_steps = 0
-        self.silent = False
+        self.clock_step_ns = 0  # last change of the system's clock
+        self.clock_steps = 0  # number of such changes
+        self.silent = False  # when following: there is no SYNC
+        # of SYNC against its deadline; when following, against the previous SYNC
         self.lateness = LatencyHistogram()
         self.produce = produce
-        self.period_ns = round(period_s * 1e9)
+        self.period_ns = round(period_s * 1e9)  # the communication cycle
         self._sync_clock = SyncClock(period_s)
         self._overflow = counter_overflow
         self._counter = 0
         self._loop_joints_of: dict[int, list[LoopJoint]] = {}
         self.reroute()
-        self.unix_ns = time.time_ns() - time.monotonic_ns()
+        self.unix_ns = time.time_ns() - time.monotonic_ns()  # UNIX time less monotonic time
         self.sync_ns = self.received_ns = time.monotonic_ns()
-        self.stopped = False
+        self.stopped = False  # `stop` was called
 
     @property
     def complete(self) -> bool:

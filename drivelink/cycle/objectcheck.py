@@ -272,7 +272,7 @@ class ReadBack:
     def __init__(self, ask: Ask, period_s: float, check: ObjectCheck) -> None:
         self._ask = ask
         self._period_s = period_s
-        self.check = check  # as given
+        self.check = check
         self._assemblers: dict[int, Assembler] = {}
         self._first: deque[_Question] = deque()  # new, or in doubt: not by turns
         self._values: deque[_Question] = deque()

@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import can
 
@@ -21,9 +21,6 @@ from drivelink.cycle.sources import open_source
 from drivelink.cycle.syncclock import MEASURED_SYNCS, measure_period
 from drivelink.errors import BusError, DriveError
 from drivelink.jointfile import BusSection, JointFile
-
-if TYPE_CHECKING:
-    from drivelink.cycle.loop import CycleLoop
 
 
 class BusPort:

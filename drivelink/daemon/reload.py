@@ -51,7 +51,7 @@ class Reloader:
         publish: Callable[[JointFile], None],
         events: EventLog,
     ) -> None:
-        self.path = path  # as given
+        self.path = path
         self._joint = joint
         self._pipeline, self._history = pipeline, pipeline.history
         self._build = build

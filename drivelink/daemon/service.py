@@ -72,7 +72,6 @@ class Daemon:
 
     Attributes:
         loop: the cycle.
-        events: the event log.
 
     Raises:
         DrivelinkError: why it cannot start, in one line.
@@ -95,7 +94,7 @@ class Daemon:
         self._closing = ExitStack()
         self._end_ns: int | None = None
         self._lockstep_ns = time.monotonic_ns()
-        self.events = EventLog(logger)
+        self.events = EventLog(logger)  # the event log
         self._stopping, self._another_s = False, 0.0  # the end is asked for; another period of SYNC
         try:
             self._publishers = self._open_publishers(session) if publish else [None] * len(joints)

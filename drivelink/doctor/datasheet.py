@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from drivelink.canopen.eds import DataSheet, load_eds
 from drivelink.canopen.layout import MappedObject, Role, Signal
-from drivelink.canopen.pdo import Assignment, Available, Entry, Tpdo, assign, describe, entry_text, unused
+from drivelink.canopen.pdo import (
+    CHECKS,
+    Assignment,
+    Available,
+    Entry,
+    Tpdo,
+    assign,
+    describe,
+    entry_text,
+    unused,
+)
 from drivelink.canopen.units import offer
 from drivelink.canopen.vendors import vendor_of
 from drivelink.doctor.report import Section
@@ -35,10 +46,29 @@ def asked_signals(role: Role) -> set[Signal]:
     return asked | ({Signal.SECOND_POSITION} if role.drive.second_encoder else set())
 
 
-def second_encoder(role: Role) -> str:
+def _second_encoder(role: Role) -> str:
     """Return the object where a second encoder of the motor would be: the first that is not the link's."""
     link = "" if role.encoder is None else role.encoder.object or _ENCODERS[0]
     return next(each for each in _ENCODERS if each.lower() != link.lower())
+
+
+def curious(role: Role) -> Role:
+    """Return a role that is interested in all signals, those for cross-checks included."""
+    if role.drive is None:
+        return role
+    update = {
+        "velocity": True,
+        "checks": ("current", "following_error"),
+        "second_encoder": role.drive.second_encoder or _second_encoder(role),
+    }
+    return replace(role, drive=role.drive.model_copy(update=update))
+
+
+def velocity_as_check(available: Available) -> dict[Signal, tuple[MappedObject, ...]]:
+    """Return what a curious role finds, with the velocity as a cross-check."""
+    found = {signal: tuple(objects) for signal, objects in available.items()}
+    velocity = found.pop(Signal.MOTOR_VELOCITY, ())
+    return found | {Signal.VELOCITY_CHECK: tuple(replace(o, signal=Signal.VELOCITY_CHECK) for o in velocity)}
 
 
 def say_sync_counter(section: Section, subject: str, bus: BusSection) -> None:
@@ -104,15 +134,6 @@ def _cost(role: Role, wanted: Available, objects: Available, tpdos: Sequence[Tpd
         return None
 
 
-# Objects for each signal, best first; the vendor's current object is last.
-_OBJECTS: dict[Signal, tuple[tuple[int, int], ...]] = {
-    Signal.MOTOR_POSITION: ((0x6064, 0),),
-    Signal.MOTOR_TORQUE: ((0x6077, 0), (0x6078, 0)),
-    Signal.STATUSWORD: ((0x6041, 0),),
-    Signal.MOTOR_VELOCITY: ((0x606C, 0),),
-    Signal.LINK_POSITION: ((0x60E4, 1), (0x60E4, 0)),
-}
-_CIA406: dict[Signal, tuple[tuple[int, int], ...]] = {Signal.LINK_POSITION: ((0x6004, 0),)}
 _NEEDED = {Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE}  # of a drive
 _NEEDED_OF_ENCODER = {Signal.LINK_POSITION}
 _UNDECLARED = {
@@ -124,7 +145,14 @@ _STATE = {
     Signal.MOTOR_TORQUE: "motor.drive: rated_torque_nm, or torque_constant_nm_a and rated_current_a or "
     "current_object, if the drive does not report it",
 }
-_ASSUMED_COUNTS = 4096.0  # a stand-in for units that need it
+# Stand-ins for the units of a drive that is not there: only which objects it has is of interest.
+_ASSUMED: dict[str, Any] = {
+    "counts_per_rev": 4096.0,
+    "rated_torque_nm": 1.0,
+    "rated_current_a": 1.0,
+    "torque_constant_nm_a": 1.0,
+    "velocity_rad_s_per_count": 1.0,
+}
 
 
 def examine_sheet(section: Section, path: Path) -> None:
@@ -141,8 +169,10 @@ def examine_sheet(section: Section, path: Path) -> None:
     tpdos = sheet.tpdos()
     section.info("by default", describe(tpdo for tpdo in tpdos if tpdo.enabled))
     role = _role(sheet)
-    mappable = {signal: objects for signal, objects in available.items() if objects}
-    mappable.pop(Signal.MOTOR_VELOCITY, None)  # not mapped by default
+    optional = (Signal.MOTOR_VELOCITY, *CHECKS)  # not mapped by default
+    mappable = {
+        signal: objects for signal, objects in available.items() if objects and signal not in optional
+    }
     if any(not available[signal] for signal in _needed(sheet) & available.keys()):
         return
     _units(section, sheet)
@@ -156,8 +186,7 @@ def examine_sheet(section: Section, path: Path) -> None:
         kept = "" if assignment.objects is not None else "its map as it is, "
         text = " + ".join(entry_text(entry) for entry in entries)
         section.ok("configured", f"TPDO{number} = {text}, {kept}at every SYNC")
-    checks = _checks(sheet, available)
-    say_checks(section, role, mappable, checks, tpdos)
+    say_checks(section, role, mappable, velocity_as_check(available), tpdos)
     section.facts["mapping"] = [
         {"tpdo": number, "objects": [f"0x{i:04X}:{s:02X}:{b}" for i, s, b in entries]}
         for number, entries in map(planned_entries, plan)
@@ -196,8 +225,8 @@ def _role(sheet: DataSheet) -> Role:
     return Role(
         node_id=1,
         motor=None if encoder else 0,
-        drive=None if encoder else DriveSection(node_id=1, counts_per_rev=_ASSUMED_COUNTS),
-        encoder=EncoderSection(source="cia406", node_id=1) if encoder else None,
+        drive=None if encoder else DriveSection(node_id=1, **_ASSUMED),
+        encoder=EncoderSection(source="cia406" if encoder else "drive", node_id=1, counts_per_rev=1.0),
         key="drive",
         eds=sheet.path,
         tpdo=(),
@@ -205,46 +234,19 @@ def _role(sheet: DataSheet) -> Role:
 
 
 def _signals(section: Section, sheet: DataSheet) -> dict[Signal, tuple[MappedObject, ...]]:
-    """Which signals the drive can put into a TPDO, with a finding for each."""
-    vendor = vendor_of(sheet.vendor_id)
+    """Objects of each signal that the drive can put into a TPDO, with a finding for what a joint reads."""
+    offered = offer(curious(_role(sheet)), {}, vendor_of(sheet.vendor_id)).candidates
     carried = {(i, s) for tpdo in sheet.tpdos() for i, s, _ in tpdo.entries}
     found: dict[Signal, tuple[MappedObject, ...]] = {}
-    for signal, addresses in (_CIA406 if _is_encoder(sheet) else _OBJECTS).items():
-        if signal is Signal.MOTOR_TORQUE and vendor.current is not None:
-            addresses += (vendor.current.address,)
-        there = [address for address in addresses if address in sheet.objects]
-        if (0x60E4, 1) in there:
-            there = [(0x60E4, 1)]  # subindex 0 is then only the count
-        usable = [a for a in there if sheet.objects[a].pdo_mappable or a in carried]
-        found[signal] = tuple(
-            MappedObject(signal=signal, index=a[0], subindex=a[1], bits=len(sheet.objects[a]), signed=True)
-            for a in usable
-        )
-        _say_signal(section, signal, sheet, there, usable)
+    for signal, objects in offered.items():
+        if signal is Signal.LINK_POSITION and objects[0].address not in sheet.objects:
+            objects += (replace(objects[0], subindex=0),)  # where 0x60E4 is no array
+        there = [one for one in objects if one.address in sheet.objects]
+        usable = [one for one in there if sheet.objects[one.address].pdo_mappable or one.address in carried]
+        found[signal] = tuple(replace(one, bits=len(sheet.objects[one.address])) for one in usable)
+        if signal not in CHECKS:
+            _say_signal(section, signal, sheet, [o.address for o in there], [o.address for o in usable])
     return found
-
-
-def _checks(
-    sheet: DataSheet, available: Mapping[Signal, tuple[MappedObject, ...]]
-) -> dict[Signal, tuple[MappedObject, ...]]:
-    """Objects for cross-checks: a second torque or current, velocity, following error."""
-
-    def mappable(signal: Signal, index: int, subindex: int = 0) -> tuple[MappedObject, ...]:
-        entry = sheet.objects.get((index, subindex))
-        if entry is None or not entry.pdo_mappable:
-            return ()
-        return (MappedObject(signal=signal, index=index, subindex=subindex, bits=len(entry), signed=True),)
-
-    as_check = {
-        Signal.VELOCITY_CHECK: available.get(Signal.MOTOR_VELOCITY, ()),
-        Signal.TORQUE_CHECK: available.get(Signal.MOTOR_TORQUE, ()),
-    }
-    return {
-        **{signal: tuple(replace(o, signal=signal) for o in objects) for signal, objects in as_check.items()},
-        Signal.FOLLOWING_ERROR: mappable(Signal.FOLLOWING_ERROR, 0x60F4),
-        Signal.POSITION_DEMAND: mappable(Signal.POSITION_DEMAND, 0x6062),
-        Signal.SECOND_POSITION: mappable(Signal.SECOND_POSITION, 0x60E4, 2),
-    }
 
 
 def _say_signal(

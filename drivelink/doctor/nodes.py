@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import can
@@ -28,10 +27,11 @@ from drivelink.canopen.scan import FoundNode, Traffic, identify, listen, scan
 from drivelink.canopen.vendors import vendor_of
 from drivelink.doctor.datasheet import (
     asked_signals,
+    curious,
     planned_entries,
     say_checks,
     say_sync_counter,
-    second_encoder,
+    velocity_as_check,
 )
 from drivelink.doctor.livevalues import Asked, Heard, record_of
 from drivelink.doctor.machine import Daemons, judge_sync
@@ -152,16 +152,8 @@ def _examine_node(
     node = identify(bus, joint.bus, role.node_id)
     state = traffic.heartbeats.get(role.node_id, "no heartbeat")
     section.ok(subject, f"{_describe_node(node)}, {state}")
-    curious = role
-    if role.drive is not None:
-        update = {
-            "velocity": True,
-            "checks": ("current", "following_error"),
-            "second_encoder": role.drive.second_encoder or second_encoder(role),
-        }
-        curious = replace(role, drive=role.drive.model_copy(update=update))
     try:
-        survey = run_program(survey_node(curious), bus, joint.bus)
+        survey = run_program(survey_node(curious(role)), bus, joint.bus)
     except DriveError as error:
         section.error(subject, str(error))
         return None, None
@@ -212,13 +204,11 @@ def _judge_eds(section: Section, role: Role, node: FoundNode) -> None:
 
 def _judge_mapping(section: Section, role: Role, survey: NodeSurvey) -> NodeLayout | None:
     """Compare the present mapping with the one that would be configured."""
-    available = dict(survey.available)
-    velocity = available.pop(Signal.MOTOR_VELOCITY, ())
-    available[Signal.VELOCITY_CHECK] = tuple(replace(o, signal=Signal.VELOCITY_CHECK) for o in velocity)
+    available = velocity_as_check(survey.available)
     asked = asked_signals(role)
     wanted = {s: objects for s, objects in available.items() if s not in CHECKS}
     if role.drive is not None and role.drive.velocity:
-        wanted[Signal.MOTOR_VELOCITY] = velocity
+        wanted[Signal.MOTOR_VELOCITY] = survey.available.get(Signal.MOTOR_VELOCITY, ())
     wanted |= {s: unused(wanted, objects) for s, objects in available.items() if s in asked}
     enabled = [tpdo for tpdo in survey.tpdos if tpdo.enabled]
     section.info(role.subject, f"sends {describe(enabled)}")

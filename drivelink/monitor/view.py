@@ -68,17 +68,6 @@ class JointView:
     Args:
         subtitle: e.g. its case or bus.
         height: lines; default: those of the terminal.
-
-    Attributes:
-        history: data of the view.
-        status: the joint's status document, or empty.
-        model: the model document, or empty.
-        finding: the newest finding, or empty.
-        gone: the daemon has ended or died.
-        hint: why there is no estimate, or empty.
-        silent_s: time since the last estimate.
-        help: show the legend in place of the plots.
-        footer: the last line, e.g. how to quit.
     """
 
     def __init__(
@@ -86,15 +75,15 @@ class JointView:
     ) -> None:
         self.name = name
         self.subtitle = subtitle
-        self.footer = ""
-        self.history = JointHistory(seconds)
+        self.footer = ""  # the last line, e.g. how to quit.
+        self.history = JointHistory(seconds)  # data of the view
         self._status: Mapping[str, Any] = {}
-        self.model: Mapping[str, Any] = {}
-        self.finding: Mapping[str, Any] = {}
-        self.gone = False
-        self.hint = ""
-        self.silent_s = 0.0
-        self.help = False
+        self.model: Mapping[str, Any] = {}  # the model document, or empty
+        self.finding: Mapping[str, Any] = {}  # the newest finding, or empty
+        self.gone = False  # the daemon has ended or died
+        self.hint = ""  # why there is no estimate, or empty
+        self.silent_s = 0.0  # time since the last estimate
+        self.help = False  # show the legend in place of the plots
         self._height = height
 
     def update(self, estimate: EstimateMessage, time_s: float, truth: TruePoint | None = None) -> None:

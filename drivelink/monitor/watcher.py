@@ -46,14 +46,11 @@ class Watcher:
     Args:
         session: an open session; it stays open.
         joint: only this one; None: all joints, up to MAX_JOINTS.
-
-    Attributes:
-        received: number of estimates.
-        refused: messages of other sessions, or invalid ones.
     """
 
     def __init__(self, session: zenoh.Session, prefix: str = "drivelink", joint: str | None = None) -> None:
-        self.received = self.refused = 0
+        self.received = 0  # number of estimates
+        self.refused = 0  # messages of other sessions, or invalid ones
         self._prefix = prefix + "/"
         self._session, self._asked = session, joint
         self._hint_s = time.monotonic() + PATIENCE_S

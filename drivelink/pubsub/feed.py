@@ -247,24 +247,18 @@ class Arrivals:
 
 
 class Feed:
-    """Estimates of one joint.
-
-    Attributes:
-        latest: the newest estimate, or None.
-        unread: decoded and not yet handed to the user, oldest first.
-        received: estimates admitted.
-        gaps: cycles lost in transport or by the daemon.
-        skipped: cycles dropped here because they were not read in time.
-        unusable: messages of the daemon that are malformed, or valid with impossible values.
-        identity: whose messages are taken.
-    """
+    """Estimates of one joint."""
 
     def __init__(self, depth: int, stale_after_s: float | None, now_ns: int) -> None:
-        self.latest: EstimateMessage | None = None
+        self.latest: EstimateMessage | None = None  # the newest estimate, or None
+        # decoded and not yet handed to the user, oldest first
         self.unread: deque[tuple[bytes, EstimateMessage]] = deque(maxlen=depth)
-        self.received = self.gaps = self.skipped = self.unusable = 0
+        self.received = 0  # estimates admitted
+        self.gaps = 0  # cycles lost in transport or by the daemon
+        self.skipped = 0  # cycles dropped here because they were not read in time
+        self.unusable = 0  # messages of the daemon that are malformed, or valid with impossible values
         self.arrivals = Arrivals(now_ns)
-        self.identity = DaemonIdentity()
+        self.identity = DaemonIdentity()  # whose messages are taken
         self._depth = depth
         self._stale_after_ns = None if stale_after_s is None else int(stale_after_s * 1e9)
         self._period_ns = 0

@@ -213,17 +213,13 @@ def _plain_frames(lines: list[tuple[str, ...]]) -> Iterator[LoggedFrame]:
 
 
 class _Lines:
-    """Reads lines one by one, in both formats of candump, tolerating foreign lines.
-
-    Attributes:
-        understood: number of lines that are frames, also omitted ones.
-        strange: number of other lines.
-        first_strange: the first of them, as a warning shows it.
-    """
+    """Reads lines one by one, in both formats of candump, tolerating foreign lines."""
 
     def __init__(self) -> None:
-        self.understood = self.strange = self._number = 0
-        self.first_strange = ""
+        self.understood = 0  # number of lines that are frames, also omitted ones
+        self.strange = 0  # number of other lines
+        self._number = 0
+        self.first_strange = ""  # the first of them, as a warning shows it
         self._parse: Callable[[bytes], LoggedFrame | None] = _compact
 
     @property

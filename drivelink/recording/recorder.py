@@ -59,10 +59,6 @@ class ZenohTap:
 
     Args:
         session: an open session; it stays open.
-
-    Attributes:
-        missed: cycles without sample.
-        newest_s: UNIX time of the newest sample, or 0.
     """
 
     def __init__(
@@ -70,8 +66,9 @@ class ZenohTap:
     ) -> None:
         self._sink = sink
         self._gate = gate or FirstSource(sink)
-        self.missed = self._impossible = 0
-        self.newest_s = 0.0
+        self.missed = 0  # cycles without sample
+        self._impossible = 0
+        self.newest_s = 0.0  # UNIX time of the newest sample, or 0
         self._sequence = -1
         self._motors = len(joint.motor)
         self._identity = DaemonIdentity()
@@ -170,10 +167,6 @@ class BusTap:
         bus: an open bus; it stays open.
         base_dir: folder of the joint file; None: make no samples.
         layouts: of its nodes, if reported by a daemon.
-
-    Attributes:
-        frames: received so far.
-        assembling: whether samples are made: the mapping is known.
     """
 
     def __init__(
@@ -194,7 +187,7 @@ class BusTap:
             listener.adopt(layouts)
             self._samples = FrameSamples(joint, listener)
         self._period_s = joint.bus.period_s  # as said last
-        self.frames = 0
+        self.frames = 0  # received so far
 
     @property
     def assembling(self) -> bool:

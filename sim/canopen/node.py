@@ -36,30 +36,23 @@ class Node:
     """One device on the bus; drives and encoders derive from it and override the `on_…` hooks.
 
     Attributes:
-        node_id: 1 to 127.
-        dictionary: live values.
-        timers: its appointments; the network moves their clock.
-        state: NMT state.
-        sync_id: identifier of the SYNC it listens to.
-        routes: handlers by identifier, besides NMT and SYNC.
         tpdos: by number from 1.
         rpdos: by number from 1.
-        sends_on_change: whether changed process data trigger types 254 and 255; if not, only the event timer
-            does.
     """
 
+    # whether changed process data trigger types 254 and 255; if not, only the event timer does
     sends_on_change = True
 
     def __init__(self, node_id: int, objects: Iterable[Object], quirks: Quirks) -> None:
         if not 1 <= node_id <= 127:
             raise ValueError(f"node_id: expected 1 to 127, got {node_id}")
-        self.node_id = node_id
+        self.node_id = node_id  # 1 to 127
         self.quirks = quirks
-        self.dictionary = Dictionary(objects, node_id)
-        self.timers = Timers()
-        self.state = Nmt.INITIALISING
-        self.sync_id = 0x80
-        self.routes: dict[int, Route] = {}
+        self.dictionary = Dictionary(objects, node_id)  # live values
+        self.timers = Timers()  # its appointments; the network moves their clock
+        self.state = Nmt.INITIALISING  # NMT state
+        self.sync_id = 0x80  # identifier of the SYNC it listens to
+        self.routes: dict[int, Route] = {}  # handlers by identifier, besides NMT and SYNC
         self._put: Callable[[int, bytes], None] = lambda _can_id, _data: None
         self._rerouted: Callable[[], None] = lambda: None
         self._synchronous: tuple[Tpdo, ...] = ()

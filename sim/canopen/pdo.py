@@ -44,15 +44,6 @@ class Pdo:
 
     Args:
         first: index of the communication parameter of number 1; the mapping is 0x200 behind it.
-
-    Attributes:
-        valid: bit 31 of the COB-ID is clear.
-        can_id: its identifier on the bus.
-        type: transmission type.
-        synchronous: whether it belongs to a SYNC.
-        event_s: event timer or deadline; 0: none.
-        entries: mapped entries in order; None: a dummy.
-        layout: the frame.
     """
 
     def __init__(self, node: Node, number: int, first: int) -> None:
@@ -62,11 +53,14 @@ class Pdo:
         self._count = find(communication + 0x200, 0)
         self._slots = [find(communication + 0x200, k) for k in range(1, MAPPED_AT_MOST + 1)]
         self._event = node.dictionary.optional(communication, 5)
-        self.entries: tuple[Entry | None, ...] = ()
-        self.layout = struct.Struct("<")
-        self.valid = self.synchronous = False
-        self.can_id = self.type = self._generation = 0
-        self.event_s = 0.0
+        self.entries: tuple[Entry | None, ...] = ()  # mapped entries in order; None: a dummy
+        self.layout = struct.Struct("<")  # the frame
+        self.valid = False  # bit 31 of the COB-ID is clear
+        self.synchronous = False  # whether it belongs to a SYNC
+        self.can_id = 0  # its identifier on the bus
+        self.type = 0  # transmission type
+        self._generation = 0
+        self.event_s = 0.0  # event timer or deadline; 0: none
         self._condition: tuple[bool, bool, int] | None = None
         self._timer: Timer | None = None
         self._cob.check, self._type.check = self._check_cob, self._check_type

@@ -23,19 +23,14 @@ _EXPEDITED, _SIZED, _LAST = 2, 1, 1
 
 
 class SdoServer(CanopenServer):
-    """One server on the default pair of identifiers.
-
-    Attributes:
-        ignored: requests that it will not answer, for tests.
-        refused: requests that it will abort, with `refusal`, for tests.
-        refusal: the abort code.
-        endless: for tests: bytes in each segment of an upload that never ends; -1: normal operation.
-    """
+    """One server on the default pair of identifiers."""
 
     def __init__(self, node: Node) -> None:
         super().__init__(0x600 + node.node_id, 0x580 + node.node_id, node.dictionary)
-        self.ignored = self.refused = 0
-        self.refusal = int(Abort.DATA_TRANSFER)
+        self.ignored = 0  # requests that it will not answer, for tests
+        self.refused = 0  # requests that it will abort, with `refusal`, for tests
+        self.refusal = int(Abort.DATA_TRANSFER)  # the abort code
+        # for tests: bytes in each segment of an upload that never ends; -1: normal operation
         self.endless = -1
         self._device = node
         self._timer: Timer | None = None

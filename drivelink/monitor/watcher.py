@@ -112,7 +112,7 @@ class Watcher:
     def follow_signals(self, wanted: bool) -> None:
         """Subscribe to the samples only while somebody looks at them: else no daemon sends any."""
         if wanted and self._samples is None:
-            ring = zenoh.handlers.RingChannel(_QUEUE)
+            ring: Any = zenoh.handlers.RingChannel(_QUEUE)
             self._samples = self._session.declare_subscriber(f"{self._key}/sample", ring)
             self._streams.append(("sample", self._samples))
         elif not wanted and self._samples is not None:

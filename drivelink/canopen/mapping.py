@@ -65,7 +65,7 @@ class Mapper:
     available: Mapping[Signal, Sequence[MappedObject]]
     tpdos: list[Tpdo]  # as they are in the node
     taken: set[int]  # identifiers in use elsewhere on the bus
-    prefer_unused: bool  # see `tpdo_assignment.assign`
+    prefer_unused: bool  # see `pdo.assign`
     findings: Findings  # added to
     period_s: float = 0.001  # communication cycle, at which a TPDO is asked for that cannot be sent on SYNC
     # further signals that are read if they are mapped anyway

@@ -327,7 +327,7 @@ class ReadBack:
         self._due_s = now_s + (_FIRST_S if self._asked < _CLOSELY else self._period_s)
 
     def contradiction(self, assembler: Assembler) -> dict[str, Any] | None:
-        """Return what is contradicted of one joint, as `crosschecks.contradiction` gives it;
+        """Return what is contradicted of one joint, as `jointwatch.contradiction` gives it;
         None: nothing.
         """
         contradicted = self.check.contradiction(assembler)

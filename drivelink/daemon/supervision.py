@@ -101,7 +101,7 @@ class Supervisor:
         return tuple(self._loop.listeners)
 
     def contradiction(self, loop_joint: LoopJoint) -> dict[str, Any] | None:
-        """Return the reading that a second one contradicts, see `crosschecks`; None: none."""
+        """Return the reading that a second one contradicts, see `jointwatch`; None: none."""
         pipeline = loop_joint.pipeline
         found = contradiction(pipeline.assembler)
         if found is None and self._read_back is not None:

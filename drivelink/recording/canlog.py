@@ -36,7 +36,7 @@ class CanFormat(NamedTuple):
 
     writer: Any  # python-can's; None: not written
     reader: Any = None  # python-can's; None: text as candump writes it, read here
-    bounded: Any = None  # what the reader reads from, see `boundedlog`
+    bounded: Any = None  # what the reader reads from, see `limits`
     text: bool = True  # whether it has lines
 
 

@@ -8,7 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from zenohkit import free_endpoint, ready, script
+from zenohkit import free_endpoint, make_estimate, make_external, ready, script
+
+from drivelink._core import encode_estimate, encode_external
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "examples"
@@ -88,3 +90,61 @@ def test_the_cpp_example_reads_the_daemon(cpp, endpoint):
         pytest.skip("zenoh-pico is not installed (CMAKE_PREFIX_PATH)")
     out = run(cpp / "subscribe", "elbow", endpoint, "20", timeout=60)
     assert out.count("700.0 ± 3.0 N·m/rad, valid 1, observable 1") == 20
+
+
+@pytest.fixture(scope="module")
+def plugin(tmp_path_factory):
+    """The plugin for ros2_control, compiled against stand-ins for ROS (tests/ros2); its messages are handed in."""
+    if shutil.which("c++") is None:
+        pytest.skip("no C++ compiler on this machine")
+    built = tmp_path_factory.mktemp("ros2") / "plugin"
+    folder, stubs = EXAMPLES / "cpp" / "ros2_control", ROOT / "tests" / "ros2"
+    strict = ("-std=c++17", "-Wall", "-Wextra", "-Werror", "-pthread", "-I", stubs, "-I", folder)
+    run("c++", *strict, folder / "sensor.cpp", stubs / "main.cpp", "-o", built)
+    return built
+
+
+def test_the_ros2_control_plugin_has_numbers_only_while_they_may_be_used(plugin):
+    valid, invalid = (encode_estimate(make_estimate(5, status), 0).hex() for status in (1, 2))
+    external, nothing = (encode_external(make_external(5, status), 0).hex() for status in (3, 0))
+    of, touch = "drivelink/elbow/estimate", "drivelink/elbow/external"
+    names = "stiffness,usable,external_torque,contact"
+    messages = (
+        f"{of}={valid}",
+        f"{touch}={external}",
+        f"{of}={invalid}",
+        f"{touch}={nothing}",
+        f"{of}={valid}",
+    )
+    lines = run(plugin, "elbow", names, "stale_after_s=0.25", "--", *messages).splitlines()
+    said = [dict(each.removeprefix("elbow/").split() for each in line.split("  ") if each) for line in lines]
+    rows = [" ".join(row[name] for name in names.split(",")) for row in said]
+    late = no_number = "nan 0 nan nan"
+    assert rows == [
+        no_number,
+        "700 1 nan nan",
+        "700 1 0.05 1",
+        "nan 0 0.05 1",
+        no_number,
+        "700 1 nan nan",
+        late,
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("elbow", "stifness"), "drivelink: elbow/stifness: no such state interface"),
+        (
+            ("elbow", "stiffness", "endpoint=tcp/10.0.0.9:1"),
+            "drivelink: tcp/10.0.0.9:1: nobody answers there",
+        ),
+        (
+            ("elbow", "stiffness", "stale_after_s=soon"),
+            "drivelink: stale_after_s: expected a number of seconds",
+        ),
+    ],
+)
+def test_the_ros2_control_plugin_says_what_it_cannot_use(plugin, arguments, said):
+    done = subprocess.run([plugin, *arguments], capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and done.stdout.strip() == said

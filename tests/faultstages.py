@@ -48,6 +48,7 @@ class LockstepStage(Stage):
             time.sleep(0.05)  # it is opened again in a thread
         for _ in range(round(seconds / self.joint.bus.period_s)):
             self.act()
+            self.truth.unseen = True  # until the devices see its SYNC
             self.daemon.run_lockstep(1)
 
     def compare(self, what: str, found: int, expected: int) -> None:

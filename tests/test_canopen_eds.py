@@ -216,3 +216,13 @@ def test_a_map_that_the_eds_file_lacks_is_unknown_and_not_empty(tmp_path):
         text += f"[{index:X}sub1]\nDataType=7\nAccessType=rw\n{first}\n"
     path.write_text(text)
     assert describe(load_eds(path).tpdos()) == "TPDO1 = unknown; TPDO2 = empty; TPDO3 = unknown"
+
+
+def test_compact_arrays_and_numbers_without_end_are_bounded(tmp_path):
+    arrays = "".join(f"[{k:x}]\nCompactSubObj=254\n" for k in range(0x1000, 0x1100))
+    with pytest.raises(DriveError, match="expected at most 20000 objects, got more"):
+        sheet(tmp_path, MINIMAL + arrays)
+    for number in ("0x" + "f" * 100_000, "9" * 100_000):
+        found = sheet(tmp_path, MINIMAL.replace("-5", number))
+        assert found.value(0x6064) is None
+        assert "6064:00 has a value that is not a number" in found.problems[0]

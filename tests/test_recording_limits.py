@@ -7,6 +7,7 @@ import json
 import os
 import resource
 import struct
+import time
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -231,6 +232,7 @@ def test_messages_of_others_in_an_mcap_file_are_one_line(tmp_path: Path) -> None
         ("sample", b"[" * 50_000),
         ("sample", b'{"time_s": "x", "motor1_position_rad": []}'),
         ("sample", b" " * 100_000 + b"{}"),
+        ("sample", b'{"sequence": 0, "x": [[], []]}'),
         ("can", b'{"id": 1e9, "data": "00"}'),
         ("can", b'{"id": 1}'),
         ("mapping", b'{"joint": "elbow", "nodes": [1]}'),
@@ -316,22 +318,68 @@ def test_a_huge_message_is_refused_before_it_is_parsed(topic: str, data: bytes, 
     assert peak_mib() - before < MOST_MIB
 
 
-@pytest.mark.parametrize(
-    ("data", "count", "said"),
-    [
-        (b'{"id": 385, "data": ""}', 300_000, "expected SYNC frames"),  # held in vain
-        (b'{"id": 128, "data": ""}', 600_000, "expected to unpack to at most 64 times its size"),
-    ],
-)
-def test_frames_without_end_are_neither_held_nor_read(
-    data: bytes, count: int, said: str, tmp_path: Path
-) -> None:
-    path = mcap_of(tmp_path / "r.mcap", [("can", 0, data)] * count)
+def test_frames_without_end_are_neither_held_nor_read(tmp_path: Path) -> None:
+    path = mcap_of(tmp_path / "r.mcap", [("can", 0, b'{"id": 385, "data": ""}')] * 300_000)
     assert path.stat().st_size < 40_000
     before = peak_mib()
-    with pytest.raises(RecordingError, match=said):
+    with pytest.raises(RecordingError, match="expected at most one record for each"):
         read(path, JOINT)
     assert peak_mib() - before < 200
+
+
+@pytest.mark.parametrize(
+    ("record", "said"), [(9, "one record for each"), (1 << 20, "at most 64 times its size")]
+)
+def test_an_mcap_file_unpacks_to_so_many_records_and_bytes(record: int, said: str, tmp_path: Path) -> None:
+    records = struct.pack("<BQ", 0x80, record - 9) + bytes(record - 9)
+    whole = records * ((10 << 20 if record == 9 else 60 << 20) // record)
+    packed = zstandard.ZstdCompressor().compress(whole)
+    path = tmp_path / "r.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n" + chunk(b"zstd", packed, len(whole)))
+    with pytest.raises(RecordingError, match=said):
+        list(read_messages(path))
+
+
+def blf_of(path: Path, frames_: int, containers: int) -> Path:
+    """A BLF file of containers with so many frames each."""
+    frame = struct.pack("<4sHHLLLHHQ", b"LOBJ", 32, 1, 48, 1, 2, 0, 0, 0) + struct.pack(
+        "<HBBL8x", 1, 0, 0, 0x80
+    )
+    packed = zlib.compress(frame * frames_, 9)
+    one = struct.pack("<4sHHLLH6xL4x", b"LOBJ", 16, 1, 32 + len(packed), 10, 2, 48 * frames_) + packed
+    one += bytes(len(one) % 4)
+    path.write_bytes(struct.pack("<4sL136x", b"LOGG", 144) + one * containers)
+    return path
+
+
+def test_a_blf_file_unpacks_to_so_many_frames_and_bytes(tmp_path: Path) -> None:
+    assert len(list(read_frames(blf_of(tmp_path / "a.blf", 100, 10)))) == 1000
+    for name, count, containers, said in (
+        ("b", 100, 1000, "one record for each"),
+        ("c", 200_000, 1, "32 times"),
+    ):
+        with pytest.raises(RecordingError, match=said):
+            list(read_frames(blf_of(tmp_path / f"{name}.blf", count, containers)))
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("r.log", b"can0 RX" + b" " * 16_000 + b"!\n"),
+        ("r.asc", b"0.0 CANFD 1 a a " + b"a" * 16_000 + b" \n"),
+        ("r.csv", b"0,0,0," + b" " * 60_000 + b"x\n"),
+    ],
+)
+def test_a_long_line_is_read_in_linear_time(name: str, line: bytes, tmp_path: Path) -> None:
+    """In quadratic time each would take minutes."""
+    head = {"r.log": b"(1.0) can0 080#\n", "r.asc": b"base hex timestamps absolute\n"}.get(
+        name, HEADER.encode()
+    )
+    (tmp_path / name).write_bytes(head + line * 60)
+    before = time.process_time()
+    with pytest.raises(RecordingError):
+        read(tmp_path / name, JOINT)
+    assert time.process_time() - before < 20.0  # of the processor, not by the wall clock
 
 
 SAMPLE = '{{"sequence": {}, "time_s": {}, "motor1_position_rad": {}, "motor1_torque_nm": 1.0, "link_position_rad": 0.0}}'

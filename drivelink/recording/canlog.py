@@ -6,6 +6,7 @@ Yields data frames with 11-bit identifiers as tuples, in file order.
 from __future__ import annotations
 
 import logging
+import os
 import re
 from collections.abc import Callable, Iterable, Iterator
 from datetime import datetime
@@ -18,7 +19,15 @@ import can
 
 from drivelink.errors import RecordingError
 from drivelink.files import open_regular
-from drivelink.recording.limits import MAX_LINE_BYTES, AscText, BlfBytes, TrcText, require_stamp
+from drivelink.recording.limits import (
+    MAX_LINE_BYTES,
+    AscText,
+    BlfBytes,
+    TrcText,
+    most_records,
+    require_stamp,
+    too_many_records,
+)
 
 _LOG = logging.getLogger("drivelink.recording")
 
@@ -82,7 +91,7 @@ _COMPACT = re.compile(
 )
 #  (1436509052.249713)  vcan0  RX - -  044   [5]  2A 36 6C 2B BA   '*6l+.'
 _SPACED = re.compile(
-    rb"^[ \t]*(?:\(?(\d{1,11})[.,](\d+)\)?[ \t]+)?(\S+)[ \t]+(?:[RT]X[ \t]+[-BE ]+[ \t]+)?"
+    rb"^[ \t]*(?:\(?(\d{1,11})[.,](\d+)\)?[ \t]+)?(\S+)[ \t]+(?:[RT]X(?:[ \t]+[-BE]){0,2}[ \t]+)?"
     rb"([0-9A-Fa-f]{1,8})[ \t]+\[ ?0?(\d{1,4})\][ \t]*((?:[0-9A-Fa-f]{2}(?:[ \t]+|$))*)(.*)"
 )
 #  (2026-01-31 09:41:02.249713)  …                     candump -t A
@@ -334,7 +343,11 @@ def _library_frames(path: Path) -> Iterator[LoggedFrame]:
     try:
         # Opened here, because a reader leaves a malformed file open.
         with open_regular(path) as file:
+            most = most_records(os.fstat(file.fileno()).st_size)
             for message in kind.reader(kind.bounded(file, path)):
+                most -= 1
+                if most < 0:
+                    raise too_many_records(path)
                 if message.is_extended_id or message.is_error_frame or message.is_remote_frame:
                     continue
                 if message.arbitration_id > _LAST_ID or len(message.data) > _LONGEST:

@@ -27,8 +27,10 @@ from estimator.sample import FloatArray
 
 _LOG = logging.getLogger("drivelink.recording")
 
-_EMPTY = re.compile(rb"(?:(?<=,)|(?<=\n)|^)[ \t]*(?:null|none|n/a|na|-)?[ \t\r]*(?=,|\n|$)", re.IGNORECASE)
-_BLOCK = 1 << 22  # bytes per read
+_EMPTY = re.compile(
+    rb"(?:(?<=,)|(?<=\n)|^)[ \t\r]*+(?:null|none|n/a|na|-)?+[ \t\r]*+(?=,|\n|$)", re.IGNORECASE
+)
+_BLOCK = 1 << 20  # bytes per read; empty cells that are filled take 200 times as much
 
 
 def read_csv_columns(path: Path, names: ColumnMap) -> tuple[dict[str, FloatArray], tuple[str, ...]]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import logging
+import os
 import re
 import zlib
 from pathlib import Path
@@ -20,6 +21,8 @@ MAX_SAMPLES = 10_000_000  # periods from first to last sample of a recording in 
 MAX_COLUMNS = 4096  # columns of a CSV file; unknown ones are not kept in memory
 MAX_LINE_BYTES = 1 << 20  # of a line of text
 MAX_BLOCK_BYTES = 64 << 20  # an MCAP chunk or a BLF container, unpacked; tools write up to 8 MiB
+_RECORD_BYTES = 3.5  # of a file for each record: a frame of a bus at rest takes 4 in MCAP, 4.8 in BLF
+_FEW_RECORDS = 5000  # that any file may have
 _LAST_STAMP_NS = (1 << 63) - 1  # of the year 2262
 
 
@@ -36,6 +39,16 @@ def require_samples(count: int, where: str) -> None:
         )
 
 
+def most_records(size: int) -> int:
+    """Return how many records, frames for instance, a file of so many bytes may have, packed as it may be."""
+    return _FEW_RECORDS + int(size / _RECORD_BYTES)
+
+
+def too_many_records(path: Path) -> RecordingError:
+    """Return the error of a file with more than `most_records`."""
+    return RecordingError(f"{path}: expected at most one record for each {_RECORD_BYTES} bytes of the file")
+
+
 def require_stamp(stamp_ns: int, path: Path) -> None:
     """Check that a stamp has 64 bits.
 
@@ -48,13 +61,16 @@ def require_stamp(stamp_ns: int, path: Path) -> None:
 
 _LOG = logging.getLogger("drivelink.recording")
 
-_DEFLATE_RATIO = 1032  # of zlib at its best
-_CONTAINER_HEAD = 16  # header bytes of a BLF container
+_BLF_RATIO = 32  # of unpacked bytes to those of the file: of a bus at rest they are 10
+_SMALL_BYTES = 1 << 20  # that any file may unpack to
+_OBJECT_HEAD = _CONTAINER_HEAD = 16  # bytes
+_CONTAINER = b"\x0a\0\0\0"  # type of object
+_DEFLATED = b"\x02\0"  # method of compression; 0: none
 _STAMP = re.compile(r"^[ \t]*(\d{1,12}\.\d{1,12})(?=[ \t])")
 _RELATIVE = re.compile(r"^\s*base\s+\w+\s+timestamps\s+relative", re.IGNORECASE)
 # time CANFD channel Rx identifier [name] BRS ESI DLC length duration bits flags …, of a frame without data
 _EMPTY_FD = re.compile(
-    r"^\s*(\S+)\s+CANFD\s+(\d+)\s+(\w+)\s+(\w+)(?:\s+\w*[^\W01]\w*)?\s+[01]\s+[01]\s+0\s+0"
+    r"^\s*(\S+)\s+CANFD\s+(\d+)\s+(\w+)\s+(\w+)(?:\s+(?![01]\s)\w+)?\s+[01]\s+[01]\s+0\s+0"
     r"\s+\d+\s+\d+\s+([0-9A-Fa-f]+)(?:\s|$)"
 )
 _REMOTE = 0x10  # among these flags
@@ -62,34 +78,37 @@ _TRC_VERSIONS = ("1.0", "1.1", "1.2", "1.3", "2.0", "2.1")
 
 
 class BlfBytes(io.BufferedIOBase):
-    """The bytes of a BLF file, with limits on packed and unpacked containers."""
+    """The bytes of a BLF file, its containers unpacked within limits."""
 
     def __init__(self, file: IO[bytes], path: Path) -> None:
         super().__init__()
         self._file, self._path = file, path
+        self._left = _BLF_RATIO * os.fstat(file.fileno()).st_size + _SMALL_BYTES
+        self._container = False  # what is read next is one
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Read so many bytes.
 
         Raises:
-            RecordingError: a container exceeds the limit.
+            RecordingError: the containers exceed the limit.
         """
         if size is None or not 0 <= size <= MAX_BLOCK_BYTES:
             raise self._too_large()
         data = self._file.read(size)
-        if len(data) * _DEFLATE_RATIO > MAX_BLOCK_BYTES:
+        if self._container and data[:2] == _DEFLATED:
             unpacker = zlib.decompressobj()
-            try:
-                unpacker.decompress(data[_CONTAINER_HEAD:], MAX_BLOCK_BYTES)
-            except zlib.error:
-                return data  # not packed
+            content = unpacker.decompress(data[_CONTAINER_HEAD:], self._left)
             if unpacker.unconsumed_tail:
                 raise self._too_large()
+            self._left -= len(content)
+            return bytes(_CONTAINER_HEAD) + content
+        self._container = size == _OBJECT_HEAD and data[-4:] == _CONTAINER
         return data
 
     def _too_large(self) -> RecordingError:
         return RecordingError(
-            f"{self._path}: expected containers of at most {MAX_BLOCK_BYTES >> 20} MiB, got a larger one"
+            f"{self._path}: expected containers of at most {MAX_BLOCK_BYTES >> 20} MiB, "
+            f"unpacked {_BLF_RATIO} times the file, got larger ones"
         )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any
 
 from drivelink.output.numbers import Units, bare_name
@@ -140,23 +141,20 @@ def log_message(joint: str, time_s: float, text: str) -> bytes:
     return json.dumps(fields).encode()
 
 
+@cache
+def _measured(motors: int) -> tuple[str, ...]:
+    """What a sample's message may hold, in order: positions, velocities, torques, then of the link."""
+    kinds = ("position_rad", "velocity_rad_s", "torque_nm")
+    of_motors = (f"motor{i}_{kind}" for kind in kinds for i in range(1, motors + 1))
+    return (*of_motors, "link_position_rad", "link_velocity_rad_s", "external_torque_nm")
+
+
 def read_sample(message: Mapping[str, Any], motors: int) -> Sample:
     """Return the sample of a message, bit for bit; null becomes NaN."""
-
-    def value(name: str) -> float:
-        found = message.get(name)
-        return math.nan if found is None else float(found)
-
-    numbers = range(1, motors + 1)
-    return Sample(
-        int(message["sequence"]),
-        tuple(value(f"motor{i}_position_rad") for i in numbers),
-        tuple(value(f"motor{i}_velocity_rad_s") for i in numbers),
-        tuple(value(f"motor{i}_torque_nm") for i in numbers),
-        value("link_position_rad"),
-        value("link_velocity_rad_s"),
-        value("external_torque_nm"),
-    )
+    found = map(message.get, _measured(motors))
+    values = tuple([math.nan if value is None else float(value) for value in found])
+    positions, velocities, torques = (values[k * motors : (k + 1) * motors] for k in range(3))
+    return Sample(int(message["sequence"]), positions, velocities, torques, *values[3 * motors :])
 
 
 _INTEGER, _TEXT, _FLAG = {"type": "integer"}, {"type": "string"}, {"type": "boolean"}

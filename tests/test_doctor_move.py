@@ -62,7 +62,7 @@ class HandMovedJoint:
         read = (name for name in self.true if name not in self.unread)
         return {name: Value(self.wrong.get(name, 1.0) * self.true[name], 1e-4) for name in read}
 
-    def say(self, text: str) -> None:
+    def show(self, text: str) -> None:
         self.said.append(text)
 
     def ask(self, text: str, meanwhile: Callable[[], object]) -> str:

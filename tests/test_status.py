@@ -85,7 +85,7 @@ def test_the_same_with_other_figures_is_the_same(caplog: pytest.LogCaptureFixtur
         clock[0] = 0.1 * k
         events.begin("slow", f"{k} cycles left out so far")
         events.end("slow", f"it keeps up again; {k} were left out")
-        events.say(f"the counter jumped, {k} times so far", key="jumped")
+        events.report(f"the counter jumped, {k} times so far", key="jumped")
     assert len(caplog.records) == 3 * 5 and len(events.recent()) == 15
     assert events.recent()[-1]["text"] == "the counter jumped, 499 times so far"
     assert sum(event["count"] for event in events.recent()) == 1500
@@ -94,7 +94,7 @@ def test_the_same_with_other_figures_is_the_same(caplog: pytest.LogCaptureFixtur
 def test_the_last_events_are_kept_and_no_more() -> None:
     events = log([0.0])
     for k in range(1000):
-        events.say(f"event {k}")
+        events.report(f"event {k}")
     assert [event["text"] for event in events.recent()] == [f"event {k}" for k in range(984, 1000)]
 
 
@@ -115,10 +115,10 @@ def test_every_message_has_a_rate(caplog: pytest.LogCaptureFixture) -> None:
     events = log(clock)
     for k in range(5000):
         clock[0] = k * 1e-3
-        events.say(f"event {k}", logging.WARNING)
+        events.report(f"event {k}", logging.WARNING)
     assert len(caplog.records) == EventLog._LINES
     clock[0] = 20.0
-    events.say("later", logging.WARNING)
+    events.report("later", logging.WARNING)
     assert [r.getMessage() for r in caplog.records[-2:]] == [
         f"{5000 - EventLog._LINES} messages were not logged: too many at a time",
         "later",
@@ -127,7 +127,7 @@ def test_every_message_has_a_rate(caplog: pytest.LogCaptureFixture) -> None:
 
 def test_words_of_a_drive_are_plain_text(caplog: pytest.LogCaptureFixture) -> None:
     events = log([0.0])
-    events.say("node 1: \x1b]0;owned\x07\x9b31m\u202ename\nnext", logging.WARNING)
+    events.report("node 1: \x1b]0;owned\x07\x9b31m\u202ename\nnext", logging.WARNING)
     assert caplog.records[0].getMessage() == "node 1: ]0;owned31mname next"
     assert events.recent()[0]["text"] == "node 1: ]0;owned31mname next"
     record = logging.LogRecord("x", logging.WARNING, "", 0, "a \x1b[2J\x9bb", (), None)
@@ -169,7 +169,7 @@ def test_emergencies_with_other_bytes_of_the_maker_are_counted(caplog: pytest.Lo
 def test_faults_of_one_kind_in_one_place_are_counted(caplog: pytest.LogCaptureFixture) -> None:
     made = supervisor([0.0])
     for k in range(1000):
-        made._say_fault("elbow", IndexError(f"index {k} is out of range"))
+        made._report_fault("elbow", IndexError(f"index {k} is out of range"))
     assert len(caplog.records) == 1 and made._events.recent()[0]["count"] == 1000
 
 

@@ -100,7 +100,7 @@ class _Terminal:
     def __init__(self, out: TextIO) -> None:
         self._out = out
 
-    def say(self, text: str) -> None:
+    def show(self, text: str) -> None:
         """Print a line."""
         print(text, file=self._out, flush=True)
 

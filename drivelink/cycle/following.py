@@ -114,7 +114,7 @@ class PassiveFollower(MapFollower):
 
     def sync(self) -> Sequence[Mismatch]:
         """See `MapFollower.sync`."""
-        self._look()
+        self._check_silence()
         for node in self._due:
             layout, before = self._configurator.layouts[node], self._in_use[node]
             if not self._use(node, layout):
@@ -137,7 +137,7 @@ class PassiveFollower(MapFollower):
         self._configurator.poll(0.0)
         self._judge()
 
-    def _look(self) -> None:
+    def _check_silence(self) -> None:
         """Doubt the nodes that were not heard for a while; every so many SYNCs, or after a gap."""
         silent = []
         for node, assembler in self._assemblers.items():

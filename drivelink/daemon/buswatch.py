@@ -49,12 +49,12 @@ class BusWatch:
         self._check_speed()
         if loop.counter_jumps != self._counter_jumps:
             self._counter_jumps = loop.counter_jumps
-            self._events.say(
+            self._events.report(
                 f"the SYNC counter jumped, {self._counter_jumps} times so far", key="SYNC counter jumped"
             )
         if loop.clock_steps != self._clock_steps:
             self._clock_steps = loop.clock_steps
-            self._events.say(
+            self._events.report(
                 f"the system's clock was set by {loop.clock_step_ns / _NS:+.3f} s: stamps follow it, "
                 "the cycle does not",
                 key="clock set forward" if loop.clock_step_ns > 0 else "clock set back",

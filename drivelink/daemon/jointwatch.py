@@ -111,7 +111,7 @@ class JointWatch:
         monitor = loop_joint.pipeline.model_monitor
         if alarm:
             self._alarmed.add(loop_joint.name)
-            self._events.say(
+            self._events.report(
                 f"{loop_joint.name}: model alarm{residual_text(monitor)}: do not control on its numbers; "
                 "record a minute of motion, then drivelink diagnose names the effect",
                 logging.WARNING,
@@ -120,7 +120,7 @@ class JointWatch:
         else:
             self._alarmed.discard(loop_joint.name)
             text = f"{loop_joint.name}: the model alarm is over{residual_text(monitor)}"
-            self._events.say(text, key=f"{loop_joint.name}: no model alarm")
+            self._events.report(text, key=f"{loop_joint.name}: no model alarm")
 
     def _check_contradiction(self, loop_joint: LoopJoint) -> None:
         """Report begin and end of a contradiction between readings."""

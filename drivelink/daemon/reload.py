@@ -104,7 +104,7 @@ class Reloader:
             self._turn.release()
         self._joint = joint
         self._publish(joint)
-        self._events.say(f"{self.path.name}: the model in it is now in use")
+        self._events.report(f"{self.path.name}: the model in it is now in use")
 
     def _signature(self) -> tuple[int, int, int] | None:
         try:
@@ -119,7 +119,7 @@ class Reloader:
             self._refuse_changes(joint)
             built = self._build(joint)
         except (DrivelinkError, EstimatorError) as error:
-            self._events.say(f"the model stays as it is: {error}", logging.ERROR)
+            self._events.report(f"the model stays as it is: {error}", logging.ERROR)
             self._thread = None
             return
         self._follow(joint, built)
@@ -147,7 +147,7 @@ class Reloader:
             if new.drive != old.drive
         ]
         if changed:
-            self._events.say(
+            self._events.report(
                 f"{self.path.name}: {', '.join(changed)} changed, which requires a restart of the daemon",
                 logging.WARNING,
             )

@@ -140,7 +140,7 @@ class Daemon:
         self._configurator.bus = self._section.model_copy(update={"period_s": after_s})
         self.events.end("period")
         text = f"SYNC comes every {after_s * 1e3:.4g} ms, not {before_s * 1e3:.4g} ms"
-        self.events.say(f"{text}: estimates begin anew with it", logging.WARNING)
+        self.events.report(f"{text}: estimates begin anew with it", logging.WARNING)
         present = {reloader.path: reloader.close() for reloader in self._reloaders}
         self._joints = tuple(
             ServedJoint(joint=present[one.path], path=one.path) if one.path in present else one

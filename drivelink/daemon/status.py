@@ -46,7 +46,7 @@ class EventLog:
         """Return the last events, oldest first: {"time", "text", "count"}."""
         return [dict(event) for event in self._recent]
 
-    def say(self, text: str, level: int = logging.INFO, key: str = "", source: str = "") -> None:
+    def report(self, text: str, level: int = logging.INFO, key: str = "", source: str = "") -> None:
         """Report an event.
 
         Args:

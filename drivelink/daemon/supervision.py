@@ -54,7 +54,7 @@ class Supervisor:
         self._read_back: ReadBack | None = None
         self.bus = BusWatch(loop, events)  # watches SYNC, the bus and this machine
         self._joints = JointWatch(events, self.contradiction)
-        loop.on_fault = self._say_fault
+        loop.on_fault = self._report_fault
         self._unread = 0  # frames lost by receive overflow
         self._nodes: dict[int, WatchedNode] = {}
         for loop_joint, mine in layouts.items():
@@ -125,7 +125,7 @@ class Supervisor:
         for found in self._follower.sync():
             self._nodes[found.node].attempt_ns = self._loop.clock()
             text = f"{found.text}: it is configured again"
-            self._events.say(text, logging.WARNING, key=f"read back {found.node}")
+            self._events.report(text, logging.WARNING, key=f"read back {found.node}")
             self._configurator.start(found.node)
 
     def _proceed(self, now_ns: int) -> None:
@@ -147,7 +147,7 @@ class Supervisor:
         if layout.tpdos != watched.layout.tpdos:
             self._loop.reroute()
             self._loop.source.narrow(self._loop.receive_ids())
-            self._events.say(f"node {node} has another mapping now: {_maps(layout)}")
+            self._events.report(f"node {node} has another mapping now: {_maps(layout)}")
         watched.layout = layout
         if isinstance(self._configurator, PassiveConfigurator):
             return
@@ -155,7 +155,7 @@ class Supervisor:
             self._read_back.watch(layout, watched.loop_joint.pipeline)
         self._events.end(f"configure {node}")
         if not watched.started:
-            self._events.say(f"node {node} is configured again and started")
+            self._events.report(f"node {node} is configured again and started")
         watched.started = True
 
     def check(self) -> None:
@@ -190,12 +190,12 @@ class Supervisor:
             if unasked > watched.unasked:
                 watched.unasked = unasked
                 text = f"node {node}: {unasked} SDO answers so far belong to no request heard: not used"
-                self._events.say(text, logging.WARNING, key=f"unasked {node}")
+                self._events.report(text, logging.WARNING, key=f"unasked {node}")
 
-    def _say_fault(self, where: str, error: Exception) -> None:
+    def _report_fault(self, where: str, error: Exception) -> None:
         logger.debug("%s", where, exc_info=error)
         kind = type(error).__name__
-        self._events.say(f"{where}: {kind}: {error}", logging.ERROR, key=f"{where}: {kind}")
+        self._events.report(f"{where}: {kind}: {error}", logging.ERROR, key=f"{where}: {kind}")
 
     def reconfigure_all(self) -> None:
         """Configure all nodes again after a loss of the bus."""
@@ -230,9 +230,9 @@ class Supervisor:
             watched.attempt_ns = now
             self._configurator.start(node, stopped=watched.state == _STOPPED)
             if watched.started:
-                self._say_unstarted(node, watched)
+                self._report_unstarted(node, watched)
 
-    def _say_unstarted(self, node: int, watched: WatchedNode) -> None:
+    def _report_unstarted(self, node: int, watched: WatchedNode) -> None:
         code = watched.loop_joint.pipeline.assembler.faults.get(node)
         why = f" and EMCY 0x{code:04X}: its error may need a reset or a power cycle" if code else ""
         self._events.begin(
@@ -249,7 +249,7 @@ class Supervisor:
         watched.heartbeat_ns = self._loop.clock()
         state = data[0] & 0x7F
         if state == 0:  # every time: it may reboot while being configured
-            self._events.say(f"node {node} has rebooted", logging.WARNING)
+            self._events.report(f"node {node} has rebooted", logging.WARNING)
             watched.attempt_ns = watched.heartbeat_ns
             self._configurator.start(node)
             if isinstance(self._follower, PassiveFollower):  # its heartbeat has its default again
@@ -263,7 +263,7 @@ class Supervisor:
         if emergency is not None and not emergency.is_reset:
             node, code = cob_id - 0x080, emergency.code
             key, source = f"EMCY {node} {code}", f"EMCY {node}"
-            self._events.say(f"node {node}: {emergency}", logging.WARNING, key, source)
+            self._events.report(f"node {node}: {emergency}", logging.WARNING, key, source)
 
     def _answer(self, cob_id: int, data: bytes) -> None:
         now_ns = self._loop.clock()
@@ -281,7 +281,7 @@ class Supervisor:
         address = written_object(data)
         if address is not None and is_mapping(address):
             text = f"node {cob_id - 0x600}: somebody else writes its mapping: it is configured again"
-            self._events.say(text, logging.WARNING)
+            self._events.report(text, logging.WARNING)
 
 
 def _maps(layout: NodeLayout) -> str:

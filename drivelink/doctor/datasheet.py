@@ -71,7 +71,7 @@ def velocity_as_check(available: Available) -> dict[Signal, tuple[MappedObject, 
     return found | {Signal.VELOCITY_CHECK: tuple(replace(o, signal=Signal.VELOCITY_CHECK) for o in velocity)}
 
 
-def say_sync_counter(section: Section, subject: str, bus: BusSection) -> None:
+def report_sync_counter(section: Section, subject: str, bus: BusSection) -> None:
     """Report a SYNC counter (0x1019) that is off: it shows each lost SYNC."""
     if bus.sync == "produce" and not bus.sync_counter_overflow:
         line = f"[bus] sync_counter_overflow = {_COUNTER}"
@@ -79,7 +79,7 @@ def say_sync_counter(section: Section, subject: str, bus: BusSection) -> None:
         section.info("cross-check", text, line)
 
 
-def say_checks(
+def report_checks(
     section: Section, role: Role, wanted: Available, available: Available, tpdos: Sequence[Tpdo]
 ) -> None:
     """Report which checks the drive can send, their cost in frames, and the line for the joint file."""
@@ -96,7 +96,7 @@ def say_checks(
     }
     encoder = found.pop("second_encoder", None)
 
-    def say(text: str, objects: Available, line: str) -> None:
+    def report(text: str, objects: Available, line: str) -> None:
         frames = _cost(role, wanted, objects, tpdos)
         if frames is not None:
             section.info("cross-check", f"{text}: {_frames(frames)}", f"[motor.drive] {line}")
@@ -105,15 +105,15 @@ def say_checks(
         return f"checks = {json.dumps([*drive.checks, *names])}"
 
     for name, objects in found.items():
-        say(f"{name} ({_names(objects)}) can be compared with {_AGAINST[name]}", objects, checks([name]))
+        report(f"{name} ({_names(objects)}) can be compared with {_AGAINST[name]}", objects, checks([name]))
     if len(found) > 1:
-        say(
+        report(
             "all of them", {signal: o for each in found.values() for signal, o in each.items()}, checks(found)
         )
     if encoder is not None and drive.second_encoder is None:
         name = _names(encoder)
         text = f"second encoder ({name}), if on the motor, can be compared with position"
-        say(text, encoder, f'second_encoder = "{name}"')
+        report(text, encoder, f'second_encoder = "{name}"')
     section.facts["cross_checks"] = list(found)
 
 
@@ -186,7 +186,7 @@ def examine_sheet(section: Section, path: Path) -> None:
         kept = "" if assignment.objects is not None else "its map as it is, "
         text = " + ".join(entry_text(entry) for entry in entries)
         section.ok("configured", f"TPDO{number} = {text}, {kept}at every SYNC")
-    say_checks(section, role, mappable, velocity_as_check(available), tpdos)
+    report_checks(section, role, mappable, velocity_as_check(available), tpdos)
     section.facts["mapping"] = [
         {"tpdo": number, "objects": [f"0x{i:04X}:{s:02X}:{b}" for i, s, b in entries]}
         for number, entries in map(planned_entries, plan)
@@ -245,11 +245,11 @@ def _signals(section: Section, sheet: DataSheet) -> dict[Signal, tuple[MappedObj
         usable = [one for one in there if sheet.objects[one.address].pdo_mappable or one.address in carried]
         found[signal] = tuple(replace(one, bits=len(sheet.objects[one.address])) for one in usable)
         if signal not in CHECKS:
-            _say_signal(section, signal, sheet, [o.address for o in there], [o.address for o in usable])
+            _report_signal(section, signal, sheet, [o.address for o in there], [o.address for o in usable])
     return found
 
 
-def _say_signal(
+def _report_signal(
     section: Section,
     signal: Signal,
     sheet: DataSheet,

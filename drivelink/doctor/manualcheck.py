@@ -81,7 +81,7 @@ class Values(Protocol):
 class Person(Protocol):
     """The person who moves the joint."""
 
-    def say(self, text: str) -> None:
+    def show(self, text: str) -> None:
         """Show a line."""
 
     def ask(self, text: str, meanwhile: Callable[[], object]) -> str:
@@ -136,7 +136,7 @@ def check_by_hand(joint: JointFile, values: Values, person: Person, seconds: flo
         UsageError: nobody answers.
     """
     steps = _Steps(joint, values, person, seconds)
-    person.say("drivelink moves nothing: you do, by hand or with whatever controls the drive.")
+    person.show("drivelink moves nothing: you do, by hand or with whatever controls the drive.")
     serial = joint.arrangement == "serial"
     together = [f"motor{i + 1}_position" for i in range(1 if serial else len(joint.motor))]
     motors = [name.replace("position", "torque") for name in together]
@@ -282,7 +282,7 @@ class _Steps:
     def _mark(self, channel: str, what: str, good: bool | None, text: str) -> None:
         mark = Mark(channel=channel, what=what, good=good, text=text)
         self.done.marks.append(mark)
-        self._person.say(f"  {mark}")
+        self._person.show(f"  {mark}")
 
     def _amount(self, text: str) -> float | None:
         """The amount of motion, rad or m; None: skipped."""
@@ -297,7 +297,7 @@ class _Steps:
             amount = _number(match[1]) * axis.units.get(match[2], math.nan) if match else math.nan
             if math.isfinite(amount) and amount != 0.0:
                 return amount
-            self._person.say(f"expected an amount like {axis.example}, got {reply}")
+            self._person.show(f"expected an amount like {axis.example}, got {reply}")
 
     def _torque(self, text: str) -> float | None:
         """The torque or force of the push, N·m or N; None: unknown."""
@@ -308,7 +308,7 @@ class _Steps:
             torque = _number(reply)
             if math.isfinite(torque) and torque != 0.0:
                 return torque
-            self._person.say(f"expected a number of {self._axis.force}, got {reply}")
+            self._person.show(f"expected a number of {self._axis.force}, got {reply}")
 
 
 def _number(text: str) -> float:

@@ -41,7 +41,7 @@ def judge_record(section: Section, joint: JointFile, record: Record | None) -> N
         section.info(joint.name, f"units and signs cannot be checked: {error}", _advice(record))
         return
     section.facts["samples"] = len(record)
-    _say_judgement(section, joint, judgement, record)
+    _report_judgement(section, joint, judgement, record)
 
 
 def _advice(record: Record) -> str:
@@ -54,7 +54,7 @@ def _advice(record: Record) -> str:
     return _STILL
 
 
-def _say_judgement(section: Section, joint: JointFile, judgement: Judgement, record: Record) -> None:
+def _report_judgement(section: Section, joint: JointFile, judgement: Judgement, record: Record) -> None:
     section.facts["torque_left"] = None if np.isnan(judgement.left) else judgement.left
     if judgement.findings:
         needed = [change for finding in judgement.findings for change in finding.changes]

@@ -29,8 +29,8 @@ from drivelink.doctor.datasheet import (
     asked_signals,
     curious,
     planned_entries,
-    say_checks,
-    say_sync_counter,
+    report_checks,
+    report_sync_counter,
     velocity_as_check,
 )
 from drivelink.doctor.livevalues import Asked, Heard, record_of
@@ -162,7 +162,7 @@ def _examine_node(
     section.notices += survey.offer.notices
     planned = _judge_mapping(section, role, survey)
     if _has(bus, joint.bus, role.node_id, 0x1019):
-        say_sync_counter(section, subject, joint.bus)
+        report_sync_counter(section, subject, joint.bus)
     return survey, planned
 
 
@@ -230,7 +230,7 @@ def _judge_mapping(section: Section, role: Role, survey: NodeSurvey) -> NodeLayo
     sensorless = vendor_of(survey.identity[0]).sensorless
     if any(o.address == sensorless for o in available.get(Signal.SECOND_POSITION, ())):
         del available[Signal.SECOND_POSITION]
-    say_checks(section, role, wanted, available, survey.tpdos)
+    report_checks(section, role, wanted, available, survey.tpdos)
     tpdos = tuple(
         TpdoLayout(cob_id=0x181, objects=a.objects) if a.objects is not None else decode([a.tpdo], wanted)[0]
         for a in plan

@@ -210,7 +210,7 @@ class BusTap:
                 for cob_id, data, stamp_ns in frames:
                     self._sink.frame(stamp_ns, cob_id, data)
                     if self._samples is not None:
-                        self._give(self._samples.take(LoggedFrame(stamp_ns, cob_id, data, "")))
+                        self._put_samples(self._samples.take(LoggedFrame(stamp_ns, cob_id, data, "")))
                 self.frames += len(frames)
         except BusLostError as error:
             raise BusError(f"the bus is gone: {error}") from error
@@ -218,9 +218,9 @@ class BusTap:
     def finish(self) -> None:
         """Take the samples waiting for later SYNCs."""
         if self._samples is not None:
-            self._give(self._samples.rest())
+            self._put_samples(self._samples.rest())
 
-    def _give(self, samples: list[tuple[Sample, int]]) -> None:
+    def _put_samples(self, samples: list[tuple[Sample, int]]) -> None:
         period_s = self._samples.period_s if samples and self._samples is not None else self._period_s
         if period_s != self._period_s:
             _LOG.warning("SYNC comes every %.4g ms: samples are numbered by that", period_s * 1e3)

@@ -28,7 +28,7 @@ from drivelink.demo.simulate import alter, network_from_joint, world_from_joint
 from drivelink.jointfile.apply_diagnosis import make_model_monitor
 from drivelink.loop import diagnosing, finding
 from drivelink.loop.blackbox import AFTER_S
-from drivelink.loop.folder import proposal_file, recording_name
+from drivelink.loop.finding import proposal_file, recording_name
 from drivelink.recording.sinks import McapSink
 from estimator.effects import LIBRARY
 from estimator.errors import EstimatorError

@@ -18,7 +18,7 @@ from test_recording_recorder import joint_file
 
 from drivelink import cli, jointfile
 from drivelink.loop.blackbox import AFTER_S, BlackBox
-from drivelink.loop.folder import drop_oldest, event_of, kept
+from drivelink.loop.finding import drop_oldest, event_of, kept
 from drivelink.pubsub.feed import DECODERS
 from drivelink.pubsub.wire import EstimateMessage
 from drivelink.recording.mapping import joint_of

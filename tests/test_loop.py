@@ -22,7 +22,7 @@ from drivelink.demo.simulate import alter, world_from_joint
 from drivelink.errors import RecordingError, UsageError
 from drivelink.loop import acceptance, diagnosing, finding
 from drivelink.loop.feed import FindingFeed
-from drivelink.loop.folder import finding_file, proposal_file
+from drivelink.loop.finding import finding_file, proposal_file
 from drivelink.loop.queue import Diagnoses, next_due
 from drivelink.monitor.view import JointView
 from drivelink.monitor.watcher import Watcher

@@ -11,7 +11,7 @@ import can
 import pytest
 from simkit import StubRig
 
-from drivelink.demo.socketcand import SocketcandServer
+from drivelink.demo.simbus import SocketcandServer
 from sim.canopen.drive import Cia402Drive
 from sim.network import Network
 

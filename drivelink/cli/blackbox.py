@@ -20,7 +20,7 @@ from drivelink.cli.record import add_taps
 from drivelink.errors import BusError, DrivelinkError
 from drivelink.jointfile import JointFile
 from drivelink.loop.blackbox import BlackBox
-from drivelink.loop.folder import folder_of
+from drivelink.loop.finding import folder_of
 from drivelink.loop.queue import Diagnoses
 from drivelink.recording.recorder import BusTap, Recorder
 

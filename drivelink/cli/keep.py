@@ -10,7 +10,7 @@ from pathlib import Path
 from drivelink import jointfile
 from drivelink.errors import RecordingError
 from drivelink.loop.blackbox import AFTER_S
-from drivelink.loop.folder import wish_of
+from drivelink.loop.finding import wish_of
 
 EPILOG = """\
 The daemon of a joint file with a folder in [recording] keeps the last minute in memory. On an alarm, a

@@ -1,17 +1,239 @@
-"""The bus of simulated devices: opened or served, and joined where another process serves it."""
+"""The bus of simulated devices: opened or served between processes by the socketcand protocol over TCP.
+
+Every client (such as python-can's `socketcand` interface) is a node on this bus, and so is the serving
+process: `SocketcandServer` is itself a python-can bus. Raw mode only, no CAN FD. See
+https://github.com/linux-can/socketcand/blob/master/doc/protocol.md.
+"""
 
 from __future__ import annotations
 
 import errno
+import selectors
+import socket
+import threading
+import time
+from collections import deque
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import can
 
 from drivelink.canopen.bus import open_bus, server_has_gone
 from drivelink.canopen.scan import scan
-from drivelink.demo.socketcand import DEFAULT_PORT, SocketcandServer
 from drivelink.errors import BusError
 from drivelink.jointfile import BusSection
+
+DEFAULT_PORT = 29536
+
+_LARGEST_BACKLOG = 1 << 20  # unread bytes at which a client is dropped
+_LONGEST_COMMAND = 1 << 12
+_SETTLE_S = 0.05  # python-can's client takes its greeting for one whole read: no frame may follow at once
+_CHUNK = 1 << 16
+
+
+class _Client:
+    """One connection: protocol state and unsent bytes."""
+
+    __slots__ = ("hold_until_s", "open", "pending", "raw", "received", "socket", "unsent")
+
+    def __init__(self, connection: socket.socket) -> None:
+        self.socket = connection
+        self.received = ""
+        self.unsent = bytearray()
+        self.open = self.raw = False
+        self.hold_until_s = 0.0
+        self.pending: list[bytes] = []
+
+
+class SocketcandServer(can.BusABC):
+    """Serves one CAN channel to any number of clients; frames pass between all of them and this process.
+
+    Args:
+        channel: name that clients have to open; empty: any name.
+        port: TCP port; 0 takes a free one.
+
+    Raises:
+        OSError: the address cannot be used.
+    """
+
+    def __init__(
+        self, channel: str = "", host: str = "127.0.0.1", port: int = DEFAULT_PORT, **kwargs: Any
+    ) -> None:
+        self._is_shutdown = True  # nothing to close yet, python-can, if the next line fails
+        self._writing = threading.RLock()  # one thread may send while another one receives
+        self._listener = socket.create_server((host, port))
+        self._is_shutdown = False
+        self._selector = selectors.DefaultSelector()
+        self._clients: list[_Client] = []
+        self._frames: deque[can.Message] = deque()
+        self._listener.setblocking(False)
+        self._selector.register(self._listener, selectors.EVENT_READ, None)
+        self.port: int = self._listener.getsockname()[1]  # the port in use
+        self.channel = channel
+        self.channel_info = f"socketcand server for {channel or 'any channel'} at {host}:{self.port}"
+        super().__init__(channel=channel, **kwargs)
+
+    # The bus
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Send a frame to every client; `timeout` is not needed, nothing blocks."""
+        if msg.is_fd:
+            raise can.CanOperationError("socketcand carries no CAN FD frames")
+        self._broadcast(_frame(msg, time.time()), None)
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if not self._frames:
+            self._serve(timeout)
+        return (self._frames.popleft() if self._frames else None), False
+
+    def shutdown(self) -> None:
+        """Close every connection."""
+        super().shutdown()
+        for client in list(self._clients):
+            self._drop(client)
+        self._selector.close()
+        self._listener.close()
+
+    # The clients
+
+    def _serve(self, timeout: float | None) -> None:
+        for key, events in self._selector.select(self._patience(timeout)):
+            client = key.data
+            if client is None:
+                self._accept()
+                continue
+            if events & selectors.EVENT_READ:
+                self._read(client)
+            if events & selectors.EVENT_WRITE and client in self._clients:
+                self._flush(client)
+        self._release()
+
+    def _patience(self, timeout: float | None) -> float | None:
+        held = any(client.pending for client in self._clients)
+        return min(timeout, _SETTLE_S) if held and timeout is not None else timeout
+
+    def _release(self) -> None:
+        """Send the frames held back after a greeting."""
+        now_s = time.monotonic()
+        for client in list(self._clients):
+            if client.pending and now_s >= client.hold_until_s:
+                waiting, client.pending = b"".join(client.pending), []
+                self._write(client, waiting)
+
+    def _accept(self) -> None:
+        connection, _ = self._listener.accept()
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        client = _Client(connection)
+        self._clients.append(client)
+        self._selector.register(connection, selectors.EVENT_READ, client)
+        self._write(client, b"< hi >")
+
+    def _drop(self, client: _Client) -> None:
+        with self._writing:
+            if client in self._clients:
+                self._clients.remove(client)
+                self._selector.unregister(client.socket)
+                client.socket.close()
+
+    def _read(self, client: _Client) -> None:
+        try:
+            data = client.socket.recv(_CHUNK)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self._drop(client)
+            return
+        *commands, rest = (client.received + data.decode("ascii", "replace")).split(">")
+        client.received = rest
+        if len(rest) > _LONGEST_COMMAND:
+            self._drop(client)
+            return
+        for command in commands:
+            self._obey(client, command.strip().removeprefix("<").split())
+
+    def _obey(self, client: _Client, words: list[str]) -> None:
+        if words[:1] == ["send"] and client.open:
+            self._forward(client, words[1:])
+        elif words[:1] == ["open"] and len(words) == 2:
+            client.open = not self.channel or words[1] == self.channel
+            self._write(client, b"< ok >" if client.open else b"< error could not open bus >")
+        elif words == ["rawmode"] and client.open:
+            self._write(client, b"< ok >")
+            client.raw = True
+            client.hold_until_s = time.monotonic() + _SETTLE_S
+        elif words == ["echo"]:
+            self._write(client, b"< echo >")
+        else:
+            self._write(client, b"< error unknown command >")
+
+    def _forward(self, client: _Client, words: list[str]) -> None:
+        try:
+            message = _message(words)
+        except ValueError:
+            self._write(client, b"< error could not parse frame >")
+            return
+        self._frames.append(message)
+        if len(self._clients) > 1:
+            self._broadcast(_frame(message, message.timestamp), client)
+
+    def _broadcast(self, text: bytes, sender: _Client | None) -> None:
+        for client in list(self._clients):
+            if client is sender or not client.raw:
+                continue
+            if client.pending or time.monotonic() < client.hold_until_s:
+                client.pending.append(text)
+            else:
+                self._write(client, text)
+
+    def _write(self, client: _Client, text: bytes) -> None:
+        with self._writing:
+            client.unsent += text
+            self._flush(client)
+
+    def _flush(self, client: _Client) -> None:
+        with self._writing:
+            self._send_unsent(client)
+
+    def _send_unsent(self, client: _Client) -> None:
+        if client not in self._clients:  # the other thread has just dropped it
+            return
+        try:
+            sent = client.socket.send(client.unsent)
+            del client.unsent[:sent]
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._drop(client)
+            return
+        if len(client.unsent) > _LARGEST_BACKLOG:
+            self._drop(client)
+            return
+        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.unsent else 0)
+        if self._selector.get_key(client.socket).events != wanted:
+            self._selector.modify(client.socket, wanted, client)
+
+
+def _frame(message: can.Message, stamp_s: float) -> bytes:
+    width = 8 if message.is_extended_id else 3
+    data = bytes(message.data).hex().upper()
+    return f"< frame {message.arbitration_id:0{width}X} {stamp_s:.6f} {data} >".encode("ascii")
+
+
+def _message(words: list[str]) -> can.Message:
+    identifier, length, *data = words
+    if len(data) != int(length) or len(data) > 8:
+        raise ValueError("length")
+    return can.Message(
+        timestamp=time.time(),
+        arbitration_id=int(identifier, 16),
+        is_extended_id=len(identifier) > 3,
+        data=bytes(int(byte, 16) for byte in data),
+        check=True,
+    )
+
 
 _LOCAL = ("127.0.0.1", "localhost", "::1")
 

@@ -16,7 +16,7 @@ from drivelink.errors import JointFileError, RecordingError, UsageError
 from drivelink.files import read_regular, write_whole
 from drivelink.jointfile import MAX_BYTES, JointFile, JointText, load, load_text, without_check, write_model
 from drivelink.loop import finding
-from drivelink.loop.folder import folder_of, proposal_file
+from drivelink.loop.finding import folder_of, proposal_file
 from drivelink.plaintext import clean_text
 
 PATIENCE_S = 60.0  # for the residual to fall

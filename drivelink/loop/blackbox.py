@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from drivelink.errors import JointFileError, RecordingError
 from drivelink.jointfile import JointText, load_text
-from drivelink.loop.folder import DOUBTS, UNFINISHED, drop_oldest, kept, recording_name, wish_of
+from drivelink.loop.finding import DOUBTS, UNFINISHED, drop_oldest, kept, recording_name, wish_of
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from drivelink.recording.sinks import McapSink, Sink
 from estimator.sample import Sample, Status

@@ -11,7 +11,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,15 +20,61 @@ from drivelink.errors import DrivelinkError
 from drivelink.jointfile import JointFile, apply_diagnosis
 from drivelink.jointfile.apply_diagnosis import make_model_monitor
 from drivelink.loop import finding
-from drivelink.loop.folder import proposal_file
-from drivelink.loop.words import summary
+from drivelink.loop.finding import proposal_file
 from drivelink.output import report
+from drivelink.output.numbers import Units
 from drivelink.recording.mapping import joint_of
 from drivelink.recording.mcapfile import read_messages
 from estimator.diagnosis import Diagnosis, Errors, diagnose
 from estimator.errors import EstimatorError
 from estimator.model_monitor import Second, can_monitor, seconds_of
 from estimator.sample import Record
+
+
+class Summary(NamedTuple):
+    """A finding in one sentence, in a few words, and its parameters with their intervals, a line each."""
+
+    sentence: str
+    short: str
+    parameters: tuple[str, ...]
+
+
+def summary(outcome: Diagnosis, error: Errors, joint: JointFile) -> Summary:
+    """Describe what was found.
+
+    Args:
+        error: of the model in use and of the proposed one, on held-out data.
+    """
+    units = Units(joint.axis == "linear")
+    fall = f"{error.before_relative:.2%} to {error.after_relative:.2%}"
+    on = "on held-out data the error of the motor torque"
+    if outcome.verdict == "effect":
+        names = " and ".join(report.title_of(one, outcome) for one in outcome.effects)
+        sentence, short = f"{report.lacks(outcome)}: {on} falls from {fall}.", f"{names}, error {fall}"
+    elif outcome.verdict == "sufficient" and error.after_rms_nm < 0.5 * error.before_rms_nm:
+        sentence = f"No effect is missing, but the joint has changed: refitted, {on} falls from {fall}."
+        short = f"the joint has changed, error {fall}"
+    else:
+        sentence = report.sentence(outcome)
+        short = sentence.partition(":")[0].rstrip(".")
+    return Summary(sentence, short, tuple(_parameters(outcome, joint, units)))
+
+
+def _parameters(outcome: Diagnosis, joint: JointFile, units: Units) -> list[str]:
+    lines = [
+        f"{report.title_of(one, outcome)}: {name} = {units.value(name, value, one.std.get(name))}"
+        for one in outcome.effects
+        for name, value in one.parameters.items()
+    ]
+    for number, (one, motor) in enumerate(zip(outcome.transmissions, joint.motor, strict=True), start=1):
+        for name, value in one.parameters.items():
+            declared = motor.transmission.parameters.get(name)
+            line = f"transmission {number}: {name} = {units.value(name, value, one.std.get(name))}"
+            lines.append(
+                line + (f", was {units.value(name, declared, None)}" if declared is not None else "")
+            )
+    return lines
+
 
 _LOG = logging.getLogger("drivelink.loop")
 _LEAST_SECONDS = 6  # of residual, to tell two levels from one

@@ -1,17 +1,109 @@
-"""The finding: what was found in a kept recording, as one JSON document beside it."""
+"""A black box's folder: recordings, beside each its finding (a JSON document) and the proposed joint file."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from drivelink.errors import DrivelinkError, RecordingError
 from drivelink.files import read_regular, write_whole
-from drivelink.loop.folder import event_of, finding_file, kept
+from drivelink.jointfile import JointText
 from drivelink.pubsub.feed import MAX_BYTES, decode_document
+
+_STAMP = "%Y%m%dT%H%M%SZ"
+_NAME = re.compile(r"-(\d{8}T\d{6}Z)-([a-z-]+)\.(mcap|part)")
+DOUBTS = ("asked", "model alarm", "suspected signal", "change")  # causes that a model may explain
+UNFINISHED = ".part"  # ending of a recording that is being written
+
+
+def recording_name(joint: str, cause: str, wall: datetime) -> str:
+    """Return the name of a recording, e.g. `elbow-20260105T081500Z-model-alarm.mcap`."""
+    return f"{joint}-{wall:{_STAMP}}-{cause.replace(' ', '-')}.mcap"
+
+
+def kept(folder: Path, joint: str, ending: str = ".mcap") -> list[Path]:
+    """Return the recordings of a joint's black box, oldest first.
+
+    Args:
+        ending: of finished ones, or `UNFINISHED`.
+
+    Raises:
+        OSError: the folder cannot be read.
+    """
+    found = (path for path in folder.iterdir() if path.suffix == ending and path.name.startswith(joint))
+    return sorted(path for path in found if _NAME.fullmatch(path.name, len(joint)))
+
+
+class Event(NamedTuple):
+    """What led to a recording: of which joint, when, and the cause."""
+
+    joint: str
+    time: datetime
+    cause: str
+
+
+def event_of(recording: Path) -> Event:
+    """Return the event of a recording, by its name.
+
+    Raises:
+        RecordingError: it is no recording of a black box.
+    """
+    match = _NAME.search(recording.name)
+    if match is None:
+        raise RecordingError(f"{recording}: expected a recording of a black box, JOINT-TIME-CAUSE.mcap")
+    time = datetime.strptime(match[1], _STAMP).replace(tzinfo=UTC)
+    return Event(recording.name[: match.start()], time, match[2].replace("-", " "))
+
+
+def finding_file(recording: Path) -> Path:
+    """Return where the finding of a recording lies."""
+    return recording.with_suffix(".finding.json")
+
+
+def proposal_file(recording: Path) -> Path:
+    """Return where the joint file lies that the finding proposes."""
+    return recording.with_suffix(".toml")
+
+
+def folder_of(text: JointText) -> Path:
+    """Return the folder of a joint's black box.
+
+    Raises:
+        RecordingError: the joint file declares none.
+    """
+    folder = text.joint.recording.folder
+    if folder is None:
+        raise RecordingError(f"{text.name}: recording.folder: expected the folder of the black box, got none")
+    return text.folder / folder
+
+
+def wish_of(text: JointText) -> Path:
+    """Return the file that asks the black box of a joint to keep the last minute; it removes it.
+
+    Raises:
+        RecordingError: the joint file declares no folder.
+    """
+    return folder_of(text) / f"{text.joint.name}.keep"
+
+
+def drop_oldest(folder: Path, joint: str, keep_mib: float) -> None:
+    """Remove the oldest recordings of a joint's black box, and what lies beside them, beyond its budget.
+
+    The newest always stays.
+    """
+    recordings = kept(folder, joint)
+    sizes = [path.stat().st_size for path in recordings]
+    for index, path in enumerate(recordings[:-1]):
+        if sum(sizes[index:]) <= keep_mib * 2**20:
+            break
+        for part in (path, finding_file(path), proposal_file(path)):
+            part.unlink(missing_ok=True)
+
 
 SCHEMA = "drivelink.finding/1"
 DIAGNOSING = "diagnosing"

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from drivelink.errors import DrivelinkError
 from drivelink.loop import finding
-from drivelink.loop.folder import DOUBTS, event_of, kept
+from drivelink.loop.finding import DOUBTS, event_of, kept
 
 _LOG = logging.getLogger("drivelink.loop")
 _APART_S = 60.0  # events closer than this are one

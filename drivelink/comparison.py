@@ -217,11 +217,14 @@ def compare(
     runs = []
     for side, path in zip(sides, paths, strict=True):
         if side.record is not None:
-            try:
-                run = free_run(side.record, sides[0].model, horizon_s)
-                runs.append((side, run, free_run(side.record, sides[1].model, run.horizon_s)))
-            except EstimatorError as error:
-                raise RecordingError(f"{path}: {error}") from error
+            made: list[FreeRun] = []
+            for of, its in zip(paths, sides, strict=True):
+                try:
+                    made.append(free_run(side.record, its.model, made[0].horizon_s if made else horizon_s))
+                except EstimatorError as error:
+                    which = f"{of}" if of == path else f"{of}, over {path}"
+                    raise RecordingError(f"{which}: {error}") from error
+            runs.append((side, made[0], made[1]))
     linear = own is not None and jointfile.load(Path(own)).axis == "linear"
     return Comparison((sides[0], sides[1]), tuple(runs), Units(linear))
 

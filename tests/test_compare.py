@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -67,5 +68,11 @@ def test_the_verb_writes_a_page_and_numbers(runs: Path, capsys: pytest.CaptureFi
     assert document["free_runs"] == [] and document["curves"][0]["a"] == document["curves"][0]["b"]
     assert cli.main(["compare", str(ELBOW), healthy, "--horizon", "0"]) == 2
     assert cli.main(["compare", str(ELBOW), str(runs / "none.csv")]) == 3
-    errors = capsys.readouterr().err.strip().splitlines()
-    assert len(errors) == 2 and "expected a number of seconds above 0" in errors[0]
+    bare = runs / "bare.toml"  # what is missing in a joint file is not said of the recording
+    bare.write_text(re.sub(r"\[motor.transmission.parameters\]\n.*\n", "", ELBOW.read_text(encoding="utf-8")))
+    assert cli.main(["compare", str(bare), healthy]) == 3
+    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("drivelink")]
+    assert len(errors) == 3 and "expected a number of seconds above 0" in errors[0]
+    assert errors[2].startswith(
+        f"drivelink compare: {bare}, over {healthy}: transmission.parameters: expected"
+    )

@@ -35,7 +35,7 @@ formats: .csv, .mcap, .mf4 (with asammdf), and raw CAN: candump .log in its vari
 
 examples:
   drivelink replay run.csv --joint elbow.toml --out estimates.csv --plots plots/
-  drivelink replay run.mcap --publish --realtime        a recording of drivelink contains its joint file
+  drivelink replay run.mcap --publish --speed 1         a recording of drivelink contains its joint file
   drivelink replay candump.log --joint elbow.toml --channel can1
   drivelink replay rig.csv --joint elbow.toml --map t=time_s:ms --map q_link=link_position_rad:deg
 """
@@ -49,8 +49,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace the CSV of --out if it exists")
     parser.add_argument("--plots", type=Path, metavar="DIR", help="write plots of the estimates")
     parser.add_argument("--publish", action="store_true", help="put samples and estimates on zenoh")
-    parser.add_argument("--realtime", action="store_true", help="at the speed of the recording")
-    parser.add_argument("--speed", type=float, metavar="X", help="X times the speed of the recording")
+    parser.add_argument(
+        "--speed",
+        type=float,
+        metavar="X",
+        help="X times the speed of the recording (default: as fast as it goes)",
+    )
     parser.add_argument(
         "--strict", action="store_true", help="refuse what has wrong units, signs or gears; else only warn"
     )
@@ -66,7 +70,6 @@ def run(args: argparse.Namespace) -> int:
     """Do the job; return the exit status."""
     if args.speed is not None and not args.speed > 0:
         raise UsageError(f"--speed: expected a number above 0, got {args.speed:g}")
-    speed = args.speed if args.speed is not None else 1.0 if args.realtime else None
     source = joint_of(args.file, args.joint)
     joint, base_dir = source.joint, source.folder
     names = parse_column_map(args.map)
@@ -94,8 +97,8 @@ def run(args: argparse.Namespace) -> int:
             rows = EstimatesFile(args.out, playback.motors, estimator, linked=linked, force=args.force)
             stack.callback(rows.close)
             takers.append(rows.take)
-        if args.publish or speed is not None:
-            publication = _publication(args, joint, base_dir, speed, playback, stack)
+        if args.publish or args.speed is not None:
+            publication = _publication(args, joint, base_dir, playback, stack)
             takers.append(publication.take)
         interrupted = _play(playback, takers, f"replay {args.file.name}")
     took_s = time.perf_counter() - begin
@@ -156,7 +159,6 @@ def _publication(
     args: argparse.Namespace,
     joint: JointFile,
     base_dir: Path,
-    speed: float | None,
     playback: Playback,
     stack: ExitStack,
 ) -> Publication:
@@ -165,12 +167,12 @@ def _publication(
     if args.publish:
         session = open_session(joint.zenoh, base_dir)
         stack.callback(close_session, session)
-        publisher = JointPublisher(session, joint, lossless=speed is None)
+        publisher = JointPublisher(session, joint, lossless=args.speed is None)
         stack.callback(publisher.close)
         end = time.monotonic() + _SUBSCRIBER_S
         while not publisher.subscribed and time.monotonic() < end:
             time.sleep(0.01)  # a subscriber that is connecting receives the beginning
     about = {"joint": joint.name, "recording": args.file.name, "period_s": playback.period_s}
-    publication = Publication(publisher, speed, about)
+    publication = Publication(publisher, args.speed, about)
     stack.callback(publication.close)
     return publication

@@ -16,7 +16,7 @@ from pathlib import Path
 from drivelink.cli import ALONE, add_bus
 from drivelink.cycle.realtime import PRIORITY, acquire, release
 from drivelink.demo.simbus import JoinedBus, open_sim_bus, require_free
-from drivelink.demo.simulate import CASE_NAMES, assumptions, bench_from_joints
+from drivelink.demo.simulate import assumptions, bench_from_joints
 from drivelink.errors import BusError, UsageError
 from drivelink.jointfile import BusSection, JointFile, load
 
@@ -40,7 +40,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="switch an effect on in the world, e.g. coulomb_friction=0.25; further parameters follow after "
         "commas (cogging=0.1,periods_per_rev=12,motor=2); may be repeated",
     )
-    parser.add_argument("--case", choices=CASE_NAMES, help="one of the paper's cases as the world")
     parser.add_argument(
         "--quirks", metavar="NAME", help="drives that behave like a vendor's, e.g. epos4; see the reference"
     )
@@ -64,13 +63,12 @@ def run(args: argparse.Namespace) -> int:
     bench = bench_from_joints(
         joints,
         effects=args.effect,
-        case_name=args.case,
         quirks=args.quirks,
         seed=args.seed,
         files=args.joints,
     )
     for joint, path in zip(joints, args.joints, strict=True):
-        for line in () if args.case else assumptions(joint):
+        for line in assumptions(joint):
             print(f"drivelink sim: {path}: {line}", file=sys.stderr)
     if args.write_eds:
         bench.write_eds(args.write_eds)

@@ -55,7 +55,6 @@ def world_from_joint(
     joint: JointFile,
     *,
     effects: Sequence[str] = (),
-    case_name: str | None = None,
     seed: int | None = None,
     file: Path | None = None,
 ) -> World:
@@ -63,7 +62,6 @@ def world_from_joint(
 
     Args:
         effects: "NAME=VALUE" as `sim --effect` takes them, besides those of the file.
-        case_name: one of the paper's cases instead of `sim.case`.
         seed: of the sensor noise, instead of `sim.seed`.
 
     Raises:
@@ -71,7 +69,7 @@ def world_from_joint(
         UsageError: an effect that does not exist.
     """
     section = joint.sim or SimSection()
-    name = case_name or section.case
+    name = section.case
     asked = _asked(effects)
     try:
         given = case(name) if name else None
@@ -301,7 +299,6 @@ def bench_from_joints(
     joints: Sequence[JointFile],
     *,
     effects: Sequence[str] = (),
-    case_name: str | None = None,
     quirks: str | None = None,
     seed: int | None = None,
     files: Sequence[Path] = (),
@@ -314,9 +311,7 @@ def bench_from_joints(
     """
     paths: Sequence[Path | None] = files or [None] * len(joints)
     named = list(zip(joints, paths, strict=True))
-    worlds = [
-        world_from_joint(j, effects=effects, case_name=case_name, seed=seed, file=path) for j, path in named
-    ]
+    worlds = [world_from_joint(j, effects=effects, seed=seed, file=path) for j, path in named]
     nodes = [
         nodes_from_joint(j, w, quirks=quirks, file=path) for (j, path), w in zip(named, worlds, strict=True)
     ]

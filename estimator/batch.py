@@ -341,7 +341,7 @@ def _spring_columns(fitted: Fitted, motor: int) -> list[int]:
 def _spring_covariances(joint: JointFit) -> list[FloatArray]:
     """Covariance of each transmission's parameters, with what undeclared effects may contribute."""
     problem, fitted = joint.problem, joint.fitted
-    search, effects = Search(problem, null=fitted), design_effects(problem, fitted, joint.surplus)
+    search, effects = Search(problem, joint.held, null=fitted), design_effects(problem, fitted, joint.surplus)
     made = []
     for i in range(len(problem.model.motors)):
         mine = _spring_columns(fitted, i)

@@ -79,6 +79,9 @@ CHOICES: dict[str, Choice] = {
     "smoothing": Choice(
         0.05, "largest velocity", "over which a sign may change, at most", "smoother, it is damping"
     ),
+    "slips": Choice(
+        0.25, "range of motion", "of a law with memory at most", "it slips both ways; else a spring"
+    ),
     "softer": Choice(5.0, "", "step of the grid of smoothings", "a sign changes as sharply or not"),
     "beam": Choice(3, "hypotheses", "grown at once", "enough for an imitation beside the true effect"),
     "tried": Choice(8, "effects", "tried beside each", "the families of friction and ripple have six"),
@@ -92,7 +95,7 @@ CHOICES: dict[str, Choice] = {
         4.0, "groups", "that the variance of rows as independent as they look counts for",
         "it is right within a factor of three: chi-squared of four degrees of freedom",
     ),
-    "held": Choice(3, "in ten groups", "held out of a single recording", "a quarter"),
+    "bootstraps": Choice(200, "", "of the blocks that weigh models", "probabilities to a few per cent"),
     "far": Choice(
         10.0, "floor", "what names leave at which something unnamed is missing", "an order of magnitude"
     ),

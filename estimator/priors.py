@@ -87,6 +87,9 @@ PRIORS: dict[str, Prior] = {
     "declared": Prior(
         0.01, "declared", "a declared number, link dynamics declared too", "a rig that has been calibrated"
     ),
+    "calibrated_torque": Prior(
+        0.005, "declared", "scale of the motor torque then", "the anchor of all other calibrated numbers"
+    ),
     "anchor": Prior(
         0.3, "declared", "an inertia that is called wrong", "inertias are the anchor of all torques"
     ),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import diagnosiskit as kit
@@ -78,15 +79,18 @@ def test_a_second_healthy_recording_has_no_finding(healthy: tuple[Record, Record
         ([1e-2] * 10, [2e-3] * 10, True),
         ([1e-5] * 10, [9e-6] * 10, False),  # less than filters and rounding leave
         ([1e-2, 1e-3] * 5, [1e-3, 9e-3] * 5, False),  # less than its scatter
+        ([1e-3] * 10, [8e-4] * 10, False),  # less than a law leaves, for another law of the same
     ],
 )
 def test_held_out_data_confirm_only_what_is_more_than_scatter_and_rounding(
     before: list[float], after: list[float], confirmed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Held, "_by_stretch", lambda _, squares: np.array(squares))
-    monkeypatch.setattr(Held, "squared", lambda _, squares: float(np.mean(squares)))
+    monkeypatch.setattr(Held, "squared", lambda _, one: float(np.mean(one.squares)))
+    monkeypatch.setattr(Held, "scores", lambda _, one, among: -0.5 * np.log(one.squares))
+    monkeypatch.setattr(Held, "_least", lambda *_: np.array([4e-4]))
     held: Any = Held.__new__(Held)
-    assert held.confirms(after, before) is confirmed
+    rest, found = (SimpleNamespace(squares=np.array(x), families=frozenset()) for x in (before, after))
+    assert held.confirms(found, rest) is confirmed
 
 
 @pytest.mark.parametrize("speed", [0.0, 2.0])

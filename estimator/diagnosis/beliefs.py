@@ -120,7 +120,9 @@ def _of_link_std(
 
 def _declared_std(frame: Frame, name: str, calibrating: bool) -> float:
     """Of a declared number; with both balances a wrong one is identifiable, an effect with a name."""
-    return PRIORS["declared" if frame.linked and not calibrating else name].std
+    if not frame.linked or calibrating:
+        return PRIORS[name].std
+    return PRIORS["calibrated_torque" if name == "torque_constant" else "declared"].std
 
 
 def effect_std(model: JointModel, candidate: Candidate, by_torque: FloatArray) -> FloatArray:

@@ -72,8 +72,9 @@ class Candidate:
     def family(self) -> tuple[str, str, str, int | None]:
         """Family of laws for the same phenomenon: place, channel and coordinate."""
         kind = self.kind
-        # Friction with memory belongs to friction: it changes with the direction.
-        coordinate = "velocity" if kind.remembers and kind.location == "motor" else kind.coordinates[0]
+        # Friction with memory is friction: it changes with the direction. A constant torque is its even part.
+        rubs = kind.location == "motor" and (kind.remembers or kind.name == "torque_offset")
+        coordinate = "velocity" if rubs else kind.coordinates[0]
         return kind.location, kind.channel, coordinate, self.motor
 
 
@@ -129,21 +130,34 @@ def _needs_deflection(kind: EffectType) -> bool:
 _OF_MOTOR = {"position", "velocity", "acceleration", "time"}  # coordinates that no correction changes
 
 
-def columns(frame: Frame, candidate: Candidate, values: Values) -> FloatArray:
-    """Stacked, filtered columns (rows, k) of an effect, one per linear parameter; made once."""
+def columns(
+    frame: Frame, candidate: Candidate, values: Values, weights: tuple[float, ...] = ()
+) -> FloatArray:
+    """Stacked, filtered columns (rows, k) of an effect, one per linear parameter; made once.
+
+    Args:
+        frame: the recording.
+        candidate: the effect. values: its nonlinear parameters.
+        weights: its linear ones, as far as they are known: the reaction depends on them too.
+    """
     kind = candidate.kind
     lasting = kind.location == "motor" and _OF_MOTOR.issuperset(kind.coordinates)
     memo = frame.signals.memo if lasting else frame.memo
-    key = (candidate.key, *values.values())
+    key = (candidate.key, *values.values(), *(weights if _bilinear(kind) else ()))
     made = memo.get(key)
     if made is None:
-        made = _columns(frame, candidate, values)
+        made = _columns(frame, candidate, values, weights)
         if "periods_per_rev" not in values:  # there are hundreds, which `Search` keeps
             memo[key] = made
     return made.T
 
 
-def _columns(frame: Frame, candidate: Candidate, values: Values) -> FloatArray:
+def _bilinear(kind: EffectType) -> bool:
+    """Whether an effect's reaction on the motor has a part in its own torque."""
+    return kind.name == "kinematic_error"
+
+
+def _columns(frame: Frame, candidate: Candidate, values: Values, weights: tuple[float, ...]) -> FloatArray:
     """The columns (k, rows) of an effect."""
     kind, motor = candidate.kind, candidate.motor or 0
     terms = kind.terms(frame.motors[motor], values)
@@ -155,7 +169,10 @@ def _columns(frame: Frame, candidate: Candidate, values: Values) -> FloatArray:
         force = -frame.motors[motor].stiffness * terms
         return frame.column(motor, force, force if frame.pulls[motor] else None)
     if kind.location == "transmission":
-        reaction = kind.reaction(frame.motors[motor], values)
+        here = frame.motors[motor]
+        if weights and _bilinear(kind):
+            here = here._replace(flexibility_torque=here.flexibility_torque + np.array(weights) @ terms)
+        reaction = kind.reaction(here, values)
         on_motor = terms if reaction is None else terms - reaction
         return frame.column(motor, on_motor, terms if frame.pulls[motor] else None)
     if kind.location == "motor" or frame.carried:
@@ -205,7 +222,7 @@ def grid(frame: Frame, candidate: Candidate, smoothing_rad_s: float) -> list[dic
     c = frame.motors[candidate.motor or 0]
     fixed = {p.name: float(p.default) for p in kind.parameters if not p.linear and p.default is not None}
     if "smoothing_rad_s" in kind.nonlinear:
-        _, most = bounds_of(frame, candidate, "smoothing_rad_s")
+        _, most = bounds_of(frame, candidate, "smoothing_rad_s", {})
         smooth = smoothing_rad_s * choice("softer") ** np.arange(3)
         smooth = smooth[smooth <= max(most, smoothing_rad_s)]
         if kind.name == "stribeck_friction":
@@ -214,12 +231,12 @@ def grid(frame: Frame, candidate: Candidate, smoothing_rad_s: float) -> list[dic
                 {**fixed, "smoothing_rad_s": float(s), "stribeck_velocity_rad_s": float(v)}
                 for s in smooth
                 for v in fast
-                if v > 3.0 * s
+                if v > choice("sure") * s
             ]
         return _vary(fixed, "smoothing_rad_s", smooth)
     if kind.remembers:
         path = c.position if kind.location == "motor" else c.deflection
-        scales = _spread(path) * np.geomspace(0.0002, 0.5, 11 if _spread(path) > 0.0 else 0)
+        scales = _spread(path) * np.geomspace(0.0002, choice("slips"), 11 if _spread(path) > 0.0 else 0)
         return [{"displacement_rad": float(d), "exponent": n, "shape": b} for n, b in LAWS for d in scales]
     if kind.name in ("cogging", "kinematic_error"):
         return _vary(fixed, "periods_per_rev", _waves(frame, c))
@@ -294,20 +311,23 @@ def reach_of(frame: Frame, candidate: Candidate, name: str) -> float | None:
     return None
 
 
-def bounds_of(frame: Frame, candidate: Candidate, name: str) -> tuple[float, float]:
-    """Bounds of a positive nonlinear parameter: resolved, and within the motion."""
+def bounds_of(frame: Frame, candidate: Candidate, name: str, values: Values) -> tuple[float, float]:
+    """Bounds of a positive nonlinear parameter beside the others: resolved, and within the motion."""
     c = frame.motors[candidate.motor or 0]
     fast = float(np.max(np.abs(c.link_velocity if candidate.motor is None else c.velocity)))
     if name == "smoothing_rad_s":
-        return 0.0, choice("smoothing") * fast  # smoothed more, a sign is damping
+        most = choice("smoothing") * fast  # smoothed more, a sign is damping
+        least = frame.signals.velocity_noise(candidate.motor or 0)  # less is not resolved
+        return least, min(most, values.get("stribeck_velocity_rad_s", np.inf) / choice("sure"))
     if name == "stribeck_velocity_rad_s":
-        return 0.0, fast
+        return choice("sure") * values["smoothing_rad_s"], fast
     if name == "exponent":
         return 1.0, 20.0
     if name == "shape":
         return 0.05, 1.0
     if name == "displacement_rad":
-        return 0.0, _spread(c.position if candidate.kind.location == "motor" else c.deflection)
+        path = c.position if candidate.kind.location == "motor" else c.deflection
+        return 0.0, choice("slips") * _spread(path)
     if name == "time_constant_s":
         return _shortest_drift() * float(c.time[-1]), float(c.time[-1])
     return 0.0, np.inf

@@ -80,8 +80,8 @@ def _moderated(
     unit = _unit(fitted, free)
     bread = posterior.covariance[np.ix_(free, free)] / np.outer(unit, unit)
     stretch = stretches(problem)
-    kind = np.where(stretch < 0, -1, _kinds(problem, fitted))
-    both = np.where(stretch < 0, -1, stretch * whole("groups") + kind)
+    kind = _kinds(problem, fitted)
+    both = stretch * whole("groups") + kind
     by_time, freedom = _clustered(fitted, free, unit, bread, stretch)
     by_kind, by_both = (_clustered(fitted, free, unit, bread, x)[0] for x in (kind, both))
     values, vectors = np.linalg.eigh(by_kind - by_both)
@@ -110,8 +110,7 @@ def _clustered(
     root = directions * np.sqrt(np.maximum(sizes, 0.0))  # rounding may leave one below zero
     total = np.zeros_like(bread)
     parts = []
-    groups = np.unique(labels[labels >= 0])
-    for group in groups:
+    for group in np.unique(labels):
         mine = labels == group
         a, e = rows[mine], left[mine]
         u, s, _ = np.linalg.svd(a @ root, full_matrices=False)  # H = u s² u'

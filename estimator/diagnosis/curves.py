@@ -58,7 +58,7 @@ def best_curve(search: Search, beside: Fitted, place: tuple[str, int | None] | N
                 best = curve
             elif place:
                 best = min(best, curve, key=lambda c: float(np.sum(np.log(c.posterior.sigma))))
-            elif search.advantage(curve, best) > 0.0:
+            elif np.mean(search.held.scores(curve)) > np.mean(search.held.scores(best)):
                 best = curve
     if best is None or best.extra is None:
         return None

@@ -87,7 +87,6 @@ class Regression:
         design: (n, k). target: (n,).
         mean, std: (k,) of the prior. low: (k,) lower bounds, or -inf.
         group: (n,) which balance a row belongs to, from 0.
-        used: (n,) whether a row takes part.
         floor: (groups,) smallest standard deviation of each balance, N·m.
         scales: of balances against their measurements.
     """
@@ -98,7 +97,6 @@ class Regression:
     std: FloatArray
     low: FloatArray
     group: NDArray[np.int64]
-    used: NDArray[np.bool_]
     floor: FloatArray
     scales: tuple[Scale, ...]
     _grams: _Grams
@@ -113,7 +111,6 @@ class Regression:
         std: FloatArray,
         low: FloatArray,
         group: NDArray[np.int64],
-        used: NDArray[np.bool_],
         floor: FloatArray,
         scales: tuple[Scale, ...] = (),
     ) -> Regression:
@@ -122,11 +119,11 @@ class Regression:
         unit[unit == 0.0] = 1.0
         grams = []
         for g in range(int(group.max()) + 1):
-            rows = np.flatnonzero((group == g) & used)
+            rows = np.flatnonzero(group == g)
             a, y = design[rows], target[rows]
             grams.append((a.T @ a / np.outer(unit, unit), a.T @ y / unit, y @ y, float(len(rows))))
         made = _Grams(*(np.array(part) for part in zip(*grams, strict=True)))
-        return cls(design, target, mean, std, low, group, used, floor, scales, made, unit)
+        return cls(design, target, mean, std, low, group, floor, scales, made, unit)
 
     def solve(self, times: FloatArray, start: Posterior | None = None) -> Posterior:
         """Return the parameters, noise and evidence by fixed-point iteration, with an active set for bounds.
@@ -210,6 +207,31 @@ class Regression:
     def residual(self, x: FloatArray) -> FloatArray:
         """Return (n,) residual of every row."""
         return np.asarray(self.target - self.design @ x)
+
+    def left_out(self, times: FloatArray, posterior: Posterior, labels: NDArray[np.int64]) -> FloatArray:
+        """Return the (n,) residual of each row under the fit without all rows of its label.
+
+        Their part of the sums is subtracted; noise and linearisation stay.
+
+        Args:
+            times: (groups,) autocorrelation times of the errors, in rows.
+            posterior: of the fit to all rows.
+            labels: (n,) of the rows that are left out together.
+        """
+        x, free = posterior.x * self._unit, ~posterior.bound
+        precision, side = self._normal(times, posterior.sigma, x)
+        weight = (1.0 / (times * posterior.sigma**2))[self.group]
+        design, held = self.design / self._unit, np.where(free, 0.0, x)
+        low, left = self.low * self._unit, np.empty(len(self.target))
+        for label in np.unique(labels):
+            mine = labels == label
+            own, y = design[mine], self.target[mine]
+            weighted = own.T * weight[mine]
+            rest, target = precision - weighted @ own, side - weighted @ y
+            there = held.copy()
+            there[free] = np.linalg.solve(rest[np.ix_(free, free)], (target - rest @ held)[free])
+            left[mine] = y - own @ np.maximum(there, low)
+        return left
 
     def autocorrelation_times(self, x: FloatArray) -> FloatArray:
         """Return the (groups,) autocorrelation times of the residual, in rows."""

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import softmax
 
 from estimator.choices import choice, whole
-from estimator.diagnosis.beliefs import OF_RUN
-from estimator.diagnosis.hypothesis import Fitted, Problem
+from estimator.diagnosis.candidates import members
+from estimator.diagnosis.hypothesis import Fitted, Problem, stretches
 from estimator.diagnosis.result import Errors
 from estimator.sample import FloatArray, Record
 
@@ -30,6 +32,10 @@ class Residual(NamedTuple):
     left_nm: FloatArray
     torque_nm: FloatArray
     motors: NDArray[np.bool_]
+
+    def of(self, rows: NDArray[np.bool_]) -> Residual:
+        """Return that of some rows."""
+        return Residual(self.left_nm[rows], self.torque_nm[rows], self.motors[rows])
 
     @property
     def rms_nm(self) -> float:
@@ -52,90 +58,123 @@ class Residual(NamedTuple):
         return float(np.mean(self.torque_nm[self.motors] ** 2))
 
 
-class Fold(NamedTuple):
-    """A fit, and what takes no part in it.
-
-    Attributes:
-        fitted: the data fitted.
-        kept: which of all recordings these are.
-        other: the held-out recording; None: the held-out blocks of `fitted`.
-        like: rows of the whole problem whose residual it should equal.
-    """
-
-    fitted: Problem
-    kept: Sequence[int]
-    other: Problem | None
-    like: NDArray[np.bool_]
-
-
 class Held:
-    """Held-out data for judging models.
+    """Data that take no part in a fit: what every decision about models is made by.
+
+    The blocks are stretches of time. Of one recording each is left out in turn; of several, each recording.
+    Another recording's blocks come on top. A block's score is its log likelihood per independent error, the
+    noise of each block and balance unknown: -1/2 log of the mean square. What filters, rounding and the laws
+    of effects leave anyway (`Regression.floor`) is added, so errors below it are not compared.
 
     Args:
-        problem: the data for fitting.
-        folds: how they are held out.
+        problem: the data that are fitted.
+        other: a recording that is not.
     """
 
-    def __init__(self, problem: Problem, folds: Sequence[Fold]) -> None:
-        self.problem, self._folds = problem, folds
-        self._memo: dict[int, tuple[Fitted, list[Residual]]] = {}
+    def __init__(self, problem: Problem, other: Problem | None = None) -> None:
+        self.problem, self.other = problem, other
+        self.price = math.log(max(len(members(problem.frames[0])), 1))  # log odds against any one effect
+        alone = len(problem.records) == 1
+        self._labels = stretches(problem) if alone else problem.group // problem.equations
+        self._memo: dict[int, tuple[Fitted, list[Residual], list[Residual]]] = {}
+        self._squares: dict[int, FloatArray] = {}
+
+    def _residuals(self, fitted: Fitted) -> tuple[list[Residual], list[Residual]]:
+        """(of what is left out of each recording, of the other one)."""
+        if id(fitted) not in self._memo:
+            other = [] if self.other is None else [_on_other(self.other, fitted)]
+            self._memo[id(fitted)] = fitted, self._left_out(fitted), other
+        return self._memo[id(fitted)][1:]
+
+    def _left_out(self, fitted: Fitted) -> list[Residual]:
+        problem = self.problem
+        left = fitted.regression.left_out(fitted.times, fitted.posterior, self._labels)
+        recording = problem.group // problem.equations
+        every = range(len(problem.records))
+        for k in every if len(every) > 1 else ():
+            left = _own_removed(fitted, left, k)
+        every_row = _residual(problem, fitted, left)
+        return [every_row.of(recording == k) for k in every]
 
     def residuals(self, fitted: Fitted) -> list[Residual]:
-        """Return the held-out residual of each fold, the model fitted again to what is kept."""
-        if id(fitted) not in self._memo:
-            self._memo[id(fitted)] = fitted, [self._residual(fitted, fold) for fold in self._folds]
-        return self._memo[id(fitted)][1]
-
-    def _residual(self, fitted: Fitted, fold: Fold) -> Residual:
-        again = fitted
-        if fold.fitted is not self.problem:
-            corrections = tuple(fitted.corrections[k] for k in fold.kept)
-            again = fold.fitted.fit(
-                fitted.terms, fitted.base, corrections, extra=fitted.extra, pinned=fitted.pinned
-            )
-        if fold.other is None:
-            return residual_of(fold.fitted, again, ~fold.fitted.used)
-        return _on_other(fold.other, again)
+        """Return the residual of the other recording; without one, of each recording when it is left out."""
+        own, other = self._residuals(fitted)
+        return other or own
 
     def squared(self, fitted: Fitted) -> float:
         """Mean squared error of all balances, relative to each recording's torque."""
         return float(np.mean([one.square / one.torque_square for one in self.residuals(fitted)]))
 
-    def confirms(self, found: Fitted, rest: Fitted) -> bool:
-        """Return whether held-out data need what one model has beyond another.
-
-        The error falls by more than filters and rounding leave, and the mean of its logarithm over stretches
-        of time by more than its standard error.
+    def scores(self, fitted: Fitted, among: Sequence[Fitted] = ()) -> FloatArray:
+        """Return (blocks,) log likelihood of each block, per independent error; errors that the laws of any
+        `among` these models leave anyway are not compared.
         """
-        least = choice("floor") ** 2
+        key = id(fitted)
+        if key not in self._squares:
+            own, other = self._residuals(fitted)
+            self._squares[key] = np.concatenate([self._by_stretch(one) for one in own + other])
+        least = np.full(self.problem.equations, choice("floor") ** 2)
+        for one in among:
+            least = np.maximum(least, self._least(one))
+        return np.asarray(-0.5 * np.sum(np.log(self._squares[key] + least), axis=1))
+
+    def _least(self, fitted: Fitted) -> FloatArray:
+        """(balances,) mean square that a model's laws leave, relative to the torque's."""
+        floor = fitted.regression.floor.reshape(-1, self.problem.equations)
+        return np.asarray(np.mean(floor**2, axis=0) / self.problem.torque_rms**2)
+
+    def _by_stretch(self, one: Residual) -> FloatArray:
+        """(stretches, balances) mean squared error, relative to the recording's torque."""
+        square = (one.left_nm**2).reshape(self.problem.equations, -1) / one.torque_square
+        parts = np.array_split(square, whole("groups"), axis=1)
+        return np.array([np.mean(part, axis=1) for part in parts])
+
+    def confirms(self, found: Fitted, rest: Fitted) -> bool:
+        """Return whether held-out data need what one model has beyond another: the one rule of acceptance.
+
+        The mean score of the blocks rises by more than its standard error, and the error falls by more than
+        filters and rounding leave anyway; by more than a law leaves, for another law of the same phenomenon.
+        """
+        laws = found.families <= rest.families
+        least = float(np.mean(self._least(rest))) if laws else choice("floor") ** 2
         if self.squared(rest) - self.squared(found) < least:
             return False
-        gain = np.log((self._by_stretch(rest) + least) / (self._by_stretch(found) + least))
+        both = found, rest
+        gain = self.scores(found, both) - self.scores(rest, both)
         return bool(np.mean(gain) > np.std(gain, ddof=1) / np.sqrt(len(gain)))
 
-    def alike(self, found: Fitted, other: Fitted) -> bool:
-        """Return whether held-out data cannot tell another model from the one found; fitted
-        alike well, too.
+    def simplest(self, models: Sequence[Fitted]) -> Fitted:
+        """Return the simplest of the models that held-out data cannot tell from the best.
+
+        Simple is what has the larger prior: few parameters, and declared numbers that are believed. Then, of
+        laws for the same phenomena, the simplest is chosen.
         """
-        square = [residual_of(self.problem, one, self.problem.used).square for one in (found, other)]
-        if square[1] - square[0] > (choice("floor") * self.problem.torque_rms) ** 2:
-            return False
-        return not self.confirms(found, other)
+        best = max(models, key=lambda one: float(np.mean(self.scores(one))))
+        errors = self._independent(best)
+        alike = [one for one in models if one is best or not self.confirms(best, one)]
+        found = max(alike, key=lambda one: one.log_prior(errors, self.price))
+        laws = [one for one in models if one.families == found.families and not self.confirms(found, one)]
+        return max([found, *laws], key=lambda one: one.log_prior(errors, self.price))
 
-    def _by_stretch(self, fitted: Fitted) -> FloatArray:
-        """Mean squared error of stretches of time, relative to each recording's torque."""
-        made = []
-        for one in self.residuals(fitted):
-            square = (one.left_nm**2).reshape(self.problem.equations, -1).mean(axis=0) / one.torque_square
-            made += [np.mean(part) for part in np.array_split(square, whole("groups"))]
-        return np.array(made)
+    def weights(self, models: Sequence[Fitted], found: Fitted) -> FloatArray:
+        """Return (m,) probability of each model: its prior times its stacking weight.
 
-    def log_likelihood(self, fitted: Fitted, like: Fitted) -> float:
-        """Log likelihood of the held-out data, up to a constant, with the noise of another hypothesis."""
-        rows = sum(len(one.left_nm) for one in self.residuals(fitted))
-        least = float(np.mean(like.regression.floor**2)) / self.problem.torque_rms**2
-        error = self.squared(fitted) + least  # errors at the level of rounding are not compared
-        return -0.5 * rows / float(np.mean(like.times)) * float(np.log(error))
+        The weight is the mean over Bayesian bootstraps of the blocks (pseudo-BMA+ of Yao, Vehtari, Simpson
+        and Gelman, Bayesian Analysis 13, 2018). A difference to the one found that is not confirmed is none.
+        """
+        errors = self._independent(found)
+        gain = np.array([self.scores(one, models) - self.scores(found, models) for one in models])
+        shares = np.random.default_rng(0).dirichlet(np.ones(gain.shape[1]), whole("bootstraps"))
+        least = np.array([-np.inf if self.confirms(found, one) else 0.0 for one in models])
+        most = np.array([np.inf if self.confirms(one, found) else 0.0 for one in models])
+        prior = np.array([one.log_prior(errors, self.price) for one in models])
+        odds = np.clip(errors * (shares @ gain.T), least, most) + prior
+        return np.asarray(np.mean(softmax(odds, axis=1), axis=0))
+
+    def _independent(self, like: Fitted) -> float:
+        """Number of independent errors in each balance of all blocks."""
+        rows = sum(self.problem.rows) + (0 if self.other is None else sum(self.other.rows))
+        return rows / float(np.mean(like.times))
 
     def surplus(self, fitted: Fitted) -> float:
         """Mean squared error on held-out data over that on the fitted data, at least 1.
@@ -147,8 +186,9 @@ class Held:
         """
         least = float(np.mean(fitted.regression.floor**2))
         ratios = []
-        for fold, outside in zip(self._folds, self.residuals(fitted), strict=True):
-            inside = residual_of(self.problem, fitted, fold.like)
+        for k, outside in enumerate(self.residuals(fitted)):
+            mine = self.problem.group // self.problem.equations == k
+            inside = residual_of(self.problem, fitted, mine if self.other is None else np.ones_like(mine))
             larger = max(outside.torque_square / max(inside.torque_square, 1e-300), 1.0)
             ratios.append((outside.square + least) / (inside.square + least) / larger)
         return max(float(np.mean(ratios)), 1.0)
@@ -159,31 +199,19 @@ class Held:
 
     def of(self, k: int, before: Fitted, after: Fitted) -> Errors | None:
         """Return errors of the k-th recording when held out; None if it never is."""
-        if len(self._folds) < 2:
+        if self.other is not None or len(self.problem.records) < 2:
             return None
         return _errors(self.residuals(before)[k], self.residuals(after)[k])
 
 
 def held_out(problem: Problem, validation: Record | None = None) -> Held:
     """Return the validation recording; or each recording in turn; or blocks of the only one."""
-    records, every = problem.records, range(len(problem.records))
-    if validation is not None:
-        return Held(problem, [Fold(problem, every, problem.alike([validation]), problem.used)])
-    if len(records) == 1:
-        blocks = problem if problem.held else problem.alike(records, held=True)
-        return Held(problem, [Fold(blocks, every, None, problem.used)])
-    folds = []
-    for k in every:
-        kept = [j for j in every if j != k]
-        rest, other = problem.alike([records[j] for j in kept]), problem.alike([records[k]])
-        folds.append(Fold(rest, kept, other, problem.group // problem.equations == k))
-    return Held(problem, folds)
+    return Held(problem, None if validation is None else problem.alike([validation]))
 
 
 def residual_of(problem: Problem, fitted: Fitted, rows: NDArray[np.bool_]) -> Residual:
     """Return the residual of some rows under a model fitted to that problem."""
-    left, torque, motors = _residual(problem, fitted, fitted.regression.residual(fitted.posterior.x))
-    return Residual(left[rows], torque[rows], motors[rows])
+    return _residual(problem, fitted, fitted.regression.residual(fitted.posterior.x)).of(rows)
 
 
 def errors_of(problem: Problem, before: Fitted, after: Fitted, rows: NDArray[np.bool_]) -> Errors:
@@ -212,17 +240,21 @@ def _on_other(other: Problem, fitted: Fitted) -> Residual:
         ),
     )
     there = other.transferred(fitted, corrections)
-    run = [
+    left = there.regression.residual(there.posterior.x)
+    return _residual(other, fitted, _own_removed(there, left, 0))
+
+
+def _own_removed(fitted: Fitted, left: FloatArray, run: int) -> FloatArray:
+    """A recording's residual without what its own offsets explain."""
+    own = [
         j
-        for j, s in enumerate(there.slots)
-        if s.kind == "everyday" and s.name in OF_RUN and (s.name, s.motor) not in fitted.pinned
+        for j, s in enumerate(fitted.slots)
+        if s.kind == "everyday" and s.run == run and (s.name, s.motor) not in fitted.pinned
     ]
-    x = there.posterior.x
-    left = there.regression.residual(x)
-    if run:
-        free = there.regression.design[:, run]
-        left = left - free @ np.linalg.lstsq(free, left, rcond=1e-9)[0]
-    return _residual(other, fitted, left)
+    if not own:
+        return left
+    free = fitted.regression.design[:, own]
+    return left - free @ np.linalg.lstsq(free, left, rcond=1e-9)[0]
 
 
 def _residual(problem: Problem, fitted: Fitted, left: FloatArray) -> Residual:

@@ -7,7 +7,8 @@ delays, zeros of readings) are iterated by Gauss-Newton steps.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -72,21 +73,39 @@ class Fitted:
         return own if self.extra is None else own | {("unlisted", self.extra.motor)}
 
     @property
+    def named(self) -> Keys:
+        """The same, and declared numbers and readings that are further off than their priors let believe."""
+        off = {(s.name, s.motor) for s, x in self._off() if s.kind == "everyday" and abs(x) > choice("sure")}
+        return self.keys | off
+
+    def _off(self) -> Iterator[tuple[Slot, float]]:
+        """Every column, and how many of its prior's standard deviations it is off."""
+        off = (self.posterior.x - self.regression.mean) / self.regression.std
+        return zip(self.slots, off.tolist(), strict=True)
+
+    @property
     def parameters(self) -> int:
-        """Number of its effects' parameters."""
-        return sum(len(t.candidate.kind.parameters) for t in self.terms)
+        """Number of parameters of its effects and its free curve."""
+        return sum(len(t.candidate.kind.parameters) for t in self.terms) + sum(
+            slot.kind == "curve" for slot in self.slots
+        )
 
     @property
-    def families(self) -> list[object]:
-        """Families of its effects, in order."""
-        return sorted((t.candidate.family for t in self.terms), key=str)
+    def families(self) -> frozenset[object]:
+        """Families of its effects: what laws are for; a free curve is of none."""
+        own = frozenset(t.candidate.family for t in self.terms)
+        return own if self.extra is None else own | {self.extra}
 
-    @property
-    def believable(self) -> bool:
-        """Whether no declared number and no reading is further off than its prior lets believe."""
-        everyday = np.array([slot.kind == "everyday" for slot in self.slots], dtype=bool)
-        off = np.abs(self.posterior.x - self.regression.mean) / self.regression.std
-        return bool(np.all(off[everyday] < choice("sure")))
+    def log_prior(self, errors: float, price: float) -> float:
+        """Return the logarithm of the prior odds of such a joint, beside one as declared.
+
+        Each declared number and reading is as improbable as it is far off. Each effect pays for multiple
+        testing (Scott and Berger, Annals of Statistics 38, 2010), each of its parameters half the logarithm
+        of the number of independent errors (Schwarz, Annals of Statistics 6, 1978).
+        """
+        off = np.array([off for slot, off in self._off() if slot.kind == "everyday"])
+        effects = price * len(self.keys) + 0.5 * self.parameters * math.log(max(errors, 1.0))
+        return -0.5 * float(off @ off) - effects
 
     def is_real_beside(self, parent: Fitted) -> bool:
         """Return whether every effect contributes, and no spring is at zero that has a
@@ -126,7 +145,6 @@ class Problem:
         records: of one joint.
         model: as declared.
         bandwidth_hz: of the filter that all channels share.
-        held: hold out some blocks of each recording.
         calibrating: the recordings are of a healthy joint and determine its declared numbers.
         least: required independent rows per recording.
         like: another problem, with the same filter: recordings of both are filtered once.
@@ -140,13 +158,12 @@ class Problem:
         records: Sequence[Record],
         model: JointModel,
         bandwidth_hz: float,
-        held: bool = False,
         calibrating: bool = False,
         least: int = 1,
         like: Problem | None = None,
     ) -> None:
         self.records, self.model, self.bandwidth_hz = records, model, bandwidth_hz
-        self.held, self.calibrating = held, calibrating
+        self.calibrating = calibrating
         known = [] if like is None else list(zip(like.records, like.signals, strict=True))
         made = [next((s for r, s in known if r is record), None) for record in records]
         pairs = zip(records, made, strict=True)
@@ -163,15 +180,8 @@ class Problem:
                 f"the recording is too short for a bandwidth of {bandwidth_hz:g} Hz: "
                 f"expected at least {least} independent rows, got {min(self.rows)}"
             )
-        group, used = [], []
         equations = frames[0].equations
-        for k, frame in enumerate(frames):
-            fitted = _fitted_rows(frame.rows) if held else np.ones(frame.rows, dtype=bool)
-            for e in range(equations):
-                group.append(np.full(frame.rows, k * equations + e))
-                used.append(fitted)
-        self.group = np.concatenate(group)
-        self.used = np.concatenate(used)
+        self.group = np.repeat(np.arange(len(frames) * equations), np.repeat(self.rows, equations))
         torque = np.concatenate(
             [
                 np.concatenate([f.project(c.torque) - f.project(c.torque).mean() for c in f.motors])
@@ -183,9 +193,9 @@ class Problem:
             signals.velocity_noise(i) for signals in self.signals for i in range(len(model.motors))
         )
 
-    def alike(self, records: Sequence[Record], held: bool = False) -> Problem:
+    def alike(self, records: Sequence[Record]) -> Problem:
         """Return the same joint and filter with other recordings."""
-        return Problem(records, self.model, self.bandwidth_hz, held, self.calibrating, like=self)
+        return Problem(records, self.model, self.bandwidth_hz, self.calibrating, like=self)
 
     @property
     def period_s(self) -> float:
@@ -334,7 +344,6 @@ class Problem:
             np.array(stack.std),
             np.array(stack.low),
             self.group,
-            self.used,
             np.full(groups, choice("exact" if self.calibrating else "floor") * self.torque_rms),
             stack.scales(terms),
         )
@@ -377,22 +386,10 @@ class Problem:
 
 
 def stretches(problem: Problem) -> NDArray[np.int64]:
-    """Return (n,) stretch of time of each row, equal in all balances of a recording; -1: not used."""
-    made = []
+    """Return (n,) stretch of time of each row, equal in all balances of a recording."""
     count = whole("groups")
-    for k, frame in enumerate(problem.frames):
-        used = problem.used[problem.group == k * problem.equations]
-        label = (np.cumsum(used) - 1) * count // max(int(used.sum()), 1) + k * count
-        made.append(np.tile(np.where(used, label, -1), frame.equations))
-    return np.concatenate(made)
-
-
-def _fitted_rows(rows: int) -> NDArray[np.bool_]:
-    """(rows,) all but a few blocks that are spread over the recording."""
-    held = whole("held")
-    total = whole("groups") + held
-    place = np.arange(rows) * total // max(rows, 1)
-    return ~np.isin(place, [int((k + 0.7) * total / held) for k in range(held)])
+    each = [np.arange(rows) * count // rows + k * count for k, rows in enumerate(problem.rows)]
+    return np.concatenate([np.tile(one, problem.equations) for one in each])
 
 
 def _weighed(terms: tuple[Term, ...], slots: list[Slot], x: FloatArray) -> tuple[Term, ...]:

@@ -10,7 +10,7 @@ from estimator.choices import choice
 from estimator.diagnosis.certainty import accounts, standing
 from estimator.diagnosis.curves import best_curve
 from estimator.diagnosis.excitation import advice_for, poor
-from estimator.diagnosis.heldout import Held, errors_of, wider
+from estimator.diagnosis.heldout import errors_of, wider
 from estimator.diagnosis.hypothesis import Fitted
 from estimator.diagnosis.outcome import (
     alignment_of,
@@ -54,32 +54,25 @@ class Judge:
 
     Args:
         search: the candidates.
-        held: held-out data.
-        first: the explanation that the fitted data alone prefer.
-        found: the one that held-out data confirm.
+        found: the explanation that held-out data confirm.
         progress: called with the current step.
     """
 
-    def __init__(self, search: Search, held: Held, first: Fitted, found: Fitted, progress: Progress) -> None:
-        self.search, self.held, self.found = search, held, found
+    def __init__(self, search: Search, found: Fitted, progress: Progress) -> None:
+        self.search, self.held, self.found = search, search.held, found
         self.problem, self.progress = search.problem, progress
-        # Held-out data took part in choosing the one found: they may show less of its error.
-        self.surplus = max(held.surplus(one) for one in (first, found))
+        self.surplus = self.held.surplus(found)
 
     def diagnosis(self) -> Diagnosis:
         """Make verdict, findings and errors."""
-        rivals = [h for k in range(len(self.found.terms)) for h in self.search.rivals(self.found, k)]
         self.progress("free curves")
         curve = best_curve(self.search, self.search.null)
-        others = [self.search.null, *rivals, *([] if curve is None else [curve])]
-        judged = self._judged(self._effects(others), curve)
-        return self._stated(judged, [h for h in (self.found, *others) if h is not judged.after])
-
-    def _effects(self, others: list[Fitted]) -> list[Finding]:
-        """The effects found, with their probabilities beside all other explanations."""
-        beside = accounts(self.search, self.held, self.found, [*others, *self.search.seen])
-        standings = [standing(self.search, self.found, k, beside) for k in range(len(self.found.terms))]
-        return findings_of(self.problem, self.found, self.search.null, standings, self.surplus)
+        seen = [*self.search.seen, *([] if curve is None else [curve])]
+        beside = accounts(self.held, self.found, seen)
+        linked = self.problem.frames[0].linked
+        standings = [standing(self.found, k, beside, linked) for k in range(len(self.found.terms))]
+        effects = findings_of(self.problem, self.found, self.search.null, standings, self.surplus)
+        return self._stated(self._judged(effects, curve), beside)
 
     def _judged(self, effects: list[Finding], curve: Fitted | None) -> _Judged:
         """The verdict on the effects found, or on a free curve that explains more than they do."""
@@ -132,12 +125,11 @@ class Judge:
             return "insufficient_excitation", [hidden]
         return verdict, []
 
-    def _stated(self, judged: _Judged, others: list[Fitted]) -> Diagnosis:
+    def _stated(self, judged: _Judged, beside: list[tuple[float, Fitted]]) -> Diagnosis:
         """What is reported of a verdict."""
         problem, surplus = self.problem, self.surplus
         effects, before, after = judged.effects, judged.before, judged.after
-        chances = [(self.search.chance(after, h, surplus), h) for h in others]
-        transmissions, unsure = transmissions_of(self.search, after, chances, surplus, self._floor(after))
+        transmissions, unsure = transmissions_of(self.search, after, beside, surplus, self._floor(after))
         if judged.in_spring:
             transmissions = tuple(Refitted(one.model, {}, {}) for one in transmissions)
             unsure = ["no stiffness is reported: what is unexplained is in the spring's torque or deflection"]
@@ -147,7 +139,7 @@ class Judge:
             verdict=judged.verdict,
             bandwidth_hz=problem.bandwidth_hz,
             effects=tuple(effects),
-            train=errors_of(problem, before, after, problem.used),
+            train=errors_of(problem, before, after, np.ones(len(problem.group), dtype=bool)),
             validation=self.held.errors(before, after),
             floor_nm=tuple(self._floor(after)),
             transmissions=transmissions,
@@ -177,9 +169,7 @@ class Judge:
 
     def _unlisted(self, curve: Fitted) -> bool:
         """Whether a free curve explains more than all named effects, here and on held-out data."""
-        if self.search.advantage(curve, self.found) <= 0.0:
-            return False
-        if not self.held.confirms(curve, self.search.null):
+        if not self.held.confirms(curve, self.found):
             return False
         named = min(self.held.squared(h) for h in (self.found, *self.search.leading()))
         return self.held.squared(curve) < (choice("curve") ** 2 if self.found.terms else 1.0) * named
@@ -227,9 +217,7 @@ class Judge:
         equation = problem.group % problem.equations
         sides = [equation < problem.equations - 1, equation == problem.equations - 1]
         residuals = [h.regression.residual(h.posterior.x) for h in (before, after)]
-        left = np.array(
-            [[np.sqrt(np.mean(r[side & problem.used] ** 2)) for side in sides] for r in residuals]
-        )
+        left = np.array([[np.sqrt(np.mean(r[side] ** 2)) for side in sides] for r in residuals])
         motor, link = left[1] / np.maximum(left[0], 1e-300)
         said = f"error after over before: {motor:.1%} in the motor's balance, {link:.1%} in the link's"
         return [f"{said} (an effect at one side lowers only that side's)"]
@@ -250,7 +238,7 @@ class Judge:
         problem, equations = self.problem, self.problem.equations
         made: list[RecordingErrors] = []
         for k in range(len(problem.signals)):
-            mine = (problem.group // equations == k) & problem.used
+            mine = problem.group // equations == k
             train: Errors = errors_of(problem, before, after, mine)
             made.append(RecordingErrors(train, self.held.of(k, before, after)))
         return tuple(made)

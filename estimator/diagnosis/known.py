@@ -47,6 +47,6 @@ def declared_torque(frame: Frame) -> FloatArray:
             continue
         kind, each = elements(effect)
         for values in each:
-            weights = np.array([values[name] for name in kind.linear])
-            total = total + columns(frame, Candidate(kind, motor), values) @ weights
+            weights = tuple(values[name] for name in kind.linear)
+            total = total + columns(frame, Candidate(kind, motor), values, weights) @ np.array(weights)
     return total

@@ -236,7 +236,7 @@ def _between(
             ]
         )
         total += chance * np.outer(there - alpha, there - alpha)
-    return np.asarray(total / (0.5 + sum(chance for chance, _ in accounts)))  # even: a half against a half
+    return total
 
 
 def rivals_of(search: Search) -> list[Rival]:
@@ -262,7 +262,7 @@ def curves_of(problem: Problem, after: Fitted) -> tuple[Curve, ...]:
     for k, term in enumerate(after.terms):
         kind, motor = term.candidate.kind, term.candidate.motor
         mine = [j for j, s in enumerate(after.slots) if s.kind == "term" and s.place == k]
-        fitted = columns(frame, term.candidate, term.values) @ np.array(term.weights)
+        fitted = columns(frame, term.candidate, term.values, term.weights) @ np.array(term.weights)
         own = after.regression.design[: len(fitted), mine] @ after.posterior.x[mine]
         equation = frame.equations - 1 if kind.location == "link" else motor or 0
         pick = rows + equation * frame.rows

@@ -1,8 +1,7 @@
-"""The search for missing effects: a beam of hypotheses, compared by evidence.
+"""The search for missing effects: a beam of hypotheses, compared by what held-out blocks say (`Held`).
 
 The best hypotheses so far are extended by one effect, with its nonlinear parameters fitted together with all
-others. Each effect pays for multiple testing: its prior probability is one over the number of candidates
-(Scott and Berger, Annals of Statistics 38, 2010).
+others; then each effect of the best is left out or replaced, until nothing better or simpler is found.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +19,8 @@ from estimator.choices import choice, whole
 from estimator.diagnosis.beliefs import effect_std
 from estimator.diagnosis.candidates import Candidate, columns, grid, members
 from estimator.diagnosis.frame import Frame
-from estimator.diagnosis.hypothesis import Fitted, Keys, Problem, Term, stretches
+from estimator.diagnosis.heldout import Held
+from estimator.diagnosis.hypothesis import Fitted, Keys, Problem, Term
 from estimator.priors import PRIORS
 from estimator.sample import FloatArray
 
@@ -96,29 +95,36 @@ def _gain(precision: FloatArray, side: FloatArray) -> FloatArray:
 
 
 class Search:
-    """Finds the hypothesis with the most evidence.
+    """Finds the simplest hypothesis that held-out data cannot tell from the best.
 
     Args:
         problem: the recordings and the declared model.
+        held: what decides; left out: blocks of the recordings.
         progress: called with the current step.
         null: the fitted declared model, if available.
+
+    Attributes:
+        seen: the hypotheses that were compared.
     """
 
     def __init__(
-        self, problem: Problem, progress: Progress = lambda _: None, null: Fitted | None = None
+        self,
+        problem: Problem,
+        held: Held | None = None,
+        progress: Progress = lambda _: None,
+        null: Fitted | None = None,
     ) -> None:
         self.problem, self._progress = problem, progress
+        self.held = held or Held(problem)
         self.null = null or problem.null()
         self._singles: list[Fitted] = []
-        self._rivals: dict[tuple[Fitted, int], list[Fitted]] = {}
         self.seen: list[Fitted] = [self.null]
         frames = problem.at(self.null.corrections, self.null.base)
         self._library: list[_Entry] = []
         made: list[FloatArray] = []
         for candidate in members(frames[0]):
             self._enter(candidate, frames, made)
-        self._columns = np.concatenate(made) if made else np.zeros((0, int(problem.used.sum())))
-        self.price = math.log(max(len(self._library), 1))  # log odds against any one effect
+        self._columns = np.concatenate(made) if made else np.zeros((0, len(problem.group)))
 
     def _enter(self, candidate: Candidate, frames: Sequence[Frame], made: list[FloatArray]) -> None:
         """Add a candidate over its grid to the library, and its columns to those made."""
@@ -127,9 +133,9 @@ class Search:
         if not values:
             return
         each = [np.concatenate([columns(f, candidate, v).T for f in frames], axis=1) for v in values]
-        stacked = np.stack(each)[..., problem.used]
+        stacked = np.stack(each)
         points, count, _ = stacked.shape
-        ends = np.cumsum(np.bincount(problem.group[problem.used]))[:-1]
+        ends = np.cumsum(np.bincount(problem.group))[:-1]
         grams = [mine @ mine.swapaxes(1, 2) for mine in np.split(stacked, ends, axis=-1)]
         sizes = np.sqrt(np.mean(stacked * stacked, axis=-1)) + 1e-100
         by_torque = PRIORS["effect"].std * problem.torque_rms / np.sqrt(count) / sizes
@@ -139,10 +145,9 @@ class Search:
         rows = slice(first, first + points * count)
         self._library.append(_Entry(candidate, values, rows, np.array(grams), std))
 
-    def run(self) -> list[Fitted]:
-        """Return the pruned hypotheses with the most evidence, best first, including single effects."""
-        seen = self.seen
-        beam, best = [self.null], self.null
+    def run(self) -> Fitted:
+        """Return the simplest hypothesis that held-out data cannot tell from the best of all compared."""
+        beam, leader = [self.null], self.null
         for size in itertools.count(1):
             self._progress(f"term {size}")
             grown = [child for parent in beam for child in self.children(parent)]
@@ -150,26 +155,50 @@ class Search:
             if not grown:
                 break
             beam = self.ranked(grown)[: whole("beam")]
-            seen += beam
-            leader = self.ranked(seen)[0]
-            if size - len(leader.terms) >= 2 or (size > 1 and leader is best):
+            self.seen += beam if size > 1 else self.ranked(grown)
+            if self.held.confirms(beam[0], leader):
+                leader = beam[0]
+            elif size > 1:
                 break
-            best = leader
-        finalists = [self._settled(h) for h in self.ranked(seen)[: whole("beam")]]
-        best = self._pruned(self._swapped(self._merged(self._pruned(self.ranked(finalists)[0]))))
-        return [best, *self.leading()]
+        self._progress("alternatives")
+        settled, tried = {self.null}, set[Fitted]()
+        while True:
+            found = self.held.simplest(self.seen)
+            if found in tried:
+                return found
+            if found in settled:
+                tried.add(found)
+                beside = self._beside(found)
+                self.seen += beside
+            else:
+                self.seen.remove(found)
+                found = self._settled(found)
+                settled.add(found)
+                self.seen.append(found)
+
+    def _beside(self, found: Fitted) -> list[Fitted]:
+        """The hypothesis without each of its effects, with another instead, with one for a pair."""
+        made: list[Fitted] = []
+        for k in range(len(found.terms)):
+            rest = self.problem.without(found, k)
+            made += [rest, *self.rivals(found, k, rest)[: whole("beam")]]
+            for j in range(k):
+                made += self.children(self.problem.without(rest, j), most=whole("beam"))
+        return made
 
     def singles(self) -> list[Fitted]:
         """Return the promising effects, each alone."""
         return self._singles
 
     def leading(self) -> list[Fitted]:
-        """Return the single effects with the most evidence."""
-        return self.ranked(self._singles)[: whole("beam")] if self._singles else []
+        """Return the best single effects."""
+        return self.ranked(self._singles)[: whole("beam")]
 
-    def children(self, parent: Fitted, like: Candidate | None = None) -> list[Fitted]:
-        """Return the most promising extensions by one effect; `like`: see `screen`."""
-        grown = (self._grown(parent, term) for term in self.screen(parent, like))
+    def children(
+        self, parent: Fitted, like: Candidate | None = None, most: int | None = None
+    ) -> list[Fitted]:
+        """Return the most promising extensions by one effect; `like`, `most`: see `screen`."""
+        grown = (self._grown(parent, term) for term in self.screen(parent, like, most))
         return [child for child in grown if child.is_real_beside(parent)]
 
     def _grown(self, parent: Fitted, term: Term) -> Fitted:
@@ -185,86 +214,21 @@ class Search:
         other = self.problem.added(parent, Term(term.candidate, softer), whole("rough_steps"))
         return max(child, other, key=lambda h: h.evidence(child))
 
-    def score(self, hypothesis: Fitted, like: Fitted) -> float:
-        """Log posterior odds, up to a constant, with the noise of another hypothesis."""
-        return hypothesis.evidence(like) - self.price * len(hypothesis.terms)
-
-    def advantage(self, one: Fitted, other: Fitted) -> float:
-        """Log odds of one hypothesis over another, with the error correlation of the better-fitting one."""
-        best = min((one, other), key=_left)
-        return self.score(one, best) - self.score(other, best)
-
-    def chance(self, found: Fitted, rival: Fitted, surplus: float = 1.0) -> float:
-        """Return the probability that the rival would be better on a longer recording;
-        `surplus`: see `Held.surplus`.
-
-        From the log odds and their scatter between stretches of time, which gives their sum a standard
-        deviation (Vuong, Econometrica 57, 1989). Otherwise the many rows would make a slightly wrong model
-        overconfident.
-        """
-        gain = self._by_stretch(found) - self._by_stretch(rival)
-        spread = math.sqrt(len(gain)) * float(np.std(gain, ddof=1))
-        odds, spread = self.advantage(found, rival) / surplus, spread / surplus
-        return max(1.0 / (1.0 + math.exp(min(odds, 700.0))), NormalDist(0.0, spread + 1e-9).cdf(-odds))
-
-    def _by_stretch(self, hypothesis: Fitted) -> FloatArray:
-        """Log likelihood of each stretch of time, with the average independence of errors."""
-        regression, posterior = hypothesis.regression, hypothesis.posterior
-        sigma, times = posterior.sigma[regression.group], hypothesis.times[regression.group]
-        left = regression.residual(posterior.x)
-        each = -(np.log(sigma) + 0.5 * (left / sigma) ** 2) / times
-        labels = stretches(self.problem)
-        return np.bincount(labels[labels >= 0], each[labels >= 0]).astype(np.float64)
-
-    def ranked(self, hypotheses: list[Fitted]) -> list[Fitted]:
-        """Return the best first, without duplicates."""
-        best = min(hypotheses, key=_left)
-        order = sorted(hypotheses, key=lambda h: -self.score(h, best))
+    def ranked(self, hypotheses: Sequence[Fitted]) -> list[Fitted]:
+        """Return the best by held-out blocks first, without duplicates."""
         unique: dict[Keys, Fitted] = {}
-        for h in order:
-            unique.setdefault(h.keys, h)
+        for one in sorted(hypotheses, key=lambda h: -float(np.mean(self.held.scores(h)))):
+            unique.setdefault(one.keys, one)
         return list(unique.values())
 
     def _settled(self, hypothesis: Fitted) -> Fitted:
         return self.problem.fit(hypothesis.terms, hypothesis.base, hypothesis.corrections)
 
-    def _pruned(self, hypothesis: Fitted) -> Fitted:
-        for k in range(len(hypothesis.terms)):
-            rest = self.problem.without(hypothesis, k)
-            if self.advantage(rest, hypothesis) > 0.0:
-                return self._pruned(rest)
-        return hypothesis
-
-    def _merged(self, hypothesis: Fitted) -> Fitted:
-        """Two terms replaced by one, if that is nearly as good."""
-        for k in range(len(hypothesis.terms)):
-            for j in range(k):
-                rest = self.problem.without(self.problem.without(hypothesis, k), j)
-                grown = self.children(rest)
-                if not grown:
-                    continue
-                one = self._settled(self.ranked(grown)[0])
-                if self.chance(hypothesis, one) > choice("even"):
-                    return self._merged(one)
-        return hypothesis
-
-    def _swapped(self, hypothesis: Fitted) -> Fitted:
-        """Each term in turn replaced by one with more evidence, or by a simpler one that is nearly even."""
-        for k in range(len(hypothesis.terms)):
-            for other in self.rivals(hypothesis, k):
-                simpler = other.parameters < hypothesis.parameters
-                if self.advantage(other, hypothesis) > (math.log(choice("even")) if simpler else 0.0):
-                    hypothesis = self._settled(other)
-                    break
-        return hypothesis
-
-    def rivals(self, hypothesis: Fitted, k: int) -> list[Fitted]:
-        """Return alternatives to a term, most evidence first; a ripple elsewhere also starts
-        at its period.
+    def rivals(self, hypothesis: Fitted, k: int, rest: Fitted) -> list[Fitted]:
+        """Return alternatives to a term beside the rest, best first; a ripple elsewhere also starts at its
+        period.
         """
-        if (hypothesis, k) in self._rivals:
-            return self._rivals[hypothesis, k]
-        own, rest = hypothesis.terms[k], self.problem.without(hypothesis, k)
+        own = hypothesis.terms[k]
         grown = self.children(rest, like=own.candidate)
         if _PERIODS in own.values:
             here = own.candidate
@@ -272,16 +236,15 @@ class Search:
             places = [c for c in ripples if c != here and c.motor == here.motor and c.key not in rest.keys]
             moved = [self._grown(rest, Term(c, own.values)) for c in places]
             grown += [child for child in moved if child.is_real_beside(rest)]
-        made = [child for child in grown if child.terms[-1].candidate.key != own.candidate.key]
-        self._rivals[hypothesis, k] = self.ranked(made) if made else []
-        return self._rivals[hypothesis, k]
+        return self.ranked([child for child in grown if child.terms[-1].candidate.key != own.candidate.key])
 
-    def screen(self, parent: Fitted, like: Candidate | None = None) -> list[Term]:
+    def screen(self, parent: Fitted, like: Candidate | None = None, most: int | None = None) -> list[Term]:
         """Return the most promising additional effects, at the best point of their grid.
 
         Args:
             parent: the hypothesis.
             like: an effect whose whole family is included.
+            most: so many at most.
         """
         found = []
         rubbing = {t.candidate.motor for t in parent.terms if t.candidate.rubs}
@@ -292,7 +255,7 @@ class Search:
             if gain > 0.0 or not parent.terms:  # fitted alone, one may gain that does not on the grid
                 found.append((gain, Term(one.candidate, dict(one.values))))
         found.sort(key=lambda pair: -pair[0])
-        tried = whole("tried")
+        tried = most or whole("tried")
         more = [t for _, t in found[tried:] if like is not None and t.candidate.family == like.family]
         return [term for _, term in found[:tried]] + more
 
@@ -325,7 +288,7 @@ class Search:
             if self.problem.calibrating and candidate.kind.channel == "motor_torque":
                 continue
             best = one.independent(effect)
-            odds.append(best.gain - math.log(one.points) - self.price)
+            odds.append(best.gain - math.log(one.points) - self.held.price)
             apart.append(np.outer(best.change, best.change) if math.isfinite(best.gain) else nothing)
             more = nothing if candidate.bends else best.covariance
             _, *family = candidate.family  # either side of the motor's balance is the same to it
@@ -337,11 +300,10 @@ class Search:
     def _library_beside(self, parent: Fitted) -> Iterator[_Tried]:
         """All additional effects, linearised, each at the most promising point of its grid."""
         problem, posterior = self.problem, parent.posterior
-        rows = problem.used
         weights = 1.0 / (parent.times * posterior.sigma**2)
-        weight = weights[problem.group[rows]]
-        cross = self._columns @ (parent.regression.design[rows] * weight[:, None])
-        sides = self._columns @ (parent.regression.residual(posterior.x)[rows] * weight)
+        weight = weights[problem.group]
+        cross = self._columns @ (parent.regression.design * weight[:, None])
+        sides = self._columns @ (parent.regression.residual(posterior.x) * weight)
         taken = {t.candidate.key for t in parent.terms}
         for entry in self._library:
             candidate = entry.candidate.beside(taken)
@@ -358,8 +320,3 @@ class Search:
             yield _Tried(
                 candidate, entry.values[k], len(gain), float(gain[k]), shift[k], precision[k], side[k]
             )
-
-
-def _left(hypothesis: Fitted) -> float:
-    """Logarithm of a hypothesis' residual over all balances."""
-    return float(np.sum(np.log(hypothesis.posterior.sigma)))

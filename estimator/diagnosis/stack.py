@@ -159,7 +159,7 @@ class Stack:
     def term(self, k: int, term: Term) -> None:
         """Add an effect and, once its size is not zero, its nonlinear parameters."""
         candidate = term.candidate
-        parts = [columns(f, candidate, term.values) for f in self._frames]
+        parts = [columns(f, candidate, term.values, term.weights) for f in self._frames]
         taken = self._taken(candidate, 0)
         made = [_of_run(parts, p, None) for p in range(parts[0].shape[1])]
         sizes = np.array([_rms_of(column) for column in made])
@@ -210,7 +210,9 @@ class Stack:
         step, scale = step_of(term, name, self._frames[0])
         up = {**term.values, name: term.values[name] + step}
         change = [
-            columns(f, term.candidate, up) - columns(f, term.candidate, term.values) for f in self._frames
+            columns(f, term.candidate, up, term.weights)
+            - columns(f, term.candidate, term.values, term.weights)
+            for f in self._frames
         ]
         return np.asarray(np.concatenate(change) @ np.array(term.weights) * (scale / step))
 
@@ -239,7 +241,7 @@ def stepped(term: Term, name: str, x: float, frame: Frame) -> dict[str, float]:
     """Return the nonlinear parameters after a step; positive ones change by factors of at most two."""
     value, scale = term.values[name], reach_of(frame, term.candidate, name)
     if scale is None:
-        low, high = bounds_of(frame, term.candidate, name)
+        low, high = bounds_of(frame, term.candidate, name, term.values)
         moved = value * float(np.exp(np.clip(x, -0.7, 0.7)))
         return {**term.values, name: float(np.clip(moved, min(low, value), max(high, value)))}
     most = spread_of(frame, term.candidate, name)

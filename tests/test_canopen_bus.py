@@ -1,15 +1,10 @@
 import errno
-import os
-import pty
 import socket
-import threading
-import tty
 
 import can
 import pytest
-from canopenkit import Slave, configure, drive_objects, joint_text
 
-from drivelink.canopen.bus import interface_is_up, open_bus, receive_buffer_frames
+from drivelink.canopen.bus import interface_is_up, open_bus
 from drivelink.canopen.layout import (
     MappedObject,
     NodeLayout,
@@ -20,7 +15,7 @@ from drivelink.canopen.layout import (
     frame_bits,
 )
 from drivelink.errors import BusError
-from drivelink.jointfile import BusSection, parse
+from drivelink.jointfile import BusSection
 
 
 def opened(**keys):
@@ -33,12 +28,6 @@ def has_af_can():
     except (OSError, AttributeError):
         return False
     return True
-
-
-def test_the_virtual_bus_keeps_the_senders_stamps():
-    with opened(channel="stamps") as one, can.Bus(interface="virtual", channel="stamps") as other:
-        other.send(can.Message(arbitration_id=0x181, data=b"\1", is_extended_id=False))
-        assert one.recv(0.5).data == b"\1"
 
 
 @pytest.mark.parametrize(
@@ -83,79 +72,6 @@ def test_a_socketcan_interface_that_is_missing_names_the_remedy():
     assert "\n" not in text
 
 
-class Adapter:
-    """A serial CAN adapter at the other end of a pseudo terminal, speaking slcan, with one drive behind it."""
-
-    def __init__(self, slave):
-        self._slave = slave
-        self._master, follower = pty.openpty()
-        tty.setraw(self._master)
-        tty.setraw(follower)
-        self.name = os.ttyname(follower)
-        self._follower = follower
-        self.commands = []
-        self._thread = threading.Thread(target=self._serve, daemon=True)
-        self._thread.start()
-
-    def close(self):
-        os.close(self._follower)
-        self._thread.join(2.0)
-        os.close(self._master)
-
-    def _serve(self):
-        buffer = b""
-        while True:
-            try:
-                buffer += os.read(self._master, 4096)
-            except OSError:  # the other end is closed
-                return
-            *lines, buffer = buffer.split(b"\r")
-            for line in lines:
-                self._line(line.decode())
-
-    def _line(self, line):
-        if line[:1] != "t":
-            self.commands.append(line)
-            return
-        cob_id, data = int(line[1:4], 16), bytes.fromhex(line[5:])
-        for answer_id, answer in self._slave.handle(cob_id, data):
-            os.write(self._master, f"t{answer_id:03X}{len(answer)}{answer.hex().upper()}\r".encode())
-
-
-def test_a_drive_behind_a_serial_adapter_is_configured():
-    slave = Slave(5, drive_objects(5))
-    adapter = Adapter(slave)
-    text = joint_text(bus="").replace("sdo_timeout_s = 0.02", "sdo_timeout_s = 1.0")
-    bus = open_bus(
-        BusSection(
-            interface="slcan", channel=adapter.name, bitrate=500_000, options={"sleep_after_open": 0.0}
-        )
-    )
-    try:
-        (layout,) = configure(bus, parse(text))
-    finally:
-        bus.shutdown()
-        adapter.close()
-    assert layout.tpdos[0].cob_id == 0x185
-    assert slave.state == 5
-    assert "S6" in adapter.commands  # 500 kbit/s
-    assert "O" in adapter.commands
-
-
-def test_a_passive_serial_adapter_is_opened_listen_only():
-    adapter = Adapter(Slave(5, {}))
-    section = BusSection(
-        interface="slcan",
-        channel=adapter.name,
-        configure=False,
-        sync="follow",
-        options={"sleep_after_open": 0.0},
-    )
-    open_bus(section).shutdown()
-    adapter.close()
-    assert "L" in adapter.commands
-
-
 def test_errors_of_the_system_are_distinguished(monkeypatch):
     for number, expected in (
         (errno.EPERM, "permission denied"),
@@ -174,35 +90,6 @@ def test_errors_of_the_system_are_distinguished(monkeypatch):
 def test_an_interface_is_up_or_not():
     assert interface_is_up("lo")
     assert not interface_is_up("vcan77")
-
-
-@pytest.mark.socketcan
-@pytest.mark.skipif(not interface_is_up("vcan0"), reason="no vcan0 here")
-def test_on_socketcan_a_stalled_reader_loses_nothing_of_half_a_second():
-    with (
-        opened(interface="socketcan", channel="vcan0") as one,
-        opened(interface="socketcan", channel="vcan0") as other,
-    ):
-        assert receive_buffer_frames(one) >= 4000
-        for k in range(4000):
-            other.send(
-                can.Message(arbitration_id=0x181, data=k.to_bytes(2, "little"), is_extended_id=False), 1.0
-            )
-        got = [int.from_bytes(one.recv(1.0).data, "little") for _ in range(4000)]
-        assert got == list(range(4000))
-
-
-@pytest.mark.socketcan
-@pytest.mark.skipif(not interface_is_up("vcan0"), reason="no vcan0 here")
-def test_on_socketcan_fd_frames_are_accepted():
-    with (
-        opened(interface="socketcan", channel="vcan0") as one,
-        opened(interface="socketcan", channel="vcan0") as other,
-    ):
-        other.send(can.Message(arbitration_id=0x181, data=bytes(24), is_fd=True, is_extended_id=False))
-        message = one.recv(1.0)
-        assert message.is_fd
-        assert len(message.data) == 24
 
 
 @pytest.mark.parametrize(("data_bytes", "bits"), [(0, 55), (1, 65), (8, 135)])

@@ -120,15 +120,6 @@ def test_a_program_can_pause_and_command_nodes_without_anybody_waiting():
     assert sent[1][0] == 0x605
 
 
-def test_an_endless_segmented_upload_ends():
-    running = session(read(5, 0x1008), [])
-    running.poll(0.0)
-    running.feed(0x585, bytes.fromhex("41 08 10 00 00 00 00 00"), 0.0)
-    for k in range(2000):
-        running.feed(0x585, bytes([0x10 * (k % 2)]) + bytes(7), 0.0)
-    assert running.done
-
-
 def segment(*, toggle=0, length=7, last=False):
     return bytes([toggle << 4 | (7 - length) << 1 | last]) + b"\xff" * 7
 

@@ -157,11 +157,6 @@ def test_questions_left_unanswered_are_one_line(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_the_next_step_is_one_that_works(tmp_path, capsys):
-    made(tmp_path, "--case", "vsa-ii")
-    assert "sim" in (said := capsys.readouterr().out) and "--interface socketcand" in said
-
-
 def test_the_bus_is_asked_who_is_there(tmp_path, request):
     channel = request.node.name
     described = jointfile.load(_vsa(tmp_path, channel))

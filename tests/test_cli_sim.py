@@ -82,12 +82,6 @@ def test_two_processes_share_the_bus_over_tcp_and_sigterm_ends_cleanly(file: Pat
         assert process.stderr.read() == ""
 
 
-def test_sigint_ends_it_too(file: Path) -> None:
-    with simulation(file) as (process, _):
-        process.send_signal(signal.SIGINT)
-        assert process.wait(PATIENCE_S) == 0
-
-
 def test_it_ends_by_itself_and_leaves_the_data_sheets(
     file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -141,12 +135,17 @@ def test_a_second_simulation_of_the_same_nodes_is_refused(
     assert "node 1, node 2: on the bus already: another `drivelink sim`" in said[1]
 
 
-def test_a_second_simulation_ends_with_the_first_and_burns_nothing(file: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("ended", ["the server", "itself"])
+def test_a_second_simulation_joins_the_first_as_a_client(file: Path, tmp_path: Path, ended: str) -> None:
     other = tmp_path / "other.toml"
     text = file.read_text(encoding="utf-8").replace('"wrist"', '"elbow"')
     other.write_text(text.replace("node_id = 1", "node_id = 11").replace("node_id = 2", "node_id = 12"))
-    with simulation(file) as (server, _), simulation(other) as (process, ready):
-        assert "elbow" in ready
+    with simulation(file) as (server, first), simulation(other) as (process, second):
+        assert "wrist (drive 1, drive 2)" in first and "elbow (drive 11, drive 12)" in second
+        if ended == "itself":
+            process.send_signal(signal.SIGINT)
+            assert process.wait(PATIENCE_S) == 0
+            return
         server.kill()
         assert process.wait(PATIENCE_S) == 4
         assert process.stderr is not None
@@ -158,17 +157,6 @@ def test_what_a_file_lacks_names_the_file(file: Path, capsys: pytest.CaptureFixt
     file.write_text(text, encoding="utf-8")
     assert main(["sim", str(file), "--interface", "virtual"]) == 2
     assert f"{file}: motor[2].drive: expected this table" in capsys.readouterr().err
-
-
-def test_a_second_simulation_joins_the_first_as_a_client(file: Path, tmp_path: Path) -> None:
-    other = tmp_path / "other.toml"
-    text = file.read_text(encoding="utf-8").replace('"wrist"', '"elbow"')
-    other.write_text(text.replace("node_id = 1", "node_id = 11").replace("node_id = 2", "node_id = 12"))
-    with simulation(file) as (_, first), simulation(other) as (process, second):
-        assert "wrist (drive 1, drive 2)" in first
-        assert "elbow (drive 11, drive 12)" in second
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(PATIENCE_S) == 0
 
 
 def test_an_address_that_cannot_be_served_is_one_line(

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import zenoh
 from zenohkit import (
     LIMIT_S,
     connected,
@@ -181,16 +180,6 @@ def test_waiting_gives_the_next_cycle_once(publisher, joint):
     timer.join()
 
 
-def test_waiting_gives_the_newest_of_what_piled_up(publisher, joint):
-    publish(publisher, 1, 2, 3)
-    until(lambda: joint.received == 3)
-    assert joint.wait(1.0).sequence == 3
-
-
-def test_a_timeout_of_nothing_does_not_wait(joint):
-    assert joint.wait(0.0) is None
-
-
 def test_iteration_gives_every_cycle_in_order(publisher, joint):
     publish(publisher, *range(1, 21))
     seen = []
@@ -199,14 +188,6 @@ def test_iteration_gives_every_cycle_in_order(publisher, joint):
         if estimate.sequence == 20:
             break
     assert seen == list(range(1, 21))
-
-
-def test_iteration_can_report_that_nothing_came(publisher, joint):
-    publish(publisher, 1)
-    until(lambda: joint.received)
-    cycles = joint.cycles(timeout_s=0.01)
-    assert next(cycles).sequence == 1
-    assert next(cycles) is None
 
 
 def test_iteration_ends_when_the_subscription_is_closed_meanwhile(publisher, joint):
@@ -297,42 +278,6 @@ def test_arrival_lies_between_the_queue_seen_empty_and_the_read(stamp_ns):
     arrivals.empty(1_000)
     arrivals.came(stamp_ns, 2_000)
     assert 0 <= arrivals.age_ns(2_000) <= 1_000
-
-
-def test_a_foreign_writer_is_noticed_and_not_believed(publisher, joint, endpoint):
-    publish(publisher, 1)
-    until(lambda: joint.received == 1)
-    config = zenoh.Config()
-    for key, value in (("mode", '"client"'), ("connect/endpoints", f'["{endpoint}"]')):
-        config.insert_json5(key, value)
-    with zenoh.open(config) as other:
-        intruder = other.declare_publisher("drivelink/elbow/estimate")
-        until(lambda: intruder.put(encode_estimate(make_estimate(999), 0)) or joint.foreign)
-        intruder.put(b"not an estimate")
-        publish(publisher, 2)
-        until(lambda: joint.received == 2)
-        assert joint.latest().sequence == 2
-        assert joint.gaps == 0
-
-
-def test_bytes_that_are_no_estimate_do_no_harm(endpoint):
-    """Also where no daemon vouches for its source."""
-    config = zenoh.Config()
-    config.insert_json5("listen/endpoints", f'["{endpoint}"]')
-    config.insert_json5("scouting/multicast/enabled", "false")
-    with (
-        zenoh.open(config) as session,
-        drivelink.subscribe("elbow", endpoint=endpoint, stale_after_s=NEVER_S) as joint,
-    ):
-        until(lambda: session.put("drivelink/elbow/estimate", b"junk") or joint.foreign)
-        until(
-            lambda: (
-                session.put("drivelink/elbow/estimate", encode_estimate(make_estimate(3), 0))
-                or joint.received
-            )
-        )
-        assert joint.latest().sequence == 3
-        assert joint.valid
 
 
 def test_the_daemons_death_and_return_are_states(endpoint):

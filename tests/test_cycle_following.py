@@ -6,12 +6,10 @@ from collections import deque
 from pathlib import Path
 
 import pytest
-from canopenkit import INVALID, joint_text
+from canopenkit import INVALID
 from fuzzrun import FuzzRun
 
 from drivelink.cycle.sources import OVERFLOW
-from drivelink.errors import RecordingError
-from drivelink.jointfile import parse
 from drivelink.recording.canframes import FrameLog
 from estimator.sample import Status
 
@@ -331,34 +329,3 @@ def test_a_node_without_heartbeat_after_its_reset_is_operational_when_it_sends(
     status = run.supervisor.node_status(run.loop.loop_joints[0])["2"]
     assert (status["state"], status["heartbeat_age_s"]) == ("operational", None)
     assert "node 2: heartbeat lost" not in master.conditions
-
-
-def test_a_log_that_begins_after_the_configuration_says_what_would_settle_its_mapping(
-    tmp_path: Path,
-) -> None:
-    sheet = (
-        "[1800sub1]\nDataType=7\nAccessType=rw\nDefaultValue=$NODEID+0x180\n"
-        "[1800sub2]\nDataType=5\nAccessType=rw\nDefaultValue=1\n[1A00sub0]\nDataType=5\nAccessType=rw\n"
-        "DefaultValue=2\n[1A00sub1]\nDataType=7\nAccessType=rw\nDefaultValue=0x60640020\n"
-        "[1A00sub2]\nDataType=7\nAccessType=rw\nDefaultValue=0x60770010\n"
-    )
-    (tmp_path / "drive.eds").write_text(sheet)
-    drive = 'eds = "drive.eds"\ncounts_per_rev = 4096\nrated_torque_nm = 1.0'
-    text = joint_text(drive=drive, bus='configure = false\nsync = "follow"')
-    text = text.replace("[motor.drive]", '[motor.transmission]\nmodel = "none"\n[motor.drive]')
-    path = tmp_path / "middle.log"
-    path.write_text(
-        "".join(
-            f"(1800000000.{k:03d}000) can0 080#\n(1800000000.{k:03d}100) can0 185#{k:08X}0000\n"
-            for k in range(600)
-        )
-    )
-    log = FrameLog(path, parse(text), tmp_path)
-    with pytest.raises(
-        RecordingError, match=r"no complete sample in it: node 5 .* in \[motor.drive\] "
-    ) as error:
-        list(log.cycles())
-    line = str(error.value).partition("in [motor.drive] ")[2]
-    assert line.startswith('tpdo = [{ cob_id = 0x185, objects = ["0x6064:00:32", "0x6077:00:16"]')
-    declared = FrameLog(path, parse(text.replace("eds =", f"{line}\neds =")), tmp_path)
-    assert len([cycle for cycle in declared.cycles() if cycle.sample is not None]) >= 599

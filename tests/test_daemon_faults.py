@@ -32,33 +32,6 @@ def test_every_cycle_has_an_estimate_in_order_and_nothing_is_missed() -> None:
         assert made.events == []
 
 
-def test_a_lost_pdo_is_one_stale_estimate_and_one_event() -> None:
-    with rig() as made:
-        settle(made)
-        made.faults.mute(made.node(2), made.tpdo(2)[0])
-        estimates = made.run(300)
-        assert [e.sequence for e in estimates] == list(range(2000, 2300))  # still one for every cycle
-        stale = [e for e in estimates if e.status & Status.STALE]
-        assert [e.sequence for e in stale] == [2000]
-        assert not stale[0].status & Status.VALID
-        assert stale[0].status & Status.BUS_FAULT
-        assert estimates[1].status & Status.GAP
-        assert not estimates[-1].status & Status.BUS_FAULT
-        assert made.status["nodes"]["2"]["missing"] == 1
-        assert made.events.count("node 2: frames are missing") == 1
-
-
-@pytest.mark.parametrize("cycles", [1, 3])
-def test_late_pdos_are_counted_late_and_never_used_unflagged(cycles: int) -> None:
-    with rig() as made:
-        settle(made)
-        made.faults.delay(made.node(3), made.tpdo(3)[0], cycles)
-        estimates = made.run(20)
-        assert made.status["nodes"]["3"]["late"] == 1
-        flagged = [e.sequence - 2000 for e in estimates if e.status & Status.BUS_FAULT]
-        assert flagged == list(range(cycles + 1))
-
-
 def test_an_emcy_is_a_drive_fault_in_words_and_said_once() -> None:
     with rig() as made:
         settle(made)

@@ -23,11 +23,11 @@ from drivelink.demo.simulate import network_from_joint, world_from_joint
 from drivelink.doctor import Report, Section, examine, examine_eds
 from drivelink.doctor.interface import examine_interface, judge_link
 from drivelink.doctor.livevalues import Asked, Heard, Series, record_of
-from drivelink.doctor.machine import Daemons, examine_machine, judge_sync, percentile
-from drivelink.doctor.motion import judge_motion, judge_record, slope
+from drivelink.doctor.machine import Daemons, examine_machine, judge_sync
+from drivelink.doctor.motion import judge_motion, judge_record
 from drivelink.doctor.nodes import _describe_node
 from drivelink.jointfile import BusSection, parse
-from drivelink.notice import Notice, Severity
+from drivelink.notice import Severity
 from estimator.sample import Record
 
 REPOSITORY = Path(__file__).parents[1]
@@ -655,14 +655,6 @@ def test_listening_counts_what_is_not_canopen_too():
     wire.queue.append(can.Message(arbitration_id=0x181, is_extended_id=False, is_fd=True, data=bytes(12)))
     traffic = listen(wire, 0.02)
     assert (traffic.error_frames, traffic.fd_frames, traffic.counts) == (1, 1, {0x181: 1})
-
-
-def test_helpers():
-    assert slope([1.0, 2.0], [2.0, 4.0]) == pytest.approx(2.0)
-    assert slope([0.0], [1.0]) == 0.0
-    assert percentile([3.0, 1.0, 2.0], 0.5) == 2.0
-    finding = Notice(severity=Severity.WARNING, subject="a", text="b", fix="c")
-    assert str(finding) == "a: b [c]"
 
 
 @pytest.mark.parametrize("mappable", [0, 1])

@@ -138,6 +138,14 @@ def test_a_joint_behind_a_serial_adapter_that_is_pulled_out_and_put_in(tmp_path:
         adapter.close()
 
 
+def test_a_passive_serial_adapter_is_opened_listen_only_at_its_bit_rate(tmp_path: Path) -> None:
+    adapter = SerialAdapter(tmp_path / "ttyCAN", "passive")
+    more = 'bitrate = 500_000\nconfigure = false\nsync = "follow"'
+    open_bus(joint_on("slcan", str(tmp_path / "ttyCAN"), "sleep_after_open = 0.0", more).bus).shutdown()
+    until(lambda: {"S6", "L"} <= set(adapter.commands))
+    adapter.close()
+
+
 def free_port() -> int:
     with socket.create_server(("127.0.0.1", 0)) as server:
         return server.getsockname()[1]

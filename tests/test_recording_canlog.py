@@ -6,7 +6,6 @@ import logging
 import random
 from pathlib import Path
 
-import can
 import pytest
 
 from drivelink.errors import RecordingError
@@ -65,34 +64,6 @@ def test_stamps_that_are_differences_are_added_up(tmp_path: Path, caplog: pytest
     assert "added up" in caplog.text
 
 
-TRC_1_1 = """\
-;$FILEVERSION=1.1
-;$STARTTIME=42195.2621788
-;
-     1)         0.2  Rx         0181  5  2A 36 6C 2B BA
-     2)         1.2  Rx         0080  0
-     3)         1.9  Rx     00000181  1  00
-"""
-TRC_2_1 = """\
-;$FILEVERSION=2.1
-;$STARTTIME=42195.2621788
-;$COLUMNS=N,O,T,B,I,d,R,L,D
-;
-      1         0.200 DT 1      0181 Rx -  5    2A 36 6C 2B BA
-      2         1.200 DT 1      0080 Rx -  0
-"""
-
-
-@pytest.mark.parametrize("text", [TRC_1_1, TRC_2_1])
-def test_peaks_traces_are_read(text: str, tmp_path: Path) -> None:
-    path = tmp_path / "x.trc"
-    path.write_text(text)
-    frames = list(read_frames(path))
-    assert [(f.can_id, f.data) for f in frames] == [(FRAME.can_id, FRAME.data), (0x080, b"")]
-    # A float of UNIX time holds a quarter of a microsecond.
-    assert frames[1].stamp_ns - frames[0].stamp_ns == pytest.approx(1_000_000, abs=500)
-
-
 def many_frames(n: int = 3000) -> list[LoggedFrame]:
     rng = random.Random(1)
     ids = (0x080, 0x181, 0x182, 0x18A)
@@ -127,9 +98,9 @@ def test_what_is_recorded_is_read_back_also_without_its_end(suffix: str, ended: 
     assert all(abs(b.stamp_ns - f.stamp_ns - first) < 2000 for b, f in zip(back, frames, strict=True))
 
 
-@pytest.mark.parametrize("suffix", [".log", ".blf", ".asc", ".trc"])
-def test_a_log_cut_off_anywhere_gives_what_is_whole(suffix: str, tmp_path: Path) -> None:
-    path = tmp_path / f"x{suffix}"
+def test_a_binary_log_cut_off_anywhere_gives_what_is_whole(tmp_path: Path) -> None:
+    """Text logs are cut at every byte in test_recording_limits."""
+    path = tmp_path / "x.blf"
     sink = open_sink(path, JOINT)
     frames = many_frames(1200)
     for k, frame in enumerate(frames):
@@ -143,10 +114,7 @@ def test_a_log_cut_off_anywhere_gives_what_is_whole(suffix: str, tmp_path: Path)
         path.write_bytes(whole[: rng.randrange(len(whole) // 2, len(whole))])
         back = list(read_frames(path))
         assert len(back) > 300
-        # The last line of a text may be cut inside its bytes.
-        assert [(f.can_id, f.data) for f in back[:-1]] == [
-            (f.can_id, f.data) for f in frames[: len(back) - 1]
-        ]
+        assert [(f.can_id, f.data) for f in back] == [(f.can_id, f.data) for f in frames[: len(back)]]
 
 
 def test_of_several_channels_the_configured_one_is_taken(tmp_path: Path) -> None:
@@ -178,24 +146,6 @@ def test_a_file_that_is_no_log_is_one_clear_line(
     assert line in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_python_cans_own_writer_and_this_reader_agree(tmp_path: Path) -> None:
-    path = tmp_path / "x.log"
-    with can.CanutilsLogWriter(path) as writer:
-        for frame in many_frames(100):
-            writer.on_message_received(
-                can.Message(
-                    timestamp=frame.stamp_ns * 1e-9,
-                    arbitration_id=frame.can_id,
-                    data=frame.data,
-                    is_extended_id=False,
-                    channel="can0",
-                )
-            )
-    with can.CanutilsLogReader(path) as reader:
-        theirs = [(m.arbitration_id, bytes(m.data)) for m in reader]
-    assert [(f.can_id, f.data) for f in read_frames(path)] == theirs
-
-
 def syncs(stamps_ms: list[float]) -> list[LoggedFrame]:
     return [LoggedFrame(round(1e6 * t), 0x080, b"", "can0") for t in stamps_ms]
 
@@ -212,25 +162,21 @@ def test_syncs_whose_stamps_come_in_a_burst_are_numbered_one_by_one() -> None:
     assert [j for _, j in numbered_at_once(syncs(stamps), 1e-3)] != [1] * 200
 
 
-def test_a_burst_at_the_very_start_is_no_gap() -> None:
-    assert jumps([5.0] * 5 + [float(k) for k in range(5, 200)]) == [1] * 200
+EVERY_MS = [float(k) for k in range(300)]
 
 
-def test_lost_syncs_are_a_gap() -> None:
-    stamps = [float(k) for k in range(300) if k not in (100, 101, 200)]
-    expected = [1] * 297
-    expected[100], expected[198] = 3, 2
-    assert jumps(stamps) == expected
-
-
-def test_syncs_that_are_not_due_are_reported() -> None:
-    stamps = [float(k) for k in range(200)]
-    stamps[150:150] = [149.2]  # a second master
-    assert jumps(stamps) == [1] * 150 + [0] + [1] * 50
-
-
-def test_a_clock_that_drifts_makes_no_gap() -> None:
-    assert jumps([k * 1.0002 for k in range(20_000)]) == [1] * 20_000
+@pytest.mark.parametrize(
+    ("stamps_ms", "expected"),
+    [
+        ([5.0] * 5 + EVERY_MS[5:], {}),  # a burst at the very start
+        ([t for t in EVERY_MS if t not in (100, 101, 200)], {100: 3, 198: 2}),  # lost: a gap
+        ([*EVERY_MS[:150], 149.2, *EVERY_MS[150:]], {150: 0}),  # one of a second master, not due
+        ([k * 1.0002 for k in range(20_000)], {}),  # a clock that drifts
+    ],
+    ids=["burst", "lost", "not due", "drift"],
+)
+def test_gaps_are_what_is_lost_and_nothing_else(stamps_ms: list[float], expected: dict[int, int]) -> None:
+    assert {k: jump for k, jump in enumerate(jumps(stamps_ms)) if jump != 1} == expected
 
 
 @pytest.mark.parametrize("factor", [1.04, 1.5, 3.0])

@@ -250,30 +250,6 @@ def test_a_log_without_its_configuration_says_what_the_joint_file_must_declare(
     assert "late.log" in str(caught.value) and "motor[1].drive" in str(caught.value)
 
 
-def test_frames_recorded_from_a_running_daemon_are_decoded_by_its_model_document(tmp_path: Path) -> None:
-    """Nobody configures the drives in this recording: the daemon did so before it began."""
-    text = daemonkit.vsa_text()
-    joint = parse(text)
-    path = tmp_path / "late.mcap"
-    sink = open_sink(path, joint, text)
-    with can.Bus(interface="virtual", channel=joint.bus.channel) as tap, daemonkit.rig(joint) as rig:
-        rig.run(20)
-        while tap.recv(0) is not None:
-            pass
-        skipped, cycle = len(rig.collector.samples), 0
-        model = describe_model(joint, list(rig.daemon.layouts.values()))
-        sink.document("model", to_json(model), BEGIN_NS)
-        rig.run(100)
-        while (message := tap.recv(0)) is not None:
-            cycle += message.arbitration_id == 0x080
-            sink.frame(BEGIN_NS + cycle * 1_000_000, message.arbitration_id, bytes(message.data))
-        live = [sample for sample, _ in rig.collector.samples[skipped:]]
-    sink.close()
-    played = [one.tick.sample for one in open_playback(path, joint, tmp_path, frames=True)]
-    assert len(live) == 100
-    assert [repr(one[1:]) for one in played if one is not None] == [repr(one[1:]) for one in live]
-
-
 def asked_over_zenoh(
     joint: JointFile, layouts: list[NodeLayout], endpoint: str, folder: Path
 ) -> Sequence[NodeLayout]:

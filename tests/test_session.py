@@ -17,7 +17,6 @@ from drivelink.jointfile import ZenohSection
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import (
     FILES,
-    client_config,
     close_session,
     daemon_config,
     open_client,
@@ -75,14 +74,6 @@ def hear(subscriber, expected):
     until(exactly)
 
 
-def test_a_plain_client_of_the_one_endpoint_receives_every_daemon_of_the_machine(endpoint, plain_client):
-    with script("a", endpoint) as a, script("b", endpoint) as b, script("c", endpoint) as c:
-        for process in (a, b, c):
-            ready(process)
-        subscriber = plain_client().declare_subscriber("drivelink/*/estimate", zenoh.handlers.RingChannel(64))
-        hear(subscriber, {"a", "b", "c"})
-
-
 def test_when_the_first_daemon_is_killed_the_others_are_received_again(endpoint, plain_client):
     with script("a", endpoint) as a:
         ready(a)
@@ -124,23 +115,6 @@ def test_nothing_listens_beyond_the_loopback_and_nothing_is_multicast(endpoint):
         ]
     assert local
     assert set(local) == {"0100007F"}  # 127.0.0.1 only, UDP included
-
-
-def test_a_second_daemon_with_the_same_joint_name_ends_with_one_line(endpoint):
-    with script("elbow", endpoint) as first:
-        ready(first)
-        with script("elbow", endpoint) as second:
-            out, error = second.communicate(timeout=LIMIT_S)
-    assert second.returncode == 1
-    assert out == ""
-    assert error.strip().count("\n") == 0
-    assert "another daemon already serves a joint named elbow" in error
-
-
-def test_the_name_is_free_again_once_its_daemon_was_killed(endpoint):
-    for _ in range(2):
-        with script("elbow", endpoint) as process:
-            ready(process)
 
 
 def test_of_two_daemons_that_start_at_once_with_one_name_one_stays(endpoint):
@@ -217,19 +191,6 @@ def test_a_configuration_that_cannot_be_used_is_one_line_with_its_file(tmp_path,
     assert str(tmp_path / "mine.json5") in str(error.value)
     assert "\n" not in str(error.value)
     assert ".rs:" not in str(error.value)
-
-
-def test_a_subscriber_that_is_stuck_never_makes_the_publisher_wait(endpoint):
-    settings = json.loads(
-        daemon_config(endpoint, listen=True).get_json("transport/link/tx/queue/congestion_control/drop")
-    )
-    assert settings["wait_before_drop"] == 0
-
-
-def test_closing_twice_and_closing_after_the_end_is_fine(endpoint):
-    session = zenoh.open(client_config(endpoint))
-    close_session(session)
-    close_session(session)
 
 
 def test_two_joints_of_one_process_share_a_session(endpoint):

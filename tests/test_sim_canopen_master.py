@@ -227,14 +227,6 @@ def test_nmt_to_all_nodes_boots_every_one(interface: str) -> None:
         assert {peer.sdo[0x1017].raw for peer in peers} == {0}
 
 
-@pytest.mark.parametrize("interface", BUSES)
-def test_strings_go_by_segments(interface: str) -> None:
-    rig = StubRig()
-    with mastered(drive(rig), rig=rig, interface=interface) as master:
-        peer = remote(master, 1, "cia402-drive.eds")
-        assert peer.sdo[0x1008].raw == "drivelink simulated CiA 402 drive"
-
-
 def test_an_emergency_reaches_the_master_and_its_history() -> None:
     rig = StubRig()
     device = drive(rig)

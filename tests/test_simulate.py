@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import can
 import pytest
 
 from drivelink.demo.simulate import (
     assumptions,
     bench_from_joints,
-    network_from_joint,
     nodes_from_joint,
     world_from_joint,
 )
@@ -204,23 +202,3 @@ def test_two_joints_share_a_bus_and_their_data_sheets_are_written(tmp_path: Path
     }
     with pytest.raises(UsageError, match="got 1 twice"):
         bench_from_joints([joint(VSA), joint(VSA)])
-
-
-def test_lockstep_is_the_same_every_time() -> None:
-    def frames() -> list[bytes]:
-        heard = []
-        with (
-            can.Bus(interface="virtual", channel="same") as device_end,
-            can.Bus(interface="virtual", channel="same") as master_end,
-        ):
-            network = network_from_joint(joint(VSA), device_end)
-            network.poll()
-            master_end.send(can.Message(arbitration_id=0, data=[1, 0], is_extended_id=False))
-            for _ in range(200):
-                master_end.send(can.Message(arbitration_id=0x80, is_extended_id=False))
-                network.poll()
-            while (message := master_end.recv(0)) is not None:
-                heard.append(bytes(message.data))
-        return heard
-
-    assert frames() == frames()

@@ -124,23 +124,6 @@ def test_numpy_reads_the_same_bytes_as_records():
     assert set(records["count"]) == {2}
 
 
-@pytest.mark.parametrize(
-    "payload",
-    [
-        b"",
-        b"\x00" * 44,
-        bytes(wire.ESTIMATE.size(1) - 1),
-        bytes(wire.ESTIMATE.size(1)),  # long enough for one element, but says none
-        bytes(wire.ESTIMATE.size(wire.MAX_ELEMENTS) + 32),
-    ],
-)
-def test_bytes_that_are_no_estimate_are_refused_in_one_line(payload):
-    with pytest.raises(ZenohError) as error:
-        wire.decode_estimate(payload)
-    assert "drivelink.estimate/1: expected" in str(error.value)
-    assert "\n" not in str(error.value)
-
-
 def test_bytes_that_are_no_sample_are_refused():
     with pytest.raises(ZenohError, match=r"drivelink\.sample/1"):
         wire.decode_sample(z_serialize(b"something else").to_bytes())

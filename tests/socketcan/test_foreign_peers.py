@@ -14,7 +14,6 @@ from zenohkit import LIMIT_S, until
 from drivelink._core import SYNC_COB_ID, Assembler
 from drivelink.canopen.bus import interface_is_up, open_bus
 from drivelink.canopen.layout import Signal
-from drivelink.canopen.passive import PassiveConfigurator
 from drivelink.cycle.sources import OVERFLOW, SocketCanSource
 from drivelink.cycle.syncclock import SyncClock, measure_period
 from drivelink.jointfile import BusSection, parse
@@ -148,40 +147,3 @@ def test_another_makers_slave_is_configured_and_what_it_sends_is_decoded() -> No
         k = round(sample.motor_position_rad[0] / position) - 1000
         assert sample.motor_torque_nm[0] == pytest.approx(-k * torque)
         assert k == sample.sequence
-
-
-def test_a_map_that_a_foreign_master_writes_is_overheard() -> None:
-    text = JOINT.replace("[bus]", '[bus]\nconfigure = false\nsync = "follow"')
-    with slave() as (_, node):
-        bus = open_bus(SECTION)
-        source = SocketCanSource(bus)
-        passive = PassiveConfigurator([parse(text)], [Path()])
-        master = canopen.Network(bus=can.Bus(interface="socketcan", channel=CHANNEL))
-        master.connect()
-        try:
-            remote = master.add_node(5, str(SHEET))
-            remote.nmt.state = "PRE-OPERATIONAL"
-            remote.tpdo.read()
-            for tpdo in remote.tpdo.values():
-                tpdo.enabled = False
-            mapped = remote.tpdo[2]
-            mapped.clear()
-            for index in (0x6064, 0x6077, 0x6041):
-                mapped.add_variable(index)
-            mapped.trans_type, mapped.enabled = 1, True
-            remote.tpdo.save()
-            for index in (0x6075, 0x6076, 0x608F):
-                remote.sdo.upload(index, 1 if index == 0x608F else 0)
-            remote.nmt.state = "OPERATIONAL"
-            end_s = time.monotonic() + LIMIT_S
-            while not passive.layouts and time.monotonic() < end_s:
-                source.wait(0.05)
-                for frame in source.take():
-                    passive.feed(frame.cob_id, frame.data, 0.0)
-                passive.poll(0.0)
-        finally:
-            master.disconnect()
-            bus.shutdown()
-    layout = passive.layouts[5]
-    assert [(o.index, o.bits) for o in layout.tpdos[0].objects] == [(0x6064, 32), (0x6077, 16), (0x6041, 16)]
-    assert node.nmt.state == "OPERATIONAL"

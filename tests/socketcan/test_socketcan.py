@@ -13,14 +13,11 @@ from pathlib import Path
 
 import can
 import pytest
-from daemonkit import running, vsa, vsa_text
+from daemonkit import vsa_text
 from zenohkit import LIMIT_S, free_endpoint, until
 
 from drivelink.canopen.bus import interface_is_up, open_bus
 from drivelink.cycle.sources import BusLostError, SocketCanSource, open_source
-from drivelink.daemon.service import Daemon, ServedJoint
-from drivelink.demo.simbus import open_sim_bus
-from drivelink.demo.simulate import network_from_joint
 from drivelink.jointfile import BusSection
 from drivelink.pubsub.client import subscribe
 from estimator.sample import Status
@@ -122,38 +119,6 @@ def test_an_interface_that_goes_down_is_a_lost_bus() -> None:
                     mine.take()
         finally:
             ip("set", "vcan1", "up")
-
-
-@pytest.mark.parametrize("removed", [False, True])
-def test_the_daemon_survives_an_interface_that_goes_and_comes_back(removed: bool) -> None:
-    joint = vsa(channel="vcan1", bus=SOCKETCAN.format(0.01))
-    bus = open_sim_bus(joint.bus)
-    network = network_from_joint(joint, bus)
-    network.start()
-    daemon = Daemon([ServedJoint(joint=joint)], publish=False, real_time=False)
-    pipeline = daemon.pipelines[0]
-    try:
-        with running(daemon):
-            until(lambda: pipeline.estimate and not pipeline.estimate.status & Status.STALE)
-            ip("set", "vcan1", "down")
-            if removed:
-                ip("del", "vcan1")
-            until(lambda: pipeline.estimate.status & Status.STALE)
-            assert not pipeline.estimate.status & Status.VALID
-            until(lambda: any("the bus is lost" in text for text in daemon.events.active.values()))
-            network.stop()
-            bus.shutdown()
-            if removed:
-                ip("add", "vcan1", "mtu", "72", "type", "vcan")
-            ip("set", "vcan1", "up")
-            bus = open_sim_bus(joint.bus)
-            network = network_from_joint(joint, bus)
-            network.start()
-            until(lambda: not pipeline.estimate.status & Status.STALE)
-            assert "bus" not in daemon.events.active
-    finally:
-        network.stop()
-        bus.shutdown()
 
 
 def test_drives_daemon_and_subscriber_are_three_processes(tmp_path: Path) -> None:

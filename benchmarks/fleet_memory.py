@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import scene
-from scene import diagnosiskit, fleetkit
+from scene import diagnosiskit, fleetkit, joints
 
 CODE = """
 import resource, sys
@@ -32,7 +32,7 @@ def rows(args) -> Iterator[scene.Row]:
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
             (record,) = diagnosiskit.World([{}], seconds=seconds).run()
-            path, joint = fleetkit.write_csv(record, folder / "elbow.csv"), folder / "elbow.toml"
+            path, joint = joints.write_csv(record, folder / "elbow.csv", 9), folder / "elbow.toml"
             joint.write_text(fleetkit.JOINT.format(name="elbow"), encoding="utf-8")
             command = [sys.executable, "-c", CODE, path, joint, folder]
             done = subprocess.run(command, capture_output=True, text=True, check=True)

@@ -79,11 +79,6 @@ class Chromium:
             time.sleep(0.1)
         raise TimeoutError(script)
 
-    def prefer(self, *, dark: bool) -> None:
-        """The colours that the reader prefers."""
-        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
-        self._call("Emulation.setEmulatedMedia", features=[scheme])
-
     def resize(self, width: int, height: int) -> None:
         """Another screen, e.g. a phone's."""
         self._call(

@@ -11,7 +11,7 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import diagnosiskit as kit
-import numpy as np
+import joints
 
 from drivelink.jointfile import parse
 from drivelink.recording.formats import open_sink
@@ -34,22 +34,12 @@ SECONDS = 4.0
 NAMES = ("elbow", "wrist")
 
 
-def write_csv(record: Record, path: Path) -> Path:
-    names = "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad"
-    assert record.link_position_rad is not None
-    motor, torque = record.motor_position_rad[:, 0], record.motor_torque_nm[:, 0]
-    table = np.column_stack((record.time_s, motor, torque, record.link_position_rad))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.savetxt(path, table, delimiter=",", header=names, comments="", fmt="%.9g")
-    return path
-
-
 def make_fleet(folder: Path, nights: int = 2) -> Path:
     """FOLDER/joints and FOLDER/recordings of two joints; the second night of the wrist has friction."""
     for night in range(nights):
         world = kit.World([{}, {"coulomb_nm": 0.4} if night % 2 else {}], seed=10 + night, seconds=SECONDS)
         for name, record in zip(NAMES, world.run(), strict=True):
-            write_csv(record, folder / "recordings" / f"{name}-2026-01-{night + 5:02d}.csv")
+            joints.write_csv(record, folder / "recordings" / f"{name}-2026-01-{night + 5:02d}.csv", 9)
     for name in NAMES:
         path = folder / "joints" / f"{name}.toml"
         path.parent.mkdir(parents=True, exist_ok=True)

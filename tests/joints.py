@@ -7,7 +7,8 @@ arrays carry the joint as their first axis, so a hundred random joints cost what
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -204,6 +205,30 @@ def record(
         motor_torque_nm=tau if torque_noise is None else tau + torque_noise,
         link_position_rad=q,
     )
+
+
+def part(whole: Record, rows: slice | Array) -> Record:
+    """Some rows of a recording."""
+    link = whole.link_position_rad
+    return replace(
+        whole,
+        sequence=whole.sequence[rows],
+        motor_position_rad=whole.motor_position_rad[rows],
+        motor_torque_nm=whole.motor_torque_nm[rows],
+        link_position_rad=None if link is None else link[rows],
+    )
+
+
+def write_csv(record: Record, path: Path, digits: int = 17) -> Path:
+    """The recording as a file, in a folder that is made if need be."""
+    motors, link = range(1, record.motors + 1), record.link_position_rad
+    names = ["time_s", *(f"motor{i}_{what}" for what in ("position_rad", "torque_nm") for i in motors)]
+    columns = [record.time_s, record.motor_position_rad, record.motor_torque_nm]
+    if link is not None:
+        columns, names = [*columns, link], [*names, "link_position_rad"]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savetxt(path, np.column_stack(columns), f"%.{digits}g", ",", header=",".join(names), comments="")
+    return path
 
 
 def sweep(

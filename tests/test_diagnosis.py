@@ -7,6 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import diagnosiskit as kit
+import joints
 import numpy as np
 import pytest
 
@@ -238,31 +239,15 @@ def test_a_fault_of_installation_is_one_line(change, message: str, records: dict
 
 
 def test_a_short_recording_is_refused(records: dict[str, Record]) -> None:
-    clean = records["clean"]
-    short = Record(
-        period_s=clean.period_s,
-        sequence=clean.sequence[:500],
-        motor_position_rad=clean.motor_position_rad[:500],
-        motor_torque_nm=clean.motor_torque_nm[:500],
-        link_position_rad=clean.link_position_rad[:500] if clean.link_position_rad is not None else None,
-    )
     with pytest.raises(EstimatorError, match="too short"):
-        diagnose(short, kit.model())
+        diagnose(joints.part(records["clean"], slice(500)), kit.model())
 
 
 @pytest.mark.slow
 def test_gaps_are_left_out(records: dict[str, Record]) -> None:
-    whole = records["coulomb"]
-    keep = np.ones(len(whole), dtype=bool)
+    keep = np.ones(len(records["coulomb"]), dtype=bool)
     keep[3000:3040] = keep[9000:9300] = False
-    assert whole.link_position_rad is not None
-    holed = Record(
-        period_s=whole.period_s,
-        sequence=whole.sequence[keep],
-        motor_position_rad=whole.motor_position_rad[keep],
-        motor_torque_nm=whole.motor_torque_nm[keep],
-        link_position_rad=whole.link_position_rad[keep],
-    )
+    holed = joints.part(records["coulomb"], keep)
     assert [e.name for e in diagnose(holed, kit.model()).effects] == ["coulomb_friction"]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import diagnosiskit as kit
+import joints
 import numpy as np
 import pytest
 
@@ -25,20 +26,9 @@ MISSING: list[dict[str, float]] = [
 ]  # fmt: skip
 
 
-def part(record: Record, rows: slice) -> Record:
-    assert record.link_position_rad is not None
-    return replace(
-        record,
-        sequence=record.sequence[rows],
-        motor_position_rad=record.motor_position_rad[rows],
-        motor_torque_nm=record.motor_torque_nm[rows],
-        link_position_rad=record.link_position_rad[rows],
-    )
-
-
 def parts(record: Record) -> list[Record]:
     length = len(record) // PARTS
-    return [part(record, slice(k * length, (k + 1) * length)) for k in range(PARTS)]
+    return [joints.part(record, slice(k * length, (k + 1) * length)) for k in range(PARTS)]
 
 
 def stiffness(record: Record, model: JointModel) -> tuple[float, float]:

@@ -112,13 +112,7 @@ def test_gaps_and_missing_values_are_bridged_or_left_out(elbow):
     whole = _record(truth, 0)
     keep = np.random.default_rng(0).random(len(whole)) > 0.01
     keep[4000:4300] = False
-    holed = Record(
-        period_s=T,
-        sequence=whole.sequence[keep],
-        motor_position_rad=whole.motor_position_rad[keep],
-        motor_torque_nm=whole.motor_torque_nm[keep],
-        link_position_rad=whole.link_position_rad[keep],
-    )
+    holed = joints.part(whole, keep)
     holed.link_position_rad[50] = np.nan
     (found,) = fit(holed, joints.joint_model(plants.B[0, 0], plants.D[0, 0]))
     assert _error(found, alpha, truth, 0) < 2e-3
@@ -128,50 +122,29 @@ def test_what_cannot_be_fitted_is_reported(elbow):
     plants, _, truth = elbow
     model = joints.joint_model(plants.B[0, 0], plants.D[0, 0])
     record = _record(truth, 0)
-    still = Record(
-        period_s=T,
-        sequence=np.arange(3000),
-        motor_position_rad=np.zeros((3000, 1)),
-        motor_torque_nm=np.zeros((3000, 1)),
-        link_position_rad=np.zeros(3000),
-    )
-    with pytest.raises(EstimatorError, match="stands still"):
-        fit(still, model)
-    with pytest.raises(EstimatorError, match="at least"):
-        fit(
-            Record(
-                period_s=T,
-                sequence=np.arange(100),
-                motor_position_rad=record.motor_position_rad[:100],
-                motor_torque_nm=record.motor_torque_nm[:100],
-                link_position_rad=record.link_position_rad[:100],
-            ),
-            model,
-        )
-    short = Record(
-        period_s=T,
-        sequence=np.arange(1500),
-        motor_position_rad=record.motor_position_rad[:1500],
-        motor_torque_nm=record.motor_torque_nm[:1500],
-        link_position_rad=record.link_position_rad[:1500],
-    )
-    with pytest.raises(EstimatorError, match="too short for a bandwidth of 4 Hz: expected at least 60"):
-        fit(short, model, 2.0 * np.pi * 4.0)
-    with pytest.raises(EstimatorError, match="2 motor"):
-        fit(record, joints.joint_model(1.0, 1.0, m=2))
+    still, nothing = np.zeros((3000, 1)), np.zeros(3000)
+    for wrong, how, message in (
+        (
+            Record(T, np.arange(3000), still, None, still, nothing),
+            (model,),
+            "stands still",
+        ),
+        (joints.part(record, slice(100)), (model,), "at least"),
+        (
+            joints.part(record, slice(1500)),
+            (model, 2.0 * np.pi * 4.0),
+            "too short for a bandwidth of 4 Hz: expected at least 60",
+        ),
+        (record, (joints.joint_model(1.0, 1.0, m=2),), "2 motor"),
+    ):
+        with pytest.raises(EstimatorError, match=message):
+            fit(wrong, *how)
 
 
 def test_command_writes_json_plots_and_a_joint_file_that_loads(elbow, tmp_path, capsys):
     plants, alpha, truth = elbow
     record = _record(truth, 2)
-    columns = [
-        record.time_s,
-        record.motor_position_rad[:, 0],
-        record.motor_torque_nm[:, 0],
-        record.link_position_rad,
-    ]
-    header = "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad"
-    np.savetxt(tmp_path / "run.csv", np.column_stack(columns), delimiter=",", header=header, comments="")
+    joints.write_csv(record, tmp_path / "run.csv")
     joint = tmp_path / "joint.toml"
     joint.write_text(
         f'name = "elbow"\n[[motor]]\ninertia_kg_m2 = {plants.B[2, 0]}  # from the drawing\n'
@@ -193,8 +166,6 @@ def test_command_writes_json_plots_and_a_joint_file_that_loads(elbow, tmp_path, 
     assert entry["parameters"]["coefficients_nm_rad"][0] == pytest.approx(alpha[2][0], rel=1e-3)
     assert set(entry["std"]) == {"coefficients_nm_rad"}
     assert (tmp_path / "out" / "fit.png").stat().st_size > 1000
-    from drivelink import jointfile
-
     written = jointfile.load(tmp_path / "fitted.toml")
     assert written.motor[0].transmission.parameters["coefficients_nm_rad"][0] == pytest.approx(
         alpha[2][0], rel=1e-3

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import diagnosiskit as kit
+import joints
 import numpy as np
 import pytest
 
@@ -79,20 +80,12 @@ def test_each_recording_is_validated_by_the_others(runs: list[Record]) -> None:
     assert last.validation.relative > 3.0 * found.recordings[-1].validation.relative  # type: ignore[union-attr]
 
 
-def _save(record: Record, path: Path) -> None:
-    columns = [record.time_s, record.motor_position_rad[:, 0], record.motor_torque_nm[:, 0]]
-    names = ["time_s", "motor1_position_rad", "motor1_torque_nm"]
-    if record.link_position_rad is not None:
-        columns, names = [*columns, record.link_position_rad], [*names, "link_position_rad"]
-    np.savetxt(path, np.column_stack(columns), delimiter=",", header=",".join(names), comments="")
-
-
 def test_the_command_takes_several_and_says_how_each_does(
     runs: list[Record], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     paths = [tmp_path / name for name in ("monday.csv", "tuesday.csv")]
     for run, path in zip(runs, paths, strict=True):
-        _save(run, path)
+        joints.write_csv(run, path)
     joint, target = tmp_path / "joint.toml", tmp_path / "written.toml"
     joint.write_text(
         f'name = "elbow"\n[[motor]]\ninertia_kg_m2 = {kit.INERTIA}\n[motor.transmission]\nmodel = "linear"\n'
@@ -120,7 +113,7 @@ def test_a_recording_in_degrees_among_others_is_named(
         link_position_rad=np.degrees(runs[1].link_position_rad),
     )
     for run, name in ((runs[0], "right"), (wrong, "wrong")):
-        _save(run, tmp_path / f"{name}.csv")
+        joints.write_csv(run, tmp_path / f"{name}.csv")
     joint = tmp_path / "joint.toml"
     joint.write_text(
         f'name = "elbow"\n[[motor]]\ninertia_kg_m2 = {kit.INERTIA}\n[motor.transmission]\nmodel = "linear"\n'
@@ -193,7 +186,7 @@ def test_gravity_and_friction_of_a_joint_with_one_encoder(arm: Record, gravity_n
 def test_what_is_written_of_a_joint_with_one_encoder_is_what_is_printed_and_fitted_again_it_stays(
     arm: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    _save(arm, tmp_path / "arm.csv")
+    joints.write_csv(arm, tmp_path / "arm.csv")
     joint, target = tmp_path / "arm.toml", tmp_path / "written.toml"
     joint.write_text(
         f'name = "arm"\n[[motor]]\ninertia_kg_m2 = {ROTOR}\n[motor.transmission]\nmodel = "none"\n'

@@ -12,6 +12,7 @@ from typing import Any
 
 import diagnosiskit as kit
 import gatekit
+import joints
 import numpy as np
 import pytest
 
@@ -20,7 +21,6 @@ from drivelink.cli import main
 from drivelink.errors import JointFileError
 from estimator import fit
 from estimator.identify import identify
-from estimator.sample import Record
 
 ROOT = Path(__file__).resolve().parents[1]
 KUKA = Path(os.environ.get("DRIVELINK_DATA", ROOT.parent / "shared" / "data")) / "kuka_kr300"
@@ -43,31 +43,20 @@ gravity_nm = {0.98 * kit.GRAVITY}
 """
 
 
-def _save(record: Record, path: Path) -> None:
-    m = record.motors
-    names = ["time_s", *(f"motor{i + 1}_{x}" for x in ("position_rad", "torque_nm") for i in range(m))]
-    assert record.link_position_rad is not None
-    columns = [record.time_s, record.motor_position_rad, record.motor_torque_nm, record.link_position_rad]
-    header = ",".join([*names, "link_position_rad"])
-    np.savetxt(path, np.column_stack(columns), delimiter=",", header=header, comments="")
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("written")
     worlds = kit.World([{}, {"late_s": LATE_S, "zero_rad": ZERO_RAD}]).run()
     for name, record in zip(("clean", "skewed"), worlds, strict=True):
-        _save(record, folder / f"{name}.csv")
+        joints.write_csv(record, folder / f"{name}.csv")
     pair = gatekit.draw("antagonistic", 1, seconds=12.0, effects=False)
-    _save(pair.record, folder / "pair.csv")
+    joints.write_csv(pair.record, folder / "pair.csv")
     texts = (
         MOTOR.format(inertia=m.inertia_kg_m2, damping=m.viscous_damping_nm_s_rad, model="polynomial")
         for m in pair.model.motors
     )
     rigid = gatekit.draw("none", 1, seconds=12.0, effects=False)
-    names = "time_s,motor1_position_rad,motor1_torque_nm"
-    columns = [rigid.record.time_s, rigid.record.motor_position_rad, rigid.record.motor_torque_nm]
-    np.savetxt(folder / "rigid.csv", np.column_stack(columns), delimiter=",", header=names, comments="")
+    joints.write_csv(rigid.record, folder / "rigid.csv")
     (m,) = rigid.model.motors
     text = MOTOR.format(inertia=m.inertia_kg_m2, damping=m.viscous_damping_nm_s_rad, model="none")
     (folder / "rigid.toml").write_text('name = "rigid"\n' + text)

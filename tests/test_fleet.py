@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ import diagnosiskit as kit
 import fleetkit
 import numpy as np
 import pytest
+from joints import write_csv
 
 REASON = "the extra [fleet] is not installed"
 pytest.importorskip("distributed", reason=REASON)
@@ -115,16 +117,7 @@ def test_units_and_signs_are_checked_before_anything_else(
 ) -> None:
     record = recording.read(fleet / "recordings" / "elbow-2026-01-05.csv")
     degrees = np.rad2deg(record.link_position_rad)  # type: ignore[arg-type]
-    wrong = fleetkit.write_csv(
-        type(record)(
-            period_s=record.period_s,
-            sequence=record.sequence,
-            motor_position_rad=record.motor_position_rad,
-            motor_torque_nm=record.motor_torque_nm,
-            link_position_rad=degrees,
-        ),
-        tmp_path / "elbow.csv",
-    )
+    wrong = write_csv(replace(record, link_position_rad=degrees), tmp_path / "elbow.csv")
     (row,) = done(wrong, joints).rows
     assert row["status"] == "error"
     assert "degree" in row["error"]

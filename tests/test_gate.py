@@ -13,6 +13,7 @@ from pathlib import Path
 
 import gatekit
 import heldmotor
+import joints
 import numpy as np
 import onlinekit
 import pytest
@@ -157,15 +158,7 @@ def degrees() -> gatekit.Drawn:
 
 
 def test_a_recording_that_is_too_short_is_not_judged(degrees: gatekit.Drawn) -> None:
-    r = degrees.record
-    assert r.link_position_rad is not None
-    short = Record(
-        period_s=r.period_s,
-        sequence=r.sequence[:200],
-        motor_position_rad=r.motor_position_rad[:200],
-        motor_torque_nm=r.motor_torque_nm[:200],
-        link_position_rad=r.link_position_rad[:200],
-    )
+    short = joints.part(degrees.record, slice(200))
     assert examine(short, degrees.model) == []
     assert "200 samples" in judge(short, degrees.model).remark
 
@@ -181,14 +174,10 @@ model = "polynomial"
 
 
 def _written(drawn: gatekit.Drawn, folder: Path, scale: str = "") -> tuple[Path, Path]:
-    r = drawn.record
-    assert r.link_position_rad is not None
-    table = np.column_stack([r.time_s, r.motor_position_rad, r.motor_torque_nm, r.link_position_rad])
-    header = "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad"
-    np.savetxt(folder / "run.csv", table, delimiter=",", header=header, comments="")
+    joint = folder / "elbow.toml"
     text = JOINT.format(scale=scale, inertia=drawn.model.motors[0].inertia_kg_m2)
-    (folder / "elbow.toml").write_text(text, encoding="utf-8")
-    return folder / "run.csv", folder / "elbow.toml"
+    joint.write_text(text, encoding="utf-8")
+    return joints.write_csv(drawn.record, folder / "run.csv"), joint
 
 
 _VERBS = (

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import diagnosiskit as kit
+import joints
 import pytest
 
 from estimator import transmissions
@@ -45,18 +46,6 @@ def _play(monitor: ModelMonitor, record: Record, first: int = 0, external_nm: fl
         sample = Sample(first + k, (theta,), (math.nan,), (tau,), q, math.nan, external_nm)
         alarms.append(monitor.step(sample, NOTHING, 0.0))
     return alarms
-
-
-def first_rows(record: Record, rows: int) -> Record:
-    """Its first rows."""
-    assert record.link_position_rad is not None
-    return replace(
-        record,
-        sequence=record.sequence[:rows],
-        motor_position_rad=record.motor_position_rad[:rows],
-        motor_torque_nm=record.motor_torque_nm[:rows],
-        link_position_rad=record.link_position_rad[:rows],
-    )
 
 
 def test_a_balance_leaves_the_torque_of_the_effect_that_is_missing(
@@ -126,7 +115,7 @@ def test_a_registered_law_is_monitored_like_one_of_the_library(
         ModelMonitor(joint, kit.PERIOD_S, baseline)
         for joint in (model, replace(model, motors=(replace(model.motors[0], transmission=mine),)))
     ]
-    some = first_rows(runs["coulomb_nm"], 2600)
+    some = joints.part(runs["coulomb_nm"], slice(2600))
     raised = [_play(monitor, some) for monitor in monitors]
     assert raised[0] == raised[1] and any(raised[0])
     assert monitors[1].residual_nm == pytest.approx(monitors[0].residual_nm)

@@ -28,7 +28,6 @@ from drivelink.recording.sinks import SafeFile
 from estimator.sample import Sample
 
 JOINT = 'name = "elbow"\n[[motor]]\ninertia_kg_m2 = 0.5\n[motor.transmission]\nmodel = "linear"\n'
-HEADER = "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad"
 
 
 @pytest.fixture
@@ -214,17 +213,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     plants = joints.Plants(*joints.polynomial(np.array([[[100.0]]])), 0.5, 0.8, 0.4, 0.2, 5.0)
     truth = joints.simulate(plants, joints.sweep(rng, 8000, 1, 1, 0.001, 8.0, 3.0), 0.001)
     record = joints.record(truth, 0, 0.001)
-    table = np.column_stack(
-        (
-            record.time_s,
-            record.motor_position_rad[:, 0],
-            record.motor_torque_nm[:, 0],
-            record.link_position_rad,
-        )
-    )
-    path = tmp_path_factory.mktemp("data") / "r.csv"
-    np.savetxt(path, table, delimiter=",", header=HEADER, comments="")
-    return path.read_bytes()
+    return joints.write_csv(record, tmp_path_factory.mktemp("data") / "r.csv").read_bytes()
 
 
 @pytest.fixture

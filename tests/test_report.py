@@ -8,6 +8,8 @@ from functools import cache
 from pathlib import Path
 
 import diagnosiskit as kit
+import fleetkit
+import joints
 import numpy as np
 import pytest
 
@@ -18,29 +20,8 @@ from drivelink.output.numbers import Units
 from estimator.model import JointModel, Motor, Transmission
 from estimator.sample import Record
 
-JOINT = f"""\
-name = "elbow"
-arrangement = "single"
-[[motor]]
-inertia_kg_m2 = {kit.INERTIA}
-viscous_damping_nm_s_rad = {kit.DAMPING}
-[motor.transmission]
-model = "linear"
-[link.dynamics]
-inertia_kg_m2 = {kit.LINK_INERTIA}
-viscous_damping_nm_s_rad = {kit.LINK_DAMPING}
-gravity_nm = {kit.GRAVITY}
-"""
+JOINT = fleetkit.JOINT.format(name="elbow")
 ERROR = {"before_rms_nm", "after_rms_nm", "before_relative", "after_relative"}
-
-
-def _csv(record: Record, path: Path) -> Path:
-    names = "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad"
-    assert record.link_position_rad is not None
-    motor, torque = record.motor_position_rad[:, 0], record.motor_torque_nm[:, 0]
-    table = np.column_stack((record.time_s, motor, torque, record.link_position_rad))
-    np.savetxt(path, table, delimiter=",", header=names, comments="", fmt="%.9g")
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("diagnose")
     effects = [{}, {"coulomb_nm": 0.4}, {"late_s": 0.004}, {"bump_nm": 1.0}]
     for name, record in zip(("clean", "coulomb", "late", "bump"), kit.World(effects).run(), strict=True):
-        _csv(record, folder / f"{name}.csv")
+        joints.write_csv(record, folder / f"{name}.csv", 9)
     (folder / "joint.toml").write_text(JOINT, encoding="utf-8")
     return folder
 

@@ -16,7 +16,7 @@ from zenohkit import LIMIT_S, free_endpoint, until
 
 from drivelink._core import SYNC_COB_ID
 from drivelink.cycle.pipeline import make_pipeline
-from drivelink.cycle.startup import join_bus, run_lockstep
+from drivelink.cycle.startup import join_bus
 from drivelink.daemon import reload
 from drivelink.daemon.service import Daemon, ServedJoint
 from drivelink.demo.simbus import open_sim_bus

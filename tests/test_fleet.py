@@ -132,7 +132,7 @@ def test_a_recording_larger_than_the_memory_is_cut_into_parts(
     joints: Joints, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (record,) = kit.World([{}], seconds=12.0).run()
-    path = fleetkit.write_csv(record, tmp_path / "elbow.csv")
+    path = write_csv(record, tmp_path / "elbow.csv")
     monkeypatch.setattr(task, "_BASE_BYTES", 0)
     monkeypatch.setattr(task, "_LEAST_BYTES", 0)
     outcome = done(path, joints, limit_bytes=30.0 * path.stat().st_size)

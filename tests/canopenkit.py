@@ -15,6 +15,9 @@ from canopen.objectdictionary import datatypes
 
 from drivelink.canopen.configure import configure_joints
 from drivelink.canopen.eds import DataSheet
+from drivelink.canopen.guard import check_frame
+from drivelink.canopen.layout import NodeLayout, Signal
+from drivelink.jointfile import parse
 
 NOT_VALID_NOW = 0x06010000
 READ_ONLY = 0x06010002
@@ -303,3 +306,27 @@ def joint_text(drive: str = "", link: str = "", bus: str = "") -> str:
 def configure(bus, joint, base_dir=Path(), *, idle=None):
     """The layouts of one joint's nodes, configured."""
     return configure_joints(bus, [joint], [base_dir], idle=idle)[1][0]
+
+
+def configured(slave: Slave, text: str = "", **sections: str) -> tuple[Wire, NodeLayout]:
+    """The wire and the layout of a node that was configured by frames which cannot move a drive."""
+    wire = Wire([slave])
+    (layout,) = configure(wire, parse(text or joint_text(**sections)))
+    for cob_id, data in wire.sent:
+        check_frame(cob_id, data)
+    return wire, layout
+
+
+def signals(layout: NodeLayout) -> list[list[Signal]]:
+    """What each TPDO carries."""
+    return [[mapped.signal for mapped in tpdo.objects] for tpdo in layout.tpdos]
+
+
+def eds_text(head: str = "", **objects: tuple[int, str | int]) -> str:
+    """A data sheet; "x6064" or "x1A00sub1" = (data type, default, "" for none); those of 0x6000 and more are mappable."""
+    text = f"[DeviceInfo]\n{head}\n"
+    for name, (kind, default) in objects.items():
+        mappable = 1 if name[1] == "6" else 0
+        value = "" if default == "" else f"DefaultValue={default}\n"
+        text += f"[{name[1:]}]\nDataType={kind}\nAccessType=rw\n{value}PDOMapping={mappable}\n"
+    return text

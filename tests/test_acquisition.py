@@ -375,7 +375,7 @@ class TestSyncClock:
 
     def test_a_drifting_master_stays_in_step(self) -> None:
         clock = SyncClock(0.001)
-        assert {clock.jump(round(k * MS * 1.0005)) for k in range(100_000)} == {1}
+        assert {clock.jump(round(k * MS * 1.0005)) for k in range(20_000)} == {1}
 
     def test_a_sync_that_was_not_due_is_no_period(self) -> None:
         clock = SyncClock(0.001)
@@ -419,7 +419,7 @@ class TestMeasuredPeriod:
     @pytest.mark.parametrize("factor", [1.02, 1.04, 1.25, 1.5, 2.0, 3.0, 0.5])
     @pytest.mark.parametrize("jitter", [0.0, 0.05, 0.5])
     def test_a_period_that_is_not_the_expected_one_is_found(self, factor: float, jitter: float) -> None:
-        for seed in range(20):
+        for seed in range(5):
             rng = random.Random(seed)
             stamps = [round((k + rng.uniform(-jitter, jitter)) * factor * MS) for k in range(256)]
             found = measure_period(stamps, 0.001)

@@ -12,26 +12,16 @@ from canopenkit import (
     READ_ONLY,
     TOO_MANY,
     Slave,
-    Wire,
-    configure,
+    configured,
     drive_objects,
-    joint_text,
+    signals,
     tpdo,
 )
 
 from drivelink.canopen.layout import Signal
 from drivelink.errors import DriveError
-from drivelink.jointfile import parse
 
 POSITION, TORQUE, STATUS = 0x60640020, 0x60770010, 0x60410010
-
-
-def configured(slave: Slave, **sections: str):
-    return configure(Wire([slave]), parse(joint_text(**sections)))[0]
-
-
-def signals(layout):
-    return [[mapped.signal for mapped in frame.objects] for frame in layout.tpdos]
 
 
 @dataclass
@@ -85,7 +75,7 @@ class OddAnswers(Slave):
 
 def test_a_node_that_is_slow_to_be_pre_operational_is_waited_for():
     slave = SlowState(5, drive_objects(5))
-    assert signals(configured(slave)) == [[Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE, Signal.STATUSWORD]]
+    assert signals(configured(slave)[1]) == [[Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE, Signal.STATUSWORD]]
     assert slave.refusals == 0
 
 
@@ -97,7 +87,7 @@ def test_a_node_that_never_takes_it_is_named_with_its_abort_code():
 @pytest.mark.parametrize("at_count", [False, True])
 def test_maps_of_two_objects_are_filled_and_the_rest_goes_into_the_next(at_count):
     objects = drive_objects(5) | tpdo(1, NO_RTR | 0x185, 255)
-    layout = configured(SmallMaps(5, objects, most=2, at_count=at_count))
+    _, layout = configured(SmallMaps(5, objects, most=2, at_count=at_count))
     assert signals(layout) == [[Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE], [Signal.STATUSWORD]]
     assert any("TPDO1 takes 2 objects" in finding.text for finding in layout.notices)
 
@@ -108,14 +98,14 @@ def test_maps_that_have_fewer_places_than_objects_are_filled():
         objects |= tpdo(number, NO_RTR | INVALID | 0x80 + 0x100 * number + 5, 255, slots=2)
         for position in range(3, 9):
             objects.pop((0x19FF + number, position), None)
-    layout = configured(Slave(5, objects))
+    _, layout = configured(Slave(5, objects))
     assert signals(layout) == [[Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE], [Signal.STATUSWORD]]
 
 
 @pytest.mark.parametrize("transmission_type", [1, 2, 255])
 def test_a_pdo_that_cannot_be_changed_at_all_is_taken_as_it_is(transmission_type):
     objects = drive_objects(5) | tpdo(1, 0x185, transmission_type, STATUS, POSITION, TORQUE)
-    layout = configured(Frozen(5, objects))
+    _, layout = configured(Frozen(5, objects))
     (frame,) = layout.tpdos
     assert (frame.cob_id, frame.transmission_type, frame.length) == (0x185, transmission_type, 8)
     warned = any(f"keeps transmission type {transmission_type}" in finding.text for finding in layout.notices)
@@ -130,7 +120,7 @@ def test_a_pdo_that_is_off_and_cannot_be_switched_on_is_no_use():
 
 def test_what_is_never_sent_on_sync_is_asked_for_once_a_period():
     slave = Slave(5, drive_objects(5), refuse={(0x1800, 2): 0x06090030})
-    layout = configured(slave, bus="period_s = 0.004")
+    _, layout = configured(slave, bus="period_s = 0.004")
     assert layout.tpdos[0].transmission_type == 255
     assert slave.objects[0x1800, 5].value == 4
     assert any("may be older than their SYNC" in finding.text for finding in layout.notices)
@@ -139,13 +129,13 @@ def test_what_is_never_sent_on_sync_is_asked_for_once_a_period():
 def test_answers_without_a_length_and_aborts_without_an_object_are_understood():
     objects = drive_objects(5)
     del objects[0x60A9, 0], objects[0x607E, 0]
-    layout = configured(OddAnswers(5, objects))
+    _, layout = configured(OddAnswers(5, objects))
     assert [mapped.bits for mapped in layout.tpdos[0].objects] == [32, 16, 16]
 
 
 def test_empty_places_that_are_counted_are_no_objects():
     objects = drive_objects(5) | tpdo(1, NO_RTR | 0x185, 255, *[0] * 8)
-    assert signals(configured(Slave(5, objects)))[0][0] is Signal.MOTOR_POSITION
+    assert signals(configured(Slave(5, objects))[1])[0][0] is Signal.MOTOR_POSITION
 
 
 def test_a_node_that_falls_silent_on_one_object_is_not_called_unpowered():

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from canopen.objectdictionary import datatypes
-from canopenkit import Slave, Wire, configure, joint_text, sheet_objects
+from canopenkit import Slave, Wire, configure, eds_text, joint_text, sheet_objects
 
 from drivelink.canopen.eds import load_eds
 from drivelink.canopen.layout import Signal
@@ -19,39 +19,11 @@ REAL = next((sorted(Path(f).iterdir()) for f in FOLDERS if f and Path(f).is_dir(
 OURS = sorted((REPOSITORY / "sim/eds").glob("*.eds"))
 needs_real = pytest.mark.skipif(not REAL, reason="the makers' EDS files are not here (DRIVELINK_EDS)")
 
-MINIMAL = """
-[DeviceInfo]
-VendorName=Somebody
-VendorNumber=0x1F
-ProductNumber=7
-[1018sub1]
-ParameterName=Vendor
-DataType=7
-AccessType=ro
-[1800sub1]
-ParameterName=COB-ID
-DataType=0x0007
-AccessType=rw
-DefaultValue=$NODEID+0x40000180
-[1800sub2]
-DataType=5
-AccessType=rw
-DefaultValue=0x01
-[1A00sub0]
-DataType=5
-AccessType=rw
-DefaultValue=1
-[1A00sub1]
-DataType=7
-AccessType=rw
-DefaultValue=0x60640020
-[6064]
-ParameterName=Position
-DataType=4
-AccessType=ro
-DefaultValue=-5
-PDOMapping=1
-"""
+MINIMAL = eds_text(
+    "VendorName=Somebody\nVendorNumber=0x1F\nProductNumber=7",
+    x1018sub1=(7, ""), x1800sub1=("0x0007", "$NODEID+0x40000180"), x1800sub2=(5, "0x01"), x1A00sub0=(5, 1),
+    x1A00sub1=(7, "0x60640020"), x6064=(4, -5),
+)  # fmt: skip
 
 
 def sheet(tmp_path, text, node=None, name="x.eds"):
@@ -196,26 +168,19 @@ def test_the_shipped_sheets_load_without_a_word(path):
 
 
 def test_roboteqs_name_for_the_node_id_is_understood(tmp_path):
-    path = tmp_path / "roboteq.eds"
-    path.write_text(
-        "[1800sub1]\nDataType=7\nAccessType=rw\nDefaultValue=$MY_NODE_ID+0x180\n"
-        "[1801sub1]\nDataType=7\nAccessType=rw\nDefaultValue=0x280+$MY_NODE_ID\n"
-    )
-    sheet = load_eds(path, 5)
-    assert (sheet.value(0x1800, 1), sheet.value(0x1801, 1)) == (0x185, 0x285)
-    assert not any("no number" in problem for problem in sheet.problems)
+    text = eds_text(x1800sub1=(7, "$MY_NODE_ID+0x180"), x1801sub1=(7, "0x280+$MY_NODE_ID"))
+    found = sheet(tmp_path, text, 5)
+    assert (found.value(0x1800, 1), found.value(0x1801, 1)) == (0x185, 0x285)
+    assert not any("no number" in problem for problem in found.problems)
 
 
 def test_a_map_that_the_eds_file_lacks_is_unknown_and_not_empty(tmp_path):
-    path = tmp_path / "silent.eds"
-    maps = {0x1A00: ("", ""), 0x1A01: ("DefaultValue=0", ""), 0x1A02: ("DefaultValue=2", "")}
-    text = ""
-    for index, (count, first) in maps.items():
-        text += f"[{index - 0x200:X}sub1]\nDataType=7\nAccessType=rw\nDefaultValue=0x{index - 0x1880:X}\n"
-        text += f"[{index:X}sub0]\nDataType=5\nAccessType=rw\n{count}\n"
-        text += f"[{index:X}sub1]\nDataType=7\nAccessType=rw\n{first}\n"
-    path.write_text(text)
-    assert describe(load_eds(path).tpdos()) == "TPDO1 = unknown; TPDO2 = empty; TPDO3 = unknown"
+    maps: dict[str, tuple[int, str | int]] = {}
+    for number, count in enumerate(("", 0, 2)):
+        maps |= {f"x{0x1800 + number:X}sub1": (7, 0x180 + number), f"x{0x1A00 + number:X}sub0": (5, count)}
+        maps[f"x{0x1A00 + number:X}sub1"] = (7, "")
+    tpdos = sheet(tmp_path, eds_text(**maps)).tpdos()
+    assert describe(tpdos) == "TPDO1 = unknown; TPDO2 = empty; TPDO3 = unknown"
 
 
 def test_compact_arrays_and_numbers_without_end_are_bounded(tmp_path):

@@ -6,20 +6,20 @@ import pytest
 from canopenkit import (
     INVALID,
     NO_RTR,
-    NOT_MAPPABLE,
     READ_ONLY,
     Item,
     Slave,
     Wire,
     configure,
+    configured,
     drive_objects,
     joint_text,
+    signals,
     tpdo,
     u32,
 )
 
 from drivelink.canopen.configure import configure_joints
-from drivelink.canopen.guard import check_frame
 from drivelink.canopen.layout import Signal
 from drivelink.errors import BusError, DriveError
 from drivelink.jointfile import parse
@@ -28,21 +28,9 @@ POSITION, TORQUE, STATUS = 0x60640020, 0x60770010, 0x60410010
 CURRENT, VELOCITY, LINK = 0x60780010, 0x606C0020, 0x60E40120
 
 
-def configured(slave, text="", **sections):
-    wire = Wire([slave])
-    layouts = configure(wire, parse(text or joint_text(**sections)))
-    for cob_id, data in wire.sent:
-        check_frame(cob_id, data)
-    return wire, layouts
-
-
 def drive(node=5, **changes):
     objects = drive_objects(node)
     return Slave(node, objects, **changes)
-
-
-def signals(layout):
-    return [[mapped.signal for mapped in tpdo.objects] for tpdo in layout.tpdos]
 
 
 def test_the_order_that_all_drives_accept_frame_by_frame():
@@ -63,27 +51,21 @@ def test_the_order_that_all_drives_accept_frame_by_frame():
     ]
 
 
-def test_one_frame_carries_position_torque_and_statusword():
-    _, (layout,) = configured(drive())
-    assert layout.node_id == 5
-    assert layout.motor == 0
-    assert layout.heartbeat_ms == 100
+def test_one_frame_carries_position_torque_and_statusword_and_a_second_one_what_is_asked_for_besides():
+    _, layout = configured(drive(), drive="velocity = true", link="[link.encoder]\ncounts_per_rev = 65536")
+    assert (layout.node_id, layout.motor, layout.heartbeat_ms) == (5, 0, 100)
     assert layout.identity == (0x1234, 0x77, 0x10002, 99)
-    (frame,) = layout.tpdos
-    assert (frame.cob_id, frame.length, frame.transmission_type, frame.number) == (0x185, 8, 1, 1)
-    assert signals(layout) == [[Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE, Signal.STATUSWORD]]
-
-
-def test_link_encoder_and_velocity_share_a_second_frame():
-    _, (layout,) = configured(drive(), drive="velocity = true", link="[link.encoder]\ncounts_per_rev = 65536")
-    assert signals(layout)[1] == [Signal.LINK_POSITION, Signal.MOTOR_VELOCITY]
-    assert [frame.cob_id for frame in layout.tpdos] == [0x185, 0x285]
+    first, second = layout.tpdos
+    assert (first.cob_id, first.length, first.transmission_type, first.number) == (0x185, 8, 1, 1)
+    assert second.cob_id == 0x285
+    plain = [Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE, Signal.STATUSWORD]
+    assert signals(layout) == [plain, [Signal.LINK_POSITION, Signal.MOTOR_VELOCITY]]
 
 
 def test_a_32_bit_current_moves_the_statusword_to_the_next_frame():
     slave = drive()
     slave.objects[0x30D1, 2] = u32(0, mappable=True)
-    _, (layout,) = configured(
+    _, layout = configured(
         slave,
         drive='torque_source = "current"\ncurrent_object = "0x30D1:02"\ntorque_constant_nm_a = 0.1',
     )
@@ -113,7 +95,7 @@ def test_bit_30_is_kept_for_drives_that_insist():
 def test_a_torque_that_cannot_be_mapped_gives_way_to_the_current():
     slave = drive()
     slave.objects[0x6077, 0].mappable = False
-    _, (layout,) = configured(slave, drive="torque_constant_nm_a = 0.1")
+    _, layout = configured(slave, drive="torque_constant_nm_a = 0.1")
     torque = layout.tpdos[0].objects[1]
     assert (torque.signal, torque.index) == (Signal.MOTOR_TORQUE, 0x6078)
     # 4 A rated: a count is 4 mA, times 0.1 N·m/A, times gear 50
@@ -121,26 +103,14 @@ def test_a_torque_that_cannot_be_mapped_gives_way_to_the_current():
     assert any("0x6077:00 cannot be mapped" in finding.text for finding in layout.notices)
 
 
-def test_a_refused_mapping_is_one_line_with_code_node_and_object():
-    slave = drive(refuse={(0x1A00, 1): NOT_MAPPABLE})
-    for item in slave.objects.values():
-        item.mappable = False
-    with pytest.raises(DriveError) as error:
-        configured(slave)
-    assert "node 5" in str(error.value)
-    assert "0x6064:00" in str(error.value)
-    assert "0x06040041" in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-def test_a_refused_mapping_is_put_back_as_it_was():
+def test_a_refused_mapping_is_one_line_with_code_node_and_object_and_put_back_as_it_was():
     slave = drive()
     slave.objects[0x6064, 0].mappable = False
-    with pytest.raises(DriveError):
+    with pytest.raises(DriveError, match=r"node 5.*0x6064:00.*0x06040041") as error:
         configured(slave)
+    assert "\n" not in str(error.value)
     assert slave.objects[0x1800, 1].value == NO_RTR | 0x185
-    assert slave.objects[0x1A00, 0].value == 1
-    assert slave.objects[0x1A00, 1].value == STATUS
+    assert (slave.objects[0x1A00, 0].value, slave.objects[0x1A00, 1].value) == (1, STATUS)
 
 
 def fixed(slave, *maps):
@@ -154,14 +124,14 @@ def fixed(slave, *maps):
 
 
 def test_a_fixed_map_that_carries_what_is_needed_is_taken():
-    wire, (layout,) = configured(fixed(drive(), (STATUS,), (STATUS, POSITION, TORQUE)))
+    wire, layout = configured(fixed(drive(), (STATUS,), (STATUS, POSITION, TORQUE)))
     assert signals(layout) == [[Signal.STATUSWORD, Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE]]
     assert layout.tpdos[0].cob_id == 0x285
     assert not [write for write in wire.written() if 0x1A00 <= write[1] <= 0x1BFF]
 
 
 def test_several_fixed_maps_are_put_together():
-    _, (layout,) = configured(fixed(drive(), (STATUS,), (STATUS, POSITION), (STATUS, VELOCITY), (TORQUE,)))
+    _, layout = configured(fixed(drive(), (STATUS,), (STATUS, POSITION), (STATUS, VELOCITY), (TORQUE,)))
     given = {signal for frame in signals(layout) for signal in frame}
     assert {Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE, Signal.STATUSWORD} <= given
     seen = Counter(signal for frame in signals(layout) for signal in frame)
@@ -178,19 +148,12 @@ def test_what_reads_back_decides_and_a_drive_that_forgets_is_found_out():
         configured(drive(forgets=True))
 
 
-def test_an_identifier_left_over_from_another_node_is_corrected():
-    slave = drive()
-    slave.objects[0x1800, 1].value = NO_RTR | INVALID | 0x181
-    _, (layout,) = configured(slave)
-    assert layout.tpdos[0].cob_id == 0x185
-
-
 def test_two_tpdos_with_one_identifier_are_distinguished():
     slave = fixed(drive(), (STATUS,), (), (STATUS, POSITION), (), ())
     slave.objects.update(tpdo(5, NO_RTR | INVALID | 0x385, 1, STATUS, TORQUE))
     for subindex in range(9):
         slave.objects[0x1A04, subindex].writable = False
-    _, (layout,) = configured(slave)
+    _, layout = configured(slave)
     assert sorted(frame.number for frame in layout.tpdos) == [3, 5]
     assert len({frame.cob_id for frame in layout.tpdos}) == 2
 
@@ -199,27 +162,27 @@ def test_a_missing_tpdo_among_the_first_ones_is_skipped():
     slave = drive()
     for key in [key for key in slave.objects if key[0] in (0x1801, 0x1A01)]:
         del slave.objects[key]
-    _, (layout,) = configured(slave, link="[link.encoder]\ncounts_per_rev = 4096")
+    _, layout = configured(slave, link="[link.encoder]\ncounts_per_rev = 4096")
     assert [frame.number for frame in layout.tpdos] == [1, 3]
 
 
 def test_beside_another_master_the_unused_tpdos_are_taken():
-    _, (layout,) = configured(drive(), bus='sync = "follow"')
+    _, layout = configured(drive(), bus='sync = "follow"')
     assert layout.tpdos[0].number == 2
     assert [frame.number for frame in layout.other_tpdos] == [1]
 
 
-def test_inhibit_time_and_event_timer_are_cleared():
+def test_inhibit_time_event_timer_and_an_identifier_left_over_from_another_node_are_corrected():
     slave = drive()
-    slave.objects[0x1800, 3].value = 10
-    slave.objects[0x1800, 5].value = 50
-    configured(slave)
-    assert slave.objects[0x1800, 3].value == 0
-    assert slave.objects[0x1800, 5].value == 0
+    for subindex, left_over in ((1, NO_RTR | INVALID | 0x181), (3, 10), (5, 50)):
+        slave.objects[0x1800, subindex].value = left_over
+    _, layout = configured(slave)
+    assert layout.tpdos[0].cob_id == 0x185
+    assert slave.objects[0x1800, 3].value == slave.objects[0x1800, 5].value == 0
 
 
 def test_a_transmission_type_that_is_refused_is_reported_and_kept():
-    _, (layout,) = configured(drive(refuse={(0x1800, 2): READ_ONLY}))
+    _, layout = configured(drive(refuse={(0x1800, 2): READ_ONLY}))
     assert layout.tpdos[0].transmission_type == 255
     assert any("keeps transmission type 255" in finding.text for finding in layout.notices)
 
@@ -243,21 +206,17 @@ def test_a_drive_that_makes_sync_itself_is_stopped_or_named():
     configured(slave)
     assert slave.objects[0x1005, 0].value == 0x80
     constant = drive()
+    constant.objects[0x1005, 0] = u32(0x80)  # EPOS4: right, and left alone
+    configured(constant)
     constant.objects[0x1005, 0] = u32(0x40000080)
     with pytest.raises(DriveError, match="makes SYNC itself"):
         configured(constant)
 
 
-def test_a_constant_sync_identifier_that_is_right_is_left_alone():
-    slave = drive()
-    slave.objects[0x1005, 0] = u32(0x80)  # EPOS4
-    configured(slave)
-
-
 def test_a_heartbeat_that_cannot_be_set_is_what_it_is():
     slave = drive(refuse={(0x1017, 0): READ_ONLY})
     slave.objects[0x1017, 0].value = 500
-    _, (layout,) = configured(slave)
+    _, layout = configured(slave)
     assert layout.heartbeat_ms == 500
     assert any("keeps its heartbeat of 500 ms" in finding.text for finding in layout.notices)
 

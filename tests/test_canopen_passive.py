@@ -1,5 +1,5 @@
 import pytest
-from canopenkit import NO_RTR, Slave, Wire, configure, drive_objects, joint_text, tpdo, u32
+from canopenkit import NO_RTR, Slave, Wire, configure, drive_objects, eds_text, joint_text, signals, tpdo, u32
 
 from drivelink.canopen.layout import Signal
 from drivelink.canopen.passive import PassiveConfigurator
@@ -14,10 +14,6 @@ MAP = """
 cob_id = 0x2A5
 objects = ["0x6041:00:16", "0x6064:00:32", "0x6077:00:16"]
 """
-
-
-def signals(layout):
-    return [[mapped.signal for mapped in frame.objects] for frame in layout.tpdos]
 
 
 def passive(text_drive, base=None):
@@ -52,42 +48,10 @@ def test_an_unknown_scale_is_one_line():
         passive("rated_torque_nm = 0.8" + MAP)
 
 
-EDS = """
-[DeviceInfo]
-VendorNumber=0x1F
-[1800sub1]
-DataType=7
-AccessType=rw
-DefaultValue=$NODEID+0x180
-[1800sub2]
-DataType=5
-AccessType=rw
-DefaultValue=1
-[1A00sub0]
-DataType=5
-AccessType=rw
-DefaultValue=2
-[1A00sub1]
-DataType=7
-AccessType=rw
-DefaultValue=0x60640020
-[1A00sub2]
-DataType=7
-AccessType=rw
-DefaultValue=0x60770010
-[608Fsub1]
-DataType=7
-AccessType=ro
-DefaultValue=16384
-[608Fsub2]
-DataType=7
-AccessType=ro
-DefaultValue=1
-[6076]
-DataType=7
-AccessType=ro
-DefaultValue=800
-"""
+EDS = eds_text(
+    "VendorNumber=0x1F", x1800sub1=(7, "$NODEID+0x180"), x1800sub2=(5, 1), x1A00sub0=(5, 2),
+    x1A00sub1=(7, "0x60640020"), x1A00sub2=(7, "0x60770010"), x608Fsub1=(7, 16384), x608Fsub2=(7, 1), x6076=(7, 800),
+)  # fmt: skip
 
 
 def test_a_data_sheet_gives_mapping_identifier_and_scale(tmp_path):

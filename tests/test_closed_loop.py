@@ -160,6 +160,7 @@ def drawn(name: str, low: float, high: float, rest: str = "") -> tuple[str, str]
     return name, f"{name}={value:.4g}{rest}"
 
 
+@pytest.mark.slow
 def test_a_healthy_joint_raises_no_alarm(floor: Live) -> None:
     assert floor.alarmed() == 0.0
 

@@ -74,7 +74,7 @@ def test_a_dead_controller_leaves_drives_without_torque():
         assert all(node.state == 0x05 for node in rig.network.nodes)  # and go on measuring for the daemon
 
 
-@pytest.mark.parametrize("reaction", ["stop", "retract", "soften"])
+@pytest.mark.parametrize("reaction", [pytest.param("stop", marks=pytest.mark.slow), "retract", "soften"])
 def test_it_reacts_to_a_push_and_goes_on_when_it_is_gone(reaction):
     with kit.running(reaction=reaction) as rig:
         push = {"kind": "none", "external": {"kind": "none", "offset_nm": 0.12}}
@@ -156,7 +156,7 @@ def test_one_bad_cycle_is_enough(what, reason):
     assert (controller.phase, events[-1][1]) == ("safe", reason)
 
 
-@pytest.mark.parametrize("status", [Status.CHANGED, Status.MODEL_ALARM])
+@pytest.mark.parametrize("status", [Status.CHANGED, pytest.param(Status.MODEL_ALARM, marks=pytest.mark.slow)])
 def test_a_joint_that_has_changed_is_identified_again(status):
     with kit.running() as rig:
         put = rig.put

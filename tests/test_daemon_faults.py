@@ -34,7 +34,7 @@ def test_every_cycle_has_an_estimate_in_order_and_nothing_is_missed() -> None:
 
 def test_an_emcy_is_a_drive_fault_in_words_and_said_once() -> None:
     with rig() as made:
-        settle(made)
+        made.run(50)
         made.faults.emergency(made.node(1), 0x2310, 0x02)
         estimates = made.run(200)
         assert all(e.status & Status.DRIVE_FAULT for e in estimates)

@@ -17,7 +17,7 @@ from zenohkit import LIMIT_S, until
 from drivelink import jointfile
 from drivelink.cycle.loop import ObjectSink
 from drivelink.daemon.service import Daemon, ServedJoint
-from drivelink.demo.closedloop import CASES, STEPS
+from drivelink.demo.closedloop import STEPS
 from drivelink.demo.closing import Comparison, as_json, closing_table
 from drivelink.demo.rig import RunSummary
 from drivelink.demo.simbus import open_sim_bus
@@ -143,7 +143,9 @@ def test_the_demo_finds_the_stiffness_it_does_not_know(case: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", list(CASES))
+@pytest.mark.parametrize(
+    "case", ["friction", "stiffness"]
+)  # a finding, a changed spring; all: benchmarks/loop.py
 def test_the_loop_closes_on_what_nobody_declared(case: str) -> None:
     # Three processes: joint and daemon, black box with its diagnoses, the one that watches and accepts.
     done = subprocess.run(

@@ -53,7 +53,7 @@ def records() -> dict[str, Record]:
     return dict(zip(effects, kit.World(list(effects.values())).run(), strict=True))
 
 
-SLOW_CASES = ("cogging", "offset", "constant", "inertia", "zero", "link")
+SLOW_CASES = ("cogging", "gauge", "offset", "constant", "inertia", "zero", "link")
 
 
 @pytest.mark.parametrize(

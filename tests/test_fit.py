@@ -122,13 +122,16 @@ def test_what_cannot_be_fitted_is_reported(elbow):
     plants, _, truth = elbow
     model = joints.joint_model(plants.B[0, 0], plants.D[0, 0])
     record = _record(truth, 0)
-    still, nothing = np.zeros((3000, 1)), np.zeros(3000)
+    zeros = np.zeros((3000, 1))
+    still = Record(
+        period_s=T,
+        sequence=np.arange(3000),
+        motor_position_rad=zeros,
+        motor_torque_nm=zeros,
+        link_position_rad=zeros[:, 0],
+    )
     for wrong, how, message in (
-        (
-            Record(T, np.arange(3000), still, None, still, nothing),
-            (model,),
-            "stands still",
-        ),
+        (still, (model,), "stands still"),
         (joints.part(record, slice(100)), (model,), "at least"),
         (
             joints.part(record, slice(1500)),

@@ -49,7 +49,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     worlds = kit.World([{}, {"late_s": LATE_S, "zero_rad": ZERO_RAD}]).run()
     for name, record in zip(("clean", "skewed"), worlds, strict=True):
         joints.write_csv(record, folder / f"{name}.csv")
-    pair = gatekit.draw("antagonistic", 1, seconds=12.0, effects=False)
+    pair = gatekit.draw("antagonistic", 1, seconds=8.0, effects=False)
     joints.write_csv(pair.record, folder / "pair.csv")
     texts = (
         MOTOR.format(inertia=m.inertia_kg_m2, damping=m.viscous_damping_nm_s_rad, model="polynomial")
@@ -70,13 +70,13 @@ def _fit(
     """Written file, fit.json, and the printed tables as [(name, text of the value)] each."""
     target = folder / "written.toml"
     asked = ["fit", str(folder / f"{run}.csv"), "--joint", str(folder / joint), "--out", str(folder)]
-    assert main(asked) == 0
-    alone, said = (folder / "fit.json").read_text(), capsys.readouterr().out
     assert main([*asked, "--write", str(target), "--force"]) == 0
-    assert (folder / "fit.json").read_text() == alone
-    printed = capsys.readouterr().out
-    assert _tables(printed) == _tables(said)
-    return tomllib.loads(target.read_text()), json.loads(alone), _tables(printed)
+    document, printed = json.loads((folder / "fit.json").read_text()), capsys.readouterr().out
+    if joint == "rigid.toml":  # to write the file changes nothing that is said
+        assert main(asked) == 0
+        assert json.loads((folder / "fit.json").read_text()) == document
+        assert _tables(capsys.readouterr().out) == _tables(printed)
+    return tomllib.loads(target.read_text()), document, _tables(printed)
 
 
 def _tables(text: str) -> list[list[tuple[str, str]]]:
@@ -119,9 +119,17 @@ def _same(printed: list[tuple[str, str]], written: dict[str, float]) -> None:
         assert abs(float(f"{mantissa}e{power or 0}") - written[name]) <= 0.51 * last * 10**tail, name
 
 
-@pytest.mark.parametrize("run", ["clean", pytest.param("skewed", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("link", ["", LINK], ids=["no link dynamics", "link dynamics"])
-@pytest.mark.parametrize("model", ["linear", "polynomial"])
+@pytest.mark.parametrize(
+    ("model", "link", "run"),
+    [
+        ("linear", LINK, "clean"),
+        ("polynomial", "", "clean"),
+        *(
+            pytest.param(m, k, "skewed", marks=pytest.mark.slow)
+            for m, k in (("linear", ""), ("polynomial", LINK))
+        ),
+    ],
+)
 def test_what_is_printed_is_what_is_written(
     model: str, link: str, run: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -21,9 +21,9 @@ def series(rng: np.random.Generator, change: FloatArray | float = 0.0) -> FloatA
 
 def test_a_fleet_without_changes_has_no_discovery_beyond_the_declared_rate() -> None:
     rng = np.random.default_rng(1)
-    p = np.array([series_test(TIME_S, series(rng), STATED).p_value for _ in range(1000)])
-    # Bonferroni's bound: at most 5 % below 0.05. Binomial, 1000 draws: 7.3 % is 3.3 sigma above.
-    assert np.mean(p < 0.05) < 0.073
+    p = np.array([series_test(TIME_S, series(rng), STATED).p_value for _ in range(400)])
+    # Bonferroni's bound: at most 5 % below 0.05. Binomial, 400 draws: 8.6 % is 3.3 sigma above.
+    assert np.mean(p < 0.05) < 0.086
     assert not np.any(q_values(p) <= 0.05)
 
 

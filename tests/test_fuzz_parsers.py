@@ -8,9 +8,7 @@ import pytest
 from fuzzparsers import CORPUS, PARSERS, damaged, seeds, take
 
 
-@pytest.mark.parametrize(
-    "times", [25, pytest.param(1000, marks=[pytest.mark.slow, pytest.mark.timeout(900)])]
-)
+@pytest.mark.parametrize("times", [25, pytest.param(400, marks=[pytest.mark.slow, pytest.mark.timeout(900)])])
 @pytest.mark.parametrize("parser", PARSERS)
 def test_damaged_inputs_are_read_or_refused_in_one_line(
     parser: str, times: int, tmp_path: Path, caplog: pytest.LogCaptureFixture

@@ -35,7 +35,7 @@ from estimator.sample import Sample
 from sim.world import record
 
 ELBOW = Path(__file__).parent.parent / "examples" / "elbow.toml"
-BEFORE_S, AFTER_S = 8, 14
+BEFORE_S, AFTER_S = 6, 9
 NAME = "demo-elbow-20260105T081500Z-model-alarm.mcap"
 STAMP_NS = 1_767_600_000_000_000_000
 

@@ -236,7 +236,14 @@ def writer(path: Path, before: str = "") -> subprocess.Popen[str]:
     )
 
 
-@pytest.mark.parametrize("suffix", [".mcap", ".csv", ".blf"])
+SUFFIXES = [
+    ".mcap",
+    pytest.param(".csv", marks=pytest.mark.slow),
+    pytest.param(".blf", marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_killed_recording_is_there_up_to_the_last_flush(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"r{suffix}"
     process = writer(path)
@@ -247,7 +254,7 @@ def test_a_killed_recording_is_there_up_to_the_last_flush(suffix: str, tmp_path:
     assert count(path) >= flushed
 
 
-@pytest.mark.parametrize("suffix", [".mcap", ".csv", ".blf"])
+@pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_full_disk_is_one_line_and_a_file_that_is_whole(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"r{suffix}"
     # No more than 40 kB in a file: the write fails as on a full disk (EFBIG instead of ENOSPC).

@@ -11,7 +11,7 @@ from sim.canopen.drive import Cia402Drive
 from sim.canopen.encoder import Cia406Encoder
 from sim.canopen.profiles import PROFILES, profile
 
-FRAMES = 3000
+FRAMES = 1000
 
 _INDICES = (
     *(0x1000, 0x1001, 0x1003, 0x1005, 0x1006, 0x1008, 0x1010, 0x1011, 0x1014, 0x1016, 0x1017, 0x1019),

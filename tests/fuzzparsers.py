@@ -53,34 +53,11 @@ counts_per_rev = 65536
 JOINT = parse(TEXT)
 RECORDINGS = (".mcap", ".csv", *(ending for ending, kind in CAN_FORMATS.items() if kind.writer))
 _FILLING = (
-    b"\xff" * 8,
-    b"\0" * 8,
-    b"9" * 8,
-    b"-inf,nan",
-    b"1e999",
-    b"[[",
-    b'{"',
-    b'"',
-    b"\n",
-    b"=",
-    b"0x",
-    b"-1",
-)
+    b"\xff" * 8, b"\0" * 8, b"9" * 8, b"-inf,nan", b"1e999", b"[[", b'{"', b'"', b"\n", b"=", b"0x", b"-1",
+)  # fmt: skip
 _REPEATED = (
-    b"-",
-    b"[",
-    b"{",
-    b"a.",
-    b'"',
-    b"9",
-    b" ",
-    b"\n",
-    b"a=1\n",
-    b"\xc3\xa9",
-    b"[a]\n",
-    b",",
-    b"\x1b[2J",
-)
+    b"-", b"[", b"{", b"a.", b'"', b"9", b" ", b"\n", b"a=1\n", b"\xc3\xa9", b"[a]\n", b",", b"\x1b[2J",
+)  # fmt: skip
 
 
 def frames(cycles: int) -> list[tuple[int, int, bytes]]:

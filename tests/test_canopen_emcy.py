@@ -37,8 +37,7 @@ def test_an_emcy_is_decoded_with_its_register_and_the_makers_bytes():
 
 def test_a_short_emcy_says_what_it_can_and_an_empty_one_nothing():
     assert parse_emergency(b"\x10\x23").code == 0x2310
-    assert parse_emergency(b"\x10") is None
-    assert parse_emergency(b"") is None
+    assert parse_emergency(b"\x10") is parse_emergency(b"") is None
 
 
 @pytest.mark.parametrize(

@@ -22,12 +22,56 @@ def scale(result, signal):
     return result.candidates[signal][0].scale
 
 
-def test_everything_is_read_from_a_drive_that_reports_it():
-    result = offered(PLAIN)
-    assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.tau / (16384 * 50))
-    # a count of 0x6077 is a thousandth of 0.8 N·m at the motor, times the gear at the joint
-    assert scale(result, Signal.MOTOR_TORQUE) == pytest.approx(0.0008 * 50)
-    assert result.notices == []
+GEAR = "gear_ratio = 50.0"
+CURRENT = {key: value for key, value in PLAIN.items() if key != (0x6076, 0)} | {(0x6075, 0): 4000}
+# Nanotec's default 0x60A8: tenths of a degree, behind the gear the drive knows
+USER = {(0x60A8, 0): 0xFF410000, (0x608F, 1): 2000, (0x608F, 2): 1, (0x6091, 1): 1, (0x6091, 2): 1}
+# values of a real EPOS4's DCF: 4.76 A, 107.746 mN·m/A, 0x6076 = 512871 µN·m, gear 26, 3200 counts
+EPOS4 = {
+    (0x3000, 5): 3200, (0x3001, 1): 4760, (0x3001, 5): 107746, (0x3003, 1): 26, (0x3003, 2): 1, (0x6076, 0): 512871,
+}  # fmt: skip
+KNOWN_CURRENT = "torque_constant_nm_a = 0.1"
+OWN_CURRENT = 'current_object = "0x2100:01"\ncurrent_unit_a = 0.1\ntorque_constant_nm_a = 0.2'
+MOTOR, TORQUE, SPEED = Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE, Signal.MOTOR_VELOCITY
+# What is reported, by whom, what the joint file says, and the scale (and object) of a signal's nth candidate.
+SCALES = [
+    (PLAIN, GENERIC, "", MOTOR, 0, math.tau / (16384 * 50), None),
+    (PLAIN, GENERIC, "", TORQUE, 0, 0.0008 * 50, None),  # a thousandth of 0.8 N·m at the motor, times the gear
+    (EPOS4, MAXON, "", MOTOR, 0, math.tau / (3200 * 26), None),
+    (EPOS4, MAXON, "", TORQUE, 0, 0.512871 / 1000 * 26, None),
+    (EPOS4, MAXON, "", TORQUE, 1, 0.001 * 0.107746 * 26, (0x30D1, 2)),
+    # nothing else reported: no such motor has 512 N·m; else the joint file says which of the two it is
+    ({**PLAIN, (0x6076, 0): 512871}, MAXON, GEAR, TORQUE, 0, 0.512871 / 1000 * 50, None),
+    ({**PLAIN, (0x6076, 0): 513}, MAXON, GEAR, TORQUE, 0, 0.513 / 1000 * 50, None),
+    ({**PLAIN, (0x6076, 0): 512}, MAXON, f"rated_torque_nm = 0.51\n{GEAR}", TORQUE, 0, 0.51 / 1000 * 50, None),
+    ({**PLAIN, (0x6076, 0): 510}, MAXON, f"rated_torque_nm = 0.00051\n{GEAR}", TORQUE, 0, 0.00051 / 1000 * 50, None),
+    # the constant and the current where 0x6076 is missing; Nanotec: 0x6077 is in the torque of the rated current
+    (CURRENT, GENERIC, f"{KNOWN_CURRENT}\ntorque_source = 'current'", TORQUE, 0, 0.004 * 0.1 * 50, (0x6078, 0)),
+    (CURRENT, GENERIC, KNOWN_CURRENT, TORQUE, 0, 4 * 0.1 / 1000 * 50, (0x6077, 0)),
+    (PLAIN, GENERIC, OWN_CURRENT, TORQUE, 0, 0.1 * 0.2 * 50, (0x2100, 1)),  # what is stated comes first
+    ({**PLAIN, (0x60A9, 0): 0x00B44700}, GENERIC, "velocity = true", SPEED, 0, math.tau / 60 / 50, None),
+    (PLAIN, ELMO, "velocity = true", SPEED, 0, math.tau / 16384 / 50, None),
+    (PLAIN, COPLEY, "velocity = true", SPEED, 0, math.tau / 163840 / 50, None),
+    (USER, GENERIC, "gear_ratio = 20.0", MOTOR, 0, math.radians(0.1) / 20, None),
+    (USER | {(0x6091, 1): 20}, GENERIC, "", MOTOR, 0, math.radians(0.1), None),
+    # an EPOS4 is not taken for its predecessor
+    ({(0x3000, 5): 4096, (0x2210, 1): 500}, MAXON, f"torque_constant_nm_a = 0.03\n{GEAR}", MOTOR, 0, math.tau / (4096 * 50), None),
+    ({(0x3000, 5): 4096, (0x2210, 1): 500}, MAXON, f"torque_constant_nm_a = 0.03\n{GEAR}", TORQUE, 0, None, (0x30D1, 2)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("reported", "vendor", "drive", "signal", "place", "expected", "address"), SCALES)
+def test_a_scale_follows_from_what_is_reported_and_stated(
+    reported, vendor, drive, signal, place, expected, address
+):
+    found = offered(reported, vendor, drive=drive).candidates[signal][place]
+    assert expected is None or found.scale == pytest.approx(expected, rel=2e-3)
+    assert address is None or found.address == address
+
+
+def test_a_velocity_of_unknown_unit_is_left_out_saying_why():
+    assert "velocity_rad_s_per_count" in offered(PLAIN, drive="velocity = true").missing[SPEED]
+    assert offered(PLAIN).notices == []
 
 
 def test_what_the_joint_file_states_is_used_and_a_disagreement_names_both_numbers():
@@ -64,59 +108,6 @@ def test_values_that_were_never_configured_count_as_missing():
     assert "rated_torque_nm" in result.missing[Signal.MOTOR_TORQUE]
 
 
-def test_epos4_reports_by_objects_of_its_own_and_in_micro_newton_metres():
-    # values of a real EPOS4's DCF: 4.76 A, 107.746 mN·m/A, 0x6076 = 512871 µN·m, gear 26, 3200 counts
-    reported = {
-        (0x3000, 5): 3200,
-        (0x3001, 1): 4760,
-        (0x3001, 5): 107746,
-        (0x3003, 1): 26,
-        (0x3003, 2): 1,
-        (0x6076, 0): 512871,
-    }
-    result = offered(reported, MAXON)
-    assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.tau / (3200 * 26))
-    assert scale(result, Signal.MOTOR_TORQUE) == pytest.approx(0.512871 / 1000 * 26)
-    current = result.candidates[Signal.MOTOR_TORQUE][1]
-    assert current.address == (0x30D1, 2)
-    assert current.scale == pytest.approx(0.001 * 0.107746 * 26)
-
-
-@pytest.mark.parametrize(
-    ("raw", "drive", "expected"),
-    [
-        (512871, "", 0.512871),  # nothing else reported: no such motor has 512 N·m
-        (513, "", 0.513),
-        (512, "rated_torque_nm = 0.51", 0.51),  # the joint file says which of the two it is
-        (510, "rated_torque_nm = 0.00051", 0.00051),
-    ],
-)
-def test_the_unit_of_maxons_rated_torque_follows_from_evidence(raw, drive, expected):
-    result = offered({**PLAIN, (0x6076, 0): raw}, MAXON, drive=f"{drive}\ngear_ratio = 50.0")
-    assert scale(result, Signal.MOTOR_TORQUE) == pytest.approx(expected / 1000 * 50, rel=2e-3)
-
-
-def test_current_with_the_constant_gives_the_torque_where_0x6076_is_missing():
-    reported = {key: value for key, value in PLAIN.items() if key != (0x6076, 0)} | {(0x6075, 0): 4000}
-    result = offered(reported, drive="torque_constant_nm_a = 0.1\ntorque_source = 'current'")
-    assert result.candidates[Signal.MOTOR_TORQUE][0].address == (0x6078, 0)
-    assert scale(result, Signal.MOTOR_TORQUE) == pytest.approx(0.004 * 0.1 * 50)
-    # Nanotec: 0x6077 without 0x6076; its unit is the torque of the rated current
-    result = offered(reported, drive="torque_constant_nm_a = 0.1")
-    assert result.candidates[Signal.MOTOR_TORQUE][0].address == (0x6077, 0)
-    assert scale(result, Signal.MOTOR_TORQUE) == pytest.approx(4 * 0.1 / 1000 * 50)
-
-
-def test_a_stated_current_object_comes_first_in_its_own_unit():
-    result = offered(
-        PLAIN,
-        drive='current_object = "0x2100:01"\ncurrent_unit_a = 0.1\ntorque_constant_nm_a = 0.2',
-    )
-    first = result.candidates[Signal.MOTOR_TORQUE][0]
-    assert first.address == (0x2100, 1)
-    assert first.scale == pytest.approx(0.1 * 0.2 * 50)
-
-
 @pytest.mark.parametrize(
     ("unit", "expected"),
     [
@@ -135,28 +126,6 @@ def test_a_stated_current_object_comes_first_in_its_own_unit():
 def test_velocity_units(unit, expected):
     reported = velocity_unit_rad_s(unit, 16384.0)
     assert reported == (None if expected is None else pytest.approx(expected, rel=1e-12))
-
-
-def test_velocity_is_scaled_to_the_joint_or_left_out_saying_why():
-    result = offered({**PLAIN, (0x60A9, 0): 0x00B44700}, drive="velocity = true")
-    assert scale(result, Signal.MOTOR_VELOCITY) == pytest.approx(math.tau / 60 / 50)
-    result = offered(PLAIN, drive="velocity = true")
-    assert "velocity_rad_s_per_count" in result.missing[Signal.MOTOR_VELOCITY]
-    assert scale(offered(PLAIN, ELMO, drive="velocity = true"), Signal.MOTOR_VELOCITY) == pytest.approx(
-        math.tau / 16384 / 50
-    )
-    assert scale(offered(PLAIN, COPLEY, drive="velocity = true"), Signal.MOTOR_VELOCITY) == pytest.approx(
-        math.tau / 163840 / 50
-    )
-
-
-def test_positions_in_user_units_are_understood():
-    # Nanotec's default 0x60A8: tenths of a degree, behind the gear the drive knows
-    reported = {(0x60A8, 0): 0xFF410000, (0x608F, 1): 2000, (0x608F, 2): 1, (0x6091, 1): 1, (0x6091, 2): 1}
-    result = offered(reported, drive="gear_ratio = 20.0")
-    assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.radians(0.1) / 20)
-    reported |= {(0x6091, 1): 20}
-    assert scale(offered(reported), Signal.MOTOR_POSITION) == pytest.approx(math.radians(0.1))
 
 
 def test_polarity_of_position_against_velocity_is_a_warning():
@@ -212,10 +181,3 @@ def test_epos2_reports_its_current_in_milliamperes_and_its_encoder_in_pulses():
     assert (current.address, current.bits, current.signed) == ((0x6078, 0), 16, True)
     assert current.scale == pytest.approx(1e-3 * 0.03 * 50)  # whatever the rated current is
     assert scale(result, Signal.MOTOR_VELOCITY) == pytest.approx(math.tau / 60 / 50)
-
-
-def test_epos4_is_not_taken_for_its_predecessor():
-    reported = {(0x3000, 5): 4096, (0x2210, 1): 500}
-    result = offered(reported, MAXON, drive="torque_constant_nm_a = 0.03\ngear_ratio = 50.0")
-    assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.tau / (4096 * 50))
-    assert result.candidates[Signal.MOTOR_TORQUE][0].address == (0x30D1, 2)

@@ -36,16 +36,10 @@ def has_af_can():
         ({"interface": "soketcan"}, r'python-can has no "soketcan", expected "socketcan"\?'),
         ({"interface": "zzzz"}, "expected .*slcan.*virtual"),
         ({"interface": "slcan", "channel": "/dev/nowhere"}, "slcan /dev/nowhere cannot be opened"),
-        (
-            {"interface": "socketcand", "channel": "can0", "options": {"host": 7}},
-            "expected bus.options = .*host",
-        ),
-        (
-            {"interface": "udp_multicast", "channel": "no address"},
-            "udp_multicast no address cannot be opened",
-        ),
+        ({"interface": "socketcand", "channel": "can0", "options": {"host": 7}}, "expected bus.options = .*host"),
+        ({"interface": "udp_multicast", "channel": "no address"}, "udp_multicast no address cannot be opened"),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_opened_is_one_line(keys, expected):
     with pytest.raises(BusError, match=expected) as error:
         opened(**keys)

@@ -66,8 +66,7 @@ def test_a_32_bit_current_moves_the_statusword_to_the_next_frame():
     slave = drive()
     slave.objects[0x30D1, 2] = u32(0, mappable=True)
     _, layout = configured(
-        slave,
-        drive='torque_source = "current"\ncurrent_object = "0x30D1:02"\ntorque_constant_nm_a = 0.1',
+        slave, drive='torque_source = "current"\ncurrent_object = "0x30D1:02"\ntorque_constant_nm_a = 0.1'
     )
     assert sorted(signals(layout), key=len) == [  # TPDO1 has the statusword already, and is taken as it is
         [Signal.STATUSWORD],

@@ -128,18 +128,13 @@ def segment(*, toggle=0, length=7, last=False):
     ("declared", "segments", "why", "abort"),
     [
         (4, [segment(length=5)], "more than 4 bytes", "12 00 07 06"),
-        (
-            10,
-            [segment(), segment(toggle=1, length=2, last=True)],
-            "9 bytes after declaring 10",
-            "13 00 07 06",
-        ),
+        (10, [segment(), segment(toggle=1, length=2, last=True)], "9 bytes after declaring 10", "13 00 07 06"),
         (9, [segment(length=0)], "a segment without data that is not the last", "10 00 07 06"),
         (None, [segment(toggle=k % 2) for k in range(37)], "more than 256 bytes", "12 00 07 06"),
         (100_000, [], "100000 bytes, expected 256 at most", "12 00 07 06"),
     ],
     ids=["longer than declared", "shorter", "empty", "undeclared and endless", "declared too long"],
-)
+)  # fmt: skip
 def test_an_upload_of_another_length_than_it_should_have_is_aborted(declared, segments, why, abort):
     sent = []
     running = session(read(5, 0x1008), sent)

@@ -105,17 +105,13 @@ def test_what_is_right_is_ticked_and_nothing_is_to_paste() -> None:
         ({"link_position": -1.0}, 1.0, ["link.encoder.direction = -1"]),
         ({"motor1_torque": -1.0}, 1.0, ["motor[1].drive.torque_direction = -1"]),
         ({"motor1_position": -1.0, "motor1_torque": -1.0}, 1.0, ["motor[1].drive.direction = -1"]),
-        (
-            {"motor1_position": -1.0},
-            1.0,
-            ["motor[1].drive.direction = -1", "motor[1].drive.torque_direction = 1"],
-        ),
+        ({"motor1_position": -1.0}, 1.0, ["motor[1].drive.direction = -1", "motor[1].drive.torque_direction = 1"]),
         ({"motor1_position": 2.0}, 1.0, ["motor[1].drive.counts_per_rev = 8011"]),  # 176 degrees for 90
         ({"motor1_position": 100.0, "motor1_torque": 0.01}, 1.0, ["motor[1].drive.gear_ratio = 97.78"]),
         ({"motor1_position": 0.02, "motor1_torque": 50.0}, 50.0, ["motor[1].drive.gear_ratio = 0.9778"]),
         ({"link_position": 4.0}, 1.0, ["link.encoder.counts_per_rev = 256300"]),
     ],
-)
+)  # fmt: skip
 def test_each_fault_ends_in_the_line_that_cures_it(
     wrong: dict[str, float], gear: float, lines: list[str]
 ) -> None:

@@ -105,11 +105,6 @@ def test_a_view_without_anything_yet_says_so() -> None:
     assert view.line() == "elbow: no estimate yet"
 
 
-def test_the_plain_line_has_no_control_characters() -> None:
-    line = filled().line()
-    assert line.startswith("elbow: stiffness ") and "observable" in line and "\x1b" not in line
-
-
 def test_what_is_not_finite_breaks_nothing() -> None:
     view = JointView("elbow")
     nan = math.nan

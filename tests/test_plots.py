@@ -17,7 +17,6 @@ from drivelink.output.plots import (
     plot_over_time,
     save,
     stiffness_against_deflection,
-    svg_text,
 )
 
 
@@ -103,13 +102,6 @@ def test_the_same_data_are_the_same_file(suffix: str, tmp_path: Path) -> None:
         over_time(axes, {"φ": PlotCurve(t, phi)}, "φ / rad")
         contents.append(save(figure, tmp_path / f"{name}{suffix}").read_bytes())
     assert contents[0] == contents[1]
-
-
-def test_svg_for_a_page_is_one_element() -> None:
-    figure, (axes,) = new_figure()
-    over_time(axes, {"a": PlotCurve(np.arange(3.0), np.arange(3.0))}, "y")
-    text = svg_text(figure)
-    assert text.startswith("<svg") and text.rstrip().endswith("</svg>")
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 100, 1000])

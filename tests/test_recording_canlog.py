@@ -69,10 +69,7 @@ def many_frames(n: int = 3000) -> list[LoggedFrame]:
     ids = (0x080, 0x181, 0x182, 0x18A)
     return [
         LoggedFrame(
-            1_700_000_000_000_000_000 + 250_000 * k,
-            ids[k % 4],
-            rng.randbytes(8) if k % 4 else b"",
-            "can0",
+            1_700_000_000_000_000_000 + 250_000 * k, ids[k % 4], rng.randbytes(8) if k % 4 else b"", "can0"
         )
         for k in range(n)
     ]

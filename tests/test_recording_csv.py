@@ -152,12 +152,9 @@ def test_irregular_stamps_that_the_motion_follows_are_resampled(
         (lambda t: np.column_stack((t[:, 0] * np.nan, t[:, 1:])), "at least 3 samples, got 0"),
         (lambda t: np.vstack((t, t)), "time_s runs backwards 1 time"),
         (lambda t: np.column_stack((t[:, 0] ** 2, t[:, 1:])), "expected uniform sampling"),
-        (
-            lambda t: np.column_stack((t[:, :2], t[:, 2] * np.nan, t[:, 3])),
-            "motor1_torque_nm holds no numeric value",
-        ),
+        (lambda t: np.column_stack((t[:, :2], t[:, 2] * np.nan, t[:, 3])), "motor1_torque_nm holds no numeric value"),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_mended_is_one_clear_line(tmp_path: Path, spoil: object, line: str) -> None:
     path = write(tmp_path / "r.csv", spoil(rows()))  # type: ignore[operator]
     with pytest.raises(RecordingError) as caught:
@@ -242,11 +239,7 @@ def test_a_rigid_joint_needs_no_link_position_and_a_flexible_one_does(tmp_path: 
 
 
 @settings(max_examples=60, deadline=None)
-@given(
-    st.floats(1e-4, 0.5),
-    st.floats(-1e6, 1e6),
-    st.lists(st.integers(1, 4), min_size=20, max_size=120),
-)
+@given(st.floats(1e-4, 0.5), st.floats(-1e6, 1e6), st.lists(st.integers(1, 4), min_size=20, max_size=120))
 def test_a_grid_with_gaps_is_found_whatever_period_and_origin(
     period_s: float, start_s: float, steps: list[int]
 ) -> None:

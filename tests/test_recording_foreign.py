@@ -242,18 +242,14 @@ def test_a_clock_that_is_set_makes_a_gap_and_loses_nothing(
     ("spoil", "mapped", "said"),
     [
         (lambda lines: lines, False, ("mapping", "tpdo")),
-        (
-            lambda lines: [line for line in lines if line.can_id != 0x080],
-            True,
-            ("SYNC frames (0x080)", "record"),
-        ),
+        (lambda lines: [line for line in lines if line.can_id != 0x080], True, ("SYNC frames (0x080)", "record")),
         (
             lambda lines: [line for line in lines if line.can_id not in (0x181, 0x281)],
             True,
             ("0x181 of node 1", "got none"),
         ),
     ],
-)
+)  # fmt: skip
 def test_what_is_missing_is_one_line_that_says_how_to_give_it(
     spoil: Callable[[list[Line]], list[Line]], mapped: bool, said: tuple[str, ...], tmp_path: Path
 ) -> None:

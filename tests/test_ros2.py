@@ -336,14 +336,6 @@ def test_a_velocity_that_is_not_measured_is_the_filtered_change_of_position(ros2
     assert message.velocity[0] == pytest.approx(2.0, rel=1e-6)
 
 
-def test_leaving_takes_the_node_off_the_graph(ros2):
-    publisher, client = ros2()
-    assert until(lambda: tokens(client))
-    publisher.close()
-    publisher.close()
-    until(lambda: not tokens(client))
-
-
 def test_the_joints_publisher_serves_ros_where_the_joint_file_asks_for_it():
     joint = make_joint("elbow", free_endpoint(), "[ros2]\n")
     session = open_session(joint.zenoh, Path())

@@ -137,10 +137,7 @@ def test_the_step_is_chosen_from_the_stiffness() -> None:
     [
         (lambda: Spring(model="cubic", parameters={}), "expected one of"),
         (lambda: Spring(model="linear", parameters={}), "expected k_nm_rad, got nothing"),
-        (
-            lambda: Spring(model="linear", parameters={"k_nm_rad": -1.0}),
-            "k_nm_rad: expected a finite number > 0",
-        ),
+        (lambda: Spring(model="linear", parameters={"k_nm_rad": -1.0}), "k_nm_rad: expected a finite number > 0"),
         (lambda: Spring(model="vsa-ii", parameters={"k_nm_rad": 0.5, "c": 0.9}), "c: expected a number > 1"),
         (lambda: Spring(model="polynomial", parameters={"coefficients_nm_rad": 3.0}), "expected a list"),
         (lambda: LinkPlant(inertia_kg_m2=0.0), "inertia_kg_m2: expected a finite number > 0"),
@@ -154,7 +151,7 @@ def test_the_step_is_chosen_from_the_stiffness() -> None:
             for step in (0.0003, 0.002, 0.0, -0.001, math.nan)
         ),
     ],
-)
+)  # fmt: skip
 def test_impossible_springs_joints_and_steps_are_one_clear_line(
     make: Callable[[], object], message: str
 ) -> None:

@@ -119,12 +119,9 @@ def test_a_recording_has_the_contracts_columns_and_the_truth() -> None:
         (lambda: world().alter(plant=sea(RIGID)), 'alter: expected arrangement "single", as before'),
         (lambda: world().command(0, math.nan), "torque_nm: expected a finite number, got nan"),
         (lambda: World(sea(motors=2), (PERFECT,)), "drives: expected 2, got 1"),
-        (
-            lambda: World(sea(RIGID), (PERFECT,), initial_rad=(0.1, 0.2)),
-            "expected q = theta at a rigid transmission",
-        ),
+        (lambda: World(sea(RIGID), (PERFECT,), initial_rad=(0.1, 0.2)), "expected q = theta at a rigid transmission"),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_is_refused_in_one_line(make: Callable[[], object], message: str) -> None:
     with pytest.raises(SimError, match=message) as caught:
         make()

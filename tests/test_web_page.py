@@ -84,19 +84,6 @@ def test_the_pointer_reads_the_curve_at_its_place() -> None:
     assert left is True  # hidden again
 
 
-def test_the_band_is_read_with_the_stiffness() -> None:
-    text = page(
-        """
-        take(sent[0]);
-        const { X, Y } = $("stiffnessplot").shown;
-        hover("stiffnessplot", X(-1.0), Y(100.0));
-        return $("tip").textContent;
-        """,
-        fed(),
-    )
-    assert text.startswith("time −1.0") and text.endswith("\n100.0 ± 2.0 N·m/rad")
-
-
 @pytest.mark.parametrize("how", ["press(' ');", "$('pause').onclick();"])
 def test_a_pause_holds_numbers_and_curves_and_what_came_is_there_afterwards(how: str) -> None:
     first, second = fed(4.0), fed(5.5)

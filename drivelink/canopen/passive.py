@@ -11,8 +11,8 @@ from pathlib import Path
 
 from drivelink.canopen.eds import load_eds
 from drivelink.canopen.layout import BusLoad, NodeLayout, Role, Signal, bus_load, roles_by_node
-from drivelink.canopen.pdo import OPTIONAL, Tpdo, decode, describe, tpdos_of
-from drivelink.canopen.sdo_sniffer import SdoSniffer, written_object
+from drivelink.canopen.pdo import OPTIONAL, Tpdo, decode, describe, objects_of, tpdos_of
+from drivelink.canopen.sdo_sniffer import SdoSniffer, is_mapping, written_object
 from drivelink.canopen.units import offer, unit_objects
 from drivelink.canopen.vendors import VENDORS, vendor_of
 from drivelink.errors import DriveError
@@ -208,7 +208,7 @@ class _PassiveNode:
             if number not in touched:
                 stated.append(tpdo)
                 continue
-            for address, value in _objects_of(tpdo, number).items():
+            for address, value in objects_of(tpdo, number).items():
                 values.setdefault(address, value)
         return _sent(stated + list(tpdos_of(values)))
 
@@ -244,26 +244,6 @@ class _PassiveNode:
         ) + (f"; it sends {heard}" if heard else "")
 
 
-def is_mapping(address: Address) -> bool:
-    """Return whether an object is a parameter of a TPDO (CiA 301, 7.5.2.37 and 38)."""
-    return 0x1800 <= address[0] <= 0x1BFF
-
-
-def _objects_of(tpdo: Tpdo, number: int) -> dict[Address, int]:
-    """A TPDO as its parameter objects."""
-    communication, mapping = 0x17FF + number, 0x19FF + number
-    entries = {
-        (mapping, place): index << 16 | subindex << 8 | bits
-        for place, (index, subindex, bits) in enumerate(tpdo.entries, start=1)
-    }
-    return {
-        (communication, 1): tpdo.cob,
-        (communication, 2): tpdo.transmission_type,
-        (mapping, 0): len(tpdo.entries),
-        **entries,
-    }
-
-
 def _sent(tpdos: Iterable[Tpdo]) -> tuple[Tpdo, ...]:
     """The enabled and known TPDOs, one per identifier."""
     found: dict[int, Tpdo] = {}
@@ -280,13 +260,10 @@ def _toml(tpdo: Tpdo) -> str:
 
 
 def _declared(section: TpdoSection) -> Tpdo:
-    entries = []
-    for text in section.objects:
-        index, subindex, bits = text.split(":")
-        entries.append((int(index, 16), int(subindex, 16), int(bits)))
-    return Tpdo(
-        number=0, cob=section.cob_id, transmission_type=section.transmission_type, entries=tuple(entries)
-    )
+    objects = (text.split(":") for text in section.objects)
+    entries = tuple((int(index, 16), int(subindex, 16), int(bits)) for index, subindex, bits in objects)
+    kind = section.transmission_type
+    return Tpdo(number=0, cob=section.cob_id, transmission_type=kind, entries=entries)
 
 
 class PassiveConfigurator:

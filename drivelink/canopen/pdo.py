@@ -154,10 +154,9 @@ def read_tpdos(node: int) -> Program[tuple[Tpdo, ...]]:
 
 
 def tpdos_of(values: Mapping[Address, int]) -> tuple[Tpdo, ...]:
-    """Return TPDOs from the values of 0x1800 to 0x1BFF; one with an incomplete mapping is not `known`.
+    """Return TPDOs from the unsigned values of 0x1800 to 0x1BFF in a data sheet or the traffic.
 
-    Args:
-        values: unsigned values by (index, subindex), from a data sheet or the traffic.
+    One with an incomplete mapping is not `known`.
     """
     found = []
     for communication in sorted({index for index, _ in values if 0x1800 <= index <= 0x19FF}):
@@ -177,6 +176,21 @@ def tpdos_of(values: Mapping[Address, int]) -> tuple[Tpdo, ...]:
             )
         )
     return tuple(found)
+
+
+def objects_of(tpdo: Tpdo, number: int) -> dict[Address, int]:
+    """Return the values of 0x1800 to 0x1BFF that make a TPDO of this number: the inverse of `tpdos_of`."""
+    communication, mapping = 0x17FF + number, 0x19FF + number
+    entries = {
+        (mapping, place): index << 16 | subindex << 8 | bits
+        for place, (index, subindex, bits) in enumerate(tpdo.entries, start=1)
+    }
+    return {
+        (communication, 1): tpdo.cob,
+        (communication, 2): tpdo.transmission_type,
+        (mapping, 0): len(tpdo.entries),
+        **entries,
+    }
 
 
 def _entries(values: Mapping[Address, int], mapping: int) -> tuple[Entry, ...] | None:

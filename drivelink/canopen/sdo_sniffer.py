@@ -173,6 +173,11 @@ class SdoSniffer:
             self._read(address, bytes(transfer.data))
 
 
+def is_mapping(address: Address) -> bool:
+    """Return whether an object is a parameter of a TPDO (CiA 301, 7.5.2.37 and 38)."""
+    return 0x1800 <= address[0] <= 0x1BFF
+
+
 def written_object(data: bytes) -> Address | None:
     """Return the object that a frame of the master begins to write."""
     begins = len(data) == 8 and (data[0] >> 5 == _DOWNLOAD or data[0] & 0xE1 == _BLOCK_DOWNLOAD << 5)

@@ -14,8 +14,8 @@ from typing import Any
 from drivelink.canopen.configure import Configurator
 from drivelink.canopen.emcy import parse_emergency
 from drivelink.canopen.layout import NodeLayout
-from drivelink.canopen.passive import PassiveConfigurator, is_mapping
-from drivelink.canopen.sdo_sniffer import written_object
+from drivelink.canopen.passive import PassiveConfigurator
+from drivelink.canopen.sdo_sniffer import is_mapping, written_object
 from drivelink.cycle.following import OwnFollower, PassiveFollower
 from drivelink.cycle.loop import CycleLoop, LoopJoint
 from drivelink.cycle.objectcheck import ObjectCheck, ReadBack

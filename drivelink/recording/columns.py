@@ -146,13 +146,11 @@ def record_from_columns(
     columns = _scaled(columns, joint)
     motors = _motors(columns, joint, where)
     _require(columns, "time_s", where)
-    nominal = joint.bus.period_s if joint else None
-    columns, grid = _on_grid(columns, where, nominal)
+    columns, grid = _on_grid(columns, where, joint.bus.period_s if joint else None)
     columns = {name: values[grid.keep] if values.size else values for name, values in columns.items()}
     channels = _channels(columns, motors, joint, where)
-    link = channels.link
-    needed = [*channels.positions, *channels.torques, link.get("link_position_rad", channels.positions[0])]
-    usable = _usable(needed, where)
+    link = channels.link.get("link_position_rad", channels.positions[0])
+    usable = _usable([*channels.positions, *channels.torques, link], where)
     rows = np.ones_like(usable) if keep_nan else usable
 
     def stacked(arrays: list[FloatArray]) -> FloatArray:
@@ -170,7 +168,7 @@ def record_from_columns(
             motor_torque_nm=stacked(channels.torques),
             motor_velocity_rad_s=stacked(channels.velocities) if channels.velocities else None,
             start_s=grid.start_s,
-            **{name: values[rows] for name, values in link.items()},
+            **{name: values[rows] for name, values in channels.link.items()},
         )
     except EstimatorError as error:
         raise RecordingError(f"{where}: {error}") from error

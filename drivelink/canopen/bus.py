@@ -169,9 +169,7 @@ def _socketcand_socket(bus: can.BusABC) -> socket.socket:
 
 
 def server_has_gone(bus: can.BusABC) -> bool:
-    """Return whether a socketcand server has closed the connection, which python-can's client
-    does not notice.
-    """
+    """Return whether a socketcand server has closed the connection; python-can does not notice."""
     try:
         return _socketcand_socket(bus).recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b""
     except BlockingIOError:

@@ -79,8 +79,6 @@ def parse_emergency(data: bytes) -> Emergency | None:
 
 
 def drive_state(statusword: int) -> str:
-    """Return the state in a statusword (CiA 402-2, table 30); bits that toggle or belong to
-    modes are ignored.
-    """
+    """Return the state in a statusword (CiA 402-2, table 30), whatever toggles or depends on modes."""
     masks = State402.SW_MASK.items()
     return next((name.lower() for name, (mask, value) in masks if statusword & mask == value), "unknown")

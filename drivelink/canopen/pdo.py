@@ -215,7 +215,6 @@ def decode(
     skipped.
 
     Args:
-        tpdos: as read back, taken from the traffic, or declared.
         candidates: for each signal the objects that can give it, best first.
     """
     mapped = {(index, subindex) for tpdo in tpdos for index, subindex, _ in tpdo.entries}

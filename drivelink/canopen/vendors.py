@@ -107,9 +107,7 @@ _DIMENSIONLESS, _INCREMENTS = 0x00, 0xB5
 
 
 def angle_unit_rad(unit: int) -> float | None:
-    """Return radians per count of a position in the unit of 0x60A8; None where that is no
-    angle (increments).
-    """
+    """Return radians per count of a position in the unit of 0x60A8; None: no angle (increments)."""
     angle = _ANGLES_RAD.get(unit >> 16 & 0xFF)
     return None if angle is None else float(angle * 10.0 ** _signed8(unit >> 24))
 

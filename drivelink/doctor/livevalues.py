@@ -218,9 +218,7 @@ def _prompt(series: Series) -> tuple[FloatArray, FloatArray]:
 
 
 def _known(grid: FloatArray, channels: Sequence[FloatArray], most_s: float) -> NDArray[np.int64]:
-    """Places of the grid where no channel's readings are further apart than that: those of the longest part
-    that no long stall interrupts.
-    """
+    """Places of the grid near readings of every channel, in the longest part without a long stall."""
     good = np.ones(len(grid), dtype=bool)
     for times in channels:
         for k in np.flatnonzero(np.diff(times) > most_s):

@@ -109,9 +109,7 @@ def _row(number: int, one: TransmissionFit) -> dict[str, Any]:
 def stiffness_at(
     model: str, parameters: dict[str, Any], covariance: list[float], deflection_rad: float
 ) -> tuple[float, float]:
-    """Return the stiffness of a transmission of the table at any deflection, and its standard
-    deviation; N·m/rad.
-    """
+    """Return stiffness and standard deviation of a transmission of the table at a deflection; N·m/rad."""
     values = {name: tuple(v) if isinstance(v, list) else v for name, v in parameters.items()}
     alpha = MODELS[model].alpha(values)
     return _stiffness(model, alpha, np.reshape(covariance, (alpha.size, alpha.size)), deflection_rad)

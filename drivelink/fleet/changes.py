@@ -266,9 +266,7 @@ def appearance(found: NDArray[np.bool_]) -> Appearance:
 
 
 def q_values(p: FloatArray) -> FloatArray:
-    """Return the smallest false discovery rate at which each test would be a discovery
-    (Benjamini and Hochberg 1995).
-    """
+    """Return each test's smallest false discovery rate as a discovery (Benjamini and Hochberg 1995)."""
     n = len(p)
     order = np.argsort(p)
     ranked = np.asarray(p)[order] * n / np.arange(1, n + 1)

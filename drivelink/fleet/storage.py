@@ -229,9 +229,7 @@ class Store:
             raise FleetError(f"{self.url}/{name}: cannot be read: {_line(error)}") from error
 
     def names(self, folder: str, suffix: str) -> list[str]:
-        """Return the names of the files in a folder with this ending, relative to the store,
-        without hidden ones.
-        """
+        """Return the names of a folder's files with this ending, relative to the store; no hidden ones."""
         self._fs.invalidate_cache()
         try:
             paths = self._fs.ls(f"{self._root}/{folder}", detail=False)

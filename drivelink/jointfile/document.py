@@ -28,9 +28,7 @@ _DIGITS = 9  # of a covariance
 
 
 def changes_to(model: JointModel) -> dict[str, Any]:
-    """Return the changes of `write_model` that put a model's numbers and their uncertainty
-    into a joint file.
-    """
+    """Return the changes of `write_model` that put a model's numbers and deviations into a joint file."""
     changes: dict[str, Any] = {"motor": [_motor(motor) for motor in model.motors]}
     link = link_entry(model)
     return changes | ({"link": link} if link else {})

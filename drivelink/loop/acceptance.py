@@ -33,9 +33,7 @@ class Proposal(NamedTuple):
     proposed: JointText  # the joint file with the finding
 
     def difference(self) -> str:
-        """Return the lines of the joint file that change, as a unified diff; baseline and
-        origin follow them.
-        """
+        """Return what changes in the joint file as a unified diff; baseline and origin follow."""
         before, after = (_model_lines(text.text) for text in (self.source, self.proposed))
         name = Path(self.source.name).name
         return "\n".join(difflib.unified_diff(before, after, name, f"{name}, proposed", lineterm="", n=1))

@@ -228,9 +228,7 @@ def status_lines(
     model: Mapping[str, Any] | None = None,
     finding: Mapping[str, Any] | None = None,
 ) -> list[Text]:
-    """Return seven lines at most: cycle, nodes, residual, why not valid, what to do, what is
-    wrong, the finding.
-    """
+    """Return seven lines at most: cycle, nodes, residual, why not valid, advice, problems, the finding."""
     if not status:
         return []
     shown = shape(status, model)

@@ -75,9 +75,7 @@ class Document(NamedTuple):
 def parameter_rows(
     name: str, value: ParameterValue, std: ParameterValue | None, units: Units
 ) -> list[tuple[str, ...]]:
-    """Return the rows of a parameter below `PARAMETER_HEAD`: one, or one for each coefficient
-    of a polynomial.
-    """
+    """Return the rows of a parameter below `PARAMETER_HEAD`: one for each coefficient."""
     return [
         (f"{name}[{k}]" if isinstance(value, tuple) else name, *cells)
         for k, cells in enumerate(units.parts(name, value, std), start=1)

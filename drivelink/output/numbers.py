@@ -9,9 +9,7 @@ from estimator.sample import SIGMA_95
 
 
 def number(value: float, digits: int = 4) -> str:
-    """Return a number in few characters, with so many significant digits; very large and
-    small ones like 4.1e6.
-    """
+    """Return a number with so many significant digits; very large and small ones like 4.1e6."""
     if not math.isfinite(value):
         return "–"
     if value != 0.0 and not 1e-3 <= abs(value) < 1e5:
@@ -100,9 +98,7 @@ class Units:
         return self.shown(next((unit for end, unit in _UNITS if f"_{name}".endswith(end)), ""))
 
     def value(self, name: str, value: ParameterValue, std: ParameterValue | None) -> str:
-        """Return a parameter with its 95 % interval and unit; of a polynomial each
-        coefficient has its own.
-        """
+        """Return a parameter, or each coefficient of a polynomial, with 95 % interval and unit."""
         return ", ".join(
             f"{text}{f' ± {half}' if half else ''} {unit}".rstrip()
             for text, half, unit in self.parts(name, value, std)
@@ -111,9 +107,7 @@ class Units:
     def parts(
         self, name: str, value: ParameterValue, std: ParameterValue | None
     ) -> list[tuple[str, str, str]]:
-        """Return (value, half its 95 % interval, unit) of a parameter, or of each of a
-        polynomial's coefficients.
-        """
+        """Return (value, half its 95 % interval, unit) of a parameter, or of each coefficient."""
         unit, length = self.of(name), self.shown("rad")
         values = value if isinstance(value, tuple) else (value,)
         deviations = std if isinstance(std, tuple) else (std,) * len(values)

@@ -110,9 +110,7 @@ class Template:
 
 
 def joint_state(name: str) -> Any:
-    """Return the packer of sensor_msgs/JointState of one joint: (s, ns, position, velocity,
-    effort) to bytes.
-    """
+    """Return the packer of a sensor_msgs/JointState: (s, ns, position, velocity, effort) to bytes."""
     template = Template().header("").number("I", 1).text(name)
     return template.doubles(1).doubles(1).doubles(1).packer()
 
@@ -132,9 +130,7 @@ def stiffness_array(transmissions: int) -> Any:
 
 
 def dynamic_joint_state(name: str, transmissions: int, linked: bool = False) -> Any:
-    """Return the packer of control_msgs/DynamicJointState of one joint: (s, ns, *values of
-    `interfaces`) to bytes.
-    """
+    """Return the packer of a control_msgs/DynamicJointState: (s, ns, *values of `interfaces`) to bytes."""
     template = Template().header("").number("I", 1).text(name).number("I", 1)
     names = interfaces(transmissions, linked)
     template.number("I", len(names))
@@ -156,9 +152,7 @@ def interfaces(transmissions: int, linked: bool = False) -> tuple[str, ...]:
 
 
 def wrench(frame_id: str) -> Any:
-    """Return the packer of geometry_msgs/WrenchStamped, z being the joint's axis: (s, ns,
-    torque) to bytes.
-    """
+    """Return the packer of a geometry_msgs/WrenchStamped, z the joint's axis: (s, ns, torque) to bytes."""
     template = Template().header(frame_id)
     for _ in range(6):
         template.number("d")

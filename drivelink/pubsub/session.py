@@ -191,9 +191,7 @@ def daemon_config(endpoint: str, listen: bool) -> zenoh.Config:
 
 
 def client_config(endpoint: str) -> zenoh.Config:
-    """Return a peer without listener that connects to `endpoint`, and through it to every
-    daemon of the machine.
-    """
+    """Return a peer that only connects to `endpoint`, and through it to the machine's daemons."""
     return _config({"listen/endpoints": [], "connect/endpoints": [endpoint], **_CONNECT})
 
 

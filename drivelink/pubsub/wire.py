@@ -46,9 +46,7 @@ class Layout:
     element: tuple[Field, ...] = ()  # the fields of one element
 
     def struct(self, count: int = 0) -> Struct:
-        """Return the whole message with `count` elements, the one-byte length between head
-        and elements included.
-        """
+        """Return the whole message with `count` elements and the byte that counts them."""
         length = "B" if self.elements else ""
         return Struct("<" + _codes(self.head) + length + _codes(self.element) * count)
 

@@ -114,9 +114,7 @@ def joint_of(path: Path, named: Path | None) -> JointText:
 
 
 def contained(joint: JointFile) -> JointFile:
-    """Return a recording's joint file without the keys that name something outside: data
-    sheets, endpoints.
-    """
+    """Return a recording's joint file without what names something outside: data sheets, endpoints."""
     motors = [
         motor.model_copy(update={"drive": motor.drive and motor.drive.model_copy(update={"eds": None})})
         for motor in joint.motor

@@ -196,9 +196,7 @@ class Summary:
         )
 
     def reasons(self) -> list[str]:
-        """Return each reason why cycles are not valid, most frequent first: share of the
-        cycles, last sentence.
-        """
+        """Return why cycles are not valid, most frequent first: share of the cycles, last sentence."""
         return [f"{100 * count / self.count:.1f} % of the cycles: {text}" for count, text in self._sorted()]
 
     def _sorted(self) -> list[tuple[int, str]]:

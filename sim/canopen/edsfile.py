@@ -29,9 +29,7 @@ def load_eds(name: str) -> tuple[Object, ...]:
 
 
 def with_values(objects: Iterable[Object], values: Mapping[tuple[int, int], int | str]) -> list[Object]:
-    """Return copies with other power-on values, by (index, subindex); those of missing
-    objects are ignored.
-    """
+    """Return copies with other power-on values, by (index, subindex); missing objects are ignored."""
 
     def changed(variable: ODVariable) -> ODVariable:
         made = copy(variable)

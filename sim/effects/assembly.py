@@ -163,9 +163,7 @@ SLIP: dict[str, Described] = {
 
 
 def at_speed(level: Dry, smoothing: float) -> Dry:
-    """Return the level of dry friction, smoothed to zero at standstill over `smoothing`
-    (rad/s); 0: unchanged.
-    """
+    """Return the level of dry friction, smoothed to zero within `smoothing` (rad/s); 0: unchanged."""
     if smoothing <= 0.0:
         return level
 

@@ -103,9 +103,7 @@ def _integrated(exponent: float, shape: float) -> Element:
 
 
 class Creep:
-    """A Maxwell element (spring and damper in series) parallel to the transmission: its torque relaxes in
-    time_s.
-    """
+    """A Maxwell element (spring and damper in series) beside the spring: its torque relaxes in time_s."""
 
     def __init__(self, stiffness_nm_rad: float, time_s: float, step_s: float) -> None:
         self._k, self._decay = stiffness_nm_rad, math.exp(-step_s / time_s)

@@ -11,6 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy
+import pytest
 import zenoh
 from zenohkit import free_endpoint, ready, script
 
@@ -50,6 +51,23 @@ def test_every_data_file_of_the_packages_is_in_the_wheel() -> None:
         if path.is_file() and path.suffix not in sources and "core" not in path.relative_to(ROOT).parts
     }
     assert data <= packed
+
+
+def test_every_example_is_in_the_wheel() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    shipped = {
+        path
+        for target, patterns in project["tool"]["setuptools"]["data-files"].items()
+        for pattern in patterns
+        for path in ROOT.glob(pattern)
+        if target == f"share/drivelink/{path.relative_to(ROOT).parent}"
+    }
+    tracked = subprocess.run(
+        ["git", "ls-files", "examples"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    if tracked.returncode:
+        pytest.skip("not a git checkout")
+    assert {ROOT / name for name in tracked.stdout.split()} == {path for path in shipped if path.is_file()}
 
 
 _SUBSCRIBER = """

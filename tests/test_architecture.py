@@ -3,6 +3,7 @@
 import ast
 import re
 import sys
+from functools import cache
 from pathlib import Path
 
 import literals
@@ -28,10 +29,16 @@ CLOCKS_AND_IO = {
 }
 
 
+@cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
 def imports(path: Path) -> set[str]:
     """Top-level names of the packages that a module imports, wherever in the file."""
     found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
             found |= {alias.name.split(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -57,7 +64,7 @@ def test_the_estimator_reads_no_clock_and_touches_no_file_or_socket() -> None:
         assert not imports(path) & CLOCKS_AND_IO, f"{path.relative_to(ROOT)}"
         calls = {
             node.func.id
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+            for node in ast.walk(tree_of(path))
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
         }
         assert not calls & {"open", "print", "input"}, f"{path.relative_to(ROOT)}"
@@ -93,7 +100,7 @@ def test_the_service_reaches_the_simulated_world_in_one_place_only() -> None:
 
 def _modules_imported(path: Path) -> set[str]:
     """Full names of the modules that a module imports at run time, wherever in the file."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = tree_of(path)
     typing_only = {
         id(inner)
         for node in ast.walk(tree)

@@ -77,7 +77,7 @@ def test_a_lie_is_found_named_and_nothing_valid_said_until_it_is_over(calibrated
     before = calibrated.run(200)
     assert not any(e.status & Status.CONTRADICTED for e in before)
     lie(calibrated, spoil)
-    found = calibrated.run(1500)
+    found = calibrated.run(800)
     first = next((k for k, e in enumerate(found) if e.status & Status.CONTRADICTED), None)
     assert first is not None
     assert first <= 500, f"found after {first} cycles"

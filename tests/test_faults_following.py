@@ -92,7 +92,7 @@ def test_a_second_masters_sync_spoils_its_cycle_only() -> None:
     assert not follower.found[-1][1] & Status.BUS_FAULT
 
 
-@pytest.mark.parametrize("most", [0.1, 0.25, 0.4, 0.5])
+@pytest.mark.parametrize("most", [0.25, 0.5])
 def test_one_master_that_jitters_by_up_to_half_a_period_is_one_master(
     most: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -65,8 +65,8 @@ def test_in_health_units_and_values_are_confirmed_and_nothing_is_said() -> None:
         assert {(1, 0x6064, 0), (2, 0x6077, 0), (1, 0x6076, 0), (3, 0x6004, 0), (3, 0x6501, 0)} <= asked
         assert made.events == []
         before = len(sent)
-        made.run(6000)
-        assert len(sent) - before <= 4  # then one in two seconds
+        made.run(3000)
+        assert len(sent) - before <= 2  # then one in two seconds
 
 
 def test_while_somebody_else_talks_to_a_node_nothing_is_asked() -> None:
@@ -74,7 +74,7 @@ def test_while_somebody_else_talks_to_a_node_nothing_is_asked() -> None:
         made.run(CONFIRMED)
         sent, other = uploads(made), Listener(made.joint)
         other.send(0x602, bytes.fromhex("4000100000000000"))
-        made.run(5000)
+        made.run(2500)
         other.close()
         assert len(sent) <= 1  # what was under way
 

@@ -197,36 +197,6 @@ def test_a_master_enables_the_drive_and_commands_torque() -> None:
         assert rig.commands[-1] == pytest.approx(0.025)
 
 
-@pytest.mark.parametrize("interface", BUSES)
-def test_nmt_to_all_nodes_boots_every_one(interface: str) -> None:
-    rig = StubRig()
-    nodes = [drive(rig, node_id=1), drive(rig, node_id=2), Cia406Encoder(9, rig)]
-    with mastered(*nodes, rig=rig, interface=interface) as master:
-        peers = [remote(master, 1, "cia402-drive.eds"), remote(master, 2, "cia402-drive.eds")]
-        peers.append(remote(master, 9, "cia406-encoder.eds"))
-        for peer in peers:
-            peer.sdo[0x1017].raw = 20
-            peer.nmt.wait_for_heartbeat(PATIENCE_S)
-        master.nmt.state = "OPERATIONAL"
-        for peer in peers:
-            while peer.nmt.wait_for_heartbeat(PATIENCE_S) != "OPERATIONAL":
-                pass
-        seen: set[int] = set()
-        booted = threading.Event()
-
-        def boot(can_id: int, data: bytearray, _stamp: float) -> None:
-            if data == b"\0":
-                seen.add(can_id)
-            if len(seen) == 3:
-                booted.set()
-
-        for peer in peers:
-            master.subscribe(0x700 + peer.id, boot)
-        master.nmt.send_command(0x82)
-        assert booted.wait(PATIENCE_S)
-        assert {peer.sdo[0x1017].raw for peer in peers} == {0}
-
-
 def test_an_emergency_reaches_the_master_and_its_history() -> None:
     rig = StubRig()
     device = drive(rig)

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from estimator import _core
+from estimator.effects import elements
 from estimator.model import JointModel, Motor, require_finite
 from estimator.reasons import reason_text
 from estimator.sample import Consistency, Estimate, External, Sample
@@ -66,6 +67,9 @@ class Estimator(Protocol):
         as in `report.json`.
         """
 
+    def friction(self) -> list[dict[str, float] | None]:
+        """Return dry friction of each motor, declared and found: {"torque_nm", "std_nm"}; None: not known."""
+
     def why(self) -> tuple[str, str] | None:
         """Return why the last estimate is not valid: key of `estimator.reasons.REASONS`,
         sentence; None: it is.
@@ -123,6 +127,22 @@ class _Compiled:
         """See `Estimator`."""
         return [self.core.undeclared(i) for i in range(len(self._model.motors))]
 
+    def friction(self) -> list[dict[str, float] | None]:
+        """See `Estimator`."""
+        return [self._friction(i, motor) for i, motor in enumerate(self._model.motors)]
+
+    def _friction(self, i: int, motor: Motor) -> dict[str, float] | None:
+        found = self.core.friction(i)
+        if found is None or not all(map(math.isfinite, found)):
+            return None
+        declared = sum(
+            values["torque_nm"]
+            for effect in motor.effects
+            if effect.name in _DRY
+            for values in elements(effect)[1]
+        )
+        return {"torque_nm": declared + found[0], "std_nm": found[1]}
+
     def why(self) -> tuple[str, str] | None:
         """See `Estimator`."""
         why = self.core.why()
@@ -166,6 +186,7 @@ class _Compiled:
         }
 
 
+_DRY = ("coulomb_friction", "stribeck_friction", "presliding_friction")
 _SIGNALS = {
     "motor_position": "motor position",
     "motor_torque": "motor torque",

@@ -135,7 +135,7 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(
     monkeypatch.setattr("drivelink.recording.sinks.os.pwrite", full)
     assert not scene.finish()
     assert [record.getMessage().count("No space left on device") for record in caplog.records] == [1]
-    assert not list((tmp_path / "kept").iterdir())
+    assert [path.name for path in (tmp_path / "kept").iterdir()] == ["elbow.day.csv"]
 
 
 def test_the_oldest_is_dropped_beyond_the_budget_and_nothing_else(tmp_path: Path) -> None:
@@ -165,12 +165,12 @@ def test_keep_asks_the_box_of_a_running_daemon(tmp_path: Path, capsys: pytest.Ca
         try:
             zenohkit.until((tmp_path / "kept").is_dir)
             zenohkit.until(lambda: cli.main(["keep", str(path)]) == 0)
-            assert not list((tmp_path / "kept").iterdir())  # 15 s more are to come
+            assert not kept(tmp_path / "kept", "elbow")  # 15 s more are to come
             box.communicate(timeout=60)  # the daemon ends: it writes what it has
         finally:
             box.kill()
     assert box.returncode == 0
-    (made,) = (tmp_path / "kept").iterdir()
+    (made,) = kept(tmp_path / "kept", "elbow")
     assert list(recorded_cycles(made, 1))
 
 

@@ -33,7 +33,8 @@ from drivelink.monitor.statuslines import shape, status_lines, status_text
 from drivelink.monitor.terminal import joints_table
 from drivelink.monitor.view import JointView, flags
 from drivelink.monitor.watcher import Watcher
-from drivelink.monitor.web import MAX_CONNECTIONS, MAX_STREAMS, WebView, snapshot
+from drivelink.monitor.web import MAX_STREAMS, WebView, snapshot
+from drivelink.monitor.webserver import MAX_CONNECTIONS
 from drivelink.output.numbers import number, with_interval
 from drivelink.pubsub.session import close_session, open_client
 from drivelink.pubsub.wire import ExternalMessage

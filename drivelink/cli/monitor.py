@@ -15,11 +15,13 @@ from rich.text import Text
 
 from drivelink import jointfile
 from drivelink.errors import UsageError
+from drivelink.loop.finding import folder_of
 from drivelink.monitor.statuslines import shape
 from drivelink.monitor.terminal import Keys, joints_table
 from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.web import WebView, document
 from drivelink.monitor.webaccept import WebAcceptance
+from drivelink.monitor.webday import WebDay
 from drivelink.pubsub.clientbase import PATIENCE_S
 from drivelink.pubsub.session import ENDPOINT, close_session, open_client
 
@@ -94,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
         end = time.monotonic() + args.seconds if args.seconds else float("inf")
         try:
             if args.web:
-                _serve(watcher, args.port, end, acceptance)
+                _serve(watcher, args, end, acceptance)
             elif sys.stdout.isatty() and not args.json:
                 _show(watcher, end, f"{prefix}/{name or '*'} at {config or endpoint}")
             else:
@@ -206,9 +208,14 @@ def _print(watcher: Watcher, end: float, every_s: float, *, as_json: bool) -> No
         time.sleep(_POLL_S)
 
 
-def _serve(watcher: Watcher, port: int, end: float, acceptance: WebAcceptance | None) -> None:
+def _serve(watcher: Watcher, args: argparse.Namespace, end: float, acceptance: WebAcceptance | None) -> None:
     """Serve the page until the end or Ctrl-C."""
-    web = WebView(watcher, port, acceptance)
+    day = None
+    if args.joint is not None and _is_file(args.joint):
+        source = jointfile.load_text(Path(args.joint))
+        if source.joint.recording.folder is not None:
+            day = WebDay(folder_of(source), source.joint.name)
+    web = WebView(watcher, args.port, acceptance, day)
     print(f"live view: {web.url}   (Ctrl-C ends)", flush=True)
     try:
         while time.monotonic() < end:

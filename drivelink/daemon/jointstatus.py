@@ -103,6 +103,7 @@ class JointStatus:
             "not_valid": self._not_valid(),
             "transmissions": loop_joint.pipeline.estimator.parameters(),
             "undeclared": loop_joint.pipeline.estimator.undeclared(),
+            "friction": loop_joint.pipeline.estimator.friction(),
             "residual_nm": loop_joint.pipeline.estimator.residual_nm,
             "residual_alarm": self._alarm(),
             "external": self._external(),

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 from drivelink.errors import JointFileError, RecordingError
 from drivelink.jointfile import JointText, load_text
+from drivelink.loop.day import Day
 from drivelink.loop.finding import DOUBTS, UNFINISHED, drop_oldest, kept, recording_name, wish_of
 from drivelink.pubsub.wire import EstimateMessage, ExternalMessage
 from drivelink.recording.sinks import McapSink, Sink
@@ -66,6 +67,7 @@ class BlackBox(Sink):
         self._section = text.joint.recording
         self._wish = wish_of(text)
         self._folder = self._wish.parent
+        self._day = Day(self._folder, text.joint.name)
         self._reach_s = self._section.keep_s + AFTER_S + _STATE_S
         self._ring: deque[tuple[float, str, tuple[Any, ...]]] = deque(
             maxlen=int(self._reach_s * _ITEMS_PER_S)
@@ -92,6 +94,7 @@ class BlackBox(Sink):
     def estimate(self, message: EstimateMessage) -> None:
         """Take one estimate; its alarms are events."""
         self._take("estimate", message)
+        self._day.estimate(message)
         flags = message.status & _MASK
         begun, self._flags = flags & ~self._flags, flags
         if begun:
@@ -114,6 +117,7 @@ class BlackBox(Sink):
             self._reread()
             return
         status = json.loads(payload)
+        self._day.status(status)
         holding = {
             cause
             for cause, holds in (
@@ -156,7 +160,8 @@ class BlackBox(Sink):
         self._event = _Event([cause], now_s, datetime.now(UTC))
 
     def flush(self) -> None:
-        """Begin to write what is complete, take a wish; called once a second."""
+        """Begin to write what is complete, take a wish, add a row to the day; called once a second."""
+        self._day.row()
         if self._wish.exists():
             self._wish.unlink(missing_ok=True)
             self.keep("asked", asked=True)

@@ -17,10 +17,11 @@ import numpy as np
 
 from drivelink import recording as recordings
 from drivelink.errors import DrivelinkError
+from drivelink.files import write_whole
 from drivelink.jointfile import JointFile, apply_diagnosis
 from drivelink.jointfile.apply_diagnosis import make_model_monitor
 from drivelink.loop import finding
-from drivelink.loop.finding import proposal_file
+from drivelink.loop.finding import page_file, proposal_file
 from drivelink.output import report
 from drivelink.output.numbers import Units
 from drivelink.recording.mapping import joint_of
@@ -124,6 +125,8 @@ def make(recording: Path) -> dict[str, Any]:
         state = finding.PROPOSED
     else:
         state = finding.NOTHING
+    title = report.Title(source.joint.name, recording.name, None, source.joint.axis == "linear")
+    write_whole(page_file(recording), report.html_page(outcome, title), force=True)
     said = summary(outcome, error, source.joint)
     return {
         **finding.begun(recording, state, said.sentence),

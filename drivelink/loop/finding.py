@@ -65,6 +65,11 @@ def finding_file(recording: Path) -> Path:
     return recording.with_suffix(".finding.json")
 
 
+def page_file(recording: Path) -> Path:
+    """Return where the page of a recording's diagnosis lies."""
+    return recording.with_suffix(".html")
+
+
 def proposal_file(recording: Path) -> Path:
     """Return where the joint file lies that the finding proposes."""
     return recording.with_suffix(".toml")
@@ -101,7 +106,7 @@ def drop_oldest(folder: Path, joint: str, keep_mib: float) -> None:
     for index, path in enumerate(recordings[:-1]):
         if sum(sizes[index:]) <= keep_mib * 2**20:
             break
-        for part in (path, finding_file(path), proposal_file(path)):
+        for part in (path, finding_file(path), proposal_file(path), page_file(path)):
             part.unlink(missing_ok=True)
 
 

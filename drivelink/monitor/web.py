@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import shutil
 import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 from drivelink.errors import UsageError, ZenohError
@@ -25,11 +28,12 @@ from drivelink.monitor.statuslines import Shown, shape
 from drivelink.monitor.view import JointView
 from drivelink.monitor.watcher import Watcher
 from drivelink.monitor.webaccept import ACTIONS, WebAcceptance
+from drivelink.monitor.webday import WebDay
+from drivelink.monitor.webserver import Server
 from drivelink.output.numbers import number
 from drivelink.pubsub.feed import decode_document
 from estimator.sample import Sample
 
-MAX_CONNECTIONS = 16
 MAX_STREAMS = 8
 _MOST_BODY = 4096  # bytes of a request of the page
 _DETAILS = 16  # lines of a finding
@@ -50,13 +54,20 @@ class WebView:
         watcher: source of the views; polled here.
         port: on loopback; 0: any free one.
         acceptance: what the page may change; None: nothing.
+        day: the last 24 hours of a joint whose black box is on this machine; None: not shown.
 
     Raises:
         UsageError: the port is taken.
     """
 
-    def __init__(self, watcher: Watcher, port: int = 0, acceptance: WebAcceptance | None = None) -> None:
-        self.acceptance = acceptance
+    def __init__(
+        self,
+        watcher: Watcher,
+        port: int = 0,
+        acceptance: WebAcceptance | None = None,
+        day: WebDay | None = None,
+    ) -> None:
+        self.acceptance, self.day = acceptance, day
         self._watcher = watcher
         self._lock = threading.Lock()
         self._closing = threading.Event()
@@ -68,7 +79,7 @@ class WebView:
             web = view
 
         try:
-            self._server = _Server(("127.0.0.1", port), Handler)
+            self._server = Server(("127.0.0.1", port), Handler)
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
             raise UsageError(f"--port {port}: cannot be served: {reason}") from error
@@ -253,39 +264,6 @@ def _finding(found: Mapping[str, Any]) -> dict[str, Any] | None:
     }
 
 
-class _Server(ThreadingHTTPServer):
-    """One thread per connection, with a limit on connections."""
-
-    daemon_threads = True
-    request_queue_size = 2 * MAX_CONNECTIONS
-
-    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
-        self._room = threading.BoundedSemaphore(MAX_CONNECTIONS)
-        super().__init__(address, handler)
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Serve a connection, or refuse it if there are too many."""
-        if self._room.acquire(blocking=False):
-            super().process_request(request, client_address)
-            return
-        with suppress(OSError):
-            request.settimeout(0.1)
-            request.sendall(
-                b"HTTP/1.1 503 Service Unavailable\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
-            )
-        self.shutdown_request(request)
-
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Serve a connection to its end."""
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            self._room.release()
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore connections that end early."""
-
-
 class _Handler(BaseHTTPRequestHandler):
     """One request: the page, or the stream of events."""
 
@@ -307,6 +285,12 @@ class _Handler(BaseHTTPRequestHandler):
             and self.headers.get("Sec-Fetch-Site", "none") in _OWN_PAGES
         ):
             self._events()
+        elif (
+            self.web.day is not None
+            and self.headers.get("Sec-Fetch-Site", "none") in _OWN_PAGES
+            and (found := self.web.day.answer(self.path)) is not None
+        ):
+            self._give(*found)
         else:
             self.send_error(HTTPStatus.NOT_FOUND)
 
@@ -335,18 +319,37 @@ class _Handler(BaseHTTPRequestHandler):
         self.close_connection = True
         page = files("drivelink.monitor").joinpath("page.html").read_bytes()
         token = self.web.acceptance.token if self.web.acceptance is not None else ""
-        self._send("text/html; charset=utf-8", page.replace(b"{{token}}", token.encode()))
+        page = page.replace(b"{{token}}", token.encode())
+        self._send(
+            "text/html; charset=utf-8", page.replace(b"{{day}}", b"hidden" if self.web.day is None else b"")
+        )
+
+    def _give(self, kind: str, content: bytes | Path) -> None:
+        """Answer with some text, or a file."""
+        self.close_connection = True
+        if isinstance(content, bytes):
+            self._send(kind, content)
+            return
+        with (
+            suppress(OSError),
+            content.open("rb") as file,
+        ):  # dropped, or the browser has closed the connection
+            self._head(kind, os.fstat(file.fileno()).st_size)
+            shutil.copyfileobj(file, self.wfile)
 
     def _send(self, kind: str, page: bytes) -> None:
+        self._head(kind, len(page))
+        self.wfile.write(page)
+
+    def _head(self, kind: str, size: int) -> None:
         self.send_response(HTTPStatus.OK)
         self.send_header("Content-Type", kind)
-        self.send_header("Content-Length", str(len(page)))
+        self.send_header("Content-Length", str(size))
         self.send_header("Cache-Control", "no-store")
         self.send_header("Content-Security-Policy", _POLICY)
         self.send_header("X-Content-Type-Options", "nosniff")
         self.send_header("Connection", "close")
         self.end_headers()
-        self.wfile.write(page)
 
     def _events(self) -> None:
         self.close_connection = True

@@ -150,4 +150,13 @@ impl Estimator {
             Estimator::Robust(robust) => robust.parameters(motor, values, std).cloned(),
         }
     }
+
+    /// Dry friction of one motor beyond what is declared, and its standard deviation, N·m; `None`: not estimated.
+    #[must_use]
+    pub fn friction(&self, motor: usize) -> Option<(f64, f64)> {
+        match self {
+            Estimator::Paper(_) => None,
+            Estimator::Robust(robust) => robust.friction(motor),
+        }
+    }
 }

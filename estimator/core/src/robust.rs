@@ -200,6 +200,12 @@ impl Robust {
         self.sides[motor].parameters(values, std)
     }
 
+    /// Dry friction of one motor beyond what is declared, and its standard deviation, N·m; `None` before any.
+    #[must_use]
+    pub fn friction(&self, motor: usize) -> Option<(f64, f64)> {
+        self.sides[motor].friction()
+    }
+
     /// Why the last estimate is not valid; `None`: it is.
     #[must_use]
     pub fn why(&self) -> Option<Why> {

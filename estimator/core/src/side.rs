@@ -17,7 +17,7 @@ use crate::sample::TransmissionEstimate;
 use crate::settings::Priors;
 use crate::signals::{Channel, Excitation, Filters};
 use crate::spring::Family;
-use crate::unknowns::{DAMPING, INERTIA, SPRING};
+use crate::unknowns::{DAMPING, DRY, INERTIA, SPRING};
 
 /// Filter delays after which a wrong start is forgotten.
 pub const SETTLE_DELAYS: f64 = 4.5;
@@ -484,5 +484,11 @@ impl Side {
             std.push(known.covariance[unknown][unknown].sqrt());
         }
         Some(&spring.law)
+    }
+
+    /// Dry friction beyond what is declared, and its standard deviation, N·m; `None` before any.
+    pub fn friction(&self) -> Option<(f64, f64)> {
+        let known = self.blocks.posterior.as_ref()?;
+        Some((known.x[DRY], known.covariance[DRY][DRY].sqrt()))
     }
 }

@@ -97,6 +97,14 @@ impl Estimator {
         Ok((law.is_some(), polynomial, values, std))
     }
 
+    /// (dry friction beyond what is declared, its standard deviation) of one motor, N·m.
+    fn friction(&self, motor: usize) -> PyResult<Option<(f64, f64)>> {
+        if motor >= self.motors {
+            return Err(PyValueError::new_err(format!("motor: expected 0 to {}", self.motors - 1)));
+        }
+        Ok(self.inner.friction(motor))
+    }
+
     /// The reading that is suspected.
     fn suspicion(&self) -> Option<Suspected> {
         let result = self.inner.suspicion()?;

@@ -1,0 +1,110 @@
+"""The last 24 hours: rows of the black box, events with their recordings and diagnoses, in the web view."""
+
+from __future__ import annotations
+
+import json
+import urllib.error
+import urllib.request
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from drivelink.loop import day, finding
+from drivelink.loop.finding import drop_oldest, page_file, recording_name
+from drivelink.monitor.web import WebView
+from drivelink.monitor.webday import WebDay
+from drivelink.pubsub.wire import EstimateMessage
+from estimator.sample import Status
+
+BEGIN_S = datetime(2026, 1, 5, tzinfo=UTC).timestamp()
+
+
+class Written:
+    """Rows of some seconds; every fifth of them with nothing valid."""
+
+    def __init__(self, folder: Path) -> None:
+        self.now_s = BEGIN_S
+        self.day = day.Day(folder, "elbow", lambda: self.now_s)
+
+    def run(self, seconds: int) -> None:
+        for _ in range(seconds):
+            self.now_s += 1.0
+            valid = 0 if self.now_s % 5 == 0 else int(Status.VALID)
+            self.day.estimate(EstimateMessage(1, 0, valid, 1.0, 700.0, 3.0, ()))
+            self.day.status({"friction": [{"torque_nm": 0.3, "std_nm": 0.01}]})
+            self.day.row()
+
+
+def kept_one(folder: Path) -> Path:
+    recording = folder / recording_name("elbow", "model alarm", datetime.fromtimestamp(BEGIN_S + 60, UTC))
+    recording.write_bytes(b"mcap")
+    finding.write(recording, finding.begun(recording, finding.NOTHING, "The model is sufficient."))
+    page_file(recording).write_text("<title>diagnosis</title>")
+    return recording
+
+
+def test_a_row_a_second_in_two_files_of_bounded_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(day, "_MOST", 20_000)
+    written = Written(tmp_path)
+    written.day.row()  # no estimate, no row
+    written.run(1000)
+    table = day.rows(tmp_path, "elbow")
+    assert 200 < len(table) < 600 and table[-1, 0] == written.now_s
+    assert sum(path.stat().st_size for path in tmp_path.iterdir()) < 22_000
+    np.testing.assert_allclose(table[-1, 1:3], [700.0, 3.0])
+    np.testing.assert_allclose(table[-1, 4:], [0.3, 0.01])
+    file, _ = day.day_files(tmp_path, "elbow")
+    file.write_text(file.read_text() + "1,2\n3,4,nonsense,1,1,1")  # a kill
+    assert len(day.rows(tmp_path, "elbow")) == len(table)
+    thin = day.thinned(table, table[0, 0], table[-1, 0], 20)
+    assert len(thin) <= 21 and all(row[1] == 700.0 and 0.5 < (row[3] or 0.0) < 1.0 for row in thin)
+
+
+def test_a_full_disk_is_one_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    written = Written(tmp_path / "missing")
+    written.run(5)
+    assert len(caplog.records) == 1
+    (tmp_path / "missing").mkdir()
+    written.run(1)
+    assert len(day.rows(tmp_path / "missing", "elbow")) == 1
+
+
+def test_the_page_links_events_to_recording_and_diagnosis(tmp_path: Path) -> None:
+    Written(tmp_path).run(200)
+    recording = kept_one(tmp_path)
+    (tmp_path / "secret.toml").write_text("x")
+
+    web = WebView(cast(Any, None), day=WebDay(tmp_path, "elbow"))  # no joint is watched
+
+    def get(path: str, **headers: str) -> bytes:
+        asked = urllib.request.Request(
+            web.url + path, headers={k.replace("_", "-"): v for k, v in headers.items()}
+        )
+        with urllib.request.urlopen(asked, timeout=10) as reply:
+            return bytes(reply.read())
+
+    try:
+        assert b"elbow: the last 24 hours" in get("day") and b'href="day" >' in get("")
+        document = json.loads(get("day.json"))
+        (event,) = document["events"]
+        assert len(document["rows"]) == 200 and document["end"] == BEGIN_S + 200
+        assert event["cause"] == "model alarm" and event["sentence"] == "The model is sufficient."
+        assert get(f"kept/{event['recording']}") == b"mcap"
+        assert b"diagnosis" in get(f"kept/{event['finding']}")
+        begin = BEGIN_S + 50.5
+        rows = json.loads(get(f"day.json?begin={begin}&end={begin + 10}"))["rows"]
+        assert [row[0] - BEGIN_S for row in rows] == list(range(51, 61))
+        for path in ("kept/secret.toml", "kept/..%2Fsecret.toml", "kept/", "day/x"):
+            with pytest.raises(urllib.error.HTTPError, match="404"):
+                get(path)
+        with pytest.raises(urllib.error.HTTPError):
+            get("day.json", Sec_Fetch_Site="cross-site")
+    finally:
+        web.close()
+    newer = tmp_path / recording_name("elbow", "change", datetime.fromtimestamp(BEGIN_S + 90, UTC))
+    newer.write_bytes(b"x")
+    drop_oldest(tmp_path, "elbow", 1e-6)
+    assert not recording.exists() and not page_file(recording).exists() and newer.exists()

@@ -52,6 +52,7 @@ SECTIONS = {
     "effect_pairs": Section(
         "Two effects at once", "--pairs --seeds 1", "--pairs --seeds 1 --seconds 10", of="diagnosis_seeds"
     ),
+    "motion": Section("What to move next: designed and random motions", quick="--recordings 1"),
     "loop": Section(
         "The loop that closes itself, on each effect", quick="--effects coulomb_friction,backlash"
     ),

@@ -49,10 +49,12 @@ def program() -> tuple[Path, tempfile.TemporaryDirectory]:
     return path, folder
 
 
-def simulate(**settings: float | str) -> World:
-    """Run a joint with these settings (`world help` lists them)."""
+def simulate(played: str | None = None, **settings: float | str) -> World:
+    """Run a joint with these settings (`world help` lists them); `played`: positions and velocities."""
     arguments = [f"{name}={value}" for name, value in settings.items()]
-    done = subprocess.run([program()[0], *arguments], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [program()[0], *arguments], input=played, capture_output=True, text=True, check=False
+    )
     if done.returncode:
         raise SystemExit(f"world.c: {done.stderr.strip()}")
     names, *lines = done.stdout.splitlines()

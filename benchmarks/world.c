@@ -20,7 +20,7 @@ static const double PI = 3.14159265358979323846;
 enum spring { LINEAR, CUBIC, EXPONENTIAL };
 enum friction { NO_FRICTION, COULOMB, STRIBECK, LUGRE };
 enum memory { NO_MEMORY, DAHL, BOUC_WEN };
-enum motion { MULTISINE, POINT_TO_POINT, HAND_GUIDED, PUSHES, HARMONIC };
+enum motion { MULTISINE, POINT_TO_POINT, HAND_GUIDED, PUSHES, HARMONIC, PLAYED };
 
 static double spring, stiffness = 150, cubic = 5000, exponent = 6, inertia = 0.12, damping = 0.8;
 static double link_inertia = 0.45, link_damping = 0.5, gravity = 3;
@@ -62,7 +62,7 @@ static const struct setting {
     {"motor_counts", &motor_counts, 0, "per turn of the joint; 0: exact"},
     {"link_bits", &link_bits, 0, "2^bits per turn of the joint; 0: exact"},
     {"torque_noise", &torque_noise, 0, "standard deviation, N·m"},
-    {"motion", &motion, "multisine point-to-point hand-guided pushes harmonic", "what moves the joint"},
+    {"motion", &motion, "multisine point-to-point hand-guided pushes harmonic played", "what moves the joint"},
     {"size", &size, 0, "amplitude of the motor's torque, N·m; point-to-point: largest step, rad"},
     {"top_hz", &top_hz, 0, "fastest sine, or the harmonic one"},
     {"push", &push, 0, "amplitude of the torque on the link, N·m: hand-guided, pushes"},
@@ -205,7 +205,18 @@ static double point_to_point(const double *x, double t) {
     return kp * (wanted - x[0]) + kd * (speed - x[1]) + gravity * sin(wanted);
 }
 
+/* A drive's position loop along what standard input says: position and velocity of each period. */
+static double played(const double *x) {
+    static double wanted, speed;
+    double next[2];
+    if (scanf("%lf%*[, ]%lf", &next[0], &next[1]) == 2) wanted = next[0], speed = next[1];
+    else speed = 0;
+    double kp = 4 * stiffness, kd = 2 * sqrt(kp * inertia);
+    return kp * (wanted - x[0]) + kd * (speed - x[1]) + damping * speed + gravity * sin(wanted);
+}
+
 static double motor_torque(const double *x, double t) {
+    if (motion == PLAYED) return played(x);
     if (motion == POINT_TO_POINT) return point_to_point(x, t);
     if (motion == HAND_GUIDED) return gravity * sin(x[0]) - 0.5 * damping * x[1]; /* gravity is compensated */
     if (motion == HARMONIC) return size * sin(2 * PI * top_hz * t);

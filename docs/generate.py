@@ -55,6 +55,7 @@ SECTIONS: list[tuple[str, type]] = [
     ("[estimator]", schema.EstimatorSettings),
     ("[zenoh]", jointfile.ZenohSection),
     ("[ros2]", jointfile.Ros2Section),
+    ("[motion]", schema.MotionSection),
     ("[sim]", jointfile.SimSection),
 ]
 

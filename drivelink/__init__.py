@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from drivelink.analysis import Picture as Picture
     from drivelink.analysis import diagnose as diagnose
     from drivelink.analysis import fit as fit
-    from drivelink.comparison import Comparison as Comparison
     from drivelink.comparison import compare as compare
+    from drivelink.output.comparison import Comparison as Comparison
     from drivelink.pubsub.client import AsyncSubscription as AsyncSubscription
     from drivelink.pubsub.client import Subscription as Subscription
     from drivelink.pubsub.client import subscribe as subscribe
@@ -50,7 +50,7 @@ __all__ = [
 
 _LAZY = {  # imported when asked for, so that `import drivelink` stays cheap
     "AsyncSubscription": "drivelink.pubsub.client",
-    "Comparison": "drivelink.comparison",
+    "Comparison": "drivelink.output.comparison",
     "Diagnosed": "drivelink.analysis",
     "Fit": "drivelink.analysis",
     "Picture": "drivelink.analysis",

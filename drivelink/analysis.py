@@ -11,11 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drivelink import jointfile, recording
-from drivelink.errors import HarmfulModelError, RecordingError
+from drivelink.errors import HarmfulModelError, RecordingError, UsageError
 from drivelink.files import check_target
 from drivelink.jointfile import JointText, apply_diagnosis, effect_entry, link_entry
 from drivelink.jointfile.apply_diagnosis import floor_entry
+from drivelink.output import motion as motions
 from drivelink.output import plots, report
+from drivelink.output.comparison import beside
+from drivelink.output.document import Section
 from drivelink.output.fitreport import fit_plot
 from drivelink.output.numbers import Units
 from drivelink.recording.columns import parse_column_map
@@ -25,6 +28,8 @@ from drivelink.version import __version__
 from estimator.batch import TransmissionFit
 from estimator.diagnosis import Diagnosis
 from estimator.diagnosis import diagnose as _diagnose
+from estimator.diagnosis.motion import NextMotion, design
+from estimator.diagnosis.shape import Limits
 from estimator.errors import EstimatorError
 from estimator.freerun import FreeRun, free_run
 from estimator.identify import Identified, identify
@@ -207,6 +212,7 @@ class Diagnosed:
     outcome: Diagnosis  # verdict, effects with parameters and probabilities, errors before and after in N·m
     validated: str | None = None  # the held-out recording's name; None: held-out blocks
     held: Record | None = None  # its values
+    motion: NextMotion | None = None  # the one to record next, if it was asked for
 
     def __str__(self) -> str:
         return report.sentence(self.outcome)
@@ -218,14 +224,63 @@ class Diagnosed:
 
     def as_json(self) -> dict[str, Any]:
         """Return the content of report.json."""
-        return report.as_json(self.documented)
+        document = report.as_json(self.documented)
+        return document if self.motion is None else document | {"motion": motions.as_json(self.motion)}
+
+    def sections(self) -> list[Section]:
+        """Return what the report describes and draws."""
+        units = Units(self.runs.source.joint.axis == "linear")
+        made = report.sections(self.documented, units)
+        if self.motion is not None:
+            made.append(motions.section(self.motion, units))
+        return made
 
     def report(self, folder: str | Path) -> list[Path]:
         """Write report.json and report.html into a folder."""
         joint, out = self.runs.source.joint, Path(folder)
         out.mkdir(parents=True, exist_ok=True)
         title = report.Title(joint.name, self.runs.named, self.validated, joint.axis == "linear")
-        return report.write(self.documented, title, out)
+        written = apply_diagnosis.diagnosed_model(joint, self.outcome)
+        record = self.runs.records[0] if self.held is None else self.held
+        made = beside(self.runs.named, joint.model(), written, record, Units(title.linear))
+        more = [*([] if self.motion is None else [motions.section(self.motion, Units(title.linear))]), *made]
+        return report.write(self.as_json(), report.html_page(self.documented, title, more), out)
+
+    def next_motion(
+        self, seconds: float = 12.0, progress: Callable[[str], None] = lambda _: None
+    ) -> Diagnosed:
+        """Design the motion that tells apart what is left open, within `[motion]` of the joint file.
+
+        Args:
+            seconds: its length, s.
+            progress: called with the name of each stage.
+
+        Returns:
+            The same with `motion`, which the reports show.
+
+        Raises:
+            RecordingError: nothing is left open, or no motion within the limits moves the joint.
+        """
+        model, joint = self.runs.source.joint.model(), self.runs.source.joint
+        try:
+            limits = Limits.declared(self.runs.records, **joint.motion.model_dump())
+            found = design(self.runs.records, model, self.outcome, limits, seconds, progress)
+        except EstimatorError as error:
+            raise RecordingError(f"{self.runs.named}: --motion: {error}") from error
+        return replace(self, motion=found)
+
+    def write_motion(self, target: str | Path, *, force: bool = False) -> list[Path]:
+        """Write the motion as a CSV file (s, rad, rad/s, rad/s², N·m), and its picture beside it.
+
+        Raises:
+            UsageError: none was designed.
+            OutputError: a file exists, or cannot be written.
+        """
+        if self.motion is None:
+            raise UsageError("expected a motion, next_motion() designs one")
+        return motions.write(
+            self.motion, Path(target), Units(self.runs.source.joint.axis == "linear"), force=force
+        )
 
     def plot(self) -> Picture:
         """Draw what the model leaves of the motor torque over time (N·m), before and after."""

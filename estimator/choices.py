@@ -109,6 +109,18 @@ CHOICES: dict[str, Choice] = {
     "one_sine": Choice(
         1.08, "spectral lines", "of a motion that separates nothing", "one, and what its window leaks"
     ),
+    # The motion to record next.
+    "motion_rivals": Choice(4, "models", "told apart by a motion, at most", "pairs of them are fitted: time"),
+    "motion_uneven": Choice(
+        0.7, "", "logarithm by which a sine is faster or slower than others, at most",
+        "twice or half: what nobody thought of shows too",
+    ),
+    "motion_taper": Choice(
+        0.08, "of the length", "in which a motion sets out, and in which it comes back", "a second of twelve"
+    ),
+    "motion_smoothing": Choice(0.05, "s", "of a motion whose reach is a limit", "shorter than its bends"),
+    "motion_margin": Choice(0.95, "torque's limit", "that a motion needs", "no drive follows exactly"),
+    "least_link": Choice(0.01, "motor's inertia", "of an undeclared link, at least", "it is above 0"),
     # Curves.
     "points": Choice(
         20, "", "that resolve a range: of a coordinate, of a parameter that is searched",

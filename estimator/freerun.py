@@ -19,7 +19,7 @@ from estimator.model import Effect, JointModel, Transmission
 from estimator.sample import FloatArray, Record
 from estimator.transmissions import RIGID, TransmissionModel, transmission_model
 
-__all__ = ["FreeRun", "free_run", "nrmse_fit"]
+__all__ = ["Bodies", "FreeRun", "free_run", "nrmse_fit"]
 
 _SUBSTEPS = 4
 _SMOOTHED = 21
@@ -105,7 +105,7 @@ def _windows(record: Record, model: JointModel, horizon_s: float) -> FreeRun:
     if not whole:
         raise EstimatorError(f"expected a run without gaps of {horizon_s:g} s for a free run")
     rows = np.asarray(whole)[None, :] + np.arange(size)[:, None]  # (size, windows)
-    joint = _Joint(record, model)
+    joint = Bodies(record, model)
     outputs = joint.run(rows)
     order = rows.T.reshape(-1)
     simulated = outputs.transpose(1, 0, 2).reshape(len(order), -1)
@@ -127,11 +127,12 @@ def _windows(record: Record, model: JointModel, horizon_s: float) -> FreeRun:
     )
 
 
-class _Joint:
+class Bodies:
     """Bodies of a joint with what acts on them; state columns: motors, then the link."""
 
     def __init__(self, record: Record, model: JointModel) -> None:
         self.record, self.model, self.m = record, model, len(model.motors)
+        self.time = record.time_s
         self.laws = [_law(motor.transmission) for motor in model.motors]
         self.carried = model.link is not None and self.laws[0] is None
         self.alphas = [
@@ -160,13 +161,14 @@ class _Joint:
             for order in (0, 1)
         )
         self.state = self.smoothed.copy()
-        self.state[:, -1] -= self._reading(self.smoothed[:, -1], self.rate[:, -1])
+        self.state[:, -1] -= self.reading_error(self.smoothed[:, -1], self.rate[:, -1])
         self.inertia = self._inertias()
         self.torque = self._acting()
-        self.given = self._remembered_torques()
+        self.given = self.remembered_torques()
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of `channels`."""
         motors = [f"motor{i + 1}_position" for i in range(self.m)]
         link = ["link_position"] if self.model.link is not None and not self.carried else []
         flexible = [f"motor{i + 1}_deflection" for i in range(self.m) if self.laws[i]]
@@ -189,7 +191,7 @@ class _Joint:
             for k, row in enumerate(rows):
                 self._hold(row, x, v)
                 out[k] = x
-                out[k, :, -1] += self._reading(x[:, -1], v[:, -1])
+                out[k, :, -1] += self.reading_error(x[:, -1], v[:, -1])
                 for _ in range(_SUBSTEPS):
                     x += 0.5 * h * v
                     v += h * self._gain(x, v, row, h)
@@ -205,19 +207,20 @@ class _Joint:
 
     def _gain(self, x: FloatArray, v: FloatArray, row: NDArray[np.int64], h: float) -> FloatArray:
         """Mean acceleration over a step: half implicit, fully where the damping is stiffer than the step."""
-        a = self._acceleration(x, v, row)
+        a = self.acceleration(x, v, row)
         slope = np.zeros_like(a)
         for j in range(self.m + (self.model.link is not None and not self.carried)):
             moved = v.copy()
             moved[:, j] += _STEP
-            slope[:, j] = (self._acceleration(x, moved, row)[:, j] - a[:, j]) / _STEP
+            slope[:, j] = (self.acceleration(x, moved, row)[:, j] - a[:, j]) / _STEP
         stiff = np.minimum(slope, 0.0) * h
         a = a / (1.0 - np.where(stiff > -1.0, 0.5, 1.0) * stiff)
         if self.carried:
             a[:, -1] = a[:, 0]
         return a
 
-    def _acceleration(self, x: FloatArray, v: FloatArray, row: NDArray[np.int64]) -> FloatArray:
+    def acceleration(self, x: FloatArray, v: FloatArray, row: NDArray[np.int64]) -> FloatArray:
+        """Return the accelerations of states (w, m + 1) and rates at these rows."""
         force = self.torque[row] - self.given[row]
         if self.model.link is not None:
             force[:, -1] -= self._link_load(x[:, -1], v[:, -1])
@@ -237,7 +240,7 @@ class _Joint:
         self, i: int, x: FloatArray, v: FloatArray, row: NDArray[np.int64]
     ) -> tuple[FloatArray, FloatArray, Coordinates]:
         """Torque through the transmission, further torque on the motor, and the coordinates."""
-        c = _coordinates(x[:, i], v[:, i], x[:, -1], v[:, -1], self.torque[row, i], self.record.time_s[row])
+        c = _coordinates(x[:, i], v[:, i], x[:, -1], v[:, -1], self.torque[row, i], self.time[row])
         law = self.laws[i]
         if law:
             phi = c.deflection - _sum(self.zero[i], c)
@@ -259,7 +262,7 @@ class _Joint:
         turned = np.sin(q + link.gravity_phase_rad)
         return load + link.viscous_damping_nm_s_rad * rate + link.gravity_nm * turned
 
-    def _reading(self, q: FloatArray, rate: FloatArray) -> FloatArray:
+    def reading_error(self, q: FloatArray, rate: FloatArray) -> FloatArray:
         """Error of the link encoder's reading."""
         c = _coordinates(q, rate, q, rate, 0.0 * q, 0.0 * q)
         return _sum(self.reading, c)
@@ -270,20 +273,24 @@ class _Joint:
         out = np.zeros((n, self.m + 1))
         for i in range(self.m):
             tau = record.motor_torque_nm[:, i]
-            c = _coordinates(0.0 * tau, 0.0 * tau, 0.0 * tau, 0.0 * tau, tau, record.time_s)
-            c = c._replace(torque_rate=np.gradient(tau, record.period_s))
-            wrong = _sum([e for e in self.elements[i] if e[0].channel == "motor_torque"], c)
-            out[:, i] = tau - wrong
+            out[:, i] = tau - self.torque_error(i, tau)
         if record.external_torque_nm is not None:
             out[:, -1] = np.nan_to_num(record.external_torque_nm)
         return out
 
-    def _remembered_torques(self) -> FloatArray:
+    def torque_error(self, i: int, tau: FloatArray) -> FloatArray:
+        """Return the error (n,) of a motor's measured torque (n,)."""
+        zero = 0.0 * tau
+        c = _coordinates(zero, zero, zero, zero, tau, self.time)
+        c = c._replace(torque_rate=np.gradient(tau, self.record.period_s))
+        return _sum([e for e in self.elements[i] if e[0].channel == "motor_torque"], c)
+
+    def remembered_torques(self) -> FloatArray:
         """(n, m + 1) torque of effects with memory along the measured motion, as a load on each body."""
         out = np.zeros((len(self.record), self.m + 1))
         x, v = self.state, self.rate
         for i in range(self.m):
-            c = _coordinates(x[:, i], v[:, i], x[:, -1], v[:, -1], self.torque[:, i], self.record.time_s)
+            c = _coordinates(x[:, i], v[:, i], x[:, -1], v[:, -1], self.torque[:, i], self.time)
             for one in [e for e in self.elements[i] if e[0].remembers]:
                 self.remembered.add(one[0].name)
                 load, through = _sum([one], c), one[0].location == "transmission"

@@ -35,6 +35,7 @@ RANGES: dict[str, Range] = {  # the longest end that fits counts
     "": Range(1e-12, 1e12, ""),
     "_rad": Range(1e-9, 1e6, "rad"),
     "_rad_s": Range(1e-9, 1e6, "rad/s"),
+    "_rad_s2": Range(1e-9, 1e9, "rad/s²"),
     "_rad2_s2": Range(1e-9, 1e12, "rad²/s²"),
     "_s2_rad2": Range(1e-9, 1e12, "s²/rad²"),
     "bandwidth_rad_s": Range(0.5, 1e4, "rad/s"),

@@ -11,7 +11,10 @@ import math
 import random
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from sim.errors import SimError
 
@@ -25,13 +28,17 @@ class Excitation:
     profiles: tuple[Profile, ...]  # torque (N·m, joint side) over time (s), one per motor
     external: Profile | None = None  # tau_k of eq 4 over time
     centre_rad: tuple[float, ...] = (0.0, 0.0)  # centre of the spring for each motor
+    moved: tuple[tuple[Profile, Profile], ...] = ()  # position and velocity of that centre instead, over time
     centring_nm_rad: float = 0.0  # stiffness of that hold
     centring_nm_s_rad: float = 0.0  # damping of that hold
 
     def torque(self, motor: int, time_s: float, position_rad: float, velocity_rad_s: float) -> float:
         """Return the torque for the period that begins now, N·m at the joint."""
-        hold = self.centring_nm_rad * (position_rad - self.centre_rad[motor])
-        return self.profiles[motor](time_s) - hold - self.centring_nm_s_rad * velocity_rad_s
+        centre, rate = self.centre_rad[motor], 0.0
+        if self.moved:
+            centre, rate = (profile(time_s) for profile in self.moved[motor])
+        hold = self.centring_nm_rad * (position_rad - centre)
+        return self.profiles[motor](time_s) - hold - self.centring_nm_s_rad * (velocity_rad_s - rate)
 
 
 class _Keys:
@@ -41,9 +48,10 @@ class _Keys:
         self._left = dict(table)
         self._where = where
 
-    def text(self, key: str, default: str, choices: tuple[str, ...]) -> str:
+    def text(self, key: str, default: str, choices: tuple[str, ...] = ()) -> str:
+        """Return one of the choices; without any: any text."""
         value = self._left.pop(key, default)
-        if value not in choices:
+        if value not in choices and (choices or not isinstance(value, str)):
             raise SimError(f"{self._where}.{key}: expected one of {', '.join(choices)}, got {value!r}")
         return str(value)
 
@@ -97,10 +105,16 @@ def build(
         SimError: unknown, missing or impossible key.
     """
     keys = _Keys(table, where)
-    profiles = _profiles(keys, motors, amplitude_nm)
+    kind = keys.text("kind", "rich", (*KINDS, "motion"))
+    moved: tuple[tuple[Profile, Profile], ...] = ()
+    if kind == "motion":
+        profiles, moved = _played(keys, motors, where)
+    else:
+        profiles = _profiles(keys, kind, motors, amplitude_nm)
     external = keys.table("external")
     excitation = Excitation(
         profiles=profiles,
+        moved=moved,
         external=None if external is None else _external(external, f"{where}.external"),
         centre_rad=tuple(keys.each("centre_rad", 0.0, motors)),
         centring_nm_rad=keys.number("centring_nm_rad", 0.0, 0.0),
@@ -112,13 +126,39 @@ def build(
 
 def _external(table: Mapping[str, Any], where: str) -> Profile:
     keys = _Keys(table, where)
-    (profile,) = _profiles(keys, 1, None)
+    (profile,) = _profiles(keys, keys.text("kind", "rich", tuple(KINDS)), 1, None)
     keys.finish()
     return profile
 
 
-def _profiles(keys: _Keys, motors: int, amplitude_nm: float | None) -> tuple[Profile, ...]:
-    kind = keys.text("kind", "rich", tuple(KINDS))
+def _played(
+    keys: _Keys, motors: int, where: str
+) -> tuple[tuple[Profile, ...], tuple[tuple[Profile, Profile], ...]]:
+    """Torque, position and velocity of each motor by a CSV file, over and over."""
+    path = Path(keys.text("file", ""))
+    names = [
+        f"motor{i}_{name}"
+        for i in range(1, motors + 1)
+        for name in ("torque_nm", "position_rad", "velocity_rad_s")
+    ]
+    try:
+        table = np.genfromtxt(path, delimiter=",", names=True, ndmin=1)
+        time, columns = table["time_s"], [table[name] for name in names]
+    except (OSError, ValueError, IndexError) as error:
+        expected = f"a CSV file with the columns time_s, {', '.join(names)}"
+        raise SimError(f"{where}.file: {path}: expected {expected}: {error}") from error
+    if len(time) < 2 or not np.all(np.isfinite([time, *columns])) or not np.all(np.diff(time) > 0.0):
+        raise SimError(f"{where}.file: {path}: expected numbers, and a time_s that rises")
+    length = float(time[-1] - time[0])
+
+    def profile(values: Any) -> Profile:
+        return lambda t: float(np.interp(time[0] + t % length, time, values))
+
+    torque, position, velocity = ([profile(x) for x in columns[k::3]] for k in range(3))
+    return tuple(torque), tuple(zip(position, velocity, strict=True))
+
+
+def _profiles(keys: _Keys, kind: str, motors: int, amplitude_nm: float | None) -> tuple[Profile, ...]:
     amplitudes = keys.each("amplitude_nm", 0.0 if kind == "none" else amplitude_nm, motors)
     offsets = keys.each("offset_nm", 0.0, motors)
     ramp_s = keys.number("ramp_s", 0.0, 0.0)

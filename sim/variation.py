@@ -78,6 +78,14 @@ def typical_torque_nm(plant: JointPlant) -> float:
     return float(_SOFT_DEFLECTION_RAD * stiffness / softness * softness**0.25)
 
 
+def following(plant: JointPlant) -> dict[str, Any]:
+    """Return the keys of an excitation with which a stiff position loop follows a motion."""
+    laws = [motor.spring.law() for motor in plant.motors if not motor.spring.rigid]
+    inertia = max(motor.inertia_kg_m2 for motor in plant.motors)
+    hold = 4.0 * max((abs(law.stiffness(0.0)) for law in laws), default=typical_torque_nm(plant))
+    return {"centring_nm_rad": hold, "centring_nm_s_rad": 2.0 * math.sqrt(hold * inertia)}
+
+
 def suitable(plant: JointPlant) -> dict[str, Any]:
     """Return the excitation table for `sim.excitation.build`: rich, with soft centring against drift."""
     torque = typical_torque_nm(plant)

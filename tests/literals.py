@@ -42,6 +42,7 @@ REASONS: dict[str, dict[str, str]] = {
     },
     "diagnosis/search.py": {"1.75": "last point of a grid of delays in octaves"},
     "diagnosis/stack.py": {"0.001": "relative step of a difference", "0.7": "ln 2: factors of at most two"},
+    "diagnosis/shape.py": {"15.0 30.0 60.0": "quintic smooth step, its slope and bend"},
     "filters.py": {"14.0": "time constants until e^-14 is below 1e-6"},
     "gate/causes.py": {"1.3": "a factor this near to a unit's is that unit"},
     "gate/evidence.py": {

@@ -10,17 +10,16 @@ from rich.console import Console
 
 from drivelink import analysis
 from drivelink.cli import add_recordings, require_distinct, warn
-from drivelink.errors import HarmfulModelError
+from drivelink.errors import HarmfulModelError, UsageError
 from drivelink.files import check_target
-from drivelink.output import report
 from drivelink.output.document import show
-from drivelink.output.numbers import Units
 from drivelink.output.progress import Meter
 from drivelink.recording.mapping import joint_of
 
 EPILOG = """\
 examples:
   drivelink diagnose suspect.csv --joint elbow.toml --out diagnosis/
+  drivelink diagnose suspect.csv --joint elbow.toml --motion next.csv
   drivelink diagnose train.csv --joint axis.toml --validate other.csv --write axis-better.toml
 
 Fit a healthy run first (`drivelink fit healthy.csv --joint elbow.toml --write elbow-healthy.toml`), then
@@ -43,7 +42,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--write", type=Path, metavar="JOINT2", help="write a joint file with the effects found"
     )
-    parser.add_argument("--force", action="store_true", help="replace the file of --write if it exists")
+    parser.add_argument(
+        "--motion",
+        type=Path,
+        metavar="FILE",
+        help="design the motion that tells apart what is left open, within [motion] of the joint file: a CSV "
+        "file for the controller and `drivelink sim --motion`, a picture beside it",
+    )
+    parser.add_argument(
+        "--motion-seconds", type=float, default=12.0, metavar="S", help="its length (default: %(default)g)"
+    )
+    parser.add_argument("--force", action="store_true", help="replace the files of --write and --motion")
     parser.add_argument(
         "--json", action="store_true", help="print the content of report.json and nothing else"
     )
@@ -56,6 +65,13 @@ def run(args: argparse.Namespace) -> int:
     inputs = [path for path in (*args.recording, args.validate, args.joint) if path is not None]
     if args.write is not None:  # the joint file itself may be brought up to date
         check_target(args.write, [path for path in inputs if path != args.joint], force=args.force)
+    if args.motion is not None:
+        if args.motion.suffix.lower() != ".csv":
+            raise UsageError(f"--motion: expected a name that ends with .csv, got {args.motion}")
+        if not 4.0 <= args.motion_seconds <= 120.0:
+            raise UsageError(f"--motion-seconds: expected 4 to 120, got {args.motion_seconds:g}")
+        for path in (args.motion, args.motion.with_suffix(".png")):
+            check_target(path, inputs, force=args.force)
     for name in ("report.json", "report.html"):
         check_target(args.out / name, inputs, force=True)
     with Meter(f"diagnose {', '.join(path.name for path in args.recording)}") as meter:
@@ -69,7 +85,11 @@ def run(args: argparse.Namespace) -> int:
             warn=warn,
             progress=meter.stage,
         )
+        if args.motion is not None:
+            found = found.next_motion(args.motion_seconds, meter.stage)
     made, harmful = found.report(args.out), None
+    if found.motion is not None:
+        made += found.write_motion(args.motion, force=args.force)
     if args.write is not None:
         try:
             made.append(found.write(args.write, force=args.force))
@@ -78,8 +98,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(found.as_json()))
     else:
-        units = Units(found.runs.source.joint.axis == "linear")
-        show(report.sections(found.outcome, units), Console())
+        show(found.sections(), Console())
         for path in made:
             print(f"wrote {path}")
     if harmful is not None:

@@ -19,12 +19,14 @@ from drivelink.demo.simbus import JoinedBus, open_sim_bus, require_free
 from drivelink.demo.simulate import assumptions, bench_from_joints
 from drivelink.errors import BusError, UsageError
 from drivelink.jointfile import BusSection, JointFile, load
+from drivelink.jointfile.schema import SimSection
 
 EPILOG = """\
 examples:
   drivelink sim elbow.toml                             on the bus of the joint file
   drivelink sim elbow.toml --interface socketcand      serve a bus over TCP: no SocketCAN needed; the daemon
                                                        in another terminal takes the same option
+  drivelink sim elbow.toml --motion next.csv           play what `drivelink diagnose --motion` designed
   drivelink sim elbow.toml --channel vcan0 --effect coulomb_friction=0.3 --quirks epos4
 """
 
@@ -39,6 +41,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="NAME=VALUE",
         help="switch an effect on in the world, e.g. coulomb_friction=0.25; further parameters follow after "
         "commas (cogging=0.1,periods_per_rev=12,motor=2); may be repeated",
+    )
+    parser.add_argument(
+        "--motion",
+        type=Path,
+        metavar="FILE",
+        help="the motors follow this motion, over and over: a CSV file of `diagnose --motion`",
     )
     parser.add_argument(
         "--quirks", metavar="NAME", help="drives that behave like a vendor's, e.g. epos4; see the reference"
@@ -59,6 +67,8 @@ def run(args: argparse.Namespace) -> int:
     if args.seconds is not None and not args.seconds > 0:
         raise UsageError(f"--seconds: expected a number > 0, got {args.seconds:g}")
     joints = [load(path) for path in args.joints]
+    if args.motion is not None:
+        joints = [_moving(joint, args.motion) for joint in joints]
     section = _bus_section(joints, args)
     bench = bench_from_joints(
         joints,
@@ -91,6 +101,13 @@ def run(args: argparse.Namespace) -> int:
         if isinstance(bus, JoinedBus) and bus.lost:
             raise BusError(f"{bus.channel_info}: the process that served it has ended")
     return 0
+
+
+def _moving(joint: JointFile, motion: Path) -> JointFile:
+    """The joint with a simulation whose motors follow a motion."""
+    table = {"kind": "motion", "file": str(motion.absolute())}
+    section = (joint.sim or SimSection()).model_copy(update={"excitation": table})
+    return joint.model_copy(update={"sim": section})
 
 
 def _bus_section(joints: list[JointFile], args: argparse.Namespace) -> BusSection:

@@ -31,7 +31,7 @@ from sim.excitation import build
 from sim.network import Bench, Network
 from sim.plant import JointPlant, LinkPlant, MotorPlant, Spring
 from sim.sensors import DriveHardware, LinkEncoder
-from sim.variation import suitable, typical_torque_nm, with_parameters
+from sim.variation import following, suitable, typical_torque_nm, with_parameters
 from sim.world import World as World
 
 CASE_NAMES = tuple(CASES)
@@ -76,7 +76,9 @@ def world_from_joint(
         if given and given.plant.arrangement != joint.arrangement:
             raise SimError(f'case "{name}" is {given.plant.arrangement}, this joint is {joint.arrangement}')
         plant = with_parameters(given.plant if given else _plant(joint), section.parameters)
-        excitation = build(_excitation(section, plant, given), len(plant.motors), where="sim.excitation")
+        excitation = build(
+            _excitation(section, plant, given, file), len(plant.motors), where="sim.excitation"
+        )
         return World(
             plant,
             [_hardware(joint, index, plant, given) for index in range(len(plant.motors))],
@@ -178,9 +180,14 @@ def _asked(effects: Sequence[str]) -> list[PlantEffect]:
         raise UsageError(f"--effect: {str(error).removeprefix('effect: ')}") from error
 
 
-def _excitation(section: SimSection, plant: JointPlant, given: Case | None) -> Mapping[str, Any]:
-    """The file's table, completed for the case or the plant."""
+def _excitation(
+    section: SimSection, plant: JointPlant, given: Case | None, file: Path | None
+) -> Mapping[str, Any]:
+    """The file's table, completed for the case or the plant; a motion's file lies beside the joint file."""
     table = section.excitation
+    if table.get("kind") == "motion":
+        folder = Path() if file is None else file.parent
+        return {**following(plant), **table, "file": str(folder / str(table.get("file", "")))}
     if given is not None and table.get("kind") in (None, given.excitation["kind"]):
         return {**given.excitation, **table}
     suited = given.rich if given is not None else suitable(plant)

@@ -293,6 +293,25 @@ class Ros2Section(_Section):
     every: int = Field(1, ge=1, description="publish every n-th cycle")
 
 
+class MotionSection(_Section):
+    """What a motion that `diagnose --motion` designs may reach; left out: what the recordings reach."""
+
+    position_rad: tuple[float, float] | None = Field(
+        None, description="of each motor: lowest and highest position, at the joint"
+    )
+    velocity_rad_s: float | None = Field(None, gt=0, description="largest amount")
+    acceleration_rad_s2: float | None = Field(None, gt=0, description="largest amount")
+    torque_nm: float | None = Field(None, gt=0, description="largest amount of the motor's torque")
+
+    @model_validator(mode="after")
+    def _positions(self) -> Self:
+        for value in self.position_rad or ():
+            require_in_range("position_rad", value)
+        if self.position_rad is not None and not self.position_rad[0] < self.position_rad[1]:
+            raise ValueError(f"position_rad: expected [lowest, highest], got {list(self.position_rad)}")
+        return self
+
+
 class SimSection(_Section):
     """The simulated world that `sim` and `demo` put on the bus; `run` never reads it."""
 
@@ -330,6 +349,7 @@ class JointFile(_Section):
     )
     zenoh: ZenohSection = Field(ZenohSection(), description="the zenoh side")
     ros2: Ros2Section | None = Field(None, description="publish for ROS 2")
+    motion: MotionSection = Field(MotionSection(), description="limits of a designed motion")
     sim: SimSection | None = Field(None, description="the simulated world")
     provenance: dict[str, Any] = Field(
         default_factory=dict,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -63,13 +64,10 @@ class Title(NamedTuple):
     linear: bool = False
 
 
-def write(outcome: Diagnosis, title: Title, folder: Path) -> list[Path]:
+def write(document: Mapping[str, Any], html: str, folder: Path) -> list[Path]:
     """Write report.json and report.html."""
     made = []
-    for name, text in (
-        ("report.json", json.dumps(as_json(outcome), indent=2) + "\n"),
-        ("report.html", html_page(outcome, title)),
-    ):
+    for name, text in (("report.json", json.dumps(document, indent=2) + "\n"), ("report.html", html)):
         path = folder / name
         write_whole(path, text, force=True)
         made.append(path)
@@ -214,14 +212,16 @@ def _place(finding: Finding, outcome: Diagnosis) -> str:
     return f"{finding.location} {(finding.motor or 0) + 1}" if several else finding.location
 
 
-def html_page(outcome: Diagnosis, title: Title) -> str:
-    """Draw the report as one self-contained page."""
+def html_page(outcome: Diagnosis, title: Title, more: Sequence[Section] = ()) -> str:
+    """Draw the report as one self-contained page; `more` follows what was found."""
     about = (
         f"Diagnosis of {title.recording}, validated on "
         f"{title.validation or 'held-out blocks of the same recording'}; "
         f"all channels filtered alike at {outcome.bandwidth_hz:.3g} Hz."
     )
-    return page(Document(f"{title.joint}: diagnosis", about, sections(outcome, Units(title.linear))))
+    return page(
+        Document(f"{title.joint}: diagnosis", about, [*sections(outcome, Units(title.linear)), *more])
+    )
 
 
 def sections(outcome: Diagnosis, units: Units) -> list[Section]:

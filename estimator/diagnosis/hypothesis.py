@@ -27,7 +27,7 @@ from estimator.errors import EstimatorError
 from estimator.model import JointModel
 from estimator.sample import FloatArray, Record
 
-__all__ = ["Extra", "Fitted", "Keys", "Problem", "Slot", "Term", "stretches"]
+__all__ = ["Extra", "Fitted", "Keys", "Problem", "Slot", "Term", "count_of", "stretches"]
 
 
 Keys = frozenset[tuple[str, int | None]]
@@ -206,8 +206,7 @@ class Problem:
         """Return the resolution of a deflection: one count of each of its encoders."""
         link = self.records[0].link_position_rad
         read = [self.records[0].motor_position_rad[:, motor], *([] if link is None else [link])]
-        steps = [np.abs(np.diff(x)) for x in read]
-        return sum(float(np.quantile(x[x > 0.0], 0.01)) if np.any(x > 0.0) else 0.0 for x in steps)
+        return sum(map(count_of, read))
 
     def unit_of(self, term: Term, name: str) -> float:
         """Return a nonlinear parameter's unit per unit of its slot."""
@@ -383,6 +382,12 @@ class Problem:
                 for run in range(len(corrections)) if slot.run is None else (slot.run,):
                     corrections[run] = corrected(corrections[run], slot.name, slot.motor, slot.part, value)
         return tuple(terms), base, tuple(corrections)
+
+
+def count_of(reading: FloatArray) -> float:
+    """Return the resolution of a reading (n,), from its steps."""
+    steps = np.abs(np.diff(reading))
+    return float(np.quantile(steps[steps > 0.0], 0.01)) if np.any(steps > 0.0) else 0.0
 
 
 def stretches(problem: Problem) -> NDArray[np.int64]:

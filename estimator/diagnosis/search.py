@@ -201,6 +201,13 @@ class Search:
         grown = (self._grown(parent, term) for term in self.screen(parent, like, most))
         return [child for child in grown if child.is_real_beside(parent)]
 
+    def with_effect(self, parent: Fitted, name: str, motor: int | None) -> Fitted | None:
+        """Return the extension by a named effect; None: the data cannot reveal it."""
+        for one in self._library_beside(parent):
+            if (one.candidate.kind.name, one.candidate.motor) == (name, motor):
+                return self._grown(parent, Term(one.candidate, dict(one.values)))
+        return None
+
     def _grown(self, parent: Fitted, term: Term) -> Fitted:
         """Add one effect; from several starts, as the smoothing of friction and a long delay have optima."""
         child = self.problem.added(parent, term, whole("rough_steps"))

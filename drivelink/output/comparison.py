@@ -1,0 +1,220 @@
+"""Two models beside each other, and beside the machine: free runs, correlations of the residual, curves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from drivelink.output import plots
+from drivelink.output.document import Chart, Document, Grid, Paragraph, Section, Share
+from drivelink.output.numbers import Units
+from estimator.comparison import Correlation, Curve, correlations, friction_curve, stiffness_curve
+from estimator.errors import EstimatorError
+from estimator.freerun import FreeRun, free_run
+from estimator.model import JointModel
+from estimator.sample import Record
+
+_POINTS = 200
+_SHOWN_S = 10.0  # of a free run in the picture
+_REACH_RAD, _SPEED_RAD_S = 0.2, 1.0  # of curves where no recording says how far
+_HORIZON_S = 1.0  # of a report's free run
+_WIDTH = 4.6  # inches: half a page
+
+
+class Side(NamedTuple):
+    """One of the two: a model, and the recording that it is fitted to, if it is one."""
+
+    name: str
+    model: JointModel
+    record: Record | None
+
+
+class Difference(NamedTuple):
+    """Two curves where they differ most: stiffness at a deflection, rad; friction at a velocity, rad/s."""
+
+    motor: int
+    kind: str
+    at: float
+    a: float
+    b: float
+    std: float
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Both sides, and free runs of both models over each recording.
+
+    Attributes:
+        sides: A and B.
+        runs: (recording's side, run of A, run of B) of each.
+        units: of the axis.
+    """
+
+    sides: tuple[Side, Side]
+    runs: tuple[tuple[Side, FreeRun, FreeRun], ...]
+    units: Units
+
+    def residuals(self, side: Side, run: FreeRun) -> tuple[Correlation, Correlation]:
+        """Return the correlations of the residual of one free run: that of the first motor's last channel."""
+        assert side.record is not None
+        return correlations(run, side.record, self.channel(run), 0, run.horizon_s / 4.0)
+
+    def channel(self, run: FreeRun) -> int:
+        """Return the first motor's deflection, or its position where that is rigid."""
+        return run.channels.index(
+            next((c for c in run.channels if c == "motor1_deflection"), run.channels[0])
+        )
+
+    def curves(self, motor: int) -> dict[str, list[tuple[str, Curve]]]:
+        """Return the stiffness over deflection and friction over velocity of one motor, of both sides."""
+        reach, speed = _ranges([side.record for side in self.sides if side.record is not None], motor)
+        phi, velocity = np.linspace(-reach, reach, _POINTS), np.linspace(-speed, speed, _POINTS)
+        made: dict[str, list[tuple[str, Curve]]] = {"stiffness": [], "friction": []}
+        for letter, side in zip("AB", self.sides, strict=True):
+            own = side.model.motors[motor]
+            if (curve := stiffness_curve(own, phi)) is not None:
+                made["stiffness"].append((letter, curve))
+            made["friction"].append((letter, friction_curve(own, velocity)))
+        return made
+
+    def differences(self) -> list[Difference]:
+        """Return where each pair of curves differs by most standard deviations, or most at all."""
+        made = []
+        for motor in range(len(self.sides[0].model.motors)):
+            for kind, curves in self.curves(motor).items():
+                if len(curves) == 2:
+                    (_, a), (_, b) = curves
+                    apart, std = b.y - a.y, np.hypot(a.std, b.std)
+                    k = int(np.argmax(np.abs(apart) / std if np.all(std > 0.0) else np.abs(apart)))
+                    place = [float(values[k]) for values in (a.x, a.y, b.y, std)]
+                    made.append(Difference(motor + 1, kind, *place))
+        return made
+
+    def as_json(self) -> dict[str, Any]:
+        """Return what the page says, as numbers."""
+        document: dict[str, Any] = {"schema": "drivelink.comparison/1"}
+        document |= {letter: side.name for letter, side in zip("ab", self.sides, strict=True)}
+        document["curves"] = [one._asdict() for one in self.differences()]
+        document["free_runs"] = [
+            {
+                "recording": side.name,
+                "horizon_s": [run.horizon_s for run in runs],
+                "fit_percent": {
+                    letter: dict(run.fit_percent) for letter, run in zip("ab", runs, strict=True)
+                },
+                "coasting_percent": dict(runs[0].coasting_percent),
+            }
+            for side, *runs in self.runs
+        ]
+        return document
+
+    def document(self) -> Document:
+        """Return the page."""
+        about = " · ".join(f"{letter}: {side.name}" for letter, side in zip("AB", self.sides, strict=True))
+        return Document("A beside B", about, self.sections())
+
+    def sections(self) -> list[Section]:
+        """Return the page's sections."""
+        sections = [Section("curves", [self._differences()])]
+        if self.runs:
+            sections.append(Section("free run", [self._fits()]))
+        for side, *runs in self.runs:
+            charts: list[Any] = [
+                Chart(partial(self._over, side, runs), "measured and simulated"),
+                Chart(
+                    partial(self._correlated, side, runs), "residual of that channel; bands: 95 % of chance"
+                ),
+            ]
+            sections.append(Section(f"over {side.name}", charts))
+        for motor in range(len(self.sides[0].model.motors)):
+            charts = [
+                Chart(partial(self._curve, motor, kind)) for kind, of in self.curves(motor).items() if of
+            ]
+            sections.append(Section(f"motor {motor + 1}", charts))
+        return sections
+
+    def _differences(self) -> Grid:
+        rows: list[tuple[str | Share, ...]] = []
+        for one in self.differences():
+            unit = self.units.shown("N·m/rad" if one.kind == "stiffness" else "N·m")
+            apart = f"{abs(one.b - one.a) / one.std:.1f} σ" if one.std > 0.0 else "–"
+            at = f"{one.at:.3g} {self.units.shown('rad' if one.kind == 'stiffness' else 'rad/s')}"
+            rows.append(
+                (f"{one.kind}, motor {one.motor}", at, f"{one.a:.5g} {unit}", f"{one.b:.5g} {unit}", apart)
+            )
+        return Grid(("where they differ most", "at", "A", "B", "apart"), rows)
+
+    def _fits(self) -> Grid:
+        rows: list[tuple[str | Share, ...]] = []
+        for side, a, b in self.runs:
+            rows.append((f"{side.name}, windows of {a.horizon_s:.3g} s",))
+            for name in a.channels:
+                fits = (one[name] for one in (a.fit_percent, b.fit_percent, a.coasting_percent))
+                rows.append((name, *(f"{fit:.2f} %" for fit in fits)))
+        return Grid(("channel", "fit of A", "fit of B", "at constant velocity"), rows)
+
+    def _over(self, side: Side, runs: Sequence[FreeRun]) -> Figure:
+        run, j = runs[0], self.channel(runs[0])
+        n = int(np.searchsorted(run.time_s, run.time_s[0] + _SHOWN_S))
+        curves = {"measured": plots.PlotCurve(run.time_s[:n], run.measured_rad[:n, j])}
+        for letter, one in zip("AB", runs, strict=True):
+            curves[letter] = plots.PlotCurve(one.time_s[:n], one.simulated_rad[:n, j])
+        figure, (axes,) = plots.new_figure(width=2 * _WIDTH)
+        label = self.units.label(f"{run.channels[j].replace('_', ' ')} / rad")
+        plots.over_time(axes, curves, label, side.name)
+        return figure
+
+    def _correlated(self, side: Side, runs: Sequence[FreeRun]) -> Figure:
+        figure, all_axes = plots.new_figure(columns=2, width=2 * _WIDTH)
+        both = [self.residuals(side, run) for run in runs]
+        for axes, title, ones in zip(
+            all_axes, ("with itself", "with the motor torque"), zip(*both, strict=True), strict=True
+        ):
+            curves = {a: plots.PlotCurve(one.lag_s, one.value) for a, one in zip("AB", ones, strict=True)}
+            plots.xy(axes, curves, "lag / s", "correlation", title)
+            band = max(one.band for one in ones)
+            axes.axhspan(-band, band, color="#000000", alpha=0.12)
+        return figure
+
+    def _curve(self, motor: int, kind: str) -> Figure:
+        figure, (axes,) = plots.new_figure(width=_WIDTH)
+        labels = {
+            "stiffness": ("deflection / rad", "stiffness / (N·m/rad)"),
+            "friction": ("motor velocity / (rad/s)", "friction / N·m"),
+        }
+        across, up = (self.units.label(text) for text in labels[kind])
+        curves = {letter: plots.PlotCurve(*curve) for letter, curve in self.curves(motor)[kind]}
+        plots.xy(axes, curves, across, up, kind)
+        return figure
+
+
+def beside(name: str, before: JointModel, after: JointModel, record: Record, units: Units) -> list[Section]:
+    """Return a report's sections: a model as declared (A) and as found (B) beside the machine.
+
+    None where one of them cannot be simulated.
+    """
+    try:
+        first, second = (free_run(record, model, _HORIZON_S) for model in (before, after))
+    except EstimatorError:
+        return []
+    declared, found = Side("as declared", before, record), Side("as found", after, None)
+    made = Comparison((declared, found), ((declared._replace(name=name), first, second),), units)
+    about = Paragraph("A: the model as declared. B: with what was found.")
+    curves, *rest = made.sections()
+    return [Section("Model beside machine", [about, *curves.blocks]), *rest]
+
+
+def _ranges(records: Sequence[Record], motor: int) -> tuple[float, float]:
+    """Largest deflection and motor velocity of the recordings."""
+    reach, speed = 0.0, 0.0
+    for record in records:
+        theta = record.motor_position_rad[:, motor]
+        speed = max(speed, float(np.percentile(np.abs(np.gradient(theta, record.time_s)), 99.0)))
+        if record.link_position_rad is not None:
+            reach = max(reach, float(np.max(np.abs(record.link_position_rad - theta))))
+    return reach or _REACH_RAD, speed or _SPEED_RAD_S

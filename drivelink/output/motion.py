@@ -1,0 +1,96 @@
+"""The motion to record next: a CSV file for the controller, a picture, the odds it is expected to give."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from drivelink.files import write_whole
+from drivelink.output import plots
+from drivelink.output.document import Chart, Grid, Paragraph, Section, Share
+from drivelink.output.numbers import Units, in_words
+from estimator.diagnosis.motion import NextMotion
+from estimator.sample import FloatArray
+
+_COLUMNS = ("position_rad", "velocity_rad_s", "acceleration_rad_s2", "torque_nm")
+_MOST = 1e6  # odds beyond are written as more than that
+_WIDTH = 9.2  # inches: of a page
+
+
+def write(motion: NextMotion, path: Path, units: Units, *, force: bool = False) -> list[Path]:
+    """Write the CSV file, and its picture beside it.
+
+    Raises:
+        OutputError: a file exists, or cannot be written.
+    """
+    names, columns = ["time_s"], [motion.time_s]
+    for i in range(motion.position_rad.shape[1]):
+        for name in _COLUMNS:
+            names.append(f"motor{i + 1}_{name}")
+            columns.append(getattr(motion, name)[:, i])
+    text = io.StringIO()
+    np.savetxt(text, np.column_stack(columns), "%.9g", ",", header=",".join(names), comments="")
+    write_whole(path, text.getvalue(), force=force)
+    picture = path.with_suffix(".png")
+    write_whole(picture, plots.png(figure(motion, units)), force=force)
+    return [path, picture]
+
+
+def as_json(motion: NextMotion) -> dict[str, Any]:
+    """Return the odds for report.json."""
+    return {
+        "seconds": float(len(motion.time_s) * (motion.time_s[1] - motion.time_s[0])),
+        "decides": motion.decides,
+        "rivals": [
+            {"effects": name, "probability": now, "told": told, "least_log_odds": least}
+            for name, now, told, least in zip(
+                motion.rivals, motion.now, motion.expected, _least(motion).tolist(), strict=True
+            )
+        ],
+        "reaches": {name: np.max(np.abs(getattr(motion, name)), axis=0).tolist() for name in _COLUMNS},
+    }
+
+
+def section(motion: NextMotion, units: Units) -> Section:
+    """Describe and draw it."""
+    said = (
+        f"This motion of {motion.time_s[-1]:.3g} s is expected to tell them apart. Record it with the "
+        "drive's position loop, and diagnose that recording."
+    )
+    rows: list[tuple[str | Share, ...]] = []
+    for name, now, told, least in zip(
+        motion.rivals, motion.now, motion.expected, _least(motion), strict=True
+    ):
+        odds = float(np.exp(np.clip(least, 0.0, np.log(_MOST))))
+        against = f"{'> ' if odds >= _MOST else ''}{odds:.3g} : 1"
+        rows.append((in_words(name), f"{now:.2f}", f"{told:.2f}", against))
+    head = (
+        "if this is what is missing",
+        "probability now",
+        "told after the motion",
+        "odds over the next best",
+    )
+    chart = Chart(
+        lambda: figure(motion, units), "Motion of the motors, and the torque that the likeliest needs."
+    )
+    return Section("What to move next", [Paragraph(said), Grid(head, rows), chart])
+
+
+def figure(motion: NextMotion, units: Units) -> Figure:
+    """Draw position, velocity and torque over time."""
+    drawn, axes = plots.new_figure(rows=3, width=_WIDTH, height=1.7)
+    labels = ("position / rad", "velocity / (rad/s)", "torque / N·m")
+    for one, name, label in zip(axes, (*_COLUMNS[:2], _COLUMNS[3]), labels, strict=True):
+        values = getattr(motion, name)
+        curves = {f"motor {i + 1}": plots.PlotCurve(motion.time_s, x) for i, x in enumerate(values.T)}
+        plots.over_time(one, curves, units.label(label))
+    return drawn
+
+
+def _least(motion: NextMotion) -> FloatArray:
+    """Log odds of each rival over the next best, where it is the true one."""
+    return np.asarray(np.min(motion.odds, axis=1))

@@ -1,0 +1,117 @@
+"""The motion to record next: within its limits, played by the simulated drives, told by the report."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivelink import cli, jointfile
+from drivelink.demo.simulate import alter, world_from_joint
+from estimator.diagnosis import motion
+from estimator.diagnosis.shape import Limits, Shape
+from estimator.driven import driven
+from estimator.freerun import free_run
+from estimator.model import Effect
+from sim.world import record
+
+ELBOW = Path(__file__).parent.parent / "examples" / "elbow.toml"
+COLUMNS = ("time_s", "motor1_position_rad", "motor1_torque_nm", "link_position_rad")
+MOTION = (
+    "[motion]\nposition_rad = [-0.6, 0.6]\nvelocity_rad_s = 3\nacceleration_rad_s2 = 30\ntorque_nm = 12\n"
+)
+
+
+def limits() -> Limits:
+    values = {
+        "low_rad": -0.6,
+        "high_rad": 0.6,
+        "velocity_rad_s": 3,
+        "acceleration_rad_s2": 30,
+        "torque_nm": 12,
+    }
+    return Limits(**{name: np.array([float(value)]) for name, value in values.items()})
+
+
+def written(folder: Path, excitation: str, name: str = "run.csv") -> tuple[Path, Path]:
+    """The elbow with backlash, moved so, and its recording of 12 s."""
+    joint = folder / "elbow.toml"
+    text = ELBOW.read_text(encoding="utf-8")
+    assert text.count('{ kind = "rich" }') == 1
+    joint.write_text(text.replace('{ kind = "rich" }', excitation) + "\n" + MOTION)
+    world = world_from_joint(jointfile.load(joint), file=joint)
+    alter(world, ["backlash=0.003"], {})
+    columns = record(world, 12.0)
+    rows = np.column_stack([columns[column] for column in COLUMNS])
+    np.savetxt(folder / name, rows, "%.9g", ",", header=",".join(COLUMNS), comments="")
+    return joint, folder / name
+
+
+def test_random_motions_begin_and_end_at_rest_and_touch_a_limit() -> None:
+    numbers = np.random.default_rng(1).uniform(-1.0, 1.0, (5, Shape.size(1)))
+    path = Shape(numbers, 8.0, limits()).path(1e-3)
+    reach = np.array([np.max(np.abs(x), axis=(0, 2)) for x in path[:3]]) / np.array([[0.6], [3.0], [30.0]])
+    np.testing.assert_allclose(np.max(reach, axis=0), 1.0, rtol=1e-9)
+    np.testing.assert_allclose(path.position[[0, -1]], 0.0, atol=1e-6)
+    rates = np.gradient(path.position, path.period_s, axis=0)
+    np.testing.assert_allclose(rates[1:-1], path.velocity[1:-1], atol=1e-3)
+    np.testing.assert_allclose(
+        np.gradient(path.velocity, 1e-3, axis=0)[1:-1], path.acceleration[1:-1], atol=0.05
+    )
+
+
+def test_what_a_driven_model_reads_its_free_run_gives_back() -> None:
+    model = jointfile.load(ELBOW).model()
+    lossy = Effect(name="hysteresis", parameters={"torque_nm": 0.3, "displacement_rad": 0.004})
+    numbers = np.random.default_rng(2).uniform(-1.0, 1.0, (2, Shape.size(1)))
+    path = Shape(numbers, 8.0, limits()).path(2e-3)
+    for effects in ((), (lossy,)):
+        changed = replace(model, motors=(replace(model.motors[0], effects=effects),))
+        for run in driven(path, changed):
+            assert min(free_run(run, changed, 1.0).fit_percent.values()) > 97.0
+
+
+def test_a_designed_motion_is_written_played_and_decides(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(motion, "_POPULATION", 5)
+    monkeypatch.setattr(motion, "_GENERATIONS", 1)
+    joint, poor = written(tmp_path, '{ kind = "sines", amplitude_nm = 3.0, frequency_hz = 0.7 }')
+    asked = ["diagnose", str(poor), "--joint", str(joint), "--out", str(tmp_path), "--motion"]
+    assert cli.main([*asked, str(tmp_path / "next.csv"), "--motion-seconds", "8"]) == 0
+    assert "What to move next" in capsys.readouterr().out and (tmp_path / "next.png").stat().st_size > 10_000
+    table = np.genfromtxt(tmp_path / "next.csv", delimiter=",", names=True)
+    most = {"position_rad": 0.6, "velocity_rad_s": 3.0, "acceleration_rad_s2": 30.0, "torque_nm": 12.0}
+    assert len(table) == 8000
+    for name, limit in most.items():
+        assert np.max(np.abs(table[f"motor1_{name}"])) <= limit * (1.0 + 1e-6)
+    document = json.loads((tmp_path / "report.json").read_text())["motion"]
+    likeliest, *others = document["rivals"]
+    assert likeliest["effects"] == "backlash" and others and 0.0 < document["decides"] <= 1.0
+    page = (tmp_path / "report.html").read_text()
+    assert (
+        "What to move next" in page and "Model beside machine" in page and "residual of that channel" in page
+    )
+
+    _, played = written(tmp_path, '{ kind = "motion", file = "next.csv" }', "played.csv")
+    moved = np.genfromtxt(played, delimiter=",", names=True)["motor1_position_rad"][:8000]
+    assert np.std(moved - table["motor1_position_rad"]) < 0.05 * np.std(moved)
+    assert cli.main(["diagnose", str(played), "--joint", str(joint), "--out", str(tmp_path), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["verdict"] == "effect" and report["effects"][0]["name"] == "backlash"
+
+
+def test_what_is_wrong_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    joint, _ = written(tmp_path, '{ kind = "none" }')
+    asked = ["diagnose", str(tmp_path / "run.csv"), "--joint", str(joint)]
+    assert cli.main([*asked, "--motion", "next.txt"]) == 2
+    assert cli.main([*asked, "--motion", "next.csv", "--motion-seconds", "1"]) == 2
+    (tmp_path / "short.csv").write_text("time_s\n0\n")
+    assert cli.main(["sim", str(joint), "--motion", str(tmp_path / "short.csv"), "--seconds", "1"]) != 0
+    joint.write_text(joint.read_text().replace("[-0.6, 0.6]", "[0.6, -0.6]"))
+    assert cli.main(asked) != 0
+    errors = capsys.readouterr().err.strip().splitlines()
+    assert len(errors) == 4 and "[lowest, highest]" in errors[3] and "columns time_s" in errors[2]

@@ -104,6 +104,12 @@ def test_a_view_without_anything_yet_says_so() -> None:
     view = JointView("elbow")
     assert "waiting for the first estimate" in "\n".join(lines(view))
     assert view.line() == "elbow: no estimate yet"
+    view = filled()
+    view.status = {
+        "state": "running"
+    }  # no baseline: not a word of what is observable, beside a green "observable"
+    text = "\n".join(lines(view, 120, 40))
+    assert "no baseline: drivelink fit" in text and "● observable" in text and "not observable" not in text
 
 
 def test_what_is_not_finite_breaks_nothing() -> None:

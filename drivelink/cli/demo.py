@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import math
 import shutil
 import tempfile
@@ -58,6 +59,7 @@ def _seconds(text: str) -> float:
 
 def run(args: argparse.Namespace) -> int:
     """Run one case and compare truth and estimate."""
+    logging.getLogger("drivelink.client").setLevel(logging.ERROR)  # its daemon comes, however late
     console = Console()
     live = console.is_terminal and not args.headless and not args.json
     if args.case in closedloop.CASES:

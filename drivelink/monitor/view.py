@@ -297,10 +297,16 @@ class JointView:
 
     def _why_empty(self) -> str:
         """Why there is no curve yet."""
-        return shape(self.status).not_valid or "not observable yet"
+        return shape(self.status).not_valid or "no values yet"
 
     def _time_plot(
-        self, width: int, height: int, title: str, series: Sequence[_Instant], truth: Sequence[float] = ()
+        self,
+        width: int,
+        height: int,
+        title: str,
+        series: Sequence[_Instant],
+        truth: Sequence[float] = (),
+        empty: str = "",
     ) -> Text:
         """A quantity over time; what is not valid is grey and sets no scale beside what is."""
         end = series[-1].time_s if series else 0.0
@@ -314,7 +320,7 @@ class JointView:
             points = [(p.time_s - end, p.value if p.valid is wanted else math.nan) for p in series]
             plot.curve(points, ink)
         if not known:
-            plot.note(self._why_empty())
+            plot.note(empty or self._why_empty())
         return plot.render(title, "s")
 
     def _torque_plot(self, width: int, height: int) -> Text:
@@ -336,7 +342,8 @@ class JointView:
             series = [_Instant(t.time_s, t.torque_nm, t.valid) for t in touches]
             return self._time_plot(width, height, "external torque over time, N·m", series)
         series = [_Instant(time_s, ratio, True) for time_s, ratio in self.history.residuals]
-        return self._time_plot(width, height, "residual over time, × its baseline", series)
+        title, empty = "residual over time, × its baseline", "no baseline: drivelink fit --write makes one"
+        return self._time_plot(width, height, title, series, empty=empty)
 
     def _flags(self) -> Text:
         text = Text(no_wrap=True)

@@ -41,7 +41,7 @@ PROTECTIONS = [
         ("depth of a joint file", "jointfile/document.py", "if _DEEP.search(text):", "if False:", "tests/test_jointfile.py -k without_end"),
         ("regular files only", "files.py", "if not stat.S_ISREG(os.fstat(fd).st_mode):", "if False:", f"{LIMITS} -k regular --timeout 20"),
         ("size of an MCAP chunk", "recording/mcapfile.py", "    if size > MAX_BLOCK_BYTES:", "    if False:", f"{LIMITS} -k mcap_chunk"),
-        ("size of an MCAP message", "recording/mcapfile.py", "if len(data) > _MESSAGE_BYTES:", "if False:", f"{LIMITS} -k huge_message"),
+        ("size of an MCAP message", "recording/mcapfile.py", "if len(data) > _MESSAGE_BYTES:", "if False:", f"{LIMITS} -k messages_of_others"),
         ("number of records", "recording/mcapfile.py", "if count > most:", "if False:", f"{LIMITS} -k 'without_end or so_many'"),
         ("number of frames", "recording/canlog.py", "if most < 0:", "if False:", f"{LIMITS} -k blf"),
         ("flat messages", "recording/mcapfile.py", 'if b"[" in data or', "if False and", f"{LIMITS} -k one_line"),

@@ -145,6 +145,15 @@ SCRIPT: tuple[Fault, ...] = (
         flags=BACK,
         says=AGAIN,
     ),
+    Fault(
+        name="another master homes a drive",
+        steps=(
+            at(0.1, "inject", 0x602, b"\x2f\x60\x60\0\x06\0\0\0"),
+            at(1.0, "inject", 0x602, b"\x2f\x60\x60\0\x0a\0\0\0"),
+        ),
+        seconds=1.5,
+        flags=Status.RESTARTED,
+    ),
     gap(
         "a drive is stopped by another master",
         at(0.1, "inject", 0x000, b"\x02\x02"),

@@ -226,6 +226,17 @@ def test_an_overheard_homing_has_lost_the_zero(writes: list[str], lost: list[boo
     assert found == lost
 
 
+def test_no_zero_is_believed_while_a_homing_runs_and_its_end_is_told() -> None:
+    assembler = Assembler(VSA, 2)
+    homing, found = 0x602, []
+    words = (0x1237, 0x0237, 0x0237, 0x2237, 0x0237, 0x1637, 0x1637, 0x1637)  # attained at the sixth
+    for k, word in enumerate(words):
+        request = [(homing, bytes.fromhex("2F60600006000000"))] if k == 1 else []
+        run(assembler, [(SYNC, b""), *request, (0x181, pdo(k)), (0x182, pdo(-k, 0, word)), (0x183, link(k))])
+        found.append(bool(assembler.flags & Status.NODE_RESTARTED))
+    assert found == [False, True, True, True, True, True, False, False]
+
+
 @pytest.mark.parametrize(("silent", "lost"), [(10, False), (11, True)])
 def test_a_node_that_was_not_heard_for_a_while_may_count_from_elsewhere(silent: int, lost: bool) -> None:
     assembler = Assembler(VSA, 2, active=False, hold_periods=10)

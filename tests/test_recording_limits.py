@@ -27,7 +27,7 @@ from drivelink.recording.canlog import read_frames
 from drivelink.recording.formats import open_sink
 from drivelink.recording.gate import Gathered
 from drivelink.recording.mapping import joint_of, side_file
-from drivelink.recording.mcapfile import read_messages
+from drivelink.recording.mcapfile import message_fields, read_messages
 from drivelink.recording.playback import open_playback
 
 HEADER = "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad\n"
@@ -240,6 +240,8 @@ def test_messages_of_others_in_an_mcap_file_are_one_line(tmp_path: Path) -> None
     ):
         mcap_of(path, [(topic, 0, text)])
         read_every_way(path)
+    with pytest.raises(ValueError, match="expected at most 64 KiB"):
+        message_fields(b" " * 100_000 + b"{}")
 
 
 def test_a_reader_of_others_reads_our_logs(whole: Path) -> None:

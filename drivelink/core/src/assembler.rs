@@ -428,7 +428,7 @@ impl Assembler {
         if self.untimed > 0 {
             flags |= UNTIMED;
         }
-        if std::mem::replace(&mut self.restart, false) {
+        if std::mem::replace(&mut self.restart, self.nodes.iter().any(|node| node.searching)) {
             flags |= NODE_RESTARTED;
             self.checks.iter_mut().for_each(CrossCheck::reset);
             self.contradicted = 0;

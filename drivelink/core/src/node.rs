@@ -9,6 +9,8 @@ const RESETS: [u8; 2] = [0x81, 0x82]; // node, communication
 const FAULT_BIT: i64 = 0x0008; // of the statusword
 const MODE: u16 = 0x6060; // mode of operation (CiA 402-2, 8.5.3)
 const HOMING: u8 = 6;
+const ATTAINED: i64 = 0x1000; // bits of the statusword in that mode: homing attained …
+const FAILED: i64 = 0x2000; // … and homing error
 const HOME: [u16; 2] = [0x607C, 0x6098]; // home offset, homing method (CiA 402-2, 11.4)
 
 /// What became of one node's frames since the start.
@@ -66,8 +68,10 @@ pub struct Node {
     pub emergency: u16,
     /// Its position counters may have started anew; for whoever reads it to clear.
     pub restarted: bool,
-    /// Its mode of operation is homing, as last written.
+    /// Its mode of operation is homing, as last written, and no end of the homing has been seen.
     homing: bool,
+    /// By its statusword the homing has not ended: its positions may be set anew with every sample.
+    pub searching: bool,
 }
 
 impl Node {
@@ -85,6 +89,7 @@ impl Node {
             emergency: 0,
             restarted: false,
             homing: false,
+            searching: false,
         }
     }
 
@@ -121,6 +126,7 @@ impl Node {
             self.faulted = false;
             self.emergency = 0;
             self.statusword = None;
+            (self.homing, self.searching) = (false, false);
             self.restarted = true;
             decoders.for_each(TpdoDecoder::forget);
             return;
@@ -142,6 +148,7 @@ impl Node {
         self.restarted |= HOME.contains(&index) || homing || (index == MODE && self.homing);
         if index == MODE {
             self.homing = homing;
+            self.searching = homing && self.statusword.is_some_and(|word| word & ATTAINED == 0);
         }
     }
 
@@ -159,6 +166,12 @@ impl Node {
             self.emergency = 0;
         }
         self.faulted = faulted;
+        if self.homing {
+            // It ends with the sample that is counted from home. A second one in the same mode begins as the first.
+            let ended = self.searching && statusword & (ATTAINED | FAILED) == ATTAINED;
+            self.restarted |= ended;
+            self.searching = statusword & ATTAINED == 0 || self.searching && !ended;
+        }
     }
 }
 
@@ -228,5 +241,30 @@ mod tests {
         node.restarted = false;
         node.request(&request(MODE, 8)); // the homing is over
         assert!(node.restarted);
+    }
+
+    #[test]
+    fn a_homing_lasts_until_its_statusword_says_attained_and_no_error() {
+        let mut node = Node::new(1, true);
+        node.take_statusword(0x1237); // the bit means something else in another mode
+        node.request(&[0x2F, 0x60, 0x60, 0, HOMING, 0, 0, 0]);
+        for (word, searching, restarted) in [
+            (0x1637, false, true), // not yet in that mode
+            (0x0237, true, false),
+            (0x2237, true, false), // failed
+            (0x3237, true, false),
+            (0x0237, true, false),
+            (0x1637, false, true),
+            (0x1237, false, false),
+            (0x0237, true, false), // again
+            (0x1637, false, true),
+        ] {
+            node.take_statusword(word);
+            assert_eq!((node.searching, node.restarted), (searching, restarted), "{word:#x}");
+            node.restarted = false;
+        }
+        node.take_statusword(0x0237);
+        node.heartbeat(0, nobody());
+        assert!(!node.searching);
     }
 }

@@ -267,6 +267,12 @@ impl Known<'_> {
             square
         };
         let healthy = judged(Cause::Nothing, &reduced, self.set, &prior, 0.0);
+        // No cause gains more than all that is left, and each has less than this chance.
+        let most = evidence(independent, 0.0) - evidence(healthy, 0.0);
+        if most + before.max(f64::MIN_POSITIVE).ln() + (CAUSES as f64 / (CAUSES - 1) as f64).ln() <= 0.0 {
+            odds.of[Cause::Nothing as usize].probability = 1.0;
+            return odds;
+        }
         if let Some(own) = own {
             for entry in &TABLE[1..] {
                 let Some((v, unit)) = self.direction(entry.cause) else { continue };

@@ -43,6 +43,15 @@ pub fn dot(z: &Row, c: &Row) -> f64 {
     z.iter().zip(c).map(|(z, c)| z * c).sum()
 }
 
+/// Σ a b, in four sums side by side.
+fn product(a: &[f64], b: &[f64]) -> f64 {
+    let (fours, rest) = (a.chunks_exact(4).zip(b.chunks_exact(4)), a.len() / 4 * 4..a.len());
+    let mut sums = [0.0; 4];
+    fours.for_each(|(a, b)| (0..4).for_each(|k| sums[k] += a[k] * b[k]));
+    let rest: f64 = a[rest.clone()].iter().zip(&b[rest]).map(|(a, b)| a * b).sum();
+    sums.iter().sum::<f64>() + rest
+}
+
 /// Σ z zᵀ of rows: the lower triangle, and how many rows.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Gram {
@@ -104,12 +113,9 @@ impl Gram {
     pub fn times(&self, c: &Row) -> Row {
         let mut out = [0.0; COLUMNS];
         for i in 0..all() {
-            let sums = &self.sums[i];
-            for (j, sum) in sums[..i].iter().enumerate() {
-                out[i] += sum * c[j];
-                out[j] += sum * c[i];
-            }
-            out[i] += sums[i] * c[i];
+            let (left, diagonal) = (&self.sums[i][..i], self.sums[i][i]);
+            out.iter_mut().zip(left).for_each(|(out, sum)| *out += sum * c[i]);
+            out[i] += product(left, &c[..i]) + diagonal * c[i];
         }
         out
     }
@@ -210,7 +216,7 @@ impl Posterior {
     #[must_use]
     pub fn variance_along(&self, g: &Vector) -> f64 {
         let mut sum = 0.0;
-        for i in unknowns(self.set) {
+        for i in unknowns(self.set).filter(|i| g[*i] != 0.0) {
             sum += g[i] * self.covariance[i].iter().zip(g).map(|(v, b)| v * b).sum::<f64>();
         }
         sum.max(0.0)

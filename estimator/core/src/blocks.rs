@@ -1,31 +1,27 @@
 //! What one motor's balance has taught: blocks of rows, and the algebra on their sum.
 
+mod doubt;
+mod known;
 mod solve;
 
 use serde::{Deserialize, Serialize};
 
 use crate::balance::{self, Balance};
-use crate::causes::{Cause, Known, Noise, Odds, TABLE};
-use crate::gram::{Frame, Gram, Posterior, Row, Set, UNKNOWNS, Vector, dot, inverse, set};
+use crate::causes::{Noise, Odds};
+use crate::gram::{Frame, Gram, Posterior, Row, Set, UNKNOWNS, Vector, dot, inverse};
 use crate::model::Motor;
 use crate::settings::Priors;
 use crate::spring::{Family, Projection, TERMS};
 use crate::student::f_quantile;
-use crate::unknowns::{
-    ACTIVE, CANDIDATES, DAMPING, INERTIA, LATE, OFFSET, RATE, Reading, SPRING, Spring, ZERO,
-};
+use crate::unknowns::{ACTIVE, Spring};
 
-/// Share of the torque that a curve may leave unexplained.
-const USEFUL: f64 = 0.2;
 const BLOCK_S: f64 = 0.25; // of motion: longer than the filters' memory, so that blocks are nearly independent
 const BLOCKS: usize = 100; // 25 s of motion: what a joint's temperature and load leave as they are
 const FEWEST: usize = 8; // blocks before one is held against the others
 const WINDOW: usize = 8; // blocks that are not explained, at most: two seconds
 const CONVINCING: usize = 2; // blocks in a row that end a doubt: one may have had little motion
-const DECIDED: f64 = 0.95; // probability at which a change of the joint itself is followed
 const QUICK_S: f64 = 0.03; // over which single rows are held against what is known: the filters' memory
 
-const REST: f64 = 0.03; // of what is left without it: an effect that bends with the change
 const EXPLAINED: f64 = 3.0; // times the usual mean square, that a change of the joint may leave
 const EARLY: f64 = 0.005; // of the torque's fluctuation: what a drive's torque is known to, before any data
 const TAILS: f64 = 8.0; // degrees of freedom of a block's noise level: it varies within a factor of two
@@ -285,14 +281,6 @@ impl Blocks {
         self.quick > usual.max(BURST * held) + self.quick_limit * known.variance_along(&along)
     }
 
-    /// Something has changed: rows are of use again when the filters have forgotten what was before.
-    fn begin_doubt(&mut self) -> Closed {
-        (self.doubting, self.good, self.doubted) = (true, 0, 0);
-        (self.open, self.skipped) = (Gram::default(), self.settle);
-        self.waiting.clear();
-        Closed::Unexplained
-    }
-
     fn close(&mut self, block: Gram) -> Closed {
         if self.frame.is_none() && self.posterior.is_some() {
             self.believe(&block);
@@ -342,12 +330,6 @@ impl Blocks {
         (self.frame, self.fitted) = (Some(frame), true);
     }
 
-    fn end_doubt(&mut self) {
-        self.waiting.clear();
-        (self.odds, self.doubting, self.doubted, self.quick) = (None, false, 0, 0.0);
-        self.suspected = false;
-    }
-
     fn keep(&mut self, block: Gram) {
         let peak = std::mem::take(&mut self.peak);
         if self.ring.len() < BLOCKS {
@@ -359,178 +341,15 @@ impl Blocks {
         }
     }
 
-    /// What the causes say of a block, with those that wait; `None`: it is explained.
-    fn judge(&self, block: &Gram) -> Option<Odds> {
-        let odds = self.odds_of(block)?;
-        if self.waiting.is_empty() {
-            return Some(odds);
-        }
-        let mut window = block.clone();
-        self.waiting.iter().for_each(|one| window.add(one, 1.0));
-        self.weigh(&window)
-    }
-
-    /// What the causes say of the last blocks together, each of which was explained: a change may be slow.
-    fn judge_latest(&self) -> Option<Odds> {
-        if self.ring.len() < 2 * WINDOW {
-            return None;
-        }
-        let mut window = Gram::default();
-        (0..WINDOW).for_each(|k| window.add(&self.ring[self.place(k)], 1.0));
-        self.odds_of(&window)
-    }
-
     /// The place of a block in the ring; 0: the newest.
     fn place(&self, age: usize) -> usize {
         (self.oldest + self.ring.len() - 1 - age) % self.ring.len()
-    }
-
-    /// The last blocks are left out of the sum, and wait.
-    fn doubt_latest(&mut self) {
-        self.begin_doubt();
-        self.skipped = 0;
-        self.ring.rotate_left(self.oldest);
-        self.peaks.rotate_left(self.oldest);
-        self.oldest = 0;
-        let kept = self.ring.len() - WINDOW;
-        self.waiting.extend(self.ring.drain(kept..));
-        self.peaks.truncate(kept);
-        self.solve();
-    }
-
-    /// What the causes say of rows; `None`: nothing has changed.
-    fn odds_of(&self, rows: &Gram) -> Option<Odds> {
-        self.weigh(rows).filter(|odds| odds.of(Cause::Nothing).probability < 0.5)
-    }
-
-    /// The probability of each cause for some rows; `None`: nothing is known to hold them against.
-    fn weigh(&self, rows: &Gram) -> Option<Odds> {
-        let (frame, posterior) = (self.frame.as_ref()?, self.posterior.as_ref()?);
-        let projection = self.projection.as_ref().filter(|_| self.is_reference())?;
-        let known = Known {
-            frame,
-            residual: &self.residual,
-            set: posterior.set,
-            precision: &inverse(&posterior.covariance, posterior.set),
-            torque: &self.spring.torque(projection),
-            slope: &self.spring.slope(projection),
-            powers: self.powers,
-            motor: (posterior.x[INERTIA], posterior.x[DAMPING]),
-            torque_rms: balance::variance(rows, balance::TORQUE).sqrt(),
-            deflection: self.deflection,
-            period_s: self.period,
-        };
-        let noise = Noise { variance: self.own * self.own, ..self.noise };
-        Some(known.judge(rows, &noise, self.per_block))
-    }
-
-    /// The window is not explained: is it the joint that has changed, or a reading?
-    fn doubt(&mut self, odds: Odds) -> Closed {
-        self.doubted += 1;
-        let of_joint: f64 =
-            TABLE.iter().filter(|entry| entry.opens != 0).map(|e| odds.of(e.cause).probability).sum();
-        let best = odds.best(|cause| cause.entry().opens != 0);
-        // A zero that goes on moving is nearly explained by one that has moved; a spring that bends is explained.
-        let bends =
-            best.is_some_and(|cause| matches!(cause, Cause::Stiffness | Cause::Shape | Cause::Friction));
-        let rest = if bends { REST * odds.of(Cause::Nothing).misfit } else { 0.0 };
-        let most = EXPLAINED.max(rest);
-        let explained = best.is_some_and(|cause| odds.of(cause).misfit < most);
-        self.odds = Some(odds);
-        if self.spoilt {
-            self.waiting.clear(); // samples that could not be used were among them: no joint is like that
-        }
-        if self.waiting.len() >= 2 && of_joint > DECIDED && explained {
-            // All that the window does not tell apart is open.
-            let likely = odds.likely(|cause| cause.entry().opens != 0);
-            let opens = TABLE.iter().zip(likely).filter(|(_, likely)| *likely).map(|(entry, _)| entry.opens);
-            self.begin(opens.fold(0, |all, one| all | one));
-            return Closed::Begun;
-        }
-        if self.lost && self.doubted >= FEWEST {
-            self.lose_zero(); // it was located wrongly
-            return Closed::Unexplained;
-        }
-        if self.doubted >= BLOCKS {
-            // Nothing in the table, for as long as anything is remembered: another joint.
-            self.begin(set(1..UNKNOWNS));
-            return Closed::Begun;
-        }
-        if self.waiting.len() >= WINDOW {
-            self.waiting.remove(0);
-        }
-        Closed::Unexplained
-    }
-
-    /// What is known begins with the window: the unknowns that have changed are open again, the others are as before.
-    fn begin(&mut self, opens: Set) {
-        self.carry(opens);
-        self.ring.clear();
-        self.peaks.clear();
-        self.oldest = 0;
-        for k in 0..self.waiting.len() {
-            let block = self.waiting[k].clone();
-            self.keep(block);
-        }
-        self.end_doubt();
-        (self.doubting, self.good) = (true, CONVINCING - 1); // until another block bears it out
-        if opens & set(SPRING) != 0 {
-            self.spring.open();
-        }
-        (self.lost, self.located) = (self.lost || opens >> ZERO & 1 == 1, true); // it is not far
-        self.solve();
-    }
-
-    fn carry(&mut self, opens: Set) {
-        let Some(posterior) = &self.posterior else { return };
-        let kept = posterior.set & !opens;
-        let mut x = posterior.x;
-        for (i, unknown) in SPRING.enumerate() {
-            x[unknown] = self.spring.alpha[i];
-        }
-        x[ZERO] = self.spring.zero;
-        self.carried = Some(Carried {
-            x,
-            precision: inverse(&posterior.covariance, kept),
-            set: kept,
-            deflection: self.deflection,
-            unexplained: self.usual_unexplained().min(self.unexplained),
-        });
-    }
-
-    /// Positions may count from elsewhere since a restart: blocks tell.
-    pub fn suspect_zero(&mut self) {
-        self.begin_doubt();
-        self.suspected = true;
     }
 
     /// Whether it is still to be told where positions count from since a restart.
     #[must_use]
     pub fn is_suspected(&self) -> bool {
         self.suspected
-    }
-
-    /// Where the zero between the encoders is, is not known any more.
-    pub fn lose_zero(&mut self) {
-        if let Some(carried) = self.carried.as_ref().filter(|_| self.lost) {
-            // What was learned without a zero may be of another one: as it was before.
-            self.spring.alpha[..TERMS].copy_from_slice(&carried.x[SPRING]);
-        } else {
-            self.carry(1 << ZERO);
-        }
-        let (carried, noise, own) = (self.carried.take(), self.noise, self.own);
-        self.forget_rows();
-        (self.carried, self.lost, self.posterior, self.located) = (carried, true, None, false);
-        self.spring.zero = 0.0; // deflections are counted from elsewhere
-        if self.carried.is_some() {
-            (self.noise, self.own) = (noise, own);
-        }
-    }
-
-    /// The deflections are counted from near the zero, from now on.
-    pub fn recentre(&mut self) {
-        self.lose_zero();
-        self.located = true;
     }
 
     /// The spring's columns have grown by these factors.
@@ -545,73 +364,5 @@ impl Blocks {
         if !self.ring.is_empty() {
             self.solve();
         }
-    }
-
-    /// Delay of the link position, s, and its standard deviation.
-    #[must_use]
-    pub fn delay(&self) -> Option<(f64, f64)> {
-        let known = self.posterior.as_ref()?;
-        (known.set & (1 << LATE | 1 << RATE) == 1 << LATE)
-            .then(|| (known.x[LATE], known.covariance[LATE][LATE].sqrt()))
-    }
-
-    /// Torque and stiffness at a deflection, with their slopes by the unknowns; `None`: nothing is known.
-    #[must_use]
-    pub fn at(&self, phi: f64, link_rate: f64, balance: &Balance) -> Option<Reading> {
-        match &self.posterior {
-            Some(known) => Some(self.spring.at(phi, &known.x, known.set, link_rate, balance)),
-            None if self.spring.known => Some(self.spring.at(phi, &[0.0; UNKNOWNS], 0, link_rate, balance)),
-            None => None,
-        }
-    }
-
-    /// Torque on the motor beside the spring's that depends on no memory and no sign, N·m; `rate`: φ′.
-    #[must_use]
-    pub fn rest(&self, rate: f64) -> f64 {
-        self.posterior.as_ref().map_or(0.0, |known| known.x[RATE] * rate - known.x[OFFSET])
-    }
-
-    /// rms of what the motor's equation leaves where friction is not taken off, N·m; ∞: unknown.
-    #[must_use]
-    pub fn unmodelled(&self) -> f64 {
-        if self.posterior.is_some() { self.own.hypot(self.friction) } else { f64::INFINITY }
-    }
-
-    /// rms of the transmission's torque over what is known, N·m; NaN before.
-    #[must_use]
-    pub fn torque_rms(&self) -> f64 {
-        self.torque
-    }
-
-    /// rms of what is left of the balance, over that of the measured torque without its mean; NaN before any.
-    #[must_use]
-    pub fn unexplained(&self) -> f64 {
-        self.unexplained
-    }
-
-    /// What was left before a change, or before a zero was lost: neither makes the balance noisier.
-    fn usual_unexplained(&self) -> f64 {
-        let carried = self.carried.as_ref().filter(|_| self.ring.len() < BLOCKS);
-        carried.map_or(f64::INFINITY, |carried| carried.unexplained)
-    }
-
-    /// Whether the balance leaves less than a useful estimate may, and about what it left before a change.
-    #[must_use]
-    pub fn is_explained(&self) -> bool {
-        let usual = self.usual_unexplained().max((self.white / self.fluctuation).sqrt());
-        self.unexplained < USEFUL && self.unexplained <= EXPLAINED.sqrt() * usual
-    }
-
-    /// rms of what the balance has left over the last moments, N·m.
-    #[must_use]
-    pub fn misfit(&self) -> f64 {
-        if self.posterior.is_some() { self.quick.sqrt() } else { f64::NAN }
-    }
-
-    /// Names of the effects that nobody declared and evidence chose.
-    pub fn undeclared(&self) -> impl Iterator<Item = &'static str> {
-        let chosen = self.posterior.as_ref().map_or(0, |posterior| posterior.set);
-        let named = CANDIDATES.iter().filter(move |c| chosen & set(c.unknowns.clone()) != 0).map(|c| c.name);
-        named.chain(self.moved.then_some("deflection_offset"))
     }
 }

@@ -13,12 +13,13 @@
 //! neither affects the flexibility torque: it helps to locate an effect, but raises no alarm (see
 //! [`crate::external`]).
 
+mod balance;
+
 use serde::{Deserialize, Serialize};
 
-use crate::effects::Coordinates;
 use crate::error::Error;
 use crate::filters::StateVariableFilter;
-use crate::joint_effects::{JointEffects, Torques};
+use crate::joint_effects::JointEffects;
 use crate::laws::Law;
 use crate::model::{Arrangement, Link, Model, Transmission};
 use crate::sample::{MOTORS, Sample};
@@ -271,20 +272,6 @@ impl ModelMonitor {
         self.alarm
     }
 
-    fn inputs_of(&self, sample: &Sample) -> [f64; CHANNELS] {
-        let mut channels = [0.0; CHANNELS];
-        let motors = self.motors.len();
-        channels[..motors].copy_from_slice(&sample.motor_position[..motors]);
-        channels[TORQUE..TORQUE + motors].copy_from_slice(&sample.motor_torque[..motors]);
-        if self.flexible {
-            channels[LINK] = sample.link_position;
-        }
-        if self.link.is_some() && sample.external_torque.is_finite() {
-            channels[EXTERNAL] = sample.external_torque;
-        }
-        channels
-    }
-
     fn restart(&mut self, now: &[f64; CHANNELS]) {
         self.inputs = *now;
         self.torque.copy_from_slice(&now[TORQUE..LINK]);
@@ -332,66 +319,6 @@ impl ModelMonitor {
             self.judge();
             self.begin_second();
         }
-    }
-
-    /// The balances with the model's own numbers, and the torques they are compared with.
-    fn balance(&mut self) -> [f64; 2 * BALANCES] {
-        let motors = self.motors.len();
-        let [q, link_rate, link_acceleration] = self.channels[LINK];
-        let (mut each, mut torques) = ([Coordinates::default(); MOTORS], [0.0; MOTORS]);
-        let time = self.ticks as f64 * self.period;
-        let at_link = Coordinates {
-            link_position: q,
-            link_velocity: link_rate,
-            link_acceleration,
-            time,
-            ..Coordinates::default()
-        };
-        for (i, side) in self.motors.iter().enumerate() {
-            let [theta, velocity, acceleration] = self.channels[i];
-            let [torque, torque_rate, _] = self.channels[TORQUE + i];
-            let phi = if side.flexible { q - theta } else { 0.0 };
-            let (flexibility, stiffness) = side.law.as_ref().map_or((0.0, 0.0), |(law, a)| law.at(phi, a));
-            torques[i] = flexibility;
-            each[i] = Coordinates {
-                position: theta,
-                velocity,
-                acceleration,
-                deflection: phi,
-                deflection_rate: if side.flexible { link_rate - velocity } else { 0.0 },
-                flexibility_torque: flexibility,
-                stiffness,
-                torque,
-                torque_rate,
-                ..at_link
-            };
-        }
-        let x: Torques = self.effects.torques(&each[..motors], &at_link);
-        let mut raw = [0.0; 2 * BALANCES];
-        let external = self.channels[EXTERNAL][0];
-        for (i, side) in self.motors.iter().enumerate() {
-            let c = &each[i];
-            // B θ″ + D θ′ + x_motor − τ_e − x_transmission − τ (eq 5)
-            let own = side.inertia * c.acceleration + side.damping * c.velocity;
-            raw[i] = own + x.motor[i] - torques[i] - x.transmission[i] - c.torque;
-            raw[BALANCES + i] = c.torque;
-        }
-        let Some(link) = self.link else { return raw };
-        let load = |position: f64, rate: f64, acceleration: f64| {
-            let gravity = link.gravity * (position + link.gravity_phase).sin();
-            link.inertia * acceleration + link.damping * rate + gravity
-        };
-        if self.linked {
-            // τ_k − (M q″ + D_q q′ + g(q) + τ_e + x_transmission + x_link) (eqs 4, 6)
-            let through: f64 = (0..self.pulls).map(|i| torques[i] + x.transmission[i]).sum();
-            raw[motors] = external - load(q, link_rate, link_acceleration) - through - x.link;
-            raw[BALANCES + motors] = through;
-        } else {
-            // Rigid: the link moves with the first motor.
-            let c = &each[0];
-            raw[0] += load(c.position, c.velocity, c.acceleration) + x.link - external;
-        }
-        raw
     }
 
     /// One second: its rms beside what is foreseen of it.
@@ -449,148 +376,4 @@ impl ModelMonitor {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::effects::Element;
-    use crate::model::Motor;
-
-    const T: f64 = 1e-3;
-
-    fn model(effects: Vec<Element>) -> Model {
-        Model {
-            arrangement: Arrangement::Single,
-            motors: vec![Motor {
-                inertia: 0.1,
-                inertia_std: None,
-                damping: 0.5,
-                damping_std: None,
-                transmission: Transmission::Elastic {
-                    law: Law::Linear,
-                    order: None,
-                    parameters: vec![100.0],
-                    covariance: None,
-                },
-                effects,
-            }],
-            link: Some(Link {
-                inertia: 0.3,
-                damping: 0.2,
-                gravity: 0.0,
-                gravity_phase: 0.0,
-                inertia_std: 0.0,
-                damping_std: 0.0,
-                gravity_std: 0.0,
-            }),
-            link_effects: Vec::new(),
-        }
-    }
-
-    /// θ and q are sines and the torques follow from eqs 5 and 4, with torques that the model lacks.
-    fn sample(k: u64, lacks: [f64; 3]) -> Sample {
-        let (t, w) = (k as f64 * T, 7.0f64);
-        let (theta, velocity, acceleration) = ((w * t).sin(), w * (w * t).cos(), -w * w * (w * t).sin());
-        let q = 1.2 * theta;
-        let wave = (3.0 * w * t).sin(); // what is lacking changes as quickly as this
-        let [motor, transmission, link] = lacks.map(|size| size * wave);
-        let through = 100.0 * (q - theta) + transmission;
-        let torque = 0.1 * acceleration + 0.5 * velocity + motor - through;
-        let external = 0.3 * 1.2 * acceleration + 0.2 * 1.2 * velocity + through + link;
-        Sample {
-            sequence: k,
-            motor_position: [theta, f64::NAN],
-            motor_velocity: [f64::NAN; MOTORS],
-            motor_torque: [torque, f64::NAN],
-            link_position: q,
-            link_velocity: f64::NAN,
-            external_torque: external,
-        }
-    }
-
-    fn baseline() -> Baseline {
-        Baseline {
-            residual: [0.1; BALANCES],
-            torque: [15.0; BALANCES],
-            log_std: [0.3; BALANCES],
-            seconds: 30,
-        }
-    }
-
-    fn monitor(effects: Vec<Element>) -> ModelMonitor {
-        ModelMonitor::new(&model(effects), Some(baseline()), 1.0, T).unwrap()
-    }
-
-    #[test]
-    fn a_true_model_leaves_little_and_a_missing_torque_is_measured_and_placed() {
-        for (lacks, place) in
-            [([3.0, 0.0, 0.0], "motor"), ([0.0, 3.0, 0.0], "transmission"), ([0.0, 0.0, 3.0], "link")]
-        {
-            let mut monitor = monitor(Vec::new());
-            for k in 0..4000 {
-                assert!(!monitor.step(&sample(k, [0.0; 3])));
-            }
-            assert!(monitor.found().ratio < 1.0);
-            (4000..7000).for_each(|k| {
-                monitor.step(&sample(k, lacks));
-            });
-            assert!(monitor.alarm());
-            assert_eq!(monitor.location(), place);
-            // A sine of 3 N·m at 21 rad/s behind (180/(s + 180))³ (60/(s + 60))².
-            let gain = |w: f64, n: i32| (1.0 + (21.0 / w).powi(2)).powf(-0.5 * f64::from(n));
-            let rms = 3.0 / 2f64.sqrt() * gain(180.0, 3) * gain(60.0, 2);
-            let b = usize::from(place == "link");
-            assert!((monitor.found().residual[b] / rms - 1.0).abs() < 0.05);
-        }
-    }
-
-    #[test]
-    fn a_push_that_nobody_measures_raises_no_alarm() {
-        let mut monitor = monitor(Vec::new());
-        for k in 0..7000 {
-            let lacks = [0.0, 0.0, if k < 4000 { 0.0 } else { 3.0 }];
-            let pushed = Sample { external_torque: f64::NAN, ..sample(k, lacks) };
-            assert!(!monitor.step(&pushed));
-        }
-        assert!(monitor.found().residual[1] > 1.0 && monitor.found().ratio < 1.0);
-    }
-
-    #[test]
-    fn an_effect_that_the_model_has_is_no_residual() {
-        let element = Element::new("viscous_damping", &[-0.5]).unwrap();
-        let mut with = monitor(vec![element]);
-        let mut without = monitor(Vec::new());
-        for k in 0..3000 {
-            let mut sample = sample(k, [0.0; 3]);
-            sample.motor_torque[0] -= 0.5 * 7.0 * (7.0 * k as f64 * T).cos();
-            with.step(&sample);
-            without.step(&sample);
-        }
-        assert!(with.found().residual[0] < 0.1 * without.found().residual[0]);
-    }
-
-    #[test]
-    fn the_rate_of_false_alarms_is_the_declared_one() {
-        // ln S of a second is normal about the baseline's as long as MOTION stands for the rest of it: the
-        // limit is exceeded as often as t says, which for many seconds is the normal distribution's tail.
-        let many = Baseline { log_std: [0.0; BALANCES], seconds: 10_001, ..baseline() };
-        let monitor = ModelMonitor::new(&model(Vec::new()), Some(many), 36.0, T).unwrap();
-        // 36 an hour and two balances: 0.5 % of the seconds, beyond 2.576 standard deviations.
-        assert!((monitor.limit[0] / MOTION - 2.576).abs() < 2e-3);
-    }
-
-    #[test]
-    fn gaps_are_bridged_or_begin_anew_and_what_is_no_measurement_is_passed_over() {
-        let mut monitor = monitor(Vec::new());
-        for k in (0..4000).filter(|k| k % 10 != 3 && k % 10 != 4) {
-            monitor.step(&sample(k, [0.0; 3]));
-        }
-        assert!(monitor.found().ratio < 1.0);
-        for value in [f64::NAN, f64::INFINITY, -1e300] {
-            let mut bad = sample(4000, [0.0; 3]);
-            bad.link_position = value;
-            assert!(!monitor.step(&bad));
-        }
-        assert!(!monitor.found().residual[0].is_nan());
-        monitor.step(&sample(9000, [0.0; 3]));
-        assert!(monitor.found().residual[0].is_nan());
-    }
-}
+mod tests;

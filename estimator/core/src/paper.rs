@@ -3,16 +3,20 @@
 //! As printed: regressors are not filtered like the residual, velocities are the drive's (else differences of
 //! positions). The robust mode avoids the resulting errors on real drives.
 
+mod recursive;
+
 use serde::{Deserialize, Serialize};
 
 use crate::external::{External, PaperMomentum};
 use crate::filters::{first_order_pole, tustin_biquad};
-use crate::laws::{Alpha, Law, PARAMETERS, powers};
+use crate::laws::{Law, PARAMETERS, powers};
 use crate::model::{Arrangement, Model, Motor, Transmission};
 use crate::reasons::{Reason, Why};
 use crate::sample::{Estimate, MOTORS, Sample, TransmissionEstimate, joint_estimate, status};
 use crate::sample_validator::SampleValidator;
 use crate::settings::{Method, Priors, Settings};
+
+pub use recursive::RecursiveLeastSquares;
 
 const EXCITED_RAD2_S2: f64 = 1e-6; // mean square of φ′ above which K_R φ′² teaches anything
 const ENERGY_S: f64 = 0.5; // over which that mean is taken
@@ -92,78 +96,6 @@ pub fn regressor_step(stiffness: f64, residual: f64, rate: f64, k_r: f64, k_max:
     let energy = rate * rate;
     let k_r = if k_r * energy > k_max { k_max / energy } else { k_r };
     stiffness + k_r * (residual * rate - stiffness * energy)
-}
-
-/// Least squares in α one row at a time (eqs 22, 23), the same answer as the batch.
-///
-/// Kept as the triangular square root of the normal equations (QR by Givens rotations), so that columns of
-/// very different size (φ, φ³, φ⁵ …) cost no more accuracy than they do in a batch QR.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-pub struct RecursiveLeastSquares {
-    size: usize,
-    r: [[f64; PARAMETERS + 1]; PARAMETERS],
-    error: f64,
-    rows: f64,
-}
-
-impl RecursiveLeastSquares {
-    /// For so many coefficients.
-    #[must_use]
-    pub fn new(size: usize) -> RecursiveLeastSquares {
-        RecursiveLeastSquares { size, r: [[0.0; PARAMETERS + 1]; PARAMETERS], error: 0.0, rows: 0.0 }
-    }
-
-    /// Take in one row J_j and its right-hand side r_j.
-    pub fn update(&mut self, row: &[f64], value: f64) {
-        let n = self.size;
-        let mut new = [0.0; PARAMETERS + 1];
-        new[..n].copy_from_slice(&row[..n]);
-        new[n] = value;
-        for i in 0..n {
-            if new[i] == 0.0 {
-                continue;
-            }
-            let old = &mut self.r[i];
-            let norm = old[i].hypot(new[i]);
-            let (c, s) = (old[i] / norm, new[i] / norm);
-            for j in i..=n {
-                (old[j], new[j]) = (c * old[j] + s * new[j], c * new[j] - s * old[j]);
-            }
-        }
-        self.error += new[n] * new[n];
-        self.rows += 1.0;
-    }
-
-    /// Coefficients; 0 where the rows so far do not determine them.
-    #[must_use]
-    pub fn alpha(&self) -> Alpha {
-        let mut alpha = [0.0; PARAMETERS];
-        for i in (0..self.size).rev() {
-            let row = &self.r[i];
-            if row[i] > 0.0 {
-                let rest: f64 = (i + 1..self.size).map(|j| row[j] * alpha[j]).sum();
-                alpha[i] = (row[self.size] - rest) / row[i];
-            }
-        }
-        alpha
-    }
-
-    /// Standard deviation of slopes · α if the rows' errors were independent; NaN where it is undetermined.
-    #[must_use]
-    pub fn std(&self, slopes: &[f64]) -> f64 {
-        let n = self.size;
-        if self.rows <= n as f64 {
-            return f64::NAN;
-        }
-        // |R^-T slopes|, by forward substitution.
-        let (mut solved, mut square) = ([0.0; PARAMETERS], 0.0);
-        for i in 0..n {
-            let rest: f64 = (0..i).map(|j| self.r[j][i] * solved[j]).sum();
-            solved[i] = (slopes[i] - rest) / self.r[i][i];
-            square += solved[i] * solved[i];
-        }
-        (square * self.error / (self.rows - n as f64)).sqrt()
-    }
 }
 
 /// One motor with its transmission.
@@ -413,41 +345,4 @@ impl Paper {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_residual_of_a_constant_torque_rises_as_its_filter_does() {
-        // A motor held at rest against a constant torque: τ_e = −τ, through K/(s + K) (eq 15).
-        let (k, period, tau) = (300.0, 1e-3, 2.0);
-        let balance =
-            Balance { inertia: 0.1, damping: 0.2, period, origin: None, integral: 0.0, torque: 0.0 };
-        let mut residual = FirstOrder { balance, k, value: 0.0, last: 0.0 };
-        for n in 0..50 {
-            let expected = -tau * (1.0 - (-k * period * f64::from(n)).exp());
-            assert!((residual.update(0.4, 0.0, tau, 1.0) - expected).abs() < 1e-12);
-        }
-    }
-
-    #[test]
-    fn recursive_least_squares_find_the_coefficients_of_exact_rows() {
-        let mut squares = RecursiveLeastSquares::new(2);
-        for k in 1..20 {
-            let phi = 0.01 * f64::from(k);
-            squares.update(&[phi, phi * phi * phi], 150.0 * phi + 1500.0 * phi * phi * phi);
-        }
-        let alpha = squares.alpha();
-        assert!((alpha[0] - 150.0).abs() < 1e-8 && (alpha[1] - 1500.0).abs() < 1e-6);
-        assert!(squares.std(&[1.0, 0.0]) < 1e-6);
-    }
-
-    #[test]
-    fn the_saturated_regressor_stays_stable_where_the_plain_one_would_not() {
-        // With K_R φ′² limited to K_max < 2 the error shrinks by 1 − K_max a step.
-        let mut stiffness = 0.0;
-        for _ in 0..200 {
-            stiffness = regressor_step(stiffness, 50.0 * 3.0, 3.0, 1900.0, 1.9);
-        }
-        assert!((stiffness - 50.0).abs() < 1e-6);
-    }
-}
+mod tests;

@@ -3,31 +3,30 @@
 //! Each tick: check the sample, correct it, bridge a gap, align the channels, filter them, add each motor's row;
 //! a full block solves. Torque and stiffness are the law's at the deflection of this moment.
 
+mod conclude;
+mod zeros;
+
 use serde::{Deserialize, Serialize};
 
 use crate::align::{Alignment, Inputs, Positions};
 use crate::corrections::Corrections;
-use crate::deflection::Present;
 use crate::effects::MotorEffects;
 use crate::error::Error;
 use crate::external::{Carried, External, LinkMomentum};
 use crate::laws::Law;
 use crate::model::{Arrangement, Model, Transmission};
 use crate::noise::NoiseMeter;
-use crate::reasons::{Reason, Why};
-use crate::sample::{Estimate, MOTORS, Sample, TransmissionEstimate, joint_estimate, status};
+use crate::reasons::Why;
+use crate::sample::{Estimate, MOTORS, Sample};
 use crate::sample_validator::SampleValidator;
 use crate::settings::{Method, Priors, Settings};
 use crate::side::{Moment, SETTLE_DELAYS, Shift, Side};
 use crate::signals::{Channel, Filters};
-use crate::suspicion::{self, Suspicion};
+use crate::suspicion::Suspicion;
 
 const LOOK_S: f64 = 0.03; // between two looks at the excitation: the filters' correlation time at 60 rad/s
 const BRIDGED: f64 = 0.4; // rad that the filter turns by in a gap: a longer one is not learned from
 const SAID_S: f64 = 0.5; // how long a restart, and what was wrong with a sample, is reported
-const TRUST_S: f64 = 0.02; // how long an estimate is carried over rejected samples
-const FORESEEN_S: f64 = 0.04; // how far ahead a deflection is extrapolated
-const HOME: f64 = 0.01; // of a jump: a zero that comes back so near to the first one is that one
 
 /// See the module.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -369,30 +368,6 @@ impl Robust {
         [i, self.motors].map(|k| self.noise[k].variance(resolution[k]))
     }
 
-    /// The link is later than was assumed: what was learned is of other moments.
-    fn shift(&mut self, periods: f64) {
-        if self.alignment.shift(periods) == 0.0 {
-            return;
-        }
-        self.unsettled = self.settle;
-        self.momentum.iter_mut().for_each(LinkMomentum::distrust);
-        let last = &self.last.at;
-        for (i, side) in self.sides.iter_mut().enumerate() {
-            side.relearn(last.motor[i], last.deflection(i));
-        }
-    }
-
-    /// The zero of one motor has been found so far from where its deflections are counted from.
-    fn recentre(&mut self, i: usize, off: f64) {
-        self.zeros.motor[i] += off;
-        self.last.at.motor[i] -= off;
-        self.last.present.motor[i] -= off;
-        self.unsettled = self.settle;
-        let at = &self.last.at;
-        let side = &mut self.sides[i];
-        side.recentre(at.motor[i], at.deflection(i), self.last.torque[i]);
-    }
-
     /// What the transmissions do to the link; `None` where a curve is not trusted.
     fn carried(&self, now: &Positions) -> Option<Carried> {
         let pulls = if self.arrangement == Arrangement::Antagonistic { self.motors } else { 1 };
@@ -401,176 +376,5 @@ impl Robust {
             all = all.and(side.carried(now.deflection(i), self.noise_of(i)[0])?);
         }
         Some(all)
-    }
-
-    /// Positions may count from anywhere: from where they did, if blocks bear it out, or from this moment's.
-    fn resume(&mut self, at: &Positions) {
-        let now = at.from_zeros(&self.zeros);
-        let as_before = |(i, side): (usize, &Side)| side.may_be_as_before(now.deflection(i));
-        if self.sides.iter().enumerate().all(as_before) {
-            self.sides.iter_mut().for_each(Side::suspect_zero);
-        } else {
-            self.count_from(&now);
-        }
-    }
-
-    /// Where the zeros are is not known: deflections are counted from these.
-    fn count_from(&mut self, now: &Positions) {
-        for (i, side) in self.sides.iter_mut().enumerate() {
-            self.zeros.motor[i] -= if self.flexible { now.deflection(i) } else { 0.0 };
-            side.move_zero(false);
-        }
-    }
-
-    /// The zeros are not where they were before a restart.
-    fn lose_here(&mut self) {
-        let now = self.last.at;
-        self.count_from(&now);
-        self.unsettled = self.settle;
-        for (i, side) in self.sides.iter_mut().enumerate() {
-            let off = if self.flexible { now.deflection(i) } else { 0.0 };
-            self.last.at.motor[i] += off;
-            self.last.present.motor[i] += off;
-            side.restart(self.last.at.motor[i], self.last.at.deflection(i), self.last.torque[i]);
-        }
-    }
-
-    /// Encoders have moved their zeros: go on as if they had not.
-    fn move_zeros(&mut self, mut jumps: [f64; MOTORS + 1], at: &Positions, sequence: u64) {
-        let m = self.motors;
-        let ahead =
-            (sequence.wrapping_sub(self.sequence) as f64 + self.alignment.periods.abs()) * self.period;
-        // A deflection that went on as it was measures a jump; the validator is coarse.
-        let now = at.from_zeros(&self.zeros);
-        for i in 0..m {
-            let side = &self.sides[i];
-            if ahead > FORESEEN_S || side.rigid || side.deflection.unsettled > 0 {
-                continue;
-            }
-            let off = now.deflection(i) - side.deflection.at(ahead);
-            if jumps[i] != 0.0 && jumps[m] == 0.0 {
-                jumps[i] = -off;
-            } else if jumps[m] != 0.0 && jumps[i] == 0.0 {
-                jumps[m] = off;
-            }
-        }
-        let moved = |zero: f64, jump: f64| {
-            // One that jumps back has come home exactly.
-            let moved = zero + jump;
-            if moved.abs() < HOME * jump.abs() { 0.0 } else { moved }
-        };
-        for i in 0..m {
-            self.zeros.motor[i] = moved(self.zeros.motor[i], jumps[i]);
-        }
-        if self.flexible {
-            self.zeros.link = moved(self.zeros.link, jumps[m]);
-        }
-        let now = at.from_zeros(&self.zeros);
-        for (i, side) in self.sides.iter_mut().enumerate() {
-            let known = ahead <= FORESEEN_S && side.is_within(now.deflection(i));
-            if !known {
-                self.zeros.motor[i] = at.motor[i] - now.link; // in the middle of where it can be
-            }
-            side.move_zero(known);
-        }
-    }
-
-    fn conclude(&mut self, sequence: u64, flags: u32) -> Estimate {
-        let mut flags = flags;
-        let settled = self.unsettled <= 0;
-        let parts = self.read(0.0);
-        self.sides.iter_mut().for_each(Side::act);
-        let [why, of_torque] = self.reasons(&parts, settled);
-        let repeats = self.refused.is_some_and(|(what, _)| what.reason == suspicion::Reason::Frozen);
-        let rejected =
-            (repeats || flags & status::INPUT_REJECTED != 0).then(|| Why::new(Reason::Rejected, None));
-        self.why = rejected.or(why);
-        if rejected.or(of_torque).is_none() {
-            flags |= status::TORQUE_VALID;
-        }
-        if self.sides.iter().any(Side::has_changed) {
-            flags |= status::CHANGED;
-        }
-        if self.why.is_none() {
-            flags |= status::VALID;
-            let excited = |side: &Side| side.rigid || side.excited;
-            if settled && self.flexible && self.sides.iter().all(excited) {
-                flags |= status::OBSERVABLE;
-            }
-        }
-        if self.said > 0 {
-            self.said -= 1;
-            flags |= status::RESTARTED;
-        }
-        if self.momentum.is_some() {
-            let valid = flags & status::VALID != 0;
-            let carried = self.carried(&self.last.present).unwrap_or_default();
-            let noise = self.noise_of(0)[1];
-            self.external =
-                self.momentum.as_mut().map(|momentum| momentum.conclude(sequence, &carried, noise, valid));
-        }
-        let estimate = joint_estimate(self.arrangement, sequence, flags, parts, self.motors);
-        self.estimate = Some(estimate);
-        estimate
-    }
-
-    /// What is said where the sample cannot be used: the last estimate, for a while.
-    fn carry(&mut self, sequence: u64, flags: u32) -> Estimate {
-        self.rejected += 1;
-        self.external = self.momentum.as_ref().map(|momentum| momentum.said.carry(sequence));
-        let since = self.rejected as f64 * self.period;
-        let rejected = Some(Why::new(Reason::Rejected, None));
-        let Some(last) = self.estimate else {
-            self.why = rejected;
-            return joint_estimate(self.arrangement, sequence, flags, self.read(0.0), self.motors);
-        };
-        let mut flags = flags | last.status & (status::CHANGED | status::RESTARTED);
-        let was = |bit: u32| last.status & bit != 0;
-        if since > TRUST_S {
-            self.why = rejected;
-            return Estimate { sequence, status: flags, ..last };
-        }
-        let parts = self.read(since);
-        let [why, of_torque] = self.reasons(&parts, true);
-        if was(status::VALID) {
-            self.why = why;
-        }
-        if self.why.is_none() {
-            flags |= status::VALID;
-        }
-        if was(status::TORQUE_VALID) && of_torque.is_none() {
-            flags |= status::TORQUE_VALID;
-        }
-        joint_estimate(self.arrangement, sequence, flags, parts, self.motors)
-    }
-
-    /// Why the joint's numbers may not be used, and why its torque may not.
-    fn reasons(&self, parts: &[TransmissionEstimate; MOTORS], settled: bool) -> [Option<Why>; 2] {
-        let mut found = [None; 2];
-        for (i, (side, part)) in self.sides.iter().zip(parts).enumerate() {
-            let reasons = side.reasons(part, self.valid_within, settled);
-            for (found, reason) in found.iter_mut().zip(reasons) {
-                *found = found.or(reason.map(|reason| Why {
-                    reason,
-                    motor: Some(i),
-                    changes: side.likely_causes(),
-                }));
-            }
-        }
-        found
-    }
-
-    /// Each transmission's estimate, so long after the last sample.
-    fn read(&self, since_s: f64) -> [TransmissionEstimate; MOTORS] {
-        // What has been waited for the latest channel, declared late or found to be.
-        let waited = self.corrections.age_s() + self.alignment.periods.abs() * self.period;
-        let behind_s = self.corrections.behind_s();
-        let mut parts = [TransmissionEstimate::NOTHING; MOTORS];
-        for (i, side) in self.sides.iter().enumerate() {
-            let phi = self.last.present.deflection(i);
-            let present = Present { phi, behind_s, ahead_s: since_s + waited };
-            parts[i] = side.estimate(&present, self.filters.delay);
-        }
-        parts
     }
 }

@@ -1,23 +1,19 @@
 //! One motor and its transmission on line: its balance, what that has taught, and what it says at this moment.
 
+mod estimate;
+
 use serde::{Deserialize, Serialize};
 
 use crate::align::Inputs;
 use crate::balance::{Balance, correlated_rows};
 use crate::blocks::{Blocks, Closed};
-use crate::causes::{CAUSES, Cause};
-use crate::deflection::{AT_REST, DeflectionFilter, Motion, Present, Tuning};
+use crate::deflection::{AT_REST, DeflectionFilter, Motion, Tuning};
 use crate::effects::{Coordinates, MotorEffects};
-use crate::external::Carried;
-use crate::gram::Vector;
-use crate::laws::Law;
 use crate::model::Motor;
-use crate::reasons::Reason;
-use crate::sample::TransmissionEstimate;
 use crate::settings::Priors;
 use crate::signals::{Channel, Excitation, Filters};
 use crate::spring::Family;
-use crate::unknowns::{DAMPING, DRY, INERTIA, SPRING};
+use crate::unknowns::{DAMPING, INERTIA};
 
 /// Filter delays after which a wrong start is forgotten.
 pub const SETTLE_DELAYS: f64 = 4.5;
@@ -27,8 +23,6 @@ const HALF: f64 = 0.5; // periods: what is later is shifted, the rest is a colum
 const SURE: f64 = 3.0; // standard deviations of a delay that is shifted
 const CONFIRMED_S: f64 = 0.05; // of rows that agree with what is known before a moved zero is believed
 const FOLLOWED_S: f64 = 0.5; // how long it is said that a change has been followed
-const DRIFT: f64 = 1e-4; // relative growth of the standard deviation per second without motion …
-const WIDEST: f64 = 0.02; // … up to this
 
 /// What a period brings to every motor.
 #[derive(Clone, Copy, Debug)]
@@ -363,132 +357,5 @@ impl Side {
         let value = self.inertia * motor[2] + self.damping * motor[1] + x[0] - tau[0];
         let rate = self.inertia * motor[3] + self.damping * motor[2] + x[1] - tau[1];
         value + ahead_s * rate
-    }
-
-    /// The estimate at the present deflection; `delay`: of the filters.
-    #[must_use]
-    pub fn estimate(&self, present: &Present, delay: f64) -> TransmissionEstimate {
-        let nothing = TransmissionEstimate::NOTHING;
-        let left = || self.left(delay + present.behind_s + present.ahead_s);
-        if self.rigid {
-            return TransmissionEstimate { flexibility_torque: left(), ..nothing };
-        }
-        let phi = self.deflection.now(present);
-        let Some(at) = self.blocks.at(phi, self.deflection.link_rate(), &self.balance) else {
-            return TransmissionEstimate { flexibility_torque: left(), deflection: phi, ..nothing };
-        };
-        let more = self.effects.spring(phi);
-        let stiffness = at.stiffness + more.1;
-        let held = (DRIFT * self.held_s).min(WIDEST);
-        // A curve is as uncertain as its parameters, and as φ is where it bends.
-        let std = |by: &Vector, slope: f64, value: f64| {
-            let variance = self.blocks.posterior.as_ref().map_or(f64::NAN, |known| known.variance_along(by));
-            (variance + slope.powi(2) * self.deflection.variance() + (held * value).powi(2)).sqrt()
-        };
-        let stiffness_std = std(&at.by_stiffness, at.bend, stiffness);
-        let (flexibility_torque, flexibility_torque_std) = if self.fits && at.stiffness > 0.0 {
-            let torque = at.torque + more.0;
-            (torque, std(&at.by_torque, stiffness, torque))
-        } else {
-            (left(), f64::NAN)
-        };
-        TransmissionEstimate {
-            flexibility_torque,
-            flexibility_torque_std,
-            stiffness,
-            stiffness_std,
-            deflection: phi + self.blocks.spring.zero,
-        }
-    }
-
-    /// Why the estimate at this moment may not be used, and its torque.
-    #[must_use]
-    pub fn reasons(
-        &self,
-        part: &TransmissionEstimate,
-        valid_within: f64,
-        settled: bool,
-    ) -> [Option<Reason>; 2] {
-        if let Some(reason) = self.unusable(part, settled) {
-            return [Some(reason); 2];
-        }
-        if self.rigid {
-            return [None; 2];
-        }
-        let lost = |reason: Reason| if self.blocks.is_lost() { Reason::Lost } else { reason };
-        let share = part.flexibility_torque_std / self.blocks.torque_rms();
-        let imprecise = share >= valid_within || part.flexibility_torque_std.is_nan();
-        let torque = imprecise.then_some(Reason::TorqueImprecise(share)).map(lost);
-        let stiffness = Reason::of_precision(part.stiffness, part.stiffness_std, valid_within).map(lost);
-        [stiffness.or(torque), torque]
-    }
-
-    /// Why none of the numbers at this moment may be used.
-    fn unusable(&self, part: &TransmissionEstimate, settled: bool) -> Option<Reason> {
-        if self.rigid {
-            return (!part.flexibility_torque.is_finite()).then_some(Reason::Settling);
-        }
-        if self.deflection.unsettled > 0 || self.unconfirmed_s > 0.0 {
-            return Some(Reason::Settling);
-        }
-        let nothing = self.blocks.posterior.is_none();
-        if nothing || self.blocks.is_unconfirmed() {
-            let unmoved = if self.blocks.is_lost() { Reason::Lost } else { Reason::Unmoved };
-            return Some(if settled { unmoved } else { Reason::Settling });
-        }
-        if self.doubtful {
-            return Some(if self.blocks.is_suspected() { Reason::Lost } else { Reason::Changed });
-        }
-        if !self.fits {
-            return Some(Reason::Unexplained(self.unexplained));
-        }
-        let reach = (BEYOND * self.balance.largest()).min(EDGE * self.blocks.spring.reach());
-        let phi = part.deflection - self.blocks.spring.zero;
-        let within = phi.abs() < if reach > 0.0 { reach } else { f64::INFINITY };
-        (!within).then_some(Reason::Beyond)
-    }
-
-    /// Which causes the window does not tell from the likeliest one.
-    #[must_use]
-    pub fn likely_causes(&self) -> [bool; CAUSES] {
-        let Some(odds) = self.blocks.odds() else { return [false; CAUSES] };
-        let named = |cause: Cause| !matches!(cause, Cause::Nothing | Cause::Noise);
-        odds.likely(named)
-    }
-
-    /// What it does to the link at a deflection as it is measured; `None` where no curve is trusted.
-    ///
-    /// `noise`: variance of θ's noise, rad².
-    #[must_use]
-    pub fn carried(&self, phi: f64, noise: f64) -> Option<Carried> {
-        if self.rigid || !self.fits || self.blocks.is_lost() {
-            return None;
-        }
-        let at = self.blocks.at(phi, self.deflection.link_rate(), &self.balance)?;
-        let stiffness = at.stiffness + self.effects.spring(phi).1;
-        let variance = self.blocks.posterior.as_ref()?.variance_along(&at.by_torque);
-        Some(Carried {
-            torque: at.torque + self.transmitted,
-            variance,
-            stiffness,
-            reading: stiffness * stiffness * noise,
-        })
-    }
-
-    /// The law's parameters with their standard deviations; `None` before any.
-    pub fn parameters(&self, values: &mut Vec<f64>, std: &mut Vec<f64>) -> Option<&Law> {
-        let known = self.blocks.posterior.as_ref().filter(|_| !self.rigid)?;
-        let spring = &self.blocks.spring;
-        for (i, unknown) in SPRING.enumerate().take(spring.size).filter(|(_, u)| known.set >> u & 1 == 1) {
-            values.push(spring.alpha[i]);
-            std.push(known.covariance[unknown][unknown].sqrt());
-        }
-        Some(&spring.law)
-    }
-
-    /// Dry friction beyond what is declared, and its standard deviation, N·m; `None` before any.
-    pub fn friction(&self) -> Option<(f64, f64)> {
-        let known = self.blocks.posterior.as_ref()?;
-        Some((known.x[DRY], known.covariance[DRY][DRY].sqrt()))
     }
 }

@@ -1,0 +1,85 @@
+//! See the module.
+
+use super::*;
+
+const T: f64 = 1e-3;
+
+/// A joint on a sine whose torque is known in closed form: the row's columns add up to zero.
+#[test]
+fn the_row_of_a_known_joint_is_a_balance() {
+    let filters = Filters::new(60.0, T);
+    let (inertia, damping, k1, k3) = (0.1, 0.5, 100.0, 4000.0);
+    let w = 7.0;
+    let at = |t: f64| (0.5 * (w * t).sin(), 0.4 * (w * t + 0.2).sin());
+    let torque = |t: f64| {
+        let (theta, q) = at(t);
+        let (rate, acceleration) = (0.5 * w * (w * t).cos(), -w * w * theta);
+        let phi = q - theta;
+        inertia * acceleration + damping * rate - k1 * phi - k3 * phi.powi(3)
+    };
+    let mut balance = Balance::new(Family::Smooth);
+    let mut link = Channel::rest(0.0);
+    let (mut left, mut largest): (f64, f64) = (0.0, 0.0);
+    for k in 0..6000 {
+        let t = f64::from(k) * T;
+        let (theta, q) = at(t);
+        if k == 1000 {
+            balance.grow(balance.largest());
+        }
+        link.smooth(&filters, q);
+        // The mean over a period is what a held torque of this value amounts to.
+        balance.feed(&filters, theta, q - theta, torque(t + 0.5 * T), &link, 0.0);
+        balance.observe(q - theta, true);
+        if k > 2000 {
+            let (row, size) = (balance.row(&link), balance.size.deflection);
+            let sum = inertia * row[ACCELERATION]
+                + damping * row[VELOCITY]
+                + k1 * size * row[SPRING.start]
+                + k3 * size.powi(3) * row[SPRING.start + 1];
+            left = left.max((row[TORQUE] - sum).abs());
+            largest = largest.max(row[TORQUE].abs());
+        }
+    }
+    assert!(left < 2e-4 * largest, "{left} of {largest}");
+}
+
+fn moved(balance: &mut Balance, from: u32, to: u32, amplitude: f64) -> Row {
+    let filters = Filters::new(60.0, T);
+    let mut link = Channel::rest(0.0);
+    for k in 0..to {
+        let q = amplitude * (f64::from(k) * 3e-3).sin();
+        link.smooth(&filters, q);
+        if k >= from {
+            balance.feed(&filters, 0.0, q, 0.0, &link, 0.0);
+            balance.observe(q, true);
+        }
+    }
+    balance.row(&link)
+}
+
+#[test]
+fn a_stop_remembers_which_way_it_came() {
+    let mut balance = Balance::new(Family::Smooth);
+    moved(&mut balance, 0, 3000, 0.01);
+    balance.grow(0.01);
+    balance.fit_widths(0.0);
+    moved(&mut balance, 0, 4000, 0.01);
+    assert!(balance.extras(0.0).0[STOPS.start].abs() > 0.05);
+    assert_eq!(balance.extras(0.0).1[STOPS.start], 0.0);
+}
+
+#[test]
+fn columns_that_have_grown_are_those_of_a_joint_that_was_larger_from_the_start() {
+    let mut grown = Balance::new(Family::Smooth);
+    moved(&mut grown, 0, 2500, 0.01);
+    grown.grow(0.01);
+    moved(&mut grown, 0, 2500, 0.01);
+    let mut link = Channel::rest(0.0);
+    link.smooth(&Filters::new(60.0, T), 0.0);
+    let before = grown.row(&link);
+    let factors = grown.grow(0.02);
+    let after = grown.row(&link);
+    for column in SPRING.chain(SLOPE) {
+        assert!((before[column] * factors[column] - after[column]).abs() < 1e-12, "{column}");
+    }
+}

@@ -1,0 +1,190 @@
+//! Blocks that what is known does not explain: has the joint changed, or a reading, or the zero?
+
+use super::{BLOCKS, Blocks, CONVINCING, Carried, Closed, EXPLAINED, FEWEST, WINDOW};
+use crate::balance;
+use crate::causes::{Cause, Known, Noise, Odds, TABLE};
+use crate::gram::{Gram, Set, UNKNOWNS, inverse, set};
+use crate::spring::TERMS;
+use crate::unknowns::{DAMPING, INERTIA, SPRING, ZERO};
+
+const REST: f64 = 0.03; // of what is left without it: an effect that bends with the change
+const DECIDED: f64 = 0.95; // probability at which a change of the joint itself is followed
+
+impl Blocks {
+    /// Something has changed: rows are of use again when the filters have forgotten what was before.
+    pub(super) fn begin_doubt(&mut self) -> Closed {
+        (self.doubting, self.good, self.doubted) = (true, 0, 0);
+        (self.open, self.skipped) = (Gram::default(), self.settle);
+        self.waiting.clear();
+        Closed::Unexplained
+    }
+
+    pub(super) fn end_doubt(&mut self) {
+        self.waiting.clear();
+        (self.odds, self.doubting, self.doubted, self.quick) = (None, false, 0, 0.0);
+        self.suspected = false;
+    }
+
+    /// What the causes say of a block, with those that wait; `None`: it is explained.
+    pub(super) fn judge(&self, block: &Gram) -> Option<Odds> {
+        let odds = self.odds_of(block)?;
+        if self.waiting.is_empty() {
+            return Some(odds);
+        }
+        let mut window = block.clone();
+        self.waiting.iter().for_each(|one| window.add(one, 1.0));
+        self.weigh(&window)
+    }
+
+    /// What the causes say of the last blocks together, each of which was explained: a change may be slow.
+    pub(super) fn judge_latest(&self) -> Option<Odds> {
+        if self.ring.len() < 2 * WINDOW {
+            return None;
+        }
+        let mut window = Gram::default();
+        (0..WINDOW).for_each(|k| window.add(&self.ring[self.place(k)], 1.0));
+        self.odds_of(&window)
+    }
+
+    /// The last blocks are left out of the sum, and wait.
+    pub(super) fn doubt_latest(&mut self) {
+        self.begin_doubt();
+        self.skipped = 0;
+        self.ring.rotate_left(self.oldest);
+        self.peaks.rotate_left(self.oldest);
+        self.oldest = 0;
+        let kept = self.ring.len() - WINDOW;
+        self.waiting.extend(self.ring.drain(kept..));
+        self.peaks.truncate(kept);
+        self.solve();
+    }
+
+    /// What the causes say of rows; `None`: nothing has changed.
+    fn odds_of(&self, rows: &Gram) -> Option<Odds> {
+        self.weigh(rows).filter(|odds| odds.of(Cause::Nothing).probability < 0.5)
+    }
+
+    /// The probability of each cause for some rows; `None`: nothing is known to hold them against.
+    fn weigh(&self, rows: &Gram) -> Option<Odds> {
+        let (frame, posterior) = (self.frame.as_ref()?, self.posterior.as_ref()?);
+        let projection = self.projection.as_ref().filter(|_| self.is_reference())?;
+        let known = Known {
+            frame,
+            residual: &self.residual,
+            set: posterior.set,
+            precision: &inverse(&posterior.covariance, posterior.set),
+            torque: &self.spring.torque(projection),
+            slope: &self.spring.slope(projection),
+            powers: self.powers,
+            motor: (posterior.x[INERTIA], posterior.x[DAMPING]),
+            torque_rms: balance::variance(rows, balance::TORQUE).sqrt(),
+            deflection: self.deflection,
+            period_s: self.period,
+        };
+        let noise = Noise { variance: self.own * self.own, ..self.noise };
+        Some(known.judge(rows, &noise, self.per_block))
+    }
+
+    /// The window is not explained: is it the joint that has changed, or a reading?
+    pub(super) fn doubt(&mut self, odds: Odds) -> Closed {
+        self.doubted += 1;
+        let of_joint: f64 =
+            TABLE.iter().filter(|entry| entry.opens != 0).map(|e| odds.of(e.cause).probability).sum();
+        let best = odds.best(|cause| cause.entry().opens != 0);
+        // A zero that goes on moving is nearly explained by one that has moved; a spring that bends is explained.
+        let bends =
+            best.is_some_and(|cause| matches!(cause, Cause::Stiffness | Cause::Shape | Cause::Friction));
+        let rest = if bends { REST * odds.of(Cause::Nothing).misfit } else { 0.0 };
+        let most = EXPLAINED.max(rest);
+        let explained = best.is_some_and(|cause| odds.of(cause).misfit < most);
+        self.odds = Some(odds);
+        if self.spoilt {
+            self.waiting.clear(); // samples that could not be used were among them: no joint is like that
+        }
+        if self.waiting.len() >= 2 && of_joint > DECIDED && explained {
+            // All that the window does not tell apart is open.
+            let likely = odds.likely(|cause| cause.entry().opens != 0);
+            let opens = TABLE.iter().zip(likely).filter(|(_, likely)| *likely).map(|(entry, _)| entry.opens);
+            self.begin(opens.fold(0, |all, one| all | one));
+            return Closed::Begun;
+        }
+        if self.lost && self.doubted >= FEWEST {
+            self.lose_zero(); // it was located wrongly
+            return Closed::Unexplained;
+        }
+        if self.doubted >= BLOCKS {
+            // Nothing in the table, for as long as anything is remembered: another joint.
+            self.begin(set(1..UNKNOWNS));
+            return Closed::Begun;
+        }
+        if self.waiting.len() >= WINDOW {
+            self.waiting.remove(0);
+        }
+        Closed::Unexplained
+    }
+
+    /// What is known begins with the window: the unknowns that have changed are open again, the others are as before.
+    pub(super) fn begin(&mut self, opens: Set) {
+        self.carry(opens);
+        self.ring.clear();
+        self.peaks.clear();
+        self.oldest = 0;
+        for k in 0..self.waiting.len() {
+            let block = self.waiting[k].clone();
+            self.keep(block);
+        }
+        self.end_doubt();
+        (self.doubting, self.good) = (true, CONVINCING - 1); // until another block bears it out
+        if opens & set(SPRING) != 0 {
+            self.spring.open();
+        }
+        (self.lost, self.located) = (self.lost || opens >> ZERO & 1 == 1, true); // it is not far
+        self.solve();
+    }
+
+    pub(super) fn carry(&mut self, opens: Set) {
+        let Some(posterior) = &self.posterior else { return };
+        let kept = posterior.set & !opens;
+        let mut x = posterior.x;
+        for (i, unknown) in SPRING.enumerate() {
+            x[unknown] = self.spring.alpha[i];
+        }
+        x[ZERO] = self.spring.zero;
+        self.carried = Some(Carried {
+            x,
+            precision: inverse(&posterior.covariance, kept),
+            set: kept,
+            deflection: self.deflection,
+            unexplained: self.usual_unexplained().min(self.unexplained),
+        });
+    }
+
+    /// Positions may count from elsewhere since a restart: blocks tell.
+    pub fn suspect_zero(&mut self) {
+        self.begin_doubt();
+        self.suspected = true;
+    }
+
+    /// Where the zero between the encoders is, is not known any more.
+    pub fn lose_zero(&mut self) {
+        if let Some(carried) = self.carried.as_ref().filter(|_| self.lost) {
+            // What was learned without a zero may be of another one: as it was before.
+            self.spring.alpha[..TERMS].copy_from_slice(&carried.x[SPRING]);
+        } else {
+            self.carry(1 << ZERO);
+        }
+        let (carried, noise, own) = (self.carried.take(), self.noise, self.own);
+        self.forget_rows();
+        (self.carried, self.lost, self.posterior, self.located) = (carried, true, None, false);
+        self.spring.zero = 0.0; // deflections are counted from elsewhere
+        if self.carried.is_some() {
+            (self.noise, self.own) = (noise, own);
+        }
+    }
+
+    /// The deflections are counted from near the zero, from now on.
+    pub fn recentre(&mut self) {
+        self.lose_zero();
+        self.located = true;
+    }
+}

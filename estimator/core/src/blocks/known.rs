@@ -1,0 +1,78 @@
+//! What the blocks have taught.
+
+use super::{BLOCKS, Blocks, EXPLAINED};
+use crate::balance::Balance;
+use crate::gram::{UNKNOWNS, set};
+use crate::unknowns::{CANDIDATES, LATE, OFFSET, RATE, Reading};
+
+const USEFUL: f64 = 0.2; // share of the torque that a curve may leave unexplained
+
+impl Blocks {
+    /// Delay of the link position, s, and its standard deviation.
+    #[must_use]
+    pub fn delay(&self) -> Option<(f64, f64)> {
+        let known = self.posterior.as_ref()?;
+        (known.set & (1 << LATE | 1 << RATE) == 1 << LATE)
+            .then(|| (known.x[LATE], known.covariance[LATE][LATE].sqrt()))
+    }
+
+    /// Torque and stiffness at a deflection, with their slopes by the unknowns; `None`: nothing is known.
+    #[must_use]
+    pub fn at(&self, phi: f64, link_rate: f64, balance: &Balance) -> Option<Reading> {
+        match &self.posterior {
+            Some(known) => Some(self.spring.at(phi, &known.x, known.set, link_rate, balance)),
+            None if self.spring.known => Some(self.spring.at(phi, &[0.0; UNKNOWNS], 0, link_rate, balance)),
+            None => None,
+        }
+    }
+
+    /// Torque on the motor beside the spring's that depends on no memory and no sign, N·m; `rate`: φ′.
+    #[must_use]
+    pub fn rest(&self, rate: f64) -> f64 {
+        self.posterior.as_ref().map_or(0.0, |known| known.x[RATE] * rate - known.x[OFFSET])
+    }
+
+    /// rms of what the motor's equation leaves where friction is not taken off, N·m; ∞: unknown.
+    #[must_use]
+    pub fn unmodelled(&self) -> f64 {
+        if self.posterior.is_some() { self.own.hypot(self.friction) } else { f64::INFINITY }
+    }
+
+    /// rms of the transmission's torque over what is known, N·m; NaN before.
+    #[must_use]
+    pub fn torque_rms(&self) -> f64 {
+        self.torque
+    }
+
+    /// rms of what is left of the balance, over that of the measured torque without its mean; NaN before any.
+    #[must_use]
+    pub fn unexplained(&self) -> f64 {
+        self.unexplained
+    }
+
+    /// What was left before a change, or before a zero was lost: neither makes the balance noisier.
+    pub(super) fn usual_unexplained(&self) -> f64 {
+        let carried = self.carried.as_ref().filter(|_| self.ring.len() < BLOCKS);
+        carried.map_or(f64::INFINITY, |carried| carried.unexplained)
+    }
+
+    /// Whether the balance leaves less than a useful estimate may, and about what it left before a change.
+    #[must_use]
+    pub fn is_explained(&self) -> bool {
+        let usual = self.usual_unexplained().max((self.white / self.fluctuation).sqrt());
+        self.unexplained < USEFUL && self.unexplained <= EXPLAINED.sqrt() * usual
+    }
+
+    /// rms of what the balance has left over the last moments, N·m.
+    #[must_use]
+    pub fn misfit(&self) -> f64 {
+        if self.posterior.is_some() { self.quick.sqrt() } else { f64::NAN }
+    }
+
+    /// Names of the effects that nobody declared and evidence chose.
+    pub fn undeclared(&self) -> impl Iterator<Item = &'static str> {
+        let chosen = self.posterior.as_ref().map_or(0, |posterior| posterior.set);
+        let named = CANDIDATES.iter().filter(move |c| chosen & set(c.unknowns.clone()) != 0).map(|c| c.name);
+        named.chain(self.moved.then_some("deflection_offset"))
+    }
+}

@@ -1,0 +1,131 @@
+//! See the module.
+
+use super::*;
+use crate::model::{Arrangement, Motor, Transmission};
+use crate::sample::{MOTORS, Sample};
+
+const T: f64 = 1e-3;
+
+fn joint(link: Link) -> Model {
+    let motor = Motor {
+        inertia: 0.1,
+        inertia_std: None,
+        damping: 0.2,
+        damping_std: None,
+        transmission: Transmission::Unknown,
+        effects: Vec::new(),
+    };
+    Model {
+        arrangement: Arrangement::Single,
+        motors: vec![motor],
+        link: Some(link),
+        link_effects: Vec::new(),
+    }
+}
+
+const FREE: Link = Link {
+    inertia: 0.4,
+    damping: 0.0,
+    gravity: 0.0,
+    gravity_phase: 0.0,
+    inertia_std: 0.0,
+    damping_std: 0.0,
+    gravity_std: 0.0,
+};
+
+const PRIORS: Priors = Priors {
+    motor_inertia: 0.05,
+    viscous_damping: 0.2,
+    viscous_damping_floor: 0.05,
+    coulomb_friction: 0.1,
+    torque_offset: 0.3,
+    deflection_offset: 0.003,
+    encoder_delay: 1.0,
+};
+
+#[test]
+fn a_load_on_a_link_that_turns_one_way_is_not_taken_for_its_friction() {
+    let mut momentum = LinkMomentum::new(&joint(FREE), &Settings::default(), &PRIORS, T).unwrap();
+    momentum.reset();
+    let (load, speed) = (-1.9, 40.0);
+    momentum.restart(0.0, load);
+    let carried = Carried { torque: load, stiffness: 35.0, ..Carried::default() };
+    let mut external = External::nothing(0);
+    for k in 1..20_000_u64 {
+        momentum.feed(speed * k as f64 * T, Some(load), f64::NAN);
+        external = momentum.conclude(k, &carried, 1e-10, k > 200); // after the jump to this speed
+    }
+    assert!(external.status & status::VALID != 0);
+    assert!((external.torque - load).abs() < 0.01 * load.abs(), "{}", external.torque);
+    // A skew of one period between the encoders would make as much: that is said.
+    assert!(external.torque_std > 0.5 * carried.stiffness * T * speed, "{}", external.torque_std);
+}
+
+#[test]
+fn a_push_on_a_free_link_rises_as_its_filter_does() {
+    // q = ½ (τ/M) t² with τ_e = 0: the residual is w³/(s + w)³ of the push.
+    let settings = Settings { contact_torque: Some(0.1), ..Settings::default() };
+    let mut momentum = LinkMomentum::new(&joint(FREE), &settings, &PRIORS, T).unwrap();
+    momentum.reset();
+    momentum.restart(0.0, 0.0);
+    for _ in 0..200 {
+        momentum.feed(0.0, Some(0.0), f64::NAN);
+    }
+    let (push, w) = (2.0, settings.external_bandwidth);
+    let mut found = None;
+    for k in 1..60 {
+        let t = f64::from(k) * T;
+        momentum.feed(0.5 * push / FREE.inertia * t * t, Some(0.0), f64::NAN);
+        let external = momentum.conclude(k as u64, &Carried::default(), 1e-14, true);
+        let x = w * t;
+        let expected = push * (1.0 - (-x).exp() * (1.0 + x + 0.5 * x * x));
+        assert!((external.torque - expected).abs() < 0.01 * push, "{k}: {} {expected}", external.torque);
+        assert!(external.difference == external.torque && external.link_torque == -external.torque);
+        if found.is_none() && external.status & status::CONTACT != 0 {
+            found = Some(k);
+        }
+    }
+    assert!(found.is_some_and(|k| k <= 12), "{found:?}");
+}
+
+#[test]
+fn an_external_torque_that_is_measured_leaves_no_difference() {
+    let settings = Settings::default();
+    let mut momentum = LinkMomentum::new(&joint(FREE), &settings, &PRIORS, T).unwrap();
+    momentum.reset();
+    momentum.restart(0.0, 0.0);
+    for k in 1..400 {
+        let t = f64::from(k) * T;
+        let push = 3.0 * (20.0 * t).sin();
+        let q = 3.0 / FREE.inertia * (t / 20.0 - (20.0 * t).sin() / 400.0);
+        momentum.feed(q, Some(0.0), push);
+        let external = momentum.conclude(k as u64, &Carried::default(), 1e-14, true);
+        assert!(external.difference.abs() < 2e-3, "{k}: {}", external.difference);
+    }
+}
+
+#[test]
+fn the_papers_external_residual_obeys_equation_13() {
+    // A link held at rest by its transmission against gravity: −r is g through K/(s + K).
+    let link = Link { gravity: 6.0, ..FREE };
+    let settings = Settings::default();
+    let mut momentum = PaperMomentum::new(&joint(link), &settings, &PRIORS, T).unwrap();
+    let q: f64 = 0.7;
+    let nothing = f64::NAN;
+    for k in 0..60u64 {
+        let sample = Sample {
+            sequence: k,
+            motor_position: [q; MOTORS],
+            motor_velocity: [0.0; MOTORS],
+            motor_torque: [0.0; MOTORS],
+            link_position: q,
+            link_velocity: 0.0,
+            external_torque: nothing,
+        };
+        let external = momentum.update(&sample, 1, 0.0, 0.0, true);
+        if k > 0 {
+            let expected = -6.0 * q.sin() * (1.0 - (-settings.k_tau * T * k as f64).exp());
+            assert!((external.link_torque - expected).abs() < 1e-9, "{k}");
+        }
+    }
+}

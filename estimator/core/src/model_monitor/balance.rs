@@ -1,0 +1,82 @@
+//! The balances with the model's own numbers (eqs 4 and 5).
+
+use super::{BALANCES, CHANNELS, EXTERNAL, LINK, ModelMonitor, TORQUE};
+use crate::effects::Coordinates;
+use crate::joint_effects::Torques;
+use crate::sample::{MOTORS, Sample};
+
+impl ModelMonitor {
+    /// The balances with the model's own numbers, and the torques they are compared with.
+    pub(super) fn balance(&mut self) -> [f64; 2 * BALANCES] {
+        let motors = self.motors.len();
+        let [q, link_rate, link_acceleration] = self.channels[LINK];
+        let (mut each, mut torques) = ([Coordinates::default(); MOTORS], [0.0; MOTORS]);
+        let time = self.ticks as f64 * self.period;
+        let at_link = Coordinates {
+            link_position: q,
+            link_velocity: link_rate,
+            link_acceleration,
+            time,
+            ..Coordinates::default()
+        };
+        for (i, side) in self.motors.iter().enumerate() {
+            let [theta, velocity, acceleration] = self.channels[i];
+            let [torque, torque_rate, _] = self.channels[TORQUE + i];
+            let phi = if side.flexible { q - theta } else { 0.0 };
+            let (flexibility, stiffness) = side.law.as_ref().map_or((0.0, 0.0), |(law, a)| law.at(phi, a));
+            torques[i] = flexibility;
+            each[i] = Coordinates {
+                position: theta,
+                velocity,
+                acceleration,
+                deflection: phi,
+                deflection_rate: if side.flexible { link_rate - velocity } else { 0.0 },
+                flexibility_torque: flexibility,
+                stiffness,
+                torque,
+                torque_rate,
+                ..at_link
+            };
+        }
+        let x: Torques = self.effects.torques(&each[..motors], &at_link);
+        let mut raw = [0.0; 2 * BALANCES];
+        let external = self.channels[EXTERNAL][0];
+        for (i, side) in self.motors.iter().enumerate() {
+            let c = &each[i];
+            // B θ″ + D θ′ + x_motor − τ_e − x_transmission − τ (eq 5)
+            let own = side.inertia * c.acceleration + side.damping * c.velocity;
+            raw[i] = own + x.motor[i] - torques[i] - x.transmission[i] - c.torque;
+            raw[BALANCES + i] = c.torque;
+        }
+        let Some(link) = self.link else { return raw };
+        let load = |position: f64, rate: f64, acceleration: f64| {
+            let gravity = link.gravity * (position + link.gravity_phase).sin();
+            link.inertia * acceleration + link.damping * rate + gravity
+        };
+        if self.linked {
+            // τ_k − (M q″ + D_q q′ + g(q) + τ_e + x_transmission + x_link) (eqs 4, 6)
+            let through: f64 = (0..self.pulls).map(|i| torques[i] + x.transmission[i]).sum();
+            raw[motors] = external - load(q, link_rate, link_acceleration) - through - x.link;
+            raw[BALANCES + motors] = through;
+        } else {
+            // Rigid: the link moves with the first motor.
+            let c = &each[0];
+            raw[0] += load(c.position, c.velocity, c.acceleration) + x.link - external;
+        }
+        raw
+    }
+
+    pub(super) fn inputs_of(&self, sample: &Sample) -> [f64; CHANNELS] {
+        let mut channels = [0.0; CHANNELS];
+        let motors = self.motors.len();
+        channels[..motors].copy_from_slice(&sample.motor_position[..motors]);
+        channels[TORQUE..TORQUE + motors].copy_from_slice(&sample.motor_torque[..motors]);
+        if self.flexible {
+            channels[LINK] = sample.link_position;
+        }
+        if self.link.is_some() && sample.external_torque.is_finite() {
+            channels[EXTERNAL] = sample.external_torque;
+        }
+        channels
+    }
+}

@@ -1,0 +1,111 @@
+//! What is said of the joint at a sample.
+
+use super::Robust;
+use crate::deflection::Present;
+use crate::reasons::{Reason, Why};
+use crate::sample::{Estimate, MOTORS, TransmissionEstimate, joint_estimate, status};
+use crate::side::Side;
+use crate::suspicion;
+
+const TRUST_S: f64 = 0.02; // how long an estimate is carried over rejected samples
+
+impl Robust {
+    pub(super) fn conclude(&mut self, sequence: u64, flags: u32) -> Estimate {
+        let mut flags = flags;
+        let settled = self.unsettled <= 0;
+        let parts = self.read(0.0);
+        self.sides.iter_mut().for_each(Side::act);
+        let [why, of_torque] = self.reasons(&parts, settled);
+        let repeats = self.refused.is_some_and(|(what, _)| what.reason == suspicion::Reason::Frozen);
+        let rejected =
+            (repeats || flags & status::INPUT_REJECTED != 0).then(|| Why::new(Reason::Rejected, None));
+        self.why = rejected.or(why);
+        if rejected.or(of_torque).is_none() {
+            flags |= status::TORQUE_VALID;
+        }
+        if self.sides.iter().any(Side::has_changed) {
+            flags |= status::CHANGED;
+        }
+        if self.why.is_none() {
+            flags |= status::VALID;
+            let excited = |side: &Side| side.rigid || side.excited;
+            if settled && self.flexible && self.sides.iter().all(excited) {
+                flags |= status::OBSERVABLE;
+            }
+        }
+        if self.said > 0 {
+            self.said -= 1;
+            flags |= status::RESTARTED;
+        }
+        if self.momentum.is_some() {
+            let valid = flags & status::VALID != 0;
+            let carried = self.carried(&self.last.present).unwrap_or_default();
+            let noise = self.noise_of(0)[1];
+            self.external =
+                self.momentum.as_mut().map(|momentum| momentum.conclude(sequence, &carried, noise, valid));
+        }
+        let estimate = joint_estimate(self.arrangement, sequence, flags, parts, self.motors);
+        self.estimate = Some(estimate);
+        estimate
+    }
+
+    /// What is said where the sample cannot be used: the last estimate, for a while.
+    pub(super) fn carry(&mut self, sequence: u64, flags: u32) -> Estimate {
+        self.rejected += 1;
+        self.external = self.momentum.as_ref().map(|momentum| momentum.said.carry(sequence));
+        let since = self.rejected as f64 * self.period;
+        let rejected = Some(Why::new(Reason::Rejected, None));
+        let Some(last) = self.estimate else {
+            self.why = rejected;
+            return joint_estimate(self.arrangement, sequence, flags, self.read(0.0), self.motors);
+        };
+        let mut flags = flags | last.status & (status::CHANGED | status::RESTARTED);
+        let was = |bit: u32| last.status & bit != 0;
+        if since > TRUST_S {
+            self.why = rejected;
+            return Estimate { sequence, status: flags, ..last };
+        }
+        let parts = self.read(since);
+        let [why, of_torque] = self.reasons(&parts, true);
+        if was(status::VALID) {
+            self.why = why;
+        }
+        if self.why.is_none() {
+            flags |= status::VALID;
+        }
+        if was(status::TORQUE_VALID) && of_torque.is_none() {
+            flags |= status::TORQUE_VALID;
+        }
+        joint_estimate(self.arrangement, sequence, flags, parts, self.motors)
+    }
+
+    /// Why the joint's numbers may not be used, and why its torque may not.
+    fn reasons(&self, parts: &[TransmissionEstimate; MOTORS], settled: bool) -> [Option<Why>; 2] {
+        let mut found = [None; 2];
+        for (i, (side, part)) in self.sides.iter().zip(parts).enumerate() {
+            let reasons = side.reasons(part, self.valid_within, settled);
+            for (found, reason) in found.iter_mut().zip(reasons) {
+                *found = found.or(reason.map(|reason| Why {
+                    reason,
+                    motor: Some(i),
+                    changes: side.likely_causes(),
+                }));
+            }
+        }
+        found
+    }
+
+    /// Each transmission's estimate, so long after the last sample.
+    fn read(&self, since_s: f64) -> [TransmissionEstimate; MOTORS] {
+        // What has been waited for the latest channel, declared late or found to be.
+        let waited = self.corrections.age_s() + self.alignment.periods.abs() * self.period;
+        let behind_s = self.corrections.behind_s();
+        let mut parts = [TransmissionEstimate::NOTHING; MOTORS];
+        for (i, side) in self.sides.iter().enumerate() {
+            let phi = self.last.present.deflection(i);
+            let present = Present { phi, behind_s, ahead_s: since_s + waited };
+            parts[i] = side.estimate(&present, self.filters.delay);
+        }
+        parts
+    }
+}

@@ -1,0 +1,108 @@
+//! Where positions are counted from: what jumps, restarts and delays do to it.
+
+use super::Robust;
+use crate::align::Positions;
+use crate::external::LinkMomentum;
+use crate::sample::MOTORS;
+use crate::side::Side;
+
+const HOME: f64 = 0.01; // of a jump: a zero that comes back so near to the first one is that one
+const FORESEEN_S: f64 = 0.04; // how far ahead a deflection is extrapolated
+
+impl Robust {
+    /// The link is later than was assumed: what was learned is of other moments.
+    pub(super) fn shift(&mut self, periods: f64) {
+        if self.alignment.shift(periods) == 0.0 {
+            return;
+        }
+        self.unsettled = self.settle;
+        self.momentum.iter_mut().for_each(LinkMomentum::distrust);
+        let last = &self.last.at;
+        for (i, side) in self.sides.iter_mut().enumerate() {
+            side.relearn(last.motor[i], last.deflection(i));
+        }
+    }
+
+    /// The zero of one motor has been found so far from where its deflections are counted from.
+    pub(super) fn recentre(&mut self, i: usize, off: f64) {
+        self.zeros.motor[i] += off;
+        self.last.at.motor[i] -= off;
+        self.last.present.motor[i] -= off;
+        self.unsettled = self.settle;
+        let at = &self.last.at;
+        let side = &mut self.sides[i];
+        side.recentre(at.motor[i], at.deflection(i), self.last.torque[i]);
+    }
+
+    /// Positions may count from anywhere: from where they did, if blocks bear it out, or from this moment's.
+    pub(super) fn resume(&mut self, at: &Positions) {
+        let now = at.from_zeros(&self.zeros);
+        let as_before = |(i, side): (usize, &Side)| side.may_be_as_before(now.deflection(i));
+        if self.sides.iter().enumerate().all(as_before) {
+            self.sides.iter_mut().for_each(Side::suspect_zero);
+        } else {
+            self.count_from(&now);
+        }
+    }
+
+    /// Where the zeros are is not known: deflections are counted from these.
+    fn count_from(&mut self, now: &Positions) {
+        for (i, side) in self.sides.iter_mut().enumerate() {
+            self.zeros.motor[i] -= if self.flexible { now.deflection(i) } else { 0.0 };
+            side.move_zero(false);
+        }
+    }
+
+    /// The zeros are not where they were before a restart.
+    pub(super) fn lose_here(&mut self) {
+        let now = self.last.at;
+        self.count_from(&now);
+        self.unsettled = self.settle;
+        for (i, side) in self.sides.iter_mut().enumerate() {
+            let off = if self.flexible { now.deflection(i) } else { 0.0 };
+            self.last.at.motor[i] += off;
+            self.last.present.motor[i] += off;
+            side.restart(self.last.at.motor[i], self.last.at.deflection(i), self.last.torque[i]);
+        }
+    }
+
+    /// Encoders have moved their zeros: go on as if they had not.
+    pub(super) fn move_zeros(&mut self, mut jumps: [f64; MOTORS + 1], at: &Positions, sequence: u64) {
+        let m = self.motors;
+        let ahead =
+            (sequence.wrapping_sub(self.sequence) as f64 + self.alignment.periods.abs()) * self.period;
+        // A deflection that went on as it was measures a jump; the validator is coarse.
+        let now = at.from_zeros(&self.zeros);
+        for i in 0..m {
+            let side = &self.sides[i];
+            if ahead > FORESEEN_S || side.rigid || side.deflection.unsettled > 0 {
+                continue;
+            }
+            let off = now.deflection(i) - side.deflection.at(ahead);
+            if jumps[i] != 0.0 && jumps[m] == 0.0 {
+                jumps[i] = -off;
+            } else if jumps[m] != 0.0 && jumps[i] == 0.0 {
+                jumps[m] = off;
+            }
+        }
+        let moved = |zero: f64, jump: f64| {
+            // One that jumps back has come home exactly.
+            let moved = zero + jump;
+            if moved.abs() < HOME * jump.abs() { 0.0 } else { moved }
+        };
+        for i in 0..m {
+            self.zeros.motor[i] = moved(self.zeros.motor[i], jumps[i]);
+        }
+        if self.flexible {
+            self.zeros.link = moved(self.zeros.link, jumps[m]);
+        }
+        let now = at.from_zeros(&self.zeros);
+        for (i, side) in self.sides.iter_mut().enumerate() {
+            let known = ahead <= FORESEEN_S && side.is_within(now.deflection(i));
+            if !known {
+                self.zeros.motor[i] = at.motor[i] - now.link; // in the middle of where it can be
+            }
+            side.move_zero(known);
+        }
+    }
+}

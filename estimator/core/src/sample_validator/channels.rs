@@ -1,0 +1,99 @@
+//! Channels that stand still, or jump.
+
+use super::{CHANNELS, MARGIN, PLACES, SampleValidator};
+use crate::sample::MOTORS;
+use crate::suspicion::{Reason, Signal};
+
+const STOPPED_COUNTS: f64 = 10.0; // … nor is a position that was slower than so many counts in that time
+const FIRST: u32 = 8; // samples after a start that are not judged
+const ROUNDING: f64 = 1e-12; // of a position: what arithmetic may leave of counts that cancel
+
+impl SampleValidator {
+    /// Whether a channel is frozen: everything at rest is no fault, one encoder count now and then no motion.
+    pub(super) fn stands_still(&mut self, places: &[f64; PLACES], torques: &[f64; MOTORS]) -> bool {
+        let watched = self.watched();
+        let count = watched + self.motors;
+        let m = &mut self.memory;
+        let mut values = [0.0; CHANNELS];
+        values[..watched].copy_from_slice(&places[..watched]);
+        values[watched..count].copy_from_slice(&torques[..self.motors]);
+        let Some(old) = m.values.replace(values) else {
+            m.runs = [0; CHANNELS];
+            return false;
+        };
+        let (mut moving, mut still) = (0.0, None);
+        for i in 0..count {
+            if values[i] == old[i] {
+                m.runs[i] += 1;
+                let run = m.runs[i];
+                if run == 1 && i < watched {
+                    m.stopped_at[i] = m.rates[i];
+                }
+                if m.samples < self.learning {
+                    m.usual[i] = m.usual[i].max(run);
+                }
+                // A torque always counts as one that was moving before.
+                let stopped_dead =
+                    i >= watched || m.stopped_at[i] * f64::from(self.still) > STOPPED_COUNTS * m.steps[i];
+                if run > self.still && run > 3 * m.usual[i] && stopped_dead {
+                    still = Some(i);
+                }
+            } else {
+                m.runs[i] = 0;
+                if i < watched {
+                    moving = 1.0;
+                }
+            }
+        }
+        m.motion += 0.05 * (moving - m.motion);
+        m.frozen = still.is_some() && m.motion > 0.2;
+        let frozen = m.frozen;
+        if let Some(place) = still.filter(|_| frozen) {
+            self.found = Some((self.signal(place), Reason::Frozen));
+        }
+        frozen
+    }
+
+    pub(super) fn jumped(&mut self, places: &[f64; PLACES], periods: f64) -> bool {
+        let watched = self.watched();
+        let m = &mut self.memory;
+        let checked = m.seen >= FIRST || (m.seen >= 2 && m.samples > self.learning);
+        if m.rejected == 0 {
+            m.astray = [false; PLACES];
+        }
+        let (mut jumped, mut slopes) = (false, [0.0; PLACES]);
+        for i in 0..watched {
+            let change = places[i] - m.places[i];
+            slopes[i] = change / periods;
+            let bend = (slopes[i] - m.slopes[i]).abs();
+            if checked && bend > m.limits[i] {
+                m.astray[i] = true;
+                jumped = true;
+                let signal = if i < self.motors { Signal::MotorPosition(i) } else { Signal::LinkPosition };
+                self.found = Some((signal, Reason::Jumped));
+            }
+            if jumped {
+                continue;
+            }
+            let size = change.abs();
+            m.rates[i] += 0.1 * (size - m.rates[i]);
+            // Of a joint that turns steadily no change is small; a change of the change is whole counts as well.
+            let second = if m.seen > 0 && periods == m.span { bend * periods } else { 0.0 };
+            for count in [size, second] {
+                if count > ROUNDING * places[i].abs() && count < m.steps[i] {
+                    m.steps[i] = count;
+                }
+            }
+            m.fastest[i] = m.fastest[i].max(size / periods);
+            if bend > m.peaks[i] && m.seen > 0 {
+                // The first two samples make the first slope.
+                m.peaks[i] = bend;
+                m.limits[i] = m.limits[i].max(MARGIN * bend);
+            }
+        }
+        if !jumped {
+            (m.slopes, m.span) = (slopes, periods);
+        }
+        jumped
+    }
+}

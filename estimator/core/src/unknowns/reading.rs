@@ -1,0 +1,50 @@
+//! Torque and stiffness that the unknowns make at a deflection.
+
+use super::{CLIPS, LATE, SPRING, STOPS, Spring, ZERO};
+use crate::balance;
+use crate::balance::Balance;
+use crate::gram::{Set, UNKNOWNS, Vector};
+use crate::laws::PARAMETERS;
+
+/// See [`Spring::at`].
+#[derive(Clone, Debug)]
+pub struct Reading {
+    /// τ_e, N·m.
+    pub torque: f64,
+    /// σ, N·m/rad.
+    pub stiffness: f64,
+    /// Slopes of τ_e by the unknowns.
+    pub by_torque: Vector,
+    /// Slopes of σ by the unknowns.
+    pub by_stiffness: Vector,
+    /// ∂σ/∂φ, N·m/rad².
+    pub bend: f64,
+}
+
+impl Spring {
+    /// τ_e and σ at a deflection as it is measured, with their slopes by the unknowns.
+    ///
+    /// `late_s` and `link_rate`: the position that was read late is brought up by them.
+    #[must_use]
+    pub fn at(&self, phi: f64, x: &Vector, set: Set, link_rate: f64, balance: &Balance) -> Reading {
+        let at = phi + self.zero + x[LATE] * link_rate;
+        let (mut torque, mut stiffness) = self.law.at(at, self.parameters());
+        let (mut by_torque, mut by_stiffness) = ([0.0; UNKNOWNS], [0.0; UNKNOWNS]);
+        let (mut f, mut s) = ([0.0; PARAMETERS], [0.0; PARAMETERS]);
+        self.law.jacobian(at, self.parameters(), &mut f[..self.size]);
+        let bend = self.law.stiffness_slopes(at, self.parameters(), &mut s[..self.size]);
+        by_torque[SPRING.start..SPRING.start + self.size].copy_from_slice(&f[..self.size]);
+        by_stiffness[SPRING.start..SPRING.start + self.size].copy_from_slice(&s[..self.size]);
+        (by_torque[ZERO], by_stiffness[ZERO]) = (stiffness, bend);
+        (by_torque[LATE], by_stiffness[LATE]) = (stiffness * link_rate, bend * link_rate);
+        if set & (crate::gram::set(STOPS) | crate::gram::set(CLIPS)) != 0 {
+            let (more, stiffer) = balance.extras(phi);
+            for (unknown, column) in STOPS.zip(balance::STOPS).chain(CLIPS.zip(balance::CLIPS)) {
+                (by_torque[unknown], by_stiffness[unknown]) = (more[column], stiffer[column]);
+                torque += x[unknown] * more[column];
+                stiffness += x[unknown] * stiffer[column];
+            }
+        }
+        Reading { torque, stiffness, by_torque, by_stiffness, bend }
+    }
+}

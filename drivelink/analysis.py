@@ -108,6 +108,11 @@ class Fit:
             RecordingError: it cannot be read, or the model cannot be simulated.
         """
         path = Path(other)
+        for number, motor in enumerate(self.found.model.motors, start=1):
+            if motor.flexible and not motor.transmission.parameters:
+                raise RecordingError(
+                    f"{self.runs.named}: expected a motion that determines the stiffness of motor {number}"
+                )
         joint, names = self.runs.source.joint, parse_column_map(self.runs.names)
         record = recording.read(path, joint, base_dir=self.runs.source.folder, names=names)
         try:

@@ -404,6 +404,8 @@ def _doubts(outcome: Diagnosis) -> Lines:
         if f.alternatives
     ]
     lines += [_LIBRARY_NAME.sub(lambda name: in_words(name[0]), line) for line in outcome.advice]
+    if outcome.verdict == "insufficient_excitation" or any(f.alternatives for f in outcome.effects):
+        lines.append("drivelink diagnose --motion next.csv designs a motion that tells them apart")
     lines += outcome.notes
     other = "No other effect" if outcome.effects else "No effect"
     return Lines(tuple(lines) or (f"{other} explains these data as well.",))

@@ -62,7 +62,7 @@ PROTECTIONS = [
         ("silence of a node", "cycle/following.py", "        if silent:\n", "        if False:\n", f"{FOLLOWING} -k not_heard"),
         ("receive overflow", "daemon/supervision.py", "if unread > self._unread:", "if False:", f"{FOLLOWING} -k overflow"),
         ("foreign pages", "monitor/web.py", 'origin not in (None, f"http://{host}")', "False", "tests/test_monitor.py"),
-        ("open streams", "monitor/web.py", "in _OWN_PAGES\n", "in _OWN_PAGES or True\n", "tests/test_monitor.py"),
+        ("open streams", "monitor/web.py", "in _OWN_PAGES\n        ):\n            self._events()", "in _OWN_PAGES or True\n        ):\n            self._events()", "tests/test_monitor.py"),
         ("claims of a joint", "pubsub/feed.py", "if len(self._claims) < MAX_CLAIMS:", "if True:", "tests/test_network_attacks.py -k tokens"),
         ("messages of others", "pubsub/feed.py", "if not (free and vouched):", "if False:", "tests/test_network_attacks.py -k 'stays or first_writer'"),
         ("valid and impossible", "pubsub/wire.py", "if message.status & _VALID and not _usable(message):", "if False:", "tests/test_wire.py"),

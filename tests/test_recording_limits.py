@@ -242,6 +242,8 @@ def test_messages_of_others_in_an_mcap_file_are_one_line(tmp_path: Path) -> None
         read_every_way(path)
     with pytest.raises(ValueError, match="expected at most 64 KiB"):
         message_fields(b" " * 100_000 + b"{}")
+    with pytest.raises(ValueError, match="without others or lists in it"):
+        message_fields(b'{"sequence": 0, "x": [[], []]}')
 
 
 def test_a_reader_of_others_reads_our_logs(whole: Path) -> None:

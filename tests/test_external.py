@@ -2,11 +2,14 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import onlinekit
 import pytest
 from scipy.signal import lfilter
 
+from drivelink import jointfile
 from drivelink._core import Assembler, JointPipeline
 from estimator import (
     EstimatorError,
@@ -285,6 +288,30 @@ def test_after_a_restart_it_settles_anew(free):
     for sample in rows[8201:8900]:
         estimator.step(sample)
     assert estimator.external.status & VALID
+
+
+@pytest.mark.parametrize("signal", ["motor", "link"])
+def test_it_returns_when_positions_count_from_elsewhere_and_gravity_is_found_again(signal):
+    joint = jointfile.load(Path(__file__).parents[1] / "examples" / "vsa-ii.toml")
+    estimator = make_estimator(joint.model(), joint.estimator, 1e-3)
+    late = []
+    for sample in onlinekit.motion("vsa-ii", 40.0, seed=1).samples:
+        if sample.sequence == 20_000:
+            estimator.lose_zeros()
+        if sample.sequence >= 20_000 and signal == "motor":
+            first, *others = sample.motor_position_rad
+            sample = sample._replace(motor_position_rad=(first + 0.3, *others))
+        elif sample.sequence >= 20_000:
+            sample = sample._replace(link_position_rad=sample.link_position_rad + 0.7)
+        estimator.step(sample)
+        if sample.sequence >= 20_000:
+            late.append(estimator.external)
+    assert all(one.status & VALID for one in late[-5000:])
+    valid = [one for one in late if one.status & VALID]
+    # Nobody touches the link: gravity in a wrong phase would be up to 0.2 N·m.
+    inside = [abs(one.external_torque_nm) < 1.96 * one.external_torque_std_nm for one in valid]
+    assert np.mean(inside) > 0.95
+    assert not any(one.status & CONTACT for one in late)
 
 
 def test_a_cycle_without_a_sample_says_so(free):

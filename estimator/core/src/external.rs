@@ -160,6 +160,7 @@ pub struct LinkMomentum {
     settle: i64,
     unsettled: i64,
     known: bool, // whether τ_e is
+    moved: bool, // whether q may count from elsewhere than gravity's phase is declared from
     position: [f64; 3],
     gravity: [f64; 3],
     carried: [f64; 3],
@@ -196,6 +197,7 @@ impl LinkMomentum {
             settle: (SETTLED * delay / period_s).ceil() as i64,
             unsettled: 0,
             known: false,
+            moved: false,
             position: [0.0; 3],
             gravity: [0.0; 3],
             carried: [0.0; 3],
@@ -231,6 +233,14 @@ impl LinkMomentum {
         (self.position, self.gravity, self.carried) = (rest(q), rest(self.last[1]), rest(carried));
         self.measured = rest(0.0);
         self.distrust();
+    }
+
+    /// Whether q may count from elsewhere since its zero was lost: gravity is then known by its size alone.
+    pub fn note_zero(&mut self, moved: bool) {
+        if moved && !self.moved {
+            self.errors = LinkErrors::default();
+        }
+        self.moved = moved;
     }
 
     /// One period: q, what the transmissions do to the link where that is known, and τ_k where it is measured.
@@ -269,7 +279,9 @@ impl LinkMomentum {
         let own = own + self.effects.iter().map(|element| element.torque(&c)).sum::<f64>();
         let sum = own + self.carried[0];
         let damping = link.damping_std.powi(2) + (carried.stiffness * self.skew).powi(2);
-        let (dry, gravity) = (self.dry * self.judge.largest, link.gravity_std.powi(2));
+        // From another phase, gravity is off by up to twice its amplitude.
+        let anywhere = if self.moved { 2.0 * link.gravity } else { 0.0 };
+        let (dry, gravity) = (self.dry * self.judge.largest, link.gravity_std.powi(2) + anywhere * anywhere);
         let prior = [f64::INFINITY, link.inertia_std.powi(2), damping, dry * dry, gravity, gravity];
         let row = self.errors.row(link, self.position);
         self.errors.forget(row[DRY], self.period);

@@ -328,7 +328,11 @@ impl Robust {
         if self.momentum.is_some() {
             let (now, measured) = (&now.present, self.measured);
             let carried = self.carried(now).map(|carried| carried.torque);
-            self.momentum.iter_mut().for_each(|momentum| momentum.feed(now.link, carried, measured));
+            let lost = self.sides.iter().any(|side| side.blocks.is_lost());
+            if let Some(momentum) = &mut self.momentum {
+                momentum.note_zero(lost);
+                momentum.feed(now.link, carried, measured);
+            }
         }
         self.last = *now;
         self.unsettled -= 1;

@@ -110,7 +110,7 @@ impl Side {
     /// `noise`: variance of θ's noise, rad².
     #[must_use]
     pub fn carried(&self, phi: f64, noise: f64) -> Option<Carried> {
-        if self.rigid || !self.fits || self.blocks.is_lost() {
+        if self.rigid || !self.fits || self.blocks.is_unconfirmed() {
             return None;
         }
         let at = self.blocks.at(phi, self.deflection.link_rate(), &self.balance)?;

@@ -276,6 +276,7 @@ def test_the_simplest_within_one_standard_error_is_chosen(
     held: Any = Held.__new__(Held)
     held.price = 3.0
     simple.families, other.families = frozenset("a"), frozenset("ab")
+    simple.parameters, other.parameters = 2, 3
     found = held.simplest([simple, other])
     assert found.name == chosen
     assert held.weights([found, other if found is simple else simple], found)[0] > probability

@@ -79,7 +79,7 @@ def test_a_second_healthy_recording_has_no_finding(healthy: tuple[Record, Record
         ([1e-2] * 10, [2e-3] * 10, True),
         ([1e-5] * 10, [9e-6] * 10, False),  # less than filters and rounding leave
         ([1e-2, 1e-3] * 5, [1e-3, 9e-3] * 5, False),  # less than its scatter
-        ([1e-3] * 10, [8e-4] * 10, False),  # less than a law leaves, for another law of the same
+        ([1e-3] * 10, [8e-4] * 10, False),  # less than a law leaves, for one with more parameters
     ],
 )
 def test_held_out_data_confirm_only_what_is_more_than_scatter_and_rounding(
@@ -89,7 +89,10 @@ def test_held_out_data_confirm_only_what_is_more_than_scatter_and_rounding(
     monkeypatch.setattr(Held, "scores", lambda _, one, among: -0.5 * np.log(one.squares))
     monkeypatch.setattr(Held, "_least", lambda *_: np.array([4e-4]))
     held: Any = Held.__new__(Held)
-    rest, found = (SimpleNamespace(squares=np.array(x), families=frozenset()) for x in (before, after))
+    rest, found = (
+        SimpleNamespace(squares=np.array(x), families=frozenset(), parameters=count)
+        for count, x in enumerate((before, after))
+    )
     assert held.confirms(found, rest) is confirmed
 
 

@@ -99,6 +99,12 @@ def test_a_model_that_holds_in_one_recording_only_is_found_out_by_the_other(mode
     assert held_out(problem, stiff).surplus(problem.null()) == pytest.approx(expected / larger, rel=0.02)
 
 
+def test_data_too_short_to_be_cut_into_blocks_are_refused(model: JointModel) -> None:
+    whole = record(SOFT)
+    with pytest.raises(EstimatorError, match="at least 10 independent rows"):
+        held_out(Problem([whole], model, BANDWIDTH_HZ), whole.rows(whole.sequence < 500))
+
+
 def test_a_larger_motion_alone_is_no_error_of_the_model(model: JointModel) -> None:
     """The same relative error, an absolute one that is four times as large."""
     small, large = record(SOFT, 1.0, STRANGE_NM), record(SOFT, 2.0, 2.0 * STRANGE_NM)

@@ -133,9 +133,10 @@ class Held:
         """Return whether held-out data need what one model has beyond another: the one rule of acceptance.
 
         The mean score of the blocks rises by more than its standard error, and the error falls by more than
-        filters and rounding leave anyway; by more than a law leaves, for another law of the same phenomenon.
+        filters and rounding leave anyway; by more than a law leaves, for a law of the same phenomenon with
+        more parameters.
         """
-        laws = found.families <= rest.families
+        laws = found.families <= rest.families and found.parameters > rest.parameters
         least = float(np.mean(self._least(rest))) if laws else choice("floor") ** 2
         if self.squared(rest) - self.squared(found) < least:
             return False
@@ -147,13 +148,20 @@ class Held:
         """Return the simplest of the models that held-out data cannot tell from the best.
 
         Simple is what has the larger prior: few parameters, and declared numbers that are believed. Then, of
-        laws for the same phenomena, the simplest is chosen.
+        laws for the same phenomena that leave no more than laws leave anyway, the simplest is chosen.
         """
         best = max(models, key=lambda one: float(np.mean(self.scores(one))))
         errors = self._independent(best)
         alike = [one for one in models if one is best or not self.confirms(best, one)]
         found = max(alike, key=lambda one: one.log_prior(errors, self.price))
-        laws = [one for one in models if one.families == found.families and not self.confirms(found, one)]
+        most = self.squared(found)
+        laws = [
+            one
+            for one in models
+            if one.families == found.families
+            and one.parameters < found.parameters
+            and self.squared(one) - most < float(np.mean(self._least(one)))
+        ]
         return max([found, *laws], key=lambda one: one.log_prior(errors, self.price))
 
     def weights(self, models: Sequence[Fitted], found: Fitted) -> FloatArray:

@@ -195,7 +195,8 @@ class Problem:
 
     def alike(self, records: Sequence[Record]) -> Problem:
         """Return the same joint and filter with other recordings."""
-        return Problem(records, self.model, self.bandwidth_hz, self.calibrating, like=self)
+        least = whole("groups")
+        return Problem(records, self.model, self.bandwidth_hz, self.calibrating, least, like=self)
 
     @property
     def period_s(self) -> float:

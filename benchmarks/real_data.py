@@ -196,7 +196,8 @@ def diagnosed(run: Run, data: Path, out: Path) -> dict[str, Any]:
         sensor = against_sensor(model, validation, torque[: len(validation)])
     folder = out / f"{run.joint}-{Path(run.train).stem}-{Path(run.validation).stem}"
     folder.mkdir(parents=True, exist_ok=True)
-    report.write(outcome, report.Title(run.joint, Path(run.train).name, Path(run.validation).name), folder)
+    title = report.Title(run.joint, Path(run.train).name, Path(run.validation).name)
+    report.write(report.as_json(outcome), report.html_page(outcome, title), folder)
     return {
         **run._asdict(),
         "sensor": sensor,

@@ -78,13 +78,13 @@ class _Drive:
         self._reported, self._result = reported, result
 
     def offer(self) -> None:
+        self._result.candidates[Signal.STATUSWORD] = (
+            MappedObject(signal=Signal.STATUSWORD, index=0x6041, subindex=0, bits=16, signed=False),
+        )
         gear = self._gear()
         counts = self._counts_per_rev()
         self._position(counts, gear)
         self._torque(gear)
-        self._result.candidates[Signal.STATUSWORD] = (
-            MappedObject(signal=Signal.STATUSWORD, index=0x6041, subindex=0, bits=16, signed=False),
-        )
         self._velocity(counts, gear)
         self._following_error()
         self._second_encoder(counts, gear)

@@ -182,6 +182,15 @@ impl Blocks {
         (self.carried, self.lost) = (None, false);
     }
 
+    /// Forget rows and what they have taught: they are of other moments. A lost zero stays lost.
+    pub fn relearn(&mut self) {
+        let lost = self.lost;
+        self.clear();
+        if lost {
+            (self.lost, self.posterior) = (true, None);
+        }
+    }
+
     fn forget_rows(&mut self) {
         self.ring.clear();
         self.peaks.clear();

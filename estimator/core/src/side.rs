@@ -161,7 +161,7 @@ impl Side {
 
     /// What has been learned is of other moments.
     pub fn relearn(&mut self, theta: f64, phi: f64) {
-        self.blocks.clear();
+        self.blocks.relearn();
         self.deflection.restart(theta, phi);
         self.judge();
     }
@@ -323,7 +323,8 @@ impl Side {
         if off != 0.0 {
             return Some(Shift::Zero(off));
         }
-        let (late, std) = self.blocks.delay().filter(|_| !self.doubtful)?;
+        let known = !self.doubtful && !self.blocks.is_lost(); // a zero that is elsewhere looks late
+        let (late, std) = self.blocks.delay().filter(|_| known)?;
         let (periods, std) = (late / self.period, std / self.period);
         let late = periods.abs() > HALF && periods.abs() - HALF > SURE * std;
         late.then(|| Shift::Late(periods.round()))

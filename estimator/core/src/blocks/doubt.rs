@@ -101,7 +101,7 @@ impl Blocks {
         if self.spoilt {
             self.waiting.clear(); // samples that could not be used were among them: no joint is like that
         }
-        if self.waiting.len() >= 2 && of_joint > DECIDED && explained {
+        if self.waiting.len() >= 2 && of_joint > DECIDED && explained && !self.is_unconfirmed() {
             // All that the window does not tell apart is open.
             let likely = odds.likely(|cause| cause.entry().opens != 0);
             let opens = TABLE.iter().zip(likely).filter(|(_, likely)| *likely).map(|(entry, _)| entry.opens);

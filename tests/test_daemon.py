@@ -392,6 +392,9 @@ class Broken:
     def undeclared(self) -> list[list[str]]:
         return []
 
+    def friction(self) -> list[object]:
+        return []
+
 
 def test_an_exception_in_one_joint_takes_that_one_to_a_fault_and_the_others_go_on() -> None:
     with two_joints() as made:

@@ -223,7 +223,7 @@ impl Posterior {
         for i in unknowns(self.set).filter(|i| g[*i] != 0.0) {
             sum += g[i] * self.covariance[i].iter().zip(g).map(|(v, b)| v * b).sum::<f64>();
         }
-        sum.max(0.0)
+        if sum < 0.0 { f64::INFINITY } else { sum } // rounding has left nothing of it: it is not known
     }
 }
 

@@ -158,6 +158,8 @@ class Motor:
             the gate tests for recordings that are not.
         inertia_std_relative: relative standard deviation of B; None: that of `estimator.priors`.
         viscous_damping_std_nm_s_rad: standard deviation of D_theta, likewise.
+        fit_rms_nm: rms of what the model leaves of the motor's torque in the recording that it is fitted to, and
+            rms of that torque; None: no recording.
     """
 
     inertia_kg_m2: float
@@ -167,6 +169,7 @@ class Motor:
     gear_ratio: float | None = None
     inertia_std_relative: float | None = None
     viscous_damping_std_nm_s_rad: float | None = None
+    fit_rms_nm: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         require_declared(0.0, strict=True, inertia_kg_m2=self.inertia_kg_m2)

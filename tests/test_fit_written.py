@@ -19,7 +19,7 @@ import pytest
 from drivelink import jointfile, recording
 from drivelink.cli import main
 from drivelink.errors import JointFileError
-from estimator import fit
+from estimator import EstimatorSettings, fit, make_estimator
 from estimator.identify import identify
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -232,3 +232,20 @@ def test_on_a_machine_no_zero_is_written_that_spoils_the_balance(axis: int, run:
     (alone,), (again,) = found.fits, fit(record, found.model)
     # The readings are interpolated anew: equal within a percent.
     assert again.error_rms_nm < 1.01 * alone.error_rms_nm
+
+
+@pytest.mark.skipif(not KUKA.exists(), reason=f"no measured data in {KUKA} (see $DRIVELINK_DATA)")
+@pytest.mark.parametrize("run", ["A", "B"])
+def test_on_a_machine_the_fitted_file_makes_its_recordings_valid(run: str, tmp_path: Path) -> None:
+    """The balance leaves a sixth of the torque there: what the fit has left is what is foreseen."""
+    example = ROOT / "examples" / "kuka_axis3.toml"
+    written, source = tmp_path / "fitted.toml", KUKA / f"axis3_{run}.csv"
+    assert main(["fit", str(source), "--joint", str(example), "--write", str(written)]) == 0
+    joint = jointfile.load(written)
+    for other in "AB":
+        record = recording.read(KUKA / f"axis3_{other}.csv", joint)
+        estimator = make_estimator(joint.model(), EstimatorSettings(), record.period_s)
+        statuses = [estimator.step(sample).status for sample in record.samples()]
+        assert (
+            np.mean([status & 1 for status in statuses]) > 0.8
+        )  # a few of a hundred without the fit's residual

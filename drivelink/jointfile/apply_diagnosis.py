@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from drivelink import jointfile
 from drivelink.jointfile import JointFile, JointText
@@ -90,7 +90,7 @@ def diagnosed_model(joint: JointFile, outcome: Diagnosis) -> JointModel:
     motors = tuple(
         replace(
             motor,
-            **(outcome.transmissions[i].motor if _decided(outcome) else {}),
+            **cast("dict[str, Any]", outcome.transmissions[i].motor if _decided(outcome) else {}),
             transmission=_transmission(motor.transmission, outcome, i),
             effects=_all_effects(motor.effects, outcome, i),
         )

@@ -331,12 +331,20 @@ impl Blocks {
         let prior = self.prior(block, &frame, near);
         let known = frame.set & ACTIVE;
         let covariance = inverse(&prior.precision, known);
-        self.noise.variance = EARLY * EARLY * balance::variance(block, balance::TORQUE);
+        self.noise.variance = self.early(block);
         self.own = self.noise.variance.sqrt();
         self.residual = frame.residual(&prior.mean, known);
         self.torque = self.spring.torque_rms(&projection, block);
         self.posterior = Some(Posterior { set: known, x: prior.mean, covariance, log_evidence: 0.0 });
         (self.frame, self.fitted) = (Some(frame), true);
+    }
+
+    /// Variance of a row's noise before rows have shown it, (N·m)².
+    fn early(&self, rows: &Gram) -> f64 {
+        // An error of the model grows with the torque.
+        let (left, torque) = self.motor.fit_rms.unwrap_or((0.0, f64::INFINITY));
+        let fitted = left * (rows.rms(balance::TORQUE) / torque).max(1.0);
+        (EARLY * EARLY * balance::variance(rows, balance::TORQUE)).max(fitted * fitted)
     }
 
     fn keep(&mut self, block: Gram) {

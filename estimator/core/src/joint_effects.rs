@@ -94,8 +94,9 @@ mod tests {
             parameters: vec![100.0],
             covariance: None,
         };
-        let (inertia_std, damping_std) = (None, None);
-        let motor = Motor { inertia: 0.1, inertia_std, damping: 0.0, damping_std, transmission, effects };
+        let (inertia_std, damping_std, fit_rms) = (None, None, None);
+        let motor =
+            Motor { inertia: 0.1, inertia_std, damping: 0.0, damping_std, fit_rms, transmission, effects };
         Model { arrangement: Arrangement::Single, motors: vec![motor], link: None, link_effects }
     }
 

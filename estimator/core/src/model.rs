@@ -50,6 +50,8 @@ pub struct Motor {
     pub damping: f64,
     /// Standard deviation of D_θ, N·m·s/rad, where it is declared.
     pub damping_std: Option<f64>,
+    /// rms of what the model leaves of the torque where it is fitted to a recording, and of that torque, N·m.
+    pub fit_rms: Option<(f64, f64)>,
     /// See [`Transmission`].
     pub transmission: Transmission,
     /// What the model has been given besides.
@@ -147,8 +149,8 @@ mod tests {
     use super::*;
 
     fn motor(transmission: Transmission) -> Motor {
-        let (inertia_std, damping_std) = (None, None);
-        Motor { inertia: 0.1, inertia_std, damping: 0.0, damping_std, transmission, effects: vec![] }
+        let (inertia_std, damping_std, fit_rms) = (None, None, None);
+        Motor { inertia: 0.1, inertia_std, damping: 0.0, damping_std, fit_rms, transmission, effects: vec![] }
     }
 
     fn elastic(law: Law, parameters: &[f64], covariance: Option<Vec<f64>>) -> Transmission {

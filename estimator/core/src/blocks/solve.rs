@@ -1,6 +1,6 @@
 //! The unknowns of one motor's balance from the sum of its blocks: prior, noise, choice, interval.
 
-use super::{Blocks, EARLY, FEWEST, REACHED};
+use super::{Blocks, FEWEST, REACHED};
 use crate::balance;
 use crate::gram::{
     Frame, Gram, Matrix, Posterior, Prior, Row, Set, UNKNOWNS, by_rows, choose, cluster, dot, log_evidence,
@@ -131,7 +131,8 @@ impl Blocks {
             self.moved = moved;
             let own = total.quadratic(&frame.residual(&chosen.x, chosen.set)) / total.rows;
             self.own = own.sqrt().max(EXACT * total.rms(balance::TORQUE));
-            (self.fluctuation, self.unexplained) = (torque, self.own / torque.sqrt());
+            let usual = self.motor.fit_rms.map_or(0.0, |(_, torque)| torque); // little motion is no worse model
+            (self.fluctuation, self.unexplained) = (torque, self.own / torque.sqrt().max(usual));
             let far = SPRING.clone().chain([ZERO]).any(|i| {
                 chosen.x[i].abs() > 0.1 * chosen.covariance[i][i].sqrt() && chosen.set >> i & 1 == 1
             });
@@ -159,11 +160,7 @@ impl Blocks {
             return; // it is as noisy as it was
         }
         // What few rows leave is less than their noise, as they are fitted: at first no less is assumed than usual.
-        let floor = if self.ring.len() < FEWEST {
-            floor.max(EARLY * EARLY * balance::variance(total, balance::TORQUE))
-        } else {
-            floor
-        };
+        let floor = if self.ring.len() < FEWEST { floor.max(self.early(total)) } else { floor };
         // What was found a block ago is near enough to begin with.
         let passes = if self.ring.len() > FEWEST { 1 } else { 2 };
         for _ in 0..passes {

@@ -12,6 +12,7 @@ fn joint(link: Link) -> Model {
         inertia_std: None,
         damping: 0.2,
         damping_std: None,
+        fit_rms: None,
         transmission: Transmission::Unknown,
         effects: Vec::new(),
     };

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import pytest
 from canopenkit import (
@@ -22,6 +22,7 @@ from drivelink.canopen.layout import Signal
 from drivelink.errors import DriveError
 
 POSITION, TORQUE, STATUS = 0x60640020, 0x60770010, 0x60410010
+POSITION_AND_TORQUE = [Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE]
 
 
 @dataclass
@@ -50,7 +51,6 @@ class SmallMaps(Slave):
         return super()._check_map(index, subindex, value)
 
 
-@dataclass
 class Frozen(Slave):
     """Nothing of its PDO parameters can be written."""
 
@@ -58,11 +58,8 @@ class Frozen(Slave):
         return READ_ONLY if 0x1800 <= address[0] <= 0x1BFF else 0
 
 
-@dataclass
 class OddAnswers(Slave):
     """Does not say how many bytes of an answer count, nor which object an abort is of."""
-
-    seen: list[bytes] = field(default_factory=list)
 
     def _sdo(self, data):
         answer = super()._sdo(data)
@@ -73,47 +70,48 @@ class OddAnswers(Slave):
         return answer
 
 
-def test_a_node_that_is_slow_to_be_pre_operational_is_waited_for():
+def test_a_node_that_is_slow_to_be_pre_operational_is_waited_for_and_one_that_never_is_is_named():
     slave = SlowState(5, drive_objects(5))
-    assert signals(configured(slave)[1]) == [[Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE, Signal.STATUSWORD]]
+    assert signals(configured(slave)[1]) == [[*POSITION_AND_TORQUE, Signal.STATUSWORD]]
     assert slave.refusals == 0
-
-
-def test_a_node_that_never_takes_it_is_named_with_its_abort_code():
     with pytest.raises(DriveError, match=r"^node 5 refuses the mapping.*0x1800:01 answers 0x08000022 \("):
         configured(SlowState(5, drive_objects(5), refusals=10_000))
 
 
-@pytest.mark.parametrize("at_count", [False, True])
-def test_maps_of_two_objects_are_filled_and_the_rest_goes_into_the_next(at_count):
-    objects = drive_objects(5) | tpdo(1, NO_RTR | 0x185, 255)
-    _, layout = configured(SmallMaps(5, objects, most=2, at_count=at_count))
-    assert signals(layout) == [[Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE], [Signal.STATUSWORD]]
-    assert any("TPDO1 takes 2 objects" in finding.text for finding in layout.notices)
-
-
-def test_maps_that_have_fewer_places_than_objects_are_filled():
+def two_places():
+    """A drive whose maps have two places each."""
     objects = drive_objects(5)
     for number in range(1, 5):
         objects |= tpdo(number, NO_RTR | INVALID | 0x80 + 0x100 * number + 5, 255, slots=2)
         for position in range(3, 9):
             objects.pop((0x19FF + number, position), None)
-    _, layout = configured(Slave(5, objects))
-    assert signals(layout) == [[Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE], [Signal.STATUSWORD]]
+    return objects
+
+
+@pytest.mark.parametrize(
+    "slave",
+    [
+        SmallMaps(5, drive_objects(5) | tpdo(1, NO_RTR | 0x185, 255)),
+        SmallMaps(5, drive_objects(5) | tpdo(1, NO_RTR | 0x185, 255), at_count=True),
+        Slave(5, two_places()),
+    ],
+    ids=["refuses the third", "refuses the count", "has two places"],
+)
+def test_maps_of_two_objects_are_filled_and_the_rest_goes_into_the_next(slave):
+    _, layout = configured(slave)
+    assert signals(layout) == [POSITION_AND_TORQUE, [Signal.STATUSWORD]]
+    assert any("TPDO1 takes 2 objects" in finding.text for finding in layout.notices)
 
 
 @pytest.mark.parametrize("transmission_type", [1, 2, 255])
-def test_a_pdo_that_cannot_be_changed_at_all_is_taken_as_it_is(transmission_type):
+def test_a_pdo_that_cannot_be_changed_at_all_is_taken_as_it_is_unless_it_is_off(transmission_type):
     objects = drive_objects(5) | tpdo(1, 0x185, transmission_type, STATUS, POSITION, TORQUE)
     _, layout = configured(Frozen(5, objects))
     (frame,) = layout.tpdos
     assert (frame.cob_id, frame.transmission_type, frame.length) == (0x185, transmission_type, 8)
     warned = any(f"keeps transmission type {transmission_type}" in finding.text for finding in layout.notices)
     assert warned == (transmission_type != 1)
-
-
-def test_a_pdo_that_is_off_and_cannot_be_switched_on_is_no_use():
-    objects = drive_objects(5) | tpdo(1, INVALID | 0x185, 1, STATUS, POSITION, TORQUE)
+    objects = drive_objects(5) | tpdo(1, INVALID | 0x185, transmission_type, STATUS, POSITION, TORQUE)
     with pytest.raises(DriveError, match=r"^node 5 .*0x1800:01: SDO abort 0x06010002"):
         configured(Frozen(5, objects))
 
@@ -126,20 +124,15 @@ def test_what_is_never_sent_on_sync_is_asked_for_once_a_period():
     assert any("may be older than their SYNC" in finding.text for finding in layout.notices)
 
 
-def test_answers_without_a_length_and_aborts_without_an_object_are_understood():
-    objects = drive_objects(5)
+def test_odd_answers_and_counted_empty_places_are_understood():
+    objects = drive_objects(5) | tpdo(1, NO_RTR | 0x185, 255, *[0] * 8)
     del objects[0x60A9, 0], objects[0x607E, 0]
     _, layout = configured(OddAnswers(5, objects))
+    assert signals(layout) == [[*POSITION_AND_TORQUE, Signal.STATUSWORD]]
     assert [mapped.bits for mapped in layout.tpdos[0].objects] == [32, 16, 16]
 
 
-def test_empty_places_that_are_counted_are_no_objects():
-    objects = drive_objects(5) | tpdo(1, NO_RTR | 0x185, 255, *[0] * 8)
-    assert signals(configured(Slave(5, objects))[1])[0][0] is Signal.MOTOR_POSITION
-
-
 def test_a_node_that_falls_silent_on_one_object_is_not_called_unpowered():
-    @dataclass
     class Deaf(Slave):
         def _sdo(self, data):
             return b"" if data[1:3] == b"\xa8\x60" else super()._sdo(data)

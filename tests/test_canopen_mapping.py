@@ -25,12 +25,11 @@ from drivelink.errors import BusError, DriveError
 from drivelink.jointfile import parse
 
 POSITION, TORQUE, STATUS = 0x60640020, 0x60770010, 0x60410010
-CURRENT, VELOCITY, LINK = 0x60780010, 0x606C0020, 0x60E40120
+VELOCITY = 0x606C0020
 
 
-def drive(node=5, **changes):
-    objects = drive_objects(node)
-    return Slave(node, objects, **changes)
+def drive(**changes):
+    return Slave(5, drive_objects(5), **changes)
 
 
 def test_the_order_that_all_drives_accept_frame_by_frame():
@@ -62,33 +61,30 @@ def test_one_frame_carries_position_torque_and_statusword_and_a_second_one_what_
     assert signals(layout) == [plain, [Signal.LINK_POSITION, Signal.MOTOR_VELOCITY]]
 
 
+CURRENT_SOURCE = 'torque_source = "current"\ncurrent_object = "0x30D1:02"\ntorque_constant_nm_a = 0.1'
+
+
 def test_a_32_bit_current_moves_the_statusword_to_the_next_frame():
     slave = drive()
     slave.objects[0x30D1, 2] = u32(0, mappable=True)
-    _, layout = configured(
-        slave, drive='torque_source = "current"\ncurrent_object = "0x30D1:02"\ntorque_constant_nm_a = 0.1'
-    )
-    assert sorted(signals(layout), key=len) == [  # TPDO1 has the statusword already, and is taken as it is
-        [Signal.STATUSWORD],
-        [Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE],
-    ]
+    _, layout = configured(slave, drive=CURRENT_SOURCE)
+    # TPDO1 has the statusword already, and is taken as it is
+    assert sorted(signals(layout), key=len) == [
+        [Signal.STATUSWORD], [Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE],
+    ]  # fmt: skip
 
 
-def test_a_second_start_writes_nothing_and_leaves_operational_alone():
-    slave = drive()
+@pytest.mark.parametrize("keep_bit_30", [False, True])
+@pytest.mark.parametrize("cob", [NO_RTR | 0x185, 0x185])
+def test_a_second_start_writes_nothing_and_bit_30_stays_as_the_drive_has_it(keep_bit_30, cob):
+    slave = drive(keep_bit_30=keep_bit_30)
+    slave.objects[0x1800, 1].value = cob
     configured(slave)
+    assert slave.objects[0x1800, 1].value == cob
     before = list(slave.writes)
     wire, _ = configured(slave)
     assert slave.writes == before
     assert [frame for frame in wire.sent if frame[0] == 0] == [(0, b"\x01\x05")]
-
-
-def test_bit_30_is_kept_for_drives_that_insist():
-    configured(drive(keep_bit_30=True))
-    slave = drive(keep_bit_30=True)
-    slave.objects[0x1800, 1].value = 0x185  # this one answers remote frames: bit 30 is clear
-    configured(slave)
-    assert slave.objects[0x1800, 1].value == 0x185
 
 
 def test_a_torque_that_cannot_be_mapped_gives_way_to_the_current():
@@ -122,29 +118,40 @@ def fixed(slave, *maps):
     return slave
 
 
-def test_a_fixed_map_that_carries_what_is_needed_is_taken():
-    wire, layout = configured(fixed(drive(), (STATUS,), (STATUS, POSITION, TORQUE)))
-    assert signals(layout) == [[Signal.STATUSWORD, Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE]]
+PLAIN = [Signal.STATUSWORD, Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE]
+
+
+@pytest.mark.parametrize(
+    "maps",
+    [
+        ((STATUS,), (STATUS, POSITION, TORQUE)),
+        ((STATUS,), (STATUS, POSITION), (STATUS, VELOCITY), (TORQUE,)),  # the second statusword is skipped over
+    ],
+)  # fmt: skip
+def test_fixed_maps_that_carry_what_is_needed_are_taken_and_put_together(maps):
+    wire, layout = configured(fixed(drive(), *maps))
+    given = Counter(signal for frame in signals(layout) for signal in frame)
+    assert set(given) >= set(PLAIN) and given[Signal.STATUSWORD] == 1
     assert layout.tpdos[0].cob_id == 0x285
-    assert not [write for write in wire.written() if 0x1A00 <= write[1] <= 0x1BFF]
+    assert not [write for write in wire.written() if 0x1A00 <= write[1] <= 0x1BFF and write[3]]
 
 
-def test_several_fixed_maps_are_put_together():
-    _, layout = configured(fixed(drive(), (STATUS,), (STATUS, POSITION), (STATUS, VELOCITY), (TORQUE,)))
-    given = {signal for frame in signals(layout) for signal in frame}
-    assert {Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE, Signal.STATUSWORD} <= given
-    seen = Counter(signal for frame in signals(layout) for signal in frame)
-    assert seen[Signal.STATUSWORD] == 1  # the second one is skipped over
-
-
-def test_fixed_maps_that_lack_something_are_shown():
-    with pytest.raises(DriveError, match=r"motor_torque.*TPDO1 = 0x6041:00; TPDO2 = 0x6064:00"):
-        configured(fixed(drive(), (STATUS,), (POSITION,)))
-
-
-def test_what_reads_back_decides_and_a_drive_that_forgets_is_found_out():
-    with pytest.raises(DriveError, match=r"does not keep the mapping: motor_position.*TPDO3 = empty"):
-        configured(drive(forgets=True))
+@pytest.mark.parametrize(
+    ("slave", "said"),
+    [
+        (
+            lambda: fixed(drive(), (STATUS,), (POSITION,)),
+            r"motor_torque.*TPDO1 = 0x6041:00; TPDO2 = 0x6064:00",
+        ),
+        # What reads back decides.
+        (lambda: drive(forgets=True), r"does not keep the mapping: motor_position.*TPDO3 = empty"),
+        (lambda: drive(silent=True), r"node 5 does not answer.*is it powered"),
+    ],
+)
+def test_a_drive_without_a_mapping_that_serves_is_one_line(slave, said, monkeypatch):
+    monkeypatch.setattr("drivelink.canopen.node.BOOT_S", 0.1)
+    with pytest.raises(DriveError, match=said):
+        configured(slave())
 
 
 def test_two_tpdos_with_one_identifier_are_distinguished():
@@ -157,17 +164,14 @@ def test_two_tpdos_with_one_identifier_are_distinguished():
     assert len({frame.cob_id for frame in layout.tpdos}) == 2
 
 
-def test_a_missing_tpdo_among_the_first_ones_is_skipped():
+def test_a_missing_tpdo_is_skipped_and_beside_another_master_the_unused_ones_are_taken():
     slave = drive()
     for key in [key for key in slave.objects if key[0] in (0x1801, 0x1A01)]:
         del slave.objects[key]
     _, layout = configured(slave, link="[link.encoder]\ncounts_per_rev = 4096")
     assert [frame.number for frame in layout.tpdos] == [1, 3]
-
-
-def test_beside_another_master_the_unused_tpdos_are_taken():
     _, layout = configured(drive(), bus='sync = "follow"')
-    assert layout.tpdos[0].number == 2
+    assert [frame.number for frame in layout.tpdos] == [2]
     assert [frame.number for frame in layout.other_tpdos] == [1]
 
 
@@ -180,23 +184,21 @@ def test_inhibit_time_event_timer_and_an_identifier_left_over_from_another_node_
     assert slave.objects[0x1800, 3].value == slave.objects[0x1800, 5].value == 0
 
 
-def test_a_transmission_type_that_is_refused_is_reported_and_kept():
-    _, layout = configured(drive(refuse={(0x1800, 2): READ_ONLY}))
-    assert layout.tpdos[0].transmission_type == 255
-    assert any("keeps transmission type 255" in finding.text for finding in layout.notices)
+def test_a_transmission_type_and_a_heartbeat_that_are_refused_are_reported_and_kept():
+    slave = drive(refuse={(0x1800, 2): READ_ONLY, (0x1017, 0): READ_ONLY})
+    slave.objects[0x1017, 0].value = 500
+    _, layout = configured(slave)
+    assert (layout.tpdos[0].transmission_type, layout.heartbeat_ms) == (255, 500)
+    said = " ".join(finding.text for finding in layout.notices)
+    assert "keeps transmission type 255" in said and "keeps its heartbeat of 500 ms" in said
 
 
 def test_the_sync_counter_is_written_with_the_period_off():
     slave = drive()
     slave.objects[0x1006, 0].value = 1000
     configured(slave, bus="sync_counter_overflow = 240")
-    assert slave.objects[0x1019, 0].value == 240
-    assert slave.objects[0x1006, 0].value == 1000
-    assert [write for write in slave.writes if write[0] in (0x1006, 0x1019)] == [
-        (0x1006, 0, 0),
-        (0x1019, 0, 240),
-        (0x1006, 0, 1000),
-    ]
+    written = [write for write in slave.writes if write[0] in (0x1006, 0x1019)]
+    assert written == [(0x1006, 0, 0), (0x1019, 0, 240), (0x1006, 0, 1000)]
 
 
 def test_a_drive_that_makes_sync_itself_is_stopped_or_named():
@@ -212,22 +214,6 @@ def test_a_drive_that_makes_sync_itself_is_stopped_or_named():
         configured(constant)
 
 
-def test_a_heartbeat_that_cannot_be_set_is_what_it_is():
-    slave = drive(refuse={(0x1017, 0): READ_ONLY})
-    slave.objects[0x1017, 0].value = 500
-    _, layout = configured(slave)
-    assert layout.heartbeat_ms == 500
-    assert any("keeps its heartbeat of 500 ms" in finding.text for finding in layout.notices)
-
-
-def test_nobody_at_home_is_one_line(monkeypatch):
-    monkeypatch.setattr("drivelink.canopen.node.BOOT_S", 0.1)
-    with pytest.raises(DriveError) as error:
-        configured(drive(silent=True))
-    assert "node 5 does not answer" in str(error.value)
-    assert "is it powered" in str(error.value)
-
-
 def test_a_foreign_sync_is_refused_before_anything_is_sent():
     wire = Wire([drive()])
     for _ in range(5):
@@ -237,39 +223,30 @@ def test_a_foreign_sync_is_refused_before_anything_is_sent():
     assert wire.sent == []
 
 
-def test_what_the_bus_cannot_carry_is_refused_with_numbers():
-    nodes = [drive_objects(node) for node in range(1, 9)]
-    wire = Wire(Slave(node, objects) for node, objects in enumerate(nodes, start=1))
-    joints = [
-        parse(joint_text().replace("node_id = 5", f"node_id = {node}").replace("elbow", f"joint{node}"))
-        for node in range(1, 9)
-    ]
+def several(*nodes):
+    """(drives, the joints of one drive each)."""
+    text = joint_text()
+    texts = (text.replace("node_id = 5", f"node_id = {n}").replace("elbow", f"joint{n}") for n in nodes)
+    return [Slave(node, drive_objects(node)) for node in nodes], [parse(one) for one in texts]
+
+
+def test_what_the_bus_cannot_carry_and_a_node_of_two_joints_are_refused():
+    slaves, joints = several(*range(1, 9))
     with pytest.raises(BusError, match=r"bus load would be 11\d%.*kbit/s of 1000 kbit/s"):
-        configure_joints(wire, joints)
+        configure_joints(Wire(slaves), joints)
+    with pytest.raises(BusError, match="node 5 is claimed by two joints"):
+        configure_joints(Wire([drive()]), [joints[4], joints[4]])
 
 
 def test_unneeded_frames_are_switched_off_where_the_load_demands_it():
-    slaves = []
-    for node in (5, 6, 7, 8):
-        objects = drive_objects(node)
-        objects[0x1801, 1].value = NO_RTR | 0x280 + node
-        slaves.append(Slave(node, objects))
-    wire = Wire(slaves)
-    joints = [
-        parse(joint_text().replace("node_id = 5", f"node_id = {node}").replace("elbow", f"joint{node}"))
-        for node in (5, 6, 7, 8)
-    ]
-    configurator, layouts = configure_joints(wire, joints)
+    slaves, joints = several(5, 6, 7, 8)
+    for slave in slaves:
+        slave.objects[0x1801, 1].value = NO_RTR | 0x280 + slave.node
+    configurator, layouts = configure_joints(Wire(slaves), joints)
     assert all(not layout.other_tpdos for mine in layouts for layout in mine)
     assert all(slave.objects[0x1801, 1].value & INVALID for slave in slaves)
     # SYNC 55 + 4 frames of 135 bits at 1 kHz, four heartbeats of 65 bits at 10 Hz
     assert configurator.load().bits_per_s == pytest.approx(1000 * (55 + 4 * 135) + 4 * 10 * 65)
-
-
-def test_one_node_cannot_serve_two_joints():
-    joint = parse(joint_text())
-    with pytest.raises(BusError, match="node 5 is claimed by two joints"):
-        configure_joints(Wire([drive()]), [joint, joint])
 
 
 def test_a_link_encoder_of_its_own_is_a_third_node():
@@ -291,66 +268,50 @@ def test_a_link_encoder_of_its_own_is_a_third_node():
     assert mapped.scale == pytest.approx(-2 * 3.141592653589793 / 8192)
 
 
-def test_a_node_that_rebooted_is_configured_again_beside_the_loop():
+def ended(configurator, wire):
+    """What a configuration beside the loop ends in: one step at a time, nothing blocks."""
+    now = 0.0
+    while not (results := configurator.poll(now)):
+        now += 0.001
+        if message := wire.recv():
+            configurator.feed(message.arbitration_id, bytes(message.data), now)
+    return results
+
+
+def test_a_node_that_rebooted_is_configured_again_beside_the_loop_and_one_that_stays_away_can_be_tried_again():
     slave = drive()
     wire = Wire([slave])
     configurator, ((before,),) = configure_joints(wire, [parse(joint_text())])
-    slave.objects = drive_objects(5)  # as after power-on
-    slave.state = 0x7F
+    slave.silent = True
     configurator.start(5)
-    ended, now = [], 0.0
-    for _ in range(2000):  # the loop's slack: one step at a time, nothing blocks
-        now += 0.001
-        ended += configurator.poll(now)
-        message = wire.recv()
-        if message is not None:
-            configurator.feed(message.arbitration_id, bytes(message.data), now)
-        if ended:
-            break
-    assert [(node, result.tpdos) for node, result in ended] == [(5, before.tpdos)]
+    ((node, error),) = ended(configurator, wire)
+    assert node == 5 and isinstance(error, DriveError)
+    slave.objects, slave.state, slave.silent = drive_objects(5), 0x7F, False  # as after power-on
+    configurator.start(5)
+    assert configurator.busy
+    assert [(node, result.tpdos) for node, result in ended(configurator, wire)] == [(5, before.tpdos)]
     assert slave.state == 5
     assert not configurator.busy
 
 
-def test_a_node_that_stays_away_ends_in_an_error_and_can_be_tried_again():
-    slave = drive()
-    wire = Wire([slave])
-    configurator, _ = configure_joints(wire, [parse(joint_text())])
-    slave.silent = True
-    configurator.start(5)
-    ended, now = [], 0.0
-    while not ended:
-        now += 0.01
-        ended += configurator.poll(now)
-    ((node, error),) = ended
-    assert node == 5
-    assert isinstance(error, DriveError)
-    slave.silent = False
-    configurator.start(5)
-    assert configurator.busy
+class Failing(Wire):
+    """A bus that every third frame cannot be sent to."""
 
-
-class FullQueue(Wire):
-    """Every third frame finds the transmit queue full."""
+    def __init__(self, number, text, slaves=()):
+        super().__init__(slaves)
+        self.error = can.CanOperationError(f"Failed to transmit: {text}", number)
+        self.count = 0
 
     def send(self, msg, timeout=None):
-        self.count = getattr(self, "count", 0) + 1
+        self.count += 1
         if self.count % 3 == 0:
-            raise can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS)
+            raise self.error
         super().send(msg, timeout)
 
 
-def test_a_full_transmit_queue_costs_time_only():
-    wire = FullQueue([drive()])
-    joint = parse(joint_text(bus="sdo_retries = 3"))
-    (layout,) = configure(wire, joint)
+def test_a_full_transmit_queue_costs_time_only_and_an_interface_that_is_down_is_one_line():
+    wire = Failing(errno.ENOBUFS, "No buffer space available", [drive()])
+    (layout,) = configure(wire, parse(joint_text(bus="sdo_retries = 3")))
     assert layout.tpdos[0].cob_id == 0x185
-
-
-def test_an_interface_that_is_down_is_one_line():
-    class Down(Wire):
-        def send(self, msg, timeout=None):
-            raise can.CanOperationError("Failed to transmit: Network is down", errno.ENETDOWN)
-
     with pytest.raises(BusError, match=r"cannot be sent: .*Network is down"):
-        configure(Down(), parse(joint_text()))
+        configure(Failing(errno.ENETDOWN, "Network is down", [drive()]), parse(joint_text()))

@@ -1,5 +1,5 @@
 import pytest
-from canopenkit import NO_RTR, Slave, Wire, configure, drive_objects, eds_text, joint_text, signals, tpdo, u32
+from canopenkit import Slave, Wire, configure, drive_objects, eds_text, joint_text, signals
 
 from drivelink.canopen.layout import Signal
 from drivelink.canopen.passive import PassiveConfigurator
@@ -31,21 +31,17 @@ def test_the_joint_files_mapping_is_taken():
     assert signals(layout) == [[Signal.STATUSWORD, Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE]]
 
 
-def test_a_mapping_without_what_is_needed_is_one_line():
-    with pytest.raises(DriveError, match=r"node 5 .* sends no motor_torque: TPDO0 = 0x6041:00 \+ 0x6064:00"):
-        passive(STATED + MAP.replace(', "0x6077:00:16"', ""))
-
-
-def test_nothing_known_at_all_is_one_line_that_says_what_would_help():
-    with pytest.raises(
-        DriveError, match=r"its mapping is not known.*motor\.drive\.tpdo.*eds.*before the master"
-    ):
-        passive(STATED)
-
-
-def test_an_unknown_scale_is_one_line():
-    with pytest.raises(DriveError, match="counts_per_rev"):
-        passive("rated_torque_nm = 0.8" + MAP)
+@pytest.mark.parametrize(
+    ("drive", "said"),
+    [
+        (STATED + MAP.replace(', "0x6077:00:16"', ""), r"node 5 .* sends no motor_torque: TPDO0 = 0x6041:00 \+ 0x6064:00"),
+        (STATED, r"its mapping is not known.*motor\.drive\.tpdo.*eds.*before the master"),
+        ("rated_torque_nm = 0.8" + MAP, "counts_per_rev"),
+    ],
+)  # fmt: skip
+def test_what_is_not_known_is_one_line_that_says_what_would_help(drive, said):
+    with pytest.raises(DriveError, match=said):
+        passive(drive)
 
 
 EDS = eds_text(
@@ -73,34 +69,18 @@ def exchanged(active, joint):
     return frames
 
 
-def test_a_foreign_masters_configuration_is_learnt_by_listening():
-    active = Slave(5, drive_objects(5))
-    frames = exchanged(active, parse(joint_text()))
-    joint = parse(joint_text(drive="", bus=PASSIVE))
-    configurator = PassiveConfigurator([joint])
-    assert configurator.busy
-    for cob_id, data in frames:
-        configurator.feed(cob_id, data, 0.0)
-    ((node, layout),) = configurator.poll(0.0)
-    assert node == 5
-    assert not configurator.busy
-    # nothing is stated in this joint file: mapping, scale, heartbeat and identity are all in the traffic
-    wire = Wire([Slave(5, drive_objects(5))])
-    (known,) = configure(wire, parse(joint_text()))
-    assert layout.tpdos == known.tpdos
-    assert layout.heartbeat_ms == 100
-    assert layout.identity == known.identity
-
-
-def test_a_mapping_that_the_master_changes_in_the_run_is_followed():
+def test_a_foreign_masters_configuration_is_learnt_by_listening_and_followed_when_it_changes():
     slave = Slave(5, drive_objects(5))
-    joint = parse(joint_text(bus=PASSIVE))
-    configurator = PassiveConfigurator([joint])
+    configurator = PassiveConfigurator([parse(joint_text(bus=PASSIVE))])
+    assert configurator.busy
     for cob_id, data in exchanged(slave, parse(joint_text())):
         configurator.feed(cob_id, data, 0.0)
-    configurator.poll(0.0)
-    wider = parse(joint_text(link="[link.encoder]\ncounts_per_rev = 1000"))
-    ended = []
+    ((node, layout),) = configurator.poll(0.0)
+    assert node == 5 and not configurator.busy
+    # nothing is stated in this joint file: mapping, scale, heartbeat and identity are all in the traffic
+    (known,) = configure(Wire([Slave(5, drive_objects(5))]), parse(joint_text()))
+    assert (layout.tpdos, layout.heartbeat_ms, layout.identity) == (known.tpdos, 100, known.identity)
+    wider, ended = parse(joint_text(link="[link.encoder]\ncounts_per_rev = 1000")), []
     for cob_id, data in exchanged(slave, wider):
         configurator.feed(cob_id, data, 0.0)
         ended += configurator.poll(0.0)
@@ -219,29 +199,6 @@ def test_the_object_of_a_block_download_is_disputed_until_it_is_read_again():
     assert (listener.disputed, listener.values) == (set(), {(0x1A00, 1): 0x60640020})
 
 
-def test_reset_communication_to_all_is_survived():
-    configurator = PassiveConfigurator([parse(joint_text(drive=STATED + MAP, bus=PASSIVE))])
-    before = dict(configurator.layouts)
-    configurator.feed(0, b"\x82\x00", 0.0)
-    configurator.feed(0x705, b"\x00", 0.0)
-    assert configurator.poll(0.0) == []
-    assert configurator.layouts == before
-
-
-def test_a_disabled_frame_of_a_data_sheet_is_not_expected():
-    objects = drive_objects(5) | tpdo(1, NO_RTR | 1 << 31 | 0x185, 1, 0x60640020, 0x60770010)
-    objects[0x6076, 0] = u32(800)
-    active = Slave(5, objects)
-    joint = parse(joint_text(drive=STATED, bus=PASSIVE))
-    configurator = PassiveConfigurator([joint])
-    for address, item in active.objects.items():
-        if 0x1800 <= address[0] <= 0x1BFF:
-            configurator._nodes[5].listener.values[address] = item.value
-    configurator._nodes[5].listener.changes += 1
-    assert configurator.poll(0.0) == []
-    assert configurator.busy
-
-
 def after(configurator, *frames):
     for cob_id, data in frames:
         configurator.feed(cob_id, data, 0.0)
@@ -269,6 +226,11 @@ def test_a_forged_answer_changes_no_scale_of_a_passive_node():
 BOOT = (0x705, b"\x00")
 
 
+def owned():
+    """A listener to a node whose joint file states its own default map."""
+    return PassiveConfigurator([parse(joint_text(drive=STATED + MAP + "default = true\n", bus=PASSIVE))])
+
+
 def test_a_stated_map_holds_until_the_node_restarts_and_one_of_its_own_for_ever():
     joint = parse(joint_text(drive=STATED + MAP, bus=PASSIVE))
     configurator = PassiveConfigurator([joint])
@@ -276,15 +238,14 @@ def test_a_stated_map_holds_until_the_node_restarts_and_one_of_its_own_for_ever(
     after(configurator, BOOT)
     assert configurator.believed == set()
     assert "default = true in [[motor.drive.tpdo]]" in configurator.doubts[5]
-    own = parse(joint_text(drive=STATED + MAP + "default = true\n", bus=PASSIVE))
-    assert after(PassiveConfigurator([own]), BOOT, (0, b"\x82\x00"), BOOT).believed == {5}
+    assert configurator.poll(0.0) == [] and configurator.layouts[5].tpdos
+    assert after(owned(), BOOT, (0, b"\x82\x00"), BOOT).believed == {5}
 
 
 @pytest.mark.parametrize("index", ["10", "11"])
 @pytest.mark.parametrize("command", ["23", "c2"])
 def test_after_parameters_were_stored_or_restored_a_stated_default_is_none(index: str, command: str) -> None:
-    own = parse(joint_text(drive=STATED + MAP + "default = true\n", bus=PASSIVE))
-    configurator = PassiveConfigurator([own])
+    configurator = owned()
     after(configurator, (0x605, bytes.fromhex(f"{command} {index} 10 01 73 61 76 65")))
     assert configurator.believed == {5}  # until the node starts with what was stored
     after(configurator, BOOT)
@@ -294,8 +255,7 @@ def test_after_parameters_were_stored_or_restored_a_stated_default_is_none(index
 
 @pytest.mark.parametrize("address", ["18 10 02", "20 10 01"])
 def test_another_identity_or_date_of_configuration_ends_all_trust(address: str) -> None:
-    own = parse(joint_text(drive=STATED + MAP + "default = true\n", bus=PASSIVE))
-    configurator = PassiveConfigurator([own])
+    configurator = owned()
 
     def read(value: str) -> None:
         request = bytes.fromhex(f"40 {address} 00000000")
@@ -310,8 +270,7 @@ def test_another_identity_or_date_of_configuration_ends_all_trust(address: str) 
 
 
 def test_what_is_overheard_counts_more_than_what_the_joint_file_states():
-    joint = parse(joint_text(drive=STATED + MAP + "default = true\n", bus=PASSIVE))
-    configurator = PassiveConfigurator([joint])
+    configurator = owned()
     after(configurator, (0x605, bytes.fromhex("23 02 18 01 a5 02 00 80")))  # TPDO3 has that identifier: off
     assert configurator.believed == set()  # it is being changed, or it is not: nobody knows before the answer
     after(configurator, (0x585, bytes.fromhex("60 02 18 01 00 00 00 00")))
@@ -330,10 +289,7 @@ def test_a_data_sheets_map_is_offered_and_not_believed(tmp_path):
     text = joint_text(drive='eds = "drive.eds"\ngear_ratio = 50.0', bus=PASSIVE)
     configurator = PassiveConfigurator([parse(text)], [tmp_path])
     assert configurator.believed == set()
-    line = (
-        'tpdo = [{ cob_id = 0x185, objects = ["0x6064:00:32", "0x6077:00:16"], transmission_type = 1, '
-        "default = true }]"
-    ).replace("transmission_type = 1, ", "")
+    line = 'tpdo = [{ cob_id = 0x185, objects = ["0x6064:00:32", "0x6077:00:16"], default = true }]'
     assert f"in [motor.drive] {line}" in configurator.doubts[5]
     pasted = parse(text.replace("gear_ratio", f"{line}\ngear_ratio"))
     assert PassiveConfigurator([pasted], [tmp_path]).believed == {5}

@@ -32,6 +32,8 @@ EPOS4 = {
 }  # fmt: skip
 KNOWN_CURRENT = "torque_constant_nm_a = 0.1"
 OWN_CURRENT = 'current_object = "0x2100:01"\ncurrent_unit_a = 0.1\ntorque_constant_nm_a = 0.2'
+EPOS2 = {(0x2210, 1): 500, (0x6410, 1): 2000}  # pulses a turn; no 0x6075, 0x6076, 0x608F, 0x3000
+EPOS2_DRIVE = f"torque_constant_nm_a = 0.03\nrated_current_a = 2.0\n{GEAR}\nvelocity = true"
 MOTOR, TORQUE, SPEED = Signal.MOTOR_POSITION, Signal.MOTOR_TORQUE, Signal.MOTOR_VELOCITY
 # What is reported, by whom, what the joint file says, and the scale (and object) of a signal's nth candidate.
 SCALES = [
@@ -54,6 +56,10 @@ SCALES = [
     (PLAIN, COPLEY, "velocity = true", SPEED, 0, math.tau / 163840 / 50, None),
     (USER, GENERIC, "gear_ratio = 20.0", MOTOR, 0, math.radians(0.1) / 20, None),
     (USER | {(0x6091, 1): 20}, GENERIC, "", MOTOR, 0, math.radians(0.1), None),
+    ({**PLAIN, (0x6091, 1): 1}, GENERIC, "gear_ratio = 100.0", MOTOR, 0, math.tau / (16384 * 100), None),
+    (EPOS2, MAXON, EPOS2_DRIVE, MOTOR, 0, math.tau / (4 * 500 * 50), None),
+    (EPOS2, MAXON, EPOS2_DRIVE, TORQUE, 0, 1e-3 * 0.03 * 50, (0x6078, 0)),  # whatever the rated current is
+    (EPOS2, MAXON, EPOS2_DRIVE, SPEED, 0, math.tau / 60 / 50, None),
     # an EPOS4 is not taken for its predecessor
     ({(0x3000, 5): 4096, (0x2210, 1): 500}, MAXON, f"torque_constant_nm_a = 0.03\n{GEAR}", MOTOR, 0, math.tau / (4096 * 50), None),
     ({(0x3000, 5): 4096, (0x2210, 1): 500}, MAXON, f"torque_constant_nm_a = 0.03\n{GEAR}", TORQUE, 0, None, (0x30D1, 2)),
@@ -69,11 +75,6 @@ def test_a_scale_follows_from_what_is_reported_and_stated(
     assert address is None or found.address == address
 
 
-def test_a_velocity_of_unknown_unit_is_left_out_saying_why():
-    assert "velocity_rad_s_per_count" in offered(PLAIN, drive="velocity = true").missing[SPEED]
-    assert offered(PLAIN).notices == []
-
-
 def test_what_the_joint_file_states_is_used_and_a_disagreement_names_both_numbers():
     result = offered(PLAIN, drive="counts_per_rev = 4096\ngear_ratio = 100.0\nrated_torque_nm = 0.5", link="")
     assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.tau / (4096 * 100))
@@ -85,27 +86,41 @@ def test_what_the_joint_file_states_is_used_and_a_disagreement_names_both_number
     assert all(finding.fix for finding in result.notices)
 
 
-def test_a_drive_whose_gear_was_never_configured_is_no_warning():
-    result = offered({**PLAIN, (0x6091, 1): 1}, drive="gear_ratio = 100.0")
-    assert [finding.severity for finding in result.notices] == [Severity.INFO]
-    assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.tau / (16384 * 100))
+@pytest.mark.parametrize(
+    ("drive", "torque"), [("direction = -1", -1), ("direction = -1\ntorque_direction = 1", 1)]
+)
+def test_direction_turns_position_and_torque_and_can_be_split(drive, torque):
+    result = offered(PLAIN, drive=drive)
+    assert scale(result, MOTOR) < 0 < torque * scale(result, TORQUE)
 
 
-def test_direction_turns_position_and_torque_and_can_be_split():
-    result = offered(PLAIN, drive="direction = -1")
-    assert scale(result, Signal.MOTOR_POSITION) < 0
-    assert scale(result, Signal.MOTOR_TORQUE) < 0
-    result = offered(PLAIN, drive="direction = -1\ntorque_direction = 1")
-    assert scale(result, Signal.MOTOR_POSITION) < 0
-    assert scale(result, Signal.MOTOR_TORQUE) > 0
+@pytest.mark.parametrize(
+    ("reported", "drive", "link", "signal", "said"),
+    [
+        # Elmo's DCF: resolution 1/1, rated values 0, were never configured
+        ({(0x608F, 1): 1, (0x608F, 2): 1, (0x6076, 0): 0, (0x6075, 0): 0}, "", "", MOTOR, "counts_per_rev"),
+        ({(0x608F, 1): 1, (0x608F, 2): 1, (0x6076, 0): 0, (0x6075, 0): 0}, "", "", TORQUE, "rated_torque_nm"),
+        (PLAIN, "velocity = true", "", SPEED, "velocity_rad_s_per_count"),
+        (PLAIN, "", "[link.encoder]", Signal.LINK_POSITION, "counts_per_rev"),
+    ],
+)  # fmt: skip
+def test_a_value_of_unknown_unit_is_missing_and_it_is_said_what_to_state(reported, drive, link, signal, said):
+    assert said in offered(reported, drive=drive, link=link).missing[signal]
 
 
-def test_values_that_were_never_configured_count_as_missing():
-    # Elmo's DCF: resolution 1/1, rated values 0
-    reported = {(0x608F, 1): 1, (0x608F, 2): 1, (0x6076, 0): 0, (0x6075, 0): 0}
-    result = offered(reported)
-    assert "counts_per_rev" in result.missing[Signal.MOTOR_POSITION]
-    assert "rated_torque_nm" in result.missing[Signal.MOTOR_TORQUE]
+@pytest.mark.parametrize(
+    ("change", "drive", "severities"),
+    [
+        ({}, "", []),
+        ({(0x6091, 1): 1}, "gear_ratio = 100.0", [Severity.INFO]),  # the drive's gear was never configured
+        ({(0x607E, 0): 0xC0}, "", [Severity.INFO]),
+        ({(0x607E, 0): 0x80}, "", [Severity.INFO, Severity.WARNING]),  # position against velocity
+    ],
+)
+def test_only_what_may_be_wrong_is_a_warning(change, drive, severities):
+    assert (
+        sorted(notice.severity for notice in offered({**PLAIN, **change}, drive=drive).notices) == severities
+    )
 
 
 @pytest.mark.parametrize(
@@ -128,21 +143,13 @@ def test_velocity_units(unit, expected):
     assert reported == (None if expected is None else pytest.approx(expected, rel=1e-12))
 
 
-def test_polarity_of_position_against_velocity_is_a_warning():
-    assert offered({**PLAIN, (0x607E, 0): 0xC0}).notices[0].severity is Severity.INFO
-    severities = [finding.severity for finding in offered({**PLAIN, (0x607E, 0): 0x80}).notices]
-    assert Severity.WARNING in severities
-
-
 def test_the_second_encoder_takes_its_resolution_from_the_drive_if_it_reports_it():
     link = "[link.encoder]"
     result = offered({**PLAIN, (0x60E6, 1): 65536, (0x60EB, 1): 1}, link=link)
     assert scale(result, Signal.LINK_POSITION) == pytest.approx(math.tau / 65536)
-    assert "counts_per_rev" in offered(PLAIN, link=link).missing[Signal.LINK_POSITION]
     result = offered({**PLAIN, (0x60E6, 1): 65536}, link=link + "\ncounts_per_rev = 1000")
     assert scale(result, Signal.LINK_POSITION) == pytest.approx(math.tau / 1000)
-    assert "65536" in result.notices[-1].text
-    assert "1000" in result.notices[-1].text
+    assert "65536" in result.notices[-1].text and "1000" in result.notices[-1].text
 
 
 @pytest.mark.parametrize("text", ["60E4:01:32", "0x60E4:zz", "x", "0x0:1", ""])
@@ -167,17 +174,3 @@ def test_absolute_encoders_report_resolution_and_where_they_start_again(reported
     (candidate,) = offer(roles(parse(text))[1], reported, GENERIC).candidates[Signal.LINK_POSITION]
     assert candidate.scale == pytest.approx(math.tau / counts)
     assert candidate.modulus == modulus
-
-
-EPOS2 = {(0x2210, 1): 500, (0x6410, 1): 2000}  # pulses a turn; no 0x6075, 0x6076, 0x608F, 0x3000
-
-
-def test_epos2_reports_its_current_in_milliamperes_and_its_encoder_in_pulses():
-    drive = "torque_constant_nm_a = 0.03\nrated_current_a = 2.0\ngear_ratio = 50.0\nvelocity = true"
-    result = offered(EPOS2, MAXON, drive=drive)
-    assert scale(result, Signal.MOTOR_POSITION) == pytest.approx(math.tau / (4 * 500 * 50))
-    current = result.candidates[Signal.MOTOR_TORQUE][0]
-    assert [c.address for c in result.candidates[Signal.MOTOR_TORQUE]].count((0x6078, 0)) == 1
-    assert (current.address, current.bits, current.signed) == ((0x6078, 0), 16, True)
-    assert current.scale == pytest.approx(1e-3 * 0.03 * 50)  # whatever the rated current is
-    assert scale(result, Signal.MOTOR_VELOCITY) == pytest.approx(math.tau / 60 / 50)

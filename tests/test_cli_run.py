@@ -13,10 +13,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from daemonkit import vsa_text
+from daemonkit import served, vsa_text
 from zenohkit import free_endpoint, until
 
 from drivelink.cli import main
+from drivelink.jointfile import load
 from drivelink.plaintext import stamped
 from drivelink.pubsub.client import subscribe
 from estimator.sample import Status
@@ -62,10 +63,7 @@ def endpoint_of(path: Path) -> str:
 
 def test_simulated_drives_daemon_and_subscriber_are_three_processes(joint: Path, tmp_path: Path) -> None:
     address = str(tmp_path / "notify")
-    with (
-        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager,
-        process("sim", str(joint)) as drives,
-    ):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager, process("sim", str(joint)) as drives:
         manager.bind(address)
         manager.settimeout(30.0)
         assert "ready" in drives.stdout.readline()
@@ -92,13 +90,19 @@ def test_simulated_drives_daemon_and_subscriber_are_three_processes(joint: Path,
             assert "ready" in closed.stdout.readline()
             closed.send_signal(signal.SIGHUP)  # its terminal is closed: no orphan stays on the bus
             assert closed.wait(timeout=60) == 0
-        with process("run", str(joint), "--no-realtime", "--seconds", "0.5", "--json") as after_kill:
-            out, err = after_kill.communicate(timeout=60.0)
-            assert after_kill.returncode == 0, err
-            ready, end = map(json.loads, out.splitlines())  # two objects and nothing else
-            assert (ready["event"], ready["joints"], ready["rate_hz"]) == ("ready", ["elbow"], 200.0)
-            (status,) = end["joints"]
-            assert (end["event"], status["joint"]) == ("end", "elbow") and status["estimates"] > 0
+
+
+def test_run_ends_after_its_seconds_and_prints_two_objects_of_json(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "elbow.toml"
+    path.write_text(vsa_text(endpoint=free_endpoint(), bus="period_s = 0.005"), encoding="utf-8")
+    with served(load(path)):
+        assert main(["run", str(path), "--no-realtime", "--seconds", "0.5", "--json"]) == 0
+    ready, end = map(json.loads, capsys.readouterr().out.splitlines())  # and nothing else
+    assert (ready["event"], ready["joints"], ready["rate_hz"]) == ("ready", ["elbow"], 200.0)
+    (status,) = end["joints"]
+    assert (end["event"], status["joint"]) == ("end", "elbow") and status["estimates"] > 0
 
 
 @pytest.mark.parametrize(

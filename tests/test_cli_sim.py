@@ -63,7 +63,9 @@ def simulation(*arguments: object) -> Iterator[tuple[subprocess.Popen[str], str]
             process.kill()
 
 
-def test_two_processes_share_the_bus_over_tcp_and_sigterm_ends_cleanly(file: Path, port: int) -> None:
+def test_two_processes_share_the_bus_over_tcp_and_sigterm_ends_cleanly(
+    file: Path, port: int, capsys: pytest.CaptureFixture[str]
+) -> None:
     with simulation(file) as (process, ready):
         assert ready == ("drivelink sim: ready on socketcand vcan0: wrist (drive 1, drive 2); Ctrl-C ends it")
         with can.Bus(interface="socketcand", channel="vcan0", host="127.0.0.1", port=port) as bus:
@@ -76,10 +78,13 @@ def test_two_processes_share_the_bus_over_tcp_and_sigterm_ends_cleanly(file: Pat
                 message = bus.recv(0.05)
                 seen |= {message.arbitration_id} if message else set()
             assert {0x281, 0x282} <= seen
+        assert main(["sim", str(file), "--seconds", "1"]) == 4  # the same nodes a second time
+        said = capsys.readouterr().err.splitlines()
+        assert "joined" in said[0]
+        assert "node 1, node 2: on the bus already: another `drivelink sim`" in said[1]
         process.send_signal(signal.SIGTERM)
         assert process.wait(PATIENCE_S) == 0
-        assert process.stderr is not None
-        assert process.stderr.read() == ""
+        assert process.stderr is not None and process.stderr.read() == ""
 
 
 def test_it_ends_by_itself_and_leaves_the_data_sheets(
@@ -93,78 +98,21 @@ def test_it_ends_by_itself_and_leaves_the_data_sheets(
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-@pytest.mark.parametrize(
-    ("arguments", "status", "message"),
-    [
-        (("--quirks", "acme"), 2, "--quirks: expected one of strict, epos4"),
-        (("--effect", "magic=1"), 2, "--effect: expected one of"),
-        (("--effect", "cogging"), 2, "--effect: expected NAME=VALUE"),
-        (("--seconds", "-1"), 2, "--seconds: expected a number > 0"),
-        (("--interface", "socketcan", "--channel", "can77"), 4, "socketcan can77"),
-        (("--interface", "carrierpigeon"), 4, "carrierpigeon"),
-    ],
-)
-def test_what_is_asked_wrongly_is_one_line(
-    file: Path, arguments: tuple[str, ...], status: int, message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["sim", str(file), *arguments]) == status
-    said = capsys.readouterr().err
-    assert message in said
-    assert len(said.strip().splitlines()) == 1
+def test_other_simulations_join_the_first_as_clients(file: Path, tmp_path: Path) -> None:
+    def others(name: str, tens: int) -> Path:
+        path, text = tmp_path / f"{name}.toml", file.read_text(encoding="utf-8")
+        path.write_text(text.replace("wrist", name).replace("node_id = ", f"node_id = {tens}"))
+        return path
 
-
-def test_a_missing_file_and_joints_of_different_buses(
-    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["sim", str(tmp_path / "none.toml")]) == 2
-    other = tmp_path / "other.toml"
-    other.write_text(JOINT.format(port=1).replace("vcan0", "vcan1"), encoding="utf-8")
-    assert main(["sim", str(file), str(other)]) == 2
-    said = capsys.readouterr().err.strip().splitlines()
-    assert len(said) == 2
-    assert "expected the same bus.channel" in said[1]
-
-
-def test_a_second_simulation_of_the_same_nodes_is_refused(
-    file: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with simulation(file):
-        assert main(["sim", str(file), "--seconds", "1"]) == 4
-    said = capsys.readouterr().err.splitlines()
-    assert "joined" in said[0]
-    assert "node 1, node 2: on the bus already: another `drivelink sim`" in said[1]
-
-
-@pytest.mark.parametrize("ended", ["the server", "itself"])
-def test_a_second_simulation_joins_the_first_as_a_client(file: Path, tmp_path: Path, ended: str) -> None:
-    other = tmp_path / "other.toml"
-    text = file.read_text(encoding="utf-8").replace('"wrist"', '"elbow"')
-    other.write_text(text.replace("node_id = 1", "node_id = 11").replace("node_id = 2", "node_id = 12"))
-    with simulation(file) as (server, first), simulation(other) as (process, second):
+    with (
+        simulation(file) as (server, first),
+        simulation(others("elbow", 1)) as (process, second),
+        simulation(others("knee", 2)) as (other, _),
+    ):
         assert "wrist (drive 1, drive 2)" in first and "elbow (drive 11, drive 12)" in second
-        if ended == "itself":
-            process.send_signal(signal.SIGINT)
-            assert process.wait(PATIENCE_S) == 0
-            return
+        other.send_signal(signal.SIGINT)
+        assert other.wait(PATIENCE_S) == 0
         server.kill()
         assert process.wait(PATIENCE_S) == 4
         assert process.stderr is not None
         assert "the process that served it has ended" in process.stderr.read()
-
-
-def test_what_a_file_lacks_names_the_file(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = file.read_text(encoding="utf-8").replace("[motor.drive]\nnode_id = 2", "", 1)
-    file.write_text(text, encoding="utf-8")
-    assert main(["sim", str(file), "--interface", "virtual"]) == 2
-    assert f"{file}: motor[2].drive: expected this table" in capsys.readouterr().err
-
-
-def test_an_address_that_cannot_be_served_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "wrist.toml"
-    path.write_text(JOINT.format(port=70000), encoding="utf-8")
-    assert main(["sim", str(path)]) == 4
-    said = capsys.readouterr().err
-    assert "port" in said
-    assert len(said.strip().splitlines()) == 1

@@ -7,14 +7,16 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import diagnosiskit as kit
 import fleetkit
-import numpy as np
 import pytest
 
 from drivelink import cli
 from drivelink.cli import main
+
+NAMED = 'name = "{}"\n[[motor]]\ninertia_kg_m2 = 0.1\n'
 
 
 @pytest.fixture(scope="module")
@@ -88,15 +90,52 @@ def test_every_verb_that_uses_a_bus_takes_it_by_option(
         (["service", "install", "none.toml", "--root", "stage"], 2, "none.toml: cannot be read"),
         (["new", "there.toml"], 2, "there.toml"),
         (["completion", "sh"], 2, "invalid choice: 'sh'"),
+        (["fit", "a.csv", "./a.csv"], 2, "given twice: expected another recording"),
+        (["diagnose", "a.csv", "--validate", "a.csv"], 2, "given twice: expected another recording"),
+        (["doctor", "--eds", "nowhere.eds"], 5, "nowhere.eds"),
+        (["doctor", "--seconds", "0"], 2, "--seconds"),
+        (["doctor", "x.toml", "--eds", "y.eds"], 2, "--eds"),
+        (["doctor", "--eds", "y.eds", "--channel", "can0"], 2, "--channel"),
+        (["doctor", "--interface", "socketcan"], 2, "--interface"),
+        (["record", "elbow.toml", "--out", "a.log", "--source", "bus", "--interface", "socketcan", "--channel", "can77"], 4, "can77"),
+        (["sim", "elbow.toml", "--quirks", "acme"], 2, "--quirks: expected one of strict, epos4"),
+        (["sim", "elbow.toml", "--effect", "magic=1"], 2, "--effect: expected one of"),
+        (["sim", "elbow.toml", "--effect", "cogging"], 2, "--effect: expected NAME=VALUE"),
+        (["sim", "elbow.toml", "--seconds", "-1"], 2, "--seconds: expected a number > 0"),
+        (["sim", "elbow.toml", "--interface", "socketcan", "--channel", "can77"], 4, "socketcan can77"),
+        (["sim", "elbow.toml", "wrist.toml"], 2, "expected the same bus.channel"),
+        (["sim", "far.toml"], 4, "port"),
+        (["sim", "driveless.toml"], 2, "driveless.toml: motor[1].drive: expected this table"),
+        (["fit", "r.csv", "--joint", "linaer.toml"], 2, "linaer.toml: motor[1]: transmission.model: expected one of linear"),
+        (["new", "a.toml", "--inertia", "-1"], 2, "inertia_kg_m2"),
+        (["new", "a.toml", "--name", "a b"], 2, "name"),
+        (["new", "a.toml", "--node", "200"], 2, "node_id"),
+        (["new", "a.toml", "--encoder", "left"], 2, "--encoder"),
+        (["new", "a.toml", "--encoder", "128"], 2, "--encoder"),
+        (["new", "a.toml", "--scan", "--passive"], 2, "--passive forbids"),
+        (["new", "a.toml", "--encoder", "none"], 2, "--encoder none: expected --model none"),
+        (["new", "a.toml", "--model", "none", "--arrangement", "serial"], 2, "expected a flexible one"),
+        (["new", "a.toml", "--inertia", "1", "--rotor-inertia", "1"], 2, "--rotor-inertia"),
+        (["new", "a.toml", "--rotor-inertia", "48.2"], 2, "--rotor-inertia: expected --gear"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
-)
+)  # fmt: skip
 def test_what_a_verb_cannot_do_is_one_line(
     arguments: list[str], status: int, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there.toml").write_text("# mine\n")
+    joint = NAMED + '[motor.drive]\nnode_id = 1\n[link.encoder]\n[sim]\ncase = "constant"\n[bus]\n{}\n'
+    texts = {
+        "elbow": joint.format("elbow", ""), "wrist": joint.format("wrist", 'channel = "other"'),
+        "far": joint.format("far", 'interface = "socketcand"\noptions = { host = "127.0.0.1", port = 70000 }'),
+        "driveless": NAMED.format("driveless"),
+        "linaer": NAMED.format("linaer") + '[motor.transmission]\nmodel = "linaer"\n',
+    }  # fmt: skip
+    for name, text in texts.items():
+        (tmp_path / f"{name}.toml").write_text(text)
+    before = sorted(tmp_path.iterdir())
     try:
         ended = main(arguments)
     except SystemExit as exit_:  # argparse's own: its usage comes first
@@ -105,7 +144,7 @@ def test_what_a_verb_cannot_do_is_one_line(
     lines = [text for text in said.err.splitlines() if not text.startswith(("usage: ", " "))]
     assert (ended, said.out) == (status, "")
     assert len(lines) == 1 and lines[0].startswith(f"drivelink {arguments[0]}: ") and line in lines[0]
-    assert (tmp_path / "there.toml").read_text() == "# mine\n"
+    assert (tmp_path / "there.toml").read_text() == "# mine\n" and sorted(tmp_path.iterdir()) == before
 
 
 @pytest.mark.parametrize("verb", cli.VERBS)
@@ -125,64 +164,29 @@ def test_an_unknown_option_prints_the_usage_of_its_own_verb(
     assert "unrecognized arguments: --no-such-option" in said
 
 
-def test_new_completion_and_service_print_one_object(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    joint = tmp_path / "elbow.toml"
-    assert main(["new", str(joint), "--json"]) == 0
-    made = json.loads(capsys.readouterr().out)
+def test_new_sim_and_service_print_one_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    joint, stage = tmp_path / "elbow.toml", str(tmp_path / "stage")
+
+    def said(*words: str) -> dict[str, Any]:
+        assert main([*words, "--json"]) == 0
+        (line,) = capsys.readouterr().out.splitlines()
+        return json.loads(line)
+
+    made = said("new", str(joint))
     assert made["joint"] == "elbow" and made["path"] == str(joint) and "placeholder" in made["remarks"][0]
-    assert main(["new", "-", "--json"]) == 0
-    assert "[[motor]]" in json.loads(capsys.readouterr().out)["text"]
-    assert main(["service", "install", str(joint), "--root", str(tmp_path / "stage"), "--json"]) == 0
-    installed = json.loads(capsys.readouterr().out)
+    assert "[[motor]]" in said("new", "-")["text"]
+    ready = said("sim", str(joint), "--interface", "virtual", "--seconds", "0.1")
+    assert ready["event"] == "ready" and ready["devices"] == {"elbow": {"drive": [1], "encoder": []}}
+    installed = said("service", "install", str(joint), "--root", stage)
     assert installed["unit"] == "drivelink@elbow.service" and not installed["running"]
     assert all(Path(path).is_file() for path in installed["written"])
-    assert main(["service", "uninstall", str(joint), "--root", str(tmp_path / "stage"), "--json"]) == 0
-    assert set(json.loads(capsys.readouterr().out)["removed"]) == set(installed["written"])
+    removed = said("service", "uninstall", str(joint), "--root", stage)
+    assert set(removed["removed"]) == set(installed["written"])
 
 
-def test_sim_says_ready_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    joint = tmp_path / "elbow.toml"
-    assert main(["new", str(joint), "--interface", "virtual"]) == 0
-    capsys.readouterr()
-    assert main(["sim", str(joint), "--seconds", "0.1", "--json"]) == 0
-    (ready,) = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert ready["event"] == "ready" and ready["devices"] == {"elbow": {"drive": [1], "encoder": []}}
-
-
-def test_record_takes_another_bus(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    joint = tmp_path / "elbow.toml"
-    assert main(["new", str(joint)]) == 0
-    capsys.readouterr()
-    out = str(tmp_path / "elbow.log")
-    assert main(["record", str(joint), "--out", out, "--source", "bus", "--channel", "can77"]) == 4
-    assert "can77" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("words", [["fit", "a.csv", "./a.csv"], ["diagnose", "a.csv", "--validate", "a.csv"]])
-def test_no_recording_validates_itself(words, capsys):
-    assert main(words) == 2
-    assert "given twice: expected another recording" in capsys.readouterr().err
-
-
-def test_a_console_without_unicode_gets_the_words_spelt_out(tmp_path: Path) -> None:
-    joint = tmp_path / "j.toml"
-    joint.write_text('name = "j"\n[[motor]]\ninertia_kg_m2 = 0.1\n[motor.transmission]\nmodel = "linear"\n')
-    time_s = np.arange(4000) * 0.002
-    table = np.column_stack((time_s, np.sin(5 * time_s), 3 * np.cos(4 * time_s), 1.01 * np.sin(5 * time_s)))
-    header = "time_s,motor1_position_rad,motor1_torque_nm,link_position_rad"
-    np.savetxt(tmp_path / "r.csv", table, delimiter=",", header=header, comments="")
-    command = [sys.executable, "-m", "drivelink", "fit", str(tmp_path / "r.csv"), "--joint", str(joint)]
+def test_a_console_without_unicode_gets_the_words_spelt_out(fleet: Path) -> None:
+    run, joint = fleet / "recordings" / "elbow-2026-01-05.csv", fleet / "joints" / "elbow.toml"
+    command = [sys.executable, "-m", "drivelink", "fit", str(run), "--joint", str(joint)]
     environment = os.environ | {"PYTHONIOENCODING": "ascii"}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert "Traceback" not in done.stderr and "N*m rms left" in done.stdout and done.stdout.isascii()
-
-
-def test_a_model_that_does_not_exist_is_an_error_of_the_joint_file(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    joint = tmp_path / "j.toml"
-    joint.write_text('name = "j"\n[[motor]]\ninertia_kg_m2 = 0.1\n[motor.transmission]\nmodel = "linaer"\n')
-    assert cli.main(["fit", "r.csv", "--joint", str(joint)]) != 0
-    assert f"{joint}: motor[1]: transmission.model: expected one of linear" in capsys.readouterr().err

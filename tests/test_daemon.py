@@ -4,7 +4,7 @@ import math
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 from daemonkit import Collector, DaemonRig, Listener, rig, running, served, vsa, vsa_text
-from zenohkit import LIMIT_S, free_endpoint, until
+from zenohkit import free_endpoint, until
 
 from drivelink._core import SYNC_COB_ID
 from drivelink.cycle.pipeline import make_pipeline
@@ -95,21 +95,6 @@ def test_the_status_says_what_touches_the_link_where_its_dynamics_are_declared()
         assert touched["torque_nm"] == pytest.approx(0.3, abs=3.0 * touched["torque_std_nm"])
 
 
-@pytest.mark.usefixtures("no_thread_left")
-def test_after_stop_the_loop_ends_within_a_few_cycles_and_nothing_stays() -> None:
-    joint = vsa()
-    with served(joint):
-        made = daemon(joint, publish=False)
-        loop = threading.Thread(target=made.run)
-        loop.start()
-        until(lambda: made.loop.cycles > 50)
-        made.stop()
-        loop.join(LIMIT_S)
-        assert not loop.is_alive()
-        made.close()
-        made.close()
-
-
 def test_a_second_daemon_of_the_same_name_is_refused_and_leaves_the_drives_alone() -> None:
     joint = vsa(endpoint=free_endpoint())
     # The first one has its name from the start on; it need not run, and so asks no drive anything.
@@ -121,15 +106,14 @@ def test_a_second_daemon_of_the_same_name_is_refused_and_leaves_the_drives_alone
         listener.close()
 
 
-def test_joints_of_one_daemon_share_the_bus() -> None:
+def test_joints_of_one_daemon_share_the_bus_and_a_passive_one_needs_sync(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     one, other = vsa(name="one", channel="a"), vsa(name="other", channel="b")
     with pytest.raises(UsageError, match=r"\[bus\] differs between one and other"):
         Daemon([ServedJoint(joint=one), ServedJoint(joint=other)])
     with pytest.raises(UsageError, match="two joints are named one"):
         Daemon([ServedJoint(joint=one), ServedJoint(joint=one)])
-
-
-def test_a_passive_daemon_without_sync_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     joint = vsa(bus='sync = "follow"')
     monkeypatch.setattr("drivelink.daemon.service.join_bus", partial(join_bus, patience_s=0.2))
     with served(joint), pytest.raises(BusError, match=r"no SYNC on \S+ in 0.2 s"):
@@ -168,44 +152,56 @@ def test_when_sync_stops_the_estimates_are_stale_and_come_back_with_it() -> None
         assert network.syncs > 0
 
 
-def reloadable(tmp_path: Path) -> DaemonRig:
+@pytest.fixture
+def reloadable(tmp_path: Path) -> Iterator[DaemonRig]:
     path = tmp_path / "elbow.toml"
     path.write_text(vsa_text(), encoding="utf-8")
-    return DaemonRig(load(path), path)
+    made = DaemonRig(load(path), path)
+    yield made
+    made.close()
 
 
-def test_a_rewritten_joint_file_changes_the_model_without_losing_a_cycle(tmp_path: Path) -> None:
-    made = reloadable(tmp_path)
-    path = tmp_path / "elbow.toml"
+def rewrite(path: Path, old: str, new: str) -> None:
+    path.write_text(path.read_text(encoding="utf-8").replace(old, new), encoding="utf-8")
+
+
+IN_USE = "elbow.toml: the model in it is now in use"
+
+
+def test_a_rewritten_joint_file_changes_the_model_without_losing_a_cycle(
+    reloadable: DaemonRig, tmp_path: Path
+) -> None:
+    made, estimates = reloadable, []
     made.run(3000)  # until the model in use has shown itself valid
     old = made.loop_joint.pipeline.estimator
-    text = path.read_text(encoding="utf-8").replace("k_nm_rad = 0.5", "k_nm_rad = 0.51")
-    path.write_text(text, encoding="utf-8")
-    estimates = []
-    limit = time.monotonic() + 60.0
-    while made.loop_joint.pipeline.estimator is old and time.monotonic() < limit:
-        estimates += made.run(1)
-        time.sleep(0.001)  # the slack of a cycle, in which the new estimator catches up
-    assert made.loop_joint.pipeline.estimator is not old
+    rewrite(tmp_path / "elbow.toml", "k_nm_rad = 0.5", "k_nm_rad = wrong")
+    made.daemon.reload()
+    until(lambda: made.run(20) and any("the model stays as it is" in text for text in made.events))
+    assert made.loop_joint.pipeline.estimator is old  # a file with an error leaves the model as it is
+    rewrite(tmp_path / "elbow.toml", "k_nm_rad = wrong", "k_nm_rad = 0.51")
+
+    def changed() -> bool:
+        estimates.extend(made.run(1))
+        return made.loop_joint.pipeline.estimator is not old
+
+    until(changed)
     estimates += made.run(50)
     sequences = [estimate.sequence for estimate in estimates]
     assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
     assert not any(estimate.status & Status.STALE for estimate in estimates)
     assert all(estimate.status & Status.VALID for estimate in estimates)
-    assert "elbow.toml: the model in it is now in use" in made.events
-    made.close()
+    assert IN_USE in made.events
 
 
 def test_the_new_model_comes_into_use_even_where_its_thread_gets_no_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    reloadable: DaemonRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reload, "_PATIENCE", 50)
     monkeypatch.setattr(reload, "_PAUSE_S", 60.0)  # five steps, and never another one
-    made = reloadable(tmp_path)
-    path = tmp_path / "elbow.toml"
+    made = reloadable
     made.run(1000)
     old = made.loop_joint.pipeline.estimator
-    path.write_text(path.read_text(encoding="utf-8").replace("= 0.5,", "= 0.51,"), encoding="utf-8")
+    rewrite(tmp_path / "elbow.toml", "= 0.5,", "= 0.51,")
     (reloader,) = made.daemon._reloaders
     reloader.check()
     until(lambda: reloader._ready is not None)
@@ -213,14 +209,13 @@ def test_the_new_model_comes_into_use_even_where_its_thread_gets_no_time(
     estimates = made.run(2 * 50 + behind)  # while it waits 50 more samples come; then two steps for each
     assert made.loop_joint.pipeline.estimator is not old
     assert not any(estimate.status & Status.STALE for estimate in estimates)
-    assert "elbow.toml: the model in it is now in use" in made.events
-    made.close()
+    assert IN_USE in made.events
 
 
 def test_another_period_of_the_master_begins_anew_with_the_model_in_use(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    reloadable: DaemonRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = reloadable(tmp_path)
+    made = reloadable
     made.run(100)
     (before,) = made.daemon.pipelines
     changed = made.joint.model_copy(update={"provenance": {"a": "reloaded"}})
@@ -242,32 +237,15 @@ def test_another_period_of_the_master_begins_anew_with_the_model_in_use(
     made.daemon.run_lockstep(50)
     status = made.daemon.documents()[0]
     assert (status["period_s"], status["estimates"], status["conditions"]) == (0.002, 50, [])
-    made.close()
-
-
-def test_a_joint_file_with_an_error_leaves_the_model_as_it_is(tmp_path: Path) -> None:
-    made = reloadable(tmp_path)
-    made.run(100)
-    old = made.loop_joint.pipeline.estimator
-    (tmp_path / "elbow.toml").write_text("name = 3", encoding="utf-8")
-    made.daemon.reload()
-
-    def said() -> bool:
-        made.run(20)
-        return any("the model stays as it is" in text for text in made.events)
-
-    until(said)
-    assert made.loop_joint.pipeline.estimator is old
-    made.close()
 
 
 def test_a_flood_of_reloads_begins_one_in_a_while_and_forgets_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    reloadable: DaemonRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now_s = 1000.0
     begun: list[float] = []
     clock = SimpleNamespace(monotonic=lambda: now_s, sleep=time.sleep)
-    made = reloadable(tmp_path)
+    made = reloadable
     monkeypatch.setattr(reload, "time", clock)
     (reloader,) = made.daemon._reloaders
     monkeypatch.setattr(
@@ -285,7 +263,6 @@ def test_a_flood_of_reloads_begins_one_in_a_while_and_forgets_none(
     while reloader._thread is not None:
         pass
     assert begun[-1] == now_s
-    made.close()
 
 
 def test_the_raw_frames_of_a_run_give_the_published_bytes_back_bit_for_bit() -> None:
@@ -336,21 +313,17 @@ def two_joints() -> Iterator[Daemon]:
     """Elbow (two motors) and wrist (one) in one daemon."""
     elbow = vsa(bus="period_s = 0.002")
     wrist = parse(SINGLE.format(channel=elbow.bus.channel))
-    wrist = wrist.model_copy(update={"bus": elbow.bus, "zenoh": elbow.zenoh})
-    bus = open_sim_bus(elbow.bus)
-    networks = [network_from_joint(joint, bus) for joint in (elbow,)]
-    other = open_sim_bus(elbow.bus)
-    networks.append(network_from_joint(wrist, other))
+    joints = (elbow, wrist.model_copy(update={"bus": elbow.bus, "zenoh": elbow.zenoh}))
+    with ExitStack() as stack:
+        buses = [stack.enter_context(open_sim_bus(elbow.bus)) for _ in joints]
+        networks = [network_from_joint(joint, bus) for joint, bus in zip(joints, buses, strict=True)]
+        serving = [ServedJoint(joint=joint) for joint in joints]
 
-    def devices() -> None:
-        for network in networks:
-            network.poll()
+        def devices() -> None:
+            for network in networks:
+                network.poll()
 
-    served_joints = [ServedJoint(joint=elbow), ServedJoint(joint=wrist)]
-    with Daemon(served_joints, publish=False, real_time=False, devices=devices) as made:
-        yield made
-    bus.shutdown()
-    other.shutdown()
+        yield stack.enter_context(Daemon(serving, publish=False, real_time=False, devices=devices))
 
 
 def test_two_joints_share_a_bus_and_its_sync() -> None:
@@ -383,17 +356,13 @@ class Broken:
     def step(self, _sample: object) -> None:
         raise ZeroDivisionError("float division by zero")
 
-    def parameters(self) -> list[object]:
-        return []
-
     def suspicion(self) -> None:
         return None
 
-    def undeclared(self) -> list[list[str]]:
+    def parameters(self) -> list[object]:
         return []
 
-    def friction(self) -> list[object]:
-        return []
+    undeclared = friction = parameters
 
 
 def test_an_exception_in_one_joint_takes_that_one_to_a_fault_and_the_others_go_on() -> None:

@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from estimator import JointModel, Motor, Record, Transmission
+from estimator import EstimatorSettings, JointModel, Motor, Record, Transmission, make_estimator
 
 Array = np.ndarray
 
@@ -255,3 +256,9 @@ def joint_model(
     transmission = Transmission(model=model, order=order, parameters=parameters or {})
     motor = Motor(inertia_kg_m2=B, viscous_damping_nm_s_rad=D, transmission=transmission)
     return JointModel(arrangement="single" if m == 1 else "antagonistic", motors=(motor,) * m)
+
+
+def estimates(model: JointModel, record: Record, **settings: Any) -> Array:
+    """What an estimator says of a recording: sequence, status, torque, stiffness and its deviation, a row a sample."""
+    estimator = make_estimator(model, EstimatorSettings(**settings), record.period_s)
+    return np.array([estimator.step(sample)[:5] for sample in record.samples()])

@@ -20,23 +20,15 @@ RIGID = Spring(model="none")
 
 # Sensors so fine that only the physics is left: 2^40 counts, no noise, no steps.
 PERFECT = DriveHardware(
-    counts_per_rev=2.0**40,
-    gear_ratio=50.0,
-    torque_constant_nm_a=0.05,
-    rated_current_a=8.0,
-    current_resolution_a=1e-12,
-    velocity_resolution_rad_s=0.0,
-)
+    counts_per_rev=2.0**40, gear_ratio=50.0, torque_constant_nm_a=0.05, rated_current_a=8.0,
+    current_resolution_a=1e-12, velocity_resolution_rad_s=0.0,
+)  # fmt: skip
 PERFECT_ENCODER = LinkEncoder(counts_per_rev=2.0**40)
 
 EXCITATION = {
-    "kind": "multisine",
-    "amplitude_nm": 8.0,
-    "low_hz": 0.3,
-    "high_hz": 6.0,
-    "centring_nm_rad": 10.0,
+    "kind": "multisine", "amplitude_nm": 8.0, "low_hz": 0.3, "high_hz": 6.0, "centring_nm_rad": 10.0,
     "centring_nm_s_rad": 1.0,
-}
+}  # fmt: skip
 
 
 def sea(

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from drivelink import cli, jointfile
 from drivelink.demo.simulate import alter, world_from_joint
@@ -26,14 +25,10 @@ MOTION = (
 
 
 def limits() -> Limits:
-    values = {
-        "low_rad": -0.6,
-        "high_rad": 0.6,
-        "velocity_rad_s": 3,
-        "acceleration_rad_s2": 30,
-        "torque_nm": 12,
-    }
-    return Limits(**{name: np.array([float(value)]) for name, value in values.items()})
+    names = ("low_rad", "high_rad", "velocity_rad_s", "acceleration_rad_s2", "torque_nm")
+    return Limits(
+        **{name: np.array([value]) for name, value in zip(names, (-0.6, 0.6, 3.0, 30.0, 12.0), strict=True)}
+    )
 
 
 def written(folder: Path, excitation: str, name: str = "run.csv") -> tuple[Path, Path]:
@@ -50,7 +45,7 @@ def written(folder: Path, excitation: str, name: str = "run.csv") -> tuple[Path,
     return joint, folder / name
 
 
-def test_random_motions_begin_and_end_at_rest_and_touch_a_limit() -> None:
+def test_random_motions_begin_and_end_at_rest_and_touch_a_limit():
     numbers = np.random.default_rng(1).uniform(-1.0, 1.0, (5, Shape.size(1)))
     path = Shape(numbers, 8.0, limits()).path(1e-3)
     reach = np.array([np.max(np.abs(x), axis=(0, 2)) for x in path[:3]]) / np.array([[0.6], [3.0], [30.0]])
@@ -63,7 +58,7 @@ def test_random_motions_begin_and_end_at_rest_and_touch_a_limit() -> None:
     )
 
 
-def test_what_a_driven_model_reads_its_free_run_gives_back() -> None:
+def test_what_a_driven_model_reads_its_free_run_gives_back():
     model = jointfile.load(ELBOW).model()
     lossy = Effect(name="hysteresis", parameters={"torque_nm": 0.3, "displacement_rad": 0.004})
     numbers = np.random.default_rng(2).uniform(-1.0, 1.0, (2, Shape.size(1)))
@@ -74,9 +69,7 @@ def test_what_a_driven_model_reads_its_free_run_gives_back() -> None:
             assert min(free_run(run, changed, 1.0).fit_percent.values()) > 97.0
 
 
-def test_a_designed_motion_is_written_played_and_decides(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_designed_motion_is_written_played_and_decides(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(motion, "_POPULATION", 5)
     monkeypatch.setattr(motion, "_GENERATIONS", 1)
     joint, poor = written(tmp_path, '{ kind = "sines", amplitude_nm = 3.0, frequency_hz = 0.7 }')
@@ -104,7 +97,7 @@ def test_a_designed_motion_is_written_played_and_decides(
     assert report["verdict"] == "effect" and report["effects"][0]["name"] == "backlash"
 
 
-def test_what_is_wrong_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_wrong_is_one_line(tmp_path, capsys):
     joint, _ = written(tmp_path, '{ kind = "none" }')
     asked = ["diagnose", str(tmp_path / "run.csv"), "--joint", str(joint)]
     assert cli.main([*asked, "--motion", "next.txt"]) == 2

@@ -13,15 +13,7 @@ from struct import pack
 import pytest
 import zenoh
 from rich.console import Console
-from zenohkit import (
-    free_endpoint,
-    make_estimate,
-    make_joint,
-    make_sample,
-    put_estimate,
-    put_sample,
-    until,
-)
+from zenohkit import free_endpoint, make_estimate, make_joint, make_sample, put_estimate, put_sample, until
 
 import drivelink
 from drivelink._core import encode_estimate, encode_sample
@@ -196,13 +188,23 @@ def test_tokens_of_others_lock_nobody_out(publisher, endpoint):
         assert len(tokens) == 200
 
 
-def test_more_tokens_than_are_remembered_lock_nobody_out_either():
-    identity = DaemonIdentity()
-    for number in range(MAX_CLAIMS + 10):
-        identity.token(f"{number:x}", True)
-    identity.token("abcdef0123456789", True)  # the daemon's, too late to be remembered
-    assert identity.accepts("abcdef0123456789", stale=True)
-    assert len(identity.claims) == MAX_CLAIMS
+FORGED = {
+    "estimate": encode_estimate(make_estimate(999_999), 1),
+    "sample": encode_sample(Sample(999_999, (9.0,), (9.0,), (9.0,), 9.0), 1),
+    "status": b'{"state": "forged"}',
+    "model": b'{"joint": "forged"}',
+}
+
+
+def forger(intruder):
+    """A function that puts all of it, as a publisher of drivelink's own would."""
+    writers = {name: source(intruder, f"drivelink/elbow/{name}") for name in FORGED}
+
+    def forge():
+        for name, (writer, info) in writers.items():
+            writer.put(FORGED[name], source_info=info)
+
+    return forge
 
 
 @pytest.mark.parametrize("claims", [False, True])
@@ -213,21 +215,12 @@ def test_a_subscriber_stays_with_its_daemon_whatever_another_session_writes(publ
         until(lambda: publish(publisher) and joint.valid and joint.status and joint.model)
         with rogue(endpoint) as intruder:
             until(lambda: len(joint._session.info.peers_zid()) > 1)
-            token = (
-                intruder.liveliness().declare_token(f"drivelink/elbow/alive/{intruder.zid()}")
-                if claims
-                else None
-            )
-            writers = {
-                name: source(intruder, f"drivelink/elbow/{name}") for name in ("estimate", "status", "model")
-            }
-            forged = {"estimate": encode_estimate(make_estimate(999_999), time.time_ns()),
-                      "status": b'{"state": "forged"}', "model": b'{"joint": "forged"}'}  # fmt: skip
+            alive = f"drivelink/elbow/alive/{intruder.zid()}"
+            token, forge = intruder.liveliness().declare_token(alive) if claims else None, forger(intruder)
 
             def attacked():
                 publish(publisher)
-                for name, (writer, info) in writers.items():
-                    writer.put(forged[name], source_info=info)
+                forge()
                 assert joint.latest().sequence != 999_999
                 assert joint.status == {"state": "running"} and joint.model["joint"] == "elbow"
                 return joint.foreign > 100
@@ -238,34 +231,38 @@ def test_a_subscriber_stays_with_its_daemon_whatever_another_session_writes(publ
             del token
 
 
-def test_another_daemon_follows_when_the_token_of_the_first_is_gone():
-    identity = DaemonIdentity()
-    identity.token("", True)
-    identity.token("a1", True)
-    identity.token("b2", True)
-    assert identity.accepts("a1", stale=False)
-    assert not identity.accepts("b2", stale=True)  # silent, but its token is there
-    identity.token("a1", False)
-    assert not identity.alive and identity.accepts("b2", stale=False) and identity.alive
-    assert not identity.accepts("a1", stale=True)
-    assert not identity.accepts("c3", stale=True)
+# What is told of tokens that come (+) or go (-), then of messages: from whom, whether the last one was long ago,
+# and whether it is taken. "" has no token of its own.
+IDENTITY = {
+    "another daemon follows when the token of the first is gone": (
+        "+", "+a1", "+b2", ("a1", False, True), ("b2", True, False), "-a1", ("b2", False, True), ("a1", True, False),
+        ("c3", True, False),
+    ),
+    "without tokens the first writer is taken until it is stale, then a token decides": (
+        ("", True, True), ("b2", False, False), ("b2", True, True), "+c3", ("b2", False, False), ("c3", False, True),
+    ),
+    "more tokens than are remembered lock nobody out": (
+        *(f"+{number:x}" for number in range(MAX_CLAIMS + 10)), "+abcdef0123456789", ("abcdef0123456789", True, True),
+    ),
+}  # fmt: skip
 
 
-def test_without_tokens_the_first_writer_is_taken_until_it_is_stale():
+@pytest.mark.parametrize("name", IDENTITY)
+def test_who_speaks_for_a_joint(name):
     identity = DaemonIdentity()
-    assert identity.accepts("", stale=True) and not identity.accepts("b2", stale=False)
-    assert identity.accepts("b2", stale=True)
-    identity.token("c3", True)  # from here on a token decides
-    assert not identity.accepts("b2", stale=False)
-    assert identity.accepts("c3", stale=False)
+    for step in IDENTITY[name]:
+        if isinstance(step, str):
+            identity.token(step[1:], step[0] == "+")
+            assert identity.alive or step[0] == "-"
+        else:
+            assert identity.accepts(step[0], stale=step[1]) is step[2], step
+    assert len(identity.claims) <= MAX_CLAIMS
 
 
 def test_the_monitor_and_the_recorder_take_a_joint_from_its_daemon_only(publisher, endpoint, tmp_path):
-    joint = make_joint("elbow", endpoint)
-    session = open_client(endpoint)
-    sink = open_sink(tmp_path / "r.mcap", joint)
-    heard: list = []
-    sink.document = lambda name, payload, stamp_ns: heard.append(json.loads(payload))  # type: ignore[method-assign]
+    joint, heard = make_joint("elbow", endpoint), []
+    session, sink = open_client(endpoint), open_sink(tmp_path / "r.mcap", joint)
+    sink.document = lambda name, payload, stamp_ns: heard.append(json.loads(payload))
     watcher, tap = Watcher(session), ZenohTap(session, joint, sink)
     publisher.put_status({"state": "running"})
 
@@ -278,16 +275,10 @@ def test_the_monitor_and_the_recorder_take_a_joint_from_its_daemon_only(publishe
     until(lambda: (view := polled()) and view.history.latest and view.status and sink.counts["estimate"] > 5)
     with rogue(endpoint) as intruder:
         until(lambda: len(session.info.peers_zid()) > 1)
-        writers = {
-            name: source(intruder, f"drivelink/elbow/{name}") for name in ("estimate", "sample", "status")
-        }
-        sample = encode_sample(Sample(999_999, (9.0,), (9.0,), (9.0,), 9.0), 1)
-        forged = {"estimate": encode_estimate(make_estimate(999_999), 1), "sample": sample,
-                  "status": b'{"state": "forged"}'}  # fmt: skip
+        forge = forger(intruder)
 
         def attacked():
-            for name, (writer, info) in writers.items():
-                writer.put(forged[name], source_info=info)
+            forge()
             view = polled()
             assert view.history.latest.sequence != 999_999 and view.status == {"state": "running"}
             return watcher.refused > 50 and tap.refused > 50
@@ -306,68 +297,51 @@ def test_the_monitor_and_the_recorder_take_a_joint_from_its_daemon_only(publishe
 
 def test_nothing_that_is_published_ends_the_monitor_the_recorder_or_a_client(endpoint, tmp_path):
     joint = make_joint("elbow", endpoint)
-    writer = open_session(joint.zenoh, Path())
-    session = open_client(endpoint)
+    writer, session = open_session(joint.zenoh, Path()), open_client(endpoint)
     sinks = [open_sink(tmp_path / name, joint) for name in ("r.mcap", "r.csv")]
     taps = [ZenohTap(session, joint, sink) for sink in sinks]
-    watcher = Watcher(session)
-    since: dict[str, float] = {}
+    watcher, since = Watcher(session), {}
+    eight = Estimate(1, GOOD, 1.0, 1.0, 1.0, (TransmissionEstimate(1.0, 1.0, 1.0, 0.1),) * 8)
+    samples = [pack(f"<QQ3dB{3 * n}d", 1, 1, *[1.0] * 3, n, *[1.0] * 3 * n) for n in (0, 1, 2, 8)]
+    never = pack("<QQ3dB3d", 2**64 - 1, 2**64 - 1, *[math.inf] * 3, 1, *[math.nan] * 3)
+    attacks = {
+        "estimate": [*ESTIMATES.values(), encode_estimate(eight, 1)],
+        "status": DOCUMENTS.values(),
+        "model": DOCUMENTS.values(),
+        "sample": [*samples, b"", b"\xff" * 41, never],
+    }
+    publishers = {name: source(writer, f"drivelink/elbow/{name}") for name in attacks}
+
+    def put(name, payload):
+        entity, info = publishers[name]
+        entity.put(payload, source_info=info)
+        time.sleep(0.002)
+
+    def put_good(sequence=1):
+        put("estimate", encode_estimate(make_estimate(sequence), time.time_ns()))
+        put("sample", encode_sample(make_sample(sequence), time.time_ns()))
+
+    def poll():
+        watcher.poll()
+        for tap in taps:
+            tap.poll()
+
     with drivelink.subscribe("elbow", session=session) as client:
-        eight = Estimate(1, GOOD, 1.0, 1.0, 1.0, (TransmissionEstimate(1.0, 1.0, 1.0, 0.1),) * 8)
-        samples = [pack(f"<QQ3dB{3 * n}d", 1, 1, *[1.0] * 3, n, *[1.0] * 3 * n) for n in (0, 1, 2, 8)]
-        samples += [
-            b"",
-            b"\xff" * 41,
-            pack("<QQ3dB3d", 2**64 - 1, 2**64 - 1, *[math.inf] * 3, 1, *[math.nan] * 3),
-        ]
-        attacks = [("estimate", payload) for payload in ESTIMATES.values()]
-        attacks += [("estimate", encode_estimate(eight, 1))]
-        attacks += [(key, payload) for key in ("status", "model") for payload in DOCUMENTS.values()]
-        attacks += [("sample", payload) for payload in samples]
-        publishers = {
-            name: source(writer, f"drivelink/elbow/{name}")
-            for name in ("estimate", "sample", "status", "model")
-        }
-
-        def put(name, payload):
-            entity, info = publishers[name]
-            entity.put(payload, source_info=info)
-            time.sleep(0.002)
-
-        good = encode_estimate(make_estimate(1), time.time_ns())
-        sample = encode_sample(make_sample(1), time.time_ns())
-
-        def everyone_listens():
-            put("estimate", good)
-            put("sample", sample)
-            for tap in taps:
-                tap.poll()
-            return client.received and all(tap.newest_s for tap in taps)
-
-        until(everyone_listens)
-        for name, payload in attacks:
-            put(name, payload)
-            watcher.poll()
-            for tap in taps:
-                tap.poll()
-            for view in watcher.views.values():
-                assert view.line() and json.dumps(snapshot(view, True, since), allow_nan=False)
-            assert client.latest() and (client.status, client.model)
-        last = encode_estimate(make_estimate(77), time.time_ns())
-        until(lambda: put("estimate", last) or (client.latest().sequence == 77 and client.valid))
-        until(
-            lambda: (
-                put("estimate", last)
-                or watcher.poll()
-                or watcher.views["elbow"].history.latest.sequence == 77
-            )
-        )
+        until(lambda: (put_good(), poll(), client.received and all(tap.newest_s for tap in taps))[-1])
+        for name, payloads in attacks.items():
+            for payload in payloads:
+                put(name, payload)
+                poll()
+                for view in watcher.views.values():
+                    assert view.line() and json.dumps(snapshot(view, True, since), allow_nan=False)
+                assert client.latest() and (client.status, client.model)
+        until(lambda: put_good(77) or (client.latest().sequence == 77 and client.valid))
+        until(lambda: put_good(77) or poll() or watcher.views["elbow"].history.latest.sequence == 77)
         assert client.foreign >= 4  # its queues of documents keep the newest only
-    for tap in taps:
+    for tap, sink in zip(taps, sinks, strict=True):
         tap.poll()
         assert tap.refused >= 4
         tap.close()
-    for sink in sinks:
         sink.flush()
         sink.close()
     watcher.close()

@@ -28,32 +28,18 @@ def run(seconds, *, scale_at=(np.inf, 1.0), coulomb=0.0, seed=11):
     K = rng.uniform(80, 220, (N, 1))
     alpha = np.stack([K, K * rng.uniform(10, 60, (N, 1))], axis=-1)
     B, D = rng.uniform(0.08, 0.2, (N, 1)), rng.uniform(0.4, 1.2, (N, 1))
-    plants = joints.Plants(
-        *joints.polynomial(alpha), B, D, 0.45, 0.3, 3.0, coulomb=coulomb, scale_at=scale_at
-    )
+    more = {"coulomb": coulomb, "scale_at": scale_at}
+    plants = joints.Plants(*joints.polynomial(alpha), B, D, 0.45, 0.3, 3.0, **more)
     truth = joints.simulate(plants, joints.sweep(rng, n, N, 1, T, 7.0, 3.0), T)
-    estimates = []
+    how, found = {"motor_counts": 8192, "link_bits": 17, "velocity_rad_s": None}, []
     for j in range(N):
-        record = joints.record(
-            truth,
-            j,
-            T,
-            motor_counts=8192,
-            link_bits=17,
-            velocity_rad_s=None,
-            torque_noise=rng.normal(0, 0.04, (n, 1)),
-        )
-        estimator = make_estimator(joints.joint_model(B[j, 0], D[j, 0]), EstimatorSettings(), T)
-        estimates.append(np.array([estimator.step(sample)[:5] for sample in record.samples()]))
-    return estimates, truth
+        record = joints.record(truth, j, T, **how, torque_noise=rng.normal(0, 0.04, (n, 1)))
+        found.append(joints.estimates(joints.joint_model(B[j, 0], D[j, 0]), record))
+    return found, truth
 
 
-def changed(out):
-    return out[:, 1].astype(int) & int(Status.CHANGED) > 0
-
-
-def valid(out):
-    return out[:, 1].astype(int) & int(Status.VALID) > 0
+def has(out, bit):
+    return out[:, 1].astype(int) & int(bit) > 0
 
 
 @pytest.mark.parametrize("factor", [0.9, *(pytest.param(f, marks=pytest.mark.slow) for f in (0.8, 1.25))])
@@ -61,13 +47,13 @@ def test_a_step_of_the_stiffness_is_announced_and_followed_and_not_valid_meanwhi
     at = 7000
     estimates, truth = run(9.0, scale_at=(at * T, factor))
     for j, out in enumerate(estimates):
-        assert not np.any(changed(out)[:at])
-        found = at + int(np.argmax(changed(out)[at:]))
-        assert changed(out)[found] and found < at + 250
+        assert not np.any(has(out, Status.CHANGED)[:at])
+        found = at + int(np.argmax(has(out, Status.CHANGED)[at:]))
+        assert has(out, Status.CHANGED)[found] and found < at + 250
         error = np.abs(out[:, 3] / truth.sigma[:, j, 0] - 1)
         assert np.median(error[at + 500 :]) < 0.02
         # From the alarm on nothing is valid that is off by more than its interval.
-        beyond = valid(out) & (error > 0.1) & (error * truth.sigma[:, j, 0] > 5 * out[:, 4])
+        beyond = has(out, Status.VALID) & (error > 0.1) & (error * truth.sigma[:, j, 0] > 5 * out[:, 4])
         assert not np.any(beyond[found:])
 
 
@@ -79,8 +65,8 @@ def test_friction_that_nobody_declared_is_no_change_but_widens_the_interval():
         estimates, truth = run(14.0, coulomb=coulomb)
         late = slice(5000, None)
         for j, out in enumerate(estimates):
-            assert not np.any(changed(out))
-            assert np.mean(valid(out)[late]) > 0.95
+            assert not np.any(has(out, Status.CHANGED))
+            assert np.mean(has(out, Status.VALID)[late]) > 0.95
             off = np.abs(out[late, 3] - truth.sigma[late, j, 0])
             assert np.mean(off < 3.0 * out[late, 4]) > 0.9
         widths.append(np.median([np.median(out[late, 4] / out[late, 3]) for out in estimates]))
@@ -117,7 +103,7 @@ def test_a_measured_curve_is_a_model_too():
         late = slice(3000, None)
         # A cubic between points of the table is good to a few parts in ten thousand.
         assert out[late, 3] == pytest.approx(truth.sigma[late, 0, 0], rel=5e-3)
-        assert np.mean(valid(out)[late]) > 0.95
+        assert np.mean(has(out, Status.VALID)[late]) > 0.95
         assert estimator.parameters()[0]["parameters"]["k_nm_rad"] == pytest.approx(1.15, rel=2e-3)
     finally:
         del MODELS[name]

@@ -26,12 +26,8 @@ def _motion(t: np.ndarray, spin: float) -> tuple[np.ndarray, np.ndarray, np.ndar
 def _joint(link_late_s: float) -> JointModel:
     torque = Effect(name="torque_delay", parameters={"delay_s": -LATE_S})
     link = Effect(name="encoder_delay", parameters={"delay_s": link_late_s})
-    motor = Motor(
-        inertia_kg_m2=B,
-        viscous_damping_nm_s_rad=D,
-        transmission=Transmission(model="linear"),
-        effects=(torque,),
-    )
+    spring = Transmission(model="linear")
+    motor = Motor(inertia_kg_m2=B, viscous_damping_nm_s_rad=D, transmission=spring, effects=(torque,))
     return JointModel(arrangement="single", motors=(motor,), link_effects=(link,))
 
 
@@ -43,9 +39,7 @@ def _joint(link_late_s: float) -> JointModel:
         (0.0, 2.6e-3, 0.01),  # nobody knows the last 2.6 ms of the deflection: they are foreseen
     ],
 )
-def test_a_torque_that_is_reported_late_is_published_for_the_present(
-    spin: float, link_late_s: float, left: float
-) -> None:
+def test_a_torque_that_is_reported_late_is_published_for_the_present(spin, link_late_s, left):
     """Waiting for it would leave an eighth of the torque; a joint that spins at the start begins as well."""
     t = T * np.arange(N)
     noise = np.random.default_rng(4).normal(scale=1e-5, size=(2, N))

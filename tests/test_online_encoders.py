@@ -1,9 +1,4 @@
-"""Encoders from 12 to 26 bits, quiet or noisy, slow or fast: valid where the motion determines the stiffness, never wrong.
-
-The deflection filter restarts where its innovation exceeds twelve standard deviations. The finer the encoder, the
-smaller its own covariance, while what the filter cannot follow stays what it is; so the innovations' mean square is
-taken where it is larger than the covariance. Otherwise fine, quiet encoders would restart it all the time.
-"""
+"""Encoders from 12 to 26 bits, or that count from elsewhere: valid where the motion shows the stiffness, never wrong."""
 
 import math
 
@@ -19,6 +14,17 @@ SLOW = pytest.mark.slow
 FINE = (17, *(pytest.param(bits, marks=SLOW) for bits in (19, 22)), 26)
 COARSE = (12, *(pytest.param(bits, marks=SLOW) for bits in (14, 16)))
 QUIET = pytest.mark.parametrize("noise", [pytest.param(False, marks=SLOW), True], ids=["quiet", "noisy"])
+
+
+def mostly_slow(names, *cases):
+    """Every case; the ones that are no tuple of `cases` are slow."""
+    every = [
+        (name, value)
+        for name in dict.fromkeys(c[0] for c in cases)
+        for value in dict.fromkeys(c[1] for c in cases)
+    ]
+    marked = [case if case in cases else pytest.param(*case, marks=SLOW) for case in every]
+    return pytest.mark.parametrize(names, marked)
 
 
 def estimates_of(name, bits, noise, excitation=None):
@@ -69,47 +75,41 @@ def test_a_joint_that_turns_all_the_time_is_valid():
     assert np.mean(sure[SETTLED:]) > 0.95
 
 
-@pytest.mark.parametrize("off", [0.0, 0.1, 2.6])
-@pytest.mark.parametrize("name", ["constant", "quadratic", "vsa-ii"])
+def rebooted(motion, name, off, doubted=-1):
+    """Estimates and estimator, sample by sample; the first motor counts from elsewhere after LOST samples."""
+    estimator = kit.make_estimator(kit.declared(name), kit.EstimatorSettings(), kit.PERIOD_S)
+    for k, sample in enumerate(motion.samples):
+        if k == LOST:
+            estimator.lose_zeros()
+        if k == LOST + doubted:
+            estimator.distrust()
+        moved = sample.motor_position_rad[0] + (off if k >= LOST else 0.0)
+        one = estimator.step(sample._replace(motor_position_rad=(moved, *sample.motor_position_rad[1:])))
+        assert doubted >= 0 or k != LOST + 500 or estimator.why()[0] == "lost"
+        yield one.status & 1, one.stiffness_nm_rad, one.flexibility_torque_nm
+
+
+LOST = 6000
+
+
+@mostly_slow(("name", "off"), ("constant", 0.1), ("quadratic", 0.0), ("vsa-ii", 2.6))
 def test_a_drive_that_counts_from_elsewhere_after_a_reboot_is_not_believed_before_motion_has_shown_from_where(
     name, off
 ):
-    lost, motion = round(6.0 / kit.PERIOD_S), kit.motion(name, 14.0)
-    estimator = kit.make_estimator(kit.declared(name), kit.EstimatorSettings(), kit.PERIOD_S)
-    found = []
-    for k, sample in enumerate(motion.samples):
-        if k == lost:
-            estimator.lose_zeros()
-        moved = sample.motor_position_rad[0] + (off if k >= lost else 0.0)
-        found.append(
-            estimator.step(sample._replace(motor_position_rad=(moved, *sample.motor_position_rad[1:])))
-        )
-        assert k != lost + 500 or estimator.why()[0] == "lost"
-    valid = np.array([bool(one.status & 1) for one in found])
-    assert valid[lost - 1000 : lost].all()
+    motion = kit.motion(name, 14.0)
+    valid, stiffness, torque = np.array(list(rebooted(motion, name, off))).T
+    valid = valid > 0
+    assert valid[LOST - 1000 : LOST].all()
     assert valid[-4000:].mean() > 0.9
-    stiffness = np.array([one.stiffness_nm_rad for one in found])
-    torque = np.array([one.flexibility_torque_nm for one in found])
     assert np.all(np.abs(stiffness / motion.stiffness_nm_rad - 1.0)[valid] < 0.1)
     # The limit of the fault matrix, a quarter of the torque's rms.
     assert np.all(np.abs(torque - motion.torque_nm)[valid] < 0.25 * np.sqrt(np.mean(motion.torque_nm**2)))
 
 
-@pytest.mark.parametrize("after", [840, 880, 920])
-@pytest.mark.parametrize("name", ["constant", "quadratic"])
+@mostly_slow(("name", "after"), ("constant", 840), ("quadratic", 880), ("constant", 920))
 def test_a_doubted_sample_in_the_middle_of_that_judgement_does_not_end_it(name, after):
     """The half block before a sample whose moment is in doubt is not judged as a whole one."""
-    lost, motion = 6000, kit.motion(name, 13.0)
-    estimator = kit.make_estimator(kit.declared(name), kit.EstimatorSettings(), kit.PERIOD_S)
-    off = []
-    for k, sample in enumerate(motion.samples):
-        if k == lost:
-            estimator.lose_zeros()
-        if k == lost + after:
-            estimator.distrust()
-        moved = sample.motor_position_rad[0] + (0.1 if k >= lost else 0.0)
-        one = estimator.step(sample._replace(motor_position_rad=(moved, *sample.motor_position_rad[1:])))
-        if k >= lost and one.status & 1:
-            off.append(abs(one.flexibility_torque_nm - motion.torque_nm[k]))
-    assert off
-    assert max(off) < 0.25 * np.sqrt(np.mean(motion.torque_nm**2))
+    motion = kit.motion(name, 14.0)
+    valid, _, torque = np.array(list(rebooted(motion, name, 0.1, after)))[LOST:].T
+    off = np.abs(torque - motion.torque_nm[LOST:])[valid > 0]
+    assert len(off) and max(off) < 0.25 * np.sqrt(np.mean(motion.torque_nm**2))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -11,33 +12,23 @@ from drivelink.output import progress
 from drivelink.output.progress import Meter
 
 
-class Clock:
-    """Seconds that pass when asked to."""
-
-    def __init__(self) -> None:
-        self.now_s = 100.0
-
-    def monotonic(self) -> float:
-        return self.now_s
-
-
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    made = Clock()
+def clock(monkeypatch):
+    """Seconds that pass when asked to."""
+    made = SimpleNamespace(now_s=100.0, monotonic=lambda: made.now_s)
     monkeypatch.setattr(progress, "time", made)
     return made
 
 
-def console(terminal: bool) -> Console:
+def console(terminal):
     return Console(file=io.StringIO(), force_terminal=terminal, width=80)
 
 
-def text(shown: Console) -> str:
-    assert isinstance(shown.file, io.StringIO)
+def text(shown):
     return shown.file.getvalue()
 
 
-def test_quick_work_shows_nothing(clock: Clock) -> None:
+def test_quick_work_shows_nothing(clock):
     for terminal in (True, False):
         shown = console(terminal)
         with Meter("count", 1000, shown) as meter:
@@ -46,7 +37,7 @@ def test_quick_work_shows_nothing(clock: Clock) -> None:
         assert text(shown) == ""
 
 
-def test_long_work_without_a_terminal_is_a_line_now_and_then(clock: Clock) -> None:
+def test_long_work_without_a_terminal_is_a_line_now_and_then(clock):
     shown = console(terminal=False)
     with Meter("fit", 100, shown) as meter:
         for k in range(100):
@@ -56,7 +47,7 @@ def test_long_work_without_a_terminal_is_a_line_now_and_then(clock: Clock) -> No
     assert lines[0] == "fit: 16 % after 5 s" and 5 <= len(lines) <= 6
 
 
-def test_progress_says_what_is_being_done(clock: Clock) -> None:
+def test_progress_says_what_is_being_done(clock):
     for terminal in (True, False):
         shown = console(terminal)
         with Meter("diagnose run.csv", None, shown) as meter:
@@ -66,7 +57,7 @@ def test_progress_says_what_is_being_done(clock: Clock) -> None:
         assert "diagnose run.csv (bandwidth)" in text(shown) and "(search)" in text(shown)
 
 
-def test_long_work_on_a_terminal_is_a_bar_that_goes_away(clock: Clock) -> None:
+def test_long_work_on_a_terminal_is_a_bar_that_goes_away(clock):
     shown = console(terminal=True)
     with Meter("fit", 100, shown) as meter:
         clock.now_s += 3.0
@@ -75,7 +66,7 @@ def test_long_work_on_a_terminal_is_a_bar_that_goes_away(clock: Clock) -> None:
     assert text(shown).rstrip().endswith("\x1b[2K")  # the line is erased
 
 
-def test_work_that_breaks_off_leaves_the_terminal_as_it_was(clock: Clock) -> None:
+def test_work_that_breaks_off_leaves_the_terminal_as_it_was(clock):
     shown = console(terminal=True)
     with pytest.raises(KeyboardInterrupt), Meter("fit", 1000, shown) as meter:
         clock.now_s += 3.0

@@ -10,27 +10,21 @@ import numpy as np
 import pytest
 from onlinekit import PERIOD_S, declared, motion
 
-from estimator import EstimatorError, EstimatorSettings, Motor, Sample, Status, make_estimator
+from estimator import EstimatorError, EstimatorSettings, Sample, Status, make_estimator
 from estimator.reasons import CHANGES, REASONS, reason_text, why_not_valid
 
 CORE = Path(__file__).parent.parent / "estimator" / "core" / "src"
 
 
-def names_of(source: str, kind: str) -> set[str]:
-    text = (CORE / source).read_text(encoding="utf-8")
-    return set(re.findall(kind + r'::\w+(?:\(_\))? => "(\w+)"', text))
-
-
 def test_every_reason_and_change_of_the_core_has_its_words():
-    assert names_of("reasons.rs", "Reason") == set(REASONS) - {"stale", "alarm", "contradicted"}
-    table = (CORE / "causes.rs").read_text(encoding="utf-8")
-    causes = set(re.findall(r'entry\(Cause::\w+, "(\w+)"', table))
-    assert causes - {"nothing", "noise"} == set(CHANGES)
+    reasons, causes = ((CORE / file).read_text(encoding="utf-8") for file in ("reasons.rs", "causes.rs"))
+    named = set(re.findall(r'Reason::\w+(?:\(_\))? => "(\w+)"', reasons))
+    assert named == set(REASONS) - {"stale", "alarm", "contradicted"}
+    assert set(re.findall(r'entry\(Cause::\w+, "(\w+)"', causes)) - {"nothing", "noise"} == set(CHANGES)
 
 
 def test_the_sentences_are_those_of_the_documentation():
-    text = reason_text("imprecise", share=0.44, asked=0.2)
-    assert text == "stiffness known to ± 44 %, asked for ± 20 %"
+    assert reason_text("imprecise", share=0.44, asked=0.2) == "stiffness known to ± 44 %, asked for ± 20 %"
     text = reason_text("changed", motor=2, changes=["torque_scale", "stiffness"])
     assert text == "motor 2: torque gain or stiffness has changed"
     assert reason_text("changed") == "the joint has changed"
@@ -86,23 +80,21 @@ def test_samples_that_cannot_be_used_are_the_reason(quadratic):
     assert why == ("rejected", REASONS["rejected"])
 
 
-def test_a_changed_torque_gain_is_named_with_what_looks_like_it(quadratic):
-    long = motion("quadratic", 12.0).samples
-    wrong = [
-        s._replace(motor_torque_nm=tuple(1.4 * t for t in s.motor_torque_nm)) if k > 8000 else s
-        for k, s in enumerate(long)
-    ]
-    rows = replayed(wrong, EstimatorSettings())
+def test_a_changed_torque_gain_is_named_with_what_looks_like_it():
+    samples = motion("quadratic", 12.0).samples
+    for k in range(8001, len(samples)):
+        samples[k] = samples[k]._replace(motor_torque_nm=tuple(1.4 * t for t in samples[k].motor_torque_nm))
+    rows = replayed(samples, EstimatorSettings())
     texts = {why[1] for _, why, _ in rows[8000:] if why and why[0] == "changed"}
     assert any("torque gain" in text and text.endswith("changed") for text in texts), texts
 
 
 def test_a_wrong_inertia_is_not_called_imprecise(quadratic):
     model = declared("quadratic")
-    motors: tuple[Motor, ...] = tuple(
+    motors = [
         replace(m, inertia_kg_m2=8.0 * m.inertia_kg_m2, inertia_std_relative=0.01) for m in model.motors
-    )
-    rows = replayed(quadratic.samples, EstimatorSettings(), replace(model, motors=motors))
+    ]
+    rows = replayed(quadratic.samples, EstimatorSettings(), replace(model, motors=tuple(motors)))
     assert {why[0] for _, why, _ in rows[2000:] if why} & {"motor", "unexplained", "changed"}
 
 

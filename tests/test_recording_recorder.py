@@ -7,8 +7,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import daemonkit
@@ -37,14 +36,9 @@ def joint_file(folder: Path, endpoint: str) -> Path:
 
 
 @contextmanager
-def start(*arguments: str) -> Iterator[subprocess.Popen[str]]:
-    process = subprocess.Popen(
-        [sys.executable, "-m", "drivelink", "record", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"PYTHONUNBUFFERED": "1"},
-    )
+def start(*arguments):
+    command, pipes = [sys.executable, "-m", "drivelink", "record", *arguments], {"stdout": -1, "stderr": -1}
+    process = subprocess.Popen(command, **pipes, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"})
     try:
         yield process
     finally:
@@ -59,9 +53,7 @@ def samples_in(path: Path) -> int:
     return sum(message.topic.endswith("/sample") for message in read_messages(path))
 
 
-def test_a_daemon_is_recorded_until_sigterm_and_replays(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_daemon_is_recorded_until_sigterm_and_replays(tmp_path, capsys):
     endpoint = zenohkit.free_endpoint()
     path, out = joint_file(tmp_path, endpoint), tmp_path / "r.mcap"
     with zenohkit.script("elbow", endpoint) as daemon, start(str(path), "--out", str(out)) as process:
@@ -83,7 +75,7 @@ def test_a_daemon_is_recorded_until_sigterm_and_replays(
     capsys.readouterr()
 
 
-def test_a_daemon_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> None:
+def test_a_daemon_that_is_not_there_yet_is_waited_for(tmp_path):
     endpoint = zenohkit.free_endpoint()
     path, out = joint_file(tmp_path, endpoint), tmp_path / "r.csv"
     with start(str(path), "--out", str(out), "--json") as process:
@@ -99,7 +91,7 @@ def test_a_daemon_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> None:
     assert len(read(out, jointfile.load(path).model_copy(update={"link": jointfile.LinkSection()}))) > 15
 
 
-def test_a_recording_of_nothing_is_an_error(tmp_path: Path) -> None:
+def test_a_recording_of_nothing_is_an_error(tmp_path):
     path, out = joint_file(tmp_path, zenohkit.free_endpoint()), tmp_path / "r.csv"
     with start(str(path), "--out", str(out), "--seconds", "0.5") as process:
         error = process.communicate(timeout=60)[1].splitlines()[-1]
@@ -118,9 +110,7 @@ def test_a_recording_of_nothing_is_an_error(tmp_path: Path) -> None:
         (["--out", "{folder}/r.csv", "--seconds", "0"], "--seconds: expected a number above 0"),
     ],
 )
-def test_what_cannot_be_recorded_is_one_line(
-    arguments: list[str], line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_recorded_is_one_line(arguments, line, tmp_path, capsys):
     path = joint_file(tmp_path, zenohkit.free_endpoint())
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -147,70 +137,46 @@ class InRealTime:
         return frames
 
 
-@pytest.mark.parametrize("suffix", [".mcap", ".csv", ".log"])
-def test_a_bus_is_recorded_by_listening_only(suffix: str, tmp_path: Path) -> None:
-    joint = daemonkit.vsa()
-    path = tmp_path / f"r{suffix}"
-    sent_before_us: list[int] = []
-    bus = open_bus(joint.bus)
-    bus.send = lambda *_: sent_before_us.append(1)  # type: ignore[method-assign,assignment]
-    sink = open_sink(path, joint)
-    tap = BusTap(bus, joint, sink, tmp_path)
-    tap._source = InRealTime(tap._source)
-    with daemonkit.rig(joint) as rig, Recorder(sink, [tap]) as recorder:
-        live = []
-        for _ in range(150):
-            live += rig.run(1)
-            tap.poll()
-        recorder.run(lambda: True)
-        samples = [sample for sample, _ in rig.collector.samples]
-    bus.shutdown()
-    assert not sent_before_us and len(live) == 150
-    if suffix == ".log":
-        assert sum(frame.can_id == 0x080 for frame in read_frames(path)) == 150
-        return
-    # Samples of the bus alone, by the mapping in the traffic: those of the daemon.
-    record = read(path, joint)
-    assert [tuple(row) for row in record.motor_position_rad.tolist()] == [
-        s.motor_position_rad for s in samples
-    ][: len(record)]
-    assert len(record) >= 148  # the first cycle's SYNC may come before the mapping is at rest
+def test_a_bus_is_recorded_by_listening_only(tmp_path):
+    """Samples by the mapping that is heard, or that the daemon publishes; without the link's they cannot be made."""
+    joint, taps, silent = daemonkit.vsa(), {}, []
+    blind = joint.model_copy(update={"link": joint.link.model_copy(update={"encoder": None})})
+    with ExitStack() as stack:
 
+        def listen(name, of=joint, **how):
+            bus, sink = open_bus(joint.bus), open_sink(tmp_path / name, joint)
+            bus.send = lambda *_: silent.append(name)
+            tap = BusTap(bus, of, sink, tmp_path, **how)
+            tap._source = InRealTime(tap._source)
+            stack.callback(bus.shutdown)
+            taps[name] = (tap, sink, stack.enter_context(Recorder(sink, [tap])))
 
-def test_a_bus_is_recorded_by_the_mapping_that_the_daemon_publishes(tmp_path: Path) -> None:
-    """The recorder begins when the drives are configured: the mapping is no longer on the bus."""
-    joint = daemonkit.vsa()
-    path = tmp_path / "r.csv"
-    with daemonkit.rig(joint) as rig:
-        rig.run(20)
-        bus = open_bus(joint.bus)
-        sink = open_sink(path, joint)
-        tap = BusTap(bus, joint, sink, tmp_path, layouts=list(rig.daemon.layouts.values()))
-        tap._source = InRealTime(tap._source)
-        with Recorder(sink, [tap]) as recorder:
-            for _ in range(150):
+        def run(cycles):
+            for _ in range(cycles):
                 rig.run(1)
-                tap.poll()
-            recorder.run(lambda: True)
-        samples = [sample for sample, _ in rig.collector.samples]
-        bus.shutdown()
-    found = [tuple(row) for row in read(path, joint).motor_position_rad.tolist()]
-    assert len(found) >= 148 and found == [s.motor_position_rad for s in samples][-len(found) :]
+                for tap, *_ in taps.values():
+                    tap.poll()
 
-
-def test_a_mapping_without_the_link_makes_no_samples_and_says_so(tmp_path: Path) -> None:
-    joint = daemonkit.vsa()
-    without_encoder = joint.model_copy(update={"link": joint.link.model_copy(update={"encoder": None})})
-    bus = open_bus(joint.bus)
-    sink = open_sink(tmp_path / "r.mcap", joint)
-    tap = BusTap(bus, without_encoder, sink, tmp_path)
-    tap._source = InRealTime(tap._source)
-    with daemonkit.rig(joint) as rig, Recorder(sink, [tap]) as recorder:
-        for _ in range(150):
-            rig.run(1)
-            tap.poll()
-        printed = _Summary(tmp_path / "r.mcap", recorder).text()
-        recorder.run(lambda: True)
-    bus.shutdown()
+        for name in ("heard.mcap", "heard.csv", "heard.log"):
+            listen(name)
+        listen("blind.mcap", blind)
+        with daemonkit.rig(joint) as rig:
+            run(20)
+            listen(
+                "late.csv", layouts=list(rig.daemon.layouts.values())
+            )  # the mapping is no longer on the bus
+            run(150)
+            samples = [sample.motor_position_rad for sample, _ in rig.collector.samples]
+        tap, sink, recorder = taps["blind.mcap"]
+        printed = _Summary(tmp_path / "blind.mcap", recorder).text()
+        for *_, each in taps.values():
+            each.run(lambda: True)
+    assert not silent
     assert "no samples: " in printed and "no frame carries the link position" in printed
     assert not tap.assembling and sink.counts["frame"] >= 150 * 4 and not sink.counts.get("sample")
+    assert sum(frame.can_id == 0x080 for frame in read_frames(tmp_path / "heard.log")) == 170
+    for name, least in (("heard.mcap", 168), ("heard.csv", 168), ("late.csv", 148)):
+        # The first cycle's SYNC may come before the mapping is at rest.
+        found = [tuple(row) for row in read(tmp_path / name, joint).motor_position_rad.tolist()]
+        # The last sample is recorded when its cycle has ended.
+        assert len(found) >= least and found == samples[len(samples) - len(found) :][: len(found)], name

@@ -1,6 +1,7 @@
 """The robust mode on drive-like signals: accuracy, honesty, standstill, bad input."""
 
 import math
+from functools import lru_cache
 
 import joints
 import numpy as np
@@ -12,6 +13,7 @@ from estimator import EstimatorSettings, JointModel, Motor, Sample, Status, Tran
 
 T = 1e-3
 USABLE = int(Status.VALID | Status.OBSERVABLE)
+DRIVE = {"motor_counts": 8192, "link_bits": 16, "velocity_rad_s": None}
 
 
 class RecordedJoint:
@@ -21,24 +23,28 @@ class RecordedJoint:
         rng, n = np.random.default_rng(21), 9000
         K = rng.uniform(80, 220, (N, 1))
         self.alpha = np.stack([K, K * rng.uniform(2, 12, (N, 1))], axis=-1)
-        torque, stiffness = joints.polynomial(self.alpha)
         self.B, self.D = rng.uniform(0.08, 0.2, (N, 1)), rng.uniform(0.4, 1.2, (N, 1))
-        plants = joints.Plants(torque, stiffness, self.B, self.D, 0.45, 0.3, 5.0)
+        plants = joints.Plants(*joints.polynomial(self.alpha), self.B, self.D, 0.45, 0.3, 5.0)
         tau = joints.sweep(rng, n, N, 1, T, 8.0, 3.0)
         tau[np.arange(n) * T >= rest_at] = 0.0
         self.truth = joints.simulate(plants, tau, T)
 
     def record(self, j, **how):
         noise = np.random.default_rng(j).normal(0, 0.04, self.truth.tau[:, j].shape)
-        how = {"motor_counts": 8192, "link_bits": 16, "velocity_rad_s": None, "torque_noise": noise, **how}
-        return joints.record(self.truth, j, T, **how)
+        return joints.record(self.truth, j, T, **{**DRIVE, "torque_noise": noise, **how})
 
     def run(self, j, samples=None, B=1.0, D=1.0, **how):
-        estimator = make_estimator(
-            joints.joint_model(B * self.B[j, 0], D * self.D[j, 0]), EstimatorSettings(**how), T
-        )
+        model = joints.joint_model(B * self.B[j, 0], D * self.D[j, 0])
+        estimator = make_estimator(model, EstimatorSettings(**how), T)
         samples = self.record(j).samples() if samples is None else samples
         return np.array([estimator.step(sample)[:5] for sample in samples]), estimator
+
+    def errors(self, j, out):
+        """Relative, while it is usable; with the share that is, and of it the share within 95 % intervals."""
+        usable = (out[:, 1].astype(int) & USABLE == USABLE) & (np.arange(len(out)) > 4000)
+        off = np.abs(out[usable, 3] - self.truth.sigma[usable, j, 0])
+        rms = np.sqrt(np.mean((off / self.truth.sigma[usable, j, 0]) ** 2))
+        return rms, usable.mean(), np.mean(off < 1.96 * out[usable, 4])
 
 
 @pytest.fixture(scope="module")
@@ -46,61 +52,40 @@ def rig():
     return RecordedJoint()
 
 
-def _usable(out):
-    return (out[:, 1].astype(int) & USABLE == USABLE) & (np.arange(len(out)) > 4000)
-
-
 @pytest.mark.parametrize(("B", "D"), [(1.0, 1.0), (1.05, 0.8)])
 def test_stiffness_is_right_along_the_motion_declared_parameters_exact_or_not(rig, B, D):
-    errors, inside = [], []
-    for j in range(6):
-        out, _ = rig.run(j, B=B, D=D)
-        usable = _usable(out)
-        off = np.abs(out[usable, 3] - rig.truth.sigma[usable, j, 0])
-        inside.append(np.mean(off < 1.96 * out[usable, 4]))
-        errors.append(np.sqrt(np.mean((out[usable, 3] / rig.truth.sigma[usable, j, 0] - 1) ** 2)))
-        assert usable.mean() > 0.4
+    errors, usable, inside = np.array([rig.errors(j, rig.run(j, B=B, D=D)[0]) for j in range(6)]).T
+    assert min(usable) > 0.4
     # Asked for: 0.1 % median, 0.3 % worst after convergence; here the first seconds count, too.
-    assert np.median(errors) < 1.5e-3
-    assert max(errors) < 4e-3
+    assert np.median(errors) < 1.5e-3 and max(errors) < 4e-3
     # Six joints are six draws, each slow to change: 95 % of them on average needs many more draws (benchmarks/ensembles.py).
     assert np.mean(inside) > 0.85
 
 
 def test_black_box_needs_no_model_and_stays_within_its_bound(rig):
-    for j in range(2):
-        out, _ = rig.run(j, method="bbe")
-        usable = _usable(out)
-        assert np.sqrt(np.mean((out[usable, 3] / rig.truth.sigma[usable, j, 0] - 1) ** 2)) < 0.025
+    assert max(rig.errors(j, rig.run(j, method="bbe")[0])[0] for j in range(2)) < 0.025
 
 
 def test_torque_noise_is_a_tenth_of_the_paper_modes(rig):
-    for j in range(2):
-        record = rig.record(j, velocity_rad_s=0.1047)  # 1 rpm
-        model = joints.joint_model(rig.B[j, 0], rig.D[j, 0])
-        late = slice(4000, None)
-        errors = []
-        for mode in ("robust", "paper"):
-            estimator = make_estimator(model, EstimatorSettings(mode=mode, k_tau_rad_s=60.0), T)
-            out = np.array([estimator.step(sample)[2] for sample in record.samples()])
-            error = out[late] - rig.truth.tau_e[late, j, 0]
-            # The paper's residual lags by design: only what is faster than the motion is noise.
-            window = np.hanning(41) / np.hanning(41).sum()
-            errors.append(np.std(error - np.convolve(error, window, "same")))
-        assert errors[0] < 0.1 * errors[1]
+    late, window = slice(4000, None), np.hanning(41) / np.hanning(41).sum()
+    samples = list(rig.record(0, velocity_rad_s=0.1047).samples())  # 1 rpm
+    noise = {}
+    for mode in ("robust", "paper"):
+        out, _ = rig.run(0, samples, mode=mode, k_tau_rad_s=60.0)
+        error = out[late, 2] - rig.truth.tau_e[late, 0, 0]
+        # The paper's residual lags by design: only what is faster than the motion is noise.
+        noise[mode] = np.std(error - np.convolve(error, window, "same"))
+    assert noise["robust"] < 0.1 * noise["paper"]
 
 
 @pytest.mark.parametrize("late", [0, 1, 3])
 def test_deflection_is_that_of_this_moment_however_late_the_link_encoder(rig, late):
-    for j in range(2):
-        estimator = make_estimator(joints.joint_model(rig.B[j, 0], rig.D[j, 0]), EstimatorSettings(), T)
-        samples = rig.record(j, link_delay=late).samples()
-        deflection = np.array([estimator.step(sample).transmissions[0].deflection_rad for sample in samples])
-        phi = rig.truth.q[:, j] - rig.truth.theta[:, j, 0]
-        settled = slice(4000, None)
-        rate = np.gradient(phi, T)[settled]
-        error = deflection[settled] - phi[settled]
-        assert abs(rate @ (error - error.mean()) / (rate @ rate)) < 0.1 * T
+    estimator = make_estimator(joints.joint_model(rig.B[0, 0], rig.D[0, 0]), EstimatorSettings(), T)
+    samples, settled = rig.record(0, link_delay=late).samples(), slice(4000, None)
+    deflection = np.array([estimator.step(sample).transmissions[0].deflection_rad for sample in samples])
+    phi = rig.truth.q[:, 0] - rig.truth.theta[:, 0, 0]
+    rate, error = np.gradient(phi, T)[settled], (deflection - phi)[settled]
+    assert abs(rate @ (error - error.mean()) / (rate @ rate)) < 0.1 * T
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in (1, 2))])
@@ -109,19 +94,17 @@ def test_the_first_reversal_of_a_motion_is_no_change(seed):
     rng = np.random.default_rng(seed)
     N, n, reversal = 4, 4000, 3000
     K = rng.uniform(80, 220, (N, 1))
-    torque, stiffness = joints.polynomial(np.stack([K, 5 * K], axis=-1))
     B, D = rng.uniform(0.08, 0.2, (N, 1)), rng.uniform(0.8, 1.2, (N, 1))
-    plants = joints.Plants(torque, stiffness, B, D, 0.45, 0.3, 0.0)
+    plants = joints.Plants(*joints.polynomial(np.stack([K, 5 * K], axis=-1)), B, D, 0.45, 0.3, 0.0)
     tau = joints.sweep(rng, n, N, 1, T, 3.0, 3.0)
     tau += np.where(np.arange(n) < reversal, 10.0, -10.0)[:, None, None]
     truth = joints.simulate(plants, tau, T)
     assert np.all(truth.omega[600:reversal] > 0) and np.all(truth.omega[-1] < 0)
     for j in range(N):
         noise = np.random.default_rng(j).normal(0, 0.02, tau[:, j].shape)
-        how = {"motor_counts": 8192, "link_bits": 16, "velocity_rad_s": None, "torque_noise": noise}
-        estimator = make_estimator(joints.joint_model(B[j, 0], D[j, 0]), EstimatorSettings(), T)
-        samples = joints.record(truth, j, T, **how).samples()
-        assert not any(estimator.step(sample).status & Status.CHANGED for sample in samples)
+        record = joints.record(truth, j, T, **DRIVE, torque_noise=noise)
+        out = joints.estimates(joints.joint_model(B[j, 0], D[j, 0]), record)
+        assert not np.any(out[:, 1].astype(int) & Status.CHANGED)
 
 
 def test_standstill_moves_nothing_and_is_not_called_observable():
@@ -146,37 +129,25 @@ def test_replay_gives_the_same_bits_as_live(rig):
     assert first.tobytes() == again.tobytes()
 
 
-def _nan_link(sample, rng):
-    return sample._replace(link_position_rad=math.nan) if rng.random() < 0.3 else sample
+SPOILT = {  # field: (probability, value); nothing: the sample is lost
+    "a link position that is no number": (0.3, {"link_position_rad": math.nan}),
+    "an infinite torque": (0.1, {"motor_torque_nm": (math.inf,)}),
+    "a spike": (0.02, {"motor_position_rad": (5.0,)}),
+    "lost samples": (0.2, None),
+    "a gap": (1.0, None),
+    "a huge torque": (1.0, {"motor_torque_nm": (1e300,)}),
+}
 
 
-def _infinite_torque(sample, rng):
-    return sample._replace(motor_torque_nm=(math.inf,)) if rng.random() < 0.1 else sample
-
-
-def _spike(sample, rng):
-    return sample._replace(motor_position_rad=(5.0,)) if rng.random() < 0.02 else sample
-
-
-def _lost(sample, rng):
-    return None if rng.random() < 0.2 else sample
-
-
-def _gone(sample, rng):
-    return None
-
-
-def _huge(sample, rng):
-    return sample._replace(motor_torque_nm=(1e300,))
-
-
-@pytest.mark.parametrize("spoil", [_nan_link, _infinite_torque, _spike, _lost, _gone, _huge])
-def test_bad_input_is_named_and_leaves_no_trace(rig, spoil):
-    rng = np.random.default_rng(5)
-    samples = [
-        spoil(sample, rng) if 4000 <= k < 4600 else sample for k, sample in enumerate(rig.record(0).samples())
-    ]
-    out, _ = rig.run(0, [sample for sample in samples if sample is not None])
+@pytest.mark.parametrize("name", SPOILT)
+def test_bad_input_is_named_and_leaves_no_trace(rig, name):
+    (probability, values), rng, samples = SPOILT[name], np.random.default_rng(5), []
+    for k, sample in enumerate(rig.record(0).samples()):
+        if not (4000 <= k < 4600 and rng.random() < probability):
+            samples.append(sample)
+        elif values is not None:
+            samples.append(sample._replace(**values))
+    out, _ = rig.run(0, samples)
     status, tick = out[:, 1].astype(int), out[:, 0].astype(int)
     during, after = (tick >= 4000) & (tick < 4650), tick > 5600
     assert np.any(status[during] & (Status.INPUT_REJECTED | Status.GAP | Status.RESTARTED))
@@ -199,32 +170,21 @@ def test_a_frozen_channel_is_noticed_and_survived(rig, channel):
 
 def test_an_encoder_that_moves_its_zero_is_followed(rig):
     samples = list(rig.record(0).samples())
-    moved = [
-        s if k < 4000 else s._replace(link_position_rad=s.link_position_rad + 0.5)
-        for k, s in enumerate(samples)
-    ]
-    out, _ = rig.run(0, moved)
+    for k in range(4000, len(samples)):
+        samples[k] = samples[k]._replace(link_position_rad=samples[k].link_position_rad + 0.5)
+    out, _ = rig.run(0, samples)
     assert np.max(np.abs(out[5000:, 3] / rig.truth.sigma[5000:, 0, 0] - 1)) < 0.03
 
 
 @settings(max_examples=60, deadline=None)
 @given(
-    st.lists(
-        st.tuples(
-            st.integers(-5, 50),
-            st.floats(allow_nan=True, allow_infinity=True),
-            st.floats(allow_nan=True, allow_infinity=True),
-            st.floats(allow_nan=True, allow_infinity=True),
-        ),
-        max_size=30,
-    ),
+    st.lists(st.tuples(st.integers(-5, 50), st.floats(), st.floats(), st.floats()), max_size=30),
     st.sampled_from(["robust", "paper"]),
     st.sampled_from(["polynomial", "vsa-ii", "none", "unknown"]),
 )
 def test_no_float_makes_a_tick_raise(rows, mode, model):
-    joint = JointModel(
-        arrangement="single", motors=(Motor(inertia_kg_m2=0.1, transmission=Transmission(model=model)),)
-    )
+    motor = Motor(inertia_kg_m2=0.1, transmission=Transmission(model=model))
+    joint = JointModel(arrangement="single", motors=(motor,))
     estimator = make_estimator(joint, EstimatorSettings(mode=mode), T)
     with np.errstate(all="ignore"):
         for sequence, theta, tau, q in rows:
@@ -301,3 +261,66 @@ def test_serial_takes_the_first_transmission_and_asks_for_a_rigid_second():
     assert out.stiffness_nm_rad == out.transmissions[0].stiffness_nm_rad == 50.0
     with pytest.raises(ValueError, match="serial"):
         make_estimator(JointModel(arrangement="serial", motors=(flexible, flexible)), EstimatorSettings(), T)
+
+
+# What is called valid is right, whatever reaches the estimator: gaps, garbage, glitches, any joint.
+
+
+@lru_cache(maxsize=2)
+def spoilt_rigs(stiff):
+    """Soft (series elastic) or stiff (harmonic drive) joints in rich motion."""
+    rng = np.random.default_rng(31 + stiff)
+    low, high, cubic = (5000, 12000, 2e4) if stiff else (80, 220, 12.0)
+    K = rng.uniform(low, high, (4, 1))
+    alpha = np.stack([K, K * rng.uniform(0, cubic, (4, 1))], -1)
+    B, D = rng.uniform(0.08, 0.2, (4, 1)), rng.uniform(0.4, 1.2, (4, 1))
+    scale = 6.0 if stiff else 1.0
+    M, Dq, gravity, size = (1.5, 2.0, 20.0, 40.0) if stiff else (0.45, 0.3, 5.0, 8.0)
+    plants = joints.Plants(*joints.polynomial(alpha), scale * B, scale * D, M, Dq, gravity)
+    tau = joints.sweep(rng, 7000, 4, 1, T, size, 3.0)
+    return plants, joints.simulate(plants, tau, T)
+
+
+def spoilt(record, seed):
+    """Gaps of up to 60 samples, and up to 12 samples at a time that are garbage."""
+    rng = np.random.default_rng(seed)
+    n = len(record)
+    keep = np.ones(n, bool)
+    for start in rng.integers(0, n, 25):
+        keep[start : start + rng.integers(1, 60)] = False
+    left = joints.part(record, keep)  # copies
+    columns = (left.motor_position_rad, left.motor_torque_nm, left.link_position_rad)
+    for start in rng.integers(0, len(left), 15):
+        value = rng.choice([np.nan, np.inf, 1e30, 5.0, -1e200])
+        columns[rng.integers(3)][start : start + rng.integers(1, 12)] = value
+    return keep, left
+
+
+def run_spoilt(stiff, j, seed, order):
+    """What an estimator says of a spoilt recording: error, standard deviation, truth and status."""
+    plants, truth = spoilt_rigs(stiff)
+    noise = np.random.default_rng(seed).normal(0, 0.1 if stiff else 0.04, truth.tau[:, j].shape)
+    fine = {"motor_counts": 8192 * 400, "link_bits": 20} if stiff else {"link_bits": 17}
+    record = joints.record(truth, j, T, **(DRIVE | fine), torque_noise=noise)
+    keep, record = spoilt(record, seed)
+    model = joints.joint_model(plants.B[j, 0], plants.D[j, 0], order=order)
+    out = joints.estimates(model, record)
+    sigma = truth.sigma[keep, j, 0]
+    return np.abs(out[:, 3] - sigma), out[:, 4], sigma, out[:, 1].astype(int)
+
+
+@pytest.mark.slow
+@settings(max_examples=5, deadline=None, derandomize=True)
+@given(st.booleans(), st.integers(0, 3), st.sampled_from(range(64)), st.sampled_from([2, 3, None]))
+def test_what_is_called_valid_is_no_nonsense(stiff, j, seed, order):
+    error, std, sigma, status = run_spoilt(stiff, j, seed, order)
+    valid, usable = status & 1 == 1, status & 3 == 3
+    # Six standard deviations, or what a controller does not notice; far beyond what noise can do.
+    assert np.all(error[usable] <= np.maximum(6 * std[usable], 0.15 * sigma[usable]))
+    assert np.all(error[valid] <= np.maximum(6 * std[valid], 0.45 * sigma[valid]))
+
+
+def test_most_of_a_spoilt_recording_is_called_valid_as_a_rule():
+    shares = [np.mean(run_spoilt(False, 0, seed, 2)[3] & 1) for seed in range(8)]
+    # A gap or garbage comes every 0.2 s, and filters settle for 0.35 s; garbage that could be true costs more.
+    assert np.median(shares) > 0.3

@@ -5,7 +5,7 @@ import resource
 import socket
 import subprocess
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -15,13 +15,7 @@ from zenohkit import LIMIT_S, free_endpoint, make_joint, ready, script, until
 from drivelink.errors import ZenohError
 from drivelink.jointfile import ZenohSection
 from drivelink.pubsub.publisher import JointPublisher
-from drivelink.pubsub.session import (
-    FILES,
-    close_session,
-    daemon_config,
-    open_client,
-    open_session,
-)
+from drivelink.pubsub.session import FILES, close_session, daemon_config, open_client, open_session
 
 
 @pytest.fixture
@@ -31,42 +25,31 @@ def endpoint():
 
 @pytest.fixture
 def plain_client(endpoint):
-    """A client as somebody else would write it: no drivelink in it."""
-    sessions = []
-
-    def connect():
-        config = zenoh.Config()
-        for key, value in {
+    """A function that opens a client as somebody else would write it: no drivelink in it."""
+    text = json.dumps(
+        {
             "mode": "client",
-            "connect/endpoints": [endpoint],
-            "scouting/multicast/enabled": False,
-        }.items():
-            config.insert_json5(key, json.dumps(value))
-        sessions.append(zenoh.open(config))
-        return sessions[-1]
-
-    yield connect
-    for session in sessions:
-        session.close()
+            "connect": {"endpoints": [endpoint]},
+            "scouting": {"multicast": {"enabled": False}},
+        }
+    )
+    with ExitStack() as stack:
+        yield lambda: stack.enter_context(zenoh.open(zenoh.Config.from_json5(text)))
 
 
-def heard(subscriber):
-    """Drain a subscriber; the joints that spoke since."""
-    names = set()
-    while (sample := subscriber.try_recv()) is not None:
-        names.add(str(sample.key_expr).split("/")[1])
-    return names
-
-
-def hear(subscriber, expected):
+def hear(session, expected):
     """Wait until all of these joints have been heard, and no other one meanwhile.
 
     A sample that a daemon sent before it was killed may come late: then that begins anew.
     """
-    joints = set()
+    joints, subscriber = (
+        set(),
+        session.declare_subscriber("drivelink/*/estimate", zenoh.handlers.RingChannel(64)),
+    )
 
     def exactly():
-        joints.update(heard(subscriber))
+        while (sample := subscriber.try_recv()) is not None:
+            joints.add(str(sample.key_expr).split("/")[1])
         if not joints <= expected:
             joints.clear()
         return joints == expected
@@ -79,42 +62,35 @@ def test_when_the_first_daemon_is_killed_the_others_are_received_again(endpoint,
         ready(a)
         with script("b", endpoint) as b, script("c", endpoint) as c:
             ready(b), ready(c)
-            subscriber = plain_client().declare_subscriber(
-                "drivelink/*/estimate", zenoh.handlers.RingChannel(64)
-            )
-            hear(subscriber, {"a", "b", "c"})
+            session = plain_client()
+            hear(session, {"a", "b", "c"})
             a.kill()
             a.wait()
-            hear(subscriber, {"b", "c"})
+            hear(session, {"b", "c"})
             with script("a", endpoint) as again:  # and the dead one may come back
                 ready(again)
-                hear(subscriber, {"a", "b", "c"})
+                hear(session, {"a", "b", "c"})
 
 
 def test_daemons_that_start_before_any_of_them_listens_still_meet(endpoint, plain_client):
     with script("a", endpoint) as a, script("b", endpoint) as b:  # at once: both ask for the endpoint
         ready(a), ready(b)
-        subscriber = plain_client().declare_subscriber("drivelink/*/estimate", zenoh.handlers.RingChannel(64))
-        hear(subscriber, {"a", "b"})
+        hear(plain_client(), {"a", "b"})
 
 
 def test_nothing_listens_beyond_the_loopback_and_nothing_is_multicast(endpoint):
     config = daemon_config(endpoint, listen=True)
     assert json.loads(config.get_json("scouting/multicast/enabled")) is False
     assert json.loads(config.get_json("adminspace/enabled")) is False
+    local = set()
     with script("a", endpoint) as process:
         ready(process)
-        inodes = {link.readlink().name for link in Path(f"/proc/{process.pid}/fd").iterdir() if link.exists()}
-        local = [
-            fields[1].split(":")[0]
-            for table in ("tcp", "tcp6", "udp", "udp6")
-            for fields in map(
-                str.split, Path(f"/proc/{process.pid}/net/{table}").read_text().splitlines()[1:]
-            )
-            if f"socket:[{fields[9]}]" in inodes
-        ]
-    assert local
-    assert set(local) == {"0100007F"}  # 127.0.0.1 only, UDP included
+        proc = Path(f"/proc/{process.pid}")
+        inodes = {link.readlink().name for link in (proc / "fd").iterdir() if link.exists()}
+        for table in ("tcp", "tcp6", "udp", "udp6"):
+            rows = map(str.split, (proc / "net" / table).read_text().splitlines()[1:])
+            local |= {row[1].split(":")[0] for row in rows if f"socket:[{row[9]}]" in inodes}
+    assert local == {"0100007F"}  # 127.0.0.1 only, UDP included
 
 
 def test_of_two_daemons_that_start_at_once_with_one_name_one_stays(endpoint):
@@ -133,19 +109,16 @@ def test_an_uncaught_exception_ends_the_process(endpoint):
 
 
 def test_a_client_that_forgets_to_close_ends_too(endpoint):
-    code = (
-        "import atexit, threading\n"  # registered first, called last
-        "atexit.register(lambda: print([t.name for t in threading.enumerate() if 'drivelink' in t.name]))\n"
-        "import drivelink\n"
-        f"joint = drivelink.subscribe('elbow', endpoint='{endpoint}')\n"
-        "joint.wait(0.05); joint.status\n"
-        "raise RuntimeError('uncaught')\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=LIMIT_S, check=False
-    )
-    assert done.returncode == 1
-    assert done.stderr.endswith("RuntimeError: uncaught\n")
+    code = f"""import atexit, threading
+atexit.register(lambda: print([t.name for t in threading.enumerate() if "drivelink" in t.name]))  # called last
+import drivelink
+joint = drivelink.subscribe("elbow", endpoint="{endpoint}")
+joint.wait(0.05); joint.status
+raise RuntimeError("uncaught")
+"""
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False)
+    assert done.returncode == 1 and done.stderr.endswith("RuntimeError: uncaught\n")
     assert done.stdout == "[]\n"  # a thread that comes out of zenoh now would abort the process
 
 
@@ -165,21 +138,26 @@ def test_an_endpoint_that_is_none_is_one_line(endpoint):
     assert endpoint in str(error.value)
 
 
-def test_the_users_configuration_is_passed_through_whole(tmp_path, endpoint):
+@contextmanager
+def closing(session):
+    yield session
+    close_session(session)
+
+
+@pytest.fixture
+def router(endpoint, tmp_path):
+    """A function that opens a session with a user's own configuration: a router."""
     (tmp_path / "mine.json5").write_text(
         f'{{ mode: "router", listen: {{ endpoints: ["{endpoint}"] }}, /* a comment */\n'
         '  scouting: { multicast: { enabled: false } }, id: "abcdef0123456789" }'
     )
-    session = open_session(ZenohSection(config="mine.json5"), tmp_path)
-    try:
+    return lambda: closing(open_session(ZenohSection(config="mine.json5"), tmp_path))
+
+
+def test_the_users_configuration_is_passed_through_whole(endpoint, router):
+    with router() as session, closing(open_client(endpoint)) as client:
         assert str(session.zid()) == "abcdef0123456789"
-        client = open_client(endpoint)
-        try:
-            assert until(lambda: [str(zid) for zid in client.info.routers_zid()]) == ["abcdef0123456789"]
-        finally:
-            close_session(client)
-    finally:
-        close_session(session)
+        assert until(lambda: [str(zid) for zid in client.info.routers_zid()]) == ["abcdef0123456789"]
 
 
 @pytest.mark.parametrize("text", [None, "{ mode: ", '{ mode: "spectator" }', "{ no_such_key: 1 }"])
@@ -195,54 +173,37 @@ def test_a_configuration_that_cannot_be_used_is_one_line_with_its_file(tmp_path,
 
 def test_two_joints_of_one_process_share_a_session(endpoint):
     elbow, knee = make_joint("elbow", endpoint), make_joint("knee", endpoint)
-    session = open_session(elbow.zenoh, Path())
-    try:
+    with closing(open_session(elbow.zenoh, Path())) as session:
         publishers = [JointPublisher(session, joint) for joint in (elbow, knee)]
         with pytest.raises(ZenohError, match="joint named knee"):
             JointPublisher(session, knee)
         for publisher in publishers:
             publisher.close()
-    finally:
-        close_session(session)
 
 
-def test_where_a_router_was_no_daemon_takes_its_place(endpoint, tmp_path):
-    (tmp_path / "router.json5").write_text(
-        f'{{ mode: "router", listen: {{ endpoints: ["{endpoint}"] }}, scouting: {{ multicast: {{ enabled: false }} }} }}'
-    )
-    router = ZenohSection(config="router.json5")
-    first = open_session(router, tmp_path)
-    daemon = open_session(ZenohSection(endpoint=endpoint), Path())
-    try:
-        until(lambda: daemon.info.routers_zid())
-        close_session(first)
-        until(lambda: not daemon.info.routers_zid())
-        again = open_session(router, tmp_path)  # fails if the endpoint is taken
-        try:
+def test_where_a_router_was_no_daemon_takes_its_place(endpoint, router):
+    with ExitStack() as stack:
+        with router():
+            daemon = stack.enter_context(closing(open_session(ZenohSection(endpoint=endpoint), Path())))
             until(lambda: daemon.info.routers_zid())
-        finally:
-            close_session(again)
-    finally:
-        close_session(daemon)
+        until(lambda: not daemon.info.routers_zid())
+        with router():  # fails if the endpoint is taken
+            until(lambda: daemon.info.routers_zid())
 
 
 def test_connections_that_say_nothing_lock_no_subscriber_out(endpoint):
     """Each waits for its handshake; more than may wait at a time would make a subscriber wait, too."""
-    idle = 1200
+    idle, (mine, permitted) = 1200, resource.getrlimit(resource.RLIMIT_NOFILE)
     with script("elbow", endpoint) as daemon:
         ready(daemon)
         limits = Path(f"/proc/{daemon.pid}/limits").read_text(encoding="ascii")
         files = next(line for line in limits.splitlines() if line.startswith("Max open files"))
-        permitted = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
         assert int(files.split()[3]) >= min(8192, permitted if permitted > 0 else 8192)
-        waiting = daemon_config(endpoint, listen=True).get_json("transport/unicast")
-        assert json.loads(waiting)["accept_pending"] > idle and json.loads(waiting)["accept_pending"] < FILES
+        waiting = json.loads(daemon_config(endpoint, listen=True).get_json("transport/unicast"))
+        assert idle < waiting["accept_pending"] < FILES
         host, port = endpoint.removeprefix("tcp/").split(":")
         with ExitStack() as stack:
-            for _ in range(min(idle, resource.getrlimit(resource.RLIMIT_NOFILE)[0] - 200)):
+            for _ in range(min(idle, mine - 200)):
                 stack.enter_context(socket.create_connection((host, int(port))))
             with open_client(endpoint) as session:
-                hear(
-                    session.declare_subscriber("drivelink/*/estimate", zenoh.handlers.RingChannel(64)),
-                    {"elbow"},
-                )
+                hear(session, {"elbow"})

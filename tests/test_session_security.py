@@ -1,5 +1,6 @@
 """TLS, mutual TLS and access control, with the configuration files that are shipped as examples."""
 
+import itertools
 import os
 import shutil
 import subprocess
@@ -8,13 +9,7 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from zenohkit import (
-    free_endpoint,
-    make_estimate,
-    make_joint,
-    put_estimate,
-    until,
-)
+from zenohkit import free_endpoint, make_estimate, make_joint, put_estimate, until
 
 import drivelink
 from drivelink._core import encode_estimate
@@ -22,6 +17,7 @@ from drivelink.errors import ZenohError
 from drivelink.pubsub.publisher import JointPublisher
 from drivelink.pubsub.session import close_session, open_session
 
+OPEN = ("enabled: true,\n    default", "enabled: false,\n    default")  # without access control
 EXAMPLES = Path(__file__).parent.parent / "examples" / "zenoh"
 
 
@@ -30,12 +26,10 @@ def certificates(tmp_path_factory):
     if shutil.which("openssl") is None:
         pytest.skip("no openssl command on this machine")
     directory = tmp_path_factory.mktemp("certificates")
-    subprocess.run(
-        ["sh", str(EXAMPLES / "certificates.sh"), str(directory)],
-        check=True,
-        capture_output=True,
-        env=os.environ | {"LC_ALL": "C"},
-    )
+    command = ["sh", str(EXAMPLES / "certificates.sh"), str(directory)]
+    subprocess.run(command, check=True, capture_output=True, env=os.environ | {"LC_ALL": "C"})
+    for name in ("ca.key", "daemon.key", "controller.key"):  # readable by their owner only
+        assert (directory / name).stat().st_mode & 0o077 == 0
     return directory
 
 
@@ -72,15 +66,10 @@ def serve():
 
 
 def put_until(publisher, condition):
-    sequence = 0
-
-    def step():
-        nonlocal sequence
-        sequence += 1
-        put_estimate(publisher, make_estimate(sequence), time.time_ns())
-        return condition()
-
-    return until(step)
+    sequence = itertools.count(1)
+    return until(
+        lambda: put_estimate(publisher, make_estimate(next(sequence)), time.time_ns()) or condition()
+    )
 
 
 @pytest.mark.parametrize("kind", ["tls", "mtls"])
@@ -100,11 +89,7 @@ def test_a_controller_with_the_right_certificates_receives_everything(configure,
     [
         pytest.param("tls", [("tls/", "tcp/")], id="without TLS"),
         pytest.param("tls", [("ca.pem", "daemon.pem")], id="with another authority"),
-        pytest.param(
-            "mtls",
-            [("enable_mtls: true,", ""), ("connect_", "// connect_")],
-            id="without its own certificate",
-        ),
+        pytest.param("mtls", [("enable_mtls: true,", ""), ("connect_", "// connect_")], id="without its own"),
     ],
 )
 def test_nobody_else_gets_in(configure, serve, kind, changes):
@@ -139,7 +124,7 @@ def test_another_server_of_the_plant_cannot_play_the_daemon(configure, serve, ce
     subprocess.run(["sh", "-euc", body], cwd=certificates, check=True, capture_output=True)
     certificate = [("daemon.pem", "other.pem"), ("daemon.key", "other.key")]
     _, publisher = serve(configure("daemon-mtls.json5", *certificate))
-    change = () if pinned else (("enabled: true,\n    default", "enabled: false,\n    default"),)
+    change = () if pinned else (OPEN,)
     with drivelink.subscribe("elbow", config=configure("controller-mtls.json5", *change)) as joint:
         if not pinned:  # so the test would see it
             put_until(publisher, lambda: joint.received)
@@ -150,17 +135,10 @@ def test_another_server_of_the_plant_cannot_play_the_daemon(configure, serve, ce
         assert not joint.received and joint.state == "waiting" and joint.status is None
 
 
-def test_the_keys_are_readable_by_their_owner_only(certificates):
-    assert all(
-        (certificates / name).stat().st_mode & 0o077 == 0
-        for name in ("ca.key", "daemon.key", "controller.key")
-    )
-
-
 @pytest.mark.parametrize("controlled", [True, False])
 def test_a_controller_can_subscribe_but_not_publish_into_the_daemons_keys(configure, serve, controlled):
     """With access control nothing gets in; without, it does: so the test would see it."""
-    change = () if controlled else (("enabled: true,\n    default", "enabled: false,\n    default"),)
+    change = () if controlled else (OPEN,)
     session, publisher = serve(configure("daemon-mtls.json5", *change))
     heard = session.declare_subscriber(
         "drivelink/**", zenoh.handlers.RingChannel(64), allowed_origin=zenoh.Locality.REMOTE
@@ -168,13 +146,7 @@ def test_a_controller_can_subscribe_but_not_publish_into_the_daemons_keys(config
     with (
         drivelink.subscribe("elbow", config=configure("controller-mtls.json5")) as joint,
         # an intruder with a controller's certificate keeps to no rules of its own
-        zenoh.open(
-            zenoh.Config.from_file(
-                configure(
-                    "controller-mtls.json5", ("enabled: true,\n    default", "enabled: false,\n    default")
-                )
-            )
-        ) as intruder,
+        zenoh.open(zenoh.Config.from_file(configure("controller-mtls.json5", OPEN))) as intruder,
     ):
         put_until(publisher, lambda: joint.valid)
         forged = encode_estimate(make_estimate(999_999), 0)

@@ -48,8 +48,11 @@ def frame(draw: random.Random) -> tuple[int, bytes]:
     return draw.randrange(0x800), draw.randbytes(draw.randrange(9))
 
 
-@pytest.mark.parametrize("name", [*PROFILES, "encoder"])
-def test_random_and_nearly_right_frames_leave_a_device_that_answers(name: str) -> None:
+@pytest.mark.parametrize(
+    "name",
+    [*(pytest.param(p, marks=pytest.mark.slow) for p in PROFILES if p != "strict"), "strict", "encoder"],
+)
+def test_random_and_nearly_right_frames_leave_a_device_that_answers(name):
     draw = random.Random(f"fuzz/{name}")
     rig = StubRig()
     node = Cia406Encoder(1, rig) if name == "encoder" else Cia402Drive(1, rig, 0, quirks=profile(name))

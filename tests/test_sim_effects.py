@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -81,42 +82,31 @@ ACROSS = {
     "link": (0.0, 1.0),
     "transmission": (-1.0, 1.0),
 }  # sign at the motor, at the link
+OMEGA, THETA, LINK, LINK_RATE = (f"truth_{n}" for n in (
+    "motor1_velocity_rad_s", "motor1_position_rad", "link_position_rad", "link_velocity_rad_s"))  # fmt: skip
+PHI, TAU_E = "truth_motor1_deflection_rad", "truth_motor1_flexibility_torque_nm"
 LAWS = {
-    "viscous_damping": ("motor", lambda r: r["truth_motor1_velocity_rad_s"]),
-    "quadratic_damping": (
-        "motor",
-        lambda r: r["truth_motor1_velocity_rad_s"] * abs(r["truth_motor1_velocity_rad_s"]),
-    ),
-    "cogging": ("motor", lambda r: np.sin(24.0 * r["truth_motor1_position_rad"])),
+    "viscous_damping": ("motor", lambda r: r[OMEGA]),
+    "quadratic_damping": ("motor", lambda r: r[OMEGA] * abs(r[OMEGA])),
+    "cogging": ("motor", lambda r: np.sin(24.0 * r[THETA])),
     "torque_offset": ("motor", lambda r: np.ones_like(r["time_s"])),
-    "coulomb_friction": ("motor", lambda r: np.sign(r["truth_motor1_velocity_rad_s"])),
-    "asymmetric_friction": ("motor", lambda r: np.where(r["truth_motor1_velocity_rad_s"] > 0, 1.0, -0.4)),
-    "load_dependent_friction": (
-        "motor",
-        lambda r: np.sign(r["truth_motor1_velocity_rad_s"]) * abs(r["truth_motor1_flexibility_torque_nm"]),
-    ),
-    "back_driving_loss": (  # tau_e drives the motor while it has the velocity's sign
-        "motor",
-        lambda r: (
-            r["truth_motor1_flexibility_torque_nm"]
-            * (r["truth_motor1_velocity_rad_s"] * r["truth_motor1_flexibility_torque_nm"] > 0.0)
-        ),
-    ),
-    "asymmetric_stiffness": ("transmission", lambda r: r["truth_motor1_deflection_rad"] ** 2),
-    "higher_order_stiffness": ("transmission", lambda r: r["truth_motor1_deflection_rad"] ** 5),
-    "transmission_damping": (
-        "transmission",
-        lambda r: r["truth_link_velocity_rad_s"] - r["truth_motor1_velocity_rad_s"],
-    ),
-    "gravity": ("link", lambda r: np.sin(r["truth_link_position_rad"])),
-    "link_coulomb_friction": ("link", lambda r: np.sign(r["truth_link_velocity_rad_s"])),
-    "link_viscous_damping": ("link", lambda r: r["truth_link_velocity_rad_s"]),
-    "air_drag": ("link", lambda r: r["truth_link_velocity_rad_s"] * abs(r["truth_link_velocity_rad_s"])),
+    "coulomb_friction": ("motor", lambda r: np.sign(r[OMEGA])),
+    "asymmetric_friction": ("motor", lambda r: np.where(r[OMEGA] > 0, 1.0, -0.4)),
+    "load_dependent_friction": ("motor", lambda r: np.sign(r[OMEGA]) * abs(r[TAU_E])),
+    # tau_e drives the motor while it has the velocity's sign
+    "back_driving_loss": ("motor", lambda r: r[TAU_E] * (r[OMEGA] * r[TAU_E] > 0.0)),
+    "asymmetric_stiffness": ("transmission", lambda r: r[PHI] ** 2),
+    "higher_order_stiffness": ("transmission", lambda r: r[PHI] ** 5),
+    "transmission_damping": ("transmission", lambda r: r[LINK_RATE] - r[OMEGA]),
+    "gravity": ("link", lambda r: np.sin(r[LINK])),
+    "link_coulomb_friction": ("link", lambda r: np.sign(r[LINK_RATE])),
+    "link_viscous_damping": ("link", lambda r: r[LINK_RATE]),
+    "air_drag": ("link", lambda r: r[LINK_RATE] * abs(r[LINK_RATE])),
 }
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_an_effect_takes_its_torque_from_where_it_acts_alone(name: str) -> None:
+def test_an_effect_takes_its_torque_from_where_it_acts_alone(name):
     plant = sea(HARDENING)
     r = switched_on(name, plant)
     place, law = LAWS[name]
@@ -137,7 +127,7 @@ TORQUE_LAWS = {
 
 
 @pytest.mark.parametrize("name", TORQUE_LAWS)
-def test_a_drive_that_errs_reports_another_torque_than_acts(name: str) -> None:
+def test_a_drive_that_errs_reports_another_torque_than_acts(name):
     plant = sea(HARDENING)
     r = switched_on(name, plant)
     regressor = TORQUE_LAWS[name](r["motor1_torque_nm"], r["time_s"])[:-1]
@@ -146,7 +136,7 @@ def test_a_drive_that_errs_reports_another_torque_than_acts(name: str) -> None:
     assert slope(-acting[:-1], regressor) == pytest.approx(NOTICEABLE[name], rel=1e-9)
 
 
-def test_inertia_beyond_the_declared_is_found_in_the_acceleration() -> None:
+def test_inertia_beyond_the_declared_is_found_in_the_acceleration():
     plant = sea(HARDENING)
     for name, remainder, column in (
         ("motor_inertia", motor_remainder, "truth_motor1_velocity_rad_s"),
@@ -157,7 +147,7 @@ def test_inertia_beyond_the_declared_is_found_in_the_acceleration() -> None:
         assert slope(remainder(r, plant), acceleration) == pytest.approx(NOTICEABLE[name], rel=2e-3)
 
 
-def test_a_delayed_torque_acts_later_by_exactly_that_time() -> None:
+def test_a_delayed_torque_acts_later_by_exactly_that_time():
     r = switched_on("torque_delay")
     tau = r["motor1_torque_nm"]
     assert r["truth_motor1_torque_nm"][2:] == pytest.approx(tau[:-2], abs=1e-9)
@@ -172,7 +162,7 @@ def test_a_delayed_torque_acts_later_by_exactly_that_time() -> None:
     assert delayed.schedule(0.0) == pytest.approx([2.0, 0.0])
 
 
-def test_a_lagging_torque_acts_or_is_reported_behind_a_low_pass() -> None:
+def test_a_lagging_torque_acts_or_is_reported_behind_a_low_pass():
     lag, r = NOTICEABLE["torque_lag"], switched_on("torque_lag")
     acting = r["truth_motor1_torque_nm"]
     rate = np.gradient(acting, PERIOD_S)
@@ -184,7 +174,7 @@ def test_a_lagging_torque_acts_or_is_reported_behind_a_low_pass() -> None:
     assert slope(late["truth_motor1_torque_nm"] - reported, rate) == pytest.approx(lag, abs=PERIOD_S)
 
 
-def test_backlash_leaves_a_range_without_torque() -> None:
+def test_backlash_leaves_a_range_without_torque():
     r = switched_on("backlash", sea(LINEAR))
     phi, te = r["truth_motor1_deflection_rad"], r["truth_motor1_flexibility_torque_nm"]
     inside = np.abs(phi) < 0.01
@@ -196,7 +186,7 @@ def test_backlash_leaves_a_range_without_torque() -> None:
     assert stated["truth_link_position_rad"] == pytest.approx(r["truth_link_position_rad"], abs=1e-9)
 
 
-def test_the_gears_error_bends_the_spring_and_does_no_work() -> None:
+def test_the_gears_error_bends_the_spring_and_does_no_work():
     plant = sea(HARDENING, damping=0.0, gravity=0.0)
     drives = (PERFECT,)
     error = parse("kinematic_error=0.01,periods_per_rev=16")
@@ -216,7 +206,7 @@ def test_the_gears_error_bends_the_spring_and_does_no_work() -> None:
     assert total() == pytest.approx(before, rel=1e-6)  # Runge-Kutta's own loss
 
 
-def test_contact_pushes_back_on_one_side_only() -> None:
+def test_contact_pushes_back_on_one_side_only():
     plant = sea(HARDENING)
     r = switched_on("contact", plant, position_rad=0.05)
     depth = np.maximum(0.0, r["truth_link_position_rad"] - 0.05)
@@ -225,33 +215,33 @@ def test_contact_pushes_back_on_one_side_only() -> None:
 
 
 READINGS = {
-    "deflection_offset": lambda r: r["truth_link_position_rad"] + 0.01,
-    "encoder_eccentricity": lambda r: (
-        r["truth_link_position_rad"] + 0.005 * np.sin(r["truth_link_position_rad"])
-    ),
-    "encoder_scale": lambda r: 1.02 * r["truth_link_position_rad"],
-    "interpolation_error": lambda r: (
-        r["truth_link_position_rad"] + 0.001 * np.sin(64.0 * r["truth_link_position_rad"])
-    ),
+    "deflection_offset": lambda q: q + 0.01,
+    "encoder_eccentricity": lambda q: q + 0.005 * np.sin(q),
+    "encoder_scale": lambda q: 1.02 * q,
+    "interpolation_error": lambda q: q + 0.001 * np.sin(64.0 * q),
 }
 
 
+@cache
+def healthy():
+    return measured(sea(HARDENING), step_s=0.00025)
+
+
 @pytest.mark.parametrize("name", READINGS)
-def test_a_reading_errs_and_the_joint_does_not(name: str) -> None:
-    r, clean = switched_on(name), measured(sea(HARDENING), seconds=4.0, step_s=0.00025)
+def test_a_reading_errs_and_the_joint_does_not(name):
+    r, clean = switched_on(name), healthy()
     assert r["truth_link_position_rad"] == pytest.approx(clean["truth_link_position_rad"])
-    assert r["link_position_rad"] == pytest.approx(READINGS[name](r), abs=1e-9)
+    assert r["link_position_rad"] == pytest.approx(READINGS[name](r[LINK]), abs=1e-9)
 
 
-def test_a_late_deflection_is_read_beside_the_present_motor() -> None:
+def test_a_late_deflection_is_read_beside_the_present_motor():
     r = measured(sea(HARDENING), make("deflection_delay", {"delay_s": 0.02}))
-    theta = r["truth_motor1_position_rad"]
-    phi = np.interp(r["time_s"] - 0.02, r["time_s"], r["truth_link_position_rad"] - theta)
-    assert r["link_position_rad"][25:] == pytest.approx((theta + phi)[25:], abs=2e-5)
+    phi = np.interp(r["time_s"] - 0.02, r["time_s"], r[LINK] - r[THETA])
+    assert r["link_position_rad"][25:] == pytest.approx((r[THETA] + phi)[25:], abs=2e-5)
 
 
 @pytest.mark.parametrize("delay_s", [0.002, 0.0023, 0.0001])
-def test_a_late_encoder_reads_where_the_link_was(delay_s: float) -> None:
+def test_a_late_encoder_reads_where_the_link_was(delay_s):
     r = measured(sea(HARDENING), make("encoder_delay", {"delay_s": delay_s}))
     t, q = r["time_s"], r["truth_link_position_rad"]
     was = np.interp(t - delay_s, t, q)
@@ -260,7 +250,7 @@ def test_a_late_encoder_reads_where_the_link_was(delay_s: float) -> None:
     assert np.abs(r["link_position_rad"] - q).max() > 100 * 1e-5 * delay_s / 0.002
 
 
-def test_deflection_offset_of_a_two_motor_joint_is_at_that_motor() -> None:
+def test_deflection_offset_of_a_two_motor_joint_is_at_that_motor():
     r = measured(sea(motors=2), parse("deflection_offset=0.01,motor=2"), seconds=0.2)
     assert r["motor1_position_rad"] == pytest.approx(r["truth_motor1_position_rad"], abs=1e-9)
     assert r["motor2_position_rad"] == pytest.approx(r["truth_motor2_position_rad"] - 0.01, abs=1e-9)
@@ -270,55 +260,42 @@ def world_at_rest(effect: str, plant: JointPlant | None = None) -> World:
     return World(plant or sea(RIGID, gravity=0.0), (PERFECT,), PERFECT_ENCODER, effects=[parse(effect)])
 
 
-def test_dry_friction_holds_against_less_than_its_level_without_creeping() -> None:
-    world = world_at_rest("coulomb_friction=0.5")
-    world.command(0, 0.49 / PERFECT.gear_ratio)
-    world.advance(2000)
+def pushed(effect, torque_nm, periods, plant=None):
+    """Position and velocity of a joint at rest that is pushed for so long."""
+    world = world_at_rest(effect, plant)
+    world.command(0, torque_nm / PERFECT.gear_ratio)
+    world.advance(periods)
+    motor = world.truth().motors[0]
+    return world, motor.position_rad, motor.velocity_rad_s
+
+
+def test_dry_friction_holds_below_its_level_and_slides_or_creeps_above():
+    _, position, velocity = pushed("coulomb_friction=0.5", 0.49, 2000)
     # Viscous damping within a step, which the stop does not see: h³ D tau / 12 J² a step.
-    assert abs(world.truth().motors[0].position_rad) < 1e-7
-    assert world.truth().motors[0].velocity_rad_s == 0.0
-
-
-def test_dry_friction_brakes_at_a_constant_rate_and_stops() -> None:
-    world = world_at_rest("coulomb_friction=0.5", sea(RIGID, gravity=0.0, damping=0.0))
-    world.command(0, 2.0 / PERFECT.gear_ratio)
-    world.advance(1001)
-    world.command(0, 0.0)
-    inertia, go = 0.525, (2.0 - 0.5) / 0.525
-    at_end = world.truth().motors[0]
-    assert at_end.velocity_rad_s == pytest.approx(go, rel=1e-9)
-    assert at_end.position_rad == pytest.approx(0.5 * go, rel=1e-6)
-    world.advance(5000)
-    stopped = world.truth().motors[0]
-    way = 0.5 * go * go / (0.5 / inertia)
-    # The drive latches a set-point with the next period: one more period of thrust.
-    assert stopped.velocity_rad_s == 0.0
-    assert stopped.position_rad - at_end.position_rad == pytest.approx(way, rel=5e-3)
-
-
-def test_stribeck_friction_breaks_away_above_its_sliding_level() -> None:
-    held, gone = world_at_rest("stribeck_friction=0.5"), world_at_rest("stribeck_friction=0.5")
-    held.command(0, 0.88 / PERFECT.gear_ratio)  # level 0.5 + 0.4 N·m at rest
-    gone.command(0, 0.92 / PERFECT.gear_ratio)
-    held.advance(500)
-    gone.advance(500)
-    assert held.truth().motors[0].velocity_rad_s == 0.0
-    assert gone.truth().motors[0].velocity_rad_s > 0.01
-
-
-def test_lubricated_friction_creeps_where_dry_friction_sticks() -> None:
-    world = world_at_rest("coulomb_friction=0.5,smoothing_rad_s=0.05")
-    world.command(0, 0.25 / PERFECT.gear_ratio)
-    world.advance(5000)
+    assert abs(position) < 1e-7 and velocity == 0.0
+    assert pushed("stribeck_friction=0.5", 0.88, 500)[2] == 0.0  # level 0.5 + 0.4 N·m at rest
+    assert pushed("stribeck_friction=0.5", 0.92, 500)[2] > 0.01
+    _, _, w = pushed("coulomb_friction=0.5,smoothing_rad_s=0.05", 0.25, 5000)
     # w / hypot(w, v0) = 1/2, less what the viscous damping of 0.9 N·m·s/rad carries.
-    w = world.truth().motors[0].velocity_rad_s
     # Sampled after the step's braking, so below the mean by half of h tau / J = 2.4e-4 rad/s: half a percent.
     assert 0.5 * w / math.hypot(w, 0.05) + 0.9 * w == pytest.approx(0.25, rel=1e-2)
 
 
+def test_dry_friction_brakes_at_a_constant_rate_and_stops():
+    plant, inertia, go = sea(RIGID, gravity=0.0, damping=0.0), 0.525, (2.0 - 0.5) / 0.525
+    world, position, velocity = pushed("coulomb_friction=0.5", 2.0, 1001, plant)
+    assert (velocity, position) == (pytest.approx(go, rel=1e-9), pytest.approx(0.5 * go, rel=1e-6))
+    world.command(0, 0.0)
+    world.advance(5000)
+    stopped = world.truth().motors[0]
+    # The drive latches a set-point with the next period: one more period of thrust.
+    assert stopped.velocity_rad_s == 0.0
+    assert stopped.position_rad - position == pytest.approx(0.5 * go * go / (0.5 / inertia), rel=5e-3)
+
+
 @pytest.mark.parametrize("exponent", [1.0, 2.0, 60.0])
 @pytest.mark.parametrize("elements", [1.0, 4.0])
-def test_slip_builds_up_saturates_and_dissipates(exponent: float, elements: float) -> None:
+def test_slip_builds_up_saturates_and_dissipates(exponent, elements):
     slip = Slip(2.0, 0.01, exponent, 1.0, elements)
     x = 0.1 * np.sin(np.linspace(0.0, 4.0 * np.pi, 4001))
     torque = []
@@ -330,7 +307,7 @@ def test_slip_builds_up_saturates_and_dissipates(exponent: float, elements: floa
     assert slip.torque(1.0) == pytest.approx(2.0)
 
 
-def test_dahl_follows_its_closed_form() -> None:
+def test_dahl_follows_its_closed_form():
     slip = Slip(1.0, 0.01, 1.0, 1.0, 1.0)
     for k in range(101):
         slip.commit(0.0003 * k)
@@ -341,7 +318,7 @@ def test_dahl_follows_its_closed_form() -> None:
     assert slip.torque(0.0) == pytest.approx(-1.0 + (1.0 + turned) * math.exp(-3.0), rel=1e-3)
 
 
-def test_hysteresis_opens_a_loop_on_both_sides() -> None:
+def test_hysteresis_opens_a_loop_on_both_sides():
     plant = sea(HARDENING)
     r = switched_on("hysteresis", plant)
     on_motor, on_link = -motor_remainder(r, plant)[5:-5], link_remainder(r, plant)[5:-5]
@@ -351,7 +328,7 @@ def test_hysteresis_opens_a_loop_on_both_sides() -> None:
     assert np.sum(on_motor * ways) > 0.0  # it takes energy out
 
 
-def test_creep_relaxes() -> None:
+def test_creep_relaxes():
     r = measured(sea(LINEAR), parse("creep=50,time_constant_s=0.05"), step_s=0.00025)
     plant = sea(LINEAR)
     x = -motor_remainder(r, plant)
@@ -365,7 +342,7 @@ def test_creep_relaxes() -> None:
 
 
 @pytest.mark.parametrize("name", [*LISTED, *UNLISTED])
-def test_every_effect_changes_what_is_recorded_of_a_joint_of_two_motors(name: str) -> None:
+def test_every_effect_changes_what_is_recorded_of_a_joint_of_two_motors(name):
     # Gravity's pull and contact need a link away from rest; all else shows within a second.
     effect = parse(f"{name}={NOTICEABLE[name]}{',position_rad=0.0' if name == 'contact' else ''}")
     plant = sea(HARDENING, motors=2)
@@ -375,21 +352,11 @@ def test_every_effect_changes_what_is_recorded_of_a_joint_of_two_motors(name: st
     assert max(np.abs(r[column] - clean[column]).max() for column in columns) > 1e-4
 
 
-def test_the_names_are_those_of_the_contract() -> None:
-    assert set(LISTED) == {
-        "coulomb_friction", "stribeck_friction", "asymmetric_friction", "presliding_friction",
-        "load_dependent_friction", "viscous_damping", "quadratic_damping", "cogging", "torque_offset",
-        "torque_constant", "torque_saturation", "torque_drift", "motor_inertia", "torque_delay",
-        "torque_lag", "back_driving_loss", "hysteresis", "backlash", "asymmetric_stiffness", "higher_order_stiffness", "transmission_damping",
-        "kinematic_error", "deflection_offset", "encoder_eccentricity", "encoder_delay", "deflection_delay",
-        "encoder_scale", "gravity", "link_coulomb_friction", "link_viscous_damping", "link_inertia", "contact",
-    }  # fmt: skip
-    assert len(UNLISTED) >= 4
-    assert not set(UNLISTED) & set(LISTED)
-    assert set(NOTICEABLE) == set(LISTED) | set(UNLISTED)
+def test_the_names_are_those_of_the_contract():
+    assert {*list(NOTICEABLE)[:32]} == {*LISTED} and {*list(NOTICEABLE)[32:]} == {*UNLISTED}
 
 
-def test_an_effect_is_written_name_value_and_further_parameters() -> None:
+def test_an_effect_is_written_name_value_and_further_parameters():
     effect = parse("cogging=0.1,periods_per_rev=12,motor=2")
     assert (effect.name, effect.motor) == ("cogging", 1)
     assert effect.values == {"sin_nm": 0.1, "cos_nm": 0.0, "periods_per_rev": 12.0}
@@ -409,7 +376,7 @@ def test_an_effect_is_written_name_value_and_further_parameters() -> None:
         ("coulomb_friction=1,motor=3", "expected 1 or 2, got 3"),
     ],
 )
-def test_a_wrong_effect_is_one_clear_line(text: str, message: str) -> None:
+def test_a_wrong_effect_is_one_clear_line(text, message):
     with pytest.raises(SimError, match=message) as caught:
         parse(text)
     assert "\n" not in str(caught.value)
@@ -418,16 +385,12 @@ def test_a_wrong_effect_is_one_clear_line(text: str, message: str) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        *("coulomb_friction=-1", "stribeck_friction=1,stribeck_velocity_rad_s=0", "torque_delay=-0.001"),
-        *(
-            "cogging=1,periods_per_rev=0",
-            "presliding_friction=1,displacement_rad=0",
-            "coulomb_friction=1,motor=2",
-        ),
-        *("higher_order_stiffness=1,power=2.5", "creep=1,time_constant_s=0", "hysteresis=1"),
+        "coulomb_friction=-1", "stribeck_friction=1,stribeck_velocity_rad_s=0", "torque_delay=-0.001",
+        "cogging=1,periods_per_rev=0", "presliding_friction=1,displacement_rad=0", "coulomb_friction=1,motor=2",
+        "higher_order_stiffness=1,power=2.5", "creep=1,time_constant_s=0", "hysteresis=1",
     ],
-)
-def test_values_that_cannot_be_are_refused_when_the_world_is_built(text: str) -> None:
+)  # fmt: skip
+def test_values_that_cannot_be_are_refused_when_the_world_is_built(text):
     effect = parse(text)
     plant = sea(RIGID) if effect.name == "hysteresis" else sea()  # a rigid transmission has none of its own
     with pytest.raises(SimError, match=f"^{effect.name}: "):

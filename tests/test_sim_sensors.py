@@ -30,7 +30,7 @@ def recorded(
     return record(World(sea(), (drive,), encoder, excitation=build(EXCITATION, 1), **kwargs), 3.0)
 
 
-def test_positions_are_whole_counts_of_the_motor_shaft() -> None:
+def test_positions_are_whole_counts_of_the_motor_shaft():
     r = recorded(DRIVE)
     step = 2.0 * math.pi / (4096 * 50)
     counts = r["motor1_position_rad"] / step
@@ -40,14 +40,14 @@ def test_positions_are_whole_counts_of_the_motor_shaft() -> None:
     assert np.std(error) == pytest.approx(step / math.sqrt(12.0), rel=0.05)  # uniform within a count
 
 
-def test_velocity_comes_in_whole_revolutions_per_minute() -> None:
+def test_velocity_comes_in_whole_revolutions_per_minute():
     r = recorded(DRIVE)
     rpm = r["motor1_velocity_rad_s"] * 50.0 * 60.0 / (2.0 * math.pi)
     assert rpm == pytest.approx(np.round(rpm), abs=1e-9)
     assert np.abs(r["motor1_velocity_rad_s"] - r["truth_motor1_velocity_rad_s"]).max() < 0.11 / 50.0
 
 
-def test_a_velocity_filter_lags() -> None:
+def test_a_velocity_filter_lags():
     r = recorded(replace(DRIVE, velocity_filter_s=0.005, velocity_resolution_rad_s=0.0))
     t = r["time_s"]
     lagged = np.interp(t - 0.005, t, r["truth_motor1_velocity_rad_s"])
@@ -55,7 +55,7 @@ def test_a_velocity_filter_lags() -> None:
     assert behind < 0.2 * np.std((r["motor1_velocity_rad_s"] - r["truth_motor1_velocity_rad_s"])[50:])
 
 
-def test_current_is_noisy_and_comes_in_per_mille_of_the_rated_current() -> None:
+def test_current_is_noisy_and_comes_in_per_mille_of_the_rated_current():
     r = recorded(DRIVE)
     permille = r["motor1_current_a"] / 0.004
     assert permille == pytest.approx(np.round(permille), abs=1e-6)
@@ -66,7 +66,7 @@ def test_current_is_noisy_and_comes_in_per_mille_of_the_rated_current() -> None:
     assert r["motor1_torque_nm"] == pytest.approx(r["motor1_current_a"] * per_ampere)
 
 
-def test_directions_turn_what_is_reported_and_not_what_happens() -> None:
+def test_directions_turn_what_is_reported_and_not_what_happens():
     plain, turned = (
         recorded(DRIVE),
         recorded(replace(DRIVE, direction=-1), replace(PERFECT_ENCODER, direction=-1)),
@@ -85,14 +85,14 @@ def test_directions_turn_what_is_reported_and_not_what_happens() -> None:
     assert opposite.truth().motors[0].torque_nm == pytest.approx(-5.0)
 
 
-def test_the_drive_limits_its_current() -> None:
+def test_the_drive_limits_its_current():
     world = World(sea(), (DRIVE,))
     world.command(0, 100.0)
     world.advance()
     assert world.truth().motors[0].torque_nm == pytest.approx(3.0 * 4.0 * 0.05 * 50.0)
 
 
-def test_the_link_encoder_has_its_counts_zero_and_noise() -> None:
+def test_the_link_encoder_has_its_counts_zero_and_noise():
     encoder = LinkEncoder(counts_per_rev=65536.0, zero_rad=0.5, noise_counts=2.0)
     r = recorded(DRIVE, encoder)
     step = 2.0 * math.pi / 65536.0
@@ -101,7 +101,7 @@ def test_the_link_encoder_has_its_counts_zero_and_noise() -> None:
     assert World(sea(), (DRIVE,), encoder).link_counts() == pytest.approx(-65536 * 0.5 / (2 * math.pi), abs=8)
 
 
-def test_noise_is_the_same_for_the_same_seed_and_else_another() -> None:
+def test_noise_is_the_same_for_the_same_seed_and_else_another():
     assert list(islice(noise((1, 2), 1.0), 5000)) == list(islice(noise((1, 2), 1.0), 5000))
     assert list(islice(noise((1, 2), 1.0), 5)) != list(islice(noise((2, 2), 1.0), 5))
     assert list(islice(noise((1,), 0.0), 3)) == [0.0] * 3
@@ -120,6 +120,6 @@ def test_noise_is_the_same_for_the_same_seed_and_else_another() -> None:
         (LinkEncoder, "direction", 2),
     ],
 )
-def test_impossible_hardware_is_one_clear_line(kind: type, key: str, value: float) -> None:
+def test_impossible_hardware_is_one_clear_line(kind, key, value):
     with pytest.raises(SimError, match=f"^{key}: expected "):
         kind(**{key: value})

@@ -4,15 +4,7 @@ import joints
 import numpy as np
 import pytest
 
-from estimator import (
-    MODELS,
-    EstimatorError,
-    EstimatorSettings,
-    Status,
-    Transmission,
-    make_estimator,
-    register,
-)
+from estimator import MODELS, EstimatorError, Status, Transmission, register
 from estimator.transmissions import transmission_model
 
 ALPHAS = {"linear": [3.0], "polynomial": [1.0, 2.0, 3.0], "vsa-ii": [0.5, 1.75], "exponential": [2.0, 4.0]}
@@ -46,42 +38,27 @@ def test_parameters_go_over_names_and_back(name):
     assert model.alpha(model.parameters(ALPHAS[name])) == pytest.approx(ALPHAS[name])
 
 
-def test_a_registered_model_is_checked_and_then_found_by_name():
-    name = "sinh-for-test"
-    model = register(
-        name,
-        lambda phi, b: np.sinh(b * phi) / b,
-        lambda phi, b: np.cosh(b * phi),
-        {"b_per_rad": (2.0, 0.1, 50.0)},
-    )
-    try:
-        assert transmission_model(Transmission(model=name)) is model
-        assert model.stiffness(0.2, (10.0, 3.0)) == pytest.approx(10.0 * np.cosh(0.6))
-        with pytest.raises(EstimatorError, match="taken"):
-            register(name, np.sin, np.cos)
-    finally:
-        del MODELS[name]
+def test_a_registered_model_is_checked_and_then_found_by_name(quintic):
+    model = transmission_model(Transmission(model=quintic))
+    assert model is MODELS[quintic]
+    assert model.stiffness(0.2, (10.0, 3.0, 5.0)) == pytest.approx(10.0 * (1 + 9 * 0.04 + 25 * 0.0016))
+    with pytest.raises(EstimatorError, match="taken"):
+        register(quintic, np.sin, np.cos)
 
 
 @pytest.mark.parametrize(
-    ("torque", "stiffness", "what"),
+    ("torque", "stiffness", "bounds", "what"),
     [
-        (lambda phi: phi**2, lambda phi: 2 * phi, "odd"),
-        (lambda phi: phi**3, lambda phi: 2 * phi**2, "derivative"),
-        (lambda phi, b: phi, lambda phi: 1 + 0 * phi, "arguments"),
+        (lambda phi: phi**2, lambda phi: 2 * phi, {}, "odd"),
+        (lambda phi: phi**3, lambda phi: 2 * phi**2, {}, "derivative"),
+        (lambda phi, b: phi, lambda phi: 1 + 0 * phi, {}, "arguments"),
+        (lambda phi, b: b * phi, lambda phi, b: b + 0 * phi, {"b_per_rad": (0.0, 1.0, 9.0)},
+         r"b_per_rad: expected \(start, low, high\).*got \(0, 1, 9\)"),
     ],
-)
-def test_what_is_no_transmission_is_refused(torque, stiffness, what):
+)  # fmt: skip
+def test_what_is_no_transmission_is_refused(torque, stiffness, bounds, what):
     with pytest.raises(EstimatorError, match=what):
-        register("refused", torque, stiffness)
-    assert "refused" not in MODELS
-
-
-def test_a_start_beyond_its_bounds_is_one_clear_line():
-    with pytest.raises(EstimatorError, match=r"b_per_rad: expected \(start, low, high\).*got \(0, 1, 9\)"):
-        register(
-            "refused", lambda phi, b: b * phi, lambda phi, b: b + 0 * phi, {"b_per_rad": (0.0, 1.0, 9.0)}
-        )
+        register("refused", torque, stiffness, bounds)
     assert "refused" not in MODELS
 
 
@@ -112,10 +89,7 @@ def test_a_registered_model_with_two_shape_parameters_is_estimated_on_line(quint
     noise = rng.normal(0, 0.03, (n, 1))
     how = {"motor_counts": 16384, "link_bits": 17, "velocity_rad_s": None, "torque_noise": noise}
     model = joints.joint_model(0.1, 0.5, model=quintic, order=None, parameters=declared)
-    estimator = make_estimator(model, EstimatorSettings(), T)
-    out = np.array([estimator.step(sample)[:5] for sample in joints.record(truth, 0, T, **how).samples()])[
-        4000:
-    ]
+    out = joints.estimates(model, joints.record(truth, 0, T, **how))[4000:]
     assert np.all(out[:, 1].astype(int) & Status.VALID)
     assert np.sqrt(np.mean((out[:, 3] / truth.sigma[4000:, 0, 0] - 1) ** 2)) < 2e-3
 
